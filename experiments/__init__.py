@@ -1,0 +1,1 @@
+"""The harness: scenarios in, tables, figures and checks out."""

@@ -1,0 +1,1 @@
+"""Map alignment: correspondences, one estimator a file, a common local refinement."""

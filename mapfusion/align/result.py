@@ -1,0 +1,54 @@
+"""What an aligner returns: a value, also when it failed."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from mapfusion.se2 import Float
+
+
+class Status(StrEnum):
+    """Outcome of an alignment."""
+
+    ACCEPTED = "accepted"
+    REFUSED = "refused"  # an answer was found and is not to be trusted
+    DEGENERATE = "degenerate"  # the data do not determine an answer
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """An estimate of T_a_b (frame b into frame a) from correspondences between two maps.
+
+    Attributes:
+        T_a_b: (3,) tx_m, ty_m, theta_rad (counter-clockwise); NaN when degenerate.
+        covariance: (3, 3) of T_a_b; NaN when degenerate.
+        inlier: (N,) bool over the correspondences given.
+        elapsed_s: time of the estimation.
+        status: accepted, refused or degenerate.
+        reason: empty when accepted, else what a person can act on.
+    """
+
+    T_a_b: Float
+    covariance: Float
+    inlier: np.ndarray
+    elapsed_s: float
+    status: Status
+    reason: str = ""
+
+    @property
+    def ok(self) -> bool:
+        """Whether the estimate may be used."""
+        return self.status is Status.ACCEPTED
+
+
+def degenerate(reason: str, n_correspondences: int, elapsed_s: float = 0.0) -> Alignment:
+    """The result for data that determine no alignment."""
+    return Alignment(
+        np.full(3, np.nan),
+        np.full((3, 3), np.nan),
+        np.zeros(n_correspondences, dtype=bool),
+        elapsed_s,
+        Status.DEGENERATE,
+        reason,
+    )

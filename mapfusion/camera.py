@@ -1,0 +1,92 @@
+"""A rectified pair of pinhole cameras on a robot, and what its pixels mean in metres.
+
+The cameras look along the robot's x axis. Pixels: u to the right, v down, the centre of the top
+left pixel is (0, 0). A point at depth Z has disparity d = u_left - u_right = f B / Z.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mapfusion.se2 import Float
+
+
+@dataclass(frozen=True)
+class StereoCamera:
+    """Intrinsics and mount; the defaults are the STH-MDCS2 head (640x480, 1/2" sensor, 6 mm lens).
+
+    `mount_x_m` and `mount_z_m` give the middle between the two optical centres in the robot frame
+    (on the floor below the middle of the axles); the left camera is half a baseline to the left.
+    """
+
+    width_px: int = 640
+    height_px: int = 480
+    focal_px: float = 577.0
+    baseline_m: float = 0.09
+    mount_x_m: float = 0.15
+    mount_z_m: float = 0.45
+
+    @property
+    def center_px(self) -> tuple[float, float]:
+        """Principal point: the middle of the image."""
+        return (self.width_px - 1) / 2, (self.height_px - 1) / 2
+
+    @property
+    def p_robot_left(self) -> Float:
+        """Optical centre of the left camera in the robot frame (3,)."""
+        return np.array([self.mount_x_m, self.baseline_m / 2, self.mount_z_m])
+
+    def project(self, p_robot: ArrayLike) -> Float:
+        """Points (N, 3) of the robot frame to (N, 3): u, v of the left image, disparity, in pixels."""
+        p_camera = np.asarray(p_robot, dtype=np.float64) - self.p_robot_left
+        depth = p_camera[:, 0]
+        center_u, center_v = self.center_px
+        return np.stack(
+            [
+                center_u - self.focal_px * p_camera[:, 1] / depth,
+                center_v - self.focal_px * p_camera[:, 2] / depth,
+                self.focal_px * self.baseline_m / depth,
+            ],
+            -1,
+        )
+
+    def back_project(self, uv_px: ArrayLike, depth_m: ArrayLike) -> Float:
+        """Left pixels (N, 2) at depths (N,) along the optical axis to points (N, 3) of the robot frame."""
+        uv = np.asarray(uv_px, dtype=np.float64)
+        depth = np.asarray(depth_m, dtype=np.float64)
+        center_u, center_v = self.center_px
+        p_camera = np.stack(
+            [
+                depth,
+                -(uv[:, 0] - center_u) * depth / self.focal_px,
+                -(uv[:, 1] - center_v) * depth / self.focal_px,
+            ],
+            -1,
+        )
+        return p_camera + self.p_robot_left
+
+    def triangulate(
+        self, uv_px: ArrayLike, disparity_px: ArrayLike, sigma_uv_px: float, sigma_disparity_px: ArrayLike
+    ) -> tuple[Float, Float]:
+        """Points (N, 3) of the robot frame and their covariances (N, 3, 3) from matched pixels.
+
+        First-order propagation of independent noise in u, v and disparity through the triangulation
+        (this is the R_t of eq. 6): the error along the ray grows with the square of the depth.
+        `sigma_disparity_px` is one number or (N,).
+        """
+        uv = np.asarray(uv_px, dtype=np.float64)
+        disparity = np.asarray(disparity_px, dtype=np.float64)
+        depth = self.focal_px * self.baseline_m / disparity
+        position = self.back_project(uv, depth)
+        center_u, center_v = self.center_px
+        jacobian = np.zeros((len(uv), 3, 3))  # d(x, y, z) / d(u, v, d)
+        jacobian[:, 0, 2] = -depth / disparity
+        jacobian[:, 1, 0] = -depth / self.focal_px
+        jacobian[:, 1, 2] = (uv[:, 0] - center_u) * depth / (self.focal_px * disparity)
+        jacobian[:, 2, 1] = -depth / self.focal_px
+        jacobian[:, 2, 2] = (uv[:, 1] - center_v) * depth / (self.focal_px * disparity)
+        variance = np.empty((len(uv), 3))
+        variance[:, :2] = sigma_uv_px**2
+        variance[:, 2] = np.asarray(sigma_disparity_px, dtype=np.float64) ** 2
+        return position, np.einsum("nij,nj,nkj->nik", jacobian, variance, jacobian)

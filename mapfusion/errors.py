@@ -1,0 +1,8 @@
+"""The one error a person is meant to read."""
+
+
+class InputError(Exception):
+    """Something a user gave is unusable.
+
+    Its text is one line that names the file, the field and what would be right.
+    """

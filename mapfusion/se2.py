@@ -1,0 +1,81 @@
+"""Poses and rigid motions of the plane, as arrays (..., 3) of x_m, y_m, theta_rad."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Float = NDArray[np.float64]
+
+IDENTITY: Float = np.zeros(3)
+IDENTITY.setflags(write=False)
+
+
+def wrap(angle_rad: ArrayLike) -> Float:
+    """Angles (...) brought into [-pi, pi)."""
+    return np.mod(np.asarray(angle_rad, dtype=np.float64) + np.pi, 2 * np.pi) - np.pi
+
+
+def rotation(theta_rad: ArrayLike) -> Float:
+    """Counter-clockwise rotations (..., 2, 2) by theta (...)."""
+    theta = np.asarray(theta_rad, dtype=np.float64)
+    cos, sin = np.cos(theta), np.sin(theta)
+    return np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
+
+
+def rotation_about_z(theta_rad: ArrayLike) -> Float:
+    """Counter-clockwise rotations (..., 3, 3) about the height axis.
+
+    The paper's eq. 11 and 16 disagree in sign; this is eq. 16, so its theta is minus that of eq. 11.
+    """
+    theta = np.asarray(theta_rad, dtype=np.float64)
+    matrix = np.zeros((*theta.shape, 3, 3))
+    matrix[..., :2, :2] = rotation(theta)
+    matrix[..., 2, 2] = 1.0
+    return matrix
+
+
+def compose(T_a_b: ArrayLike, T_b_c: ArrayLike) -> Float:
+    """T_a_c (..., 3) of two chained motions (..., 3)."""
+    a_b = np.asarray(T_a_b, dtype=np.float64)
+    b_c = np.asarray(T_b_c, dtype=np.float64)
+    cos, sin = np.cos(a_b[..., 2]), np.sin(a_b[..., 2])
+    return np.stack(
+        [
+            a_b[..., 0] + cos * b_c[..., 0] - sin * b_c[..., 1],
+            a_b[..., 1] + sin * b_c[..., 0] + cos * b_c[..., 1],
+            wrap(a_b[..., 2] + b_c[..., 2]),
+        ],
+        -1,
+    )
+
+
+def inverse(T_a_b: ArrayLike) -> Float:
+    """T_b_a (..., 3)."""
+    a_b = np.asarray(T_a_b, dtype=np.float64)
+    cos, sin = np.cos(a_b[..., 2]), np.sin(a_b[..., 2])
+    return np.stack(
+        [
+            -cos * a_b[..., 0] - sin * a_b[..., 1],
+            sin * a_b[..., 0] - cos * a_b[..., 1],
+            wrap(-a_b[..., 2]),
+        ],
+        -1,
+    )
+
+
+def between(T_w_a: ArrayLike, T_w_b: ArrayLike) -> Float:
+    """T_a_b (..., 3) of two poses given in one frame w."""
+    return compose(inverse(T_w_a), T_w_b)
+
+
+def transform_points(T_a_b: ArrayLike, p_b: ArrayLike) -> Float:
+    """Points (N, 2) or (N, 3) of frame b in frame a; heights stay as they are."""
+    a_b = np.asarray(T_a_b, dtype=np.float64)
+    points = np.array(p_b, dtype=np.float64)
+    points[..., :2] = points[..., :2] @ rotation(a_b[2]).T + a_b[:2]
+    return points
+
+
+def transform_covariances(T_a_b: ArrayLike, covariance_m2: ArrayLike) -> Float:
+    """Covariances (N, 3, 3) of frame b in frame a: R S R^T (eq. 15 with our sign of theta)."""
+    rotation_a_b = rotation_about_z(np.asarray(T_a_b, dtype=np.float64)[2])
+    return rotation_a_b @ np.asarray(covariance_m2, dtype=np.float64) @ rotation_a_b.T

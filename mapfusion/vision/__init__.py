@@ -1,0 +1,1 @@
+"""Visual landmarks: Harris corners, U-SURF descriptors, stereo, tracking."""

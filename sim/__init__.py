@@ -1,0 +1,1 @@
+"""The simulator: textured worlds, P3-AT robots, a stereo head; it knows the truth."""
