@@ -38,7 +38,7 @@ class StereoCamera:
         return np.array([self.mount_x_m, self.baseline_m / 2, self.mount_z_m])
 
     def project(self, p_robot: ArrayLike) -> Float:
-        """Points (N, 3) of the robot frame to (N, 3): u, v of the left image, disparity, in pixels."""
+        """Points (N, 3) of the robot frame to (N, 3) u, v (left image) and disparity, in pixels."""
         p_camera = np.asarray(p_robot, dtype=np.float64) - self.p_robot_left
         depth = p_camera[:, 0]
         center_u, center_v = self.center_px
@@ -52,7 +52,7 @@ class StereoCamera:
         )
 
     def back_project(self, uv_px: ArrayLike, depth_m: ArrayLike) -> Float:
-        """Left pixels (N, 2) at depths (N,) along the optical axis to points (N, 3) of the robot frame."""
+        """Left pixels (N, 2) at depths (N,) along the optical axis to robot-frame points (N, 3)."""
         uv = np.asarray(uv_px, dtype=np.float64)
         depth = np.asarray(depth_m, dtype=np.float64)
         center_u, center_v = self.center_px
@@ -67,7 +67,11 @@ class StereoCamera:
         return p_camera + self.p_robot_left
 
     def triangulate(
-        self, uv_px: ArrayLike, disparity_px: ArrayLike, sigma_uv_px: float, sigma_disparity_px: ArrayLike
+        self,
+        uv_px: ArrayLike,
+        disparity_px: ArrayLike,
+        sigma_uv_px: float,
+        sigma_disparity_px: ArrayLike,
     ) -> tuple[Float, Float]:
         """Points (N, 3) of the robot frame and their covariances (N, 3, 3) from matched pixels.
 

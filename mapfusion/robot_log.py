@@ -160,7 +160,7 @@ class RobotLog:
 
 @dataclass(frozen=True)
 class RobotTruth:
-    """The truth about a log: `T_world_robot` (T, 3) and `point_world_m` (N, 3), NaN where unknown."""
+    """The truth about a log: `T_world_robot` (T, 3), `point_world_m` (N, 3); NaN where unknown."""
 
     T_world_robot: Float
     point_world_m: Float

@@ -24,7 +24,7 @@ def rotation(theta_rad: ArrayLike) -> Float:
 def rotation_about_z(theta_rad: ArrayLike) -> Float:
     """Counter-clockwise rotations (..., 3, 3) about the height axis.
 
-    The paper's eq. 11 and 16 disagree in sign; this is eq. 16, so its theta is minus that of eq. 11.
+    The paper's eq. 11 and 16 disagree in sign; this is eq. 16: its theta is minus eq. 11's.
     """
     theta = np.asarray(theta_rad, dtype=np.float64)
     matrix = np.zeros((*theta.shape, 3, 3))

@@ -1,4 +1,4 @@
-"""Tables on disk: Parquet with an explicit schema, a kind and a version, written whole or not at all."""
+"""Tables on disk: Parquet with an explicit schema, a kind and a version, written whole."""
 
 import os
 import tempfile
@@ -18,7 +18,7 @@ _PREFIX = "mapfusion."
 
 
 def write_whole(path: Path, write: Callable[[Path], None]) -> None:
-    """Let `write` fill a temporary file beside `path`, then rename it: readers never see half a file."""
+    """Let `write` fill a temporary file beside `path`, then rename it: no reader sees half a file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=path.suffix)
     os.close(handle)
