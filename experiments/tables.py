@@ -1,0 +1,267 @@
+"""Schemas of the result tables: what the figures, the checks and other people's scripts read.
+
+All are Parquet, in `RESULT/tables/`. Units are in the names; rotations are counter-clockwise.
+`elapsed_s` columns live in `timings` and `aligner_timings` alone: every other table is the same,
+bit for bit, whenever the scenario and the seed are.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pyarrow as pa
+
+from mapfusion.storage import point_fields, read_table, schema, write_table
+
+_TEXT, _INT, _FLOAT, _BOOL = pa.string(), pa.int32(), pa.float64(), pa.bool_()
+
+
+def _fields(**types: pa.DataType) -> list[pa.Field]:
+    return [pa.field(name, kind) for name, kind in types.items()]
+
+
+# What the aligners said, without any truth: the align stage writes it.
+ESTIMATES = schema(
+    "result.estimates",
+    1,
+    _fields(
+        robot_a=_TEXT,
+        robot_b=_TEXT,
+        iteration=_INT,
+        aligner=_TEXT,
+        repetition=_INT,
+        n_correspondences=_INT,
+        status=_TEXT,
+        reason=_TEXT,
+        tx_m=_FLOAT,
+        ty_m=_FLOAT,
+        theta_rad=_FLOAT,
+        refined_status=_TEXT,
+        refined_reason=_TEXT,
+        refined_tx_m=_FLOAT,
+        refined_ty_m=_FLOAT,
+        refined_theta_rad=_FLOAT,
+        drift_sigma_m=_FLOAT,
+        # upper triangle of the refined alignment's covariance (m2, m rad, rad2)
+        cov_xx=_FLOAT,
+        cov_xy=_FLOAT,
+        cov_xt=_FLOAT,
+        cov_yy=_FLOAT,
+        cov_yt=_FLOAT,
+        cov_tt=_FLOAT,
+        # one bit a correspondence, most significant first (numpy.packbits)
+        inliers=pa.binary(),
+        refined_inliers=pa.binary(),
+    ),
+)
+
+# The pairs offered to the aligners; rows of the two maps at that iteration.
+CORRESPONDENCES = schema(
+    "result.correspondences",
+    1,
+    _fields(
+        robot_a=_TEXT,
+        robot_b=_TEXT,
+        iteration=_INT,
+        index_a=_INT,
+        index_b=_INT,
+        descriptor_distance=_FLOAT,
+    ),
+)
+
+# One row per (robot pair, iteration, aligner, repetition), the estimates joined with the truth.
+# The aligner named "oracle" was given the true pairs; it has one repetition.
+ERRORS = schema(
+    "result.errors",
+    1,
+    _fields(
+        robot_a=_TEXT,
+        robot_b=_TEXT,
+        iteration=_INT,
+        aligner=_TEXT,
+        repetition=_INT,
+        status=_TEXT,
+        reason=_TEXT,
+        translation_error_m=_FLOAT,
+        rotation_error_rad=_FLOAT,  # signed: estimate minus truth
+        refined_status=_TEXT,
+        refined_translation_error_m=_FLOAT,
+        refined_rotation_error_rad=_FLOAT,
+        oracle_distance_m=_FLOAT,  # refined translation against the oracle's
+        oracle_distance_rad=_FLOAT,
+        n_correspondences=_INT,
+        n_true=_INT,  # true ones among the correspondences
+        n_common=_INT,  # landmarks of the two maps that truly correspond
+        n_inliers=_INT,
+        precision=_FLOAT,  # of the refined inliers
+        recall=_FLOAT,
+        alignment_nees=_FLOAT,  # of the refined alignment, 3 degrees of freedom
+    ),
+)
+
+# One row per (robot, iteration); best particle online, anchored at the start, no fit.
+ROBOTS = schema(
+    "result.robots",
+    1,
+    _fields(
+        robot=_TEXT,
+        iteration=_INT,
+        path_error_m=_FLOAT,
+        path_error_rad=_FLOAT,
+        odometry_error_m=_FLOAT,
+        odometry_error_rad=_FLOAT,
+        effective_sample_size=_FLOAT,
+        resampled=_BOOL,
+        n_landmarks=_INT,
+        spread_m=_FLOAT,  # root of the trace of the particles' weighted position covariance
+    ),
+)
+
+# Paths in the robot's own frame: the best particle's whole path at the end, the online estimate,
+# odometry alone, and the truth.
+PATHS = schema(
+    "result.paths",
+    1,
+    _fields(
+        robot=_TEXT,
+        iteration=_INT,
+        **{
+            f"{source}_{field}": _FLOAT
+            for source in ("final", "online", "odometry", "truth")
+            for field in ("x_m", "y_m", "theta_rad")
+        },
+    ),
+)
+
+# Particles at the kept iterations, in the robot's own frame.
+CLOUDS = schema(
+    "result.clouds",
+    1,
+    _fields(
+        robot=_TEXT,
+        iteration=_INT,
+        particle=_INT,
+        x_m=_FLOAT,
+        y_m=_FLOAT,
+        theta_rad=_FLOAT,
+        log_weight=_FLOAT,
+    ),
+)
+
+# The robots' last maps, each in its own frame; the true point is given in the same frame.
+LANDMARKS = schema(
+    "result.landmarks",
+    1,
+    [
+        pa.field("robot", _TEXT),
+        pa.field("landmark", _INT),
+        *point_fields(),
+        *_fields(count=_INT, truth_x_m=_FLOAT, truth_y_m=_FLOAT, truth_z_m=_FLOAT),
+    ],
+)
+
+# The fused map in the frame of the first robot. Parents are rows of the robots' last maps.
+FUSED = schema(
+    "result.fused",
+    1,
+    [
+        pa.field("landmark", _INT),
+        *point_fields(),
+        *_fields(
+            n_parents=_INT,
+            robot_a=_TEXT,  # first parent
+            landmark_a=_INT,
+            robot_b=_TEXT,  # second parent, empty when carried over from one map
+            landmark_b=_INT,
+            truth_x_m=_FLOAT,
+            truth_y_m=_FLOAT,
+            truth_z_m=_FLOAT,
+        ),
+    ],
+)
+
+# One row per fused landmark with two parents, per robot pair: was fusing worth it?
+FUSION = schema(
+    "result.fusion",
+    1,
+    _fields(
+        robot_a=_TEXT,
+        robot_b=_TEXT,
+        landmark_a=_INT,
+        landmark_b=_INT,
+        error_a_m=_FLOAT,
+        error_b_m=_FLOAT,  # moved into frame a by the estimate
+        error_fused_m=_FLOAT,
+        nees_with_drift=_FLOAT,
+        nees_without_drift=_FLOAT,
+        degrees_of_freedom=_INT,
+        true_pair=_BOOL,
+    ),
+)
+
+# Per map, after the best rigid fit to the truth; "fused" is the fused map.
+MAP_FITS = schema(
+    "result.map_fits",
+    1,
+    _fields(map=_TEXT, n_landmarks=_INT, rmse_m=_FLOAT),
+)
+
+# Harris points of a few consecutive frames, for figure 1.
+TRACKS = schema(
+    "result.tracks",
+    1,
+    _fields(robot=_TEXT, iteration=_INT, track=pa.int64(), length=_INT, u_px=_FLOAT, v_px=_FLOAT),
+)
+
+TIMINGS = schema("result.timings", 1, _fields(stage=_TEXT, name=_TEXT, elapsed_s=_FLOAT))
+
+# Serial, warmed, repeated: figure 6.
+ALIGNER_TIMINGS = schema(
+    "result.aligner_timings",
+    1,
+    _fields(
+        robot_a=_TEXT,
+        robot_b=_TEXT,
+        iteration=_INT,
+        aligner=_TEXT,
+        n_correspondences=_INT,
+        n_common=_INT,
+        elapsed_s=_FLOAT,  # median of the repeats
+        elapsed_low_s=_FLOAT,  # 10th and 90th percentile
+        elapsed_high_s=_FLOAT,
+    ),
+)
+
+ALL = {
+    "estimates": ESTIMATES,
+    "correspondences": CORRESPONDENCES,
+    "errors": ERRORS,
+    "robots": ROBOTS,
+    "paths": PATHS,
+    "clouds": CLOUDS,
+    "landmarks": LANDMARKS,
+    "fused": FUSED,
+    "fusion": FUSION,
+    "map_fits": MAP_FITS,
+    "tracks": TRACKS,
+    "timings": TIMINGS,
+    "aligner_timings": ALIGNER_TIMINGS,
+}
+
+
+def table_path(result: Path, name: str) -> Path:
+    """Where a result folder keeps the table of that name."""
+    return result / "tables" / f"{name}.parquet"
+
+
+def write(path: Path, name: str, rows: pd.DataFrame | list[dict[str, Any]]) -> None:
+    """Write rows as the table of that name."""
+    table_schema = ALL[name]
+    frame = pd.DataFrame(rows, columns=pd.Index(table_schema.names))
+    write_table(path, {column: frame[column].to_numpy() for column in frame}, table_schema)
+
+
+def read(path: Path, name: str) -> pd.DataFrame:
+    """Read the table of that name; raises InputError that names the file."""
+    table, _ = read_table(path, ALL[name])
+    return table.to_pandas()

@@ -1,0 +1,73 @@
+"""Scenario files: safe YAML 1.2 in, plain mappings out, one clear line when that fails."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
+from mapfusion.errors import InputError
+
+
+def read_mapping(path: Path) -> dict[str, Any]:
+    """Read one YAML mapping; raises InputError that names the file and the line."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file (expected a scenario, for example quick.yaml)") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as UTF-8 text ({error})") from error
+    data = _parse(text, str(path))
+    if not isinstance(data, dict):
+        found = "nothing" if data is None else f"a {type(data).__name__}"
+        raise InputError(f"{path}: holds {found}, expected a mapping of scenario keys")
+    return data
+
+
+def _parse(text: str, where: str) -> Any:
+    try:
+        return YAML(typ="safe", pure=True).load(text)
+    except YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f", line {mark.line + 1}" if mark is not None else ""
+        problem = str(getattr(error, "problem", None) or error).splitlines()[0]
+        raise InputError(f"{where}{line}: not plain YAML ({problem})") from error
+    except ValueError as error:  # for example an impossible date
+        raise InputError(f"{where}: not plain YAML ({error})") from error
+
+
+def apply_overrides(data: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
+    """Return a copy with `key.sub=value` entries set; values are YAML, list items go by index."""
+    result = _copied(data)
+    for override in overrides:
+        dotted, separator, value = override.partition("=")
+        if not separator or not dotted:
+            raise InputError(f"--set {override}: expected key=value, for example evaluate.every=1")
+        _assign(result, dotted, _parse(value, f"--set {override}"))
+    return result
+
+
+def _copied(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _copied(v) for k, v in value.items()}
+    return [_copied(v) for v in value] if isinstance(value, list) else value
+
+
+def _assign(data: dict[str, Any], dotted: str, value: Any) -> None:
+    node: Any = data
+    *parents, last = dotted.split(".")
+    for name in parents:
+        if isinstance(node, list) and name.isdigit() and int(name) < len(node):
+            node = node[int(name)]
+        elif isinstance(node, dict):
+            child = node.get(name)
+            node = node.setdefault(name, {}) if child is not None else node.update({name: {}}) or node[name]
+        else:
+            raise InputError(f"--set {dotted}: {name} is not a key here")
+    if isinstance(node, list) and last.isdigit() and int(last) < len(node):
+        node[int(last)] = value
+    elif isinstance(node, dict):
+        node[last] = value
+    else:
+        raise InputError(f"--set {dotted}: {last} is not a key here")
