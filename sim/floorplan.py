@@ -1,0 +1,214 @@
+"""Walls in plan: what stands where, which faces can be seen, how much room is left beside them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mapfusion.arguments import require_finite, require_shape
+from mapfusion.errors import InputError
+from mapfusion.se2 import Float
+
+SHARPEST_CORNER_RAD = np.radians(30)  # below it the mitred outer edge runs off towards infinity
+
+
+@dataclass(frozen=True)
+class Wall:
+    """An upright wall along a polyline; it is closed where the last point equals the first.
+
+    Attributes:
+        points_m: (K, 2) middle line, K >= 2.
+        height_m: from the floor up.
+        thickness_m: half of it lies on either side of the line.
+    """
+
+    points_m: Float
+    height_m: float = 2.5
+    thickness_m: float = 0.1
+
+    def __post_init__(self) -> None:
+        points = np.asarray(self.points_m, dtype=np.float64)
+        object.__setattr__(self, "points_m", points)
+        require_shape("points_m", points, (None, 2))
+        require_finite("points_m", points)
+        if len(points) < 2:
+            raise InputError("wall: points_m needs at least two points")
+        for name in ("height_m", "thickness_m"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"wall: {name} is {getattr(self, name)}, must be above 0")
+        steps = np.diff(points, axis=0)
+        if np.any(np.hypot(*steps.T) < self.thickness_m):
+            raise InputError(
+                f"wall from {_place(points[0])}: a segment is shorter than the wall is thick"
+            )
+        pairs = np.concatenate([steps, steps[:1]]) if self.closed else steps
+        headings = np.unwrap(np.arctan2(pairs[:, 1], pairs[:, 0]))
+        if np.any(np.abs(np.diff(headings)) > np.pi - SHARPEST_CORNER_RAD):
+            raise InputError(
+                f"wall from {_place(points[0])}: a corner is sharper than "
+                f"{np.degrees(SHARPEST_CORNER_RAD):.0f} degrees"
+            )
+
+    @property
+    def closed(self) -> bool:
+        """Whether the polyline ends where it starts."""
+        return len(self.points_m) > 3 and bool(np.all(self.points_m[0] == self.points_m[-1]))
+
+    def side(self, left: bool) -> Float:
+        """The wall's left or right edge in plan (K, 2), joined by mitres at the corners."""
+        points = self.points_m
+        directions = np.diff(points, axis=0)
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        before = np.concatenate([directions[-1:] if self.closed else directions[:1], directions])
+        after = np.concatenate([directions, directions[:1] if self.closed else directions[-1:]])
+        normals = np.stack([-(before + after)[:, 1], (before + after)[:, 0]], -1)
+        # the mitre is longer than half the thickness by one over the cosine of half the turn
+        normals *= 2 / np.sum(normals**2, axis=1, keepdims=True)
+        return points + (0.5 if left else -0.5) * self.thickness_m * normals
+
+
+@dataclass(frozen=True)
+class Face:
+    """A flat rectangle of the world, seen from its front only.
+
+    Attributes:
+        corners_m: (4, 3) counter-clockwise seen from the front, from the lower left.
+        kind: "wall", "floor" or "ceiling".
+    """
+
+    corners_m: Float
+    kind: str
+
+    @property
+    def size_m(self) -> tuple[float, float]:
+        """Width and height."""
+        first, second, _, last = self.corners_m
+        return float(np.linalg.norm(second - first)), float(np.linalg.norm(last - first))
+
+
+@dataclass(frozen=True)
+class FloorPlan:
+    """Everything that stands still.
+
+    The floor (and the ceiling) is the smallest upright rectangle around the walls' middle lines.
+
+    Attributes:
+        walls: one or more.
+        ceiling: whether there is a ceiling, at the height of the highest wall.
+    """
+
+    walls: tuple[Wall, ...]
+    ceiling: bool = True
+
+    def __post_init__(self) -> None:
+        if not self.walls:
+            raise InputError("walls: at least one is needed")
+        low, high = self.extent_m
+        if np.any(high - low <= 0):
+            raise InputError("walls: they span no area, so there would be no floor")
+
+    @property
+    def extent_m(self) -> tuple[Float, Float]:
+        """Lowest and highest corner (2,), (2,) of the floor."""
+        points = np.concatenate([wall.points_m for wall in self.walls])
+        return points.min(axis=0), points.max(axis=0)
+
+    @property
+    def ceiling_m(self) -> float:
+        """Height of the highest wall."""
+        return max(wall.height_m for wall in self.walls)
+
+    def segments(self) -> tuple[Float, Float, Float, Float]:
+        """All walls' segments: starts (S, 2), ends (S, 2), thickness (S,), height (S,)."""
+        starts = np.concatenate([wall.points_m[:-1] for wall in self.walls])
+        ends = np.concatenate([wall.points_m[1:] for wall in self.walls])
+        counts = [len(wall.points_m) - 1 for wall in self.walls]
+        thickness = np.repeat([wall.thickness_m for wall in self.walls], counts)
+        height = np.repeat([wall.height_m for wall in self.walls], counts)
+        return starts, ends, thickness, height
+
+    def clearance_m(self, points: ArrayLike) -> Float:
+        """Room (N,) between points (N, 2) and the nearest wall's surface; negative inside a wall."""
+        points = np.asarray(points, dtype=np.float64)
+        starts, ends, thickness, _ = self.segments()
+        distance = _point_segment_distance(points[:, None], starts[None], ends[None])
+        return np.min(distance - thickness / 2, axis=1)
+
+    def leg_clearance_m(self, start: ArrayLike, end: ArrayLike) -> float:
+        """Room between the straight leg from `start` to `end` (2,), (2,) and the nearest wall."""
+        start, end = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
+        starts, ends, thickness, _ = self.segments()
+        distance = np.min(
+            [
+                _point_segment_distance(start, starts, ends),
+                _point_segment_distance(end, starts, ends),
+                _point_segment_distance(starts, start, end),
+                _point_segment_distance(ends, start, end),
+            ],
+            axis=0,
+        )
+        distance[_cross(start, end, starts, ends)] = 0.0
+        return float(np.min(distance - thickness / 2))
+
+    def contains(self, points: ArrayLike) -> np.ndarray:
+        """Whether points (N, 2) lie on the floor."""
+        low, high = self.extent_m
+        return np.all((np.asarray(points) >= low) & (np.asarray(points) <= high), axis=-1)
+
+    def faces(self) -> list[Face]:
+        """All faces a robot on the floor can see: walls, then floor, then ceiling."""
+        faces = [face for wall in self.walls for face in self._wall_faces(wall)]
+        (x0, y0), (x1, y1) = self.extent_m
+        plan = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
+        faces.append(Face(np.column_stack([plan, np.zeros(4)]), "floor"))
+        if self.ceiling:
+            seen_from_below = plan[[1, 0, 3, 2]]
+            faces.append(
+                Face(np.column_stack([seen_from_below, np.full(4, self.ceiling_m)]), "ceiling")
+            )
+        return faces
+
+    def _wall_faces(self, wall: Wall) -> list[Face]:
+        left, right = wall.side(left=True), wall.side(left=False)
+        # seen from the left side the wall runs from right to left
+        edges = [(left[i + 1], left[i]) for i in range(len(left) - 1)]
+        edges += [(right[i], right[i + 1]) for i in range(len(right) - 1)]
+        if not wall.closed:
+            edges += [(left[0], right[0]), (right[-1], left[-1])]
+        # a face beyond the floor's edge shows to nobody
+        return [
+            _upright(start, end, wall.height_m)
+            for start, end in edges
+            if np.all(self.contains(np.stack([start, end])))
+        ]
+
+
+def _upright(start: Float, end: Float, height_m: float) -> Face:
+    corners = np.zeros((4, 3))
+    corners[:, :2] = [start, end, end, start]
+    corners[2:, 2] = height_m
+    return Face(corners, "wall")
+
+
+def _point_segment_distance(points: Float, starts: Float, ends: Float) -> Float:
+    """Distances of points (..., 2) to segments (..., 2), broadcast."""
+    along = ends - starts
+    share = np.sum((points - starts) * along, -1) / np.maximum(np.sum(along**2, -1), 1e-300)
+    nearest = starts + np.clip(share, 0, 1)[..., None] * along
+    return np.linalg.norm(points - nearest, axis=-1)
+
+
+def _cross(start: Float, end: Float, starts: Float, ends: Float) -> np.ndarray:
+    """Whether the segment start-end properly crosses each of the segments (S,)."""
+
+    def side(a: Float, b: Float, c: Float) -> Float:
+        ab, ac = b - a, c - a
+        return np.sign(ab[..., 0] * ac[..., 1] - ab[..., 1] * ac[..., 0])
+
+    return (side(start, end, starts) * side(start, end, ends) < 0) & (
+        side(starts, ends, start) * side(starts, ends, end) < 0
+    )
+
+
+def _place(point: Float) -> str:
+    return f"({point[0]:.2f}, {point[1]:.2f})"

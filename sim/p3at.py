@@ -1,0 +1,98 @@
+"""The Pioneer P3-AT: a body with four driven wheels, steered by skidding."""
+
+from pathlib import Path
+
+import numpy as np
+
+from mapfusion.se2 import Float
+from sim.world import World
+
+URDF = Path(__file__).with_name("p3at.urdf")
+WHEEL_RADIUS_M = 0.111
+TRACK_M = 0.394
+LENGTH_M = 0.508
+WIDTH_M = 0.497
+OUTER_RADIUS_M = float(np.hypot(LENGTH_M, WIDTH_M) / 2)  # the circle it sweeps turning in place
+TOP_SPEED_M_S = 0.7
+TOP_WHEEL_SPEED_RAD_S = 6.4
+WHEEL_TORQUE_N_M = 20.0
+TIRE_FRICTION = 0.6  # against a ground of friction 1: rubber on a smooth indoor floor
+WHEELS = ("front_left_wheel", "rear_left_wheel", "front_right_wheel", "rear_right_wheel")
+
+
+class P3at:
+    """One robot in a world.
+
+    Attributes:
+        body: its id in the world.
+    """
+
+    def __init__(self, world: World, T_world_robot: Float) -> None:
+        self._p, self._client = world.bullet, world.client
+        # without the flag the URDF's inertias would be replaced by those of the collision shapes
+        self.body = self._p.loadURDF(
+            str(URDF), flags=self._p.URDF_USE_INERTIA_FROM_FILE, physicsClientId=self._client
+        )
+        self.place(T_world_robot)
+        joints = {
+            self._p.getJointInfo(self.body, j, physicsClientId=self._client)[1].decode(): j
+            for j in range(self._p.getNumJoints(self.body, physicsClientId=self._client))
+        }
+        self._wheels = [joints[name] for name in WHEELS]
+        for wheel in self._wheels:
+            self._p.changeDynamics(
+                self.body,
+                wheel,
+                lateralFriction=TIRE_FRICTION,
+                linearDamping=0,
+                angularDamping=0,
+                physicsClientId=self._client,
+            )
+        self.drive(0.0, 0.0)
+
+    def place(self, T_world_robot: Float, height_m: float = 0.0) -> None:
+        """Put it level at a pose (3,), whatever the physics say."""
+        x, y, theta = T_world_robot
+        # the base's own frame lies in its centre of mass, so place that
+        self._p.resetBasePositionAndOrientation(
+            self.body,
+            [x, y, height_m + CENTER_OF_MASS_M],
+            [0, 0, np.sin(theta / 2), np.cos(theta / 2)],
+            physicsClientId=self._client,
+        )
+
+    def drive(self, left_rad_s: float, right_rad_s: float) -> None:
+        """Set the wheel motors' speeds; their torque is limited."""
+        top = TOP_WHEEL_SPEED_RAD_S
+        left, right = np.clip([left_rad_s, right_rad_s], -top, top)
+        self._p.setJointMotorControlArray(
+            self.body,
+            self._wheels,
+            self._p.VELOCITY_CONTROL,
+            targetVelocities=[left, left, right, right],
+            forces=[WHEEL_TORQUE_N_M] * 4,
+            physicsClientId=self._client,
+        )
+
+    def pose(self) -> Float:
+        """T_world_robot (3,) of the point on the floor below the middle of the wheels."""
+        position, quaternion = self._p.getBasePositionAndOrientation(
+            self.body, physicsClientId=self._client
+        )
+        x, y, z, w = quaternion
+        theta = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        return np.array([position[0], position[1], theta])
+
+    def wheel_angles(self) -> Float:
+        """Encoders: left and right (2,) in radians since the start, mean of the side's wheels."""
+        states = self._p.getJointStates(self.body, self._wheels, physicsClientId=self._client)
+        angles = np.array([state[0] for state in states])
+        return np.array([angles[:2].mean(), angles[2:].mean()])
+
+    def touched_bodies(self) -> set[int]:
+        """Ids of all bodies in contact with it."""
+        contacts = self._p.getContactPoints(bodyA=self.body, physicsClientId=self._client)
+        return {contact[2] for contact in contacts} - {self.body}
+
+
+CENTER_OF_MASS_M = 0.1735  # of the base link, above the floor

@@ -1,0 +1,96 @@
+"""Frames of a recording, each on its own: any process can render any frame in any order."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mapfusion.arguments import require_shape
+from mapfusion.camera import StereoCamera
+from mapfusion.errors import InputError
+from mapfusion.se2 import Float, transform_points
+from sim.p3at import P3at
+from sim.stereo_head import RadiometricNoise, StereoFrame, render_stereo
+from sim.world import World
+
+OUT_OF_SIGHT_M = -100.0  # a robot does not see itself: its body waits below the floor
+SAME_SURFACE = 0.02  # neighbouring pixels whose depths differ by more belong to two surfaces
+
+
+class FrameSource:
+    """A world with all robots' bodies; renders what one of them sees. Use it in a `with` block.
+
+    Args:
+        faces: folder that `sim.world.write_faces` has filled.
+        camera: of all robots.
+        robots: their names.
+        noise: of the images.
+    """
+
+    def __init__(
+        self,
+        faces: Path,
+        camera: StereoCamera,
+        robots: Sequence[str],
+        noise: RadiometricNoise,
+    ) -> None:
+        self._camera, self._noise = camera, noise
+        self._world = World()
+        self._world.add_painted_faces(faces)
+        start = np.zeros(3)
+        self._robots = {name: P3at(self._world, start) for name in robots}
+
+    def __enter__(self) -> "FrameSource":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Free the world."""
+        self._world.close()
+
+    def render(
+        self, T_world_robots: ArrayLike, robot: str, rng: np.random.Generator
+    ) -> StereoFrame:
+        """What `robot` sees when the robots (in the order of their names) stand at poses (R, 3)."""
+        poses = np.asarray(T_world_robots, dtype=np.float64)
+        require_shape("T_world_robots", poses, (len(self._robots), 3))
+        if robot not in self._robots:
+            raise InputError(f"robot {robot}: unknown, there are {', '.join(self._robots)}")
+        own_pose = poses[list(self._robots).index(robot)]
+        for (name, body), pose in zip(self._robots.items(), poses, strict=True):
+            body.place(pose, OUT_OF_SIGHT_M if name == robot else 0.0)
+        return render_stereo(self._world, self._camera, own_pose, self._noise, rng)
+
+
+def truth_points(
+    camera: StereoCamera, depth_m: np.ndarray, uv_px: ArrayLike, T_world_robot: ArrayLike
+) -> Float:
+    """World points (N, 3) behind pixels (N, 2) of the left image; NaN where nothing is.
+
+    Between pixels of one surface the inverse depth is interpolated (it is linear in the image for a
+    plane); at the edge of a surface the nearest pixel's depth counts.
+    """
+    uv = np.asarray(uv_px, dtype=np.float64).reshape(-1, 2)
+    p_robot = camera.back_project(uv, _depth_at(depth_m, uv))
+    return transform_points(T_world_robot, p_robot)
+
+
+def _depth_at(depth_m: np.ndarray, uv_px: Float) -> Float:
+    height, width = depth_m.shape
+    uv = np.clip(uv_px, 0, [width - 1, height - 1])
+    low = np.minimum(uv.astype(np.intp), [width - 2, height - 2])
+    share = uv - low
+    u, v = low.T
+    corners = np.stack(
+        [depth_m[v, u], depth_m[v, u + 1], depth_m[v + 1, u], depth_m[v + 1, u + 1]], -1
+    ).astype(np.float64)
+    a, b = share.T
+    weights = np.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b], -1)
+    smooth = 1 / np.sum(weights / corners, axis=-1)
+    nearest = corners[np.arange(len(uv)), np.argmax(weights, axis=-1)]
+    # comparisons with NaN are false, so a pixel of the background makes an edge too
+    one_surface = corners.max(axis=-1) - corners.min(axis=-1) <= SAME_SURFACE * nearest
+    return np.where(one_surface, smooth, nearest)

@@ -1,0 +1,125 @@
+"""The stereo head: what a rectified pair of pinhole cameras on a robot sees of a world."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mapfusion.camera import StereoCamera
+from mapfusion.se2 import Float, compose, transform_points
+from sim.world import World
+
+NEAR_M = 0.1  # nearer than any wall can come to the lens
+FAR_M = 60.0  # beyond the largest building's diagonal
+
+
+@dataclass(frozen=True)
+class RadiometricNoise:
+    """Sensor noise, independent in the two images of a pair.
+
+    Attributes:
+        sigma_gray: standard deviation of each pixel's additive noise, in gray levels of 255.
+        sigma_gain: standard deviation of an image's gain around 1.
+        sigma_offset_gray: standard deviation of an image's offset, in gray levels.
+    """
+
+    sigma_gray: float = 2.0
+    sigma_gain: float = 0.01
+    sigma_offset_gray: float = 1.0
+
+    def apply(self, gray: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """A noisy copy of a gray image (H, W) uint8."""
+        gain = 1 + self.sigma_gain * rng.standard_normal()
+        offset = self.sigma_offset_gray * rng.standard_normal()
+        noise = rng.standard_normal(gray.shape, dtype=np.float32)
+        noise *= np.float32(self.sigma_gray)
+        noise += np.float32(gain) * gray + np.float32(offset)
+        return np.clip(np.rint(noise), 0, 255).astype(np.uint8)
+
+
+@dataclass(frozen=True)
+class StereoFrame:
+    """What one robot sees at one moment.
+
+    Attributes:
+        left: (H, W) uint8 gray.
+        right: (H, W) uint8 gray.
+        depth_m: (H, W) float32 along the optical axis of the left camera; NaN where nothing is.
+        left_rgb: (H, W, 3) uint8 without noise, for figures.
+    """
+
+    left: np.ndarray
+    right: np.ndarray
+    depth_m: np.ndarray
+    left_rgb: np.ndarray
+
+
+def render_stereo(
+    world: World,
+    camera: StereoCamera,
+    T_world_robot: ArrayLike,
+    noise: RadiometricNoise,
+    rng: np.random.Generator,
+) -> StereoFrame:
+    """Render both images and the left one's depth for a robot at a pose (3,)."""
+    left_rgb, depth_m = _render(world, camera, T_world_robot, camera.baseline_m / 2)
+    right_rgb, _ = _render(world, camera, T_world_robot, -camera.baseline_m / 2)
+    left, right = (cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) for rgb in (left_rgb, right_rgb))
+    return StereoFrame(noise.apply(left, rng), noise.apply(right, rng), depth_m, left_rgb)
+
+
+def _render(
+    world: World, camera: StereoCamera, T_world_robot: ArrayLike, y_m: float
+) -> tuple[np.ndarray, np.ndarray]:
+    p = world.bullet
+    T_world_camera = compose(T_world_robot, [camera.mount_x_m, y_m, 0.0])
+    _, _, rgba, buffer, _ = p.getCameraImage(
+        camera.width_px,
+        camera.height_px,
+        viewMatrix=_view_matrix(T_world_camera, camera.mount_z_m),
+        projectionMatrix=_projection_matrix(camera),
+        shadow=0,
+        # the texture as painted: a wall looks the same from everywhere
+        lightAmbientCoeff=1.0,
+        lightDiffuseCoeff=0.0,
+        lightSpecularCoeff=0.0,
+        renderer=p.ER_TINY_RENDERER,
+        flags=p.ER_NO_SEGMENTATION_MASK,
+        physicsClientId=world.client,
+    )
+    shape = (camera.height_px, camera.width_px)
+    rgb = np.ascontiguousarray(np.reshape(rgba, (*shape, 4))[..., :3].astype(np.uint8))
+    return rgb, _metric_depth(np.reshape(buffer, shape))
+
+
+def _view_matrix(T_world_camera: Float, z_m: float) -> list[float]:
+    """World to OpenGL's camera (x right, y up, z backwards), column by column."""
+    x, y, theta = T_world_camera
+    cos, sin = np.cos(theta), np.sin(theta)
+    matrix = np.eye(4)
+    matrix[:3, :3] = [[sin, -cos, 0], [0, 0, 1], [-cos, -sin, 0]]
+    matrix[:3, 3] = -matrix[:3, :3] @ [x, y, z_m]
+    return matrix.T.ravel().tolist()
+
+
+def _projection_matrix(camera: StereoCamera) -> list[float]:
+    """Exact pinhole, column by column.
+
+    TinyRenderer samples pixel i at the coordinate i of a viewport that is `width` wide, so the
+    middle of its frustum falls on width / 2; the principal point belongs on (width - 1) / 2.
+    """
+    width, height, f = camera.width_px, camera.height_px, camera.focal_px
+    matrix = np.zeros((4, 4))
+    matrix[0, 0], matrix[0, 2] = 2 * f / width, 1 / width
+    matrix[1, 1], matrix[1, 2] = 2 * f / height, 1 / height
+    matrix[2, 2] = -(FAR_M + NEAR_M) / (FAR_M - NEAR_M)
+    matrix[2, 3] = -2 * FAR_M * NEAR_M / (FAR_M - NEAR_M)
+    matrix[3, 2] = -1
+    return matrix.T.ravel().tolist()
+
+
+def _metric_depth(buffer: np.ndarray) -> np.ndarray:
+    depth = FAR_M * NEAR_M / (FAR_M - (FAR_M - NEAR_M) * buffer.astype(np.float64))
+    depth[buffer >= 1] = np.nan
+    return depth.astype(np.float32)

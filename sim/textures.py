@@ -1,0 +1,92 @@
+"""Procedural textures: no two alike, rich in corners at every scale, fit for nearest sampling.
+
+The renderer takes the nearest texel without any filter, so detail finer than a pixel's footprint
+turns into noise that differs between the left and the right image. Texels are therefore about as
+large as a pixel seen from 3 m (577 px / 3 m = 192 per metre), and slightly low-passed.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from sim.floorplan import Face
+
+
+@dataclass(frozen=True)
+class TextureStyle:
+    """How one kind of face is painted.
+
+    Attributes:
+        texels_per_m: density.
+        scales_m: sizes of the shapes, painted from large to small.
+        coverage: area painted at each scale over the face's area.
+        contrast: range of gray levels at each scale, over the 8-bit range.
+        low_pass_texels: standard deviation of the Gaussian that smooths the texel grid.
+    """
+
+    texels_per_m: float
+    scales_m: tuple[float, ...]
+    coverage: tuple[float, ...]
+    contrast: tuple[float, ...]
+    low_pass_texels: float
+
+
+# Smallest wall shapes: 4 px at 8 m, 30 px at 1 m. Floor and ceiling are seen at a grazing angle,
+# where a pixel covers centimetres to decimetres: coarse shapes only.
+STYLES = {
+    "wall": TextureStyle(
+        texels_per_m=175,
+        scales_m=(0.8, 0.4, 0.2, 0.1, 0.05),
+        coverage=(0.7, 0.5, 0.4, 0.3, 0.12),
+        contrast=(0.5, 0.8, 0.8, 0.8, 0.7),
+        low_pass_texels=1.0,
+    ),
+    "floor": TextureStyle(60, (1.6, 0.8, 0.4), (0.7, 0.5, 0.3), (0.3, 0.4, 0.4), 1.0),
+    "ceiling": TextureStyle(60, (1.6, 0.8, 0.4), (0.7, 0.5, 0.3), (0.3, 0.4, 0.4), 1.0),
+}
+
+TINT_LEVELS = 35  # colour is for the eye; the cameras are gray
+_SUBTEXEL_BITS = 4
+
+
+def paint(face: Face, rng: np.random.Generator) -> np.ndarray:
+    """An RGB picture (H, W, 3) uint8 of a face, its first row along the upper edge."""
+    style = STYLES[face.kind]
+    width = max(8, round(face.size_m[0] * style.texels_per_m))
+    height = max(8, round(face.size_m[1] * style.texels_per_m))
+    picture = np.empty((height, width, 3), dtype=np.uint8)
+    picture[:] = _colours(1, 0.4, rng)[0]
+    for scale_m, coverage, contrast in zip(
+        style.scales_m, style.coverage, style.contrast, strict=True
+    ):
+        scale = scale_m * style.texels_per_m
+        _scatter(picture, scale, rng.poisson(coverage * width * height / scale**2), contrast, rng)
+    return cv2.GaussianBlur(picture, (0, 0), style.low_pass_texels)
+
+
+def _scatter(
+    picture: np.ndarray, scale: float, n: int, contrast: float, rng: np.random.Generator
+) -> None:
+    """Paint n convex polygons of about `scale` texels across."""
+    height, width = picture.shape[:2]
+    center = rng.uniform((0, 0), (width, height), (n, 2))
+    corners = rng.integers(3, 7, n)
+    radius = 0.5 * scale * rng.uniform(0.6, 1.3, n)
+    stretch = rng.uniform(0.5, 1.0, n)
+    turn = rng.uniform(0, 2 * np.pi, (n, 2))
+    jitter = rng.uniform(-0.3, 0.3, (n, 6))
+    colour = _colours(n, contrast, rng).tolist()
+    for i in range(n):
+        k = corners[i]
+        angle = turn[i, 0] + 2 * np.pi * (np.arange(k) + jitter[i, :k]) / k
+        x, y = np.cos(angle), stretch[i] * np.sin(angle)
+        cos, sin = np.cos(turn[i, 1]), np.sin(turn[i, 1])
+        points = center[i] + radius[i] * np.stack([cos * x - sin * y, sin * x + cos * y], -1)
+        fixed_point = np.round(points * 2**_SUBTEXEL_BITS).astype(np.int32)
+        cv2.fillConvexPoly(picture, fixed_point, colour[i], cv2.LINE_8, _SUBTEXEL_BITS)
+
+
+def _colours(n: int, contrast: float, rng: np.random.Generator) -> np.ndarray:
+    gray = 127.5 + 127.5 * contrast * rng.uniform(-1, 1, (n, 1))
+    return np.clip(gray + rng.normal(0, TINT_LEVELS, (n, 3)), 10, 245)

@@ -1,0 +1,149 @@
+"""The PyBullet world: one client, walls to bump into, or painted faces to look at."""
+
+import contextlib
+import ctypes
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+
+import cv2
+import numpy as np
+
+from sim.floorplan import Face, FloorPlan
+from sim.textures import paint
+
+GRAVITY_M_S2 = 9.81
+PHYSICS_HZ = 240  # PyBullet's own default; contacts and motors are tuned for it
+
+
+@contextlib.contextmanager
+def silence() -> Iterator[None]:
+    """Keep what C code prints off the user's screen: stdout and stderr lead nowhere meanwhile.
+
+    PyBullet writes with C's printf, past `sys.stdout`, so the file descriptors are redirected.
+    """
+    sys.stdout.flush()
+    sys.stderr.flush()
+    libc = ctypes.CDLL(None)
+    libc.fflush(None)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    saved = {fd: os.dup(fd) for fd in (1, 2) if _is_open(fd)}
+    try:
+        for fd in saved:
+            os.dup2(nowhere, fd)
+        yield
+    finally:
+        libc.fflush(None)  # what C still buffers must not reach the screen later
+        for fd, copy in saved.items():
+            os.dup2(copy, fd)
+            os.close(copy)
+        os.close(nowhere)
+
+
+def _is_open(fd: int) -> bool:
+    try:
+        os.fstat(fd)
+    except OSError:
+        return False
+    return True
+
+
+class World:
+    """Owns a PyBullet client without a screen; use it in a `with` block.
+
+    Attributes:
+        bullet: the `pybullet` module.
+        client: id to pass as `physicsClientId`.
+    """
+
+    def __init__(self) -> None:
+        with silence():
+            import pybullet
+
+            self.bullet = pybullet
+            self.client = pybullet.connect(pybullet.DIRECT)
+
+    def __enter__(self) -> "World":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Disconnect; a second call does nothing."""
+        if self.client >= 0:
+            with silence():
+                self.bullet.disconnect(physicsClientId=self.client)
+            self.client = -1
+
+    def start_physics(self) -> int:
+        """Gravity, time step and a flat ground; returns the ground's body id."""
+        p, client = self.bullet, self.client
+        p.setGravity(0, 0, -GRAVITY_M_S2, physicsClientId=client)
+        p.setPhysicsEngineParameter(
+            fixedTimeStep=1 / PHYSICS_HZ,
+            deterministicOverlappingPairs=1,
+            physicsClientId=client,
+        )
+        plane = p.createCollisionShape(p.GEOM_PLANE, physicsClientId=client)
+        return p.createMultiBody(0, plane, physicsClientId=client)
+
+    def add_solid_walls(self, plan: FloorPlan) -> None:
+        """Collision boxes, one a wall segment."""
+        p, client = self.bullet, self.client
+        for start, end, thickness, height in zip(*plan.segments(), strict=True):
+            along = end - start
+            half = [float(np.linalg.norm(along)) / 2, thickness / 2, height / 2]
+            shape = p.createCollisionShape(p.GEOM_BOX, halfExtents=half, physicsClientId=client)
+            p.createMultiBody(
+                0,
+                shape,
+                basePosition=[*((start + end) / 2), height / 2],
+                baseOrientation=p.getQuaternionFromEuler([0, 0, np.arctan2(along[1], along[0])]),
+                physicsClientId=client,
+            )
+
+    def add_painted_faces(self, folder: Path) -> None:
+        """Load the faces that `write_faces` left in `folder`, to be seen and not touched."""
+        p, client = self.bullet, self.client
+        with silence():
+            for mesh in sorted(folder.glob("face_*.obj")):
+                shape = p.createVisualShape(p.GEOM_MESH, fileName=str(mesh), physicsClientId=client)
+                body = p.createMultiBody(
+                    0, baseVisualShapeIndex=shape, physicsClientId=client
+                )
+                texture = p.loadTexture(str(mesh.with_suffix(".png")), physicsClientId=client)
+                p.changeVisualShape(
+                    body, -1, textureUniqueId=texture, physicsClientId=client
+                )
+
+
+def write_faces(folder: Path, plan: FloorPlan, rng: np.random.Generator) -> None:
+    """Write each face's mesh and texture into `folder`; each texture has a child generator."""
+    folder.mkdir(parents=True, exist_ok=True)
+    faces = plan.faces()
+    for i, (face, child) in enumerate(zip(faces, rng.spawn(len(faces)), strict=True)):
+        path = folder / f"face_{i:04d}"
+        picture = cv2.cvtColor(paint(face, child), cv2.COLOR_RGB2BGR)
+        if not cv2.imwrite(f"{path}.png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
+            raise OSError(f"{path}.png: could not be written")
+        path.with_suffix(".obj").write_text(_mesh(face), encoding="ascii")
+
+
+def _mesh(face: Face) -> str:
+    """One quad as OBJ; with normals and texture coordinates, or the renderer draws nothing."""
+    edge_right, edge_up = face.corners_m[1] - face.corners_m[0], face.corners_m[3] - face.corners_m[0]
+    normal = np.cross(edge_right, edge_up)
+    normal /= np.linalg.norm(normal)
+    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in face.corners_m]
+    lines += ["vt 0 0", "vt 1 0", "vt 1 1", "vt 0 1"]
+    lines += [f"vn {normal[0]:.9g} {normal[1]:.9g} {normal[2]:.9g}"]
+    lines += ["f 1/1/1 2/2/1 3/3/1", "f 1/1/1 3/3/1 4/4/1"]
+    return "\n".join(lines) + "\n"
