@@ -1,0 +1,40 @@
+"""What one stereo pair yields, as arrays; nothing in it depends on any other pair."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapfusion.arguments import require_finite, require_shape
+from mapfusion.robot_log import DESCRIPTOR_LENGTH
+from mapfusion.se2 import Float
+
+
+@dataclass(frozen=True)
+class Features:
+    """Matched and described corners of one frame, the strongest corner first.
+
+    Attributes:
+        uv_px: (N, 2) in the left image.
+        disparity_px: (N,) positive.
+        sigma_disparity_px: (N,) standard deviation of the disparity.
+        descriptor: (N, 64) float32, unit length.
+    """
+
+    uv_px: Float
+    disparity_px: Float
+    sigma_disparity_px: Float
+    descriptor: np.ndarray
+
+    def __post_init__(self) -> None:
+        n = len(self.uv_px)
+        require_shape("uv_px", self.uv_px, (n, 2))
+        require_shape("disparity_px", self.disparity_px, (n,))
+        require_shape("sigma_disparity_px", self.sigma_disparity_px, (n,))
+        require_shape("descriptor", self.descriptor, (n, DESCRIPTOR_LENGTH))
+        for name in ("uv_px", "disparity_px", "sigma_disparity_px", "descriptor"):
+            require_finite(name, getattr(self, name))
+        if np.any(self.disparity_px <= 0):
+            raise ValueError("disparity_px: must be positive")
+
+    def __len__(self) -> int:
+        return len(self.uv_px)

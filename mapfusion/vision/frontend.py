@@ -1,0 +1,97 @@
+"""The visual front end: a stereo pair in, landmark observations out."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mapfusion.camera import StereoCamera
+from mapfusion.robot_log import Observations
+from mapfusion.vision.features import Features
+from mapfusion.vision.harris import HarrisParameters, detect
+from mapfusion.vision.stereo import MATCHED, StereoParameters, match
+from mapfusion.vision.tracks import TrackParameters
+from mapfusion.vision.usurf import USurfParameters, describe
+
+
+@dataclass(frozen=True)
+class FrontEndParameters:
+    """All the front end's parameters.
+
+    Attributes:
+        harris, stereo, usurf, tracks: of the parts.
+        sigma_uv_px: standard deviation of a corner's place in the image, each axis.
+        max_depth_m: points farther away are tracked but not observed,
+        max_sigma_depth_m: nor are points whose depth has a larger standard deviation.
+    """
+
+    harris: HarrisParameters = field(default_factory=HarrisParameters)
+    stereo: StereoParameters = field(default_factory=StereoParameters)
+    usurf: USurfParameters = field(default_factory=USurfParameters)
+    tracks: TrackParameters = field(default_factory=TrackParameters)
+    sigma_uv_px: float = 0.5
+    max_depth_m: float = 8.0
+    max_sigma_depth_m: float = 0.4
+
+    def __post_init__(self) -> None:
+        for name in ("sigma_uv_px", "max_depth_m", "max_sigma_depth_m"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}: must be positive")
+
+
+@dataclass(frozen=True)
+class FrontEnd:
+    """Features of single stereo pairs; stateless, so frames may be done in any order."""
+
+    camera: StereoCamera
+    parameters: FrontEndParameters = field(default_factory=FrontEndParameters)
+
+    def extract(self, left: np.ndarray, right: np.ndarray) -> Features:
+        """Corners of the left image that have a match in the right one, described.
+
+        Args:
+            left: (H, W) uint8, rectified, of the camera's size.
+            right: likewise.
+
+        Raises:
+            ValueError: wrong shape or type; names the argument.
+        """
+        size = (self.camera.height_px, self.camera.width_px)
+        for name, image in (("left", left), ("right", right)):
+            if image.shape != size or image.dtype != np.uint8:
+                raise ValueError(f"{name}: is {image.dtype} {image.shape}, expected uint8 {size}")
+        corners = detect(left, self.parameters.harris)
+        matches = match(left, right, corners, self.camera, self.parameters.stereo)
+        matched = matches.verdict == MATCHED
+        uv, disparity = corners[matched], matches.disparity_px[matched]
+        depth = self.camera.focal_px * self.camera.baseline_m / disparity
+        scale = self.parameters.usurf.scales_px(depth, self.camera.focal_px)
+        descriptor = describe(left, uv, scale)
+        return Features(uv, disparity, matches.sigma_px[matched], descriptor)
+
+
+def observe(
+    camera: StereoCamera, features: Features, keep: np.ndarray, parameters: FrontEndParameters
+) -> Observations:
+    """Observations of the features marked in `keep` (N,) bool that are near and certain enough.
+
+    Their covariance is R_t of eq. 6, from the stereo geometry.
+
+    Raises:
+        ValueError: `keep` has another length than `features`.
+    """
+    if keep.shape != (len(features),):
+        raise ValueError(f"keep: shape is {keep.shape}, expected ({len(features)},)")
+    depth = camera.focal_px * camera.baseline_m / features.disparity_px
+    sigma_depth = depth * features.sigma_disparity_px / features.disparity_px
+    near = (depth <= parameters.max_depth_m) & (sigma_depth <= parameters.max_sigma_depth_m)
+    rows = np.nonzero(keep & near)[0]
+    position, covariance = camera.triangulate(
+        features.uv_px[rows],
+        features.disparity_px[rows],
+        parameters.sigma_uv_px,
+        features.sigma_disparity_px[rows],
+    )
+    uvd = np.column_stack([features.uv_px[rows], features.disparity_px[rows]])
+    return Observations(
+        position, covariance, features.descriptor[rows], uvd_px=uvd.astype(np.float32)
+    )

@@ -1,0 +1,149 @@
+"""Harris corners (Harris and Stephens 1988), the strongest of each part of the image."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit
+
+from mapfusion.se2 import Float
+
+_SOBEL_APERTURE_PX = 3
+_SOBEL_GAIN = 2.0  # OpenCV divides its Sobel sum, 8 times the slope per pixel, by 4
+
+
+@dataclass(frozen=True)
+class HarrisParameters:
+    """Which corners to take.
+
+    Attributes:
+        max_corners: at most so many an image.
+        min_distance_px: no two corners nearer than this.
+        cell_px: side of the squares of the grid that share `max_corners` evenly, so that one rich
+            poster does not take all.
+        block_px: side of the square over which the structure tensor is averaged.
+        k: Harris' constant, 0.04 to 0.06 by custom.
+        min_slope: grey levels per pixel; a corner whose brightness changes by this (RMS) in every
+            direction is the weakest that counts. The Sobel slope of white noise of n grey levels is
+            0.43 n, so the default stands clear of a noise of 2 levels.
+        border_px: margin in which no corners are taken; the stereo windows must fit.
+        subpixel_half_px: half side of the window of the sub-pixel step.
+    """
+
+    max_corners: int = 220
+    min_distance_px: int = 10
+    cell_px: int = 80
+    block_px: int = 5
+    k: float = 0.04
+    min_slope: float = 2.5
+    border_px: int = 12
+    subpixel_half_px: int = 3
+
+    def __post_init__(self) -> None:
+        for name in ("max_corners", "min_distance_px", "cell_px", "block_px", "subpixel_half_px"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: must be at least 1")
+        if not 0 < self.k < 0.25:
+            raise ValueError("k: must lie between 0 and 0.25, where no corner can pass")
+        if self.min_slope <= 0:
+            raise ValueError("min_slope: must be positive")
+        if self.border_px < self.subpixel_half_px + 2:
+            raise ValueError("border_px: must be at least subpixel_half_px + 2")
+
+    @property
+    def min_response(self) -> float:
+        """OpenCV's response of a corner with `min_slope` in every direction.
+
+        det M - k (trace M)^2 with both eigenvalues of M equal; OpenCV scales grey levels to 0..1.
+        """
+        eigenvalue = (_SOBEL_GAIN * self.min_slope / 255) ** 2
+        return eigenvalue**2 * (1 - 4 * self.k)
+
+
+def detect(image: np.ndarray, parameters: HarrisParameters) -> Float:
+    """Corners (N, 2), u and v in pixels at sub-pixel precision, strongest first.
+
+    Args:
+        image: (H, W) uint8.
+        parameters: see there.
+
+    Raises:
+        ValueError: the image has another shape or type.
+    """
+    if image.ndim != 2 or image.dtype != np.uint8:
+        raise ValueError(f"image: is {image.dtype} {image.shape}, expected uint8 (H, W)")
+    if min(image.shape) <= 2 * parameters.border_px:
+        return np.zeros((0, 2))
+    response = cv2.cornerHarris(image, parameters.block_px, _SOBEL_APERTURE_PX, parameters.k)
+    pixels = _strongest(response, parameters)
+    if len(pixels) == 0:
+        return np.zeros((0, 2))
+    return _refine(image, pixels, parameters)
+
+
+def _strongest(response: np.ndarray, parameters: HarrisParameters) -> np.ndarray:
+    """Pixels (N, 2) int64 of the corners to keep, strongest first."""
+    border = parameters.border_px
+    inner = response[border:-border, border:-border]
+    local_maximum = inner == cv2.dilate(response, np.ones((3, 3)))[border:-border, border:-border]
+    v, u = np.nonzero(local_maximum & (inner > parameters.min_response))
+    order = np.argsort(-inner[v, u], kind="stable")
+    candidates = np.stack([u[order], v[order]], -1) + border
+    height, width = response.shape
+    cells = -(-height // parameters.cell_px) * -(-width // parameters.cell_px)
+    kept = _spread(
+        candidates,
+        height,
+        width,
+        parameters.min_distance_px,
+        parameters.cell_px,
+        -(-parameters.max_corners // cells),
+        parameters.max_corners,
+    )
+    return candidates[kept]
+
+
+@njit(cache=True)
+def _spread(
+    candidates: np.ndarray,
+    height: int,
+    width: int,
+    min_distance: int,
+    cell: int,
+    per_cell: int,
+    most: int,
+) -> np.ndarray:
+    """Rows of candidates (N, 2), sorted by strength, that a greedy choice keeps.
+
+    A first pass fills each cell up to its share, a second hands what poor cells left over to the
+    strongest remaining. No two are nearer than `min_distance`.
+    """
+    blocked = np.zeros((height, width), dtype=np.uint8)
+    filled = np.zeros((height // cell + 1, width // cell + 1), dtype=np.int64)
+    taken = np.zeros(len(candidates), dtype=np.bool_)
+    count = 0
+    for share in (per_cell, most):
+        for n in range(len(candidates)):
+            u, v = candidates[n, 0], candidates[n, 1]
+            if count == most:
+                return np.nonzero(taken)[0]
+            if taken[n] or blocked[v, u] or filled[v // cell, u // cell] >= share:
+                continue
+            taken[n] = True
+            count += 1
+            filled[v // cell, u // cell] += 1
+            for y in range(max(v - min_distance + 1, 0), min(v + min_distance, height)):
+                for x in range(max(u - min_distance + 1, 0), min(u + min_distance, width)):
+                    if (x - u) ** 2 + (y - v) ** 2 < min_distance**2:
+                        blocked[y, x] = 1
+    return np.nonzero(taken)[0]
+
+
+def _refine(image: np.ndarray, pixels: np.ndarray, parameters: HarrisParameters) -> Float:
+    """Sub-pixel corners (N, 2): where gradients are orthogonal to the rays (Foerstner 1987)."""
+    half = parameters.subpixel_half_px
+    corners = pixels.astype(np.float32).reshape(-1, 1, 2)
+    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 20, 0.01)
+    return (
+        cv2.cornerSubPix(image, corners, (half, half), (-1, -1), stop).reshape(-1, 2).astype(float)
+    )

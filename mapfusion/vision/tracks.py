@@ -1,0 +1,146 @@
+"""Features followed over consecutive frames; a landmark counts only after some frames in a row."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from mapfusion.vision.features import Features
+
+_NO_MATCH = -1
+
+
+@dataclass(frozen=True)
+class TrackParameters:
+    """How features of consecutive frames are linked.
+
+    Attributes:
+        min_length: p, the frames in a row after which a track counts as a landmark.
+        max_shift_u_px: largest motion along a row between two frames; turning moves all points.
+        max_shift_v_px: across rows; driving moves near points outwards.
+        max_disparity_ratio: largest change of disparity, as a factor: the robot's step against the
+            nearest depth, and noise at the farthest.
+        max_descriptor_distance: between unit vectors.
+    """
+
+    min_length: int = 3
+    max_shift_u_px: float = 80.0
+    max_shift_v_px: float = 25.0
+    max_disparity_ratio: float = 1.3
+    max_descriptor_distance: float = 0.35
+
+    def __post_init__(self) -> None:
+        if self.min_length < 1:
+            raise ValueError("min_length: must be at least 1")
+        for name in ("max_shift_u_px", "max_shift_v_px", "max_descriptor_distance"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}: must be positive")
+        if not self.max_disparity_ratio > 1:
+            raise ValueError("max_disparity_ratio: must exceed 1")
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """The tracks that a frame's features belong to.
+
+    Attributes:
+        track_id: (N,) int64, never used twice by one tracker.
+        length: (N,) int64 frames in a row up to this one, 1 for a new track.
+    """
+
+    track_id: np.ndarray
+    length: np.ndarray
+
+
+class Tracker:
+    """Links each frame's features to those of the frame before; frames come in their order."""
+
+    def __init__(self, parameters: TrackParameters) -> None:
+        self.parameters = parameters
+        self._previous: Features | None = None
+        self._tracks = Tracks(np.zeros(0, np.int64), np.zeros(0, np.int64))
+        self._next_id = 0
+
+    def update(self, features: Features) -> Tracks:
+        """Tracks of this frame's features."""
+        n = len(features)
+        source = np.full(n, _NO_MATCH)
+        if self._previous is not None:
+            source = link(self._previous, features, self.parameters)
+        linked = source != _NO_MATCH
+        born = n - np.count_nonzero(linked)
+        track_id = np.empty(n, np.int64)
+        track_id[linked] = self._tracks.track_id[source[linked]]
+        track_id[~linked] = np.arange(self._next_id, self._next_id + born)
+        length = np.ones(n, np.int64)
+        length[linked] += self._tracks.length[source[linked]]
+        self._next_id += born
+        self._previous = features
+        self._tracks = Tracks(track_id, length)
+        return self._tracks
+
+    def landmarks(self, tracks: Tracks) -> np.ndarray:
+        """(N,) bool: features whose track has lasted `min_length` frames."""
+        return tracks.length >= self.parameters.min_length
+
+
+def link(previous: Features, current: Features, parameters: TrackParameters) -> np.ndarray:
+    """For each feature of `current` (N,) its row in `previous`, or -1.
+
+    Two features are linked when each is the other's nearest descriptor among those that the limits
+    on shift and disparity allow, and the distance is within its limit.
+    """
+    return _link(
+        previous.uv_px,
+        previous.disparity_px,
+        previous.descriptor,
+        current.uv_px,
+        current.disparity_px,
+        current.descriptor,
+        parameters.max_shift_u_px,
+        parameters.max_shift_v_px,
+        parameters.max_disparity_ratio,
+        parameters.max_descriptor_distance**2,
+    )
+
+
+@njit(cache=True)
+def _link(
+    previous_uv: np.ndarray,
+    previous_disparity: np.ndarray,
+    previous_descriptor: np.ndarray,
+    uv: np.ndarray,
+    disparity: np.ndarray,
+    descriptor: np.ndarray,
+    max_shift_u: float,
+    max_shift_v: float,
+    max_ratio: float,
+    max_squared: float,
+) -> np.ndarray:
+    n_previous, n = len(previous_uv), len(uv)
+    forward = np.full(n_previous, _NO_MATCH)
+    forward_squared = np.full(n_previous, np.inf)
+    backward = np.full(n, _NO_MATCH)
+    backward_squared = np.full(n, np.inf)
+    for i in range(n):
+        for j in range(n_previous):
+            if abs(uv[i, 0] - previous_uv[j, 0]) > max_shift_u:
+                continue
+            if abs(uv[i, 1] - previous_uv[j, 1]) > max_shift_v:
+                continue
+            ratio = disparity[i] / previous_disparity[j]
+            if ratio > max_ratio or ratio * max_ratio < 1:
+                continue
+            squared = 0.0
+            for k in range(descriptor.shape[1]):
+                difference = descriptor[i, k] - previous_descriptor[j, k]
+                squared += difference * difference
+            if squared < backward_squared[i]:
+                backward_squared[i], backward[i] = squared, j
+            if squared < forward_squared[j]:
+                forward_squared[j], forward[j] = squared, i
+    for i in range(n):
+        j = backward[i]
+        if j != _NO_MATCH and (forward[j] != i or backward_squared[i] > max_squared):
+            backward[i] = _NO_MATCH
+    return backward
