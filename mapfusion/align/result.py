@@ -22,11 +22,13 @@ class Alignment:
 
     Attributes:
         T_a_b: (3,) tx_m, ty_m, theta_rad (counter-clockwise); NaN when degenerate.
-        covariance: (3, 3) of T_a_b; NaN when degenerate.
+        covariance: (3, 3) of T_a_b, drift included; NaN when degenerate.
         inlier: (N,) bool over the correspondences given.
         elapsed_s: time of the estimation.
         status: accepted, refused or degenerate.
         reason: empty when accepted, else what a person can act on.
+        drift_sigma_m: s_drift, the standard deviation per axis of the residuals of pairs beyond
+            what the landmarks' covariances explain (both maps together); NaN when degenerate.
     """
 
     T_a_b: Float
@@ -35,6 +37,7 @@ class Alignment:
     elapsed_s: float
     status: Status
     reason: str = ""
+    drift_sigma_m: float = float("nan")
 
     @property
     def ok(self) -> bool:

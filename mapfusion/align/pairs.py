@@ -1,0 +1,148 @@
+"""The landmarks of corresponding pairs side by side, and whether they can determine a motion."""
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from mapfusion.align.correspondences import Correspondences, HeightGate
+from mapfusion.align.drift import estimate_drift_m
+from mapfusion.align.result import Alignment, Status, degenerate
+from mapfusion.align.rigid import motion_covariance, residual_covariances, residuals
+from mapfusion.landmark_map import LandmarkMap
+from mapfusion.se2 import Float
+
+MIN_PAIRS = 3  # two determine a motion, the third is the first that can contradict it
+# probability that points without extent pass for a shape by their noise alone
+SHAPE_FALSE_ALARM = 1e-3
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """N pairs of landmarks.
+
+    Attributes:
+        p_a, p_b: (N, 3) positions in metres, each in its own frame.
+        covariance_a, covariance_b: (N, 3, 3).
+        planar: heights carry no information.
+    """
+
+    p_a: Float
+    p_b: Float
+    covariance_a: Float
+    covariance_b: Float
+    planar: bool
+
+    def __len__(self) -> int:
+        return len(self.p_a)
+
+    def __getitem__(self, rows: np.ndarray) -> "Pairs":
+        return Pairs(
+            self.p_a[rows],
+            self.p_b[rows],
+            self.covariance_a[rows],
+            self.covariance_b[rows],
+            self.planar,
+        )
+
+    def of_one_height(self, gate: HeightGate) -> np.ndarray:
+        """Rows (n,) of the pairs whose heights agree; of planar maps all."""
+        if self.planar:
+            return np.arange(len(self))
+        return np.flatnonzero(
+            gate.agrees(
+                self.p_a[:, 2],
+                self.covariance_a[:, 2, 2],
+                self.p_b[:, 2],
+                self.covariance_b[:, 2, 2],
+            )
+        )
+
+
+def gather(map_a: LandmarkMap, map_b: LandmarkMap, correspondences: Correspondences) -> Pairs:
+    """Look the pairs up in their maps.
+
+    Raises:
+        ValueError: an index lies outside its map.
+    """
+    for name, index, landmarks in (
+        ("index_a", correspondences.index_a, map_a),
+        ("index_b", correspondences.index_b, map_b),
+    ):
+        if len(index) and not 0 <= index.min() <= index.max() < len(landmarks):
+            raise ValueError(f"{name}: must lie in 0..{len(landmarks) - 1}")
+    return Pairs(
+        map_a.position_m[correspondences.index_a],
+        map_b.position_m[correspondences.index_b],
+        map_a.covariance_m2[correspondences.index_a],
+        map_b.covariance_m2[correspondences.index_b],
+        map_a.planar or map_b.planar,
+    )
+
+
+def why_too_few(map_a: LandmarkMap, map_b: LandmarkMap, n_pairs: int, needed: int) -> str:
+    """Why there are fewer than `needed` pairs; empty when there are enough."""
+    if n_pairs >= needed:
+        return ""
+    for landmarks in (map_a, map_b):
+        if len(landmarks) == 0:
+            return f"map {landmarks.name} is empty"
+    if n_pairs == 0:
+        for landmarks in (map_a, map_b):
+            if landmarks.descriptor is None and landmarks.label is None:
+                return f"map {landmarks.name} has neither descriptors nor labels to match by"
+    return f"{n_pairs} correspondences, at least {needed} are needed"
+
+
+def lacks_extent(p: Float, covariance_m2: Float, dimensions: int) -> bool:
+    """Whether points (N, 2) may lie on one point (dimensions 1) or on one line (dimensions 2).
+
+    Exact zeros never occur: the spread along the weakest of the strongest `dimensions` principal
+    axes is compared with what the landmarks' own noise (N, 2, 2) along it would give (chi-square).
+    """
+    centred = p - p.mean(axis=0)
+    spread, axes = np.linalg.eigh(centred.T @ centred)  # ascending
+    axis = axes[:, 2 - dimensions]
+    noise = np.mean(np.einsum("i,nij,j->n", axis, covariance_m2, axis))
+    # rounding alone leaves this much, as in numpy.linalg.matrix_rank
+    rounding = (len(p) * np.finfo(np.float64).eps * np.abs(p).max()) ** 2
+    freedom = max(len(p) - dimensions, 1)
+    return spread[2 - dimensions] <= noise * chi2.ppf(1 - SHAPE_FALSE_ALARM, freedom) + rounding
+
+
+def finish(
+    pairs: Pairs, T_a_b: Float, inlier: np.ndarray, started_s: float, refusal: str = ""
+) -> Alignment:
+    """An estimator's result: its motion with drift and covariance judged from the inliers.
+
+    Args:
+        pairs: all that were given to the estimator.
+        T_a_b: (3,).
+        inlier: (N,) bool.
+        started_s: `time.perf_counter()` at the start.
+        refusal: why the estimate is not to be trusted, if so.
+    """
+    n_inliers = int(np.count_nonzero(inlier))
+    if n_inliers < MIN_PAIRS and not refusal:
+        refusal = f"{n_inliers} correspondences agree, at least {MIN_PAIRS} are needed"
+    covariance, drift = np.full((3, 3), np.nan), float("nan")
+    if n_inliers >= 2:
+        kept = pairs[inlier]
+        own = residual_covariances(T_a_b, kept.covariance_a, kept.covariance_b)
+        drift = estimate_drift_m(residuals(T_a_b, kept.p_a, kept.p_b), own)
+        covariance = motion_covariance(T_a_b, kept.p_b, own + drift**2 * np.eye(2))
+    return Alignment(
+        T_a_b,
+        covariance,
+        inlier,
+        time.perf_counter() - started_s,
+        Status.REFUSED if refusal else Status.ACCEPTED,
+        refusal,
+        drift,
+    )
+
+
+def undetermined(reason: str, n_pairs: int, started_s: float) -> Alignment:
+    """A degenerate result with its elapsed time."""
+    return degenerate(reason, n_pairs, time.perf_counter() - started_s)

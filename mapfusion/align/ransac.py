@@ -1,0 +1,215 @@
+"""RANSAC: of the motions of random minimal sets, the one with the most support (section 5)."""
+
+import math
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+from numba import njit
+
+from mapfusion.align.correspondences import Correspondences, HeightGate
+from mapfusion.align.pairs import finish, gather, undetermined, why_too_few
+from mapfusion.align.result import Alignment
+from mapfusion.align.rigid import fit_rigid
+from mapfusion.landmark_map import LandmarkMap
+from mapfusion.se2 import Float
+
+_LOCAL_ROUNDS = 10  # of fit and support after a new best; two or three are the rule
+
+
+@dataclass(frozen=True)
+class Ransac:
+    """Motion with the largest support among those of random pairs of correspondences.
+
+    Two pairs whose landmarks are not equally far apart in both maps cannot both be true, and a
+    pair whose heights disagree cannot be; neither costs a look at its support.
+
+    Attributes:
+        gate_m: a pair supports a motion that brings its landmarks this close (in 3-D; in the plane
+            for planar maps). Three times 0.1 m, the drift between two maps of one loop.
+        min_baseline_m: minimal sets closer together are passed over: at 1 m an error of 0.1 m
+            turns the map by 6 degrees already.
+        confidence: that at least one set of two supporters of the answer was drawn.
+        max_draws: ends the search where there is next to no support.
+        height: which pairs can be true by their heights.
+    """
+
+    gate_m: float = 0.3
+    min_baseline_m: float = 1.0
+    confidence: float = 0.9999
+    max_draws: int = 100_000
+    height: HeightGate = field(default_factory=HeightGate)
+
+    def __post_init__(self) -> None:
+        if not self.gate_m > 0:
+            raise ValueError("gate_m: must be positive")
+        if not self.min_baseline_m > 0:
+            raise ValueError("min_baseline_m: must be positive")
+        if not 0 < self.confidence < 1:
+            raise ValueError("confidence: must lie between 0 and 1")
+        if not self.max_draws > 0:
+            raise ValueError("max_draws: must be positive")
+
+    def align(
+        self,
+        map_a: LandmarkMap,
+        map_b: LandmarkMap,
+        correspondences: Correspondences,
+        rng: np.random.Generator,
+    ) -> Alignment:
+        """Estimate T_a_b.
+
+        Raises:
+            ValueError: an index of the correspondences lies outside its map.
+        """
+        started_s = time.perf_counter()
+        pairs = gather(map_a, map_b, correspondences)
+        rows = pairs.of_one_height(self.height)
+        reason = why_too_few(map_a, map_b, len(pairs), needed=2)
+        if not reason and len(rows) < 2:
+            reason = f"the heights of {len(rows)} correspondences agree, at least 2 are needed"
+        if reason:
+            return undetermined(reason, len(pairs), started_s)
+        dimensions = 2 if pairs.planar else 3
+        seed = rng.integers(1, 2**64, dtype=np.uint64)
+        found, T_a_b, support = search(
+            np.ascontiguousarray(pairs.p_a[rows, :dimensions]),
+            np.ascontiguousarray(pairs.p_b[rows, :dimensions]),
+            self.gate_m,
+            self.min_baseline_m,
+            math.log1p(-self.confidence),
+            self.max_draws,
+            seed,
+        )
+        if not found:
+            reason = (
+                f"no two of {len(rows)} correspondences are {self.min_baseline_m:g} m or more and "
+                "equally far apart in both maps"
+            )
+            return undetermined(reason, len(pairs), started_s)
+        inlier = np.zeros(len(pairs), dtype=bool)
+        inlier[rows[support]] = True
+        return finish(pairs, T_a_b, inlier, started_s)
+
+
+@njit(cache=True)
+def next_random(state: np.uint64) -> np.uint64:
+    """Next state of a xorshift generator with 64 bits (Marsaglia 2003); state must not be 0."""
+    state ^= state << np.uint64(13)
+    state ^= state >> np.uint64(7)
+    state ^= state << np.uint64(17)
+    return state
+
+
+@njit(cache=True)
+def _below(state: np.uint64, n: int) -> np.int64:
+    # upper 32 bits, scaled: uneven by n / 2^32 at most
+    return np.int64(((state >> np.uint64(32)) * np.uint64(n)) >> np.uint64(32))
+
+
+@njit(cache=True)
+def _two_point_motion(
+    p_a: Float, p_b: Float, i: int, j: int, gate_m: float, min_baseline_m: float, T_a_b: Float
+) -> bool:
+    """Fill T_a_b from pairs i and j, or return False when they cannot both support one motion."""
+    ax, ay = p_a[j, 0] - p_a[i, 0], p_a[j, 1] - p_a[i, 1]
+    bx, by = p_b[j, 0] - p_b[i, 0], p_b[j, 1] - p_b[i, 1]
+    length_a, length_b = math.sqrt(ax * ax + ay * ay), math.sqrt(bx * bx + by * by)
+    # the fit leaves half the difference at either end, so beyond 2 gates neither end is a supporter
+    if abs(length_a - length_b) > 2 * gate_m or min(length_a, length_b) < min_baseline_m:
+        return False
+    theta = math.atan2(ay * bx - ax * by, ax * bx + ay * by)
+    cos, sin = math.cos(theta), math.sin(theta)
+    mid_bx, mid_by = (p_b[i, 0] + p_b[j, 0]) / 2, (p_b[i, 1] + p_b[j, 1]) / 2
+    T_a_b[0] = (p_a[i, 0] + p_a[j, 0]) / 2 - cos * mid_bx + sin * mid_by
+    T_a_b[1] = (p_a[i, 1] + p_a[j, 1]) / 2 - sin * mid_bx - cos * mid_by
+    T_a_b[2] = theta
+    return True
+
+
+@njit(cache=True)
+def support_of(
+    T_a_b: Float, p_a: Float, p_b: Float, gate_m: float, to_beat: int, rows: np.ndarray
+) -> tuple[int, float]:
+    """Number of supporters, which go into `rows`, and their summed squared distance.
+
+    Gives up, with the number so far, when `to_beat` is out of reach.
+    """
+    cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+    n, dimensions = p_a.shape
+    count = 0
+    cost = 0.0
+    for i in range(n):
+        if count + n - i < to_beat:
+            break
+        dx = p_a[i, 0] - T_a_b[0] - cos * p_b[i, 0] + sin * p_b[i, 1]
+        dy = p_a[i, 1] - T_a_b[1] - sin * p_b[i, 0] - cos * p_b[i, 1]
+        square = dx * dx + dy * dy
+        if dimensions == 3:
+            dz = p_a[i, 2] - p_b[i, 2]
+            square += dz * dz
+        if square <= gate_m * gate_m:
+            rows[count] = i
+            count += 1
+            cost += square
+    return count, cost
+
+
+@njit(cache=True)
+def search(
+    p_a: Float,
+    p_b: Float,
+    gate_m: float,
+    min_baseline_m: float,
+    log_miss: float,
+    max_draws: int,
+    seed: np.uint64,
+) -> tuple[bool, Float, np.ndarray]:
+    """Draw minimal sets until two supporters of the best motion would have come up by now.
+
+    Each new best motion is fitted to its support in closed form, and again while that gains.
+
+    Args:
+        p_a: (N, 2 or 3), N at least 2.
+        p_b: (N, 2 or 3).
+        gate_m: distance up to which a pair supports a motion.
+        min_baseline_m: smallest distance within a minimal set.
+        log_miss: logarithm of the chance accepted of never drawing two supporters.
+        max_draws: end of the search in any case.
+        seed: of the draws, not 0.
+
+    Returns:
+        Whether any motion was found, T_a_b (3,), rows of its supporters.
+    """
+    n = len(p_a)
+    best_T, T_a_b = np.full(3, np.nan), np.empty(3)
+    rows, best_rows = np.empty(n, np.int64), np.empty(n, np.int64)
+    best_count, best_cost = 0, math.inf
+    needed = float(max_draws)
+    draws = 0
+    state = seed
+    while draws < needed:
+        draws += 1
+        state = next_random(state)
+        i = _below(state, n)
+        state = next_random(state)
+        j = _below(state, n - 1)
+        if j >= i:
+            j += 1
+        if not _two_point_motion(p_a, p_b, i, j, gate_m, min_baseline_m, T_a_b):
+            continue
+        count, cost = support_of(T_a_b, p_a, p_b, gate_m, best_count, rows)
+        rounds = 0
+        while count > best_count or (count == best_count and cost < best_cost):
+            best_T[:] = T_a_b
+            best_count, best_cost = count, cost
+            best_rows[:count] = rows[:count]
+            if rounds == _LOCAL_ROUNDS or count < 2:
+                break
+            rounds += 1
+            T_a_b[0], T_a_b[1], T_a_b[2] = fit_rigid(p_a, p_b, best_rows[:count])
+            count, cost = support_of(T_a_b, p_a, p_b, gate_m, best_count, rows)
+        if rounds > 0:
+            hit = best_count * (best_count - 1) / (n * (n - 1))
+            needed = min(needed, log_miss / math.log1p(-hit)) if hit < 1 else 0.0
+    return best_count > 0, best_T, best_rows[:best_count].copy()

@@ -1,0 +1,216 @@
+"""The least squares that every estimate goes through: local, no new sampling."""
+
+import math
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+from numba import njit
+
+from mapfusion.align.correspondences import Correspondences, HeightGate
+from mapfusion.align.drift import drift_step
+from mapfusion.align.pairs import MIN_PAIRS, gather, undetermined
+from mapfusion.align.result import Alignment, Status
+from mapfusion.arguments import require_shape
+from mapfusion.landmark_map import LandmarkMap
+from mapfusion.se2 import Float, wrap
+
+# A gate of three standard deviations keeps 99 % of a plane's residuals; a larger s_drift could not
+# be told from false pairs spread over the gate.
+_GATE_SIGMAS = 3.0
+_TOLERANCE_M = 1e-9  # movement of the landmarks that counts as none
+_SINGULAR = 1e-12  # determinant of the normal matrix scaled to a unit diagonal
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """Weighted least squares within a fixed gate, repeated to a fixed point.
+
+    The pairs inside the gate are a mixture: true ones with covariance S_a + R S_b R^T +
+    s_drift^2 I, and false ones spread evenly over the gate. Each round weighs the pairs by their
+    probability of being true, then takes a step for the motion (Gauss-Newton on the weighted normal
+    equations), for s_drift (Fisher scoring) and for the share of true ones (expectation
+    maximisation, Dempster et al. 1977).
+
+    Attributes:
+        gate_m: distance in the plane under the estimate up to which a pair takes part. Between two
+            maps drift displaces true pairs by 0.1 to 0.3 m, and the estimate adds its own error.
+        max_rounds: an estimate that still moves then is refused.
+        height: which pairs can be true by their heights (not for planar maps).
+    """
+
+    gate_m: float = 0.5
+    max_rounds: int = 500
+    height: HeightGate = field(default_factory=HeightGate)
+
+    def __post_init__(self) -> None:
+        if not self.gate_m > 0:
+            raise ValueError("gate_m: must be positive")
+        if not self.max_rounds > 0:
+            raise ValueError("max_rounds: must be positive")
+
+    def refine(
+        self,
+        map_a: LandmarkMap,
+        map_b: LandmarkMap,
+        correspondences: Correspondences,
+        T_a_b: Float,
+    ) -> Alignment:
+        """Improve T_a_b (3,); an estimate of NaN stays degenerate.
+
+        Raises:
+            ValueError: T_a_b has another shape, or an index lies outside its map.
+        """
+        started_s = time.perf_counter()
+        T_a_b = np.asarray(T_a_b, dtype=np.float64)
+        require_shape("T_a_b", T_a_b, (3,))
+        pairs = gather(map_a, map_b, correspondences)
+        if not np.all(np.isfinite(T_a_b)):
+            return undetermined("there is no estimate to refine", len(pairs), started_s)
+        rows = pairs.of_one_height(self.height)
+        solved, moved_m, T_a_b, covariance, variance, truth = iterate(
+            pairs.p_a[rows, :2],
+            pairs.p_b[rows, :2],
+            pairs.covariance_a[rows, :2, :2],
+            pairs.covariance_b[rows, :2, :2],
+            T_a_b,
+            self.gate_m,
+            self.max_rounds,
+        )
+        if not solved:
+            reason = f"the pairs within {self.gate_m:g} m of the estimate determine no motion"
+            return undetermined(reason, len(pairs), started_s)
+        inlier = np.zeros(len(pairs), dtype=bool)
+        inlier[rows] = truth > 0.5
+        reason = ""
+        if moved_m > _TOLERANCE_M:
+            reason = f"still moved by {moved_m:.1e} m after {self.max_rounds} rounds"
+        elif np.count_nonzero(inlier) < MIN_PAIRS:
+            reason = f"{np.count_nonzero(inlier)} correspondences agree, {MIN_PAIRS} are needed"
+        T_a_b[2] = wrap(T_a_b[2])
+        return Alignment(
+            T_a_b,
+            covariance,
+            inlier,
+            time.perf_counter() - started_s,
+            Status.REFUSED if reason else Status.ACCEPTED,
+            reason,
+            math.sqrt(variance),
+        )
+
+
+@njit(cache=True)
+def residuals_under(
+    T_a_b: Float, p_a: Float, p_b: Float, S_a: Float, S_b: Float, e: Float, S: Float
+) -> None:
+    """Fill e = p_a - T p_b (N, 2) and S = S_a + R S_b R^T (N, 2, 2)."""
+    cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+    for i in range(len(p_a)):
+        e[i, 0] = p_a[i, 0] - T_a_b[0] - cos * p_b[i, 0] + sin * p_b[i, 1]
+        e[i, 1] = p_a[i, 1] - T_a_b[1] - sin * p_b[i, 0] - cos * p_b[i, 1]
+        xx, xy, yy = S_b[i, 0, 0], S_b[i, 0, 1], S_b[i, 1, 1]
+        S[i, 0, 0] = S_a[i, 0, 0] + cos * cos * xx - 2 * cos * sin * xy + sin * sin * yy
+        S[i, 1, 1] = S_a[i, 1, 1] + sin * sin * xx + 2 * cos * sin * xy + cos * cos * yy
+        turned_xy = cos * sin * (xx - yy) + (cos * cos - sin * sin) * xy
+        S[i, 0, 1] = S[i, 1, 0] = S_a[i, 0, 1] + turned_xy
+
+
+@njit(cache=True)
+def truth_probabilities(
+    e: Float, S: Float, variance_m2: float, share: float, gate_m: float, truth: Float
+) -> int:
+    """Fill each pair's probability (N,) of being true; returns how many lie inside the gate."""
+    inside = 0
+    false_density = (1 - share) / (math.pi * gate_m * gate_m)
+    for i in range(len(e)):
+        truth[i] = 0.0
+        if e[i, 0] * e[i, 0] + e[i, 1] * e[i, 1] > gate_m * gate_m:
+            continue
+        inside += 1
+        xx, xy, yy = S[i, 0, 0] + variance_m2, S[i, 0, 1], S[i, 1, 1] + variance_m2
+        det = xx * yy - xy * xy
+        square = (yy * e[i, 0] ** 2 - 2 * xy * e[i, 0] * e[i, 1] + xx * e[i, 1] ** 2) / det
+        true_density = share * math.exp(-square / 2) / (2 * math.pi * math.sqrt(det))
+        if true_density > 0:
+            truth[i] = true_density / (true_density + false_density)
+    return inside
+
+
+@njit(cache=True)
+def normal_equations(
+    T_a_b: Float, p_b: Float, e: Float, S: Float, variance_m2: float, truth: Float
+) -> tuple[Float, Float]:
+    """J' W J (3, 3) and J' W e (3,) with W = truth (S + s_drift^2 I)^-1 and J = d(T p_b)/dT."""
+    cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+    normal = np.zeros((3, 3))
+    right = np.zeros(3)
+    for i in range(len(e)):
+        if truth[i] == 0:
+            continue
+        xx, xy, yy = S[i, 0, 0] + variance_m2, S[i, 0, 1], S[i, 1, 1] + variance_m2
+        scale = truth[i] / (xx * yy - xy * xy)
+        wxx, wxy, wyy = scale * yy, -scale * xy, scale * xx
+        jx = -sin * p_b[i, 0] - cos * p_b[i, 1]
+        jy = cos * p_b[i, 0] - sin * p_b[i, 1]
+        wx, wy = wxx * e[i, 0] + wxy * e[i, 1], wxy * e[i, 0] + wyy * e[i, 1]
+        normal[0, 0] += wxx
+        normal[0, 1] += wxy
+        normal[1, 1] += wyy
+        normal[0, 2] += wxx * jx + wxy * jy
+        normal[1, 2] += wxy * jx + wyy * jy
+        normal[2, 2] += wxx * jx * jx + 2 * wxy * jx * jy + wyy * jy * jy
+        right[0] += wx
+        right[1] += wy
+        right[2] += jx * wx + jy * wy
+    normal[1, 0], normal[2, 0], normal[2, 1] = normal[0, 1], normal[0, 2], normal[1, 2]
+    return normal, right
+
+
+@njit(cache=True)
+def iterate(
+    p_a: Float,
+    p_b: Float,
+    S_a: Float,
+    S_b: Float,
+    T_start: Float,
+    gate_m: float,
+    max_rounds: int,
+) -> tuple[bool, float, Float, np.ndarray, float, Float]:
+    """Expectation maximisation for motion, s_drift and share of true pairs.
+
+    Returns:
+        Whether the pairs determine a motion, how far the last step moved a landmark (m), T_a_b
+        (3,), its covariance (3, 3), s_drift^2, each pair's probability of being true (N,).
+    """
+    n = len(p_a)
+    T_a_b = T_start.copy()
+    e, S, truth = np.empty((n, 2)), np.empty((n, 2, 2)), np.zeros(n)
+    widest = (gate_m / _GATE_SIGMAS) ** 2
+    variance, share = widest, 0.5
+    covariance = np.full((3, 3), np.nan)
+    moved = math.inf
+    for _ in range(max_rounds):
+        residuals_under(T_a_b, p_a, p_b, S_a, S_b, e, S)
+        inside = truth_probabilities(e, S, variance, share, gate_m, truth)
+        total = np.sum(truth)
+        if total < 1.0:
+            return False, moved, T_a_b, covariance, variance, truth
+        normal, right = normal_equations(T_a_b, p_b, e, S, variance, truth)
+        diagonal = normal[0, 0] * normal[1, 1] * normal[2, 2]
+        if not np.linalg.det(normal) > _SINGULAR * diagonal:
+            return False, moved, T_a_b, covariance, variance, truth
+        covariance = np.linalg.inv(normal)
+        step = covariance @ right
+        share = total / inside
+        variance = min(drift_step(e, S, truth, variance, gate_m), widest)
+        cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+        moved = 0.0
+        for i in range(n):
+            if truth[i] > 0:
+                dx = step[0] - (sin * p_b[i, 0] + cos * p_b[i, 1]) * step[2]
+                dy = step[1] + (cos * p_b[i, 0] - sin * p_b[i, 1]) * step[2]
+                moved = max(moved, math.sqrt(dx * dx + dy * dy))
+        T_a_b += step
+        if moved <= _TOLERANCE_M:
+            break
+    return True, moved, T_a_b, covariance, variance, truth

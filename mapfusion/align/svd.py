@@ -1,0 +1,77 @@
+"""SVD: one linear least squares over all correspondences (algorithm 1)."""
+
+import math
+import time
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+
+from mapfusion.align.correspondences import Correspondences
+from mapfusion.align.pairs import MIN_PAIRS, finish, gather, lacks_extent, undetermined, why_too_few
+from mapfusion.align.result import Alignment
+from mapfusion.landmark_map import LandmarkMap
+from mapfusion.se2 import Float, rotation
+
+Translation = Literal["printed", "solved"]
+
+
+@dataclass(frozen=True)
+class Svd:
+    """Algorithm 1: the unconstrained T that minimises |T m' - m| over all pairs, by pseudo-inverse.
+
+    m and m' are homogeneous points of the plane, one pair a row. T's block for the rotation is any
+    2x2 matrix: theta is that of the nearest rotation. False pairs pull at full strength, and noise
+    in m' shrinks the block and with it the printed translation.
+
+    Attributes:
+        translation: "printed" takes T's last column as it is, "solved" brings the centroids
+            together under theta.
+    """
+
+    translation: Translation = "printed"
+
+    def __post_init__(self) -> None:
+        if self.translation not in get_args(Translation):
+            known = ", ".join(get_args(Translation))
+            raise ValueError(f"translation: is {self.translation!r}, expected one of {known}")
+
+    def align(
+        self,
+        map_a: LandmarkMap,
+        map_b: LandmarkMap,
+        correspondences: Correspondences,
+        rng: np.random.Generator,
+    ) -> Alignment:
+        """Estimate T_a_b; nothing is drawn from `rng`.
+
+        Raises:
+            ValueError: an index of the correspondences lies outside its map.
+        """
+        del rng
+        started_s = time.perf_counter()
+        pairs = gather(map_a, map_b, correspondences)
+        reason = why_too_few(map_a, map_b, len(pairs), needed=MIN_PAIRS)
+        if not reason and lacks_extent(pairs.p_b[:, :2], pairs.covariance_b[:, :2, :2], 2):
+            reason = (
+                "in plan the landmarks of map b lie on one line, as far as their noise can tell"
+            )
+        if reason:
+            return undetermined(reason, len(pairs), started_s)
+        T_a_b = solve(pairs.p_a[:, :2], pairs.p_b[:, :2], self.translation)
+        return finish(pairs, T_a_b, np.ones(len(pairs), dtype=bool), started_s)
+
+
+def solve(m: Float, m_prime: Float, translation: Translation) -> Float:
+    """Algorithm 1 for points (N, 2) of frame a and b; returns (3,) tx, ty, theta.
+
+    The listing's z = u' m, w = z / sv, T = (v w)' is the pseudo-inverse of m' times m.
+    """
+    ones = np.ones((len(m), 1))
+    T = (np.linalg.pinv(np.hstack([m_prime, ones])) @ np.hstack([m, ones])).T
+    theta = math.atan2(T[1, 0] - T[0, 1], T[0, 0] + T[1, 1])
+    if translation == "printed":
+        t = T[:2, 2]
+    else:
+        t = m.mean(axis=0) - rotation(theta) @ m_prime.mean(axis=0)
+    return np.array([t[0], t[1], theta])

@@ -1,0 +1,86 @@
+"""Synthetic pairs of maps that share a part of their world."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapfusion import se2
+from mapfusion.align.correspondences import Correspondences
+from mapfusion.landmark_map import LandmarkMap
+from mapfusion.robot_log import DESCRIPTOR_LENGTH
+
+SIZE_M = np.array([20.0, 20.0, 2.5])
+
+
+@dataclass(frozen=True)
+class MapPair:
+    """Two maps, the true motion between them and the pairs, of which `is_true` are one point."""
+
+    map_a: LandmarkMap
+    map_b: LandmarkMap
+    T_a_b: np.ndarray
+    correspondences: Correspondences
+    is_true: np.ndarray
+
+
+def landmarks(position_m, sigma_m=0.05, descriptor=None, label=None, planar=False, name="map"):
+    """A map with isotropic covariances."""
+    n = len(position_m)
+    covariance = np.tile(np.eye(3) * sigma_m**2, (n, 1, 1))
+    if planar:
+        covariance[:, 2] = covariance[:, :, 2] = 0.0
+    return LandmarkMap(
+        np.asarray(position_m, dtype=float),
+        covariance,
+        np.full(n, 5, np.int32),
+        np.arange(n),
+        descriptor,
+        label,
+        planar,
+        name,
+    )
+
+
+def motion(rng):
+    """A motion of the plane with any angle."""
+    return np.array([*rng.uniform(-10, 10, 2), rng.uniform(-np.pi, np.pi)])
+
+
+def unit_vectors(rng, n):
+    vectors = rng.standard_normal((n, DESCRIPTOR_LENGTH))
+    return (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
+
+
+def given_pairs(rng, n=100, true_share=1.0, sigma_m=0.0, drift_m=0.0, T_a_b=None, planar=False):
+    """Pairs as the bar for RANSAC has them: uniform points, noise on side b, false pairs uniform."""
+    T_a_b = motion(rng) if T_a_b is None else T_a_b
+    n_true = round(true_share * n)
+    p_a = rng.uniform(0, SIZE_M, (n, 3))
+    p_b = se2.transform_points(se2.inverse(T_a_b), p_a)
+    p_b += rng.normal(0, sigma_m, (n, 3)) + rng.normal(0, drift_m, (n, 3)) * [1, 1, 0]
+    others = rng.uniform(0, SIZE_M, (n, 3))
+    p_b[n_true:] = se2.transform_points(se2.inverse(T_a_b), others)[n_true:]
+    if planar:
+        p_a[:, 2] = p_b[:, 2] = 0
+    order = rng.permutation(n)
+    is_true = np.zeros(n, dtype=bool)
+    is_true[order[:n_true]] = True
+    shuffled_b = np.empty_like(p_b)
+    shuffled_b[order] = p_b
+    shuffled_a = np.empty_like(p_a)
+    shuffled_a[order] = p_a
+    return MapPair(
+        landmarks(shuffled_a, 0.0, planar=planar, name="a"),
+        landmarks(shuffled_b, sigma_m, planar=planar, name="b"),
+        T_a_b,
+        Correspondences(np.arange(n), np.arange(n), rng.uniform(0, 0.3, n)),
+        is_true,
+    )
+
+
+def error(T_estimated, T_a_b):
+    """Translation error (m) and rotation error (rad)."""
+    return (
+        float(np.hypot(*(T_estimated - T_a_b)[:2])),
+        abs(float(se2.wrap(T_estimated[2] - T_a_b[2]))),
+    )
