@@ -1,0 +1,157 @@
+"""Which landmark an observation shows, decided in each particle for itself.
+
+An observation takes at most one landmark in a frame, and a landmark at most one observation.
+"""
+
+from enum import StrEnum
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from mapfusion.fastslam.particles import ParticleMaps
+from mapfusion.fastslam.sensor import Sightings, innovation, quadratic_form
+from mapfusion.fastslam.update import DROPPED, NEW
+from mapfusion.robot_log import Observations
+from mapfusion.se2 import Float
+
+
+class Association(StrEnum):
+    """What decides among the landmarks inside the gate."""
+
+    DESCRIPTOR = "descriptor"  # the nearest descriptor under a threshold
+    LABEL = "label"  # known identity; outside the gate the observation is dropped
+    GATE = "gate"  # the nearest by Mahalanobis distance
+
+
+class Pairs(NamedTuple):
+    """Observations and slots that may belong together, the best first."""
+
+    observation: np.ndarray  # (P,)
+    slot: np.ndarray  # (P,)
+
+
+def box_of(seen: Sightings, gate: float) -> Float:
+    """Boxes (K, 4) of observations and their gates over all particles."""
+    margin = np.sqrt(gate * seen.covariance_m2[:, :, [0, 3]].max(axis=1))
+    low, high = seen.point_m[:, :, :2].min(axis=1), seen.point_m[:, :, :2].max(axis=1)
+    return np.concatenate([low - margin, high + margin], axis=1)
+
+
+def pairs_nearby(
+    maps: ParticleMaps,
+    seen: Sightings,
+    gate: float,
+    descriptor: np.ndarray | None,
+    descriptor_threshold: float,
+) -> Pairs:
+    """Pairs whose gates can touch in some particle, by distance of descriptors where these are given."""
+    boxes = box_of(seen, gate)
+    around = np.concatenate([boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)])
+    slots = maps.near(around)
+    if descriptor is None:
+        descriptor = np.empty((len(boxes), 0), dtype=np.float32)
+        descriptor_threshold = np.inf
+    observation, slot, distance = _touching(
+        maps.slots, slots, boxes, descriptor, np.float32(descriptor_threshold)
+    )
+    order = np.lexsort((maps.slots.source[slot], observation, distance))
+    return Pairs(observation[order], slot[order])
+
+
+@njit(cache=True)
+def _touching(slots, names, boxes, descriptor, threshold):
+    observation = np.empty(len(boxes) * len(names), dtype=np.int64)
+    slot = np.empty(len(observation), dtype=np.int64)
+    distance = np.empty(len(observation), dtype=np.float32)
+    n = 0
+    for k in range(len(boxes)):
+        for s in names:
+            box, other = boxes[k], slots.box_m[s]
+            if other[0] > box[2] or other[2] < box[0] or other[1] > box[3] or other[3] < box[1]:
+                continue
+            apart = np.float32(0.0)
+            for i in range(descriptor.shape[1]):
+                apart += (descriptor[k, i] - slots.descriptor[s, i]) ** 2
+            apart = np.sqrt(apart)
+            if apart < threshold:
+                observation[n], slot[n], distance[n] = k, s, apart
+                n += 1
+    return observation[:n], slot[:n], distance[:n]
+
+
+def choose(
+    maps: ParticleMaps,
+    pairs: Pairs,
+    seen: Sightings,
+    may_create: np.ndarray,
+    gate: float,
+    planar: bool,
+    nearest: bool,
+) -> np.ndarray:
+    """The slot of each observation in each particle.
+
+    Args:
+        maps: the particles' landmarks; those of `pairs` are brought up to date.
+        pairs: candidates, the best first.
+        seen: K observations in M maps.
+        may_create: (K,) whether an observation that matches nothing starts a landmark.
+        gate: largest squared Mahalanobis distance of a match.
+        planar: two degrees of freedom.
+        nearest: take pairs by Mahalanobis distance instead of in their order.
+
+    Returns:
+        (K, M) int64 slot, NEW or DROPPED.
+    """
+    used = np.unique(pairs.slot)
+    alive = used[maps.bring_up_to_date(used)]
+    kept = np.isin(pairs.slot, alive)
+    observation, slot = pairs.observation[kept], pairs.slot[kept]
+    chosen = np.empty(seen.point_m.shape[:2], dtype=np.int64)
+    chosen[:] = np.where(may_create, NEW, DROPPED)[:, None]
+    place = np.searchsorted(alive, slot)
+    take = _take_nearest if nearest else _take_in_order
+    take(maps.slots, observation, slot, place, len(alive), seen, gate, planar, chosen)
+    return chosen
+
+
+@njit(cache=True)
+def _distance(slots, s, m, seen, k, planar):
+    dx, dy, dz, ixx, ixy, ixz, iyy, iyz, izz, _ = innovation(
+        seen.point_m[k, m],
+        seen.covariance_m2[k, m],
+        slots.mean_m[s, m],
+        slots.covariance_m2[s, m],
+        planar,
+    )
+    return quadratic_form(dx, dy, dz, ixx, ixy, ixz, iyy, iyz, izz)
+
+
+@njit(cache=True)
+def _take_in_order(slots, observation, slot, place, n_places, seen, gate, planar, chosen):
+    n_particles = chosen.shape[1]
+    taken = np.zeros((n_places, n_particles), dtype=np.bool_)
+    for i in range(len(slot)):
+        k, s, j = observation[i], slot[i], place[i]
+        for m in range(n_particles):
+            if chosen[k, m] >= 0 or taken[j, m] or slots.count[s, m] == 0:
+                continue
+            if _distance(slots, s, m, seen, k, planar) <= gate:
+                chosen[k, m] = s
+                taken[j, m] = True
+
+
+@njit(cache=True)
+def _take_nearest(slots, observation, slot, place, n_places, seen, gate, planar, chosen):
+    for m in range(chosen.shape[1]):
+        taken = np.zeros(n_places, dtype=np.bool_)
+        distance = np.full(len(slot), np.inf)
+        for i in range(len(slot)):
+            if slots.count[slot[i], m] > 0:
+                distance[i] = _distance(slots, slot[i], m, seen, observation[i], planar)
+        inside = np.flatnonzero(distance <= gate)
+        for i in inside[np.argsort(distance[inside], kind="mergesort")]:
+            k, j = observation[i], place[i]
+            if chosen[k, m] < 0 and not taken[j]:
+                chosen[k, m] = slot[i]
+                taken[j] = True

@@ -1,0 +1,285 @@
+"""FastSLAM 1.0: a particle for each path, a Kalman filter for each particle and landmark.
+
+Montemerlo, Thrun, Koller, Wegbreit (2002), in the paper's form (eq. 1-10) with these additions:
+association per particle, a density for observations that match nothing, weights that are
+multiplied until a resampling, and resampling by effective sample size.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.special import chdtri
+
+from mapfusion.arguments import require_finite, require_shape
+from mapfusion.fastslam.association import Association, Pairs, choose, pairs_nearby
+from mapfusion.fastslam.history import History
+from mapfusion.fastslam.motion import MotionNoise, sample_motion
+from mapfusion.fastslam.particles import ParticleMaps
+from mapfusion.fastslam.resampling import (
+    effective_sample_size,
+    normalised,
+    systematic_ancestors,
+)
+from mapfusion.fastslam.sensor import Sightings, log_density_at_gate, sightings
+from mapfusion.fastslam.update import NEW, update_landmarks
+from mapfusion.landmark_map import LandmarkMap
+from mapfusion.robot_log import Observations
+from mapfusion.se2 import Float
+
+
+@dataclass(frozen=True)
+class FastSlamParameters:
+    """Settings of the filter.
+
+    Attributes:
+        n_particles: M.
+        motion: noise of the odometry.
+        association: what decides among the landmarks inside the gate.
+        gate_probability: share of true matches that the gate lets pass (chi-square quantile).
+        descriptor_threshold: largest Euclidean distance of matching descriptors (unit vectors).
+        resample_fraction: resample when the effective sample size is at most this share of M;
+            0 never, 1 in every step.
+        noise_scale: factor on the observations' standard deviations. Above 1 for errors that are
+            alike from frame to frame, which the filter would otherwise take for independent news.
+        noise_floor_m: standard deviation added to each coordinate of an observation.
+        log_new_landmark_density: log of p_new in 1/m^3 (1/m^2 in planar data), the density of an
+            observation that matches nothing; None: that of a match exactly at the gate, with the
+            covariance of a landmark seen once.
+        planar: z carries no information; gates and weights have 2 degrees of freedom.
+    """
+
+    n_particles: int = 200
+    motion: MotionNoise = field(default_factory=MotionNoise)
+    association: Association = Association.DESCRIPTOR
+    gate_probability: float = 0.99
+    descriptor_threshold: float = 0.5
+    resample_fraction: float = 0.5
+    noise_scale: float = 1.0
+    noise_floor_m: float = 0.0
+    log_new_landmark_density: float | None = None
+    planar: bool = False
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "association", Association(self.association))
+        if self.n_particles < 1:
+            raise ValueError(f"n_particles: is {self.n_particles}, must be at least 1")
+        if not 0 < self.gate_probability < 1:
+            raise ValueError(f"gate_probability: is {self.gate_probability}, must be in (0, 1)")
+        if not 0 <= self.resample_fraction <= 1:
+            raise ValueError(f"resample_fraction: is {self.resample_fraction}, must be in [0, 1]")
+        if not self.descriptor_threshold > 0:
+            raise ValueError(
+                f"descriptor_threshold: is {self.descriptor_threshold}, must be positive"
+            )
+        if not self.noise_scale > 0:
+            raise ValueError(f"noise_scale: is {self.noise_scale}, must be positive")
+        if not self.noise_floor_m >= 0:
+            raise ValueError(f"noise_floor_m: is {self.noise_floor_m}, must not be negative")
+
+    @property
+    def gate(self) -> float:
+        """Largest squared Mahalanobis distance of a match."""
+        return float(chdtri(2 if self.planar else 3, 1 - self.gate_probability))
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """The particles after weighting and before resampling.
+
+    Attributes:
+        best_pose: (3,) of the heaviest particle.
+        effective_sample_size: 1 to M.
+        resampled: whether a resampling followed.
+        n_landmarks: of the heaviest particle, however often seen.
+        cloud: (M, 3) poses.
+        log_weights: (M,) normalised.
+    """
+
+    best_pose: Float
+    effective_sample_size: float
+    resampled: bool
+    n_landmarks: int
+    cloud: Float
+    log_weights: Float
+
+
+class FastSlam:
+    """The filter as a stream: one `step` for each frame of a robot, also those that saw nothing.
+
+    Observations are numbered in the order in which they come; `source_observation` of a landmark
+    is the number of the one it came from (the row of the log, when a log is streamed from its start).
+
+    Args:
+        parameters: settings.
+        rng: of the motion and the resampling.
+        keep_history: keep what `best_path` and `best_associations` tell. It grows with every step;
+            without it the filter's memory grows with the map alone.
+    """
+
+    def __init__(
+        self,
+        parameters: FastSlamParameters,
+        rng: np.random.Generator,
+        keep_history: bool = True,
+    ) -> None:
+        self.parameters = parameters
+        self._rng = rng
+        self._poses = np.zeros((parameters.n_particles, 3))
+        self._log_weights = np.full(parameters.n_particles, -np.log(parameters.n_particles))
+        self._maps = ParticleMaps(parameters.n_particles, parameters.gate)
+        self._best = 0
+        self._n_observations = 0
+        self._slot_of_label: dict[int, int] = {}
+        self._has_descriptors = self._has_labels = False
+        self._history = History(parameters.n_particles) if keep_history else None
+
+    def step(self, odometry: Float, observations: Observations) -> StepResult:
+        """Take in one frame.
+
+        Args:
+            odometry: (3,) motion since the frame before, in the robot frame of the frame before.
+            observations: what the frame shows; may be none.
+
+        Raises:
+            ValueError: odometry is not three finite numbers, a covariance is not positive definite,
+                or descriptors or labels are missing that the association needs.
+        """
+        odometry = np.asarray(odometry, dtype=np.float64)
+        require_shape("odometry", odometry, (3,))
+        require_finite("odometry", odometry)
+        noise = self._observation_noise(observations)
+        log_new = self._log_new(noise)
+
+        self._poses = sample_motion(
+            self._poses, odometry, self.parameters.motion, self._rng
+        )  # eq. 3
+        seen = sightings(
+            self._poses, observations.position_m, noise, self.parameters.planar
+        )  # eq. 4, 5
+        chosen = self._associate(seen, observations)
+        log_likelihood = update_landmarks(
+            self._maps.slots, chosen, seen, log_new, self.parameters.planar
+        )  # eq. 4-9
+        self._log_weights = normalised(self._log_weights + log_likelihood)  # eq. 10
+        self._follow_changes(chosen, seen, observations)
+        return self._resample()
+
+    def best_map(self, min_count: int = 1) -> LandmarkMap:
+        """The map of the heaviest particle: its landmarks seen at least `min_count` times, by age."""
+        which, column = self._maps.of_particle(self._best, min_count)
+        slots = self._maps.slots
+        upper = slots.covariance_m2[which, column]
+        covariance = upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+        return LandmarkMap(
+            position_m=slots.mean_m[which, column],
+            covariance_m2=covariance,
+            count=slots.count[which, column],
+            source_observation=slots.source[which],
+            descriptor=slots.descriptor[which] if self._has_descriptors else None,
+            label=slots.label[which] if self._has_labels else None,
+            planar=self.parameters.planar,
+        )
+
+    def best_path(self) -> Float:
+        """Poses (steps, 3) of the heaviest particle and its ancestors. Raises ValueError without history."""
+        return self._kept_history().path(self._best)
+
+    def best_associations(self) -> np.ndarray:
+        """(observations so far,) int64: for each the source of the heaviest particle's landmark it was used for.
+
+        -1 where it was dropped. Raises ValueError without history.
+        """
+        return self._kept_history().associations(self._best)
+
+    def _observation_noise(self, observations: Observations) -> Float:
+        """R_t (K, 3, 3) with the filter's own additions."""
+        noise = self.parameters.noise_scale**2 * observations.covariance_m2
+        return noise + self.parameters.noise_floor_m**2 * np.eye(3)
+
+    def _log_new(self, noise: Float) -> Float:
+        """Log p_new (K,)."""
+        at_gate = log_density_at_gate(noise, self.parameters.gate, self.parameters.planar)
+        given = self.parameters.log_new_landmark_density
+        return at_gate if given is None else np.full(len(noise), given)
+
+    def _associate(self, seen: Sightings, observations: Observations) -> np.ndarray:
+        """(K, M) slot of each observation in each particle, or NEW or DROPPED."""
+        settings = self.parameters
+        may_create = np.ones(len(observations), dtype=bool)
+        if len(observations) == 0:
+            return np.empty(seen.point_m.shape[:2], dtype=np.int64)
+        if settings.association is Association.LABEL:
+            pairs, may_create = self._pairs_of_labels(_given("label", observations.label))
+        else:
+            descriptor = None
+            if settings.association is Association.DESCRIPTOR:
+                descriptor = _given("descriptor", observations.descriptor)
+            pairs = pairs_nearby(
+                self._maps, seen, settings.gate, descriptor, settings.descriptor_threshold
+            )
+        nearest = settings.association is Association.GATE
+        return choose(self._maps, pairs, seen, may_create, settings.gate, settings.planar, nearest)
+
+    def _pairs_of_labels(self, label: np.ndarray) -> tuple[Pairs, np.ndarray]:
+        """Each observation with the slot of its label; only the first of a new label may start one."""
+        known = np.array([int(name) in self._slot_of_label for name in label])
+        first = np.zeros(len(label), dtype=bool)
+        first[np.unique(label, return_index=True)[1]] = True
+        rows = np.flatnonzero(known)
+        slots = np.array([self._slot_of_label[int(label[k])] for k in rows], dtype=np.int64)
+        return Pairs(rows, slots), ~known & first
+
+    def _follow_changes(
+        self, chosen: np.ndarray, seen: Sightings, observations: Observations
+    ) -> None:
+        """Start landmarks, keep the index of the map and the history."""
+        source = np.where(chosen >= 0, self._maps.slots.source[chosen], -1)
+        if len(observations):
+            self._maps.moved(np.unique(chosen[chosen >= 0]))
+            created = self._maps.create(chosen, seen, observations, self._n_observations)
+            if self.parameters.association is Association.LABEL:
+                assert observations.label is not None
+                rows = self._maps.slots.source[created] - self._n_observations
+                labels = observations.label[rows].tolist()
+                self._slot_of_label.update(zip(labels, created.tolist(), strict=True))
+            self._has_descriptors |= observations.descriptor is not None
+            self._has_labels |= observations.label is not None
+        if self._history is not None:
+            number = self._n_observations + np.arange(len(observations))
+            self._history.add(self._poses, np.where(chosen == NEW, number[:, None], source))
+        self._n_observations += len(observations)
+
+    def _resample(self) -> StepResult:
+        """Take the result, then replace light particles by heavy ones if few carry the weight."""
+        n_particles = self.parameters.n_particles
+        n_effective = effective_sample_size(self._log_weights)
+        few = n_effective <= self.parameters.resample_fraction * n_particles
+        self._best = int(np.argmax(self._log_weights))
+        result = StepResult(
+            best_pose=self._poses[self._best],
+            effective_sample_size=n_effective,
+            resampled=few,
+            n_landmarks=int(self._maps.n_landmarks[self._best]),
+            cloud=self._poses,
+            log_weights=self._log_weights,
+        )
+        if few:
+            ancestors = systematic_ancestors(self._log_weights, self._rng)
+            self._poses = self._poses[ancestors]
+            self._maps.resampled(ancestors)
+            self._log_weights = np.full(n_particles, -np.log(n_particles))
+            if self._history is not None:
+                self._history.resampled(ancestors)
+            self._best = int(np.searchsorted(ancestors, self._best))
+        return result
+
+    def _kept_history(self) -> History:
+        if self._history is None:
+            raise ValueError("keep_history: is False, the path was not kept")
+        return self._history
+
+
+def _given(name: str, values: np.ndarray | None) -> np.ndarray:
+    if values is None:
+        raise ValueError(f"{name}: the observations have none, and the association needs it")
+    return values

@@ -1,0 +1,70 @@
+"""Where a particle may have gone, given what the wheels counted (eq. 3)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapfusion.se2 import Float, compose
+
+
+@dataclass(frozen=True)
+class MotionNoise:
+    """Standard deviations of the odometry, as a random walk that covers the systematic errors too.
+
+    A relative error e that stays the same over a horizon h (metres or radians) ends in an error of
+    e h. A random walk of e sqrt(h) per root unit ends in the same standard deviation, and has a
+    larger one before: so the particles cover the systematic errors without knowing them. Beyond
+    the horizon the map is expected to have corrected the robot.
+
+    Standing still adds nothing by default: wheels that do not turn make no odometry error. The
+    floor is for robots that are pushed, or odometry that drops increments below its resolution.
+
+    Attributes:
+        translation_m_per_sqrt_m: random walk along and across the motion.
+        rotation_rad_per_sqrt_m: random walk of the heading with the distance.
+        rotation_rad_per_sqrt_rad: random walk of the heading with the angle turned.
+        scale_error: relative systematic error of distances.
+        track_error: relative systematic error of angles.
+        horizon_m: distance over which the scale error adds up.
+        horizon_rad: angle over which the track error adds up.
+        floor_m: added to x and y in every step, whatever the motion.
+        floor_rad: added to the heading in every step, whatever the motion.
+    """
+
+    translation_m_per_sqrt_m: float = 0.02
+    rotation_rad_per_sqrt_m: float = 0.01
+    rotation_rad_per_sqrt_rad: float = 0.03
+    scale_error: float = 0.01
+    track_error: float = 0.02
+    horizon_m: float = 10.0
+    horizon_rad: float = 2 * np.pi
+    floor_m: float = 0.0
+    floor_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not (np.isfinite(value) and value >= 0):
+                raise ValueError(f"{name}: is {value}, must be finite and not negative")
+
+    def standard_deviations(self, odometry: Float) -> Float:
+        """(3,) of x_m, y_m, theta_rad for one odometry increment (3,)."""
+        distance_m = np.hypot(odometry[0], odometry[1])
+        angle_rad = abs(odometry[2])
+        translation = (
+            self.translation_m_per_sqrt_m**2 + self.scale_error**2 * self.horizon_m
+        ) * distance_m
+        rotation = (
+            self.rotation_rad_per_sqrt_m**2 * distance_m
+            + (self.rotation_rad_per_sqrt_rad**2 + self.track_error**2 * self.horizon_rad)
+            * angle_rad
+        )
+        variance = np.array([translation, translation, rotation])
+        return np.sqrt(variance + np.array([self.floor_m, self.floor_m, self.floor_rad]) ** 2)
+
+
+def sample_motion(
+    T_map_robot: Float, odometry: Float, noise: MotionNoise, rng: np.random.Generator
+) -> Float:
+    """Draw the poses (M, 3) after a motion from those before it (M, 3) (eq. 3)."""
+    disturbance = rng.standard_normal(T_map_robot.shape) * noise.standard_deviations(odometry)
+    return compose(T_map_robot, odometry + disturbance)

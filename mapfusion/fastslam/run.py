@@ -1,0 +1,58 @@
+"""A log, streamed through the filter."""
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mapfusion.fastslam.filter import FastSlam, FastSlamParameters, StepResult
+from mapfusion.landmark_map import LandmarkMap
+from mapfusion.robot_log import RobotLog
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame of a log, filtered.
+
+    Attributes:
+        iteration: of the log.
+        result: of the step.
+        landmarks: the best map, at the iterations that were asked for.
+        slam: the filter itself, as it is after this step (for `best_path`, `best_associations`).
+    """
+
+    iteration: int
+    result: StepResult
+    landmarks: LandmarkMap | None
+    slam: FastSlam
+
+
+def run_log(
+    log: RobotLog,
+    parameters: FastSlamParameters,
+    rng: np.random.Generator,
+    snapshots: Collection[int] = (),
+    min_count: int = 3,
+) -> Iterator[Frame]:
+    """Filter a log frame by frame.
+
+    Args:
+        log: what the robot measured; it also says whether the data are planar.
+        parameters: settings.
+        rng: of the filter.
+        snapshots: iterations at which the best map is taken.
+        min_count: sightings that a landmark needs to be in it.
+
+    Yields:
+        One `Frame` for each row of the log's frames.
+    """
+    wanted = frozenset(snapshots)
+    slam = FastSlam(replace(parameters, planar=log.planar), rng)
+    starts = log.frame_starts()
+    for iteration, odometry in enumerate(log.odometry):
+        frame = log.observations[starts[iteration] : starts[iteration + 1]]
+        result = slam.step(odometry, frame)
+        landmarks = None
+        if iteration in wanted:
+            landmarks = replace(slam.best_map(min_count), name=log.robot)
+        yield Frame(iteration, result, landmarks, slam)

@@ -1,0 +1,140 @@
+"""What a particle expects to observe, and how well an observation agrees with it (eq. 4-6, 10).
+
+The observation model g maps a landmark into the robot frame: a rigid motion, whose Jacobian G is a
+rotation. Everything here is turned by the transpose of G into the map frame, where G is the
+identity: innovation z - z_hat becomes (observed point in the map) - (landmark), Z becomes
+Sigma + R_map, and determinants and Mahalanobis distances stay what they are.
+
+Symmetric matrices are their six upper entries: xx, xy, xz, yy, yz, zz.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from mapfusion.se2 import Float
+
+
+class Sightings(NamedTuple):
+    """K observations of one frame, as each of M particles sees them in its map."""
+
+    point_m: Float  # (K, M, 3)
+    covariance_m2: Float  # (K, M, 6)
+
+
+def sightings(
+    T_map_robot: Float, position_m: Float, covariance_m2: Float, planar: bool
+) -> Sightings:
+    """Observations (K, 3), (K, 3, 3) of the robot frame in the maps of poses (M, 3)."""
+    shape = (len(position_m), len(T_map_robot))
+    seen = Sightings(np.empty((*shape, 3)), np.empty((*shape, 6)))
+    _turn_into_map(T_map_robot, position_m, covariance_m2, planar, seen)
+    return seen
+
+
+@njit(cache=True)
+def _turn_into_map(T_map_robot, position, covariance, planar, seen):
+    cos, sin = np.cos(T_map_robot[:, 2]), np.sin(T_map_robot[:, 2])
+    for k in range(len(position)):
+        x, y, z = position[k]
+        xx, xy, xz = covariance[k, 0]
+        yy, yz, zz = covariance[k, 1, 1], covariance[k, 1, 2], covariance[k, 2, 2]
+        if planar:
+            z = xz = yz = zz = 0.0
+        for m in range(len(T_map_robot)):
+            c, s = cos[m], sin[m]
+            point = seen.point_m[k, m]
+            point[0] = T_map_robot[m, 0] + c * x - s * y
+            point[1] = T_map_robot[m, 1] + s * x + c * y
+            point[2] = z
+            turned = seen.covariance_m2[k, m]
+            turned[0] = c * c * xx - 2 * c * s * xy + s * s * yy
+            turned[1] = c * s * (xx - yy) + (c * c - s * s) * xy
+            turned[2] = c * xz - s * yz
+            turned[3] = s * s * xx + 2 * c * s * xy + c * c * yy
+            turned[4] = s * xz + c * yz
+            turned[5] = zz
+
+
+@njit(cache=True)
+def inverse_and_determinant(xx, xy, xz, yy, yz, zz):
+    """Inverse (six upper entries) and determinant of a symmetric 3x3 matrix, by cofactors."""
+    a = yy * zz - yz * yz
+    b = xz * yz - xy * zz
+    c = xy * yz - xz * yy
+    determinant = xx * a + xy * b + xz * c
+    f = 1.0 / determinant
+    return (
+        f * a,
+        f * b,
+        f * c,
+        f * (xx * zz - xz * xz),
+        f * (xy * xz - xx * yz),
+        f * (xx * yy - xy * xy),
+        determinant,
+    )
+
+
+@njit(cache=True)
+def innovation(point, noise, mean, covariance, planar):
+    """Innovation, inverse of Z (eq. 6) and |Z| for one observation and one landmark.
+
+    In planar data the height says nothing: its innovation is 0 and its variance in Z 1, so that it
+    leaves the Mahalanobis distance and the determinant alone.
+
+    Returns:
+        dx, dy, dz, six upper entries of the inverse of Z, |Z|.
+    """
+    xx = covariance[0] + noise[0]
+    xy = covariance[1] + noise[1]
+    yy = covariance[3] + noise[3]
+    if planar:
+        xz, yz, zz, dz = 0.0, 0.0, 1.0, 0.0
+    else:
+        xz = covariance[2] + noise[2]
+        yz = covariance[4] + noise[4]
+        zz = covariance[5] + noise[5]
+        dz = point[2] - mean[2]
+    ixx, ixy, ixz, iyy, iyz, izz, determinant = inverse_and_determinant(xx, xy, xz, yy, yz, zz)
+    return (
+        point[0] - mean[0],
+        point[1] - mean[1],
+        dz,
+        ixx,
+        ixy,
+        ixz,
+        iyy,
+        iyz,
+        izz,
+        determinant,
+    )
+
+
+@njit(cache=True)
+def quadratic_form(dx, dy, dz, ixx, ixy, ixz, iyy, iyz, izz):
+    """Squared Mahalanobis distance: d^T Z^-1 d."""
+    return (
+        ixx * dx * dx
+        + iyy * dy * dy
+        + izz * dz * dz
+        + 2.0 * (ixy * dx * dy + ixz * dx * dz + iyz * dy * dz)
+    )
+
+
+def log_density_at_gate(covariance_m2: Float, gate: float, planar: bool) -> Float:
+    """Log of p_new (K,): the density of a match exactly at the gate of a landmark seen once.
+
+    Such a landmark has the observation's own covariance R, so Z = 2 R. The density carries the
+    unit 1/m^3 (1/m^2 in the plane) of a match's, so a change of units cancels in the weights.
+
+    Raises:
+        ValueError: a covariance (K, 3, 3) is not positive definite.
+    """
+    dimensions = 2 if planar else 3
+    try:
+        root = np.linalg.cholesky(2.0 * covariance_m2[:, :dimensions, :dimensions])
+    except np.linalg.LinAlgError as error:
+        raise ValueError("covariance_m2: an observation's is not positive definite") from error
+    half_log_det = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+    return -0.5 * (gate + dimensions * np.log(2 * np.pi)) - half_log_det
