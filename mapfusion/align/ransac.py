@@ -14,7 +14,7 @@ from mapfusion.align.rigid import fit_rigid
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.se2 import Float
 
-_LOCAL_ROUNDS = 10  # of fit and support after a new best; two or three are the rule
+_LOCAL_ROUNDS = 10  # of fit and support; two or three are the rule
 
 
 @dataclass(frozen=True)
@@ -156,6 +156,27 @@ def support_of(
 
 
 @njit(cache=True)
+def settle(
+    p_a: Float, p_b: Float, gate_m: float, T_a_b: Float, rows: np.ndarray, count: int
+) -> tuple[int, float]:
+    """Fit to the support and take the support again until it repeats; T_a_b and rows are changed.
+
+    Motions are compared only after this: a raw minimal set can gain a false supporter by leaning
+    towards it, with its true ones at the gate's edge.
+    """
+    cost = 0.0
+    before = np.empty(len(rows), np.int64)
+    for _ in range(_LOCAL_ROUNDS):
+        T_a_b[0], T_a_b[1], T_a_b[2] = fit_rigid(p_a, p_b, rows[:count])
+        before_count = count
+        before[:count] = rows[:count]
+        count, cost = support_of(T_a_b, p_a, p_b, gate_m, 0, rows)
+        if count < 2 or (count == before_count and np.all(rows[:count] == before[:count])):
+            break
+    return count, cost
+
+
+@njit(cache=True)
 def search(
     p_a: Float,
     p_b: Float,
@@ -167,7 +188,7 @@ def search(
 ) -> tuple[bool, Float, np.ndarray]:
     """Draw minimal sets until two supporters of the best motion would have come up by now.
 
-    Each new best motion is fitted to its support in closed form, and again while that gains.
+    A motion with as much support as the best so far is settled on its support before it counts.
 
     Args:
         p_a: (N, 2 or 3), N at least 2.
@@ -198,18 +219,14 @@ def search(
             j += 1
         if not _two_point_motion(p_a, p_b, i, j, gate_m, min_baseline_m, T_a_b):
             continue
-        count, cost = support_of(T_a_b, p_a, p_b, gate_m, best_count, rows)
-        rounds = 0
-        while count > best_count or (count == best_count and cost < best_cost):
+        count, _ = support_of(T_a_b, p_a, p_b, gate_m, best_count, rows)
+        if count < max(best_count, 2):
+            continue
+        count, cost = settle(p_a, p_b, gate_m, T_a_b, rows, count)
+        if count > best_count or (count == best_count and cost < best_cost):
             best_T[:] = T_a_b
             best_count, best_cost = count, cost
             best_rows[:count] = rows[:count]
-            if rounds == _LOCAL_ROUNDS or count < 2:
-                break
-            rounds += 1
-            T_a_b[0], T_a_b[1], T_a_b[2] = fit_rigid(p_a, p_b, best_rows[:count])
-            count, cost = support_of(T_a_b, p_a, p_b, gate_m, best_count, rows)
-        if rounds > 0:
-            hit = best_count * (best_count - 1) / (n * (n - 1))
+            hit = count * (count - 1) / (n * (n - 1))
             needed = min(needed, log_miss / math.log1p(-hit)) if hit < 1 else 0.0
     return best_count > 0, best_T, best_rows[:best_count].copy()
