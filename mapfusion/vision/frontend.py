@@ -69,12 +69,10 @@ class FrontEnd:
         return Features(uv, disparity, matches.sigma_px[matched], descriptor)
 
 
-def observe(
+def observable(
     camera: StereoCamera, features: Features, keep: np.ndarray, parameters: FrontEndParameters
-) -> Observations:
-    """Observations of the features marked in `keep` (N,) bool that are near and certain enough.
-
-    Their covariance is R_t of eq. 6, from the stereo geometry.
+) -> np.ndarray:
+    """Rows of the features marked in `keep` (N,) bool that are near and certain enough.
 
     Raises:
         ValueError: `keep` has another length than `features`.
@@ -84,7 +82,20 @@ def observe(
     depth = camera.focal_px * camera.baseline_m / features.disparity_px
     sigma_depth = depth * features.sigma_disparity_px / features.disparity_px
     near = (depth <= parameters.max_depth_m) & (sigma_depth <= parameters.max_sigma_depth_m)
-    rows = np.nonzero(keep & near)[0]
+    return np.nonzero(keep & near)[0]
+
+
+def observe(
+    camera: StereoCamera, features: Features, keep: np.ndarray, parameters: FrontEndParameters
+) -> Observations:
+    """Observations of the `observable` features.
+
+    Their covariance is R_t of eq. 6, from the stereo geometry.
+
+    Raises:
+        ValueError: `keep` has another length than `features`.
+    """
+    rows = observable(camera, features, keep, parameters)
     position, covariance = camera.triangulate(
         features.uv_px[rows],
         features.disparity_px[rows],

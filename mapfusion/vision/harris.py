@@ -18,6 +18,8 @@ class HarrisParameters:
 
     Attributes:
         max_corners: at most so many an image.
+        smoothing_px: standard deviation of the Gaussian that the image is smoothed with first;
+            noise and the staircase edges of unfiltered textures make corners of their own.
         min_distance_px: no two corners nearer than this.
         cell_px: side of the squares of the grid that share `max_corners` evenly, so that one rich
             poster does not take all.
@@ -30,14 +32,15 @@ class HarrisParameters:
         subpixel_half_px: half side of the window of the sub-pixel step.
     """
 
-    max_corners: int = 220
+    max_corners: int = 110
+    smoothing_px: float = 1.5
     min_distance_px: int = 10
-    cell_px: int = 80
-    block_px: int = 5
+    cell_px: int = 160
+    block_px: int = 3
     k: float = 0.04
     min_slope: float = 2.5
     border_px: int = 12
-    subpixel_half_px: int = 3
+    subpixel_half_px: int = 4
 
     def __post_init__(self) -> None:
         for name in ("max_corners", "min_distance_px", "cell_px", "block_px", "subpixel_half_px"):
@@ -45,8 +48,9 @@ class HarrisParameters:
                 raise ValueError(f"{name}: must be at least 1")
         if not 0 < self.k < 0.25:
             raise ValueError("k: must lie between 0 and 0.25, where no corner can pass")
-        if self.min_slope <= 0:
-            raise ValueError("min_slope: must be positive")
+        for name in ("smoothing_px", "min_slope"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}: must be positive")
         if self.border_px < self.subpixel_half_px + 2:
             raise ValueError("border_px: must be at least subpixel_half_px + 2")
 
@@ -74,11 +78,12 @@ def detect(image: np.ndarray, parameters: HarrisParameters) -> Float:
         raise ValueError(f"image: is {image.dtype} {image.shape}, expected uint8 (H, W)")
     if min(image.shape) <= 2 * parameters.border_px:
         return np.zeros((0, 2))
-    response = cv2.cornerHarris(image, parameters.block_px, _SOBEL_APERTURE_PX, parameters.k)
+    smooth = cv2.GaussianBlur(image, (0, 0), parameters.smoothing_px)
+    response = cv2.cornerHarris(smooth, parameters.block_px, _SOBEL_APERTURE_PX, parameters.k)
     pixels = _strongest(response, parameters)
     if len(pixels) == 0:
         return np.zeros((0, 2))
-    return _refine(image, pixels, parameters)
+    return _refine(smooth, pixels, parameters)
 
 
 def _strongest(response: np.ndarray, parameters: HarrisParameters) -> np.ndarray:

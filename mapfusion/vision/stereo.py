@@ -51,27 +51,35 @@ class StereoParameters:
         silhouette_half_px: half side of the window of the silhouette test.
         max_misfit_px: a half window may differ from the plane by noise and by what this error in
             disparity would explain.
-        sigma_floor_px: error that stays however much texture there is (sampling of the image).
+        residual_correlation_px: residuals are alike over so many pixels each way (staircase edges,
+            texture seen through a lens), so that many squared count as one.
+        sigma_floor_px: error that stays however much texture there is.
     """
 
     min_depth_m: float = 0.5
     max_depth_m: float = 20.0
-    half_px: int = 6
+    half_px: int = 8
     min_correlation: float = 0.8
     max_ambiguity: float = 0.7
     max_round_trip_px: int = 1
     max_jump_px: float = 1.5
     nearest_plane_m: float = 1.0
     noise_grey: float = 2.0
-    silhouette_half_px: int = 10
-    max_misfit_px: float = 0.7
-    sigma_floor_px: float = 0.03
+    silhouette_half_px: int = 12
+    max_misfit_px: float = 1.0
+    residual_correlation_px: float = 3.0
+    sigma_floor_px: float = 0.1
 
     def __post_init__(self) -> None:
         for name in ("min_depth_m", "nearest_plane_m", "max_jump_px", "max_misfit_px"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name}: must be positive")
-        for name in ("noise_grey", "sigma_floor_px", "max_round_trip_px"):
+        for name in (
+            "noise_grey",
+            "residual_correlation_px",
+            "sigma_floor_px",
+            "max_round_trip_px",
+        ):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name}: must not be negative")
         for name in ("min_correlation", "max_ambiguity"):
@@ -145,6 +153,7 @@ def match(
         parameters.noise_grey,
         parameters.silhouette_half_px,
         parameters.max_misfit_px,
+        parameters.residual_correlation_px,
         parameters.sigma_floor_px,
         disparity,
         sigma,
@@ -169,6 +178,7 @@ def _match(
     noise: float,
     silhouette_half: int,
     max_misfit: float,
+    residual_correlation: float,
     sigma_floor: float,
     disparity: np.ndarray,
     sigma: np.ndarray,
@@ -182,7 +192,7 @@ def _match(
         sigma[n] = np.nan
         u, v = int(np.rint(uv[n, 0])), int(np.rint(uv[n, 1]))
         inside_left = half < u < width - half - 1 and half <= v < height - half
-        first, last = max(u - max_disparity, half + 2), u - min_disparity
+        first, last = max(u - max_disparity, half), u - min_disparity
         if not inside_left or first > last:
             verdict[n] = OUTSIDE
             continue
@@ -207,7 +217,7 @@ def _match(
             verdict[n] = SILHOUETTE
             continue
         disparity[n] = plane[0] + plane[1] * (uv[n, 0] - u) + plane[2] * (uv[n, 1] - v)
-        sigma[n] = np.sqrt(variance + sigma_floor**2)
+        sigma[n] = np.sqrt(variance * residual_correlation**2 + sigma_floor**2)
 
 
 @njit(cache=True)
@@ -299,14 +309,11 @@ def _correlate(
 
 @njit(cache=True)
 def _grey(image: np.ndarray, x: float, y: int) -> float:
-    """Grey level between columns by the cubic of Catmull and Rom; the border pixels repeat."""
-    last = image.shape[1] - 1
-    k = int(np.floor(x))
+    """Grey level between columns by the cubic of Catmull and Rom, for 1 <= x < width - 2."""
+    k = int(x)
     t = x - k
-    p0 = float(image[y, min(max(k - 1, 0), last)])
-    p1 = float(image[y, min(max(k, 0), last)])
-    p2 = float(image[y, min(max(k + 1, 0), last)])
-    p3 = float(image[y, min(max(k + 2, 0), last)])
+    p0, p1 = float(image[y, k - 1]), float(image[y, k])
+    p2, p3 = float(image[y, k + 1]), float(image[y, k + 2])
     return p1 + 0.5 * t * (
         p2 - p0 + t * (2 * p0 - 5 * p1 + 4 * p2 - p3 + t * (3 * (p1 - p2) + p3 - p0))
     )
@@ -327,49 +334,76 @@ def _fit_plane(
 ) -> float:
     """Move `plane` (disparity at (u, v), slope along u, slope along v) to the least squares.
 
-    Unknowns: offset in brightness, disparity, two slopes. Returns the variance of the disparity at
-    the corner (u + du, v + dv); NaN and a plane of NaN when the texture does not determine it.
+    Unknowns: offset in brightness, disparity, two slopes. The derivatives are those of the left
+    image, so the normal matrix is built once (Baker and Matthews 2004, inverse composition).
+    Returns the variance of the disparity at the corner (u + du, v + dv); `plane` becomes NaN when
+    the texture does not determine it or the fit leaves the image.
     """
     count = (2 * half + 1) ** 2
-    normal = np.empty((4, 4))
-    moment = np.empty(4)
+    normal = np.zeros((4, 4))
     row = np.empty(4)
+    for y in range(v - half, v + half + 1):
+        for x in range(-half, half + 1):
+            slope = 0.5 * (float(left[y, u + x + 1]) - float(left[y, u + x - 1]))
+            row[0], row[1], row[2], row[3] = 1.0, slope, slope * x, slope * (y - v)
+            for i in range(4):
+                for j in range(i + 1):
+                    normal[i, j] += row[i] * row[j]
+    factor = np.empty((4, 4))
+    step = np.empty(4)
     variance_grey = 2 * noise**2
     for _ in range(_MAX_STEPS):
-        normal[:] = 0.0
-        moment[:] = 0.0
-        square = 0.0
-        for y in range(-half, half + 1):
-            for x in range(-half, half + 1):
-                at = u + x - plane[0] - plane[1] * x - plane[2] * y
-                slope_left = 0.5 * (float(left[v + y, u + x + 1]) - float(left[v + y, u + x - 1]))
-                slope_right = 0.5 * (_grey(right, at + 1, v + y) - _grey(right, at - 1, v + y))
-                slope = 0.5 * (slope_left + slope_right)
-                residual = _grey(right, at, v + y) - float(left[v + y, u + x])
-                row[0], row[1], row[2], row[3] = 1.0, slope, slope * x, slope * y
-                square += residual * residual
-                for i in range(4):
-                    moment[i] += row[i] * residual
-                    for j in range(i + 1):
-                        normal[i, j] += row[i] * row[j]
-        prior = variance_grey / slope_sigma**2
-        normal[2, 2] += prior
-        normal[3, 3] += prior
-        moment[2] -= prior * plane[1]
-        moment[3] -= prior * plane[2]
-        if not _cholesky(normal):
+        first = u - half - plane[0] + plane[1] * half
+        last = u + half - plane[0] - plane[1] * half
+        lean = abs(plane[2]) * half
+        if not (first - lean >= 1 and last + lean < right.shape[1] - 2 and first < last):
             plane[:] = np.nan
             return np.nan
-        _solve(normal, moment)
-        plane += moment[1:]
-        mean = moment[0]
-        variance_grey = max(square / count - mean * mean, 0.0) * count / (count - 4)
-        if abs(moment[1]) < _CONVERGED_PX:
+        square = _residuals(left, right, u, v, half, plane, step)
+        prior = variance_grey / slope_sigma**2
+        factor[:] = normal
+        factor[2, 2] += prior
+        factor[3, 3] += prior
+        step[2] -= prior * plane[1]
+        step[3] -= prior * plane[2]
+        if not _cholesky(factor):
+            plane[:] = np.nan
+            return np.nan
+        _solve(factor, step)
+        plane += step[1:]
+        variance_grey = max(square - count * step[0] ** 2, 0.0) / (count - 4)
+        if abs(step[1]) < _CONVERGED_PX:
             break
     row[0], row[1], row[2], row[3] = 0.0, 1.0, du, dv
-    moment[:] = row
-    _solve(normal, moment)
-    return variance_grey * (moment[1] + du * moment[2] + dv * moment[3])
+    step[:] = row
+    _solve(factor, step)
+    return variance_grey * (step[1] + du * step[2] + dv * step[3])
+
+
+@njit(cache=True)
+def _residuals(
+    left: np.ndarray,
+    right: np.ndarray,
+    u: int,
+    v: int,
+    half: int,
+    plane: np.ndarray,
+    moment: np.ndarray,
+) -> float:
+    """Sum of the squared differences right - left under `plane`; `moment` gets J^T r."""
+    square = 0.0
+    moment[:] = 0.0
+    for y in range(-half, half + 1):
+        start = u - plane[0] - plane[2] * y
+        for x in range(-half, half + 1):
+            residual = _grey(right, start + x - plane[1] * x, v + y) - float(left[v + y, u + x])
+            slope = 0.5 * (float(left[v + y, u + x + 1]) - float(left[v + y, u + x - 1]))
+            square += residual * residual
+            moment[0] += residual
+            moment[1] += slope * residual
+            moment[2] += slope * x * residual
+            moment[3] += slope * y * residual
+    return square
 
 
 @njit(cache=True)
@@ -424,7 +458,7 @@ def _is_silhouette(
     for y in range(max(-half, -v), min(half, height - 1 - v) + 1):
         for x in range(max(-half, 1 - u), min(half, width - 2 - u) + 1):
             at = u + x - plane[0] - plane[1] * x - plane[2] * y
-            if at < 0 or at > width - 1:
+            if not 1 <= at < width - 2:
                 continue
             residual = _grey(right, at, v + y) - float(left[v + y, u + x])
             slope = 0.5 * (float(left[v + y, u + x + 1]) - float(left[v + y, u + x - 1]))
