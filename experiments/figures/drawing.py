@@ -1,0 +1,97 @@
+"""All figures of one result, each from stored tables and key frames alone."""
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from experiments.figures.result_tables import NothingToDraw, ResultTables
+from experiments.figures.style import PNG_DPI, house_style
+from experiments.workers import workers
+from mapfusion.storage import write_whole
+
+FIGURES = (
+    "fig01_tracks",
+    "fig02_two_maps",
+    "fig03_dispersion",
+    "fig04_translation_error",
+    "fig05_rotation_error",
+    "fig06_aligner_time",
+    "fig07_correspondences",
+    "fig08_fused_landmark",
+    "fig09_aligned_maps",
+    "fig10_fused_map",
+)
+_FORMATS = ("png", "svg")
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What became of one figure.
+
+    Attributes:
+        name: the figure.
+        files: the pictures written; none when it was skipped.
+        skipped: why it was skipped, in one line; empty when it was drawn.
+    """
+
+    name: str
+    files: tuple[Path, ...]
+    skipped: str = ""
+
+
+def draw_all(
+    result: Path, jobs: int = 2, on_progress: Callable[[Drawn], None] | None = None
+) -> list[Path]:
+    """Draw figures 1 to 10 of a result folder into `RESULT/figures/`.
+
+    A figure whose data the result does not hold is skipped; `on_progress` is told why.
+
+    Args:
+        result: a folder written by `run`.
+        jobs: worker processes.
+        on_progress: called after each figure.
+
+    Returns:
+        The pictures written, in the figures' order.
+
+    Raises:
+        InputError: a table is missing or damaged.
+    """
+    outcomes: dict[str, Drawn] = {}
+    with workers(jobs) as pool:
+        for name in FIGURES:
+            pool.submit(name, _draw_in_worker, result, name)
+        for name, outcome in pool.completed():
+            outcomes[name] = outcome
+            if on_progress is not None:
+                on_progress(outcome)
+    return [file for name in FIGURES for file in outcomes[name].files]
+
+
+def _draw_in_worker(result: Path, name: str) -> Drawn:
+    return draw_figure(ResultTables(result), name)
+
+
+def draw_figure(data: ResultTables, name: str) -> Drawn:
+    """Draw one figure and write its pictures, or remove old ones when there is nothing to draw."""
+    module = importlib.import_module(f"experiments.figures.{name}")
+    files = tuple(data.folder / "figures" / f"{name}.{suffix}" for suffix in _FORMATS)
+    with house_style():
+        try:
+            figure: Figure = module.draw(data)
+        except NothingToDraw as reason:
+            for file in files:
+                file.unlink(missing_ok=True)
+            return Drawn(name, (), str(reason))
+        for file in files:
+            write_whole(file, lambda path: _save(figure, path))
+    return Drawn(name, files)
+
+
+def _save(figure: Figure, path: Path) -> None:
+    # No date: the same tables give the same bytes.
+    metadata = {"Date": None} if path.suffix == ".svg" else None
+    figure.savefig(path, dpi=PNG_DPI, metadata=metadata)

@@ -1,0 +1,203 @@
+"""Figure 3: how the particle set spreads along the paths, and draws together again."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from experiments.figures.plan import add_frame, add_walls, label_plan, set_view
+from experiments.figures.result_tables import NothingToDraw, ResultTables
+from experiments.figures.style import BLACK, GRAY, PAGE_WIDTH_IN, robot_colours
+from mapfusion.se2 import Float
+
+_MAX_ROBOTS = 3
+_MAGNIFICATIONS = (1, 2, 5, 10, 20, 50, 100)
+_WIDEST_SHARE = 1 / 10  # of the map's extent that the widest drawn particle set may take
+_ZOOM_MARGIN = 1.25
+
+
+class Moments(NamedTuple):
+    """Two kept iterations of one robot."""
+
+    robot: str
+    wide: int
+    tight: int
+
+
+def draw(data: ResultTables) -> Figure:
+    """Particles along up to three paths, the spread over time, and a wide and a tight moment."""
+    clouds = data.table("clouds")
+    robots = [robot for robot in data.robots if (clouds["robot"] == robot).any()][:_MAX_ROBOTS]
+    if not robots:
+        raise NothingToDraw("no particles were kept")
+    clouds = clouds[clouds["robot"].isin(robots)]
+    moments = choose_moments(clouds)
+    figure = Figure(figsize=(PAGE_WIDTH_IN, 5.2))
+    halves = figure.subfigures(2, 1, height_ratios=(1.15, 1.0), squeeze=False)
+    panels = halves[0, 0].subplots(1, len(robots), squeeze=False)[0]
+    magnification = _magnification(data, clouds, robots)
+    for axes, robot in zip(panels, robots, strict=True):
+        _draw_path(axes, data, robot, clouds[clouds["robot"] == robot], magnification)
+        if moments is not None and robot == moments.robot:
+            _mark_on_path(axes, data, moments)
+    timeline, *zooms = halves[1, 0].subplots(1, 3)
+    _draw_timeline(timeline, data, robots, moments)
+    if moments is None:
+        for axes in zooms:
+            axes.set_axis_off()
+    else:
+        _draw_zooms(zooms, data, clouds[clouds["robot"] == moments.robot], moments)
+    return figure
+
+
+def choose_moments(clouds: pd.DataFrame) -> Moments | None:
+    """The pair of moments between which one robot's particles drew together the most.
+
+    Wide comes before tight, so the fall is what seeing old ground again did. None when no robot has
+    two moments with any spread.
+    """
+    best, best_ratio = None, 0.0
+    for robot, rows in clouds.groupby("robot", sort=False):
+        spread = rows.groupby("iteration")[["x_m", "y_m", "log_weight"]].apply(_spread_m)
+        spread = spread[np.isfinite(spread) & (spread > 0)]
+        if len(spread) < 2:
+            continue
+        widest_before = np.maximum.accumulate(spread.to_numpy())[:-1]
+        ratio = widest_before / spread.to_numpy()[1:]
+        tight = int(np.argmax(ratio)) + 1
+        if ratio[tight - 1] > best_ratio:
+            best_ratio = ratio[tight - 1]
+            wide = int(np.argmax(spread.to_numpy()[:tight]))
+            best = Moments(str(robot), int(spread.index[wide]), int(spread.index[tight]))
+    return best
+
+
+def _weights(rows: pd.DataFrame) -> Float:
+    weight = np.exp(rows["log_weight"].to_numpy() - rows["log_weight"].max())
+    return weight / weight.sum()
+
+
+def _mean(rows: pd.DataFrame) -> Float:
+    return _weights(rows) @ rows[["x_m", "y_m"]].to_numpy()
+
+
+def _spread_m(rows: pd.DataFrame) -> float:
+    """Root of the trace of the weighted covariance of the positions."""
+    offset = rows[["x_m", "y_m"]].to_numpy() - _mean(rows)
+    return float(np.sqrt(_weights(rows) @ (offset**2).sum(axis=1)))
+
+
+def _magnification(data: ResultTables, clouds: pd.DataFrame, robots: list[str]) -> int:
+    """The largest round factor at which the particle sets still look like spots on the paths."""
+    extent = min(float(np.ptp(data.path_of(robot)[:, :2], axis=0).max()) for robot in robots)
+    groups = clouds.groupby(["robot", "iteration"])[["x_m", "y_m"]]
+    widest = float((groups.max() - groups.min()).to_numpy().max())
+    fitting = [m for m in _MAGNIFICATIONS if m * widest <= _WIDEST_SHARE * extent]
+    return max(fitting, default=1)
+
+
+def _draw_path(
+    axes: Axes, data: ResultTables, robot: str, clouds: pd.DataFrame, magnification: int
+) -> None:
+    path = data.path_of(robot)
+    walls = data.walls_in_frame_of(robot)
+    add_walls(axes, walls)
+    axes.plot(path[:, 0], path[:, 1], color=GRAY, linewidth=0.7, zorder=2)
+    for _, rows in clouds.groupby("iteration"):
+        points, mean = rows[["x_m", "y_m"]].to_numpy(), _mean(rows)
+        spot = mean + magnification * (points - mean)
+        axes.plot(
+            *spot.T,
+            linestyle="none",
+            marker=".",
+            markersize=1.0,
+            color=robot_colours(data.robots)[robot],
+            rasterized=True,
+            zorder=3,
+        )
+    add_frame(axes)
+    set_view(axes, np.empty((0, 3)), path, *walls)
+    label_plan(axes, robot)
+    enlarged = f", spread x{magnification}" if magnification > 1 else ""
+    axes.set_title(f"{robot}: particles{enlarged}")
+
+
+def _pose(data: ResultTables, robot: str, iteration: int) -> Float:
+    return data.path_of(robot)[iteration]
+
+
+def _mark_on_path(axes: Axes, data: ResultTables, moments: Moments) -> None:
+    for name, iteration in (("A", moments.wide), ("B", moments.tight)):
+        axes.annotate(
+            name,
+            xy=tuple(_pose(data, moments.robot, iteration)[:2]),
+            xytext=(9, 9) if name == "A" else (-15, 9),
+            textcoords="offset points",
+            fontweight="bold",
+            bbox={"boxstyle": "round,pad=0.15", "facecolor": "white", "linewidth": 0.5},
+            arrowprops={"arrowstyle": "-", "linewidth": 0.8},
+            zorder=7,
+        )
+
+
+def _draw_timeline(
+    axes: Axes, data: ResultTables, robots: list[str], moments: Moments | None
+) -> None:
+    table = data.table("robots")
+    for robot in robots:
+        rows = table[table["robot"] == robot].sort_values("iteration")
+        axes.plot(
+            rows["iteration"],
+            rows["spread_m"],
+            color=robot_colours(data.robots)[robot],
+            linewidth=0.8,
+            label=robot,
+        )
+        if moments is not None and robot == moments.robot:
+            spread = rows.set_index("iteration")["spread_m"]
+            for name, iteration in (("A", moments.wide), ("B", moments.tight)):
+                axes.plot(iteration, spread[iteration], "o", color=BLACK, zorder=4)
+                axes.annotate(
+                    name,
+                    (iteration, spread[iteration]),
+                    xytext=(3, 3),
+                    textcoords="offset points",
+                    fontweight="bold",
+                )
+    axes.set_xlabel("FastSLAM iteration k")
+    axes.set_ylabel("spread of the particles (m)")
+    axes.set_ylim(bottom=0)
+    axes.margins(y=0.15)
+    axes.legend(loc="best")
+    axes.set_title("spread over time")
+
+
+def _draw_zooms(
+    zooms: list[Axes], data: ResultTables, clouds: pd.DataFrame, moments: Moments
+) -> None:
+    """Both moments at one scale, so that tight looks tight."""
+    sets = [clouds[clouds["iteration"] == k] for k in (moments.wide, moments.tight)]
+    reach = max(float(np.abs(rows[["x_m", "y_m"]].to_numpy() - _mean(rows)).max()) for rows in sets)
+    path = data.path_of(moments.robot)
+    titles = ("A: wide, new territory", "B: tight, after closing a loop")
+    for axes, rows, title in zip(zooms, sets, titles, strict=True):
+        mean = _mean(rows)
+        axes.plot(path[:, 0], path[:, 1], color=GRAY, zorder=1)
+        axes.plot(
+            rows["x_m"],
+            rows["y_m"],
+            linestyle="none",
+            marker=".",
+            markersize=2.5,
+            alpha=0.7,
+            color=robot_colours(data.robots)[moments.robot],
+            rasterized=True,
+        )
+        axes.set_xlim(mean[0] - _ZOOM_MARGIN * reach, mean[0] + _ZOOM_MARGIN * reach)
+        axes.set_ylim(mean[1] - _ZOOM_MARGIN * reach, mean[1] + _ZOOM_MARGIN * reach)
+        axes.set_aspect("equal")
+        axes.locator_params(nbins=4)
+        label_plan(axes, moments.robot)
+        axes.set_title(f"{title}\nk = {rows['iteration'].iloc[0]}, spread {_spread_m(rows):.3f} m")

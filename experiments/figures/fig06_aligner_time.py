@@ -1,0 +1,70 @@
+"""Figure 6: time of the aligners against the number of overlapping points."""
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from experiments.figures.result_tables import NothingToDraw, ResultTables
+from experiments.figures.style import PAGE_WIDTH_IN, aligner_styles
+from experiments.metrics import ORACLE
+
+_BINS = 8  # of equal counts, for the line that guides the eye
+
+
+def draw(data: ResultTables) -> Figure:
+    """Medians and 10-90 % of the repeats; beside it the same against the correspondences given."""
+    timings = data.table("aligner_timings").dropna(subset="elapsed_s")
+    if timings.empty:
+        raise NothingToDraw("no aligner was timed")
+    figure = Figure(figsize=(PAGE_WIDTH_IN, 3.4))
+    panels = figure.subplots(1, 2, sharey=True)
+    found = set(timings["aligner"])
+    names = [name for name in data.aligners if name in found]
+    for axes, column, label in (
+        (panels[0], "n_common", "overlapping points (true common landmarks)"),
+        (panels[1], "n_correspondences", "correspondences given to the aligner"),
+    ):
+        for name in names:
+            _add_aligner(axes, timings[timings["aligner"] == name], column, data.aligners)
+        axes.set_xlabel(label)
+        axes.set_yscale("log")
+    panels[0].set_ylabel("time of one alignment (s)")
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), handlelength=3.2)
+    return figure
+
+
+def _add_aligner(axes: Axes, rows: pd.DataFrame, column: str, aligners: list[str]) -> None:
+    name = rows["aligner"].iloc[0]
+    style = aligner_styles(aligners)[name]
+    count, elapsed = rows[column].to_numpy(), rows["elapsed_s"].to_numpy()
+    axes.vlines(
+        count,
+        rows["elapsed_low_s"],
+        rows["elapsed_high_s"],
+        color=style["color"],
+        linewidth=0.5,
+        alpha=0.5,
+        rasterized=True,
+    )
+    axes.plot(
+        count,
+        elapsed,
+        color=style["color"],
+        marker=style["marker"],
+        linestyle="none",
+        markersize=2.5,
+        alpha=0.6,
+        rasterized=True,
+    )
+    guide = binned_medians(count, elapsed)
+    axes.plot(*guide, label=name, zorder=4 if name == ORACLE else 3, **style)
+
+
+def binned_medians(count: np.ndarray, elapsed_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Medians of both within bins of about equal counts, ties never split."""
+    rank = pd.Series(count).rank(pct=True).to_numpy()
+    frame = pd.DataFrame({"bin": np.ceil(rank * _BINS), "count": count, "elapsed": elapsed_s})
+    medians = frame.groupby("bin").median()
+    return medians["count"].to_numpy(), medians["elapsed"].to_numpy()

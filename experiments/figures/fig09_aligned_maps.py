@@ -1,0 +1,100 @@
+"""Figure 9: corresponding landmarks of two aligned maps, and the landmarks fused from them."""
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from scipy.spatial import KDTree
+
+from experiments.figures.ellipses import LEVEL_TEXT, add_ellipses
+from experiments.figures.fused_frame import FusedPairs, fused_pairs
+from experiments.figures.plan import add_walls, label_plan, set_view
+from experiments.figures.result_tables import ResultTables
+from experiments.figures.style import BLACK, FUSED_COLOUR, GRAY, PAGE_WIDTH_IN, robot_colours
+from mapfusion.se2 import Float
+
+_ZOOM_SIDE_M = 1.0
+_ZOOM_LANDMARKS = 7  # what a panel of that size shows without clutter
+
+
+def draw(data: ResultTables) -> Figure:
+    """All corresponding landmarks in one frame, with ellipses, and a small part enlarged."""
+    pairs = fused_pairs(data)
+    figure = Figure(figsize=(PAGE_WIDTH_IN, 4.1))
+    overview, zoom = figure.subplots(1, 2)
+    walls = data.walls_in_frame_of(data.robots[0])
+    for axes, scale in ((overview, 0.5), (zoom, 1.0)):
+        add_walls(axes, walls)
+        _draw_landmarks(axes, data, pairs, scale)
+        label_plan(axes, data.robots[0])
+    fused = pairs.position_m[2]
+    set_view(overview, fused)
+    corner = zoom_corner(fused)
+    zoom.set_xlim(corner[0], corner[0] + _ZOOM_SIDE_M)
+    zoom.set_ylim(corner[1], corner[1] + _ZOOM_SIDE_M)
+    zoom.set_aspect("equal")
+    overview.add_patch(
+        Rectangle(
+            (corner[0], corner[1]),
+            _ZOOM_SIDE_M,
+            _ZOOM_SIDE_M,
+            fill=False,
+            edgecolor=BLACK,
+            linestyle="--",
+            zorder=6,
+        )
+    )
+    overview.set_title(f"{len(fused)} landmarks in both maps, aligned")
+    zoom.set_title("zoom of the dashed rectangle")
+    handles, labels = zoom.get_legend_handles_labels()
+    figure.legend(
+        handles, labels, loc="outside lower center", ncols=4,
+        title=f"{LEVEL_TEXT} ellipses, to scale", title_fontsize=7.5,
+    )  # fmt: skip
+    return figure
+
+
+def _draw_landmarks(axes: Axes, data: ResultTables, pairs: FusedPairs, scale: float) -> None:
+    colours = [robot_colours(data.robots)[robot] for robot in pairs.robots] + [FUSED_COLOUR]
+    names = [f"map of {robot}" for robot in pairs.robots] + ["fused"]
+    parents = np.stack(list(pairs.position_m[:2, :, :2]), axis=1)
+    axes.add_collection(
+        LineCollection(
+            list(parents), colors=GRAY, linewidths=0.6, label="correspondences", rasterized=True
+        ),
+        autolim=False,
+    )
+    for k, marker in enumerate("*^s"):
+        style = {"color": colours[k], "rasterized": True, "zorder": 3 + 0.1 * k}
+        axes.plot(
+            *pairs.position_m[k, :, :2].T,
+            linestyle="none",
+            marker=marker,
+            markersize=6 * scale,
+            markerfacecolor="none",
+            markeredgewidth=0.8 * scale,
+            label=names[k],
+            **style,
+        )
+        add_ellipses(
+            axes,
+            pairs.position_m[k],
+            pairs.covariance_m2[k],
+            edgecolors=colours[k],
+            linewidths=(1.4 if k == 2 else 0.8) * scale,
+            rasterized=True,
+            zorder=2 + 0.1 * k,
+        )
+
+
+def zoom_corner(position_m: Float) -> Float:
+    """Lower left corner of a square that shows about the wished number of landmarks.
+
+    It is centred on the landmark whose neighbourhood comes nearest to that number.
+    """
+    tree = KDTree(position_m[:, :2])
+    half = _ZOOM_SIDE_M / 2
+    count = tree.query_ball_point(position_m[:, :2], half, p=np.inf, return_length=True)
+    best = int(np.argmin(np.abs(np.asarray(count) - _ZOOM_LANDMARKS)))
+    return position_m[best, :2] - half

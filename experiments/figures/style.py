@@ -1,0 +1,80 @@
+"""One look for all figures: legible in print, safe for colour-blind readers, reproducible."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import matplotlib
+import matplotlib.style
+
+from experiments.metrics import ORACLE
+
+PAGE_WIDTH_IN = 7.2  # two columns of a journal page
+PNG_DPI = 200  # also of the parts that are drawn as pixels inside an SVG
+
+# Okabe and Ito (2008): told apart by readers with any common colour blindness. Their yellow is left
+# out: too pale for lines on white.
+BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY = (
+    "#0072B2",
+    "#D55E00",
+    "#009E73",
+    "#CC79A7",
+    "#E69F00",
+    "#56B4E9",
+)
+BLACK, GRAY, PALE_GRAY = "#000000", "#7F7F7F", "#C8C8C8"
+SEQUENTIAL_MAP = "viridis"
+
+_RC: dict[str, Any] = {
+    "font.family": "DejaVu Sans",  # comes with matplotlib: the same on every machine
+    "font.size": 8.0,
+    "axes.titlesize": 8.5,
+    "axes.labelsize": 8.0,
+    "legend.fontsize": 7.5,
+    "legend.framealpha": 0.9,
+    "xtick.labelsize": 7.5,
+    "ytick.labelsize": 7.5,
+    "axes.linewidth": 0.6,
+    "lines.linewidth": 1.1,
+    "lines.markersize": 3.5,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.alpha": 0.35,
+    "grid.linewidth": 0.4,
+    "figure.constrained_layout.use": True,
+    "svg.fonttype": "path",
+    "svg.hashsalt": "mapfusion",  # else every SVG gets element ids of its own
+}
+# Lines also differ in dashes and markers, for prints in gray.
+_ALIGNER_STYLES: tuple[dict[str, Any], ...] = (
+    {"color": BLUE, "linestyle": "-", "marker": "o"},
+    {"color": VERMILLION, "linestyle": (0, (6, 1, 1, 1)), "marker": "s"},
+    {"color": ORANGE, "linestyle": (0, (1, 1)), "marker": "D"},
+    {"color": GREEN, "linestyle": (0, (5, 1)), "marker": "^"},
+    {"color": PURPLE, "linestyle": (0, (3, 1, 1, 1, 1, 1)), "marker": "v"},
+    {"color": SKY, "linestyle": "-", "marker": "P"},
+)
+_ORACLE_STYLE: dict[str, Any] = {"color": BLACK, "linestyle": (0, (4, 2)), "marker": "x"}
+_ROBOT_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
+FUSED_COLOUR = BLACK
+
+
+@contextmanager
+def house_style() -> Iterator[None]:
+    """Matplotlib's defaults and ours, whatever the user's own settings; those come back after."""
+    with matplotlib.style.context(["default", _RC]):
+        yield
+
+
+def aligner_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Line style of each aligner by its place in the display order; the oracle has its own."""
+    estimators = [name for name in names if name != ORACLE]
+    styles = {
+        name: _ALIGNER_STYLES[place % len(_ALIGNER_STYLES)] for place, name in enumerate(estimators)
+    }
+    return styles | {ORACLE: _ORACLE_STYLE}
+
+
+def robot_colours(names: Sequence[str]) -> dict[str, str]:
+    """Colour of each robot by its place in the display order."""
+    return {name: _ROBOT_COLOURS[place % len(_ROBOT_COLOURS)] for place, name in enumerate(names)}
