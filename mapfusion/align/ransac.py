@@ -102,9 +102,9 @@ def next_random(state: np.uint64) -> np.uint64:
 
 
 @njit(cache=True)
-def _below(state: np.uint64, n: int) -> np.int64:
+def _below(state: np.uint64, n: int) -> int:
     # upper 32 bits, scaled: uneven by n / 2^32 at most
-    return np.int64(((state >> np.uint64(32)) * np.uint64(n)) >> np.uint64(32))
+    return int(np.int64(((state >> np.uint64(32)) * np.uint64(n)) >> np.uint64(32)))
 
 
 @njit(cache=True)

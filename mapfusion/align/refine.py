@@ -18,7 +18,7 @@ from mapfusion.se2 import Float, wrap
 # A gate of three standard deviations keeps 99 % of a plane's residuals; a larger s_drift could not
 # be told from false pairs spread over the gate.
 _GATE_SIGMAS = 3.0
-_TOLERANCE_M = 1e-9  # movement of the landmarks that counts as none
+_TOLERANCE_M = 1e-8  # movement of the landmarks that counts as none
 _SINGULAR = 1e-12  # determinant of the normal matrix scaled to a unit diagonal
 
 
@@ -40,7 +40,7 @@ class Refinement:
     """
 
     gate_m: float = 0.5
-    max_rounds: int = 500
+    max_rounds: int = 1000
     height: HeightGate = field(default_factory=HeightGate)
 
     def __post_init__(self) -> None:

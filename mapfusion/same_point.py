@@ -1,0 +1,92 @@
+"""Which landmarks in one frame may be the same point of the world."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import KDTree
+from scipy.stats import chi2
+
+from mapfusion.align.correspondences import HeightGate
+from mapfusion.aligned_landmarks import AlignedLandmarks
+from mapfusion.robot_log import NO_LABEL
+
+
+@dataclass(frozen=True)
+class SamePoint:
+    """The test by which two landmarks in one frame can be one point of the world.
+
+    Attributes:
+        max_descriptor_distance: where not both carry labels; these decide by themselves.
+        gate_probability: of keeping landmarks of one point (chi-square, 2 degrees of freedom,
+            drift included).
+        height: which landmarks can have one height.
+        planar: heights carry no information.
+    """
+
+    max_descriptor_distance: float
+    gate_probability: float
+    height: HeightGate
+    planar: bool
+
+    def candidates(
+        self, a: AlignedLandmarks, b: AlignedLandmarks
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rows of a and of b that pass, and their descriptors' distance (0 by label)."""
+        i, j = self._neighbours(a, b)
+        same_label = (a.label[i] == b.label[j]) & (a.label[i] != NO_LABEL)
+        labelled = (a.label[i] != NO_LABEL) & (b.label[j] != NO_LABEL)
+        unlike = np.linalg.norm(a.descriptor[i] - b.descriptor[j], axis=1)
+        unlike = np.where(same_label, 0.0, unlike)
+        near = unlike <= self.max_descriptor_distance  # False for NaN
+        passes = np.where(labelled, same_label, near) & self._inside(a, b, i, j)
+        return i[passes], j[passes], unlike[passes]
+
+    def _bound(self) -> float:
+        return float(chi2.ppf(self.gate_probability, 2))
+
+    def _neighbours(
+        self, a: AlignedLandmarks, b: AlignedLandmarks
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """All pairs that the gate could hold, and some more."""
+        if not len(a) or not len(b):
+            return np.zeros(0, np.int64), np.zeros(0, np.int64)
+        widest_a, widest_b = (
+            np.trace(x.covariance_m2[:, :2, :2], axis1=1, axis2=2) + x.drift_m2 for x in (a, b)
+        )
+        radius = np.sqrt(self._bound() * (widest_a + widest_b.max()))
+        found = KDTree(b.position_m[:, :2]).query_ball_point(a.position_m[:, :2], radius)
+        lengths = [len(rows) for rows in found]
+        rows = np.concatenate([np.sort(rows) for rows in found]).astype(np.int64)
+        return np.repeat(np.arange(len(a)), lengths), rows
+
+    def _inside(
+        self, a: AlignedLandmarks, b: AlignedLandmarks, i: np.ndarray, j: np.ndarray
+    ) -> np.ndarray:
+        drift_m2 = a.drift_m2[i] + b.drift_m2[j]
+        S = a.covariance_m2[i][:, :2, :2] + b.covariance_m2[j][:, :2, :2]
+        S = S + drift_m2[:, None, None] * np.eye(2)
+        e = (a.position_m[i] - b.position_m[j])[:, :2]
+        inside = np.einsum("ni,ni->n", e, np.linalg.solve(S, e[:, :, None])[:, :, 0])
+        inside = inside <= self._bound()
+        if self.planar:
+            return inside
+        return inside & self.height.agrees(
+            a.position_m[i, 2],
+            a.covariance_m2[i, 2, 2],
+            b.position_m[j, 2],
+            b.covariance_m2[j, 2, 2],
+        )
+
+
+def one_to_one(i: np.ndarray, j: np.ndarray, unlike: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The most alike first, each landmark once."""
+    taken_i: set[int] = set()
+    taken_j: set[int] = set()
+    kept = []
+    for row in np.argsort(unlike, kind="stable"):
+        at_i, at_j = int(i[row]), int(j[row])
+        if at_i not in taken_i and at_j not in taken_j:
+            taken_i.add(at_i)
+            taken_j.add(at_j)
+            kept.append(row)
+    return i[kept], j[kept]
