@@ -8,9 +8,10 @@ from mapfusion.camera import StereoCamera
 from mapfusion.robot_log import Observations
 from mapfusion.vision.features import Features
 from mapfusion.vision.harris import HarrisParameters, detect
-from mapfusion.vision.stereo import MATCHED, StereoParameters, match
+from mapfusion.vision.stereo import StereoParameters, match
 from mapfusion.vision.tracks import TrackParameters
 from mapfusion.vision.usurf import USurfParameters, describe
+from mapfusion.vision.verdict import Verdict
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ class FrontEnd:
                 raise ValueError(f"{name}: is {image.dtype} {image.shape}, expected uint8 {size}")
         corners = detect(left, self.parameters.harris)
         matches = match(left, right, corners, self.camera, self.parameters.stereo)
-        matched = matches.verdict == MATCHED
+        matched = matches.verdict == Verdict.MATCHED
         uv, disparity = corners[matched], matches.disparity_px[matched]
         depth = self.camera.focal_px * self.camera.baseline_m / disparity
         scale = self.parameters.usurf.scales_px(depth, self.camera.focal_px)

@@ -27,7 +27,7 @@ class TrackParameters:
     max_shift_u_px: float = 80.0
     max_shift_v_px: float = 25.0
     max_disparity_ratio: float = 1.3
-    max_descriptor_distance: float = 0.35
+    max_descriptor_distance: float = 0.3
 
     def __post_init__(self) -> None:
         if self.min_length < 1:

@@ -49,7 +49,7 @@ class USurfParameters:
     scale_px: float = 2.0
     side_m: float = 0.6
     min_scale_px: float = 1.0
-    max_scale_px: float = 12.0
+    max_scale_px: float = 30.0
 
     def __post_init__(self) -> None:
         if self.window not in ("pixels", "metric"):

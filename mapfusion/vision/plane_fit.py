@@ -1,0 +1,243 @@
+"""Sub-pixel disparity by least squares on grey levels, for windows that show a piece of a plane.
+
+The disparity of a plane is linear in the image: d(x, y) = d + a x + b y around the window's centre.
+"""
+
+import numpy as np
+from numba import njit
+
+_MAX_STEPS = 8
+_CONVERGED_PX = 0.005  # far below what noise lets one measure
+_SINGULAR = 1e-9  # pivot, as a share of its diagonal element, that is rounding error
+
+
+@njit(cache=True)
+def fit_planes(
+    left: np.ndarray,
+    right: np.ndarray,
+    pixel: np.ndarray,
+    offset: np.ndarray,
+    start: np.ndarray,
+    half: int,
+    slope_sigma: float,
+    noise: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Fit disparity, slopes and an offset in brightness to each window.
+
+    Args:
+        left: (H, W) uint8.
+        right: (H, W) uint8.
+        pixel: (N, 2) int64 centres (u, v) of the windows, which lie inside the left image with one
+            pixel to spare.
+        offset: (N, 2) from the centres to the points whose variance is wanted.
+        start: (N,) disparities right to a pixel or two.
+        half: half side of the window, pixels.
+        slope_sigma: standard deviation of the prior on a and b, around zero.
+        noise: standard deviation of one image's grey levels, for the first step's prior.
+
+    Returns:
+        Planes (N, 3) of d, a, b, and the variances (N,) of d + a x + b y at the offsets, as if the
+        residuals were independent; NaN where the fit left the image or the texture is too poor.
+    """
+    plane = np.zeros((len(pixel), 3))
+    variance = np.empty(len(pixel))
+    for n in range(len(pixel)):
+        plane[n, 0] = start[n]
+        variance[n] = _fit_plane(
+            left, right, pixel[n], offset[n], half, slope_sigma, noise, plane[n]
+        )
+    return plane, variance
+
+
+@njit(cache=True)
+def _grey(image: np.ndarray, x: float, y: int) -> float:
+    """Grey level between columns by the cubic of Catmull and Rom, for 1 <= x < width - 2."""
+    k = int(x)
+    t = x - k
+    p0, p1 = float(image[y, k - 1]), float(image[y, k])
+    p2, p3 = float(image[y, k + 1]), float(image[y, k + 2])
+    return p1 + 0.5 * t * (
+        p2 - p0 + t * (2 * p0 - 5 * p1 + 4 * p2 - p3 + t * (3 * (p1 - p2) + p3 - p0))
+    )
+
+
+@njit(cache=True)
+def _fit_plane(
+    left: np.ndarray,
+    right: np.ndarray,
+    pixel: np.ndarray,
+    offset: np.ndarray,
+    half: int,
+    slope_sigma: float,
+    noise: float,
+    plane: np.ndarray,
+) -> float:
+    """Move `plane` (3,) to the least squares and return the variance at the offset.
+
+    Gauss-Newton steps after Lucas and Kanade (1981). The derivatives are those of the left image,
+    so the normal matrix is built once (inverse composition, Baker and Matthews 2004).
+    """
+    u, v = pixel[0], pixel[1]
+    count = (2 * half + 1) ** 2
+    normal = np.zeros((4, 4))  # of the offset in brightness, d, a, b
+    row = np.empty(4)
+    for y in range(v - half, v + half + 1):
+        for x in range(-half, half + 1):
+            slope = 0.5 * (float(left[y, u + x + 1]) - float(left[y, u + x - 1]))
+            row[0], row[1], row[2], row[3] = 1.0, slope, slope * x, slope * (y - v)
+            for i in range(4):
+                for j in range(i + 1):
+                    normal[i, j] += row[i] * row[j]
+    factor = np.empty((4, 4))
+    step = np.empty(4)
+    variance_grey = 2 * noise**2
+    for _ in range(_MAX_STEPS):
+        first = u - half - plane[0] + plane[1] * half
+        last = u + half - plane[0] - plane[1] * half
+        lean = abs(plane[2]) * half
+        if not (first - lean >= 1 and last + lean < right.shape[1] - 2 and first < last):
+            plane[:] = np.nan
+            return np.nan
+        square = _residuals(left, right, u, v, half, plane, step)
+        prior = variance_grey / slope_sigma**2
+        factor[:] = normal
+        factor[2, 2] += prior
+        factor[3, 3] += prior
+        step[2] -= prior * plane[1]
+        step[3] -= prior * plane[2]
+        if not _cholesky(factor):
+            plane[:] = np.nan
+            return np.nan
+        _solve(factor, step)
+        plane += step[1:]
+        variance_grey = max(square - count * step[0] ** 2, 0.0) / (count - 4)
+        if abs(step[1]) < _CONVERGED_PX:
+            break
+    row[0], row[1], row[2], row[3] = 0.0, 1.0, offset[0], offset[1]
+    step[:] = row
+    _solve(factor, step)
+    return variance_grey * np.dot(row, step)
+
+
+@njit(cache=True)
+def _residuals(
+    left: np.ndarray,
+    right: np.ndarray,
+    u: int,
+    v: int,
+    half: int,
+    plane: np.ndarray,
+    moment: np.ndarray,
+) -> float:
+    """Sum of the squared differences right - left under `plane`; `moment` gets J^T r."""
+    square = 0.0
+    moment[:] = 0.0
+    for y in range(-half, half + 1):
+        start = u - plane[0] - plane[2] * y
+        for x in range(-half, half + 1):
+            residual = _grey(right, start + x - plane[1] * x, v + y) - float(left[v + y, u + x])
+            slope = 0.5 * (float(left[v + y, u + x + 1]) - float(left[v + y, u + x - 1]))
+            square += residual * residual
+            moment[0] += residual
+            moment[1] += slope * residual
+            moment[2] += slope * x * residual
+            moment[3] += slope * y * residual
+    return square
+
+
+@njit(cache=True)
+def _cholesky(matrix: np.ndarray) -> bool:
+    """Lower factor of a symmetric matrix in place; False when it is not positive definite."""
+    for i in range(len(matrix)):
+        for j in range(i + 1):
+            total = matrix[i, j]
+            for k in range(j):
+                total -= matrix[i, k] * matrix[j, k]
+            if i > j:
+                matrix[i, j] = total / matrix[j, j]
+            elif total > _SINGULAR * matrix[i, i]:
+                matrix[i, i] = np.sqrt(total)
+            else:
+                return False
+    return True
+
+
+@njit(cache=True)
+def _solve(factor: np.ndarray, x: np.ndarray) -> None:
+    """Solve with the lower factor in place."""
+    for i in range(len(x)):
+        for k in range(i):
+            x[i] -= factor[i, k] * x[k]
+        x[i] /= factor[i, i]
+    for i in range(len(x) - 1, -1, -1):
+        for k in range(i + 1, len(x)):
+            x[i] -= factor[k, i] * x[k]
+        x[i] /= factor[i, i]
+
+
+@njit(cache=True)
+def disagrees(
+    left: np.ndarray,
+    right: np.ndarray,
+    pixel: np.ndarray,
+    plane: np.ndarray,
+    half: int,
+    noise: float,
+    max_misfit: float,
+) -> np.ndarray:
+    """Whether any half (left, right, upper, lower) of each window does not fit the plane.
+
+    An error e in disparity changes the grey level by g e, g its slope. So a half fits when
+    sum r^2 <= n 2 noise^2 + max_misfit^2 sum g^2.
+
+    Args:
+        left: (H, W) uint8.
+        right: (H, W) uint8.
+        pixel: (N, 2) int64 centres of the windows; what leaves an image is not looked at.
+        plane: (N, 3) from `fit_planes`.
+        half: half side of the window, pixels.
+        noise: standard deviation of one image's grey levels.
+        max_misfit: e, pixels.
+
+    Returns:
+        (N,) bool.
+    """
+    verdict = np.empty(len(pixel), dtype=np.bool_)
+    for n in range(len(pixel)):
+        verdict[n] = _disagrees(left, right, pixel[n], plane[n], half, noise, max_misfit)
+    return verdict
+
+
+@njit(cache=True)
+def _disagrees(
+    left: np.ndarray,
+    right: np.ndarray,
+    pixel: np.ndarray,
+    plane: np.ndarray,
+    half: int,
+    noise: float,
+    max_misfit: float,
+) -> bool:
+    height, width = left.shape
+    u, v = pixel[0], pixel[1]
+    sums = np.zeros((4, 4))  # left, right, upper, lower; n, sum r, sum r^2, sum g^2
+    for y in range(max(-half, -v), min(half, height - 1 - v) + 1):
+        for x in range(max(-half, 1 - u), min(half, width - 2 - u) + 1):
+            at = u + x - plane[0] - plane[1] * x - plane[2] * y
+            if not 1 <= at < width - 2:
+                continue
+            residual = _grey(right, at, v + y) - float(left[v + y, u + x])
+            slope = 0.5 * (float(left[v + y, u + x + 1]) - float(left[v + y, u + x - 1]))
+            for k in range(4):
+                if (x < 0, x > 0, y < 0, y > 0)[k]:
+                    sums[k, 0] += 1
+                    sums[k, 1] += residual
+                    sums[k, 2] += residual**2
+                    sums[k, 3] += slope**2
+    count = sums[2, 0] + sums[3, 0]
+    offset = (sums[2, 1] + sums[3, 1]) / count if count > 0 else 0.0  # in brightness
+    for k in range(4):
+        square = sums[k, 2] - 2 * offset * sums[k, 1] + sums[k, 0] * offset**2
+        if square > sums[k, 0] * 2 * noise**2 + max_misfit**2 * sums[k, 3]:
+            return True
+    return False
