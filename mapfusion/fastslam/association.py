@@ -12,7 +12,6 @@ from numba import njit
 from mapfusion.fastslam.particles import ParticleMaps
 from mapfusion.fastslam.sensor import Sightings, innovation, quadratic_form
 from mapfusion.fastslam.update import DROPPED, NEW
-from mapfusion.robot_log import Observations
 from mapfusion.se2 import Float
 
 
@@ -45,7 +44,7 @@ def pairs_nearby(
     descriptor: np.ndarray | None,
     descriptor_threshold: float,
 ) -> Pairs:
-    """Pairs whose gates can touch in some particle, by distance of descriptors where these are given."""
+    """Pairs whose gates can touch in some particle, by distance of their descriptors if given."""
     boxes = box_of(seen, gate)
     around = np.concatenate([boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)])
     slots = maps.near(around)

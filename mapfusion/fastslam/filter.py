@@ -23,7 +23,7 @@ from mapfusion.fastslam.resampling import (
 from mapfusion.fastslam.sensor import Sightings, log_density_at_gate, sightings
 from mapfusion.fastslam.update import NEW, update_landmarks
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.robot_log import Observations
+from mapfusion.robot_log import NO_LABEL, Observations
 from mapfusion.se2 import Float
 
 
@@ -93,6 +93,8 @@ class StepResult:
         n_landmarks: of the heaviest particle, however often seen.
         cloud: (M, 3) poses.
         log_weights: (M,) normalised.
+        log_evidence: log density of the frame's observations given all before. Its sum over a log
+            tells which noise explains the data best, without the truth.
     """
 
     best_pose: Float
@@ -101,13 +103,14 @@ class StepResult:
     n_landmarks: int
     cloud: Float
     log_weights: Float
+    log_evidence: float
 
 
 class FastSlam:
     """The filter as a stream: one `step` for each frame of a robot, also those that saw nothing.
 
     Observations are numbered in the order in which they come; `source_observation` of a landmark
-    is the number of the one it came from (the row of the log, when a log is streamed from its start).
+    is the number of the one it came from (the row of the log, if a log is streamed from its start).
 
     Args:
         parameters: settings.
@@ -132,6 +135,11 @@ class FastSlam:
         self._slot_of_label: dict[int, int] = {}
         self._has_descriptors = self._has_labels = False
         self._history = History(parameters.n_particles) if keep_history else None
+
+    @property
+    def n_slots(self) -> int:
+        """Distinct landmarks that the particles have between them: what the filter's memory holds."""
+        return self._maps.n_slots
 
     def step(self, odometry: Float, observations: Observations) -> StepResult:
         """Take in one frame.
@@ -160,12 +168,12 @@ class FastSlam:
         log_likelihood = update_landmarks(
             self._maps.slots, chosen, seen, log_new, self.parameters.planar
         )  # eq. 4-9
-        self._log_weights = normalised(self._log_weights + log_likelihood)  # eq. 10
+        self._log_weights, log_evidence = normalised(self._log_weights + log_likelihood)  # eq. 10
         self._follow_changes(chosen, seen, observations)
-        return self._resample()
+        return self._resample(log_evidence)
 
     def best_map(self, min_count: int = 1) -> LandmarkMap:
-        """The map of the heaviest particle: its landmarks seen at least `min_count` times, by age."""
+        """The heaviest particle's landmarks that were seen at least `min_count` times, by age."""
         which, column = self._maps.of_particle(self._best, min_count)
         slots = self._maps.slots
         upper = slots.covariance_m2[which, column]
@@ -181,13 +189,21 @@ class FastSlam:
         )
 
     def best_path(self) -> Float:
-        """Poses (steps, 3) of the heaviest particle and its ancestors. Raises ValueError without history."""
+        """Poses (steps, 3) of the heaviest particle and its ancestors.
+
+        Raises:
+            ValueError: the history was not kept.
+        """
         return self._kept_history().path(self._best)
 
     def best_associations(self) -> np.ndarray:
-        """(observations so far,) int64: for each the source of the heaviest particle's landmark it was used for.
+        """For each observation so far the source of the heaviest particle's landmark it went into.
 
-        -1 where it was dropped. Raises ValueError without history.
+        Returns:
+            (n,) int64, -1 where the observation was dropped.
+
+        Raises:
+            ValueError: the history was not kept.
         """
         return self._kept_history().associations(self._best)
 
@@ -221,7 +237,9 @@ class FastSlam:
         return choose(self._maps, pairs, seen, may_create, settings.gate, settings.planar, nearest)
 
     def _pairs_of_labels(self, label: np.ndarray) -> tuple[Pairs, np.ndarray]:
-        """Each observation with the slot of its label; only the first of a new label may start one."""
+        """Observations with the slots of their labels; the first of a new label may start one."""
+        if np.any(label == NO_LABEL):
+            raise ValueError("label: an observation has none, and the association needs it")
         known = np.array([int(name) in self._slot_of_label for name in label])
         first = np.zeros(len(label), dtype=bool)
         first[np.unique(label, return_index=True)[1]] = True
@@ -249,7 +267,7 @@ class FastSlam:
             self._history.add(self._poses, np.where(chosen == NEW, number[:, None], source))
         self._n_observations += len(observations)
 
-    def _resample(self) -> StepResult:
+    def _resample(self, log_evidence: float) -> StepResult:
         """Take the result, then replace light particles by heavy ones if few carry the weight."""
         n_particles = self.parameters.n_particles
         n_effective = effective_sample_size(self._log_weights)
@@ -262,6 +280,7 @@ class FastSlam:
             n_landmarks=int(self._maps.n_landmarks[self._best]),
             cloud=self._poses,
             log_weights=self._log_weights,
+            log_evidence=log_evidence,
         )
         if few:
             ancestors = systematic_ancestors(self._log_weights, self._rng)

@@ -22,7 +22,7 @@ class Genealogy:
         self.ancestors[0] = np.arange(n_particles)
 
     def resampled(self, ancestors: np.ndarray) -> None:
-        """A new generation, whose particle m is a child of the present particle ancestors[m] (M,)."""
+        """A new generation: its particle m is a child of the present particle ancestors[m] (M,)."""
         self.generation += 1
         _compose(self.ancestors, ancestors, self.generation % MEMORY)
 

@@ -1,4 +1,4 @@
-"""Which boxes lie near a box: a hash grid whose cost depends on what is near, not on how much is held.
+"""Which boxes lie near a box: a hash grid, whose cost depends on what is near, not on all it holds.
 
 A box is kept in one cell: that of its lower corner, on the level whose cells are at least as large
 as the box (each level doubles the cell). So it reaches at most into the next cells, and a query

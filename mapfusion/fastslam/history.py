@@ -17,7 +17,7 @@ class History:
         self._source = np.empty((1024, n_particles), dtype=np.int32)
 
     def add(self, T_map_robot: Float, source: np.ndarray) -> None:
-        """One step: poses (M, 3) before resampling, and what each observation was used for (K, M)."""
+        """One step: poses (M, 3) before resampling, and what each observation went into (K, M)."""
         n_particles = len(T_map_robot)
         self._poses = _with_room(self._poses, self._n_steps + 1)
         self._ancestors = _with_room(self._ancestors, self._n_steps + 1)
@@ -36,11 +36,11 @@ class History:
         self._ancestors[self._n_steps - 1] = ancestors
 
     def path(self, particle: int) -> Float:
-        """Poses (steps, 3) that a particle of today and its ancestors had, before each resampling."""
+        """Poses (steps, 3) of a particle of today and its ancestors, before each resampling."""
         return self._poses[np.arange(self._n_steps), self._line(particle)]
 
     def associations(self, particle: int) -> np.ndarray:
-        """(n,) int64 for each observation the one its landmark came from, -1 where it was dropped."""
+        """(n,) int64 source of the landmark each observation went into, -1 where it was dropped."""
         line = self._line(particle)
         n = self._n_observations
         return self._source[np.arange(n), line[self._step[:n]]].astype(np.int64)

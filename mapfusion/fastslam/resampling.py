@@ -5,10 +5,11 @@ import numpy as np
 from mapfusion.se2 import Float
 
 
-def normalised(log_weights: Float) -> Float:
-    """Log weights (M,) shifted so that the weights sum to one."""
+def normalised(log_weights: Float) -> tuple[Float, float]:
+    """Log weights (M,) shifted so that the weights sum to one, and the log of their sum before."""
     top = log_weights.max()
-    return log_weights - (top + np.log(np.sum(np.exp(log_weights - top))))
+    log_sum = float(top + np.log(np.sum(np.exp(log_weights - top))))
+    return log_weights - log_sum, log_sum
 
 
 def effective_sample_size(log_weights: Float) -> float:

@@ -1,0 +1,158 @@
+"""FastSLAM as the equations say it: every particle owns its map, and a resampling copies it.
+
+Slow and obvious, with matrices in the robot frame. It draws the same random numbers as the filter.
+"""
+
+import copy
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapfusion.fastslam.filter import FastSlamParameters
+from mapfusion.fastslam.motion import sample_motion
+from mapfusion.fastslam.resampling import systematic_ancestors
+from mapfusion.robot_log import Observations
+from mapfusion.se2 import inverse, rotation_about_z, transform_points
+
+
+@dataclass
+class Landmark:
+    mean: np.ndarray
+    covariance: np.ndarray
+    count: int
+    source: int
+    descriptor: np.ndarray | None
+    label: int | None
+
+
+@dataclass
+class Particle:
+    pose: np.ndarray
+    weight: float
+    landmarks: dict[int, Landmark]
+    path: list
+    associations: list
+
+
+class CopyingFilter:
+    def __init__(self, parameters: FastSlamParameters, rng: np.random.Generator) -> None:
+        self.parameters = parameters
+        self.rng = rng
+        m = parameters.n_particles
+        self.particles = [Particle(np.zeros(3), 1 / m, {}, [], []) for _ in range(m)]
+        self.best = self.particles[0]
+        self.n_observations = 0
+        self.weights = np.full(m, 1 / m)
+        self.cloud = np.zeros((m, 3))
+        self.n_dof = 2 if parameters.planar else 3
+
+    def step(self, odometry: np.ndarray, observations: Observations) -> None:
+        settings = self.parameters
+        poses = np.array([p.pose for p in self.particles])
+        poses = sample_motion(poses, odometry, settings.motion, self.rng)
+        for particle, pose in zip(self.particles, poses, strict=True):
+            particle.pose = pose
+            particle.path.append(pose)
+            particle.weight *= self.take_in(particle, observations)
+        self.n_observations += len(observations)
+        self.weights = np.array([p.weight for p in self.particles])
+        self.weights /= self.weights.sum()
+        for particle, weight in zip(self.particles, self.weights, strict=True):
+            particle.weight = weight
+        self.cloud = poses
+        self.best = copy.deepcopy(self.particles[int(np.argmax(self.weights))])
+        if 1 / np.sum(self.weights**2) <= settings.resample_fraction * len(poses):
+            ancestors = systematic_ancestors(np.log(self.weights), self.rng)
+            self.particles = [copy.deepcopy(self.particles[a]) for a in ancestors]
+            for particle in self.particles:
+                particle.weight = 1 / len(poses)
+
+    def take_in(self, particle: Particle, observations: Observations) -> float:
+        """The frame's likelihood (eq. 10), after the particle's landmarks are corrected."""
+        chosen = self.associate(particle, observations)
+        likelihood = 1.0
+        for k in range(len(observations)):
+            z, R = self.observation(observations, k)
+            if chosen[k] is None or chosen[k] == "drop":
+                at_gate = self.density(self.parameters.gate, 2 * R)
+                given = self.parameters.log_new_landmark_density
+                likelihood *= at_gate if given is None else np.exp(given)
+            else:
+                landmark = particle.landmarks[chosen[k]]
+                difference, Z, G = self.expectation(particle, landmark, z, R)
+                distance = difference @ np.linalg.solve(Z, difference)
+                likelihood *= self.density(distance, Z)
+                K = landmark.covariance @ G.T @ np.linalg.inv(Z)  # eq. 7
+                landmark.mean = landmark.mean + K @ difference  # eq. 8
+                identity = np.eye(len(landmark.mean))
+                landmark.covariance = (identity - K @ G) @ landmark.covariance  # eq. 9
+                landmark.count += 1
+            if chosen[k] == "drop":
+                particle.associations.append(-1)
+                continue
+            number = self.n_observations + k if chosen[k] is None else chosen[k]
+            particle.associations.append(number)
+            if chosen[k] is None:
+                rotation = rotation_about_z(particle.pose[2])[: self.n_dof, : self.n_dof]
+                mean = transform_points(particle.pose, observations.position_m[[k]])[0]
+                descriptor = observations.descriptor
+                label = observations.label
+                particle.landmarks[number] = Landmark(
+                    mean[: self.n_dof],
+                    rotation @ R @ rotation.T,
+                    1,
+                    number,
+                    None if descriptor is None else descriptor[k],
+                    None if label is None else int(label[k]),
+                )
+        return likelihood
+
+    def associate(self, particle: Particle, observations: Observations) -> list:
+        candidates = []
+        for k in range(len(observations)):
+            z, R = self.observation(observations, k)
+            for number, landmark in particle.landmarks.items():
+                difference, Z, _ = self.expectation(particle, landmark, z, R)
+                distance = difference @ np.linalg.solve(Z, difference)
+                if distance > self.parameters.gate:
+                    continue
+                if self.parameters.association == "gate":
+                    candidates.append((distance, k, number))
+                elif self.parameters.association == "label":
+                    if landmark.label == observations.label[k]:
+                        candidates.append((0.0, k, number))
+                else:
+                    apart = np.linalg.norm(landmark.descriptor - observations.descriptor[k])
+                    if apart < self.parameters.descriptor_threshold:
+                        candidates.append((apart, k, number))
+        chosen: list = [None] * len(observations)
+        for _, k, number in sorted(candidates):
+            if chosen[k] is None and number not in chosen:
+                chosen[k] = number
+        if self.parameters.association == "label":
+            named = {landmark.label for landmark in particle.landmarks.values()}
+            for k in range(len(observations)):
+                if chosen[k] is None and int(observations.label[k]) in named:
+                    chosen[k] = "drop"
+                named.add(int(observations.label[k]))
+        return chosen
+
+    def observation(self, observations: Observations, k: int) -> tuple[np.ndarray, np.ndarray]:
+        n = self.n_dof
+        R = self.parameters.noise_scale**2 * observations.covariance_m2[k][:n, :n]
+        R = R + self.parameters.noise_floor_m**2 * np.eye(n)
+        return observations.position_m[k][:n], R
+
+    def expectation(self, particle, landmark, z, R):
+        """Innovation, Z and G in the robot frame (eq. 4-6)."""
+        G = rotation_about_z(particle.pose[2]).T[: self.n_dof, : self.n_dof]
+        expected = transform_points(inverse(particle.pose), landmark.mean[None])[0]
+        return z - expected, G @ landmark.covariance @ G.T + R, G
+
+    @staticmethod
+    def density(distance: float, Z: np.ndarray) -> float:
+        return np.exp(-distance / 2) / np.sqrt(np.linalg.det(2 * np.pi * Z))
+
+    def best_landmarks(self, min_count: int = 1) -> list[Landmark]:
+        kept = [m for m in self.best.landmarks.values() if m.count >= min_count]
+        return sorted(kept, key=lambda landmark: landmark.source)

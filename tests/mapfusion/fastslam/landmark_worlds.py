@@ -1,0 +1,72 @@
+"""Small worlds with landmarks, a robot that drives in them and what it measures."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapfusion.robot_log import Observations
+from mapfusion.se2 import compose, inverse, transform_points
+
+SIGMA_M = 0.03
+
+
+@dataclass
+class World:
+    landmarks: np.ndarray  # (L, 3) in the frame of the robot's start
+    descriptor: np.ndarray  # (L, 64) unit vectors
+    path: np.ndarray  # (T, 3) true poses
+    odometry: list[np.ndarray]
+    frames: list[Observations]
+    seen: list[np.ndarray]  # rows of `landmarks` in each frame
+
+
+def drive(
+    seed: int,
+    n_landmarks: int = 12,
+    n_frames: int = 30,
+    per_frame: int = 5,
+    planar: bool = False,
+    sigma_m: float = SIGMA_M,
+    odometry_sigma: tuple[float, float, float] = (0.01, 0.01, 0.01),
+) -> World:
+    """A drive on a circle through random landmarks, of which every frame shows a few."""
+    rng = np.random.default_rng(seed)
+    landmarks = rng.uniform([-2.0, -1.0, 0.0], [2.0, 4.0, 0.0 if planar else 1.5], (n_landmarks, 3))
+    descriptor = unit(rng.standard_normal((n_landmarks, 64)))
+    pose, path, odometry, frames, seen = np.zeros(3), [], [], [], []
+    for frame in range(n_frames):
+        motion = np.array([0.15, 0.0, 0.1]) if frame else np.zeros(3)
+        pose = compose(pose, motion)
+        noise = rng.normal(0, odometry_sigma) if frame else np.zeros(3)
+        rows = np.sort(rng.choice(n_landmarks, min(per_frame, n_landmarks), replace=False))
+        if frame % 7 == 6:
+            rows = rows[:0]
+        path.append(pose)
+        odometry.append(motion + noise)
+        frames.append(observe(pose, landmarks[rows], descriptor[rows], rows, rng, planar, sigma_m))
+        seen.append(rows)
+    return World(landmarks, descriptor, np.array(path), odometry, frames, seen)
+
+
+def observe(pose, points, descriptor, label, rng, planar=False, sigma_m=SIGMA_M) -> Observations:
+    """Points of the world in the robot frame, with noise twice as large along x as across."""
+    n = len(points)
+    sigma = np.array([2.0, 1.0, 0.0 if planar else 1.0]) * sigma_m
+    covariance = np.diag(sigma**2)
+    covariance[0, 1] = covariance[1, 0] = 0.5 * sigma[0] * sigma[1]
+    if not planar:
+        covariance[1, 2] = covariance[2, 1] = -0.3 * sigma[1] * sigma[2]
+    root = np.linalg.cholesky(covariance + 1e-300 * np.eye(3))
+    position = transform_points(inverse(pose), points) + rng.standard_normal((n, 3)) @ root.T
+    noisy = unit(descriptor + 0.03 * rng.standard_normal((n, 64)))
+    return Observations(
+        position, np.tile(covariance, (n, 1, 1)), noisy.astype(np.float32), label.astype(np.int32)
+    )
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def nothing() -> Observations:
+    return Observations(np.empty((0, 3)), np.empty((0, 3, 3)))

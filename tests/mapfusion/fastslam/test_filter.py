@@ -1,0 +1,331 @@
+"""The filter as a whole: against the filter that copies everything, and against closed forms."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from copying_filter import CopyingFilter
+from landmark_worlds import drive, nothing, observe, unit
+
+from mapfusion.fastslam.filter import FastSlam, FastSlamParameters
+from mapfusion.fastslam.motion import MotionNoise
+from mapfusion.robot_log import Observations
+from mapfusion.se2 import compose, inverse, rotation_about_z, transform_points, wrap
+
+EXACT_MOTION = MotionNoise(0, 0, 0, 0, 0)
+LOOSE_MOTION = MotionNoise(0.1, 0.05, 0.1, 0, 0)
+
+
+def parameters(**changes) -> FastSlamParameters:
+    return replace(FastSlamParameters(n_particles=15, motion=LOOSE_MOTION), **changes)
+
+
+def assert_same(slam: FastSlam, result, twin: CopyingFilter, planar: bool) -> None:
+    np.testing.assert_allclose(np.exp(result.log_weights), twin.weights, rtol=1e-7, atol=1e-12)
+    np.testing.assert_array_equal(result.cloud, twin.cloud)
+    landmarks, expected = slam.best_map(), twin.best_landmarks()
+    n = 2 if planar else 3
+    assert len(landmarks) == result.n_landmarks == len(expected)
+    assert landmarks.source_observation.tolist() == [m.source for m in expected]
+    assert landmarks.count.tolist() == [m.count for m in expected]
+    np.testing.assert_array_equal(slam.best_path(), twin.best.path)
+    assert slam.best_associations().tolist() == twin.best.associations
+    if not expected:
+        return
+    np.testing.assert_allclose(
+        landmarks.position_m[:, :n], [m.mean for m in expected], rtol=1e-9, atol=1e-9
+    )
+    np.testing.assert_allclose(
+        landmarks.covariance_m2[:, :n, :n], [m.covariance for m in expected], rtol=1e-9, atol=1e-9
+    )
+    np.testing.assert_array_equal(landmarks.descriptor, [m.descriptor for m in expected])
+    np.testing.assert_array_equal(landmarks.label, [m.label for m in expected])
+
+
+@pytest.mark.parametrize("association", ["descriptor", "label", "gate"])
+@pytest.mark.parametrize("planar", [False, True])
+@pytest.mark.parametrize("resample_fraction", [0.0, 0.5, 1.0])
+def test_equals_the_filter_that_copies(association, planar, resample_fraction):
+    # Landmarks 0 and 1 look alike, and a tight gate makes particles disagree about the rest.
+    world = drive(7, planar=planar)
+    settings = parameters(
+        association=association,
+        planar=planar,
+        resample_fraction=resample_fraction,
+        gate_probability=0.9,
+        descriptor_threshold=0.6,
+        noise_scale=1.1,
+        noise_floor_m=0.005,
+    )
+    slam = FastSlam(settings, np.random.default_rng(5))
+    twin = CopyingFilter(settings, np.random.default_rng(5))
+    n_resampled, n_sizes = 0, set()
+    for odometry, frame in zip(world.odometry, world.frames, strict=True):
+        result = slam.step(odometry, frame)
+        twin.step(odometry, frame)
+        assert_same(slam, result, twin, planar)
+        n_resampled += result.resampled
+        n_sizes.update(len(p.landmarks) for p in twin.particles)
+    assert n_resampled == {0.0: 0, 1.0: len(world.frames)}.get(resample_fraction, n_resampled)
+    if association != "label":
+        assert max(n_sizes) > len(world.landmarks), "no particle ever started a second landmark"
+
+
+def test_equals_the_filter_that_copies_longer_than_the_genealogy_remembers(monkeypatch):
+    # A landmark seen at the start, then not for several rounds of refreshing, then again.
+    world = drive(3, n_landmarks=4, per_frame=4, n_frames=2)
+    settings = parameters(n_particles=4, association="label", resample_fraction=1.0)
+    slam = FastSlam(settings, np.random.default_rng(1))
+    twin = CopyingFilter(settings, np.random.default_rng(1))
+    pose = world.path[-1]
+    rng = np.random.default_rng(2)
+    for odometry, frame in zip(world.odometry, world.frames, strict=True):
+        slam.step(odometry, frame)
+        twin.step(odometry, frame)
+    for _ in range(3 * 256 + 17):
+        slam.step(np.zeros(3), nothing())
+        twin.step(np.zeros(3), nothing())
+    frame = observe(pose, world.landmarks, world.descriptor, np.arange(4), rng)
+    result = slam.step(np.zeros(3), frame)
+    twin.step(np.zeros(3), frame)
+    assert_same(slam, result, twin, planar=False)
+
+
+def test_with_exact_odometry_the_map_is_the_least_squares_solution():
+    world = drive(11, odometry_sigma=(0, 0, 0))
+    settings = parameters(motion=EXACT_MOTION, association="label", gate_probability=1 - 1e-12)
+    slam = FastSlam(settings, np.random.default_rng(0))
+    for odometry, frame in zip(world.odometry, world.frames, strict=True):
+        slam.step(odometry, frame)
+    landmarks = slam.best_map()
+    assert landmarks.label is not None
+    for row, label in enumerate(landmarks.label):
+        information, vector, count = np.zeros((3, 3)), np.zeros(3), 0
+        for pose, frame, seen in zip(world.path, world.frames, world.seen, strict=True):
+            for k in np.flatnonzero(seen == label):
+                turn = rotation_about_z(pose[2])
+                weight = turn @ np.linalg.inv(frame.covariance_m2[k]) @ turn.T
+                information += weight
+                vector += weight @ transform_points(pose, frame.position_m[[k]])[0]
+                count += 1
+        covariance = np.linalg.inv(information)
+        assert landmarks.count[row] == count
+        np.testing.assert_allclose(landmarks.position_m[row], covariance @ vector, atol=1e-9)
+        np.testing.assert_allclose(landmarks.covariance_m2[row], covariance, atol=1e-12)
+
+
+def test_weights_of_two_poses_follow_from_the_density_of_the_difference():
+    """One landmark, seen twice: the weight is N(difference; 0, 2 R), in closed form."""
+    settings = parameters(
+        n_particles=50, association="label", resample_fraction=0.0, gate_probability=1 - 1e-12
+    )
+    slam = FastSlam(settings, np.random.default_rng(4))
+    R = np.diag([0.04, 0.01, 0.02])
+    point = np.array([[2.0, 0.5, 0.3]])
+    frame = Observations(point, R[None], label=np.array([7], dtype=np.int32))
+    slam.step(np.zeros(3), frame)
+    motion = np.array([0.5, 0.0, 0.2])
+    moved = replace(frame, position_m=transform_points(inverse(motion), point))
+    result = slam.step(motion, moved)
+    log_density = []
+    for pose in result.cloud:
+        turn = rotation_about_z(pose[2])
+        Z = R + turn @ R @ turn.T
+        difference = transform_points(pose, moved.position_m)[0] - point[0]
+        log_density.append(
+            -0.5 * difference @ np.linalg.inv(Z) @ difference
+            - 0.5 * np.log(np.linalg.det(2 * np.pi * Z))
+        )
+    weights = np.exp(log_density - np.max(log_density))
+    np.testing.assert_allclose(np.exp(result.log_weights), weights / weights.sum(), rtol=1e-9)
+    assert result.log_evidence == pytest.approx(np.log(np.mean(np.exp(log_density))), abs=1e-9)
+    assert np.ptp(result.log_weights) > 1
+
+
+@pytest.mark.parametrize("association", ["descriptor", "gate", "label"])
+@pytest.mark.parametrize("planar", [False, True])
+def test_millimetres_give_the_same_weights(association, planar):
+    world = drive(5, planar=planar)
+    scale = 1000.0
+    length = np.array([scale, scale, 1.0])
+    small = parameters(association=association, planar=planar, gate_probability=0.9)
+    large = replace(
+        small,
+        # Variances are per length: sigma^2 in mm^2 per mm is 1e3 sigma^2, not 1e6.
+        motion=MotionNoise(
+            small.motion.translation_m_per_sqrt_m * np.sqrt(scale),
+            small.motion.rotation_rad_per_sqrt_m / np.sqrt(scale),
+            small.motion.rotation_rad_per_sqrt_rad,
+            0,
+            0,
+        ),
+    )
+    in_m = FastSlam(small, np.random.default_rng(9))
+    in_mm = FastSlam(large, np.random.default_rng(9))
+    for odometry, frame in zip(world.odometry, world.frames, strict=True):
+        frame_mm = replace(
+            frame, position_m=scale * frame.position_m, covariance_m2=scale**2 * frame.covariance_m2
+        )
+        expected = in_m.step(odometry, frame)
+        result = in_mm.step(odometry * length, frame_mm)
+        np.testing.assert_allclose(result.log_weights, expected.log_weights, atol=1e-6)
+        assert result.n_landmarks == expected.n_landmarks
+    np.testing.assert_allclose(
+        in_mm.best_map().position_m, scale * in_m.best_map().position_m, rtol=1e-6, atol=1e-6
+    )
+
+
+def test_order_of_observations_does_not_matter():
+    world = drive(13)
+    rng = np.random.default_rng(0)
+    settings = parameters()
+    slam, shuffled = (FastSlam(settings, np.random.default_rng(2)) for _ in range(2))
+    for odometry, frame in zip(world.odometry, world.frames, strict=True):
+        expected = slam.step(odometry, frame)
+        result = shuffled.step(odometry, frame[rng.permutation(len(frame))])
+        np.testing.assert_allclose(result.log_weights, expected.log_weights, atol=1e-9)
+    first, second = slam.best_map().position_m, shuffled.best_map().position_m
+    np.testing.assert_allclose(
+        first[np.argsort(first[:, 0])], second[np.argsort(second[:, 0])], atol=1e-9
+    )
+
+
+def test_localises_better_than_odometry():
+    errors, odometry_errors = [], []
+    for seed in range(4):
+        sigma = np.array([0.02, 0.01, 0.03])
+        world = drive(seed, n_frames=60, per_frame=6, odometry_sigma=tuple(sigma))
+        motion = MotionNoise(0.02 / np.sqrt(0.15), 0, 0.03 / np.sqrt(0.1), 0, 0)
+        settings = parameters(n_particles=100, motion=motion)
+        slam = FastSlam(settings, np.random.default_rng(seed))
+        reckoned, path = np.zeros(3), []
+        for odometry, frame in zip(world.odometry, world.frames, strict=True):
+            slam.step(odometry, frame)
+            reckoned = compose(reckoned, odometry)
+            path.append(reckoned)
+        errors.append(slam.best_path()[:, :2] - world.path[:, :2])
+        odometry_errors.append(np.array(path)[:, :2] - world.path[:, :2])
+    assert np.std(errors) < 0.5 * np.std(odometry_errors)
+
+
+def test_one_landmark_takes_one_observation_a_frame():
+    point = np.array([[1.0, 0.0, 0.5], [1.0, 0.01, 0.5]])
+    descriptor = unit(np.ones((2, 64))).astype(np.float32)
+    both = Observations(point, np.tile(1e-2 * np.eye(3), (2, 1, 1)), descriptor)
+    slam = FastSlam(parameters(motion=EXACT_MOTION), np.random.default_rng(0))
+    slam.step(np.zeros(3), both[:1])
+    slam.step(np.zeros(3), both)
+    assert slam.best_map().count.tolist() == [2, 1]
+    assert slam.best_associations().tolist() == [0, 0, 2]
+
+
+def test_a_known_label_outside_the_gate_is_dropped():
+    label = np.array([3], dtype=np.int32)
+    R = 1e-4 * np.eye(3)[None]
+    slam = FastSlam(
+        parameters(motion=EXACT_MOTION, association="label"), np.random.default_rng(0)
+    )
+    slam.step(np.zeros(3), Observations(np.array([[1.0, 0, 0]]), R, label=label))
+    slam.step(np.zeros(3), Observations(np.array([[1.5, 0, 0]]), R, label=label))
+    landmarks = slam.best_map()
+    assert landmarks.position_m.tolist() == [[1.0, 0.0, 0.0]]
+    assert slam.best_associations().tolist() == [0, -1]
+
+
+def test_headings_wrap():
+    slam = FastSlam(parameters(n_particles=3), np.random.default_rng(0))
+    for _ in range(40):
+        result = slam.step(np.array([0.0, 0.0, 0.5]), nothing())
+        assert np.all(np.abs(result.cloud[:, 2]) <= np.pi)
+    assert abs(wrap(result.best_pose[2] - 20.0)) < 1.5
+
+
+def test_a_robot_that_sees_nothing_dead_reckons():
+    slam = FastSlam(parameters(motion=EXACT_MOTION), np.random.default_rng(0))
+    pose = np.zeros(3)
+    for _ in range(10):
+        motion = np.array([0.1, 0.02, 0.3])
+        pose = compose(pose, motion)
+        result = slam.step(motion, nothing())
+    np.testing.assert_allclose(result.best_pose, pose, atol=1e-12)
+    assert result.n_landmarks == 0
+    assert not result.resampled
+    assert len(slam.best_map()) == 0
+    assert slam.best_path().shape == (10, 3)
+    assert slam.best_associations().shape == (0,)
+
+
+def test_same_seed_same_bits():
+    world = drive(17)
+    maps = []
+    for _ in range(2):
+        slam = FastSlam(parameters(), np.random.default_rng(6))
+        for odometry, frame in zip(world.odometry, world.frames, strict=True):
+            slam.step(odometry, frame)
+        maps.append(slam.best_map())
+    assert maps[0].position_m.tobytes() == maps[1].position_m.tobytes()
+    assert maps[0].covariance_m2.tobytes() == maps[1].covariance_m2.tobytes()
+
+
+def test_history_changes_no_estimate():
+    world = drive(19)
+    kept = FastSlam(parameters(), np.random.default_rng(6))
+    plain = FastSlam(parameters(), np.random.default_rng(6), keep_history=False)
+    for odometry, frame in zip(world.odometry, world.frames, strict=True):
+        expected = kept.step(odometry, frame)
+        result = plain.step(odometry, frame)
+        np.testing.assert_array_equal(result.log_weights, expected.log_weights)
+    with pytest.raises(ValueError, match="keep_history"):
+        plain.best_path()
+
+
+def test_an_endless_stream_keeps_its_memory():
+    """Slots that no particle has any more are freed, also where the robot never comes again."""
+    rng = np.random.default_rng(0)
+    settings = parameters(resample_fraction=1.0)
+    slam = FastSlam(settings, rng, keep_history=False)
+    descriptor = unit(rng.standard_normal((1, 64))).astype(np.float32)
+    used = []
+    for _ in range(600):
+        # Sees a landmark at random places, so that each frame adds some in some particles only.
+        position = rng.uniform(-3, 3, (1, 3))
+        frame = Observations(position, 0.05 * np.eye(3)[None], descriptor)
+        result = slam.step(np.array([0.3, 0.0, 0.1]), frame)
+        used.append(slam.n_slots - result.n_landmarks)
+    assert np.mean(used[400:]) < 2 * np.mean(used[200:400])
+    assert max(used) < 300
+
+
+@pytest.mark.parametrize(
+    ("changes", "name"),
+    [
+        ({"n_particles": 0}, "n_particles"),
+        ({"gate_probability": 1.0}, "gate_probability"),
+        ({"resample_fraction": 1.5}, "resample_fraction"),
+        ({"descriptor_threshold": 0.0}, "descriptor_threshold"),
+        ({"noise_scale": 0.0}, "noise_scale"),
+        ({"noise_floor_m": -1.0}, "noise_floor_m"),
+        ({"association": "smell"}, "smell"),
+    ],
+)
+def test_wrong_parameters_are_named(changes, name):
+    with pytest.raises(ValueError, match=name):
+        FastSlamParameters(**changes)
+
+
+def test_wrong_arguments_are_named():
+    slam = FastSlam(parameters(), np.random.default_rng(0))
+    frame = drive(1).frames[0]
+    with pytest.raises(ValueError, match="odometry"):
+        slam.step(np.zeros(2), frame)
+    with pytest.raises(ValueError, match="odometry"):
+        slam.step(np.array([np.nan, 0, 0]), frame)
+    with pytest.raises(ValueError, match="descriptor"):
+        slam.step(np.zeros(3), replace(frame, descriptor=None))
+    with pytest.raises(ValueError, match="covariance_m2"):
+        slam.step(np.zeros(3), replace(frame, covariance_m2=0 * frame.covariance_m2))
+    by_label = FastSlam(parameters(association="label"), np.random.default_rng(0))
+    with pytest.raises(ValueError, match="label"):
+        by_label.step(np.zeros(3), replace(frame, label=None))
+    with pytest.raises(ValueError, match="label"):
+        by_label.step(np.zeros(3), replace(frame, label=np.full(len(frame), -1, dtype=np.int32)))
