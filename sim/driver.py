@@ -11,8 +11,8 @@ from mapfusion.se2 import Float, between, wrap
 from sim.floorplan import FloorPlan
 from sim.p3at import (
     OUTER_RADIUS_M,
+    SKID_TRACK_M,
     TOP_SPEED_M_S,
-    TRACK_M,
     WHEEL_RADIUS_M,
     WIDTH_M,
     P3at,
@@ -23,7 +23,6 @@ from sim.world import PHYSICS_HZ, World
 CONTROL_HZ = 30
 STEPS_PER_CONTROL = PHYSICS_HZ // CONTROL_HZ
 SETTLING_S = 0.5  # until the wheels have come to rest on the floor
-SKID_RATIO = 2.4  # wheel track that the turning body behaves as having, over the geometric one
 HEADING_GAIN_PER_S = 2.0  # turn rate per radian of heading error: half of it gone in 0.35 s
 
 
@@ -165,7 +164,7 @@ def drive(
             _Driver(route, robot, settings) for route, robot in zip(routes, robots, strict=True)
         ]
         names = {robot.body: route.robot for route, robot in zip(routes, robots, strict=True)}
-        _step(world, round(SETTLING_S * PHYSICS_HZ))
+        world.step(round(SETTLING_S * PHYSICS_HZ))
         encoder_zero = np.stack([robot.wheel_angles() for robot in robots])
         poses = np.empty((len(robots), n_frames, 3))
         wheels = np.empty((len(robots), n_frames, 2))
@@ -178,10 +177,10 @@ def drive(
                 now = [robot.pose() for robot in robots]
                 for i, driver in enumerate(drivers):
                     driver.control(time_s, now[i], now[:i] + now[i + 1 :])
-                _step(world, STEPS_PER_CONTROL)
+                world.step(STEPS_PER_CONTROL)
                 for driver in drivers:
                     driver.refuse_contact(time_s, ground, names)
-    time_s = np.arange(n_frames) * frame_interval_s
+    time_s = np.arange(n_frames, dtype=np.float64) * frame_interval_s
     return Trajectory(tuple(route.robot for route in routes), time_s, poses, wheels)
 
 
@@ -192,11 +191,6 @@ def _controls_per_frame(frame_interval_s: float) -> int:
             f"frame_interval_s is {frame_interval_s}: must be a multiple of 1/{CONTROL_HZ} s"
         )
     return round(controls)
-
-
-def _step(world: World, n: int) -> None:
-    for _ in range(n):
-        world.bullet.stepSimulation(physicsClientId=world.client)
 
 
 class _Driver:
@@ -220,13 +214,11 @@ class _Driver:
         self._waiting = speed > 0 and self._must_wait(pose, others)
         if self._waiting:
             speed = turn = 0.0
-        self._speed_m_s = _towards(
-            self._speed_m_s, speed, settings.acceleration_m_s2 / CONTROL_HZ
-        )
+        self._speed_m_s = _towards(self._speed_m_s, speed, settings.acceleration_m_s2 / CONTROL_HZ)
         self._turn_rad_s = _towards(
             self._turn_rad_s, turn, settings.turn_acceleration_rad_s2 / CONTROL_HZ
         )
-        difference = self._turn_rad_s * SKID_RATIO * TRACK_M / 2
+        difference = self._turn_rad_s * SKID_TRACK_M / 2
         left, right = self._speed_m_s - difference, self._speed_m_s + difference
         self._robot.drive(left / WHEEL_RADIUS_M, right / WHEEL_RADIUS_M)
 
@@ -259,9 +251,7 @@ class _Driver:
         along = self._route.waypoints_m[self._target] - pose[:2]
         error = float(wrap(np.arctan2(along[1], along[0]) - pose[2]))
         turn = float(
-            np.clip(
-                HEADING_GAIN_PER_S * error, -settings.turn_rate_rad_s, settings.turn_rate_rad_s
-            )
+            np.clip(HEADING_GAIN_PER_S * error, -settings.turn_rate_rad_s, settings.turn_rate_rad_s)
         )
         return settings.speed_m_s * max(0.0, 1 - abs(error) / settings.turn_in_place_rad), turn
 

@@ -128,7 +128,7 @@ class FloorPlan:
         return starts, ends, thickness, height
 
     def clearance_m(self, points: ArrayLike) -> Float:
-        """Room (N,) between points (N, 2) and the nearest wall's surface; negative inside a wall."""
+        """Room (N,) between points (N, 2) and the nearest wall; negative inside a wall."""
         points = np.asarray(points, dtype=np.float64)
         starts, ends, thickness, _ = self.segments()
         distance = _point_segment_distance(points[:, None], starts[None], ends[None])

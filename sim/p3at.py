@@ -5,11 +5,12 @@ from pathlib import Path
 import numpy as np
 
 from mapfusion.se2 import Float
-from sim.world import World
+from sim.world import BODY, GROUND, WHEEL, World
 
 URDF = Path(__file__).with_name("p3at.urdf")
 WHEEL_RADIUS_M = 0.111
 TRACK_M = 0.394
+WHEELBASE_M = 0.268
 LENGTH_M = 0.508
 WIDTH_M = 0.497
 OUTER_RADIUS_M = float(np.hypot(LENGTH_M, WIDTH_M) / 2)  # the circle it sweeps turning in place
@@ -17,6 +18,12 @@ TOP_SPEED_M_S = 0.7
 TOP_WHEEL_SPEED_RAD_S = 6.4
 WHEEL_TORQUE_N_M = 20.0
 TIRE_FRICTION = 0.6  # against a ground of friction 1: rubber on a smooth indoor floor
+CENTER_OF_MASS_M = 0.1735  # of the body without wheels, above the floor
+
+# A body turning at w on four sliding points: Coulomb friction opposes each one's slip
+# (v - w t / 2 along, w l / 2 across), and its moment vanishes where v = w (t / 2 + l^2 / (2 t)).
+# So the wheels act as if they stood this far apart (the maker's parameter files: 0.588 m).
+SKID_TRACK_M = TRACK_M + WHEELBASE_M**2 / TRACK_M
 WHEELS = ("front_left_wheel", "rear_left_wheel", "front_right_wheel", "rear_right_wheel")
 
 
@@ -48,6 +55,12 @@ class P3at:
                 angularDamping=0,
                 physicsClientId=self._client,
             )
+            self._p.setCollisionFilterGroupMask(
+                self.body, wheel, WHEEL, GROUND, physicsClientId=self._client
+            )
+        self._p.setCollisionFilterGroupMask(
+            self.body, -1, BODY, GROUND | BODY, physicsClientId=self._client
+        )
         self.drive(0.0, 0.0)
 
     def place(self, T_world_robot: Float, height_m: float = 0.0) -> None:
@@ -93,6 +106,3 @@ class P3at:
         """Ids of all bodies in contact with it."""
         contacts = self._p.getContactPoints(bodyA=self.body, physicsClientId=self._client)
         return {contact[2] for contact in contacts} - {self.body}
-
-
-CENTER_OF_MASS_M = 0.1735  # of the base link, above the floor

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mapfusion.camera import StereoCamera
-from mapfusion.se2 import Float, compose, transform_points
+from mapfusion.se2 import Float, compose
 from sim.world import World
 
 NEAR_M = 0.1  # nearer than any wall can come to the lens

@@ -17,6 +17,9 @@ from sim.textures import paint
 GRAVITY_M_S2 = 9.81
 PHYSICS_HZ = 240  # PyBullet's own default; contacts and motors are tuned for it
 
+# Who collides with whom (bit masks): wheels with the ground alone.
+GROUND, WHEEL, BODY = 1, 2, 4
+
 
 @contextlib.contextmanager
 def silence() -> Iterator[None]:
@@ -64,6 +67,8 @@ class World:
 
             self.bullet = pybullet
             self.client = pybullet.connect(pybullet.DIRECT)
+        # else a mesh written anew under an old name would still look as it did before
+        pybullet.setPhysicsEngineParameter(enableFileCaching=0, physicsClientId=self.client)
 
     def __enter__(self) -> "World":
         return self
@@ -90,10 +95,21 @@ class World:
         p.setPhysicsEngineParameter(
             fixedTimeStep=1 / PHYSICS_HZ,
             deterministicOverlappingPairs=1,
+            # PyBullet's friction cone is aligned with the world's axes: with it the track of a
+            # turning robot varies fourfold with its heading, without it by a fifth
+            enableConeFriction=0,
             physicsClientId=client,
         )
         plane = p.createCollisionShape(p.GEOM_PLANE, physicsClientId=client)
-        return p.createMultiBody(0, plane, physicsClientId=client)
+        ground = p.createMultiBody(0, plane, physicsClientId=client)
+        p.changeDynamics(ground, -1, lateralFriction=1.0, physicsClientId=client)
+        p.setCollisionFilterGroupMask(ground, -1, GROUND, WHEEL | BODY, physicsClientId=client)
+        return ground
+
+    def step(self, n: int) -> None:
+        """Let 1/240 s pass, n times."""
+        for _ in range(n):
+            self.bullet.stepSimulation(physicsClientId=self.client)
 
     def add_solid_walls(self, plan: FloorPlan) -> None:
         """Collision boxes, one a wall segment."""
@@ -102,13 +118,14 @@ class World:
             along = end - start
             half = [float(np.linalg.norm(along)) / 2, thickness / 2, height / 2]
             shape = p.createCollisionShape(p.GEOM_BOX, halfExtents=half, physicsClientId=client)
-            p.createMultiBody(
+            wall = p.createMultiBody(
                 0,
                 shape,
                 basePosition=[*((start + end) / 2), height / 2],
                 baseOrientation=p.getQuaternionFromEuler([0, 0, np.arctan2(along[1], along[0])]),
                 physicsClientId=client,
             )
+            p.setCollisionFilterGroupMask(wall, -1, BODY, BODY, physicsClientId=client)
 
     def add_painted_faces(self, folder: Path) -> None:
         """Load the faces that `write_faces` left in `folder`, to be seen and not touched."""
@@ -116,13 +133,9 @@ class World:
         with silence():
             for mesh in sorted(folder.glob("face_*.obj")):
                 shape = p.createVisualShape(p.GEOM_MESH, fileName=str(mesh), physicsClientId=client)
-                body = p.createMultiBody(
-                    0, baseVisualShapeIndex=shape, physicsClientId=client
-                )
+                body = p.createMultiBody(0, baseVisualShapeIndex=shape, physicsClientId=client)
                 texture = p.loadTexture(str(mesh.with_suffix(".png")), physicsClientId=client)
-                p.changeVisualShape(
-                    body, -1, textureUniqueId=texture, physicsClientId=client
-                )
+                p.changeVisualShape(body, -1, textureUniqueId=texture, physicsClientId=client)
 
 
 def write_faces(folder: Path, plan: FloorPlan, rng: np.random.Generator) -> None:
@@ -139,7 +152,10 @@ def write_faces(folder: Path, plan: FloorPlan, rng: np.random.Generator) -> None
 
 def _mesh(face: Face) -> str:
     """One quad as OBJ; with normals and texture coordinates, or the renderer draws nothing."""
-    edge_right, edge_up = face.corners_m[1] - face.corners_m[0], face.corners_m[3] - face.corners_m[0]
+    edge_right, edge_up = (
+        face.corners_m[1] - face.corners_m[0],
+        face.corners_m[3] - face.corners_m[0],
+    )
     normal = np.cross(edge_right, edge_up)
     normal /= np.linalg.norm(normal)
     lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in face.corners_m]

@@ -1,0 +1,112 @@
+"""Odometry as a real P3-AT computes it: wheel encoders, a calibrated track, and noise."""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mapfusion.arguments import require_finite, require_shape
+from mapfusion.errors import InputError
+from mapfusion.se2 import Float, wrap
+from sim.p3at import WHEEL_RADIUS_M, P3at
+from sim.world import World
+
+SPIN_WHEEL_RAD_S = 4.0  # a brisk turn, 1.7 rad/s; friction makes the track independent of it
+SPIN_UP_RAD = 1.0  # turned before the measurement begins
+SPIN_TURNS = 2  # whole turns, so that friction that depends on the heading averages out
+STEPS_PER_READING = 8
+
+
+@dataclass(frozen=True)
+class OdometryNoise:
+    """What makes a robot's odometry drift; 0 switches a term off.
+
+    Attributes:
+        translation_m_per_sqrt_m: random walk along the way, per root metre driven.
+        yaw_rad_per_sqrt_m: random walk of the heading, per root metre driven.
+        yaw_rad_per_sqrt_rad: random walk of the heading, per root radian turned.
+        scale_sigma: relative error of the wheels' radius, drawn once a robot.
+        track_sigma: relative error of the effective track, drawn once a robot.
+    """
+
+    translation_m_per_sqrt_m: float = 0.02
+    yaw_rad_per_sqrt_m: float = 0.01
+    yaw_rad_per_sqrt_rad: float = 0.03
+    scale_sigma: float = 0.01
+    track_sigma: float = 0.02
+
+    def __post_init__(self) -> None:
+        for name in self.__dataclass_fields__:
+            if not 0 <= getattr(self, name) < np.inf:
+                raise InputError(f"odometry: {name} is {getattr(self, name)}, must be 0 or more")
+
+
+@cache
+def calibrated_track_m() -> float:
+    """Effective track of the turning robot, from a spin test on an empty floor.
+
+    Turning skids: the body yaws less than the wheels would have it do on rails. As on the real
+    robot, two whole turns on the spot are compared with what the encoders read meanwhile.
+    """
+    with World() as world:
+        world.start_physics()
+        robot = P3at(world, np.zeros(3))
+        robot.drive(-SPIN_WHEEL_RAD_S, SPIN_WHEEL_RAD_S)
+        _, start = _spin(world, robot, SPIN_UP_RAD)
+        yaw_rad, end = _spin(world, robot, SPIN_TURNS * 2 * np.pi)
+    left, right = end - start
+    return float((right - left) * WHEEL_RADIUS_M / yaw_rad)
+
+
+def _spin(world: World, robot: P3at, until_rad: float) -> tuple[float, Float]:
+    """Step until the body has turned so far; returns what it has turned and the wheels' angles."""
+    yaw_rad, last = 0.0, robot.pose()[2]
+    while yaw_rad < until_rad:
+        world.step(STEPS_PER_READING)
+        theta = robot.pose()[2]
+        yaw_rad += float(wrap(theta - last))
+        last = theta
+    return yaw_rad, robot.wheel_angles()
+
+
+def encoder_increments(wheel_rad: ArrayLike, effective_track_m: float) -> Float:
+    """Motion (T, 3) from frame to frame, in the robot frame of the frame before.
+
+    Args:
+        wheel_rad: (T, 2) left and right encoder angles.
+        effective_track_m: see `calibrated_track_m`.
+
+    Returns:
+        Chords of the circular arcs that constant wheel speeds drive; the first row is zero.
+    """
+    wheel = np.asarray(wheel_rad, dtype=np.float64)
+    require_shape("wheel_rad", wheel, (None, 2))
+    require_finite("wheel_rad", wheel)
+    left, right = np.diff(wheel, axis=0, prepend=wheel[:1]).T * WHEEL_RADIUS_M
+    yaw = (right - left) / effective_track_m
+    chord = (left + right) / 2 * np.sinc(yaw / (2 * np.pi))  # numpy's sinc(x) is sin(pi x) / (pi x)
+    return np.stack([chord * np.cos(yaw / 2), chord * np.sin(yaw / 2), yaw], -1)
+
+
+def add_noise(increments: ArrayLike, noise: OdometryNoise, rng: np.random.Generator) -> Float:
+    """Increments (T, 3) as a drifting robot measures them.
+
+    A wrong wheel radius scales distances and turns alike, a wrong track turns alone. The random
+    walks' variances grow with the distance driven and the angle turned, so they do not depend on
+    the frame rate.
+    """
+    true = np.asarray(increments, dtype=np.float64)
+    require_shape("increments", true, (None, 3))
+    require_finite("increments", true)
+    scale = 1 + noise.scale_sigma * rng.standard_normal()
+    track = 1 + noise.track_sigma * rng.standard_normal()
+    walk = rng.standard_normal((len(true), 2))
+    distance, turned = np.hypot(true[:, 0], true[:, 1]), np.abs(true[:, 2])
+    direction = np.arctan2(true[:, 1], true[:, 0])
+
+    yaw_variance = noise.yaw_rad_per_sqrt_m**2 * distance + noise.yaw_rad_per_sqrt_rad**2 * turned
+    yaw = true[:, 2] * scale / track + np.sqrt(yaw_variance) * walk[:, 0]
+    along = distance * scale + noise.translation_m_per_sqrt_m * np.sqrt(distance) * walk[:, 1]
+    direction += (yaw - true[:, 2]) / 2  # a chord points half its arc's turn away from its start
+    return np.stack([along * np.cos(direction), along * np.sin(direction), yaw], -1)
