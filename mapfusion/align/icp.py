@@ -1,14 +1,15 @@
 """ICP from a random minimal set of correspondences (section 5)."""
 
+import math
 import time
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import KDTree
+from numba import njit
 
+from mapfusion.align.closest import Grid, nearest_two
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.pairs import (
-    MIN_PAIRS,
     Pairs,
     finish,
     gather,
@@ -19,7 +20,7 @@ from mapfusion.align.pairs import (
 from mapfusion.align.result import Alignment
 from mapfusion.align.rigid import fit_rigid
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.se2 import Float, transform_points
+from mapfusion.se2 import Float
 
 MAX_ROUNDS = 200  # of pairing and solving; maps of 1600 landmarks take 10 to 60
 
@@ -61,7 +62,7 @@ class Icp:
             return undetermined(reason, len(pairs), started_s)
         start = draw_motion(pairs, np.arange(len(pairs)), rng)
         closest = ClosestPoints(map_a, map_b)
-        return closest.iterate(start, pairs, correspondences, self.max_rounds, started_s)
+        return closest.align(start, pairs, correspondences, self.max_rounds, started_s)
 
 
 def why_no_start(map_a: LandmarkMap, map_b: LandmarkMap, pairs: Pairs) -> str:
@@ -85,18 +86,17 @@ class ClosestPoints:
     """Pairs each landmark of map b with the nearest of map a (planar maps: in the plane)."""
 
     def __init__(self, map_a: LandmarkMap, map_b: LandmarkMap) -> None:
-        self._dimensions = 2 if map_a.planar or map_b.planar else 3
-        self._p_a = map_a.position_m
-        self._p_b = map_b.position_m
-        self._tree = KDTree(map_a.position_m[:, : self._dimensions])
+        upright = np.array([1.0, 1.0, 0.0 if map_a.planar or map_b.planar else 1.0])
+        grid = Grid.of(map_a.position_m * upright)
+        self._row = grid.row
+        self._cells = (grid.p, grid.start, grid.corner_m, grid.cell_m, grid.shape)
+        self._p_b = map_b.position_m * upright
 
-    def pair(self, T_a_b: Float) -> tuple[np.ndarray, Float]:
-        """Row of map a (N_b,) nearest to each landmark of map b, and its distance."""
-        moved = transform_points(T_a_b, self._p_b)[:, : self._dimensions]
-        distance, nearest = self._tree.query(moved)
-        return np.asarray(nearest), np.asarray(distance)
+    def cost_m2(self, T_a_b: Float) -> float:
+        """Summed squared distance of map b's landmarks under T_a_b to their nearest in map a."""
+        return summed_square_distance(T_a_b, self._p_b, *self._cells)
 
-    def iterate(
+    def align(
         self,
         T_a_b: Float,
         pairs: Pairs,
@@ -104,18 +104,80 @@ class ClosestPoints:
         max_rounds: int,
         started_s: float,
     ) -> Alignment:
-        """Pair and solve until the pairing repeats."""
-        everyone = np.arange(len(self._p_b))
-        nearest, _ = self.pair(T_a_b)
-        refusal = f"still changed after {max_rounds} rounds"
-        for _ in range(max_rounds):
-            T_a_b = np.array(fit_rigid(self._p_a[nearest], self._p_b, everyone))
-            before = nearest
-            nearest, _ = self.pair(T_a_b)
-            if np.array_equal(nearest, before):
-                refusal = ""
-                break
-        inlier = nearest[correspondences.index_b] == correspondences.index_a
-        if np.count_nonzero(inlier) < MIN_PAIRS and not refusal:
-            refusal = f"confirms {np.count_nonzero(inlier)} of {len(inlier)} correspondences"
+        """Pair and solve from T_a_b on until the pairing repeats."""
+        T_a_b, nearest, repeats = iterate(T_a_b, max_rounds, self._p_b, *self._cells)
+        refusal = "" if repeats else f"pairs still changed after {max_rounds} rounds"
+        inlier = self._row[nearest][correspondences.index_b] == correspondences.index_a
         return finish(pairs, T_a_b, inlier, started_s, refusal)
+
+
+@njit(cache=True)
+def summed_square_distance(
+    T_a_b: Float,
+    p_b: Float,
+    p: Float,
+    start: np.ndarray,
+    corner_m: Float,
+    cell_m: float,
+    shape: np.ndarray,
+) -> float:
+    """Sum over p_b (N, 3) of the squared distance under T_a_b to the nearest point of a Grid."""
+    cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+    total = 0.0
+    for i in range(len(p_b)):
+        x = T_a_b[0] + cos * p_b[i, 0] - sin * p_b[i, 1]
+        y = T_a_b[1] + sin * p_b[i, 0] + cos * p_b[i, 1]
+        _, distance, _ = nearest_two(x, y, p_b[i, 2], p, start, corner_m, cell_m, shape)
+        total += distance * distance
+    return total
+
+
+@njit(cache=True)
+def iterate(
+    T_start: Float,
+    max_rounds: int,
+    p_b: Float,
+    p: Float,
+    start: np.ndarray,
+    corner_m: Float,
+    cell_m: float,
+    shape: np.ndarray,
+) -> tuple[Float, np.ndarray, bool]:
+    """Pair p_b (N, 3) with the nearest points of a Grid and solve, until no pair changes.
+
+    A landmark that moved less than its neighbours' distances differ keeps its neighbour (triangle
+    inequality), and is not looked up again.
+
+    Returns:
+        T_a_b (3,), index into the grid's points of each one's nearest (N,), whether it repeats.
+    """
+    n = len(p_b)
+    T_a_b = T_start.copy()
+    nearest = np.full(n, -1)
+    clear = np.zeros(n)  # no other point of the grid is nearer than this
+    moved, matched = np.zeros((n, 3)), np.empty((n, 3))
+    everyone = np.arange(n)
+    for rounds in range(max_rounds + 1):
+        cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+        changed = False
+        for i in range(n):
+            x = T_a_b[0] + cos * p_b[i, 0] - sin * p_b[i, 1]
+            y = T_a_b[1] + sin * p_b[i, 0] + cos * p_b[i, 1]
+            z = p_b[i, 2]
+            clear[i] -= math.hypot(x - moved[i, 0], y - moved[i, 1])
+            moved[i, 0], moved[i, 1] = x, y
+            k = nearest[i]
+            if k >= 0:
+                dx, dy, dz = x - p[k, 0], y - p[k, 1], z - p[k, 2]
+                if clear[i] > 0 and dx * dx + dy * dy + dz * dz < clear[i] * clear[i]:
+                    continue
+            found, _, clear[i] = nearest_two(x, y, z, p, start, corner_m, cell_m, shape)
+            if found != k:
+                changed = True
+                nearest[i] = found
+                matched[i] = p[found]
+        if not changed:
+            return T_a_b, nearest, True
+        if rounds < max_rounds:
+            T_a_b[0], T_a_b[1], T_a_b[2] = fit_rigid(matched, p_b, everyone)
+    return T_a_b, nearest, False

@@ -61,5 +61,5 @@ class ImpIcp:
         best = np.flatnonzero(correspondences.distance <= last)
         closest = ClosestPoints(map_a, map_b)
         starts = [draw_motion(pairs, best, rng) for _ in range(self.sets)]
-        start = min(starts, key=lambda T_a_b: float(np.sum(closest.pair(T_a_b)[1] ** 2)))
-        return closest.iterate(start, pairs, correspondences, self.max_rounds, started_s)
+        start = min(starts, key=closest.cost_m2)
+        return closest.align(start, pairs, correspondences, self.max_rounds, started_s)
