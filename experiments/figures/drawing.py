@@ -8,7 +8,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from experiments.figures.result_tables import NothingToDraw, ResultTables
-from experiments.figures.style import PNG_DPI, house_style
+from experiments.figures.style import PNG_DPI, SVG_DPI, house_style
 from experiments.workers import workers
 from mapfusion.storage import write_whole
 
@@ -24,7 +24,7 @@ FIGURES = (
     "fig09_aligned_maps",
     "fig10_fused_map",
 )
-_FORMATS = ("png", "svg")
+_DPI = {"png": PNG_DPI, "svg": SVG_DPI}
 
 
 @dataclass(frozen=True)
@@ -43,16 +43,20 @@ class Drawn:
 
 
 def draw_all(
-    result: Path, jobs: int = 2, on_progress: Callable[[Drawn], None] | None = None
+    result: Path,
+    jobs: int = 2,
+    on_progress: Callable[[int, int], None] | None = None,
+    on_skip: Callable[[str], None] | None = None,
 ) -> list[Path]:
     """Draw figures 1 to 10 of a result folder into `RESULT/figures/`.
 
-    A figure whose data the result does not hold is skipped; `on_progress` is told why.
+    A figure whose data the result does not hold is skipped; `on_skip` is told why.
 
     Args:
         result: a folder written by `run`.
         jobs: worker processes.
-        on_progress: called after each figure.
+        on_progress: told (figures done, figures in all) after each one.
+        on_skip: given one line for each figure that was skipped.
 
     Returns:
         The pictures written, in the figures' order.
@@ -67,7 +71,11 @@ def draw_all(
         for name, outcome in pool.completed():
             outcomes[name] = outcome
             if on_progress is not None:
-                on_progress(outcome)
+                on_progress(len(outcomes), len(FIGURES))
+    if on_skip is not None:
+        for name in FIGURES:
+            if outcomes[name].skipped:
+                on_skip(f"{name}: {outcomes[name].skipped}")
     return [file for name in FIGURES for file in outcomes[name].files]
 
 
@@ -78,7 +86,7 @@ def _draw_in_worker(result: Path, name: str) -> Drawn:
 def draw_figure(data: ResultTables, name: str) -> Drawn:
     """Draw one figure and write its pictures, or remove old ones when there is nothing to draw."""
     module = importlib.import_module(f"experiments.figures.{name}")
-    files = tuple(data.folder / "figures" / f"{name}.{suffix}" for suffix in _FORMATS)
+    files = tuple(data.folder / "figures" / f"{name}.{suffix}" for suffix in _DPI)
     with house_style():
         try:
             figure: Figure = module.draw(data)
@@ -88,10 +96,11 @@ def draw_figure(data: ResultTables, name: str) -> Drawn:
             return Drawn(name, (), str(reason))
         for file in files:
             write_whole(file, lambda path: _save(figure, path))
+            figure.set_layout_engine("none")  # as laid out for the first; once is enough
     return Drawn(name, files)
 
 
 def _save(figure: Figure, path: Path) -> None:
     # No date: the same tables give the same bytes.
     metadata = {"Date": None} if path.suffix == ".svg" else None
-    figure.savefig(path, dpi=PNG_DPI, metadata=metadata)
+    figure.savefig(path, dpi=_DPI[path.suffix[1:]], metadata=metadata)

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
+from matplotlib.lines import Line2D
 from scipy.stats import chi2
 
 from mapfusion.se2 import Float
@@ -27,6 +28,12 @@ def semi_axes(covariance_m2: Float, level: float = LEVEL) -> tuple[Float, Float,
     lengths = np.sqrt(np.maximum(values, 0.0) * chi2.ppf(level, _PLANE_DIMENSIONS))
     direction = np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
     return lengths[:, 1], lengths[:, 0], direction
+
+
+def ellipse_handle(colour: str) -> Line2D:
+    """What stands for the ellipses in a legend, and says their level."""
+    style = {"marker": "o", "markerfacecolor": "none", "markersize": 7, "linestyle": "none"}
+    return Line2D([], [], color=colour, label=f"{LEVEL_TEXT} ellipses, to scale", **style)
 
 
 def add_ellipses(

@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from experiments.figures.result_tables import NothingToDraw, Pair, ResultTables, of_pair
-from experiments.figures.style import GRAY, PAGE_WIDTH_IN, PALE_GRAY, aligner_styles
+from experiments.figures.style import BLUE, PAGE_WIDTH_IN, PALE_GRAY, aligner_styles
 from experiments.metrics import ORACLE
 from mapfusion.se2 import Float
 
@@ -20,6 +20,7 @@ _PANEL_HEIGHT_IN = 1.9
 _EXTRA_HEIGHT_IN = 0.9  # legend and the common x label
 _MARKERS_PER_LINE = 8
 _LEGEND_COLUMNS = 4
+_BAND_ALPHA = 0.16
 
 
 def draw_error_curves(
@@ -92,7 +93,7 @@ def _draw_panel(axes: Axes, summary: pd.DataFrame, pair: Pair, aligners: list[st
             curve["low"].to_numpy(),
             curve["high"].to_numpy(),
             color=styles[name]["color"],
-            alpha=0.16,
+            alpha=_BAND_ALPHA,
             linewidth=0,
             zorder=1,
             rasterized=True,
@@ -133,7 +134,9 @@ def _add_legend(figure: Figure, aligners: list[str]) -> None:
     handles: list[Line2D | Patch] = []
     for name in aligners:
         handles.append(Line2D([], [], label=name, **styles[name]))
-    handles.append(Patch(color=GRAY, alpha=0.3, linewidth=0, label="10-90 % of repetitions"))
+    handles.append(
+        Patch(color=BLUE, alpha=_BAND_ALPHA, linewidth=0, label="10-90 % of repetitions")
+    )
     handles.append(
         Patch(color=PALE_GRAY, alpha=0.5, linewidth=0, label=f"< {MIN_TRUE_PAIRS} true pairs")
     )

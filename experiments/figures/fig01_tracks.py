@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from experiments.figures.result_tables import NothingToDraw, ResultTables
 from experiments.figures.style import PAGE_WIDTH_IN, SEQUENTIAL_MAP
@@ -44,7 +45,12 @@ def draw(data: ResultTables) -> Figure:
     figure.supylabel("v (pixels)", fontsize=8)
     if points is not None:
         figure.colorbar(
-            points, ax=list(panels), label="age of the track (frames)", shrink=0.8, aspect=30
+            points,
+            ax=list(panels),
+            label="age of the track (frames)",
+            ticks=MaxNLocator(integer=True),
+            shrink=0.8,
+            aspect=30,
         )
     return figure
 
@@ -78,6 +84,7 @@ def _show_image(axes: Axes, path: Path) -> None:
     except (OSError, SyntaxError, ValueError) as error:  # how Pillow reports damaged files
         raise InputError(f"{path}: not a readable PNG image ({error})") from error
     axes.imshow(image, cmap="gray", vmin=0, vmax=1)
+    axes.autoscale(enable=False)  # points near the border must not widen the view
     axes.grid(visible=False)
 
 

@@ -3,10 +3,12 @@
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from experiments.figures.ellipses import LEVEL_TEXT, add_ellipses
-from experiments.figures.plan import add_frame, add_walls, label_plan, set_view
+from experiments.figures.ellipses import add_ellipses, ellipse_handle
+from experiments.figures.plan import add_frame, add_walls, height_of_row, label_plan, set_view
 from experiments.figures.result_tables import NothingToDraw, ResultTables
 from experiments.figures.style import BLACK, GRAY, PAGE_WIDTH_IN, PURPLE, robot_colours
+
+_LEGEND_HEIGHT_IN = 0.55
 
 
 def draw(data: ResultTables) -> Figure:
@@ -14,12 +16,15 @@ def draw(data: ResultTables) -> Figure:
     robots = [robot for robot in data.robots if len(data.landmarks_of(robot)[0])][:2]
     if not robots:
         raise NothingToDraw("no robot has a landmark in its map")
-    figure = Figure(figsize=(PAGE_WIDTH_IN, 4.3))
+    figure = Figure(figsize=(PAGE_WIDTH_IN, PAGE_WIDTH_IN))
     panels = figure.subplots(1, len(robots), squeeze=False)[0]
     for axes, robot in zip(panels, robots, strict=True):
         _draw_map(axes, data, robot)
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3)
+    handles, _ = panels[0].get_legend_handles_labels()
+    handles.insert(1, ellipse_handle(robot_colours(data.robots)[robots[0]]))
+    figure.legend(handles=handles, loc="outside lower center", ncols=3)
+    row = height_of_row(panels, PAGE_WIDTH_IN / len(panels))
+    figure.set_figheight(row + _LEGEND_HEIGHT_IN)
     return figure
 
 
@@ -40,10 +45,16 @@ def _draw_map(axes: Axes, data: ResultTables, robot: str) -> None:
         rasterized=True,
         zorder=2,
     )
-    ellipses = add_ellipses(
-        axes, position, covariance, edgecolors=colour, linewidths=0.4, rasterized=True, zorder=2
+    add_ellipses(
+        axes,
+        position,
+        covariance,
+        edgecolors=colour,
+        linewidths=0.4,
+        alpha=0.6,
+        rasterized=True,
+        zorder=2,
     )
-    ellipses.set_label(f"{LEVEL_TEXT} ellipses, to scale")
     axes.plot(path[:, 0], path[:, 1], color=GRAY, label="path of the best particle", zorder=3)
     axes.plot(0, 0, linestyle="none", marker="o", color=BLACK, label="start pose, the map's frame")
     cloud = data.table("clouds")

@@ -7,7 +7,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from experiments.figures.plan import add_frame, add_walls, label_plan, set_view
+from experiments.figures.plan import add_frame, add_walls, height_of_row, label_plan, set_view
 from experiments.figures.result_tables import NothingToDraw, ResultTables
 from experiments.figures.style import BLACK, GRAY, PAGE_WIDTH_IN, robot_colours
 from mapfusion.se2 import Float
@@ -16,6 +16,10 @@ _MAX_ROBOTS = 3
 _MAGNIFICATIONS = (1, 2, 5, 10, 20, 50, 100)
 _WIDEST_SHARE = 1 / 10  # of the map's extent that the widest drawn particle set may take
 _ZOOM_MARGIN = 1.25
+_RECENT_ITERATIONS = 50
+_FRAME_LENGTH_M = 2.0
+_GRID_COLUMNS = 6  # holds one, two or three panels of one width
+_LOWER_ROW_IN = 2.6
 
 
 class Moments(NamedTuple):
@@ -34,31 +38,41 @@ def draw(data: ResultTables) -> Figure:
         raise NothingToDraw("no particles were kept")
     clouds = clouds[clouds["robot"].isin(robots)]
     moments = choose_moments(clouds)
-    figure = Figure(figsize=(PAGE_WIDTH_IN, 5.2))
-    halves = figure.subfigures(2, 1, height_ratios=(1.15, 1.0), squeeze=False)
-    panels = halves[0, 0].subplots(1, len(robots), squeeze=False)[0]
+    figure = Figure(figsize=(PAGE_WIDTH_IN, PAGE_WIDTH_IN))
+    grid = figure.add_gridspec(2, _GRID_COLUMNS)
+    span = _GRID_COLUMNS // max(2, len(robots))
+    first = (_GRID_COLUMNS - span * len(robots)) // 2
+    panels = [
+        figure.add_subplot(grid[0, first + i * span : first + (i + 1) * span])
+        for i in range(len(robots))
+    ]
     magnification = _magnification(data, clouds, robots)
     for axes, robot in zip(panels, robots, strict=True):
         _draw_path(axes, data, robot, clouds[clouds["robot"] == robot], magnification)
         if moments is not None and robot == moments.robot:
             _mark_on_path(axes, data, moments)
-    timeline, *zooms = halves[1, 0].subplots(1, 3)
+    timeline, *zooms = (
+        figure.add_subplot(grid[1, column : column + 2]) for column in range(0, _GRID_COLUMNS, 2)
+    )
     _draw_timeline(timeline, data, robots, moments)
     if moments is None:
         for axes in zooms:
             axes.set_axis_off()
     else:
         _draw_zooms(zooms, data, clouds[clouds["robot"] == moments.robot], moments)
+    upper = height_of_row(panels, PAGE_WIDTH_IN * span / _GRID_COLUMNS)
+    grid.set_height_ratios([upper, _LOWER_ROW_IN])
+    figure.set_figheight(upper + _LOWER_ROW_IN)
     return figure
 
 
 def choose_moments(clouds: pd.DataFrame) -> Moments | None:
     """The pair of moments between which one robot's particles drew together the most.
 
-    Wide comes before tight, so the fall is what seeing old ground again did. None when no robot has
-    two moments with any spread.
+    Wide comes before tight, so the fall is what seeing old ground again did. None when no robot's
+    particles ever did.
     """
-    best, best_ratio = None, 0.0
+    best, best_ratio = None, 1.0
     for robot, rows in clouds.groupby("robot", sort=False):
         spread = rows.groupby("iteration")[["x_m", "y_m", "log_weight"]].apply(_spread_m)
         spread = spread[np.isfinite(spread) & (spread > 0)]
@@ -117,7 +131,7 @@ def _draw_path(
             rasterized=True,
             zorder=3,
         )
-    add_frame(axes)
+    add_frame(axes, _FRAME_LENGTH_M)
     set_view(axes, np.empty((0, 3)), path, *walls)
     label_plan(axes, robot)
     enlarged = f", spread x{magnification}" if magnification > 1 else ""
@@ -181,8 +195,7 @@ def _draw_zooms(
     sets = [clouds[clouds["iteration"] == k] for k in (moments.wide, moments.tight)]
     reach = max(float(np.abs(rows[["x_m", "y_m"]].to_numpy() - _mean(rows)).max()) for rows in sets)
     path = data.path_of(moments.robot)
-    titles = ("A: wide, new territory", "B: tight, after closing a loop")
-    for axes, rows, title in zip(zooms, sets, titles, strict=True):
+    for axes, rows, name in zip(zooms, sets, ("A, wide", "B, tight"), strict=True):
         mean = _mean(rows)
         axes.plot(path[:, 0], path[:, 1], color=GRAY, zorder=1)
         axes.plot(
@@ -200,4 +213,17 @@ def _draw_zooms(
         axes.set_aspect("equal")
         axes.locator_params(nbins=4)
         label_plan(axes, moments.robot)
-        axes.set_title(f"{title}\nk = {rows['iteration'].iloc[0]}, spread {_spread_m(rows):.3f} m")
+        k = int(rows["iteration"].iloc[0])
+        grown = _new_landmarks(data, moments.robot, k)
+        axes.set_title(
+            f"{name}: k = {k}, spread {_spread_m(rows):.3f} m\n"
+            f"+{grown} landmarks in {_RECENT_ITERATIONS} iterations",
+            fontsize=7.5,
+        )
+
+
+def _new_landmarks(data: ResultTables, robot: str, iteration: int) -> int:
+    """How much the map grew of late: much in new territory, little on known ground."""
+    table = data.table("robots")
+    count = table[table["robot"] == robot].set_index("iteration")["n_landmarks"]
+    return int(count[iteration] - count[max(0, iteration - _RECENT_ITERATIONS)])

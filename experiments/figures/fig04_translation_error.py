@@ -5,6 +5,7 @@ from matplotlib.figure import Figure
 
 from experiments.figures.error_curves import draw_error_curves
 from experiments.figures.result_tables import ResultTables
+from experiments.figures.style import plain_numbers
 from mapfusion.se2 import Float
 
 _FLOOR_M = 1e-4  # a tenth of a millimetre: anything below is exact for a robot
@@ -24,4 +25,5 @@ def draw(data: ResultTables) -> Figure:
 def _log_axis(axes: Axes, drawn: Float) -> None:
     axes.set_yscale("log", nonpositive="clip")
     low, high = max(float(drawn.min()), _FLOOR_M), max(float(drawn.max()), 2 * _FLOOR_M)
+    axes.yaxis.set_major_formatter(plain_numbers())
     axes.set_ylim(low / 1.3, high * 1.3)

@@ -6,6 +6,7 @@ from matplotlib.figure import Figure
 
 from experiments.figures.error_curves import draw_error_curves
 from experiments.figures.result_tables import ResultTables
+from experiments.figures.style import plain_numbers
 from mapfusion.se2 import Float
 
 # The axis is linear up to here and logarithmic beyond: good alignments err by a few thousandths of
@@ -27,5 +28,6 @@ def draw(data: ResultTables) -> Figure:
 
 def _symmetric_axis(axes: Axes, drawn: Float) -> None:
     axes.set_yscale("symlog", linthresh=_LINEAR_RAD, linscale=1.0)
+    axes.yaxis.set_major_formatter(plain_numbers())
     largest = max(float(np.abs(drawn).max()), _LINEAR_RAD)
     axes.set_ylim(-1.3 * largest, 1.3 * largest)

@@ -6,7 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.figures.result_tables import NothingToDraw, ResultTables
-from experiments.figures.style import PAGE_WIDTH_IN, aligner_styles
+from experiments.figures.style import PAGE_WIDTH_IN, aligner_styles, plain_numbers
 from experiments.metrics import ORACLE
 
 _BINS = 8  # of equal counts, for the line that guides the eye
@@ -29,6 +29,7 @@ def draw(data: ResultTables) -> Figure:
             _add_aligner(axes, timings[timings["aligner"] == name], column, data.aligners)
         axes.set_xlabel(label)
         axes.set_yscale("log")
+        axes.yaxis.set_major_formatter(plain_numbers())
     panels[0].set_ylabel("time of one alignment (s)")
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), handlelength=3.2)

@@ -14,6 +14,7 @@ from mapfusion.se2 import Float, transform_points
 _STRAY_SHARE = 0.005  # of the landmarks on each side, kept from shrinking the picture
 _GAP = 0.15  # between the two maps, as a share of the first one's width
 _HEIGHT_STRETCH = 2.5  # rooms are low and wide; the axis carries true metres all the same
+_ZOOM = 1.3  # fills the page: the default leaves room for any view
 _ELEVATION_DEG, _AZIMUTH_DEG = 32.0, -72.0
 
 
@@ -23,7 +24,7 @@ def draw(data: ResultTables) -> Figure:
     position_a, position_b = (_clipped(data.landmarks_of(robot)[0]) for robot in pair)
     shift = np.array([np.nanmax(position_a[:, 0]) - np.nanmin(position_b[:, 0]), 0.0, 0.0])
     shift[0] += _GAP * np.ptp(position_a[np.isfinite(position_a[:, 0]), 0])
-    figure = Figure(figsize=(PAGE_WIDTH_IN, 4.6))
+    figure = Figure(figsize=(PAGE_WIDTH_IN, 4.2))
     axes: Axes3D = figure.add_subplot(projection="3d")
     colours = robot_colours(data.robots)
     for robot, points, marker in ((pair[0], position_a, "*"), (pair[1], position_b + shift, "^")):
@@ -39,12 +40,15 @@ def draw(data: ResultTables) -> Figure:
         )
     _add_correspondences(axes, data, pair, position_a, position_b + shift)
     _set_space(axes, np.concatenate([position_a, position_b + shift]))
-    axes.set_xlabel(
-        f"x (m) in {pair[0]}'s frame;\n{pair[1]}'s moved by {shift[0]:.1f} m", labelpad=8
-    )
-    axes.set_ylabel("y (m), each in its own frame")
+    axes.set_xlabel("x (m)")
+    axes.set_ylabel("y (m)")
     axes.set_zlabel("z (m)")
-    figure.legend(loc="outside upper center", ncols=4)
+    figure.legend(
+        loc="outside upper center",
+        ncols=4,
+        title=f"each map in its own frame; {pair[1]}'s is drawn {shift[0]:.1f} m along x",
+        title_fontsize=7.5,
+    )
     return figure
 
 
@@ -102,7 +106,7 @@ def _add_correspondences(
     drawable = np.isfinite(ends).all(axis=(1, 2))
     for chosen, name, style in (
         (~right, names[1], {"colors": GRAY, "linewidths": 0.3, "linestyles": (0, (4, 2))}),
-        (right, names[0], {"colors": BLACK, "linewidths": 0.6}),
+        (right, names[0], {"colors": BLACK, "linewidths": 0.6, "alpha": 0.7}),
     ):
         if not chosen.any():
             continue
@@ -121,5 +125,6 @@ def _set_space(axes: Axes3D, points: Float) -> None:
     axes.set_ylim(low[1], high[1])
     bottom, top = min(0.0, low[2]), max(high[2], low[2] + 0.1)
     axes.set_zlim(bottom, top)
-    axes.set_box_aspect((*(high - low)[:2], _HEIGHT_STRETCH * (top - bottom)))
+    box = (*(high - low)[:2], _HEIGHT_STRETCH * (top - bottom))
+    axes.set_box_aspect(box, zoom=_ZOOM)  # pyright: ignore[reportArgumentType]  # takes floats
     axes.view_init(elev=_ELEVATION_DEG, azim=_AZIMUTH_DEG)

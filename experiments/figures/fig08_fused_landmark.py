@@ -3,6 +3,7 @@
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 
 from experiments.figures.ellipses import LEVEL_TEXT, add_ellipses, semi_axes
 from experiments.figures.fused_frame import FusedPairs, fused_pairs
@@ -10,7 +11,7 @@ from experiments.figures.plan import label_plan
 from experiments.figures.result_tables import NothingToDraw, ResultTables
 from experiments.figures.style import FUSED_COLOUR, robot_colours
 
-_MAX_ELONGATION = 5.0  # beyond, an ellipse is a needle in print
+_MAX_ELONGATION = 3.0  # beyond, an ellipse is a needle in print
 _MIN_SEPARATION = 0.25  # of the parents, in semi-major axes: nearer, their labels collide
 _MARGIN = 1.15
 
@@ -84,6 +85,8 @@ def _name_points(axes: Axes, position_m: np.ndarray) -> None:
             ha="center",
             va="center",
             fontsize=10,
+            path_effects=[withStroke(linewidth=2.5, foreground="white")],
+            zorder=5,
         )
 
 

@@ -15,7 +15,8 @@ from experiments.figures.style import BLACK, FUSED_COLOUR, GRAY, PAGE_WIDTH_IN, 
 from mapfusion.se2 import Float
 
 _ZOOM_SIDE_M = 1.0
-_ZOOM_LANDMARKS = 7  # what a panel of that size shows without clutter
+_ZOOM_LANDMARKS = 5  # what a panel of that size shows without clutter
+_INNER_SHARE = 0.35  # of the side: nearer the rim, ellipses are cut off
 
 
 def draw(data: ResultTables) -> Figure:
@@ -89,12 +90,14 @@ def _draw_landmarks(axes: Axes, data: ResultTables, pairs: FusedPairs, scale: fl
 
 
 def zoom_corner(position_m: Float) -> Float:
-    """Lower left corner of a square that shows about the wished number of landmarks.
+    """Lower left corner of a square that shows a few landmarks whole.
 
-    It is centred on the landmark whose neighbourhood comes nearest to that number.
+    It is centred on the landmark with about the wished number near it and the fewest at the rim.
     """
     tree = KDTree(position_m[:, :2])
-    half = _ZOOM_SIDE_M / 2
-    count = tree.query_ball_point(position_m[:, :2], half, p=np.inf, return_length=True)
-    best = int(np.argmin(np.abs(np.asarray(count) - _ZOOM_LANDMARKS)))
-    return position_m[best, :2] - half
+    near, visible = (
+        tree.query_ball_point(position_m[:, :2], share * _ZOOM_SIDE_M, p=np.inf, return_length=True)
+        for share in (_INNER_SHARE, 0.5)
+    )
+    cost = np.abs(np.asarray(near) - _ZOOM_LANDMARKS) + (np.asarray(visible) - near)
+    return position_m[int(np.argmin(cost)), :2] - _ZOOM_SIDE_M / 2

@@ -2,7 +2,7 @@
 
 from matplotlib.figure import Figure
 
-from experiments.figures.plan import add_frame, add_walls, label_plan, set_view
+from experiments.figures.plan import add_frame, add_walls, height_of_row, label_plan, set_view
 from experiments.figures.result_tables import (
     NothingToDraw,
     ResultTables,
@@ -10,6 +10,7 @@ from experiments.figures.result_tables import (
 )
 from experiments.figures.style import FUSED_COLOUR, PAGE_WIDTH_IN, robot_colours
 
+_LEGEND_HEIGHT_IN = 0.3
 _ROBOT_MARKERS = ("*", "^", "v", "x", "d")
 
 
@@ -19,7 +20,7 @@ def draw(data: ResultTables) -> Figure:
     if fused.empty:
         raise NothingToDraw("the fused map is empty")
     frame = data.robots[0]
-    figure = Figure(figsize=(PAGE_WIDTH_IN, 5.6))
+    figure = Figure(figsize=(PAGE_WIDTH_IN, PAGE_WIDTH_IN))
     axes = figure.subplots()
     walls = data.walls_in_frame_of(frame)
     add_walls(axes, walls)
@@ -45,9 +46,9 @@ def draw(data: ResultTables) -> Figure:
             rows["y_m"],
             linestyle="none",
             marker="s",
-            markersize=3,
+            markersize=2.8,
             markerfacecolor="none",
-            markeredgewidth=0.7,
+            markeredgewidth=0.6,
             color=FUSED_COLOUR,
             label=f"fused from two or more ({len(rows)})",
             rasterized=True,
@@ -58,5 +59,6 @@ def draw(data: ResultTables) -> Figure:
     label_plan(axes, frame)
     note = f", {outside} out of view" if outside else ""
     axes.set_title(f"fused map: {len(fused)} landmarks{note}")
+    figure.set_figheight(height_of_row([axes], PAGE_WIDTH_IN) + _LEGEND_HEIGHT_IN)
     figure.legend(loc="outside lower center", ncols=4, markerscale=1.6)
     return figure

@@ -12,7 +12,7 @@ from experiments.figures.result_tables import (
     positions_and_covariances,
 )
 from mapfusion.align.rigid import fit_rigid
-from mapfusion.se2 import IDENTITY, Float, transform_covariances, transform_points
+from mapfusion.se2 import Float, transform_covariances, transform_points
 
 _MIN_POINTS = 2  # that fix a rigid motion of the plane
 
@@ -24,7 +24,8 @@ class FusedPairs:
     Attributes:
         robots: the parents' robots.
         position_m: (3, N, 3) of the first parent, the second parent and the fused landmark.
-        covariance_m2: (3, N, 3, 3) likewise.
+        covariance_m2: (3, N, 3, 3) likewise; the parents' as the merge weighed them, so with what
+            it added to the maps' own for their drift.
     """
 
     robots: Pair
@@ -46,11 +47,10 @@ def fused_pairs(data: ResultTables) -> FusedPairs:
     rows = rows[(rows["robot_a"] == robots[0]) & (rows["robot_b"] == robots[1])]
     positions, covariances = [], []
     for robot, index in zip(robots, ("landmark_a", "landmark_b"), strict=True):
-        T_fused = T_fused_robot(data, robot)
-        position, covariance = data.landmarks_of(robot)
+        moved = moved_map(data, robot)
         chosen = rows[index].to_numpy()
-        positions.append(transform_points(T_fused, position[chosen]))
-        covariances.append(transform_covariances(T_fused, covariance[chosen]))
+        positions.append(moved[0][chosen])
+        covariances.append(moved[1][chosen])
     position, covariance = positions_and_covariances(rows)
     return FusedPairs(
         robots, np.stack([*positions, position]), np.stack([*covariances, covariance])
@@ -63,19 +63,21 @@ def _most_common_pair(rows: pd.DataFrame) -> Pair:
     return robot_a, robot_b
 
 
-def T_fused_robot(data: ResultTables, robot: str) -> Float:  # noqa: N802  # the field's notation
-    """The motion (3,) by which the merge brought a robot's map into the fused one.
+def moved_map(data: ResultTables, robot: str) -> tuple[Float, Float]:
+    """A robot's last map as it went into the merge: positions (N, 3), covariances (N, 3, 3).
 
-    A landmark that only this robot had was carried over, moved by that motion and nothing else; so
-    the closed-form least squares over those landmarks gives it back exactly.
+    A landmark that only this robot had was carried over as it went in: moved, its covariance turned
+    and widened by the map's drift. So the landmarks carried over tell the motion (closed-form least
+    squares, exact here) and the widening (the mean of what was added).
     """
-    if robot == data.robots[0]:
-        return IDENTITY
     fused = data.table("fused")
     carried = fused[(fused["n_parents"] == 1) & (fused["robot_a"] == robot)]
     if len(carried) < _MIN_POINTS:
         raise NothingToDraw(f"too few of {robot}'s landmarks were carried over to place its map")
-    position, _ = data.landmarks_of(robot)
-    moved, _ = positions_and_covariances(carried)
-    own = position[carried["landmark_a"].to_numpy()]
-    return np.array(fit_rigid(moved, own, np.arange(len(own))))
+    position, covariance = data.landmarks_of(robot)
+    went_in, went_in_covariance = positions_and_covariances(carried)
+    rows = carried["landmark_a"].to_numpy()
+    T_fused_robot = np.array(fit_rigid(went_in, position[rows], np.arange(len(rows))))
+    turned = transform_covariances(T_fused_robot, covariance)
+    added = (went_in_covariance - turned[rows]).mean(axis=0)
+    return transform_points(T_fused_robot, position), turned + added

@@ -11,6 +11,7 @@ from mapfusion.se2 import Float
 _STRAY_SHARE = 0.005  # a stray landmark tens of metres off, on each side, must not shrink the map
 _MARGIN = 0.05  # of the view's extent
 _AXIS_LENGTH_M = 1.0
+_LABELS_WIDTH_IN, _LABELS_HEIGHT_IN = 0.55, 0.55  # what labels and titles take beside each panel
 
 
 def add_walls(axes: Axes, walls: Sequence[Float]) -> None:
@@ -49,6 +50,12 @@ def set_view(axes: Axes, landmarks_m: Float, *others_m: Float) -> int:
     axes.set_aspect("equal", adjustable="box")
     inside = np.all((landmarks_m[:, :2] >= low - margin) & (landmarks_m[:, :2] <= high + margin), 1)
     return int(len(landmarks_m) - inside.sum())
+
+
+def height_of_row(panels: Sequence[Axes], width_in: float) -> float:
+    """Inches that a row of plans needs, their views set, when each is given so much width."""
+    ratio = max(np.ptp(axes.get_ylim()) / np.ptp(axes.get_xlim()) for axes in panels)
+    return (width_in - _LABELS_WIDTH_IN) * float(ratio) + _LABELS_HEIGHT_IN
 
 
 def label_plan(axes: Axes, frame: str) -> None:

@@ -4,13 +4,14 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-import matplotlib
 import matplotlib.style
+from matplotlib.ticker import FuncFormatter
 
 from experiments.metrics import ORACLE
 
 PAGE_WIDTH_IN = 7.2  # two columns of a journal page
-PNG_DPI = 200  # also of the parts that are drawn as pixels inside an SVG
+PNG_DPI = 200
+SVG_DPI = 150  # of the parts that are drawn as pixels, which make up most of the file
 
 # Okabe and Ito (2008): told apart by readers with any common colour blindness. Their yellow is left
 # out: too pale for lines on white.
@@ -57,6 +58,11 @@ _ALIGNER_STYLES: tuple[dict[str, Any], ...] = (
 _ORACLE_STYLE: dict[str, Any] = {"color": BLACK, "linestyle": (0, (4, 2)), "marker": "x"}
 _ROBOT_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
 FUSED_COLOUR = BLACK
+
+
+def plain_numbers() -> FuncFormatter:
+    """Ticks of logarithmic axes as people read them: 0.01, 0.1, 1, 10."""
+    return FuncFormatter(lambda value, _: f"{value:g}")
 
 
 @contextmanager

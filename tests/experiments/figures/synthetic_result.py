@@ -39,6 +39,8 @@ _ROUTES = (
     ((18.5, 1.5), (15, 1.5), (14.5, 10), (10, 10), (10, 2), (11.5, 6), (14.5, 10), (18.5, 5)),
     ((18.5, 13.5), (15, 13), (15, 10), (10, 10), (10, 13.5), (5, 5), (2, 2), (10, 10)),
 )
+ALIGNMENT_ERROR = np.array([0.04, -0.03, 0.004])  # of the motions the maps were merged with
+DRIFT_SIGMA_M = 0.03  # that the merge added to each map's covariances
 _SEEN_WITHIN_M = 3.2
 _PAIR_RADIUS_M = 0.10
 _IMAGE_SHAPE = (480, 640)
@@ -380,13 +382,15 @@ def _fused_rows(maps: dict[str, _Map]) -> pd.DataFrame:
 
 def _fused_row(maps: dict[str, _Map], start: Float, parents: list[tuple[str, int]]) -> dict:
     information, weighted = np.zeros((3, 3)), np.zeros(3)
-    error = np.array([0.04, -0.03, 0.004])
     for robot, landmark in parents:
         own = maps[robot]
-        T_fused = se2.between(start, own.start) + (error if own.start is not start else 0.0)
+        T_fused = se2.between(start, own.start)
+        if own.start is not start:
+            T_fused = T_fused + ALIGNMENT_ERROR
         here = slice(landmark, landmark + 1)
         position = se2.transform_points(T_fused, own.position_m[here])[0]
-        inverse = np.linalg.inv(se2.transform_covariances(T_fused, own.covariance_m2[here])[0])
+        turned = se2.transform_covariances(T_fused, own.covariance_m2[here])[0]
+        inverse = np.linalg.inv(turned + DRIFT_SIGMA_M**2 * np.diag([1, 1, 0]))
         information += inverse
         weighted += inverse @ position
     covariance = np.linalg.inv(information)
