@@ -1,55 +1,25 @@
 """Drives all robots along their routes in one physical world and writes down what happened."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from mapfusion.arguments import require_finite, require_shape
 from mapfusion.errors import InputError
 from mapfusion.se2 import Float, between, wrap
 from sim.floorplan import FloorPlan
-from sim.p3at import (
-    OUTER_RADIUS_M,
-    SKID_TRACK_M,
-    TOP_SPEED_M_S,
-    WHEEL_RADIUS_M,
-    WIDTH_M,
-    P3at,
-)
+from sim.p3at import OUTER_RADIUS_M, SKID_TRACK_M, TOP_SPEED_M_S, WHEEL_RADIUS_M, P3at
+from sim.route import Route, check_routes, place
 from sim.trajectory import Trajectory
 from sim.world import PHYSICS_HZ, World
 
-CONTROL_HZ = 30
+CONTROL_HZ = 60
 STEPS_PER_CONTROL = PHYSICS_HZ // CONTROL_HZ
 SETTLING_S = 0.5  # until the wheels have come to rest on the floor
+PROGRESS_M = 0.05  # to count as progress; more than a standing robot trembles
+STOPPING_GAP_M = 0.15  # between robots, kept also by the one that has the right of way
 HEADING_GAIN_PER_S = 2.0  # turn rate per radian of heading error: half of it gone in 0.35 s
-
-
-@dataclass(frozen=True)
-class Route:
-    """Where a robot starts and what it is to visit.
-
-    Attributes:
-        robot: its name.
-        T_world_start: (3,).
-        waypoints_m: (K, 2), visited in order.
-        loop: whether it begins again with the first waypoint after the last; else it stands still.
-    """
-
-    robot: str
-    T_world_start: Float
-    waypoints_m: Float
-    loop: bool = False
-
-    def __post_init__(self) -> None:
-        for name, shape in (("T_world_start", (3,)), ("waypoints_m", (None, 2))):
-            values = np.asarray(getattr(self, name), dtype=np.float64)
-            object.__setattr__(self, name, values)
-            require_shape(name, values, shape)
-            require_finite(name, values)
-        if len(self.waypoints_m) == 0:
-            raise InputError(f"robot {self.robot}: needs at least one waypoint")
 
 
 @dataclass(frozen=True)
@@ -64,7 +34,7 @@ class DriverSettings:
         turn_in_place_rad: heading error above which the robot stops to turn.
         arrival_m: a waypoint counts as visited this near.
         patience_s: without progress for so long a robot counts as stuck.
-        give_way_m: a robot waits while another is this near ahead of it.
+        give_way_m: a robot waits while one listed before it is this near ahead of it.
     """
 
     speed_m_s: float = 0.5
@@ -86,54 +56,6 @@ class DriverSettings:
             )
 
 
-def check_routes(plan: FloorPlan, routes: Sequence[Route]) -> None:
-    """Refuse routes that cannot be driven; raises InputError that names robot and place."""
-    names = [route.robot for route in routes]
-    for name in names:
-        if names.count(name) > 1:
-            raise InputError(f"robot {name}: two robots have this name")
-    for route in routes:
-        _check_route(plan, route)
-    for i, first in enumerate(routes):
-        for second in routes[i + 1 :]:
-            gap = np.hypot(*(first.T_world_start - second.T_world_start)[:2])
-            if gap < 2 * OUTER_RADIUS_M:
-                raise InputError(
-                    f"robots {first.robot} and {second.robot}: they start {gap:.2f} m apart, "
-                    f"at {_place(first.T_world_start)}; {2 * OUTER_RADIUS_M:.2f} m are needed"
-                )
-
-
-def _check_route(plan: FloorPlan, route: Route) -> None:
-    points = np.concatenate([route.T_world_start[None, :2], route.waypoints_m])
-    labels = ["start", *(f"waypoint {i}" for i in range(1, len(points)))]
-    on_floor, clearance = plan.contains(points), plan.clearance_m(points)
-    for label, point, inside, room in zip(labels, points, on_floor, clearance, strict=True):
-        where = f"robot {route.robot}: {label} {_place(point)}"
-        if not inside:
-            raise InputError(f"{where} lies outside the world")
-        if room < 0:
-            raise InputError(f"{where} lies inside a wall")
-        if room < OUTER_RADIUS_M:
-            raise InputError(
-                f"{where} is {room:.2f} m from a wall, turning needs {OUTER_RADIUS_M:.2f} m"
-            )
-    ends = list(range(1, len(points))) + ([1] if route.loop else [])
-    starts = list(range(len(ends)))
-    for start, end in zip(starts, ends, strict=True):
-        room = plan.leg_clearance_m(points[start], points[end])
-        where = (
-            f"robot {route.robot}: the way from {labels[start]} {_place(points[start])} "
-            f"to {labels[end]} {_place(points[end])}"
-        )
-        if room < 0:
-            raise InputError(f"{where} leads through a wall")
-        if room < WIDTH_M / 2:
-            raise InputError(
-                f"{where} passes a wall at {room:.2f} m, the robot needs {WIDTH_M / 2:.2f} m"
-            )
-
-
 def drive(
     plan: FloorPlan,
     routes: Sequence[Route],
@@ -148,7 +70,7 @@ def drive(
         routes: one a robot.
         settings: speeds and tolerances.
         n_frames: frames to record; the first shows the start.
-        frame_interval_s: a multiple of the controller's period, 1/30 s.
+        frame_interval_s: a multiple of the controller's period, 1/60 s.
 
     Raises:
         InputError: an impossible route or frame interval; a robot that hits something or is stuck
@@ -176,7 +98,7 @@ def drive(
                 time_s = frame * frame_interval_s + control / CONTROL_HZ
                 now = [robot.pose() for robot in robots]
                 for i, driver in enumerate(drivers):
-                    driver.control(time_s, now[i], now[:i] + now[i + 1 :])
+                    driver.control(time_s, now[i], before=now[:i], after=now[i + 1 :])
                 world.step(STEPS_PER_CONTROL)
                 for driver in drivers:
                     driver.refuse_contact(time_s, ground, names)
@@ -206,12 +128,12 @@ class _Driver:
         self._progress_s = 0.0
         self._waiting = False
 
-    def control(self, time_s: float, pose: Float, others: list[Float]) -> None:
-        """One step of the controller."""
+    def control(self, time_s: float, pose: Float, before: list[Float], after: list[Float]) -> None:
+        """One step, given the poses of the robots listed before and after this one."""
         settings = self._settings
         self._advance(time_s, pose)
         speed, turn = (0.0, 0.0) if self._done else self._wish(pose)
-        self._waiting = speed > 0 and self._must_wait(pose, others)
+        self._waiting = speed > 0 and self._must_wait(pose, before, after)
         if self._waiting:
             speed = turn = 0.0
         self._speed_m_s = _towards(self._speed_m_s, speed, settings.acceleration_m_s2 / CONTROL_HZ)
@@ -232,34 +154,37 @@ class _Driver:
                 self._target = 0
             self._nearest_m, self._progress_s = np.inf, time_s
             distance = self._distance_m(pose)
-        if self._done or distance < self._nearest_m - 0.05:
+        if self._done or distance < self._nearest_m - PROGRESS_M:
             self._nearest_m, self._progress_s = distance, time_s
         if time_s - self._progress_s > self._settings.patience_s:
             why = "waits for another robot" if self._waiting else "is stuck"
             raise InputError(
-                f"robot {self._route.robot}: {why} at {_place(pose)} since t = "
+                f"robot {self._route.robot}: {why} at {place(pose)} since t = "
                 f"{self._progress_s:.1f} s, on the way to waypoint {self._target + 1} "
-                f"{_place(self._route.waypoints_m[self._target])}"
+                f"{place(self._route.waypoints_m[self._target])}"
             )
 
     def _distance_m(self, pose: Float) -> float:
-        return float(np.hypot(*(self._route.waypoints_m[self._target] - pose[:2])))
+        return math.dist(self._route.waypoints_m[self._target], pose[:2])
 
     def _wish(self, pose: Float) -> tuple[float, float]:
         """Speed and turn rate towards the waypoint: slower the more it lies to the side."""
         settings = self._settings
-        along = self._route.waypoints_m[self._target] - pose[:2]
-        error = float(wrap(np.arctan2(along[1], along[0]) - pose[2]))
-        turn = float(
-            np.clip(HEADING_GAIN_PER_S * error, -settings.turn_rate_rad_s, settings.turn_rate_rad_s)
-        )
+        x, y = self._route.waypoints_m[self._target] - pose[:2]
+        error = float(wrap(math.atan2(y, x) - pose[2]))
+        top = settings.turn_rate_rad_s
+        turn = min(max(HEADING_GAIN_PER_S * error, -top), top)
         return settings.speed_m_s * max(0.0, 1 - abs(error) / settings.turn_in_place_rad), turn
 
-    def _must_wait(self, pose: Float, others: list[Float]) -> bool:
-        """Whether another robot is near, ahead, and in the way."""
-        for other in others:
+    def _must_wait(self, pose: Float, before: list[Float], after: list[Float]) -> bool:
+        """Whether another robot is ahead in the way; those listed first go first."""
+        reach = [(other, self._settings.give_way_m) for other in before]
+        reach += [(other, 2 * OUTER_RADIUS_M + STOPPING_GAP_M) for other in after]
+        for other, reach_m in reach:
+            if math.dist(pose[:2], other[:2]) > reach_m + 2 * OUTER_RADIUS_M:
+                continue
             x, y, _ = between(pose, other)
-            if 0 < x < self._settings.give_way_m and abs(y) < 2 * OUTER_RADIUS_M:
+            if 0 < x < reach_m and abs(y) < 2 * OUTER_RADIUS_M:
                 return True
         return False
 
@@ -270,14 +195,10 @@ class _Driver:
             body = min(touched)
             what = f"robot {names[body]}" if body in names else "a wall"
             raise InputError(
-                f"robot {self._route.robot}: hits {what} at {_place(self._robot.pose())}, "
+                f"robot {self._route.robot}: hits {what} at {place(self._robot.pose())}, "
                 f"t = {time_s:.1f} s"
             )
 
 
 def _towards(value: float, target: float, step: float) -> float:
-    return value + float(np.clip(target - value, -step, step))
-
-
-def _place(point: Float) -> str:
-    return f"({point[0]:.2f}, {point[1]:.2f})"
+    return value + min(max(target - value, -step), step)
