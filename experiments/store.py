@@ -10,7 +10,7 @@ import hashlib
 import importlib.metadata
 import json
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -98,6 +98,14 @@ class Store:
         key = hashlib.sha256(text.encode()).hexdigest()[:_KEY_LENGTH]
         return StageFolder(stage, key, self.root / stage / key)
 
+    def imported(self, stage: str, path: Path) -> StageFolder:
+        """A folder that came from elsewhere; its key is the hash of what it holds."""
+        digest = hashlib.sha256()
+        for file in sorted(path.glob("*.parquet")):
+            digest.update(file.name.encode() + b"\0")
+            digest.update(file.read_bytes())
+        return StageFolder(stage, digest.hexdigest()[:_KEY_LENGTH], path)
+
 
 def link_or_copy(source: Path, target: Path) -> None:
     """Put a finished, immutable file at a second place without a second copy where possible."""
@@ -110,6 +118,3 @@ def link_or_copy(source: Path, target: Path) -> None:
             shutil.copyfile(source, temporary)
 
     write_whole(target, place)
-
-
-Progress = Callable[[int, int], None]

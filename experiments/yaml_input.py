@@ -15,7 +15,9 @@ def read_mapping(path: Path) -> dict[str, Any]:
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise InputError(f"{path}: no such file (expected a scenario, for example quick.yaml)") from None
+        raise InputError(
+            f"{path}: no such file (expected a scenario, for example quick.yaml)"
+        ) from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read as UTF-8 text ({error})") from error
     data = _parse(text, str(path))
@@ -62,7 +64,11 @@ def _assign(data: dict[str, Any], dotted: str, value: Any) -> None:
             node = node[int(name)]
         elif isinstance(node, dict):
             child = node.get(name)
-            node = node.setdefault(name, {}) if child is not None else node.update({name: {}}) or node[name]
+            node = (
+                node.setdefault(name, {})
+                if child is not None
+                else node.update({name: {}}) or node[name]
+            )
         else:
             raise InputError(f"--set {dotted}: {name} is not a key here")
     if isinstance(node, list) and last.isdigit() and int(last) < len(node):

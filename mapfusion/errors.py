@@ -1,7 +1,7 @@
 """The one error a person is meant to read."""
 
 
-class InputError(Exception):
+class InputError(ValueError):
     """Something a user gave is unusable.
 
     Its text is one line that names the file, the field and what would be right.

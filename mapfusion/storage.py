@@ -17,7 +17,7 @@ _VERSION = b"mapfusion.schema_version"
 _PREFIX = "mapfusion."
 
 
-def write_whole(path: Path, write: Callable[[Path], None]) -> None:
+def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write` fill a temporary file beside `path`, then rename it: no reader sees half a file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=path.suffix)
@@ -38,7 +38,7 @@ def schema(kind: str, version: int, fields: list[pa.Field]) -> pa.Schema:
 
 def write_table(
     path: Path,
-    columns: Mapping[str, Any],
+    columns: Mapping[Any, Any],
     table_schema: pa.Schema,
     attributes: Mapping[str, str] | None = None,
 ) -> None:

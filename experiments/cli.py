@@ -1,0 +1,242 @@
+"""The command `mapfusion`: load, compute, show. Heavy imports sit inside the commands."""
+
+import os
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Measures how well landmark maps of independent robots can be fused.\n\n"
+    "Start with:  mapfusion run scenarios/quick.yaml",
+)
+import_app = typer.Typer(no_args_is_help=True, help="Turn recordings of others into robot logs.")
+app.add_typer(import_app, name="import")
+
+ScenarioPath = Annotated[Path, typer.Argument(metavar="SCENARIO", help="Scenario file (YAML).")]
+Seed = Annotated[int | None, typer.Option(help="Replaces the scenario's seed.", min=0)]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Replaces a value, e.g. evaluate.every=1."),
+]
+Jobs = Annotated[int | None, typer.Option(help="Processes; all cores by default.", min=1)]
+Fresh = Annotated[bool, typer.Option("--fresh", help="Compute again what is stored already.")]
+Results = Annotated[Path, typer.Option(help="Folder that results go to.")]
+DEFAULT_RESULTS = Path("results")
+
+
+@app.command()
+def run(
+    scenario: ScenarioPath,
+    seed: Seed = None,
+    overrides: Overrides = None,
+    jobs: Jobs = None,
+    fresh: Fresh = False,
+    results: Results = DEFAULT_RESULTS,
+) -> None:
+    """Simulate, map, align, merge, evaluate and draw: `mapfusion run scenarios/quick.yaml`.
+
+    Finished stages are reused; an interrupted run goes on where it was.
+    """
+    from experiments import screen
+    from experiments.figures import draw_all
+    from experiments.result import result_folder, run_scenario
+    from experiments.scenario import load_scenario
+
+    loaded = load_scenario(scenario, overrides or (), seed)
+    folder = result_folder(results, loaded)
+    n_jobs = jobs or available_cores()
+    with screen.progress() as show:
+        run_scenario(loaded, results, n_jobs, show, fresh)
+        draw_all(folder, n_jobs, lambda done, total: show("figures", done, total))
+    screen.print_result(folder)
+
+
+@app.command()
+def figures(
+    result: Annotated[Path, typer.Argument(metavar="RESULT", help="A run's result folder.")],
+    jobs: Jobs = None,
+) -> None:
+    """Draw a result's figures again, from its tables alone: `mapfusion figures results/quick-0`."""
+    from experiments import screen
+    from experiments.figures import draw_all
+    from experiments.result import require_result
+
+    require_result(result)
+    with screen.progress() as show:
+        paths = draw_all(
+            result, jobs or available_cores(), lambda done, total: show("figures", done, total)
+        )
+    screen.print_paths(result, paths)
+
+
+@app.command()
+def check(
+    scenarios: Annotated[list[Path], typer.Argument(metavar="SCENARIO...", help="Scenario files.")],
+    seeds: Annotated[str, typer.Option(help="A seed, a range 0..4 or a list 0,2,5.")] = "0",
+    overrides: Overrides = None,
+    jobs: Jobs = None,
+    fresh: Fresh = False,
+    junit: Annotated[Path | None, typer.Option(help="Write a JUnit report to this file.")] = None,
+    results: Results = DEFAULT_RESULTS,
+) -> None:
+    """Run scenarios over seeds and hold them to their `expect` blocks; exit code 1 if one fails."""
+    from experiments import screen
+    from experiments.checks import check as check_scenario
+    from experiments.checks import parse_seeds, write_junit
+    from experiments.result import run_scenario
+    from experiments.scenario import load_scenario
+
+    wanted = parse_seeds(seeds)
+    loaded = [[load_scenario(s, overrides or (), seed) for seed in wanted] for s in scenarios]
+    outcomes = []
+    for per_seed in loaded:
+        folders = {}
+        with screen.progress() as show:
+            for entry in per_seed:
+                folders[entry.seed] = run_scenario(
+                    entry, results, jobs or available_cores(), show, fresh
+                )
+        outcomes += check_scenario(per_seed[0], folders)
+    screen.print_outcomes(outcomes)
+    if junit is not None:
+        write_junit(junit, outcomes)
+    if not all(outcome.passed for outcome in outcomes):
+        raise typer.Exit(EXIT_FAILED)
+
+
+@app.command()
+def schema() -> None:
+    """Print the JSON schema of scenarios, for editors: `mapfusion schema > schema.json`."""
+    from experiments.scenario import schema_text
+
+    typer.echo(schema_text())
+
+
+@app.command()
+def record(
+    scenario: ScenarioPath,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the logs.")],
+    seed: Seed = None,
+    overrides: Overrides = None,
+    jobs: Jobs = None,
+    results: Results = DEFAULT_RESULTS,
+) -> None:
+    """Simulate only: one robot log (with its truth) per robot: `mapfusion record S -o logs`."""
+    from experiments import screen, single
+    from experiments.scenario import load_scenario
+
+    loaded = load_scenario(scenario, overrides or (), seed)
+    with screen.progress() as show:
+        paths = single.record(loaded, output, results, jobs or available_cores(), show)
+    screen.print_paths(output, paths)
+
+
+@app.command()
+def slam(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="A robot log (folder).")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Map file to write.")],
+    settings: Annotated[
+        Path | None, typer.Option("--scenario", help="Scenario whose `slam` section to use.")
+    ] = None,
+    overrides: Overrides = None,
+    seed: Annotated[int, typer.Option(help="Of the filter's randomness.", min=0)] = 0,
+) -> None:
+    """Build one robot's map from its log: `mapfusion slam logs/R1 -o R1.parquet`."""
+    from experiments import screen, single
+
+    slam_settings = single.slam_settings(settings, overrides or ())
+    with screen.progress() as show:
+        landmarks = single.slam(log, slam_settings, seed, show)
+    single.save_map(output, landmarks)
+    screen.print_map(output, landmarks)
+
+
+@app.command()
+def align(
+    map_a: Annotated[Path, typer.Argument(metavar="MAP_A")],
+    map_b: Annotated[Path, typer.Argument(metavar="MAP_B")],
+    settings: Annotated[
+        Path | None, typer.Option("--scenario", help="Scenario whose `align` section to use.")
+    ] = None,
+    overrides: Overrides = None,
+    seed: Annotated[int, typer.Option(help="Of the aligners' randomness.", min=0)] = 0,
+) -> None:
+    """Estimate T_a_b with every aligner: `mapfusion align R1.parquet R2.parquet`."""
+    from experiments import screen, single
+
+    rows = single.align(map_a, map_b, single.align_settings(settings, overrides or ()), seed)
+    screen.print_estimates(rows)
+
+
+@app.command()
+def merge(
+    maps: Annotated[list[Path], typer.Argument(metavar="MAP MAP...", help="Two maps or more.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Fused map file to write.")],
+    settings: Annotated[
+        Path | None, typer.Option("--scenario", help="Scenario whose sections to use.")
+    ] = None,
+    overrides: Overrides = None,
+    seed: Annotated[int, typer.Option(help="Of the aligner's randomness.", min=0)] = 0,
+) -> None:
+    """Fuse maps in the frame of the first: `mapfusion merge A.parquet B.parquet -o F.parquet`."""
+    from experiments import screen, single
+
+    fused, joined = single.merge(maps, settings, overrides or (), seed)
+    single.save_map(output, fused.landmarks)
+    screen.print_fused(output, fused, joined)
+
+
+@import_app.command("mrclam")
+def import_mrclam_command(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="An MRCLAM recording.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the logs.")],
+) -> None:
+    """UTIAS MRCLAM recordings: `mapfusion import mrclam MRCLAM_Dataset7 -o logs/mrclam7`."""
+    from experiments import screen
+    from experiments.mrclam import import_mrclam
+
+    screen.print_paths(output, import_mrclam(folder, output))
+
+
+def available_cores() -> int:
+    """Cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def main() -> None:
+    """Run the command; every failure a user can cause is one line and an exit code."""
+    from mapfusion.errors import InputError
+
+    try:
+        code = app(standalone_mode=False) or 0
+    except InputError as error:
+        _complain(str(error))
+        code = EXIT_BAD_INPUT
+    except BrokenPipeError:
+        code = EXIT_FAILED
+    except Exception as error:
+        # Typer keeps its usage errors' classes private; all of them can tell their message.
+        message = getattr(error, "format_message", None)
+        if message is None:
+            raise
+        if message():  # empty where the help was shown instead
+            _complain(f"{message()} (see mapfusion --help)")
+        code = EXIT_BAD_INPUT
+    if code == EXIT_INTERRUPTED:
+        _complain("interrupted; what was finished is kept, the same command goes on from there")
+    sys.exit(code)
+
+
+def _complain(line: str) -> None:
+    typer.echo(f"mapfusion: {line}", err=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,25 @@
+"""Where a result came from: enough to make it again, or to see why it cannot be."""
+
+import platform
+from datetime import UTC, datetime
+from typing import Any
+
+from experiments.pipeline import Plan
+from experiments.store import library_versions
+
+RESULT_SCHEMA_VERSION = 1
+
+
+def provenance(plan: Plan) -> dict[str, Any]:
+    """JSON-able description of a run."""
+    return {
+        "schema_version": RESULT_SCHEMA_VERSION,
+        "scenario": plan.scenario.name,
+        "seed": plan.scenario.seed,
+        "renderer": "none (imported logs)" if plan.scenario.logs else "TinyRenderer",
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "libraries": library_versions(),
+        "written": datetime.now(UTC).isoformat(timespec="seconds"),
+        "stages": {f"{folder.stage}/{folder.key}": folder.finished for folder in plan.folders()},
+    }

@@ -1,0 +1,198 @@
+"""The result folder of a run: everything that figures, checks and people read.
+
+`RESULT/tables/*.parquet`, `maps/` (one file a robot, and the fused map), `keyframes/`, `figures/`,
+`scenario.json` (resolved), `world.json`, `provenance.json`.
+"""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from experiments import tables
+from experiments.evaluate import EvaluatedRobot, path_columns, robot_rows
+from experiments.fusion import fused_maps, fused_truth, map_fit_rows
+from experiments.pipeline import OnProgress, Plan, execute
+from experiments.provenance import provenance
+from experiments.scenario import Scenario
+from experiments.stages import slam
+from experiments.stages.judge import load_robot
+from experiments.store import Store, link_or_copy
+from experiments.timing import time_aligners
+from mapfusion import se2
+from mapfusion.aligned_landmarks import ABSENT
+from mapfusion.errors import InputError
+from mapfusion.landmark_map import LandmarkMap, write_map
+from mapfusion.merge import FusedMap
+from mapfusion.robot_log import read_log
+from mapfusion.se2 import Float
+from mapfusion.storage import point_columns, read_table, write_whole
+
+STORE_FOLDER = "store"
+
+
+def result_folder(results: Path, scenario: Scenario) -> Path:
+    """Where the result of a scenario goes: `RESULTS/NAME-SEED`."""
+    return results / f"{scenario.name}-{scenario.seed}"
+
+
+def require_result(result: Path) -> None:
+    """Raise InputError unless the folder holds a finished result."""
+    for name in ("scenario.json", "tables"):
+        if not (result / name).exists():
+            raise InputError(f"{result}: not a result folder (no {name}); make one with `run`")
+
+
+def run_scenario(
+    scenario: Scenario, results: Path, jobs: int, on_progress: OnProgress, fresh: bool = False
+) -> Path:
+    """Run a scenario and write its result folder; returns the folder."""
+    plan = execute(scenario, Store(results / STORE_FOLDER), jobs, on_progress, fresh)
+    folder = result_folder(results, scenario)
+    on_progress("tables", 0, 1)
+    write_result(plan, folder)
+    on_progress("tables", 1, 1)
+    return folder
+
+
+def write_result(plan: Plan, folder: Path) -> None:
+    """Collect a finished plan's tables, maps and images in a result folder."""
+    scenario = plan.scenario
+    robots = [load_robot(robot.folders) for robot in plan.robots]
+    _join_pair_tables(plan, folder)
+    _write_robot_tables(plan, robots, folder)
+    _write_maps(plan, robots, folder)
+    _write_images(plan, folder)
+    time_aligners(scenario, robots, folder)
+    _write_json(folder / "scenario.json", scenario.resolved())
+    _write_json(folder / "world.json", _world(scenario, robots))
+    _write_json(folder / "provenance.json", provenance(plan))
+
+
+def _write_json(path: Path, content: object) -> None:
+    text = json.dumps(content, indent=1)
+    write_whole(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+
+
+def _world(scenario: Scenario, robots: Sequence[EvaluatedRobot]) -> dict[str, object]:
+    """The truth that figures show as background."""
+    walls = [] if scenario.world is None else [list(wall.points) for wall in scenario.world.walls]
+    starts = {robot.name: robot.path.T_world_map.tolist() for robot in robots}
+    return {"walls": walls, "robots": starts}
+
+
+def _join_pair_tables(plan: Plan, folder: Path) -> None:
+    sources = {
+        "estimates": [pair.align.path for pair in plan.pairs],
+        "correspondences": [pair.align.path for pair in plan.pairs],
+        "errors": [pair.judge.path for pair in plan.pairs],
+        "fusion": [pair.judge.path for pair in plan.pairs],
+    }
+    for name, folders in sources.items():
+        parts = [tables.read(path / f"{name}.parquet", name) for path in folders]
+        joined = pd.concat(parts, ignore_index=True) if parts else []
+        tables.write(tables.table_path(folder, name), name, joined)
+
+
+def _write_robot_tables(plan: Plan, robots: Sequence[EvaluatedRobot], folder: Path) -> None:
+    paths, online, clouds, timings = [], [], [], []
+    for stages, robot in zip(plan.robots, robots, strict=True):
+        poses = read_table(stages.slam.path / "poses.parquet", slam.POSES)[0].to_pandas()
+        joined = path_columns(poses, read_log(stages.log.path).odometry, robot.path)
+        paths.append(joined.assign(robot=robot.name))
+        online.append(robot_rows(poses, joined).assign(robot=robot.name))
+        cloud = read_table(stages.slam.path / "clouds.parquet", slam.CLOUDS)[0].to_pandas()
+        clouds.append(cloud.assign(robot=robot.name))
+    for stage_folder in plan.folders():
+        figures = stage_folder.figures()
+        for name in ("elapsed_s", "rendering_s"):
+            if name in figures:
+                timings.append(
+                    {
+                        "stage": stage_folder.stage,
+                        "name": f"{stage_folder.key}:{name}",
+                        "elapsed_s": figures[name],
+                    }
+                )
+    for name, parts in (("paths", paths), ("robots", online), ("clouds", clouds)):
+        tables.write(tables.table_path(folder, name), name, pd.concat(parts, ignore_index=True))
+    tables.write(tables.table_path(folder, "timings"), "timings", timings)
+
+
+def _write_maps(plan: Plan, robots: list[EvaluatedRobot], folder: Path) -> None:
+    last = max(max(robot.maps) for robot in robots)
+    landmark_rows = []
+    for robot in robots:
+        landmarks, points = robot.at(last)
+        write_map(folder / "maps" / f"{robot.name}.parquet", landmarks)
+        truth = se2.transform_points(se2.inverse(robot.path.T_world_map), points)
+        rows = _landmark_columns(landmarks, truth) | {"count": landmarks.count}
+        landmark_rows.append(pd.DataFrame({"robot": robot.name} | rows))
+    joined = pd.concat(landmark_rows, ignore_index=True)
+    tables.write(tables.table_path(folder, "landmarks"), "landmarks", joined)
+    fused = _fused(plan, robots, folder, last)
+    fits = map_fit_rows(robots, fused, last)
+    tables.write(tables.table_path(folder, "map_fits"), "map_fits", fits)
+    fused_rows = [] if fused is None else _fused_rows(fused, robots, last)
+    tables.write(tables.table_path(folder, "fused"), "fused", fused_rows)
+
+
+def _fused(plan: Plan, robots: list[EvaluatedRobot], folder: Path, last: int) -> FusedMap | None:
+    if len(robots) < 2:
+        return None
+    estimates = tables.read(tables.table_path(folder, "estimates"), "estimates")
+    offered = tables.read(tables.table_path(folder, "correspondences"), "correspondences")
+    # a pair's last estimates are at the later of its two robots' last frames
+    ends = estimates.groupby(["robot_a", "robot_b"])["iteration"].transform("max")
+    offered_ends = offered.merge(
+        estimates[["robot_a", "robot_b", "iteration"]][
+            estimates["iteration"] == ends
+        ].drop_duplicates()
+    )
+    maps = [robot.at(last)[0] for robot in robots]
+    fused = fused_maps(
+        maps, estimates[estimates["iteration"] == ends], offered_ends, plan.scenario.merge
+    )
+    write_map(folder / "maps" / "fused.parquet", fused.landmarks)
+    return fused
+
+
+def _landmark_columns(landmarks: LandmarkMap, truth: Float) -> dict[str, np.ndarray]:
+    return {
+        "landmark": np.arange(len(landmarks)),
+        **point_columns(landmarks.position_m, landmarks.covariance_m2),
+        **{f"truth_{axis}_m": truth[:, i] for i, axis in enumerate("xyz")},
+    }
+
+
+def _fused_rows(fused: FusedMap, robots: list[EvaluatedRobot], iteration: int) -> pd.DataFrame:
+    truth = fused_truth(fused, robots, iteration)
+    truth = se2.transform_points(se2.inverse(robots[0].path.T_world_map), truth)
+    rows = pd.DataFrame(_landmark_columns(fused.landmarks, truth))
+    has = fused.parents != ABSENT
+    names = np.array([robot.name for robot in robots], dtype=object)
+    first = np.argmax(has, axis=1)
+    later = has & (np.arange(len(robots)) > first[:, None])
+    second = np.where(later.any(axis=1), np.argmax(later, axis=1), ABSENT)
+    each = np.arange(len(rows))
+    rows["n_parents"] = has.sum(axis=1)
+    rows["robot_a"] = names[first]
+    rows["landmark_a"] = fused.parents[each, first]
+    rows["robot_b"] = np.where(second != ABSENT, names[second], "")
+    rows["landmark_b"] = np.where(second != ABSENT, fused.parents[each, second], ABSENT)
+    return rows
+
+
+def _write_images(plan: Plan, folder: Path) -> None:
+    tracks = []
+    for robot in plan.robots:
+        if robot.features is None or robot.observed is None:
+            continue
+        for path in sorted(robot.features.path.glob("image_*.png")):
+            iteration = int(path.stem.removeprefix("image_"))
+            link_or_copy(path, folder / "keyframes" / f"{robot.name}_{iteration:05d}.png")
+        tracks.append(tables.read(robot.observed.path / "tracks.parquet", "tracks"))
+    joined = pd.concat(tracks, ignore_index=True) if tracks else []
+    tables.write(tables.table_path(folder, "tracks"), "tracks", joined)

@@ -1,0 +1,212 @@
+"""What the commands show: progress, tables, where files are."""
+
+import json
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from experiments import tables
+from experiments.metrics import ORACLE
+
+if TYPE_CHECKING:
+    from experiments.checks import Outcome
+    from mapfusion.landmark_map import LandmarkMap
+    from mapfusion.merge import FusedMap
+
+MIN_TRUE_PAIRS_SHOWN = 3  # as figures 4 and 5 shade: fewer cannot carry an alignment
+
+_STAGE_TEXT = {
+    "drive": "drive the robots",
+    "faces": "paint the walls",
+    "render": "render and find features",
+    "slam": "FastSLAM",
+    "align": "align the maps",
+    "judge": "compare with the truth",
+    "tables": "write the tables",
+    "figures": "draw the figures",
+}
+
+
+@contextmanager
+def progress() -> Iterator[Callable[[str, int, int], None]]:
+    """A progress display on stderr; yields the function to tell (stage, done, total)."""
+    display = Progress(
+        TextColumn("{task.description:<26}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        console=Console(stderr=True),
+    )
+    bars: dict[str, Any] = {}
+    with display:
+
+        def show(stage: str, done: int, total: int) -> None:
+            if stage not in bars or (done == 0 and bars[stage][1]):
+                bars[stage] = [display.add_task(_STAGE_TEXT.get(stage, stage), total=total), False]
+            bar, _ = bars[stage]
+            display.update(bar, completed=done, total=total)
+            bars[stage][1] = done == total
+
+        yield show
+
+
+def print_result(result: Path) -> None:
+    """The table of all aligners, and where everything is."""
+    errors = tables.read(tables.table_path(result, "errors"), "errors")
+    timings = tables.read(tables.table_path(result, "aligner_timings"), "aligner_timings")
+    console = Console()
+    console.print(_aligner_table(errors, timings, _aligner_order(result)))
+    robots = tables.read(tables.table_path(result, "robots"), "robots")
+    console.print(_robot_table(robots))
+    console.print(f"Figures: {result / 'figures'}   tables: {result / 'tables'}", soft_wrap=True)
+
+
+def _aligner_order(result: Path) -> list[str]:
+    scenario = json.loads((result / "scenario.json").read_text(encoding="utf-8"))
+    return [entry["name"] for entry in scenario["align"]["aligners"]] + [ORACLE]
+
+
+def aligner_summary(errors: pd.DataFrame, timings: pd.DataFrame, order: list[str]) -> pd.DataFrame:
+    """One row an aligner: medians over the iterations with three or more true pairs."""
+    used = errors[errors["n_true"] >= MIN_TRUE_PAIRS_SHOWN]
+    rows = []
+    for aligner in order:
+        own = used[used["aligner"] == aligner]
+        spread = own.groupby(["robot_a", "robot_b", "iteration"])["translation_error_m"]
+        time_s = timings[timings["aligner"] == aligner]["elapsed_s"]
+        rows.append(
+            {
+                "aligner": aligner,
+                "estimated_m": own["translation_error_m"].median(),
+                "estimated_rad": own["rotation_error_rad"].abs().median(),
+                "spread_m": (spread.quantile(0.9) - spread.quantile(0.1)).median(),
+                "refined_m": own["refined_translation_error_m"].median(),
+                "refined_rad": own["refined_rotation_error_rad"].abs().median(),
+                "accepted": (own["refined_status"] == "accepted").mean(),
+                "pairs": own["n_correspondences"].median(),
+                "true_share": (own["n_true"] / own["n_correspondences"]).median(),
+                "time_ms": 1e3 * time_s.median() if len(time_s) else math.nan,
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def _aligner_table(errors: pd.DataFrame, timings: pd.DataFrame, order: list[str]) -> Table:
+    columns = {
+        "estimated_m": ("estimated\n[m]", ".3f"),
+        "estimated_rad": ("\n[rad]", ".4f"),
+        "spread_m": ("10-90 %\n[m]", ".3f"),
+        "refined_m": ("refined\n[m]", ".3f"),
+        "refined_rad": ("\n[rad]", ".4f"),
+        "accepted": ("accepted\n", ".0%"),
+        "pairs": ("pairs\n", ".0f"),
+        "true_share": ("true\n", ".0%"),
+        "time_ms": ("time\n[ms]", ".2f"),
+    }
+    table = Table(
+        title="Alignment error against the truth: medians over all iterations with "
+        f"{MIN_TRUE_PAIRS_SHOWN} or more true pairs"
+    )
+    table.add_column("aligner", vertical="bottom")
+    for heading, _ in columns.values():
+        table.add_column(heading, justify="right")
+    for row in aligner_summary(errors, timings, order).to_dict("records"):
+        cells = [_number(row[name], layout) for name, (_, layout) in columns.items()]
+        table.add_row(str(row["aligner"]), *cells)
+    return table
+
+
+def _number(value: float, layout: str) -> str:
+    return "-" if math.isnan(value) else format(value, layout)
+
+
+def _robot_table(robots: pd.DataFrame) -> Table:
+    table = Table(title="Paths, RMS over all iterations")
+    for heading in ("robot", "FastSLAM [m]", "odometry [m]", "ratio", "landmarks"):
+        table.add_column(heading, justify="left" if heading == "robot" else "right")
+    for name, rows in robots.groupby("robot"):
+        path, odometry = ((rows[f"{x}_error_m"] ** 2).mean() ** 0.5 for x in ("path", "odometry"))
+        landmarks = rows["n_landmarks"].iloc[-1]
+        ratio = path / odometry if odometry else math.nan
+        table.add_row(
+            str(name), f"{path:.3f}", f"{odometry:.3f}", _number(ratio, ".2f"), str(landmarks)
+        )
+    return table
+
+
+def print_outcomes(outcomes: Sequence["Outcome"]) -> None:
+    """The table of a check."""
+    table = Table(title="Checks against the truth")
+    for heading in ("scenario", "metric", "measured", "expected", "by seed", ""):
+        table.add_column(heading, justify="right" if heading == "measured" else "left")
+    for outcome in outcomes:
+        seeds = "  ".join(f"{value:.3g}" for value in outcome.per_seed.values())
+        verdict = "[green]pass[/]" if outcome.passed else "[bold red]FAIL[/]"
+        table.add_row(
+            outcome.scenario,
+            outcome.metric,
+            f"{outcome.value:.4g}",
+            outcome.bound_text,
+            seeds,
+            verdict,
+        )
+    console = Console()
+    console.print(table)
+    failed = sum(not outcome.passed for outcome in outcomes)
+    console.print(f"{len(outcomes) - failed} passed, {failed} failed")
+
+
+def print_paths(folder: Path, paths: Sequence[Path]) -> None:
+    """Where files were written."""
+    Console().print(f"{len(paths)} written to {folder}", soft_wrap=True)
+
+
+def print_map(path: Path, landmarks: "LandmarkMap") -> None:
+    """What a map holds and where it is."""
+    Console().print(f"{len(landmarks)} landmarks of {landmarks.name} in {path}", soft_wrap=True)
+
+
+def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
+    """Estimates of all aligners on two maps."""
+    table = Table(title="T_a_b, as estimated and refined")
+    headings = ("aligner", "status", "tx [m]", "ty [m]", "theta [rad]")
+    headings += ("refined tx", "ty", "theta", "inliers", "time [ms]")
+    for heading in headings:
+        table.add_column(heading, justify="left" if heading in {"aligner", "status"} else "right")
+    for row in rows:
+        reason = row["reason"] or row["refined_reason"]
+        table.add_row(
+            row["aligner"],
+            row["refined_status"] + (f": {reason}" if reason else ""),
+            *(_number(row[name], ".3f") for name in ("tx_m", "ty_m")),
+            _number(row["theta_rad"], ".4f"),
+            *(_number(row[f"refined_{name}"], ".3f") for name in ("tx_m", "ty_m")),
+            _number(row["refined_theta_rad"], ".4f"),
+            f"{row['n_inliers']}/{row['n_correspondences']}",
+            f"{1e3 * row['elapsed_s']:.2f}",
+        )
+    Console().print(table)
+
+
+def print_fused(path: Path, fused: "FusedMap", names: Sequence[str]) -> None:
+    """What a fused map was made of."""
+    console = Console()
+    several = int(((fused.parents >= 0).sum(axis=1) > 1).sum())
+    console.print(
+        f"{len(fused.landmarks)} landmarks in {path}, {several} of them fused from several maps; "
+        f"{fused.duplicate_share:.1%} look like duplicates that remain",
+        soft_wrap=True,
+    )
+    for name, motion in zip(names, fused.T_first_map, strict=True):
+        if not math.isnan(motion[0]):
+            text = f"({motion[0]:.3f} m, {motion[1]:.3f} m, {motion[2]:.4f} rad)"
+            console.print(f"  {name}: T_first_map = {text}")
+    for name, reason in fused.left_out:
+        console.print(f"  {name}: left out, its alignment was not accepted ({reason})")

@@ -1,0 +1,191 @@
+"""Stage: all aligners on the correspondences of one robot pair, at each evaluated iteration."""
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from experiments import tables
+from experiments.randomness import generator
+from experiments.scenario import Align, Scenario
+from experiments.stages.slam import read_snapshots
+from experiments.store import StageFolder, Store
+from mapfusion.align.correspondences import Correspondences, match
+from mapfusion.align.registry import make_aligner
+from mapfusion.align.result import Alignment, Status
+from mapfusion.landmark_map import LandmarkMap
+from mapfusion.robot_log import read_log
+
+SOURCES = (
+    "mapfusion/align",
+    "mapfusion/landmark_map.py",
+    "mapfusion/storage.py",
+    "mapfusion/se2.py",
+)
+SOURCES += ("experiments/stages/align.py", "experiments/tables.py", "experiments/randomness.py")
+
+# Evaluated iterations a task: small enough that an interruption loses little and two cores end
+# at about the same time, large enough that reading the maps costs little beside aligning them.
+ITERATIONS_PER_BATCH = 12
+_COVARIANCE_COLUMNS = ("cov_xx", "cov_xy", "cov_xt", "cov_yy", "cov_yt", "cov_tt")
+
+
+def stage(
+    store: Store, scenario: Scenario, slam_a: StageFolder, slam_b: StageFolder
+) -> StageFolder:
+    """Where the estimates of this pair of robots are or will be."""
+    settings = {"seed": scenario.seed, "align": scenario.align.model_dump(mode="json")}
+    return store.stage("align", settings, [slam_a, slam_b], SOURCES)
+
+
+def batches(iterations: list[int]) -> list[list[int]]:
+    """Evaluated iterations shared out into tasks."""
+    starts = range(0, len(iterations), ITERATIONS_PER_BATCH)
+    return [iterations[start : start + ITERATIONS_PER_BATCH] for start in starts]
+
+
+def run_batch(
+    scenario: Scenario,
+    robots: tuple[tuple[Path, Path], tuple[Path, Path]],
+    output: StageFolder,
+    index: int,
+    iterations: list[int],
+) -> None:
+    """Align at some iterations; `robots` are the (log, slam) folders of both.
+
+    A batch that is already on disk is kept: an interrupted run goes on after it.
+    """
+    estimates_path, correspondences_path = _batch_paths(output, index)
+    if estimates_path.is_file() and correspondences_path.is_file():
+        return
+    maps = []
+    for log_folder, slam_folder in robots:
+        maps.append(read_snapshots(slam_folder, read_log(log_folder)))
+    estimates: list[dict[str, Any]] = []
+    offered: list[pd.DataFrame] = []
+    for iteration in iterations:
+        map_a, map_b = map_at(maps[0], iteration), map_at(maps[1], iteration)
+        pairs = match(map_a, map_b, scenario.align.match)
+        names = {"robot_a": map_a.name, "robot_b": map_b.name, "iteration": iteration}
+        offered.append(_offered(names, pairs))
+        estimates += [
+            names | row
+            for row in _estimate(scenario.align, map_a, map_b, pairs, scenario.seed, iteration)
+        ]
+    tables.write(correspondences_path, "correspondences", pd.concat(offered))
+    tables.write(estimates_path, "estimates", estimates)
+
+
+def _batch_paths(output: StageFolder, index: int) -> tuple[Path, Path]:
+    return (
+        output.path / f"estimates_{index:03d}.parquet",
+        output.path / f"correspondences_{index:03d}.parquet",
+    )
+
+
+def map_at(maps: dict[int, LandmarkMap], iteration: int) -> LandmarkMap:
+    """A robot's map at an iteration; a robot whose log ended earlier keeps its last map."""
+    return maps[max((k for k in maps if k <= iteration), default=min(maps))]
+
+
+def _offered(names: dict[str, Any], pairs: Correspondences) -> pd.DataFrame:
+    return pd.DataFrame(
+        {
+            **names,
+            "index_a": pairs.index_a,
+            "index_b": pairs.index_b,
+            "descriptor_distance": pairs.distance,
+        }
+    )
+
+
+def _estimate(
+    align: Align,
+    map_a: LandmarkMap,
+    map_b: LandmarkMap,
+    pairs: Correspondences,
+    seed: int,
+    iteration: int,
+) -> list[dict[str, Any]]:
+    rows = []
+    for entry in align.aligners:
+        aligner = make_aligner(entry.method, **entry.parameters)
+        for repetition in range(align.repetitions):
+            rng = generator(
+                seed, "align", map_a.name, map_b.name, iteration, entry.name, repetition
+            )
+            estimated = aligner.align(map_a, map_b, pairs, rng)
+            refined = align.refinement.refine(map_a, map_b, pairs, estimated.T_a_b)
+            rows.append(
+                {"aligner": entry.name, "repetition": repetition}
+                | estimate_row(len(pairs), estimated, refined)
+            )
+    return rows
+
+
+def estimate_row(
+    n_correspondences: int, estimated: Alignment, refined: Alignment
+) -> dict[str, Any]:
+    """One estimate and its refinement as columns of the table `estimates`."""
+    upper = refined.covariance[np.triu_indices(3)]
+    return {
+        "n_correspondences": n_correspondences,
+        "status": str(estimated.status),
+        "reason": estimated.reason,
+        "tx_m": estimated.T_a_b[0],
+        "ty_m": estimated.T_a_b[1],
+        "theta_rad": estimated.T_a_b[2],
+        "refined_status": str(refined.status),
+        "refined_reason": refined.reason,
+        "refined_tx_m": refined.T_a_b[0],
+        "refined_ty_m": refined.T_a_b[1],
+        "refined_theta_rad": refined.T_a_b[2],
+        "drift_sigma_m": refined.drift_sigma_m,
+        **dict(zip(_COVARIANCE_COLUMNS, upper, strict=True)),
+        "inliers": np.packbits(estimated.inlier).tobytes(),
+        "refined_inliers": np.packbits(refined.inlier).tobytes(),
+    }
+
+
+def inlier_mask(bits: bytes, n_correspondences: int) -> np.ndarray:
+    """The mask (n,) that `estimate_row` packed."""
+    return np.unpackbits(np.frombuffer(bits, np.uint8), count=n_correspondences).astype(bool)
+
+
+def alignment_of(row: Mapping[Any, Any], n_correspondences: int) -> Alignment:
+    """The refined alignment that a row of the table `estimates` tells of."""
+    covariance = np.empty((3, 3))
+    covariance[np.triu_indices(3)] = [row[name] for name in _COVARIANCE_COLUMNS]
+    covariance.T[np.triu_indices(3)] = covariance[np.triu_indices(3)]
+    return Alignment(
+        np.array([row["refined_tx_m"], row["refined_ty_m"], row["refined_theta_rad"]]),
+        covariance,
+        inlier_mask(row["refined_inliers"], n_correspondences),
+        np.nan,
+        Status(row["refined_status"]),
+        row["refined_reason"],
+        row["drift_sigma_m"],
+    )
+
+
+def correspondences_of(rows: pd.DataFrame) -> Correspondences:
+    """The correspondences that rows of one pair and iteration hold."""
+    return Correspondences(
+        rows["index_a"].to_numpy(dtype=np.int64),
+        rows["index_b"].to_numpy(dtype=np.int64),
+        rows["descriptor_distance"].to_numpy(dtype=np.float64),
+    )
+
+
+def finish(output: StageFolder, n_batches: int, started: float) -> None:
+    """Join the batches in order and mark the stage as finished."""
+    for column, name in enumerate(("estimates", "correspondences")):
+        paths = [_batch_paths(output, index)[column] for index in range(n_batches)]
+        joined = pd.concat([tables.read(path, name) for path in paths], ignore_index=True)
+        tables.write(output.path / f"{name}.parquet", name, joined)
+        for path in paths:
+            path.unlink()
+    output.finish(elapsed_s=time.perf_counter() - started)

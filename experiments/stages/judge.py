@@ -1,0 +1,63 @@
+"""Stage: one robot pair's estimates against the truth, and whether fusing the pair was worth it."""
+
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+from experiments import tables
+from experiments.evaluate import EvaluatedRobot, error_rows
+from experiments.fusion import fusion_rows
+from experiments.scenario import Scenario
+from experiments.stages.slam import read_associations, read_snapshots
+from experiments.store import StageFolder, Store
+from experiments.truth import PathTruth, landmark_truth
+from mapfusion.robot_log import read_log, read_truth
+
+SOURCES = ("mapfusion", "experiments/stages/judge.py", "experiments/evaluate.py")
+SOURCES += ("experiments/fusion.py", "experiments/truth.py", "experiments/tables.py")
+
+
+class RobotFolders(NamedTuple):
+    """Where a robot's log (with its truth) and its SLAM result lie."""
+
+    log: Path
+    slam: Path
+
+
+def load_robot(folders: RobotFolders) -> EvaluatedRobot:
+    """A robot's maps joined with the truth."""
+    log, truth = read_log(folders.log), read_truth(folders.log)
+    maps = read_snapshots(folders.slam, log)
+    points = landmark_truth(truth, read_associations(folders.slam), maps)
+    return EvaluatedRobot(log.robot, maps, points, PathTruth.of(truth))
+
+
+def stage(
+    store: Store, scenario: Scenario, align: StageFolder, slams: list[StageFolder]
+) -> StageFolder:
+    """Where this pair's errors are or will be."""
+    resolved = scenario.resolved()
+    settings = {
+        "refinement": resolved["align"]["refinement"],
+        "merge": resolved["merge"],
+        "radius_m": scenario.evaluate.true_pair_radius_m,
+    }
+    return store.stage("judge", settings, [align, *slams], SOURCES)
+
+
+def run(
+    scenario: Scenario, a: RobotFolders, b: RobotFolders, align: StageFolder, output: StageFolder
+) -> None:
+    """Write the pair's `errors.parquet` and `fusion.parquet`."""
+    started = time.perf_counter()
+    robot_a, robot_b = load_robot(a), load_robot(b)
+    estimates = tables.read(align.path / "estimates.parquet", "estimates")
+    correspondences = tables.read(align.path / "correspondences.parquet", "correspondences")
+    radius_m = scenario.evaluate.true_pair_radius_m
+    errors = error_rows(
+        robot_a, robot_b, estimates, correspondences, scenario.align.refinement, radius_m
+    )
+    tables.write(output.path / "errors.parquet", "errors", errors)
+    fusion = fusion_rows(robot_a, robot_b, estimates, correspondences, scenario.merge, radius_m)
+    tables.write(output.path / "fusion.parquet", "fusion", fusion)
+    output.finish(elapsed_s=time.perf_counter() - started)

@@ -1,0 +1,58 @@
+"""How long each aligner takes: serial, warmed, repeated (figure 6)."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments import tables
+from experiments.evaluate import EvaluatedRobot
+from experiments.randomness import generator
+from experiments.scenario import Scenario
+from experiments.truth import common_landmarks
+from mapfusion.align.correspondences import match
+from mapfusion.align.registry import make_aligner
+
+_WARM_UP_RUNS = 1  # compilation and caches
+
+
+def time_aligners(scenario: Scenario, robots: list[EvaluatedRobot], folder: Path) -> None:
+    """Time every aligner on maps of growing overlap and write the table `aligner_timings`."""
+    rows: list[dict[str, Any]] = []
+    for first in range(len(robots)):
+        for second in range(first + 1, len(robots)):
+            rows += _time_pair(scenario, robots[first], robots[second])
+    tables.write(tables.table_path(folder, "aligner_timings"), "aligner_timings", rows)
+
+
+def _time_pair(scenario: Scenario, a: EvaluatedRobot, b: EvaluatedRobot) -> list[dict[str, Any]]:
+    iterations = sorted(set(a.maps) | set(b.maps))
+    spread = np.linspace(0, len(iterations) - 1, scenario.evaluate.timing_points)
+    rows = []
+    for iteration in (iterations[i] for i in sorted(set(spread.round().astype(int).tolist()))):
+        (map_a, points_a), (map_b, points_b) = a.at(iteration), b.at(iteration)
+        pairs = match(map_a, map_b, scenario.align.match)
+        n_common = common_landmarks(points_a, points_b, scenario.evaluate.true_pair_radius_m)
+        for entry in scenario.align.aligners:
+            aligner = make_aligner(entry.method, **entry.parameters)
+            elapsed = [
+                aligner.align(
+                    map_a, map_b, pairs, generator(scenario.seed, "timing", entry.name, repeat)
+                ).elapsed_s
+                for repeat in range(_WARM_UP_RUNS + scenario.evaluate.timing_repeats)
+            ][_WARM_UP_RUNS:]
+            low, median, high = np.percentile(elapsed, [10, 50, 90])
+            rows.append(
+                {
+                    "robot_a": a.name,
+                    "robot_b": b.name,
+                    "iteration": iteration,
+                    "aligner": entry.name,
+                    "n_correspondences": len(pairs),
+                    "n_common": n_common,
+                    "elapsed_s": median,
+                    "elapsed_low_s": low,
+                    "elapsed_high_s": high,
+                }
+            )
+    return rows

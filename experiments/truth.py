@@ -1,0 +1,96 @@
+"""The truth joined to estimates. Only the evaluation imports this; no estimator does."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from scipy.spatial import KDTree
+
+from mapfusion import se2
+from mapfusion.align.rigid import fit_rigid
+from mapfusion.landmark_map import LandmarkMap
+from mapfusion.robot_log import RobotTruth
+from mapfusion.se2 import Float
+
+
+def landmark_truth(
+    truth: RobotTruth, associations: pd.DataFrame, maps: dict[int, LandmarkMap]
+) -> dict[int, Float]:
+    """The true world point (N, 3) of each landmark of each evaluated map; NaN where unknown.
+
+    It is the median of the true points of all observations that went into the landmark.
+
+    Args:
+        truth: of the robot that built the maps.
+        associations: changes by iteration, as the SLAM stage lists them.
+        maps: by iteration.
+    """
+    owner = np.full(len(truth.point_world_m), -1, dtype=np.int64)
+    changes = dict(associations.groupby("from_iteration"))
+    points = {}
+    for iteration in sorted(maps):
+        if iteration in changes:
+            rows = changes[iteration]
+            owner[rows["observation"].to_numpy()] = rows["source_observation"].to_numpy()
+        points[iteration] = _medians(owner, truth.point_world_m, maps[iteration].source_observation)
+    return points
+
+
+def _medians(owner: np.ndarray, point_world_m: Float, landmarks: np.ndarray) -> Float:
+    known = (owner >= 0) & np.isfinite(point_world_m).all(axis=1)
+    medians = pd.DataFrame(point_world_m[known]).groupby(owner[known]).median()
+    return medians.reindex(landmarks).to_numpy(dtype=np.float64)
+
+
+def true_pairs(
+    points_a: Float, points_b: Float, index_a: np.ndarray, index_b: np.ndarray, radius_m: float
+) -> np.ndarray:
+    """(N,) bool: index pairs whose true points lie within the radius; unknown points never do."""
+    distance = np.linalg.norm(points_a[index_a] - points_b[index_b], axis=1)
+    return distance <= radius_m  # False for NaN
+
+
+def common_landmarks(points_a: Float, points_b: Float, radius_m: float) -> int:
+    """How many landmarks of two maps truly correspond: mutual nearest true points within radius."""
+    known_a = points_a[np.isfinite(points_a).all(axis=1)]
+    known_b = points_b[np.isfinite(points_b).all(axis=1)]
+    if not len(known_a) or not len(known_b):
+        return 0
+    distance, nearest_b = KDTree(known_b).query(known_a)
+    _, nearest_a = KDTree(known_a).query(known_b)
+    mutual = np.asarray(nearest_a)[nearest_b] == np.arange(len(known_a))
+    return int(np.sum(mutual & (distance <= radius_m)))
+
+
+@dataclass(frozen=True)
+class PathTruth:
+    """True poses (T, 3) of a robot in its own map frame, which is its pose at the first frame."""
+
+    T_map_robot: Float
+    T_world_map: Float
+
+    @classmethod
+    def of(cls, truth: RobotTruth) -> "PathTruth":
+        """From poses in the world; the first known pose is taken for the start.
+
+        Recordings may begin a moment before their truth does; the robots stand still by then.
+        """
+        start = first_known_pose(truth)
+        return cls(se2.between(start, truth.T_world_robot), start)
+
+
+def first_known_pose(truth: RobotTruth) -> Float:
+    """T_world_map (3,): the first pose that is known."""
+    known = np.isfinite(truth.T_world_robot).all(axis=1)
+    return truth.T_world_robot[int(np.argmax(known))]
+
+
+def fit_rmse_m(position_m: Float, point_world_m: Float) -> tuple[int, float]:
+    """How many landmarks have a known truth, and their RMSE after the best rigid fit to it."""
+    known = np.isfinite(point_world_m).all(axis=1)
+    if known.sum() < 2:
+        return int(known.sum()), np.nan
+    points, target = position_m[known], point_world_m[known]
+    T_world_map = np.array(fit_rigid(target, points, np.arange(len(points))))
+    residual = se2.transform_points(T_world_map, points) - target
+    return int(known.sum()), float(np.sqrt(np.mean(np.sum(residual**2, axis=1))))
