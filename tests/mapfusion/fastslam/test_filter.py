@@ -8,6 +8,7 @@ from copying_filter import CopyingFilter
 from landmark_worlds import drive, nothing, observe, unit
 
 from mapfusion.fastslam.filter import FastSlam, FastSlamParameters
+from mapfusion.fastslam.genealogy import MEMORY
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.robot_log import Observations
 from mapfusion.se2 import compose, inverse, rotation_about_z, transform_points, wrap
@@ -46,9 +47,10 @@ def assert_same(slam: FastSlam, result, twin: CopyingFilter, planar: bool) -> No
 @pytest.mark.parametrize("planar", [False, True])
 @pytest.mark.parametrize("resample_fraction", [0.0, 0.5, 1.0])
 def test_equals_the_filter_that_copies(association, planar, resample_fraction):
-    # Landmarks 0 and 1 look alike, and a tight gate makes particles disagree about the rest.
-    world = drive(7, planar=planar)
+    # A tight gate makes particles disagree about what they see.
+    world = drive(7, planar=planar, n_landmarks=8, n_frames=20, per_frame=4)
     settings = parameters(
+        n_particles=8,
         association=association,
         planar=planar,
         resample_fraction=resample_fraction,
@@ -71,7 +73,7 @@ def test_equals_the_filter_that_copies(association, planar, resample_fraction):
         assert max(n_sizes) > len(world.landmarks), "no particle ever started a second landmark"
 
 
-def test_equals_the_filter_that_copies_longer_than_the_genealogy_remembers(monkeypatch):
+def test_equals_the_filter_that_copies_longer_than_the_genealogy_remembers():
     # A landmark seen at the start, then not for several rounds of refreshing, then again.
     world = drive(3, n_landmarks=4, per_frame=4, n_frames=2)
     settings = parameters(n_particles=4, association="label", resample_fraction=1.0)
@@ -82,7 +84,7 @@ def test_equals_the_filter_that_copies_longer_than_the_genealogy_remembers(monke
     for odometry, frame in zip(world.odometry, world.frames, strict=True):
         slam.step(odometry, frame)
         twin.step(odometry, frame)
-    for _ in range(3 * 256 + 17):
+    for _ in range(3 * MEMORY + 17):
         slam.step(np.zeros(3), nothing())
         twin.step(np.zeros(3), nothing())
     frame = observe(pose, world.landmarks, world.descriptor, np.arange(4), rng)
@@ -222,9 +224,7 @@ def test_one_landmark_takes_one_observation_a_frame():
 def test_a_known_label_outside_the_gate_is_dropped():
     label = np.array([3], dtype=np.int32)
     R = 1e-4 * np.eye(3)[None]
-    slam = FastSlam(
-        parameters(motion=EXACT_MOTION, association="label"), np.random.default_rng(0)
-    )
+    slam = FastSlam(parameters(motion=EXACT_MOTION, association="label"), np.random.default_rng(0))
     slam.step(np.zeros(3), Observations(np.array([[1.0, 0, 0]]), R, label=label))
     slam.step(np.zeros(3), Observations(np.array([[1.5, 0, 0]]), R, label=label))
     landmarks = slam.best_map()

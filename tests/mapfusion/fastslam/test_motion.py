@@ -1,0 +1,59 @@
+import numpy as np
+import pytest
+
+from mapfusion.fastslam.motion import MotionNoise, sample_motion
+from mapfusion.se2 import between, compose
+
+NOISE = MotionNoise(0.02, 0.01, 0.03, 0.05, 0.04, horizon_m=4.0, horizon_rad=2.0)
+
+
+def test_spread_is_the_stated_one():
+    n = 40_000
+    start = np.tile([3.0, -1.0, 3.0], (n, 1))  # the heading is near pi: samples wrap
+    odometry = np.array([0.3, 0.4, -0.6])
+    poses = sample_motion(start, odometry, NOISE, np.random.default_rng(0))
+    moved = between(start, poses) - odometry
+    along = 0.02**2 * 0.5 + 0.05**2 * 4.0 * 0.5
+    heading = 0.01**2 * 0.5 + (0.03**2 + 0.04**2 * 2.0) * 0.6
+    expected = np.sqrt([along, along, heading])
+    # A standard deviation from n samples scatters by 1 / sqrt(2 n); five of these.
+    np.testing.assert_allclose(moved.std(axis=0), expected, rtol=5 / np.sqrt(2 * n))
+    assert np.all(np.abs(moved.mean(axis=0)) < 5 * expected / np.sqrt(n))
+    assert np.all(np.abs(poses[:, 2]) <= np.pi)
+
+
+def test_many_short_steps_spread_as_one_long():
+    long = NOISE.standard_deviations(np.array([0.6, 0.0, 0.9]))
+    short = NOISE.standard_deviations(np.array([0.06, 0.0, 0.09]))
+    np.testing.assert_allclose(long, np.sqrt(10) * short)
+
+
+@pytest.mark.parametrize("relative_error", [0.02, 0.1])
+def test_covers_a_systematic_error_at_the_horizon(relative_error):
+    noise = MotionNoise(0, 0, 0, relative_error, relative_error, horizon_m=5, horizon_rad=3)
+    sigma = noise.standard_deviations(np.array([5.0, 0.0, 3.0]))
+    np.testing.assert_allclose(sigma, [5 * relative_error, 5 * relative_error, 3 * relative_error])
+
+
+def test_standing_still_adds_only_the_floor():
+    start = np.tile([1.0, 2.0, 0.5], (10, 1))
+    rng = np.random.default_rng(0)
+    np.testing.assert_allclose(sample_motion(start, np.zeros(3), NOISE, rng), start, atol=1e-15)
+    pushed = MotionNoise(floor_m=0.1, floor_rad=0.2)
+    np.testing.assert_array_equal(pushed.standard_deviations(np.zeros(3)), [0.1, 0.1, 0.2])
+
+
+def test_without_noise_it_is_the_odometry():
+    rng = np.random.default_rng(1)
+    start, odometry = rng.normal(size=(20, 3)), rng.normal(size=3)
+    exact = MotionNoise(0, 0, 0, 0, 0)
+    np.testing.assert_allclose(
+        sample_motion(start, odometry, exact, rng), compose(start, odometry), atol=1e-15
+    )
+
+
+@pytest.mark.parametrize("name", ["scale_error", "floor_m", "horizon_rad"])
+def test_wrong_values_are_named(name):
+    for value in (-1.0, np.nan):
+        with pytest.raises(ValueError, match=name):
+            MotionNoise(**{name: value})
