@@ -1,0 +1,126 @@
+"""Time of one filter step, with a resampling forced in every step.
+
+The robot drives laps on a ring road with landmarks on both sides. The first lap fills the map, the
+next one is measured: each frame shows other landmarks than the one before, the way a camera does,
+and landmarks come into view that were not touched for hundreds of resamplings.
+"""
+
+import tracemalloc
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from mapfusion.fastslam.filter import FastSlam, FastSlamParameters
+from mapfusion.fastslam.motion import MotionNoise
+from mapfusion.robot_log import Observations
+from mapfusion.se2 import compose, inverse, transform_points
+
+SIGMA_M = 0.05
+ROAD_M = 6.0  # landmarks stand up to half of this to the left and to the right
+LANDMARKS_PER_M = 4.0
+MOTION = MotionNoise(0.01, 0.001, 0.01, 0, 0)
+MEASURED_STEPS = 300
+MIB = 2**20
+
+
+class RingRoad:
+    """Frames of a robot that drives round and round; a frame shows the next landmarks ahead."""
+
+    def __init__(self, n_landmarks: int, per_frame: int) -> None:
+        rng = np.random.default_rng(0)
+        self.rng, self.per_frame, self.n_landmarks = rng, per_frame, n_landmarks
+        length_m = n_landmarks / LANDMARKS_PER_M
+        self.radius_m = length_m / (2 * np.pi)
+        self.angle = np.sort(rng.uniform(0, 2 * np.pi, n_landmarks))
+        radius = self.radius_m + rng.uniform(-ROAD_M / 2, ROAD_M / 2, n_landmarks)
+        self.point = np.stack(
+            [
+                radius * np.sin(self.angle),
+                self.radius_m - radius * np.cos(self.angle),
+                rng.uniform(0, 2, n_landmarks),
+            ],
+            -1,
+        )
+        descriptor = rng.standard_normal((n_landmarks, 64))
+        self.descriptor = descriptor / np.linalg.norm(descriptor, axis=1, keepdims=True)
+        # A fifth of the view is new in each frame.
+        self.step_rad = 2 * np.pi * per_frame / (5 * n_landmarks)
+        self.frames_a_lap = 5 * n_landmarks // per_frame + 1
+
+    def frames(self) -> Iterator[tuple[np.ndarray, Observations]]:
+        motion = np.array(
+            [
+                self.radius_m * np.sin(self.step_rad),
+                self.radius_m * (1 - np.cos(self.step_rad)),
+                self.step_rad,
+            ]
+        )
+        pose, ahead = np.zeros(3), 0.0
+        covariance = np.tile(SIGMA_M**2 * np.eye(3), (self.per_frame, 1, 1))
+        while True:
+            first = np.searchsorted(self.angle, ahead % (2 * np.pi))
+            rows = (first + np.arange(self.per_frame)) % self.n_landmarks
+            position = transform_points(inverse(pose), self.point[rows])
+            position += self.rng.normal(0, SIGMA_M, position.shape)
+            noisy = self.descriptor[rows] + self.rng.normal(0, 0.03, (self.per_frame, 64))
+            noisy /= np.linalg.norm(noisy, axis=1, keepdims=True)
+            noise = self.rng.standard_normal(3) * MOTION.standard_deviations(motion)
+            yield (
+                motion + noise if ahead else np.zeros(3),
+                Observations(position, covariance, noisy.astype(np.float32), rows.astype(np.int32)),
+            )
+            pose, ahead = compose(pose, motion), ahead + self.step_rad
+
+
+def mapped(
+    association: str, n_landmarks: int, per_frame: int
+) -> tuple[FastSlam, Iterator[tuple[np.ndarray, Observations]]]:
+    """A filter after its first lap, and the frames that follow."""
+    road = RingRoad(n_landmarks, per_frame)
+    settings = FastSlamParameters(motion=MOTION, association=association, resample_fraction=1.0)
+    slam, frames = FastSlam(settings, np.random.default_rng(1)), road.frames()
+    for _ in range(road.frames_a_lap):
+        slam.step(*next(frames))
+    return slam, frames
+
+
+@pytest.mark.parametrize(
+    ("association", "n_landmarks", "per_frame"),
+    [
+        ("label", 1_000, 20),
+        ("label", 10_000, 20),
+        ("descriptor", 1_500, 40),
+        ("descriptor", 10_000, 40),
+        ("gate", 1_500, 40),
+    ],
+)
+def test_step(benchmark, association, n_landmarks, per_frame):
+    slam, frames = mapped(association, n_landmarks, per_frame)
+
+    def next_frame():
+        return next(frames), {}
+
+    result = benchmark.pedantic(slam.step, setup=next_frame, rounds=MEASURED_STEPS)
+    assert result.resampled
+    assert result.n_landmarks >= 0.95 * n_landmarks
+    percentile_ms = 1e3 * np.percentile(benchmark.stats.stats.data, 95)
+    benchmark.extra_info["p95_ms"] = round(float(percentile_ms), 3)
+    benchmark.extra_info["landmarks"] = result.n_landmarks
+    print(f"\n{association} {n_landmarks}: p95 {percentile_ms:.2f} ms, {result.n_landmarks} mapped")
+
+
+def test_peak_memory_with_10_000_landmarks(benchmark):
+    def peak_bytes() -> int:
+        tracemalloc.start()
+        try:
+            slam, _ = mapped("label", 10_000, 20)
+            assert len(slam.best_map(min_count=1)) >= 9_900
+            return tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+    peak = benchmark.pedantic(peak_bytes, rounds=1)
+    benchmark.extra_info["peak_mib"] = round(peak / MIB, 1)
+    print(f"\npeak memory with 10 000 landmarks: {peak / MIB:.0f} MiB")
+    assert peak < 1024 * MIB
