@@ -10,6 +10,7 @@ from mapfusion.errors import InputError
 from mapfusion.se2 import Float
 
 SHARPEST_CORNER_RAD = np.radians(30)  # below it the mitred outer edge runs off towards infinity
+BURIED_M = 0.001  # deeper in a wall than rounding puts a wall's own surface
 
 
 @dataclass(frozen=True)
@@ -128,7 +129,10 @@ class FloorPlan:
         return starts, ends, thickness, height
 
     def clearance_m(self, points: ArrayLike) -> Float:
-        """Room (N,) between points (N, 2) and the nearest wall; negative inside a wall."""
+        """Room (N,) between points (N, 2) and the nearest wall; negative inside a wall.
+
+        A wall's free end counts as rounded, so that little less room is reported than there is.
+        """
         points = np.asarray(points, dtype=np.float64)
         starts, ends, thickness, _ = self.segments()
         distance = _point_segment_distance(points[:, None], starts[None], ends[None])
@@ -173,14 +177,12 @@ class FloorPlan:
         # seen from the left side the wall runs from right to left
         edges = [(left[i + 1], left[i]) for i in range(len(left) - 1)]
         edges += [(right[i], right[i + 1]) for i in range(len(right) - 1)]
+        # a face beyond the floor's edge shows to nobody, nor does an end buried in another wall
+        edges = [edge for edge in edges if np.all(self.contains(np.stack(edge)))]
         if not wall.closed:
-            edges += [(left[0], right[0]), (right[-1], left[-1])]
-        # a face beyond the floor's edge shows to nobody
-        return [
-            _upright(start, end, wall.height_m)
-            for start, end in edges
-            if np.all(self.contains(np.stack([start, end])))
-        ]
+            ends = [(left[0], right[0]), (right[-1], left[-1])]
+            edges += [end for end in ends if np.any(self.clearance_m(np.stack(end)) > -BURIED_M)]
+        return [_upright(start, end, wall.height_m) for start, end in edges]
 
 
 def _upright(start: Float, end: Float, height_m: float) -> Face:

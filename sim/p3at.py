@@ -24,6 +24,7 @@ CENTER_OF_MASS_M = 0.1735  # of the body without wheels, above the floor
 # (v - w t / 2 along, w l / 2 across), and its moment vanishes where v = w (t / 2 + l^2 / (2 t)).
 # So the wheels act as if they stood this far apart (the maker's parameter files: 0.588 m).
 SKID_TRACK_M = TRACK_M + WHEELBASE_M**2 / TRACK_M
+BODY_B, NORMAL_FORCE = 2, 9  # fields of PyBullet's contact points
 WHEELS = ("front_left_wheel", "rear_left_wheel", "front_right_wheel", "rear_right_wheel")
 
 
@@ -103,6 +104,7 @@ class P3at:
         return np.array([angles[:2].mean(), angles[2:].mean()])
 
     def touched_bodies(self) -> set[int]:
-        """Ids of all bodies in contact with it."""
+        """Ids of all bodies that press against it."""
         contacts = self._p.getContactPoints(bodyA=self.body, physicsClientId=self._client)
-        return {contact[2] for contact in contacts} - {self.body}
+        pressing = (contact for contact in contacts if contact[NORMAL_FORCE] > 0)
+        return {contact[BODY_B] for contact in pressing} - {self.body}

@@ -11,7 +11,8 @@ from mapfusion.se2 import Float, compose
 from sim.world import World
 
 NEAR_M = 0.1  # nearer than any wall can come to the lens
-FAR_M = 60.0  # beyond the largest building's diagonal
+FAR_M = 100.0  # beyond the largest building's diagonal
+BACKGROUND_M = 0.99 * FAR_M  # an untouched depth buffer is not exactly 1
 
 
 @dataclass(frozen=True)
@@ -121,5 +122,5 @@ def _projection_matrix(camera: StereoCamera) -> list[float]:
 
 def _metric_depth(buffer: np.ndarray) -> np.ndarray:
     depth = FAR_M * NEAR_M / (FAR_M - (FAR_M - NEAR_M) * buffer.astype(np.float64))
-    depth[buffer >= 1] = np.nan
+    depth[depth > BACKGROUND_M] = np.nan
     return depth.astype(np.float32)

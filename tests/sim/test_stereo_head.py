@@ -1,0 +1,157 @@
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mapfusion.camera import StereoCamera
+from mapfusion.se2 import transform_points
+from sim.floorplan import Face, FloorPlan
+from sim.stereo_head import RadiometricNoise, StereoFrame, render_stereo
+from sim.world import World
+
+CAMERA = StereoCamera()
+NO_NOISE = RadiometricNoise(0, 0, 0)
+POSE = np.array([1.2, 2.1, -0.35])  # sees two walls, the stub, floor and ceiling
+
+
+def ray_cast(
+    room: FloorPlan, folder: Path, y_m: float, shift_px: tuple[float, float] = (0, 0)
+) -> np.ndarray:
+    """RGB of the texel that each pixel's ray hits: pinhole geometry written out by hand."""
+    v, u = np.mgrid[: CAMERA.height_px, : CAMERA.width_px].astype(float)
+    x, y, theta = POSE
+    forward = np.array([np.cos(theta), np.sin(theta), 0])
+    left, up = np.array([-np.sin(theta), np.cos(theta), 0]), np.array([0, 0, 1.0])
+    to_left = (319.5 - u - shift_px[0]) / 577
+    to_up = (239.5 - v - shift_px[1]) / 577
+    ray = forward + to_left[..., None] * left + to_up[..., None] * up
+    eye = np.array([x, y, 0]) + CAMERA.mount_x_m * forward + y_m * left + CAMERA.mount_z_m * up
+    nearest = np.full(u.shape, np.inf)
+    picture = np.zeros((*u.shape, 3), dtype=np.uint8)
+    for i, face in enumerate(room.faces()):
+        texture = cv2.imread(str(folder / f"face_{i:04d}.png"))[::-1, :, ::-1]
+        height, width = texture.shape[:2]
+        distance, right, upward = hit(face, eye, ray)
+        seen = (distance > 0) & (distance < nearest)
+        seen &= (right >= 0) & (right < 1) & (upward >= 0) & (upward < 1)
+        nearest[seen] = distance[seen]
+        row, column = (upward[seen] * height).astype(int), (right[seen] * width).astype(int)
+        picture[seen] = texture[row, column]
+    return picture
+
+
+def hit(face: Face, eye: np.ndarray, ray: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Depth of the hit, and its place along the face's edges in 0..1; -1 from behind."""
+    corner, right, up = face.corners_m[0], *(face.corners_m[[1, 3]] - face.corners_m[0])
+    normal = np.cross(right, up)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = np.where(ray @ normal < 0, ((corner - eye) @ normal) / (ray @ normal), -1.0)
+    point = eye + distance[..., None] * ray - corner
+    return distance, point @ right / (right @ right), point @ up / (up @ up)
+
+
+@pytest.fixture(scope="module")
+def frame(faces: Path) -> StereoFrame:
+    with World() as world:
+        world.add_painted_faces(faces)
+        return render_stereo(world, CAMERA, POSE, NO_NOISE, np.random.default_rng(0))
+
+
+def test_left_image_is_that_of_an_exact_pinhole(
+    room: FloorPlan, faces: Path, frame: StereoFrame
+) -> None:
+    same = np.all(frame.left_rgb == ray_cast(room, faces, CAMERA.baseline_m / 2), axis=-1)
+    assert same.mean() > 0.999
+
+
+@pytest.mark.parametrize("shift_px", [(0.1, 0), (-0.1, 0), (0, 0.1), (0, -0.1)])
+def test_a_tenth_of_a_pixel_would_show(
+    room: FloorPlan, faces: Path, frame: StereoFrame, shift_px: tuple[float, float]
+) -> None:
+    shifted = ray_cast(room, faces, CAMERA.baseline_m / 2, shift_px)
+    assert np.all(frame.left_rgb == shifted, axis=-1).mean() < 0.98
+
+
+def test_right_image_is_seen_a_baseline_further_right(
+    room: FloorPlan, faces: Path, frame: StereoFrame
+) -> None:
+    expected = cv2.cvtColor(ray_cast(room, faces, -CAMERA.baseline_m / 2), cv2.COLOR_RGB2GRAY)
+    assert np.mean(frame.right == expected) > 0.999
+
+
+def test_depth_puts_every_pixel_on_a_surface(room: FloorPlan, frame: StereoFrame) -> None:
+    assert off_surface_m(room, CAMERA, frame.depth_m).max() < 2e-4
+
+
+def off_surface_m(room: FloorPlan, camera: StereoCamera, depth_m: np.ndarray) -> np.ndarray:
+    """Distance of each pixel's world point from the nearest face's plane."""
+    v, u = np.mgrid[: camera.height_px, : camera.width_px]
+    p_robot = camera.back_project(np.stack([u.ravel(), v.ravel()], -1), depth_m.ravel())
+    p_world = transform_points(POSE, p_robot)
+    best = np.full(len(p_world), np.inf)
+    for face in room.faces():
+        corner, right, up = face.corners_m[0], *(face.corners_m[[1, 3]] - face.corners_m[0])
+        normal = np.cross(right, up)
+        best = np.minimum(best, np.abs((p_world - corner) @ normal) / np.linalg.norm(normal))
+    return best
+
+
+def test_disparity_found_by_matching_agrees_with_depth(frame: StereoFrame) -> None:
+    """A slow, plain matcher: whole-window correlation along the row."""
+    rng = np.random.default_rng(1)
+    errors = []
+    for u, v in zip(rng.integers(120, 600, 60), rng.integers(20, 220, 60), strict=True):
+        around = frame.depth_m[v - 9 : v + 10, u - 9 : u + 10]
+        window = frame.left[v - 9 : v + 10, u - 9 : u + 10]
+        if np.ptp(around) > 0.1 or window.std() < 15:
+            continue
+        row = frame.right[v - 9 : v + 10, u - 109 : u + 10]
+        score = cv2.matchTemplate(row, window, cv2.TM_CCOEFF_NORMED)[0]
+        expected = CAMERA.focal_px * CAMERA.baseline_m / frame.depth_m[v, u]
+        errors.append(100 - int(score.argmax()) - expected)
+    assert len(errors) > 20
+    assert np.median(np.abs(errors)) < 0.6  # whole pixels err by 0.25 on average
+    assert abs(np.median(errors)) < 0.4
+
+
+def test_nothing_has_no_depth() -> None:
+    with World() as world:
+        empty = render_stereo(world, CAMERA, POSE, NO_NOISE, np.random.default_rng(0))
+    assert np.all(np.isnan(empty.depth_m))
+
+
+def test_noise_is_independent_in_both_images(faces: Path, frame: StereoFrame) -> None:
+    noise = RadiometricNoise(sigma_gray=3.0, sigma_gain=0, sigma_offset_gray=0)
+    with World() as world:
+        world.add_painted_faces(faces)
+        noisy = render_stereo(world, CAMERA, POSE, noise, np.random.default_rng(5))
+    left = noisy.left.astype(float) - frame.left
+    right = noisy.right.astype(float) - frame.right
+    rounding_variance = 1 / 12
+    for difference in (left, right):
+        assert abs(difference.mean()) < 0.03
+        assert difference.std() == pytest.approx(np.sqrt(9 + rounding_variance), rel=0.01)
+    assert abs(np.corrcoef(left.ravel(), right.ravel())[0, 1]) < 0.01
+    np.testing.assert_array_equal(noisy.left_rgb, frame.left_rgb)
+
+
+def test_gain_and_offset_are_those_of_a_whole_image() -> None:
+    noise = RadiometricNoise(sigma_gray=0, sigma_gain=0.05, sigma_offset_gray=4)
+    ramp = np.tile(np.arange(60, 200, dtype=np.uint8), (4, 1))
+    fits = [
+        np.polyfit(ramp[0], noise.apply(ramp, np.random.default_rng(seed))[0], 1)
+        for seed in range(400)
+    ]
+    gain, offset = np.transpose(fits)
+    assert gain.mean() == pytest.approx(1, abs=0.01)
+    assert gain.std() == pytest.approx(0.05, rel=0.15)
+    assert offset.std() == pytest.approx(4, rel=0.15)
+
+
+def test_camera_of_another_size_and_mount_is_exact_too(room: FloorPlan, faces: Path) -> None:
+    camera = StereoCamera(321, 200, 250.0, 0.2, mount_x_m=-0.1, mount_z_m=0.8)
+    with World() as world:
+        world.add_painted_faces(faces)
+        frame = render_stereo(world, camera, POSE, NO_NOISE, np.random.default_rng(0))
+    assert off_surface_m(room, camera, frame.depth_m).max() < 2e-4
