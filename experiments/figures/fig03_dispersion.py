@@ -17,7 +17,7 @@ _MAGNIFICATIONS = (1, 2, 5, 10, 20, 50, 100)
 _WIDEST_SHARE = 1 / 10  # of the map's extent that the widest drawn particle set may take
 _ZOOM_MARGIN = 1.25
 _RECENT_ITERATIONS = 50
-_FRAME_LENGTH_M = 2.0
+_FRAME_LENGTH_M = 1.5
 _GRID_COLUMNS = 6  # holds one, two or three panels of one width
 _LOWER_ROW_IN = 2.6
 

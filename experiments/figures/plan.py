@@ -30,7 +30,7 @@ def add_frame(axes: Axes, length_m: float = _AXIS_LENGTH_M) -> None:
             arrowprops={"arrowstyle": "-|>", "color": BLACK, "linewidth": 1.2, "shrinkA": 0},
             zorder=6,
         )
-        axes.annotate(name, xy=tip, xytext=(2, 2), textcoords="offset points", zorder=6)
+        axes.annotate(name, xy=tip, xytext=(3, -4), textcoords="offset points", zorder=6)
 
 
 def set_view(axes: Axes, landmarks_m: Float, *others_m: Float) -> int:

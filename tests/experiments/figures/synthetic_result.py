@@ -75,7 +75,7 @@ def write_result(folder: Path, size: Size = SMALL, seed: int = 0, world: bool = 
         "paths": _path_rows(rng, paths),
         "clouds": _cloud_rows(rng, paths, size),
         "landmarks": _landmark_rows(maps),
-        "tracks": _track_rows(rng, robots[0], size),
+        "tracks": _track_rows(rng, robots[0], size) if size.keyframes else [],
         "fused": _fused_rows(maps),
         "timings": [{"stage": "slam", "name": "R1", "elapsed_s": 1.0}],
     }
