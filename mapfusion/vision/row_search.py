@@ -31,7 +31,7 @@ def search_rows(
         max_disparity: whole pixels.
         half: half side of the window, pixels.
         min_correlation: weakest zero-mean normalised correlation that counts.
-        max_ambiguity: largest 1 - correlation as a share of the best rival's.
+        max_ambiguity: 1 - correlation must stay below this share of the best rival's.
         max_round_trip: largest difference between start and end, pixels.
 
     Returns:
@@ -90,7 +90,7 @@ def _search(
     for k in range(last - first + 1):
         if abs(k - best) > _PEAK_HALF_WIDTH_PX and scores[k] > rival:
             rival = scores[k]
-    if 1 - scores[best] > max_ambiguity * (1 - rival):
+    if 1 - scores[best] >= max_ambiguity * (1 - rival):
         return first + best, Verdict.AMBIGUOUS
     return first + best, Verdict.MATCHED
 

@@ -30,7 +30,7 @@ class StereoParameters:
         min_depth_m, max_depth_m: range of the search.
         half_px: half side of the window of search and refinement.
         min_correlation: weakest correlation that counts as a match.
-        max_ambiguity: a match needs 1 - correlation at most this share of its best rival's.
+        max_ambiguity: a match needs 1 - correlation below this share of its best rival's.
         max_round_trip_px: allowed difference between the search there and the search back.
         max_jump_px: how far the refinement may move from the search's whole pixel.
         nearest_plane_m: distance h of the optical centre from the nearest plane that is to be

@@ -43,11 +43,12 @@ def wall(
     start: tuple[float, float],
     end: tuple[float, float],
     height_m: float = 2.5,
+    base_m: float = 0.0,
     texels_per_m: float = 100.0,
     contrast: float = 45.0,
 ) -> Plane:
-    """An upright wall between two points of the floor plan."""
-    a, b = np.array([*start, 0.0]), np.array([*end, 0.0])
+    """An upright wall between two points of the floor plan, from `base_m` up."""
+    a, b = np.array([*start, base_m]), np.array([*end, base_m])
     length = float(np.linalg.norm(b - a))
     rows, columns = int(height_m * texels_per_m) + 1, int(length * texels_per_m) + 1
     picture = texture(rng, rows, columns, contrast)

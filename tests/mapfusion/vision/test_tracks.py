@@ -1,0 +1,175 @@
+"""Tracks: born, confirmed after p frames, lost; links against an obvious twin."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mapfusion.vision.features import Features
+from mapfusion.vision.tracks import Tracker, TrackParameters, link
+
+
+def unit(rng: np.random.Generator, n: int) -> np.ndarray:
+    rows = rng.standard_normal((n, 64)).astype(np.float32)
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
+def features(
+    uv: np.ndarray, descriptor: np.ndarray, disparity: np.ndarray | float = 10.0
+) -> Features:
+    n = len(uv)
+    return Features(
+        np.asarray(uv, float), np.full(n, disparity) * np.ones(n), np.full(n, 0.1), descriptor
+    )
+
+
+def empty() -> Features:
+    return features(np.zeros((0, 2)), np.zeros((0, 64), np.float32))
+
+
+def test_birth_confirmation_and_loss() -> None:
+    rng = np.random.default_rng(0)
+    descriptor = unit(rng, 3)
+    uv = np.array([[100.0, 100], [200, 100], [300, 100]])
+    tracker = Tracker(TrackParameters(min_length=3))
+    # feature 0 stays, 1 misses the third frame, 2 comes in the second
+    seen = [[0, 1], [2, 1, 0], [0, 2], [1, 0, 2], []]
+    ids, lengths, confirmed = [], [], []
+    for t, rows in enumerate(seen):
+        frame = features(uv[rows] + [5.0 * t, 0], descriptor[rows]) if rows else empty()
+        tracks = tracker.update(frame)
+        ids.append(tracks.track_id.tolist())
+        lengths.append(tracks.length.tolist())
+        confirmed.append(tracker.landmarks(tracks).tolist())
+    assert ids == [[0, 1], [2, 1, 0], [0, 2], [3, 0, 2], []]
+    assert lengths == [[1, 1], [1, 2, 2], [3, 2], [1, 4, 3], []]
+    assert confirmed == [[False] * 2, [False] * 3, [True, False], [False, True, True], []]
+
+
+def test_a_gap_ends_every_track() -> None:
+    descriptor = unit(np.random.default_rng(0), 1)
+    tracker = Tracker(TrackParameters())
+    here = features(np.array([[50.0, 50.0]]), descriptor)
+    assert tracker.update(here).track_id.tolist() == [0]
+    tracker.update(empty())
+    again = tracker.update(here)
+    assert again.track_id.tolist() == [1]
+    assert again.length.tolist() == [1]
+
+
+def test_one_frame_suffices_when_asked() -> None:
+    tracker = Tracker(TrackParameters(min_length=1))
+    tracks = tracker.update(features(np.zeros((2, 2)), unit(np.random.default_rng(0), 2)))
+    assert tracker.landmarks(tracks).all()
+
+
+def link_twin(previous: Features, current: Features, parameters: TrackParameters) -> list[int]:
+    distance = np.linalg.norm(current.descriptor[:, None] - previous.descriptor[None], axis=-1)
+    shift = np.abs(current.uv_px[:, None] - previous.uv_px[None])
+    change = np.abs(np.log(current.disparity_px[:, None] / previous.disparity_px[None]))
+    allowed = (shift <= [parameters.max_shift_u_px, parameters.max_shift_v_px]).all(-1)
+    allowed &= change <= np.log(parameters.max_disparity_ratio)
+    distance[~allowed] = np.inf
+    rows = []
+    for i in range(len(current)):
+        j = int(np.argmin(distance[i]))
+        mutual = np.argmin(distance[:, j]) == i
+        near = distance[i, j] <= parameters.max_descriptor_distance
+        rows.append(j if mutual and near else -1)
+    return rows
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_links_equal_an_obvious_twin(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    base = unit(rng, 60)
+    uv = rng.uniform(0, 300, (60, 2))
+    disparity = rng.uniform(5, 9, 60)
+    previous = features(uv, base, disparity)
+    noisy = base + 0.04 * rng.standard_normal(base.shape).astype(np.float32)
+    order = rng.permutation(60)[:45]
+    current = features(
+        uv[order] + rng.normal(0, 20, (45, 2)),
+        noisy[order],
+        disparity[order] * rng.uniform(0.8, 1.25, 45),
+    )
+    parameters = TrackParameters(
+        max_shift_u_px=40, max_shift_v_px=30, max_disparity_ratio=1.15, max_descriptor_distance=0.35
+    )
+    expected = link_twin(previous, current, parameters)
+    assert 5 < np.sum(np.array(expected) >= 0) < 40
+    assert link(previous, current, parameters).tolist() == expected
+
+
+@pytest.mark.parametrize(
+    ("shift", "disparity", "noise", "linked"),
+    [
+        ((0, 0), 10.0, 0.0, True),
+        ((19, 0), 10.0, 0.0, True),
+        ((-21, 0), 10.0, 0.0, False),
+        ((0, 9), 10.0, 0.0, True),
+        ((0, -11), 10.0, 0.0, False),
+        ((0, 0), 11.9, 0.0, True),
+        ((0, 0), 12.1, 0.0, False),
+        ((0, 0), 10 / 1.19, 0.0, True),
+        ((0, 0), 10 / 1.21, 0.0, False),
+        ((0, 0), 10.0, 0.29, True),
+        ((0, 0), 10.0, 0.31, False),
+    ],
+)
+def test_each_limit_holds(
+    shift: tuple[float, float], disparity: float, noise: float, linked: bool
+) -> None:
+    descriptor = np.zeros((1, 64), np.float32)
+    descriptor[0, 0] = 1
+    other = descriptor.copy()
+    other[0, 1] = noise
+    parameters = TrackParameters(3, 20, 10, 1.2, 0.3)
+    uv = np.array([[100.0, 100.0]])
+    source = link(features(uv, descriptor), features(uv + shift, other, disparity), parameters)
+    assert source.tolist() == [0 if linked else -1]
+
+
+def test_of_two_claims_the_nearer_wins() -> None:
+    descriptor = np.zeros((2, 64), np.float32)
+    descriptor[:, 0] = 1
+    descriptor[1, 1] = 0.2
+    uv = np.array([[100.0, 100.0], [103.0, 100.0]])
+    one = features(uv[:1], descriptor[:1])
+    assert link(one, features(uv, descriptor), TrackParameters()).tolist() == [0, -1]
+    assert link(features(uv, descriptor), one, TrackParameters()).tolist() == [0]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("min_length", 0),
+        ("max_shift_u_px", 0.0),
+        ("max_disparity_ratio", 1.0),
+        ("max_descriptor_distance", -1.0),
+    ],
+)
+def test_wrong_parameters_are_named(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=f"^{name}:"):
+        replace(TrackParameters(), **{name: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("uv_px", np.zeros((2, 3))),
+        ("disparity_px", np.ones(3)),
+        ("disparity_px", np.array([1.0, 0.0])),
+        ("sigma_disparity_px", np.array([1.0, np.nan])),
+        ("descriptor", np.zeros((2, 32), np.float32)),
+    ],
+)
+def test_wrong_features_are_named(name: str, value: np.ndarray) -> None:
+    fields = {
+        "uv_px": np.zeros((2, 2)),
+        "disparity_px": np.ones(2),
+        "sigma_disparity_px": np.ones(2),
+        "descriptor": np.zeros((2, 64), np.float32),
+    }
+    with pytest.raises(ValueError, match=f"^{name}:"):
+        Features(**(fields | {name: value}))
