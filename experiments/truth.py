@@ -26,7 +26,7 @@ def landmark_truth(
         maps: by iteration.
     """
     owner = np.full(len(truth.point_world_m), -1, dtype=np.int64)
-    changes = dict(associations.groupby("from_iteration"))
+    changes = dict(iter(associations.groupby("from_iteration")))
     points = {}
     for iteration in sorted(maps):
         if iteration in changes:
