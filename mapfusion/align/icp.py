@@ -13,8 +13,8 @@ from mapfusion.align.pairs import (
     Pairs,
     finish,
     gather,
-    lacks_extent,
     undetermined,
+    why_one_place,
     why_too_few,
 )
 from mapfusion.align.result import Alignment
@@ -67,13 +67,7 @@ class Icp:
 
 def why_no_start(map_a: LandmarkMap, map_b: LandmarkMap, pairs: Pairs) -> str:
     """Why no minimal set gives a motion to start from; empty when one does."""
-    reason = why_too_few(map_a, map_b, len(pairs), needed=2)
-    if not reason and any(
-        lacks_extent(p[:, :2], covariance[:, :2, :2], 1)
-        for p, covariance in ((pairs.p_a, pairs.covariance_a), (pairs.p_b, pairs.covariance_b))
-    ):
-        reason = "in plan the landmarks lie on one point, as far as their noise can tell"
-    return reason
+    return why_too_few(map_a, map_b, len(pairs), needed=2) or why_one_place(pairs)
 
 
 def draw_motion(pairs: Pairs, rows: np.ndarray, rng: np.random.Generator) -> Float:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.pairs import MIN_PAIRS, undetermined, why_too_few
+from mapfusion.align.pairs import MIN_PAIRS, gather, undetermined, why_too_few
 from mapfusion.align.refine import Refinement
 from mapfusion.align.result import Alignment
 from mapfusion.align.rigid import fit_rigid
@@ -38,14 +38,13 @@ class Oracle:
         """
         started_s = time.perf_counter()
         require_shape("is_true", is_true, (len(correspondences),))
+        pairs = gather(map_a, map_b, correspondences)
         rows = np.flatnonzero(is_true)
         reason = why_too_few(map_a, map_b, len(rows), needed=MIN_PAIRS)
         if reason:
             return undetermined(f"true ones: {reason}", len(correspondences), started_s)
         true = correspondences[rows]
-        start = fit_rigid(
-            map_a.position_m[true.index_a], map_b.position_m[true.index_b], np.arange(len(true))
-        )
+        start = fit_rigid(pairs.p_a, pairs.p_b, rows)
         found = self.refinement.refine(map_a, map_b, true, np.array(start))
         inlier = np.zeros(len(correspondences), dtype=bool)
         inlier[rows] = found.inlier

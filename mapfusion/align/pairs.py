@@ -111,6 +111,18 @@ def lacks_extent(p: Float, covariance_m2: Float, dimensions: int) -> bool:
     return spread[2 - dimensions] <= noise * chi2.ppf(1 - SHAPE_FALSE_ALARM, freedom) + rounding
 
 
+def why_one_place(pairs: Pairs, drift_m2: float = 0.0) -> str:
+    """Why the angle between the maps is open: all pairs (1 or more) lie on one point of either."""
+    drift = drift_m2 * np.eye(2)
+    for name, p, covariance in (
+        ("a", pairs.p_a, pairs.covariance_a),
+        ("b", pairs.p_b, pairs.covariance_b),
+    ):
+        if lacks_extent(p[:, :2], covariance[:, :2, :2] + drift, 1):
+            return f"in plan map {name}'s landmarks lie on one point, as far as noise can tell"
+    return ""
+
+
 def finish(
     pairs: Pairs, T_a_b: Float, inlier: np.ndarray, started_s: float, refusal: str = ""
 ) -> Alignment:

@@ -169,9 +169,13 @@ def settle(
     for _ in range(_LOCAL_ROUNDS):
         T_a_b[0], T_a_b[1], T_a_b[2] = fit_rigid(p_a, p_b, rows[:count])
         before_count = count
-        before[:count] = rows[:count]
+        for i in range(count):
+            before[i] = rows[i]
         count, cost = support_of(T_a_b, p_a, p_b, gate_m, 0, rows)
-        if count < 2 or (count == before_count and np.all(rows[:count] == before[:count])):
+        same = count == before_count
+        for i in range(count):
+            same = same and rows[i] == before[i]
+        if count < 2 or same:
             break
     return count, cost
 

@@ -9,7 +9,7 @@ from numba import njit
 
 from mapfusion.align.correspondences import Correspondences, HeightGate
 from mapfusion.align.drift import drift_step
-from mapfusion.align.pairs import MIN_PAIRS, gather, undetermined
+from mapfusion.align.pairs import MIN_PAIRS, gather, undetermined, why_one_place
 from mapfusion.align.result import Alignment, Status
 from mapfusion.arguments import require_shape
 from mapfusion.landmark_map import LandmarkMap
@@ -19,6 +19,11 @@ from mapfusion.se2 import Float, wrap
 # be told from false pairs spread over the gate.
 _GATE_SIGMAS = 3.0
 _TOLERANCE_M = 1e-8  # movement of the landmarks that counts as none
+# A pair on the gate's edge could go in and out for ever; from this round on it stays where it is.
+_GATE_ROUNDS = 50
+# False pairs in the gate counted before any is seen: a share of exactly 1 could never be revised,
+# and is approached without end.
+_PRIOR_FALSE = 1.0
 _SINGULAR = 1e-12  # determinant of the normal matrix scaled to a unit diagonal
 
 
@@ -40,7 +45,7 @@ class Refinement:
     """
 
     gate_m: float = 0.5
-    max_rounds: int = 1000
+    max_rounds: int = 500
     height: HeightGate = field(default_factory=HeightGate)
 
     def __post_init__(self) -> None:
@@ -82,7 +87,9 @@ class Refinement:
             return undetermined(reason, len(pairs), started_s)
         inlier = np.zeros(len(pairs), dtype=bool)
         inlier[rows] = truth > 0.5
-        reason = ""
+        reason = why_one_place(pairs[inlier], variance) if np.any(inlier) else ""
+        if reason:
+            return undetermined(reason, len(pairs), started_s)
         if moved_m > _TOLERANCE_M:
             reason = f"still moved by {moved_m:.1e} m after {self.max_rounds} rounds"
         elif np.count_nonzero(inlier) < MIN_PAIRS:
@@ -117,23 +124,26 @@ def residuals_under(
 
 @njit(cache=True)
 def truth_probabilities(
-    e: Float, S: Float, variance_m2: float, share: float, gate_m: float, truth: Float
-) -> int:
-    """Fill each pair's probability (N,) of being true; returns how many lie inside the gate."""
-    inside = 0
+    e: Float,
+    S: Float,
+    variance_m2: float,
+    share: float,
+    gate_m: float,
+    inside: np.ndarray,
+    truth: Float,
+) -> None:
+    """Fill the probability (N,) of being true of each pair inside the gate, 0 of the others."""
     false_density = (1 - share) / (math.pi * gate_m * gate_m)
     for i in range(len(e)):
         truth[i] = 0.0
-        if e[i, 0] * e[i, 0] + e[i, 1] * e[i, 1] > gate_m * gate_m:
+        if not inside[i]:
             continue
-        inside += 1
         xx, xy, yy = S[i, 0, 0] + variance_m2, S[i, 0, 1], S[i, 1, 1] + variance_m2
         det = xx * yy - xy * xy
         square = (yy * e[i, 0] ** 2 - 2 * xy * e[i, 0] * e[i, 1] + xx * e[i, 1] ** 2) / det
         true_density = share * math.exp(-square / 2) / (2 * math.pi * math.sqrt(det))
         if true_density > 0:
             truth[i] = true_density / (true_density + false_density)
-    return inside
 
 
 @njit(cache=True)
@@ -167,6 +177,29 @@ def normal_equations(
 
 
 @njit(cache=True)
+def invert(matrix: Float, inverse: Float) -> bool:
+    """Fill the inverse (3, 3) of a symmetric matrix by cofactors; False when it is singular.
+
+    Three by three needs no LAPACK, whose wrappers take seconds to compile.
+    """
+    a, b, c = matrix[0, 0], matrix[0, 1], matrix[0, 2]
+    d, e, f = matrix[1, 1], matrix[1, 2], matrix[2, 2]
+    inverse[0, 0] = d * f - e * e
+    inverse[0, 1] = inverse[1, 0] = c * e - b * f
+    inverse[0, 2] = inverse[2, 0] = b * e - c * d
+    inverse[1, 1] = a * f - c * c
+    inverse[1, 2] = inverse[2, 1] = b * c - a * e
+    inverse[2, 2] = a * d - b * b
+    det = a * inverse[0, 0] + b * inverse[0, 1] + c * inverse[0, 2]
+    if not det > _SINGULAR * a * d * f:
+        return False
+    for i in range(3):
+        for j in range(3):
+            inverse[i, j] /= det
+    return True
+
+
+@njit(cache=True)
 def iterate(
     p_a: Float,
     p_b: Float,
@@ -184,24 +217,31 @@ def iterate(
     """
     n = len(p_a)
     T_a_b = T_start.copy()
-    e, S, truth = np.empty((n, 2)), np.empty((n, 2, 2)), np.zeros(n)
+    e, S = np.empty((n, 2)), np.empty((n, 2, 2))
+    inside, truth = np.zeros(n, np.bool_), np.zeros(n)
     widest = (gate_m / _GATE_SIGMAS) ** 2
     variance, share = widest, 0.5
-    covariance = np.full((3, 3), np.nan)
+    covariance, step = np.full((3, 3), np.nan), np.empty(3)
     moved = math.inf
-    for _ in range(max_rounds):
+    for rounds in range(max_rounds):
         residuals_under(T_a_b, p_a, p_b, S_a, S_b, e, S)
-        inside = truth_probabilities(e, S, variance, share, gate_m, truth)
+        if rounds < _GATE_ROUNDS:
+            for i in range(n):
+                inside[i] = e[i, 0] * e[i, 0] + e[i, 1] * e[i, 1] <= gate_m * gate_m
+        truth_probabilities(e, S, variance, share, gate_m, inside, truth)
         total = np.sum(truth)
         if total < 1.0:
             return False, moved, T_a_b, covariance, variance, truth
         normal, right = normal_equations(T_a_b, p_b, e, S, variance, truth)
-        diagonal = normal[0, 0] * normal[1, 1] * normal[2, 2]
-        if not np.linalg.det(normal) > _SINGULAR * diagonal:
+        if not invert(normal, covariance):
             return False, moved, T_a_b, covariance, variance, truth
-        covariance = np.linalg.inv(normal)
-        step = covariance @ right
-        share = total / inside
+        for k in range(3):
+            step[k] = (
+                covariance[k, 0] * right[0]
+                + covariance[k, 1] * right[1]
+                + covariance[k, 2] * right[2]
+            )
+        share = total / (np.sum(inside) + _PRIOR_FALSE)
         variance = min(drift_step(e, S, truth, variance, gate_m), widest)
         cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
         moved = 0.0
@@ -210,7 +250,8 @@ def iterate(
                 dx = step[0] - (sin * p_b[i, 0] + cos * p_b[i, 1]) * step[2]
                 dy = step[1] + (cos * p_b[i, 0] - sin * p_b[i, 1]) * step[2]
                 moved = max(moved, math.sqrt(dx * dx + dy * dy))
-        T_a_b += step
+        for k in range(3):
+            T_a_b[k] += step[k]
         if moved <= _TOLERANCE_M:
             break
     return True, moved, T_a_b, covariance, variance, truth

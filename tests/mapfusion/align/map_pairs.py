@@ -1,6 +1,6 @@
 """Synthetic pairs of maps that share a part of their world."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -52,7 +52,7 @@ def unit_vectors(rng, n):
 
 
 def given_pairs(rng, n=100, true_share=1.0, sigma_m=0.0, drift_m=0.0, T_a_b=None, planar=False):
-    """Pairs as the bar for RANSAC has them: uniform points, noise on side b, false pairs uniform."""
+    """Pairs as RANSAC's bar has them: uniform points, noise on side b, false ones uniform."""
     T_a_b = motion(rng) if T_a_b is None else T_a_b
     n_true = round(true_share * n)
     p_a = rng.uniform(0, SIZE_M, (n, 3))
@@ -84,3 +84,35 @@ def error(T_estimated, T_a_b):
         float(np.hypot(*(T_estimated - T_a_b)[:2])),
         abs(float(se2.wrap(T_estimated[2] - T_a_b[2]))),
     )
+
+
+def swapped(pair):
+    """The same pairs with the maps' roles exchanged."""
+    c = pair.correspondences
+    return MapPair(
+        pair.map_b,
+        pair.map_a,
+        se2.inverse(pair.T_a_b),
+        Correspondences(c.index_b, c.index_a, c.distance),
+        pair.is_true,
+    )
+
+
+def moved(landmark_map, T_new_old):
+    """A map written in another frame."""
+    return replace(
+        landmark_map,
+        position_m=se2.transform_points(T_new_old, landmark_map.position_m),
+        covariance_m2=se2.transform_covariances(T_new_old, landmark_map.covariance_m2),
+    )
+
+
+def stretched(rng, landmark_map, ratio=4.0):
+    """The map with covariances `ratio` times as long one way, turned at random."""
+    n = len(landmark_map)
+    turn = se2.rotation(rng.uniform(-np.pi, np.pi, n))
+    covariance = landmark_map.covariance_m2.copy()
+    sigma2 = covariance[:, :1, :1]
+    long = turn @ np.diag([ratio**2, 1.0]) @ np.swapaxes(turn, 1, 2)
+    covariance[:, :2, :2] = sigma2 * long
+    return replace(landmark_map, covariance_m2=covariance)

@@ -1,0 +1,39 @@
+import numpy as np
+import pytest
+from scipy.spatial.distance import cdist
+
+from mapfusion.align.closest import Grid, nearest_two
+
+
+def points(kind, rng):
+    return {
+        "spread": rng.uniform(0, 20, (300, 3)),
+        "one wall": np.column_stack([np.full(200, 3.0), rng.uniform(0, 15, 200), np.zeros(200)]),
+        "far outlier": np.vstack([rng.uniform(0, 5, (200, 3)), [[500.0, -300.0, 1.0]]]),
+        "one place": np.ones((40, 3)),
+        "two": rng.uniform(0, 1, (2, 3)),
+    }[kind]
+
+
+@pytest.mark.parametrize("kind", ["spread", "one wall", "far outlier", "one place", "two"])
+def test_finds_what_looking_at_all_finds(kind):
+    rng = np.random.default_rng(0)
+    p = points(kind, rng)
+    grid = Grid.of(p)
+    queries = np.vstack([rng.uniform(-2, 22, (300, 3)), rng.uniform(-100, 100, (50, 3)), p[:20]])
+    all_distances = cdist(queries, p)
+    two = np.sort(all_distances, axis=1)[:, :2]
+    for q, distances, (d1, d2) in zip(queries, all_distances, two, strict=True):
+        k, first, second = nearest_two(
+            *q, grid.p, grid.start, grid.corner_m, grid.cell_m, grid.shape
+        )
+        assert (first, second) == pytest.approx((d1, d2), abs=1e-12)
+        assert distances[grid.row[k]] == pytest.approx(d1, abs=1e-12)
+
+
+def test_one_point_has_no_second():
+    grid = Grid.of(np.zeros((1, 3)))
+    k, first, second = nearest_two(
+        3.0, 4.0, 0.0, grid.p, grid.start, grid.corner_m, grid.cell_m, grid.shape
+    )
+    assert (k, first, second) == (0, 5.0, np.inf)

@@ -1,0 +1,111 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from map_pairs import landmarks, unit_vectors
+
+from mapfusion.align import correspondences as module
+from mapfusion.align.correspondences import Correspondences, HeightGate, MatchParameters, match
+
+
+def two_maps(rng, n=120, noise=0.03):
+    descriptor = unit_vectors(rng, n)
+    p = rng.uniform(0, 3, (n, 3))
+    order = rng.permutation(n)
+    other = descriptor[order] + rng.normal(0, noise, (n, 64)).astype(np.float32)
+    return landmarks(p, descriptor=descriptor), landmarks(p[order], descriptor=other), order
+
+
+def slow_match(a, b, parameters):
+    """Pairs by the definition: each the nearest of the other among those of compatible height."""
+    distance = np.full((len(a), len(b)), np.inf)
+    for i in range(len(a)):
+        for j in range(len(b)):
+            variance = a.covariance_m2[i, 2, 2] + b.covariance_m2[j, 2, 2]
+            sigma = np.sqrt(variance + parameters.height.floor_m**2)
+            if abs(a.position_m[i, 2] - b.position_m[j, 2]) <= 3.2905 * sigma:  # 0.999
+                distance[i, j] = np.linalg.norm(a.descriptor[i] - b.descriptor[j])
+    return {
+        (i, j)
+        for i, j in enumerate(distance.argmin(axis=1))
+        if distance[:, j].argmin() == i and distance[i, j] <= parameters.max_descriptor_distance
+    }
+
+
+@pytest.mark.parametrize("noise", [0.02, 0.1])
+def test_pairs_are_those_of_the_definition(noise, monkeypatch):
+    monkeypatch.setattr(module, "_BLOCK_ROWS", 50)  # so that pairs lie in different blocks
+    a, b, _ = two_maps(np.random.default_rng(0), noise=noise)
+    parameters = MatchParameters(max_descriptor_distance=0.9)
+    found = match(a, b, parameters)
+    assert set(zip(found.index_a, found.index_b, strict=True)) == slow_match(a, b, parameters)
+    assert len(found) > 20
+    expected = np.linalg.norm(a.descriptor[found.index_a] - b.descriptor[found.index_b], axis=1)
+    np.testing.assert_allclose(found.distance, expected, atol=1e-3)
+
+
+def test_true_pairs_are_found():
+    a, b, order = two_maps(np.random.default_rng(1))
+    found = match(a, b, MatchParameters(max_descriptor_distance=0.5))
+    np.testing.assert_array_equal(found.index_a, order[found.index_b])
+    assert len(found) == len(a)
+
+
+def test_heights_decide_unless_planar():
+    a, b, _ = two_maps(np.random.default_rng(2))
+    lifted = replace(b, position_m=b.position_m + np.array([0, 0, 10.0]))
+    parameters = MatchParameters(max_descriptor_distance=0.5)
+    assert len(match(a, lifted, parameters)) == 0
+    flat = [replace(m, planar=True) for m in (a, lifted)]
+    assert len(match(*flat, parameters)) == len(a)
+
+
+def test_height_gate_keeps_the_share_it_promises():
+    rng = np.random.default_rng(3)
+    gate = HeightGate(probability=0.9, floor_m=0.03)
+    z_a, z_b, repeated = rng.normal(0, [[0.05], [0.02], [0.03]], (3, 100_000))
+    kept = gate.agrees(z_a + repeated, np.float64(0.05**2), z_b, np.float64(0.02**2))
+    assert kept.mean() == pytest.approx(0.9, abs=0.005)
+
+
+def test_labels_win_and_the_most_observed_of_one_label_is_taken():
+    a = landmarks(np.zeros((4, 3)), label=np.array([7, -1, 3, 7], np.int32))
+    a = replace(a, count=np.array([2, 9, 5, 6], np.int32), descriptor=np.eye(4, 64))
+    b = landmarks(np.zeros((3, 3)), label=np.array([3, 7, -1], np.int32))
+    b = replace(b, descriptor=np.eye(3, 64))
+    found = match(a, b)
+    assert set(zip(found.index_a, found.index_b, strict=True)) == {(3, 1), (2, 0)}
+
+
+def test_landmark_without_descriptor_matches_nothing():
+    a, b, order = two_maps(np.random.default_rng(4), n=30)
+    a.descriptor[5] = np.nan
+    b.descriptor[6] = np.nan
+    found = match(a, b, MatchParameters(max_descriptor_distance=0.5))
+    assert not np.isin(5, found.index_a)
+    assert not np.isin(6, found.index_b)
+    assert len(found) == 30 - len({5, order[6]})
+
+
+@pytest.mark.parametrize("n", [0, 5])
+def test_nothing_to_match_by(n):
+    bare = landmarks(np.zeros((n, 3)))
+    described = landmarks(np.zeros((3, 3)), descriptor=np.eye(3, 64))
+    for pair in ((bare, described), (described, bare), (bare, bare)):
+        assert len(match(*pair)) == 0
+
+
+def test_wrong_arguments_are_named():
+    index = np.arange(3)
+    with pytest.raises(ValueError, match="index_b"):
+        Correspondences(index, index[:2], np.zeros(3))
+    with pytest.raises(ValueError, match="index_a"):
+        Correspondences(index.astype(float), index, np.zeros(3))
+    with pytest.raises(ValueError, match="distance"):
+        Correspondences(index, index, np.array([0, np.nan, 0]))
+    with pytest.raises(ValueError, match="max_descriptor_distance"):
+        MatchParameters(max_descriptor_distance=float("nan"))
+    with pytest.raises(ValueError, match="probability"):
+        HeightGate(probability=1.0)
+    with pytest.raises(ValueError, match="floor_m"):
+        HeightGate(floor_m=-1.0)

@@ -1,0 +1,101 @@
+import numpy as np
+import pytest
+from map_pairs import error, given_pairs, landmarks
+from scipy.spatial.distance import cdist
+
+from mapfusion import se2
+from mapfusion.align.icp import ClosestPoints, Icp
+from mapfusion.align.impicp import ImpIcp
+from mapfusion.align.pairs import gather
+from mapfusion.align.registry import make_aligner
+from mapfusion.align.result import Status
+from mapfusion.align.rigid import fit_rigid
+
+
+def slow_icp(p_a, p_b, T, max_rounds):
+    """Pairs every landmark anew in every round, by looking at all."""
+    everyone = np.arange(len(p_b))
+
+    def pair(T):
+        return cdist(se2.transform_points(T, p_b), p_a).argmin(axis=1)
+
+    nearest = pair(T)
+    for _ in range(max_rounds):
+        T = np.array(fit_rigid(p_a[nearest], p_b, everyone))
+        before, nearest = nearest, pair(T)
+        if np.array_equal(nearest, before):
+            return T, nearest, True
+    return T, nearest, False
+
+
+@pytest.mark.parametrize("offset_m", [0.2, 1.0, 5.0])
+@pytest.mark.parametrize("max_rounds", [3, 200])
+def test_kernel_equals_its_twin(offset_m, max_rounds):
+    pair = given_pairs(np.random.default_rng(0), 300, 0.7, 0.05)
+    start = pair.T_a_b + np.array([offset_m, -offset_m, 0.1 * offset_m])
+    closest = ClosestPoints(pair.map_a, pair.map_b)
+    pairs = gather(pair.map_a, pair.map_b, pair.correspondences)
+    alignment = closest.align(start, pairs, pair.correspondences, max_rounds, 0.0)
+    T, nearest, repeats = slow_icp(pair.map_a.position_m, pair.map_b.position_m, start, max_rounds)
+    np.testing.assert_allclose(alignment.T_a_b, T, atol=1e-9)
+    np.testing.assert_array_equal(alignment.inlier, nearest == np.arange(300))
+    assert ("still changed" in alignment.reason) == (not repeats)
+
+
+def test_cost_is_the_summed_square_distance():
+    pair = given_pairs(np.random.default_rng(1), 80, 0.5, 0.05)
+    cost = ClosestPoints(pair.map_a, pair.map_b).cost_m2(pair.T_a_b)
+    moved = se2.transform_points(pair.T_a_b, pair.map_b.position_m)
+    assert cost == pytest.approx(np.sum(cdist(moved, pair.map_a.position_m).min(axis=1) ** 2))
+
+
+def test_planar_maps_ignore_heights():
+    rng = np.random.default_rng(2)
+    p = rng.uniform(0, 10, (50, 3))
+    other = np.column_stack([p[:, :2], rng.uniform(0, 10, 50)])
+    closest = ClosestPoints(landmarks(p, planar=True), landmarks(other, planar=True))
+    assert closest.cost_m2(np.zeros(3)) == pytest.approx(0, abs=1e-20)
+
+
+def share_of_good_answers(name, pair):
+    close = 0
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        aligner = make_aligner(name)
+        alignment = aligner.align(pair.map_a, pair.map_b, pair.correspondences, rng)
+        close += error(alignment.T_a_b, pair.T_a_b)[0] < 0.5
+    return close / 60
+
+
+def test_a_better_start_makes_a_good_answer_more_probable():
+    pair = given_pairs(np.random.default_rng(3), 100, 0.6, 0.03)
+    # descriptors of true pairs are nearer, as they are in truth
+    pair.correspondences.distance[pair.is_true] *= 0.5
+    assert share_of_good_answers("impicp", pair) > share_of_good_answers("icp", pair) + 0.2
+
+
+def test_starts_come_from_the_best_matching():
+    """False pairs with bad descriptors alone cannot spoil the start."""
+    pair = given_pairs(np.random.default_rng(4), 100, 0.5, 0.02)
+    pair.correspondences.distance[:] = np.where(pair.is_true, 0.1, 0.2)
+    for seed in range(10):
+        alignment = ImpIcp(best_share=0.5).align(
+            pair.map_a, pair.map_b, pair.correspondences, np.random.default_rng(seed)
+        )
+        assert alignment.status is Status.ACCEPTED
+        assert error(alignment.T_a_b, pair.T_a_b)[0] < 0.5
+
+
+@pytest.mark.parametrize(
+    ("aligner", "name", "value"),
+    [
+        (Icp, "max_rounds", 0),
+        (ImpIcp, "max_rounds", 0),
+        (ImpIcp, "sets", 0),
+        (ImpIcp, "best_share", 0.0),
+        (ImpIcp, "best_share", 1.5),
+    ],
+)
+def test_wrong_parameters_are_named(aligner, name, value):
+    with pytest.raises(ValueError, match=name):
+        aligner(**{name: value})

@@ -1,0 +1,175 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from map_pairs import error, given_pairs, stretched
+from scipy.stats import chi2
+
+from mapfusion import se2
+from mapfusion.align.drift import drift_step
+from mapfusion.align.pairs import gather
+from mapfusion.align.refine import Refinement, iterate
+from mapfusion.align.result import Status
+from mapfusion.align.rigid import motion_jacobian, residual_covariances, residuals
+
+
+def slow_iterate(pairs, T, gate_m, rounds):
+    """Expectation maximisation written out with whole matrices."""
+    variance, share = (gate_m / 3) ** 2, 0.5
+    for _ in range(rounds):
+        e = residuals(T, pairs.p_a, pairs.p_b)
+        S = residual_covariances(T, pairs.covariance_a, pairs.covariance_b)
+        C = S + variance * np.eye(2)
+        square = np.einsum("ni,nij,nj->n", e, np.linalg.inv(C), e)
+        true = share * np.exp(-square / 2) / (2 * np.pi * np.sqrt(np.linalg.det(C)))
+        inside = np.hypot(*e.T) <= gate_m
+        truth = np.where(inside, true / (true + (1 - share) / (np.pi * gate_m**2)), 0)
+        W = truth[:, None, None] * np.linalg.inv(C)
+        J = motion_jacobian(T, pairs.p_b)
+        normal = np.einsum("nki,nkl,nlj->ij", J, W, J)
+        step = np.linalg.solve(normal, np.einsum("nki,nkl,nl->i", J, W, e))
+        share = truth.sum() / (inside.sum() + 1)
+        variance = min(drift_step(e, S, truth, variance, gate_m), (gate_m / 3) ** 2)
+        T = T + step
+    return T, np.linalg.inv(normal), variance, truth
+
+
+def offered(rng, n, true_share, drift_m, sigma_m=0.04):
+    pair = given_pairs(rng, n, true_share, sigma_m, drift_m)
+    return pair, (pair.map_a, pair.map_b, pair.correspondences)
+
+
+@pytest.mark.parametrize("rounds", [1, 2, 30])
+def test_kernel_equals_its_twin(rounds):
+    rng = np.random.default_rng(0)
+    pair, (map_a, map_b, c) = offered(rng, 80, 0.5, 0.1)
+    map_a = replace(map_a, covariance_m2=map_b.covariance_m2)
+    pairs = gather(stretched(rng, map_a), stretched(rng, map_b), c)
+    start = pair.T_a_b + np.array([0.1, -0.05, 0.005])
+    solved, _, T, covariance, variance, truth = iterate(
+        pairs.p_a, pairs.p_b, pairs.covariance_a, pairs.covariance_b, start, 0.5, rounds
+    )
+    twin = slow_iterate(pairs, start, 0.5, rounds)
+    assert solved
+    for ours, theirs in zip((T, covariance, variance, truth), twin, strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-7, atol=1e-10)
+
+
+def test_answer_is_where_the_likelihood_is_flat():
+    """With round covariances, weights do not turn with theta, and the fixed point is a maximum."""
+    pair, maps = offered(np.random.default_rng(1), 150, 0.4, 0.1)
+    refinement = Refinement(gate_m=0.5)
+    found = refinement.refine(*maps, pair.T_a_b)
+    pairs = gather(*maps)
+    e = residuals(found.T_a_b, pairs.p_a, pairs.p_b)
+    variance = 0.04**2 + found.drift_sigma_m**2
+    candidates = pairs.of_one_height(refinement.height)
+    e = e[candidates]
+    inside = np.hypot(*e.T) < 0.5
+    # the share at the fixed point, by bisection: the mean probability, one false pair added
+    density = np.exp(-np.sum(e[inside] ** 2, axis=1) / (2 * variance)) / (2 * np.pi * variance)
+    uniform = 1 / (np.pi * 0.25)
+    low, high = 0.0, 1.0
+    for _ in range(60):
+        share = (low + high) / 2
+        truth = share * density / (share * density + (1 - share) * uniform)
+        mean = truth.sum() / (len(truth) + 1)
+        low, high = (share, high) if mean > share else (low, share)
+
+    def log_likelihood(T):
+        r = residuals(T, pairs.p_a, pairs.p_b)[candidates][inside]
+        true = np.exp(-np.sum(r**2, axis=1) / (2 * variance)) / (2 * np.pi * variance)
+        return np.sum(np.log(share * true + (1 - share) * uniform))
+
+    sigma = np.sqrt(np.diag(found.covariance))
+    top = log_likelihood(found.T_a_b)
+    for step in np.eye(3) * sigma * 0.1:
+        plus, minus = log_likelihood(found.T_a_b + step), log_likelihood(found.T_a_b - step)
+        assert max(plus, minus) < top
+        # the maximum of the parabola through the three lies where we are
+        assert abs((plus - minus) / (2 * (2 * top - plus - minus))) < 1e-3
+
+
+def test_error_falls_with_the_root_of_the_number_of_pairs():
+    rmse = []
+    sizes = (25, 100, 400)
+    for n in sizes:
+        squares = []
+        for seed in range(80):
+            pair, maps = offered(np.random.default_rng(seed), n, 1.0, 0.1)
+            found = Refinement().refine(*maps, pair.T_a_b)
+            centre = pair.map_b.position_m.mean(axis=0)[None]
+            squares.append(
+                np.sum(
+                    (
+                        se2.transform_points(found.T_a_b, centre)
+                        - se2.transform_points(pair.T_a_b, centre)
+                    )
+                    ** 2
+                )
+            )
+        rmse.append(np.sqrt(np.mean(squares)))
+    slope = np.polyfit(np.log(sizes), np.log(rmse), 1)[0]
+    assert slope == pytest.approx(-0.5, abs=0.08)
+
+
+@pytest.mark.parametrize("drift_m", [0.0, 0.1])
+def test_covariance_covers_the_error(drift_m):
+    """Mean normalised squared error of 3 parameters, true covariances stretched, 40 % false."""
+    nees, drifts = [], []
+    for seed in range(400):
+        rng = np.random.default_rng(seed)
+        pair = given_pairs(rng, 150, 0.6, 0.0)
+        map_b = stretched(
+            rng, replace(pair.map_b, covariance_m2=np.tile(np.eye(3) * 4e-4, (150, 1, 1)))
+        )
+        noise = np.linalg.cholesky(map_b.covariance_m2) @ rng.standard_normal((150, 3, 1))
+        noise[:, :2] += rng.normal(0, drift_m, (150, 2, 1))
+        map_b = replace(map_b, position_m=map_b.position_m + noise[:, :, 0])
+        found = Refinement().refine(pair.map_a, map_b, pair.correspondences, pair.T_a_b)
+        assert found.status is Status.ACCEPTED
+        difference = found.T_a_b - pair.T_a_b
+        difference[2] = se2.wrap(difference[2])
+        nees.append(difference @ np.linalg.solve(found.covariance, difference))
+        drifts.append(found.drift_sigma_m)
+    low, high = chi2.ppf([1e-4, 1 - 1e-4], 3 * 400) / 400
+    assert low < np.mean(nees) < high * 1.05  # covariances are estimated, which widens the tail
+    assert np.median(drifts) == pytest.approx(drift_m, abs=0.01)
+
+
+def test_stays_local():
+    pair, maps = offered(np.random.default_rng(2), 100, 1.0, 0.0)
+    far = Refinement(gate_m=0.5).refine(*maps, pair.T_a_b + np.array([5.0, 0, 0]))
+    assert far.status is not Status.ACCEPTED or error(far.T_a_b, pair.T_a_b)[0] > 3
+
+
+def test_heights_decide_unless_planar():
+    pair, (map_a, map_b, c) = offered(np.random.default_rng(3), 50, 1.0, 0.0)
+    lifted = replace(map_b, position_m=map_b.position_m + np.array([0, 0, 3.0]))
+    assert Refinement().refine(map_a, lifted, c, pair.T_a_b).status is Status.DEGENERATE
+    flat = [replace(m, planar=True) for m in (map_a, lifted)]
+    assert Refinement().refine(*flat, c, pair.T_a_b).ok
+
+
+def test_no_estimate_to_refine():
+    _, maps = offered(np.random.default_rng(4), 50, 1.0, 0.0)
+    found = Refinement().refine(*maps, np.full(3, np.nan))
+    assert found.status is Status.DEGENERATE
+    assert "no estimate" in found.reason
+
+
+def test_a_refinement_that_still_moves_is_refused():
+    pair, maps = offered(np.random.default_rng(5), 50, 0.6, 0.1)
+    found = Refinement(max_rounds=2).refine(*maps, pair.T_a_b + np.array([0.2, 0.2, 0.01]))
+    assert found.status is Status.REFUSED
+    assert "moved" in found.reason
+
+
+def test_wrong_arguments_are_named():
+    _, maps = offered(np.random.default_rng(6), 5, 1.0, 0.0)
+    with pytest.raises(ValueError, match="T_a_b"):
+        Refinement().refine(*maps, np.zeros(2))
+    with pytest.raises(ValueError, match="gate_m"):
+        Refinement(gate_m=0.0)
+    with pytest.raises(ValueError, match="max_rounds"):
+        Refinement(max_rounds=0)

@@ -1,0 +1,80 @@
+import numpy as np
+import pytest
+from map_pairs import error, given_pairs, landmarks, moved
+
+from mapfusion import se2
+from mapfusion.align.correspondences import Correspondences
+from mapfusion.align.result import Status
+from mapfusion.align.svd import Svd, solve
+
+RNG = np.random.default_rng(0)  # SVD draws nothing
+
+
+def listing(m, m_prime):
+    """Algorithm 1 line by line, on homogeneous points one a row."""
+    m, m_prime = (np.column_stack([p, np.ones(len(p))]) for p in (m, m_prime))
+    u, d, vt = np.linalg.svd(m_prime, full_matrices=False)
+    z = u.T @ m
+    w = z / d[:, None]
+    return (vt.T @ w).T
+
+
+def test_is_algorithm_1():
+    pair = given_pairs(np.random.default_rng(1), 50, 0.8, 0.1)
+    m, m_prime = pair.map_a.position_m[:, :2], pair.map_b.position_m[:, :2]
+    T = listing(m, m_prime)
+    u, _, vt = np.linalg.svd(T[:2, :2])
+    nearest = u @ np.diag([1, np.linalg.det(u @ vt)]) @ vt
+    printed = solve(m, m_prime, "printed")
+    np.testing.assert_allclose(printed[:2], T[:2, 2], atol=1e-9)
+    np.testing.assert_allclose(se2.rotation(printed[2]), nearest, atol=1e-9)
+
+
+def test_result_of_the_listing_is_no_rotation():
+    pair = given_pairs(np.random.default_rng(2), 50, 1.0, 1.0)
+    block = listing(pair.map_a.position_m[:, :2], pair.map_b.position_m[:, :2])[:2, :2]
+    assert abs(np.linalg.det(block) - 1) > 0.01
+
+
+def test_solved_translation_brings_centroids_together():
+    pair = given_pairs(np.random.default_rng(3), 50, 0.5, 0.1)
+    m, m_prime = pair.map_a.position_m[:, :2], pair.map_b.position_m[:, :2]
+    T_a_b = solve(m, m_prime, "solved")
+    centroid = se2.transform_points(T_a_b, m_prime).mean(axis=0)
+    np.testing.assert_allclose(centroid, m.mean(axis=0), atol=1e-9)
+
+
+def test_printed_translation_depends_on_where_map_b_begins():
+    """Only the solved translation stays the same motion when map b gets another origin."""
+    pair = given_pairs(np.random.default_rng(4), 50, 0.5, 0.1)
+    T_new_b = np.array([30.0, -20.0, 0.0])
+    shifted = moved(pair.map_b, T_new_b)
+    for translation, least, most in (("solved", 0.0, 1e-6), ("printed", 0.1, np.inf)):
+        aligner = Svd(translation)
+        first, second = (
+            aligner.align(pair.map_a, b, pair.correspondences, RNG).T_a_b
+            for b in (pair.map_b, shifted)
+        )
+        assert least <= error(se2.compose(second, T_new_b), first)[0] <= most
+
+
+@pytest.mark.parametrize(("across_m", "status"), [(0.0, "degenerate"), (2.0, "accepted")])
+def test_one_common_wall_is_degenerate(across_m, status):
+    """Landmarks of one wall, whose spread across it is their noise, beside a room."""
+    rng = np.random.default_rng(5)
+    sigma, n = 0.05, 60
+    p = np.column_stack(
+        [rng.uniform(0, 10, n), rng.uniform(0, across_m, n), rng.uniform(0, 2.5, n)]
+    )
+    T_b_a = np.array([3.0, 1.0, 0.7])
+    map_a = landmarks(p + rng.normal(0, sigma, p.shape), sigma)
+    map_b = landmarks(se2.transform_points(T_b_a, p + rng.normal(0, sigma, p.shape)), sigma)
+    pairs = Correspondences(np.arange(n), np.arange(n), np.zeros(n))
+    alignment = Svd().align(map_a, map_b, pairs, RNG)
+    assert alignment.status == status
+    assert ("line" in alignment.reason) == (alignment.status is Status.DEGENERATE)
+
+
+def test_unknown_translation_is_named():
+    with pytest.raises(ValueError, match="translation: is 'guessed', expected one of printed"):
+        Svd(translation="guessed")
