@@ -34,7 +34,8 @@ class DriverSettings:
         turn_in_place_rad: heading error above which the robot stops to turn.
         arrival_m: a waypoint counts as visited this near.
         patience_s: without progress for so long a robot counts as stuck.
-        give_way_m: a robot waits while one listed before it is this near ahead of it.
+        give_way_m: a robot waits while one listed before it drives this near ahead of it; enough to
+            stop short of its way where both come to a crossing at once.
     """
 
     speed_m_s: float = 0.5
@@ -44,7 +45,7 @@ class DriverSettings:
     turn_in_place_rad: float = 0.5
     arrival_m: float = 0.2
     patience_s: float = 30.0
-    give_way_m: float = 1.2
+    give_way_m: float = 1.6
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
@@ -97,8 +98,14 @@ def drive(
             for control in range(controls_per_frame if frame + 1 < n_frames else 0):
                 time_s = frame * frame_interval_s + control / CONTROL_HZ
                 now = [robot.pose() for robot in robots]
+                parked = [driver.parked for driver in drivers]
                 for i, driver in enumerate(drivers):
-                    driver.control(time_s, now[i], before=now[:i], after=now[i + 1 :])
+                    others = [
+                        _Other(now[j], goes_first=j < i and not parked[j])
+                        for j in range(len(drivers))
+                        if j != i
+                    ]
+                    driver.control(time_s, now[i], others)
                 world.step(STEPS_PER_CONTROL)
                 for driver in drivers:
                     driver.refuse_contact(time_s, ground, names)
@@ -115,6 +122,14 @@ def _controls_per_frame(frame_interval_s: float) -> int:
     return round(controls)
 
 
+@dataclass(frozen=True)
+class _Other:
+    """Another robot as a driver sees it; those listed first go first."""
+
+    T_world_robot: Float
+    goes_first: bool
+
+
 class _Driver:
     """Steers one robot from waypoint to waypoint by its true pose."""
 
@@ -128,12 +143,17 @@ class _Driver:
         self._progress_s = 0.0
         self._waiting = False
 
-    def control(self, time_s: float, pose: Float, before: list[Float], after: list[Float]) -> None:
-        """One step, given the poses of the robots listed before and after this one."""
+    @property
+    def parked(self) -> bool:
+        """Whether it has come to the end of its route."""
+        return self._done
+
+    def control(self, time_s: float, pose: Float, others: list[_Other]) -> None:
+        """One step, given where all robots are."""
         settings = self._settings
         self._advance(time_s, pose)
         speed, turn = (0.0, 0.0) if self._done else self._wish(pose)
-        self._waiting = speed > 0 and self._must_wait(pose, before, after)
+        self._waiting = speed > 0 and self._must_wait(pose, others)
         if self._waiting:
             speed = turn = 0.0
         self._speed_m_s = _towards(self._speed_m_s, speed, settings.acceleration_m_s2 / CONTROL_HZ)
@@ -176,15 +196,13 @@ class _Driver:
         turn = min(max(HEADING_GAIN_PER_S * error, -top), top)
         return settings.speed_m_s * max(0.0, 1 - abs(error) / settings.turn_in_place_rad), turn
 
-    def _must_wait(self, pose: Float, before: list[Float], after: list[Float]) -> bool:
-        """Whether another robot is ahead in the way; those listed first go first."""
-        reach = [(other, self._settings.give_way_m) for other in before]
-        reach += [(other, 2 * OUTER_RADIUS_M + STOPPING_GAP_M) for other in after]
-        for other, reach_m in reach:
-            if math.dist(pose[:2], other[:2]) > reach_m + 2 * OUTER_RADIUS_M:
-                continue
-            x, y, _ = between(pose, other)
-            if 0 < x < reach_m and abs(y) < 2 * OUTER_RADIUS_M:
+    def _must_wait(self, pose: Float, others: list[_Other]) -> bool:
+        """Whether another robot ahead goes first or stands in the way."""
+        for other in others:
+            x, y, _ = between(pose, other.T_world_robot)
+            in_the_way = x < 2 * OUTER_RADIUS_M + STOPPING_GAP_M and abs(y) < 2 * OUTER_RADIUS_M
+            goes_first = other.goes_first and math.hypot(x, y) < self._settings.give_way_m
+            if x > 0 and (in_the_way or goes_first):
                 return True
         return False
 

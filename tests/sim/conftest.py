@@ -8,7 +8,11 @@ import pytest
 from sim.floorplan import FloorPlan, Wall
 from sim.world import write_faces
 
-TEXTURE_SEED = 11
+
+@pytest.fixture(scope="session")
+def texture_seed() -> int:
+    """Of the room's textures."""
+    return 11
 
 
 @pytest.fixture(scope="session")
@@ -23,8 +27,8 @@ def room() -> FloorPlan:
 
 
 @pytest.fixture(scope="session")
-def faces(room: FloorPlan, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def faces(room: FloorPlan, texture_seed: int, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The room's meshes and textures."""
     folder = tmp_path_factory.mktemp("faces")
-    write_faces(folder, room, np.random.default_rng(TEXTURE_SEED))
+    write_faces(folder, room, np.random.default_rng(texture_seed))
     return folder

@@ -1,0 +1,124 @@
+import hashlib
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapfusion.camera import StereoCamera
+from mapfusion.errors import InputError
+from sim.p3at import LENGTH_M
+from sim.recorder import FrameSource, truth_points
+from sim.stereo_head import RadiometricNoise, StereoFrame
+
+CAMERA = StereoCamera(320, 240, 288.0)
+ROBOTS = ("a", "b")
+# a looks at b, which stands broadside 2 m ahead of it, before the far wall at y = 3.95
+POSES = np.array([[1.0, 0.8, np.pi / 2], [1.0, 2.8, 0.0]])
+
+
+@pytest.fixture(scope="module")
+def source(faces: Path) -> Iterator[FrameSource]:
+    with FrameSource(faces, CAMERA, ROBOTS, RadiometricNoise()) as opened:
+        yield opened
+
+
+def render(source: FrameSource, k: int) -> StereoFrame:
+    """Frame k of robot a: it backs off while b turns."""
+    poses = POSES + k * np.array([[0, -0.05, 0.02], [0, 0, 0.1]])
+    return source.render(poses, "a", np.random.default_rng([7, k]))
+
+
+def digest(frames: list[StereoFrame]) -> str:
+    pictures = [p for f in frames for p in (f.left, f.right, f.depth_m, f.left_rgb)]
+    return hashlib.sha256(b"".join(picture.tobytes() for picture in pictures)).hexdigest()
+
+
+def test_any_order_and_any_process_give_the_same_bits(source: FrameSource, faces: Path) -> None:
+    forth = [render(source, k) for k in range(4)]
+    source.render(POSES[::-1], "b", np.random.default_rng(1))  # something else in between
+    back = [render(source, k) for k in reversed(range(4))][::-1]
+    assert digest(forth) == digest(back)
+    assert len({digest([frame]) for frame in forth}) == 4
+    program = (
+        f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+        "from pathlib import Path\n"
+        "import test_recorder as t\n"
+        "s = t.FrameSource(Path(sys.argv[1]), t.CAMERA, t.ROBOTS, t.RadiometricNoise())\n"
+        "print(t.digest([t.render(s, k) for k in (2, 0, 3, 1)][1::2]))\n"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", program, str(faces)], capture_output=True, check=True, text=True
+    )
+    assert result.stdout.strip() == digest([forth[0], forth[1]])
+
+
+def test_robots_see_each_other_where_they_are(source: FrameSource) -> None:
+    depth = source.render(POSES, "a", np.random.default_rng(0)).depth_m
+    center = int(CAMERA.center_px[0])
+    # the deck of b begins half its width nearer than its middle; the wall shows on either side
+    assert depth[148:165, center].min() == pytest.approx(2.0 - 0.15 - 0.497 / 2, abs=1e-3)
+    wall_m = 3.95 - 0.8 - 0.15
+    assert depth[140, 90] == pytest.approx(wall_m, abs=1e-3)
+    hidden = depth[148:157, 80:240] < wall_m - 0.5
+    width_px = np.ptp(np.flatnonzero(hidden.any(axis=0)))
+    # its nearest side is half a width nearer than its middle; half a baseline shifts, not scales
+    assert width_px == pytest.approx(CAMERA.focal_px * LENGTH_M / (1.85 - 0.497 / 2), abs=4)
+
+
+def test_a_robot_does_not_see_itself(source: FrameSource) -> None:
+    """With b behind it, a sees the room's surfaces only; its own deck would begin at 0.1 m."""
+    poses = np.array([[2.0, 2.8, 0.3], [1.0, 2.8, 0.0]])
+    depth = source.render(poses, "a", np.random.default_rng(0)).depth_m
+    lowest_ray = (CAMERA.height_px - 1 - CAMERA.center_px[1]) / CAMERA.focal_px
+    assert depth.min() == pytest.approx(CAMERA.mount_z_m / lowest_ray, abs=1e-3)  # the floor
+
+
+def test_truth_points_lie_on_what_is_seen(source: FrameSource) -> None:
+    frame = source.render(POSES, "a", np.random.default_rng(0))
+    rng = np.random.default_rng(2)
+    uv = rng.uniform([90, 1], [140, 100], (200, 2))  # above b: the wall at y = 3.95, sub-pixel
+    points = truth_points(CAMERA, frame.depth_m, uv, POSES[0])
+    np.testing.assert_allclose(points[:, 1], 3.95, atol=1e-4)
+    # seen from the left camera, the points fall on their pixels again
+    x, y, z = points.T
+    depth = y - 0.8 - CAMERA.mount_x_m
+    lateral = 1.0 - x  # a looks along y, so its left is towards smaller x
+    u = CAMERA.center_px[0] - CAMERA.focal_px * (lateral - CAMERA.baseline_m / 2) / depth
+    v = CAMERA.center_px[1] - CAMERA.focal_px * (z - CAMERA.mount_z_m) / depth
+    np.testing.assert_allclose(np.stack([u, v], -1), uv, atol=0.01)
+
+
+def test_truth_on_a_slanted_plane_interpolates_the_inverse_depth() -> None:
+    """A plane's inverse depth is linear in the image; linear depth would be off by millimetres."""
+    v, u = np.mgrid[:240, :320]
+    depth = (1 / (0.2 + 0.0005 * u + 0.0002 * v)).astype(np.float32)
+    uv = np.random.default_rng(3).uniform([0, 0], [319, 239], (500, 2))
+    points = truth_points(CAMERA, depth, uv, np.zeros(3))
+    expected = 1 / (0.2 + 0.0005 * uv[:, 0] + 0.0002 * uv[:, 1])
+    np.testing.assert_allclose(points[:, 0] - CAMERA.mount_x_m, expected, atol=2e-6)
+
+
+def test_at_an_edge_the_nearest_pixel_counts() -> None:
+    depth = np.full((240, 320), 2.0, dtype=np.float32)
+    depth[:, 100:] = 5.0
+    depth[:, 200:] = np.nan
+    uv = np.array([[99.4, 50.0], [99.6, 50.0], [199.4, 50.0], [199.6, 50.0], [319.0, 239.0]])
+    points = truth_points(CAMERA, depth, uv, np.zeros(3))
+    np.testing.assert_allclose(
+        points[:, 0] - CAMERA.mount_x_m, [2, 5, 5, np.nan, np.nan], atol=1e-6
+    )
+
+
+def test_no_pixels_no_points() -> None:
+    depth = np.ones((240, 320), dtype=np.float32)
+    assert truth_points(CAMERA, depth, np.zeros((0, 2)), np.zeros(3)).shape == (0, 3)
+
+
+def test_unknown_robots_and_wrong_shapes_are_named(source: FrameSource) -> None:
+    with pytest.raises(InputError, match="robot c: unknown, there are a, b"):
+        source.render(POSES, "c", np.random.default_rng(0))
+    with pytest.raises(ValueError, match="T_world_robots: shape"):
+        source.render(POSES[:1], "a", np.random.default_rng(0))

@@ -1,0 +1,78 @@
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from mapfusion.errors import InputError
+from sim.trajectory import TRAJECTORY, Trajectory, read_trajectory, write_trajectory
+
+RNG = np.random.default_rng(0)
+TRAJECTORY_OF_TWO = Trajectory(
+    ("b", "a"), np.arange(5) * 0.25, RNG.normal(size=(2, 5, 3)), RNG.normal(size=(2, 5, 2))
+)
+
+
+def test_written_and_read_it_is_the_same(tmp_path: Path) -> None:
+    write_trajectory(tmp_path / "t.parquet", TRAJECTORY_OF_TWO)
+    back = read_trajectory(tmp_path / "t.parquet")
+    assert back.robots == ("b", "a")
+    for name in ("time_s", "T_world_robot", "wheel_rad"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(TRAJECTORY_OF_TWO, name))
+    assert len(back) == 5
+    assert back.index("a") == 1
+
+
+def test_readable_with_plain_pandas(tmp_path: Path) -> None:
+    write_trajectory(tmp_path / "t.parquet", TRAJECTORY_OF_TWO)
+    table = pd.read_parquet(tmp_path / "t.parquet")
+    row = table[(table["robot"] == "a") & (table["iteration"] == 3)].iloc[0]
+    assert row["time_s"] == 0.75
+    pose = row[["x_m", "y_m", "theta_rad"]].to_numpy(dtype=float)
+    np.testing.assert_array_equal(pose, TRAJECTORY_OF_TWO.T_world_robot[1, 3])
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ([*range(5), *range(5, 9)], "rows must be ordered"),
+        ([1, 0, *range(2, 10)], "rows must be ordered"),
+        ([0, 5, 1, 6, 2, 7, 3, 8, 4, 9], "rows must be ordered"),
+        ([], "holds no rows"),
+    ],
+)
+def test_disordered_rows_are_refused(tmp_path: Path, rows: list[int], message: str) -> None:
+    path = tmp_path / "t.parquet"
+    write_trajectory(path, TRAJECTORY_OF_TWO)
+    pq.write_table(pq.read_table(path).take(pa.array(rows, pa.int32())), path)
+    with pytest.raises(InputError, match=f"t.parquet: {message}"):
+        read_trajectory(path)
+
+
+def test_values_are_checked(tmp_path: Path) -> None:
+    path = tmp_path / "t.parquet"
+    write_trajectory(path, TRAJECTORY_OF_TWO)
+    table = pq.read_table(path)
+    damaged = table.set_column(3, TRAJECTORY.field("x_m"), pa.array([np.nan] * 10))
+    pq.write_table(damaged, path)
+    with pytest.raises(InputError, match=r"t.parquet: T_world_robot: contains NaN"):
+        read_trajectory(path)
+
+
+def test_missing_file_and_unknown_robot_are_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        read_trajectory(tmp_path / "none.parquet")
+    with pytest.raises(InputError, match="robot c: unknown, there are b, a"):
+        TRAJECTORY_OF_TWO.index("c")
+
+
+def test_names_and_times_must_make_sense() -> None:
+    poses, wheels = np.zeros((2, 3, 3)), np.zeros((2, 3, 2))
+    with pytest.raises(ValueError, match="a name occurs twice"):
+        Trajectory(("a", "a"), np.arange(3.0), poses, wheels)
+    with pytest.raises(ValueError, match="time_s: must increase"):
+        Trajectory(("a", "b"), np.array([0.0, 1, 1]), poses, wheels)
+    with pytest.raises(ValueError, match="wheel_rad: shape"):
+        Trajectory(("a", "b"), np.arange(3.0), poses, wheels[:1])
