@@ -12,7 +12,6 @@ from numba import njit
 from mapfusion.fastslam.particles import ParticleMaps
 from mapfusion.fastslam.sensor import Sightings, innovation, quadratic_form
 from mapfusion.fastslam.update import DROPPED, NEW
-from mapfusion.se2 import Float
 
 
 class Association(StrEnum):
@@ -30,11 +29,22 @@ class Pairs(NamedTuple):
     slot: np.ndarray  # (P,)
 
 
-def box_of(seen: Sightings, gate: float) -> Float:
+@njit(cache=True)
+def boxes_of(seen, gate):
     """Boxes (K, 4) of observations and their gates over all particles."""
-    margin = np.sqrt(gate * seen.covariance_m2[:, :, [0, 3]].max(axis=1))
-    low, high = seen.point_m[:, :, :2].min(axis=1), seen.point_m[:, :, :2].max(axis=1)
-    return np.concatenate([low - margin, high + margin], axis=1)
+    boxes = np.empty((len(seen.point_m), 4))
+    for k in range(len(boxes)):
+        point, noise, box = seen.point_m[k], seen.covariance_m2[k], boxes[k]
+        box[:2], box[2:] = np.inf, -np.inf
+        spread_x = spread_y = 0.0
+        for m in range(len(point)):
+            box[0], box[1] = min(box[0], point[m, 0]), min(box[1], point[m, 1])
+            box[2], box[3] = max(box[2], point[m, 0]), max(box[3], point[m, 1])
+            spread_x, spread_y = max(spread_x, noise[m, 0]), max(spread_y, noise[m, 3])
+        margin_x, margin_y = np.sqrt(gate * spread_x), np.sqrt(gate * spread_y)
+        box[0], box[1] = box[0] - margin_x, box[1] - margin_y
+        box[2], box[3] = box[2] + margin_x, box[3] + margin_y
+    return boxes
 
 
 def pairs_nearby(
@@ -45,7 +55,7 @@ def pairs_nearby(
     descriptor_threshold: float,
 ) -> Pairs:
     """Pairs whose gates can touch in some particle, by distance of their descriptors if given."""
-    boxes = box_of(seen, gate)
+    boxes = boxes_of(seen, gate)
     around = np.concatenate([boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)])
     slots = maps.near(around)
     if descriptor is None:
@@ -87,8 +97,8 @@ def choose(
     gate: float,
     planar: bool,
     nearest: bool,
-) -> np.ndarray:
-    """The slot of each observation in each particle.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Decide, in each particle, which landmark each observation shows.
 
     Args:
         maps: the particles' landmarks; those of `pairs` are brought up to date.
@@ -100,57 +110,51 @@ def choose(
         nearest: take pairs by Mahalanobis distance instead of in their order.
 
     Returns:
-        (K, M) int64 slot, NEW or DROPPED.
+        (K, M) int64 slot, NEW or DROPPED; and the slots that were chosen, ascending.
     """
     used = np.unique(pairs.slot)
     alive = used[maps.bring_up_to_date(used)]
     kept = np.isin(pairs.slot, alive)
-    observation, slot = pairs.observation[kept], pairs.slot[kept]
+    pairs = Pairs(pairs.observation[kept], pairs.slot[kept])
     chosen = np.empty(seen.point_m.shape[:2], dtype=np.int64)
     chosen[:] = np.where(may_create, NEW, DROPPED)[:, None]
-    place = np.searchsorted(alive, slot)
+    taken = np.zeros((len(alive), seen.point_m.shape[1]), dtype=bool)
     take = _take_nearest if nearest else _take_in_order
-    take(maps.slots, observation, slot, place, len(alive), seen, gate, planar, chosen)
-    return chosen
+    take(maps.slots, pairs, np.searchsorted(alive, pairs.slot), taken, seen, gate, planar, chosen)
+    return chosen, alive[taken.any(axis=1)]
 
 
 @njit(cache=True)
-def _distance(slots, s, m, seen, k, planar):
+def _distance(slots, s, seen, k, m, planar):
     dx, dy, dz, ixx, ixy, ixz, iyy, iyz, izz, _ = innovation(
-        seen.point_m[k, m],
-        seen.covariance_m2[k, m],
-        slots.mean_m[s, m],
-        slots.covariance_m2[s, m],
-        planar,
+        seen.point_m[k], seen.covariance_m2[k], slots.mean_m[s], slots.covariance_m2[s], m, planar
     )
     return quadratic_form(dx, dy, dz, ixx, ixy, ixz, iyy, iyz, izz)
 
 
 @njit(cache=True)
-def _take_in_order(slots, observation, slot, place, n_places, seen, gate, planar, chosen):
-    n_particles = chosen.shape[1]
-    taken = np.zeros((n_places, n_particles), dtype=np.bool_)
-    for i in range(len(slot)):
-        k, s, j = observation[i], slot[i], place[i]
-        for m in range(n_particles):
+def _take_in_order(slots, pairs, place, taken, seen, gate, planar, chosen):
+    for i in range(len(place)):
+        k, s, j = pairs.observation[i], pairs.slot[i], place[i]
+        for m in range(chosen.shape[1]):
             if chosen[k, m] >= 0 or taken[j, m] or slots.count[s, m] == 0:
                 continue
-            if _distance(slots, s, m, seen, k, planar) <= gate:
+            if _distance(slots, s, seen, k, m, planar) <= gate:
                 chosen[k, m] = s
                 taken[j, m] = True
 
 
 @njit(cache=True)
-def _take_nearest(slots, observation, slot, place, n_places, seen, gate, planar, chosen):
+def _take_nearest(slots, pairs, place, taken, seen, gate, planar, chosen):
     for m in range(chosen.shape[1]):
-        taken = np.zeros(n_places, dtype=np.bool_)
-        distance = np.full(len(slot), np.inf)
-        for i in range(len(slot)):
-            if slots.count[slot[i], m] > 0:
-                distance[i] = _distance(slots, slot[i], m, seen, observation[i], planar)
+        distance = np.full(len(place), np.inf)
+        for i in range(len(place)):
+            k, s = pairs.observation[i], pairs.slot[i]
+            if slots.count[s, m] > 0:
+                distance[i] = _distance(slots, s, seen, k, m, planar)
         inside = np.flatnonzero(distance <= gate)
         for i in inside[np.argsort(distance[inside], kind="mergesort")]:
-            k, j = observation[i], place[i]
-            if chosen[k, m] < 0 and not taken[j]:
-                chosen[k, m] = slot[i]
-                taken[j] = True
+            k, j = pairs.observation[i], place[i]
+            if chosen[k, m] < 0 and not taken[j, m]:
+                chosen[k, m] = pairs.slot[i]
+                taken[j, m] = True

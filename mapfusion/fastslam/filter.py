@@ -138,7 +138,7 @@ class FastSlam:
 
     @property
     def n_slots(self) -> int:
-        """Distinct landmarks that the particles have between them: what the filter's memory holds."""
+        """Distinct landmarks that the particles hold between them; the memory grows with these."""
         return self._maps.n_slots
 
     def step(self, odometry: Float, observations: Observations) -> StepResult:
@@ -164,12 +164,12 @@ class FastSlam:
         seen = sightings(
             self._poses, observations.position_m, noise, self.parameters.planar
         )  # eq. 4, 5
-        chosen = self._associate(seen, observations)
+        chosen, changed = self._associate(seen, observations)
         log_likelihood = update_landmarks(
             self._maps.slots, chosen, seen, log_new, self.parameters.planar
         )  # eq. 4-9
         self._log_weights, log_evidence = normalised(self._log_weights + log_likelihood)  # eq. 10
-        self._follow_changes(chosen, seen, observations)
+        self._follow_changes(chosen, changed, seen, observations)
         return self._resample(log_evidence)
 
     def best_map(self, min_count: int = 1) -> LandmarkMap:
@@ -218,12 +218,14 @@ class FastSlam:
         given = self.parameters.log_new_landmark_density
         return at_gate if given is None else np.full(len(noise), given)
 
-    def _associate(self, seen: Sightings, observations: Observations) -> np.ndarray:
-        """(K, M) slot of each observation in each particle, or NEW or DROPPED."""
+    def _associate(
+        self, seen: Sightings, observations: Observations
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """(K, M) slot of each observation in each particle, or NEW or DROPPED; the slots chosen."""
         settings = self.parameters
         may_create = np.ones(len(observations), dtype=bool)
         if len(observations) == 0:
-            return np.empty(seen.point_m.shape[:2], dtype=np.int64)
+            return np.empty(seen.point_m.shape[:2], dtype=np.int64), np.empty(0, dtype=np.int64)
         if settings.association is Association.LABEL:
             pairs, may_create = self._pairs_of_labels(_given("label", observations.label))
         else:
@@ -248,12 +250,16 @@ class FastSlam:
         return Pairs(rows, slots), ~known & first
 
     def _follow_changes(
-        self, chosen: np.ndarray, seen: Sightings, observations: Observations
+        self,
+        chosen: np.ndarray,
+        changed: np.ndarray,
+        seen: Sightings,
+        observations: Observations,
     ) -> None:
         """Start landmarks, keep the index of the map and the history."""
         source = np.where(chosen >= 0, self._maps.slots.source[chosen], -1)
         if len(observations):
-            self._maps.moved(np.unique(chosen[chosen >= 0]))
+            self._maps.moved(changed)
             created = self._maps.create(chosen, seen, observations, self._n_observations)
             if self.parameters.association is Association.LABEL:
                 assert observations.label is not None

@@ -187,8 +187,10 @@ def _inherit(slots, which, ancestors, generation):
             slots.count[s, m] = count[parent]
             if count[parent] > 0:
                 alive[i] = True
-                slots.mean_m[s, m] = mean[parent]
-                slots.covariance_m2[s, m] = covariance[parent]
+                for i in range(3):
+                    slots.mean_m[s, m, i] = mean[parent, i]
+                for i in range(6):
+                    slots.covariance_m2[s, m, i] = covariance[parent, i]
     return alive
 
 

@@ -42,19 +42,18 @@ def _turn_into_map(T_map_robot, position, covariance, planar, seen):
         yy, yz, zz = covariance[k, 1, 1], covariance[k, 1, 2], covariance[k, 2, 2]
         if planar:
             z = xz = yz = zz = 0.0
+        point, turned = seen.point_m[k], seen.covariance_m2[k]
         for m in range(len(T_map_robot)):
             c, s = cos[m], sin[m]
-            point = seen.point_m[k, m]
-            point[0] = T_map_robot[m, 0] + c * x - s * y
-            point[1] = T_map_robot[m, 1] + s * x + c * y
-            point[2] = z
-            turned = seen.covariance_m2[k, m]
-            turned[0] = c * c * xx - 2 * c * s * xy + s * s * yy
-            turned[1] = c * s * (xx - yy) + (c * c - s * s) * xy
-            turned[2] = c * xz - s * yz
-            turned[3] = s * s * xx + 2 * c * s * xy + c * c * yy
-            turned[4] = s * xz + c * yz
-            turned[5] = zz
+            point[m, 0] = T_map_robot[m, 0] + c * x - s * y
+            point[m, 1] = T_map_robot[m, 1] + s * x + c * y
+            point[m, 2] = z
+            turned[m, 0] = c * c * xx - 2 * c * s * xy + s * s * yy
+            turned[m, 1] = c * s * (xx - yy) + (c * c - s * s) * xy
+            turned[m, 2] = c * xz - s * yz
+            turned[m, 3] = s * s * xx + 2 * c * s * xy + c * c * yy
+            turned[m, 4] = s * xz + c * yz
+            turned[m, 5] = zz
 
 
 @njit(cache=True)
@@ -77,38 +76,36 @@ def inverse_and_determinant(xx, xy, xz, yy, yz, zz):
 
 
 @njit(cache=True)
-def innovation(point, noise, mean, covariance, planar):
-    """Innovation, inverse of Z (eq. 6) and |Z| for one observation and one landmark.
+def innovation(point, noise, mean, covariance, m, planar):
+    """Innovation, inverse of Z (eq. 6) and |Z| of one observation and one landmark in particle m.
 
     In planar data the height says nothing: its innovation is 0 and its variance in Z 1, so that it
     leaves the Mahalanobis distance and the determinant alone.
 
+    Args:
+        point: (M, 3) the observation in the maps.
+        noise: (M, 6) its covariances.
+        mean: (M, 3) of the landmark.
+        covariance: (M, 6) of the landmark.
+        m: the particle. (Rows are not passed: making a view costs more than the arithmetic.)
+        planar: two degrees of freedom.
+
     Returns:
         dx, dy, dz, six upper entries of the inverse of Z, |Z|.
     """
-    xx = covariance[0] + noise[0]
-    xy = covariance[1] + noise[1]
-    yy = covariance[3] + noise[3]
+    xx = covariance[m, 0] + noise[m, 0]
+    xy = covariance[m, 1] + noise[m, 1]
+    yy = covariance[m, 3] + noise[m, 3]
     if planar:
         xz, yz, zz, dz = 0.0, 0.0, 1.0, 0.0
     else:
-        xz = covariance[2] + noise[2]
-        yz = covariance[4] + noise[4]
-        zz = covariance[5] + noise[5]
-        dz = point[2] - mean[2]
+        xz = covariance[m, 2] + noise[m, 2]
+        yz = covariance[m, 4] + noise[m, 4]
+        zz = covariance[m, 5] + noise[m, 5]
+        dz = point[m, 2] - mean[m, 2]
     ixx, ixy, ixz, iyy, iyz, izz, determinant = inverse_and_determinant(xx, xy, xz, yy, yz, zz)
-    return (
-        point[0] - mean[0],
-        point[1] - mean[1],
-        dz,
-        ixx,
-        ixy,
-        ixz,
-        iyy,
-        iyz,
-        izz,
-        determinant,
-    )
+    dx, dy = point[m, 0] - mean[m, 0], point[m, 1] - mean[m, 1]
+    return dx, dy, dz, ixx, ixy, ixz, iyy, iyz, izz, determinant
 
 
 @njit(cache=True)

@@ -210,11 +210,13 @@ def test_localises_better_than_odometry():
     assert np.std(errors) < 0.5 * np.std(odometry_errors)
 
 
-def test_one_landmark_takes_one_observation_a_frame():
+@pytest.mark.parametrize("association", ["descriptor", "gate"])
+def test_one_landmark_takes_one_observation_a_frame(association):
     point = np.array([[1.0, 0.0, 0.5], [1.0, 0.01, 0.5]])
     descriptor = unit(np.ones((2, 64))).astype(np.float32)
     both = Observations(point, np.tile(1e-2 * np.eye(3), (2, 1, 1)), descriptor)
-    slam = FastSlam(parameters(motion=EXACT_MOTION), np.random.default_rng(0))
+    settings = parameters(motion=EXACT_MOTION, association=association)
+    slam = FastSlam(settings, np.random.default_rng(0))
     slam.step(np.zeros(3), both[:1])
     slam.step(np.zeros(3), both)
     assert slam.best_map().count.tolist() == [2, 1]
