@@ -1,0 +1,333 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import chi2
+
+from mapfusion import se2
+from mapfusion.align.correspondences import Correspondences
+from mapfusion.align.result import Alignment, Status, degenerate
+from mapfusion.aligned_landmarks import ABSENT, fuse
+from mapfusion.landmark_map import LandmarkMap
+from mapfusion.merge import MergeParameters, merge
+
+DRIFT_M = 0.05
+
+
+def covariances(rng, n, dimensions=3):
+    root = rng.normal(0, 0.1, (n, dimensions, dimensions))
+    return root @ np.swapaxes(root, 1, 2) + 1e-4 * np.eye(dimensions)
+
+
+def pairs_to_fuse(seed=0, n=50):
+    rng = np.random.default_rng(seed)
+    L_i, L_j = rng.uniform(-5, 5, (2, n, 3))
+    return L_i, covariances(rng, n), L_j, covariances(rng, n)
+
+
+def test_fusion_equals_the_information_form():
+    L_i, S_i, L_j, S_j = pairs_to_fuse()
+    W_i, W_j = np.linalg.inv(S_i), np.linalg.inv(S_j)
+    expected = np.linalg.inv(W_i + W_j)
+    weighted = (W_i @ L_i[:, :, None] + W_j @ L_j[:, :, None])[:, :, 0]
+    position, covariance = fuse(L_i, S_i, L_j, S_j)
+    np.testing.assert_allclose(covariance, expected, atol=1e-12)
+    np.testing.assert_allclose(
+        position, np.einsum("nij,nj->ni", expected, weighted), rtol=1e-9, atol=1e-9
+    )
+
+
+def test_fused_covariance_is_below_both_parents():
+    _, S_i, _, S_j = pairs = pairs_to_fuse(1)
+    _, covariance = fuse(*pairs)
+    for parent in (S_i, S_j):
+        assert np.linalg.eigvalsh(parent - covariance).min() > -1e-15
+
+
+def test_fusion_does_not_care_who_is_first():
+    L_i, S_i, L_j, S_j = pairs_to_fuse(2)
+    for ours, other in zip(fuse(L_i, S_i, L_j, S_j), fuse(L_j, S_j, L_i, S_i), strict=True):
+        np.testing.assert_allclose(ours, other, atol=1e-12)
+
+
+def as_printed(L_i, S_i, L_j, S_j):
+    """Eq. 12 to 14 letter by letter."""
+    K = S_i @ np.linalg.inv(S_i + S_j)
+    return L_i + np.einsum("nij,nj->ni", K, L_i - L_j), (np.eye(3) - K) @ S_i
+
+
+@pytest.mark.parametrize(("form", "holds"), [(fuse, True), (as_printed, False)])
+def test_round_landmarks_meet_between_their_parents(form, holds):
+    L_i, _, L_j, _ = pairs_to_fuse(3)
+    rng = np.random.default_rng(3)
+    s_i, s_j = rng.uniform(0.01, 1, (2, len(L_i), 1, 1))
+    position, _ = form(L_i, s_i * np.eye(3), L_j, s_j * np.eye(3))
+    along = np.einsum("ni,ni->n", position - L_i, L_j - L_i) / np.sum((L_j - L_i) ** 2, axis=1)
+    between = np.all((along > 0) & (along < 1))
+    on_line = np.allclose(L_i + along[:, None] * (L_j - L_i), position, atol=1e-9)
+    assert (between and on_line) == holds
+
+
+@given(st.floats(1e-3, 1e3), st.floats(1e-3, 1e3))
+def test_round_landmarks_share_by_their_certainty(s_i, s_j):
+    position, covariance = fuse(
+        np.zeros((1, 3)), s_i * np.eye(3)[None], np.ones((1, 3)), s_j * np.eye(3)[None]
+    )
+    assert position[0] == pytest.approx(s_i / (s_i + s_j))
+    assert covariance[0] == pytest.approx(np.eye(3) * s_i * s_j / (s_i + s_j))
+
+
+class Robots:
+    """Maps of one world by robots that saw parts of it, and the alignments to the first."""
+
+    def __init__(self, parts, drift_m=DRIFT_M, planar=False, labels=False, seed=0, false_T=None):
+        rng = np.random.default_rng(seed)
+        n = 1 + max(p.stop for p in parts) - 1
+        self.world = rng.uniform(0, [20, 20, 0 if planar else 2.5], (n, 3))
+        descriptor = rng.standard_normal((n, 64))
+        descriptor /= np.linalg.norm(descriptor, axis=1, keepdims=True)
+        self.rows = [np.arange(p.start, p.stop) for p in parts]
+        self.T_world_map = rng.uniform([-5, -5, -3], [5, 5, 3], (len(parts), 3))
+        free = np.array([1, 1, 0 if planar else 1])
+        self.maps = []
+        for k, rows in enumerate(self.rows):
+            rows = rng.permutation(rows)
+            self.rows[k] = rows
+            S = covariances(rng, len(rows)) * 0.2 * np.outer(free, free)
+            noise = rng.standard_normal((len(rows), 3, 1))
+            p = se2.transform_points(se2.inverse(self.T_world_map[k]), self.world[rows])
+            p += (np.linalg.cholesky(S + 1e-18 * np.eye(3)) @ noise)[:, :, 0] * free
+            p += rng.normal(0, drift_m, (len(rows), 3)) * [1, 1, 0]
+            seen = descriptor[rows] + rng.normal(0, 0.01, (len(rows), 64))
+            self.maps.append(
+                LandmarkMap(
+                    p,
+                    S,
+                    rng.integers(3, 20, len(rows)).astype(np.int32),
+                    np.arange(len(rows)),
+                    None if labels else seen.astype(np.float32),
+                    rows.astype(np.int32) if labels else None,
+                    planar,
+                    f"robot {k}",
+                )
+            )
+        self.correspondences, self.alignments = [], []
+        for k in range(1, len(parts)):
+            _, at_a, at_b = np.intersect1d(self.rows[0], self.rows[k], return_indices=True)
+            self.correspondences.append(Correspondences(at_a, at_b, np.zeros(len(at_a))))
+            T = se2.between(self.T_world_map[0], self.T_world_map[k])
+            accepted = np.ones(len(at_a), dtype=bool)
+            covariance = np.diag([0.02, 0.03, 0.004]) ** 2
+            self.alignments.append(
+                Alignment(T, covariance, accepted, 0.0, Status.ACCEPTED, "", drift_m * 2**0.5)
+            )
+
+    def merge(self, **parameters):
+        return merge(
+            self.maps, self.alignments, self.correspondences, MergeParameters(**parameters)
+        )
+
+    def point_of(self, fused):
+        """Row of the world that each fused landmark is, after its first parent."""
+        points = np.full(len(fused.landmarks), -1)
+        for rows, parents in zip(self.rows, fused.parents.T, strict=True):
+            points[(parents != ABSENT) & (points < 0)] = rows[
+                parents[(parents != ABSENT) & (points < 0)]
+            ]
+        return points
+
+    def errors(self, fused):
+        truth = se2.transform_points(se2.inverse(self.T_world_map[0]), self.world)
+        return fused.landmarks.position_m - truth[self.point_of(fused)]
+
+
+def test_every_landmark_once():
+    robots = Robots([slice(0, 100), slice(60, 160), slice(140, 200)])
+    fused = robots.merge()
+    points = robots.point_of(fused)
+    assert len(np.unique(points)) == len(points) == 200
+    for rows, parents in zip(robots.rows, fused.parents.T, strict=True):
+        known = parents != ABSENT
+        assert sorted(parents[known]) == list(range(len(rows)))  # none lost, none twice
+        np.testing.assert_array_equal(rows[parents[known]], points[known])
+    # points 140 to 160 are known to robots 1 and 2 only: no alignment speaks of them
+    assert np.sum(np.sum(fused.parents != ABSENT, axis=1) == 2) == 60
+    assert fused.duplicate_share == 0
+    assert fused.left_out == ()
+
+
+def test_order_of_the_sums():
+    """Fusing three in a row is the information form of all three."""
+    robots = Robots([slice(0, 30)] * 3)
+    fused = robots.merge(use_drift=False)
+    total, weighted = np.zeros((30, 3, 3)), np.zeros((30, 3))
+    for k in range(3):
+        T = fused.T_first_map[k]
+        S = se2.transform_covariances(T, robots.maps[k].covariance_m2)[fused.parents[:, k]]
+        p = se2.transform_points(T, robots.maps[k].position_m)[fused.parents[:, k]]
+        total += np.linalg.inv(S)
+        weighted += np.linalg.solve(S, p[:, :, None])[:, :, 0]
+    expected = np.linalg.inv(total)
+    np.testing.assert_allclose(fused.landmarks.covariance_m2, expected, atol=1e-10)
+    np.testing.assert_allclose(
+        fused.landmarks.position_m, np.einsum("nij,nj->ni", expected, weighted), atol=1e-7
+    )
+    counts = sum(robots.maps[k].count[fused.parents[:, k]] for k in range(3))
+    np.testing.assert_array_equal(fused.landmarks.count, counts)
+
+
+def test_unmatched_landmarks_move_with_their_covariance():
+    robots = Robots([slice(0, 40), slice(30, 70)])
+    fused = robots.merge(use_drift=False)
+    alone = np.flatnonzero(fused.parents[:, 0] == ABSENT)
+    source = robots.maps[1][fused.parents[alone, 1]]
+    T, c, s = fused.T_first_map[1], *(f(fused.T_first_map[1][2]) for f in (np.cos, np.sin))
+    R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    np.testing.assert_allclose(
+        fused.landmarks.position_m[alone], source.position_m @ R.T + [T[0], T[1], 0], atol=1e-12
+    )
+    np.testing.assert_allclose(
+        fused.landmarks.covariance_m2[alone], R @ source.covariance_m2 @ R.T, atol=1e-15
+    )
+    np.testing.assert_array_equal(fused.landmarks.descriptor[alone], source.descriptor)
+
+
+@pytest.mark.parametrize("use_drift", [True, False])
+def test_drift_makes_the_covariances_honest(use_drift):
+    robots = Robots([slice(0, 800), slice(200, 1000)])
+    fused = robots.merge(use_drift=use_drift)
+    e = robots.errors(fused)
+    nees = np.einsum("ni,nij,nj->n", e, np.linalg.inv(fused.landmarks.covariance_m2), e)
+    low, high = chi2.ppf([1e-4, 1 - 1e-4], 3 * len(e)) / len(e)
+    assert (low < nees.mean() < high) == use_drift
+    np.testing.assert_allclose(fused.drift_sigma_m, DRIFT_M)
+
+
+def test_fused_landmarks_beat_their_parents():
+    robots = Robots([slice(0, 500), slice(0, 500)])
+    fused = robots.merge()
+    truth = se2.transform_points(se2.inverse(robots.T_world_map[0]), robots.world)
+    parents = [
+        se2.transform_points(T, m.position_m) - truth[rows]
+        for T, m, rows in zip(fused.T_first_map, robots.maps, robots.rows, strict=True)
+    ]
+    rms = [np.sqrt(np.mean(np.sum(e**2, axis=1))) for e in (robots.errors(fused), *parents)]
+    assert rms[0] < 0.85 * np.mean(rms[1:])
+
+
+def test_alignment_uncertainty_against_monte_carlo():
+    """A landmark far from the origin of its map, moved by motions drawn from the covariance."""
+    robots = Robots([slice(0, 5), slice(3, 8)])
+    T, S_T = robots.alignments[0].T_a_b, robots.alignments[0].covariance
+    plain, widened = (
+        robots.merge(use_drift=False, use_alignment_uncertainty=u).landmarks for u in (False, True)
+    )
+    fused = robots.merge()
+    row = int(np.flatnonzero(fused.parents[:, 0] == ABSENT)[0])
+    p_b = robots.maps[1].position_m[fused.parents[row, 1]]
+    drawn = np.random.default_rng(0).multivariate_normal(T, S_T, 20_000)
+    moved = np.array([se2.transform_points(t, p_b[None])[0, :2] for t in drawn])
+    added = (widened.covariance_m2 - plain.covariance_m2)[row]
+    np.testing.assert_allclose(added[:2, :2], np.cov(moved.T), rtol=0.1, atol=2e-4)
+    assert np.all(added[2] == 0)
+
+
+def test_second_pass_finds_what_the_alignment_missed():
+    robots = Robots([slice(0, 100), slice(0, 100)])
+    inlier = np.arange(100) < 70
+    robots.alignments[0] = replace(robots.alignments[0], inlier=inlier)
+    fused = robots.merge()
+    assert len(fused.landmarks) == 100
+    assert np.all(fused.parents != ABSENT)
+
+
+@pytest.mark.parametrize("wrong", ["descriptor", "height", "place"])
+def test_second_pass_pairs_only_what_may_be_one_point(wrong):
+    robots = Robots([slice(0, 50), slice(0, 50)])
+    robots.alignments[0] = replace(robots.alignments[0], inlier=np.zeros(50, dtype=bool))
+    b = robots.maps[1]
+    changed = {
+        "descriptor": {"descriptor": -b.descriptor},
+        "height": {"position_m": b.position_m + np.array([0, 0, 2.0])},
+        "place": {"position_m": b.position_m + np.array([3.0, 0, 0])},
+    }[wrong]
+    robots.maps[1] = replace(b, **changed)
+    assert len(robots.merge().landmarks) == 100
+
+
+def test_duplicates_that_remain_are_counted():
+    """A robot that mapped 20 of its 80 points twice: fusing is one to one, so they remain."""
+    robots = Robots([slice(0, 80), slice(80, 120)], drift_m=0.01)
+    twice = np.concatenate([np.arange(80), np.arange(20)])
+    robots.maps[0] = robots.maps[0][twice]
+    fused = robots.merge()
+    assert len(fused.landmarks) == 140
+    assert fused.duplicate_share == pytest.approx(40 / 140)
+
+
+def test_labels_pair_in_the_second_pass():
+    robots = Robots([slice(0, 15), slice(5, 20)], labels=True, planar=True)
+    robots.alignments[0] = replace(robots.alignments[0], inlier=np.zeros(10, dtype=bool))
+    fused = robots.merge()
+    assert sorted(fused.landmarks.label) == list(range(20))
+    assert fused.landmarks.descriptor is None
+
+
+def test_planar_maps_stay_in_the_plane():
+    robots = Robots([slice(0, 30), slice(0, 30)], planar=True)
+    fused = robots.merge().landmarks
+    assert fused.planar
+    assert np.all(fused.position_m[:, 2] == 0)
+    assert np.all(fused.covariance_m2[:, 2] == 0)
+
+
+def test_maps_that_did_not_align_are_left_out():
+    robots = Robots([slice(0, 50), slice(20, 70), slice(40, 90)])
+    n = len(robots.correspondences[0])
+    robots.alignments[0] = degenerate("two correspondences only", n)
+    fused = robots.merge()
+    assert fused.left_out == (("robot 1", "two correspondences only"),)
+    assert np.all(fused.parents[:, 1] == ABSENT)
+    assert np.isnan(fused.T_first_map[1]).all()
+    assert len(fused.landmarks) == 90
+    robots.alignments[1] = degenerate("none", len(robots.correspondences[1]))
+    assert len(robots.merge().landmarks) == 50
+
+
+def test_empty_maps_merge():
+    robots = Robots([slice(0, 20), slice(0, 20)])
+    nothing = np.zeros(0, dtype=np.int64)
+    robots.maps[1] = robots.maps[1][nothing]
+    robots.correspondences[0] = Correspondences(nothing, nothing, np.zeros(0))
+    robots.alignments[0] = replace(robots.alignments[0], inlier=np.zeros(0, dtype=bool))
+    assert len(robots.merge().landmarks) == 20
+    robots.maps[0] = robots.maps[0][nothing]
+    fused = robots.merge()
+    assert len(fused.landmarks) == 0
+    assert fused.duplicate_share == 0
+
+
+def test_wrong_arguments_are_named():
+    robots = Robots([slice(0, 20), slice(0, 20)])
+    maps, alignments, pairs = robots.maps, robots.alignments, robots.correspondences
+    with pytest.raises(ValueError, match="maps: 1 given"):
+        merge(maps[:1], [], [])
+    with pytest.raises(ValueError, match="alignments: 0 given"):
+        merge(maps, [], pairs)
+    with pytest.raises(ValueError, match="correspondences: 2 given"):
+        merge(maps, alignments, pairs * 2)
+    short = replace(alignments[0], inlier=np.ones(3, dtype=bool))
+    with pytest.raises(ValueError, match="inlier"):
+        merge(maps, [short], pairs)
+    double = Correspondences(np.zeros(20, np.int64), np.arange(20), np.zeros(20))
+    with pytest.raises(ValueError, match="index_a: inliers are not one to one"):
+        merge(maps, alignments, [double])
+    outside = Correspondences(np.arange(20), np.arange(20) + 1, np.zeros(20))
+    with pytest.raises(ValueError, match="index_b: lies outside"):
+        merge(maps, alignments, [outside])
+    with pytest.raises(ValueError, match="gate_probability"):
+        MergeParameters(gate_probability=1.0)
+    with pytest.raises(ValueError, match="max_descriptor_distance"):
+        MergeParameters(max_descriptor_distance=0.0)
