@@ -68,12 +68,14 @@ def test_robots_see_each_other_where_they_are(source: FrameSource) -> None:
     assert width_px == pytest.approx(CAMERA.focal_px * LENGTH_M / (1.85 - 0.497 / 2), abs=4)
 
 
-def test_a_robot_does_not_see_itself(source: FrameSource) -> None:
-    """With b behind it, a sees the room's surfaces only; its own deck would begin at 0.1 m."""
-    poses = np.array([[2.0, 2.8, 0.3], [1.0, 2.8, 0.0]])
-    depth = source.render(poses, "a", np.random.default_rng(0)).depth_m
-    lowest_ray = (CAMERA.height_px - 1 - CAMERA.center_px[1]) / CAMERA.focal_px
-    assert depth.min() == pytest.approx(CAMERA.mount_z_m / lowest_ray, abs=1e-3)  # the floor
+def test_a_robot_does_not_see_itself(faces: Path) -> None:
+    """From the rear of the deck it would see the deck; b, behind it, is out of sight too."""
+    camera = StereoCamera(320, 240, 288.0, mount_x_m=-0.3)
+    poses = np.array([[2.2, 2.8, 0.3], [1.0, 2.8, 0.0]])
+    with FrameSource(faces, camera, ROBOTS, RadiometricNoise()) as source:
+        depth = source.render(poses, "a", np.random.default_rng(0)).depth_m
+    lowest_ray = (camera.height_px - 1 - camera.center_px[1]) / camera.focal_px
+    assert depth.min() == pytest.approx(camera.mount_z_m / lowest_ray, abs=1e-3)  # the floor
 
 
 def test_truth_points_lie_on_what_is_seen(source: FrameSource) -> None:

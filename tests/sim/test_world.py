@@ -51,6 +51,25 @@ def test_silence_lets_python_speak_before_and_after(capfd: pytest.CaptureFixture
     assert capfd.readouterr() == ("before after", "error")
 
 
+C_PRINTS = """
+import ctypes
+from sim.world import silence
+libc = ctypes.CDLL(None)
+libc.printf(b"before ")
+with silence():
+    libc.printf(b"inside")
+libc.printf(b"after")
+"""
+
+
+def test_what_c_still_buffers_is_sorted_too() -> None:
+    buffered = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"}
+    result = subprocess.run(
+        [sys.executable, "-c", C_PRINTS], capture_output=True, check=True, env=buffered
+    )
+    assert result.stdout == b"before after"
+
+
 def test_silence_ends_with_an_error(capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(ValueError, match="broken"), silence():
         raise ValueError("broken")
