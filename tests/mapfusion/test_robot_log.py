@@ -1,0 +1,156 @@
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from mapfusion.errors import InputError
+from mapfusion.robot_log import (
+    Observations,
+    RobotLog,
+    read_log,
+    read_truth,
+    write_log,
+    write_observations,
+    write_truth_points,
+    write_truth_poses,
+)
+
+
+def a_log(descriptor=True, label=True, uvd=True, n=6, planar=False):
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(n, 3, 3))
+    observations = Observations(
+        rng.normal(size=(n, 3)),
+        root @ np.swapaxes(root, 1, 2),
+        rng.normal(size=(n, 64)).astype(np.float32) if descriptor else None,
+        rng.integers(0, 9, n).astype(np.int32) if label else None,
+        rng.normal(size=(n, 3)).astype(np.float32) if uvd else None,
+    )
+    odometry = rng.normal(size=(4, 3))
+    odometry[0] = 0
+    iteration = np.sort(rng.choice([0, 2, 3], n)).astype(np.int32)  # frame 1 sees nothing
+    return RobotLog("north", planar, np.arange(4) * 0.1, odometry, iteration, observations)
+
+
+def assert_equal(log, other):
+    for name in ("robot", "planar"):
+        assert getattr(log, name) == getattr(other, name)
+    for name in ("time_s", "odometry", "iteration"):
+        np.testing.assert_array_equal(getattr(log, name), getattr(other, name))
+    for name in Observations.__dataclass_fields__:
+        ours, theirs = (getattr(x.observations, name) for x in (log, other))
+        assert (ours is None) == (theirs is None)
+        if ours is not None:
+            assert ours.dtype == theirs.dtype
+            np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize("optional", [True, False])
+@pytest.mark.parametrize("planar", [True, False])
+def test_round_trip(tmp_path, optional, planar):
+    log = a_log(optional, optional, optional, planar=planar)
+    write_log(tmp_path / "north", log)
+    assert_equal(read_log(tmp_path / "north"), log)
+
+
+def test_log_that_saw_nothing(tmp_path):
+    log = a_log(n=0)
+    write_log(tmp_path, log)
+    read = read_log(tmp_path)
+    assert len(read) == 4
+    assert len(read.observations) == 0
+    np.testing.assert_array_equal(read.frame_starts(), np.zeros(5))
+
+
+def test_frames_and_their_observations():
+    log = replace(a_log(), iteration=np.array([0, 0, 2, 2, 2, 3], np.int32))
+    np.testing.assert_array_equal(log.frame_starts(), [0, 2, 2, 5, 6])
+    third = log.observations[slice(2, 5)]
+    assert len(third) == 3
+    np.testing.assert_array_equal(third.label, log.observations.label[2:5])
+
+
+def test_truth_round_trip(tmp_path):
+    rng = np.random.default_rng(1)
+    poses, points = rng.normal(size=(4, 3)), rng.normal(size=(6, 3))
+    points[2] = np.nan  # unknown
+    write_truth_poses(tmp_path, poses)
+    write_truth_points(tmp_path, points)
+    truth = read_truth(tmp_path)
+    np.testing.assert_array_equal(truth.T_world_robot, poses)
+    np.testing.assert_array_equal(truth.point_world_m, points)
+
+
+def test_log_holds_no_truth(tmp_path):
+    write_log(tmp_path, a_log())
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["frames.parquet", "observations.parquet"]
+    with pytest.raises(InputError, match="truth_poses"):
+        read_truth(tmp_path)
+
+
+def test_tables_are_readable_with_plain_pandas(tmp_path):
+    log = a_log()
+    write_log(tmp_path, log)
+    frame = pd.read_parquet(tmp_path / "observations.parquet")
+    np.testing.assert_array_equal(frame["x_m"], log.observations.position_m[:, 0])
+    np.testing.assert_array_equal(np.stack(frame["descriptor"]), log.observations.descriptor)
+
+
+@pytest.mark.parametrize("name", ["frames.parquet", "observations.parquet"])
+def test_missing_or_foreign_table_is_named(tmp_path, name):
+    write_log(tmp_path, a_log())
+    other = {"frames.parquet": "observations.parquet", "observations.parquet": "frames.parquet"}
+    (tmp_path / name).write_bytes((tmp_path / other[name]).read_bytes())
+    with pytest.raises(InputError, match=f"{name}: kind is robot_log"):
+        read_log(tmp_path)
+    (tmp_path / name).unlink()
+    with pytest.raises(InputError, match=f"{name}: no such file"):
+        read_log(tmp_path)
+
+
+def test_missing_folder_is_named(tmp_path):
+    with pytest.raises(InputError, match="nowhere: no such folder"):
+        read_log(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize(
+    ("iteration", "message"),
+    [([3, 2, 2, 2, 0, 0], "ordered"), ([0, 0, 0, 0, 0, 9], "0..3"), ([-1, 0, 0, 0, 0, 0], "0..3")],
+)
+def test_observations_of_no_frame_are_bad_input(tmp_path, iteration, message):
+    log = a_log()
+    write_log(tmp_path, log)
+    write_observations(tmp_path, np.array(iteration), log.observations)
+    with pytest.raises(InputError, match=message):
+        read_log(tmp_path)
+
+
+def test_nan_position_is_bad_input(tmp_path):
+    log = a_log()
+    write_log(tmp_path, log)
+    path = tmp_path / "observations.parquet"
+    log.observations.position_m[3, 1] = np.nan
+    write_observations(tmp_path, log.iteration, log.observations)
+    with pytest.raises(InputError, match="position_m: contains NaN") as caught:
+        read_log(tmp_path)
+    assert str(path) in str(caught.value)
+
+
+def test_wrong_arguments_are_named():
+    log = a_log()
+    o = log.observations
+    with pytest.raises(
+        ValueError, match=r"covariance_m2: shape is \(5, 3, 3\), expected \(6, 3, 3\)"
+    ):
+        replace(o, covariance_m2=o.covariance_m2[:5])
+    with pytest.raises(ValueError, match="descriptor"):
+        replace(o, descriptor=o.descriptor[:, :32])
+    with pytest.raises(ValueError, match="label"):
+        replace(o, label=o.label[:2])
+    with pytest.raises(ValueError, match="uvd_px"):
+        replace(o, uvd_px=o.uvd_px[:, :2])
+    with pytest.raises(ValueError, match="odometry"):
+        replace(log, odometry=log.odometry[:2])
+    with pytest.raises(ValueError, match="iteration"):
+        replace(log, iteration=log.iteration[:2])

@@ -1,0 +1,102 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from mapfusion import se2
+
+metres = st.floats(-100, 100)
+# whole turns and their neighbourhood included
+radians = st.floats(-10, 10) | st.sampled_from([0.0, 1e-9, np.pi, -np.pi, np.pi - 1e-9, 3 * np.pi])
+motions = st.tuples(metres, metres, radians).map(np.array)
+batches = hnp.array_shapes(min_dims=1, max_dims=3, max_side=4).flatmap(
+    lambda shape: hnp.arrays(np.float64, (*shape, 3), elements=metres)
+)
+
+
+def matrix(T):
+    c, s = np.cos(T[2]), np.sin(T[2])
+    return np.array([[c, -s, T[0]], [s, c, T[1]], [0, 0, 1]])
+
+
+def assert_same(T, other):
+    np.testing.assert_allclose(T[..., :2], other[..., :2], atol=1e-9)
+    np.testing.assert_allclose(se2.wrap(T[..., 2] - other[..., 2]), 0, atol=1e-9)
+
+
+@given(motions, motions)
+def test_compose_is_the_product_of_matrices(T_a_b, T_b_c):
+    composed = se2.compose(T_a_b, T_b_c)
+    np.testing.assert_allclose(matrix(composed), matrix(T_a_b) @ matrix(T_b_c), atol=1e-9)
+    assert -np.pi <= composed[2] < np.pi
+
+
+@given(motions)
+def test_inverse_is_the_inverse_matrix(T_a_b):
+    np.testing.assert_allclose(matrix(se2.inverse(T_a_b)) @ matrix(T_a_b), np.eye(3), atol=1e-9)
+
+
+@given(motions)
+def test_identity(T_a_b):
+    assert_same(se2.compose(T_a_b, se2.IDENTITY), T_a_b)
+    assert_same(se2.compose(se2.IDENTITY, T_a_b), T_a_b)
+    assert_same(se2.compose(T_a_b, se2.inverse(T_a_b)), se2.IDENTITY)
+
+
+@given(motions, motions, motions)
+def test_associative(T_a_b, T_b_c, T_c_d):
+    assert_same(
+        se2.compose(se2.compose(T_a_b, T_b_c), T_c_d),
+        se2.compose(T_a_b, se2.compose(T_b_c, T_c_d)),
+    )
+
+
+@given(motions, motions)
+def test_between_undoes_compose(T_w_a, T_a_b):
+    assert_same(se2.between(T_w_a, se2.compose(T_w_a, T_a_b)), T_a_b)
+
+
+@given(batches)
+def test_batches_are_their_elements(T):
+    assert se2.inverse(T).shape == se2.compose(T, T).shape == T.shape
+    for index in np.ndindex(T.shape[:-1]):
+        assert_same(se2.inverse(T)[index], se2.inverse(T[index]))
+        assert_same(se2.compose(T, T[..., ::-1])[index], se2.compose(T[index], T[index][::-1]))
+        np.testing.assert_array_equal(se2.rotation(T[..., 2])[index], se2.rotation(T[index][2]))
+
+
+@given(radians)
+def test_wrap(angle):
+    wrapped = se2.wrap(angle)
+    assert -np.pi <= wrapped < np.pi
+    assert np.cos(wrapped) == pytest.approx(np.cos(angle), abs=1e-9)
+    assert np.sin(wrapped) == pytest.approx(np.sin(angle), abs=1e-9)
+
+
+@given(motions, hnp.arrays(np.float64, (5, 3), elements=metres))
+def test_points_move_as_under_the_matrix_and_keep_their_height(T_a_b, p_b):
+    before = p_b.copy()
+    p_a = se2.transform_points(T_a_b, p_b)
+    homogeneous = np.column_stack([p_b[:, :2], np.ones(5)])
+    np.testing.assert_allclose(p_a[:, :2], (homogeneous @ matrix(T_a_b).T)[:, :2], atol=1e-9)
+    np.testing.assert_array_equal(p_a[:, 2], p_b[:, 2])
+    np.testing.assert_array_equal(p_b, before)
+    np.testing.assert_allclose(se2.transform_points(T_a_b, p_b[:, :2]), p_a[:, :2], atol=1e-9)
+
+
+def test_a_quarter_turn_is_counter_clockwise():
+    T_a_b = np.array([1.0, 2.0, np.pi / 2])
+    np.testing.assert_allclose(
+        se2.transform_points(T_a_b, np.array([[1.0, 0.0, 5.0]])), [[1.0, 3.0, 5.0]], atol=1e-12
+    )
+    turned = se2.transform_covariances(T_a_b, np.diag([4.0, 1.0, 9.0])[None])
+    np.testing.assert_allclose(turned[0], np.diag([1.0, 4.0, 9.0]), atol=1e-12)
+
+
+def test_covariance_moves_as_samples_do():
+    T_a_b = np.array([3.0, -2.0, 0.6])
+    S = np.array([[0.5, 0.2, 0.1], [0.2, 0.3, 0.0], [0.1, 0.0, 0.2]])
+    p = np.random.default_rng(0).multivariate_normal([1, 2, 3], S, 200_000)
+    expected = se2.transform_covariances(T_a_b, S[None])[0]
+    np.testing.assert_allclose(np.cov(se2.transform_points(T_a_b, p).T), expected, atol=0.01)

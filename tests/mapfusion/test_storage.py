@@ -1,0 +1,173 @@
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pytest
+
+from mapfusion.errors import InputError
+from mapfusion.storage import (
+    column,
+    point_columns,
+    point_fields,
+    points_from,
+    read_table,
+    schema,
+    write_table,
+    write_whole,
+)
+
+THINGS = schema(
+    "test.things",
+    2,
+    [
+        pa.field("name", pa.string()),
+        pa.field("weight_kg", pa.float64()),
+        pa.field("code", pa.list_(pa.float32(), 3)),
+    ],
+)
+COLUMNS = {
+    "name": np.array(["a", "b"]),
+    "weight_kg": np.array([1.5, np.nan]),
+    "code": np.arange(6, dtype=np.float32).reshape(2, 3),
+}
+
+
+def test_round_trip(tmp_path):
+    path = tmp_path / "new" / "things.parquet"
+    write_table(path, COLUMNS, THINGS, {"robot": "north"})
+    table, attributes = read_table(path, THINGS)
+    assert attributes["robot"] == "north"
+    assert list(column(table, "name")) == ["a", "b"]
+    np.testing.assert_array_equal(column(table, "weight_kg"), COLUMNS["weight_kg"])
+    np.testing.assert_array_equal(column(table, "code"), COLUMNS["code"])
+    assert list(pd.read_parquet(path).columns) == list(COLUMNS)
+
+
+def test_empty_table_keeps_its_types(tmp_path):
+    path = tmp_path / "things.parquet"
+    write_table(path, {name: values[:0] for name, values in COLUMNS.items()}, THINGS)
+    table, _ = read_table(path, THINGS)
+    assert table.schema.equals(THINGS, check_metadata=False)
+    assert column(table, "code").shape == (0, 3)
+
+
+def test_points_round_trip(tmp_path):
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(7, 3, 3))
+    position, covariance = rng.normal(size=(7, 3)), root @ np.swapaxes(root, 1, 2)
+    points = schema("test.points", 1, point_fields())
+    write_table(tmp_path / "p.parquet", point_columns(position, covariance), points)
+    table, _ = read_table(tmp_path / "p.parquet", points)
+    for read, written in zip(points_from(table), (position, covariance), strict=True):
+        np.testing.assert_array_equal(read, written)
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):
+    path = tmp_path / "things.parquet"
+    path.write_text("old")
+
+    def fail(temporary):
+        temporary.write_text("half")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_whole(path, fail)
+    assert [p.name for p in tmp_path.iterdir()] == ["things.parquet"]
+    assert path.read_text() == "old"
+
+
+def damaged(path):
+    """Ways to spoil a table, with what the message must say."""
+    write_table(path, COLUMNS, THINGS)
+    whole = path.read_bytes()
+
+    def missing():
+        path.unlink()
+
+    def truncated():
+        path.write_bytes(whole[: len(whole) // 2])
+
+    def empty():
+        path.write_bytes(b"")
+
+    def foreign():
+        path.write_text("name,weight_kg\na,1\n")
+
+    def folder():
+        path.unlink()
+        path.mkdir()
+
+    def no_metadata():
+        pd.DataFrame({"name": ["a"]}).to_parquet(path)
+
+    def other_kind():
+        write_table(path, COLUMNS, schema("test.others", 2, list(THINGS)))
+
+    def other_version():
+        write_table(path, COLUMNS, schema("test.things", 1, list(THINGS)))
+
+    def column_lost():
+        write_table(path, COLUMNS, schema("test.things", 2, list(THINGS)[:2]))
+
+    def other_type():
+        fields = [
+            pa.field("name", pa.string()),
+            pa.field("weight_kg", pa.float32()),
+            THINGS.field(2),
+        ]
+        write_table(path, COLUMNS, schema("test.things", 2, fields))
+
+    return {
+        "missing": (missing, "no such file"),
+        "truncated": (truncated, "damaged"),
+        "empty": (empty, "damaged"),
+        "foreign": (foreign, "not a Parquet file"),
+        "folder": (folder, "no such file"),
+        "no metadata": (no_metadata, "kind is none, expected test.things"),
+        "other kind": (other_kind, "kind is test.others, expected test.things"),
+        "other version": (other_version, "schema_version is 1"),
+        "column lost": (column_lost, "columns are not those of test.things"),
+        "other type": (other_type, "columns are not those of test.things"),
+    }
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        "missing",
+        "truncated",
+        "empty",
+        "foreign",
+        "folder",
+        "no metadata",
+        "other kind",
+        "other version",
+        "column lost",
+        "other type",
+    ],
+)
+def test_damaged_file_is_one_clear_line(tmp_path, case):
+    path = tmp_path / "things.parquet"
+    spoil, message = damaged(path)[case]
+    spoil()
+    with pytest.raises(InputError) as caught:
+        read_table(path, THINGS)
+    text = str(caught.value)
+    assert text.startswith(str(path))
+    assert message in text
+    assert "\n" not in text
+
+
+@pytest.mark.parametrize("position", [0.1, 0.5, 0.9])
+def test_flipped_bytes_never_pass_unnoticed_as_another_error(tmp_path, position):
+    """Whatever is hit, a reader sees an InputError or a table of the right schema."""
+    path = tmp_path / "things.parquet"
+    write_table(path, COLUMNS, THINGS)
+    spoilt = bytearray(path.read_bytes())
+    at = int(position * len(spoilt))
+    spoilt[at : at + 8] = bytes(255 - b for b in spoilt[at : at + 8])
+    path.write_bytes(bytes(spoilt))
+    try:
+        table, _ = read_table(path, THINGS)
+    except InputError:
+        return
+    assert table.schema.equals(THINGS, check_metadata=False)
