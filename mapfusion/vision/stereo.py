@@ -21,6 +21,8 @@ from mapfusion.vision.plane_fit import disagrees, fit_planes
 from mapfusion.vision.row_search import search_rows
 from mapfusion.vision.verdict import Verdict
 
+_MAX_HALF_PX = 90  # (2 * 90 + 1)^2 squared grey levels still fit a 32-bit sum
+
 
 @dataclass(frozen=True)
 class StereoParameters:
@@ -42,7 +44,9 @@ class StereoParameters:
             disparity would explain.
         residual_correlation_px: residuals are alike over so many pixels each way (staircase edges,
             texture seen through a lens), so that many squared count as one.
-        sigma_floor_px: error that stays however much texture there is.
+        sigma_floor_px: error that stays however much texture there is. This and the one before
+            are the most probable values for the errors against rendered depth, where edges
+            fall on whole pixels; a lens and a sensor do better.
     """
 
     min_depth_m: float = 0.5
@@ -76,8 +80,8 @@ class StereoParameters:
                 raise ValueError(f"{name}: must lie in (0, 1]")
         if self.max_depth_m <= self.min_depth_m:
             raise ValueError("max_depth_m: must exceed min_depth_m")
-        if self.half_px < 2:
-            raise ValueError("half_px: must be at least 2")
+        if not 2 <= self.half_px <= _MAX_HALF_PX:
+            raise ValueError(f"half_px: must lie in 2..{_MAX_HALF_PX}")
         if self.silhouette_half_px < self.half_px:
             raise ValueError("silhouette_half_px: must be at least half_px")
 

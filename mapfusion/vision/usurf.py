@@ -41,6 +41,7 @@ class USurfParameters:
             of a wall from any distance, which needs the depth.
         scale_px: scale s of "pixels".
         side_m: side of the window of "metric" at the keypoint's depth Z; s = f side_m / (20 Z).
+            Rendered walls from two distances or angles matched best at 0.5 to 0.8 m.
         min_scale_px: lower bound of "metric"; below one pixel there is nothing left to average.
         max_scale_px: upper bound of "metric"; a window near the image's size is mostly border.
     """

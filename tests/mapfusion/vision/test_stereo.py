@@ -262,6 +262,7 @@ def test_wrong_arguments_are_named(name: str, change: dict) -> None:
         ("min_depth_m", 0.0),
         ("max_depth_m", 0.1),
         ("half_px", 1),
+        ("half_px", 91),
         ("min_correlation", 1.5),
         ("silhouette_half_px", 3),
         ("sigma_floor_px", -0.1),
