@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from scipy.stats import chi2
 
 from mapfusion.arguments import require_finite, require_shape
@@ -70,10 +71,15 @@ class HeightGate:
         if not self.floor_m >= 0:
             raise ValueError(f"floor_m: is {self.floor_m}, expected 0 or more")
 
+    @property
+    def bound(self) -> float:
+        """Most for the squared difference of two heights over its variance."""
+        return float(chi2.ppf(self.probability, 1))
+
     def agrees(self, z_a_m: Float, variance_a_m2: Float, z_b_m: Float, variance_b_m2: Float):
         """Bool array: heights that agree; arguments broadcast."""
         variance = variance_a_m2 + variance_b_m2 + self.floor_m**2
-        return (z_a_m - z_b_m) ** 2 <= chi2.ppf(self.probability, 1) * variance
+        return (z_a_m - z_b_m) ** 2 <= self.bound * variance
 
 
 @dataclass(frozen=True)
@@ -140,31 +146,77 @@ def _nearest_both_ways(
     """Nearest b of each a, its squared distance (infinite: none fits), and nearest a of each b."""
     assert map_a.descriptor is not None
     assert map_b.descriptor is not None
-    planar = map_a.planar or map_b.planar
     descriptor_a = np.nan_to_num(map_a.descriptor.astype(np.float32), nan=_ABSENT)
     descriptor_b = np.nan_to_num(map_b.descriptor.astype(np.float32), nan=-_ABSENT)
-    norm_b = np.einsum("ij,ij->i", descriptor_b, descriptor_b)
-    nearest_b = np.zeros(len(map_a), np.int64)
-    best_of_a = np.full(len(map_a), np.inf)
-    nearest_a = np.zeros(len(map_b), np.int64)
-    best_of_b = np.full(len(map_b), np.inf)
-    columns = np.arange(len(map_b))
+    square_a = np.einsum("ij,ij->i", descriptor_a, descriptor_a)
+    square_b = np.einsum("ij,ij->i", descriptor_b, descriptor_b)
+    planar = map_a.planar or map_b.planar
+    height_bound = np.inf if planar else parameters.height.bound
+    nearest_b, best_of_a = np.zeros(len(map_a), np.int64), np.full(len(map_a), np.inf)
+    nearest_a, best_of_b = np.zeros(len(map_b), np.int64), np.full(len(map_b), np.inf)
     for start in range(0, len(map_a), _BLOCK_ROWS):
-        block = slice(start, start + _BLOCK_ROWS)
-        a = descriptor_a[block]
-        distance2 = np.einsum("ij,ij->i", a, a)[:, None] + norm_b - 2 * (a @ descriptor_b.T)
-        if not planar:
-            fits = parameters.height.agrees(
-                map_a.position_m[block, 2, None],
-                map_a.covariance_m2[block, 2, 2, None],
-                map_b.position_m[:, 2],
-                map_b.covariance_m2[:, 2, 2],
-            )
-            distance2 = np.where(fits, distance2, np.inf)
-        nearest_b[block] = np.argmin(distance2, axis=1)
-        best_of_a[block] = np.min(distance2, axis=1)
-        row = np.argmin(distance2, axis=0)
-        nearer = distance2[row, columns] < best_of_b
-        nearest_a[nearer] = row[nearer] + start
-        best_of_b[nearer] = distance2[row, columns][nearer]
+        rows = slice(start, start + _BLOCK_ROWS)
+        take_nearer(
+            descriptor_a[rows] @ descriptor_b.T,
+            start,
+            square_a,
+            square_b,
+            map_a.position_m[:, 2],
+            map_b.position_m[:, 2],
+            map_a.covariance_m2[:, 2, 2],
+            map_b.covariance_m2[:, 2, 2] + parameters.height.floor_m**2,
+            height_bound,
+            nearest_b,
+            best_of_a,
+            nearest_a,
+            best_of_b,
+        )
     return nearest_b, best_of_a, nearest_a
+
+
+@njit(cache=True)
+def take_nearer(
+    product: np.ndarray,
+    start: int,
+    square_a: np.ndarray,
+    square_b: np.ndarray,
+    z_a: Float,
+    z_b: Float,
+    variance_a: Float,
+    variance_b: Float,
+    height_bound: float,
+    nearest_b: np.ndarray,
+    best_of_a: Float,
+    nearest_a: np.ndarray,
+    best_of_b: Float,
+) -> None:
+    """Update the nearest both ways, with squared distances, from scalar products of descriptors.
+
+    Args:
+        product: (n, N_b) of rows start to start + n of map a with all of map b.
+        start: first of these rows.
+        square_a: (N_a,) squared norms of the descriptors.
+        square_b: (N_b,) squared norms of the descriptors.
+        z_a: (N_a,) heights.
+        z_b: (N_b,) heights.
+        variance_a: (N_a,) of the heights.
+        variance_b: (N_b,) of the heights.
+        height_bound: most for the squared difference of heights over its variance.
+        nearest_b: (N_a,) updated.
+        best_of_a: (N_a,) updated.
+        nearest_a: (N_b,) updated.
+        best_of_b: (N_b,) updated.
+    """
+    for k in range(product.shape[0]):
+        i = start + k
+        for j in range(product.shape[1]):
+            distance2 = square_a[i] + square_b[j] - 2 * product[k, j]
+            if distance2 >= best_of_a[i] and distance2 >= best_of_b[j]:
+                continue
+            dz = z_a[i] - z_b[j]
+            if dz * dz > height_bound * (variance_a[i] + variance_b[j]):
+                continue
+            if distance2 < best_of_a[i]:
+                nearest_b[i], best_of_a[i] = j, distance2
+            if distance2 < best_of_b[j]:
+                nearest_a[j], best_of_b[j] = i, distance2

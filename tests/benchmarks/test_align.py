@@ -1,0 +1,62 @@
+"""Speed of map alignment: `pytest tests/benchmarks/test_align.py --benchmark-only`."""
+
+import numpy as np
+import pytest
+
+from mapfusion import se2
+from mapfusion.align.correspondences import Correspondences, match
+from mapfusion.align.ransac import Ransac
+from mapfusion.align.refine import Refinement
+from mapfusion.align.registry import make_aligner
+from mapfusion.landmark_map import LandmarkMap
+
+SIZE_M = np.array([20.0, 20.0, 2.5])
+NOISE_M = 0.05
+T_A_B = np.array([3.0, -2.0, 0.7])
+
+
+def a_map(position_m, descriptor=None):
+    n = len(position_m)
+    covariance = np.tile(np.eye(3) * NOISE_M**2, (n, 1, 1))
+    return LandmarkMap(position_m, covariance, np.full(n, 5), np.arange(n), descriptor)
+
+
+def maps_with_pairs(n_landmarks, n_pairs, true_share):
+    """Two maps of a 20x20x2.5 m world of which the first pairs, as far as true, are one point."""
+    rng = np.random.default_rng(0)
+    p = rng.uniform(0, SIZE_M, (n_landmarks, 3))
+    other = p + rng.normal(0, NOISE_M, p.shape)
+    n_true = round(true_share * n_pairs)
+    other[n_true:n_pairs] = rng.uniform(0, SIZE_M, (n_pairs - n_true, 3))
+    map_b = a_map(se2.transform_points(se2.inverse(T_A_B), other))
+    rows = np.arange(n_pairs)
+    return a_map(p), map_b, Correspondences(rows, rows, rng.uniform(0, 0.3, n_pairs))
+
+
+@pytest.mark.parametrize("outliers", [0.5, 0.95, 0.99])
+def test_ransac_1000_pairs(benchmark, outliers):
+    """Bars: 5 ms at 95 % outliers, 50 ms at 99 %."""
+    maps = maps_with_pairs(1000, 1000, 1 - outliers)
+    found = benchmark(lambda: Ransac().align(*maps, np.random.default_rng(0)))
+    assert found.ok
+
+
+@pytest.mark.parametrize("name", ["ransac", "svd", "icp", "impicp"])
+def test_aligner_on_maps_of_1600_landmarks(benchmark, name):
+    maps = maps_with_pairs(1600, 200, 0.3)
+    aligner = make_aligner(name)
+    benchmark(lambda: aligner.align(*maps, np.random.default_rng(0)))
+
+
+def test_refinement_200_pairs(benchmark):
+    maps = maps_with_pairs(1600, 200, 0.3)
+    assert benchmark(lambda: Refinement().refine(*maps, T_A_B)).ok
+
+
+@pytest.mark.parametrize("n", [1600, 5000])
+def test_match(benchmark, n):
+    rng = np.random.default_rng(0)
+    descriptor = rng.standard_normal((n, 64)).astype(np.float32)
+    descriptor /= np.linalg.norm(descriptor, axis=1, keepdims=True)
+    landmarks = a_map(rng.uniform(0, SIZE_M, (n, 3)), descriptor)
+    assert len(benchmark(lambda: match(landmarks, landmarks))) == n
