@@ -62,7 +62,11 @@ def pairs_nearby(
         descriptor = np.empty((len(boxes), 0), dtype=np.float32)
         descriptor_threshold = np.inf
     observation, slot, distance = _touching(
-        maps.slots, slots, boxes, descriptor, np.float32(descriptor_threshold)
+        maps.slots,
+        slots,
+        boxes,
+        np.ascontiguousarray(descriptor, dtype=np.float32),
+        np.float32(descriptor_threshold),
     )
     order = np.lexsort((maps.slots.source[slot], observation, distance))
     return Pairs(observation[order], slot[order])

@@ -29,6 +29,10 @@ def sightings(
     """Observations (K, 3), (K, 3, 3) of the robot frame in the maps of poses (M, 3)."""
     shape = (len(position_m), len(T_map_robot))
     seen = Sightings(np.empty((*shape, 3)), np.empty((*shape, 6)))
+    position_m, covariance_m2 = (
+        np.ascontiguousarray(position_m),
+        np.ascontiguousarray(covariance_m2),
+    )
     _turn_into_map(T_map_robot, position_m, covariance_m2, planar, seen)
     return seen
 

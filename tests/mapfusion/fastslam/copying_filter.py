@@ -33,6 +33,12 @@ class Particle:
     path: list
     associations: list
 
+    def copied(self) -> "Particle":
+        landmarks = {number: copy.deepcopy(m) for number, m in self.landmarks.items()}
+        return Particle(
+            self.pose.copy(), self.weight, landmarks, list(self.path), list(self.associations)
+        )
+
 
 class CopyingFilter:
     def __init__(self, parameters: FastSlamParameters, rng: np.random.Generator) -> None:
@@ -60,10 +66,10 @@ class CopyingFilter:
         for particle, weight in zip(self.particles, self.weights, strict=True):
             particle.weight = weight
         self.cloud = poses
-        self.best = copy.deepcopy(self.particles[int(np.argmax(self.weights))])
+        self.best = self.particles[int(np.argmax(self.weights))].copied()
         if 1 / np.sum(self.weights**2) <= settings.resample_fraction * len(poses):
             ancestors = systematic_ancestors(np.log(self.weights), self.rng)
-            self.particles = [copy.deepcopy(self.particles[a]) for a in ancestors]
+            self.particles = [self.particles[a].copied() for a in ancestors]
             for particle in self.particles:
                 particle.weight = 1 / len(poses)
 

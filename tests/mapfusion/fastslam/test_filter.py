@@ -116,6 +116,22 @@ def test_with_exact_odometry_the_map_is_the_least_squares_solution():
         np.testing.assert_allclose(landmarks.covariance_m2[row], covariance, atol=1e-12)
 
 
+def test_a_landmark_seen_a_thousand_times_keeps_a_covariance_of_one_thousandth():
+    turn = rotation_about_z(0.4)
+    R = turn @ np.diag([0.5, 1e-4, 1e-6]) @ turn.T  # a far point: long along the ray
+    frame = Observations(
+        np.array([[8.0, 1.0, 0.5]]), 0.5 * (R + R.T)[None], label=np.array([1], dtype=np.int32)
+    )
+    settings = parameters(n_particles=1, motion=EXACT_MOTION, association="label")
+    slam = FastSlam(settings, np.random.default_rng(0))
+    for _ in range(1000):
+        slam.step(np.zeros(3), frame)
+    landmarks = slam.best_map()
+    assert np.linalg.eigvalsh(landmarks.covariance_m2[0]).min() > 0
+    np.testing.assert_allclose(landmarks.covariance_m2[0], R / 1000, rtol=1e-9, atol=1e-18)
+    np.testing.assert_allclose(landmarks.position_m, frame.position_m, atol=1e-12)
+
+
 def test_weights_of_two_poses_follow_from_the_density_of_the_difference():
     """One landmark, seen twice: the weight is N(difference; 0, 2 R), in closed form."""
     settings = parameters(
