@@ -21,6 +21,9 @@ _EXTRA_HEIGHT_IN = 0.9  # legend and the common x label
 _MARKERS_PER_LINE = 8
 _LEGEND_COLUMNS = 4
 _BAND_ALPHA = 0.16
+# Bands, and lines of more points, are drawn as pixels: evaluated at each iteration, their outlines
+# alone would make an SVG of megabytes.
+_MAX_VECTOR_POINTS = 200
 
 
 def draw_error_curves(
@@ -87,7 +90,6 @@ def _draw_panel(axes: Axes, summary: pd.DataFrame, pair: Pair, aligners: list[st
     for place, name in enumerate(aligners):
         curve = curves[curves["aligner"] == name]
         iteration = curve["iteration"].to_numpy()
-        # Bands as pixels: at one evaluation an iteration their outlines would swell the SVG.
         axes.fill_between(
             iteration,
             curve["low"].to_numpy(),
@@ -105,6 +107,7 @@ def _draw_panel(axes: Axes, summary: pd.DataFrame, pair: Pair, aligners: list[st
             label=name,
             markevery=(place * step // len(aligners), step),
             zorder=3 if name == ORACLE else 2,
+            rasterized=len(curve) > _MAX_VECTOR_POINTS,
             **styles[name],
         )
 

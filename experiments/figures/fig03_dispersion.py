@@ -37,7 +37,8 @@ def draw(data: ResultTables) -> Figure:
     if not robots:
         raise NothingToDraw("no particles were kept")
     clouds = clouds[clouds["robot"].isin(robots)]
-    moments = choose_moments(clouds)
+    spread = spread_over_time(clouds)
+    moments = choose_moments(spread)
     figure = Figure(figsize=(PAGE_WIDTH_IN, PAGE_WIDTH_IN))
     grid = figure.add_gridspec(2, _GRID_COLUMNS)
     span = _GRID_COLUMNS // max(2, len(robots))
@@ -54,53 +55,47 @@ def draw(data: ResultTables) -> Figure:
     timeline, *zooms = (
         figure.add_subplot(grid[1, column : column + 2]) for column in range(0, _GRID_COLUMNS, 2)
     )
-    _draw_timeline(timeline, data, robots, moments)
+    _draw_timeline(timeline, data, spread, moments)
     if moments is None:
         for axes in zooms:
             axes.set_axis_off()
     else:
-        _draw_zooms(zooms, data, clouds[clouds["robot"] == moments.robot], moments)
+        _draw_zooms(zooms, data, clouds[clouds["robot"] == moments.robot], spread, moments)
     upper = height_of_row(panels, PAGE_WIDTH_IN * span / _GRID_COLUMNS)
     grid.set_height_ratios([upper, _LOWER_ROW_IN])
     figure.set_figheight(upper + _LOWER_ROW_IN)
     return figure
 
 
-def choose_moments(clouds: pd.DataFrame) -> Moments | None:
+def spread_over_time(clouds: pd.DataFrame) -> pd.DataFrame:
+    """Root mean square distance of the particles from their mean, all particles counted alike.
+
+    Alike, because it is the particle set that is drawn; the weights of one iteration come on top.
+
+    Returns:
+        Columns robot, iteration, spread_m.
+    """
+    groups = clouds.groupby(["robot", "iteration"], sort=False)[["x_m", "y_m"]]
+    variance = groups.var(ddof=0).sum(axis="columns")
+    return variance.pow(0.5).rename("spread_m").reset_index()
+
+
+def choose_moments(spread: pd.DataFrame) -> Moments | None:
     """The pair of moments between which one robot's particles drew together the most.
 
     Wide comes before tight, so the fall is what seeing old ground again did. None when no robot's
     particles ever did.
     """
     best, best_ratio = None, 1.0
-    for robot, rows in clouds.groupby("robot", sort=False):
-        spread = rows.groupby("iteration")[["x_m", "y_m", "log_weight"]].apply(_spread_m)
-        spread = spread[np.isfinite(spread) & (spread > 0)]
-        if len(spread) < 2:
-            continue
-        widest_before = np.maximum.accumulate(spread.to_numpy())[:-1]
-        ratio = widest_before / spread.to_numpy()[1:]
-        tight = int(np.argmax(ratio)) + 1
-        if ratio[tight - 1] > best_ratio:
-            best_ratio = ratio[tight - 1]
-            wide = int(np.argmax(spread.to_numpy()[:tight]))
-            best = Moments(str(robot), int(spread.index[wide]), int(spread.index[tight]))
+    for robot, rows in spread[spread["spread_m"] > 0].groupby("robot", sort=False):
+        values, iteration = rows["spread_m"].to_numpy(), rows["iteration"].to_numpy()
+        ratio = np.maximum.accumulate(values) / values
+        tight = int(np.argmax(ratio))
+        if ratio[tight] > best_ratio:
+            best_ratio = ratio[tight]
+            wide = int(np.argmax(values[:tight]))
+            best = Moments(str(robot), int(iteration[wide]), int(iteration[tight]))
     return best
-
-
-def _weights(rows: pd.DataFrame) -> Float:
-    weight = np.exp(rows["log_weight"].to_numpy() - rows["log_weight"].max())
-    return weight / weight.sum()
-
-
-def _mean(rows: pd.DataFrame) -> Float:
-    return _weights(rows) @ rows[["x_m", "y_m"]].to_numpy()
-
-
-def _spread_m(rows: pd.DataFrame) -> float:
-    """Root of the trace of the weighted covariance of the positions."""
-    offset = rows[["x_m", "y_m"]].to_numpy() - _mean(rows)
-    return float(np.sqrt(_weights(rows) @ (offset**2).sum(axis=1)))
 
 
 def _magnification(data: ResultTables, clouds: pd.DataFrame, robots: list[str]) -> int:
@@ -120,7 +115,8 @@ def _draw_path(
     add_walls(axes, walls)
     axes.plot(path[:, 0], path[:, 1], color=GRAY, linewidth=0.7, zorder=2)
     for _, rows in clouds.groupby("iteration"):
-        points, mean = rows[["x_m", "y_m"]].to_numpy(), _mean(rows)
+        points = rows[["x_m", "y_m"]].to_numpy()
+        mean = points.mean(axis=0)
         spot = mean + magnification * (points - mean)
         axes.plot(
             *spot.T,
@@ -157,29 +153,27 @@ def _mark_on_path(axes: Axes, data: ResultTables, moments: Moments) -> None:
 
 
 def _draw_timeline(
-    axes: Axes, data: ResultTables, robots: list[str], moments: Moments | None
+    axes: Axes, data: ResultTables, spread: pd.DataFrame, moments: Moments | None
 ) -> None:
-    table = data.table("robots")
-    for robot in robots:
-        rows = table[table["robot"] == robot].sort_values("iteration")
+    for robot, rows in spread.groupby("robot", sort=False):
         axes.plot(
             rows["iteration"],
             rows["spread_m"],
-            color=robot_colours(data.robots)[robot],
+            color=robot_colours(data.robots)[str(robot)],
             linewidth=0.8,
             label=robot,
         )
-        if moments is not None and robot == moments.robot:
-            spread = rows.set_index("iteration")["spread_m"]
-            for name, iteration in (("A", moments.wide), ("B", moments.tight)):
-                axes.plot(iteration, spread[iteration], "o", color=BLACK, zorder=4)
-                axes.annotate(
-                    name,
-                    (iteration, spread[iteration]),
-                    xytext=(3, 3),
-                    textcoords="offset points",
-                    fontweight="bold",
-                )
+    if moments is not None:
+        for name, iteration in (("A", moments.wide), ("B", moments.tight)):
+            value = _spread_at(spread, moments.robot, iteration)
+            axes.plot(iteration, value, "o", color=BLACK, zorder=4)
+            axes.annotate(
+                name,
+                (iteration, value),
+                xytext=(3, 3),
+                textcoords="offset points",
+                fontweight="bold",
+            )
     axes.set_xlabel("FastSLAM iteration k")
     axes.set_ylabel("spread of the particles (m)")
     axes.set_ylim(bottom=0)
@@ -188,19 +182,31 @@ def _draw_timeline(
     axes.set_title("spread over time")
 
 
+def _spread_at(spread: pd.DataFrame, robot: str, iteration: int) -> float:
+    rows = spread[(spread["robot"] == robot) & (spread["iteration"] == iteration)]
+    return float(rows["spread_m"].iloc[0])
+
+
 def _draw_zooms(
-    zooms: list[Axes], data: ResultTables, clouds: pd.DataFrame, moments: Moments
+    zooms: list[Axes],
+    data: ResultTables,
+    clouds: pd.DataFrame,
+    spread: pd.DataFrame,
+    moments: Moments,
 ) -> None:
     """Both moments at one scale, so that tight looks tight."""
-    sets = [clouds[clouds["iteration"] == k] for k in (moments.wide, moments.tight)]
-    reach = max(float(np.abs(rows[["x_m", "y_m"]].to_numpy() - _mean(rows)).max()) for rows in sets)
+    iterations = (moments.wide, moments.tight)
+    sets = [clouds[clouds["iteration"] == k] for k in iterations]
+    points = [rows[["x_m", "y_m"]].to_numpy() for rows in sets]
+    reach = max(float(np.abs(p - p.mean(axis=0)).max()) for p in points)
     path = data.path_of(moments.robot)
-    for axes, rows, name in zip(zooms, sets, ("A, wide", "B, tight"), strict=True):
-        mean = _mean(rows)
+    for axes, k, particles, name in zip(
+        zooms, iterations, points, ("A, wide", "B, tight"), strict=True
+    ):
+        mean = particles.mean(axis=0)
         axes.plot(path[:, 0], path[:, 1], color=GRAY, zorder=1)
         axes.plot(
-            rows["x_m"],
-            rows["y_m"],
+            *particles.T,
             linestyle="none",
             marker=".",
             markersize=2.5,
@@ -213,10 +219,9 @@ def _draw_zooms(
         axes.set_aspect("equal")
         axes.locator_params(nbins=4)
         label_plan(axes, moments.robot)
-        k = int(rows["iteration"].iloc[0])
         grown = _new_landmarks(data, moments.robot, k)
         axes.set_title(
-            f"{name}: k = {k}, spread {_spread_m(rows):.3f} m\n"
+            f"{name}: k = {k}, spread {_spread_at(spread, moments.robot, k):.3f} m\n"
             f"+{grown} landmarks in {_RECENT_ITERATIONS} iterations",
             fontsize=7.5,
         )

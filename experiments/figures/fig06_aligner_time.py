@@ -9,7 +9,9 @@ from experiments.figures.result_tables import NothingToDraw, ResultTables
 from experiments.figures.style import PAGE_WIDTH_IN, aligner_styles, plain_numbers
 from experiments.metrics import ORACLE
 
-_BINS = 8  # of equal counts, for the line that guides the eye
+# The line that guides the eye joins the points while they are few, else medians of so many groups.
+_MAX_JOINED = 16
+_GROUPS = 8
 
 
 def draw(data: ResultTables) -> Figure:
@@ -64,8 +66,9 @@ def _add_aligner(axes: Axes, rows: pd.DataFrame, column: str, aligners: list[str
 
 
 def binned_medians(count: np.ndarray, elapsed_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Medians of both within bins of about equal counts, ties never split."""
+    """Medians of both within groups of about equal size along the count; ties are never split."""
+    groups = len(count) if len(count) <= _MAX_JOINED else _GROUPS
     rank = pd.Series(count).rank(pct=True).to_numpy()
-    frame = pd.DataFrame({"bin": np.ceil(rank * _BINS), "count": count, "elapsed": elapsed_s})
-    medians = frame.groupby("bin").median()
+    frame = pd.DataFrame({"group": np.ceil(rank * groups), "count": count, "elapsed": elapsed_s})
+    medians = frame.groupby("group").median()
     return medians["count"].to_numpy(), medians["elapsed"].to_numpy()

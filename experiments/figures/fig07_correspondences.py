@@ -1,7 +1,10 @@
 """Figure 7: two maps in their own frames, in space, and the correspondences between them."""
 
+from typing import Any
+
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
@@ -13,8 +16,12 @@ from mapfusion.se2 import Float, transform_points
 
 _STRAY_SHARE = 0.005  # of the landmarks on each side, kept from shrinking the picture
 _GAP = 0.15  # between the two maps, as a share of the first one's width
-_HEIGHT_STRETCH = 2.5  # rooms are low and wide; the axis carries true metres all the same
+_MIN_HEIGHT = 0.2  # of the box, as a share of its length: rooms are low; the axis is true anyway
+_MAX_LINES = 80  # of each kind: more would hide the maps
+# The enlarged box reaches beyond the axes' own rectangle.
+_BEYOND_AXES: dict[str, Any] = {"clip_on": False, "in_layout": False}
 _ZOOM = 1.3  # fills the page: the default leaves room for any view
+_SHORT_AXIS_TICKS = 4
 _ELEVATION_DEG, _AZIMUTH_DEG = 32.0, -72.0
 
 
@@ -35,6 +42,7 @@ def draw(data: ResultTables) -> Figure:
             markersize=2.0,
             markeredgewidth=0.2,
             color=colours[robot],
+            **_BEYOND_AXES,
             label=f"{robot}: {len(points)} landmarks",
             rasterized=True,
         )
@@ -45,7 +53,7 @@ def draw(data: ResultTables) -> Figure:
     axes.set_zlabel("z (m)")
     figure.legend(
         loc="outside upper center",
-        ncols=4,
+        ncols=2,
         title=f"each map in its own frame; {pair[1]}'s is drawn {shift[0]:.1f} m along x",
         title_fontsize=7.5,
     )
@@ -93,8 +101,8 @@ def judge_correspondences(data: ResultTables, pair: Pair) -> tuple[np.ndarray, t
         if name != ORACLE and len(accepted):
             packed = np.frombuffer(accepted["refined_inliers"].iloc[0], dtype=np.uint8)
             bits = np.unpackbits(packed, count=len(rows)).astype(bool)
-            return bits, (f"inliers of {name}", "others")
-    return np.zeros(len(rows), dtype=bool), ("inliers", "not verified")
+            return bits, (f"{name}'s inlier", "other")
+    return np.zeros(len(rows), dtype=bool), ("verified", "unverified")
 
 
 def _add_correspondences(
@@ -110,10 +118,14 @@ def _add_correspondences(
     ):
         if not chosen.any():
             continue
+        candidates = np.flatnonzero(chosen & drawable)
+        drawn = candidates[:: -(-len(candidates) // _MAX_LINES) or 1]
+        some = f", {len(drawn)} drawn" if len(drawn) < chosen.sum() else ""
         lines = Line3DCollection(
-            list(ends[chosen & drawable]),
-            label=f"{name} correspondences ({chosen.sum()})",
+            list(ends[drawn]),
+            label=f"{chosen.sum()} {name} correspondences{some}",
             rasterized=True,
+            **_BEYOND_AXES,
             **style,
         )
         axes.add_collection3d(lines, autolim=False)
@@ -125,6 +137,9 @@ def _set_space(axes: Axes3D, points: Float) -> None:
     axes.set_ylim(low[1], high[1])
     bottom, top = min(0.0, low[2]), max(high[2], low[2] + 0.1)
     axes.set_zlim(bottom, top)
-    box = (*(high - low)[:2], _HEIGHT_STRETCH * (top - bottom))
+    length, width = (high - low)[:2]
+    box = (length, width, max(top - bottom, _MIN_HEIGHT * max(length, width)))
     axes.set_box_aspect(box, zoom=_ZOOM)  # pyright: ignore[reportArgumentType]  # takes floats
+    axes.yaxis.set_major_locator(MaxNLocator(_SHORT_AXIS_TICKS))
+    axes.zaxis.set_major_locator(MaxNLocator(_SHORT_AXIS_TICKS))
     axes.view_init(elev=_ELEVATION_DEG, azim=_AZIMUTH_DEG)

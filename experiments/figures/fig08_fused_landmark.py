@@ -37,11 +37,15 @@ def draw(data: ResultTables) -> Figure:
             *position[k, :2], marker=marker, markersize=6, color=colours[k], linestyle=dashes,
             label=labels[k],
         )  # fmt: skip
+    own = pairs.own_covariance_m2[:, chosen]
+    add_ellipses(axes, position[:2], own, edgecolors=colours[:2], linewidths=0.6)
     axes.plot(*position[:2, :2].T, color="gray", linewidth=0.6, linestyle=":", zorder=1)
     _name_points(axes, position)
     _set_view(axes, position, covariance)
     label_plan(axes, data.robots[0])
-    axes.set_title(f"{LEVEL_TEXT} ellipses, to scale")
+    axes.set_title(
+        f"{LEVEL_TEXT} ellipses, to scale\n(thin: the maps' own covariances, before drift is added)"
+    )
     figure.legend(loc="outside lower center", ncols=3)
     return figure
 

@@ -7,45 +7,42 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from scipy.spatial import KDTree
 
-from experiments.figures.ellipses import LEVEL_TEXT, add_ellipses
+from experiments.figures.ellipses import LEVEL_TEXT, add_ellipses, semi_axes
 from experiments.figures.fused_frame import FusedPairs, fused_pairs
-from experiments.figures.plan import add_walls, label_plan, set_view
+from experiments.figures.plan import add_walls, height_of_row, label_plan, set_view
 from experiments.figures.result_tables import ResultTables
 from experiments.figures.style import BLACK, FUSED_COLOUR, GRAY, PAGE_WIDTH_IN, robot_colours
 from mapfusion.se2 import Float
 
-_ZOOM_SIDE_M = 1.0
+_ZOOM_SIDE = 7.0  # in semi-major axes of the parents' ellipses (median)
 _ZOOM_LANDMARKS = 5  # what a panel of that size shows without clutter
 _INNER_SHARE = 0.35  # of the side: nearer the rim, ellipses are cut off
+_LEGEND_HEIGHT_IN = 0.55
 
 
 def draw(data: ResultTables) -> Figure:
     """All corresponding landmarks in one frame, with ellipses, and a small part enlarged."""
     pairs = fused_pairs(data)
-    figure = Figure(figsize=(PAGE_WIDTH_IN, 4.1))
+    figure = Figure(figsize=(PAGE_WIDTH_IN, PAGE_WIDTH_IN))
     overview, zoom = figure.subplots(1, 2)
     walls = data.walls_in_frame_of(data.robots[0])
-    for axes, scale in ((overview, 0.5), (zoom, 1.0)):
+    for axes, scale in ((overview, 0.3), (zoom, 1.0)):
         add_walls(axes, walls)
         _draw_landmarks(axes, data, pairs, scale)
         label_plan(axes, data.robots[0])
     fused = pairs.position_m[2]
     set_view(overview, fused)
-    corner = zoom_corner(fused)
-    zoom.set_xlim(corner[0], corner[0] + _ZOOM_SIDE_M)
-    zoom.set_ylim(corner[1], corner[1] + _ZOOM_SIDE_M)
+    major, _, _ = semi_axes(pairs.covariance_m2[:2].reshape(-1, 3, 3)[:, :2, :2])
+    side = _ZOOM_SIDE * float(np.median(major))
+    corner = zoom_corner(fused, side)
+    zoom.set_xlim(corner[0], corner[0] + side)
+    zoom.set_ylim(corner[1], corner[1] + side)
     zoom.set_aspect("equal")
-    overview.add_patch(
-        Rectangle(
-            (corner[0], corner[1]),
-            _ZOOM_SIDE_M,
-            _ZOOM_SIDE_M,
-            fill=False,
-            edgecolor=BLACK,
-            linestyle="--",
-            zorder=6,
-        )
+    frame = Rectangle(
+        (corner[0], corner[1]), side, side, fill=False, edgecolor=BLACK, linestyle="--", zorder=6
     )
+    overview.add_patch(frame)
+    figure.set_figheight(height_of_row([overview, zoom], PAGE_WIDTH_IN / 2) + _LEGEND_HEIGHT_IN)
     overview.set_title(f"{len(fused)} landmarks in both maps, aligned")
     zoom.set_title("zoom of the dashed rectangle")
     handles, labels = zoom.get_legend_handles_labels()
@@ -89,15 +86,17 @@ def _draw_landmarks(axes: Axes, data: ResultTables, pairs: FusedPairs, scale: fl
         )
 
 
-def zoom_corner(position_m: Float) -> Float:
+def zoom_corner(position_m: Float, side_m: float) -> Float:
     """Lower left corner of a square that shows a few landmarks whole.
 
-    It is centred on the landmark with about the wished number near it and the fewest at the rim.
+    Around the landmark with about the wished number near it and the fewest at the rim.
     """
     tree = KDTree(position_m[:, :2])
     near, visible = (
-        tree.query_ball_point(position_m[:, :2], share * _ZOOM_SIDE_M, p=np.inf, return_length=True)
+        tree.query_ball_point(position_m[:, :2], share * side_m, p=np.inf, return_length=True)
         for share in (_INNER_SHARE, 0.5)
     )
     cost = np.abs(np.asarray(near) - _ZOOM_LANDMARKS) + (np.asarray(visible) - near)
-    return position_m[int(np.argmin(cost)), :2] - _ZOOM_SIDE_M / 2
+    centre = position_m[int(np.argmin(cost)), :2]
+    shown = tree.query_ball_point(centre, _INNER_SHARE * side_m, p=np.inf)
+    return position_m[shown, :2].mean(axis=0) - side_m / 2

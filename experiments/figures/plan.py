@@ -9,9 +9,9 @@ from experiments.figures.style import BLACK, PALE_GRAY
 from mapfusion.se2 import Float
 
 _STRAY_SHARE = 0.005  # a stray landmark tens of metres off, on each side, must not shrink the map
-_MARGIN = 0.05  # of the view's extent
+_MARGIN, _MIN_MARGIN_M = 0.05, 0.3  # of the view's extent
 _AXIS_LENGTH_M = 1.0
-_LABELS_WIDTH_IN, _LABELS_HEIGHT_IN = 0.55, 0.55  # what labels and titles take beside each panel
+_LABELS_WIDTH_IN, _LABELS_HEIGHT_IN = 0.55, 0.65  # what labels and titles take beside each panel
 
 
 def add_walls(axes: Axes, walls: Sequence[Float]) -> None:
@@ -44,7 +44,7 @@ def set_view(axes: Axes, landmarks_m: Float, *others_m: Float) -> int:
         core.append(np.quantile(landmarks_m[:, :2], [_STRAY_SHARE, 1 - _STRAY_SHARE], axis=0))
     points = np.concatenate(core) if core else np.zeros((1, 2))
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
-    margin = max(_MARGIN * float((high - low).max()), _AXIS_LENGTH_M)
+    margin = max(_MARGIN * float((high - low).max()), _MIN_MARGIN_M)
     axes.set_xlim(low[0] - margin, high[0] + margin)
     axes.set_ylim(low[1] - margin, high[1] + margin)
     axes.set_aspect("equal", adjustable="box")

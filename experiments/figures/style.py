@@ -62,7 +62,7 @@ FUSED_COLOUR = BLACK
 
 def plain_numbers() -> FuncFormatter:
     """Ticks of logarithmic axes as people read them: 0.01, 0.1, 1, 10."""
-    return FuncFormatter(lambda value, _: f"{value:g}")
+    return FuncFormatter(lambda value, _: f"{value:g}".replace("-", "−"))
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from synthetic_result import SMALL, write_result
 from experiments import tables
 from experiments.figures import draw_all, drawing
 from experiments.figures.drawing import FIGURES, draw_figure
-from experiments.figures.fig03_dispersion import choose_moments
+from experiments.figures.fig03_dispersion import choose_moments, spread_over_time
 from experiments.figures.result_tables import ResultTables
 from experiments.figures.style import aligner_styles, house_style
 from mapfusion.errors import InputError
@@ -153,28 +153,29 @@ def test_lines_differ_in_dashes_and_markers() -> None:
     assert styles["oracle"]["color"] == "#000000"
 
 
-def cloud(robot: str, spreads: list[float]) -> pd.DataFrame:
-    """Particles whose weighted spread is exact, and beside them far ones of no weight."""
-    frames = []
-    for k, spread in enumerate(spreads):
-        x = np.array([-spread, spread, 50.0])
-        frames.append(
-            pd.DataFrame(
-                {
-                    "robot": robot, "iteration": 10 * k, "particle": range(3), "x_m": x,
-                    "y_m": 0.0, "theta_rad": 0.0, "log_weight": [-800.0, -800.0, -2000.0],
-                }
-            )
-        )  # fmt: skip
-    return pd.concat(frames)
+def spreads(robot: str, values: list[float]) -> pd.DataFrame:
+    iteration = 10 * np.arange(len(values))
+    return pd.DataFrame({"robot": robot, "iteration": iteration, "spread_m": values})
 
 
 def test_moments_are_the_deepest_fall_of_the_spread() -> None:
-    clouds = pd.concat(
-        [cloud("R1", [0, 0.1, 0.2, 0.1, 0.3]), cloud("R2", [0, 0.3, 0.2, 0.01, 0.9, 0.8])]
+    spread = pd.concat(
+        [spreads("R1", [0, 0.1, 0.2, 0.1, 0.3]), spreads("R2", [0, 0.3, 0.2, 0.01, 0.9, 0.8])]
     )
-    assert choose_moments(clouds) == ("R2", 10, 30)
+    assert choose_moments(spread) == ("R2", 10, 30)
 
 
 def test_particles_that_only_spread_have_no_such_moments() -> None:
-    assert choose_moments(cloud("R1", [0, 0.1, 0.2, 0.3])) is None
+    assert choose_moments(spreads("R1", [0, 0.1, 0.2, 0.3])) is None
+
+
+def test_spread_is_the_root_mean_square_distance_from_the_mean() -> None:
+    x = {("R1", 0): [1.0, 1.0, 1.0, 1.0], ("R1", 10): [0.0, 2.0, 2.0, 0.0]}
+    rows = [
+        {"robot": robot, "iteration": k, "x_m": value, "y_m": 3 * value}
+        for (robot, k), values in x.items()
+        for value in values
+    ]
+    spread = spread_over_time(pd.DataFrame(rows))
+    assert spread["iteration"].tolist() == [0, 10]
+    assert spread["spread_m"].tolist() == pytest.approx([0.0, np.sqrt(1 + 9)])

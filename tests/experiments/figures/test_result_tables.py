@@ -92,5 +92,5 @@ def test_without_the_truth_they_are_judged_by_the_first_aligners_inliers(copied:
     chosen &= (estimates["iteration"] == data.last_iteration(PAIR)) & (estimates["repetition"] == 0)
     packed = estimates[chosen & (estimates["aligner"] == "ransac")]["refined_inliers"].iloc[0]
     bits = "".join(f"{byte:08b}" for byte in packed)
-    assert names[0] == "inliers of ransac"
+    assert names[0] == "ransac's inlier"
     assert "".join(str(int(bit)) for bit in right) == bits[: len(right)]
