@@ -12,9 +12,9 @@ from mapfusion.errors import InputError
 from mapfusion.se2 import Float, transform_points
 from sim.p3at import P3at
 from sim.stereo_head import RadiometricNoise, StereoFrame, render_stereo
-from sim.world import World
+from sim.visibility import Visibility
+from sim.world import OUT_OF_SIGHT_M, World
 
-OUT_OF_SIGHT_M = -100.0  # a robot does not see itself: its body waits below the floor
 SAME_SURFACE = 0.02  # neighbouring pixels whose depths differ by more belong to two surfaces
 
 
@@ -37,7 +37,7 @@ class FrameSource:
     ) -> None:
         self._camera, self._noise = camera, noise
         self._world = World()
-        self._world.add_painted_faces(faces)
+        self._visibility = Visibility(self._world.add_painted_faces(faces), camera)
         start = np.zeros(3)
         self._robots = {name: P3at(self._world, start) for name in robots}
 
@@ -61,7 +61,8 @@ class FrameSource:
             raise InputError(f"robot {robot}: unknown, there are {', '.join(self._robots)}")
         own_pose = poses[list(self._robots).index(robot)]
         for (name, body), pose in zip(self._robots.items(), poses, strict=True):
-            body.place(pose, OUT_OF_SIGHT_M if name == robot else 0.0)
+            body.place(pose, OUT_OF_SIGHT_M if name == robot else 0.0)  # it does not see itself
+        self._world.show_faces(self._visibility.seen(own_pose))
         return render_stereo(self._world, self._camera, own_pose, self._noise, rng)
 
 

@@ -11,11 +11,14 @@ from types import TracebackType
 import cv2
 import numpy as np
 
+from mapfusion.se2 import Float
 from sim.floorplan import Face, FloorPlan
 from sim.textures import paint
 
 GRAVITY_M_S2 = 9.81
 PHYSICS_HZ = 240  # PyBullet's own default; contacts and motors are tuned for it
+CORNERS = "corners.npy"  # of all faces, beside their meshes and textures
+OUT_OF_SIGHT_M = -100.0  # below the floor, where what must not be seen waits
 
 # Who collides with whom (bit masks): wheels with the ground alone.
 GROUND, WHEEL, BODY = 1, 2, 4
@@ -67,6 +70,8 @@ class World:
 
             self.bullet = pybullet
             self.client = pybullet.connect(pybullet.DIRECT)
+        self._faces: list[int] = []
+        self._shown = np.zeros(0, dtype=bool)
         # else a mesh written anew under an old name would still look as it did before
         pybullet.setPhysicsEngineParameter(enableFileCaching=0, physicsClientId=self.client)
 
@@ -127,15 +132,33 @@ class World:
             )
             p.setCollisionFilterGroupMask(wall, -1, BODY, BODY, physicsClientId=client)
 
-    def add_painted_faces(self, folder: Path) -> None:
-        """Load the faces that `write_faces` left in `folder`, to be seen and not touched."""
+    def add_painted_faces(self, folder: Path) -> Float:
+        """Load the faces that `write_faces` left in `folder`, to be seen and not touched.
+
+        Returns:
+            Their corners (F, 4, 3).
+        """
         p, client = self.bullet, self.client
+        corners_m = np.load(folder / CORNERS)
         with silence():
-            for mesh in sorted(folder.glob("face_*.obj")):
+            for i in range(len(corners_m)):
+                mesh, picture = _face_files(folder, i)
                 shape = p.createVisualShape(p.GEOM_MESH, fileName=str(mesh), physicsClientId=client)
                 body = p.createMultiBody(0, baseVisualShapeIndex=shape, physicsClientId=client)
-                texture = p.loadTexture(str(mesh.with_suffix(".png")), physicsClientId=client)
+                texture = p.loadTexture(str(picture), physicsClientId=client)
                 p.changeVisualShape(body, -1, textureUniqueId=texture, physicsClientId=client)
+                self._faces.append(body)
+        self._shown = np.ones(len(corners_m), dtype=bool)
+        return corners_m
+
+    def show_faces(self, shown: np.ndarray) -> None:
+        """Show some of the painted faces (mask) and put the others out of sight."""
+        for i in np.flatnonzero(shown != self._shown):
+            height_m = 0.0 if shown[i] else OUT_OF_SIGHT_M
+            self.bullet.resetBasePositionAndOrientation(
+                self._faces[i], [0, 0, height_m], [0, 0, 0, 1], physicsClientId=self.client
+            )
+        self._shown = shown.copy()
 
 
 def write_faces(folder: Path, plan: FloorPlan, rng: np.random.Generator) -> None:
@@ -143,11 +166,16 @@ def write_faces(folder: Path, plan: FloorPlan, rng: np.random.Generator) -> None
     folder.mkdir(parents=True, exist_ok=True)
     faces = plan.faces()
     for i, (face, child) in enumerate(zip(faces, rng.spawn(len(faces)), strict=True)):
-        path = folder / f"face_{i:04d}"
+        mesh, path = _face_files(folder, i)
         picture = cv2.cvtColor(paint(face, child), cv2.COLOR_RGB2BGR)
-        if not cv2.imwrite(f"{path}.png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
-            raise OSError(f"{path}.png: could not be written")
-        path.with_suffix(".obj").write_text(_mesh(face), encoding="ascii")
+        if not cv2.imwrite(str(path), picture, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
+            raise OSError(f"{path}: could not be written")
+        mesh.write_text(_mesh(face), encoding="ascii")
+    np.save(folder / CORNERS, np.stack([face.corners_m for face in faces]))
+
+
+def _face_files(folder: Path, i: int) -> tuple[Path, Path]:
+    return folder / f"face_{i:04d}.obj", folder / f"face_{i:04d}.png"
 
 
 def _mesh(face: Face) -> str:
