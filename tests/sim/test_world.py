@@ -40,6 +40,17 @@ def test_nothing_reaches_the_screen(faces: Path) -> None:
     assert result.stderr == b""
 
 
+IMPORTS = """
+import sys
+from sim import driver, floorplan, odometry, recorder, route, stereo_head, textures, trajectory
+assert "pybullet" not in sys.modules
+"""
+
+
+def test_pybullet_is_imported_by_what_simulates_alone() -> None:
+    subprocess.run([sys.executable, "-c", IMPORTS], check=True)
+
+
 def test_silence_lets_python_speak_before_and_after(capfd: pytest.CaptureFixture[str]) -> None:
     sys.stdout.write("before ")
     with silence():
