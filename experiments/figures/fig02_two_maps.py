@@ -4,11 +4,18 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.figures.ellipses import add_ellipses, ellipse_handle
-from experiments.figures.plan import add_frame, add_walls, height_of_row, label_plan, set_view
+from experiments.figures.plan import (
+    add_frame,
+    add_walls,
+    height_of_row,
+    label_plan,
+    legend_height,
+    set_view,
+)
 from experiments.figures.result_tables import NothingToDraw, ResultTables
 from experiments.figures.style import BLACK, GRAY, PAGE_WIDTH_IN, PURPLE, robot_colours
 
-_LEGEND_HEIGHT_IN = 0.55
+_LEGEND_COLUMNS = 3
 
 
 def draw(data: ResultTables) -> Figure:
@@ -22,9 +29,9 @@ def draw(data: ResultTables) -> Figure:
         _draw_map(axes, data, robot)
     handles, _ = panels[0].get_legend_handles_labels()
     handles.insert(1, ellipse_handle(robot_colours(data.robots)[robots[0]]))
-    figure.legend(handles=handles, loc="outside lower center", ncols=3)
+    figure.legend(handles=handles, loc="outside lower center", ncols=_LEGEND_COLUMNS)
     row = height_of_row(panels, PAGE_WIDTH_IN / len(panels))
-    figure.set_figheight(row + _LEGEND_HEIGHT_IN)
+    figure.set_figheight(row + legend_height(len(handles), _LEGEND_COLUMNS))
     return figure
 
 

@@ -31,7 +31,7 @@ def draw(data: ResultTables) -> Figure:
     position_a, position_b = (_clipped(data.landmarks_of(robot)[0]) for robot in pair)
     shift = np.array([np.nanmax(position_a[:, 0]) - np.nanmin(position_b[:, 0]), 0.0, 0.0])
     shift[0] += _GAP * np.ptp(position_a[np.isfinite(position_a[:, 0]), 0])
-    figure = Figure(figsize=(PAGE_WIDTH_IN, 4.2))
+    figure = Figure(figsize=(PAGE_WIDTH_IN, 3.9))
     axes: Axes3D = figure.add_subplot(projection="3d")
     colours = robot_colours(data.robots)
     for robot, points, marker in ((pair[0], position_a, "*"), (pair[1], position_b + shift, "^")):
@@ -91,7 +91,7 @@ def judge_correspondences(data: ResultTables, pair: Pair) -> tuple[np.ndarray, t
             rows["index_b"].to_numpy(),
             data.scenario["evaluate"]["true_pair_radius_m"],
         )
-        return true, ("true", "false")
+        return true, ("true correspondences", "false correspondences")
     estimates = of_pair(data.table("estimates"), pair)
     estimates = estimates[estimates["iteration"] == data.last_iteration(pair)]
     for name in data.aligners:
@@ -101,8 +101,8 @@ def judge_correspondences(data: ResultTables, pair: Pair) -> tuple[np.ndarray, t
         if name != ORACLE and len(accepted):
             packed = np.frombuffer(accepted["refined_inliers"].iloc[0], dtype=np.uint8)
             bits = np.unpackbits(packed, count=len(rows)).astype(bool)
-            return bits, (f"{name}'s inlier", "other")
-    return np.zeros(len(rows), dtype=bool), ("verified", "unverified")
+            return bits, (f"{name}'s refined inliers", "other correspondences")
+    return np.zeros(len(rows), dtype=bool), ("inliers", "correspondences")
 
 
 def _add_correspondences(
@@ -119,11 +119,12 @@ def _add_correspondences(
         if not chosen.any():
             continue
         candidates = np.flatnonzero(chosen & drawable)
-        drawn = candidates[:: -(-len(candidates) // _MAX_LINES) or 1]
-        some = f", {len(drawn)} drawn" if len(drawn) < chosen.sum() else ""
+        n_drawn = min(len(candidates), _MAX_LINES)
+        drawn = candidates[np.linspace(0, len(candidates) - 1, n_drawn).astype(int)]
+        some = f", {n_drawn} drawn" if n_drawn < chosen.sum() else ""
         lines = Line3DCollection(
             list(ends[drawn]),
-            label=f"{chosen.sum()} {name} correspondences{some}",
+            label=f"{name}: {chosen.sum()}{some}",
             rasterized=True,
             **_BEYOND_AXES,
             **style,

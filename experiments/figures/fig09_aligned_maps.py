@@ -9,15 +9,14 @@ from scipy.spatial import KDTree
 
 from experiments.figures.ellipses import LEVEL_TEXT, add_ellipses, semi_axes
 from experiments.figures.fused_frame import FusedPairs, fused_pairs
-from experiments.figures.plan import add_walls, height_of_row, label_plan, set_view
+from experiments.figures.plan import add_walls, height_of_row, label_plan, legend_height, set_view
 from experiments.figures.result_tables import ResultTables
 from experiments.figures.style import BLACK, FUSED_COLOUR, GRAY, PAGE_WIDTH_IN, robot_colours
 from mapfusion.se2 import Float
 
-_ZOOM_SIDE = 7.0  # in semi-major axes of the parents' ellipses (median)
+_ZOOM_SIDE = 6.0  # in semi-major axes of the parents' ellipses (median)
 _ZOOM_LANDMARKS = 5  # what a panel of that size shows without clutter
 _INNER_SHARE = 0.35  # of the side: nearer the rim, ellipses are cut off
-_LEGEND_HEIGHT_IN = 0.55
 
 
 def draw(data: ResultTables) -> Figure:
@@ -42,12 +41,13 @@ def draw(data: ResultTables) -> Figure:
         (corner[0], corner[1]), side, side, fill=False, edgecolor=BLACK, linestyle="--", zorder=6
     )
     overview.add_patch(frame)
-    figure.set_figheight(height_of_row([overview, zoom], PAGE_WIDTH_IN / 2) + _LEGEND_HEIGHT_IN)
     overview.set_title(f"{len(fused)} landmarks in both maps, aligned")
     zoom.set_title("zoom of the dashed rectangle")
     handles, labels = zoom.get_legend_handles_labels()
+    legend_in = legend_height(len(handles), len(handles), title=True)
+    figure.set_figheight(height_of_row([overview, zoom], PAGE_WIDTH_IN / 2) + legend_in)
     figure.legend(
-        handles, labels, loc="outside lower center", ncols=4,
+        handles, labels, loc="outside lower center", ncols=len(handles),
         title=f"{LEVEL_TEXT} ellipses, to scale", title_fontsize=7.5,
     )  # fmt: skip
     return figure

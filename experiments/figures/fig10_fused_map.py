@@ -2,7 +2,14 @@
 
 from matplotlib.figure import Figure
 
-from experiments.figures.plan import add_frame, add_walls, height_of_row, label_plan, set_view
+from experiments.figures.plan import (
+    add_frame,
+    add_walls,
+    height_of_row,
+    label_plan,
+    legend_height,
+    set_view,
+)
 from experiments.figures.result_tables import (
     NothingToDraw,
     ResultTables,
@@ -10,7 +17,7 @@ from experiments.figures.result_tables import (
 )
 from experiments.figures.style import FUSED_COLOUR, PAGE_WIDTH_IN, robot_colours
 
-_LEGEND_HEIGHT_IN = 0.3
+_LEGEND_COLUMNS = 4
 _ROBOT_MARKERS = ("*", "^", "v", "x", "d")
 
 
@@ -59,6 +66,8 @@ def draw(data: ResultTables) -> Figure:
     label_plan(axes, frame)
     note = f", {outside} out of view" if outside else ""
     axes.set_title(f"fused map: {len(fused)} landmarks{note}")
-    figure.set_figheight(height_of_row([axes], PAGE_WIDTH_IN) + _LEGEND_HEIGHT_IN)
-    figure.legend(loc="outside lower center", ncols=4, markerscale=1.6)
+    handles, _ = axes.get_legend_handles_labels()
+    legend_in = legend_height(len(handles), _LEGEND_COLUMNS)
+    figure.set_figheight(height_of_row([axes], PAGE_WIDTH_IN) + legend_in)
+    figure.legend(loc="outside lower center", ncols=_LEGEND_COLUMNS, markerscale=1.6)
     return figure

@@ -12,6 +12,7 @@ _STRAY_SHARE = 0.005  # a stray landmark tens of metres off, on each side, must 
 _MARGIN, _MIN_MARGIN_M = 0.05, 0.3  # of the view's extent
 _AXIS_LENGTH_M = 1.0
 _LABELS_WIDTH_IN, _LABELS_HEIGHT_IN = 0.55, 0.65  # what labels and titles take beside each panel
+_LEGEND_ROW_IN, _LEGEND_FRAME_IN = 0.16, 0.2
 
 
 def add_walls(axes: Axes, walls: Sequence[Float]) -> None:
@@ -56,6 +57,12 @@ def height_of_row(panels: Sequence[Axes], width_in: float) -> float:
     """Inches that a row of plans needs, their views set, when each is given so much width."""
     ratio = max(np.ptp(axes.get_ylim()) / np.ptp(axes.get_xlim()) for axes in panels)
     return (width_in - _LABELS_WIDTH_IN) * float(ratio) + _LABELS_HEIGHT_IN
+
+
+def legend_height(n_entries: int, n_columns: int, title: bool = False) -> float:
+    """Inches that a legend below or above a figure takes."""
+    rows = -(-n_entries // n_columns) + title
+    return _LEGEND_ROW_IN * rows + _LEGEND_FRAME_IN
 
 
 def label_plan(axes: Axes, frame: str) -> None:

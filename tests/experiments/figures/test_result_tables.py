@@ -78,7 +78,7 @@ def test_correspondences_are_judged_by_the_truth(made_up_result: Path) -> None:
     errors = data.table("errors")
     rows = (errors["robot_a"] == PAIR[0]) & (errors["robot_b"] == PAIR[1])
     n_true = int(errors[rows & (errors["iteration"] == data.last_iteration(PAIR))]["n_true"].max())
-    assert names == ("true", "false")
+    assert names[0] == "true correspondences"
     assert right[:n_true].all()
     assert right[n_true:].sum() <= 2  # a random pair may hit the right landmark
 
@@ -92,5 +92,5 @@ def test_without_the_truth_they_are_judged_by_the_first_aligners_inliers(copied:
     chosen &= (estimates["iteration"] == data.last_iteration(PAIR)) & (estimates["repetition"] == 0)
     packed = estimates[chosen & (estimates["aligner"] == "ransac")]["refined_inliers"].iloc[0]
     bits = "".join(f"{byte:08b}" for byte in packed)
-    assert names[0] == "ransac's inlier"
+    assert names[0] == "ransac's refined inliers"
     assert "".join(str(int(bit)) for bit in right) == bits[: len(right)]
