@@ -3,6 +3,7 @@
 An observation takes at most one landmark in a frame, and a landmark at most one observation.
 """
 
+from collections.abc import Mapping
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -51,25 +52,42 @@ def pairs_nearby(
     maps: ParticleMaps,
     seen: Sightings,
     gate: float,
-    descriptor: np.ndarray | None,
-    descriptor_threshold: float,
+    descriptor: np.ndarray | None = None,
+    descriptor_threshold: float = np.inf,
 ) -> Pairs:
-    """Pairs whose gates can touch in some particle, by distance of their descriptors if given."""
+    """Pairs whose gates can touch in some particle.
+
+    With descriptors (K, 64) of the observations only those nearer than the threshold, the nearest
+    first. Equal distances are ordered by observation and by the age of the landmark.
+    """
+    if descriptor is None:
+        descriptor = np.empty((len(seen.point_m), 0), dtype=np.float32)
     boxes = boxes_of(seen, gate)
     around = np.concatenate([boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)])
-    slots = maps.near(around)
-    if descriptor is None:
-        descriptor = np.empty((len(boxes), 0), dtype=np.float32)
-        descriptor_threshold = np.inf
     observation, slot, distance = _touching(
         maps.slots,
-        slots,
+        maps.near(around),
         boxes,
         np.ascontiguousarray(descriptor, dtype=np.float32),
         np.float32(descriptor_threshold),
     )
     order = np.lexsort((maps.slots.source[slot], observation, distance))
     return Pairs(observation[order], slot[order])
+
+
+def pairs_of_labels(
+    slot_of_label: Mapping[int, int], label: np.ndarray
+) -> tuple[Pairs, np.ndarray]:
+    """Observations with the slots of their labels (K,), and which may start a landmark (K,).
+
+    All particles start a label's landmark together, so one slot holds it. Only the first
+    observation of a new label starts one.
+    """
+    slot = np.array([slot_of_label.get(name, -1) for name in label.tolist()], dtype=np.int64)
+    known = np.flatnonzero(slot >= 0)
+    first = np.zeros(len(label), dtype=bool)
+    first[np.unique(label, return_index=True)[1]] = True
+    return Pairs(known, slot[known]), first & (slot < 0)
 
 
 @njit(cache=True)

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from mapfusion.arguments import require_finite, require_shape
-from mapfusion.fastslam.association import Association, Pairs, choose, pairs_nearby
+from mapfusion.fastslam.association import Association, choose, pairs_nearby, pairs_of_labels
 from mapfusion.fastslam.history import History
 from mapfusion.fastslam.motion import MotionNoise, sample_motion
 from mapfusion.fastslam.particles import ParticleMaps
@@ -21,7 +21,7 @@ from mapfusion.fastslam.resampling import (
     systematic_ancestors,
 )
 from mapfusion.fastslam.sensor import Sightings, log_density_at_gate, sightings
-from mapfusion.fastslam.update import NEW, update_landmarks
+from mapfusion.fastslam.update import DROPPED, NEW, update_landmarks
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import NO_LABEL, Observations
 from mapfusion.se2 import Float
@@ -142,37 +142,36 @@ class FastSlam:
         return self._maps.n_slots
 
     def step(self, odometry: Float, observations: Observations) -> StepResult:
-        """Take in one frame.
+        """Take in one frame: predict, associate, update, weigh, resample.
 
         Args:
             odometry: (3,) motion since the frame before, in the robot frame of the frame before.
             observations: what the frame shows; may be none.
 
+        Returns:
+            The particles after weighting and before resampling.
+
         Raises:
             ValueError: odometry is not three finite numbers, a covariance is not positive definite,
-                or descriptors or labels are missing that the association needs.
+                or descriptors or labels are missing that the association needs. The filter is as it
+                was before then.
         """
         odometry = np.asarray(odometry, dtype=np.float64)
-        require_shape("odometry", odometry, (3,))
-        require_finite("odometry", odometry)
-        noise = self._observation_noise(observations)
-        log_new = self._log_new(noise)
+        self._check(odometry, observations)
+        noise, log_new = self._noise(observations)
+        planar = self.parameters.planar
 
-        self._poses = sample_motion(
-            self._poses, odometry, self.parameters.motion, self._rng
-        )  # eq. 3
-        seen = sightings(
-            self._poses, observations.position_m, noise, self.parameters.planar
-        )  # eq. 4, 5
+        self._poses = sample_motion(self._poses, odometry, self.parameters.motion, self._rng)
+        seen = sightings(self._poses, observations.position_m, noise, planar)
         chosen, changed = self._associate(seen, observations)
-        log_likelihood = update_landmarks(
-            self._maps.slots, chosen, seen, log_new, self.parameters.planar
-        )  # eq. 4-9
-        self._log_weights, log_evidence = normalised(self._log_weights + log_likelihood)  # eq. 10
-        self._follow_changes(chosen, changed, seen, observations)
+        log_likelihood = update_landmarks(self._maps.slots, chosen, seen, log_new, planar)
+        self._maps.moved(changed)
+        self._start_landmarks(chosen, seen, observations)
+        log_evidence = self._weigh(log_likelihood)
+        self._remember(chosen)
         return self._resample(log_evidence)
 
-    def best_map(self, min_count: int = 1) -> LandmarkMap:
+    def best_map(self, min_count: int = 3) -> LandmarkMap:
         """The heaviest particle's landmarks that were seen at least `min_count` times, by age."""
         which, column = self._maps.of_particle(self._best, min_count)
         slots = self._maps.slots
@@ -207,16 +206,29 @@ class FastSlam:
         """
         return self._kept_history().associations(self._best)
 
-    def _observation_noise(self, observations: Observations) -> Float:
-        """R_t (K, 3, 3) with the filter's own additions."""
-        noise = self.parameters.noise_scale**2 * observations.covariance_m2
-        return noise + self.parameters.noise_floor_m**2 * np.eye(3)
+    def _check(self, odometry: Float, observations: Observations) -> None:
+        """Refuse a frame before anything has changed."""
+        require_shape("odometry", odometry, (3,))
+        require_finite("odometry", odometry)
+        if len(observations) == 0:
+            return
+        needed = {Association.DESCRIPTOR: "descriptor", Association.LABEL: "label"}
+        name = needed.get(self.parameters.association)
+        if name is None:
+            return
+        values = getattr(observations, name)
+        if values is None or (name == "label" and np.any(values == NO_LABEL)):
+            raise ValueError(f"{name}: observations have none, and the association needs it")
 
-    def _log_new(self, noise: Float) -> Float:
-        """Log p_new (K,)."""
-        at_gate = log_density_at_gate(noise, self.parameters.gate, self.parameters.planar)
-        given = self.parameters.log_new_landmark_density
-        return at_gate if given is None else np.full(len(noise), given)
+    def _noise(self, observations: Observations) -> tuple[Float, Float]:
+        """R_t (K, 3, 3) with the filter's own additions, and log p_new (K,)."""
+        settings = self.parameters
+        noise = settings.noise_scale**2 * observations.covariance_m2
+        noise = noise + settings.noise_floor_m**2 * np.eye(3)
+        log_new = log_density_at_gate(noise, settings.gate, settings.planar)
+        if settings.log_new_landmark_density is not None:
+            log_new[:] = settings.log_new_landmark_density
+        return noise, log_new
 
     def _associate(
         self, seen: Sightings, observations: Observations
@@ -227,58 +239,58 @@ class FastSlam:
         if len(observations) == 0:
             return np.empty(seen.point_m.shape[:2], dtype=np.int64), np.empty(0, dtype=np.int64)
         if settings.association is Association.LABEL:
-            pairs, may_create = self._pairs_of_labels(_given("label", observations.label))
-        else:
-            descriptor = None
-            if settings.association is Association.DESCRIPTOR:
-                descriptor = _given("descriptor", observations.descriptor)
+            assert observations.label is not None
+            pairs, may_create = pairs_of_labels(self._slot_of_label, observations.label)
+        elif settings.association is Association.DESCRIPTOR:
             pairs = pairs_nearby(
-                self._maps, seen, settings.gate, descriptor, settings.descriptor_threshold
+                self._maps,
+                seen,
+                settings.gate,
+                observations.descriptor,
+                settings.descriptor_threshold,
             )
+        else:
+            pairs = pairs_nearby(self._maps, seen, settings.gate)
         nearest = settings.association is Association.GATE
         return choose(self._maps, pairs, seen, may_create, settings.gate, settings.planar, nearest)
 
-    def _pairs_of_labels(self, label: np.ndarray) -> tuple[Pairs, np.ndarray]:
-        """Observations with the slots of their labels; the first of a new label may start one."""
-        if np.any(label == NO_LABEL):
-            raise ValueError("label: an observation has none, and the association needs it")
-        known = np.array([int(name) in self._slot_of_label for name in label])
-        first = np.zeros(len(label), dtype=bool)
-        first[np.unique(label, return_index=True)[1]] = True
-        rows = np.flatnonzero(known)
-        slots = np.array([self._slot_of_label[int(label[k])] for k in rows], dtype=np.int64)
-        return Pairs(rows, slots), ~known & first
-
-    def _follow_changes(
-        self,
-        chosen: np.ndarray,
-        changed: np.ndarray,
-        seen: Sightings,
-        observations: Observations,
+    def _start_landmarks(
+        self, chosen: np.ndarray, seen: Sightings, observations: Observations
     ) -> None:
-        """Start landmarks, keep the index of the map and the history."""
-        source = np.where(chosen >= 0, self._maps.slots.source[chosen], -1)
-        if len(observations):
-            self._maps.moved(changed)
-            created = self._maps.create(chosen, seen, observations, self._n_observations)
-            if self.parameters.association is Association.LABEL:
-                assert observations.label is not None
-                rows = self._maps.slots.source[created] - self._n_observations
-                labels = observations.label[rows].tolist()
-                self._slot_of_label.update(zip(labels, created.tolist(), strict=True))
-            self._has_descriptors |= observations.descriptor is not None
-            self._has_labels |= observations.label is not None
+        """A landmark for each observation that is NEW in some particle."""
+        if len(observations) == 0:
+            return
+        created, rows = self._maps.create(chosen, seen, observations, self._n_observations)
+        if self.parameters.association is Association.LABEL:
+            assert observations.label is not None
+            labels = observations.label[rows].tolist()
+            self._slot_of_label.update(zip(labels, created.tolist(), strict=True))
+        self._has_descriptors |= observations.descriptor is not None
+        self._has_labels |= observations.label is not None
+
+    def _weigh(self, log_likelihood: Float) -> float:
+        """Multiply the weights by the frame's likelihood (eq. 10).
+
+        Returns:
+            Log density of the frame's observations given all before.
+        """
+        self._log_weights, log_evidence = normalised(self._log_weights + log_likelihood)
+        self._best = int(np.argmax(self._log_weights))
+        return log_evidence
+
+    def _remember(self, chosen: np.ndarray) -> None:
+        """Number the observations, and keep what became of them."""
         if self._history is not None:
-            number = self._n_observations + np.arange(len(observations))
-            self._history.add(self._poses, np.where(chosen == NEW, number[:, None], source))
-        self._n_observations += len(observations)
+            number = self._n_observations + np.arange(len(chosen))
+            source = np.where(chosen == NEW, number[:, None], self._maps.slots.source[chosen])
+            self._history.add(self._poses, np.where(chosen == DROPPED, -1, source))
+        self._n_observations += len(chosen)
 
     def _resample(self, log_evidence: float) -> StepResult:
-        """Take the result, then replace light particles by heavy ones if few carry the weight."""
+        """Take the result; then replace light particles by heavy ones if few carry the weight."""
         n_particles = self.parameters.n_particles
         n_effective = effective_sample_size(self._log_weights)
         few = n_effective <= self.parameters.resample_fraction * n_particles
-        self._best = int(np.argmax(self._log_weights))
         result = StepResult(
             best_pose=self._poses[self._best],
             effective_sample_size=n_effective,
@@ -302,9 +314,3 @@ class FastSlam:
         if self._history is None:
             raise ValueError("keep_history: is False, the path was not kept")
         return self._history
-
-
-def _given(name: str, values: np.ndarray | None) -> np.ndarray:
-    if values is None:
-        raise ValueError(f"{name}: the observations have none, and the association needs it")
-    return values

@@ -27,6 +27,9 @@ class MotionNoise:
         track_error: relative systematic error of angles.
         horizon_m: distance over which the scale error adds up.
         horizon_rad: angle over which the track error adds up.
+        lateral_slip_m_per_rad: sideways motion that the wheels do not count. A skid-steered robot
+            turns about a point that wanders along its x axis between the axles, so by up to half
+            the wheelbase (P3-AT: 0.134 m); 0 for two driven wheels on one axle.
         floor_m: added to x and y in every step, whatever the motion.
         floor_rad: added to the heading in every step, whatever the motion.
     """
@@ -38,6 +41,7 @@ class MotionNoise:
     track_error: float = 0.02
     horizon_m: float = 10.0
     horizon_rad: float = 2 * np.pi
+    lateral_slip_m_per_rad: float = 0.15
     floor_m: float = 0.0
     floor_rad: float = 0.0
 
@@ -58,7 +62,8 @@ class MotionNoise:
             + (self.rotation_rad_per_sqrt_rad**2 + self.track_error**2 * self.horizon_rad)
             * angle_rad
         )
-        variance = np.array([translation, translation, rotation])
+        slip = (self.lateral_slip_m_per_rad * angle_rad) ** 2
+        variance = np.array([translation, translation + slip, rotation])
         return np.sqrt(variance + np.array([self.floor_m, self.floor_m, self.floor_rad]) ** 2)
 
 

@@ -87,7 +87,7 @@ class ParticleMaps:
 
     def create(
         self, chosen: np.ndarray, seen: Sightings, observations: Observations, first_source: int
-    ) -> np.ndarray:
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Start a slot for each observation that is NEW in some particle.
 
         Args:
@@ -97,7 +97,7 @@ class ParticleMaps:
             first_source: running number of the first of them.
 
         Returns:
-            (n,) the new slots, in the order of their observations.
+            (n,) the new slots, and the rows of their observations.
         """
         rows = np.flatnonzero(np.any(chosen == NEW, axis=1))
         created = np.array([self._take_slot() for _ in rows], dtype=np.int64)
@@ -110,7 +110,7 @@ class ParticleMaps:
             slots.label[created] = observations.label[rows]
         _initialise(slots, created, rows, chosen, seen, self.n_landmarks)
         self.moved(created)
-        return created
+        return created, rows
 
     def resampled(self, ancestors: np.ndarray) -> None:
         """Go on with the children of `ancestors` (M,)."""

@@ -1,6 +1,6 @@
 """Time of one filter step, with a resampling forced in every step.
 
-The robot drives laps on a ring road between walls full of landmarks, as dense as in an indoor scene.
+The robot drives laps on a ring road between walls full of landmarks, as dense as indoors.
 The first lap fills the map, the next one is measured: each frame shows some of the landmarks in
 view, others than the frame before, and landmarks come into view that were not touched for hundreds
 of resamplings. Odometry is good, so that the laps meet and the map keeps its size.
@@ -23,7 +23,7 @@ ROAD_M = 6.0  # landmarks stand up to half of this to the left and to the right
 VIEW_M = 6.0
 STEP_M = 0.1
 LANDMARKS_PER_M = 40.0
-MOTION = MotionNoise(0.002, 0.0002, 0.0005, 0, 0)
+MOTION = MotionNoise(0.002, 0.0002, 0.0005, 0, 0, lateral_slip_m_per_rad=0)
 MEASURED_STEPS = 300
 MIB = 2**20
 

@@ -134,7 +134,9 @@ def test_the_filter_finds_the_landmarks(recording: Path, tmp_path: Path):
     path = import_mrclam(recording, tmp_path / "logs")[1]
     log, truth = read_log(path), read_truth(path)
     settings = FastSlamParameters(
-        n_particles=20, association="label", motion=MotionNoise(0.005, 0, 0.005, 0, 0)
+        n_particles=20,
+        association="label",
+        motion=MotionNoise(0.005, 0, 0.005, 0, 0, lateral_slip_m_per_rad=0),
     )
     frames = list(run_log(log, settings, np.random.default_rng(0), snapshots=[len(log) - 1]))
     landmarks = frames[-1].landmarks

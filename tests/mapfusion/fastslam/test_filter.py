@@ -13,8 +13,8 @@ from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.robot_log import Observations
 from mapfusion.se2 import compose, inverse, rotation_about_z, transform_points, wrap
 
-EXACT_MOTION = MotionNoise(0, 0, 0, 0, 0)
-LOOSE_MOTION = MotionNoise(0.1, 0.05, 0.1, 0, 0)
+EXACT_MOTION = MotionNoise(0, 0, 0, 0, 0, lateral_slip_m_per_rad=0)
+LOOSE_MOTION = MotionNoise(0.1, 0.05, 0.1, 0, 0, lateral_slip_m_per_rad=0.03)
 
 
 def parameters(**changes) -> FastSlamParameters:
@@ -24,7 +24,7 @@ def parameters(**changes) -> FastSlamParameters:
 def assert_same(slam: FastSlam, result, twin: CopyingFilter, planar: bool) -> None:
     np.testing.assert_allclose(np.exp(result.log_weights), twin.weights, rtol=1e-7, atol=1e-12)
     np.testing.assert_array_equal(result.cloud, twin.cloud)
-    landmarks, expected = slam.best_map(), twin.best_landmarks()
+    landmarks, expected = slam.best_map(min_count=1), twin.best_landmarks()
     n = 2 if planar else 3
     assert len(landmarks) == result.n_landmarks == len(expected)
     assert landmarks.source_observation.tolist() == [m.source for m in expected]
@@ -99,7 +99,7 @@ def test_with_exact_odometry_the_map_is_the_least_squares_solution():
     slam = FastSlam(settings, np.random.default_rng(0))
     for odometry, frame in zip(world.odometry, world.frames, strict=True):
         slam.step(odometry, frame)
-    landmarks = slam.best_map()
+    landmarks = slam.best_map(min_count=1)
     assert landmarks.label is not None
     for row, label in enumerate(landmarks.label):
         information, vector, count = np.zeros((3, 3)), np.zeros(3), 0
@@ -126,7 +126,7 @@ def test_a_landmark_seen_a_thousand_times_keeps_a_covariance_of_one_thousandth()
     slam = FastSlam(settings, np.random.default_rng(0))
     for _ in range(1000):
         slam.step(np.zeros(3), frame)
-    landmarks = slam.best_map()
+    landmarks = slam.best_map(min_count=1)
     assert np.linalg.eigvalsh(landmarks.covariance_m2[0]).min() > 0
     np.testing.assert_allclose(landmarks.covariance_m2[0], R / 1000, rtol=1e-9, atol=1e-18)
     np.testing.assert_allclose(landmarks.position_m, frame.position_m, atol=1e-12)
@@ -176,6 +176,7 @@ def test_millimetres_give_the_same_weights(association, planar):
             small.motion.rotation_rad_per_sqrt_rad,
             0,
             0,
+            lateral_slip_m_per_rad=scale * small.motion.lateral_slip_m_per_rad,
         ),
     )
     in_m = FastSlam(small, np.random.default_rng(9))
@@ -189,7 +190,10 @@ def test_millimetres_give_the_same_weights(association, planar):
         np.testing.assert_allclose(result.log_weights, expected.log_weights, atol=1e-6)
         assert result.n_landmarks == expected.n_landmarks
     np.testing.assert_allclose(
-        in_mm.best_map().position_m, scale * in_m.best_map().position_m, rtol=1e-6, atol=1e-6
+        in_mm.best_map(min_count=1).position_m,
+        scale * in_m.best_map(min_count=1).position_m,
+        rtol=1e-6,
+        atol=1e-6,
     )
 
 
@@ -202,7 +206,7 @@ def test_order_of_observations_does_not_matter():
         expected = slam.step(odometry, frame)
         result = shuffled.step(odometry, frame[rng.permutation(len(frame))])
         np.testing.assert_allclose(result.log_weights, expected.log_weights, atol=1e-9)
-    first, second = slam.best_map().position_m, shuffled.best_map().position_m
+    first, second = slam.best_map(min_count=1).position_m, shuffled.best_map(min_count=1).position_m
     np.testing.assert_allclose(
         first[np.argsort(first[:, 0])], second[np.argsort(second[:, 0])], atol=1e-9
     )
@@ -213,7 +217,9 @@ def test_localises_better_than_odometry():
     for seed in range(4):
         sigma = np.array([0.02, 0.01, 0.03])
         world = drive(seed, n_frames=60, per_frame=6, odometry_sigma=tuple(sigma))
-        motion = MotionNoise(0.02 / np.sqrt(0.15), 0, 0.03 / np.sqrt(0.1), 0, 0)
+        motion = MotionNoise(
+            0.02 / np.sqrt(0.15), 0, 0.03 / np.sqrt(0.1), 0, 0, lateral_slip_m_per_rad=0
+        )
         settings = parameters(n_particles=100, motion=motion)
         slam = FastSlam(settings, np.random.default_rng(seed))
         reckoned, path = np.zeros(3), []
@@ -235,7 +241,7 @@ def test_one_landmark_takes_one_observation_a_frame(association):
     slam = FastSlam(settings, np.random.default_rng(0))
     slam.step(np.zeros(3), both[:1])
     slam.step(np.zeros(3), both)
-    assert slam.best_map().count.tolist() == [2, 1]
+    assert slam.best_map(min_count=1).count.tolist() == [2, 1]
     assert slam.best_associations().tolist() == [0, 0, 2]
 
 
@@ -245,7 +251,7 @@ def test_a_known_label_outside_the_gate_is_dropped():
     slam = FastSlam(parameters(motion=EXACT_MOTION, association="label"), np.random.default_rng(0))
     slam.step(np.zeros(3), Observations(np.array([[1.0, 0, 0]]), R, label=label))
     slam.step(np.zeros(3), Observations(np.array([[1.5, 0, 0]]), R, label=label))
-    landmarks = slam.best_map()
+    landmarks = slam.best_map(min_count=1)
     assert landmarks.position_m.tolist() == [[1.0, 0.0, 0.0]]
     assert slam.best_associations().tolist() == [0, -1]
 
@@ -268,7 +274,7 @@ def test_a_robot_that_sees_nothing_dead_reckons():
     np.testing.assert_allclose(result.best_pose, pose, atol=1e-12)
     assert result.n_landmarks == 0
     assert not result.resampled
-    assert len(slam.best_map()) == 0
+    assert len(slam.best_map(min_count=1)) == 0
     assert slam.best_path().shape == (10, 3)
     assert slam.best_associations().shape == (0,)
 
@@ -280,7 +286,7 @@ def test_same_seed_same_bits():
         slam = FastSlam(parameters(), np.random.default_rng(6))
         for odometry, frame in zip(world.odometry, world.frames, strict=True):
             slam.step(odometry, frame)
-        maps.append(slam.best_map())
+        maps.append(slam.best_map(min_count=1))
     assert maps[0].position_m.tobytes() == maps[1].position_m.tobytes()
     assert maps[0].covariance_m2.tobytes() == maps[1].covariance_m2.tobytes()
 
@@ -329,6 +335,28 @@ def test_an_endless_stream_keeps_its_memory():
 def test_wrong_parameters_are_named(changes, name):
     with pytest.raises(ValueError, match=name):
         FastSlamParameters(**changes)
+
+
+def test_best_map_leaves_out_what_was_seen_too_rarely():
+    world = drive(23)
+    slam = FastSlam(parameters(), np.random.default_rng(6))
+    for odometry, frame in zip(world.odometry, world.frames, strict=True):
+        slam.step(odometry, frame)
+    everything = slam.best_map(min_count=1)
+    enough = everything.count >= 3
+    assert 0 < enough.sum() < len(enough)
+    np.testing.assert_array_equal(slam.best_map().position_m, everything.position_m[enough])
+
+
+def test_a_refused_frame_changes_nothing():
+    world = drive(29)
+    slam, undisturbed = (FastSlam(parameters(), np.random.default_rng(2)) for _ in range(2))
+    for odometry, frame in zip(world.odometry, world.frames, strict=True):
+        if len(frame):
+            with pytest.raises(ValueError, match="descriptor"):
+                slam.step(odometry, replace(frame, descriptor=None))
+        result, expected = slam.step(odometry, frame), undisturbed.step(odometry, frame)
+        np.testing.assert_array_equal(result.cloud, expected.cloud)
 
 
 def test_wrong_arguments_are_named():

@@ -1,10 +1,15 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from mapfusion.fastslam.motion import MotionNoise, sample_motion
 from mapfusion.se2 import between, compose
 
-NOISE = MotionNoise(0.02, 0.01, 0.03, 0.05, 0.04, horizon_m=4.0, horizon_rad=2.0)
+NOISE = MotionNoise(
+    0.02, 0.01, 0.03, 0.05, 0.04, horizon_m=4.0, horizon_rad=2.0, lateral_slip_m_per_rad=0.0
+)
+EXACT = MotionNoise(0, 0, 0, 0, 0, lateral_slip_m_per_rad=0)
 
 
 def test_spread_is_the_stated_one():
@@ -22,6 +27,12 @@ def test_spread_is_the_stated_one():
     assert np.all(np.abs(poses[:, 2]) <= np.pi)
 
 
+def test_turning_slips_sideways():
+    slipping = replace(EXACT, lateral_slip_m_per_rad=0.1)
+    sigma = slipping.standard_deviations(np.array([0.3, 0.0, -0.5]))
+    np.testing.assert_allclose(sigma, [0, 0.05, 0])
+
+
 def test_many_short_steps_spread_as_one_long():
     long = NOISE.standard_deviations(np.array([0.6, 0.0, 0.9]))
     short = NOISE.standard_deviations(np.array([0.06, 0.0, 0.09]))
@@ -30,7 +41,9 @@ def test_many_short_steps_spread_as_one_long():
 
 @pytest.mark.parametrize("relative_error", [0.02, 0.1])
 def test_covers_a_systematic_error_at_the_horizon(relative_error):
-    noise = MotionNoise(0, 0, 0, relative_error, relative_error, horizon_m=5, horizon_rad=3)
+    noise = replace(
+        EXACT, scale_error=relative_error, track_error=relative_error, horizon_m=5, horizon_rad=3
+    )
     sigma = noise.standard_deviations(np.array([5.0, 0.0, 3.0]))
     np.testing.assert_allclose(sigma, [5 * relative_error, 5 * relative_error, 3 * relative_error])
 
@@ -46,9 +59,8 @@ def test_standing_still_adds_only_the_floor():
 def test_without_noise_it_is_the_odometry():
     rng = np.random.default_rng(1)
     start, odometry = rng.normal(size=(20, 3)), rng.normal(size=3)
-    exact = MotionNoise(0, 0, 0, 0, 0)
     np.testing.assert_allclose(
-        sample_motion(start, odometry, exact, rng), compose(start, odometry), atol=1e-15
+        sample_motion(start, odometry, EXACT, rng), compose(start, odometry), atol=1e-15
     )
 
 
