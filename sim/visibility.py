@@ -29,11 +29,12 @@ class Visibility:
         self._start, edge = walls[:, 0, :2], walls[:, 1, :2] - walls[:, 0, :2]
         self._width_m = np.linalg.norm(edge, axis=1)
         self._along = edge / self._width_m[:, None]
-        self._hides = walls[:, 2, 2] >= heights.max()
+        top_m = heights.max()  # a camera above it looks over all walls
+        self._hides = (walls[:, 2, 2] >= top_m) & (top_m > camera.mount_z_m)
         center_u, center_v = camera.center_px
         to_left = (center_u - np.arange(camera.width_px)) / camera.focal_px
         self._ray = np.stack([np.ones_like(to_left), to_left], -1)  # in the camera's frame
-        to_ceiling_m = heights.max() - camera.mount_z_m
+        to_ceiling_m = top_m - camera.mount_z_m
         self._ceiling_from_m = to_ceiling_m * camera.focal_px / center_v - MARGIN_M
 
     def seen(self, T_world_robot: Float) -> np.ndarray:

@@ -180,11 +180,8 @@ def _face_files(folder: Path, i: int) -> tuple[Path, Path]:
 
 def _mesh(face: Face) -> str:
     """One quad as OBJ; with normals and texture coordinates, or the renderer draws nothing."""
-    edge_right, edge_up = (
-        face.corners_m[1] - face.corners_m[0],
-        face.corners_m[3] - face.corners_m[0],
-    )
-    normal = np.cross(edge_right, edge_up)
+    right, up = face.corners_m[[1, 3]] - face.corners_m[0]
+    normal = np.cross(right, up)
     normal /= np.linalg.norm(normal)
     lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in face.corners_m]
     lines += ["vt 0 0", "vt 1 0", "vt 1 1", "vt 0 1"]
