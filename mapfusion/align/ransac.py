@@ -72,7 +72,7 @@ class Ransac:
             return undetermined(reason, len(pairs), started_s)
         dimensions = 2 if pairs.planar else 3
         seed = rng.integers(1, 2**64, dtype=np.uint64)
-        found, T_a_b, support = search(
+        _, T_a_b, support = search(
             np.ascontiguousarray(pairs.p_a[rows, :dimensions]),
             np.ascontiguousarray(pairs.p_b[rows, :dimensions]),
             self.gate_m,
@@ -81,7 +81,7 @@ class Ransac:
             self.max_draws,
             seed,
         )
-        if not found:
+        if not len(support):
             reason = (
                 f"no two of {len(rows)} correspondences are {self.min_baseline_m:g} m or more and "
                 "equally far apart in both maps"
@@ -189,7 +189,7 @@ def search(
     log_miss: float,
     max_draws: int,
     seed: np.uint64,
-) -> tuple[bool, Float, np.ndarray]:
+) -> tuple[int, Float, np.ndarray]:
     """Draw minimal sets until two supporters of the best motion would have come up by now.
 
     A motion with as much support as the best so far is settled on its support before it counts.
@@ -204,7 +204,7 @@ def search(
         seed: of the draws, not 0.
 
     Returns:
-        Whether any motion was found, T_a_b (3,), rows of its supporters.
+        Number of draws, T_a_b (3,), rows of its supporters; none when no motion was found.
     """
     n = len(p_a)
     best_T, T_a_b = np.full(3, np.nan), np.empty(3)
@@ -233,4 +233,4 @@ def search(
             best_rows[:count] = rows[:count]
             hit = count * (count - 1) / (n * (n - 1))
             needed = min(needed, log_miss / math.log1p(-hit)) if hit < 1 else 0.0
-    return best_count > 0, best_T, best_rows[:best_count].copy()
+    return draws, best_T, best_rows[:best_count].copy()

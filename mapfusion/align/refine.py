@@ -40,17 +40,23 @@ class Refinement:
     Attributes:
         gate_m: distance in the plane under the estimate up to which a pair takes part. Between two
             maps drift displaces true pairs by 0.1 to 0.3 m, and the estimate adds its own error.
+        least_drift_m: pairs are judged true or false with an s_drift of at least this. Drift is
+            common to neighbours: a part of a map that moved as one, by the 0.1 m that are usual,
+            would else pass for false pairs, and the answer depend on where the search began.
         max_rounds: an estimate that still moves then is refused.
         height: which pairs can be true by their heights (not for planar maps).
     """
 
     gate_m: float = 0.5
+    least_drift_m: float = 0.1
     max_rounds: int = 500
     height: HeightGate = field(default_factory=HeightGate)
 
     def __post_init__(self) -> None:
         if not self.gate_m > 0:
             raise ValueError("gate_m: must be positive")
+        if not self.least_drift_m >= 0:
+            raise ValueError("least_drift_m: must not be negative")
         if not self.max_rounds > 0:
             raise ValueError("max_rounds: must be positive")
 
@@ -80,6 +86,7 @@ class Refinement:
             pairs.covariance_b[rows, :2, :2],
             T_a_b,
             self.gate_m,
+            self.least_drift_m,
             self.max_rounds,
         )
         if not solved:
@@ -207,6 +214,7 @@ def iterate(
     S_b: Float,
     T_start: Float,
     gate_m: float,
+    least_drift_m: float,
     max_rounds: int,
 ) -> tuple[bool, float, Float, np.ndarray, float, Float]:
     """Expectation maximisation for motion, s_drift and share of true pairs.
@@ -228,7 +236,8 @@ def iterate(
         if rounds < _GATE_ROUNDS:
             for i in range(n):
                 inside[i] = e[i, 0] * e[i, 0] + e[i, 1] * e[i, 1] <= gate_m * gate_m
-        truth_probabilities(e, S, variance, share, gate_m, inside, truth)
+        judged = max(variance, least_drift_m * least_drift_m)
+        truth_probabilities(e, S, judged, share, gate_m, inside, truth)
         total = np.sum(truth)
         if total < 1.0:
             return False, moved, T_a_b, covariance, variance, truth

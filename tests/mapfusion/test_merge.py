@@ -12,6 +12,7 @@ from mapfusion.align.result import Alignment, Status, degenerate
 from mapfusion.aligned_landmarks import ABSENT, fuse
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.merge import MergeParameters, merge
+from mapfusion.same_point import one_to_one
 
 DRIFT_M = 0.05
 
@@ -243,17 +244,46 @@ def test_second_pass_finds_what_the_alignment_missed():
     assert np.all(fused.parents != ABSENT)
 
 
-@pytest.mark.parametrize("wrong", ["descriptor", "height", "place"])
+@pytest.mark.parametrize("use_drift", [True, False])
+def test_second_pass_keeps_the_share_its_gate_promises(use_drift):
+    robots = Robots([slice(0, 1500), slice(0, 1500)])
+    robots.alignments[0] = replace(robots.alignments[0], inlier=np.zeros(1500, dtype=bool))
+    fused = robots.merge(use_drift=use_drift, gate_probability=0.9)
+    # heights keep more than theirs, 0.999: their floor covers errors that these maps do not have
+    found = np.mean(np.all(fused.parents != ABSENT, axis=1)[fused.parents[:, 0] != ABSENT])
+    assert found == pytest.approx(0.9, abs=0.025)
+
+
+def test_one_to_one_takes_the_most_alike_first():
+    i, j, unlike = np.array([0, 0, 1, 1, 2]), np.array([5, 6, 5, 6, 6]), np.array([3, 2, 1, 4, 0.5])
+    rows, others = one_to_one(i, j, unlike)
+    assert set(zip(rows, others, strict=True)) == {(2, 6), (1, 5)}
+
+
+def test_fused_landmark_keeps_the_descriptor_seen_more_often():
+    robots = Robots([slice(0, 30), slice(0, 30)])
+    fused = robots.merge()
+    a, b = (m[fused.parents[:, k]] for k, m in enumerate(robots.maps))
+    assert np.any(a.count > b.count)
+    assert np.any(b.count > a.count)
+    expected = np.where((b.count > a.count)[:, None], b.descriptor, a.descriptor)
+    np.testing.assert_array_equal(fused.landmarks.descriptor, expected)
+
+
+@pytest.mark.parametrize("wrong", ["label", "descriptor", "height", "place"])
 def test_second_pass_pairs_only_what_may_be_one_point(wrong):
     robots = Robots([slice(0, 50), slice(0, 50)])
     robots.alignments[0] = replace(robots.alignments[0], inlier=np.zeros(50, dtype=bool))
     b = robots.maps[1]
     changed = {
+        "label": {"label": np.arange(50, 100, dtype=np.int32)},
         "descriptor": {"descriptor": -b.descriptor},
         "height": {"position_m": b.position_m + np.array([0, 0, 2.0])},
         "place": {"position_m": b.position_m + np.array([3.0, 0, 0])},
     }[wrong]
     robots.maps[1] = replace(b, **changed)
+    if wrong == "label":  # equal descriptors do not make up for different labels
+        robots.maps[0] = replace(robots.maps[0], label=np.arange(50, dtype=np.int32))
     assert len(robots.merge().landmarks) == 100
 
 

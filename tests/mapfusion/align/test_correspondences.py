@@ -32,11 +32,11 @@ def slow_match(a, b, parameters):
     }
 
 
-@pytest.mark.parametrize("noise", [0.02, 0.1])
+@pytest.mark.parametrize("noise", [0.02, 0.1, 0.3])
 def test_pairs_are_those_of_the_definition(noise, monkeypatch):
     monkeypatch.setattr(module, "_BLOCK_ROWS", 50)  # so that pairs lie in different blocks
     a, b, _ = two_maps(np.random.default_rng(0), noise=noise)
-    parameters = MatchParameters(max_descriptor_distance=0.9)
+    parameters = MatchParameters(max_descriptor_distance=max(0.9, 8 * noise))
     found = match(a, b, parameters)
     assert set(zip(found.index_a, found.index_b, strict=True)) == slow_match(a, b, parameters)
     assert len(found) > 20
