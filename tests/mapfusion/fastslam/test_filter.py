@@ -303,21 +303,17 @@ def test_history_changes_no_estimate():
         plain.best_path()
 
 
-def test_an_endless_stream_keeps_its_memory():
-    """Slots that no particle has any more are freed, also where the robot never comes again."""
+def test_landmarks_that_no_particle_has_any_more_are_forgotten():
+    """A narrow gate makes particles disagree: about 1000 landmarks are started, one map has 220."""
     rng = np.random.default_rng(0)
-    settings = parameters(resample_fraction=1.0)
+    settings = parameters(resample_fraction=1.0, gate_probability=0.5, association="gate")
     slam = FastSlam(settings, rng, keep_history=False)
-    descriptor = unit(rng.standard_normal((1, 64))).astype(np.float32)
-    used = []
     for _ in range(600):
-        # Sees a landmark at random places, so that each frame adds some in some particles only.
-        position = rng.uniform(-3, 3, (1, 3))
-        frame = Observations(position, 0.05 * np.eye(3)[None], descriptor)
+        position = rng.uniform(-0.5, 0.5, (3, 3))
+        frame = Observations(position, np.tile(0.05 * np.eye(3), (3, 1, 1)))
         result = slam.step(np.array([0.3, 0.0, 0.1]), frame)
-        used.append(slam.n_slots - result.n_landmarks)
-    assert np.mean(used[400:]) < 2 * np.mean(used[200:400])
-    assert max(used) < 300
+    assert result.n_landmarks > 150
+    assert slam.n_slots < 1.5 * result.n_landmarks
 
 
 @pytest.mark.parametrize(
