@@ -102,9 +102,14 @@ def next_random(state: np.uint64) -> np.uint64:
 
 
 @njit(cache=True)
-def _below(state: np.uint64, n: int) -> int:
-    # upper 32 bits, scaled: uneven by n / 2^32 at most
-    return int(np.int64(((state >> np.uint64(32)) * np.uint64(n)) >> np.uint64(32)))
+def draw_pair(state: np.uint64, n: int) -> tuple[np.uint64, int, int]:
+    """The state after drawing two different numbers below n, and the numbers."""
+    # the upper 32 bits, scaled, are uneven by n / 2^32 at most
+    state = next_random(state)
+    i = int(np.int64(((state >> np.uint64(32)) * np.uint64(n)) >> np.uint64(32)))
+    state = next_random(state)
+    j = int(np.int64(((state >> np.uint64(32)) * np.uint64(n - 1)) >> np.uint64(32)))
+    return state, i, j + 1 if j >= i else j
 
 
 @njit(cache=True)
@@ -215,12 +220,7 @@ def search(
     state = seed
     while draws < needed:
         draws += 1
-        state = next_random(state)
-        i = _below(state, n)
-        state = next_random(state)
-        j = _below(state, n - 1)
-        if j >= i:
-            j += 1
+        state, i, j = draw_pair(state, n)
         if not _two_point_motion(p_a, p_b, i, j, gate_m, min_baseline_m, T_a_b):
             continue
         count, _ = support_of(T_a_b, p_a, p_b, gate_m, best_count, rows)

@@ -9,7 +9,7 @@ from scipy.stats import chisquare
 from mapfusion import se2
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.oracle import Oracle
-from mapfusion.align.ransac import Ransac, next_random, search
+from mapfusion.align.ransac import Ransac, draw_pair, search
 from mapfusion.align.refine import Refinement
 from mapfusion.align.result import Status
 
@@ -120,12 +120,13 @@ def test_of_equal_support_the_nearer_wins():
         assert error(T, exact) == pytest.approx((0, 0), abs=1e-9)
 
 
-def test_draws_are_uniform():
-    state, upper = np.uint64(12345), []
-    for _ in range(20_000):
-        state = np.uint64(next_random(state))
-        upper.append((int(state) >> 32) * 50 >> 32)
-    assert chisquare(np.bincount(upper, minlength=50)).pvalue > 1e-3
+def test_every_two_pairs_are_drawn_equally_often():
+    state, drawn = np.uint64(12345), np.zeros((7, 7))
+    for _ in range(42_000):
+        state, i, j = draw_pair(np.uint64(state), 7)
+        drawn[i, j] += 1
+    assert np.trace(drawn) == 0
+    assert chisquare(drawn[~np.eye(7, dtype=bool)]).pvalue > 1e-3
 
 
 @pytest.mark.parametrize(("outliers", "least"), [(0.95, 100), (0.99, 95)])
