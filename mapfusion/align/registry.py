@@ -4,7 +4,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from mapfusion.align.correspondences import Correspondences
+from mapfusion.align.correspondences import Correspondences, HeightGate
 from mapfusion.align.icp import Icp
 from mapfusion.align.impicp import ImpIcp
 from mapfusion.align.ransac import Ransac
@@ -39,6 +39,8 @@ def make_aligner(name: str, **parameters: Any) -> Aligner:
     if name not in ALIGNERS:
         raise ValueError(f"name: unknown aligner {name!r}, known are {', '.join(ALIGNERS)}")
     try:
+        if isinstance(parameters.get("height"), dict):  # as a scenario file has it
+            parameters = parameters | {"height": HeightGate(**parameters["height"])}
         return ALIGNERS[name](**parameters)
     except TypeError as error:
         raise ValueError(f"parameters: {name}: {error}") from error

@@ -181,4 +181,7 @@ def test_unknown_names_and_parameters():
         make_aligner("ransack")
     with pytest.raises(ValueError, match=r"ransac.*gate_mm"):
         make_aligner("ransac", gate_mm=3)
-    assert make_aligner("ransac", gate_m=0.2).gate_m == 0.2
+    with pytest.raises(ValueError, match=r"ransac.*floor"):
+        make_aligner("ransac", height={"floor": 3})
+    made = make_aligner("ransac", gate_m=0.2, height={"floor_m": 0.1})
+    assert (made.gate_m, made.height.floor_m, made.height.probability) == (0.2, 0.1, 0.999)
