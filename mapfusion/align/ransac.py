@@ -227,6 +227,8 @@ def search(
         if count < max(best_count, 2):
             continue
         count, cost = settle(p_a, p_b, gate_m, T_a_b, rows, count)
+        if count < 2:  # the motion moved away from its own support
+            continue
         if count > best_count or (count == best_count and cost < best_cost):
             best_T[:] = T_a_b
             best_count, best_cost = count, cost
