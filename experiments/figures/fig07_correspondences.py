@@ -14,7 +14,8 @@ from experiments.metrics import ORACLE
 from experiments.truth import true_pairs
 from mapfusion.se2 import Float, transform_points
 
-_STRAY_SHARE = 0.005  # of the landmarks on each side, kept from shrinking the picture
+# Strays must not shrink the picture: beyond this share on each side, widened by some of the extent.
+_STRAY_SHARE, _STRAY_MARGIN = 0.005, 0.05
 _GAP = 0.15  # between the two maps, as a share of the first one's width
 _MIN_HEIGHT = 0.2  # of the box, as a share of its length: rooms are low; the axis is true anyway
 _MAX_LINES = 80  # of each kind: more would hide the maps
@@ -70,7 +71,7 @@ def _pair_to_show(data: ResultTables) -> Pair:
 def _clipped(position_m: Float) -> Float:
     """Positions with strays as NaN, so that row numbers stay."""
     low, high = np.quantile(position_m, [_STRAY_SHARE, 1 - _STRAY_SHARE], axis=0)
-    margin = 0.05 * (high - low)
+    margin = _STRAY_MARGIN * (high - low)
     inside = np.all((position_m >= low - margin) & (position_m <= high + margin), axis=1)
     return np.where(inside[:, None], position_m, np.nan)
 

@@ -34,9 +34,13 @@ def draw(data: ResultTables) -> Figure:
             axes, position[here], covariance[here], edgecolors=colours[k], linestyles=dashes
         )
         axes.plot(
-            *position[k, :2], marker=marker, markersize=6, color=colours[k], linestyle=dashes,
+            *position[k, :2],
+            marker=marker,
+            markersize=6,
+            color=colours[k],
+            linestyle=dashes,
             label=labels[k],
-        )  # fmt: skip
+        )
     own = pairs.own_covariance_m2[:, chosen]
     add_ellipses(axes, position[:2], own, edgecolors=colours[:2], linewidths=0.6)
     axes.plot(*position[:2, :2].T, color="gray", linewidth=0.6, linestyle=":", zorder=1)

@@ -31,26 +31,33 @@ def draw(data: ResultTables) -> Figure:
         label_plan(axes, data.robots[0])
     fused = pairs.position_m[2]
     set_view(overview, fused)
-    major, _, _ = semi_axes(pairs.covariance_m2[:2].reshape(-1, 3, 3)[:, :2, :2])
-    side = _ZOOM_SIDE * float(np.median(major))
-    corner = zoom_corner(fused, side)
-    zoom.set_xlim(corner[0], corner[0] + side)
-    zoom.set_ylim(corner[1], corner[1] + side)
-    zoom.set_aspect("equal")
-    frame = Rectangle(
-        (corner[0], corner[1]), side, side, fill=False, edgecolor=BLACK, linestyle="--", zorder=6
-    )
-    overview.add_patch(frame)
+    _set_zoom(overview, zoom, pairs)
     overview.set_title(f"{len(fused)} landmarks in both maps, aligned")
     zoom.set_title("zoom of the dashed rectangle")
     handles, labels = zoom.get_legend_handles_labels()
     legend_in = legend_height(len(handles), len(handles), title=True)
     figure.set_figheight(height_of_row([overview, zoom], PAGE_WIDTH_IN / 2) + legend_in)
     figure.legend(
-        handles, labels, loc="outside lower center", ncols=len(handles),
-        title=f"{LEVEL_TEXT} ellipses, to scale", title_fontsize=7.5,
-    )  # fmt: skip
+        handles,
+        labels,
+        loc="outside lower center",
+        ncols=len(handles),
+        title=f"{LEVEL_TEXT} ellipses, to scale",
+        title_fontsize=7.5,
+    )
     return figure
+
+
+def _set_zoom(overview: Axes, zoom: Axes, pairs: FusedPairs) -> None:
+    major, _, _ = semi_axes(pairs.covariance_m2[:2].reshape(-1, 3, 3)[:, :2, :2])
+    side = _ZOOM_SIDE * float(np.median(major))
+    x, y = zoom_corner(pairs.position_m[2], side)
+    zoom.set_xlim(x, x + side)
+    zoom.set_ylim(y, y + side)
+    zoom.set_aspect("equal")
+    overview.add_patch(
+        Rectangle((x, y), side, side, fill=False, edgecolor=BLACK, linestyle="--", zorder=6)
+    )
 
 
 def _draw_landmarks(axes: Axes, data: ResultTables, pairs: FusedPairs, scale: float) -> None:
