@@ -212,8 +212,10 @@ def available_cores() -> int:
 
 def main() -> None:
     """Run the command; every failure a user can cause is one line and an exit code."""
+    from experiments.kernel_cache import use_kernel_cache
     from mapfusion.errors import InputError
 
+    use_kernel_cache()
     try:
         code = app(standalone_mode=False) or 0
     except InputError as error:

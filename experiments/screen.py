@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
+from rich import box
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -21,6 +22,15 @@ if TYPE_CHECKING:
     from mapfusion.merge import FusedMap
 
 MIN_TRUE_PAIRS_SHOWN = 3  # as figures 4 and 5 shade: fewer cannot carry an alignment
+
+# Plain rules and narrow gaps: all columns must fit into 80 characters.
+_LAYOUT: Any = {
+    "box": box.SIMPLE_HEAD,
+    "padding": (0, 1, 0, 0),
+    "title_style": "bold",
+    "title_justify": "left",
+    "caption_justify": "left",
+}
 
 _STAGE_TEXT = {
     "drive": "drive the robots",
@@ -100,23 +110,25 @@ def aligner_summary(errors: pd.DataFrame, timings: pd.DataFrame, order: list[str
 
 def _aligner_table(errors: pd.DataFrame, timings: pd.DataFrame, order: list[str]) -> Table:
     columns = {
-        "estimated_m": ("estimated\n[m]", ".3f"),
-        "estimated_rad": ("\n[rad]", ".4f"),
-        "spread_m": ("10-90 %\n[m]", ".3f"),
-        "refined_m": ("refined\n[m]", ".3f"),
-        "refined_rad": ("\n[rad]", ".4f"),
-        "accepted": ("accepted\n", ".0%"),
+        "estimated_m": ("estim.\nm", ".3f"),
+        "estimated_rad": ("\nrad", ".4f"),
+        "spread_m": ("spread\nm", ".3f"),
+        "refined_m": ("refined\nm", ".3f"),
+        "refined_rad": ("\nrad", ".4f"),
+        "accepted": ("ok\n", ".0%"),
         "pairs": ("pairs\n", ".0f"),
         "true_share": ("true\n", ".0%"),
-        "time_ms": ("time\n[ms]", ".2f"),
+        "time_ms": ("time\nms", ".2f"),
     }
     table = Table(
-        title="Alignment error against the truth: medians over all iterations with "
-        f"{MIN_TRUE_PAIRS_SHOWN} or more true pairs"
+        title=f"Alignment errors: medians over iterations with {MIN_TRUE_PAIRS_SHOWN}+ true pairs",
+        caption="spread: 10-90 % of the repetitions on the same maps; ok: accepted once refined;\n"
+        "pairs: offered, and the share of true ones among them",
+        **_LAYOUT,
     )
-    table.add_column("aligner", vertical="bottom")
+    table.add_column("\naligner", no_wrap=True)
     for heading, _ in columns.values():
-        table.add_column(heading, justify="right")
+        table.add_column(heading, justify="right", no_wrap=True)
     for row in aligner_summary(errors, timings, order).to_dict("records"):
         cells = [_number(row[name], layout) for name, (_, layout) in columns.items()]
         table.add_row(str(row["aligner"]), *cells)
@@ -128,7 +140,7 @@ def _number(value: float, layout: str) -> str:
 
 
 def _robot_table(robots: pd.DataFrame) -> Table:
-    table = Table(title="Paths, RMS over all iterations")
+    table = Table(title="Position errors (RMS)", **_LAYOUT)
     for heading in ("robot", "FastSLAM [m]", "odometry [m]", "ratio", "landmarks"):
         table.add_column(heading, justify="left" if heading == "robot" else "right")
     for name, rows in robots.groupby("robot"):
@@ -143,7 +155,7 @@ def _robot_table(robots: pd.DataFrame) -> Table:
 
 def print_outcomes(outcomes: Sequence["Outcome"]) -> None:
     """The table of a check."""
-    table = Table(title="Checks against the truth")
+    table = Table(title="Checks against the truth", **_LAYOUT)
     for heading in ("scenario", "metric", "measured", "expected", "by seed", ""):
         table.add_column(heading, justify="right" if heading == "measured" else "left")
     for outcome in outcomes:
@@ -175,7 +187,7 @@ def print_map(path: Path, landmarks: "LandmarkMap") -> None:
 
 def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
     """Estimates of all aligners on two maps."""
-    table = Table(title="T_a_b, as estimated and refined")
+    table = Table(title="T_a_b, as estimated and refined", **_LAYOUT)
     headings = ("aligner", "status", "tx [m]", "ty [m]", "theta [rad]")
     headings += ("refined tx", "ty", "theta", "inliers", "time [ms]")
     for heading in headings:
