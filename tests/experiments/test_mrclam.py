@@ -92,7 +92,9 @@ def test_logs_agree_with_the_truth(recording: Path, tmp_path: Path):
         np.testing.assert_allclose(wrap(difference[:, 2]), 0, atol=1e-6)
 
         assert set(np.unique(log.observations.label)) == set(LANDMARKS)
-        assert len(log.observations) == 150 * len(LANDMARKS)
+        times = np.loadtxt(recording / f"Robot{robot}_Measurement.dat")[:-1, 0] - START_S
+        frames = np.unique(np.ceil(times / 0.25))
+        assert log.iteration.tolist() == np.repeat(frames, len(LANDMARKS)).tolist()
         world = np.array(
             [
                 transform_points(expected[frame], p[None])[0]
@@ -101,6 +103,15 @@ def test_logs_agree_with_the_truth(recording: Path, tmp_path: Path):
         )
         np.testing.assert_allclose(world, truth.point_world_m, atol=1e-5)
         assert np.all(log.observations.position_m[:, 2] == 0)
+
+
+def test_a_frame_keeps_the_last_sighting_of_a_landmark(recording: Path, tmp_path: Path):
+    rows = [(0.1, 72, 1.0, 0.0), (0.2, 27, 3.0, 0.0), (0.3, 72, 2.0, 0.0), (0.7, 72, 4.0, 0.0)]
+    write(recording / "Robot1_Measurement.dat", [(START_S + t, *rest) for t, *rest in rows])
+    log = read_log(import_mrclam(recording, tmp_path / "logs", MrclamSettings(frame_s=0.5))[0])
+    assert log.iteration.tolist() == [1, 1, 2]
+    assert log.observations.label.tolist() == [7, 6, 6]
+    assert log.observations.position_m[:, 0].tolist() == [3.0, 2.0, 4.0]
 
 
 def test_covariance_is_the_spread_of_the_noise(recording: Path, tmp_path: Path):

@@ -245,6 +245,32 @@ def test_one_landmark_takes_one_observation_a_frame(association):
     assert slam.best_associations().tolist() == [0, 0, 2]
 
 
+@pytest.mark.parametrize("association", ["descriptor", "gate"])
+def test_a_landmark_that_creeps_is_followed(association):
+    """Each observation lies inside the gate, on the same side: the sum of 2 / n has no bound."""
+    sigma_m, n_frames = 0.01, 300
+    descriptor = unit(np.ones((1, 64))).astype(np.float32)
+    settings = parameters(n_particles=1, motion=EXACT_MOTION, association=association)
+    slam = FastSlam(settings, np.random.default_rng(0))
+    expected_x = 1.0
+    for n in range(n_frames):
+        point = np.array([[expected_x + 2 * sigma_m * (n > 0), 0.0, 0.0]])
+        slam.step(np.zeros(3), Observations(point, sigma_m**2 * np.eye(3)[None], descriptor))
+        expected_x += (point[0, 0] - expected_x) / (n + 1)
+    landmarks = slam.best_map(min_count=1)
+    assert landmarks.count.tolist() == [n_frames]
+    np.testing.assert_allclose(landmarks.position_m, [[expected_x, 0, 0]])
+
+
+def test_a_new_label_twice_in_a_frame_starts_one_landmark():
+    point = np.array([[1.0, 0.0, 0.0], [1.1, 0.0, 0.0]])
+    label = np.array([4, 4], dtype=np.int32)
+    slam = FastSlam(parameters(association="label"), np.random.default_rng(0))
+    slam.step(np.zeros(3), Observations(point, np.tile(np.eye(3), (2, 1, 1)), label=label))
+    assert slam.best_map(min_count=1).position_m.tolist() == [[1.0, 0.0, 0.0]]
+    assert slam.best_associations().tolist() == [0, -1]
+
+
 def test_a_known_label_outside_the_gate_is_dropped():
     label = np.array([3], dtype=np.int32)
     R = 1e-4 * np.eye(3)[None]
