@@ -52,10 +52,11 @@ def run(
     loaded = load_scenario(scenario, overrides or (), seed)
     folder = result_folder(results, loaded)
     n_jobs = jobs or available_cores()
+    skipped: list[str] = []
     with screen.progress() as show:
         run_scenario(loaded, results, n_jobs, show, fresh)
-        draw_all(folder, n_jobs, lambda done, total: show("figures", done, total))
-    screen.print_result(folder)
+        draw_all(folder, n_jobs, lambda done, total: show("figures", done, total), skipped.append)
+    screen.print_result(folder, skipped)
 
 
 @app.command()
@@ -69,11 +70,15 @@ def figures(
     from experiments.result import require_result
 
     require_result(result)
+    skipped: list[str] = []
     with screen.progress() as show:
         paths = draw_all(
-            result, jobs or available_cores(), lambda done, total: show("figures", done, total)
+            result,
+            jobs or available_cores(),
+            lambda done, total: show("figures", done, total),
+            skipped.append,
         )
-    screen.print_paths(result, paths)
+    screen.print_paths(result / "figures", paths, skipped)
 
 
 @app.command()

@@ -67,7 +67,7 @@ def progress() -> Iterator[Callable[[str, int, int], None]]:
         yield show
 
 
-def print_result(result: Path) -> None:
+def print_result(result: Path, skipped_figures: Sequence[str]) -> None:
     """The table of all aligners, and where everything is."""
     errors = tables.read(tables.table_path(result, "errors"), "errors")
     timings = tables.read(tables.table_path(result, "aligner_timings"), "aligner_timings")
@@ -76,6 +76,7 @@ def print_result(result: Path) -> None:
     robots = tables.read(tables.table_path(result, "robots"), "robots")
     console.print(_robot_table(robots))
     console.print(f"Figures: {result / 'figures'}   tables: {result / 'tables'}", soft_wrap=True)
+    _print_skipped(console, skipped_figures)
 
 
 def _aligner_order(result: Path) -> list[str]:
@@ -175,9 +176,16 @@ def print_outcomes(outcomes: Sequence["Outcome"]) -> None:
     console.print(f"{len(outcomes) - failed} passed, {failed} failed")
 
 
-def print_paths(folder: Path, paths: Sequence[Path]) -> None:
+def print_paths(folder: Path, paths: Sequence[Path], skipped: Sequence[str] = ()) -> None:
     """Where files were written."""
-    Console().print(f"{len(paths)} written to {folder}", soft_wrap=True)
+    console = Console()
+    console.print(f"{len(paths)} written to {folder}", soft_wrap=True)
+    _print_skipped(console, skipped)
+
+
+def _print_skipped(console: Console, skipped: Sequence[str]) -> None:
+    for line in skipped:
+        console.print(f"  not drawn: {line}", soft_wrap=True)
 
 
 def print_map(path: Path, landmarks: "LandmarkMap") -> None:
