@@ -147,10 +147,8 @@ def choose(
 
 
 @njit(cache=True)
-def _distance(slots, s, seen, k, m, planar):
-    dx, dy, dz, ixx, ixy, ixz, iyy, iyz, izz, _ = innovation(
-        seen.point_m[k], seen.covariance_m2[k], slots.mean_m[s], slots.covariance_m2[s], m, planar
-    )
+def _distance(point, noise, mean, sigma, m, planar):
+    dx, dy, dz, ixx, ixy, ixz, iyy, iyz, izz, _ = innovation(point, noise, mean, sigma, m, planar)
     return quadratic_form(dx, dy, dz, ixx, ixy, ixz, iyy, iyz, izz)
 
 
@@ -158,24 +156,30 @@ def _distance(slots, s, seen, k, m, planar):
 def _take_in_order(slots, pairs, place, taken, seen, gate, planar, chosen):
     for i in range(len(place)):
         k, s, j = pairs.observation[i], pairs.slot[i], place[i]
+        point, noise = seen.point_m[k], seen.covariance_m2[k]
+        mean, sigma, count = slots.mean_m[s], slots.covariance_m2[s], slots.count[s]
         for m in range(chosen.shape[1]):
-            if chosen[k, m] >= 0 or taken[j, m] or slots.count[s, m] == 0:
+            if chosen[k, m] >= 0 or taken[j, m] or count[m] == 0:
                 continue
-            if _distance(slots, s, seen, k, m, planar) <= gate:
+            if _distance(point, noise, mean, sigma, m, planar) <= gate:
                 chosen[k, m] = s
                 taken[j, m] = True
 
 
 @njit(cache=True)
 def _take_nearest(slots, pairs, place, taken, seen, gate, planar, chosen):
-    for m in range(chosen.shape[1]):
-        distance = np.full(len(place), np.inf)
-        for i in range(len(place)):
-            k, s = pairs.observation[i], pairs.slot[i]
-            if slots.count[s, m] > 0:
-                distance[i] = _distance(slots, s, seen, k, m, planar)
-        inside = np.flatnonzero(distance <= gate)
-        for i in inside[np.argsort(distance[inside], kind="mergesort")]:
+    n_particles = chosen.shape[1]
+    distance = np.full((n_particles, len(place)), np.inf)
+    for i in range(len(place)):
+        k, s = pairs.observation[i], pairs.slot[i]
+        point, noise = seen.point_m[k], seen.covariance_m2[k]
+        mean, sigma, count = slots.mean_m[s], slots.covariance_m2[s], slots.count[s]
+        for m in range(n_particles):
+            if count[m] > 0:
+                distance[m, i] = _distance(point, noise, mean, sigma, m, planar)
+    for m in range(n_particles):
+        inside = np.flatnonzero(distance[m] <= gate)
+        for i in inside[np.argsort(distance[m][inside], kind="mergesort")]:
             k, j = pairs.observation[i], place[i]
             if chosen[k, m] < 0 and not taken[j, m]:
                 chosen[k, m] = pairs.slot[i]
