@@ -21,9 +21,6 @@ from pathlib import Path
 import numpy as np
 
 from mapfusion.errors import InputError
-from mapfusion.fastslam.association import Association
-from mapfusion.fastslam.filter import FastSlamParameters
-from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.robot_log import (
     Observations,
     RobotLog,
@@ -34,25 +31,6 @@ from mapfusion.robot_log import (
 from mapfusion.se2 import Float, between, compose, rotation, wrap
 
 _LAST_ROBOT_SUBJECT = 5
-
-# The robots' dead reckoning is poor on yaw. Its errors against the truth of dataset 7, over 1 to
-# 20 s: 0.13 to 0.2 rad per root radian turned, to 0.15 rad a metre on straight runs (to one side
-# for a while; as a random walk 0.1), 0.03 m per root metre. Two driven wheels slip little sideways.
-# Identities are known, so the gate is there for gross errors alone: it is wide, since ranges have
-# long tails and a gate that cuts them is a bias.
-FILTER = FastSlamParameters(
-    association=Association.LABEL,
-    gate_probability=0.999,
-    planar=True,
-    motion=MotionNoise(
-        translation_m_per_sqrt_m=0.03,
-        rotation_rad_per_sqrt_m=0.1,
-        rotation_rad_per_sqrt_rad=0.15,
-        scale_error=0.0,
-        track_error=0.0,
-        lateral_slip_m_per_rad=0.0,
-    ),
-)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ class SamePoint:
     Attributes:
         max_descriptor_distance: where not both carry labels; these decide by themselves.
         gate_probability: of keeping landmarks of one point (chi-square, 2 degrees of freedom,
-            drift included).
+            drift included); not for labels.
         height: which landmarks can have one height.
         planar: heights carry no information.
     """
@@ -31,15 +31,22 @@ class SamePoint:
     def candidates(
         self, a: AlignedLandmarks, b: AlignedLandmarks
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Rows of a and of b that pass, and their descriptors' distance (0 by label)."""
+        """Rows of a and of b that pass, and their descriptors' distance (0 by label).
+
+        A known identity needs no gate: where the maps are distorted, two landmarks of one label
+        stay one point, and leaving them apart would leave a duplicate for certain.
+        """
+        known_i, known_j = _of_one_label(a.label, b.label)
         i, j = self._neighbours(a, b)
-        same_label = (a.label[i] == b.label[j]) & (a.label[i] != NO_LABEL)
         labelled = (a.label[i] != NO_LABEL) & (b.label[j] != NO_LABEL)
         unlike = np.linalg.norm(a.descriptor[i] - b.descriptor[j], axis=1)
-        unlike = np.where(same_label, 0.0, unlike)
         near = unlike <= self.max_descriptor_distance  # False for NaN
-        passes = np.where(labelled, same_label, near) & self._inside(a, b, i, j)
-        return i[passes], j[passes], unlike[passes]
+        passes = ~labelled & near & self._inside(a, b, i, j)
+        return (
+            np.concatenate([known_i, i[passes]]),
+            np.concatenate([known_j, j[passes]]),
+            np.concatenate([np.zeros(len(known_i)), unlike[passes]]),
+        )
 
     def _bound(self) -> float:
         return float(chi2.ppf(self.gate_probability, 2))
@@ -76,6 +83,13 @@ class SamePoint:
             b.position_m[j, 2],
             b.covariance_m2[j, 2, 2],
         )
+
+
+def _of_one_label(label_a: np.ndarray, label_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """All pairs of rows that carry the same label."""
+    rows_a, rows_b = np.flatnonzero(label_a != NO_LABEL), np.flatnonzero(label_b != NO_LABEL)
+    i, j = np.nonzero(label_a[rows_a][:, None] == label_b[rows_b])
+    return rows_a[i], rows_b[j]
 
 
 def one_to_one(i: np.ndarray, j: np.ndarray, unlike: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

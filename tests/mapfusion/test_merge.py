@@ -305,6 +305,15 @@ def test_labels_pair_in_the_second_pass():
     assert fused.landmarks.descriptor is None
 
 
+def test_one_label_is_one_landmark_however_distorted_the_maps():
+    robots = Robots([slice(0, 15), slice(0, 15)], labels=True, planar=True)
+    robots.alignments[0] = replace(robots.alignments[0], inlier=np.zeros(15, dtype=bool))
+    b = robots.maps[1]
+    robots.maps[1] = replace(b, position_m=b.position_m + np.array([3.0, 0, 0]))
+    fused = robots.merge()
+    assert sorted(fused.landmarks.label) == list(range(15))
+
+
 def test_planar_maps_stay_in_the_plane():
     robots = Robots([slice(0, 30), slice(0, 30)], planar=True)
     fused = robots.merge().landmarks
