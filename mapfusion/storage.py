@@ -18,7 +18,7 @@ _PREFIX = "mapfusion."
 
 
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
-    """Let `write` fill a temporary file beside `path`, then rename it: no reader sees half a file."""
+    """Let `write` fill a temporary file beside `path`, then rename it: nobody sees half a file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=path.suffix)
     os.close(handle)
