@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: lock demo test lint check bench paper install clean
+.PHONY: clean-kernels lock demo test lint check bench paper install clean
 
 install: $(STAMP)
 
@@ -35,6 +35,10 @@ bench: $(STAMP)
 
 paper: $(STAMP)
 	$(BIN)/mapfusion run scenarios/paper.yaml
+
+# Compiled kernels of an earlier state of the source, where the command did not keep them apart.
+clean-kernels:
+	find mapfusion experiments -name '*.nbi' -delete -o -name '*.nbc' -delete
 
 clean:
 	rm -rf $(VENV) *.egg-info .pytest_cache .ruff_cache
