@@ -33,6 +33,9 @@ class DriverSettings:
         acceleration_m_s2: change of speed; gentle enough for the wheels to hold on straight legs.
         turn_acceleration_rad_s2: change of turn rate.
         turn_in_place_rad: heading error above which the robot stops to turn.
+        stand_s: how long all robots stand before they set out. A front end needs a few frames for
+            its first tracks; a turn before that is known from the odometry alone, and in the map's
+            own frame its error never goes away.
         arrival_m: a waypoint counts as visited this near.
         patience_s: without progress for so long a robot counts as stuck.
         give_way_m: a robot waits while one listed before it drives this near ahead of it; enough to
@@ -44,12 +47,15 @@ class DriverSettings:
     acceleration_m_s2: float = 0.5
     turn_acceleration_rad_s2: float = 2.0
     turn_in_place_rad: float = 0.5
+    stand_s: float = 1.0
     arrival_m: float = 0.2
     patience_s: float = 30.0
     give_way_m: float = 1.6
 
     def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
+        if self.stand_s < 0:
+            raise InputError(f"driver: stand_s is {self.stand_s}, must not be negative")
+        for name in sorted(set(self.__dataclass_fields__) - {"stand_s"}):
             if not getattr(self, name) > 0:
                 raise InputError(f"driver: {name} is {getattr(self, name)}, must be above 0")
         if self.speed_m_s > TOP_SPEED_M_S:
@@ -153,7 +159,8 @@ class _Driver:
         """One step, given where all robots are."""
         settings = self._settings
         self._advance(time_s, pose)
-        speed, turn = (0.0, 0.0) if self._done else self._wish(pose)
+        stands = self._done or time_s < settings.stand_s
+        speed, turn = (0.0, 0.0) if stands else self._wish(pose)
         self._waiting = speed > 0 and self._must_wait(pose, others)
         if self._waiting:
             speed = turn = 0.0
