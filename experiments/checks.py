@@ -13,6 +13,8 @@ from experiments.scenario import Bound, Scenario
 from mapfusion.errors import InputError
 from mapfusion.storage import write_whole
 
+MAX_SEEDS = 1000  # days of computing: more is a slip of the keyboard
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -92,11 +94,13 @@ def parse_seeds(text: str) -> list[int]:
     try:
         if ".." in text:
             first, last = (int(part) for part in text.split(".."))
-            seeds = list(range(first, last + 1))
+            seeds = range(first, last + 1)[: MAX_SEEDS + 1]
         else:
             seeds = [int(part) for part in text.split(",")]
     except ValueError:
         seeds = []
     if not seeds or min(seeds) < 0 or len(set(seeds)) < len(seeds):
         raise InputError(f"--seeds {text}: expected a number, a range 0..4 or a list 0,2,5")
-    return seeds
+    if len(seeds) > MAX_SEEDS:
+        raise InputError(f"--seeds {text}: more than {MAX_SEEDS} seeds")
+    return list(seeds)

@@ -220,14 +220,20 @@ def main() -> None:
     from experiments.kernel_cache import use_kernel_cache
     from mapfusion.errors import InputError
 
-    use_kernel_cache()
     try:
+        use_kernel_cache()
         code = app(standalone_mode=False) or 0
     except InputError as error:
         _complain(str(error))
         code = EXIT_BAD_INPUT
     except BrokenPipeError:
         code = EXIT_FAILED
+    except OSError as error:  # a full disk, a folder that is a file or not ours
+        where = "" if error.filename is None else f"{error.filename}: "
+        _complain(f"{where}cannot be read or written ({error.strerror or error})")
+        code = EXIT_BAD_INPUT
+    except KeyboardInterrupt:  # before or after what the command itself guards
+        code = EXIT_INTERRUPTED
     except Exception as error:
         # Typer keeps its usage errors' classes private; all of them can tell their message.
         message = getattr(error, "format_message", None)
@@ -241,8 +247,8 @@ def main() -> None:
     sys.exit(code)
 
 
-def _complain(line: str) -> None:
-    typer.echo(f"mapfusion: {line}", err=True)
+def _complain(text: str) -> None:
+    typer.echo(f"mapfusion: {' '.join(text.split())}", err=True)  # one line, whatever was quoted
 
 
 if __name__ == "__main__":

@@ -132,7 +132,7 @@ def fused_truth(fused: FusedMap, robots: list[EvaluatedRobot], iteration: int) -
     for k, robot in enumerate(robots):
         has = fused.parents[:, k] != ABSENT
         points[has, k] = robot.at(iteration)[1][fused.parents[has, k]]
-    known = np.isfinite(points).all(axis=2)
+    known = np.all(np.isfinite(points), axis=2)
     total = np.where(known[:, :, None], points, 0.0).sum(axis=1)
     count = np.count_nonzero(known, axis=1, keepdims=True)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)

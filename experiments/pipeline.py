@@ -1,16 +1,18 @@
 """A whole run: each stage as soon as what it needs is there, on all cores, resumable."""
 
 import itertools
+import re
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from experiments.scenario import Scenario
+from experiments.scenario import NAME_PATTERN, Scenario
 from experiments.stages import align, drive, features, judge, log, slam
 from experiments.stages.judge import RobotFolders
 from experiments.store import StageFolder, Store
 from experiments.workers import Workers, workers
+from mapfusion.errors import InputError
 from mapfusion.robot_log import read_log
 
 OnProgress = Callable[[str, int, int], None]
@@ -67,6 +69,7 @@ def plan(scenario: Scenario, store: Store) -> Plan:
     """Lay out the stages of a scenario; nothing is computed."""
     if scenario.logs:
         robots = [_imported(scenario, store, Path(folder)) for folder in scenario.logs]
+        _require_usable_names(robots)
         return Plan(scenario, robots, _pairs(scenario, store, robots))
     driven, faces = drive.stage(store, scenario), features.faces_stage(store, scenario)
     robots = [_simulated(scenario, store, driven, faces, r.name) for r in scenario.robots]
@@ -83,9 +86,23 @@ def _simulated(
 
 
 def _imported(scenario: Scenario, store: Store, folder: Path) -> RobotStages:
-    name = read_log(folder).robot
+    log = read_log(folder)
+    if not len(log):
+        raise InputError(f"{folder}: frames.parquet holds no frame")
     logged = store.imported("log", folder)
-    return RobotStages(name, logged, slam.stage(store, scenario, logged))
+    return RobotStages(log.robot, logged, slam.stage(store, scenario, logged))
+
+
+def _require_usable_names(robots: Sequence[RobotStages]) -> None:
+    """Robots of recorded logs give their names to files, as those of scenarios do."""
+    known: set[str] = set()
+    for robot in robots:
+        frames = robot.log.path / "frames.parquet"
+        if not re.fullmatch(NAME_PATTERN, robot.name):
+            raise InputError(f"{frames}: robot is named {robot.name!r}, expected {NAME_PATTERN}")
+        if robot.name in known:
+            raise InputError(f"{frames}: robot {robot.name} is in another log already")
+        known.add(robot.name)
 
 
 def _pairs(scenario: Scenario, store: Store, robots: Sequence[RobotStages]) -> list[PairStages]:
@@ -270,9 +287,20 @@ def execute(
     if fresh:
         for folder in laid_out.folders():
             folder.discard()
-    with workers(jobs) as pool:
-        _Run(laid_out, pool, on_progress).execute()
+    _run(laid_out, store, jobs, on_progress)
     return laid_out
+
+
+def _run(
+    laid_out: Plan, store: Store, jobs: int, on_progress: OnProgress, logs_only: bool = False
+) -> None:
+    try:
+        with workers(jobs) as pool:
+            _Run(laid_out, pool, on_progress, logs_only).execute()
+    except InputError as error:
+        if str(store.root) in str(error):  # no file of the user's own, but one that was stored
+            raise InputError(f"{error}; delete its folder, then it is computed again") from error
+        raise
 
 
 def record_logs(
@@ -280,6 +308,5 @@ def record_logs(
 ) -> dict[str, Path]:
     """Simulate only; returns each robot's log folder in the store."""
     laid_out = plan(scenario, store)
-    with workers(jobs) as pool:
-        _Run(laid_out, pool, on_progress, logs_only=True).execute()
+    _run(laid_out, store, jobs, on_progress, logs_only=True)
     return {robot.name: robot.log.path for robot in laid_out.robots}

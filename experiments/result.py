@@ -5,6 +5,7 @@
 """
 
 import json
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -63,6 +64,8 @@ def write_result(plan: Plan, folder: Path) -> None:
     robots = [load_robot(robot.folders) for robot in plan.robots]
     _join_pair_tables(plan, folder)
     _write_robot_tables(plan, robots, folder)
+    for outdated in ("maps", "keyframes"):  # of robots or frames that are no longer there
+        shutil.rmtree(folder / outdated, ignore_errors=True)
     _write_maps(plan, robots, folder)
     _write_images(plan, folder)
     time_aligners(scenario, robots, folder)

@@ -9,7 +9,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
 
 from experiments.metrics import known_metrics
 from experiments.yaml_input import apply_overrides, read_mapping
@@ -25,16 +32,30 @@ from sim.driver import DriverSettings
 from sim.odometry import OdometryNoise
 from sim.stereo_head import RadiometricNoise
 
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,40}$")]
+NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,40}$"  # names become parts of file names
+Name = Annotated[str, Field(pattern=NAME_PATTERN)]
 Point = tuple[float, float]
 Pose = tuple[float, float, float]
 S = TypeVar("S", bound=BaseModel)
+MAX_IMAGE_SIDE_PX = 4096  # the software renderer takes seconds and 100 MB a frame at this size
 
 
 def _require_unique(field: str, names: Sequence[str]) -> None:
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f"{field}: two are named {name}; names must differ")
+
+
+def _renderable(camera: StereoCamera) -> StereoCamera:
+    for name in ("width_px", "height_px"):
+        if not 1 <= getattr(camera, name) <= MAX_IMAGE_SIDE_PX:
+            raise ValueError(
+                f"{name}: is {getattr(camera, name)}, must be in [1, {MAX_IMAGE_SIDE_PX}]"
+            )
+    for name in ("focal_px", "baseline_m", "mount_z_m"):
+        if not getattr(camera, name) > 0:
+            raise ValueError(f"{name}: is {getattr(camera, name)}, must be positive")
+    return camera
 
 
 class Section(BaseModel):
@@ -160,6 +181,8 @@ class Bound(Section):
     def _one_end(self) -> Self:
         if self.min is None and self.max is None:
             raise ValueError("give min, max or both")
+        if self.min is not None and self.max is not None and self.min > self.max:
+            raise ValueError(f"min {self.min:g} is above max {self.max:g}")
         return self
 
 
@@ -174,7 +197,7 @@ class Scenario(Section):
     robots: list[Robot] = []
     drive: Drive | None = None
     logs: list[str] = []
-    camera: StereoCamera = StereoCamera()
+    camera: Annotated[StereoCamera, AfterValidator(_renderable)] = StereoCamera()
     radiometry: RadiometricNoise = RadiometricNoise()
     odometry: OdometryNoise = OdometryNoise()
     vision: FrontEndParameters = FrontEndParameters()
@@ -271,7 +294,10 @@ def _siblings(kind: type[BaseModel], location: tuple[int | str, ...]) -> list[st
     node: dict[str, Any] = root
     for part in location[:-1]:
         node = _resolved_node(root, node)
-        node = node["items"] if isinstance(part, int) else node["properties"][part]
+        if isinstance(part, int):
+            node = node["items"]
+        else:  # a mapping with free keys, as `expect`, describes all its values at once
+            node = node.get("properties", {}).get(part) or node["additionalProperties"]
     return sorted(_resolved_node(root, node)["properties"])
 
 

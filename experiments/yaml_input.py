@@ -29,7 +29,7 @@ def read_mapping(path: Path) -> dict[str, Any]:
 
 def _parse(text: str, where: str) -> Any:
     try:
-        return YAML(typ="safe", pure=True).load(text)
+        return _copied(YAML(typ="safe", pure=True).load(text))
     except YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         line = f", line {mark.line + 1}" if mark is not None else ""
@@ -37,6 +37,8 @@ def _parse(text: str, where: str) -> Any:
         raise InputError(f"{where}{line}: not plain YAML ({problem})") from error
     except ValueError as error:  # for example an impossible date
         raise InputError(f"{where}: not plain YAML ({error})") from error
+    except RecursionError as error:
+        raise InputError(f"{where}: nested too deeply, or holds itself") from error
 
 
 def apply_overrides(data: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
@@ -63,12 +65,9 @@ def _assign(data: dict[str, Any], dotted: str, value: Any) -> None:
         if isinstance(node, list) and name.isdigit() and int(name) < len(node):
             node = node[int(name)]
         elif isinstance(node, dict):
-            child = node.get(name)
-            node = (
-                node.setdefault(name, {})
-                if child is not None
-                else node.update({name: {}}) or node[name]
-            )
+            if node.get(name) is None:
+                node[name] = {}
+            node = node[name]
         else:
             raise InputError(f"--set {dotted}: {name} is not a key here")
     if isinstance(node, list) and last.isdigit() and int(last) < len(node):

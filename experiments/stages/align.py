@@ -22,6 +22,7 @@ from mapfusion.robot_log import read_log
 SOURCES = (
     "mapfusion/align",
     "mapfusion/landmark_map.py",
+    "mapfusion/robot_log.py",
     "mapfusion/storage.py",
     "mapfusion/se2.py",
 )

@@ -7,12 +7,14 @@ import numpy as np
 from experiments.randomness import generator
 from experiments.scenario import Scenario
 from experiments.store import StageFolder, Store
+from mapfusion.errors import InputError
 from mapfusion.se2 import Float
 from sim.driver import Route, drive
 from sim.floorplan import FloorPlan, Wall
 from sim.trajectory import write_trajectory
 
-SOURCES = ("sim", "mapfusion/se2.py", "mapfusion/storage.py", "experiments/stages/drive.py")
+SOURCES = ("sim", "mapfusion/se2.py", "mapfusion/storage.py")
+SOURCES += ("experiments/stages/drive.py", "experiments/randomness.py")
 
 
 def floor_plan(scenario: Scenario) -> FloorPlan:
@@ -63,12 +65,15 @@ def run(scenario: Scenario, output: StageFolder) -> None:
         Route(robot.name, starts[robot.name], np.array(robot.route), robot.loop)
         for robot in scenario.robots
     ]
-    trajectory = drive(
-        floor_plan(scenario),
-        routes,
-        drive_settings.control,
-        drive_settings.frames,
-        drive_settings.frame_interval_s,
-    )
+    try:
+        trajectory = drive(
+            floor_plan(scenario),
+            routes,
+            drive_settings.control,
+            drive_settings.frames,
+            drive_settings.frame_interval_s,
+        )
+    except InputError as error:
+        raise InputError(f"scenario {scenario.name}: {error}") from error
     write_trajectory(output.path / "trajectory.parquet", trajectory)
     output.finish(elapsed_s=time.perf_counter() - started)

@@ -26,7 +26,11 @@ from sim.trajectory import read_trajectory
 from sim.world import write_faces
 
 SOURCES = ("sim", "mapfusion/vision", "mapfusion/camera.py", "mapfusion/se2.py")
-SOURCES += ("mapfusion/storage.py", "experiments/stages/features.py", "experiments/randomness.py")
+SOURCES += ("mapfusion/storage.py", "mapfusion/robot_log.py")
+SOURCES += ("experiments/stages/features.py", "experiments/randomness.py")
+
+FACES_SOURCES = ("sim", "mapfusion/se2.py", "experiments/stages/drive.py")
+FACES_SOURCES += ("experiments/stages/features.py", "experiments/randomness.py")
 
 # Frames a task: about two seconds of work, so little is lost when a run is interrupted.
 FRAMES_PER_CHUNK = 20
@@ -51,7 +55,7 @@ def faces_stage(store: Store, scenario: Scenario) -> StageFolder:
     """Where the world's textures are or will be."""
     assert scenario.world is not None
     settings = {"seed": scenario.seed, "world": scenario.world.model_dump(mode="json")}
-    return store.stage("faces", settings, [], ("sim", "experiments/randomness.py"))
+    return store.stage("faces", settings, [], FACES_SOURCES)
 
 
 def run_faces(scenario: Scenario, output: StageFolder) -> None:

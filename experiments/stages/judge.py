@@ -11,6 +11,7 @@ from experiments.scenario import Scenario
 from experiments.stages.slam import read_associations, read_snapshots
 from experiments.store import StageFolder, Store
 from experiments.truth import PathTruth, landmark_truth
+from mapfusion.errors import InputError
 from mapfusion.robot_log import read_log, read_truth
 
 SOURCES = ("mapfusion", "experiments/stages/judge.py", "experiments/evaluate.py")
@@ -27,6 +28,14 @@ class RobotFolders(NamedTuple):
 def load_robot(folders: RobotFolders) -> EvaluatedRobot:
     """A robot's maps joined with the truth."""
     log, truth = read_log(folders.log), read_truth(folders.log)
+    for file, rows, expected in (
+        ("truth_poses", truth.T_world_robot, len(log)),
+        ("truth_points", truth.point_world_m, len(log.observations)),
+    ):
+        if len(rows) != expected:
+            raise InputError(
+                f"{folders.log / file}.parquet: {len(rows)} rows, the log has {expected} of them"
+            )
     maps = read_snapshots(folders.slam, log)
     points = landmark_truth(truth, read_associations(folders.slam), maps)
     return EvaluatedRobot(log.robot, maps, points, PathTruth.of(truth))

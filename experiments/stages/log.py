@@ -26,7 +26,8 @@ from sim.odometry import add_noise, calibrated_track_m, encoder_increments
 from sim.trajectory import read_trajectory
 
 SOURCES = ("mapfusion/vision", "mapfusion/camera.py", "mapfusion/robot_log.py", "mapfusion/se2.py")
-SOURCES += ("mapfusion/storage.py", "experiments/stages/log.py", "experiments/randomness.py", "sim")
+SOURCES += ("mapfusion/storage.py", "sim", "experiments/stages/log.py", "experiments/tables.py")
+SOURCES += ("experiments/randomness.py",)
 
 
 def observed_stage(store: Store, scenario: Scenario, features: StageFolder) -> StageFolder:

@@ -27,6 +27,7 @@ from mapfusion.storage import (
 
 SOURCES = (
     "mapfusion/fastslam",
+    "mapfusion/landmark_map.py",
     "mapfusion/robot_log.py",
     "mapfusion/storage.py",
     "mapfusion/se2.py",

@@ -1,0 +1,54 @@
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from tiny_scenario import TINY
+
+from experiments.pipeline import plan
+from experiments.result import run_scenario
+from experiments.scenario import Scenario, load_scenario
+from experiments.store import Store
+from experiments.workers import single_threaded
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _kernels_beside_the_source() -> Iterator[None]:
+    # Set but empty: commands, and processes they start, share the kernels that tests compiled.
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("NUMBA_CACHE_DIR", "")
+        yield
+
+
+@pytest.fixture(scope="session")
+def tiny_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The tiny scenario's file."""
+    path = tmp_path_factory.mktemp("scenario") / "tiny.yaml"
+    path.write_text(TINY, encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="session")
+def tiny(tiny_path: Path) -> Scenario:
+    """The tiny scenario."""
+    return load_scenario(tiny_path)
+
+
+@pytest.fixture(scope="session")
+def tiny_results(tiny: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Results folder of one uninterrupted run in one process; tests must not change it."""
+    results = tmp_path_factory.mktemp("results")
+    single_threaded()
+    run_scenario(tiny, results, 1, lambda stage, done, total: None)
+    return results
+
+
+@pytest.fixture(scope="session")
+def tiny_result(tiny_results: Path) -> Path:
+    """The result folder of that run."""
+    return tiny_results / "tiny-3"
+
+
+@pytest.fixture(scope="session")
+def tiny_log(tiny: Scenario, tiny_results: Path) -> Path:
+    """The log of R1 in the store of that run."""
+    return plan(tiny, Store(tiny_results / "store")).robots[0].log.path
