@@ -142,7 +142,10 @@ DEFAULT_ALIGNERS = [
 
 
 class Align(Section):
-    """Correspondences, the aligners on them, and the least squares after each."""
+    """Correspondences, the aligners on them, and the least squares after each.
+
+    Randomised aligners are repeated on each pair of maps, so that their own spread can be seen.
+    """
 
     match: MatchParameters = MatchParameters()
     aligners: Annotated[list[AlignerEntry], Field(min_length=1)] = DEFAULT_ALIGNERS

@@ -114,7 +114,7 @@ def _estimate(
     rows = []
     for entry in align.aligners:
         aligner = make_aligner(entry.method, **entry.parameters)
-        for repetition in range(align.repetitions):
+        for repetition in range(align.repetitions if aligner.randomised else 1):
             rng = generator(
                 seed, "align", map_a.name, map_b.name, iteration, entry.name, repetition
             )

@@ -3,6 +3,7 @@
 import math
 import time
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numba import njit
@@ -37,6 +38,7 @@ class Icp:
         max_rounds: an estimate that still changes then is refused.
     """
 
+    randomised: ClassVar[bool] = True
     max_rounds: int = MAX_ROUNDS
 
     def __post_init__(self) -> None:

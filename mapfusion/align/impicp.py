@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -27,6 +28,7 @@ class ImpIcp:
         max_rounds: an estimate that still changes then is refused.
     """
 
+    randomised: ClassVar[bool] = True
     sets: int = 3
     best_share: float = 0.25
     max_rounds: int = MAX_ROUNDS

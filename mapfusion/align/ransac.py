@@ -3,6 +3,7 @@
 import math
 import time
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 from numba import njit
@@ -34,6 +35,7 @@ class Ransac:
         height: which pairs can be true by their heights.
     """
 
+    randomised: ClassVar[bool] = True
     gate_m: float = 0.3
     min_baseline_m: float = 1.0
     confidence: float = 0.9999

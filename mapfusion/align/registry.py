@@ -1,6 +1,6 @@
 """The aligners by name."""
 
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
@@ -14,7 +14,12 @@ from mapfusion.landmark_map import LandmarkMap
 
 
 class Aligner(Protocol):
-    """Estimates the motion between two maps from correspondences."""
+    """Estimates the motion between two maps from correspondences.
+
+    `randomised` tells whether another generator can give another answer.
+    """
+
+    randomised: ClassVar[bool]
 
     def align(
         self,

@@ -3,7 +3,7 @@
 import math
 import time
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import ClassVar, Literal, get_args
 
 import numpy as np
 
@@ -29,6 +29,7 @@ class Svd:
             together under theta.
     """
 
+    randomised: ClassVar[bool] = False
     translation: Translation = "printed"
 
     def __post_init__(self) -> None:
