@@ -62,13 +62,13 @@ def write_result(plan: Plan, folder: Path) -> None:
     """Collect a finished plan's tables, maps and images in a result folder."""
     scenario = plan.scenario
     robots = [load_robot(robot.folders) for robot in plan.robots]
+    _time_aligners(plan, robots)
     _join_pair_tables(plan, folder)
     _write_robot_tables(plan, robots, folder)
     for outdated in ("maps", "keyframes"):  # of robots or frames that are no longer there
         shutil.rmtree(folder / outdated, ignore_errors=True)
     _write_maps(plan, robots, folder)
     _write_images(plan, folder)
-    time_aligners(scenario, robots, folder)
     _write_json(folder / "scenario.json", scenario.resolved())
     _write_json(folder / "world.json", _world(scenario, robots))
     _write_json(folder / "provenance.json", provenance(plan))
@@ -86,8 +86,17 @@ def _world(scenario: Scenario, robots: Sequence[EvaluatedRobot]) -> dict[str, ob
     return {"walls": walls, "robots": starts}
 
 
+def _time_aligners(plan: Plan, robots: Sequence[EvaluatedRobot]) -> None:
+    """Serial, when all else is done: nothing else may be running."""
+    by_name = {robot.name: robot for robot in robots}
+    for pair in plan.pairs:
+        path = pair.align.path / "aligner_timings.parquet"
+        time_aligners(plan.scenario, by_name[pair.a.name], by_name[pair.b.name], path)
+
+
 def _join_pair_tables(plan: Plan, folder: Path) -> None:
     sources = {
+        "aligner_timings": [pair.align.path for pair in plan.pairs],
         "estimates": [pair.align.path for pair in plan.pairs],
         "correspondences": [pair.align.path for pair in plan.pairs],
         "errors": [pair.judge.path for pair in plan.pairs],

@@ -170,8 +170,8 @@ class Evaluate(Section):
 
     every: Annotated[int, Field(ge=1)] = 25
     true_pair_radius_m: Annotated[float, Field(gt=0)] = 0.10
-    timing_points: Annotated[int, Field(ge=1)] = 12
-    timing_repeats: Annotated[int, Field(ge=1)] = 9
+    timing_points: Annotated[int, Field(ge=1)] = 8
+    timing_repeats: Annotated[int, Field(ge=1)] = 5
 
 
 class Bound(Section):

@@ -16,13 +16,10 @@ from mapfusion.align.registry import make_aligner
 _WARM_UP_RUNS = 1  # compilation and caches
 
 
-def time_aligners(scenario: Scenario, robots: list[EvaluatedRobot], folder: Path) -> None:
-    """Time every aligner on maps of growing overlap and write the table `aligner_timings`."""
-    rows: list[dict[str, Any]] = []
-    for first in range(len(robots)):
-        for second in range(first + 1, len(robots)):
-            rows += _time_pair(scenario, robots[first], robots[second])
-    tables.write(tables.table_path(folder, "aligner_timings"), "aligner_timings", rows)
+def time_aligners(scenario: Scenario, a: EvaluatedRobot, b: EvaluatedRobot, path: Path) -> None:
+    """Time every aligner on a pair's maps of growing overlap; a table already there is kept."""
+    if not path.is_file():
+        tables.write(path, "aligner_timings", _time_pair(scenario, a, b))
 
 
 def _time_pair(scenario: Scenario, a: EvaluatedRobot, b: EvaluatedRobot) -> list[dict[str, Any]]:
