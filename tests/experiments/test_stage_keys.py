@@ -1,0 +1,166 @@
+"""A stage's key changes with all that it depends on, and with nothing else."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import grimp
+import pytest
+from tiny_scenario import TINY
+
+from experiments import store as store_module
+from experiments.pipeline import plan
+from experiments.scenario import load_scenario
+from experiments.stages import align, drive, features, judge, log, slam
+from experiments.store import Store, source_hash
+
+STAGES = ["drive", "faces", "features", "observed", "log", "slam", "align", "judge"]
+
+
+def keys(tmp_path: Path, *overrides: str) -> dict[str, tuple[str, ...]]:
+    path = tmp_path / "tiny.yaml"
+    path.write_text(TINY, encoding="utf-8")
+    laid_out = plan(load_scenario(path, overrides), Store(tmp_path / "store"))
+    found: dict[str, list[str]] = {stage: [] for stage in STAGES}
+    for folder in laid_out.folders():
+        found[folder.stage].append(folder.key)
+    return {stage: tuple(own) for stage, own in found.items()}
+
+
+AFTER = {stage: STAGES[i:] for i, stage in enumerate(STAGES)}
+
+
+@pytest.mark.parametrize(
+    ("override", "changed"),
+    [
+        ("description=other", []),
+        ("expect={}", []),
+        ("evaluate.timing_repeats=2", []),
+        ("evaluate.true_pair_radius_m=0.2", ["judge"]),
+        ("merge.parameters.use_drift=false", ["judge"]),
+        ("align.aligners.0.parameters={height: {floor_m: 0.02}}", ["align", "judge"]),
+        ("align.repetitions=3", ["align", "judge"]),
+        ("align.refinement.gate_m=0.3", ["align", "judge"]),
+        ("slam.filter.noise_scale=2", AFTER["slam"]),
+        ("slam.min_count=2", AFTER["slam"]),
+        ("evaluate.every=5", AFTER["slam"]),
+        ("odometry.scale_sigma=0.1", AFTER["log"]),
+        ("vision.tracks.min_length=4", AFTER["observed"]),
+        ("vision.max_depth_m=4", AFTER["observed"]),
+        ("vision.harris.max_corners=50", AFTER["features"]),
+        ("camera.baseline_m=0.1", AFTER["features"]),
+        ("radiometry.sigma_gray=3", AFTER["features"]),
+        ("drive.frames=45", [stage for stage in STAGES if stage != "faces"]),
+        ("world.wall_height_m=2", STAGES),
+        ("seed=4", STAGES),
+    ],
+)
+def test_a_setting_changes_the_keys_of_what_depends_on_it(
+    tmp_path: Path, override: str, changed: list[str]
+) -> None:
+    before, after = keys(tmp_path), keys(tmp_path, override)
+    assert [stage for stage in STAGES if before[stage] != after[stage]] == changed
+
+
+@pytest.fixture
+def source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A small source tree that keys are made of, instead of the real one."""
+    root = tmp_path / "source"
+    (root / "package").mkdir(parents=True)
+    (root / "package" / "a.py").write_text("1")
+    (root / "package" / "robot.urdf").write_text("1")
+    (root / "package" / "notes.txt").write_text("1")
+    (root / "single.py").write_text("1")
+    monkeypatch.setattr(store_module, "SOURCE_ROOT", root)
+    source_hash.cache_clear()
+    yield root
+    source_hash.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("file", "matters"),
+    [
+        ("package/a.py", True),
+        ("package/new.py", True),
+        ("package/robot.urdf", True),
+        ("single.py", True),
+        ("package/notes.txt", False),
+        ("other.py", False),
+    ],
+)
+def test_changed_source_gives_a_new_key(source: Path, file: str, matters: bool) -> None:
+    def key() -> str:
+        source_hash.cache_clear()
+        return Store(source).stage("stage", {}, [], ("package", "single.py")).key
+
+    before = key()
+    assert key() == before
+    (source / file).write_text("2")
+    assert (key() != before) == matters
+
+
+def test_moved_source_gives_a_new_key(source: Path) -> None:
+    before = source_hash(("package",))
+    (source / "package" / "a.py").rename(source / "package" / "b.py")
+    source_hash.cache_clear()
+    assert source_hash(("package",)) != before
+
+
+def test_library_versions_and_stages_before_it_are_in_the_key(
+    source: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = Store(source)
+    first = store.stage("one", {}, [], ())
+    other = store.stage("one", {"a": 1}, [], ())
+    after = {store.stage("two", {}, before, ()).key for before in ([], [first], [other])}
+    assert len(after) == 3
+    before = store.stage("two", {}, [], ()).key
+    monkeypatch.setattr(store_module, "library_versions", lambda: {"numpy": "0.0"})
+    assert store.stage("two", {}, [], ()).key != before
+
+
+def test_imported_logs_are_known_by_their_content(tmp_path: Path) -> None:
+    def key() -> str:
+        return Store(tmp_path).imported("log", tmp_path).key
+
+    (tmp_path / "frames.parquet").write_bytes(b"1")
+    before = key()
+    (tmp_path / "frames.parquet").write_bytes(b"2")
+    assert key() != before
+    (tmp_path / "frames.parquet").write_bytes(b"1")
+    assert key() == before
+
+
+# Settings are in the key by value, and how files get to disk does not change what is in them.
+NOT_RESULTS = {"experiments.scenario", "experiments.store", "experiments.metrics"}
+# Shape checks and error texts: they refuse, they compute nothing.
+REFUSING = {"mapfusion.arguments", "mapfusion.errors"}
+
+
+@pytest.mark.parametrize(
+    ("module", "sources"),
+    [
+        ("drive", drive.SOURCES),
+        ("features", features.SOURCES + drive.SOURCES),
+        ("log", log.SOURCES + features.SOURCES + drive.SOURCES),
+        ("slam", slam.SOURCES),
+        ("align", align.SOURCES + slam.SOURCES),
+        ("judge", judge.SOURCES + align.SOURCES + slam.SOURCES),
+    ],
+)
+def test_keys_cover_all_the_source_a_stage_runs(module: str, sources: tuple[str, ...]) -> None:
+    """`sources` are the stage's own and those of stages before it, whose keys are in its key."""
+    graph: Any = grimp.build_graph("mapfusion", "sim", "experiments")
+    reached, todo = set(), [f"experiments.stages.{module}"]
+    while todo:
+        name = todo.pop()
+        if name not in reached | NOT_RESULTS:
+            reached.add(name)
+            todo += graph.find_modules_directly_imported_by(name)
+    covered = [part.removesuffix(".py").replace("/", ".") for part in sources]
+    missing = {
+        name
+        for name in reached - REFUSING
+        if not any(name == part or name.startswith(f"{part}.") for part in covered)
+    }
+    assert not missing
