@@ -1,0 +1,83 @@
+import numpy as np
+import pandas as pd
+import pytest
+from made_up_maps import ITERATION, offered, paired, robot
+
+from experiments.fusion import fused_truth, fusion_rows, map_fit_rows
+from experiments.scenario import Merge
+from experiments.stages.align import estimate_row
+from mapfusion import se2
+from mapfusion.align.result import Alignment, Status
+from mapfusion.aligned_landmarks import ABSENT
+from mapfusion.merge import FusedMap
+
+T_WORLD_A = np.array([1.0, 2.0, 0.3])
+T_WORLD_B = np.array([4.0, -1.0, 3.0])
+N = 3000
+SIGMA_M = 0.02
+
+
+def fused_pairs(drift_sigma_m: float, seed: int = 6) -> pd.DataFrame:
+    """Two noisy maps of one world, aligned by the true motion; drift is noise in the plane."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(0, 200, (N, 3))
+    drift = drift_sigma_m / np.sqrt(2) * np.array([1, 1, 0])  # half of its variance in each map
+    real = np.hypot(SIGMA_M, drift)
+    a = robot("A", points, T_WORLD_A, rng.normal(0, real, (N, 3)), SIGMA_M)
+    b = robot("B", points, T_WORLD_B, rng.normal(0, real, (N, 3)), SIGMA_M)
+    T_true = se2.between(T_WORLD_A, T_WORLD_B)
+    found = Alignment(
+        T_true,
+        1e-12 * np.eye(3),
+        np.ones(N, bool),
+        0.0,
+        Status.ACCEPTED,
+        drift_sigma_m=drift_sigma_m,
+    )
+    names = {"robot_a": "A", "robot_b": "B", "iteration": ITERATION}
+    row = names | {"aligner": "ransac", "repetition": 0} | estimate_row(N, found, found)
+    pairs = offered("A", "B", paired(list(range(N)), list(range(N))))
+    return pd.DataFrame(fusion_rows(a, b, pd.DataFrame([row]), pairs, Merge(), 0.1))
+
+
+def test_fusing_equal_maps_halves_the_variance() -> None:
+    rows = fused_pairs(drift_sigma_m=0.0)
+    assert len(rows) == N
+    assert rows["true_pair"].all()
+    assert (rows["degrees_of_freedom"] == 3).all()
+    rms = {name: np.sqrt(np.mean(rows[f"error_{name}_m"] ** 2)) for name in ("a", "b", "fused")}
+    # RMS of 3 N normal errors: relative standard deviation 1 / sqrt(6 N) = 0.75 %
+    assert rms["a"] == pytest.approx(SIGMA_M * np.sqrt(3), rel=0.03)
+    assert rms["b"] == pytest.approx(SIGMA_M * np.sqrt(3), rel=0.03)
+    assert rms["fused"] == pytest.approx(SIGMA_M * np.sqrt(3 / 2), rel=0.03)
+    # equal parents: the fused landmark lies half way, so never farther off than the worse one
+    assert (rows["error_fused_m"] <= rows[["error_a_m", "error_b_m"]].max(axis=1) + 1e-12).all()
+
+
+def test_nees_is_consistent_with_drift_and_not_without() -> None:
+    rows = fused_pairs(drift_sigma_m=0.06)
+    # real variance over the landmarks' own in x and y; heights do not drift
+    share = (2 * (1 + (0.06 / np.sqrt(2) / SIGMA_M) ** 2) + 1) / 3
+    # mean of chi-square(3) / 3 over N: standard deviation sqrt(2 / 3 / N) = 1.5 %
+    per_degree = rows[["nees_with_drift", "nees_without_drift"]].mean() / 3
+    assert per_degree["nees_with_drift"] == pytest.approx(1, rel=0.06)
+    assert per_degree["nees_without_drift"] == pytest.approx(share, rel=0.06)
+
+
+def test_truth_of_fused_landmarks_and_fits() -> None:
+    points = np.arange(18, dtype=float).reshape(6, 3)
+    a, b = robot("A", points[:4], T_WORLD_A), robot("B", points[2:], T_WORLD_B)
+    a.points_world_m[ITERATION][1] = np.nan
+    parents = np.array([[0, ABSENT], [1, ABSENT], [2, 0], [3, 2], [ABSENT, 3]])
+    landmarks = robot("A", np.zeros((5, 3)), np.zeros(3)).maps[ITERATION]
+    fused = FusedMap(landmarks, parents, np.zeros((2, 3)), np.zeros(2), 0.0, ())
+    truth = fused_truth(fused, [a, b], ITERATION)
+    np.testing.assert_array_equal(truth[0], points[0])
+    assert np.isnan(truth[1]).all()
+    np.testing.assert_array_equal(truth[2], points[2])
+    np.testing.assert_array_equal(truth[3], (points[3] + points[4]) / 2)
+    np.testing.assert_array_equal(truth[4], points[5])
+    rows = pd.DataFrame(map_fit_rows([a, b], fused, ITERATION)).set_index("map")
+    assert rows["n_landmarks"].to_dict() == {"A": 3, "B": 4, "fused": 4}
+    assert rows["rmse_m"][["A", "B"]].to_numpy() == pytest.approx(0, abs=1e-9)
+    assert list(pd.DataFrame(map_fit_rows([a], None, ITERATION))["map"]) == ["A"]
