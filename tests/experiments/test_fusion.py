@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -62,6 +64,28 @@ def test_nees_is_consistent_with_drift_and_not_without() -> None:
     per_degree = rows[["nees_with_drift", "nees_without_drift"]].mean() / 3
     assert per_degree["nees_with_drift"] == pytest.approx(1, rel=0.06)
     assert per_degree["nees_without_drift"] == pytest.approx(share, rel=0.06)
+
+
+@pytest.mark.parametrize("planar", [False, True])
+def test_fused_landmarks_are_judged_by_the_middle_of_two_truths(planar: bool) -> None:
+    """Corners 0.08 m apart, fused half way; their variances (sigma^2 each) halve."""
+    points = np.random.default_rng(1).uniform(0, 5, (6, 3)) * [1, 1, 0]
+    apart = np.array([0.0, 0.08, 0.0])
+    a, b = robot("A", points, np.zeros(3)), robot("B", points + apart, np.zeros(3))
+    for one in (a, b):
+        one.maps[ITERATION] = replace(one.maps[ITERATION], planar=planar)
+    found = Alignment(
+        np.zeros(3), np.eye(3), np.ones(6, bool), 0.0, Status.ACCEPTED, drift_sigma_m=0.0
+    )
+    names = {"robot_a": "A", "robot_b": "B", "iteration": ITERATION}
+    row = names | {"aligner": "ransac", "repetition": 0} | estimate_row(6, found, found)
+    pairs = offered("A", "B", paired(list(range(6)), list(range(6))))
+    rows = pd.DataFrame(fusion_rows(a, b, pd.DataFrame([row]), pairs, Merge(), 0.1))
+    assert rows["error_fused_m"].to_numpy() == pytest.approx(0, abs=1e-9)
+    assert rows["error_a_m"].to_numpy() == pytest.approx(0.04)
+    assert rows["error_b_m"].to_numpy() == pytest.approx(0.04)
+    assert rows["nees_with_drift"].to_numpy() == pytest.approx(0, abs=1e-9)
+    assert (rows["degrees_of_freedom"] == (2 if planar else 3)).all()
 
 
 def test_truth_of_fused_landmarks_and_fits() -> None:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -93,6 +94,31 @@ def test_finished_stages_are_reused_and_fresh_computes_again(
     execute(quick, store, 1, lambda stage, done, total: told.append(stage), fresh=True)
     assert set(told) == {"drive", "faces", "render", "slam", "align", "judge"}
     assert all(path.stat().st_mtime_ns > before for path, before in marks.items())
+
+
+def test_nothing_of_an_earlier_run_is_left(
+    tiny_path: Path, tiny_results: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(tiny_results, tmp_path, dirs_exist_ok=True)
+    result = tmp_path / "tiny-3"
+    outdated = [result / "maps" / "R3.parquet", result / "keyframes" / "R1_00099.png"]
+    for path in outdated:
+        path.write_bytes(b"of an earlier run")
+    run_scenario(load_scenario(tiny_path), tmp_path, 1, quietly)
+    assert not any(path.exists() for path in outdated)
+    assert len(list((result / "keyframes").iterdir())) == 4
+
+
+def test_ctrl_c_before_the_command_starts(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def press() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("experiments.kernel_cache.use_kernel_cache", press)
+    reply = command(capsys, "schema")
+    assert reply.code == 130
+    assert len(reply.err.splitlines()) == 1
 
 
 def interrupted_run(path: Path, results: Path) -> subprocess.CompletedProcess[str]:
@@ -270,9 +296,12 @@ def test_runs_with_little_to_go_on(
     tiny_results: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
     name: str,
     overrides: list[str],
 ) -> None:
+    if name == "nothing alike":  # differs from a usual run in its tables alone
+        monkeypatch.setattr("experiments.figures.draw_all", lambda *_: [])
     path = tmp_path / "tiny.yaml"
     path.write_text(TINY, encoding="utf-8")
     changes = [part for override in overrides for part in ("--set", override)]
@@ -290,4 +319,3 @@ def test_runs_with_little_to_go_on(
         capsys, "check", path, "--jobs", 1, "--results", tmp_path, "--seeds", 3, *changes
     )
     assert reply.code == 0
-    assert load_scenario(path).expect
