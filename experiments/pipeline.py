@@ -40,6 +40,7 @@ class PairStages:
 
     a: RobotStages
     b: RobotStages
+    parts: align.Parts
     align: StageFolder
     judge: StageFolder
 
@@ -108,9 +109,10 @@ def _require_usable_names(robots: Sequence[RobotStages]) -> None:
 def _pairs(scenario: Scenario, store: Store, robots: Sequence[RobotStages]) -> list[PairStages]:
     pairs = []
     for a, b in itertools.combinations(robots, 2):
+        parts = align.parts(store, scenario, a.slam, b.slam)
         aligned = align.stage(store, scenario, a.slam, b.slam)
         judged = judge.stage(store, scenario, aligned, [a.slam, b.slam])
-        pairs.append(PairStages(a, b, aligned, judged))
+        pairs.append(PairStages(a, b, parts, aligned, judged))
     return pairs
 
 
@@ -235,7 +237,7 @@ class _Run:
         self.open_batches[index] = len(batches)
         folders = (pair.a.folders, pair.b.folders)
         for number, iterations in enumerate(batches):
-            self._submit(("align", index), align.run_batch, folders, pair.align, number, iterations)
+            self._submit(("align", index), align.run_batch, folders, pair.parts, number, iterations)
 
     def _batches(self, pair: PairStages) -> list[list[int]]:
         known = [slam.snapshot_iterations(robot.slam.path) for robot in (pair.a, pair.b)]
@@ -246,7 +248,8 @@ class _Run:
         if self.open_batches[index]:
             return
         pair = self.plan.pairs[index]
-        align.finish(pair.align, len(self._batches(pair)), self.started[pair.align.key])
+        started = self.started[pair.align.key]
+        align.finish(pair.align, pair.parts, len(self._batches(pair)), started)
         self._submit_judge(index, pair)
 
     def _submit_judge(self, index: int, pair: PairStages) -> None:
@@ -285,7 +288,8 @@ def execute(
     """
     laid_out = plan(scenario, store)
     if fresh:
-        for folder in laid_out.folders():
+        parts = [f for pair in laid_out.pairs for f in (pair.parts.match, *pair.parts.aligners)]
+        for folder in laid_out.folders() + parts:
             folder.discard()
     _run(laid_out, store, jobs, on_progress)
     return laid_out

@@ -3,14 +3,14 @@
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from experiments import tables
 from experiments.randomness import generator
-from experiments.scenario import Align, Scenario
+from experiments.scenario import AlignerEntry, Scenario
 from experiments.stages.slam import read_snapshots
 from experiments.store import StageFolder, Store
 from mapfusion.align.correspondences import Correspondences, match
@@ -34,12 +34,35 @@ ITERATIONS_PER_BATCH = 12
 _COVARIANCE_COLUMNS = ("cov_xx", "cov_xy", "cov_xt", "cov_yy", "cov_yt", "cov_tt")
 
 
+class Parts(NamedTuple):
+    """Where the batches of one robot pair lie, apart for each aligner.
+
+    So a run in which one aligner has changed takes all others' estimates as they are.
+    """
+
+    match: StageFolder
+    aligners: tuple[StageFolder, ...]
+
+
 def stage(
     store: Store, scenario: Scenario, slam_a: StageFolder, slam_b: StageFolder
 ) -> StageFolder:
-    """Where the estimates of this pair of robots are or will be."""
+    """Where the joined estimates of this pair of robots are or will be."""
     settings = {"seed": scenario.seed, "align": scenario.align.model_dump(mode="json")}
     return store.stage("align", settings, [slam_a, slam_b], SOURCES)
+
+
+def parts(store: Store, scenario: Scenario, slam_a: StageFolder, slam_b: StageFolder) -> Parts:
+    """Where the pair's batches are or will be."""
+    resolved = scenario.align.model_dump(mode="json")
+    match_folder = store.stage("match", resolved["match"], [slam_a, slam_b], SOURCES)
+    common = {"seed": scenario.seed}
+    common |= {name: resolved[name] for name in ("refinement", "repetitions")}
+    aligners = tuple(
+        store.stage("aligner", common | {"entry": entry}, [match_folder], SOURCES)
+        for entry in resolved["aligners"]
+    )
+    return Parts(match_folder, aligners)
 
 
 def batches(iterations: list[int]) -> list[list[int]]:
@@ -48,43 +71,50 @@ def batches(iterations: list[int]) -> list[list[int]]:
     return [iterations[start : start + ITERATIONS_PER_BATCH] for start in starts]
 
 
+def _batch_path(folder: StageFolder, index: int) -> Path:
+    return folder.path / f"batch_{index:03d}.parquet"
+
+
 def run_batch(
     scenario: Scenario,
     robots: tuple[tuple[Path, Path], tuple[Path, Path]],
-    output: StageFolder,
+    output: Parts,
     index: int,
     iterations: list[int],
 ) -> None:
     """Align at some iterations; `robots` are the (log, slam) folders of both.
 
-    A batch that is already on disk is kept: an interrupted run goes on after it.
+    What is already on disk is kept: an interrupted run goes on after it.
     """
-    estimates_path, correspondences_path = _batch_paths(output, index)
-    if estimates_path.is_file() and correspondences_path.is_file():
+    wanted = {_batch_path(folder, index) for folder in (output.match, *output.aligners)}
+    if all(path.is_file() for path in wanted):
         return
-    maps = []
-    for log_folder, slam_folder in robots:
-        maps.append(read_snapshots(slam_folder, read_log(log_folder)))
-    estimates: list[dict[str, Any]] = []
-    offered: list[pd.DataFrame] = []
-    for iteration in iterations:
-        map_a, map_b = map_at(maps[0], iteration), map_at(maps[1], iteration)
-        pairs = match(map_a, map_b, scenario.align.match)
-        names = {"robot_a": map_a.name, "robot_b": map_b.name, "iteration": iteration}
-        offered.append(_offered(names, pairs))
-        estimates += [
-            names | row
-            for row in _estimate(scenario.align, map_a, map_b, pairs, scenario.seed, iteration)
-        ]
-    tables.write(correspondences_path, "correspondences", pd.concat(offered))
-    tables.write(estimates_path, "estimates", estimates)
+    a, b = (read_snapshots(slam_folder, read_log(log_folder)) for log_folder, slam_folder in robots)
+    maps = {k: (map_at(a, k), map_at(b, k)) for k in iterations}
+    offered = _offered_batch(scenario, maps, _batch_path(output.match, index))
+    for entry, folder in zip(scenario.align.aligners, output.aligners, strict=True):
+        path = _batch_path(folder, index)
+        if not path.is_file():
+            rows = [
+                row
+                for k, (map_a, map_b) in maps.items()
+                for row in _estimate(scenario, entry, map_a, map_b, offered[k], k)
+            ]
+            tables.write(path, "estimates", rows)
 
 
-def _batch_paths(output: StageFolder, index: int) -> tuple[Path, Path]:
-    return (
-        output.path / f"estimates_{index:03d}.parquet",
-        output.path / f"correspondences_{index:03d}.parquet",
-    )
+def _offered_batch(
+    scenario: Scenario, maps: dict[int, tuple[LandmarkMap, LandmarkMap]], path: Path
+) -> dict[int, Correspondences]:
+    """Correspondences by iteration, from the file if it is there, else made and written."""
+    if not path.is_file():
+        made = []
+        for k, (map_a, map_b) in maps.items():
+            names = {"robot_a": map_a.name, "robot_b": map_b.name, "iteration": k}
+            made.append(_offered(names, match(map_a, map_b, scenario.align.match)))
+        tables.write(path, "correspondences", pd.concat(made))
+    rows = tables.read(path, "correspondences")
+    return {k: correspondences_of(rows[rows["iteration"] == k]) for k in maps}
 
 
 def map_at(maps: dict[int, LandmarkMap], iteration: int) -> LandmarkMap:
@@ -104,26 +134,29 @@ def _offered(names: dict[str, Any], pairs: Correspondences) -> pd.DataFrame:
 
 
 def _estimate(
-    align: Align,
+    scenario: Scenario,
+    entry: AlignerEntry,
     map_a: LandmarkMap,
     map_b: LandmarkMap,
     pairs: Correspondences,
-    seed: int,
     iteration: int,
 ) -> list[dict[str, Any]]:
+    settings, seed = scenario.align, scenario.seed
+    aligner = make_aligner(entry.method, **entry.parameters)
+    names = {"robot_a": map_a.name, "robot_b": map_b.name, "iteration": iteration}
     rows = []
-    for entry in align.aligners:
-        aligner = make_aligner(entry.method, **entry.parameters)
-        for repetition in range(align.repetitions if aligner.randomised else 1):
-            rng = generator(
-                seed, "align", map_a.name, map_b.name, iteration, entry.name, repetition
-            )
-            estimated = aligner.align(map_a, map_b, pairs, rng)
-            refined = align.refinement.refine(map_a, map_b, pairs, estimated.T_a_b)
-            rows.append(
-                {"aligner": entry.name, "repetition": repetition}
-                | estimate_row(len(pairs), estimated, refined)
-            )
+    refinements: dict[bytes, Alignment] = {}  # repetitions often come to the very same estimate
+    for repetition in range(settings.repetitions if aligner.randomised else 1):
+        purpose = (map_a.name, map_b.name, iteration, entry.name, repetition)
+        estimated = aligner.align(map_a, map_b, pairs, generator(seed, "align", *purpose))
+        known = estimated.T_a_b.tobytes()
+        if known not in refinements:
+            refinements[known] = settings.refinement.refine(map_a, map_b, pairs, estimated.T_a_b)
+        rows.append(
+            names
+            | {"aligner": entry.name, "repetition": repetition}
+            | estimate_row(len(pairs), estimated, refinements[known])
+        )
     return rows
 
 
@@ -181,12 +214,13 @@ def correspondences_of(rows: pd.DataFrame) -> Correspondences:
     )
 
 
-def finish(output: StageFolder, n_batches: int, started: float) -> None:
-    """Join the batches in order and mark the stage as finished."""
-    for column, name in enumerate(("estimates", "correspondences")):
-        paths = [_batch_paths(output, index)[column] for index in range(n_batches)]
+def finish(output: StageFolder, made: Parts, n_batches: int, started: float) -> None:
+    """Join the batches in order of iteration and mark the stage as finished."""
+    sources = {"estimates": made.aligners, "correspondences": (made.match,)}
+    for name, folders in sources.items():
+        paths = [_batch_path(folder, i) for i in range(n_batches) for folder in folders]
         joined = pd.concat([tables.read(path, name) for path in paths], ignore_index=True)
+        # within an iteration the aligners stay in their order
+        joined = joined.sort_values("iteration", kind="stable", ignore_index=True)
         tables.write(output.path / f"{name}.parquet", name, joined)
-        for path in paths:
-            path.unlink()
     output.finish(elapsed_s=time.perf_counter() - started)

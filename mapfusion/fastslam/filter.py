@@ -35,7 +35,9 @@ class FastSlamParameters:
         n_particles: M.
         motion: noise of the odometry.
         association: what decides among the landmarks inside the gate.
-        gate_probability: share of true matches that the gate lets pass (chi-square quantile).
+        gate_probability: share of true matches that the gate lets pass (chi-square quantile). Close
+            to 1, as a landmark's covariance leaves out the drift since it was last seen; among
+            those inside, the descriptors decide.
         descriptor_threshold: largest Euclidean distance of matching descriptors (unit vectors).
         resample_fraction: resample when the effective sample size is at most this share of M;
             0 never, 1 in every step.
@@ -51,7 +53,7 @@ class FastSlamParameters:
     n_particles: int = 200
     motion: MotionNoise = field(default_factory=MotionNoise)
     association: Association = Association.DESCRIPTOR
-    gate_probability: float = 0.99
+    gate_probability: float = 0.9999
     descriptor_threshold: float = 0.5
     resample_fraction: float = 0.5
     noise_scale: float = 1.0

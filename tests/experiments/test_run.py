@@ -19,7 +19,7 @@ from experiments import tables
 from experiments.pipeline import execute, plan
 from experiments.result import run_scenario
 from experiments.scenario import Scenario, load_scenario
-from experiments.stages.align import run_batch
+from experiments.stages.align import Parts, run_batch
 from experiments.stages.slam import run_filter
 from experiments.store import StageFolder, Store
 from mapfusion.landmark_map import read_map
@@ -208,9 +208,24 @@ def test_estimating_opens_no_truth(tiny: Scenario, tiny_results: Path, tmp_path:
             (log / name).hardlink_to(robot.log.path / name)
         run_filter(read_log(log), tiny.slam, tiny.seed, [10, 43], 10, log / "slam")
         folders.append((log, log / "slam"))
-    output = StageFolder("align", "x", tmp_path / "align")
-    run_batch(tiny, (folders[0], folders[1]), output, 0, [43])
-    assert (output.path / "estimates_000.parquet").is_file()
+    offered = StageFolder("match", "x", tmp_path / "match")
+    aligners = tuple(
+        StageFolder("aligner", entry.name, tmp_path / entry.name) for entry in tiny.align.aligners
+    )
+    run_batch(tiny, (folders[0], folders[1]), Parts(offered, aligners), 0, [43])
+    for folder in (offered, *aligners):
+        assert (folder.path / "batch_000.parquet").is_file()
+
+
+def test_only_the_changed_aligner_runs_again(tiny: Scenario, tiny_results: Path) -> None:
+    store = Store(tiny_results / "store")
+    changed = tiny.align.aligners[0].model_copy(update={"parameters": {"gate_m": 0.25}})
+    entries = [changed, *tiny.align.aligners[1:]]
+    other = tiny.model_copy(update={"align": tiny.align.model_copy(update={"aligners": entries})})
+    before, after = (plan(scenario, store).pairs[0].parts for scenario in (tiny, other))
+    assert after.match == before.match
+    assert after.aligners[0] != before.aligners[0]
+    assert after.aligners[1:] == before.aligners[1:]
 
 
 def test_commands_one_by_one(
