@@ -5,10 +5,13 @@ import signal
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from typing import Any
 
 from threadpoolctl import threadpool_limits
+
+from mapfusion.errors import InputError
 
 
 def single_threaded() -> None:
@@ -58,7 +61,16 @@ class Workers:
             done, _ = wait(self._pending, return_when=FIRST_COMPLETED)
             # In order of submission: what follows from them is then submitted in a fixed order.
             for future in [f for f in self._pending if f in done]:
-                yield self._pending.pop(future), future.result()
+                tag = self._pending.pop(future)
+                try:
+                    result = future.result()
+                except BrokenProcessPool as error:
+                    raise InputError(
+                        "a worker process was killed from outside (out of memory?); what was "
+                        "finished is kept, the same command goes on from there (--jobs 1 needs "
+                        "least memory)"
+                    ) from error
+                yield tag, result
 
     def stop(self) -> None:
         """End all processes at once, also those at work."""
