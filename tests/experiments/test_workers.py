@@ -12,6 +12,7 @@ def _die() -> None:
 
 
 def test_a_killed_worker_is_told_in_one_line() -> None:
-    with pytest.raises(InputError, match="killed from outside"), workers(2) as pool:
+    with workers(2) as pool:
         pool.submit("task", _die)
-        list(pool.completed())
+        with pytest.raises(InputError, match="killed from outside"):
+            list(pool.completed())
