@@ -19,6 +19,7 @@ STEPS_PER_CONTROL = PHYSICS_HZ // CONTROL_HZ
 SETTLING_S = 0.5  # until the wheels have come to rest on the floor
 PROGRESS_M = 0.05  # to count as progress; more than a standing robot trembles
 STOPPING_GAP_M = 0.15  # between robots, kept also by the one that has the right of way
+ALIGNED_RAD = 0.1  # heading error with which a turn in place ends; what is left is steered out
 HEADING_GAIN_PER_S = 2.0  # turn rate per radian of heading error: half of it gone in 0.35 s
 
 
@@ -149,6 +150,7 @@ class _Driver:
         self._nearest_m = np.inf
         self._progress_s = 0.0
         self._waiting = False
+        self._turning = False
 
     @property
     def parked(self) -> bool:
@@ -196,12 +198,19 @@ class _Driver:
         return math.dist(self._route.waypoints_m[self._target], pose[:2])
 
     def _wish(self, pose: Float) -> tuple[float, float]:
-        """Speed and turn rate towards the waypoint: slower the more it lies to the side."""
+        """Speed and turn rate towards the waypoint.
+
+        A corner is turned in place, after a stop: a skid-steered robot that turns while it still
+        rolls slides sideways by 0.1 m per radian, which no encoder counts.
+        """
         settings = self._settings
         x, y = self._route.waypoints_m[self._target] - pose[:2]
         error = float(wrap(math.atan2(y, x) - pose[2]))
         top = settings.turn_rate_rad_s
         turn = min(max(HEADING_GAIN_PER_S * error, -top), top)
+        self._turning = abs(error) > (ALIGNED_RAD if self._turning else settings.turn_in_place_rad)
+        if self._turning:
+            return 0.0, turn if self._speed_m_s == 0 else 0.0
         return settings.speed_m_s * max(0.0, 1 - abs(error) / settings.turn_in_place_rad), turn
 
     def _must_wait(self, pose: Float, others: list[_Other]) -> bool:
