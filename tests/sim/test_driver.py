@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mapfusion import se2
 from mapfusion.errors import InputError
 from sim.driver import DriverSettings, drive
 from sim.floorplan import FloorPlan, Wall
@@ -32,7 +33,7 @@ def drive_two() -> Trajectory:
         route("a", [1, 1, 0.5], (1, 3), (6, 3), (6, 1)),
         route("b", [6, 5, 3], (2, 5), (6, 5), loop=True),
     ]
-    return drive(HALL, routes, DriverSettings(), 190, 0.2)
+    return drive(HALL, routes, DriverSettings(), 250, 0.2)
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +56,7 @@ def test_waypoints_are_visited_in_order(driven: Trajectory) -> None:
 def test_it_starts_where_told_and_its_encoders_at_zero(driven: Trajectory) -> None:
     np.testing.assert_allclose(driven.T_world_robot[0, 0], [1, 1, 0.5], atol=2e-3)
     np.testing.assert_array_equal(driven.wheel_rad[:, 0], 0)
-    np.testing.assert_allclose(driven.time_s, 0.2 * np.arange(190))
+    np.testing.assert_allclose(driven.time_s, 0.2 * np.arange(250))
 
 
 def test_at_the_end_of_its_route_it_stands_still(driven: Trajectory) -> None:
@@ -68,6 +69,13 @@ def test_a_loop_begins_again(driven: Trajectory) -> None:
     there = nearest_m(driven, 1, (2, 5)) < 0.5
     arrivals = np.flatnonzero(np.diff(there.astype(int)) == 1)
     assert len(arrivals) == 2
+
+
+def test_it_does_not_slide_sideways_in_a_turn(driven: Trajectory) -> None:
+    steps = se2.between(driven.T_world_robot[:, :-1], driven.T_world_robot[:, 1:])
+    turning = np.abs(steps[..., 2]) > 0.05
+    assert turning.sum() > 20
+    assert np.abs(steps[..., 1][turning]).max() < 2e-3
 
 
 def test_speeds_are_respected(driven: Trajectory) -> None:
