@@ -75,7 +75,7 @@ def test_it_does_not_slide_sideways_in_a_turn(driven: Trajectory) -> None:
     steps = se2.between(driven.T_world_robot[:, :-1], driven.T_world_robot[:, 1:])
     turning = np.abs(steps[..., 2]) > 0.05
     assert turning.sum() > 20
-    assert np.abs(steps[..., 1][turning]).max() < 2e-3
+    assert np.abs(steps[..., 1][turning]).max() < 4e-3  # it was 15e-3 when it turned while rolling
 
 
 def test_speeds_are_respected(driven: Trajectory) -> None:
