@@ -1,12 +1,15 @@
 """Processes that share out tasks; results do not depend on how many there are."""
 
 import multiprocessing
+import os
 import signal
+import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from multiprocessing import connection
 from typing import Any
 
 from threadpoolctl import threadpool_limits
@@ -25,7 +28,16 @@ def single_threaded() -> None:
 def _start_worker() -> None:
     # Ctrl-C reaches the whole process group; the parent alone decides what then happens.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     single_threaded()
+
+
+def _end_with_parent() -> None:
+    """A parent that was killed cannot stop its workers, so each of them watches for it."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    connection.wait([parent.sentinel])
+    os._exit(1)
 
 
 class Workers:
