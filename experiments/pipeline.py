@@ -305,6 +305,10 @@ def _run(
         if str(store.root) in str(error):  # no file of the user's own, but one that was stored
             raise InputError(f"{error}; delete its folder, then it is computed again") from error
         raise
+    wanted = [robot.log for robot in laid_out.robots] if logs_only else laid_out.folders()
+    for folder in wanted:
+        if not folder.finished:
+            raise InputError(f"{folder.path}: was removed while it was being made; run again")
 
 
 def record_logs(
