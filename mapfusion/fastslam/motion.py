@@ -25,14 +25,12 @@ class MotionNoise:
         rotation_rad_per_sqrt_rad: random walk of the heading with the angle turned.
         scale_error: relative systematic error of distances.
         track_error: relative systematic error of angles. The track that a skid-steered robot
-            behaves as having changes with the manoeuvre (P3-AT in simulation: 0.42 to 0.62 m).
+            behaves as having changes within a turn (P3-AT in simulation: 0.42 to 0.62 m, RMS 10 %).
         horizon_m: distance over which the scale error adds up: the way for which most of what the
             robot sees stays in view.
         horizon_rad: angle over which the track error adds up: two frames of turning.
-        lateral_slip_m_per_rad: sideways motion that the wheels do not count. A skid-steered robot
-            turns about a point that wanders along its x axis between the axles, so by up to half
-            the wheelbase (P3-AT: 0.134 m), and rolls on for a moment when it turns while moving;
-            0 for two driven wheels on one axle.
+        lateral_slip_m_per_rad: sideways motion in a turn that the wheels do not count. A P3-AT that
+            stops to turn slides by 0.025 at most, one that turns while it still rolls by 0.15.
         floor_m: added to x and y in every step, whatever the motion.
         floor_rad: added to the heading in every step, whatever the motion.
     """
@@ -41,10 +39,10 @@ class MotionNoise:
     rotation_rad_per_sqrt_m: float = 0.01
     rotation_rad_per_sqrt_rad: float = 0.03
     scale_error: float = 0.01
-    track_error: float = 0.2
+    track_error: float = 0.1
     horizon_m: float = 3.0
     horizon_rad: float = 0.2
-    lateral_slip_m_per_rad: float = 0.25
+    lateral_slip_m_per_rad: float = 0.03
     floor_m: float = 0.0
     floor_rad: float = 0.0
 
