@@ -47,7 +47,7 @@ class DriverSettings:
     turn_rate_rad_s: float = 0.4
     acceleration_m_s2: float = 0.5
     turn_acceleration_rad_s2: float = 2.0
-    turn_in_place_rad: float = 0.5
+    turn_in_place_rad: float = 0.2
     stand_s: float = 1.0
     arrival_m: float = 0.2
     patience_s: float = 30.0
