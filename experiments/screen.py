@@ -73,6 +73,7 @@ def print_result(result: Path, skipped_figures: Sequence[str]) -> None:
     timings = tables.read(tables.table_path(result, "aligner_timings"), "aligner_timings")
     console = Console()
     console.print(_aligner_table(errors, timings, _aligner_order(result)))
+    console.print(_pair_table(errors, _aligner_order(result)[0]))
     robots = tables.read(tables.table_path(result, "robots"), "robots")
     console.print(_robot_table(robots))
     console.print(f"Figures: {result / 'figures'}   tables: {result / 'tables'}", soft_wrap=True)
@@ -140,9 +141,26 @@ def _number(value: float, layout: str) -> str:
     return "-" if math.isnan(value) else format(value, layout)
 
 
+def _pair_table(errors: pd.DataFrame, aligner: str) -> Table:
+    """Each pair at its last iteration: the first aligner, refined, beside the oracle."""
+    table = Table(title=f"Pairs at the last iteration, {aligner} refined", **_LAYOUT)
+    for heading in ("pair", "error, m", "error, rad", "oracle, m", "oracle, rad", "true pairs"):
+        table.add_column(heading, justify="left" if heading == "pair" else "right")
+    for (a, b), rows in errors.groupby(["robot_a", "robot_b"]):
+        last = rows[rows["iteration"] == rows["iteration"].max()]
+        cells = []
+        for name in (aligner, ORACLE):
+            own = last[last["aligner"] == name]
+            cells.append(_number(own["refined_translation_error_m"].median(), ".3f"))
+            cells.append(_number(own["refined_rotation_error_rad"].median(), "+.4f"))
+        n_true = f"{last['n_true'].iloc[0]} of {last['n_correspondences'].iloc[0]}"
+        table.add_row(f"{a} - {b}", *cells, n_true)
+    return table
+
+
 def _robot_table(robots: pd.DataFrame) -> Table:
     table = Table(title="Position errors (RMS)", **_LAYOUT)
-    for heading in ("robot", "FastSLAM [m]", "odometry [m]", "ratio", "landmarks"):
+    for heading in ("robot", "FastSLAM, m", "odometry, m", "ratio", "landmarks"):
         table.add_column(heading, justify="left" if heading == "robot" else "right")
     for name, rows in robots.groupby("robot"):
         path, odometry = ((rows[f"{x}_error_m"] ** 2).mean() ** 0.5 for x in ("path", "odometry"))
@@ -196,8 +214,8 @@ def print_map(path: Path, landmarks: "LandmarkMap") -> None:
 def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
     """Estimates of all aligners on two maps."""
     table = Table(title="T_a_b, as estimated and refined", **_LAYOUT)
-    headings = ("aligner", "status", "tx [m]", "ty [m]", "theta [rad]")
-    headings += ("refined tx", "ty", "theta", "inliers", "time [ms]")
+    headings = ("aligner", "status", "tx, m", "ty, m", "theta, rad")
+    headings += ("refined tx", "ty", "theta", "inliers", "time, ms")
     for heading in headings:
         table.add_column(heading, justify="left" if heading in {"aligner", "status"} else "right")
     for row in rows:
