@@ -212,25 +212,29 @@ def print_map(path: Path, landmarks: "LandmarkMap") -> None:
 
 
 def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
-    """Estimates of all aligners on two maps."""
+    """Estimates of all aligners on two maps, and why those were not accepted that were not."""
     table = Table(title="T_a_b, as estimated and refined", **_LAYOUT)
-    headings = ("aligner", "status", "tx, m", "ty, m", "theta, rad")
-    headings += ("refined tx", "ty", "theta", "inliers", "time, ms")
+    headings = ["\naligner", "tx\nm", "ty\nm", "theta\nrad"]
+    headings += ["refined\nm", "ty\nm", "theta\nrad", "\ninliers", "time\nms"]
     for heading in headings:
-        table.add_column(heading, justify="left" if heading in {"aligner", "status"} else "right")
+        table.add_column(heading, justify="left" if "aligner" in heading else "right", no_wrap=True)
     for row in rows:
-        reason = row["reason"] or row["refined_reason"]
         table.add_row(
             row["aligner"],
-            row["refined_status"] + (f": {reason}" if reason else ""),
             *(_number(row[name], ".3f") for name in ("tx_m", "ty_m")),
             _number(row["theta_rad"], ".4f"),
             *(_number(row[f"refined_{name}"], ".3f") for name in ("tx_m", "ty_m")),
             _number(row["refined_theta_rad"], ".4f"),
             f"{row['n_inliers']}/{row['n_correspondences']}",
-            f"{1e3 * row['elapsed_s']:.2f}",
+            f"{1e3 * row['elapsed_s']:.1f}",
         )
-    Console().print(table)
+    console = Console()
+    console.print(table)
+    for row in rows:
+        reason = row["reason"] or row["refined_reason"]
+        if reason:
+            status = row["refined_status"]
+            console.print(f"  {row['aligner']}: {status}: {reason}", soft_wrap=True, markup=False)
 
 
 def print_fused(path: Path, fused: "FusedMap", names: Sequence[str]) -> None:
