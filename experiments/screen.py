@@ -222,9 +222,9 @@ def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
         table.add_row(
             row["aligner"],
             *(_number(row[name], ".3f") for name in ("tx_m", "ty_m")),
-            _number(row["theta_rad"], ".4f"),
+            _number(row["theta_rad"], ".3f"),
             *(_number(row[f"refined_{name}"], ".3f") for name in ("tx_m", "ty_m")),
-            _number(row["refined_theta_rad"], ".4f"),
+            _number(row["refined_theta_rad"], ".3f"),
             f"{row['n_inliers']}/{row['n_correspondences']}",
             f"{1e3 * row['elapsed_s']:.1f}",
         )
