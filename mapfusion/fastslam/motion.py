@@ -25,7 +25,8 @@ class MotionNoise:
         rotation_rad_per_sqrt_rad: random walk of the heading with the angle turned.
         scale_error: relative systematic error of distances.
         track_error: relative systematic error of angles. The track that a skid-steered robot
-            behaves as having changes within a turn (P3-AT in simulation: 0.42 to 0.62 m, so about 10 %).
+            behaves as having changes within a turn (P3-AT in simulation: 0.42 to 0.62 m, so about
+            10 %).
         horizon_m: distance over which the scale error adds up: the way for which most of what the
             robot sees stays in view.
         horizon_rad: angle over which the track error adds up: two frames of turning.
