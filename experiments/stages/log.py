@@ -43,7 +43,7 @@ def run_observed(
     """Track features over the frames and write the observations and their truth."""
     started = time.perf_counter()
     assert scenario.drive is not None
-    tracker = Tracker(scenario.vision.tracks)
+    tracker = Tracker(scenario.vision.tracks, scenario.camera, scenario.vision.sigma_uv_px)
     observed: list[Observations] = []
     truth: list[Float] = []
     counts: list[int] = []

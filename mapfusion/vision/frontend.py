@@ -30,7 +30,7 @@ class FrontEndParameters:
     stereo: StereoParameters = field(default_factory=StereoParameters)
     usurf: USurfParameters = field(default_factory=USurfParameters)
     tracks: TrackParameters = field(default_factory=TrackParameters)
-    sigma_uv_px: float = 0.5
+    sigma_uv_px: float = 0.3
     max_depth_m: float = 8.0
     max_sigma_depth_m: float = 0.4
 

@@ -5,7 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from mapfusion.camera import StereoCamera
+from mapfusion.se2 import Float
 from mapfusion.vision.features import Features
+from mapfusion.vision.rigid_links import rigid_links
 
 _NO_MATCH = -1
 
@@ -23,6 +26,8 @@ class TrackParameters:
         max_disparity_ratio: largest change of disparity, as a factor: the robot's step against the
             nearest depth, and noise at the farthest.
         max_descriptor_distance: between unit vectors.
+        rigid_probability: share of true links that agree with the robot's motion as far as noise
+            lets them (chi-square); what agrees less is cut.
     """
 
     min_length: int = 3
@@ -30,6 +35,7 @@ class TrackParameters:
     max_shift_v_px: float = 25.0
     max_disparity_ratio: float = 1.3
     max_descriptor_distance: float = 0.3
+    rigid_probability: float = 0.999
 
     def __post_init__(self) -> None:
         if self.min_length < 1:
@@ -39,6 +45,8 @@ class TrackParameters:
                 raise ValueError(f"{name}: must be positive")
         if not self.max_disparity_ratio > 1:
             raise ValueError("max_disparity_ratio: must exceed 1")
+        if not 0 < self.rigid_probability < 1:
+            raise ValueError("rigid_probability: must lie between 0 and 1")
 
 
 @dataclass(frozen=True)
@@ -55,10 +63,20 @@ class Tracks:
 
 
 class Tracker:
-    """Links each frame's features to those of the frame before; frames come in their order."""
+    """Links each frame's features to those of the frame before; frames come in their order.
 
-    def __init__(self, parameters: TrackParameters) -> None:
+    Args:
+        parameters: see there.
+        camera: that took the frames.
+        sigma_uv_px: standard deviation of a feature's place in the image.
+    """
+
+    def __init__(
+        self, parameters: TrackParameters, camera: StereoCamera, sigma_uv_px: float
+    ) -> None:
         self.parameters = parameters
+        self._camera = camera
+        self._sigma_uv_px = sigma_uv_px
         self._previous: Features | None = None
         self._tracks = Tracks(np.zeros(0, np.int64), np.zeros(0, np.int64))
         self._next_id = 0
@@ -69,6 +87,7 @@ class Tracker:
         source = np.full(n, _NO_MATCH)
         if self._previous is not None:
             source = link(self._previous, features, self.parameters)
+            self._cut_slips(self._previous, features, source)
         linked = source != _NO_MATCH
         born = n - np.count_nonzero(linked)
         track_id = np.empty(n, np.int64)
@@ -80,6 +99,24 @@ class Tracker:
         self._previous = features
         self._tracks = Tracks(track_id, length)
         return self._tracks
+
+    def _cut_slips(self, previous: Features, current: Features, source: np.ndarray) -> None:
+        """Set to -1, in place, what no motion of the robot explains together with the others."""
+        rows = np.flatnonzero(source != _NO_MATCH)
+        agree = rigid_links(
+            *self._points(previous, source[rows]),
+            *self._points(current, rows),
+            self.parameters.rigid_probability,
+        )
+        source[rows[~agree]] = _NO_MATCH
+
+    def _points(self, features: Features, rows: np.ndarray) -> tuple[Float, Float]:
+        return self._camera.triangulate(
+            features.uv_px[rows],
+            features.disparity_px[rows],
+            self._sigma_uv_px,
+            features.sigma_disparity_px[rows],
+        )
 
     def landmarks(self, tracks: Tracks) -> np.ndarray:
         """(N,) bool: features whose track has lasted `min_length` frames."""

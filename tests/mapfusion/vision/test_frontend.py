@@ -10,7 +10,7 @@ from mapfusion.camera import StereoCamera
 from mapfusion.se2 import transform_points
 from mapfusion.vision.features import Features
 from mapfusion.vision.frontend import FrontEnd, FrontEndParameters, observe
-from mapfusion.vision.tracks import Tracker
+from mapfusion.vision.tracks import Tracker, TrackParameters
 from mapfusion.vision.usurf import USurfParameters
 
 CAMERA = StereoCamera()
@@ -67,7 +67,7 @@ def test_features_fill_the_frame_in_a_fixed_order(room: list[Plane]) -> None:
 def test_landmarks_come_from_tracks_of_a_moving_robot(room: list[Plane]) -> None:
     rng = np.random.default_rng(2)
     front_end, parameters = FrontEnd(CAMERA), FrontEndParameters()
-    tracker = Tracker(parameters.tracks)
+    tracker = Tracker(parameters.tracks, CAMERA, parameters.sigma_uv_px)
     places: dict[int, list[np.ndarray]] = {}
     for t in range(5):
         pose = (0.08 * t, 0.0, 0.05 * t)
@@ -142,7 +142,7 @@ def test_empty_images_yield_empty_observations(size: tuple[int, int]) -> None:
         image = np.full(size, level, np.uint8)
         features = FrontEnd(camera).extract(image, image)
         assert len(features) == 0
-        tracks = Tracker(FrontEndParameters().tracks).update(features)
+        tracks = Tracker(TrackParameters(), camera, 0.3).update(features)
         assert len(tracks.track_id) == 0
         assert len(observe(camera, features, everything(features), FrontEndParameters())) == 0
 

@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mapfusion.camera import StereoCamera
+from mapfusion.se2 import transform_points
 from mapfusion.vision.features import Features
 from mapfusion.vision.tracks import Tracker, TrackParameters, link
 
@@ -31,7 +33,7 @@ def test_birth_confirmation_and_loss() -> None:
     rng = np.random.default_rng(0)
     descriptor = unit(rng, 3)
     uv = np.array([[100.0, 100], [200, 100], [300, 100]])
-    tracker = Tracker(TrackParameters(min_length=3))
+    tracker = Tracker(TrackParameters(min_length=3), StereoCamera(), 0.3)
     # feature 0 stays, 1 misses the third frame, 2 comes in the second
     seen = [[0, 1], [2, 1, 0], [0, 2], [1, 0, 2], []]
     ids, lengths, confirmed = [], [], []
@@ -48,7 +50,7 @@ def test_birth_confirmation_and_loss() -> None:
 
 def test_a_gap_ends_every_track() -> None:
     descriptor = unit(np.random.default_rng(0), 1)
-    tracker = Tracker(TrackParameters())
+    tracker = Tracker(TrackParameters(), StereoCamera(), 0.3)
     here = features(np.array([[50.0, 50.0]]), descriptor)
     assert tracker.update(here).track_id.tolist() == [0]
     tracker.update(empty())
@@ -58,9 +60,24 @@ def test_a_gap_ends_every_track() -> None:
 
 
 def test_one_frame_suffices_when_asked() -> None:
-    tracker = Tracker(TrackParameters(min_length=1))
+    tracker = Tracker(TrackParameters(min_length=1), StereoCamera(), 0.3)
     tracks = tracker.update(features(np.zeros((2, 2)), unit(np.random.default_rng(0), 2)))
     assert tracker.landmarks(tracks).all()
+
+
+def test_a_feature_that_slips_begins_a_new_track() -> None:
+    """All but one move as a turning robot sees them; the one jumps by 6 pixels."""
+    rng = np.random.default_rng(0)
+    camera = StereoCamera()
+    p_robot = rng.uniform((2, -0.8, 0), (4, 0.8, 1), (12, 3))
+    descriptor = unit(rng, 12)
+    tracker = Tracker(TrackParameters(), camera, 0.3)
+    for t in range(3):
+        uvd = camera.project(transform_points([-0.05 * t, 0, -0.05 * t], p_robot))
+        uvd[7, 0] += 6.0 * (t == 2)
+        tracks = tracker.update(features(uvd[:, :2], descriptor, uvd[:, 2]))
+    assert tracks.length.tolist() == [3] * 7 + [1] + [3] * 4
+    assert tracks.track_id.tolist() == [*range(7), 12, *range(8, 12)]
 
 
 def link_twin(previous: Features, current: Features, parameters: TrackParameters) -> list[int]:
