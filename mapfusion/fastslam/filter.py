@@ -11,10 +11,17 @@ import numpy as np
 from scipy.special import chdtri
 
 from mapfusion.arguments import require_finite, require_shape
-from mapfusion.fastslam.association import Association, choose, pairs_nearby, pairs_of_labels
+from mapfusion.fastslam.association import (
+    Association,
+    Pairs,
+    choose,
+    pairs_nearby,
+    pairs_of_labels,
+)
 from mapfusion.fastslam.history import History
 from mapfusion.fastslam.motion import MotionNoise, sample_motion
 from mapfusion.fastslam.particles import ParticleMaps
+from mapfusion.fastslam.proposal import Proposal, informed_disturbance, widened
 from mapfusion.fastslam.resampling import (
     effective_sample_size,
     normalised,
@@ -24,7 +31,7 @@ from mapfusion.fastslam.sensor import Sightings, log_density_at_gate, sightings
 from mapfusion.fastslam.update import DROPPED, NEW, update_landmarks
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import NO_LABEL, Observations
-from mapfusion.se2 import Float
+from mapfusion.se2 import Float, compose
 
 
 @dataclass(frozen=True)
@@ -34,6 +41,7 @@ class FastSlamParameters:
     Attributes:
         n_particles: M.
         motion: noise of the odometry.
+        proposal: what particles are drawn from.
         association: what decides among the landmarks inside the gate.
         gate_probability: share of true matches that the gate lets pass (chi-square quantile). Close
             to 1, as a landmark's covariance leaves out the drift since it was last seen; among
@@ -52,6 +60,7 @@ class FastSlamParameters:
 
     n_particles: int = 200
     motion: MotionNoise = field(default_factory=MotionNoise)
+    proposal: Proposal = Proposal.MOTION
     association: Association = Association.DESCRIPTOR
     gate_probability: float = 0.9999
     descriptor_threshold: float = 0.5
@@ -62,6 +71,7 @@ class FastSlamParameters:
     planar: bool = False
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "proposal", Proposal(self.proposal))
         object.__setattr__(self, "association", Association(self.association))
         if self.n_particles < 1:
             raise ValueError(f"n_particles: is {self.n_particles}, must be at least 1")
@@ -163,13 +173,15 @@ class FastSlam:
         noise, log_new = self._noise(observations)
         planar = self.parameters.planar
 
-        self._poses = sample_motion(self._poses, odometry, self.parameters.motion, self._rng)
+        candidates, log_ratio = self._propose(odometry, observations, noise)
         seen = sightings(self._poses, observations.position_m, noise, planar)
-        chosen, changed = self._associate(seen, observations)
+        if candidates is None:
+            candidates = self._candidates(seen, observations)
+        chosen, changed = self._choose(candidates, seen)
         log_likelihood = update_landmarks(self._maps.slots, chosen, seen, log_new, planar)
         self._maps.moved(changed)
         self._start_landmarks(chosen, seen, observations)
-        log_evidence = self._weigh(log_likelihood)
+        log_evidence = self._weigh(log_likelihood + log_ratio)
         self._remember(chosen)
         return self._resample(log_evidence)
 
@@ -232,18 +244,53 @@ class FastSlam:
             log_new[:] = settings.log_new_landmark_density
         return noise, log_new
 
-    def _associate(
-        self, seen: Sightings, observations: Observations
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """(K, M) slot of each observation in each particle, or NEW or DROPPED; the slots chosen."""
+    def _propose(
+        self, odometry: Float, observations: Observations, noise: Float
+    ) -> tuple[tuple[Pairs, np.ndarray] | None, Float]:
+        """Move the particles.
+
+        Returns:
+            Candidates of the association, if the proposal has looked for them already; and log of
+            the density of eq. 3 over the density that the poses (M, 3) were drawn from.
+        """
+        settings = self.parameters
+        sigma = settings.motion.standard_deviations(odometry)
+        equal = np.zeros(settings.n_particles)
+        # a robot that stands still is where it was
+        informed = settings.proposal is Proposal.INFORMED and len(observations) and sigma.any()
+        if not informed:
+            self._poses = sample_motion(self._poses, odometry, settings.motion, self._rng)
+            return None, equal
+        predicted = compose(self._poses, odometry)
+        seen = sightings(predicted, observations.position_m, noise, settings.planar)
+        wide = widened(seen, predicted, odometry, sigma)
+        candidates = self._candidates(wide, observations)
+        chosen, _ = self._choose(candidates, wide)
+        eta, log_ratio = informed_disturbance(
+            self._maps.slots,
+            chosen,
+            seen,
+            predicted,
+            odometry[2],
+            sigma,
+            settings.gate,
+            settings.planar,
+            self._rng.standard_normal(predicted.shape),
+        )
+        self._poses = compose(self._poses, odometry + sigma * eta)
+        return candidates, log_ratio
+
+    def _candidates(self, seen: Sightings, observations: Observations) -> tuple[Pairs, np.ndarray]:
+        """Pairs that may belong together, and which observations (K,) may start a landmark."""
         settings = self.parameters
         may_create = np.ones(len(observations), dtype=bool)
         if len(observations) == 0:
-            return np.empty(seen.point_m.shape[:2], dtype=np.int64), np.empty(0, dtype=np.int64)
+            none = np.empty(0, dtype=np.int64)
+            return Pairs(none, none), may_create
         if settings.association is Association.LABEL:
             assert observations.label is not None
-            pairs, may_create = pairs_of_labels(self._slot_of_label, observations.label)
-        elif settings.association is Association.DESCRIPTOR:
+            return pairs_of_labels(self._slot_of_label, observations.label)
+        if settings.association is Association.DESCRIPTOR:
             pairs = pairs_nearby(
                 self._maps,
                 seen,
@@ -253,6 +300,16 @@ class FastSlam:
             )
         else:
             pairs = pairs_nearby(self._maps, seen, settings.gate)
+        return pairs, may_create
+
+    def _choose(
+        self, candidates: tuple[Pairs, np.ndarray], seen: Sightings
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """(K, M) slot of each observation in each particle, or NEW or DROPPED; the slots chosen."""
+        settings = self.parameters
+        pairs, may_create = candidates
+        if len(may_create) == 0:
+            return np.empty(seen.point_m.shape[:2], dtype=np.int64), np.empty(0, dtype=np.int64)
         nearest = settings.association is Association.GATE
         return choose(self._maps, pairs, seen, may_create, settings.gate, settings.planar, nearest)
 
