@@ -51,7 +51,8 @@ def rigid_links(
     gate = float(chdtri(3, 1 - probability))
     by_distance = np.argsort(np.argsort(np.linalg.norm(p_before_m, axis=1), kind="stable"))
     part = by_distance * _PARTS // n
-    start = part != np.array([-1, *range(_PARTS)])[:, None]  # (B, N); the first leaves out none
+    left_out = np.array([-1, *range(_PARTS)])[:, None]
+    start = np.not_equal(part, left_out)  # (B, N); the first leaves out none
     motion, agree = np.zeros((len(start), 3)), start
     for i, tolerance_m in enumerate(_TOLERANCES_M):
         S_before = covariance_before_m2 + tolerance_m**2 * np.eye(3)
@@ -59,7 +60,7 @@ def rigid_links(
             motion, square = _step(
                 motion, agree, p_before_m, S_before, p_after_m, covariance_after_m2
             )
-        agree = square <= gate
+        agree = np.less_equal(square, gate)
         if i < _ALL_AFTER:
             agree &= start
     return agree[np.argmax(agree.sum(axis=1))]
