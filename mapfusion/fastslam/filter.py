@@ -11,13 +11,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from mapfusion.arguments import require_finite, require_shape
-from mapfusion.fastslam.association import (
-    Association,
-    Pairs,
-    choose,
-    pairs_nearby,
-    pairs_of_labels,
-)
+from mapfusion.fastslam.association import Association, choose, pairs_nearby, pairs_of_labels
 from mapfusion.fastslam.history import History
 from mapfusion.fastslam.motion import MotionNoise, sample_motion
 from mapfusion.fastslam.particles import ParticleMaps
@@ -173,11 +167,9 @@ class FastSlam:
         noise, log_new = self._noise(observations)
         planar = self.parameters.planar
 
-        candidates, log_ratio = self._propose(odometry, observations, noise)
+        self._poses, log_ratio = self._propose(odometry, observations, noise)
         seen = sightings(self._poses, observations.position_m, noise, planar)
-        if candidates is None:
-            candidates = self._candidates(seen, observations)
-        chosen, changed = self._choose(candidates, seen)
+        chosen, changed = self._associate(seen, observations)
         log_likelihood = update_landmarks(self._maps.slots, chosen, seen, log_new, planar)
         self._maps.moved(changed)
         self._start_landmarks(chosen, seen, observations)
@@ -246,26 +238,23 @@ class FastSlam:
 
     def _propose(
         self, odometry: Float, observations: Observations, noise: Float
-    ) -> tuple[tuple[Pairs, np.ndarray] | None, Float]:
-        """Move the particles.
+    ) -> tuple[Float, Float]:
+        """Where the particles are after a motion.
 
         Returns:
-            Candidates of the association, if the proposal has looked for them already; and log of
-            the density of eq. 3 over the density that the poses (M, 3) were drawn from.
+            Poses (M, 3), and (M,) log of eq. 3's density over the density they were drawn from.
         """
         settings = self.parameters
         sigma = settings.motion.standard_deviations(odometry)
-        equal = np.zeros(settings.n_particles)
-        # a robot that stands still is where it was
+        # a robot that stands still is where it was, and without observations there is no news
         informed = settings.proposal is Proposal.INFORMED and len(observations) and sigma.any()
         if not informed:
-            self._poses = sample_motion(self._poses, odometry, settings.motion, self._rng)
-            return None, equal
+            poses = sample_motion(self._poses, odometry, settings.motion, self._rng)
+            return poses, np.zeros(settings.n_particles)
         predicted = compose(self._poses, odometry)
         seen = sightings(predicted, observations.position_m, noise, settings.planar)
         wide = widened(seen, predicted, odometry, sigma)
-        candidates = self._candidates(wide, observations)
-        chosen, _ = self._choose(candidates, wide)
+        chosen, _ = self._associate(wide, observations)
         eta, log_ratio = informed_disturbance(
             self._maps.slots,
             chosen,
@@ -277,20 +266,20 @@ class FastSlam:
             settings.planar,
             self._rng.standard_normal(predicted.shape),
         )
-        self._poses = compose(self._poses, odometry + sigma * eta)
-        return candidates, log_ratio
+        return compose(self._poses, odometry + sigma * eta), log_ratio
 
-    def _candidates(self, seen: Sightings, observations: Observations) -> tuple[Pairs, np.ndarray]:
-        """Pairs that may belong together, and which observations (K,) may start a landmark."""
+    def _associate(
+        self, seen: Sightings, observations: Observations
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """(K, M) slot of each observation in each particle, or NEW or DROPPED; the slots chosen."""
         settings = self.parameters
         may_create = np.ones(len(observations), dtype=bool)
         if len(observations) == 0:
-            none = np.empty(0, dtype=np.int64)
-            return Pairs(none, none), may_create
+            return np.empty(seen.point_m.shape[:2], dtype=np.int64), np.empty(0, dtype=np.int64)
         if settings.association is Association.LABEL:
             assert observations.label is not None
-            return pairs_of_labels(self._slot_of_label, observations.label)
-        if settings.association is Association.DESCRIPTOR:
+            pairs, may_create = pairs_of_labels(self._slot_of_label, observations.label)
+        elif settings.association is Association.DESCRIPTOR:
             pairs = pairs_nearby(
                 self._maps,
                 seen,
@@ -300,16 +289,6 @@ class FastSlam:
             )
         else:
             pairs = pairs_nearby(self._maps, seen, settings.gate)
-        return pairs, may_create
-
-    def _choose(
-        self, candidates: tuple[Pairs, np.ndarray], seen: Sightings
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """(K, M) slot of each observation in each particle, or NEW or DROPPED; the slots chosen."""
-        settings = self.parameters
-        pairs, may_create = candidates
-        if len(may_create) == 0:
-            return np.empty(seen.point_m.shape[:2], dtype=np.int64), np.empty(0, dtype=np.int64)
         nearest = settings.association is Association.GATE
         return choose(self._maps, pairs, seen, may_create, settings.gate, settings.planar, nearest)
 

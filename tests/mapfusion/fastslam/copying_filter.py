@@ -7,12 +7,13 @@ import copy
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import multivariate_normal
 
 from mapfusion.fastslam.filter import FastSlamParameters
 from mapfusion.fastslam.motion import sample_motion
 from mapfusion.fastslam.resampling import systematic_ancestors
 from mapfusion.robot_log import Observations
-from mapfusion.se2 import inverse, rotation_about_z, transform_points
+from mapfusion.se2 import compose, inverse, rotation_about_z, transform_points
 
 
 @dataclass
@@ -55,11 +56,18 @@ class CopyingFilter:
     def step(self, odometry: np.ndarray, observations: Observations) -> None:
         settings = self.parameters
         poses = np.array([p.pose for p in self.particles])
-        poses = sample_motion(poses, odometry, settings.motion, self.rng)
-        for particle, pose in zip(self.particles, poses, strict=True):
+        ratios = np.ones(len(poses))
+        sigma = settings.motion.standard_deviations(odometry)
+        if settings.proposal == "informed" and len(observations) and sigma.any():
+            draws = self.rng.standard_normal(poses.shape)
+            for m, (particle, draw) in enumerate(zip(self.particles, draws, strict=True)):
+                poses[m], ratios[m] = self.informed(particle, odometry, observations, draw)
+        else:
+            poses = sample_motion(poses, odometry, settings.motion, self.rng)
+        for particle, pose, ratio in zip(self.particles, poses, ratios, strict=True):
             particle.pose = pose
             particle.path.append(pose)
-            particle.weight *= self.take_in(particle, observations)
+            particle.weight *= self.take_in(particle, observations) * ratio
         self.n_observations += len(observations)
         self.weights = np.array([p.weight for p in self.particles])
         self.weights /= self.weights.sum()
@@ -72,6 +80,49 @@ class CopyingFilter:
             self.particles = [self.particles[a].copied() for a in ancestors]
             for particle in self.particles:
                 particle.weight = 1 / len(poses)
+
+    def informed(self, particle, odometry, observations, draw) -> tuple[np.ndarray, float]:
+        """A pose near the most probable one, and its density by eq. 3 over that it is drawn by.
+
+        Everything in the map frame; derivatives by differences.
+        """
+        n, gate = self.n_dof, self.parameters.gate
+        sigma = self.parameters.motion.standard_deviations(odometry)
+        before, particle.pose = particle.pose, compose(particle.pose, odometry)
+        turn = rotation_about_z(particle.pose[2])[:n, :n]
+
+        def place(k: int, eta: np.ndarray) -> np.ndarray:
+            pose = compose(before, odometry + sigma * eta)
+            return transform_points(pose, observations.position_m[[k]])[0][:n]
+
+        def slope(k: int, eta: np.ndarray) -> np.ndarray:
+            h = 1e-6 * np.eye(3)
+            return np.stack([(place(k, eta + d) - place(k, eta - d)) / 2e-6 for d in h], -1)
+
+        widening = []
+        for k in range(len(observations)):
+            J = turn.T @ slope(k, np.zeros(3))
+            widening.append(J @ J.T)
+        chosen = self.associate(particle, observations, widening)
+        eta = np.zeros(3)
+        for _ in range(3):
+            normal, right = np.eye(3), -eta
+            for k, number in enumerate(chosen):
+                if number is None or number == "drop":
+                    continue
+                landmark = particle.landmarks[number]
+                R = self.observation(observations, k)[1]
+                Z = landmark.covariance + turn @ R @ turn.T
+                difference = place(k, eta) - landmark.mean
+                J = slope(k, eta)
+                weight = 1 / (1 + difference @ np.linalg.solve(Z, difference) / gate)
+                normal = normal + weight * J.T @ np.linalg.solve(Z, J)
+                right = right - weight * J.T @ np.linalg.solve(Z, difference)
+            eta = eta + np.linalg.solve(normal, right)
+        drawn = eta + np.linalg.solve(np.linalg.cholesky(normal).T, draw)
+        prior = multivariate_normal(np.zeros(3), np.eye(3)).pdf(drawn)
+        ratio = prior / multivariate_normal(eta, np.linalg.inv(normal)).pdf(drawn)
+        return compose(before, odometry + sigma * drawn), ratio
 
     def take_in(self, particle: Particle, observations: Observations) -> float:
         """The frame's likelihood (eq. 10), after the particle's landmarks are corrected."""
@@ -113,12 +164,16 @@ class CopyingFilter:
                 )
         return likelihood
 
-    def associate(self, particle: Particle, observations: Observations) -> list:
+    def associate(
+        self, particle: Particle, observations: Observations, widening: list | None = None
+    ) -> list:
         candidates = []
         for k in range(len(observations)):
             z, R = self.observation(observations, k)
             for number, landmark in particle.landmarks.items():
                 difference, Z, _ = self.expectation(particle, landmark, z, R)
+                if widening is not None:
+                    Z = Z + widening[k]
                 distance = difference @ np.linalg.solve(Z, difference)
                 if distance > self.parameters.gate:
                     continue

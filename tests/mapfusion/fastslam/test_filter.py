@@ -22,22 +22,27 @@ def parameters(**changes) -> FastSlamParameters:
 
 
 def assert_same(slam: FastSlam, result, twin: CopyingFilter, planar: bool) -> None:
-    np.testing.assert_allclose(np.exp(result.log_weights), twin.weights, rtol=1e-7, atol=1e-12)
-    np.testing.assert_array_equal(result.cloud, twin.cloud)
+    np.testing.assert_allclose(np.exp(result.log_weights), twin.weights, rtol=1e-6, atol=1e-12)
+    # the twin differentiates numerically
+    tolerance = 1e-7 if slam.parameters.proposal == "informed" else 0
+    np.testing.assert_allclose(result.cloud, twin.cloud, rtol=0, atol=tolerance)
     landmarks, expected = slam.best_map(min_count=1), twin.best_landmarks()
     n = 2 if planar else 3
     assert len(landmarks) == result.n_landmarks == len(expected)
     assert landmarks.source_observation.tolist() == [m.source for m in expected]
     assert landmarks.count.tolist() == [m.count for m in expected]
-    np.testing.assert_array_equal(slam.best_path(), twin.best.path)
+    np.testing.assert_allclose(slam.best_path(), twin.best.path, rtol=0, atol=tolerance)
     assert slam.best_associations().tolist() == twin.best.associations
     if not expected:
         return
     np.testing.assert_allclose(
-        landmarks.position_m[:, :n], [m.mean for m in expected], rtol=1e-9, atol=1e-9
+        landmarks.position_m[:, :n], [m.mean for m in expected], rtol=1e-9, atol=1e-9 + tolerance
     )
     np.testing.assert_allclose(
-        landmarks.covariance_m2[:, :n, :n], [m.covariance for m in expected], rtol=1e-9, atol=1e-9
+        landmarks.covariance_m2[:, :n, :n],
+        [m.covariance for m in expected],
+        rtol=1e-9,
+        atol=1e-9 + tolerance,
     )
     np.testing.assert_array_equal(landmarks.descriptor, [m.descriptor for m in expected])
     np.testing.assert_array_equal(landmarks.label, [m.label for m in expected])
@@ -46,11 +51,13 @@ def assert_same(slam: FastSlam, result, twin: CopyingFilter, planar: bool) -> No
 @pytest.mark.parametrize("association", ["descriptor", "label", "gate"])
 @pytest.mark.parametrize("planar", [False, True])
 @pytest.mark.parametrize("resample_fraction", [0.0, 0.5, 1.0])
-def test_equals_the_filter_that_copies(association, planar, resample_fraction):
+@pytest.mark.parametrize("proposal", ["motion", "informed"])
+def test_equals_the_filter_that_copies(association, planar, resample_fraction, proposal):
     # A tight gate makes particles disagree about what they see.
     world = drive(7, planar=planar, n_landmarks=8, n_frames=20, per_frame=4)
     settings = parameters(
         n_particles=8,
+        proposal=proposal,
         association=association,
         planar=planar,
         resample_fraction=resample_fraction,
