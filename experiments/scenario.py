@@ -25,7 +25,7 @@ from mapfusion.align.refine import Refinement
 from mapfusion.align.registry import ALIGNERS, make_aligner
 from mapfusion.camera import StereoCamera
 from mapfusion.errors import InputError
-from mapfusion.fastslam.filter import FastSlamParameters
+from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.merge import MergeParameters
 from mapfusion.vision.frontend import FrontEndParameters
 from sim.driver import DriverSettings

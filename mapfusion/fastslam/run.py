@@ -5,7 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mapfusion.fastslam.filter import FastSlam, FastSlamParameters, StepResult
+from mapfusion.fastslam.filter import FastSlam, StepResult
+from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import RobotLog
 

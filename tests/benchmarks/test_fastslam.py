@@ -13,8 +13,11 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from mapfusion.fastslam.filter import FastSlam, FastSlamParameters
+from mapfusion.fastslam.association import Association
+from mapfusion.fastslam.filter import FastSlam
 from mapfusion.fastslam.motion import MotionNoise
+from mapfusion.fastslam.parameters import FastSlamParameters
+from mapfusion.fastslam.proposal import Proposal
 from mapfusion.robot_log import Observations
 from mapfusion.se2 import compose, inverse, transform_points
 
@@ -81,11 +84,16 @@ class RingRoad:
 
 
 def mapped(
-    association: str, n_landmarks: int, per_frame: int
+    association: str, n_landmarks: int, per_frame: int, proposal: str = "motion"
 ) -> tuple[FastSlam, Iterator[tuple[np.ndarray, Observations]]]:
     """A filter after its first lap, and the frames that follow."""
     road = RingRoad(n_landmarks, per_frame)
-    settings = FastSlamParameters(motion=MOTION, association=association, resample_fraction=1.0)
+    settings = FastSlamParameters(
+        motion=MOTION,
+        proposal=Proposal(proposal),
+        association=Association(association),
+        resample_fraction=1.0,
+    )
     slam, frames = FastSlam(settings, np.random.default_rng(1)), road.frames()
     for _ in range(road.frames_a_lap):
         slam.step(*next(frames))
@@ -93,17 +101,20 @@ def mapped(
 
 
 @pytest.mark.parametrize(
-    ("association", "n_landmarks", "per_frame"),
+    ("association", "n_landmarks", "per_frame", "proposal"),
     [
-        ("label", 1_000, 20),
-        ("label", 10_000, 20),
-        ("descriptor", 1_500, 40),
-        ("descriptor", 10_000, 40),
-        ("gate", 1_500, 40),
+        ("label", 1_000, 20, "motion"),
+        ("label", 10_000, 20, "motion"),
+        ("descriptor", 1_500, 40, "motion"),
+        ("descriptor", 10_000, 40, "motion"),
+        ("gate", 1_500, 40, "motion"),
+        ("label", 1_000, 20, "informed"),
+        ("label", 10_000, 20, "informed"),
+        ("descriptor", 1_500, 40, "informed"),
     ],
 )
-def test_step(benchmark, association, n_landmarks, per_frame):
-    slam, frames = mapped(association, n_landmarks, per_frame)
+def test_step(benchmark, association, n_landmarks, per_frame, proposal):
+    slam, frames = mapped(association, n_landmarks, per_frame, proposal)
 
     def next_frame():
         return next(frames), {}
@@ -114,7 +125,9 @@ def test_step(benchmark, association, n_landmarks, per_frame):
     percentile_ms = 1e3 * np.percentile(benchmark.stats.stats.data, 95)
     benchmark.extra_info["p95_ms"] = round(float(percentile_ms), 3)
     benchmark.extra_info["landmarks"] = result.n_landmarks
-    sys.stdout.write(f"\n{association}, {n_landmarks} landmarks: p95 {percentile_ms:.2f} ms\n")
+    sys.stdout.write(
+        f"\n{association}, {n_landmarks} landmarks, {proposal}: p95 {percentile_ms:.2f} ms\n"
+    )
 
 
 def test_peak_memory_with_10_000_landmarks(benchmark):

@@ -7,8 +7,8 @@ import pytest
 
 from experiments.mrclam import MrclamSettings, import_mrclam
 from mapfusion.errors import InputError
-from mapfusion.fastslam.filter import FastSlamParameters
 from mapfusion.fastslam.motion import MotionNoise
+from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.fastslam.run import run_log
 from mapfusion.robot_log import read_log, read_truth
 from mapfusion.se2 import between, compose, inverse, transform_points, wrap

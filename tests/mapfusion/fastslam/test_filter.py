@@ -7,9 +7,10 @@ import pytest
 from copying_filter import CopyingFilter
 from landmark_worlds import drive, nothing, observe, unit
 
-from mapfusion.fastslam.filter import FastSlam, FastSlamParameters
+from mapfusion.fastslam.filter import FastSlam
 from mapfusion.fastslam.genealogy import MEMORY
 from mapfusion.fastslam.motion import MotionNoise
+from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.robot_log import Observations
 from mapfusion.se2 import compose, inverse, rotation_about_z, transform_points, wrap
 

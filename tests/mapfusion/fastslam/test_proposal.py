@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from landmark_worlds import drive, observe, unit
 
-from mapfusion.fastslam.filter import FastSlam, FastSlamParameters
+from mapfusion.fastslam.filter import FastSlam
 from mapfusion.fastslam.motion import MotionNoise
+from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.fastslam.particles import ParticleMaps, Slots
 from mapfusion.fastslam.proposal import Proposal, informed_disturbance, widened
 from mapfusion.fastslam.sensor import Sightings, sightings

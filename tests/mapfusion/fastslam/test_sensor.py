@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, multivariate_normal
 
-from mapfusion.fastslam.filter import FastSlamParameters
+from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.fastslam.sensor import (
     innovation,
     log_density_at_gate,
