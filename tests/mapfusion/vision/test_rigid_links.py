@@ -64,6 +64,18 @@ def test_another_robot_is_cut() -> None:
     assert agree[30:].sum() <= 1
 
 
+def test_a_robot_that_passes_close_before_walls_is_cut() -> None:
+    """Walls at like distances hardly tell a turn from a slide; near points must not decide."""
+    rng = np.random.default_rng(8)
+    wall = rng.uniform((3.0, -1.4, 0.2), (4.7, 1.4, 2), (80, 3))
+    body = rng.uniform((1.1, 0.0, 0.05), (1.2, 0.35, 0.25), (5, 3))
+    before = seen(np.concatenate([wall, body + [0, -0.087, 0]]), rng)
+    after = seen(np.concatenate([wall, body]), rng)
+    agree = rigid_links(*before, *after, probability=0.999)
+    assert agree[:80].mean() > 0.95
+    assert not agree[80:].any()
+
+
 def test_finds_the_largest_set_that_one_motion_explains() -> None:
     """Against all subsets of eight links, noise-free but for two slips."""
     rng = np.random.default_rng(3)
