@@ -67,9 +67,9 @@ def test_another_robot_is_cut() -> None:
 def test_a_robot_that_passes_close_before_walls_is_cut() -> None:
     """Walls at like distances hardly tell a turn from a slide; near points must not decide."""
     rng = np.random.default_rng(8)
-    wall = rng.uniform((3.0, -1.4, 0.2), (4.7, 1.4, 2), (80, 3))
+    wall = rng.uniform((3.5, -1.4, 0.2), (4.7, 1.4, 2), (80, 3))
     body = rng.uniform((1.1, 0.0, 0.05), (1.2, 0.35, 0.25), (5, 3))
-    before = seen(np.concatenate([wall, body + [0, -0.087, 0]]), rng)
+    before = seen(np.concatenate([wall, body - np.array([0, 0.087, 0])]), rng)
     after = seen(np.concatenate([wall, body]), rng)
     agree = rigid_links(*before, *after, probability=0.999)
     assert agree[:80].mean() > 0.95
