@@ -22,6 +22,7 @@ from mapfusion.se2 import Float
 # Gauss-Newton steps; the turn of a frame is off by 0.1 rad at most, which the second step makes
 # 0.005 and the third nothing.
 _ROUNDS = 3
+_PAIR = 11  # numbers kept of a pair, see _gather_pairs
 
 
 class Proposal(StrEnum):
@@ -90,14 +91,14 @@ def informed_disturbance(
     """
     eta = np.zeros(T_map_predicted.shape)
     log_ratio = np.empty(len(eta))
+    pairs = np.empty((len(chosen), _PAIR))
     normal, root = np.empty((3, 3)), np.zeros((3, 3))
     right, pull = np.empty(3), np.empty(3)
     for m in range(len(eta)):
+        n_pairs = _gather_pairs(slots, chosen, predicted, T_map_predicted, planar, m, pairs)
+        before = T_map_predicted[m, 2] - turn
         for _ in range(_ROUNDS):
-            _normal_equations(
-                slots, chosen, predicted, T_map_predicted, turn, sigma, gate, planar,
-                m, eta[m], normal, right,
-            )  # fmt: skip
+            _normal_equations(pairs[:n_pairs], before, sigma, gate, eta[m], normal, right)
             _cholesky(normal, root)
             _solve_lower(root, right)
             _solve_upper(root, right)
@@ -113,11 +114,28 @@ def informed_disturbance(
 
 
 @njit(cache=True)
-def _normal_equations(
-    slots, chosen, predicted, pose, turn, sigma, gate, planar, m, eta, normal, right
-):
+def _gather_pairs(slots, chosen, predicted, pose, planar, m, pairs):
+    """Fill rows of innovation (3), inverse of Z (6) and arm from robot to point (2); their number.
+
+    What does not change from step to step; Z with the noise turned by the predicted heading.
+    """
+    n = 0
+    for k in range(len(chosen)):
+        s = chosen[k, m]
+        if s < 0:
+            continue
+        point, row = predicted.point_m[k], pairs[n]
+        row[0], row[1], row[2], row[3], row[4], row[5], row[6], row[7], row[8], _ = innovation(
+            point, predicted.covariance_m2[k], slots.mean_m[s], slots.covariance_m2[s], m, planar
+        )
+        row[9], row[10] = point[m, 0] - pose[m, 0], point[m, 1] - pose[m, 1]
+        n += 1
+    return n
+
+
+@njit(cache=True)
+def _normal_equations(pairs, before, sigma, gate, eta, normal, right):
     """Fill the precision (3, 3) of eta and the gradient (3,) of the log density at eta."""
-    before = pose[m, 2] - turn
     ax, ay = sigma[0] * np.cos(before), sigma[0] * np.sin(before)  # d(x, y) / d eta_0
     bx, by = -sigma[1] * np.sin(before), sigma[1] * np.cos(before)  # d(x, y) / d eta_1
     cos, sin = np.cos(sigma[2] * eta[2]), np.sin(sigma[2] * eta[2])
@@ -126,23 +144,14 @@ def _normal_equations(
     for i in range(3):
         normal[i, i] = 1.0
         right[i] = -eta[i]
-    for k in range(len(chosen)):
-        s = chosen[k, m]
-        if s < 0:
-            continue
-        dx, dy, dz, ixx, ixy, ixz, iyy, iyz, izz, _ = innovation(
-            predicted.point_m[k],
-            predicted.covariance_m2[k],
-            slots.mean_m[s],
-            slots.covariance_m2[s],
-            m,
-            planar,
-        )
-        # the arm from robot to point, and how far eta moves the point from where it was predicted
-        rx, ry = predicted.point_m[k, m, 0] - pose[m, 0], predicted.point_m[k, m, 1] - pose[m, 1]
+    for n in range(len(pairs)):
+        dz, ixx, ixy, ixz = pairs[n, 2], pairs[n, 3], pairs[n, 4], pairs[n, 5]
+        iyy, iyz, izz = pairs[n, 6], pairs[n, 7], pairs[n, 8]
+        rx, ry = pairs[n, 9], pairs[n, 10]
+        # eta moves the point from where it was predicted
         tx, ty = cos * rx - sin * ry, sin * rx + cos * ry
-        dx += shift_x + tx - rx
-        dy += shift_y + ty - ry
+        dx = pairs[n, 0] + (shift_x + tx - rx)
+        dy = pairs[n, 1] + (shift_y + ty - ry)
         weight = 1.0 / (1.0 + quadratic_form(dx, dy, dz, ixx, ixy, ixz, iyy, iyz, izz) / gate)
         cx, cy = -sigma[2] * ty, sigma[2] * tx  # d(point) / d eta_2
         wx = weight * (ixx * dx + ixy * dy + ixz * dz)
