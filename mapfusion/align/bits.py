@@ -1,30 +1,38 @@
 """Sets of small numbers as bits of 64-bit words."""
 
+from collections.abc import Callable
+from typing import Any, cast
+
 import numpy as np
 from numba import njit, types
 from numba.extending import intrinsic
 
-# Two instructions of every processor that Numba itself has no name for.
+# Two instructions of every processor that Numba has no name for.
 
 
 @intrinsic
-def trailing_zeros(typing_context, word):
-    """Number of the lowest bit set in a 64-bit word that is not 0."""
+def _trailing_zeros(typing_context: Any, word: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        del signature
+        return builder.cttz(arguments[0], context.get_constant(types.boolean, True))
 
-    def generate(context, builder, signature, args):
-        return builder.cttz(args[0], context.get_constant(types.boolean, True))
-
+    del typing_context, word
     return types.int64(types.uint64), generate
 
 
 @intrinsic
-def ones(typing_context, word):
-    """Number of bits set in a 64-bit word."""
+def _ones(typing_context: Any, word: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        del context, signature
+        return builder.ctpop(arguments[0])
 
-    def generate(context, builder, signature, args):
-        return builder.ctpop(args[0])
-
+    del typing_context, word
     return types.int64(types.uint64), generate
+
+
+# inside kernels only: number of the lowest bit set of a word that is not 0, and number of bits set
+trailing_zeros = cast(Callable[[Any], int], _trailing_zeros)
+ones = cast(Callable[[Any], int], _ones)
 
 
 @njit(cache=True)

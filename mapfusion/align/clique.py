@@ -43,18 +43,29 @@ class Clique(ConsensusAligner):
             raise ValueError("max_nodes: must be positive")
 
     def find(self, pairs: PlanarPairs, rng: np.random.Generator) -> Float:
-        """T_a_b (3,) whose support is least likely by chance; nothing is drawn from `rng`."""
+        """T_a_b (3,) under which the residuals are likeliest; nothing is drawn from `rng`."""
         del rng
         agreement = float(chi2.ppf(self.agreement_probability, 1))
         scales = self.variances_m2[[0, -1]]
-        best_T, best_log, inside = np.full(3, np.nan), np.inf, np.empty(len(pairs.p_a), np.bool_)
+        best_T, best_log, inside = np.full(3, np.nan), -np.inf, np.empty(len(pairs.p_a), np.bool_)
         for variance, graph in zip(scales, consistency(pairs, scales, agreement), strict=True):
-            clique = greedy_clique(graph, _GREEDY_STARTS)
-            while len(clique) >= 2:
+            support = 0
+            for search in (_greedy, self._exact):
+                clique = search(graph, support)
+                if len(clique) < 2:
+                    continue
                 T_a_b = np.array(fit_rigid(pairs.p_a, pairs.p_b, clique))
                 log, _ = settle_at_best_scale(T_a_b, pairs, self.variances_m2, self.bound, inside)
-                if log < best_log:
+                if log > best_log:
                     best_T, best_log = T_a_b, log
                 support = settle(best_T.copy(), pairs, variance, self.bound, inside)
-                clique, _ = larger_clique(graph, max(support, len(clique)), self.max_nodes)
+                support = max(support, len(clique))
         return best_T
+
+    def _exact(self, graph: np.ndarray, at_least: int) -> np.ndarray:
+        return larger_clique(graph, at_least, self.max_nodes)[0]
+
+
+def _greedy(graph: np.ndarray, at_least: int) -> np.ndarray:
+    del at_least
+    return greedy_clique(graph, _GREEDY_STARTS)

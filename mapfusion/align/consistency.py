@@ -102,14 +102,17 @@ def consistency(pairs: PlanarPairs, variances_m2: Float, bound: float) -> np.nda
         at = ax[i], ay[i], bx[i], by[i], most[i]
         _mark_near(ax[i:], ay[i:], bx[i:], by[i:], most[i:], at, near[i:n])
         near[i] = 0
+        own_bit = np.uint64(1) << np.uint64(i & 63)
         for group in range(i // _BYTES, len(eight)):
             word = eight[group]
             while word:
-                j = group * _BYTES + trailing_zeros(word) // _BYTES
+                j = (group << 3) + (trailing_zeros(word) >> 3)
                 word &= word - np.uint64(1)
                 needed = drift_needed(pairs, i, j, bound)
-                for level in range(levels):
-                    if needed <= variances_m2[level]:
-                        graphs[level, i, j // WORD] |= np.uint64(1) << np.uint64(j % WORD)
-                        graphs[level, j, i // WORD] |= np.uint64(1) << np.uint64(i % WORD)
+                bit = np.uint64(1) << np.uint64(j & 63)
+                for level in range(levels - 1, -1, -1):
+                    if needed > variances_m2[level]:
+                        break
+                    graphs[level, i, j >> 6] |= bit
+                    graphs[level, j, i >> 6] |= own_bit
     return graphs

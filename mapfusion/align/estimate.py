@@ -26,7 +26,7 @@ class ConsensusAligner(ABC):
     """Finds a motion that many pairs support; what counts as support follows from covariances.
 
     Pairs whose heights disagree are left out. The method then gives a motion; it is fitted to its
-    support in closed form, at the s_drift whose support is least likely by chance.
+    support in closed form, at the s_drift under which the residuals are likeliest.
 
     Attributes:
         drift_sigma_m: largest s_drift expected, per axis, of both maps together: 0.1 m is usual

@@ -1,10 +1,8 @@
 """Which pairs support a motion: a gate from the landmarks' covariances, and the chance of it.
 
 The residual of a true pair has the covariance C = S_a + R S_b R^T + s_drift^2 I, so it lies inside
-e^T C^-1 e <= chi-square with a stated probability. How large s_drift is, nobody says; the scale is
-taken at which the support is least likely to have come about by chance (Moisan, Moulon and Monasse
-2012, "Automatic homographic registration of a pair of images, with a contrario elimination of
-outliers").
+e^T C^-1 e <= chi-square with a stated probability. How large s_drift is, nobody says; of a few the
+one is taken under which the residuals, true and false ones mixed, are most likely.
 """
 
 import math
@@ -81,6 +79,19 @@ def fit_weighted(p_a: Float, p_b: Float, weight: Float, T_a_b: Float) -> None:
 
 
 @njit(cache=True)
+def _square_and_det(
+    ex: float, ey: float, cos: float, sin: float, S_a: Float, S_b: Float, variance_m2: float
+) -> tuple[float, float]:
+    """e^T C^-1 e and |C| of one residual; covariances (2, 2)."""
+    xx, xy, yy = S_b[0, 0], S_b[0, 1], S_b[1, 1]
+    Cxx = S_a[0, 0] + cos * cos * xx - 2 * cos * sin * xy + sin * sin * yy + variance_m2
+    Cyy = S_a[1, 1] + sin * sin * xx + 2 * cos * sin * xy + cos * cos * yy + variance_m2
+    Cxy = S_a[0, 1] + cos * sin * (xx - yy) + (cos * cos - sin * sin) * xy
+    det = Cxx * Cyy - Cxy * Cxy
+    return (Cyy * ex * ex - 2 * Cxy * ex * ey + Cxx * ey * ey) / det, det
+
+
+@njit(cache=True)
 def support_of(
     T_a_b: Float,
     pairs: PlanarPairs,
@@ -100,8 +111,8 @@ def support_of(
         inside: (N,) bool, filled.
 
     Returns:
-        Number of supporters, and the sum of what each stays below the bound: minus the truncated
-        least squares, up to a constant.
+        Number of supporters, and the sum of what each stays below the bound: up to a constant,
+        minus the truncated squares of all.
     """
     p_a, p_b, S_a, S_b = pairs
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
@@ -113,16 +124,33 @@ def support_of(
         # no direction's variance is above the trace, so this loses none and spares most
         if ex * ex + ey * ey > 2 * bound * mean_m2[i]:
             continue
-        xx, xy, yy = S_b[i, 0, 0], S_b[i, 0, 1], S_b[i, 1, 1]
-        Cxx = S_a[i, 0, 0] + cos * cos * xx - 2 * cos * sin * xy + sin * sin * yy + variance_m2
-        Cyy = S_a[i, 1, 1] + sin * sin * xx + 2 * cos * sin * xy + cos * cos * yy + variance_m2
-        Cxy = S_a[i, 0, 1] + cos * sin * (xx - yy) + (cos * cos - sin * sin) * xy
-        square = (Cyy * ex * ex - 2 * Cxy * ex * ey + Cxx * ey * ey) / (Cxx * Cyy - Cxy * Cxy)
+        square, _ = _square_and_det(ex, ey, cos, sin, S_a[i], S_b[i], variance_m2)
         if square <= bound:
             inside[i] = True
             count += 1
             score += bound - square
     return count, score
+
+
+@njit(cache=True)
+def log_likelihood(
+    T_a_b: Float, pairs: PlanarPairs, variance_m2: float, share: float, area_m2: float
+) -> float:
+    """Of the residuals when `share` of the pairs are true, less that when none are.
+
+    True ones have covariance C, false ones lie anywhere in an area (MLESAC: Torr and Zisserman
+    2000, eq. 9).
+    """
+    p_a, p_b, S_a, S_b = pairs
+    cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+    log = 0.0
+    for i in range(len(p_a)):
+        ex = p_a[i, 0] - T_a_b[0] - cos * p_b[i, 0] + sin * p_b[i, 1]
+        ey = p_a[i, 1] - T_a_b[1] - sin * p_b[i, 0] - cos * p_b[i, 1]
+        square, det = _square_and_det(ex, ey, cos, sin, S_a[i], S_b[i], variance_m2)
+        density = math.exp(-square / 2) / (2 * math.pi * math.sqrt(det))
+        log += math.log(1 - share + share * area_m2 * density)
+    return log
 
 
 @njit(cache=True)
@@ -171,25 +199,10 @@ def spread_area_m2(p: Float) -> float:
 
 
 @njit(cache=True)
-def log_chance(supporters: int, n: int, probability: float) -> float:
-    """Bound on the log of the chance that as many of n pairs support a motion of two of them.
-
-    Hoeffding's (1963) bound on the binomial tail, for the n - 2 that were free to fall anywhere.
-    """
-    k, m = supporters - 2, n - 2
-    if k <= m * probability:
-        return 0.0
-    log = -k * math.log(k / (m * probability))
-    if k < m:
-        log -= (m - k) * math.log((m - k) / (m * (1 - probability)))
-    return log
-
-
-@njit(cache=True)
 def settle_at_best_scale(
     T_a_b: Float, pairs: PlanarPairs, variances_m2: Float, bound: float, inside: np.ndarray
 ) -> tuple[float, int]:
-    """Settle T_a_b at every scale, coarse to fine, and keep what chance explains least.
+    """Settle T_a_b at every scale, coarse to fine, and keep the likeliest.
 
     T_a_b (3,) and inside (N,) are changed.
 
@@ -201,20 +214,20 @@ def settle_at_best_scale(
         inside: (N,) bool, filled with the support at the scale chosen.
 
     Returns:
-        The bound on the log of the chance, and the scale chosen (-1: at none is there support).
+        The log-likelihood, and the scale chosen; -1 when fewer than two pairs support any.
     """
     n = len(pairs.p_a)
     area = max(spread_area_m2(pairs.p_a), spread_area_m2(pairs.p_b))
     T, marks = T_a_b.copy(), np.empty(n, np.bool_)
     inside[:] = False
-    best, best_level = 0.0, -1
+    best, best_level = -math.inf, -1
     for level in range(len(variances_m2) - 1, -1, -1):
         count = settle(T, pairs, variances_m2[level], bound, marks)
         if count < 2:
             break
-        gate = math.pi * bound * np.mean(mean_variances(pairs, variances_m2[level]))
-        log = log_chance(count, n, gate / (gate + area))
-        if log < best or best_level < 0:
+        # one false pair counted before any is seen keeps the share below 1
+        log = log_likelihood(T, pairs, variances_m2[level], count / (n + 1), area)
+        if log > best:
             best, best_level = log, level
             T_a_b[:] = T
             inside[:] = marks
