@@ -15,6 +15,7 @@ from rich.table import Table
 
 from experiments import tables
 from experiments.metrics import ORACLE
+from mapfusion.align.result import NOT_RUN, Status
 
 if TYPE_CHECKING:
     from experiments.checks import Outcome
@@ -73,6 +74,8 @@ def print_result(result: Path, skipped_figures: Sequence[str]) -> None:
     timings = tables.read(tables.table_path(result, "aligner_timings"), "aligner_timings")
     console = Console()
     console.print(_aligner_table(errors, timings, _aligner_order(result)))
+    for line in not_run_lines(errors):
+        console.print(f"  {line}", soft_wrap=True, markup=False)
     console.print(_pair_table(errors, _aligner_order(result)[0]))
     robots = tables.read(tables.table_path(result, "robots"), "robots")
     console.print(_robot_table(robots))
@@ -88,6 +91,7 @@ def _aligner_order(result: Path) -> list[str]:
 def aligner_summary(errors: pd.DataFrame, timings: pd.DataFrame, order: list[str]) -> pd.DataFrame:
     """One row an aligner: medians over the iterations with three or more true pairs."""
     used = errors[errors["n_true"] >= MIN_TRUE_PAIRS_SHOWN]
+    used = used[used["status"] != Status.ABSENT]  # neither accepted nor not
     rows = []
     for aligner in order:
         own = used[used["aligner"] == aligner]
@@ -108,6 +112,19 @@ def aligner_summary(errors: pd.DataFrame, timings: pd.DataFrame, order: list[str
             }
         )
     return pd.DataFrame(rows)
+
+
+def not_run_lines(errors: pd.DataFrame) -> list[str]:
+    """One line for each aligner, and each reason, that did not run."""
+    not_run = errors[errors["status"].isin(NOT_RUN)]
+    n_rows = errors.groupby("aligner").size()
+    lines = []
+    for (aligner, status, reason), rows in not_run.groupby(
+        ["aligner", "status", "reason"], sort=False
+    ):
+        share = "" if status == Status.ABSENT else f" in {len(rows)} of {n_rows[aligner]} rows"
+        lines.append(f"{aligner}: {status}{share}: {reason}")
+    return lines
 
 
 def _aligner_table(errors: pd.DataFrame, timings: pd.DataFrame, order: list[str]) -> Table:

@@ -10,6 +10,7 @@ import importlib.util
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
+from importlib.machinery import ModuleSpec
 from pathlib import Path
 
 ENTRY_POINTS = "mapfusion.aligners"  # the group by which an installed package declares aligners
@@ -52,7 +53,7 @@ class Method:
     @property
     def absence(self) -> str:
         """Why it cannot run, and what would help; empty where it can."""
-        if not self.module or importlib.util.find_spec(_top(self.module)) is not None:
+        if self.kind is not Kind.PEER or _find(_top(self.module)) is not None:
             return ""
         return (
             f"the package {self.distribution} is not installed; "
@@ -73,16 +74,12 @@ class Method:
 
 def declared() -> tuple[Method, ...]:
     """Every aligner that an installed package declares, by name and package."""
-    found = [
-        Method(
-            entry.name,
-            Kind.PLUG_IN,
-            entry.value,
-            entry.dist.name if entry.dist is not None else "an unnamed package",
-            entry.module,
-        )
-        for entry in importlib.metadata.entry_points(group=ENTRY_POINTS)
-    ]
+    found = []
+    for entry in importlib.metadata.entry_points(group=ENTRY_POINTS):
+        target = entry.value.partition("[")[0].strip()  # without the extras it may ask for
+        package = entry.dist.name if entry.dist is not None else "an unnamed package"
+        module = target.partition(":")[0].strip()
+        found.append(Method(entry.name, Kind.PLUG_IN, target, package, module))
     return tuple(sorted(found, key=lambda method: (method.name, method.distribution)))
 
 
@@ -113,6 +110,14 @@ def _top(module: str) -> str:
     return module.partition(".")[0]
 
 
+def _find(package: str) -> ModuleSpec | None:
+    """Where a top-level package lies; it is not imported."""
+    try:
+        return importlib.util.find_spec(package)
+    except (ImportError, ValueError):  # no name that a module can have
+        return None
+
+
 def _version(distribution: str) -> str:
     try:
         return importlib.metadata.version(distribution)
@@ -123,7 +128,7 @@ def _version(distribution: str) -> str:
 @functools.cache
 def fingerprint(package: str) -> str:
     """Hash of the code files of an installed top-level package or module; empty when absent."""
-    spec = importlib.util.find_spec(package)
+    spec = _find(package)
     if spec is None:
         return ""
     digest = hashlib.sha256()

@@ -99,11 +99,19 @@ def make_aligner(name: str, **parameters: Any) -> Aligner:
     if method.kind is Kind.BUILT_IN:
         constructor: Any = ALIGNERS[name]
     else:
-        module, _, attribute = method.target.partition(":")
-        constructor = getattr(importlib.import_module(module), attribute)
+        constructor = load(method.target)
     try:
         if isinstance(parameters.get("height"), dict):  # as a scenario file has it
             parameters = parameters | {"height": HeightGate(**parameters["height"])}
         return constructor(**parameters)
     except TypeError as error:
         raise ValueError(f"parameters: {name}: {error}") from error
+
+
+def load(target: str) -> Any:
+    """The object that `module:name` (or `module:outer.inner`) stands for; imports the module."""
+    module, _, names = target.partition(":")
+    found: Any = importlib.import_module(module)
+    for name in names.split("."):
+        found = getattr(found, name)
+    return found
