@@ -2,8 +2,9 @@
 
 import os
 import sys
+import warnings
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -198,6 +199,14 @@ def merge(
     screen.print_fused(output, fused, joined)
 
 
+@app.command()
+def aligners() -> None:
+    """List the alignment methods that scenarios can name, and whose they are."""
+    from experiments import screen
+
+    screen.print_methods()
+
+
 @import_app.command("mrclam")
 def import_mrclam_command(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="An MRCLAM recording.")],
@@ -220,6 +229,7 @@ def main() -> None:
     from experiments.kernel_cache import use_kernel_cache
     from mapfusion.errors import InputError
 
+    _tell_name_clashes()
     try:
         use_kernel_cache()
         code = app(standalone_mode=False) or 0
@@ -245,6 +255,21 @@ def main() -> None:
     if code == EXIT_INTERRUPTED:
         _complain("interrupted; what was finished is kept, the same command goes on from there")
     sys.exit(code)
+
+
+def _tell_name_clashes() -> None:
+    """In one line each; other warnings keep Python's own form."""
+    from mapfusion.errors import NameClashWarning
+
+    show = warnings.showwarning
+
+    def tell(message: Warning | str, category: type[Warning], *rest: Any) -> None:
+        if issubclass(category, NameClashWarning):
+            _complain(f"warning: {message}")
+        else:
+            show(message, category, *rest)
+
+    warnings.showwarning = tell
 
 
 def _complain(text: str) -> None:

@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from experiments import tables
 from experiments.metrics import ORACLE
+from mapfusion.align.registry import known_methods, name_clashes
 from mapfusion.align.result import NOT_RUN, Status
 
 if TYPE_CHECKING:
@@ -252,6 +254,23 @@ def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
         if reason:
             status = row["refined_status"]
             console.print(f"  {row['aligner']}: {status}: {reason}", soft_wrap=True, markup=False)
+
+
+def print_methods() -> None:
+    """Every alignment method by name, whose it is, and what is wrong where something is."""
+    table = Table(title="Alignment methods", **_LAYOUT)
+    for heading in ("method", "whose", "package", "version"):
+        table.add_column(heading)
+    methods = known_methods().values()
+    for method in methods:
+        version = "absent" if method.absence else method.version
+        cells = (method.name, method.kind, method.distribution, version)
+        table.add_row(*(escape(cell) for cell in cells))
+    console = Console()
+    console.print(table)
+    lines = [f"{method.name}: {method.absence}" for method in methods if method.absence]
+    for line in [*lines, *name_clashes().values()]:
+        console.print(f"  {line}", soft_wrap=True, markup=False)
 
 
 def print_fused(path: Path, fused: "FusedMap", names: Sequence[str]) -> None:
