@@ -11,7 +11,7 @@ from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.pairs import finish, gather, undetermined, why_too_few
 from mapfusion.align.result import Alignment
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.se2 import rotation
+from mapfusion.se2 import rotation, transform_points
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,8 @@ class OpenCv:
 
     It fits a similarity, scale included, and our maps share their scale: theta is that of the
     rotation nearest to its 2x2 block, and the translation is solved again for that theta on the
-    supporters it names. Heights are not used.
+    supporters it names. Those that the motion, without the scale, leaves outside the gate are no
+    supporters. Heights are not used.
 
     Attributes:
         gate_m: `ransacReprojThreshold`; as RANSAC of our own.
@@ -52,7 +53,11 @@ class OpenCv:
         correspondences: Correspondences,
         rng: np.random.Generator,
     ) -> Alignment:
-        """Estimate T_a_b. OpenCV draws from a generator of its own that is global: seeded here.
+        """Estimate T_a_b.
+
+        OpenCV's RANSAC draws the same rows at every call, whatever `cv2.setRNGSeed` was told (its
+        issue 24835, intended). So that its spread can be seen, the pairs come in an order from
+        `rng`.
 
         Raises:
             ValueError: an index of the correspondences lies outside its map.
@@ -64,8 +69,8 @@ class OpenCv:
         reason = why_too_few(map_a, map_b, len(pairs), needed=2)
         if reason:
             return undetermined(reason, len(pairs), started_s)
-        cv2.setRNGSeed(int(rng.integers(2**31)))
-        p_a, p_b = (np.ascontiguousarray(p[:, :2]) for p in (pairs.p_a, pairs.p_b))
+        order = rng.permutation(len(pairs))
+        p_a, p_b = (np.ascontiguousarray(p[order, :2]) for p in (pairs.p_a, pairs.p_b))
         similarity, supports = cv2.estimateAffinePartial2D(
             p_b,
             p_a,
@@ -75,11 +80,13 @@ class OpenCv:
             confidence=self.confidence,
             refineIters=self.local_rounds,
         )
-        inlier = np.zeros(len(pairs), dtype=bool)
-        if supports is not None:
-            inlier[:] = supports.ravel() != 0
-        if similarity is None or not np.isfinite(similarity).all() or not inlier.any():
+        supporter = np.zeros(len(pairs), dtype=bool) if supports is None else supports.ravel() != 0
+        if similarity is None or not np.isfinite(similarity).all() or not supporter.any():
             return undetermined("OpenCV found no similarity", len(pairs), started_s)
         theta = math.atan2(similarity[1, 0], similarity[0, 0])
-        t = p_a[inlier].mean(axis=0) - rotation(theta) @ p_b[inlier].mean(axis=0)
-        return finish(pairs, np.array([*t, theta]), inlier, started_s)
+        t = p_a[supporter].mean(axis=0) - rotation(theta) @ p_b[supporter].mean(axis=0)
+        T_a_b = np.array([*t, theta])
+        within = np.linalg.norm(p_a - transform_points(T_a_b, p_b), axis=1) <= self.gate_m
+        inlier = np.zeros(len(pairs), dtype=bool)
+        inlier[order] = supporter & within
+        return finish(pairs, T_a_b, inlier, started_s)
