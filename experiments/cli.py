@@ -200,6 +200,57 @@ def merge(
 
 
 @app.command()
+def benchmark(
+    methods: Annotated[
+        list[str] | None,
+        typer.Option("--method", metavar="NAME", help="Only this method; may be repeated."),
+    ] = None,
+    trials: Annotated[int, typer.Option(help="Of each method in each cell.", min=1)] = 100,
+    pairs: Annotated[
+        list[int] | None, typer.Option(help="Numbers of pairs; may be repeated.", min=3)
+    ] = None,
+    outliers: Annotated[
+        list[float] | None,
+        typer.Option(help="Shares of false pairs; may be repeated.", min=0, max=1),
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of maps and methods.", min=0)] = 0,
+    settings: Annotated[
+        Path | None, typer.Option("--scenario", help="Scenario whose `align.aligners` to measure.")
+    ] = None,
+    budget_s: Annotated[
+        float, typer.Option(help="A cell that took longer ends with the trials it has.", min=0)
+    ] = 600.0,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Folder to write.")] = None,
+    results: Results = DEFAULT_RESULTS,
+) -> None:
+    """Success, error over the oracle and time of all methods on made-up maps: `mapfusion benchmark`.
+
+    Serial, so that times can be compared; finished cells are reused.
+    """
+    from experiments import benchmark as measure
+    from experiments import screen
+    from experiments.benchmark_report import write_benchmark
+    from experiments.store import Store
+
+    plan = measure.Plan(
+        measure.entries_of(methods or (), settings),
+        trials,
+        seed,
+        budget_s,
+        tuple(pairs or measure.PAIR_COUNTS),
+        tuple(outliers or measure.OUTLIER_SHARES),
+    )
+    folder = output or results / "benchmark"
+    with screen.progress() as show:
+        rows = measure.run_benchmark(
+            plan, Store(results / "store"), lambda done, total: show("benchmark", done, total)
+        )
+    summary = measure.summarise(rows)
+    write_benchmark(folder, plan, rows, summary)
+    screen.print_benchmark(folder, summary)
+
+
+@app.command()
 def aligners() -> None:
     """List the alignment methods that scenarios can name, and whose they are."""
     from experiments import screen

@@ -44,6 +44,7 @@ _STAGE_TEXT = {
     "judge": "compare with the truth",
     "tables": "write the tables",
     "figures": "draw the figures",
+    "benchmark": "measure the aligners",
 }
 
 
@@ -254,6 +255,30 @@ def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
         if reason:
             status = row["refined_status"]
             console.print(f"  {row['aligner']}: {status}: {reason}", soft_wrap=True, markup=False)
+
+
+def print_benchmark(folder: Path, summary: pd.DataFrame) -> None:
+    """Successes and times for each number of pairs, and where the rest is."""
+    console = Console()
+    for n_pairs, rows in summary.groupby("n_pairs", sort=False):
+        table = Table(title=f"{n_pairs} pairs: success in %, time in ms", **_LAYOUT)
+        table.add_column("outliers", no_wrap=True)
+        for share in rows["outlier_share"].drop_duplicates():
+            table.add_column(f"{100 * share:g} %", justify="right", no_wrap=True)
+        for method, own in rows.groupby("method", sort=False):
+            cells = [
+                "absent"
+                if row.status == Status.ABSENT
+                else f"{100 * row.success:.0f}, {_number(1e3 * row.elapsed_s, '.3g')}"
+                for row in own.itertuples()
+            ]
+            table.add_row(escape(str(method)), *cells)
+        console.print(table)
+    failed = summary[summary["n_failed"] > 0]
+    for method, rows in failed.groupby("method", sort=False):
+        text = f"  {method}: failed in {rows['n_failed'].sum()} trials, see trials.parquet"
+        console.print(text, soft_wrap=True, markup=False)
+    console.print(f"Table and figure: {folder}", soft_wrap=True)
 
 
 def print_methods() -> None:
