@@ -2,7 +2,7 @@
 
 import functools
 import warnings
-from typing import Any, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -10,35 +10,16 @@ from experiments.isolation import ChildFailedError, IsolatedAligner, Spec, child
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.plugins import Kind
 from mapfusion.align.refine import Refinement
-from mapfusion.align.registry import find_method, make_aligner, name_clashes
+from mapfusion.align.registry import Aligner, find_method, make_aligner, name_clashes
 from mapfusion.align.result import NOT_RUN, Alignment, Status, without_answer
 from mapfusion.errors import NameClashWarning
 from mapfusion.landmark_map import LandmarkMap
 
 
-class CallableAligner(Protocol):
-    """What the harness needs of an aligner."""
-
-    @property
-    def randomised(self) -> bool:
-        """Whether another generator can give another answer."""
-        ...
-
-    def align(
-        self,
-        map_a: LandmarkMap,
-        map_b: LandmarkMap,
-        correspondences: Correspondences,
-        rng: np.random.Generator,
-    ) -> Alignment:
-        """Estimate T_a_b."""
-        ...
-
-
 class AbsentAligner:
     """Stands for a method whose package is not installed: every answer says so."""
 
-    randomised = False
+    randomised: ClassVar[bool] = False
 
     def __init__(self, reason: str) -> None:
         self._reason = reason
@@ -53,6 +34,9 @@ class AbsentAligner:
         """The status `absent`."""
         del map_a, map_b, rng
         return without_answer(Status.ABSENT, self._reason, len(correspondences))
+
+
+CallableAligner = Aligner | IsolatedAligner | AbsentAligner
 
 
 def callable_aligner(

@@ -95,11 +95,11 @@ SUMMARY = _schema(
     n_failed=_INT,  # raised, hung or answered nonsense
     error_m=_FLOAT,  # medians over the successes
     error_rad=_FLOAT,
-    ratio_m=_FLOAT,  # of that median to the oracle's over all trials
+    ratio_m=_FLOAT,  # of that median to the oracle's on the same maps
     ratio_rad=_FLOAT,
     refined_ratio_m=_FLOAT,  # the same after the common least squares
     refined_ratio_rad=_FLOAT,
-    oracle_error_m=_FLOAT,
+    oracle_error_m=_FLOAT,  # medians over all trials
     oracle_error_rad=_FLOAT,
     elapsed_s=_FLOAT,  # median
     elapsed_low_s=_FLOAT,  # 10th and 90th percentile
@@ -151,7 +151,9 @@ def entries_of(methods: Sequence[str], scenario: Path | None = None) -> tuple[Al
     return tuple(AlignerEntry(name=name, method=name) for name in names or known_methods())
 
 
-def run_benchmark(plan: Plan, store: Store, on_progress: Callable[[int, int], None]) -> pd.DataFrame:
+def run_benchmark(
+    plan: Plan, store: Store, on_progress: Callable[[int, int], None]
+) -> pd.DataFrame:
     """All trials of all cells, from the store where they are there; told (cells done, in all)."""
     single_threaded()
     cells = list(itertools.product(plan.aligners, plan.pair_counts, plan.outlier_shares))
@@ -227,10 +229,10 @@ def errors(T_estimated: Float, T_true: Float) -> tuple[float, float]:
 
 def summarise(trials: pd.DataFrame) -> pd.DataFrame:
     """One row a cell (see SUMMARY), in the order of the trials."""
-    rows = [
-        dict(zip(_CELL, cell, strict=True)) | _summary(group, int(cell[1]), float(cell[2]))
-        for cell, group in trials.groupby(list(_CELL), sort=False)
-    ]
+    rows = []
+    for _, group in trials.groupby(list(_CELL), sort=False):
+        cell = {name: group[name].iloc[0] for name in _CELL}
+        rows.append(cell | _summary(group, int(cell["n_pairs"]), float(cell["outlier_share"])))
     return pd.DataFrame(rows, columns=pd.Index(SUMMARY.names))
 
 
@@ -251,12 +253,12 @@ def _summary(group: pd.DataFrame, n_pairs: int, share: float) -> dict[str, Any]:
         interval = binomtest(int(good.sum()), n).proportion_ci(_CONFIDENCE, "wilson")
         row |= {"success": good.mean(), "success_low": interval.low, "success_high": interval.high}
     for unit in ("m", "rad"):
-        oracle = group[f"oracle_error_{unit}"].median()
-        row[f"oracle_error_{unit}"] = oracle
+        row[f"oracle_error_{unit}"] = group[f"oracle_error_{unit}"].median()
         row[f"error_{unit}"] = group[f"error_{unit}"][good].median()
-        row[f"ratio_{unit}"] = row[f"error_{unit}"] / oracle
-        refined = group[f"refined_error_{unit}"][succeeded(group, "refined_")].median()
-        row[f"refined_ratio_{unit}"] = refined / oracle
+        for prefix in ("", "refined_"):
+            ours = group[succeeded(group, prefix)]
+            ratio = ours[f"{prefix}error_{unit}"].median() / ours[f"oracle_error_{unit}"].median()
+            row[f"{prefix}ratio_{unit}"] = ratio
     elapsed = group["elapsed_s"][~group["status"].isin(NOT_RUN)]
     row["elapsed_s"] = elapsed.median()
     row["elapsed_low_s"], row["elapsed_high_s"] = (elapsed.quantile(q) for q in _TIME_BAND)

@@ -1,6 +1,7 @@
 """What a benchmark leaves behind: tables for machines and people, and its figure."""
 
 import json
+import math
 import platform
 from datetime import UTC, datetime
 from pathlib import Path
@@ -76,10 +77,11 @@ def _preamble(plan: Plan) -> str:
         f"Planar maps of landmarks uniform in {SIZE_M:g} x {SIZE_M:g} m, residuals of true pairs "
         f"{SIGMA_M:g} m per axis, false pairs uniform; {plan.trials} trials a cell, seed "
         f"{plan.seed}, the same maps for all methods.\n\n"
-        f"Each cell: successes of 100 (accepted and within {TOLERANCE_M:g} m and "
+        f"Each cell: successes in % (accepted and within {TOLERANCE_M:g} m and "
         f"{TOLERANCE_RAD:g} rad as estimated) with Wilson's 95 % interval; the median translation "
-        "error of the successes over the oracle's (least squares on the true pairs), as estimated "
-        "and after the common least squares; the median time of one call, serial and warmed. "
+        "error of the successes over the oracle's (least squares on the true pairs) on the same "
+        "maps, as estimated / after the common least squares; the median time of one call, serial "
+        "and warmed. "
         "`wrong` counts, where there are any, trials accepted though outside the tolerance. Below "
         f"{_MIN_TRUE_PAIRS} true pairs no motion is determined: there the right answer is a "
         "refusal.\n"
@@ -105,8 +107,9 @@ def cell_text(cell: pd.Series) -> str:
     low, high = (f"{100 * cell[name]:.0f}" for name in ("success_low", "success_high"))
     parts = [f"**{100 * cell['success']:.0f}** ({low}-{high})"]
     if cell["n_success"]:
-        parts.append(f"{cell['ratio_m']:.2f} / {cell['refined_ratio_m']:.2f}")
-    if cell["elapsed_s"] == cell["elapsed_s"]:
+        ratios = (cell["ratio_m"], cell["refined_ratio_m"])
+        parts.append(" / ".join("-" if math.isnan(r) else f"{r:.2f}" for r in ratios))
+    if not math.isnan(cell["elapsed_s"]):
         parts.append(f"{1e3 * cell['elapsed_s']:.3g} ms")
     parts += [f"{cell[f'n_{what}']} {what}" for what in ("wrong", "failed") if cell[f"n_{what}"]]
     return ", ".join(parts)

@@ -223,7 +223,7 @@ def benchmark(
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Folder to write.")] = None,
     results: Results = DEFAULT_RESULTS,
 ) -> None:
-    """Success, error over the oracle and time of all methods on made-up maps: `mapfusion benchmark`.
+    """Success, error and time of all methods on made-up maps: `mapfusion benchmark`.
 
     Serial, so that times can be compared; finished cells are reused.
     """

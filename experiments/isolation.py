@@ -31,11 +31,14 @@ from mapfusion.landmark_map import LandmarkMap
 _START_LIMIT_S = 120.0  # imports take a second, many times that from a cold network disk
 _END_LIMIT_S = 5.0  # from a broken connection to the end of the process behind it
 _MAX_CHILDREN = 4  # kept alive by one process: 200 MB each with the numerical libraries
+# A process that has grown by this much is replaced before the next call: KISS-Matcher 1.0.2 keeps
+# 53 MB of each call with 5000 pairs for ever.
+_MOST_GROWTH_BYTES = 2**30
 # A plug-in that always hangs or dies would else cost its limit, or the start of a process, for each
 # repetition on each map; the second chance is for a machine that was busy.
 _MAX_LOST_ON_MAPS = 2
 _MAX_TIME_OUTS = 2  # in a row, on whatever maps
-_ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
+_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 _MAIN = "import sys; from experiments.isolated_child import main; main(*map(int, sys.argv[1:]))"
 
 
@@ -78,7 +81,8 @@ class Child:
         self._process = _start(theirs, lifeline)
         theirs.close()
         os.close(lifeline)
-        kind, detail = self._ask("make", spec.method, json.loads(spec.parameters), _START_LIMIT_S)
+        made = self._ask("make", spec.method, json.loads(spec.parameters), _START_LIMIT_S)
+        kind, detail, self._memory_at_start = made
         if kind != "made":
             self.kill()
             raise ChildFailedError(detail)
@@ -97,7 +101,9 @@ class Child:
         if not _same(maps, self._maps):
             self._send("maps", pickle.dumps(maps, pickle.HIGHEST_PROTOCOL))
             self._maps = maps  # held, so that another object cannot come to the same identity
-        kind, detail = self._ask("align", rng, limit_s)
+        kind, detail, memory_bytes = self._ask("align", rng, limit_s)
+        if memory_bytes > self._memory_at_start + _MOST_GROWTH_BYTES:
+            self.kill()
         if kind == "failed":
             return without_answer(Status.FAILED, detail, len(correspondences))
         return Alignment(
@@ -116,7 +122,7 @@ class Child:
         except OSError:  # ended between two calls
             raise ChildFailedError(self._why_ended()) from None
 
-    def _ask(self, *request: Any) -> tuple[str, Any]:
+    def _ask(self, *request: Any) -> tuple[str, Any, int]:
         """Send a request, whose last entry is its time limit in seconds; returns the answer."""
         limit_s: float = request[-1]
         try:

@@ -120,7 +120,7 @@ def aligner_summary(errors: pd.DataFrame, timings: pd.DataFrame, order: list[str
 def not_run_lines(errors: pd.DataFrame) -> list[str]:
     """One line for each aligner, and each reason, that did not run."""
     not_run = errors[errors["status"].isin(NOT_RUN)]
-    n_rows = errors.groupby("aligner").size()
+    n_rows = errors.groupby("aligner").size().to_dict()
     lines = []
     for (aligner, status, reason), rows in not_run.groupby(
         ["aligner", "status", "reason"], sort=False
@@ -268,9 +268,9 @@ def print_benchmark(folder: Path, summary: pd.DataFrame) -> None:
         for method, own in rows.groupby("method", sort=False):
             cells = [
                 "absent"
-                if row.status == Status.ABSENT
-                else f"{100 * row.success:.0f}, {_number(1e3 * row.elapsed_s, '.3g')}"
-                for row in own.itertuples()
+                if row["status"] == Status.ABSENT
+                else f"{100 * row['success']:.0f}, {_number(1e3 * row['elapsed_s'], '.3g')}"
+                for row in own.to_dict("records")
             ]
             table.add_row(escape(str(method)), *cells)
         console.print(table)

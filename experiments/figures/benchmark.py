@@ -5,6 +5,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import NullLocator
 
 from experiments.figures.style import PAGE_WIDTH_IN, aligner_styles, plain_numbers
 from mapfusion.align.result import Status
@@ -13,6 +14,8 @@ _HEIGHT_IN = 6.6
 _LEGEND_COLUMNS = 5
 _BAND_ALPHA = 0.14
 _DODGE = 0.45  # of the distance between two shares, over which the methods are spread
+_MIN_SUCCESSES = 10  # the median error of fewer says little
+_RATIO_TICKS = (1, 2, 5, 10, 20, 50, 100)
 _ROWS = ("success (%)", "error over the oracle's", "time of one call (ms)")
 
 
@@ -47,7 +50,8 @@ def _add_method(axes: np.ndarray, x: np.ndarray, own: pd.DataFrame, style: dict)
     low, high = (100 * own[f"success_{end}"].to_numpy() for end in ("low", "high"))
     success.vlines(x, low, high, color=style["color"], linewidth=2.2, alpha=0.35)
     success.plot(x, 100 * own["success"].to_numpy(), **style)
-    ratio.plot(x, own["ratio_m"].to_numpy(), **style)
+    shown = own["n_success"].to_numpy() >= _MIN_SUCCESSES
+    ratio.plot(x, np.where(shown, own["ratio_m"].to_numpy(), np.nan), **style)
     low, high = (1e3 * own[f"elapsed_{end}_s"].to_numpy() for end in ("low", "high"))
     elapsed.fill_between(x, low, high, color=style["color"], alpha=_BAND_ALPHA, linewidth=0)
     elapsed.plot(x, 1e3 * own["elapsed_s"].to_numpy(), **style)
@@ -65,8 +69,8 @@ def _lay_out(panels: np.ndarray, shares: list[float]) -> None:
     for axes in panels[1:].flat:
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter(plain_numbers())
-    for axes in panels[1]:
-        axes.yaxis.set_minor_formatter(plain_numbers())
+    panels[1, 0].set_yticks(_RATIO_TICKS)
+    panels[1, 0].yaxis.set_minor_locator(NullLocator())
 
 
 def _add_legend(figure: Figure, summary: pd.DataFrame, methods: list[str]) -> None:

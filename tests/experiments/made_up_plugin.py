@@ -30,15 +30,17 @@ class Method:
     def align(self, map_a, map_b, correspondences, rng):
         self.calls += 1
         n = len(correspondences)
-        good = Alignment(
-            GOOD_T + rng.normal(0, 1e-3, 3), GOOD_COVARIANCE, np.ones(n, bool), 99.0, Status.ACCEPTED
-        )
+        T_a_b = GOOD_T + rng.normal(0, 1e-3, 3)
+        good = Alignment(T_a_b, GOOD_COVARIANCE, np.ones(n, bool), 99.0, Status.ACCEPTED)
         good.T_a_b[0] += self.calls
         what = self.what
         print("noise on stdout", flush=True)
         print("noise on stderr", file=sys.stderr, flush=True)
         time.sleep(self.seconds)
         if what == "good":
+            return good
+        if what == "grows":
+            self.kept = getattr(self, "kept", []) + [np.ones(2**18)]  # 2 MB
             return good
         if what == "sums":  # of all it was given
             total = sum(float(np.sum(m.position_m)) for m in (map_a, map_b))

@@ -171,6 +171,14 @@ def test_no_more_than_a_few_processes_live() -> None:
     assert not any(child.alive for child in children)
 
 
+def test_a_process_that_keeps_its_memory_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(isolation, "_MOST_GROWTH_BYTES", 2**25)
+    calls = [answer("grows").T_a_b[0] for _ in range(40)]
+    assert all(answer_ > 1 for answer_ in calls)
+    starts = np.flatnonzero(np.diff(calls) < -1)  # it counts its calls from the start again
+    assert 1 <= len(starts) <= 4
+
+
 @pytest.mark.parametrize(
     ("parameters", "reason"),
     [

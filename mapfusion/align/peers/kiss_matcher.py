@@ -1,9 +1,10 @@
 """KISS-Matcher (Lim et al. 2024): pruning by pairwise consistency, then GNC for yaw and shift."""
 
+import importlib
 import math
 import time
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -21,9 +22,9 @@ class KissMatcher:
     """`KISSMatcher.prune_and_solve` on given correspondences, rotation about the height axis only.
 
     The correspondences are pruned to the maximum core of those that are pairwise equally far
-    apart in both maps (ROBIN), then solved with graduated non-convexity (Quatro's yaw-only rotation,
-    translation axis by axis). Its own features and matching are not used. It says how many
-    correspondences it kept but not which: supporters are those within the bound.
+    apart in both maps (ROBIN), then solved with graduated non-convexity (Quatro's yaw-only
+    rotation, translation axis by axis). Its own features and matching are not used. It says how
+    many correspondences it kept but not which: supporters are those within the bound.
 
     The package keeps the first noise bound that its rotation solver saw for as long as the process
     lives; the harness gives each set of parameters a process of its own.
@@ -57,7 +58,7 @@ class KissMatcher:
         Raises:
             ValueError: an index of the correspondences lies outside its map.
         """
-        import kiss_matcher
+        package: Any = importlib.import_module("kiss_matcher")  # it carries no types
 
         del rng
         started_s = time.perf_counter()
@@ -65,7 +66,7 @@ class KissMatcher:
         reason = why_too_few(map_a, map_b, len(pairs), needed=2)
         if reason:
             return undetermined(reason, len(pairs), started_s)
-        config = kiss_matcher.KISSMatcherConfig(
+        config = package.KISSMatcherConfig(
             voxel_size=self.noise_bound_m,
             use_voxel_sampling=False,
             use_quatro=True,
@@ -73,7 +74,7 @@ class KissMatcher:
             solver_noise_bound_gain=self.solver_share,
         )
         p_a, p_b = (list(p.astype(np.float32)) for p in (pairs.p_a, pairs.p_b))
-        solution = kiss_matcher.KISSMatcher(config).prune_and_solve(p_b, p_a)
+        solution = package.KISSMatcher(config).prune_and_solve(p_b, p_a)
         if not solution.valid:
             reason = "KISS-Matcher found no correspondences that agree"
             return undetermined(reason, len(pairs), started_s)

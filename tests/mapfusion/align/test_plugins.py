@@ -55,7 +55,7 @@ def test_it_is_made_with_its_parameters(site):
     install(site, "some_package", "theirs = made_elsewhere:Outer.Method")
     made = make_aligner("theirs", a=3)
     assert getattr(made, "a") == 3  # noqa: B009
-    with pytest.raises(ValueError, match="parameters: theirs: .*'b'"):
+    with pytest.raises(ValueError, match=r"parameters: theirs: .*'b'"):
         make_aligner("theirs", b=3)
 
 
