@@ -86,7 +86,7 @@ def _style(place: int) -> dict[str, Any]:
     turn, index = divmod(place, len(_ALIGNER_STYLES))
     if turn == 0:
         return _ALIGNER_STYLES[index]
-    dashes = _ALIGNER_STYLES[(index + turn) % len(_ALIGNER_STYLES)]["linestyle"]
+    dashes = _ALIGNER_STYLES[(index + 2 * turn) % len(_ALIGNER_STYLES)]["linestyle"]
     return _ALIGNER_STYLES[index] | {"linestyle": dashes, "markerfacecolor": "white"}
 
 
