@@ -243,7 +243,7 @@ def larger_clique(graph: np.ndarray, at_least: int, budget: int) -> tuple[np.nda
 
     Args:
         graph: (N, W) symmetric, bit j of row i for an edge, no diagonal.
-        at_least: size to exceed.
+        at_least: size to exceed, 1 or more.
         budget: nodes of the search, after which the largest found so far is returned.
 
     Returns:
