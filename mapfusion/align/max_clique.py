@@ -209,29 +209,30 @@ def _among(graph: np.ndarray, chosen: np.ndarray, needed: int) -> tuple[np.ndarr
     Takes vertices away from `chosen` until all that remain have enough.
 
     Returns:
-        Their numbers (n,), and the graph (n, ceil(n / 64)) in which they are numbered 0 to n - 1.
+        Their numbers (n,), none where they are too few to have so many neighbours, and the graph
+        (n, ceil(n / 64)) in which they are numbered 0 to n - 1.
     """
     rows = np.empty(len(graph), np.int64)
-    while True:
-        n = members(chosen, rows)
+    n, before = members(chosen, rows), -1
+    while n > needed and n != before:
         before = n
         for i in range(before):
             v = rows[i]
             if count_common(graph[v], chosen) < needed:
                 chosen[v // WORD] &= ~(np.uint64(1) << np.uint64(v % WORD))
                 n -= 1
-        if n == before or n <= needed:
-            break
-    n = members(chosen, rows)
-    rows = rows[:n].copy()
+                if n <= needed:  # too few are left, the others need no look
+                    break
+        members(chosen, rows)
     if n <= needed:
         n = 0
+    rows = rows[:n].copy()
     small = np.zeros((n, (n + WORD - 1) // WORD), np.uint64)
     for i in range(n):
         for j in range(n):
             if has(graph[rows[i]], rows[j]):
                 small[i, j // WORD] |= np.uint64(1) << np.uint64(j % WORD)
-    return rows[:n], small
+    return rows, small
 
 
 @njit(cache=True)
@@ -243,7 +244,7 @@ def larger_clique(graph: np.ndarray, at_least: int, budget: int) -> tuple[np.nda
 
     Args:
         graph: (N, W) symmetric, bit j of row i for an edge, no diagonal.
-        at_least: size to exceed.
+        at_least: size to exceed, 1 or more.
         budget: nodes of the search, after which the largest found so far is returned.
 
     Returns:

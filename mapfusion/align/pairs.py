@@ -1,5 +1,6 @@
 """The landmarks of corresponding pairs side by side, and whether they can determine a motion."""
 
+import math
 import time
 from dataclasses import dataclass
 
@@ -130,6 +131,7 @@ def finish(
     inlier: np.ndarray,
     started_s: float,
     refusal: str = "",
+    gate_m: float = math.inf,
 ) -> Alignment:
     """An estimator's result: its motion, with drift and covariance judged from what it fitted.
 
@@ -140,12 +142,13 @@ def finish(
         inlier: (N,) bool over the correspondences given.
         started_s: `time.perf_counter()` at the start.
         refusal: why the estimate is not to be trusted, if so.
+        gate_m: radius beyond which residuals were not fitted.
     """
     n_inliers = int(np.count_nonzero(inlier))
     if n_inliers < MIN_PAIRS and not refusal:
         refusal = f"{n_inliers} correspondences agree, at least {MIN_PAIRS} are needed"
     own = residual_covariances(T_a_b, fitted.covariance_a, fitted.covariance_b)
-    drift = estimate_drift_m(residuals(T_a_b, fitted.p_a, fitted.p_b), own)
+    drift = estimate_drift_m(residuals(T_a_b, fitted.p_a, fitted.p_b), own, gate_m)
     return Alignment(
         T_a_b,
         motion_covariance(gain, own + drift**2 * np.eye(2)),

@@ -93,7 +93,7 @@ class Ransac:
         inlier[rows[support]] = True
         fitted = pairs[inlier]
         gain = least_squares_gain(T_a_b, fitted.p_b)
-        return finish(fitted, gain, T_a_b, inlier, started_s)
+        return finish(fitted, gain, T_a_b, inlier, started_s, gate_m=self.gate_m)
 
 
 @njit(cache=True)
