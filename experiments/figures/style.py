@@ -73,21 +73,12 @@ def house_style() -> Iterator[None]:
 
 
 def aligner_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Line style of each aligner by its place in the display order; the oracle has its own.
-
-    After six the colours come again, with hollow markers and other dashes.
-    """
+    """Line style of each aligner by its place in the display order; the oracle has its own."""
     estimators = [name for name in names if name != ORACLE]
-    styles = {name: _style(place) for place, name in enumerate(estimators)}
+    styles = {
+        name: _ALIGNER_STYLES[place % len(_ALIGNER_STYLES)] for place, name in enumerate(estimators)
+    }
     return styles | {ORACLE: _ORACLE_STYLE}
-
-
-def _style(place: int) -> dict[str, Any]:
-    turn, index = divmod(place, len(_ALIGNER_STYLES))
-    if turn == 0:
-        return _ALIGNER_STYLES[index]
-    dashes = _ALIGNER_STYLES[(index + 2 * turn) % len(_ALIGNER_STYLES)]["linestyle"]
-    return _ALIGNER_STYLES[index] | {"linestyle": dashes, "markerfacecolor": "white"}
 
 
 def robot_colours(names: Sequence[str]) -> dict[str, str]:
