@@ -140,6 +140,9 @@ DEFAULT_ALIGNERS = [
     AlignerEntry(name="svd-solved", method="svd", parameters={"translation": "solved"}),
     AlignerEntry(name="icp", method="icp"),
     AlignerEntry(name="impicp", method="impicp"),
+    AlignerEntry(name="gnc", method="gnc"),
+    AlignerEntry(name="clique", method="clique"),
+    AlignerEntry(name="ransac_mahalanobis", method="ransac_mahalanobis"),
 ]
 
 

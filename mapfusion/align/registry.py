@@ -6,11 +6,14 @@ from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
+from mapfusion.align.clique import Clique
 from mapfusion.align.correspondences import Correspondences, HeightGate
+from mapfusion.align.gnc import Gnc
 from mapfusion.align.icp import Icp
 from mapfusion.align.impicp import ImpIcp
 from mapfusion.align.plugins import Kind, Method, clashes, declared
 from mapfusion.align.ransac import Ransac
+from mapfusion.align.ransac_mahalanobis import RansacMahalanobis
 from mapfusion.align.result import Alignment
 from mapfusion.align.svd import Svd
 from mapfusion.landmark_map import LandmarkMap
@@ -35,7 +38,15 @@ class Aligner(Protocol):
         ...
 
 
-ALIGNERS: dict[str, type[Aligner]] = {"ransac": Ransac, "svd": Svd, "icp": Icp, "impicp": ImpIcp}
+ALIGNERS: dict[str, type[Aligner]] = {
+    "ransac": Ransac,
+    "svd": Svd,
+    "icp": Icp,
+    "impicp": ImpIcp,
+    "gnc": Gnc,
+    "clique": Clique,
+    "ransac_mahalanobis": RansacMahalanobis,
+}
 
 _PEERS = (
     Method(

@@ -1,0 +1,235 @@
+"""What the aligners that judge by covariances have in common, and their bars."""
+
+import math
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from map_pairs import error, given_pairs, landmarks, moved, swapped
+from scipy.stats import chi2
+from scipy.stats import f as f_distribution
+from test_consistency import blurred, slow_consistency
+from test_ransac import LOG_MISS, draw
+from test_support import slow_squares
+
+from mapfusion import se2
+from mapfusion.align.clique import Clique
+from mapfusion.align.correspondences import Correspondences
+from mapfusion.align.gnc import Gnc
+from mapfusion.align.oracle import Oracle
+from mapfusion.align.pairs import gather
+from mapfusion.align.ransac_mahalanobis import RansacMahalanobis, search
+from mapfusion.align.registry import make_aligner
+from mapfusion.align.result import Status
+from mapfusion.align.rigid import fit_rigid
+from mapfusion.align.support import in_plan, settle
+
+NAMES = ["gnc", "clique", "ransac_mahalanobis"]
+SUCCESS_M, SUCCESS_RAD = 0.2, 0.05
+motions = st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(-3.14, 3.14)).map(np.array)
+
+
+def estimate(aligner, pair, seed=0):
+    if isinstance(aligner, str):
+        aligner = make_aligner(aligner)
+    return aligner.align(pair.map_a, pair.map_b, pair.correspondences, np.random.default_rng(seed))
+
+
+def with_noise_in_both(seed, n, true_share, sigma_m=0.05, drift_m=0.0):
+    """A planar pair whose noise, sigma_m per axis of a residual, is shared by both maps."""
+    rng = np.random.default_rng(seed)
+    share = sigma_m / math.sqrt(2)
+    pair = given_pairs(rng, n, true_share, share, drift_m, planar=True)
+    p_a = pair.map_a.position_m + rng.normal(0, share, (n, 3)) * [1, 1, 0]
+    return replace(pair, map_a=landmarks(p_a, share, planar=True, name="a"))
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.sampled_from(NAMES), st.integers(0, 1000), motions, motions)
+def test_follows_the_frames_of_the_maps(name, seed, T_u_a, T_v_b):
+    maps, pair = blurred(np.random.default_rng(seed), 60, 0.6)
+    pair = replace(pair, map_a=maps[0], map_b=maps[1])
+    other = replace(pair, map_a=moved(maps[0], T_u_a), map_b=moved(maps[1], T_v_b))
+    found, found_other = estimate(name, pair), estimate(name, other)
+    expected = se2.compose(se2.compose(T_u_a, found.T_a_b), se2.inverse(T_v_b))
+    np.testing.assert_array_equal(found.inlier, found_other.inlier)
+    assert error(found_other.T_a_b, expected) == pytest.approx((0, 0), abs=1e-8)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_exchanged_maps_give_the_inverse(name):
+    pair = with_noise_in_both(1, 100, 0.5)
+    there, back = estimate(name, pair), estimate(name, swapped(pair))
+    np.testing.assert_array_equal(there.inlier, back.inlier)
+    assert error(se2.inverse(back.T_a_b), there.T_a_b) == pytest.approx((0, 0), abs=1e-9)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("drift_m", [0.0, 0.1])
+def test_covariance_covers_the_error(name, drift_m):
+    """Mean normalised squared error of 3 parameters; landmarks of many shapes and sizes."""
+    nees = []
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        maps, pair = blurred(rng, 100, 0.6, sigma_m=0.02)
+        maps[1].position_m[:, :2] += rng.normal(0, drift_m, (100, 2))
+        found = estimate(name, replace(pair, map_a=maps[0], map_b=maps[1]))
+        difference = found.T_a_b - pair.T_a_b
+        difference[2] = se2.wrap(difference[2])
+        if error(found.T_a_b, pair.T_a_b)[0] < SUCCESS_M:
+            nees.append(difference @ np.linalg.solve(found.covariance, difference) / 3)
+    assert len(nees) >= 195
+    mean, variance = f_distribution.stats(3, 2 * 60 - 3)
+    assert np.mean(nees) == pytest.approx(mean, abs=4 * np.sqrt(variance / len(nees)))
+
+
+@pytest.mark.parametrize("name", ["clique", "ransac_mahalanobis"])
+@pytest.mark.parametrize(("n", "outliers", "least"), [(1000, 0.99, 100), (60, 0.9, 99)])
+def test_the_bars(name, n, outliers, least):
+    """Successes of 100 on planar maps, and the median error beside the oracle's."""
+    found, best = [], []
+    for seed in range(100):
+        pair = with_noise_in_both(seed, n, 1 - outliers)
+        found.append(error(estimate(name, pair, seed).T_a_b, pair.T_a_b))
+        oracle = Oracle().align(pair.map_a, pair.map_b, pair.correspondences, pair.is_true)
+        best.append(error(oracle.T_a_b, pair.T_a_b))
+    assert np.sum(np.all(np.array(found) < (SUCCESS_M, SUCCESS_RAD), axis=1)) >= least
+    assert np.median(found, axis=0)[0] <= 1.1 * np.median(best, axis=0)[0]
+
+
+@pytest.mark.parametrize("name", ["clique", "ransac_mahalanobis"])
+def test_five_thousand_pairs(name):
+    """A tenth of the bar's hundred; the benchmark has its time."""
+    for seed in range(10):
+        pair = with_noise_in_both(seed, 5000, 0.01)
+        found = error(estimate(name, pair, seed).T_a_b, pair.T_a_b)
+        assert found[0] < SUCCESS_M
+        assert found[1] < SUCCESS_RAD
+
+
+@pytest.mark.parametrize("name", ["clique", "ransac_mahalanobis"])
+def test_drift_does_not_lead_astray(name):
+    for seed in range(20):
+        pair = with_noise_in_both(seed, 500, 0.1, drift_m=0.1)
+        assert error(estimate(name, pair, seed).T_a_b, pair.T_a_b)[0] < SUCCESS_M
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_heights_count_unless_planar(name):
+    p = np.random.default_rng(6).uniform(0, 10, (20, 3))
+    lifted = p + np.array([0, 0, 5.0])
+    pairs = Correspondences(np.arange(20), np.arange(20), np.zeros(20))
+    rng = np.random.default_rng(0)
+    found = make_aligner(name).align(landmarks(p), landmarks(lifted), pairs, rng)
+    assert found.status is Status.DEGENERATE
+    assert "height" in found.reason
+    flat = [landmarks(x, planar=True) for x in (p, lifted)]
+    assert make_aligner(name).align(*flat, pairs, rng).ok
+
+
+def test_clique_is_the_largest_set_that_agrees():
+    """Of 14 pairs, the best of all subsets tried one by one agrees with the answer."""
+    aligner = Clique(drift_sigma_m=0.0)
+    bound = chi2.ppf(aligner.agreement_probability, 1)
+    for seed in range(5):
+        pair = with_noise_in_both(seed, 14, 6 / 14)
+        a, b = pair.map_a.position_m[:, :2], pair.map_b.position_m[:, :2]
+        difference = np.abs(
+            np.linalg.norm(a[:, None] - a, axis=2) - np.linalg.norm(b[:, None] - b, axis=2)
+        )
+        agree = difference**2 <= bound * 2 * 0.05**2
+        sets = (s for size in range(14, 1, -1) for s in combinations(range(14), size))
+        largest = np.array(next(s for s in sets if agree[np.ix_(s, s)].all()))
+        planar = in_plan(gather(pair.map_a, pair.map_b, pair.correspondences))
+        T, inside = np.array(fit_rigid(a, b, largest)), np.empty(14, dtype=bool)
+        settle(T, planar, 1e-12, aligner.bound, inside)
+        found = estimate(aligner, pair)
+        np.testing.assert_array_equal(found.inlier, inside)
+        assert error(found.T_a_b, T) == pytest.approx((0, 0), abs=1e-6)
+
+
+def slow_search(pairs, variance, bound, agreement, max_draws, seed):
+    """The search as its docstring has it, with the twins of what it is made of."""
+    n, state, draws, needed = len(pairs), seed, 0, max_draws
+    agree, planar = slow_consistency(in_plan(pairs), variance, agreement), in_plan(pairs)
+    best_T, best_score, best_raw = None, 0.0, 0.0
+    while draws < needed:
+        draws += 1
+        state = draw(state)
+        i = ((state >> 32) * n) >> 32
+        state = draw(state)
+        j = ((state >> 32) * (n - 1)) >> 32
+        j += j >= i
+        lengths = [np.linalg.norm(p[i, :2] - p[j, :2]) for p in (pairs.p_a, pairs.p_b)]
+        if not agree[i, j] or min(lengths) < 1.0:
+            continue
+        T = np.array(fit_rigid(pairs.p_a, pairs.p_b, np.array([i, j])))
+        raw = scores(T, pairs, variance, bound)
+        if np.sum(raw > 0) < 2 or np.sum(raw) <= best_raw:
+            continue
+        best_raw = np.sum(raw)
+        settle(T, planar, variance, bound, np.empty(n, dtype=bool))
+        score = scores(T, pairs, variance, bound)
+        if np.sum(score > 0) >= 2 and np.sum(score) > best_score:
+            best_T, best_score, count = T, np.sum(score), np.sum(score > 0)
+            needed = min(needed, LOG_MISS / math.log1p(-count * (count - 1) / (n * (n - 1))))
+    return draws, best_T
+
+
+def scores(T_a_b, pairs, variance, bound):
+    return np.maximum(bound - slow_squares(T_a_b, pairs, variance)[2], 0)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_search_equals_its_twin(seed):
+    maps, pair = blurred(np.random.default_rng(seed), 50, 0.2)
+    pairs = gather(*maps, pair.correspondences)
+    bound, agreement = float(chi2.ppf(0.99, 2)), float(chi2.ppf(0.99, 1))
+    draws, T = search(
+        in_plan(pairs), 0.0025, bound, agreement, 1.0, LOG_MISS, 3000, np.uint64(seed + 1)
+    )
+    slow_draws, slow_T = slow_search(pairs, 0.0025, bound, agreement, 3000, seed + 1)
+    assert draws == slow_draws
+    np.testing.assert_allclose(T, slow_T, atol=1e-9)
+
+
+def test_a_sharp_landmark_is_held_to_more_than_a_blurred_one():
+    """Half a metre off is support where the landmark is known to a metre along that way only."""
+    rng = np.random.default_rng(3)
+    p = rng.uniform(0, 20, (40, 3)) * [1, 1, 0]
+    off = p.copy()
+    off[:3, 0] += 0.5
+    map_a = landmarks(p, 0.02, planar=True)
+    covariance = map_a.covariance_m2.copy()
+    covariance[0, 0, 0] = 1.0  # along the way it is off
+    covariance[1, 1, 1] = 1.0  # across
+    map_a = replace(map_a, covariance_m2=covariance)
+    map_b = landmarks(off, 0.02, planar=True)
+    pairs = Correspondences(np.arange(40), np.arange(40), np.zeros(40))
+    for name in NAMES:
+        found = make_aligner(name, drift_sigma_m=0.05).align(map_a, map_b, pairs, rng)
+        assert found.inlier[0]
+        assert not found.inlier[1:3].any()
+        assert found.inlier[3:].all()
+
+
+@pytest.mark.parametrize(
+    ("aligner", "name", "value"),
+    [
+        (Gnc, "drift_sigma_m", -0.1),
+        (Gnc, "probability", 1.0),
+        (Clique, "agreement_probability", 0.0),
+        (Clique, "max_nodes", 0),
+        (Clique, "probability", float("nan")),
+        (RansacMahalanobis, "min_baseline_m", 0.0),
+        (RansacMahalanobis, "confidence", 1.0),
+        (RansacMahalanobis, "max_draws", 0),
+        (RansacMahalanobis, "drift_sigma_m", float("nan")),
+    ],
+)
+def test_wrong_parameters_are_named(aligner, name, value):
+    with pytest.raises(ValueError, match=name):
+        aligner(**{name: value})

@@ -1,0 +1,87 @@
+import numpy as np
+import pytest
+from map_pairs import given_pairs, motion, moved, stretched
+from scipy.spatial.distance import cdist
+from scipy.stats import chi2
+
+from mapfusion.align.consistency import consistency
+from mapfusion.align.pairs import gather
+from mapfusion.align.support import in_plan
+
+BOUND = float(chi2.ppf(0.999, 1))
+
+
+def blurred(rng, n, true_share=0.3, sigma_m=0.05):
+    """Planar pairs with noise in both maps, stretched at random, and the covariances to match."""
+    pair = given_pairs(rng, n, true_share, planar=True)
+    maps = []
+    for landmarks in (pair.map_a, pair.map_b):
+        covariance = landmarks.covariance_m2.copy()
+        covariance[:, :2, :2] = np.eye(2) * sigma_m**2
+        known = stretched(rng, type(landmarks)(**{**vars(landmarks), "covariance_m2": covariance}))
+        root = np.linalg.cholesky(known.covariance_m2[:, :2, :2])
+        position = known.position_m.copy()
+        position[:, :2] += (root @ rng.standard_normal((n, 2, 1)))[:, :, 0]
+        maps.append(type(landmarks)(**{**vars(known), "position_m": position}))
+    return maps, pair
+
+
+def unpacked(graphs, n):
+    bits = np.unpackbits(graphs.view(np.uint8), axis=2, bitorder="little")
+    assert not bits[:, :, n:].any()
+    return bits[:, :, :n].astype(bool)
+
+
+def slow_consistency(pairs, variance, bound=BOUND):
+    """Distances and the variances along their lines, with whole matrices."""
+    total = 2 * variance
+    for p, S in ((pairs.p_a, pairs.S_a), (pairs.p_b, pairs.S_b)):
+        line = p[None] - p[:, None]
+        length = np.linalg.norm(line, axis=2)
+        unit = line / np.where(length > 0, length, 1)[:, :, None]
+        total = total + np.einsum("ijk,ijkl,ijl->ij", unit, S[:, None] + S[None], unit)
+    difference = cdist(pairs.p_a, pairs.p_a) - cdist(pairs.p_b, pairs.p_b)
+    return (difference**2 <= bound * total) & ~np.eye(len(pairs.p_a), dtype=bool)
+
+
+@pytest.mark.parametrize("n", [2, 8, 63, 64, 65, 200])
+def test_kernel_equals_its_twin(n):
+    (map_a, map_b), pair = blurred(np.random.default_rng(n), n)
+    pairs = in_plan(gather(map_a, map_b, pair.correspondences))
+    variances = np.array([1e-12, 0.0025, 0.01])
+    found = unpacked(consistency(pairs, variances, BOUND), n)
+    for graph, variance in zip(found, variances, strict=True):
+        np.testing.assert_array_equal(graph, slow_consistency(pairs, variance))
+        np.testing.assert_array_equal(graph, graph.T)
+
+
+@pytest.mark.parametrize("drift_m", [0.0, 0.1])
+def test_true_pairs_agree_with_the_probability_stated(drift_m):
+    n = 400
+    rng = np.random.default_rng(0)
+    (map_a, map_b), pair = blurred(rng, n, true_share=1.0)
+    map_b.position_m[:, :2] += rng.normal(0, drift_m, (n, 2))
+    pairs = in_plan(gather(map_a, map_b, pair.correspondences))
+    graph = unpacked(consistency(pairs, np.array([max(drift_m**2, 1e-12)]), BOUND), n)[0]
+    disagreeing = 1 - np.sum(graph) / (n * (n - 1))
+    # each landmark is in 399 comparisons, so the share scatters more than that of 80 000 draws
+    assert disagreeing == pytest.approx(0.001, abs=0.0005)
+
+
+def test_does_not_depend_on_the_frames():
+    rng = np.random.default_rng(1)
+    (map_a, map_b), pair = blurred(rng, 150)
+    graphs = [
+        consistency(in_plan(gather(a, b, pair.correspondences)), np.array([0.01]), BOUND)
+        for a, b in ((map_a, map_b), (moved(map_a, motion(rng)), moved(map_b, motion(rng))))
+    ]
+    np.testing.assert_array_equal(*graphs)
+
+
+def test_exact_maps_without_covariance_agree():
+    """Nothing but rounding keeps these distances apart, a kilometre from the origin."""
+    rng = np.random.default_rng(2)
+    pair = given_pairs(rng, 100, planar=True, T_a_b=np.array([1000.0, -700.0, 2.0]))
+    pairs = in_plan(gather(pair.map_a, pair.map_b, pair.correspondences))
+    graph = unpacked(consistency(pairs, np.array([1e-12]), BOUND), 100)[0]
+    assert np.sum(graph) == 100 * 99

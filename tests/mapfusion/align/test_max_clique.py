@@ -1,0 +1,112 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mapfusion.align.max_clique import degeneracy_order, greedy_clique, larger_clique
+
+UNLIMITED = 1_000_000
+
+
+def on_bits(adjacent):
+    n = len(adjacent)
+    padded = np.zeros((n, -(-n // 64) * 64), np.uint8)
+    padded[:, :n] = adjacent
+    return np.packbits(padded, axis=1, bitorder="little").view(np.uint64)
+
+
+def random_graph(seed, n, density, planted=0):
+    rng = np.random.default_rng(seed)
+    upper = np.triu(rng.random((n, n)) < density, 1)
+    members = rng.choice(n, planted, replace=False)
+    upper[np.ix_(members, members)] = True
+    adjacent = np.triu(upper | upper.T, 1)
+    return adjacent | adjacent.T
+
+
+def bron_kerbosch(adjacent):
+    """Size of the largest clique (Bron and Kerbosch 1973, with a pivot)."""
+    neighbours = [set(np.flatnonzero(row)) for row in adjacent]
+    largest = 0
+
+    def extend(size, candidates, excluded):
+        nonlocal largest
+        if not candidates and not excluded:
+            largest = max(largest, size)
+            return
+        pivot = max(candidates | excluded, key=lambda u: len(neighbours[u] & candidates))
+        for v in list(candidates - neighbours[pivot]):
+            extend(size + 1, candidates & neighbours[v], excluded & neighbours[v])
+            candidates.remove(v)
+            excluded.add(v)
+
+    extend(0, set(range(len(adjacent))), set())
+    return largest
+
+
+def is_clique(adjacent, vertices):
+    joined = adjacent[np.ix_(vertices, vertices)]
+    return len(set(vertices)) == len(vertices) and np.all(
+        joined | np.eye(len(vertices), dtype=bool)
+    )
+
+
+graphs = st.builds(
+    random_graph,
+    st.integers(0, 10**6),
+    st.sampled_from([1, 2, 5, 12, 25, 63, 64, 65, 130]),
+    st.floats(0, 0.35),
+)
+dense_graphs = st.builds(
+    random_graph, st.integers(0, 10**6), st.integers(1, 22), st.floats(0.3, 1.0)
+)
+
+
+@settings(max_examples=80, deadline=None)
+@given(st.one_of(graphs, dense_graphs), st.integers(0, 4))
+def test_as_large_as_the_slow_way_finds(adjacent, short_of):
+    size = bron_kerbosch(adjacent)
+    at_least = max(size - short_of, 1)
+    clique, finished = larger_clique(on_bits(adjacent), at_least, UNLIMITED)
+    assert finished
+    assert len(clique) == (size if size > at_least else 0)
+    assert is_clique(adjacent, clique)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.one_of(graphs, dense_graphs))
+def test_greedy_gives_a_clique_that_nothing_can_join(adjacent):
+    clique = greedy_clique(on_bits(adjacent), 10)
+    assert is_clique(adjacent, clique)
+    joined_to_all = adjacent[clique].all(axis=0)
+    assert len(clique) >= 1
+    assert not joined_to_all.any()
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.one_of(graphs, dense_graphs))
+def test_core_numbers_are_what_taking_away_leaves(adjacent):
+    order, core = degeneracy_order(on_bits(adjacent))
+    np.testing.assert_array_equal(np.sort(order), np.arange(len(adjacent)))
+    assert np.all(np.diff(core[order]) >= 0)
+    for k in range(core.max() + 2):
+        left = np.ones(len(adjacent), dtype=bool)
+        while np.any(poor := left & (adjacent[:, left].sum(axis=1) < k)):
+            left &= ~poor
+        np.testing.assert_array_equal(core >= k, left)
+
+
+def test_planted_clique_is_found_among_thousands():
+    adjacent = random_graph(1, 2000, 0.03, planted=15)
+    clique, finished = larger_clique(on_bits(adjacent), 5, UNLIMITED)
+    assert finished
+    assert len(clique) == 15
+    assert is_clique(adjacent, clique)
+
+
+@pytest.mark.parametrize("budget", [1, 3, 20])
+def test_a_spent_budget_is_told_and_what_was_found_is_a_clique(budget):
+    adjacent = random_graph(2, 200, 0.7)
+    clique, finished = larger_clique(on_bits(adjacent), 2, budget)
+    assert not finished
+    assert is_clique(adjacent, clique)
