@@ -1,7 +1,6 @@
 """How the harness calls an aligner: our own in place, others' in a process of their own."""
 
 import functools
-import warnings
 from typing import Any, ClassVar
 
 import numpy as np
@@ -10,9 +9,8 @@ from experiments.isolation import ChildFailedError, IsolatedAligner, Spec, child
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.plugins import Kind
 from mapfusion.align.refine import Refinement
-from mapfusion.align.registry import Aligner, find_method, make_aligner, name_clashes
+from mapfusion.align.registry import Aligner, find_method, make_aligner
 from mapfusion.align.result import NOT_RUN, Alignment, Status, without_answer
-from mapfusion.errors import NameClashWarning
 from mapfusion.landmark_map import LandmarkMap
 
 
@@ -70,10 +68,7 @@ def require_usable(method: str, parameters: dict[str, Any]) -> None:
     Raises:
         ValueError: the name or a parameter is unknown, or a parameter is out of range.
     """
-    found = find_method(method)
-    if method in name_clashes():
-        warnings.warn(name_clashes()[method], NameClashWarning, stacklevel=2)
-    if found.kind is Kind.PLUG_IN:
+    if find_method(method).kind is Kind.PLUG_IN:
         _require_made(spec_of(method, parameters))
     else:
         make_aligner(method, **parameters)

@@ -110,6 +110,7 @@ def cell_text(cell: pd.Series) -> str:
         ratios = (cell["ratio_m"], cell["refined_ratio_m"])
         parts.append(" / ".join("-" if math.isnan(r) else f"{r:.2f}" for r in ratios))
     if not math.isnan(cell["elapsed_s"]):
-        parts.append(f"{1e3 * cell['elapsed_s']:.3g} ms")
+        elapsed_ms = 1e3 * cell["elapsed_s"]
+        parts.append(f"{elapsed_ms:.0f} ms" if elapsed_ms >= 100 else f"{elapsed_ms:.3g} ms")
     parts += [f"{cell[f'n_{what}']} {what}" for what in ("wrong", "failed") if cell[f"n_{what}"]]
     return ", ".join(parts)

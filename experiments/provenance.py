@@ -6,6 +6,7 @@ from typing import Any
 
 from experiments.pipeline import Plan
 from experiments.store import library_versions
+from mapfusion.align.registry import find_method
 
 RESULT_SCHEMA_VERSION = 1
 
@@ -21,5 +22,10 @@ def provenance(plan: Plan) -> dict[str, Any]:
         "machine": platform.machine(),
         "libraries": library_versions(),
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
+        "others_aligners": {
+            entry.name: origin
+            for entry in plan.scenario.align.aligners
+            if (origin := find_method(entry.method).origin())
+        },
         "stages": {f"{folder.stage}/{folder.key}": folder.finished for folder in plan.folders()},
     }

@@ -5,6 +5,7 @@ are: pydantic validates them in place, so a parameter is named and explained onc
 """
 
 import json
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
@@ -23,8 +24,9 @@ from experiments.metrics import known_metrics
 from experiments.yaml_input import apply_overrides, read_mapping
 from mapfusion.align.correspondences import MatchParameters
 from mapfusion.align.refine import Refinement
+from mapfusion.align.registry import name_clashes
 from mapfusion.camera import StereoCamera
-from mapfusion.errors import InputError
+from mapfusion.errors import InputError, NameClashWarning
 from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.merge import MergeParameters
 from mapfusion.vision.frontend import FrontEndParameters
@@ -253,6 +255,7 @@ def load_scenario(path: Path, overrides: Sequence[str] = (), seed: int | None = 
     if seed is not None:
         data["seed"] = seed
     scenario = _validated(str(path), Scenario, data)
+    _warn_of_name_clashes(scenario.align)
     logs = [str((path.parent / log).resolve()) for log in scenario.logs]
     return scenario.model_copy(update={"logs": logs})
 
@@ -264,10 +267,19 @@ def load_section(path: Path | None, name: str, kind: type[S], overrides: Sequenc
         InputError: as `load_scenario`.
     """
     if path is None:
-        return _validated(name, kind, apply_overrides({}, overrides))
+        section = _validated(name, kind, apply_overrides({}, overrides))
+        if isinstance(section, Align):
+            _warn_of_name_clashes(section)
+        return section
     load_scenario(path)
     data = read_mapping(path).get(name) or {}
     return _validated(f"{path}: {name}", kind, apply_overrides(data, overrides))
+
+
+def _warn_of_name_clashes(align: Align) -> None:
+    for method in dict.fromkeys(entry.method for entry in align.aligners):
+        if method in name_clashes():
+            warnings.warn(name_clashes()[method], NameClashWarning, stacklevel=3)
 
 
 def _validated(where: str, kind: type[S], data: dict[str, Any]) -> S:

@@ -269,7 +269,7 @@ def print_benchmark(folder: Path, summary: pd.DataFrame) -> None:
             cells = [
                 "absent"
                 if row["status"] == Status.ABSENT
-                else f"{100 * row['success']:.0f}, {_number(1e3 * row['elapsed_s'], '.3g')}"
+                else f"{100 * row['success']:.0f}, {_milliseconds(row['elapsed_s'])}"
                 for row in own.to_dict("records")
             ]
             table.add_row(escape(str(method)), *cells)
@@ -279,6 +279,12 @@ def print_benchmark(folder: Path, summary: pd.DataFrame) -> None:
         text = f"  {method}: failed in {rows['n_failed'].sum()} trials, see trials.parquet"
         console.print(text, soft_wrap=True, markup=False)
     console.print(f"Table and figure: {folder}", soft_wrap=True)
+
+
+def _milliseconds(elapsed_s: float) -> str:
+    """Two digits or all before the point: 0.23, 4.6, 31, 1710."""
+    elapsed_ms = 1e3 * elapsed_s
+    return _number(elapsed_ms, ".0f" if elapsed_ms >= 10 else ".2g")
 
 
 def print_methods() -> None:

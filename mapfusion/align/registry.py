@@ -68,22 +68,27 @@ _PEERS = (
 )
 
 
-@functools.cache
-def known_methods() -> dict[str, Method]:
-    """Every method that can be named, built-in ones first; installed packages are read once."""
-    own = [
+def _own_methods() -> dict[str, Method]:
+    """Built-in ones and peers."""
+    built_in = [
         Method(name, Kind.BUILT_IN, f"{aligner.__module__}:{aligner.__name__}")
         for name, aligner in ALIGNERS.items()
     ]
-    found = {method.name: method for method in (*own, *_PEERS)}
+    return {method.name: method for method in (*built_in, *_PEERS)}
+
+
+@functools.cache
+def known_methods() -> dict[str, Method]:
+    """Every method that can be named, built-in ones first; installed packages are read once."""
     refused = name_clashes()
-    return found | {method.name: method for method in declared() if method.name not in refused}
+    plug_ins = {method.name: method for method in declared() if method.name not in refused}
+    return _own_methods() | plug_ins
 
 
 @functools.cache
 def name_clashes() -> dict[str, str]:
     """One line for each name that several methods claim."""
-    return clashes([*ALIGNERS, *(peer.name for peer in _PEERS)], declared())
+    return clashes(_own_methods(), declared())
 
 
 def find_method(name: str) -> Method:
@@ -92,6 +97,9 @@ def find_method(name: str) -> Method:
     Raises:
         ValueError: nobody's name, or that of several plug-ins.
     """
+    own = _own_methods()
+    if name in own:  # installed packages need not be read
+        return own[name]
     known = known_methods()
     if name in known:
         return known[name]

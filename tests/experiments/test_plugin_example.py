@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from made_up_maps import landmark_map
+from made_up_plugin import install
 from tiny_scenario import TINY
 
 from experiments import tables
@@ -173,3 +174,14 @@ class Hide:
 
 sys.meta_path.insert(0, Hide())
 """
+
+
+def test_a_clash_of_names_is_one_line(tmp_path: Path, maps: tuple[Path, Path]) -> None:
+    install(tmp_path / "site", name="ransac", package="clasher")
+    line = (
+        "aligner ransac: mapfusion's own is used, the one that clasher declares under the same "
+        "name is not"
+    )
+    ended = command(tmp_path / "site", "align", *maps, "--set", entry("ransac"))
+    assert (ended.code, ended.err) == (0, f"mapfusion: warning: {line}\n")
+    assert line in command(tmp_path / "site", "aligners").out

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapfusion.align.pairs import finish, gather, undetermined, why_too_few
+from mapfusion.align.pairs import gather, undetermined, why_too_few
 from mapfusion.align.rigid import fit_rigid
+from mapfusion.align.supported import supported_by
 
 
 @dataclass(frozen=True)
@@ -32,4 +33,4 @@ class BestShare:
         inlier = np.zeros(len(pairs), dtype=bool)
         inlier[rows] = True
         T_a_b = np.array(fit_rigid(pairs.p_a, pairs.p_b, rows))
-        return finish(pairs, T_a_b, inlier, started_s)
+        return supported_by(pairs, inlier, T_a_b, started_s)

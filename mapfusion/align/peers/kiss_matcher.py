@@ -10,8 +10,8 @@ import numpy as np
 
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.pairs import gather, undetermined, why_too_few
-from mapfusion.align.peers.answer import answer
 from mapfusion.align.result import Alignment
+from mapfusion.align.supported import supported_by
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.se2 import transform_points
 
@@ -86,4 +86,4 @@ class KissMatcher:
         dimensions = 2 if pairs.planar else 3
         residual = (pairs.p_a - transform_points(T_a_b, pairs.p_b))[:, :dimensions]
         inlier = np.linalg.norm(residual, axis=1) <= self.noise_bound_m
-        return answer(pairs, T_a_b, inlier, started_s)
+        return supported_by(pairs, inlier, T_a_b, started_s)

@@ -9,8 +9,8 @@ import numpy as np
 
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.pairs import gather, undetermined, why_too_few
-from mapfusion.align.peers.answer import answer
 from mapfusion.align.result import Alignment
+from mapfusion.align.supported import supported_by
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.se2 import rotation, transform_points
 
@@ -90,4 +90,4 @@ class OpenCv:
         within = np.linalg.norm(p_a - transform_points(T_a_b, p_b), axis=1) <= self.gate_m
         inlier = np.zeros(len(pairs), dtype=bool)
         inlier[order] = supporter & within
-        return answer(pairs, T_a_b, inlier, started_s)
+        return supported_by(pairs, inlier, T_a_b, started_s)

@@ -1,4 +1,4 @@
-"""Methods whose package is not installed are shown as absent; many methods stay tellable."""
+"""Methods whose package is not installed are shown as absent."""
 
 import shutil
 from pathlib import Path
@@ -9,7 +9,6 @@ import pytest
 from experiments import tables
 from experiments.figures import fig04_translation_error, fig05_rotation_error, fig06_aligner_time
 from experiments.figures.result_tables import ResultTables
-from experiments.figures.style import aligner_styles
 
 MEASURED = {
     "errors": [
@@ -48,14 +47,3 @@ def test_legends_say_absent(module, made_up_result: Path, without_svd: ResultTab
     before, after = labels(ResultTables(made_up_result)), labels(without_svd)
     assert "svd" in before
     assert after == ["svd (absent)" if label == "svd" else label for label in before]
-
-
-def test_twelve_methods_have_twelve_looks() -> None:
-    names = [f"m{k}" for k in range(12)]
-    styles = aligner_styles([*names, "oracle"])
-    looks = {tuple(sorted((key, str(value)) for key, value in styles[n].items())) for n in names}
-    assert len(looks) == 12
-    dashes = {
-        (style["color"], str(style["linestyle"])) for n, style in styles.items() if n in names
-    }
-    assert len(dashes) == 12
