@@ -101,7 +101,7 @@ def aligner_summary(errors: pd.DataFrame, timings: pd.DataFrame, order: list[str
                 "spread_m": (spread.quantile(0.9) - spread.quantile(0.1)).median(),
                 "refined_m": own["refined_translation_error_m"].median(),
                 "refined_rad": own["refined_rotation_error_rad"].abs().median(),
-                "accepted": (own["refined_status"] == "accepted").mean(),
+                "accepted": own["accepted"].mean(),
                 "pairs": own["n_correspondences"].median(),
                 "true_share": (own["n_true"] / own["n_correspondences"]).median(),
                 "time_ms": 1e3 * time_s.median() if len(time_s) else math.nan,
@@ -124,7 +124,7 @@ def _aligner_table(errors: pd.DataFrame, timings: pd.DataFrame, order: list[str]
     }
     table = Table(
         title=f"Alignment errors: medians over iterations with {MIN_TRUE_PAIRS_SHOWN}+ true pairs",
-        caption="spread: 10-90 % of the repetitions on the same maps; ok: accepted once refined;\n"
+        caption="spread: 10-90 % of the repetitions on the same maps; ok: refined, not chance;\n"
         "pairs: offered, and the share of true ones among them",
         **_LAYOUT,
     )
@@ -213,27 +213,31 @@ def print_map(path: Path, landmarks: "LandmarkMap") -> None:
 
 def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
     """Estimates of all aligners on two maps, and why those were not accepted that were not."""
-    table = Table(title="T_a_b, as estimated and refined", **_LAYOUT)
+    table = Table(
+        title="T_a_b, as estimated and refined",
+        caption="NFA: expected number of alignments that chance alone supports as well",
+        **_LAYOUT,
+    )
     headings = ["\naligner", "tx\nm", "ty\nm", "theta\nrad"]
-    headings += ["refined\nm", "ty\nm", "theta\nrad", "\ninliers", "time\nms"]
+    headings += ["refined\nm", "ty\nm", "theta\nrad", "\ninliers", "NFA\nlog10", "time\nms"]
     for heading in headings:
         table.add_column(heading, justify="left" if "aligner" in heading else "right", no_wrap=True)
     for row in rows:
         table.add_row(
             row["aligner"],
-            *(_number(row[name], ".3f") for name in ("tx_m", "ty_m")),
-            _number(row["theta_rad"], ".3f"),
+            *(_number(row[name], ".2f") for name in ("tx_m", "ty_m", "theta_rad")),
             *(_number(row[f"refined_{name}"], ".3f") for name in ("tx_m", "ty_m")),
             _number(row["refined_theta_rad"], ".3f"),
             f"{row['n_inliers']}/{row['n_correspondences']}",
+            _number(row["log10_false_alarms"], ".0f"),
             f"{1e3 * row['elapsed_s']:.1f}",
         )
     console = Console()
     console.print(table)
     for row in rows:
-        reason = row["reason"] or row["refined_reason"]
+        reason = row["reason"] or row["acceptance_reason"]
         if reason:
-            status = row["refined_status"]
+            status = "accepted" if row["accepted"] else "refused"
             console.print(f"  {row['aligner']}: {status}: {reason}", soft_wrap=True, markup=False)
 
 

@@ -23,7 +23,7 @@ def _fields(**types: pa.DataType) -> list[pa.Field]:
 # What the aligners said, without any truth: the align stage writes it.
 ESTIMATES = schema(
     "result.estimates",
-    1,
+    2,
     _fields(
         robot_a=_TEXT,
         robot_b=_TEXT,
@@ -41,6 +41,10 @@ ESTIMATES = schema(
         refined_tx_m=_FLOAT,
         refined_ty_m=_FLOAT,
         refined_theta_rad=_FLOAT,
+        # of the refined alignment, against chance; NaN where there was none to judge
+        accepted=_BOOL,
+        log10_false_alarms=_FLOAT,
+        acceptance_reason=_TEXT,
         drift_sigma_m=_FLOAT,
         # upper triangle of the refined alignment's covariance (m2, m rad, rad2)
         cov_xx=_FLOAT,
@@ -73,7 +77,7 @@ CORRESPONDENCES = schema(
 # The aligner named "oracle" was given the true pairs; it has one repetition.
 ERRORS = schema(
     "result.errors",
-    1,
+    2,
     _fields(
         robot_a=_TEXT,
         robot_b=_TEXT,
@@ -87,6 +91,8 @@ ERRORS = schema(
         refined_status=_TEXT,
         refined_translation_error_m=_FLOAT,
         refined_rotation_error_rad=_FLOAT,
+        accepted=_BOOL,  # the refined alignment, by the test against chance
+        log10_false_alarms=_FLOAT,
         oracle_distance_m=_FLOAT,  # refined translation against the oracle's
         oracle_distance_rad=_FLOAT,
         n_correspondences=_INT,
