@@ -226,7 +226,7 @@ def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
         table.add_row(
             row["aligner"],
             *(_number(row[name], ".2f") for name in ("tx_m", "ty_m", "theta_rad")),
-            *(_number(row[f"refined_{name}"], ".3f") for name in ("tx_m", "ty_m")),
+            *(_number(row[f"refined_{name}"], ".2f") for name in ("tx_m", "ty_m")),
             _number(row["refined_theta_rad"], ".3f"),
             f"{row['n_inliers']}/{row['n_correspondences']}",
             _number(row["log10_false_alarms"], ".0f"),

@@ -238,6 +238,42 @@ ALIGNER_TIMINGS = schema(
     ),
 )
 
+# One row per (pair of maps, aligner) of the experiment `refusal`; errors are NaN for maps of two
+# worlds. Ground is apart, common, few or repeated (see experiments/refusal/cases.py).
+REFUSALS = schema(
+    "refusal.refusals",
+    1,
+    _fields(
+        ground=_TEXT,
+        world_a=_TEXT,
+        robot_a=_TEXT,
+        world_b=_TEXT,
+        robot_b=_TEXT,
+        iteration=_INT,
+        aligner=_TEXT,
+        n_correspondences=_INT,
+        n_true=_INT,
+        n_common=_INT,
+        n_inliers=_INT,  # of the refined alignment: what a threshold on support would go by
+        accepted=_BOOL,
+        log10_false_alarms=_FLOAT,
+        refined_translation_error_m=_FLOAT,
+        refined_rotation_error_rad=_FLOAT,
+    ),
+)
+
+# The test itself on made-up maps of walls with random pairs, over every motion of two pairs.
+CALIBRATION = schema(
+    "refusal.calibration",
+    1,
+    _fields(
+        stated=_FLOAT,  # expected number of false alarms accepted
+        motions_a_pair=_FLOAT,  # mean number of motions accepted on a pair of maps
+        n_accepted=_INT,  # pairs of maps with at least one
+        n_pairs=_INT,
+    ),
+)
+
 ALL = {
     "estimates": ESTIMATES,
     "correspondences": CORRESPONDENCES,
@@ -252,6 +288,8 @@ ALL = {
     "tracks": TRACKS,
     "timings": TIMINGS,
     "aligner_timings": ALIGNER_TIMINGS,
+    "refusals": REFUSALS,
+    "calibration": CALIBRATION,
 }
 
 
