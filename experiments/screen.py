@@ -41,6 +41,7 @@ _STAGE_TEXT = {
     "judge": "compare with the truth",
     "tables": "write the tables",
     "figures": "draw the figures",
+    "refusal": "cross the worlds",
 }
 
 
@@ -192,6 +193,32 @@ def print_outcomes(outcomes: Sequence["Outcome"]) -> None:
     console.print(table)
     failed = sum(not outcome.passed for outcome in outcomes)
     console.print(f"{len(outcomes) - failed} passed, {failed} failed")
+
+
+def print_refusals(rows: Sequence[dict[str, Any]], false_alarms: float) -> None:
+    """False and missed merges of each aligner (rows of `experiments.refusal.summary`)."""
+    columns = {
+        "false": "false\nmerges",
+        "wrong": "wrong\nmerges",
+        "missed": "missed\nall",
+        "missed_though_right": "\nright",
+        "few_missed_though_right": "\n20 true",
+        "repeated": "poster\naccepted",
+    }
+    table = Table(
+        title=f"Accepted where chance gives at most {false_alarms:g} a pair of maps",
+        caption="false: accepted without common ground; wrong: with some, 0.5 m or 0.1 rad off;\n"
+        "missed: refused with 20 or more true pairs: of all, of those that were right, and of\n"
+        "right ones with just 20 in one corner; poster: one picture hangs in both worlds",
+        **_LAYOUT,
+    )
+    table.add_column("\naligner", no_wrap=True)
+    for heading in columns.values():
+        table.add_column(heading, justify="right", no_wrap=True)
+    for row in rows:
+        cells = [f"{row[name].hits}/{row[name].n}" for name in columns]
+        table.add_row(row["aligner"], *cells)
+    Console().print(table)
 
 
 def print_paths(folder: Path, paths: Sequence[Path], skipped: Sequence[str] = ()) -> None:

@@ -21,6 +21,7 @@ from experiments.stages.judge import load_robot
 from experiments.stages.slam import evaluated_iterations
 from experiments.workers import workers
 from mapfusion import se2
+from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.registry import make_aligner
 
 REPEATED_PER_WORLDS = 8  # posters hung in each pair of worlds
@@ -40,8 +41,8 @@ def run(
     n_apart: int,
     jobs: int,
     on_progress: Callable[[str, int, int], None],
-) -> Path:
-    """Write the tables `refusals` and `calibration` into a folder; returns the folder.
+) -> Acceptance:
+    """Write the tables `refusals` and `calibration` into a folder; returns the test they used.
 
     Args:
         results: result folders of different worlds; the first one's scenario gives the methods.
@@ -68,7 +69,7 @@ def run(
     rng = generator(scenario.seed, "calibration")
     calibrated = calibrate(scenario.align.acceptance, rng)
     tables.write(tables.table_path(output, "calibration"), "calibration", calibrated)
-    return output
+    return scenario.align.acceptance
 
 
 def _iterations(scenario: Scenario) -> list[int]:
@@ -188,6 +189,9 @@ def _answers(
     return rows
 
 
-def read_refusals(folder: Path) -> pd.DataFrame:
-    """The table that `run` wrote."""
-    return tables.read(tables.table_path(folder, "refusals"), "refusals")
+def read_tables(folder: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """The tables `refusals` and `calibration` that `run` wrote."""
+    refusals, calibration = (
+        tables.read(tables.table_path(folder, name), name) for name in ("refusals", "calibration")
+    )
+    return refusals, calibration
