@@ -132,11 +132,12 @@ def refusal(
     from experiments import screen
     from experiments.figures.refusal import write
     from experiments.refusal.summary import summary
-    from experiments.refusal.trial import read_tables, run
+    from experiments.refusal.results import read
+    from experiments.refusal.trial import run
 
     with screen.progress() as show:
         acceptance = run(results, output, pairs, jobs or available_cores(), show)
-    refusals, calibration = read_tables(output)
+    refusals, calibration = read(output, "refusals"), read(output, "calibration")
     pictures = write(output, refusals, calibration, acceptance.false_alarms)
     screen.print_refusals(summary(refusals), acceptance.false_alarms)
     screen.print_paths(output, pictures)

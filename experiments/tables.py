@@ -238,42 +238,6 @@ ALIGNER_TIMINGS = schema(
     ),
 )
 
-# One row per (pair of maps, aligner) of the experiment `refusal`; errors are NaN for maps of two
-# worlds. Ground is apart, common, few or repeated (see experiments/refusal/cases.py).
-REFUSALS = schema(
-    "refusal.refusals",
-    1,
-    _fields(
-        ground=_TEXT,
-        world_a=_TEXT,
-        robot_a=_TEXT,
-        world_b=_TEXT,
-        robot_b=_TEXT,
-        iteration=_INT,
-        aligner=_TEXT,
-        n_correspondences=_INT,
-        n_true=_INT,
-        n_common=_INT,
-        n_inliers=_INT,  # of the refined alignment: what a threshold on support would go by
-        accepted=_BOOL,
-        log10_false_alarms=_FLOAT,
-        refined_translation_error_m=_FLOAT,
-        refined_rotation_error_rad=_FLOAT,
-    ),
-)
-
-# The test itself on made-up maps of walls with random pairs, over every motion of two pairs.
-CALIBRATION = schema(
-    "refusal.calibration",
-    1,
-    _fields(
-        stated=_FLOAT,  # expected number of false alarms accepted
-        motions_a_pair=_FLOAT,  # mean number of motions accepted on a pair of maps
-        n_accepted=_INT,  # pairs of maps with at least one
-        n_pairs=_INT,
-    ),
-)
-
 ALL = {
     "estimates": ESTIMATES,
     "correspondences": CORRESPONDENCES,
@@ -288,8 +252,6 @@ ALL = {
     "tracks": TRACKS,
     "timings": TIMINGS,
     "aligner_timings": ALIGNER_TIMINGS,
-    "refusals": REFUSALS,
-    "calibration": CALIBRATION,
 }
 
 
@@ -300,12 +262,23 @@ def table_path(result: Path, name: str) -> Path:
 
 def write(path: Path, name: str, rows: pd.DataFrame | list[dict[str, Any]]) -> None:
     """Write rows as the table of that name."""
-    table_schema = ALL[name]
-    frame = pd.DataFrame(rows, columns=pd.Index(table_schema.names))
-    write_table(path, {column: frame[column].to_numpy() for column in frame}, table_schema)
+    write_rows(path, ALL[name], rows)
 
 
 def read(path: Path, name: str) -> pd.DataFrame:
     """Read the table of that name; raises InputError that names the file."""
-    table, _ = read_table(path, ALL[name])
+    return read_rows(path, ALL[name])
+
+
+def write_rows(
+    path: Path, table_schema: pa.Schema, rows: pd.DataFrame | list[dict[str, Any]]
+) -> None:
+    """Write rows as a table of that schema."""
+    frame = pd.DataFrame(rows, columns=pd.Index(table_schema.names))
+    write_table(path, {column: frame[column].to_numpy() for column in frame}, table_schema)
+
+
+def read_rows(path: Path, table_schema: pa.Schema) -> pd.DataFrame:
+    """Read a table of that schema; raises InputError that names the file."""
+    table, _ = read_table(path, table_schema)
     return table.to_pandas()

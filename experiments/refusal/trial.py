@@ -6,12 +6,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import pandas as pd
 
-from experiments import tables
 from experiments.evaluate import EvaluatedRobot
 from experiments.randomness import generator
-from experiments.refusal import cases
+from experiments.refusal import cases, results
 from experiments.refusal.calibration import calibrate
 from experiments.refusal.cases import Case
 from experiments.refusal.worlds import World, load_worlds
@@ -36,7 +34,7 @@ class Meeting(NamedTuple):
 
 
 def run(
-    results: Sequence[Path],
+    folders: Sequence[Path],
     output: Path,
     n_apart: int,
     jobs: int,
@@ -45,13 +43,13 @@ def run(
     """Write the tables `refusals` and `calibration` into a folder; returns the test they used.
 
     Args:
-        results: result folders of different worlds; the first one's scenario gives the methods.
+        folders: result folders of different worlds; the first one's scenario gives the methods.
         output: folder.
         n_apart: pairs of maps without common ground, drawn from all there are.
         jobs: processes.
         on_progress: told (stage, done, total).
     """
-    scenario, worlds = load_worlds(results)
+    scenario, worlds = load_worlds(folders)
     drawn = _drawn_meetings(scenario, worlds, n_apart)
     done: dict[Any, list[dict[str, Any]]] = {}
     with workers(jobs) as pool:
@@ -65,10 +63,10 @@ def run(
             done[tag] = rows
             on_progress("refusal", len(done), total)
     ordered = [row for tag in sorted(done) for row in done[tag]]
-    tables.write(tables.table_path(output, "refusals"), "refusals", ordered)
+    results.write(output, "refusals", ordered)
     rng = generator(scenario.seed, "calibration")
     calibrated = calibrate(scenario.align.acceptance, rng)
-    tables.write(tables.table_path(output, "calibration"), "calibration", calibrated)
+    results.write(output, "calibration", calibrated)
     return scenario.align.acceptance
 
 
@@ -187,11 +185,3 @@ def _answers(
             }
         )
     return rows
-
-
-def read_tables(folder: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """The tables `refusals` and `calibration` that `run` wrote."""
-    refusals, calibration = (
-        tables.read(tables.table_path(folder, name), name) for name in ("refusals", "calibration")
-    )
-    return refusals, calibration
