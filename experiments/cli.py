@@ -131,8 +131,8 @@ def refusal(
     """
     from experiments import screen
     from experiments.figures.refusal import write
-    from experiments.refusal.summary import summary
     from experiments.refusal.results import read
+    from experiments.refusal.summary import summary
     from experiments.refusal.trial import run
 
     with screen.progress() as show:
