@@ -197,28 +197,39 @@ def print_outcomes(outcomes: Sequence["Outcome"]) -> None:
 
 def print_refusals(rows: Sequence[dict[str, Any]], false_alarms: float) -> None:
     """False and missed merges of each aligner (rows of `experiments.refusal.summary`)."""
-    columns = {
+    headings = {
         "false": "false\nmerges",
-        "wrong": "wrong\nmerges",
-        "missed": "missed\nall",
-        "missed_though_right": "\nright",
-        "few_missed_though_right": "\n20 true",
-        "repeated": "poster\naccepted",
+        "wrong": "wrong\n",
+        "missed": "missed\nof all",
+        "missed_though_right": "\nof right",
+        "few_missed_though_right": "20 true:\nmissed",
+        "few_wrong": "\nwrong",
     }
     table = Table(
         title=f"Accepted where chance gives at most {false_alarms:g} a pair of maps",
-        caption="false: accepted without common ground; wrong: with some, 0.5 m or 0.1 rad off;\n"
-        "missed: refused with 20 or more true pairs: of all, of those that were right, and of\n"
-        "right ones with just 20 in one corner; poster: one picture hangs in both worlds",
+        caption="false: accepted without common ground; wrong: accepted, 0.5 m or 0.1 rad\n"
+        "off; missed: refused with 20 or more true pairs, of all and of those right;\n"
+        "20 true: the same where just 20 in one corner are left",
         **_LAYOUT,
     )
     table.add_column("\naligner", no_wrap=True)
-    for heading in columns.values():
+    for heading in headings.values():
         table.add_column(heading, justify="right", no_wrap=True)
+    posters = Table(title="Accepted: maps of two worlds that share one picture", **_LAYOUT)
+    posters.add_column("aligner", no_wrap=True)
+    radii = [name for name in rows[0] if name.startswith("poster_")]
+    for name in radii:
+        posters.add_column(f"{2 * float(name.removeprefix('poster_')):g} m wide", justify="right")
     for row in rows:
-        cells = [f"{row[name].hits}/{row[name].n}" for name in columns]
-        table.add_row(row["aligner"], *cells)
-    Console().print(table)
+        table.add_row(row["aligner"], *(_of_all(row[name]) for name in headings))
+        posters.add_row(row["aligner"], *(_of_all(row[name]) for name in radii))
+    console = Console()
+    console.print(table)
+    console.print(posters)
+
+
+def _of_all(rate: Any) -> str:
+    return f"{rate.hits}/{rate.n}"
 
 
 def print_paths(folder: Path, paths: Sequence[Path], skipped: Sequence[str] = ()) -> None:

@@ -12,12 +12,15 @@ from experiments.figures.drawing import save_figure
 from experiments.figures.style import (
     BLACK,
     GRAY,
+    ORANGE,
     PAGE_WIDTH_IN,
+    PURPLE,
+    VERMILLION,
     aligner_styles,
     house_style,
     plain_numbers,
 )
-from experiments.refusal.cases import FEW, REPEATED
+from experiments.refusal.cases import FEW, POSTER_RADII_M
 from experiments.refusal.summary import Rate, mergeable, swept, without_common_ground
 
 _SUPPORT_OF = "ransac"  # whose plain number of inliers is swept for comparison
@@ -102,7 +105,14 @@ def _draw_rates(axes: Axes, refusals: pd.DataFrame, names: list[str], false_alar
         (without_common_ground(own), "no common ground", {"color": GRAY}),
         (mergeable(own), "20 or more true pairs", {"color": BLACK}),
         (own[own["ground"] == FEW], "20, in one corner", {"color": BLACK, "linestyle": "--"}),
-        (own[own["ground"] == REPEATED], "a poster twice", {"color": GRAY, "linestyle": "--"}),
+        *(
+            (
+                own[own["poster_radius_m"] == radius_m],
+                f"a {2 * radius_m:g} m picture in both",
+                {"color": colour, "linestyle": ":"},
+            )
+            for radius_m, colour in zip(POSTER_RADII_M, (ORANGE, VERMILLION, PURPLE), strict=True)
+        ),
     )
     for rows, label, style in kinds:
         if len(rows):

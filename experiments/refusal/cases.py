@@ -21,7 +21,7 @@ from mapfusion.landmark_map import LandmarkMap
 from mapfusion.se2 import Float
 
 APART, COMMON, FEW, REPEATED = "apart", "common", "few", "repeated"
-POSTER_RADIUS_M = 0.5  # a poster one metre wide
+POSTER_RADII_M = (0.5, 1.0, 2.0)  # of a poster, a mural, and half a wall
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,7 @@ class Case:
         ground: APART, COMMON, FEW or REPEATED.
         n_common: landmarks of both maps that are one point of the world.
         T_true: (3,) NaN without a common world.
+        poster_radius_m: NaN without a poster.
     """
 
     ground: str
@@ -41,6 +42,7 @@ class Case:
     is_true: np.ndarray
     n_common: int
     T_true: Float
+    poster_radius_m: float = np.nan
 
 
 def apart(map_a: LandmarkMap, map_b: LandmarkMap, matching: MatchParameters) -> Case:
@@ -84,7 +86,11 @@ def few(case: Case, rng: np.random.Generator) -> Case | None:
 
 
 def repeated(
-    source: Case, other: LandmarkMap, matching: MatchParameters, rng: np.random.Generator
+    source: Case,
+    other: LandmarkMap,
+    radius_m: float,
+    matching: MatchParameters,
+    rng: np.random.Generator,
 ) -> Case | None:
     """Map a of a common case against another world's map in which a poster of map b hangs.
 
@@ -95,7 +101,7 @@ def repeated(
         return None
     centre = source.map_b.position_m[source.pairs.index_b[rng.choice(true)]]
     apart_m = np.linalg.norm(source.map_b.position_m - centre, axis=1)
-    poster = source.map_b[np.flatnonzero(apart_m <= POSTER_RADIUS_M)]
+    poster = source.map_b[np.flatnonzero(apart_m <= radius_m)]
     hook = other.position_m[rng.integers(len(other))]
     turn = rng.uniform(-np.pi, np.pi)
     T_other_b = np.array([*(hook[:2] - se2.rotation(turn) @ centre[:2]), turn])
@@ -104,7 +110,8 @@ def repeated(
         position_m=se2.transform_points(T_other_b, poster.position_m),
         covariance_m2=se2.transform_covariances(T_other_b, poster.covariance_m2),
     )
-    return _without_truth(REPEATED, source.map_a, _joined(other, hung), matching)
+    case = _without_truth(REPEATED, source.map_a, _joined(other, hung), matching)
+    return replace(case, poster_radius_m=radius_m)
 
 
 def _joined(first: LandmarkMap, second: LandmarkMap) -> LandmarkMap:

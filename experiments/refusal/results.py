@@ -21,6 +21,7 @@ REFUSALS = schema(
     1,
     _fields(
         ground=pa.string(),
+        poster_radius_m=pa.float64(),  # NaN without a poster
         world_a=pa.string(),
         robot_a=pa.string(),
         world_b=pa.string(),

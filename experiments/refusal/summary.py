@@ -7,7 +7,7 @@ import pandas as pd
 from scipy.stats import binomtest
 
 from experiments.metrics import FALSE_MERGE_M, FALSE_MERGE_RAD, MERGEABLE_TRUE_PAIRS
-from experiments.refusal.cases import APART, COMMON, FEW, REPEATED
+from experiments.refusal.cases import APART, COMMON, FEW, POSTER_RADII_M
 from mapfusion.se2 import Float
 
 CONFIDENCE = 0.95
@@ -56,7 +56,7 @@ def summary(refusals: pd.DataFrame) -> list[dict[str, Any]]:
     for name in refusals["aligner"].drop_duplicates():
         own = refusals[refusals["aligner"] == name]
         able, few = mergeable(own), own[own["ground"] == FEW]
-        some = own[(own["ground"].isin([COMMON, FEW])) & (own["n_common"] > 0)]
+        some = own[(own["ground"] == COMMON) & (own["n_common"] > 0)]
         rows.append(
             {
                 "aligner": name,
@@ -65,7 +65,11 @@ def summary(refusals: pd.DataFrame) -> list[dict[str, Any]]:
                 "missed": _refused(able),
                 "missed_though_right": _refused(able[is_right(able)]),
                 "few_missed_though_right": _refused(few[is_right(few)]),
-                "repeated": _accepted(own[own["ground"] == REPEATED]),
+                "few_wrong": _rate(few["accepted"] & ~is_right(few)),
+            }
+            | {
+                f"poster_{radius_m:g}": _accepted(own[own["poster_radius_m"] == radius_m])
+                for radius_m in POSTER_RADII_M
             }
         )
     return rows

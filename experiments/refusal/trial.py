@@ -22,7 +22,7 @@ from mapfusion import se2
 from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.registry import make_aligner
 
-REPEATED_PER_WORLDS = 8  # posters hung in each pair of worlds
+REPEATED_PER_WORLDS = 9  # posters hung in each pair of worlds
 
 
 class Meeting(NamedTuple):
@@ -138,8 +138,10 @@ def _posters(
     source = _common(scenario, in_a[0], in_a[1], iteration)
     for number in range(REPEATED_PER_WORLDS):
         rng = generator(scenario.seed, "poster", *names, number)
-        other = map_at(in_b[number % len(in_b)].maps, iteration)
-        case = cases.repeated(source, other, scenario.align.match, rng)
+        # each robot meets each size
+        other = map_at(in_b[number // len(cases.POSTER_RADII_M) % len(in_b)].maps, iteration)
+        radius_m = cases.POSTER_RADII_M[number % len(cases.POSTER_RADII_M)]
+        case = cases.repeated(source, other, radius_m, scenario.align.match, rng)
         if case is not None:
             yield iteration, case
 
@@ -156,6 +158,7 @@ def _answers(
     settings = scenario.align
     names = {
         "ground": case.ground,
+        "poster_radius_m": case.poster_radius_m,
         "world_a": worlds[0],
         "robot_a": case.map_a.name,
         "world_b": worlds[1],
