@@ -207,15 +207,15 @@ def print_refusals(rows: Sequence[dict[str, Any]], false_alarms: float) -> None:
     }
     table = Table(
         title=f"Accepted where chance gives at most {false_alarms:g} a pair of maps",
-        caption="false: accepted without common ground; wrong: accepted, 0.5 m or 0.1 rad\n"
-        "off; missed: refused with 20 or more true pairs, of all and of those right;\n"
-        "20 true: the same where just 20 in one corner are left",
+        caption="false: accepted without common ground; wrong: accepted with some,\n"
+        "0.5 m or 0.1 rad off; missed: refused with 20 or more true pairs, of\n"
+        "all and of those right; 20 true: just 20 in one corner are left",
         **_LAYOUT,
     )
     table.add_column("\naligner", no_wrap=True)
     for heading in headings.values():
         table.add_column(heading, justify="right", no_wrap=True)
-    posters = Table(title="Accepted: maps of two worlds that share one picture", **_LAYOUT)
+    posters = Table(title="Accepted: one picture in two worlds", **_LAYOUT)
     posters.add_column("aligner", no_wrap=True)
     radii = [name for name in rows[0] if name.startswith("poster_")]
     for name in radii:

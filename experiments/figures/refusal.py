@@ -28,15 +28,22 @@ _LEAST_DECADES = 0.5  # shares of zero are drawn so far below one in all pairs
 
 
 def draw(refusals: pd.DataFrame, calibration: pd.DataFrame, false_alarms: float) -> Figure:
-    """Three panels: false against missed merges; both against the threshold; the calibration."""
-    figure = Figure(figsize=(PAGE_WIDTH_IN, 3.2))
-    curve, rates, calibrated = figure.subplots(1, 3)
+    """False against missed merges; shares accepted against the threshold; the calibration."""
+    figure = Figure(figsize=(PAGE_WIDTH_IN, 5.6))
+    (curve, rates), (calibrated, key) = figure.subplots(2, 2)
     names = refusals["aligner"].drop_duplicates().tolist()
     _draw_curves(curve, refusals, names, false_alarms)
     _draw_rates(rates, refusals, names, false_alarms)
     _draw_calibration(calibrated, calibration, false_alarms)
     handles, labels = curve.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), handlelength=2.6)
+    key.set_axis_off()
+    key.legend(
+        *rates.get_legend_handles_labels(),
+        loc="upper left",
+        title=f"Above: {names[0]} (pairs of maps)",
+        alignment="left",
+    )
     return figure
 
 
@@ -70,8 +77,8 @@ def _draw_curves(axes: Axes, refusals: pd.DataFrame, names: list[str], false_ala
         label=f"{_SUPPORT_OF}, number of inliers alone",
     )
     axes.set(xscale="log", yscale="log", xlim=(floor_x / 1.3, 1.3), ylim=(floor_y / 1.3, 1.3))
-    axes.set_xlabel("false merges, maps without common ground\n(left edge: none)")
-    axes.set_ylabel("missed merges, 20 or more true pairs\n(lower edge: none)")
+    axes.set_xlabel("false merges, maps without common ground (left edge: none)")
+    axes.set_ylabel("missed merges, 20+ true pairs (lower edge: none)")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter(plain_numbers())
 
@@ -100,7 +107,7 @@ def _draw_point(
 def _draw_rates(axes: Axes, refusals: pd.DataFrame, names: list[str], false_alarms: float) -> None:
     """Share accepted against the threshold, for the first aligner's kinds of ground."""
     own = refusals[refusals["aligner"] == names[0]]
-    thresholds = np.linspace(-60, 8, 500)
+    thresholds = np.linspace(-100, 8, 500)
     kinds: tuple[tuple[pd.DataFrame, str, dict[str, Any]], ...] = (
         (without_common_ground(own), "no common ground", {"color": GRAY}),
         (mergeable(own), "20 or more true pairs", {"color": BLACK}),
@@ -121,7 +128,6 @@ def _draw_rates(axes: Axes, refusals: pd.DataFrame, names: list[str], false_alar
     axes.axvline(np.log10(false_alarms), color=GRAY, linewidth=0.8)
     axes.set_xlabel("threshold on log10 of the false alarms")
     axes.set_ylabel(f"share accepted, {names[0]}")
-    axes.legend(loc="center left", bbox_to_anchor=(0.0, 0.6))
 
 
 def _draw_calibration(axes: Axes, calibration: pd.DataFrame, false_alarms: float) -> None:
@@ -133,7 +139,7 @@ def _draw_calibration(axes: Axes, calibration: pd.DataFrame, false_alarms: float
     axes.plot(stated[found], measured[found], color=BLACK, marker="o", label="measured")
     upper = [Rate(k, n).interval[1] for k in calibration["n_accepted"]]
     axes.plot(
-        stated, upper, color=BLACK, linestyle=":", label="pairs of maps with one,\nupper 97.5 %"
+        stated, upper, color=BLACK, linestyle=":", label="pairs of maps with one, upper 97.5 %"
     )
     axes.axvline(false_alarms, color=GRAY, linewidth=0.8)
     axes.set(xscale="log", yscale="log")
