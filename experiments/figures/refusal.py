@@ -32,7 +32,7 @@ def draw(refusals: pd.DataFrame, calibration: pd.DataFrame, false_alarms: float)
     figure = Figure(figsize=(PAGE_WIDTH_IN, 5.6))
     (curve, rates), (calibrated, key) = figure.subplots(2, 2)
     names = refusals["aligner"].drop_duplicates().tolist()
-    _draw_curves(curve, refusals, names, false_alarms)
+    _draw_curves(curve, refusals, names)
     _draw_rates(rates, refusals, names, false_alarms)
     _draw_calibration(calibrated, calibration, false_alarms)
     handles, labels = curve.get_legend_handles_labels()
@@ -55,7 +55,8 @@ def write(
         return save_figure(draw(refusals, calibration, false_alarms), folder / "figures", "refusal")
 
 
-def _draw_curves(axes: Axes, refusals: pd.DataFrame, names: list[str], false_alarms: float) -> None:
+def _draw_curves(axes: Axes, refusals: pd.DataFrame, names: list[str]) -> None:
+    """ROC of each method as the threshold moves, and the point it works at."""
     floor_x, floor_y = _floor(without_common_ground(refusals)), _floor(mergeable(refusals))
     for name in names:
         own = refusals[refusals["aligner"] == name]
@@ -77,8 +78,8 @@ def _draw_curves(axes: Axes, refusals: pd.DataFrame, names: list[str], false_ala
         label=f"{_SUPPORT_OF}, number of inliers alone",
     )
     axes.set(xscale="log", yscale="log", xlim=(floor_x / 1.3, 1.3), ylim=(floor_y / 1.3, 1.3))
-    axes.set_xlabel("false merges, maps without common ground (left edge: none)")
-    axes.set_ylabel("missed merges, 20+ true pairs (lower edge: none)")
+    axes.set_xlabel("false merges: no common ground (left edge: none)")
+    axes.set_ylabel("missed merges: 20+ true pairs (bottom: none)")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter(plain_numbers())
 
@@ -98,9 +99,9 @@ def _draw_point(
     for rate, at in ((false, x), (missed, y)):
         low, high = np.clip(rate.interval, floor[0] / 2, None)
         if rate is false:
-            axes.plot([min(low, at), high], [y, y], color=colour, linewidth=0.8, alpha=0.7)
+            axes.plot([min(low, at), high], [y, y], color=colour, linewidth=3, alpha=0.35)
         else:
-            axes.plot([x, x], [min(low, at), high], color=colour, linewidth=0.8, alpha=0.7)
+            axes.plot([x, x], [min(low, at), high], color=colour, linewidth=3, alpha=0.35)
     axes.plot(x, y, marker="o", color=colour, markeredgecolor=BLACK, clip_on=False, zorder=5)
 
 

@@ -1,5 +1,6 @@
 """Maps crossed between worlds: the cases, the rates, the tables and the command."""
 
+import itertools
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -67,9 +68,9 @@ def test_few_leaves_twenty_neighbours(same_world: cases.Case) -> None:
 def test_a_poster_hangs_elsewhere_and_looks_the_same(same_world: cases.Case) -> None:
     other = described("C", np.random.default_rng(5).uniform(0, 8, (40, 3)), [0, 0, 0], 7)
     landmarks = other.maps[ITERATION]
-    case = cases.repeated(same_world, landmarks, 2.0, MATCHING, np.random.default_rng(2))
+    case = cases.repeated(same_world, landmarks, 4.0, MATCHING, np.random.default_rng(2))
     assert case is not None
-    assert (case.ground, case.poster_radius_m, case.n_common) == ("repeated", 2.0, 0)
+    assert (case.ground, case.poster_radius_m, case.n_common) == ("repeated", 4.0, 0)
     hung = case.map_b[np.arange(len(landmarks), len(case.map_b))]
     assert len(hung) > 3
     assert not case.is_true.any()
@@ -133,17 +134,16 @@ def test_sweeping_accepts_up_to_the_threshold_and_never_nan() -> None:
 
 def test_calibration_counts_every_motion_of_two_pairs() -> None:
     rng = np.random.default_rng(3)
-    p_a, p_b = points_on_walls(rng, 18), points_on_walls(rng, 18)
-    gates, bounds = np.array([0.1, 0.4]), np.array([1.0, 2.0, 3.0])
-    found = [
-        fewest_false_alarms(
-            p_a, p_b, np.zeros((18, 4)), np.array(fit_rigid(p_a, p_b, np.array([i, j]))), gates
-        )[0]
-        for j in range(18)
-        for i in range(j)
-    ]
-    expected = [sum(log10 <= bound for log10 in found) for bound in bounds]
-    assert expected[2] > 0
+    n = 30
+    p_a, p_b = points_on_walls(rng, n), points_on_walls(rng, n)
+    gates, bounds = np.array([0.1, 0.4]), np.array([1.0, 2.0, 2.5, 4.0])
+    heights = np.zeros((n, 4))
+    expected = np.zeros(4, np.int64)
+    for i, j in itertools.combinations(range(n), 2):
+        T_a_b = np.array(fit_rigid(p_a, p_b, np.array([i, j])))
+        log10 = fewest_false_alarms(p_a, p_b, heights, T_a_b, gates)[0]
+        expected += log10 <= bounds
+    assert 0 < expected[2] < expected[3]
     np.testing.assert_array_equal(accepted_motions(p_a, p_b, gates, bounds), expected)
 
 
