@@ -77,6 +77,8 @@ def print_result(result: Path, skipped_figures: Sequence[str]) -> None:
     console.print(_pair_table(errors, _aligner_order(result)[0]))
     robots = tables.read(tables.table_path(result, "robots"), "robots")
     console.print(_robot_table(robots))
+    for line in _left_out(result, robots["robot"].iloc[0]):
+        console.print(line, soft_wrap=True, markup=False)
     console.print(f"Figures: {result / 'figures'}   tables: {result / 'tables'}", soft_wrap=True)
     _print_skipped(console, skipped_figures)
 
@@ -84,6 +86,22 @@ def print_result(result: Path, skipped_figures: Sequence[str]) -> None:
 def _aligner_order(result: Path) -> list[str]:
     scenario = json.loads((result / "scenario.json").read_text(encoding="utf-8"))
     return [entry["name"] for entry in scenario["align"]["aligners"]] + [ORACLE]
+
+
+def _left_out(result: Path, first: str) -> list[str]:
+    """Which maps are not in the fused one, and why."""
+    scenario = json.loads((result / "scenario.json").read_text(encoding="utf-8"))
+    estimates = tables.read(tables.table_path(result, "estimates"), "estimates")
+    used = estimates[
+        (estimates["aligner"] == scenario["merge"]["aligner"])
+        & (estimates["repetition"] == 0)
+        & (estimates["robot_a"] == first)
+    ]
+    last = used[used["iteration"] == used.groupby("robot_b")["iteration"].transform("max")]
+    return [
+        f"  {row['robot_b']} is left out of the fused map: {row['acceptance_reason']}"
+        for row in last[~last["accepted"]].to_dict("records")
+    ]
 
 
 def aligner_summary(errors: pd.DataFrame, timings: pd.DataFrame, order: list[str]) -> pd.DataFrame:
