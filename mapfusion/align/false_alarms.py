@@ -27,22 +27,28 @@ def thin(p_a: Float, p_b: Float, patch_m: float) -> np.ndarray:
     """
     kept = np.empty(len(p_a), np.int64)
     n = 0
-    limit = patch_m * patch_m
     for i in range(len(p_a)):
         free = True
         for m in range(n):
             j = kept[m]
-            apart_a = apart_b = 0.0
-            for axis in range(p_a.shape[1]):
-                apart_a += (p_a[i, axis] - p_a[j, axis]) ** 2
-                apart_b += (p_b[i, axis] - p_b[j, axis]) ** 2
-            if apart_a < limit and apart_b < limit:
+            if apart_by_less(p_a, i, j, patch_m) and apart_by_less(p_b, i, j, patch_m):
                 free = False
                 break
         if free:
             kept[n] = i
             n += 1
     return kept[:n].copy()
+
+
+@njit(cache=True)
+def apart_by_less(p: Float, i: int, j: int, distance_m: float) -> bool:
+    """Whether points i and j of (N, D) are less than a distance apart."""
+    if abs(p[i, 0] - p[j, 0]) >= distance_m:  # most are already told apart by this
+        return False
+    square = 0.0
+    for axis in range(p.shape[1]):
+        square += (p[i, axis] - p[j, axis]) ** 2
+    return square < distance_m * distance_m
 
 
 @njit(cache=True)
