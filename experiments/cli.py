@@ -118,6 +118,33 @@ def check(
 
 
 @app.command()
+def refusal(
+    results: Annotated[
+        list[Path], typer.Argument(metavar="RESULT RESULT...", help="Results of different worlds.")
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for tables and figure.")],
+    pairs: Annotated[int, typer.Option(help="Pairs of maps without common ground.", min=1)] = 500,
+    jobs: Jobs = None,
+) -> None:
+    """Cross the maps of several worlds: are those without common ground refused, and only those?
+
+    For example: `mapfusion refusal results/quick-0 results/quick-1 -o results/refusal`.
+    """
+    from experiments import screen
+    from experiments.figures.refusal import write
+    from experiments.refusal.results import read
+    from experiments.refusal.summary import summary
+    from experiments.refusal.trial import run
+
+    with screen.progress() as show:
+        acceptance = run(results, output, pairs, jobs or available_cores(), show)
+    refusals, calibration = read(output, "refusals"), read(output, "calibration")
+    pictures = write(output, refusals, calibration, acceptance.false_alarms)
+    screen.print_refusals(summary(refusals), acceptance.false_alarms)
+    screen.print_paths(output, pictures)
+
+
+@app.command()
 def schema() -> None:
     """Print the JSON schema of scenarios, for editors: `mapfusion schema > schema.json`."""
     from experiments.scenario import schema_text

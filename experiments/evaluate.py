@@ -16,6 +16,7 @@ from experiments.stages.align import (
 )
 from experiments.truth import PathTruth, common_landmarks, true_pairs
 from mapfusion import se2
+from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.oracle import Oracle
 from mapfusion.align.refine import Refinement
 from mapfusion.landmark_map import LandmarkMap
@@ -72,6 +73,8 @@ class _Comparison:
             "refined_status": estimate["refined_status"],
             "refined_translation_error_m": np.hypot(*(refined - self.T_true)[:2]),
             "refined_rotation_error_rad": float(se2.wrap(refined[2] - self.T_true[2])),
+            "accepted": estimate["accepted"],
+            "log10_false_alarms": estimate["log10_false_alarms"],
             "oracle_distance_m": np.hypot(*(refined - self.T_oracle)[:2]),
             "oracle_distance_rad": float(abs(se2.wrap(refined[2] - self.T_oracle[2]))),
             "n_correspondences": len(self.is_true),
@@ -99,6 +102,7 @@ def error_rows(
     estimates: pd.DataFrame,
     correspondences: pd.DataFrame,
     refinement: Refinement,
+    acceptance: Acceptance,
     radius_m: float,
 ) -> list[dict[str, Any]]:
     """Rows of the table `errors` for one robot pair, the oracle's among them."""
@@ -114,7 +118,9 @@ def error_rows(
         comparison = _Comparison(
             T_true, oracle.T_a_b, is_true, common_landmarks(points_a, points_b, radius_m)
         )
-        oracle_row = {"aligner": ORACLE, "repetition": 0} | estimate_row(len(pairs), oracle, oracle)
+        verdict = acceptance.judge(map_a, map_b, pairs, oracle)
+        oracle_row = {"aligner": ORACLE, "repetition": 0}
+        oracle_row |= estimate_row(len(pairs), oracle, oracle, verdict)
         names = {"robot_a": a.name, "robot_b": b.name, "iteration": iteration}
         for estimate in [oracle_row, *group.to_dict("records")]:
             rows.append(names | comparison.row(estimate))

@@ -14,6 +14,12 @@ PAPER_ALIGNERS = ("ransac", "svd", "svd-solved", "icp", "impicp")
 # Iterations with fewer true pairs are left out where an aligner is compared with the oracle: with
 # a handful of pairs both are dominated by chance.
 MIN_TRUE_PAIRS = 30
+# An accepted alignment farther off than this is a false merge: it doubles every wall of a room, and
+# is several times what the drift of two maps does (0.05 to 0.2 m, 0.01 rad).
+FALSE_MERGE_M = 0.5
+FALSE_MERGE_RAD = 0.1
+# With as many true correspondences a robust method finds the motion, and refusing it is a miss.
+MERGEABLE_TRUE_PAIRS = 20
 ORACLE = "oracle"
 
 Tables = Mapping[str, pd.DataFrame]
@@ -168,6 +174,28 @@ def scatter_m(tables: Tables, aligner: str) -> float:
     return float((groups.quantile(0.9) - groups.quantile(0.1)).median())
 
 
+def is_false_merge(rows: pd.DataFrame) -> pd.Series:
+    """Bool per row of `errors`: accepted without common ground, or more than 0.5 m or 0.1 rad off.
+
+    An alignment of maps without one common landmark has nothing to be right about.
+    """
+    off = (rows["refined_translation_error_m"] > FALSE_MERGE_M) | (
+        rows["refined_rotation_error_rad"].abs() > FALSE_MERGE_RAD
+    )
+    return rows["accepted"] & (off | (rows["n_common"] == 0))
+
+
+def false_merges(tables: Tables, aligner: str) -> float:
+    """Share of false merges among all of an aligner's answers (pairs, iterations, repetitions)."""
+    return float(is_false_merge(_of(tables["errors"], aligner)).mean())
+
+
+def missed_merges(tables: Tables, aligner: str) -> float:
+    """Share refused of an aligner's answers where there are 20 or more true correspondences."""
+    errors = _of(tables["errors"], aligner)
+    return float((~errors[errors["n_true"] >= MERGEABLE_TRUE_PAIRS]["accepted"]).mean())
+
+
 METRICS: dict[str, Callable[[Tables], float]] = {
     function.__name__: function
     for function in (
@@ -194,6 +222,8 @@ ALIGNER_METRICS: dict[str, Callable[[Tables, str], float]] = {
         estimated_translation_m,
         lead_over_others,
         scatter_m,
+        false_merges,
+        missed_merges,
     )
 }
 USED_TABLES = ("robots", "errors", "fusion", "map_fits")

@@ -22,6 +22,7 @@ from pydantic import (
 from experiments.aligner_calls import require_usable
 from experiments.metrics import known_metrics
 from experiments.yaml_input import apply_overrides, read_mapping
+from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.correspondences import MatchParameters
 from mapfusion.align.refine import Refinement
 from mapfusion.align.registry import name_clashes
@@ -147,7 +148,7 @@ DEFAULT_ALIGNERS = [
 
 
 class Align(Section):
-    """Correspondences, the aligners on them, and the least squares after each.
+    """Correspondences, the aligners on them, the least squares after each, the test against chance.
 
     Randomised aligners are repeated on each pair of maps, so that their own spread can be seen.
     """
@@ -155,6 +156,7 @@ class Align(Section):
     match: MatchParameters = MatchParameters()
     aligners: Annotated[list[AlignerEntry], Field(min_length=1)] = DEFAULT_ALIGNERS
     refinement: Refinement = Refinement()
+    acceptance: Acceptance = Acceptance()
     repetitions: Annotated[int, Field(ge=1, le=1000)] = 20
 
     @model_validator(mode="after")

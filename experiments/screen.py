@@ -45,6 +45,7 @@ _STAGE_TEXT = {
     "tables": "write the tables",
     "figures": "draw the figures",
     "benchmark": "measure the aligners",
+    "refusal": "cross the worlds",
 }
 
 
@@ -82,6 +83,8 @@ def print_result(result: Path, skipped_figures: Sequence[str]) -> None:
     console.print(_pair_table(errors, _aligner_order(result)[0]))
     robots = tables.read(tables.table_path(result, "robots"), "robots")
     console.print(_robot_table(robots))
+    for line in _left_out(result, robots["robot"].iloc[0]):
+        console.print(line, soft_wrap=True, markup=False)
     console.print(f"Figures: {result / 'figures'}   tables: {result / 'tables'}", soft_wrap=True)
     _print_skipped(console, skipped_figures)
 
@@ -89,6 +92,22 @@ def print_result(result: Path, skipped_figures: Sequence[str]) -> None:
 def _aligner_order(result: Path) -> list[str]:
     scenario = json.loads((result / "scenario.json").read_text(encoding="utf-8"))
     return [entry["name"] for entry in scenario["align"]["aligners"]] + [ORACLE]
+
+
+def _left_out(result: Path, first: str) -> list[str]:
+    """Which maps are not in the fused one, and why."""
+    scenario = json.loads((result / "scenario.json").read_text(encoding="utf-8"))
+    estimates = tables.read(tables.table_path(result, "estimates"), "estimates")
+    used = estimates[
+        (estimates["aligner"] == scenario["merge"]["aligner"])
+        & (estimates["repetition"] == 0)
+        & (estimates["robot_a"] == first)
+    ]
+    last = used[used["iteration"] == used.groupby("robot_b")["iteration"].transform("max")]
+    return [
+        f"  {row['robot_b']} is left out of the fused map: {row['acceptance_reason']}"
+        for row in last[~last["accepted"]].to_dict("records")
+    ]
 
 
 def aligner_summary(errors: pd.DataFrame, timings: pd.DataFrame, order: list[str]) -> pd.DataFrame:
@@ -108,7 +127,7 @@ def aligner_summary(errors: pd.DataFrame, timings: pd.DataFrame, order: list[str
                 "spread_m": (spread.quantile(0.9) - spread.quantile(0.1)).median(),
                 "refined_m": own["refined_translation_error_m"].median(),
                 "refined_rad": own["refined_rotation_error_rad"].abs().median(),
-                "accepted": (own["refined_status"] == "accepted").mean(),
+                "accepted": own["accepted"].mean(),
                 "pairs": own["n_correspondences"].median(),
                 "true_share": (own["n_true"] / own["n_correspondences"]).median(),
                 "time_ms": 1e3 * time_s.median() if len(time_s) else math.nan,
@@ -144,7 +163,7 @@ def _aligner_table(errors: pd.DataFrame, timings: pd.DataFrame, order: list[str]
     }
     table = Table(
         title=f"Alignment errors: medians over iterations with {MIN_TRUE_PAIRS_SHOWN}+ true pairs",
-        caption="spread: 10-90 % of the repetitions on the same maps; ok: accepted once refined;\n"
+        caption="spread: 10-90 % of the repetitions on the same maps; ok: refined, not chance;\n"
         "pairs: offered, and the share of true ones among them",
         **_LAYOUT,
     )
@@ -214,6 +233,43 @@ def print_outcomes(outcomes: Sequence["Outcome"]) -> None:
     console.print(f"{len(outcomes) - failed} passed, {failed} failed")
 
 
+def print_refusals(rows: Sequence[dict[str, Any]], false_alarms: float) -> None:
+    """False and missed merges of each aligner (rows of `experiments.refusal.summary`)."""
+    headings = {
+        "false": "false\nmerges",
+        "wrong": "wrong\n",
+        "missed": "missed\nof all",
+        "missed_though_right": "\nof right",
+        "few_missed_though_right": "20 true:\nmissed",
+        "few_wrong": "\nwrong",
+    }
+    table = Table(
+        title=f"Accepted where chance gives at most {false_alarms:g} a pair of maps",
+        caption="false: accepted without common ground; wrong: accepted with some,\n"
+        "0.5 m or 0.1 rad off; missed: refused with 20 or more true pairs, of\n"
+        "all and of those right; 20 true: just 20 in one corner are left",
+        **_LAYOUT,
+    )
+    table.add_column("\naligner", no_wrap=True)
+    for heading in headings.values():
+        table.add_column(heading, justify="right", no_wrap=True)
+    posters = Table(title="Accepted: one picture in two worlds", **_LAYOUT)
+    posters.add_column("aligner", no_wrap=True)
+    radii = [name for name in rows[0] if name.startswith("poster_")]
+    for name in radii:
+        posters.add_column(f"{2 * float(name.removeprefix('poster_')):g} m wide", justify="right")
+    for row in rows:
+        table.add_row(row["aligner"], *(_of_all(row[name]) for name in headings))
+        posters.add_row(row["aligner"], *(_of_all(row[name]) for name in radii))
+    console = Console()
+    console.print(table)
+    console.print(posters)
+
+
+def _of_all(rate: Any) -> str:
+    return f"{rate.hits}/{rate.n}"
+
+
 def print_paths(folder: Path, paths: Sequence[Path], skipped: Sequence[str] = ()) -> None:
     """Where files were written."""
     console = Console()
@@ -233,27 +289,31 @@ def print_map(path: Path, landmarks: "LandmarkMap") -> None:
 
 def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
     """Estimates of all aligners on two maps, and why those were not accepted that were not."""
-    table = Table(title="T_a_b, as estimated and refined", **_LAYOUT)
+    table = Table(
+        title="T_a_b, as estimated and refined",
+        caption="NFA: expected number of alignments that chance alone supports as well",
+        **_LAYOUT,
+    )
     headings = ["\naligner", "tx\nm", "ty\nm", "theta\nrad"]
-    headings += ["refined\nm", "ty\nm", "theta\nrad", "\ninliers", "time\nms"]
+    headings += ["refined\nm", "ty\nm", "theta\nrad", "\ninliers", "NFA\nlog10", "time\nms"]
     for heading in headings:
         table.add_column(heading, justify="left" if "aligner" in heading else "right", no_wrap=True)
     for row in rows:
         table.add_row(
             row["aligner"],
-            *(_number(row[name], ".3f") for name in ("tx_m", "ty_m")),
-            _number(row["theta_rad"], ".3f"),
-            *(_number(row[f"refined_{name}"], ".3f") for name in ("tx_m", "ty_m")),
+            *(_number(row[name], ".2f") for name in ("tx_m", "ty_m", "theta_rad")),
+            *(_number(row[f"refined_{name}"], ".2f") for name in ("tx_m", "ty_m")),
             _number(row["refined_theta_rad"], ".3f"),
             f"{row['n_inliers']}/{row['n_correspondences']}",
+            _number(row["log10_false_alarms"], ".0f"),
             f"{1e3 * row['elapsed_s']:.1f}",
         )
     console = Console()
     console.print(table)
     for row in rows:
-        reason = row["reason"] or row["refined_reason"]
+        reason = row["reason"] or row["acceptance_reason"]
         if reason:
-            status = row["refined_status"]
+            status = "accepted" if row["accepted"] else "refused"
             console.print(f"  {row['aligner']}: {status}: {reason}", soft_wrap=True, markup=False)
 
 

@@ -68,7 +68,7 @@ def save_map(path: Path, landmarks: LandmarkMap) -> None:
 
 
 def align(path_a: Path, path_b: Path, settings: Align, seed: int) -> list[dict[str, Any]]:
-    """Every aligner's estimate and its refinement, as rows."""
+    """Every aligner's estimate, its refinement and the verdict on it, as rows."""
     map_a, map_b = read_map(path_a), read_map(path_b)
     pairs = match(map_a, map_b, settings.match)
     rows = []
@@ -76,13 +76,14 @@ def align(path_a: Path, path_b: Path, settings: Align, seed: int) -> list[dict[s
         aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
         estimated = aligner.align(map_a, map_b, pairs, generator(seed, "align", entry.name))
         refined = refine_estimate(settings.refinement, map_a, map_b, pairs, estimated)
+        verdict = settings.acceptance.judge(map_a, map_b, pairs, refined)
         rows.append(
             {
                 "aligner": entry.name,
                 "n_inliers": int(refined.inlier.sum()),
                 "elapsed_s": estimated.elapsed_s,
             }
-            | estimate_row(len(pairs), estimated, refined)
+            | estimate_row(len(pairs), estimated, refined, verdict)
         )
     return rows
 
@@ -107,7 +108,8 @@ def merge(
         rng = generator(seed, "align", entry.name, number)
         estimated = aligner.align(maps[0], other, pairs, rng)
         refined = refine_estimate(align_section.refinement, maps[0], other, pairs, estimated)
-        alignments.append(refined)
+        verdict = align_section.acceptance.judge(maps[0], other, pairs, refined)
+        alignments.append(verdict.applied_to(refined))
         offered.append(pairs)
     fused = merge_maps(maps, alignments, offered, settings.parameters)
     return fused, [str(path) for path in paths]

@@ -23,7 +23,7 @@ def _fields(**types: pa.DataType) -> list[pa.Field]:
 # What the aligners said, without any truth: the align stage writes it.
 ESTIMATES = schema(
     "result.estimates",
-    1,
+    2,
     _fields(
         robot_a=_TEXT,
         robot_b=_TEXT,
@@ -41,6 +41,10 @@ ESTIMATES = schema(
         refined_tx_m=_FLOAT,
         refined_ty_m=_FLOAT,
         refined_theta_rad=_FLOAT,
+        # of the refined alignment, against chance; NaN where there was none to judge
+        accepted=_BOOL,
+        log10_false_alarms=_FLOAT,
+        acceptance_reason=_TEXT,
         drift_sigma_m=_FLOAT,
         # upper triangle of the refined alignment's covariance (m2, m rad, rad2)
         cov_xx=_FLOAT,
@@ -73,7 +77,7 @@ CORRESPONDENCES = schema(
 # The aligner named "oracle" was given the true pairs; it has one repetition.
 ERRORS = schema(
     "result.errors",
-    1,
+    2,
     _fields(
         robot_a=_TEXT,
         robot_b=_TEXT,
@@ -87,6 +91,8 @@ ERRORS = schema(
         refined_status=_TEXT,
         refined_translation_error_m=_FLOAT,
         refined_rotation_error_rad=_FLOAT,
+        accepted=_BOOL,  # the refined alignment, by the test against chance
+        log10_false_alarms=_FLOAT,
         oracle_distance_m=_FLOAT,  # refined translation against the oracle's
         oracle_distance_rad=_FLOAT,
         n_correspondences=_INT,
@@ -256,12 +262,23 @@ def table_path(result: Path, name: str) -> Path:
 
 def write(path: Path, name: str, rows: pd.DataFrame | list[dict[str, Any]]) -> None:
     """Write rows as the table of that name."""
-    table_schema = ALL[name]
-    frame = pd.DataFrame(rows, columns=pd.Index(table_schema.names))
-    write_table(path, {column: frame[column].to_numpy() for column in frame}, table_schema)
+    write_rows(path, ALL[name], rows)
 
 
 def read(path: Path, name: str) -> pd.DataFrame:
     """Read the table of that name; raises InputError that names the file."""
-    table, _ = read_table(path, ALL[name])
+    return read_rows(path, ALL[name])
+
+
+def write_rows(
+    path: Path, table_schema: pa.Schema, rows: pd.DataFrame | list[dict[str, Any]]
+) -> None:
+    """Write rows as a table of that schema."""
+    frame = pd.DataFrame(rows, columns=pd.Index(table_schema.names))
+    write_table(path, {column: frame[column].to_numpy() for column in frame}, table_schema)
+
+
+def read_rows(path: Path, table_schema: pa.Schema) -> pd.DataFrame:
+    """Read a table of that schema; raises InputError that names the file."""
+    table, _ = read_table(path, table_schema)
     return table.to_pandas()

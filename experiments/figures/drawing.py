@@ -86,18 +86,28 @@ def _draw_in_worker(result: Path, name: str) -> Drawn:
 def draw_figure(data: ResultTables, name: str) -> Drawn:
     """Draw one figure and write its pictures, or remove old ones when there is nothing to draw."""
     module = importlib.import_module(f"experiments.figures.{name}")
-    files = tuple(data.folder / "figures" / f"{name}.{suffix}" for suffix in _DPI)
+    folder = data.folder / "figures"
     with house_style():
         try:
             figure: Figure = module.draw(data)
         except NothingToDraw as reason:
-            for file in files:
+            for file in _pictures(folder, name):
                 file.unlink(missing_ok=True)
             return Drawn(name, (), str(reason))
-        for file in files:
-            write_whole(file, lambda path: _save(figure, path))
-            figure.set_layout_engine("none")  # as laid out for the first; once is enough
-    return Drawn(name, files)
+        return Drawn(name, tuple(save_figure(figure, folder, name)))
+
+
+def _pictures(folder: Path, name: str) -> list[Path]:
+    return [folder / f"{name}.{suffix}" for suffix in _DPI]
+
+
+def save_figure(figure: Figure, folder: Path, name: str) -> list[Path]:
+    """Write a figure in all formats (inside `house_style`); returns the pictures."""
+    files = _pictures(folder, name)
+    for file in files:
+        write_whole(file, lambda path: _save(figure, path))
+        figure.set_layout_engine("none")  # as laid out for the first; once is enough
+    return files
 
 
 def _save(figure: Figure, path: Path) -> None:

@@ -96,9 +96,7 @@ def judge_correspondences(data: ResultTables, pair: Pair) -> tuple[np.ndarray, t
     estimates = of_pair(data.table("estimates"), pair)
     estimates = estimates[estimates["iteration"] == data.last_iteration(pair)]
     for name in data.aligners:
-        accepted = estimates[
-            (estimates["aligner"] == name) & (estimates["refined_status"] == "accepted")
-        ]
+        accepted = estimates[(estimates["aligner"] == name) & estimates["accepted"]]
         if name != ORACLE and len(accepted):
             packed = np.frombuffer(accepted["refined_inliers"].iloc[0], dtype=np.uint8)
             bits = np.unpackbits(packed, count=len(rows)).astype(bool)

@@ -14,6 +14,7 @@ from experiments.randomness import generator
 from experiments.scenario import AlignerEntry, Scenario
 from experiments.stages.slam import read_snapshots
 from experiments.store import StageFolder, Store
+from mapfusion.align.acceptance import Verdict
 from mapfusion.align.correspondences import Correspondences, match
 from mapfusion.align.registry import find_method
 from mapfusion.align.result import Alignment, Status
@@ -61,7 +62,7 @@ def parts(store: Store, scenario: Scenario, slam_a: StageFolder, slam_b: StageFo
     resolved = scenario.align.model_dump(mode="json")
     match_folder = store.stage("match", resolved["match"], [slam_a, slam_b], SOURCES)
     common = {"seed": scenario.seed}
-    common |= {name: resolved[name] for name in ("refinement", "repetitions")}
+    common |= {name: resolved[name] for name in ("refinement", "acceptance", "repetitions")}
     aligners = tuple(
         store.stage(
             "aligner",
@@ -160,27 +161,28 @@ def _estimate(
     settings, seed = scenario.align, scenario.seed
     names = {"robot_a": map_a.name, "robot_b": map_b.name, "iteration": iteration}
     rows = []
-    refinements: dict[object, Alignment] = {}  # repetitions often come to the very same estimate
+    # repetitions often come to the very same estimate
+    refinements: dict[object, tuple[Alignment, Verdict]] = {}
     for repetition in range(settings.repetitions if aligner.randomised else 1):
         purpose = (map_a.name, map_b.name, iteration, entry.name, repetition)
         estimated = aligner.align(map_a, map_b, pairs, generator(seed, "align", *purpose))
         known = (estimated.T_a_b.tobytes(), estimated.status, estimated.reason)
         if known not in refinements:
-            refinements[known] = refine_estimate(
-                settings.refinement, map_a, map_b, pairs, estimated
-            )
+            refined = refine_estimate(settings.refinement, map_a, map_b, pairs, estimated)
+            verdict = settings.acceptance.judge(map_a, map_b, pairs, refined)
+            refinements[known] = refined, verdict
         rows.append(
             names
             | {"aligner": entry.name, "repetition": repetition}
-            | estimate_row(len(pairs), estimated, refinements[known])
+            | estimate_row(len(pairs), estimated, *refinements[known])
         )
     return rows
 
 
 def estimate_row(
-    n_correspondences: int, estimated: Alignment, refined: Alignment
+    n_correspondences: int, estimated: Alignment, refined: Alignment, verdict: Verdict
 ) -> dict[str, Any]:
-    """One estimate and its refinement as columns of the table `estimates`."""
+    """One estimate, its refinement and the verdict on it as columns of the table `estimates`."""
     upper = refined.covariance[np.triu_indices(3)]
     return {
         "n_correspondences": n_correspondences,
@@ -194,6 +196,9 @@ def estimate_row(
         "refined_tx_m": refined.T_a_b[0],
         "refined_ty_m": refined.T_a_b[1],
         "refined_theta_rad": refined.T_a_b[2],
+        "accepted": verdict.accepted,
+        "log10_false_alarms": verdict.log10_false_alarms,
+        "acceptance_reason": verdict.reason,
         "drift_sigma_m": refined.drift_sigma_m,
         **dict(zip(_COVARIANCE_COLUMNS, upper, strict=True)),
         "inliers": np.packbits(estimated.inlier).tobytes(),
@@ -207,11 +212,12 @@ def inlier_mask(bits: bytes, n_correspondences: int) -> np.ndarray:
 
 
 def alignment_of(row: Mapping[Any, Any], n_correspondences: int) -> Alignment:
-    """The refined alignment that a row of the table `estimates` tells of."""
+    """The refined alignment a row of `estimates` tells of, refused where the verdict says so."""
     covariance = np.empty((3, 3))
     covariance[np.triu_indices(3)] = [row[name] for name in _COVARIANCE_COLUMNS]
     covariance.T[np.triu_indices(3)] = covariance[np.triu_indices(3)]
-    return Alignment(
+    verdict = Verdict(bool(row["accepted"]), row["log10_false_alarms"], row["acceptance_reason"])
+    refined = Alignment(
         np.array([row["refined_tx_m"], row["refined_ty_m"], row["refined_theta_rad"]]),
         covariance,
         inlier_mask(row["refined_inliers"], n_correspondences),
@@ -220,6 +226,7 @@ def alignment_of(row: Mapping[Any, Any], n_correspondences: int) -> Alignment:
         row["refined_reason"],
         row["drift_sigma_m"],
     )
+    return verdict.applied_to(refined)
 
 
 def correspondences_of(rows: pd.DataFrame) -> Correspondences:

@@ -48,6 +48,7 @@ def stage(
     resolved = scenario.resolved()
     settings = {
         "refinement": resolved["align"]["refinement"],
+        "acceptance": resolved["align"]["acceptance"],
         "merge": resolved["merge"],
         "radius_m": scenario.evaluate.true_pair_radius_m,
     }
@@ -63,8 +64,15 @@ def run(
     estimates = tables.read(align.path / "estimates.parquet", "estimates")
     correspondences = tables.read(align.path / "correspondences.parquet", "correspondences")
     radius_m = scenario.evaluate.true_pair_radius_m
+    settings = scenario.align
     errors = error_rows(
-        robot_a, robot_b, estimates, correspondences, scenario.align.refinement, radius_m
+        robot_a,
+        robot_b,
+        estimates,
+        correspondences,
+        settings.refinement,
+        settings.acceptance,
+        radius_m,
     )
     tables.write(output.path / "errors.parquet", "errors", errors)
     fusion = fusion_rows(robot_a, robot_b, estimates, correspondences, scenario.merge, radius_m)

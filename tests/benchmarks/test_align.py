@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mapfusion import se2
+from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.correspondences import Correspondences, match
 from mapfusion.align.ransac import Ransac
 from mapfusion.align.refine import Refinement
@@ -80,6 +81,13 @@ def test_aligner_on_maps_of_1600_landmarks(benchmark, name):
 def test_refinement_200_pairs(benchmark):
     maps = maps_with_pairs(1600, 200, 0.3)
     assert benchmark(lambda: Refinement().refine(*maps, T_A_B)).ok
+
+
+@pytest.mark.parametrize("n_pairs", [200, 1000, 5000])
+def test_acceptance(benchmark, n_pairs):
+    maps = maps_with_pairs(n_pairs, n_pairs, 0.3)
+    refined = Refinement().refine(*maps, T_A_B)
+    assert benchmark(lambda: Acceptance().judge(*maps, refined)).accepted
 
 
 @pytest.mark.parametrize("n", [1600, 5000])

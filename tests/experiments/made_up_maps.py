@@ -6,11 +6,13 @@ import pandas as pd
 from experiments.evaluate import EvaluatedRobot
 from experiments.truth import PathTruth
 from mapfusion import se2
+from mapfusion.align.acceptance import Verdict
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.se2 import Float
 
 ITERATION = 7
+ACCEPTED = Verdict(True, -50.0)
 
 
 def landmark_map(

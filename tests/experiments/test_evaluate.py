@@ -1,7 +1,7 @@
 import numpy as np
 import pandas as pd
 import pytest
-from made_up_maps import ITERATION, offered, paired, robot
+from made_up_maps import ACCEPTED, ITERATION, offered, paired, robot
 from scipy.stats import chi2
 
 from experiments.evaluate import (
@@ -14,6 +14,7 @@ from experiments.evaluate import (
 from experiments.stages.align import alignment_of, estimate_row, inlier_mask
 from experiments.truth import PathTruth
 from mapfusion import se2
+from mapfusion.align.acceptance import Acceptance, Verdict
 from mapfusion.align.refine import Refinement
 from mapfusion.align.result import Alignment, Status, degenerate
 
@@ -27,9 +28,10 @@ def judged(estimated: Alignment, refined: Alignment, index_b: list[int]) -> pd.D
     pairs = paired(list(range(len(index_b))), index_b)
     names = {"robot_a": "A", "robot_b": "B", "iteration": ITERATION}
     row = names | {"aligner": "ransac", "repetition": 0}
-    estimates = pd.DataFrame([row | estimate_row(len(pairs), estimated, refined)])
+    estimates = pd.DataFrame([row | estimate_row(len(pairs), estimated, refined, ACCEPTED)])
     a, b = robot("A", POINTS, T_WORLD_A), robot("B", POINTS, T_WORLD_B)
-    rows = error_rows(a, b, estimates, offered("A", "B", pairs), Refinement(), 0.1)
+    offers = offered("A", "B", pairs)
+    rows = error_rows(a, b, estimates, offers, Refinement(), Acceptance(), 0.1)
     return pd.DataFrame(rows).set_index("aligner")
 
 
@@ -100,7 +102,7 @@ def test_an_alignment_survives_its_row() -> None:
     refined = Alignment(
         rng.normal(size=3), square @ square.T, inlier, 0.1, Status.REFUSED, "a reason", 0.2
     )
-    row = estimate_row(13, degenerate("other", 13), refined)
+    row = estimate_row(13, degenerate("other", 13), refined, Verdict(False, np.nan, "a reason"))
     found = alignment_of(row, 13)
     np.testing.assert_array_equal(found.T_a_b, refined.T_a_b)
     np.testing.assert_allclose(found.covariance, refined.covariance, rtol=0, atol=1e-15)
@@ -108,6 +110,18 @@ def test_an_alignment_survives_its_row() -> None:
     assert (found.status, found.reason) == (Status.REFUSED, "a reason")
     assert found.drift_sigma_m == 0.2
     assert not inlier_mask(row["inliers"], 13).any()
+
+
+def test_a_refused_alignment_is_refused_when_read_again() -> None:
+    accepted = alignment(np.array([1.0, 2.0, 0.3]), [True] * 4)
+    row = estimate_row(4, accepted, accepted, Verdict(False, 1.5, "chance does as well"))
+    assert (row["refined_status"], row["accepted"], row["log10_false_alarms"]) == (
+        "accepted",
+        False,
+        1.5,
+    )
+    found = alignment_of(row, 4)
+    assert (found.status, found.reason) == (Status.REFUSED, "chance does as well")
 
 
 def test_alignment_nees_follows_its_law() -> None:

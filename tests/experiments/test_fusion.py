@@ -3,12 +3,13 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
-from made_up_maps import ITERATION, offered, paired, robot
+from made_up_maps import ACCEPTED, ITERATION, offered, paired, robot
 
-from experiments.fusion import fused_truth, fusion_rows, map_fit_rows
+from experiments.fusion import fused_maps, fused_truth, fusion_rows, map_fit_rows
 from experiments.scenario import Merge
 from experiments.stages.align import estimate_row
 from mapfusion import se2
+from mapfusion.align.acceptance import Verdict
 from mapfusion.align.result import Alignment, Status
 from mapfusion.aligned_landmarks import ABSENT
 from mapfusion.merge import FusedMap
@@ -37,7 +38,7 @@ def fused_pairs(drift_sigma_m: float, seed: int = 6) -> pd.DataFrame:
         drift_sigma_m=drift_sigma_m,
     )
     names = {"robot_a": "A", "robot_b": "B", "iteration": ITERATION}
-    row = names | {"aligner": "ransac", "repetition": 0} | estimate_row(N, found, found)
+    row = names | {"aligner": "ransac", "repetition": 0} | estimate_row(N, found, found, ACCEPTED)
     pairs = offered("A", "B", paired(list(range(N)), list(range(N))))
     return pd.DataFrame(fusion_rows(a, b, pd.DataFrame([row]), pairs, Merge(), 0.1))
 
@@ -78,7 +79,7 @@ def test_fused_landmarks_are_judged_by_the_middle_of_two_truths(planar: bool) ->
         np.zeros(3), np.eye(3), np.ones(6, bool), 0.0, Status.ACCEPTED, drift_sigma_m=0.0
     )
     names = {"robot_a": "A", "robot_b": "B", "iteration": ITERATION}
-    row = names | {"aligner": "ransac", "repetition": 0} | estimate_row(6, found, found)
+    row = names | {"aligner": "ransac", "repetition": 0} | estimate_row(6, found, found, ACCEPTED)
     pairs = offered("A", "B", paired(list(range(6)), list(range(6))))
     rows = pd.DataFrame(fusion_rows(a, b, pd.DataFrame([row]), pairs, Merge(), 0.1))
     assert rows["error_fused_m"].to_numpy() == pytest.approx(0, abs=1e-9)
@@ -86,6 +87,26 @@ def test_fused_landmarks_are_judged_by_the_middle_of_two_truths(planar: bool) ->
     assert rows["error_b_m"].to_numpy() == pytest.approx(0.04)
     assert rows["nees_with_drift"].to_numpy() == pytest.approx(0, abs=1e-9)
     assert (rows["degrees_of_freedom"] == (2 if planar else 3)).all()
+
+
+def test_only_accepted_alignments_are_fused() -> None:
+    points = np.random.default_rng(1).uniform(0, 5, (6, 3))
+    maps = [robot(name, points, np.zeros(3)).maps[ITERATION] for name in ("A", "B")]
+    found = Alignment(
+        np.zeros(3), np.eye(3), np.ones(6, bool), 0.0, Status.ACCEPTED, drift_sigma_m=0.0
+    )
+    names = {"robot_a": "A", "robot_b": "B", "iteration": ITERATION}
+    pairs = offered("A", "B", paired(list(range(6)), list(range(6))))
+    for verdict, n, left_out in (
+        (ACCEPTED, 6, ()),
+        (Verdict(False, 1.0, "chance does as well"), 6, (("B", "chance does as well"),)),
+    ):
+        row = names | {"aligner": "ransac", "repetition": 0}
+        row |= estimate_row(6, found, found, verdict)
+        fused = fused_maps(maps, pd.DataFrame([row]), pairs, Merge())
+        assert fused.left_out == left_out
+        assert len(fused.landmarks) == n  # fused with B's, or A's alone
+        assert (fused.parents[:, 1] == ABSENT).all() == bool(left_out)
 
 
 def test_truth_of_fused_landmarks_and_fits() -> None:

@@ -16,6 +16,7 @@ def error(
     row = {"seed": 0, "robot_a": "A", "robot_b": "B", "iteration": iteration, "aligner": aligner}
     row |= {"translation_error_m": translation_m, "refined_translation_error_m": refined_m}
     row |= {"refined_rotation_error_rad": 0.0, "oracle_distance_m": 0.0, "n_true": 40}
+    row |= {"accepted": True, "n_common": 60}
     return row | more
 
 
@@ -39,7 +40,7 @@ def tables() -> dict[str, pd.DataFrame]:
         error("ransac", 15, 0.1, 99.0, n_true=3, oracle_distance_m=99.0),
         error("ransac", 20, 0.6, 0.3, oracle_distance_m=0.01),
         error("ransac", 20, 0.8, 0.5, oracle_distance_m=0.03),
-        error("ransac", 20, 0.7, math.nan, oracle_distance_m=math.nan),
+        error("ransac", 20, 0.7, math.nan, oracle_distance_m=math.nan, accepted=False),
         error("svd", 20, 2.1, 0.3),
         error("icp", 20, 1.4, 0.3),
     ]
@@ -83,12 +84,30 @@ KNOWN = {
     "svd.lead_over_others": 0.7 / 2.1,
     "ransac.scatter_m": 0.16,
     "svd.scatter_m": 0.0,
+    "ransac.false_merges": 2 / 5,  # those 99 m off
+    "ransac.missed_merges": 1 / 3,
 }
 
 
 @pytest.mark.parametrize(("name", "value"), KNOWN.items())
 def test_known_answer(tables: dict[str, pd.DataFrame], name: str, value: float) -> None:
     assert compute(name, tables) == pytest.approx(value)
+
+
+@pytest.mark.parametrize(
+    ("changed", "false"),
+    [
+        ({}, False),
+        ({"refined_translation_error_m": 0.51}, True),
+        ({"refined_rotation_error_rad": -0.11}, True),
+        ({"refined_rotation_error_rad": -0.11, "accepted": False}, False),
+        ({"n_common": 0}, True),  # right by chance at best
+        ({"n_common": 0, "accepted": False}, False),
+    ],
+)
+def test_false_merge(changed: dict[str, object], false: bool) -> None:
+    rows = pd.DataFrame([error("ransac", 20, 0.3, 0.2) | changed])
+    assert metrics.is_false_merge(rows).tolist() == [false]
 
 
 def test_no_metric_is_left_untested() -> None:

@@ -298,6 +298,7 @@ def _append_estimates(
             row = names | {"aligner": aligner, "repetition": repetition, "reason": ""}
             row |= {"refined_reason": ""}
             row |= {"status": "accepted", "refined_status": "accepted"}
+            row |= {"accepted": not lost, "log10_false_alarms": 2.0 if lost else -30.0}
             refined_errors = (0.075, 0.0025) if good else (translation, rotation)
             if aligner == "oracle" and lost:
                 row |= {"status": "degenerate", "refined_status": "degenerate"}
@@ -326,6 +327,7 @@ def _append_estimates(
                     row
                     | _estimate_columns(T_true, translation, rotation)
                     | {
+                        "acceptance_reason": "chance does as well" if lost else "",
                         "n_correspondences": len(is_true),
                         "inliers": np.packbits(is_true).tobytes(),
                         "refined_inliers": np.packbits(is_true).tobytes(),

@@ -1,0 +1,147 @@
+"""Acceptance: is the support of an alignment more than chance would give for these two maps?"""
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from mapfusion.align.correspondences import Correspondences, HeightGate
+from mapfusion.align.false_alarms import fewest_false_alarms, thin
+from mapfusion.align.pairs import MIN_PAIRS, Pairs, gather
+from mapfusion.align.result import Alignment, Status
+from mapfusion.landmark_map import LandmarkMap
+from mapfusion.se2 import Float
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether an alignment may be used.
+
+    Attributes:
+        accepted: by the estimator and by the test against chance.
+        log10_false_alarms: decimal logarithm of how many alignments at least this well supported
+            chance is expected to give for these two maps; NaN where there was none to judge.
+        reason: empty when accepted, else what a person can act on.
+    """
+
+    accepted: bool
+    log10_false_alarms: float
+    reason: str = ""
+
+    def applied_to(self, alignment: Alignment) -> Alignment:
+        """The alignment, refused where the verdict says so; a failed one stays what it is."""
+        if self.accepted or not alignment.ok:
+            return alignment
+        return replace(alignment, status=Status.REFUSED, reason=self.reason)
+
+
+@dataclass(frozen=True)
+class Acceptance:
+    """A-contrario test of an alignment, the same for every estimator (Moisan and Stival 2004).
+
+    Against it stands chance: all correspondences false, each landmark of map a paired with a random
+    one of the same height among map b's. Under a motion T such a pair agrees within a gate with a
+    probability p(T), the share that do so among all re-pairings of the very landmarks at hand; maps
+    made of walls have a larger p(T) where T lays wall on wall. A motion that two of n
+    correspondences determine then finds k - 2 supporters or more among the others with probability
+    at most the binomial's tail B(k - 2; n - 2, p) (pairs of unequal p only make it smaller:
+    Hoeffding 1956), and the expected number of such motions among all n (n - 1) / 2 is at most
+
+        NFA = tests * n (n - 1) / 2 * B(k - 2; n - 2, p(T)),
+
+    where `tests` counts the gates and selections tried. An alignment is judged by the motion of two
+    of its own supporters that lies nearest to it; only those count that both bring together. So
+    whatever estimator was used, and however often: two maps without common ground have an
+    acceptable alignment with probability at most `false_alarms`.
+
+    Two things would break this and are met. Neighbours are not independent: corners of one patch
+    share most of their descriptors' windows, and one point may be in a map twice. So of
+    correspondences that are neighbours in both maps only the best-matching one is used. And n false
+    ones can hide few true ones: the best-matching half, quarter, ... are tested as well.
+
+    What it cannot see: texture that repeats is not chance. A poster that hangs on two walls gives
+    as many supporters as common ground does.
+
+    Attributes:
+        false_alarms: accepted expected number of chance alignments for a pair of maps.
+        gates_m: distances in the plane up to which a pair supports a motion: from a landmark's own
+            noise to what drift displaces true pairs by.
+        patch_m: correspondences nearer than this to each other, in both maps, are one. Measured
+            on maps without common ground: such neighbours are 11 times (below 0.1 m) and 2.8 times
+            (0.1 to 0.2 m) as frequent as under re-pairing, 1.3 times beyond.
+        height: which landmarks can have one height (not for planar maps).
+    """
+
+    false_alarms: float = 1e-3
+    gates_m: tuple[float, ...] = (0.05, 0.1, 0.2, 0.4)
+    patch_m: float = 0.2
+    height: HeightGate = field(default_factory=HeightGate)
+
+    def __post_init__(self) -> None:
+        if not 0 < self.false_alarms <= 1:
+            raise ValueError(f"false_alarms: is {self.false_alarms}, expected above 0, at most 1")
+        if not self.gates_m or not all(0 < gate < math.inf for gate in self.gates_m):
+            raise ValueError("gates_m: expected one or more positive distances")
+        if not 0 <= self.patch_m < math.inf:
+            raise ValueError("patch_m: must not be negative")
+
+    def judge(
+        self,
+        map_a: LandmarkMap,
+        map_b: LandmarkMap,
+        correspondences: Correspondences,
+        alignment: Alignment,
+    ) -> Verdict:
+        """Hold an alignment of these correspondences against chance.
+
+        Raises:
+            ValueError: an index of the correspondences lies outside its map.
+        """
+        if not alignment.ok or not np.all(np.isfinite(alignment.T_a_b)):
+            return Verdict(False, math.nan, alignment.reason)
+        pairs = gather(map_a, map_b, correspondences)
+        pairs = pairs[self._independent(pairs, correspondences.distance)]
+        log10, gate_m, n, k = fewest_false_alarms(
+            np.ascontiguousarray(pairs.p_a[:, :2]),
+            np.ascontiguousarray(pairs.p_b[:, :2]),
+            self._heights(pairs),
+            alignment.T_a_b,
+            np.array(sorted(self.gates_m)),
+        )
+        if log10 <= math.log10(self.false_alarms):
+            return Verdict(True, log10)
+        return Verdict(False, log10, self._why(log10, gate_m, n, k))
+
+    def _independent(self, pairs: Pairs, distance: Float) -> np.ndarray:
+        """Rows (n,) of the pairs that count, best match first."""
+        rows = pairs.of_one_height(self.height)
+        rows = rows[np.argsort(distance[rows], kind="stable")]
+        dimensions = 2 if pairs.planar else 3
+        kept = thin(
+            np.ascontiguousarray(pairs.p_a[rows, :dimensions]),
+            np.ascontiguousarray(pairs.p_b[rows, :dimensions]),
+            self.patch_m,
+        )
+        return rows[kept]
+
+    def _heights(self, pairs: Pairs) -> Float:
+        """Heights (n, 4) as `agreeing_repairings` takes them; of planar maps all 0."""
+        if pairs.planar:
+            return np.zeros((len(pairs), 4))
+        bound = self.height.bound
+        variance_a = pairs.covariance_a[:, 2, 2]
+        variance_b = pairs.covariance_b[:, 2, 2] + self.height.floor_m**2
+        return np.stack(
+            [pairs.p_a[:, 2], pairs.p_b[:, 2], bound * variance_a, bound * variance_b], axis=1
+        )
+
+    def _why(self, log10: float, gate_m: float, n: int, k: int) -> str:
+        if n < MIN_PAIRS:
+            return f"{n} independent correspondences are too few to tell from chance"
+        if k < MIN_PAIRS:
+            return f"fewer than {MIN_PAIRS} of {n} independent correspondences support it"
+        times = f"{10**log10:.2g}" if log10 < 4 else f"1e{log10:.0f}"
+        return (
+            f"{k} of {n} independent correspondences agree within {gate_m:g} m; chance alone gives "
+            f"as much {times} times for these maps, {self.false_alarms:g} are allowed"
+        )

@@ -1,0 +1,244 @@
+"""Number of false alarms (NFA) of a motion: the kernels behind `Acceptance`.
+
+Pairs are independent of each other and ordered by how well they match, best first.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from mapfusion.align.pairs import MIN_PAIRS
+from mapfusion.align.rigid import fit_rigid
+from mapfusion.se2 import Float
+
+# Best supporters among whose pairs the motion to be judged is sought: of 190 pairs one reproduces
+# the alignment to a few millimetres.
+_CANDIDATES = 20
+# Halving ends above this: p is not known from fewer pairs, and 8 of them could hardly be accepted.
+_SMALLEST_SELECTION = 16
+
+
+@njit(cache=True)
+def thin(p_a: Float, p_b: Float, patch_m: float) -> np.ndarray:
+    """Rows (n,) of the pairs (N, 2 or 3), in order, that are no neighbours of a kept one.
+
+    Neighbours are less than patch_m apart in both maps.
+    """
+    kept = np.empty(len(p_a), np.int64)
+    n = 0
+    for i in range(len(p_a)):
+        free = True
+        for m in range(n):
+            j = kept[m]
+            if apart_by_less(p_a, i, j, patch_m) and apart_by_less(p_b, i, j, patch_m):
+                free = False
+                break
+        if free:
+            kept[n] = i
+            n += 1
+    return kept[:n].copy()
+
+
+@njit(cache=True)
+def apart_by_less(p: Float, i: int, j: int, distance_m: float) -> bool:
+    """Whether points i and j of (N, D) are less than a distance apart."""
+    if abs(p[i, 0] - p[j, 0]) >= distance_m:  # most are already told apart by this
+        return False
+    square = 0.0
+    for axis in range(p.shape[1]):
+        square += (p[i, axis] - p[j, axis]) ** 2
+    return square < distance_m * distance_m
+
+
+@njit(cache=True)
+def log10_tail(k: int, n: int, p: float) -> float:
+    """log10 of the probability of k or more successes in n trials; 0 up to the mean.
+
+    The first term in logarithms and the others relative to it: tails far below the smallest
+    number a float can hold.
+    """
+    if k <= n * p:
+        return 0.0
+    if p >= 1.0:
+        return 0.0 if k <= n else -math.inf
+    first = math.lgamma(n + 1.0) - math.lgamma(k + 1.0) - math.lgamma(n - k + 1.0)
+    first += k * math.log(p) + (n - k) * math.log1p(-p)
+    total = term = 1.0
+    for m in range(k, n):
+        term *= (n - m) / (m + 1.0) * p / (1 - p)
+        total += term
+        if term < 1e-17 * total:
+            break
+    return min((first + math.log(total)) / math.log(10.0), 0.0)
+
+
+@njit(cache=True)
+def moved_points(T_a_b: Float, p_b: Float) -> Float:
+    """T p_b (n, 2)."""
+    cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+    moved = np.empty((len(p_b), 2))
+    for i in range(len(p_b)):
+        moved[i, 0] = T_a_b[0] + cos * p_b[i, 0] - sin * p_b[i, 1]
+        moved[i, 1] = T_a_b[1] + sin * p_b[i, 0] + cos * p_b[i, 1]
+    return moved
+
+
+@njit(cache=True)
+def residuals_m(T_a_b: Float, p_a: Float, p_b: Float) -> Float:
+    """Distances (n,) in the plane between p_a and T p_b."""
+    apart = p_a - moved_points(T_a_b, p_b)
+    return np.sqrt(apart[:, 0] ** 2 + apart[:, 1] ** 2)
+
+
+@njit(cache=True)
+def minimal_motion(p_a: Float, p_b: Float, supporters: np.ndarray, T_a_b: Float) -> Float:
+    """The motion (3,) of two pairs nearest to T_a_b: least displacement of the supporters (RMS).
+
+    Args:
+        p_a: (n, 2).
+        p_b: (n, 2).
+        supporters: (k,) rows of the pairs, those that T_a_b fits best first.
+        T_a_b: (3,).
+    """
+    k = len(supporters)
+    mean_x = mean_y = square = 0.0
+    for row in supporters:
+        mean_x += p_b[row, 0] / k
+        mean_y += p_b[row, 1] / k
+    for row in supporters:
+        square += ((p_b[row, 0] - mean_x) ** 2 + (p_b[row, 1] - mean_y) ** 2) / k
+    nearest, found = math.inf, T_a_b.copy()
+    two = np.empty(2, np.int64)
+    candidates = min(k, _CANDIDATES)
+    for m in range(1, candidates):
+        for l in range(m):  # noqa: E741
+            two[0], two[1] = supporters[l], supporters[m]
+            tx, ty, theta = fit_rigid(p_a, p_b, two)
+            turned = math.cos(theta) - math.cos(T_a_b[2]), math.sin(theta) - math.sin(T_a_b[2])
+            dx = tx - T_a_b[0] + turned[0] * mean_x - turned[1] * mean_y
+            dy = ty - T_a_b[1] + turned[1] * mean_x + turned[0] * mean_y
+            moved = dx * dx + dy * dy + (turned[0] ** 2 + turned[1] ** 2) * square
+            if moved < nearest:
+                nearest = moved
+                found[0], found[1], found[2] = tx, ty, theta
+    return found
+
+
+@njit(cache=True)
+def same_height(heights: Float, i: int, j: int) -> bool:
+    """Whether landmark a of pair i and landmark b of pair j can have one height."""
+    dz = heights[i, 0] - heights[j, 1]
+    return dz * dz <= heights[i, 2] + heights[j, 3]
+
+
+@njit(cache=True)
+def possible_repairings(heights: Float) -> np.ndarray:
+    """How many (i, j), i not j, can have one height, both among the first m + 1 pairs: (N,)."""
+    counts = np.zeros(len(heights), np.int64)
+    total = 0
+    for m in range(len(heights)):
+        for i in range(m):
+            total += same_height(heights, i, m)
+            total += same_height(heights, m, i)
+        counts[m] = total
+    return counts
+
+
+@njit(cache=True)
+def agreeing_repairings(
+    T_a_b: Float, p_a: Float, p_b: Float, heights: Float, gates_m: Float, first: int
+) -> np.ndarray:
+    """How many (i, j), i not j, of one height agree under T_a_b within each gate.
+
+    Args:
+        T_a_b: (3,).
+        p_a: (N, 2).
+        p_b: (N, 2).
+        heights: (N, 4) z of a and of b, and the most that the squared difference of two heights may
+            be, as the sum of a part of a's and one of b's.
+        gates_m: (G,) ascending.
+        first: size of the selection.
+
+    Returns:
+        (2, G): among the first pairs only, among all.
+    """
+    moved = moved_points(T_a_b, p_b)
+    order_a, order_b = np.argsort(p_a[:, 0]), np.argsort(moved[:, 0])
+    agreeing = np.zeros((2, len(gates_m)), np.int64)
+    widest = gates_m[-1]
+    low = 0
+    for j in order_b:  # from left to right, so that only landmarks in reach are looked at
+        while low < len(p_a) and p_a[order_a[low], 0] < moved[j, 0] - widest:
+            low += 1
+        for m in range(low, len(p_a)):
+            i = order_a[m]
+            if p_a[i, 0] > moved[j, 0] + widest:
+                break
+            distance = math.hypot(p_a[i, 0] - moved[j, 0], p_a[i, 1] - moved[j, 1])
+            if distance > widest or i == j or not same_height(heights, i, j):
+                continue
+            for g in range(len(gates_m)):
+                if distance <= gates_m[g]:
+                    agreeing[1, g] += 1
+                    if i < first and j < first:
+                        agreeing[0, g] += 1
+    return agreeing
+
+
+@njit(cache=True)
+def chance_of_agreeing(agreeing: np.ndarray, possible: np.ndarray) -> Float:
+    """The larger p (G,) of the selection's and all pairs', from counts (2, G) and (2,).
+
+    One more than was counted, as in a test by permutations: that none of a few re-pairings agrees
+    does not make p zero.
+    """
+    p = np.empty(agreeing.shape[1])
+    for g in range(len(p)):
+        selected = (agreeing[0, g] + 1) / (possible[0] + 1)
+        p[g] = max(selected, (agreeing[1, g] + 1) / (possible[1] + 1))
+    return p
+
+
+@njit(cache=True)
+def fewest_false_alarms(
+    p_a: Float, p_b: Float, heights: Float, T_a_b: Float, gates_m: Float
+) -> tuple[float, float, int, int]:
+    """The smallest NFA over gates and selections of the best-matching pairs.
+
+    Args:
+        p_a: (N, 2) of independent pairs, best match first.
+        p_b: (N, 2).
+        heights: (N, 4), see `agreeing_repairings`.
+        T_a_b: (3,) to be judged.
+        gates_m: (G,) ascending.
+
+    Returns:
+        log10 of the NFA, and the gate, number of pairs and of supporters it came from.
+    """
+    total = len(p_a)
+    selections = 1
+    while total >> selections >= _SMALLEST_SELECTION:
+        selections += 1
+    distance = residuals_m(T_a_b, p_a, p_b)
+    possible = possible_repairings(heights)
+    best, best_gate, best_n, best_k = math.inf, 0.0, total, 0
+    for s in range(selections):
+        n = total >> s
+        order = np.argsort(distance[:n], kind="mergesort")
+        supporters = order[: np.sum(distance[:n] <= gates_m[-1])]
+        if len(supporters) < MIN_PAIRS:
+            continue
+        T_two = minimal_motion(p_a, p_b, supporters, T_a_b)
+        agreeing = agreeing_repairings(T_two, p_a, p_b, heights, gates_m, n)
+        p = chance_of_agreeing(agreeing, possible[np.array([n - 1, total - 1])])
+        both = np.maximum(distance[:n], residuals_m(T_two, p_a[:n], p_b[:n]))
+        tests = math.log10(selections * len(gates_m)) + math.log10(n * (n - 1) / 2)
+        for g in range(len(gates_m)):
+            k = int(np.sum(both <= gates_m[g]))
+            if k < MIN_PAIRS:
+                continue
+            log10 = tests + log10_tail(k - 2, n - 2, p[g])
+            if log10 < best:
+                best, best_gate, best_n, best_k = log10, gates_m[g], n, k
+    return best, best_gate, best_n, best_k
