@@ -35,7 +35,9 @@ class P3at:
         body: its id in the world.
     """
 
-    def __init__(self, world: World, T_world_robot: Float) -> None:
+    def __init__(
+        self, world: World, T_world_robot: Float, tire_friction: float = TIRE_FRICTION
+    ) -> None:
         self._p, self._client = world.bullet, world.client
         # without the flag the URDF's inertias would be replaced by those of the collision shapes
         self.body = self._p.loadURDF(
@@ -51,7 +53,7 @@ class P3at:
             self._p.changeDynamics(
                 self.body,
                 wheel,
-                lateralFriction=TIRE_FRICTION,
+                lateralFriction=tire_friction,
                 linearDamping=0,
                 angularDamping=0,
                 physicsClientId=self._client,

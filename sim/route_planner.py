@@ -14,13 +14,12 @@ import numpy as np
 from mapfusion.errors import InputError
 from mapfusion.se2 import Float
 from sim.floorplan import segment_distance_m
-from sim.p3at import OUTER_RADIUS_M
 from sim.plan_generator import GeneratedPlan, PlanParameters, Wing, generate_plan
 
 GROUND_HALF_WIDTH_M = 0.5  # ground this far beside a path counts as visited: about the robot's body
 CELL_M = 0.1  # the ground is counted in squares of this side
-# Between two starts: two robots' outer circles, and what the start jitter may take on either side.
-START_GAP_M = 2 * OUTER_RADIUS_M + 0.5
+# Between two starts: farther than a robot gives way (1.6 m), with what the start jitter may take.
+START_GAP_M = 1.9
 MOST_PLANS = 20  # drawn until one offers the overlap asked for
 NEAR_ENOUGH = 0.03  # of the overlap asked for: drawing stops
 TOLERANCE = 0.13  # of the overlap asked for: farther off is refused (half the gap below 1)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mapfusion.camera import StereoCamera
+from mapfusion.errors import InputError
 from mapfusion.se2 import Float, compose
 from sim.world import World
 
@@ -21,17 +22,24 @@ class RadiometricNoise:
 
     Attributes:
         sigma_gray: standard deviation of each pixel's additive noise, in gray levels of 255.
-        sigma_gain: standard deviation of an image's gain around 1.
+        gain: mean gain; below 1 the pictures are dark, and the noise is not.
+        sigma_gain: standard deviation of an image's gain, relative to the mean gain.
         sigma_offset_gray: standard deviation of an image's offset, in gray levels.
     """
 
     sigma_gray: float = 2.0
     sigma_gain: float = 0.01
     sigma_offset_gray: float = 1.0
+    gain: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in self.__dataclass_fields__:
+            if not 0 <= getattr(self, name) < np.inf:
+                raise InputError(f"radiometry: {name} is {getattr(self, name)}, must be 0 or more")
 
     def apply(self, gray: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """A noisy copy of a gray image (H, W) uint8."""
-        gain = 1 + self.sigma_gain * rng.standard_normal()
+        gain = self.gain * (1 + self.sigma_gain * rng.standard_normal())
         offset = self.sigma_offset_gray * rng.standard_normal()
         noise = rng.standard_normal(gray.shape, dtype=np.float32)
         noise *= np.float32(self.sigma_gray)
@@ -73,7 +81,7 @@ def render_stereo(
 def _render(
     world: World, camera: StereoCamera, T_world_robot: ArrayLike, y_m: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    p = world.bullet
+    p, tiny = world.bullet, world.renderer == "tiny"
     T_world_camera = compose(T_world_robot, [camera.mount_x_m, y_m, 0.0])
     _, _, rgba, buffer, _ = p.getCameraImage(
         camera.width_px,
@@ -85,7 +93,7 @@ def _render(
         lightAmbientCoeff=1.0,
         lightDiffuseCoeff=0.0,
         lightSpecularCoeff=0.0,
-        renderer=p.ER_TINY_RENDERER,
+        renderer=p.ER_TINY_RENDERER if tiny else p.ER_BULLET_HARDWARE_OPENGL,
         flags=p.ER_NO_SEGMENTATION_MASK,
         physicsClientId=world.client,
     )

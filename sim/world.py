@@ -13,7 +13,8 @@ import numpy as np
 
 from mapfusion.se2 import Float
 from sim.floorplan import Face, FloorPlan
-from sim.textures import paint
+from sim.renderer import Renderer, load_egl, require_egl
+from sim.textures import Texture, paint, paint_posters
 
 GRAVITY_M_S2 = 9.81
 PHYSICS_HZ = 240  # PyBullet's own default; contacts and motors are tuned for it
@@ -59,17 +60,26 @@ def _is_open(fd: int) -> bool:
 class World:
     """Owns a PyBullet client without a screen; use it in a `with` block.
 
+    Args:
+        renderer: what draws; raises InputError where it cannot.
+
     Attributes:
+        renderer: what draws.
         bullet: the `pybullet` module.
         client: id to pass as `physicsClientId`.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, renderer: Renderer = "tiny") -> None:
+        if renderer == "egl":
+            require_egl()
+        self.renderer = renderer
         with silence():
             import pybullet
 
             self.bullet = pybullet
             self.client = pybullet.connect(pybullet.DIRECT)
+            if renderer == "egl":
+                load_egl(pybullet, self.client)
         self._faces: list[int] = []
         self._shown = np.zeros(0, dtype=bool)
         # else a mesh written anew under an old name would still look as it did before
@@ -161,13 +171,17 @@ class World:
         self._shown = shown.copy()
 
 
-def write_faces(folder: Path, plan: FloorPlan, rng: np.random.Generator) -> None:
+def write_faces(
+    folder: Path, plan: FloorPlan, rng: np.random.Generator, texture: Texture = Texture()
+) -> None:
     """Write each face's mesh and texture into `folder`; each texture has a child generator."""
     folder.mkdir(parents=True, exist_ok=True)
     faces = plan.faces()
-    for i, (face, child) in enumerate(zip(faces, rng.spawn(len(faces)), strict=True)):
+    *children, of_posters = rng.spawn(len(faces) + 1)
+    posters = paint_posters(texture, of_posters)
+    for i, (face, child) in enumerate(zip(faces, children, strict=True)):
         mesh, path = _face_files(folder, i)
-        picture = cv2.cvtColor(paint(face, child), cv2.COLOR_RGB2BGR)
+        picture = cv2.cvtColor(paint(face, child, texture, posters), cv2.COLOR_RGB2BGR)
         if not cv2.imwrite(str(path), picture, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
             raise OSError(f"{path}: could not be written")
         mesh.write_text(_mesh(face), encoding="ascii")
