@@ -1,4 +1,4 @@
-"""Generated worlds: a scenario's `generate` section becomes its `world` and `robots` at load time."""
+"""Generated worlds: a scenario's `generate` section becomes `world` and `robots` at load time."""
 
 from typing import Annotated, Any
 

@@ -1,4 +1,4 @@
-"""The renderers: PyBullet's own, and the system's OpenGL without a screen (EGL), if there is one."""
+"""The renderers: PyBullet's own, and the system's OpenGL without a screen (EGL)."""
 
 import functools
 import importlib.util
@@ -32,7 +32,7 @@ def require_egl() -> None:
     root = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
     environment = {**os.environ, "PYTHONPATH": root}
     try:
-        tried = subprocess.run(
+        tried = subprocess.run(  # noqa: S603 - our own text, no input of a user's
             [sys.executable, "-c", _PROBE], env=environment, capture_output=True, timeout=PROBE_S
         )
     except subprocess.TimeoutExpired:

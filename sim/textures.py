@@ -67,6 +67,8 @@ class Texture:
             raise InputError("texture: poster_m must be positive, poster_gap_m 0 or more")
 
 
+AS_PAINTED = Texture()
+
 # Smallest wall shapes: 4 px at 8 m, 30 px at 1 m. Floor and ceiling are seen at a grazing angle,
 # where a pixel covers centimetres to decimetres: coarse shapes only.
 STYLES = {
@@ -89,7 +91,7 @@ _SUBTEXEL_BITS = 4
 def paint(
     face: Face,
     rng: np.random.Generator,
-    texture: Texture = Texture(),
+    texture: Texture = AS_PAINTED,
     posters: Sequence[np.ndarray] = (),
 ) -> np.ndarray:
     """An RGB picture (H, W, 3) uint8 of a face, its first row along the upper edge.
@@ -108,7 +110,9 @@ def paint(
 
 def paint_posters(texture: Texture, rng: np.random.Generator) -> list[np.ndarray]:
     """The world's posters, as rich as a wall is by default."""
-    return [_paint_shapes("wall", texture.poster_m, rng, Texture()) for _ in range(texture.posters)]
+    return [
+        _paint_shapes("wall", texture.poster_m, rng, AS_PAINTED) for _ in range(texture.posters)
+    ]
 
 
 def _hang(
