@@ -10,7 +10,6 @@ from typing import Any, Literal
 from mapfusion.errors import InputError
 
 Renderer = Literal["tiny", "egl"]
-RENDERER_NAMES = {"tiny": "TinyRenderer", "egl": "OpenGL by EGL"}
 PLUGIN, PLUGIN_SYMBOL = "eglRenderer", "_eglRendererPlugin"
 PROBE_S = 60  # a first picture takes a second, on a slow disk a few
 NEEDED = (
@@ -22,8 +21,8 @@ _PROBE = "from sim.renderer import probe; probe()"
 
 
 @functools.cache
-def require_egl() -> None:
-    """Raise InputError where EGL cannot draw.
+def egl_driver() -> str:
+    """Name and version of what draws by EGL; raises InputError where it cannot.
 
     It is tried in a process of its own: without a driver the plug-in ends its process.
     """
@@ -39,6 +38,14 @@ def require_egl() -> None:
         raise InputError(NEEDED.format(reason=f"no picture within {PROBE_S} s")) from None
     if tried.returncode:
         raise InputError(NEEDED.format(reason="it drew no picture"))
+    lines = tried.stdout.decode(errors="replace").splitlines()
+    told = dict(line.split("=", 1) for line in lines if line.startswith("GL_") and "=" in line)
+    return ", ".join(told[name] for name in ("GL_RENDERER", "GL_VERSION") if name in told)
+
+
+def renderer_name(renderer: Renderer) -> str:
+    """What results call the renderer that made their images."""
+    return "TinyRenderer" if renderer == "tiny" else f"OpenGL by EGL ({egl_driver()})"
 
 
 def probe() -> None:
@@ -47,12 +54,7 @@ def probe() -> None:
 
     client = pybullet.connect(pybullet.DIRECT)
     load_egl(pybullet, client)
-    width = pybullet.getCameraImage(
-        8, 8, renderer=pybullet.ER_BULLET_HARDWARE_OPENGL, physicsClientId=client
-    )[0]
-    sys.stdout.flush()
-    # the library's own tidying up may fail after the picture
-    os._exit(0 if width == 8 else 1)
+    pybullet.disconnect(physicsClientId=client)
 
 
 def load_egl(bullet: Any, client: int) -> None:
@@ -65,3 +67,8 @@ def load_egl(bullet: Any, client: int) -> None:
         loaded = bullet.loadPlugin(spec.origin, PLUGIN_SYMBOL, physicsClientId=client)
     if loaded < 0:
         raise InputError(NEEDED.format(reason="the plug-in does not load"))
+    # the plug-in talks on stdout during its first two pictures
+    size, opengl = (8, 8), bullet.ER_BULLET_HARDWARE_OPENGL
+    for _ in range(2):
+        if bullet.getCameraImage(*size, renderer=opengl, physicsClientId=client)[:2] != size:
+            raise InputError(NEEDED.format(reason="it drew no picture"))

@@ -14,7 +14,7 @@ import numpy as np
 
 from mapfusion.se2 import Float
 from sim.floorplan import Face, FloorPlan
-from sim.renderer import Renderer, load_egl, require_egl
+from sim.renderer import Renderer, egl_driver, load_egl
 from sim.textures import AS_PAINTED, Texture, paint, paint_posters
 
 GRAVITY_M_S2 = 9.81
@@ -74,7 +74,7 @@ class World:
 
     def __init__(self, renderer: Renderer = "tiny") -> None:
         if renderer == "egl":
-            require_egl()
+            egl_driver()  # raises where there is none
         self.renderer = renderer
         with silence():
             import pybullet

@@ -23,6 +23,7 @@ from mapfusion.storage import column, read_table, schema, write_table, write_who
 from mapfusion.vision.features import Features
 from mapfusion.vision.frontend import FrontEnd
 from sim.recorder import FrameSource, truth_points
+from sim.renderer import renderer_name
 from sim.trajectory import read_trajectory
 from sim.world import write_faces
 
@@ -80,7 +81,10 @@ def stage(
     keep = {"images_at": scenario.keep.images_at, "images": scenario.keep.images}
     vision = {k: v for k, v in resolved["vision"].items() if k in {"harris", "stereo", "usurf"}}
     settings = {"seed": scenario.seed, "robot": robot, "keep": keep, "vision": vision}
-    settings |= {"camera": resolved["camera"], "render": resolved["render"]}
+    settings |= {
+        "camera": resolved["camera"],
+        "renderer": renderer_name(scenario.render.renderer),
+    }
     settings |= {"radiometry": asdict(scenario.radiometry_of(robot))}
     return store.stage("features", settings, [drive, faces], SOURCES)
 
