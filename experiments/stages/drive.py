@@ -50,7 +50,7 @@ def stage(store: Store, scenario: Scenario) -> StageFolder:
     assert drive_settings is not None
     settings = {
         "seed": scenario.seed,
-        "world": world.model_dump(mode="json"),
+        "world": world.model_dump(mode="json", exclude={"texture"}),
         "robots": [robot.model_dump(mode="json", exclude=_SENSORS) for robot in scenario.robots],
         "drive": drive_settings.model_dump(mode="json"),
     }
