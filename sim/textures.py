@@ -41,7 +41,7 @@ class Texture:
     """How a world is painted, against the styles below.
 
     Attributes:
-        contrast: factor on the shapes' contrast and tint; 0 leaves plain faces.
+        contrast: of the shapes against the face's plain colour, as a factor; 0 leaves it plain.
         coverage: factor on how many shapes there are.
         bare: share of the walls' faces that are left plain.
         posters: how many different posters there are; each wall has them side by side, drawn at
@@ -58,7 +58,7 @@ class Texture:
     poster_gap_m: float = 0.4
 
     def __post_init__(self) -> None:
-        for name, most in (("contrast", 1.2), ("coverage", 2), ("bare", 1), ("posters", 100)):
+        for name, most in (("contrast", 1), ("coverage", 2), ("bare", 1), ("posters", 100)):
             if not 0 <= getattr(self, name) <= most:
                 raise InputError(
                     f"texture: {name} is {getattr(self, name)}, must be in [0, {most}]"
@@ -139,7 +139,8 @@ def _paint_shapes(
     width = max(8, round(size_m[0] * style.texels_per_m))
     height = max(8, round(size_m[1] * style.texels_per_m))
     picture = np.empty((height, width, 3), dtype=np.uint8)
-    picture[:] = _colours(1, 0.4, TINT_LEVELS, rng)[0]
+    plain = _colours(1, 0.4, rng)[0].astype(np.uint8)
+    picture[:] = plain
     # no draw where nothing can be bare, so that worlds without bare walls stay as they were
     if texture.bare and kind == "wall" and rng.random() < texture.bare:
         return picture
@@ -148,17 +149,15 @@ def _paint_shapes(
     ):
         scale = scale_m * style.texels_per_m
         n = rng.poisson(coverage * texture.coverage * width * height / scale**2)
-        levels = (contrast * texture.contrast, TINT_LEVELS * texture.contrast)
-        _scatter(picture, scale, n, levels, rng)
+        _scatter(picture, scale, n, contrast, rng)
+    if texture.contrast < 1:
+        above = picture.astype(np.float32) - plain
+        picture = np.rint(plain + texture.contrast * above).astype(np.uint8)
     return cv2.GaussianBlur(picture, (0, 0), style.low_pass_m * style.texels_per_m)
 
 
 def _scatter(
-    picture: np.ndarray,
-    scale: float,
-    n: int,
-    contrast_and_tint: tuple[float, float],
-    rng: np.random.Generator,
+    picture: np.ndarray, scale: float, n: int, contrast: float, rng: np.random.Generator
 ) -> None:
     """Paint n convex polygons of about `scale` texels across."""
     height, width = picture.shape[:2]
@@ -168,7 +167,7 @@ def _scatter(
     stretch = rng.uniform(0.5, 1.0, n)
     turn = rng.uniform(0, 2 * np.pi, (n, 2))
     jitter = rng.uniform(-0.3, 0.3, (n, 6))
-    colour = _colours(n, *contrast_and_tint, rng).tolist()
+    colour = _colours(n, contrast, rng).tolist()
     for i in range(n):
         k = corners[i]
         angle = turn[i, 0] + 2 * np.pi * (np.arange(k) + jitter[i, :k]) / k
@@ -179,6 +178,6 @@ def _scatter(
         cv2.fillConvexPoly(picture, fixed_point, colour[i], cv2.LINE_8, _SUBTEXEL_BITS)
 
 
-def _colours(n: int, contrast: float, tint: float, rng: np.random.Generator) -> np.ndarray:
+def _colours(n: int, contrast: float, rng: np.random.Generator) -> np.ndarray:
     gray = 127.5 + 127.5 * contrast * rng.uniform(-1, 1, (n, 1))
-    return np.clip(gray + rng.normal(0, tint, (n, 3)), 10, 245)
+    return np.clip(gray + rng.normal(0, TINT_LEVELS, (n, 3)), 10, 245)
