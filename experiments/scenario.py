@@ -238,9 +238,12 @@ class Scenario(Section):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        simulated = self.world is not None and self.drive is not None and bool(self.robots)
+        given = self.world is not None and bool(self.robots)
+        simulated = self.drive is not None and (given or self.generate is not None)
         if simulated == bool(self.logs):
-            raise ValueError("give either world, robots and drive, or generate and drive, or logs")
+            raise ValueError(
+                "give either world, robots and drive, or logs (generate stands for world and robots)"
+            )
         _require_unique("robots", [robot.name for robot in self.robots])
         _require_unique("logs", self.logs)
         aligners = [entry.name for entry in self.align.aligners]
