@@ -242,7 +242,7 @@ class Scenario(Section):
         simulated = self.drive is not None and (given or self.generate is not None)
         if simulated == bool(self.logs):
             raise ValueError(
-                "give either world, robots and drive, or logs (generate stands for world and robots)"
+                "give either world, robots and drive, or logs; generate stands for world and robots"
             )
         _require_unique("robots", [robot.name for robot in self.robots])
         _require_unique("logs", self.logs)
