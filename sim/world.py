@@ -1,5 +1,6 @@
 """The PyBullet world: one client, walls to bump into, or painted faces to look at."""
 
+import atexit
 import contextlib
 import ctypes
 import os
@@ -83,6 +84,7 @@ class World:
             self.client = pybullet.connect(pybullet.DIRECT)
             if renderer == "egl":
                 load_egl(pybullet, self.client)
+                atexit.register(self.close)  # a world left open would take its leave on stdout
         self._faces: list[int] = []
         self._shown = np.zeros(0, dtype=bool)
         # else a mesh written anew under an old name would still look as it did before
@@ -105,6 +107,7 @@ class World:
             with silence():
                 self.bullet.disconnect(physicsClientId=self.client)
             self.client = -1
+            atexit.unregister(self.close)
 
     def start_physics(self) -> int:
         """Gravity, time step and a flat ground; returns the ground's body id."""

@@ -108,6 +108,18 @@ def test_nothing_has_no_depth_and_nothing_is_said(capfd: pytest.CaptureFixture[s
     assert capfd.readouterr() == ("", "")
 
 
+@needs_egl
+def test_a_world_left_open_ends_in_silence() -> None:
+    code = "from sim.world import World; world = World('egl')"
+    ended = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | {"PYTHONPATH": os.getcwd()},
+        capture_output=True,
+        check=True,
+    )
+    assert (ended.stdout, ended.stderr) == (b"", b"")
+
+
 def test_a_system_without_a_driver_is_told_in_one_line() -> None:
     """In a process of its own: the plug-in would end this one."""
     code = (
