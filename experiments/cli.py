@@ -20,6 +20,10 @@ app = typer.Typer(
 import_app = typer.Typer(no_args_is_help=True, help="Turn recordings of others into robot logs.")
 app.add_typer(import_app, name="import")
 
+ScenarioNames = Annotated[
+    list[str],
+    typer.Argument(metavar="SCENARIO...", help="Scenario files, or names or tags of the suite."),
+]
 ScenarioPath = Annotated[Path, typer.Argument(metavar="SCENARIO", help="Scenario file (YAML).")]
 Seed = Annotated[int | None, typer.Option(help="Replaces the scenario's seed.", min=0)]
 Overrides = Annotated[
@@ -34,7 +38,7 @@ DEFAULT_RESULTS = Path("results")
 
 @app.command()
 def run(
-    scenario: ScenarioPath,
+    scenarios: ScenarioNames,
     seed: Seed = None,
     overrides: Overrides = None,
     jobs: Jobs = None,
@@ -49,15 +53,21 @@ def run(
     from experiments.figures import draw_all
     from experiments.result import result_folder, run_scenario
     from experiments.scenario import load_scenario
+    from experiments.suite import scenarios_of
 
-    loaded = load_scenario(scenario, overrides or (), seed)
-    folder = result_folder(results, loaded)
     n_jobs = jobs or available_cores()
-    skipped: list[str] = []
-    with screen.progress() as show:
-        run_scenario(loaded, results, n_jobs, show, fresh)
-        draw_all(folder, n_jobs, lambda done, total: show("figures", done, total), skipped.append)
-    screen.print_result(folder, skipped)
+    for loaded in [load_scenario(s, overrides or (), seed) for s in scenarios_of(scenarios)]:
+        folder = result_folder(results, loaded)
+        skipped: list[str] = []
+        with screen.progress() as show:
+            run_scenario(loaded, results, n_jobs, show, fresh)
+            draw_all(
+                folder,
+                n_jobs,
+                lambda done, total, show=show: show("figures", done, total),
+                skipped.append,
+            )
+        screen.print_result(folder, skipped)
 
 
 @app.command()
@@ -84,7 +94,7 @@ def figures(
 
 @app.command()
 def check(
-    scenarios: Annotated[list[Path], typer.Argument(metavar="SCENARIO...", help="Scenario files.")],
+    scenarios: ScenarioNames,
     seeds: Annotated[str, typer.Option(help="A seed, a range 0..4 or a list 0,2,5.")] = "0",
     overrides: Overrides = None,
     jobs: Jobs = None,
@@ -92,15 +102,17 @@ def check(
     junit: Annotated[Path | None, typer.Option(help="Write a JUnit report to this file.")] = None,
     results: Results = DEFAULT_RESULTS,
 ) -> None:
-    """Run scenarios over seeds and hold them to their `expect` blocks; exit code 1 if one fails."""
+    """Hold runs to their `expect` blocks, exit code 1 if one fails: `mapfusion check ci`."""
     from experiments import screen
     from experiments.checks import check as check_scenario
     from experiments.checks import parse_seeds, write_junit
     from experiments.result import run_scenario
     from experiments.scenario import load_scenario
+    from experiments.suite import scenarios_of
 
     wanted = parse_seeds(seeds)
-    loaded = [[load_scenario(s, overrides or (), seed) for seed in wanted] for s in scenarios]
+    paths = scenarios_of(scenarios)
+    loaded = [[load_scenario(path, overrides or (), seed) for seed in wanted] for path in paths]
     outcomes = []
     for per_seed in loaded:
         folders = {}
@@ -115,6 +127,19 @@ def check(
         write_junit(junit, outcomes)
     if not all(outcome.passed for outcome in outcomes):
         raise typer.Exit(EXIT_FAILED)
+
+
+@app.command("scenarios")
+def list_scenarios(
+    folder: Annotated[Path, typer.Argument(metavar="[FOLDER]", help="Of scenario files.")] = Path(
+        "scenarios"
+    ),
+) -> None:
+    """List the suite, with the tags that `run` and `check` take: `mapfusion scenarios`."""
+    from experiments import screen
+    from experiments.suite import entries
+
+    screen.print_scenarios(entries(folder))
 
 
 @app.command()

@@ -7,6 +7,7 @@ from typing import Any
 from experiments.pipeline import Plan
 from experiments.store import library_versions
 from mapfusion.align.registry import find_method
+from sim.renderer import renderer_name
 
 RESULT_SCHEMA_VERSION = 1
 
@@ -17,7 +18,9 @@ def provenance(plan: Plan) -> dict[str, Any]:
         "schema_version": RESULT_SCHEMA_VERSION,
         "scenario": plan.scenario.name,
         "seed": plan.scenario.seed,
-        "renderer": "none (imported logs)" if plan.scenario.logs else "TinyRenderer",
+        "renderer": "none (imported logs)"
+        if plan.scenario.logs
+        else renderer_name(plan.scenario.render.renderer),
         "python": platform.python_version(),
         "machine": platform.machine(),
         "libraries": library_versions(),

@@ -20,6 +20,7 @@ from pydantic import (
 )
 
 from experiments.aligner_calls import require_usable
+from experiments.generate import Generate, Generated, expanded
 from experiments.metrics import known_metrics
 from experiments.yaml_input import apply_overrides, read_mapping
 from mapfusion.align.acceptance import Acceptance
@@ -33,7 +34,9 @@ from mapfusion.merge import MergeParameters
 from mapfusion.vision.frontend import FrontEndParameters
 from sim.driver import DriverSettings
 from sim.odometry import OdometryNoise
+from sim.p3at import TIRE_FRICTION
 from sim.stereo_head import RadiometricNoise
+from sim.textures import Texture
 
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,40}$"  # names become parts of file names
 Name = Annotated[str, Field(pattern=NAME_PATTERN)]
@@ -79,15 +82,23 @@ class World(Section):
     walls: Annotated[list[Wall], Field(min_length=1)]
     wall_height_m: Annotated[float, Field(gt=0.5, le=6)] = 2.5
     wall_thickness_m: Annotated[float, Field(gt=0.01, le=1)] = 0.12
+    texture: Texture = Texture()
 
 
 class Robot(Section):
-    """One robot: where it starts (x_m, y_m, theta_rad in the world) and the points it visits."""
+    """One robot: where it starts (x_m, y_m, theta_rad in the world) and the points it visits.
+
+    `odometry` and `radiometry` replace the scenario's for this robot. `tire_friction` is that of
+    its wheels against the ground; on a slippery floor they spin as it speeds up.
+    """
 
     name: Name
     start: Pose
     route: Annotated[list[Point], Field(min_length=1)]
     loop: bool = True
+    odometry: OdometryNoise | None = None
+    radiometry: RadiometricNoise | None = None
+    tire_friction: Annotated[float, Field(gt=0, le=2)] = TIRE_FRICTION
 
 
 class Drive(Section):
@@ -98,6 +109,12 @@ class Drive(Section):
     start_jitter_m: Annotated[float, Field(ge=0, le=1)] = 0.1
     start_jitter_rad: Annotated[float, Field(ge=0, le=3.2)] = 0.1
     control: DriverSettings = DriverSettings()
+
+
+class Render(Section):
+    """What draws the images: PyBullet's own software renderer, or the system's OpenGL by EGL."""
+
+    renderer: Literal["tiny", "egl"] = "tiny"
 
 
 class Keep(Section):
@@ -197,16 +214,24 @@ class Bound(Section):
 
 
 class Scenario(Section):
-    """One experiment: simulated (world, robots, drive) or from recorded logs."""
+    """One experiment: simulated (world, robots, drive) or from recorded logs.
+
+    `generate` stands in place of world and robots; once loaded, these are there instead, and
+    `generated` tells where they came from.
+    """
 
     schema_version: Literal[1]
     name: Name
     description: str = ""
+    tags: list[Name] = []
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    generate: Generate | None = None
+    generated: Generated | None = None
     world: World | None = None
     robots: list[Robot] = []
     drive: Drive | None = None
     logs: list[str] = []
+    render: Render = Render()
     camera: Annotated[StereoCamera, AfterValidator(_renderable)] = StereoCamera()
     radiometry: RadiometricNoise = RadiometricNoise()
     odometry: OdometryNoise = OdometryNoise()
@@ -220,9 +245,12 @@ class Scenario(Section):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        simulated = self.world is not None and self.drive is not None and bool(self.robots)
+        given = self.world is not None and bool(self.robots)
+        simulated = self.drive is not None and (given or self.generate is not None)
         if simulated == bool(self.logs):
-            raise ValueError("give either world, robots and drive, or logs")
+            raise ValueError(
+                "give either world, robots and drive, or logs; generate stands for world and robots"
+            )
         _require_unique("robots", [robot.name for robot in self.robots])
         _require_unique("logs", self.logs)
         aligners = [entry.name for entry in self.align.aligners]
@@ -236,6 +264,16 @@ class Scenario(Section):
         if unknown:
             raise ValueError(f"expect.{unknown[0]}: unknown; known: {', '.join(known)}")
         return self
+
+    def radiometry_of(self, robot: str) -> RadiometricNoise:
+        """The noise of a robot's images."""
+        own = {r.name: r.radiometry for r in self.robots}[robot]
+        return self.radiometry if own is None else own
+
+    def odometry_of(self, robot: str) -> OdometryNoise:
+        """The noise of a robot's odometry."""
+        own = {r.name: r.odometry for r in self.robots}[robot]
+        return self.odometry if own is None else own
 
     def resolved(self) -> dict[str, Any]:
         """All settings, defaults filled in, as JSON-able values."""
@@ -256,10 +294,28 @@ def load_scenario(path: Path, overrides: Sequence[str] = (), seed: int | None = 
     data = apply_overrides(read_mapping(path), overrides)
     if seed is not None:
         data["seed"] = seed
+    data = _expanded(str(path), data)
     scenario = _validated(str(path), Scenario, data)
     _warn_of_name_clashes(scenario.align)
     logs = [str((path.parent / log).resolve()) for log in scenario.logs]
     return scenario.model_copy(update={"logs": logs})
+
+
+def _expanded(where: str, data: dict[str, Any]) -> dict[str, Any]:
+    """The data with the world and the robots that its `generate` section stands for."""
+    if data.get("generate") is None:
+        return data
+    if data.get("world") is not None or data.get("robots") or data.get("logs"):
+        raise InputError(f"{where}: give either generate, or world and robots, or logs")
+    # the rest is judged first: what is wrong with the seed must not show as a broken plan
+    if not isinstance(data.get("seed", 0), int):
+        return data
+    settings = _validated(f"{where}: generate", Generate, data["generate"])
+    try:
+        made = expanded(settings, data.get("seed", 0))
+    except InputError as error:
+        raise InputError(f"{where}: generate.{error}") from error
+    return {key: value for key, value in data.items() if key != "generate"} | made
 
 
 def load_section(path: Path | None, name: str, kind: type[S], overrides: Sequence[str]) -> S:

@@ -21,6 +21,7 @@ from mapfusion.align.result import NOT_RUN, Status
 
 if TYPE_CHECKING:
     from experiments.checks import Outcome
+    from experiments.suite import Entry
     from mapfusion.landmark_map import LandmarkMap
     from mapfusion.merge import FusedMap
 
@@ -379,3 +380,23 @@ def print_fused(path: Path, fused: "FusedMap", names: Sequence[str]) -> None:
             console.print(f"  {name}: T_first_map = {text}")
     for name, reason in fused.left_out:
         console.print(f"  {name}: left out, its alignment was not accepted ({reason})")
+
+
+def print_scenarios(entries: "Sequence[Entry]") -> None:
+    """The scenarios of a folder."""
+    table = Table(**_LAYOUT)
+    for title in ("scenario", "tags"):
+        table.add_column(title, overflow="fold")
+    for title in ("robots", "iterations", "overlap"):
+        table.add_column(title, justify="right")
+    table.add_column("what it is", ratio=1)
+    for entry in entries:
+        table.add_row(
+            escape(entry.name),
+            escape(" ".join(entry.tags)),
+            str(entry.robots),
+            "recorded" if entry.iterations is None else str(entry.iterations),
+            "" if entry.overlap is None else f"{entry.overlap:.2f}",
+            escape(entry.description),
+        )
+    Console().print(table)

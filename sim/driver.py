@@ -90,7 +90,7 @@ def drive(
     with World() as world:
         ground = world.start_physics()
         world.add_solid_walls(plan)
-        robots = [P3at(world, route.T_world_start) for route in routes]
+        robots = [P3at(world, route.T_world_start, route.tire_friction) for route in routes]
         drivers = [
             _Driver(route, robot, settings) for route, robot in zip(routes, robots, strict=True)
         ]

@@ -135,7 +135,7 @@ class FloorPlan:
         """
         points = np.asarray(points, dtype=np.float64)
         starts, ends, thickness, _ = self.segments()
-        distance = _point_segment_distance(points[:, None], starts[None], ends[None])
+        distance = segment_distance_m(points[:, None], starts[None], ends[None])
         return np.min(distance - thickness / 2, axis=1)
 
     def leg_clearance_m(self, start: ArrayLike, end: ArrayLike) -> float:
@@ -144,10 +144,10 @@ class FloorPlan:
         starts, ends, thickness, _ = self.segments()
         distance = np.min(
             [
-                _point_segment_distance(start, starts, ends),
-                _point_segment_distance(end, starts, ends),
-                _point_segment_distance(starts, start, end),
-                _point_segment_distance(ends, start, end),
+                segment_distance_m(start, starts, ends),
+                segment_distance_m(end, starts, ends),
+                segment_distance_m(starts, start, end),
+                segment_distance_m(ends, start, end),
             ],
             axis=0,
         )
@@ -192,7 +192,7 @@ def _upright(start: Float, end: Float, height_m: float) -> Face:
     return Face(corners, "wall")
 
 
-def _point_segment_distance(points: Float, starts: Float, ends: Float) -> Float:
+def segment_distance_m(points: Float, starts: Float, ends: Float) -> Float:
     """Distances of points (..., 2) to segments (..., 2), broadcast."""
     along = ends - starts
     share = np.sum((points - starts) * along, -1) / np.maximum(np.sum(along**2, -1), 1e-300)

@@ -17,7 +17,7 @@ OUTER_RADIUS_M = float(np.hypot(LENGTH_M, WIDTH_M) / 2)  # the circle it sweeps 
 TOP_SPEED_M_S = 0.7
 TOP_WHEEL_SPEED_RAD_S = 6.4
 WHEEL_TORQUE_N_M = 20.0
-TIRE_FRICTION = 0.6  # against a ground of friction 1: rubber on a smooth indoor floor
+TIRE_FRICTION = 0.5  # against a ground of friction 1: rubber on a smooth indoor floor
 CENTER_OF_MASS_M = 0.1735  # of the body without wheels, above the floor
 
 # A body turning at w on four sliding points: Coulomb friction opposes each one's slip
@@ -35,7 +35,9 @@ class P3at:
         body: its id in the world.
     """
 
-    def __init__(self, world: World, T_world_robot: Float) -> None:
+    def __init__(
+        self, world: World, T_world_robot: Float, tire_friction: float = TIRE_FRICTION
+    ) -> None:
         self._p, self._client = world.bullet, world.client
         # without the flag the URDF's inertias would be replaced by those of the collision shapes
         self.body = self._p.loadURDF(
@@ -49,12 +51,11 @@ class P3at:
         self._wheels = [joints[name] for name in WHEELS]
         for wheel in self._wheels:
             self._p.changeDynamics(
-                self.body,
-                wheel,
-                lateralFriction=TIRE_FRICTION,
-                linearDamping=0,
-                angularDamping=0,
-                physicsClientId=self._client,
+                self.body, wheel, linearDamping=0, angularDamping=0, physicsClientId=self._client
+            )
+            # in a call of its own: beside dampings PyBullet passes over the friction
+            self._p.changeDynamics(
+                self.body, wheel, lateralFriction=tire_friction, physicsClientId=self._client
             )
             self._p.setCollisionFilterGroupMask(
                 self.body, wheel, WHEEL, GROUND, physicsClientId=self._client

@@ -1,6 +1,6 @@
 """Frames of a recording, each on its own: any process can render any frame in any order."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ from mapfusion.camera import StereoCamera
 from mapfusion.errors import InputError
 from mapfusion.se2 import Float, transform_points
 from sim.p3at import P3at
+from sim.renderer import Renderer
 from sim.stereo_head import RadiometricNoise, StereoFrame, render_stereo
 from sim.visibility import Visibility
 from sim.world import OUT_OF_SIGHT_M, World
@@ -24,22 +25,22 @@ class FrameSource:
     Args:
         faces: folder that `sim.world.write_faces` has filled.
         camera: of all robots.
-        robots: their names.
-        noise: of the images.
+        noise: of each robot's images, by the robot's name.
+        renderer: see `sim.world.World`.
     """
 
     def __init__(
         self,
         faces: Path,
         camera: StereoCamera,
-        robots: Sequence[str],
-        noise: RadiometricNoise,
+        noise: Mapping[str, RadiometricNoise],
+        renderer: Renderer = "tiny",
     ) -> None:
-        self._camera, self._noise = camera, noise
-        self._world = World()
+        self._camera, self._noise = camera, dict(noise)
+        self._world = World(renderer)
         self._visibility = Visibility(self._world.add_painted_faces(faces), camera)
         start = np.zeros(3)
-        self._robots = {name: P3at(self._world, start) for name in robots}
+        self._robots = {name: P3at(self._world, start) for name in noise}
 
     def __enter__(self) -> "FrameSource":
         return self
@@ -63,7 +64,7 @@ class FrameSource:
         for (name, body), pose in zip(self._robots.items(), poses, strict=True):
             body.place(pose, OUT_OF_SIGHT_M if name == robot else 0.0)  # it does not see itself
         self._world.show_faces(self._visibility.seen(own_pose))
-        return render_stereo(self._world, self._camera, own_pose, self._noise, rng)
+        return render_stereo(self._world, self._camera, own_pose, self._noise[robot], rng)
 
 
 def truth_points(

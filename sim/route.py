@@ -10,7 +10,7 @@ from mapfusion.arguments import require_finite, require_shape
 from mapfusion.errors import InputError
 from mapfusion.se2 import Float
 from sim.floorplan import FloorPlan
-from sim.p3at import OUTER_RADIUS_M, WIDTH_M
+from sim.p3at import OUTER_RADIUS_M, TIRE_FRICTION, WIDTH_M
 
 
 @dataclass(frozen=True)
@@ -22,12 +22,14 @@ class Route:
         T_world_start: (3,).
         waypoints_m: (K, 2), visited in order.
         loop: whether it begins again with the first waypoint after the last; else it stands still.
+        tire_friction: of the robot's wheels against the ground; low, and they slip.
     """
 
     robot: str
     T_world_start: Float
     waypoints_m: Float
     loop: bool = False
+    tire_friction: float = TIRE_FRICTION
 
     def __post_init__(self) -> None:
         for name, shape in (("T_world_start", (3,)), ("waypoints_m", (None, 2))):
@@ -37,6 +39,10 @@ class Route:
             require_finite(name, values)
         if len(self.waypoints_m) == 0:
             raise InputError(f"robot {self.robot}: needs at least one waypoint")
+        if not 0 < self.tire_friction < np.inf:
+            raise InputError(
+                f"robot {self.robot}: tire_friction is {self.tire_friction}, must be above 0"
+            )
 
 
 def check_routes(plan: FloorPlan, routes: Sequence[Route]) -> None:

@@ -7,11 +7,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mapfusion.camera import StereoCamera
+from mapfusion.errors import InputError
 from mapfusion.se2 import Float, compose
 from sim.world import World
 
 NEAR_M = 0.1  # nearer than any wall can come to the lens
 FAR_M = 100.0  # beyond the largest building's diagonal
+LAMP_M = (0.0, 0.0, 1000.0)  # so far above that its light is parallel
 BACKGROUND_M = 0.99 * FAR_M  # an untouched depth buffer is not exactly 1
 
 
@@ -21,17 +23,24 @@ class RadiometricNoise:
 
     Attributes:
         sigma_gray: standard deviation of each pixel's additive noise, in gray levels of 255.
-        sigma_gain: standard deviation of an image's gain around 1.
+        gain: mean gain; below 1 the pictures are dark, and the noise is not.
+        sigma_gain: standard deviation of an image's gain, relative to the mean gain.
         sigma_offset_gray: standard deviation of an image's offset, in gray levels.
     """
 
     sigma_gray: float = 2.0
     sigma_gain: float = 0.01
     sigma_offset_gray: float = 1.0
+    gain: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in self.__dataclass_fields__:
+            if not 0 <= getattr(self, name) < np.inf:
+                raise InputError(f"radiometry: {name} is {getattr(self, name)}, must be 0 or more")
 
     def apply(self, gray: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """A noisy copy of a gray image (H, W) uint8."""
-        gain = 1 + self.sigma_gain * rng.standard_normal()
+        gain = self.gain * (1 + self.sigma_gain * rng.standard_normal())
         offset = self.sigma_offset_gray * rng.standard_normal()
         noise = rng.standard_normal(gray.shape, dtype=np.float32)
         noise *= np.float32(self.sigma_gray)
@@ -64,34 +73,39 @@ def render_stereo(
     rng: np.random.Generator,
 ) -> StereoFrame:
     """Render both images and the left one's depth for a robot at a pose (3,)."""
-    left_rgb, depth_m = _render(world, camera, T_world_robot, camera.baseline_m / 2)
-    right_rgb, _ = _render(world, camera, T_world_robot, -camera.baseline_m / 2)
-    left, right = (cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) for rgb in (left_rgb, right_rgb))
+    left_rgba, buffer = _render(world, camera, T_world_robot, camera.baseline_m / 2)
+    right_rgba, _ = _render(world, camera, T_world_robot, -camera.baseline_m / 2)
+    left, right = (cv2.cvtColor(rgba, cv2.COLOR_RGBA2GRAY) for rgba in (left_rgba, right_rgba))
+    left_rgb = cv2.cvtColor(left_rgba, cv2.COLOR_RGBA2RGB)
+    depth_m = _metric_depth(buffer)
     return StereoFrame(noise.apply(left, rng), noise.apply(right, rng), depth_m, left_rgb)
 
 
 def _render(
     world: World, camera: StereoCamera, T_world_robot: ArrayLike, y_m: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    p = world.bullet
+    """RGBA (H, W, 4) uint8 and the depth buffer (H, W) of a camera beside the robot's middle."""
+    p, tiny = world.bullet, world.renderer == "tiny"
+    # EGL takes no coefficients; a lamp along all meshes' normals shows the texture as painted
+    lamp = {} if tiny else {"lightDirection": LAMP_M}
     T_world_camera = compose(T_world_robot, [camera.mount_x_m, y_m, 0.0])
     _, _, rgba, buffer, _ = p.getCameraImage(
         camera.width_px,
         camera.height_px,
         viewMatrix=_view_matrix(T_world_camera, camera.mount_z_m),
-        projectionMatrix=_projection_matrix(camera),
+        projectionMatrix=_projection_matrix(camera, sampled_at_px=0.0 if tiny else 0.5),
         shadow=0,
         # the texture as painted: a wall looks the same from everywhere
         lightAmbientCoeff=1.0,
         lightDiffuseCoeff=0.0,
         lightSpecularCoeff=0.0,
-        renderer=p.ER_TINY_RENDERER,
+        renderer=p.ER_TINY_RENDERER if tiny else p.ER_BULLET_HARDWARE_OPENGL,
         flags=p.ER_NO_SEGMENTATION_MASK,
         physicsClientId=world.client,
+        **lamp,
     )
     shape = (camera.height_px, camera.width_px)
-    rgb = np.ascontiguousarray(np.reshape(rgba, (*shape, 4))[..., :3].astype(np.uint8))
-    return rgb, _metric_depth(np.reshape(buffer, shape))
+    return np.reshape(rgba, (*shape, 4)).astype(np.uint8, copy=False), np.reshape(buffer, shape)
 
 
 def _view_matrix(T_world_camera: Float, z_m: float) -> list[float]:
@@ -104,16 +118,18 @@ def _view_matrix(T_world_camera: Float, z_m: float) -> list[float]:
     return matrix.T.ravel().tolist()
 
 
-def _projection_matrix(camera: StereoCamera) -> list[float]:
+def _projection_matrix(camera: StereoCamera, sampled_at_px: float) -> list[float]:
     """Exact pinhole, column by column.
 
-    TinyRenderer samples pixel i at the coordinate i of a viewport that is `width` wide, so the
-    middle of its frustum falls on width / 2; the principal point belongs on (width - 1) / 2.
+    The principal point belongs on pixel (width - 1) / 2. TinyRenderer samples pixel i at the
+    coordinate i of a viewport that is `width` wide, so there the middle of its frustum falls on
+    width / 2, half a pixel off; OpenGL samples at i + 1/2, where nothing is to be mended.
     """
+    off_px = 1 - 2 * sampled_at_px
     width, height, f = camera.width_px, camera.height_px, camera.focal_px
     matrix = np.zeros((4, 4))
-    matrix[0, 0], matrix[0, 2] = 2 * f / width, 1 / width
-    matrix[1, 1], matrix[1, 2] = 2 * f / height, 1 / height
+    matrix[0, 0], matrix[0, 2] = 2 * f / width, off_px / width
+    matrix[1, 1], matrix[1, 2] = 2 * f / height, off_px / height
     matrix[2, 2] = -(FAR_M + NEAR_M) / (FAR_M - NEAR_M)
     matrix[2, 3] = -2 * FAR_M * NEAR_M / (FAR_M - NEAR_M)
     matrix[3, 2] = -1

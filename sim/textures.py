@@ -7,11 +7,13 @@ metre), and the picture is low-passed to what a pixel resolves at 5 m and beyond
 matching errs by 0.02 m (median) at 5-6 m; with 175 texels per metre and less smoothing by 0.03 m.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
+from mapfusion.errors import InputError
 from sim.floorplan import Face
 
 
@@ -34,6 +36,39 @@ class TextureStyle:
     low_pass_m: float
 
 
+@dataclass(frozen=True)
+class Texture:
+    """How a world is painted, against the styles below.
+
+    Attributes:
+        contrast: of the shapes against the face's plain colour, as a factor; 0 leaves it plain.
+        coverage: factor on how many shapes there are.
+        bare: share of the walls' faces that are left plain.
+        posters: how many different posters there are; each wall has them side by side, drawn at
+            random, so the same picture hangs in many places. 0: no posters.
+        poster_m: a poster's width and height.
+        poster_gap_m: between two posters.
+    """
+
+    contrast: float = 1.0
+    coverage: float = 1.0
+    bare: float = 0.0
+    posters: int = 0
+    poster_m: tuple[float, float] = (1.2, 1.6)
+    poster_gap_m: float = 0.4
+
+    def __post_init__(self) -> None:
+        for name, most in (("contrast", 1), ("coverage", 2), ("bare", 1), ("posters", 100)):
+            if not 0 <= getattr(self, name) <= most:
+                raise InputError(
+                    f"texture: {name} is {getattr(self, name)}, must be in [0, {most}]"
+                )
+        if not min(self.poster_m) > 0 or not self.poster_gap_m >= 0:
+            raise InputError("texture: poster_m must be positive, poster_gap_m 0 or more")
+
+
+AS_PAINTED = Texture()
+
 # Smallest wall shapes: 4 px at 8 m, 30 px at 1 m. Floor and ceiling are seen at a grazing angle,
 # where a pixel covers centimetres to decimetres: coarse shapes only.
 STYLES = {
@@ -48,22 +83,76 @@ STYLES = {
     "ceiling": TextureStyle(60, (1.6, 0.8, 0.4), (0.7, 0.5, 0.3), (0.3, 0.4, 0.4), 0.016),
 }
 
+POSTER_FOOT_M = 0.2  # lower edge above the floor: the camera looks from 0.45 m, level
 TINT_LEVELS = 35  # colour is for the eye; the cameras are gray
 _SUBTEXEL_BITS = 4
 
 
-def paint(face: Face, rng: np.random.Generator) -> np.ndarray:
-    """An RGB picture (H, W, 3) uint8 of a face, its first row along the upper edge."""
-    style = STYLES[face.kind]
-    width = max(8, round(face.size_m[0] * style.texels_per_m))
-    height = max(8, round(face.size_m[1] * style.texels_per_m))
+def paint(
+    face: Face,
+    rng: np.random.Generator,
+    texture: Texture = AS_PAINTED,
+    posters: Sequence[np.ndarray] = (),
+) -> np.ndarray:
+    """An RGB picture (H, W, 3) uint8 of a face, its first row along the upper edge.
+
+    Args:
+        face: what is painted.
+        rng: decides all that is on it.
+        texture: how rich it is.
+        posters: pictures (from `paint_posters`) that hang on it if it is a wall.
+    """
+    picture = _paint_shapes(face.kind, face.size_m, rng, texture)
+    if face.kind == "wall" and len(posters):
+        _hang(picture, posters, texture, rng)
+    return picture
+
+
+def paint_posters(texture: Texture, rng: np.random.Generator) -> list[np.ndarray]:
+    """The world's posters, as rich as a wall is by default."""
+    return [
+        _paint_shapes("wall", texture.poster_m, rng, AS_PAINTED) for _ in range(texture.posters)
+    ]
+
+
+def _hang(
+    picture: np.ndarray, posters: Sequence[np.ndarray], texture: Texture, rng: np.random.Generator
+) -> None:
+    """Paste as many posters, drawn at random, as fit side by side in the middle of a wall."""
+    density = STYLES["wall"].texels_per_m
+    height, width = posters[0].shape[:2]
+    gap, foot = round(texture.poster_gap_m * density), round(POSTER_FOOT_M * density)
+    n = (picture.shape[1] - gap) // (width + gap)
+    if n < 1 or picture.shape[0] < foot + height:
+        return
+    left = (picture.shape[1] - n * (width + gap) + gap) // 2
+    top = picture.shape[0] - foot - height
+    for i, kind in enumerate(rng.integers(0, len(posters), n)):
+        u = left + i * (width + gap)
+        picture[top : top + height, u : u + width] = posters[kind]
+
+
+def _paint_shapes(
+    kind: str, size_m: tuple[float, float], rng: np.random.Generator, texture: Texture
+) -> np.ndarray:
+    style = STYLES[kind]
+    width = max(8, round(size_m[0] * style.texels_per_m))
+    height = max(8, round(size_m[1] * style.texels_per_m))
     picture = np.empty((height, width, 3), dtype=np.uint8)
-    picture[:] = _colours(1, 0.4, rng)[0]
+    plain = _colours(1, 0.4, rng)[0].astype(np.uint8)
+    picture[:] = plain
+    # no draw where nothing can be bare, so that worlds without bare walls stay as they were
+    if texture.bare and kind == "wall" and rng.random() < texture.bare:
+        return picture
     for scale_m, coverage, contrast in zip(
         style.scales_m, style.coverage, style.contrast, strict=True
     ):
         scale = scale_m * style.texels_per_m
-        _scatter(picture, scale, rng.poisson(coverage * width * height / scale**2), contrast, rng)
+        n = rng.poisson(coverage * texture.coverage * width * height / scale**2)
+        _scatter(picture, scale, n, contrast, rng)
+    if texture.contrast < 1:
+        above = picture.astype(np.float32) - plain
+        picture = np.rint(plain + texture.contrast * above).astype(np.uint8)
     return cv2.GaussianBlur(picture, (0, 0), style.low_pass_m * style.texels_per_m)
 
 

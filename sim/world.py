@@ -1,9 +1,11 @@
 """The PyBullet world: one client, walls to bump into, or painted faces to look at."""
 
+import atexit
 import contextlib
 import ctypes
 import os
 import sys
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
@@ -13,12 +15,15 @@ import numpy as np
 
 from mapfusion.se2 import Float
 from sim.floorplan import Face, FloorPlan
-from sim.textures import paint
+from sim.renderer import Renderer, egl_driver, load_egl
+from sim.textures import AS_PAINTED, Texture, paint, paint_posters
 
 GRAVITY_M_S2 = 9.81
 PHYSICS_HZ = 240  # PyBullet's own default; contacts and motors are tuned for it
 CORNERS = "corners.npy"  # of all faces, beside their meshes and textures
 OUT_OF_SIGHT_M = -100.0  # below the floor, where what must not be seen waits
+
+GL_ROW_TEXELS = 4  # OpenGL's default row alignment
 
 # Who collides with whom (bit masks): wheels with the ground alone.
 GROUND, WHEEL, BODY = 1, 2, 4
@@ -59,17 +64,27 @@ def _is_open(fd: int) -> bool:
 class World:
     """Owns a PyBullet client without a screen; use it in a `with` block.
 
+    Args:
+        renderer: what draws; raises InputError where it cannot.
+
     Attributes:
+        renderer: what draws.
         bullet: the `pybullet` module.
         client: id to pass as `physicsClientId`.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, renderer: Renderer = "tiny") -> None:
+        if renderer == "egl":
+            egl_driver()  # raises where there is none
+        self.renderer = renderer
         with silence():
             import pybullet
 
             self.bullet = pybullet
             self.client = pybullet.connect(pybullet.DIRECT)
+            if renderer == "egl":
+                load_egl(pybullet, self.client)
+                atexit.register(self.close)  # a world left open would take its leave on stdout
         self._faces: list[int] = []
         self._shown = np.zeros(0, dtype=bool)
         # else a mesh written anew under an old name would still look as it did before
@@ -92,6 +107,7 @@ class World:
             with silence():
                 self.bullet.disconnect(physicsClientId=self.client)
             self.client = -1
+            atexit.unregister(self.close)
 
     def start_physics(self) -> int:
         """Gravity, time step and a flat ground; returns the ground's body id."""
@@ -145,11 +161,30 @@ class World:
                 mesh, picture = _face_files(folder, i)
                 shape = p.createVisualShape(p.GEOM_MESH, fileName=str(mesh), physicsClientId=client)
                 body = p.createMultiBody(0, baseVisualShapeIndex=shape, physicsClientId=client)
-                texture = p.loadTexture(str(picture), physicsClientId=client)
+                texture = self._load_texture(picture)
                 p.changeVisualShape(body, -1, textureUniqueId=texture, physicsClientId=client)
                 self._faces.append(body)
         self._shown = np.ones(len(corners_m), dtype=bool)
         return corners_m
+
+    def _load_texture(self, picture: Path) -> int:
+        """Load a picture; for EGL as one whose rows the plug-in reads right.
+
+        It hands rows of 3 bytes a texel to OpenGL, which takes each to begin at a multiple of 4
+        bytes: of any other width a picture comes out sheared.
+        """
+        p, client = self.bullet, self.client
+        if self.renderer == "tiny":
+            return p.loadTexture(str(picture), physicsClientId=client)
+        image = cv2.imread(str(picture))
+        if image is None:
+            raise OSError(f"{picture}: could not be read")
+        size = (-(-image.shape[1] // GL_ROW_TEXELS) * GL_ROW_TEXELS, image.shape[0])
+        with tempfile.TemporaryDirectory() as folder:
+            fitting = str(Path(folder) / "texture.bmp")
+            if not cv2.imwrite(fitting, cv2.resize(image, size, interpolation=cv2.INTER_LINEAR)):
+                raise OSError(f"{fitting}: could not be written")
+            return p.loadTexture(fitting, physicsClientId=client)
 
     def show_faces(self, shown: np.ndarray) -> None:
         """Show some of the painted faces (mask) and put the others out of sight."""
@@ -161,13 +196,17 @@ class World:
         self._shown = shown.copy()
 
 
-def write_faces(folder: Path, plan: FloorPlan, rng: np.random.Generator) -> None:
+def write_faces(
+    folder: Path, plan: FloorPlan, rng: np.random.Generator, texture: Texture = AS_PAINTED
+) -> None:
     """Write each face's mesh and texture into `folder`; each texture has a child generator."""
     folder.mkdir(parents=True, exist_ok=True)
     faces = plan.faces()
-    for i, (face, child) in enumerate(zip(faces, rng.spawn(len(faces)), strict=True)):
+    *children, of_posters = rng.spawn(len(faces) + 1)
+    posters = paint_posters(texture, of_posters)
+    for i, (face, child) in enumerate(zip(faces, children, strict=True)):
         mesh, path = _face_files(folder, i)
-        picture = cv2.cvtColor(paint(face, child), cv2.COLOR_RGB2BGR)
+        picture = cv2.cvtColor(paint(face, child, texture, posters), cv2.COLOR_RGB2BGR)
         if not cv2.imwrite(str(path), picture, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
             raise OSError(f"{path}: could not be written")
         mesh.write_text(_mesh(face), encoding="ascii")
@@ -179,12 +218,13 @@ def _face_files(folder: Path, i: int) -> tuple[Path, Path]:
 
 
 def _mesh(face: Face) -> str:
-    """One quad as OBJ; with normals and texture coordinates, or the renderer draws nothing."""
-    right, up = face.corners_m[[1, 3]] - face.corners_m[0]
-    normal = np.cross(right, up)
-    normal /= np.linalg.norm(normal)
+    """One quad as OBJ; with normals and texture coordinates, or the renderer draws nothing.
+
+    The normals all point up. They only serve the light: TinyRenderer is told to use none, and EGL,
+    which takes no such order, has its lamp above, so that it too shows each texture as painted.
+    """
     lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in face.corners_m]
     lines += ["vt 0 0", "vt 1 0", "vt 1 1", "vt 0 1"]
-    lines += [f"vn {normal[0]:.9g} {normal[1]:.9g} {normal[2]:.9g}"]
+    lines += ["vn 0 0 1"]
     lines += ["f 1/1/1 2/2/1 3/3/1", "f 1/1/1 3/3/1 4/4/1"]
     return "\n".join(lines) + "\n"

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from experiments.aligner_calls import callable_aligner, refine_estimate
 from experiments.evaluate import EvaluatedRobot
 from experiments.randomness import generator
 from experiments.refusal import cases, results
@@ -20,7 +21,6 @@ from experiments.stages.slam import evaluated_iterations
 from experiments.workers import workers
 from mapfusion import se2
 from mapfusion.align.acceptance import Acceptance
-from mapfusion.align.registry import make_aligner
 
 REPEATED_PER_WORLDS = 9  # posters hung in each pair of worlds
 
@@ -168,9 +168,11 @@ def _answers(
     rows = []
     for entry in settings.aligners:
         rng = generator(scenario.seed, *map(str, names.values()), entry.name)
-        aligner = make_aligner(entry.method, **entry.parameters)
+        aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
         estimated = aligner.align(case.map_a, case.map_b, case.pairs, rng)
-        refined = settings.refinement.refine(case.map_a, case.map_b, case.pairs, estimated.T_a_b)
+        refined = refine_estimate(
+            settings.refinement, case.map_a, case.map_b, case.pairs, estimated
+        )
         verdict = settings.acceptance.judge(case.map_a, case.map_b, case.pairs, refined)
         error = refined.T_a_b - case.T_true
         rows.append(

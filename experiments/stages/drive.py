@@ -16,6 +16,8 @@ from sim.trajectory import write_trajectory
 SOURCES = ("sim", "mapfusion/se2.py", "mapfusion/storage.py")
 SOURCES += ("experiments/stages/drive.py", "experiments/randomness.py")
 
+_SENSORS = {"odometry", "radiometry"}  # of a robot; its way does not depend on them
+
 
 def floor_plan(scenario: Scenario) -> FloorPlan:
     """The scenario's walls as the simulator takes them."""
@@ -48,8 +50,8 @@ def stage(store: Store, scenario: Scenario) -> StageFolder:
     assert drive_settings is not None
     settings = {
         "seed": scenario.seed,
-        "world": world.model_dump(mode="json"),
-        "robots": [robot.model_dump(mode="json") for robot in scenario.robots],
+        "world": world.model_dump(mode="json", exclude={"texture"}),
+        "robots": [robot.model_dump(mode="json", exclude=_SENSORS) for robot in scenario.robots],
         "drive": drive_settings.model_dump(mode="json"),
     }
     return store.stage("drive", settings, [], SOURCES)
@@ -62,7 +64,9 @@ def run(scenario: Scenario, output: StageFolder) -> None:
     assert drive_settings is not None
     starts = start_poses(scenario)
     routes = [
-        Route(robot.name, starts[robot.name], np.array(robot.route), robot.loop)
+        Route(
+            robot.name, starts[robot.name], np.array(robot.route), robot.loop, robot.tire_friction
+        )
         for robot in scenario.robots
     ]
     try:

@@ -6,6 +6,7 @@ never made again. Images are kept for a few frames only (for figure 1).
 
 import time
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 
 import cv2
@@ -22,6 +23,7 @@ from mapfusion.storage import column, read_table, schema, write_table, write_who
 from mapfusion.vision.features import Features
 from mapfusion.vision.frontend import FrontEnd
 from sim.recorder import FrameSource, truth_points
+from sim.renderer import renderer_name
 from sim.trajectory import read_trajectory
 from sim.world import write_faces
 
@@ -61,7 +63,13 @@ def faces_stage(store: Store, scenario: Scenario) -> StageFolder:
 def run_faces(scenario: Scenario, output: StageFolder) -> None:
     """Paint the walls, once for all processes."""
     started = time.perf_counter()
-    write_faces(output.path, floor_plan(scenario), generator(scenario.seed, "textures"))
+    assert scenario.world is not None
+    write_faces(
+        output.path,
+        floor_plan(scenario),
+        generator(scenario.seed, "textures"),
+        scenario.world.texture,
+    )
     output.finish(elapsed_s=time.perf_counter() - started)
 
 
@@ -73,7 +81,11 @@ def stage(
     keep = {"images_at": scenario.keep.images_at, "images": scenario.keep.images}
     vision = {k: v for k, v in resolved["vision"].items() if k in {"harris", "stereo", "usurf"}}
     settings = {"seed": scenario.seed, "robot": robot, "keep": keep, "vision": vision}
-    settings |= {"camera": resolved["camera"], "radiometry": resolved["radiometry"]}
+    settings |= {
+        "camera": resolved["camera"],
+        "renderer": renderer_name(scenario.render.renderer),
+    }
+    settings |= {"radiometry": asdict(scenario.radiometry_of(robot))}
     return store.stage("features", settings, [drive, faces], SOURCES)
 
 
@@ -96,12 +108,16 @@ class _OpenWorld:
 
     @classmethod
     def get(cls, scenario: Scenario, faces: StageFolder) -> FrameSource:
-        key = (faces.key, scenario.model_dump_json(include={"camera", "radiometry", "robots"}))
+        key = (
+            faces.key,
+            scenario.model_dump_json(include={"camera", "radiometry", "render", "robots"}),
+        )
         if cls.key != key:
             if cls.source is not None:
                 cls.source.close()
-            names = [robot.name for robot in scenario.robots]
-            cls.source = FrameSource(faces.path, scenario.camera, names, scenario.radiometry)
+            noise = {robot.name: scenario.radiometry_of(robot.name) for robot in scenario.robots}
+            renderer = scenario.render.renderer
+            cls.source = FrameSource(faces.path, scenario.camera, noise, renderer)
             cls.key = key
         assert cls.source is not None
         return cls.source

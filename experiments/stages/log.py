@@ -81,7 +81,11 @@ def stage(
     store: Store, scenario: Scenario, drive: StageFolder, observed: StageFolder, robot: str
 ) -> StageFolder:
     """Where this robot's log is or will be."""
-    settings = {"seed": scenario.seed, "robot": robot, "odometry": asdict(scenario.odometry)}
+    settings = {
+        "seed": scenario.seed,
+        "robot": robot,
+        "odometry": asdict(scenario.odometry_of(robot)),
+    }
     return store.stage("log", settings, [drive, observed], SOURCES)
 
 
@@ -94,7 +98,7 @@ def run(
     index = trajectory.index(robot)
     increments = encoder_increments(trajectory.wheel_rad[index], calibrated_track_m())
     rng = generator(scenario.seed, "odometry", robot)
-    odometry = add_noise(increments, scenario.odometry, rng)
+    odometry = add_noise(increments, scenario.odometry_of(robot), rng)
     write_frames(output.path, robot, False, trajectory.time_s, odometry)
     for name in ("observations.parquet", "truth_points.parquet"):
         link_or_copy(observed.path / name, output.path / name)

@@ -34,7 +34,7 @@ def faces(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("place", ["corridor", "room"])
 def test_stereo_frame_of_640x480(benchmark: BenchmarkFixture, faces: Path, place: str) -> None:
     poses = np.array([[1.0, 7.5, 0.0], [2.6, 2.0, 0.7]])
-    with FrameSource(faces, StereoCamera(), ["a", "b"], RadiometricNoise()) as source:
+    with FrameSource(faces, StereoCamera(), dict.fromkeys("ab", RadiometricNoise())) as source:
         robot = "a" if place == "corridor" else "b"
         benchmark(lambda: source.render(poses, robot, np.random.default_rng(0)))
 
@@ -54,6 +54,6 @@ def test_painting_a_world(benchmark: BenchmarkFixture, tmp_path: Path) -> None:
 
 def test_loading_a_world(benchmark: BenchmarkFixture, faces: Path) -> None:
     def load() -> None:
-        FrameSource(faces, StereoCamera(), ["a", "b", "c"], RadiometricNoise()).close()
+        FrameSource(faces, StereoCamera(), dict.fromkeys("abc", RadiometricNoise())).close()
 
     benchmark.pedantic(load, rounds=3)

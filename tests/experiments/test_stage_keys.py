@@ -13,6 +13,8 @@ from experiments.pipeline import plan
 from experiments.scenario import load_scenario
 from experiments.stages import align, drive, features, judge, log, slam
 from experiments.store import Store, source_hash
+from mapfusion.errors import InputError
+from sim.renderer import egl_driver
 
 STAGES = ["drive", "faces", "features", "observed", "log", "slam", "align", "judge"]
 
@@ -27,6 +29,26 @@ def keys(tmp_path: Path, *overrides: str) -> dict[str, tuple[str, ...]]:
     return {stage: tuple(own) for stage, own in found.items()}
 
 
+def test_one_robot_s_own_noise_leaves_the_other_s_stages_alone(tmp_path: Path) -> None:
+    before = keys(tmp_path)
+    for override, stage in (
+        ("odometry={scale_sigma: 0.1}", "log"),
+        ("radiometry={gain: 0.3}", "features"),
+    ):
+        after = keys(tmp_path, f"robots.1.{override}")
+        assert after[stage][0] == before[stage][0]
+        assert after[stage][1] != before[stage][1]
+
+
+def egl_works() -> bool:
+    try:
+        egl_driver()
+    except InputError:
+        return False
+    return True
+
+
+needs_egl = pytest.mark.skipif(not egl_works(), reason="this system has no EGL")
 AFTER = {stage: STAGES[i:] for i, stage in enumerate(STAGES)}
 
 
@@ -52,6 +74,13 @@ AFTER = {stage: STAGES[i:] for i, stage in enumerate(STAGES)}
         ("camera.baseline_m=0.1", AFTER["features"]),
         ("radiometry.sigma_gray=3", AFTER["features"]),
         ("drive.frames=45", [stage for stage in STAGES if stage != "faces"]),
+        ("tags=[ci]", []),
+        ("robots.0.odometry={scale_sigma: 0.1}", AFTER["log"]),
+        ("robots.0.radiometry={gain: 0.3}", AFTER["features"]),
+        ("radiometry.gain=0.3", AFTER["features"]),
+        ("robots.0.tire_friction=0.3", [stage for stage in STAGES if stage != "faces"]),
+        ("world.texture.contrast=0.5", [stage for stage in STAGES if stage != "drive"]),
+        pytest.param("render.renderer=egl", AFTER["features"], marks=needs_egl),
         ("world.wall_height_m=2", STAGES),
         ("seed=4", STAGES),
     ],

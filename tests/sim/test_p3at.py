@@ -7,6 +7,7 @@ from sim.p3at import (
     CENTER_OF_MASS_M,
     LENGTH_M,
     SKID_TRACK_M,
+    TIRE_FRICTION,
     TOP_WHEEL_SPEED_RAD_S,
     TRACK_M,
     URDF,
@@ -110,6 +111,32 @@ def test_a_straight_run_agrees_with_the_encoders() -> None:
     assert steady == pytest.approx(2.0 * WHEEL_RADIUS_M * 3, abs=2e-3)
     assert wheels == pytest.approx([8.0, 8.0], rel=0.01)
     assert abs(poses[-1][2] - 0.5) < 0.01
+
+
+def test_the_tires_have_the_friction_they_are_given() -> None:
+    """PyBullet passes over a friction that is set together with dampings."""
+    with World() as world:
+        for friction in (TIRE_FRICTION, 0.05):
+            robot = P3at(world, np.zeros(3), friction)
+            for wheel in range(world.bullet.getNumJoints(robot.body, physicsClientId=world.client)):
+                info = world.bullet.getDynamicsInfo(robot.body, wheel, physicsClientId=world.client)
+                assert info[1] == friction
+
+
+def test_wheels_spin_on_a_slippery_floor() -> None:
+    """At rest, all wheels are set to 0.44 m/s at once: friction mu lets the body follow at mu g."""
+    friction, time_s = 0.03, 0.5
+    with World() as world:
+        world.start_physics()
+        robot = P3at(world, np.zeros(3), friction)
+        world.step(PHYSICS_HZ // 2)
+        start = robot.pose()[0]
+        robot.drive(4.0, 4.0)
+        world.step(round(time_s * PHYSICS_HZ))
+        way = robot.pose()[0] - start
+        turned = robot.wheel_angles().mean() * WHEEL_RADIUS_M
+    assert way == pytest.approx(0.5 * friction * 9.81 * time_s**2, rel=0.1)
+    assert turned > 4 * way
 
 
 @pytest.mark.parametrize("sign", [1, -1])

@@ -14,14 +14,14 @@ from sim.recorder import FrameSource, truth_points
 from sim.stereo_head import RadiometricNoise, StereoFrame
 
 CAMERA = StereoCamera(320, 240, 288.0)
-ROBOTS = ("a", "b")
+NOISE = dict.fromkeys("ab", RadiometricNoise())
 # a looks at b, which stands broadside 2 m ahead of it, before the far wall at y = 3.95
 POSES = np.array([[1.0, 0.8, np.pi / 2], [1.0, 2.8, 0.0]])
 
 
 @pytest.fixture(scope="module")
 def source(faces: Path) -> Iterator[FrameSource]:
-    with FrameSource(faces, CAMERA, ROBOTS, RadiometricNoise()) as opened:
+    with FrameSource(faces, CAMERA, NOISE) as opened:
         yield opened
 
 
@@ -46,7 +46,7 @@ def test_any_order_and_any_process_give_the_same_bits(source: FrameSource, faces
         f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
         "from pathlib import Path\n"
         "import test_recorder as t\n"
-        "s = t.FrameSource(Path(sys.argv[1]), t.CAMERA, t.ROBOTS, t.RadiometricNoise())\n"
+        "s = t.FrameSource(Path(sys.argv[1]), t.CAMERA, t.NOISE)\n"
         "print(t.digest([t.render(s, k) for k in (2, 0, 3, 1)][1::2]))\n"
     )
     result = subprocess.run(
@@ -72,7 +72,7 @@ def test_a_robot_does_not_see_itself(faces: Path) -> None:
     """From the rear of the deck it would see the deck; b, behind it, is out of sight too."""
     camera = StereoCamera(320, 240, 288.0, mount_x_m=-0.3)
     poses = np.array([[2.2, 2.8, 0.3], [1.0, 2.8, 0.0]])
-    with FrameSource(faces, camera, ROBOTS, RadiometricNoise()) as source:
+    with FrameSource(faces, camera, NOISE) as source:
         depth = source.render(poses, "a", np.random.default_rng(0)).depth_m
     lowest_ray = (camera.height_px - 1 - camera.center_px[1]) / camera.focal_px
     assert depth.min() == pytest.approx(camera.mount_z_m / lowest_ray, abs=1e-3)  # the floor

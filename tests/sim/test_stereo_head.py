@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from mapfusion.camera import StereoCamera
+from mapfusion.errors import InputError
 from mapfusion.se2 import transform_points
 from sim.floorplan import Face, FloorPlan
 from sim.stereo_head import RadiometricNoise, StereoFrame, render_stereo
@@ -155,3 +156,16 @@ def test_camera_of_another_size_and_mount_is_exact_too(room: FloorPlan, faces: P
         world.add_painted_faces(faces)
         frame = render_stereo(world, camera, POSE, NO_NOISE, np.random.default_rng(0))
     assert off_surface_m(room, camera, frame.depth_m).max() < 2e-4
+
+
+def test_a_dark_camera_scales_the_light_and_not_the_noise() -> None:
+    dark = RadiometricNoise(sigma_gray=3.0, sigma_gain=0, sigma_offset_gray=0, gain=0.25)
+    flat = np.full((200, 300), 160, dtype=np.uint8)
+    seen = dark.apply(flat, np.random.default_rng(2)).astype(float)
+    assert seen.mean() == pytest.approx(40, abs=0.05)
+    assert seen.std() == pytest.approx(np.sqrt(9 + 1 / 12), rel=0.02)
+
+
+def test_negative_noise_is_refused() -> None:
+    with pytest.raises(InputError, match="radiometry: gain is -1"):
+        RadiometricNoise(gain=-1)

@@ -2,8 +2,9 @@ import cv2
 import numpy as np
 import pytest
 
+from mapfusion.errors import InputError
 from sim.floorplan import Face
-from sim.textures import STYLES, paint
+from sim.textures import STYLES, Texture, paint, paint_posters
 
 WALL = Face(np.array([[0, 0, 0], [3, 0, 0], [3, 0, 2.5], [0, 0, 2.5]], dtype=float), "wall")
 
@@ -48,3 +49,63 @@ def test_nothing_repeats() -> None:
         score[max(0, row - near) : row + near, max(0, column - near) : column + near] = 0
         assert score.max() < 0.6
         assert cv2.matchTemplate(second, patch, cv2.TM_CCOEFF_NORMED).max() < 0.6
+
+
+def painted(**settings: object) -> np.ndarray:
+    texture = Texture(**settings)
+    posters = paint_posters(texture, np.random.default_rng(9))
+    picture = paint(WALL, np.random.default_rng(3), texture, posters)
+    return cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+
+
+def test_contrast_scales_all_that_differs_from_the_plain_colour() -> None:
+    full, third, none = (painted(contrast=c).astype(float) for c in (1.0, 0.3, 0.0))
+    assert np.ptp(none) == 0
+    np.testing.assert_allclose(third - none, 0.3 * (full - none), atol=2)  # rounded thrice
+    assert full.std() > 20
+
+
+def test_less_coverage_leaves_fewer_corners() -> None:
+    def corners(**settings: object) -> int:
+        return len(cv2.goodFeaturesToTrack(painted(**settings), 5000, 0.02, 8))
+
+    assert corners(coverage=0.25) < 0.6 * corners()
+
+
+def test_the_share_of_bare_walls_is_the_one_asked_for() -> None:
+    texture = Texture(bare=0.3)
+    bare = [
+        np.ptp(paint(WALL, np.random.default_rng(seed), texture), axis=(0, 1)).max() == 0
+        for seed in range(60)
+    ]
+    assert 8 <= sum(bare) <= 28  # 18 expected, standard deviation 3.5
+
+
+def test_the_same_posters_hang_on_different_walls() -> None:
+    texture = Texture(posters=1, contrast=0.2)
+    (poster,) = paint_posters(texture, np.random.default_rng(9))
+    for seed in (1, 2):
+        wall = paint(WALL, np.random.default_rng(seed), texture, [poster])
+        found = cv2.matchTemplate(wall, poster, cv2.TM_SQDIFF)
+        assert found.min() == 0
+        hung = np.argwhere(found == 0)
+        assert len(hung) == 1  # 3 m hold one of 1.2 m with gaps of 0.4 m, not two
+        assert hung[0, 0] == round((2.5 - 0.2 - 1.6) * STYLES["wall"].texels_per_m)
+    assert len(paint_posters(Texture(posters=3), np.random.default_rng(0))) == 3
+
+
+def test_a_poster_hangs_only_where_there_is_room() -> None:
+    texture = Texture(posters=1)
+    low = Face(WALL.corners_m * [1, 1, 0.5], "wall")
+    posters = paint_posters(texture, np.random.default_rng(9))
+    with_posters = paint(low, np.random.default_rng(1), texture, posters)
+    np.testing.assert_array_equal(with_posters, paint(low, np.random.default_rng(1)))
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"contrast": -1}, {"bare": 2}, {"posters": 1000}, {"poster_m": (0, 1)}, {"coverage": np.nan}],
+)
+def test_impossible_textures_are_refused(settings: dict) -> None:
+    with pytest.raises(InputError, match=f"texture: {next(iter(settings))}"):
+        Texture(**settings)
