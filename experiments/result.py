@@ -15,12 +15,13 @@ import pandas as pd
 from experiments import tables
 from experiments.evaluate import EvaluatedRobot, path_columns, robot_rows
 from experiments.fusion import fused_maps, fused_truth, map_fit_rows
-from experiments.pipeline import OnProgress, Plan, execute
+from experiments.pipeline import Plan, execute
 from experiments.provenance import provenance
 from experiments.scenario import Scenario
 from experiments.stages import slam
 from experiments.stages.judge import load_robot
 from experiments.store import Store, link_or_copy
+from experiments.tasks import OnProgress
 from experiments.timing import time_aligners
 from mapfusion import se2
 from mapfusion.aligned_landmarks import ABSENT

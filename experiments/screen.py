@@ -36,6 +36,7 @@ _STAGE_TEXT = {
     "drive": "drive the robots",
     "faces": "paint the walls",
     "render": "render and find features",
+    "log": "track features",
     "slam": "FastSLAM",
     "align": "align the maps",
     "judge": "compare with the truth",

@@ -4,12 +4,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.pipeline import OnProgress, record_logs
+from experiments.pipeline import record_logs
 from experiments.randomness import generator
 from experiments.scenario import Align, Merge, Scenario, Slam, load_section
 from experiments.stages.align import estimate_row
 from experiments.stages.log import copy_log
 from experiments.store import Store
+from experiments.tasks import OnProgress
 from mapfusion.align.correspondences import match
 from mapfusion.align.registry import make_aligner
 from mapfusion.errors import InputError

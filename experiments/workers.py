@@ -48,6 +48,7 @@ class Workers:
     """
 
     def __init__(self, jobs: int) -> None:
+        self.jobs = jobs
         self._queue: deque[tuple[Any, Callable[..., Any], tuple]] = deque()
         self._pending: dict[Future, Any] = {}
         self._pool: ProcessPoolExecutor | None = None
@@ -62,6 +63,11 @@ class Workers:
             self._queue.append((tag, function, arguments))
         else:
             self._pending[self._pool.submit(function, *arguments)] = tag
+
+    @property
+    def open_tasks(self) -> int:
+        """How many tasks were submitted and have not ended."""
+        return len(self._queue) + len(self._pending)
 
     def completed(self) -> Iterator[tuple[Any, Any]]:
         """(tag, result) of each task as it ends; a task's error is raised here."""
