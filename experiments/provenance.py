@@ -5,9 +5,15 @@ from datetime import UTC, datetime
 from typing import Any
 
 from experiments.pipeline import Plan
+from experiments.scenario import Scenario
 from experiments.store import library_versions
 
 RESULT_SCHEMA_VERSION = 1
+
+
+def renderer(scenario: Scenario) -> str:
+    """What made the pictures."""
+    return "none (imported logs)" if scenario.logs else "TinyRenderer"
 
 
 def provenance(plan: Plan) -> dict[str, Any]:
@@ -16,7 +22,7 @@ def provenance(plan: Plan) -> dict[str, Any]:
         "schema_version": RESULT_SCHEMA_VERSION,
         "scenario": plan.scenario.name,
         "seed": plan.scenario.seed,
-        "renderer": "none (imported logs)" if plan.scenario.logs else "TinyRenderer",
+        "renderer": renderer(plan.scenario),
         "python": platform.python_version(),
         "machine": platform.machine(),
         "libraries": library_versions(),

@@ -28,7 +28,7 @@ class Task:
         kind: what progress counts it under.
         function: called with the arguments.
         arguments: all can be pickled.
-        outputs: files that are there once it is done.
+        outputs: files that are there once it is done; without any it is never taken for done.
         needs: names of the tasks that must be done before.
     """
 
@@ -42,7 +42,7 @@ class Task:
     @property
     def finished(self) -> bool:
         """Whether all it makes is on disk."""
-        return all(path.is_file() for path in self.outputs)
+        return bool(self.outputs) and all(path.is_file() for path in self.outputs)
 
     def run(self) -> None:
         """Do the work, unless somebody else has done it meanwhile."""
