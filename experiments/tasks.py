@@ -14,10 +14,6 @@ from experiments.workers import Workers
 
 OnProgress = Callable[[str, int, int], None]
 
-# Tasks handed out for each process: while it works on one, the next is there already. More would
-# be begun in the order in which they became ready; those left are begun in the order of the plan.
-_HANDED_OUT_PER_PROCESS = 2
-
 
 @dataclass(frozen=True)
 class Task:
@@ -89,7 +85,7 @@ def run_tasks(tasks: Sequence[Task], pool: Workers, on_progress: OnProgress) -> 
         on_progress(kind, 0, total[kind])
 
     def hand_out() -> None:
-        while ready and pool.open_tasks < _HANDED_OUT_PER_PROCESS * pool.jobs:
+        while ready and pool.has_room:
             i = heapq.heappop(ready)
             pool.submit(i, tasks[i].run)
 

@@ -3,7 +3,6 @@
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import cast
 
 import dask.config
 from distributed import Client, LocalCluster
@@ -59,7 +58,7 @@ def _local(jobs: int) -> Iterator[Client]:
             n_workers=jobs,
             threads_per_worker=1,
             processes=True,
-            dashboard_address=cast(str, None),  # none is served
+            dashboard_address="localhost:0",  # any port that is free
             silence_logs=logging.CRITICAL,
             preload=["experiments.sweep.worker"],
         )
