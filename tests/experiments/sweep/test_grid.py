@@ -90,7 +90,10 @@ def test_names_do_not_depend_on_the_rest_of_the_sweep(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("entry", "words"),
     [
-        ("slam.particles=5", ["slam.particles", "unknown key", "filter"]),
+        (
+            "slam.particles=5",
+            ["slam.particles", "unknown key", "did you mean slam.filter.n_particles?"],
+        ),
         ("slam.filter.particles=5", ["slam.filter.particles", "n_particles"]),
         ("slam.filter.n_particles=5,few", ["n_particles", "'few'"]),
     ],
