@@ -164,7 +164,7 @@ def sweep(
         failed = command.execute(asked, jobs or available_cores(), scheduler, show)
     if timings:
         with screen.timing_progress() as show_timing:
-            command.measure_times(asked, show_timing)
+            command.measure_times(asked, failed, show_timing)
     screen.print_sweep(asked.dataset, asked.runs, failed)
     if failed:
         raise typer.Exit(EXIT_FAILED)

@@ -9,7 +9,7 @@ from pathlib import Path
 from experiments.scenario import NAME_PATTERN, Scenario
 from experiments.stages import align, drive, features, judge, log, slam
 from experiments.stages.slam import RobotFolders
-from experiments.store import StageFolder, Store
+from experiments.store import StageFolder, Store, explained
 from experiments.tasks import OnProgress, Task, run_tasks, unfinished
 from experiments.workers import workers
 from mapfusion.errors import InputError
@@ -256,9 +256,7 @@ def _run(
         with workers(jobs) as pool:
             run_tasks(left, pool, on_progress)
     except InputError as error:
-        if str(store.root) in str(error):  # no file of the user's own, but one that was stored
-            raise InputError(f"{error}; delete its folder, then it is computed again") from error
-        raise
+        raise InputError(explained(str(error), store)) from error
     for folder in wanted:
         if not folder.finished:
             raise InputError(f"{folder.path}: was removed while it was being made; run again")

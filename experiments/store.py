@@ -126,6 +126,13 @@ class Store:
         return StageFolder(stage, digest.hexdigest()[:_KEY_LENGTH], path)
 
 
+def explained(reason: str, store: Store) -> str:
+    """What to do about a reason that names a file of the store: it is no file of the user's."""
+    if str(store.root) not in reason:
+        return reason
+    return f"{reason}; delete its folder, then it is computed again"
+
+
 def link_or_copy(source: Path, target: Path) -> None:
     """Put a finished, immutable file at a second place without a second copy where possible."""
 

@@ -3,7 +3,7 @@
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from experiments.result import STORE_FOLDER, measure_aligners, pair_table
 from experiments.stages.judge import load_robot
 from experiments.store import Store
 from experiments.sweep.cluster import connected
-from experiments.sweep.dataset import ALIGNER_TIMINGS, RUNS, Dataset, open_dataset
+from experiments.sweep.dataset import ALIGNER_TIMINGS, Dataset, open_dataset
 from experiments.sweep.driver import Progress, Survey, SweepDriver, survey
 from experiments.sweep.grid import Axis, Run, parse_axes, runs_of
 from experiments.sweep.planned import PlannedRun, planned
@@ -104,20 +104,21 @@ def execute(
     return driver.failed_runs
 
 
-def measure_times(sweep: Sweep, on_progress: Callable[[int, int], None]) -> None:
-    """Aligners' times, serial, for all finished runs without: nothing else may be running."""
+def measure_times(
+    sweep: Sweep, failed: Collection[str], on_progress: Callable[[int, int], None]
+) -> None:
+    """Aligners' times, serial, for all runs without that did not fail: nothing else may run."""
     dataset = sweep.dataset
     single_threaded()
-    for done, run in enumerate(sweep.runs):
-        on_progress(done, len(sweep.runs))
-        if dataset.path(RUNS, run).is_file() and not dataset.path(ALIGNER_TIMINGS, run).is_file():
+    runs = [run for run in sweep.runs if run.run_id not in failed]
+    for done, run in enumerate(runs):
+        on_progress(done, len(runs))
+        if not dataset.path(ALIGNER_TIMINGS, run).is_file():
             _measure(planned(run, sweep.store, dataset), dataset)
-    on_progress(len(sweep.runs), len(sweep.runs))
+    on_progress(len(runs), len(runs))
 
 
 def _measure(laid_out: PlannedRun, dataset: Dataset) -> None:
-    if not laid_out.finished:
-        return
     robots = [load_robot(robot.folders) for robot in laid_out.plan.robots]
     measure_aligners(laid_out.plan, robots)
     dataset.write(ALIGNER_TIMINGS, laid_out.run, pair_table(laid_out.plan, ALIGNER_TIMINGS))

@@ -88,15 +88,22 @@ class Dataset:
     def finish(self, run: Run, renderer: str, stages: Sequence[str]) -> None:
         """Say that all rows of a run are there."""
         row = {"status": FINISHED, "reason": "", "renderer": renderer} | _made_by(stages)
+        self._details(run).unlink(missing_ok=True)
         self.write(RUNS, run, [row])
 
-    def fail(self, run: Run, reason: str, renderer: str = "", stages: Sequence[str] = ()) -> None:
+    def fail(self, run: Run, reason: str, details: str = "", stages: Sequence[str] = ()) -> None:
         """Say why a run has no rows; those of an earlier, finished one are removed."""
-        row = {"status": FAILED, "reason": reason, "renderer": renderer} | _made_by(stages)
+        row = {"status": FAILED, "reason": reason, "renderer": ""} | _made_by(stages)
         self.write(RUNS, run, [row])
         for folder in self.folder.iterdir():
             if folder.is_dir() and folder.name != RUNS:
                 (folder / f"{run.run_id}.parquet").unlink(missing_ok=True)
+        self._details(run).unlink(missing_ok=True)
+        if details:
+            write_whole(self._details(run), lambda file: file.write_text(details, encoding="utf-8"))
+
+    def _details(self, run: Run) -> Path:
+        return self.folder / "failures" / f"{run.run_id}.txt"
 
     def holds(self, run: Run, stages: Sequence[str]) -> bool:
         """Whether the run is finished, made from these stages by the source as it is now."""

@@ -11,14 +11,13 @@ from typing import cast
 from distributed import Client, Future, as_completed
 from distributed.scheduler import KilledWorker
 
-from experiments.store import Store
+from experiments.store import Store, explained
 from experiments.sweep.dataset import Dataset
 from experiments.sweep.grid import Run
 from experiments.sweep.planned import PlannedRun, planned
 from experiments.sweep.worker import TaskFailedError, Terms, UnfitWorkerError, perform
 from experiments.tasks import Task
 from mapfusion.errors import InputError
-from mapfusion.storage import write_whole
 
 # Tasks at Dask for each worker. Enough that none waits while this process plans the next run; few
 # enough that memory does not grow with the number of runs.
@@ -199,7 +198,7 @@ class SweepDriver:
             )
         error = future.exception()
         if isinstance(error, TaskFailedError):
-            return error.task, Failure(error.reason, error.details)
+            return error.task, Failure(explained(error.reason, self._store), error.details)
         if isinstance(error, KilledWorker):
             cause = str(error.task).split("-", 2)[2]
             kind = cause.partition("/")[0]
@@ -224,10 +223,7 @@ class SweepDriver:
     def _fail(self, run: Run, failure: Failure, laid_out: PlannedRun | None = None) -> None:
         self.failed_runs[run.run_id] = failure.reason
         stages = [] if laid_out is None else laid_out.stages
-        self._dataset.fail(run, failure.reason, stages=stages)
-        if failure.details:
-            path = self._dataset.folder / "failures" / f"{run.run_id}.txt"
-            write_whole(path, lambda file: file.write_text(failure.details, encoding="utf-8"))
+        self._dataset.fail(run, failure.reason, failure.details, stages)
 
 
 @dataclass(frozen=True)

@@ -108,8 +108,7 @@ def _attempt(name: str, task: bytes, terms: Terms) -> None:
     except InputError as error:
         raise TaskFailedError(name, " ".join(str(error).split())) from None
     except Exception as error:
-        text = " ".join(f"{type(error).__name__}: {error}".split())
-        stage = name.partition("/")[0]
-        raise TaskFailedError(name, f"{stage}: {text}", traceback.format_exc()) from None
+        text = " ".join(f"{name.partition('/')[0]}: {type(error).__name__} {error}".split())
+        raise TaskFailedError(name, text, traceback.format_exc()) from None
     finally:
         mark.unlink(missing_ok=True)

@@ -9,20 +9,28 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
 Victim = Literal["worker", "everything"]
-_PATIENCE_S = 240
+_PATIENCE_S = 900  # kernels may have to be compiled, on a busy machine
 
 
 class KilledSweep:
-    """Runs one and the same sweep again and again until nothing is left to do."""
+    """Runs one and the same sweep again and again until nothing is left; use in a `with` block."""
 
     def __init__(self, arguments: Sequence[object], results: Path) -> None:
         self._results = results
         self._command = [sys.executable, "-m", "experiments.cli", "sweep", *map(str, arguments)]
         self._command += ["--jobs", "2", "--results", str(results)]
         self.process = self._start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.process.poll() is None:  # a test that failed leaves nothing running
+            os.killpg(self.process.pid, signal.SIGKILL)
+            self.process.communicate()
 
     def _start(self) -> subprocess.Popen[bytes]:
         return subprocess.Popen(

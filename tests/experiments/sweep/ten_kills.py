@@ -17,13 +17,13 @@ GRID = ("--seeds", "0..3", "--set", "slam.filter.n_particles=10,20")
 @pytest.mark.parametrize("seed", [int(os.environ.get("MAPFUSION_KILLS_SEED", "0"))])
 def test_ten_random_kills(tiny_path: Path, tmp_path: Path, seed: int) -> None:
     rng = random.Random(seed)
-    undisturbed = KilledSweep((tiny_path, *GRID), tmp_path / "undisturbed")
-    assert undisturbed.finish()[0] == 0
+    with KilledSweep((tiny_path, *GRID), tmp_path / "undisturbed") as undisturbed:
+        assert undisturbed.finish()[0] == 0
     kinds: list[Victim] = ["worker", "everything"]
     victims = [rng.choice(kinds) for _ in range(KILLS)]
-    disturbed = KilledSweep((tiny_path, *GRID), tmp_path / "disturbed")
-    killed = disturbed.kill_at_random(rng, victims)
-    assert disturbed.finish()[0] == 0
+    with KilledSweep((tiny_path, *GRID), tmp_path / "disturbed") as disturbed:
+        killed = disturbed.kill_at_random(rng, victims)
+        assert disturbed.finish()[0] == 0
     assert len(killed) == KILLS, f"the sweep ended after {len(killed)} kills: {killed}"
     sweeps = (tmp_path / folder / "sweeps" / "tiny" for folder in ("undisturbed", "disturbed"))
     compared = same_files(*sweeps)

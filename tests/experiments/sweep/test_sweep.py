@@ -164,16 +164,16 @@ def test_killed_sweeps_go_on_and_readers_always_find_whole_runs(
             time.sleep(0.2)
 
     reader = threading.Thread(target=read)
-    killed = KilledSweep((short_path, "--seeds", "0..1", *GRID), tmp_path)
-    reader.start()
-    try:
-        victims = killed.kill_at_random(
-            random.Random(1), ["worker", "everything", "worker", "worker"]
-        )
-        code, complaints = killed.finish()
-    finally:
-        stop.set()
-        reader.join()
+    with KilledSweep((short_path, "--seeds", "0..1", *GRID), tmp_path) as killed:
+        reader.start()
+        try:
+            victims = killed.kill_at_random(
+                random.Random(1), ["worker", "everything", "worker", "worker"]
+            )
+            code, complaints = killed.finish()
+        finally:
+            stop.set()
+            reader.join()
     assert (code, "Traceback" in complaints) == (0, False), complaints
     assert len(victims) >= 2
     assert len(same_files(sweep, swept)) == 4 * 5
@@ -192,15 +192,16 @@ def _whole_runs(sweep: Path) -> int:
     return len(runs)
 
 
-def test_two_sweeps_and_a_run_at_once_on_one_store(
-    swept: Path, short_path: Path, tmp_path: Path
-) -> None:
+def test_two_sweeps_at_once_on_one_store(swept: Path, short_path: Path, tmp_path: Path) -> None:
     """They do some work twice, and nothing wrong."""
     arguments = (short_path, "--seeds", "0..1", *GRID)
-    both = [KilledSweep((*arguments, "-o", tmp_path / name), tmp_path) for name in ("one", "two")]
-    for one in both:
-        code, complaints = one.finish()
-        assert code == 0, complaints
+    with (
+        KilledSweep((*arguments, "-o", tmp_path / "one"), tmp_path) as one,
+        KilledSweep((*arguments, "-o", tmp_path / "two"), tmp_path) as two,
+    ):
+        for sweep in (one, two):
+            code, complaints = sweep.finish()
+            assert code == 0, complaints
     for name in ("one", "two"):
         same_files(tmp_path / name, swept)
 
