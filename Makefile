@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: clean-kernels lock demo test lint check bench paper install clean
+.PHONY: clean-kernels lock demo test endurance lint check bench paper install clean
 
 install: $(STAMP)
 
@@ -20,6 +20,10 @@ demo: $(STAMP)
 
 test: $(STAMP)
 	$(BIN)/python -m pytest
+
+# Ten random kills of a sweep; minutes.
+endurance: $(STAMP)
+	$(BIN)/python -m pytest tests/experiments/sweep/ten_kills.py -s
 
 lint: $(STAMP)
 	$(BIN)/ruff format --check .

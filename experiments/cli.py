@@ -170,6 +170,59 @@ def refusal(
 
 
 @app.command()
+def sweep(
+    scenarios: Annotated[
+        list[str], typer.Argument(metavar="SCENARIO|TAG...", help="Scenario files, or tags.")
+    ],
+    seeds: Annotated[str, typer.Option(help="A seed, a range 0..4 or a list 0,2,5.")] = "0",
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE,...",
+            help="Values to try, e.g. slam.filter.n_particles=50,200; several give all "
+            "combinations. Commas inside brackets part nothing.",
+        ),
+    ] = None,
+    jobs: Jobs = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(help="A running Dask scheduler, tcp://HOST:PORT, in place of --jobs."),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Folder; RESULTS/sweeps/NAME by default.")
+    ] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only count what is to do.")] = False,
+    timings: Annotated[
+        bool, typer.Option("--timings", help="At the end, time the aligners one after the other.")
+    ] = False,
+    results: Results = DEFAULT_RESULTS,
+) -> None:
+    """Run all combinations: `mapfusion sweep scenarios/quick.yaml --seeds 0..9 --set KEY=A,B`.
+
+    What is finished is kept, also in the middle of a run; the same command goes on from there, and
+    with more seeds or values adds to the same tables. Exit code 1 if a run failed.
+    """
+    from experiments.checks import parse_seeds
+    from experiments.suite import scenarios_of
+    from experiments.sweep import command, screen
+
+    paths = scenarios_of(scenarios)
+    asked = command.prepare(scenarios, paths, parse_seeds(seeds), overrides or (), results, output)
+    if dry_run:
+        screen.print_survey(command.look_ahead(asked))
+        return
+    with screen.progress() as show:
+        failed = command.execute(asked, jobs or available_cores(), scheduler, show)
+    if timings:
+        with screen.timing_progress() as show_timing:
+            command.measure_times(asked, failed, show_timing)
+    screen.print_sweep(asked.dataset, asked.runs, failed)
+    if failed:
+        raise typer.Exit(EXIT_FAILED)
+
+
+@app.command()
 def schema() -> None:
     """Print the JSON schema of scenarios, for editors: `mapfusion schema > schema.json`."""
     from experiments.scenario import schema_text

@@ -2,20 +2,18 @@
 
 import itertools
 import re
-import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from experiments.scenario import NAME_PATTERN, Scenario
 from experiments.stages import align, drive, features, judge, log, slam
-from experiments.stages.judge import RobotFolders
-from experiments.store import StageFolder, Store
-from experiments.workers import Workers, workers
+from experiments.stages.slam import RobotFolders
+from experiments.store import StageFolder, Store, explained
+from experiments.tasks import OnProgress, Task, run_tasks, unfinished
+from experiments.workers import workers
 from mapfusion.errors import InputError
 from mapfusion.robot_log import read_log
-
-OnProgress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
@@ -23,6 +21,7 @@ class RobotStages:
     """Where one robot's intermediate results lie."""
 
     name: str
+    n_frames: int
     log: StageFolder
     slam: StageFolder
     features: StageFolder | None = None  # None for imported logs
@@ -83,7 +82,9 @@ def _simulated(
     seen = features.stage(store, scenario, driven, faces, robot)
     observed = log.observed_stage(store, scenario, seen)
     logged = log.stage(store, scenario, driven, observed, robot)
-    return RobotStages(robot, logged, slam.stage(store, scenario, logged), seen, observed)
+    slammed = slam.stage(store, scenario, logged)
+    assert scenario.drive is not None
+    return RobotStages(robot, scenario.drive.frames, logged, slammed, seen, observed)
 
 
 def _imported(scenario: Scenario, store: Store, folder: Path) -> RobotStages:
@@ -91,7 +92,7 @@ def _imported(scenario: Scenario, store: Store, folder: Path) -> RobotStages:
     if not len(log):
         raise InputError(f"{folder}: frames.parquet holds no frame")
     logged = store.imported("log", folder)
-    return RobotStages(log.robot, logged, slam.stage(store, scenario, logged))
+    return RobotStages(log.robot, len(log), logged, slam.stage(store, scenario, logged))
 
 
 def _require_usable_names(robots: Sequence[RobotStages]) -> None:
@@ -116,162 +117,113 @@ def _pairs(scenario: Scenario, store: Store, robots: Sequence[RobotStages]) -> l
     return pairs
 
 
-@dataclass
-class _Run:
-    """Submits each stage's tasks once those before it are done."""
+def tasks_of(plan: Plan) -> dict[str, Task]:
+    """All tasks of a plan by name, each after those it needs, one robot or pair after the other."""
+    tasks: list[Task] = []
+    if plan.drive is not None and plan.faces is not None:
+        tasks.append(_task(plan.drive, "drive", drive.run, (plan.scenario, plan.drive)))
+        tasks.append(_task(plan.faces, "faces", features.run_faces, (plan.scenario, plan.faces)))
+    for robot in plan.robots:
+        tasks += _robot_tasks(plan, robot)
+    for pair in plan.pairs:
+        tasks += _pair_tasks(plan.scenario, pair)
+    return {task.name: task for task in tasks}
 
-    plan: Plan
-    pool: Workers
-    on_progress: OnProgress
-    logs_only: bool = False
-    open_chunks: dict[str, int] = field(default_factory=dict)
-    open_batches: dict[int, int] = field(default_factory=dict)
-    rendering_s: dict[str, float] = field(default_factory=dict)
-    done: dict[str, int] = field(default_factory=dict)
-    total: dict[str, int] = field(default_factory=dict)
-    started: dict[str, float] = field(default_factory=dict)
 
-    def execute(self) -> None:
-        """Run everything that is not finished."""
-        if self.plan.drive is not None and self.plan.faces is not None:
-            self._submit_once(("drive",), self.plan.drive, drive.run, self.plan.drive)
-            self._submit_once(("faces",), self.plan.faces, features.run_faces, self.plan.faces)
-        self._after_world()
-        for tag, result in self.pool.completed():
-            self._ended(tag, result)
+def task_name(folder: StageFolder) -> str:
+    """The name of the task that ends a stage."""
+    return f"{folder.stage}/{folder.key}"
 
-    def _submit_once(
-        self, tag: tuple, folder: StageFolder, function: Callable, *args: object
-    ) -> None:
-        if not folder.finished:
-            self._submit(tag, function, *args)
 
-    def _submit(self, tag: tuple, function: Callable, *args: object) -> None:
-        self.total[tag[0]] = self.total.get(tag[0], 0) + 1
-        self._report(tag[0])
-        self.pool.submit(tag, function, self.plan.scenario, *args)
+def _task(
+    folder: StageFolder,
+    kind: str,
+    function: Callable[..., object],
+    arguments: tuple[object, ...],
+    needs: Sequence[StageFolder] = (),
+    parts: Sequence[Task] = (),
+) -> Task:
+    """The task that ends a stage."""
+    names = [task_name(before) for before in needs] + [part.name for part in parts]
+    return Task(task_name(folder), kind, function, arguments, (folder.mark,), tuple(names))
 
-    def _report(self, kind: str) -> None:
-        self.on_progress(kind, self.done.get(kind, 0), self.total[kind])
 
-    def _ended(self, tag: tuple, result: object) -> None:
-        kind = tag[0]
-        self.done[kind] = self.done.get(kind, 0) + 1
-        self._report(kind)
-        if kind in {"drive", "faces"}:
-            self._after_world()
-        elif kind == "render":
-            self._after_chunk(self.plan.robots[tag[1]], result)
-        elif kind == "slam":
-            self._after_slam(self.plan.robots[tag[1]])
-        elif kind == "align":
-            self._after_batch(tag[1])
+def _robot_tasks(plan: Plan, robot: RobotStages) -> list[Task]:
+    """From the world, or the recorded log, to the robot's maps."""
+    scenario, name = plan.scenario, robot.name
+    tasks, before = [], []
+    if robot.features is not None and robot.observed is not None:
+        assert plan.drive is not None
+        seen, observed, driven = robot.features, robot.observed, plan.drive
+        chunks = _chunk_tasks(plan, robot)
+        tasks += [
+            *chunks,
+            _task(seen, "render", features.finish, (seen,), parts=chunks),
+            _task(observed, "log", log.run_observed, (scenario, seen, observed, name), [seen]),
+            _task(
+                robot.log,
+                "log",
+                log.run,
+                (scenario, driven, observed, robot.log, name),
+                [driven, observed],
+            ),
+        ]
+        before = [robot.log]
+    return [*tasks, _task(robot.slam, "slam", slam.run, (scenario, robot.log, robot.slam), before)]
 
-    def _after_world(self) -> None:
-        world = [folder for folder in (self.plan.drive, self.plan.faces) if folder is not None]
-        if not all(folder.finished for folder in world):
-            return
-        for index, robot in enumerate(self.plan.robots):
-            if self.logs_only and robot.log.finished:
-                continue
-            if robot.slam.finished:
-                self._after_slam(robot)
-            elif robot.features is None or robot.features.finished:
-                self._submit_slam(robot)
-            else:
-                self._submit_chunks(index, robot, robot.features)
 
-    def _submit_chunks(self, index: int, robot: RobotStages, output: StageFolder) -> None:
-        missing = features.chunks(self.plan.scenario, output)
-        self.open_chunks[robot.name] = len(missing)
-        self.started[robot.name] = time.perf_counter()
-        if not missing:  # interrupted between the last chunk and the mark
-            self._features_done(robot)
-        for start in missing:
-            self._submit(
-                ("render", index),
-                features.run_chunk,
-                self.plan.drive,
-                self.plan.faces,
-                output,
-                robot.name,
-                start,
-            )
-
-    def _after_chunk(self, robot: RobotStages, rendering_s: object) -> None:
-        assert isinstance(rendering_s, float)
-        self.rendering_s[robot.name] = self.rendering_s.get(robot.name, 0.0) + rendering_s
-        self.open_chunks[robot.name] -= 1
-        if not self.open_chunks[robot.name]:
-            self._features_done(robot)
-
-    def _features_done(self, robot: RobotStages) -> None:
-        assert robot.features is not None
-        robot.features.finish(
-            elapsed_s=time.perf_counter() - self.started[robot.name],
-            rendering_s=self.rendering_s.get(robot.name, 0.0),
+def _chunk_tasks(plan: Plan, robot: RobotStages) -> list[Task]:
+    output, driven, faces = robot.features, plan.drive, plan.faces
+    assert output is not None
+    assert driven is not None
+    assert faces is not None
+    return [
+        Task(
+            f"{task_name(output)}/{start:06d}",
+            "render",
+            features.run_chunk,
+            (plan.scenario, driven, faces, output, robot.name, start),
+            features.chunk_paths(output.path, start),
+            (task_name(driven), task_name(faces)),
         )
-        self._submit_slam(robot)
-
-    def _submit_slam(self, robot: RobotStages) -> None:
-        index = self.plan.robots.index(robot)
-        if self.logs_only:
-            self._submit(("log", index), write_log, self.plan.drive, robot)
-        else:
-            self._submit(("slam", index), run_robot, self.plan.drive, robot)
-
-    def _after_slam(self, robot: RobotStages) -> None:
-        for index, pair in enumerate(self.plan.pairs):
-            if robot not in (pair.a, pair.b) or index in self.open_batches:
-                continue
-            if pair.a.slam.finished and pair.b.slam.finished:
-                self._submit_pair(index, pair)
-
-    def _submit_pair(self, index: int, pair: PairStages) -> None:
-        self.open_batches[index] = 0
-        self.started[pair.align.key] = time.perf_counter()
-        if pair.align.finished:
-            self._submit_judge(index, pair)
-            return
-        batches = self._batches(pair)
-        self.open_batches[index] = len(batches)
-        folders = (pair.a.folders, pair.b.folders)
-        for number, iterations in enumerate(batches):
-            self._submit(("align", index), align.run_batch, folders, pair.parts, number, iterations)
-
-    def _batches(self, pair: PairStages) -> list[list[int]]:
-        known = [slam.snapshot_iterations(robot.slam.path) for robot in (pair.a, pair.b)]
-        return align.batches(max(known, key=lambda iterations: iterations[-1]))
-
-    def _after_batch(self, index: int) -> None:
-        self.open_batches[index] -= 1
-        if self.open_batches[index]:
-            return
-        pair = self.plan.pairs[index]
-        started = self.started[pair.align.key]
-        align.finish(pair.align, pair.parts, len(self._batches(pair)), started)
-        self._submit_judge(index, pair)
-
-    def _submit_judge(self, index: int, pair: PairStages) -> None:
-        arguments = (pair.a.folders, pair.b.folders, pair.align, pair.judge)
-        self._submit_once(("judge", index), pair.judge, judge.run, *arguments)
+        for start in features.chunks(robot.n_frames)
+    ]
 
 
-def write_log(scenario: Scenario, driven: StageFolder, robot: RobotStages) -> None:
-    """One simulated robot's log from its features and its trajectory."""
-    assert robot.features is not None
-    assert robot.observed is not None
-    if not robot.observed.finished:
-        log.run_observed(scenario, robot.features, robot.observed, robot.name)
-    if not robot.log.finished:
-        log.run(scenario, driven, robot.observed, robot.log, robot.name)
+def _pair_tasks(scenario: Scenario, pair: PairStages) -> list[Task]:
+    """From two robots' maps to the judged estimates, each aligner apart."""
+    n_frames = max(pair.a.n_frames, pair.b.n_frames)
+    batches = align.batches(slam.evaluated_iterations(n_frames, scenario.evaluate.every))
+    a, b, offered = pair.a.folders, pair.b.folders, pair.parts.match
+    maps = (task_name(pair.a.slam), task_name(pair.b.slam))
+    parts = []
+    for i, iterations in enumerate(batches):
+        arguments = (scenario, (a, b), offered, i, iterations)
+        parts.append(_batch_task(offered, i, align.run_match, arguments, maps))
+    for entry, output in zip(scenario.align.aligners, pair.parts.aligners, strict=True):
+        for i, iterations in enumerate(batches):
+            arguments = (scenario, entry, (a, b), offered, output, i, iterations)
+            needs = (*maps, parts[i].name)
+            parts.append(_batch_task(output, i, align.run_aligner, arguments, needs))
+    ending = (pair.align, pair.parts, len(batches))
+    judging = (scenario, a, b, pair.align, pair.judge)
+    slams = [pair.a.slam, pair.b.slam]
+    return [
+        *parts,
+        _task(pair.align, "align", align.finish, ending, parts=parts),
+        _task(pair.judge, "judge", judge.run, judging, [pair.align, *slams]),
+    ]
 
 
-def run_robot(scenario: Scenario, driven: StageFolder | None, robot: RobotStages) -> None:
-    """One robot from its features (or its log) to its maps: in one task, as each step is short."""
-    if driven is not None:
-        write_log(scenario, driven, robot)
-    slam.run(scenario, robot.log, robot.slam)
+def _batch_task(
+    output: StageFolder,
+    index: int,
+    function: Callable[..., object],
+    arguments: tuple[object, ...],
+    needs: tuple[str, ...],
+) -> Task:
+    name, path = f"{task_name(output)}/{index:03d}", align.batch_path(output, index)
+    return Task(name, "align", function, arguments, (path,), needs)
 
 
 def execute(
@@ -283,7 +235,7 @@ def execute(
         scenario: what to run.
         store: where stages are kept.
         jobs: processes.
-        on_progress: told (stage, tasks done, tasks so far).
+        on_progress: told (stage, tasks done, tasks in all).
         fresh: forget what the store holds of this scenario first.
     """
     laid_out = plan(scenario, store)
@@ -298,14 +250,13 @@ def execute(
 def _run(
     laid_out: Plan, store: Store, jobs: int, on_progress: OnProgress, logs_only: bool = False
 ) -> None:
+    wanted = [robot.log for robot in laid_out.robots] if logs_only else laid_out.folders()
+    left = unfinished(tasks_of(laid_out), [task_name(folder) for folder in wanted])
     try:
         with workers(jobs) as pool:
-            _Run(laid_out, pool, on_progress, logs_only).execute()
+            run_tasks(left, pool, on_progress)
     except InputError as error:
-        if str(store.root) in str(error):  # no file of the user's own, but one that was stored
-            raise InputError(f"{error}; delete its folder, then it is computed again") from error
-        raise
-    wanted = [robot.log for robot in laid_out.robots] if logs_only else laid_out.folders()
+        raise InputError(explained(str(error), store)) from error
     for folder in wanted:
         if not folder.finished:
             raise InputError(f"{folder.path}: was removed while it was being made; run again")

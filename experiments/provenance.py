@@ -5,11 +5,16 @@ from datetime import UTC, datetime
 from typing import Any
 
 from experiments.pipeline import Plan
+from experiments.scenario import Scenario
 from experiments.store import library_versions
 from mapfusion.align.registry import find_method
-from sim.renderer import renderer_name
 
 RESULT_SCHEMA_VERSION = 1
+
+
+def renderer(scenario: Scenario) -> str:
+    """What made the pictures."""
+    return "none (imported logs)" if scenario.logs else renderer_name(scenario.render.renderer)
 
 
 def provenance(plan: Plan) -> dict[str, Any]:
@@ -18,9 +23,7 @@ def provenance(plan: Plan) -> dict[str, Any]:
         "schema_version": RESULT_SCHEMA_VERSION,
         "scenario": plan.scenario.name,
         "seed": plan.scenario.seed,
-        "renderer": "none (imported logs)"
-        if plan.scenario.logs
-        else renderer_name(plan.scenario.render.renderer),
+        "renderer": renderer(plan.scenario),
         "python": platform.python_version(),
         "machine": platform.machine(),
         "libraries": library_versions(),

@@ -15,12 +15,13 @@ import pandas as pd
 from experiments import tables
 from experiments.evaluate import EvaluatedRobot, path_columns, robot_rows
 from experiments.fusion import fused_maps, fused_truth, map_fit_rows
-from experiments.pipeline import OnProgress, Plan, execute
+from experiments.pipeline import Plan, execute
 from experiments.provenance import provenance
-from experiments.scenario import Scenario
+from experiments.scenario import Merge, Scenario
 from experiments.stages import slam
 from experiments.stages.judge import load_robot
 from experiments.store import Store, link_or_copy
+from experiments.tasks import OnProgress
 from experiments.timing import time_aligners
 from mapfusion import se2
 from mapfusion.aligned_landmarks import ABSENT
@@ -62,7 +63,7 @@ def write_result(plan: Plan, folder: Path) -> None:
     """Collect a finished plan's tables, maps and images in a result folder."""
     scenario = plan.scenario
     robots = [load_robot(robot.folders) for robot in plan.robots]
-    _time_aligners(plan, robots)
+    measure_aligners(plan, robots)
     _join_pair_tables(plan, folder)
     _write_robot_tables(plan, robots, folder)
     for outdated in ("maps", "keyframes"):  # of robots or frames that are no longer there
@@ -86,30 +87,36 @@ def _world(scenario: Scenario, robots: Sequence[EvaluatedRobot]) -> dict[str, ob
     return {"walls": walls, "robots": starts}
 
 
-def _time_aligners(plan: Plan, robots: Sequence[EvaluatedRobot]) -> None:
-    """Serial, when all else is done: nothing else may be running."""
+def measure_aligners(plan: Plan, robots: Sequence[EvaluatedRobot]) -> None:
+    """Time the aligners, serially, when all else is done: nothing else may be running."""
     by_name = {robot.name: robot for robot in robots}
     for pair in plan.pairs:
         path = pair.align.path / "aligner_timings.parquet"
         time_aligners(plan.scenario, by_name[pair.a.name], by_name[pair.b.name], path)
 
 
+_JUDGED = {"errors", "fusion"}  # the other tables of pairs come from the aligners
+
+
+def pair_table(plan: Plan, name: str) -> pd.DataFrame:
+    """A table of robot pairs, of all pairs."""
+    parts = [
+        tables.read((pair.judge if name in _JUDGED else pair.align).path / f"{name}.parquet", name)
+        for pair in plan.pairs
+    ]
+    if not parts:
+        return pd.DataFrame(columns=pd.Index(tables.ALL[name].names))
+    return pd.concat(parts, ignore_index=True)
+
+
 def _join_pair_tables(plan: Plan, folder: Path) -> None:
-    sources = {
-        "aligner_timings": [pair.align.path for pair in plan.pairs],
-        "estimates": [pair.align.path for pair in plan.pairs],
-        "correspondences": [pair.align.path for pair in plan.pairs],
-        "errors": [pair.judge.path for pair in plan.pairs],
-        "fusion": [pair.judge.path for pair in plan.pairs],
-    }
-    for name, folders in sources.items():
-        parts = [tables.read(path / f"{name}.parquet", name) for path in folders]
-        joined = pd.concat(parts, ignore_index=True) if parts else []
-        tables.write(tables.table_path(folder, name), name, joined)
+    for name in ("aligner_timings", "estimates", "correspondences", *sorted(_JUDGED)):
+        tables.write(tables.table_path(folder, name), name, pair_table(plan, name))
 
 
-def _write_robot_tables(plan: Plan, robots: Sequence[EvaluatedRobot], folder: Path) -> None:
-    paths, online, clouds, timings = [], [], [], []
+def robot_tables(plan: Plan, robots: Sequence[EvaluatedRobot]) -> dict[str, pd.DataFrame]:
+    """The tables `paths`, `robots` and `clouds`, of all robots."""
+    paths, online, clouds = [], [], []
     for stages, robot in zip(plan.robots, robots, strict=True):
         poses = read_table(stages.slam.path / "poses.parquet", slam.POSES)[0].to_pandas()
         joined = path_columns(poses, read_log(stages.log.path).odometry, robot.path)
@@ -117,6 +124,16 @@ def _write_robot_tables(plan: Plan, robots: Sequence[EvaluatedRobot], folder: Pa
         online.append(robot_rows(poses, joined).assign(robot=robot.name))
         cloud = read_table(stages.slam.path / "clouds.parquet", slam.CLOUDS)[0].to_pandas()
         clouds.append(cloud.assign(robot=robot.name))
+    return {
+        name: pd.concat(parts, ignore_index=True)
+        for name, parts in (("paths", paths), ("robots", online), ("clouds", clouds))
+    }
+
+
+def _write_robot_tables(plan: Plan, robots: Sequence[EvaluatedRobot], folder: Path) -> None:
+    for name, rows in robot_tables(plan, robots).items():
+        tables.write(tables.table_path(folder, name), name, rows)
+    timings = []
     for stage_folder in plan.folders():
         figures = stage_folder.figures()
         for name in ("elapsed_s", "rendering_s"):
@@ -128,8 +145,6 @@ def _write_robot_tables(plan: Plan, robots: Sequence[EvaluatedRobot], folder: Pa
                         "elapsed_s": figures[name],
                     }
                 )
-    for name, parts in (("paths", paths), ("robots", online), ("clouds", clouds)):
-        tables.write(tables.table_path(folder, name), name, pd.concat(parts, ignore_index=True))
     tables.write(tables.table_path(folder, "timings"), "timings", timings)
 
 
@@ -144,18 +159,29 @@ def _write_maps(plan: Plan, robots: list[EvaluatedRobot], folder: Path) -> None:
         landmark_rows.append(pd.DataFrame({"robot": robot.name} | rows))
     joined = pd.concat(landmark_rows, ignore_index=True)
     tables.write(tables.table_path(folder, "landmarks"), "landmarks", joined)
-    fused = _fused(plan, robots, folder, last)
+    estimates, offered = (
+        tables.read(tables.table_path(folder, name), name)
+        for name in ("estimates", "correspondences")
+    )
+    fused = fused_map(plan.scenario.merge, robots, estimates, offered, last)
+    if fused is not None:
+        write_map(folder / "maps" / "fused.parquet", fused.landmarks)
     fits = map_fit_rows(robots, fused, last)
     tables.write(tables.table_path(folder, "map_fits"), "map_fits", fits)
     fused_rows = [] if fused is None else _fused_rows(fused, robots, last)
     tables.write(tables.table_path(folder, "fused"), "fused", fused_rows)
 
 
-def _fused(plan: Plan, robots: list[EvaluatedRobot], folder: Path, last: int) -> FusedMap | None:
+def fused_map(
+    settings: Merge,
+    robots: Sequence[EvaluatedRobot],
+    estimates: pd.DataFrame,
+    offered: pd.DataFrame,
+    last: int,
+) -> FusedMap | None:
+    """All robots' last maps fused, from all pairs' estimates; None for a single robot."""
     if len(robots) < 2:
         return None
-    estimates = tables.read(tables.table_path(folder, "estimates"), "estimates")
-    offered = tables.read(tables.table_path(folder, "correspondences"), "correspondences")
     # a pair's last estimates are at the later of its two robots' last frames
     ends = estimates.groupby(["robot_a", "robot_b"])["iteration"].transform("max")
     offered_ends = offered.merge(
@@ -164,11 +190,7 @@ def _fused(plan: Plan, robots: list[EvaluatedRobot], folder: Path, last: int) ->
         ].drop_duplicates()
     )
     maps = [robot.at(last)[0] for robot in robots]
-    fused = fused_maps(
-        maps, estimates[estimates["iteration"] == ends], offered_ends, plan.scenario.merge
-    )
-    write_map(folder / "maps" / "fused.parquet", fused.landmarks)
-    return fused
+    return fused_maps(maps, estimates[estimates["iteration"] == ends], offered_ends, settings)
 
 
 def _landmark_columns(landmarks: LandmarkMap, truth: Float) -> dict[str, np.ndarray]:

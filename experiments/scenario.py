@@ -6,7 +6,7 @@ are: pydantic validates them in place, so a parameter is named and explained onc
 
 import json
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
@@ -43,6 +43,7 @@ Name = Annotated[str, Field(pattern=NAME_PATTERN)]
 Point = tuple[float, float]
 Pose = tuple[float, float, float]
 S = TypeVar("S", bound=BaseModel)
+_MOST_SUGGESTED = 3  # keys that an error message offers
 MAX_IMAGE_SIDE_PX = 4096  # the software renderer takes seconds and 100 MB a frame at this size
 
 
@@ -358,6 +359,8 @@ def _first_problem(kind: type[BaseModel], error: ValidationError) -> str:
     message = problem["msg"].removeprefix("Value error, ")
     if unknown:
         message = f"unknown key; known here: {', '.join(_siblings(kind, problem['loc']))}"
+        elsewhere = _paths_like(kind, str(problem["loc"][-1]))
+        message += f"; did you mean {' or '.join(elsewhere)}?" if elsewhere else ""
     elif problem["type"] != "value_error" and not isinstance(problem["input"], dict):
         message = f"{message} (it is {problem['input']!r})"
     more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
@@ -375,6 +378,19 @@ def _siblings(kind: type[BaseModel], location: tuple[int | str, ...]) -> list[st
         else:  # a mapping with free keys, as `expect`, describes all its values at once
             node = node.get("properties", {}).get(part) or node["additionalProperties"]
     return sorted(_resolved_node(root, node)["properties"])
+
+
+def _paths_like(kind: type[BaseModel], name: str) -> list[str]:
+    """Dotted keys, wherever they are, whose last part holds this name as a word: n_particles."""
+    root = kind.model_json_schema()
+
+    def below(node: dict[str, Any], prefix: str) -> Iterator[str]:
+        for key, child in _resolved_node(root, node).get("properties", {}).items():
+            if name in key.split("_"):
+                yield prefix + key
+            yield from below(child, f"{prefix}{key}.")
+
+    return list(below(root, ""))[:_MOST_SUGGESTED]
 
 
 def _resolved_node(root: dict[str, Any], node: dict[str, Any]) -> dict[str, Any]:

@@ -36,10 +36,11 @@ _LAYOUT: Any = {
     "caption_justify": "left",
 }
 
-_STAGE_TEXT = {
+STAGE_TEXT = {
     "drive": "drive the robots",
     "faces": "paint the walls",
     "render": "render and find features",
+    "log": "track features",
     "slam": "FastSLAM",
     "align": "align the maps",
     "judge": "compare with the truth",
@@ -65,7 +66,7 @@ def progress() -> Iterator[Callable[[str, int, int], None]]:
 
         def show(stage: str, done: int, total: int) -> None:
             if stage not in bars or (done == 0 and bars[stage][1]):
-                bars[stage] = [display.add_task(_STAGE_TEXT.get(stage, stage), total=total), False]
+                bars[stage] = [display.add_task(STAGE_TEXT.get(stage, stage), total=total), False]
             bar, _ = bars[stage]
             display.update(bar, completed=done, total=total)
             bars[stage][1] = done == total

@@ -5,12 +5,13 @@ from pathlib import Path
 from typing import Any
 
 from experiments.aligner_calls import callable_aligner, refine_estimate
-from experiments.pipeline import OnProgress, record_logs
+from experiments.pipeline import record_logs
 from experiments.randomness import generator
 from experiments.scenario import Align, Merge, Scenario, Slam, load_section
 from experiments.stages.align import estimate_row
 from experiments.stages.log import copy_log
 from experiments.store import Store
+from experiments.tasks import OnProgress
 from mapfusion.align.correspondences import match
 from mapfusion.errors import InputError
 from mapfusion.fastslam.run import run_log

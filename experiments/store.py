@@ -10,6 +10,7 @@ import hashlib
 import importlib.metadata
 import json
 import shutil
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ from mapfusion.storage import write_whole
 SOURCE_ROOT = Path(__file__).resolve().parent.parent
 _KEY_LENGTH = 16  # hexadecimal digits: 64 bits, no collision in any store one disk can hold
 _DONE = "done.json"
+_TIMES = "times_"  # and the part
 _NUMERICAL_LIBRARIES = (
     "numba",
     "numpy",
@@ -59,18 +61,35 @@ class StageFolder:
     path: Path
 
     @property
+    def mark(self) -> Path:
+        """The file that says that the stage ran to its end."""
+        return self.path / _DONE
+
+    @property
     def finished(self) -> bool:
         """Whether the stage ran to its end."""
-        return (self.path / _DONE).is_file()
+        return self.mark.is_file()
 
     def finish(self, **figures: Any) -> None:
         """Mark the stage as finished, with figures about the run (times; never results)."""
         text = json.dumps({"stage": self.stage, "key": self.key, **figures}, indent=1)
-        write_whole(self.path / _DONE, lambda file: file.write_text(text))
+        write_whole(self.mark, lambda file: file.write_text(text))
 
     def figures(self) -> dict[str, Any]:
         """What `finish` was given."""
-        return json.loads((self.path / _DONE).read_text())
+        return json.loads(self.mark.read_text())
+
+    def note(self, part: str, **seconds: float) -> None:
+        """Keep the times of one part of the stage."""
+        text = json.dumps(seconds)
+        write_whole(self.path / f"{_TIMES}{part}.json", lambda file: file.write_text(text))
+
+    def noted(self) -> dict[str, float]:
+        """The times of all parts, added up."""
+        total = Counter[str]()
+        for path in sorted(self.path.glob(f"{_TIMES}*.json")):
+            total.update(json.loads(path.read_text()))
+        return dict(total)
 
     def discard(self) -> None:
         """Forget the stage's results."""
@@ -105,6 +124,13 @@ class Store:
             digest.update(file.name.encode() + b"\0")
             digest.update(file.read_bytes())
         return StageFolder(stage, digest.hexdigest()[:_KEY_LENGTH], path)
+
+
+def explained(reason: str, store: Store) -> str:
+    """What to do about a reason that names a file of the store: it is no file of the user's."""
+    if str(store.root) not in reason:
+        return reason
+    return f"{reason}; delete its folder, then it is computed again"
 
 
 def link_or_copy(source: Path, target: Path) -> None:

@@ -16,6 +16,10 @@ from threadpoolctl import threadpool_limits
 
 from mapfusion.errors import InputError
 
+# While a process works on one task, the next is there already. More of them would be begun in the
+# order they were submitted, though a later one may be what others wait for.
+TASKS_PER_PROCESS = 2
+
 
 def single_threaded() -> None:
     """Bind BLAS and OpenCV to one thread: several would change the order of sums."""
@@ -48,6 +52,7 @@ class Workers:
     """
 
     def __init__(self, jobs: int) -> None:
+        self._jobs = jobs
         self._queue: deque[tuple[Any, Callable[..., Any], tuple]] = deque()
         self._pending: dict[Future, Any] = {}
         self._pool: ProcessPoolExecutor | None = None
@@ -62,6 +67,13 @@ class Workers:
             self._queue.append((tag, function, arguments))
         else:
             self._pending[self._pool.submit(function, *arguments)] = tag
+
+    @property
+    def has_room(self) -> bool:
+        """Whether a process would have to wait for its next task unless one is submitted."""
+        if self._pool is None:
+            return not self._queue
+        return len(self._pending) < TASKS_PER_PROCESS * self._jobs
 
     def completed(self) -> Iterator[tuple[Any, Any]]:
         """(tag, result) of each task as it ends; a task's error is raised here."""

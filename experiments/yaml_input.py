@@ -20,14 +20,15 @@ def read_mapping(path: Path) -> dict[str, Any]:
         ) from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read as UTF-8 text ({error})") from error
-    data = _parse(text, str(path))
+    data = parse_value(text, str(path))
     if not isinstance(data, dict):
         found = "nothing" if data is None else f"a {type(data).__name__}"
         raise InputError(f"{path}: holds {found}, expected a mapping of scenario keys")
     return data
 
 
-def _parse(text: str, where: str) -> Any:
+def parse_value(text: str, where: str) -> Any:
+    """Read one YAML value; raises InputError that begins with `where`."""
     try:
         return _copied(YAML(typ="safe", pure=True).load(text))
     except YAMLError as error:
@@ -48,7 +49,7 @@ def apply_overrides(data: dict[str, Any], overrides: Sequence[str]) -> dict[str,
         dotted, separator, value = override.partition("=")
         if not separator or not dotted:
             raise InputError(f"--set {override}: expected key=value, for example evaluate.every=1")
-        _assign(result, dotted, _parse(value, f"--set {override}"))
+        _assign(result, dotted, parse_value(value, f"--set {override}"))
     return result
 
 

@@ -18,9 +18,13 @@ _PREFIX = "mapfusion."
 
 
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
-    """Let `write` fill a temporary file beside `path`, then rename it: nobody sees half a file."""
+    """Let `write` fill a temporary file beside `path`, then rename it: nobody sees half a file.
+
+    The temporary name ends in `.part`, so that no pattern like `*.parquet` finds it, also where a
+    killed process left it behind.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=path.suffix)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
     os.close(handle)
     temporary = Path(name)
     try:

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from mapfusion.se2 import Float
+from mapfusion.storage import write_whole
 from sim.floorplan import Face, FloorPlan
 from sim.renderer import Renderer, egl_driver, load_egl
 from sim.textures import AS_PAINTED, Texture, paint, paint_posters
@@ -200,17 +201,24 @@ def write_faces(
     folder: Path, plan: FloorPlan, rng: np.random.Generator, texture: Texture = AS_PAINTED
 ) -> None:
     """Write each face's mesh and texture into `folder`; each texture has a child generator."""
-    folder.mkdir(parents=True, exist_ok=True)
     faces = plan.faces()
     *children, of_posters = rng.spawn(len(faces) + 1)
     posters = paint_posters(texture, of_posters)
     for i, (face, child) in enumerate(zip(faces, children, strict=True)):
         mesh, path = _face_files(folder, i)
         picture = cv2.cvtColor(paint(face, child, texture, posters), cv2.COLOR_RGB2BGR)
-        if not cv2.imwrite(str(path), picture, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
-            raise OSError(f"{path}: could not be written")
-        mesh.write_text(_mesh(face), encoding="ascii")
-    np.save(folder / CORNERS, np.stack([face.corners_m for face in faces]))
+        encoded = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
+        text = _mesh(face).encode("ascii")
+        # whole: another run may be painting, or looking at, the same walls
+        write_whole(path, lambda temporary, data=encoded: temporary.write_bytes(data))
+        write_whole(mesh, lambda temporary, data=text: temporary.write_bytes(data))
+    corners = np.stack([face.corners_m for face in faces])
+    write_whole(folder / CORNERS, lambda temporary: _save_array(temporary, corners))
+
+
+def _save_array(path: Path, array: np.ndarray) -> None:
+    with path.open("wb") as file:
+        np.save(file, array)
 
 
 def _face_files(folder: Path, i: int) -> tuple[Path, Path]:

@@ -105,12 +105,12 @@ def save_figure(figure: Figure, folder: Path, name: str) -> list[Path]:
     """Write a figure in all formats (inside `house_style`); returns the pictures."""
     files = _pictures(folder, name)
     for file in files:
-        write_whole(file, lambda path: _save(figure, path))
+        write_whole(file, lambda path, kind=file.suffix[1:]: _save(figure, path, kind))
         figure.set_layout_engine("none")  # as laid out for the first; once is enough
     return files
 
 
-def _save(figure: Figure, path: Path) -> None:
+def _save(figure: Figure, path: Path, kind: str) -> None:
     # No date: the same tables give the same bytes.
-    metadata = {"Date": None} if path.suffix == ".svg" else None
-    figure.savefig(path, dpi=_DPI[path.suffix[1:]], metadata=metadata)
+    metadata = {"Date": None} if kind == "svg" else None
+    figure.savefig(path, format=kind, dpi=_DPI[kind], metadata=metadata)

@@ -1,7 +1,8 @@
 """Stage: all aligners on the correspondences of one robot pair, at each evaluated iteration."""
 
+import functools
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,7 +13,7 @@ from experiments import tables
 from experiments.aligner_calls import CallableAligner, callable_aligner, refine_estimate
 from experiments.randomness import generator
 from experiments.scenario import AlignerEntry, Scenario
-from experiments.stages.slam import read_snapshots
+from experiments.stages.slam import RobotFolders, read_snapshots
 from experiments.store import StageFolder, Store
 from mapfusion.align.acceptance import Verdict
 from mapfusion.align.correspondences import Correspondences, match
@@ -86,51 +87,60 @@ def batches(iterations: list[int]) -> list[list[int]]:
     return [iterations[start : start + ITERATIONS_PER_BATCH] for start in starts]
 
 
-def _batch_path(folder: StageFolder, index: int) -> Path:
+def batch_path(folder: StageFolder, index: int) -> Path:
+    """Where a part keeps one batch."""
     return folder.path / f"batch_{index:03d}.parquet"
 
 
-def run_batch(
+# The maps of one pair of robots stay in memory: each aligner of the pair wants the same.
+@functools.lru_cache(maxsize=2)
+def _maps(log: Path, slam: Path) -> dict[int, LandmarkMap]:
+    return read_snapshots(slam, read_log(log))
+
+
+def _pairs_of_maps(
+    robots: tuple[RobotFolders, RobotFolders], iterations: list[int]
+) -> Iterator[tuple[int, LandmarkMap, LandmarkMap]]:
+    a, b = (_maps(*folders) for folders in robots)
+    return ((k, map_at(a, k), map_at(b, k)) for k in iterations)
+
+
+def run_match(
     scenario: Scenario,
-    robots: tuple[tuple[Path, Path], tuple[Path, Path]],
-    output: Parts,
+    robots: tuple[RobotFolders, RobotFolders],
+    output: StageFolder,
     index: int,
     iterations: list[int],
 ) -> None:
-    """Align at some iterations; `robots` are the (log, slam) folders of both.
-
-    What is already on disk is kept: an interrupted run goes on after it.
-    """
-    wanted = {_batch_path(folder, index) for folder in (output.match, *output.aligners)}
-    if all(path.is_file() for path in wanted):
-        return
-    a, b = (read_snapshots(slam_folder, read_log(log_folder)) for log_folder, slam_folder in robots)
-    maps = {k: (map_at(a, k), map_at(b, k)) for k in iterations}
-    offered = _offered_batch(scenario, maps, _batch_path(output.match, index))
-    for entry, folder in zip(scenario.align.aligners, output.aligners, strict=True):
-        path = _batch_path(folder, index)
-        if not path.is_file():
-            aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
-            rows = [
-                row
-                for k, (map_a, map_b) in maps.items()
-                for row in _estimate(scenario, entry, aligner, map_a, map_b, offered[k], k)
-            ]
-            tables.write(path, "estimates", rows)
+    """Find the correspondences of one batch of iterations."""
+    started = time.perf_counter()
+    made = []
+    for k, map_a, map_b in _pairs_of_maps(robots, iterations):
+        names = {"robot_a": map_a.name, "robot_b": map_b.name, "iteration": k}
+        made.append(_offered(names, match(map_a, map_b, scenario.align.match)))
+    tables.write(batch_path(output, index), "correspondences", pd.concat(made))
+    output.note(f"{index:03d}", elapsed_s=time.perf_counter() - started)
 
 
-def _offered_batch(
-    scenario: Scenario, maps: dict[int, tuple[LandmarkMap, LandmarkMap]], path: Path
-) -> dict[int, Correspondences]:
-    """Correspondences by iteration, from the file if it is there, else made and written."""
-    if not path.is_file():
-        made = []
-        for k, (map_a, map_b) in maps.items():
-            names = {"robot_a": map_a.name, "robot_b": map_b.name, "iteration": k}
-            made.append(_offered(names, match(map_a, map_b, scenario.align.match)))
-        tables.write(path, "correspondences", pd.concat(made))
-    rows = tables.read(path, "correspondences")
-    return {k: correspondences_of(rows[rows["iteration"] == k]) for k in maps}
+def run_aligner(
+    scenario: Scenario,
+    entry: AlignerEntry,
+    robots: tuple[RobotFolders, RobotFolders],
+    offered: StageFolder,
+    output: StageFolder,
+    index: int,
+    iterations: list[int],
+) -> None:
+    """Let one aligner estimate at one batch of iterations, on what the match stage offers."""
+    started = time.perf_counter()
+    pairs = tables.read(batch_path(offered, index), "correspondences")
+    aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
+    rows = []
+    for k, map_a, map_b in _pairs_of_maps(robots, iterations):
+        offered_here = correspondences_of(pairs[pairs["iteration"] == k])
+        rows += _estimate(scenario, entry, aligner, map_a, map_b, offered_here, k)
+    tables.write(batch_path(output, index), "estimates", rows)
+    output.note(f"{index:03d}", elapsed_s=time.perf_counter() - started)
 
 
 def map_at(maps: dict[int, LandmarkMap], iteration: int) -> LandmarkMap:
@@ -238,13 +248,15 @@ def correspondences_of(rows: pd.DataFrame) -> Correspondences:
     )
 
 
-def finish(output: StageFolder, made: Parts, n_batches: int, started: float) -> None:
+def finish(output: StageFolder, made: Parts, n_batches: int) -> None:
     """Join the batches in order of iteration and mark the stage as finished."""
+    started = time.perf_counter()
     sources = {"estimates": made.aligners, "correspondences": (made.match,)}
     for name, folders in sources.items():
-        paths = [_batch_path(folder, i) for i in range(n_batches) for folder in folders]
+        paths = [batch_path(folder, i) for i in range(n_batches) for folder in folders]
         joined = pd.concat([tables.read(path, name) for path in paths], ignore_index=True)
         # within an iteration the aligners stay in their order
         joined = joined.sort_values("iteration", kind="stable", ignore_index=True)
         tables.write(output.path / f"{name}.parquet", name, joined)
-    output.finish(elapsed_s=time.perf_counter() - started)
+    parts_s = sum(folder.noted().get("elapsed_s", 0.0) for folder in (made.match, *made.aligners))
+    output.finish(elapsed_s=parts_s + time.perf_counter() - started)

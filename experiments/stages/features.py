@@ -33,6 +33,7 @@ SOURCES += ("experiments/stages/features.py", "experiments/randomness.py")
 
 FACES_SOURCES = ("sim", "mapfusion/se2.py", "experiments/stages/drive.py")
 FACES_SOURCES += ("experiments/stages/features.py", "experiments/randomness.py")
+FACES_SOURCES += ("mapfusion/storage.py",)
 
 # Frames a task: about two seconds of work, so little is lost when a run is interrupted.
 FRAMES_PER_CHUNK = 20
@@ -89,14 +90,13 @@ def stage(
     return store.stage("features", settings, [drive, faces], SOURCES)
 
 
-def chunks(scenario: Scenario, output: StageFolder) -> list[int]:
-    """First frames of the chunks that are not on disk yet."""
-    assert scenario.drive is not None
-    starts = range(0, scenario.drive.frames, FRAMES_PER_CHUNK)
-    return [start for start in starts if not all(p.is_file() for p in _paths(output.path, start))]
+def chunks(n_frames: int) -> range:
+    """First frames of the chunks."""
+    return range(0, n_frames, FRAMES_PER_CHUNK)
 
 
-def _paths(folder: Path, start: int) -> tuple[Path, Path]:
+def chunk_paths(folder: Path, start: int) -> tuple[Path, Path]:
+    """The truth and the features of one chunk; the features are written last."""
     return folder / f"truth_{start:06d}.parquet", folder / f"features_{start:06d}.parquet"
 
 
@@ -130,8 +130,9 @@ def run_chunk(
     output: StageFolder,
     robot: str,
     start: int,
-) -> float:
-    """Render and extract the frames of one chunk; returns the seconds spent rendering."""
+) -> None:
+    """Render and extract the frames of one chunk."""
+    chunk_started = time.perf_counter()
     trajectory = read_trajectory(drive.path / "trajectory.parquet")
     source = _OpenWorld.get(scenario, faces)
     front_end = FrontEnd(scenario.camera, scenario.vision)
@@ -151,11 +152,17 @@ def run_chunk(
         truth.append(truth_points(scenario.camera, frame.depth_m, found.uv_px, own_pose))
         if 0 <= iteration - scenario.keep.images_at < scenario.keep.images:
             _write_image(output.path / f"image_{iteration:06d}.png", frame.left)
-    truth_path, features_path = _paths(output.path, start)
+    truth_path, features_path = chunk_paths(output.path, start)
     points = np.concatenate(truth)
     write_table(truth_path, {n: points[:, i] for i, n in enumerate(TRUTH.names)}, TRUTH)
     write_table(features_path, _columns(frames, features), FEATURES)
-    return rendering_s
+    elapsed_s = time.perf_counter() - chunk_started
+    output.note(f"{start:06d}", elapsed_s=elapsed_s, rendering_s=rendering_s)
+
+
+def finish(output: StageFolder) -> None:
+    """Mark the stage as finished once all chunks are there."""
+    output.finish(**output.noted())
 
 
 def _write_image(path: Path, image: np.ndarray) -> None:
@@ -177,8 +184,8 @@ def _columns(frames: range, features: list[Features]) -> dict[str, np.ndarray]:
 
 def read_features(folder: Path, n_frames: int) -> Iterator[tuple[Features, Float]]:
     """Features and their true world points (N, 3), frame by frame, in order."""
-    for start in range(0, n_frames, FRAMES_PER_CHUNK):
-        truth_path, features_path = _paths(folder, start)
+    for start in chunks(n_frames):
+        truth_path, features_path = chunk_paths(folder, start)
         table, _ = read_table(features_path, FEATURES)
         truth_table, _ = read_table(truth_path, TRUTH)
         truth = np.stack([column(truth_table, name) for name in TRUTH.names], -1)

@@ -1,14 +1,12 @@
 """Stage: one robot pair's estimates against the truth, and whether fusing the pair was worth it."""
 
 import time
-from pathlib import Path
-from typing import NamedTuple
 
 from experiments import tables
 from experiments.evaluate import EvaluatedRobot, error_rows
 from experiments.fusion import fusion_rows
 from experiments.scenario import Scenario
-from experiments.stages.slam import read_associations, read_snapshots
+from experiments.stages.slam import RobotFolders, read_associations, read_snapshots
 from experiments.store import StageFolder, Store
 from experiments.truth import PathTruth, landmark_truth
 from mapfusion.errors import InputError
@@ -16,13 +14,6 @@ from mapfusion.robot_log import read_log, read_truth
 
 SOURCES = ("mapfusion", "experiments/stages/judge.py", "experiments/evaluate.py")
 SOURCES += ("experiments/fusion.py", "experiments/truth.py", "experiments/tables.py")
-
-
-class RobotFolders(NamedTuple):
-    """Where a robot's log (with its truth) and its SLAM result lie."""
-
-    log: Path
-    slam: Path
 
 
 def load_robot(folders: RobotFolders) -> EvaluatedRobot:

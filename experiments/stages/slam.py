@@ -3,6 +3,7 @@
 import time
 from dataclasses import asdict
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -80,6 +81,13 @@ CLOUDS = schema(
         *(pa.field(name, pa.float64()) for name in ("x_m", "y_m", "theta_rad", "log_weight")),
     ],
 )
+
+
+class RobotFolders(NamedTuple):
+    """Where a robot's log (with its truth) and its SLAM result lie."""
+
+    log: Path
+    slam: Path
 
 
 def evaluated_iterations(n_frames: int, every: int) -> list[int]:
@@ -248,12 +256,6 @@ def read_snapshots(slam: Path, log: RobotLog) -> dict[int, LandmarkMap]:
             log.robot,
         )
     return maps
-
-
-def snapshot_iterations(slam: Path) -> list[int]:
-    """The iterations at which a robot's map was kept."""
-    _, attributes = read_table(slam / "snapshots.parquet", SNAPSHOTS)
-    return [int(iteration) for iteration in attributes["iterations"].split(",")]
 
 
 def read_associations(slam: Path) -> pd.DataFrame:

@@ -19,8 +19,8 @@ from experiments import tables
 from experiments.pipeline import execute, plan
 from experiments.result import run_scenario
 from experiments.scenario import Scenario, load_scenario
-from experiments.stages.align import Parts, run_batch
-from experiments.stages.slam import run_filter
+from experiments.stages.align import run_aligner, run_match
+from experiments.stages.slam import RobotFolders, run_filter
 from experiments.store import StageFolder, Store
 from mapfusion.landmark_map import read_map
 from mapfusion.robot_log import read_log, read_truth, write_truth_points, write_truth_poses
@@ -92,7 +92,7 @@ def test_finished_stages_are_reused_and_fresh_computes_again(
     execute(quick, store, 1, quietly)
     marks = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("done.json")}
     execute(quick, store, 1, lambda stage, done, total: told.append(stage), fresh=True)
-    assert set(told) == {"drive", "faces", "render", "slam", "align", "judge"}
+    assert set(told) == {"drive", "faces", "render", "log", "slam", "align", "judge"}
     assert all(path.stat().st_mtime_ns > before for path, before in marks.items())
 
 
@@ -207,12 +207,15 @@ def test_estimating_opens_no_truth(tiny: Scenario, tiny_results: Path, tmp_path:
         for name in ("frames.parquet", "observations.parquet"):
             (log / name).hardlink_to(robot.log.path / name)
         run_filter(read_log(log), tiny.slam, tiny.seed, [10, 43], 10, log / "slam")
-        folders.append((log, log / "slam"))
+        folders.append(RobotFolders(log, log / "slam"))
     offered = StageFolder("match", "x", tmp_path / "match")
     aligners = tuple(
         StageFolder("aligner", entry.name, tmp_path / entry.name) for entry in tiny.align.aligners
     )
-    run_batch(tiny, (folders[0], folders[1]), Parts(offered, aligners), 0, [43])
+    robots = (folders[0], folders[1])
+    run_match(tiny, robots, offered, 0, [43])
+    for entry, folder in zip(tiny.align.aligners, aligners, strict=True):
+        run_aligner(tiny, entry, robots, offered, folder, 0, [43])
     for folder in (offered, *aligners):
         assert (folder.path / "batch_000.parquet").is_file()
 

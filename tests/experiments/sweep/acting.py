@@ -1,0 +1,48 @@
+"""Tasks that misbehave, importable in worker processes."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+from mapfusion.errors import InputError
+
+
+def write(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+
+
+def note(journal: Path, text: str) -> None:
+    with journal.open("a") as file:
+        file.write(f"{text}\n")
+
+
+def collide() -> None:
+    raise InputError("scenario x: R1 drove into\n a wall at (1, 2)")
+
+
+def run_out_of_memory() -> None:
+    raise MemoryError
+
+
+def break_down() -> None:
+    raise ZeroDivisionError("a bug")
+
+
+def die(journal: Path) -> None:
+    note(journal, "died")
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def die_first(journal: Path, path: Path) -> None:
+    """Killed twice, then all is well."""
+    if not journal.exists() or len(journal.read_text().split()) < 2:
+        die(journal)
+    write(path, "done")
+
+
+def wait_for(path: Path, output: Path) -> None:
+    while not path.exists():
+        time.sleep(0.01)
+    write(output, "done")
