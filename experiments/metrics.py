@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import pandas as pd
 
+# The four methods of the paper, algorithm 1 in both readings, as the default list names them.
 PAPER_ALIGNERS = ("ransac", "svd", "svd-solved", "icp", "impicp")
 # Iterations with fewer true pairs are left out where an aligner is compared with the oracle: with
 # a handful of pairs both are dominated by chance.
