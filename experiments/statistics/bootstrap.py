@@ -121,7 +121,8 @@ def mean_interval(
         return Interval(float(np.mean(values)) if len(values) else np.nan, np.nan, np.nan)
     if np.ptp(values) == 0:
         return Interval(float(values[0]), float(values[0]), float(values[0]))
-    with warnings.catch_warnings():  # equal jackknife values; the percentile then does
+    with warnings.catch_warnings(), np.errstate(invalid="ignore"):
+        # where all jackknife values are equal BCa has no answer; the percentile then does
         warnings.simplefilter("ignore", scipy.stats.DegenerateDataWarning)
         result = scipy.stats.bootstrap(
             (values,),

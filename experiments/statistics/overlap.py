@@ -1,7 +1,5 @@
 """How much of two maps is common ground, as a share."""
 
-from collections.abc import Sequence
-
 import numpy as np
 import pandas as pd
 
@@ -15,7 +13,7 @@ def with_overlap_share(maps: pd.DataFrame, runs: Runs) -> pd.DataFrame:
     """
     if not runs.has("robots"):
         return maps.assign(overlap_share=np.nan)
-    sizes = map_sizes(runs, np.unique(maps["iteration"]).tolist())
+    sizes = map_sizes(runs, np.unique(maps["iteration"]))
     for side in "ab":
         own = sizes.rename(columns={"robot": f"robot_{side}", "n_landmarks": f"size_{side}"})
         maps = maps.merge(own, on=["run_id", f"robot_{side}", "iteration"], how="left")
@@ -25,7 +23,7 @@ def with_overlap_share(maps: pd.DataFrame, runs: Runs) -> pd.DataFrame:
     return maps.drop(columns=["size_a", "size_b"]).assign(overlap_share=share)
 
 
-def map_sizes(runs: Runs, iterations: Sequence[int]) -> pd.DataFrame:
+def map_sizes(runs: Runs, iterations: np.ndarray) -> pd.DataFrame:
     """Landmarks of each robot's map at these iterations: run_id, robot, iteration, n_landmarks."""
     parts = []
     for rows in runs.each("robots", ["robot", "iteration", "n_landmarks"]):
@@ -33,5 +31,5 @@ def map_sizes(runs: Runs, iterations: Sequence[int]) -> pd.DataFrame:
             known = own.set_index("iteration")["n_landmarks"].sort_index()
             at = known.reindex(iterations, method="ffill")
             part = pd.DataFrame({"run_id": run_id, "robot": robot, "n_landmarks": at.to_numpy()})
-            parts.append(part.assign(iteration=np.array(iterations)))
+            parts.append(part.assign(iteration=iterations))
     return pd.concat(parts, ignore_index=True)
