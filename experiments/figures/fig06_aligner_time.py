@@ -11,7 +11,8 @@ from experiments.figures.runs_tables import RunsTables
 from experiments.figures.style import PAGE_WIDTH_IN, aligner_styles, plain_numbers
 from experiments.metrics import ORACLE
 
-# The line that guides the eye joins the points while they are few, else medians of so many groups.
+# The line that guides the eye joins the points of one run while they are few, else medians of so
+# many groups.
 _MAX_JOINED = 16
 _GROUPS = 8
 
@@ -50,9 +51,10 @@ def _add_aligner(
     name = rows["aligner"].iloc[0]
     style = aligner_styles(aligners)[name]
     count, elapsed = rows[column].to_numpy(), rows["elapsed_s"].to_numpy()
+    groups = len(count) if len(count) <= _MAX_JOINED and not several_runs else _GROUPS
     if several_runs:
-        middle, low = binned_quantiles(count, elapsed, BAND[0])
-        _, high = binned_quantiles(count, elapsed, BAND[1])
+        middle, low = binned_quantiles(count, elapsed, groups, BAND[0])
+        _, high = binned_quantiles(count, elapsed, groups, BAND[1])
         axes.fill_between(middle, low, high, color=style["color"], alpha=0.16, linewidth=0)
     else:
         axes.vlines(
@@ -74,18 +76,17 @@ def _add_aligner(
         alpha=0.3 if several_runs else 0.6,
         rasterized=True,
     )
-    guide = binned_quantiles(count, elapsed)
+    guide = binned_quantiles(count, elapsed, groups)
     axes.plot(*guide, label=name, zorder=4 if name == ORACLE else 3, **style)
 
 
 def binned_quantiles(
-    count: np.ndarray, elapsed_s: np.ndarray, quantile: float = 0.5
+    count: np.ndarray, elapsed_s: np.ndarray, groups: int, quantile: float = 0.5
 ) -> tuple[np.ndarray, np.ndarray]:
     """Median counts and quantiles of the times of groups of about equal size along the count.
 
     Ties are never split.
     """
-    groups = len(count) if len(count) <= _MAX_JOINED else _GROUPS
     rank = pd.Series(count).rank(pct=True).to_numpy()
     frame = pd.DataFrame({"group": np.ceil(rank * groups), "count": count, "elapsed": elapsed_s})
     grouped = frame.groupby("group")

@@ -12,10 +12,11 @@ from rich.table import Table
 from experiments.metrics import MIN_TRUE_PAIRS, ORACLE
 from experiments.screen import _LAYOUT as TABLE_LAYOUT
 from experiments.statistics.bootstrap import MAPS_OF_ONE_RUN
-from experiments.statistics.compare import BETTER, NOISE, SAME, UNKNOWN, WORSE, Comparison
+from experiments.statistics.compare import BETTER, FEW_RUNS, NOISE, SAME, UNKNOWN, WORSE, Comparison
 from experiments.statistics.summary import ALL_SCENARIOS, Summary
 
 _COLOURS = {BETTER: "green", WORSE: "bold red", UNKNOWN: "yellow"}
+_SHORT = {NOISE: "noise", SAME: "same", UNKNOWN: "unknown"}
 _PATH_NAMES = {"ate_m": "ATE, m", "rpe_m": "RPE, m", "rpe_rad": "RPE, rad"}
 
 
@@ -23,6 +24,7 @@ def print_summary(summary: Summary, written: Path | None, skipped: Sequence[str]
     """The main tables, and where all of them are."""
     console = Console()
     _print_success(console, summary)
+    _print_where_it_fails(console, summary)
     _print_oracle_ratios(console, summary)
     _print_best_against_others(console, summary)
     _print_paths(console, summary)
@@ -49,13 +51,19 @@ def _shown(summary: Summary, name: str) -> tuple[pd.DataFrame, list[str]]:
     return table, [str(c) for c in labels if len(table[c].unique()) > 1]
 
 
-def _table(title: str, headings: Sequence[str], labels: Sequence[str], caption: str = "") -> Table:
-    table = Table(title=title, caption=caption or None, **TABLE_LAYOUT)
+def _table(title: str, headings: Sequence[str], labels: Sequence[str]) -> Table:
+    table = Table(title=title, **TABLE_LAYOUT)
     for label in labels:
         table.add_column(escape(label))
     for place, heading in enumerate(headings):
         table.add_column(heading, justify="right" if place else "left", no_wrap=place > 0)
     return table
+
+
+def _show(console: Console, table: Table, caption: str) -> None:
+    """A table and what its columns mean; as a caption rich would break it at the table's width."""
+    console.print(table)
+    console.print(f"[dim]{escape(caption)}[/]\n", highlight=False)
 
 
 def _cells(row: dict, labels: Sequence[str]) -> list[str]:
@@ -74,15 +82,34 @@ def _print_success(console: Console, summary: Summary) -> None:
         f"Success at the end of {_runs(summary.n_runs)}",
         headings,
         labels,
-        f"right: within {limits.translation_m:g} m and {limits.rotation_rad:g} rad of the truth, "
-        "the reach of the refinement;\nin brackets 95 % (Wilson)",
     )
     for row in rows.to_dict("records"):
         shares = ["estimated_success", "refined_success"]
         shares += ["accepted", "false_accepted"] if tested else []
         cells = [_share(row, name) for name in shares]
         table.add_row(*_cells(row, [*labels, "aligner"]), *cells)
-    console.print(table)
+    reach = f"{limits.translation_m:g} m and {limits.rotation_rad:g} rad"
+    caption = f"right: within {reach}, the reach of the refinement; (95 %, Wilson)"
+    _show(console, table, caption)
+
+
+def _print_where_it_fails(console: Console, summary: Summary) -> None:
+    """Success as estimated by the number of true pairs: methods down, bins across."""
+    rows, labels = _shown(summary, "success_by_true_pairs")
+    if rows.empty:
+        return
+    bins = rows[["from", "to"]].drop_duplicates().sort_values("from").to_dict("records")
+    headings = [f"{b['from']:.0f}+" if math.isinf(b["to"]) else f"{b['from']:.0f}" for b in bins]
+    table = _table("Right as estimated, percent of the maps", ["method", *headings], labels)
+    for keys, own in rows.groupby([*labels, "aligner"], sort=False):
+        shares = own.set_index("from")["estimated_success"]
+        cells = [_number(100 * shares.get(b["from"], math.nan), ".0f") for b in bins]
+        table.add_row(*(escape(str(key)) for key in keys), *cells)
+    _show(
+        console,
+        table,
+        "by the number of true pairs, from the one given up; intervals are in the files",
+    )
 
 
 def _print_oracle_ratios(console: Console, summary: Summary) -> None:
@@ -93,15 +120,14 @@ def _print_oracle_ratios(console: Console, summary: Summary) -> None:
         "Median translation error, and its ratio to the oracle's",
         ["\nmethod", "estim.\nm", "\nover the oracle", "refined\nm", "\nover the oracle"],
         labels,
-        f"maps with {MIN_TRUE_PAIRS}+ true pairs; inf: no estimate on most; in brackets 95 % "
-        "(bootstrap)",
     )
     for row in rows.to_dict("records"):
         cells = []
         for stage in ("estimated", "refined"):
             cells += [_number(row[f"{stage}_m"], ".3f"), _interval(row, f"{stage}_ratio")]
         table.add_row(*_cells(row, [*labels, "aligner"]), *cells)
-    console.print(table)
+    caption = f"maps with {MIN_TRUE_PAIRS}+ true pairs; inf: no estimate on most; (95 %, bootstrap)"
+    _show(console, table, caption)
 
 
 def _print_best_against_others(console: Console, summary: Summary) -> None:
@@ -116,14 +142,13 @@ def _print_best_against_others(console: Console, summary: Summary) -> None:
         f"{best} against each other method on the same maps, as estimated",
         ["other", "its error over other's", "nearer than other", "p (Holm)"],
         labels,
-        "median ratio, and share of the maps; in brackets 95 % (bootstrap)",
     )
     for row in rows[(rows["first"] == best) | (rows["second"] == best)].to_dict("records"):
         if row["second"] == best:
             row = _swapped(row)
         cells = [_interval(row, "ratio"), _share(row, "first_wins"), _number(row["p_holm"], ".2g")]
         table.add_row(*_cells(row, [*labels, "second"]), *cells)
-    console.print(table)
+    _show(console, table, "median ratio, and share of the maps; (95 %, bootstrap)")
 
 
 def _swapped(row: dict) -> dict:
@@ -138,21 +163,20 @@ def _swapped(row: dict) -> dict:
 
 def _print_paths(console: Console, summary: Summary) -> None:
     rows, labels = _shown(summary, "paths")
-    rows = rows[rows["quantity"].isin(list(_PATH_NAMES))] if len(rows) else rows
     if rows.empty:
         return
+    shown = rows["quantity"].isin(list(_PATH_NAMES)) & (rows["delta_unit"] != "frames")
     table = _table(
-        "Path errors (RMSE, median over robots and runs)",
-        ["path", "error", "over", "RMSE", "median", "max"],
+        "Path errors, median over robots and runs",
+        ["path", "error", "RMSE", "median", "max"],
         labels,
-        "ATE: after the best rigid fit; RPE: relative, over that much of the way",
     )
-    for row in rows.to_dict("records"):
-        over = "" if math.isnan(row["delta"]) else f"{row['delta']:g} {row['delta_unit']}"
-        cells = [_PATH_NAMES[row["quantity"]], over, _interval(row, "rmse", ".3g")]
+    for row in rows[shown].to_dict("records"):
+        cells = [_PATH_NAMES[row["quantity"]], _interval(row, "rmse", ".3g")]
         cells += [_number(row["median"], ".3g"), _number(row["max"], ".3g")]
         table.add_row(*_cells(row, [*labels, "source"]), *cells)
-    console.print(table)
+    caption = "ATE: after the best rigid fit; RPE: relative, along a metre; (95 %, bootstrap)"
+    _show(console, table, caption)
 
 
 def _print_nees(console: Console, summary: Summary) -> None:
@@ -160,17 +184,18 @@ def _print_nees(console: Console, summary: Summary) -> None:
     if rows.empty:
         return
     table = _table(
-        "Landmark NEES per degree of freedom",
-        ["landmarks", "n", "NEES", "consistent", "inside 95 %"],
+        "Landmark NEES per degree of freedom: 1 is consistent, more is too sure",
+        ["landmarks", "n", "NEES", "chi-square", "in gate"],
         labels,
-        "1 is consistent, more is too sure; consistent: where the mean of so many independent\n"
-        "landmarks lies 95 times of 100 (chi-square); in brackets 95 % over runs (bootstrap)",
     )
     for row in rows.to_dict("records"):
-        band = f"{row['band_low']:.3f}-{row['band_high']:.3f}"
+        band = f"{row['band_low']:.2f}-{row['band_high']:.2f}"
+        inside = _number(100 * row["share_in_gate"], ".0f")
         cells = [str(row["n_landmarks"]), _interval(row, "nees_per_dof", ".3g"), band]
-        table.add_row(*_cells(row, [*labels, "landmarks"]), *cells, _share(row, "share_in_gate"))
-    console.print(table)
+        cells.append(inside if inside == "-" else f"{inside} %")
+        table.add_row(*_cells(row, [*labels, "landmarks"]), *cells)
+    caption = "chi-square: 95 % band of a consistent mean; in gate: of 95 %; (95 %, bootstrap)"
+    _show(console, table, caption)
 
 
 def _print_caveats(console: Console, summary: Summary) -> None:
@@ -178,6 +203,12 @@ def _print_caveats(console: Console, summary: Summary) -> None:
         console.print(
             f"One run: the brackets tell of the {MAPS_OF_ONE_RUN}, which depend on each other, and "
             "nothing of other seeds.",
+            soft_wrap=True,
+        )
+    elif summary.n_runs < FEW_RUNS:
+        console.print(
+            f"{summary.n_runs} runs: bootstrap intervals of so few are too narrow; take {FEW_RUNS} "
+            "seeds or more.",
             soft_wrap=True,
         )
     for row in summary.failed.to_dict("records"):
@@ -193,40 +224,41 @@ def print_comparison(found: Comparison, show_all: bool, written: Path | None) ->
     counts = found.table["verdict"].value_counts()
     shown = found.table if show_all else found.table[found.table["verdict"].isin([BETTER, WORSE])]
     if len(shown):
-        console.print(_comparison_table(found, shown))
+        _show(
+            console,
+            _comparison_table(shown),
+            "change: factor, or difference; (95 %, bootstrap); "
+            f"verdicts at 5 %, corrected for {found.table['p'].notna().sum()} tests",
+        )
     tally = ", ".join(
         f"{counts.get(verdict, 0)} {verdict}"
         for verdict in (WORSE, BETTER, NOISE, SAME, UNKNOWN)
         if verdict != UNKNOWN or counts.get(UNKNOWN, 0)
     )
-    console.print(f"{_runs(found.n_runs)} compared in {len(found.table)} ways: {tally}")
+    console.print(
+        f"{_runs(found.n_runs)} compared in {len(found.table)} ways: {tally}", soft_wrap=True
+    )
     for note in found.notes:
         console.print(f"  {note}", soft_wrap=True, markup=False)
     if written is not None:
         console.print(f"All rows (CSV, Markdown, LaTeX): {written}", soft_wrap=True)
 
 
-def _comparison_table(found: Comparison, shown: pd.DataFrame) -> Table:
+def _comparison_table(shown: pd.DataFrame) -> Table:
     order = [WORSE, BETTER, UNKNOWN, NOISE, SAME]
     rows = shown.sort_values("verdict", key=lambda names: names.map(order.index), kind="stable")
-    unit = "run" if found.unit != MAPS_OF_ONE_RUN else "map"
-    table = _table(
-        "Second version against the first",
-        ["metric", "first", "second", "change", "p", "verdict"],
-        [],
-        f"change: factor, or difference, mean over each {unit}'s; in brackets 95 % (bootstrap);\n"
-        f"p: corrected for {found.table['p'].notna().sum()} tests (Holm)",
-    )
-    table.columns[-1].justify = "left"
+    headings = ["method", "metric", "first", "second", "change", "verdict"]
+    table = _table("Second version against the first", headings, [])
+    for column in (table.columns[1], table.columns[-1]):
+        column.justify = "left"
     for row in rows.to_dict("records"):
-        name = f"{row['method']}: {row['metric']}" if row["method"] else row["metric"]
         colour = _COLOURS.get(row["verdict"], "dim")
         table.add_row(
-            escape(name),
+            escape(row["method"]),
+            escape(row["metric"]),
             *(_value(row[side], row["scale"]) for side in "ab"),
-            _change(row),
-            "<0.001" if row["p_holm"] < 1e-3 else _number(row["p_holm"], ".2g"),
-            f"[{colour}]{row['verdict'].removeprefix('no difference beyond ')}[/]",
+            "" if row["verdict"] == SAME else _change(row),
+            f"[{colour}]{_SHORT.get(row['verdict'], row['verdict'])}[/]",
         )
     return table
 
@@ -237,7 +269,7 @@ def _value(value: float, scale: str) -> str:
 
 def _change(row: dict) -> str:
     if row["scale"] == "ratio":
-        return "x" + _interval(row, "change")
+        return _interval(row, "change")
     if row["scale"] == "share":
         points = {name: 100 * row[name] for name in ("change", "low", "high")}
         return _bracketed(points["change"], points["low"], points["high"], "+.0f", " %")
@@ -258,7 +290,7 @@ def _share(row: dict, name: str) -> str:
 
 def _bracketed(value: float, low: float, high: float, layout: str, unit: str = "") -> str:
     text = _number(value, layout) + (unit if not math.isnan(value) else "")
-    if math.isnan(low) or math.isnan(high):
+    if math.isnan(low) or math.isnan(high) or (math.isinf(low) and math.isinf(high)):
         return text
     return f"{text} ({_number(low, layout)} to {_number(high, layout)})"
 

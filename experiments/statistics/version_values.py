@@ -85,25 +85,25 @@ def _alignment_values(maps: pd.DataFrame) -> Iterator[Values]:
         own = maps[maps["aligner"] == aligner]
         if aligner == ORACLE:
             enough = own[scarce[own.index] >= ANSWERABLE_PAIRS]
-            metric = Metric("refined translation error (m)", aligner, "ratio")
+            metric = Metric("refined error, m", aligner, "ratio")
             yield _ratio(metric, enough, "refined_translation_error_m")
-            yield _ratio(Metric("true pairs offered", "", "ratio", True), enough, "n_true")
+            yield _ratio(Metric("true pairs", "", "ratio", True), enough, "n_true")
             continue
         for name, label, higher in (
-            ("estimated_success", "success as estimated", True),
+            ("estimated_success", "success estimated", True),
             ("refined_success", "success refined", True),
             ("accepted", "accepted", True),
-            ("false_accepted", "accepted though wrong", False),
+            ("false_accepted", "wrongly accepted", False),
         ):
             yield _difference(Metric(label, aligner, "share", higher), own, name)
         enough = own[scarce[own.index] >= ANSWERABLE_PAIRS]
-        metric = Metric("translation error as estimated (m)", aligner, "ratio")
+        metric = Metric("estimated error, m", aligner, "ratio")
         yield _ratio(metric, enough, "translation_error_m")
         rich = own[scarce[own.index] >= MIN_TRUE_PAIRS].set_index(keys)
         for side in "ab":
             column = f"refined_translation_error_m_{side}"
             rich[f"over_oracle_{side}"] = rich[column] / oracle[column].reindex(rich.index)
-        metric = Metric("refined error over the oracle's", aligner, "ratio")
+        metric = Metric("refined / oracle", aligner, "ratio")
         yield _ratio(metric, rich.reset_index(), "over_oracle")
 
 
@@ -136,8 +136,8 @@ def _path_rms(runs: Runs, column: str) -> pd.DataFrame:
 
 def _paths(a: Runs, b: Runs) -> Iterator[Values]:
     for column, label in (
-        ("path_error_m", "path error, RMS (m)"),
-        ("odometry_error_m", "odometry error, RMS (m)"),
+        ("path_error_m", "path RMSE, m"),
+        ("odometry_error_m", "odometry RMSE, m"),
     ):
         first, second = (_path_rms(runs, column) for runs in (a, b))
         yield _ratio(Metric(label, "", "ratio"), _joined(first, second, ["robot"]), column)
@@ -148,8 +148,8 @@ def _fits(a: Runs, b: Runs) -> Iterator[Values]:
     rows = _joined(first, second, ["map"])
     is_fused = rows["map"] == "fused"
     for label, own in (
-        ("landmark RMSE (m)", rows[~is_fused]),
-        ("fused landmark RMSE (m)", rows[is_fused]),
+        ("landmark RMSE, m", rows[~is_fused]),
+        ("fused RMSE, m", rows[is_fused]),
     ):
         yield _ratio(Metric(label, "", "ratio"), own, "rmse_m")
 
@@ -163,7 +163,7 @@ def _nees(a: Runs, b: Runs) -> Iterator[Values]:
     frame = pd.DataFrame(
         {MATCH: rows[MATCH], "a": rows["nees_a"], "b": rows["nees_b"], "change": change}
     )
-    yield Values(Metric("fused landmarks' NEES per degree of freedom", "", "ln"), frame)
+    yield Values(Metric("fused NEES / dof", "", "ln"), frame)
 
 
 def _nees_of_pairs(runs: Runs) -> pd.DataFrame:
@@ -183,5 +183,5 @@ def _times(a: Runs, b: Runs) -> Iterator[Values]:
     first, second = (runs.read("aligner_timings", [*keys, "elapsed_s"]) for runs in (a, b))
     rows = _joined(first, second, keys)
     for aligner in methods_in(rows):
-        metric = Metric("time of one alignment (s)", aligner, "ratio", timed=True)
+        metric = Metric("time, s", aligner, "ratio", timed=True)
         yield _ratio(metric, rows[rows["aligner"] == aligner], "elapsed_s")
