@@ -46,7 +46,7 @@ def oracle_ratios(maps: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
             ratio = ratio_of_medians(
                 (values, clusters.codes[own]), (reference, clusters.codes[is_oracle]), rng
             )
-            row |= {f"{stage}_m": np.median(values) if len(values) else np.nan}
+            row |= {f"{stage}_m": WeightedMedian(values, clusters.codes[own])(np.ones(clusters.n))}
             row |= dict(zip(_names(stage), ratio, strict=True))
         rows.append(row)
     return pd.DataFrame(rows)

@@ -228,7 +228,7 @@ def print_comparison(found: Comparison, show_all: bool, written: Path | None) ->
             console,
             _comparison_table(shown),
             "change: factor, or difference; (95 %, bootstrap); "
-            f"verdicts at 5 %, corrected for {found.table['p'].notna().sum()} tests",
+            f"verdict: 5 % over {found.table['p'].notna().sum()} tests",
         )
     tally = ", ".join(
         f"{counts.get(verdict, 0)} {verdict}"
@@ -251,6 +251,7 @@ def _comparison_table(shown: pd.DataFrame) -> Table:
     table = _table("Second version against the first", headings, [])
     for column in (table.columns[1], table.columns[-1]):
         column.justify = "left"
+    table.columns[0].no_wrap, table.columns[1].no_wrap = True, False
     for row in rows.to_dict("records"):
         colour = _COLOURS.get(row["verdict"], "dim")
         table.add_row(
