@@ -21,7 +21,7 @@ from experiments.statistics.bootstrap import MAPS_OF_ONE_RUN, RUN, mean_interval
 from experiments.statistics.maps import Criteria
 from experiments.statistics.paired import holm
 from experiments.statistics.sources import Runs, find_runs
-from experiments.statistics.version_values import MATCH, Metric, Values, all_values, match_names
+from experiments.statistics.version_values import MATCH, Metric, Values, all_values
 from mapfusion.errors import InputError
 from mapfusion.se2 import Float
 
@@ -75,7 +75,7 @@ def compare(path_a: Path, path_b: Path) -> Comparison:
         InputError: the two have no run in common, or no table.
     """
     a, b = find_runs(path_a), find_runs(path_b)
-    runs_a, runs_b = _run_names(a), _run_names(b)
+    runs_a, runs_b = a.names, b.names
     common = runs_a & runs_b
     if not common:
         raise InputError(
@@ -97,13 +97,6 @@ def compare(path_a: Path, path_b: Path) -> Comparison:
         *_notes_on(table, unit, len(common)),
     ]
     return Comparison(table.drop(columns="higher_is_better"), unit, len(common), tuple(notes))
-
-
-def _run_names(runs: Runs) -> set[str]:
-    """The runs that have errors, or, of recordings of one robot, paths."""
-    table = "errors" if runs.has("errors") else "robots"
-    column = "iteration"
-    return {name for rows in runs.each(table, [column]) for name in match_names(rows.head(1))}
 
 
 def _judged(values: Values, unit: str) -> dict[str, Any]:

@@ -105,7 +105,8 @@ def maps_of(errors: pd.DataFrame, criteria: Criteria) -> pd.DataFrame:
 def read_maps(runs: Runs, criteria: Criteria) -> pd.DataFrame:
     """The same for all runs, one run in memory at a time."""
     parts = [maps_of(errors, criteria) for errors in runs.each("errors", NEEDED, OPTIONAL)]
-    return pd.concat(parts, ignore_index=True)
+    # a run of one robot has no rows, and must not decide the columns' types
+    return pd.concat([part for part in parts if len(part)] or parts[:1], ignore_index=True)
 
 
 def at_the_end(maps: pd.DataFrame) -> pd.DataFrame:

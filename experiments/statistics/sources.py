@@ -66,11 +66,12 @@ class Runs:
             for result in self.results
             if (path := tables.table_path(result.folder, table)).is_file()
         ]
-        for sweep in self.sweeps:  # names with a dot in front are files still being written
+        for sweep in self.sweeps:
+            finished = self._finished.get(sweep)
             found += [
                 _File(path)
-                for path in sorted((sweep / table).glob("*.parquet"))
-                if not path.name.startswith(".")
+                for path in _whole_files(sweep / table)
+                if finished is None or path.stem in finished
             ]
         return found
 
@@ -109,15 +110,43 @@ class Runs:
         return [result.folder for result in self.results] + list(self.sweeps)
 
     @cached_property
+    def names(self) -> set[str]:
+        """All runs that have errors or paths, by scenario, seed and settings."""
+        found: set[str] = set()
+        for table in ("errors", "robots"):
+            if self.has(table):
+                for rows in self.each(table, ["iteration"]):
+                    found |= set(match_names(rows.drop_duplicates("run_id")))
+        return found
+
+    @cached_property
+    def _said_of_runs(self) -> dict[Path, pd.DataFrame]:
+        """The table `runs` of each sweep that has one."""
+        said = {}
+        for sweep in self.sweeps:
+            parts = [
+                _read(_File(path), "runs", ["status", "reason"], ())
+                for path in _whole_files(sweep / "runs")
+            ]
+            if parts:
+                said[sweep] = pd.concat(parts, ignore_index=True)
+        return said
+
+    @cached_property
+    def _finished(self) -> dict[Path, set[str]]:
+        """Runs of each sweep whose rows are complete; of a sweep that goes on, others are not."""
+        return {
+            sweep: set(rows.loc[rows["status"] == "finished", "run_id"])
+            for sweep, rows in self._said_of_runs.items()
+        }
+
+    @property
     def failed(self) -> pd.DataFrame:
         """Runs of sweeps that failed: run_id, scenario, seed, reason."""
         columns = [*RUN_KEYS, "reason"]
-        parts = []
-        for sweep in self.sweeps:
-            for path in sorted((sweep / "runs").glob("*.parquet")):
-                if not path.name.startswith("."):
-                    rows = _read(_File(path), "runs", ["status", "reason"], ())
-                    parts.append(rows[rows["status"] == "failed"][columns])
+        parts = [
+            rows.loc[rows["status"] == "failed", columns] for rows in self._said_of_runs.values()
+        ]
         return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=columns)
 
 
@@ -164,6 +193,19 @@ def read_runs(
             column, or a run given twice.
     """
     return find_runs(paths).read(table, columns, optional)
+
+
+def match_names(frame: pd.DataFrame) -> pd.Series:
+    """What a run is matched by: scenario, seed, settings."""
+    names = frame["scenario"].astype(str) + " seed " + frame["seed"].astype(str)
+    for column in sorted(setting_columns(frame)):
+        names = names + " " + column + "=" + frame[column].astype(str)
+    return names
+
+
+def _whole_files(folder: Path) -> list[Path]:
+    """The tables in a folder; names with a dot in front are files still being written."""
+    return [path for path in sorted(folder.glob("*.parquet")) if not path.name.startswith(".")]
 
 
 def setting_columns(frame: pd.DataFrame) -> list[str]:
@@ -227,7 +269,7 @@ def _require_readable(path: Path, table: str, schema: pa.Schema) -> None:
     kind = metadata.get(_KIND, table.encode()).decode()
     if kind.rpartition(".")[2] != table:
         raise InputError(f"{path}: kind is {kind}, expected {table}")
-    if table not in tables.ALL:
+    if kind != f"result.{table}":  # a sweep has a version of its own
         return
     known = int(tables.ALL[table].metadata[_VERSION])
     version = metadata.get(_VERSION, b"0").decode()

@@ -21,7 +21,7 @@ from experiments.statistics.overlap import with_overlap_share
 from experiments.statistics.paired import compare_methods
 from experiments.statistics.paths import path_summary
 from experiments.statistics.sources import RUN_KEYS, Runs, setting_columns
-from experiments.statistics.success import BY, LAST, rates_of_maps
+from experiments.statistics.success import LAST, rates_of_maps
 
 ALL_SCENARIOS = "(all)"
 _TIMING_COLUMNS = (*MAP_KEYS, "aligner", "n_correspondences", "n_common", "elapsed_s")
@@ -78,16 +78,8 @@ def configurations(frame: pd.DataFrame) -> Iterator[tuple[dict[str, Any], pd.Dat
 
 def summarise(runs: Runs, criteria: Criteria) -> Summary:
     """Everything there is to say about these runs; a table that none of them has is left out."""
-    made: dict[str, pd.DataFrame] = {}
     maps, medians = _reduced_errors(runs, criteria)
-    for by in BY:
-        made[_FILE_NAMES[by]] = _each(maps, lambda rows, label, by=by: rates_of_maps(rows, by))
-    made["error_over_oracle"] = _each(
-        maps, lambda rows, label: oracle_ratios(rows, generator(0, "oracle", *label))
-    )
-    made["methods_compared"] = _each(
-        maps, lambda rows, label: compare_methods(rows, generator(0, "paired", *label))
-    )
+    made = _alignment_tables(maps)
     made["errors_by_iteration"] = _each(medians, lambda rows, label: error_bands(rows))
     timings, missing = pd.DataFrame(), []
     if runs.has("aligner_timings"):
@@ -101,17 +93,35 @@ def summarise(runs: Runs, criteria: Criteria) -> Summary:
         if parts:
             made[name] = pd.concat(parts, ignore_index=True)
     made = {name: table for name, table in made.items() if len(table)}
-    n_runs = maps["run_id"].nunique()
-    return Summary(criteria, n_runs, made, medians, timings, tuple(missing), runs.failed)
+    return Summary(criteria, len(runs.names), made, medians, timings, tuple(missing), runs.failed)
+
+
+def _alignment_tables(maps: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """What rows of `maps_of` have to say."""
+    made = {
+        name: _each(maps, lambda rows, label, by=by: rates_of_maps(rows, by))
+        for by, name in _FILE_NAMES.items()
+    }
+    made["error_over_oracle"] = _each(
+        maps, lambda rows, label: oracle_ratios(rows, generator(0, "oracle", *label))
+    )
+    made["methods_compared"] = _each(
+        maps, lambda rows, label: compare_methods(rows, generator(0, "paired", *label))
+    )
+    return made
 
 
 def _reduced_errors(runs: Runs, criteria: Criteria) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Rows of `maps_of`, and each run's medians, read run by run."""
     maps, medians = [], []
     for errors in runs.each("errors", NEEDED, OPTIONAL):
+        if errors.empty:
+            continue
         maps.append(maps_of(errors, criteria))
         reduced = medians_of_run(errors).reset_index()
         medians.append(reduced.merge(_labels(errors), on="run_id"))
+    if not maps:  # robots that were alone
+        return pd.DataFrame(columns=["scenario"]), pd.DataFrame(columns=["scenario", "run_id"])
     joined = with_overlap_share(pd.concat(maps, ignore_index=True), runs)
     return joined, pd.concat(medians, ignore_index=True)
 

@@ -11,7 +11,7 @@ import pandas as pd
 
 from experiments.metrics import MIN_TRUE_PAIRS, ORACLE
 from experiments.statistics.maps import ANSWERABLE_PAIRS, MAP_KEYS, Criteria, methods_in, read_maps
-from experiments.statistics.sources import RUN_KEYS, Runs, setting_columns
+from experiments.statistics.sources import RUN_KEYS, Runs, match_names, setting_columns
 
 MATCH = "match"
 # How a change is told: as a ratio b / a, as a difference of shares, or as a difference of distances
@@ -42,14 +42,6 @@ class Values(NamedTuple):
 
     metric: Metric
     rows: pd.DataFrame
-
-
-def match_names(frame: pd.DataFrame) -> pd.Series:
-    """What a run is matched by: scenario, seed, settings."""
-    names = frame["scenario"].astype(str) + " seed " + frame["seed"].astype(str)
-    for column in sorted(setting_columns(frame)):
-        names = names + " " + column + "=" + frame[column].astype(str)
-    return names
 
 
 def all_values(a: Runs, b: Runs, criteria: Criteria) -> Iterator[Values]:
