@@ -16,7 +16,8 @@ RESAMPLES = 2000
 RUN, MAPS_OF_ONE_RUN = "run", "maps of one run"
 _MAP_KEYS = ["robot_a", "robot_b", "iteration"]
 
-Statistic = Callable[[Float], float]
+Statistic = Callable[[Float], Float]
+_MAX_CELLS = 1_000_000  # resamples times rows that are worked on at once: some 8 MB an array
 
 
 class Clusters(NamedTuple):
@@ -63,17 +64,26 @@ class WeightedMedian:
         self._values = values[known][order]
         self._codes = codes[known][order]
 
-    def __call__(self, counts: Float) -> float:
-        """The median for counts (n_clusters,); NaN if no row counts."""
-        cumulative = np.cumsum(counts[self._codes])
-        if not len(cumulative) or cumulative[-1] == 0:
-            return np.nan
-        half = cumulative[-1] / 2
-        lower = self._values[np.searchsorted(cumulative, half, side="left")]
-        upper = self._values[np.searchsorted(cumulative, half, side="right")]
-        if np.isfinite(lower) and np.isfinite(upper):
-            return float(lower + (upper - lower) / 2)
-        return float(lower)
+    def __call__(self, counts: Float) -> Float:
+        """The medians (B,) for counts (B, n_clusters); NaN where no row counts."""
+        if not len(self._values):
+            return np.full(len(counts), np.nan)
+        found = [self._of(part) for part in np.array_split(counts, self._n_parts(len(counts)))]
+        return np.concatenate(found)
+
+    def _n_parts(self, n_counts: int) -> int:
+        """How often to cut the counts, so that memory stays bounded."""
+        return max(1, min(n_counts, n_counts * len(self._values) // _MAX_CELLS))
+
+    def _of(self, counts: Float) -> Float:
+        cumulative = np.cumsum(counts[:, self._codes], axis=1)
+        half = cumulative[:, -1:] / 2
+        last = len(self._values) - 1
+        lower = self._values[np.minimum(np.sum(cumulative < half, axis=1), last)]
+        upper = self._values[np.minimum(np.sum(cumulative <= half, axis=1), last)]
+        finite = np.isfinite(lower) & np.isfinite(upper)
+        middle = lower + np.subtract(upper, lower, out=np.zeros(len(lower)), where=finite) / 2
+        return np.where(half[:, 0] > 0, middle, np.nan)
 
 
 def percentile_interval(
@@ -89,17 +99,17 @@ def percentile_interval(
     is not consistent for medians (Efron & Tibshirani 1993, ch. 10.6).
 
     Args:
-        statistic: of counts (n_clusters,): how often each cluster is in the sample.
+        statistic: numbers (B,) of counts (B, n_clusters): how often each cluster is in a sample.
         n_clusters: with one there is nothing to resample, and the ends are NaN.
         rng: decides the resamples.
         confidence: level of the interval.
         resamples: how many.
     """
-    value = statistic(np.ones(n_clusters))
+    value = float(statistic(np.ones((1, max(n_clusters, 1))))[0])
     if n_clusters < 2 or np.isnan(value):
         return Interval(value, np.nan, np.nan)
     counts = rng.multinomial(n_clusters, np.full(n_clusters, 1 / n_clusters), size=resamples)
-    drawn = np.array([statistic(row) for row in counts])
+    drawn = statistic(counts.astype(np.float64))
     drawn = drawn[~np.isnan(drawn)]  # resamples in which no row had a value
     tail = (1 - confidence) / 2
     # a quantile that is one of the draws: no arithmetic with infinite ones

@@ -65,8 +65,8 @@ def _weighted(sums: Float, weights: Float, codes: np.ndarray, rng: np.random.Gen
     sum_of_run = np.bincount(codes, sums, minlength=n_runs)
     weight_of_run = np.bincount(codes, weights, minlength=n_runs)
 
-    def mean(counts: Float) -> float:
-        return float(counts @ sum_of_run / (counts @ weight_of_run))
+    def mean(counts: Float) -> Float:
+        return counts @ sum_of_run / (counts @ weight_of_run)
 
     return percentile_interval(mean, n_runs, rng)
 

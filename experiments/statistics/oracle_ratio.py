@@ -46,7 +46,11 @@ def oracle_ratios(maps: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
             ratio = ratio_of_medians(
                 (values, clusters.codes[own]), (reference, clusters.codes[is_oracle]), rng
             )
-            row |= {f"{stage}_m": WeightedMedian(values, clusters.codes[own])(np.ones(clusters.n))}
+            row |= {
+                f"{stage}_m": WeightedMedian(values, clusters.codes[own])(np.ones((1, clusters.n)))[
+                    0
+                ]
+            }
             row |= dict(zip(_names(stage), ratio, strict=True))
         rows.append(row)
     return pd.DataFrame(rows)
@@ -62,9 +66,9 @@ def ratio_of_medians(
     """Ratio of the medians of two sets of rows, (values, cluster codes) each; 95 % interval."""
     above, below = WeightedMedian(*over), WeightedMedian(*under)
 
-    def ratio(counts: Float) -> float:
+    def ratio(counts: Float) -> Float:
         divisor = below(counts)
-        return above(counts) / divisor if divisor > 0 else np.nan
+        return above(counts) / np.where(divisor > 0, divisor, np.nan)
 
     n_clusters = max((int(codes.max()) + 1 for _, codes in (over, under) if len(codes)), default=1)
     return percentile_interval(ratio, n_clusters, rng)

@@ -76,9 +76,9 @@ def win_share(
     won = np.bincount(codes, wins, minlength=n_clusters)
     played = np.bincount(codes, minlength=n_clusters)
 
-    def share(counts: Float) -> float:
+    def share(counts: Float) -> Float:
         n = counts @ played
-        return float(counts @ won / n) if n else np.nan
+        return counts @ won / np.where(n > 0, n, np.nan)
 
     return percentile_interval(share, n_clusters, rng)
 

@@ -16,6 +16,7 @@ from experiments.statistics.compare import BETTER, FEW_RUNS, NOISE, SAME, UNKNOW
 from experiments.statistics.summary import ALL_SCENARIOS, Summary
 
 _COLOURS = {BETTER: "green", WORSE: "bold red", UNKNOWN: "yellow"}
+_MAX_CONFIGURATIONS = 6  # more would fill screens; the files hold all
 _SHORT = {NOISE: "noise", SAME: "same", UNKNOWN: "unknown"}
 _PATH_NAMES = {"ate_m": "ATE, m", "rpe_m": "RPE, m", "rpe_rad": "RPE, rad"}
 
@@ -48,6 +49,9 @@ def _shown(summary: Summary, name: str) -> tuple[pd.DataFrame, list[str]]:
     if (table["scenario"] == ALL_SCENARIOS).any():
         table = table[table["scenario"] == ALL_SCENARIOS]
     labels = [c for c in table if c == "scenario" or "." in str(c)]
+    if len(table):
+        numbers = table.groupby(labels, sort=False, dropna=False).ngroup()
+        table = table[numbers < _MAX_CONFIGURATIONS]
     return table, [str(c) for c in labels if len(table[c].unique()) > 1]
 
 
@@ -209,6 +213,12 @@ def _print_caveats(console: Console, summary: Summary) -> None:
         console.print(
             f"{summary.n_runs} runs: bootstrap intervals of so few are too narrow; take {FEW_RUNS} "
             "seeds or more.",
+            soft_wrap=True,
+        )
+    n_settings = summary.n_configurations
+    if n_settings > _MAX_CONFIGURATIONS:
+        console.print(
+            f"Shown are {_MAX_CONFIGURATIONS} of {n_settings} settings; `-o FOLDER` writes all.",
             soft_wrap=True,
         )
     for row in summary.failed.to_dict("records"):

@@ -57,6 +57,12 @@ class Summary:
     missing: tuple[str, ...]
     failed: pd.DataFrame = field(default_factory=pd.DataFrame)
 
+    @property
+    def n_configurations(self) -> int:
+        """How many settings the sweeps tried (1 without sweeps)."""
+        settings = setting_columns(self.run_medians)
+        return len(self.run_medians[settings].drop_duplicates()) if settings else 1
+
 
 def configurations(frame: pd.DataFrame) -> Iterator[tuple[dict[str, Any], pd.DataFrame]]:
     """Rows by scenario and settings; with several scenarios, also all of them together.

@@ -23,14 +23,25 @@ def test_weighted_median_is_the_median_of_repeated_rows() -> None:
         repeated = np.repeat(values, counts[codes])
         repeated = repeated[~np.isnan(repeated)]
         expected = np.median(repeated) if len(repeated) else np.nan
-        np.testing.assert_allclose(WeightedMedian(values, codes)(counts), expected)
+        np.testing.assert_allclose(WeightedMedian(values, codes)(counts[None]), [expected])
 
 
 def test_weighted_median_counts_missing_answers_as_infinitely_far() -> None:
     one_each = WeightedMedian(np.array([1.0, np.inf, np.inf, 2.0, 3.0]), np.arange(5))
-    assert one_each(np.ones(5)) == 3.0
-    assert one_each(np.array([1, 1, 1, 1, 0])) == 2.0  # between 2 and infinity: the lower
-    assert one_each(np.array([1, 1, 1, 0, 0])) == np.inf
+    counts = np.array([[1, 1, 1, 1, 1], [1, 1, 1, 1, 0], [1, 1, 1, 0, 0], [0, 0, 0, 0, 0]])
+    # between 2 and infinity: the lower
+    np.testing.assert_array_equal(one_each(counts), [3.0, 2.0, np.inf, np.nan])
+
+
+def test_weighted_medians_are_the_same_in_however_many_parts(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng = np.random.default_rng(9)
+    median = WeightedMedian(rng.normal(size=50), rng.integers(0, 10, 50))
+    counts = rng.multinomial(10, np.full(10, 0.1), size=40)
+    whole = median(counts)
+    monkeypatch.setattr("experiments.statistics.bootstrap._MAX_CELLS", 60)
+    np.testing.assert_array_equal(median(counts), whole)
 
 
 def test_percentile_interval_agrees_with_scipys_where_clusters_are_rows() -> None:
