@@ -223,6 +223,41 @@ def sweep(
 
 
 @app.command()
+def statistics(
+    paths: Annotated[list[Path], typer.Argument(metavar="PATH...", help="Results or sweeps.")],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Folder for all tables and figures.")
+    ] = None,
+) -> None:
+    """Success, errors and consistency over many runs: `mapfusion statistics results/quick-*`."""
+    from experiments.statistics.command import run_statistics
+
+    run_statistics(paths, output)
+
+
+@app.command()
+def compare(
+    first: Annotated[Path, typer.Argument(metavar="FIRST", help="Result or sweep of the one.")],
+    second: Annotated[Path, typer.Argument(metavar="SECOND", help="And of the other version.")],
+    show_all: Annotated[bool, typer.Option("--all", help="Show also what did not change.")] = False,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Folder for the table.")
+    ] = None,
+    fail_if_worse: Annotated[
+        bool, typer.Option("--fail-if-worse", help="Exit code 1 if anything got worse.")
+    ] = False,
+) -> None:
+    """What got better or worse between two versions: `mapfusion compare old/quick-0 new/quick-0`.
+
+    Runs are matched by scenario, seed and settings; a verdict means more than noise.
+    """
+    from experiments.statistics.command import run_compare
+
+    if run_compare(first, second, show_all, output) and fail_if_worse:
+        raise typer.Exit(EXIT_FAILED)
+
+
+@app.command()
 def schema() -> None:
     """Print the JSON schema of scenarios, for editors: `mapfusion schema > schema.json`."""
     from experiments.scenario import schema_text

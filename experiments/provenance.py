@@ -8,6 +8,7 @@ from experiments.pipeline import Plan
 from experiments.scenario import Scenario
 from experiments.store import library_versions
 from mapfusion.align.registry import find_method
+from sim.renderer import renderer_name
 
 RESULT_SCHEMA_VERSION = 1
 

@@ -15,6 +15,8 @@ import pandas as pd
 from experiments import tables
 from experiments.evaluate import EvaluatedRobot, path_columns, robot_rows
 from experiments.fusion import fused_maps, fused_truth, map_fit_rows
+from experiments.landmark_nees import landmark_nees_rows
+from experiments.path_errors import path_statistics_rows
 from experiments.pipeline import Plan, execute
 from experiments.provenance import provenance
 from experiments.scenario import Merge, Scenario
@@ -115,7 +117,7 @@ def _join_pair_tables(plan: Plan, folder: Path) -> None:
 
 
 def robot_tables(plan: Plan, robots: Sequence[EvaluatedRobot]) -> dict[str, pd.DataFrame]:
-    """The tables `paths`, `robots` and `clouds`, of all robots."""
+    """The tables `paths`, `path_statistics`, `robots` and `clouds`, of all robots."""
     paths, online, clouds = [], [], []
     for stages, robot in zip(plan.robots, robots, strict=True):
         poses = read_table(stages.slam.path / "poses.parquet", slam.POSES)[0].to_pandas()
@@ -124,10 +126,11 @@ def robot_tables(plan: Plan, robots: Sequence[EvaluatedRobot]) -> dict[str, pd.D
         online.append(robot_rows(poses, joined).assign(robot=robot.name))
         cloud = read_table(stages.slam.path / "clouds.parquet", slam.CLOUDS)[0].to_pandas()
         clouds.append(cloud.assign(robot=robot.name))
-    return {
+    made = {
         name: pd.concat(parts, ignore_index=True)
         for name, parts in (("paths", paths), ("robots", online), ("clouds", clouds))
     }
+    return made | {"path_statistics": pd.DataFrame(path_statistics_rows(made["paths"]))}
 
 
 def _write_robot_tables(plan: Plan, robots: Sequence[EvaluatedRobot], folder: Path) -> None:
@@ -168,6 +171,8 @@ def _write_maps(plan: Plan, robots: list[EvaluatedRobot], folder: Path) -> None:
         write_map(folder / "maps" / "fused.parquet", fused.landmarks)
     fits = map_fit_rows(robots, fused, last)
     tables.write(tables.table_path(folder, "map_fits"), "map_fits", fits)
+    nees = landmark_nees_rows(robots, fused, last, plan.scenario.evaluate.true_pair_radius_m)
+    tables.write(tables.table_path(folder, "landmark_nees"), "landmark_nees", nees)
     fused_rows = [] if fused is None else _fused_rows(fused, robots, last)
     tables.write(tables.table_path(folder, "fused"), "fused", fused_rows)
 

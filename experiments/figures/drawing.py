@@ -8,6 +8,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from experiments.figures.result_tables import NothingToDraw, ResultTables
+from experiments.figures.runs_tables import RunsTables
 from experiments.figures.style import PNG_DPI, SVG_DPI, house_style
 from experiments.workers import workers
 from mapfusion.storage import write_whole
@@ -83,10 +84,10 @@ def _draw_in_worker(result: Path, name: str) -> Drawn:
     return draw_figure(ResultTables(result), name)
 
 
-def draw_figure(data: ResultTables, name: str) -> Drawn:
+def draw_figure(data: ResultTables | RunsTables, name: str) -> Drawn:
     """Draw one figure and write its pictures, or remove old ones when there is nothing to draw."""
     module = importlib.import_module(f"experiments.figures.{name}")
-    folder = data.folder / "figures"
+    folder = data.pictures
     with house_style():
         try:
             figure: Figure = module.draw(data)

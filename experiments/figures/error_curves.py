@@ -10,11 +10,12 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from experiments.figures.result_tables import NothingToDraw, Pair, ResultTables, of_pair
+from experiments.figures.runs_tables import RunsTables
 from experiments.figures.style import BLUE, PAGE_WIDTH_IN, PALE_GRAY, aligner_styles
 from experiments.metrics import ORACLE
 from mapfusion.se2 import Float
 
-BAND = (0.1, 0.9)  # quantiles of the repetitions
+BAND = (0.1, 0.9)  # quantiles of the repetitions, or of the runs where there are several
 MIN_TRUE_PAIRS = 3  # below, even the oracle has hardly anything to go by
 _PANEL_HEIGHT_IN = 1.9
 _EXTRA_HEIGHT_IN = 0.9  # legend and the common x label
@@ -27,7 +28,7 @@ _MAX_VECTOR_POINTS = 200
 
 
 def draw_error_curves(
-    data: ResultTables,
+    data: ResultTables | RunsTables,
     columns: tuple[str, str],
     label: str,
     note: str,
@@ -36,7 +37,7 @@ def draw_error_curves(
     """One row of panels per robot pair: as estimated on the left, refined on the right.
 
     Args:
-        data: the result.
+        data: the result, or several runs.
         columns: columns of the `errors` table, as estimated and refined.
         label: the y axis' label, with its unit.
         note: a line below the x axis; may be empty.
@@ -68,7 +69,7 @@ def draw_error_curves(
 
 
 def summarise(errors: pd.DataFrame, column: str) -> pd.DataFrame:
-    """Median and band over the repetitions that gave an estimate.
+    """Median and band over the repetitions (of several runs: over the runs) with an estimate.
 
     Returns:
         Columns robot_a, robot_b, aligner, iteration, low, median, high; NaN where none did.
@@ -113,8 +114,11 @@ def _draw_panel(axes: Axes, summary: pd.DataFrame, pair: Pair, aligners: list[st
 
 
 def _shade_scarce(axes: Axes, errors: pd.DataFrame) -> None:
-    """Shade the iterations with fewer than MIN_TRUE_PAIRS true pairs, out to half way between."""
-    n_true = errors.groupby("iteration")["n_true"].max()
+    """Shade the iterations with fewer than MIN_TRUE_PAIRS true pairs, out to half way between.
+
+    All rows of one run agree on their number; of several runs the median counts.
+    """
+    n_true = errors.groupby("iteration")["n_true"].median()
     iteration = n_true.index.to_numpy(dtype=np.float64)
     half = np.diff(iteration) / 2 if len(iteration) > 1 else np.array([0.5])
     start = iteration - np.concatenate([half[:1], half])[: len(iteration)]
@@ -132,13 +136,13 @@ def _shade_scarce(axes: Axes, errors: pd.DataFrame) -> None:
         )
 
 
-def _add_legend(figure: Figure, data: ResultTables) -> None:
+def _add_legend(figure: Figure, data: ResultTables | RunsTables) -> None:
     styles = aligner_styles(data.aligners)
     handles: list[Line2D | Patch] = []
     for name in data.aligners:
         handles.append(Line2D([], [], label=data.label_of(name), **styles[name]))
     handles.append(
-        Patch(color=BLUE, alpha=_BAND_ALPHA, linewidth=0, label="10-90 % of repetitions")
+        Patch(color=BLUE, alpha=_BAND_ALPHA, linewidth=0, label=f"10-90 % of {data.bands_over}")
     )
     handles.append(
         Patch(color=PALE_GRAY, alpha=0.5, linewidth=0, label=f"< {MIN_TRUE_PAIRS} true pairs")

@@ -6,6 +6,7 @@ from matplotlib.figure import Figure
 
 from experiments.figures.error_curves import draw_error_curves
 from experiments.figures.result_tables import ResultTables
+from experiments.figures.runs_tables import RunsTables
 from experiments.figures.style import plain_numbers
 from mapfusion.se2 import Float
 
@@ -14,8 +15,8 @@ from mapfusion.se2 import Float
 _LINEAR_RAD = 0.01
 
 
-def draw(data: ResultTables) -> Figure:
-    """Median and 10-90 % band of the repetitions, per robot pair."""
+def draw(data: ResultTables | RunsTables) -> Figure:
+    """Median and 10-90 % band of the repetitions or the runs, per robot pair."""
     return draw_error_curves(
         data,
         ("rotation_error_rad", "refined_rotation_error_rad"),

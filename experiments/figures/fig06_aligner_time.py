@@ -6,18 +6,24 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from experiments.figures.error_curves import BAND
 from experiments.figures.result_tables import NothingToDraw, ResultTables
+from experiments.figures.runs_tables import RunsTables
 from experiments.figures.style import PAGE_WIDTH_IN, aligner_styles, plain_numbers
 from experiments.metrics import ORACLE
 
-# The line that guides the eye joins the points while they are few, else medians of so many groups.
+# The line that guides the eye joins the points of one run while they are few, else medians of so
+# many groups.
 _MAX_JOINED = 16
 _GROUPS = 8
 _LEGEND_COLUMNS = 5
 
 
-def draw(data: ResultTables) -> Figure:
-    """Medians and 10-90 % of the repeats; beside it the same against the correspondences given."""
+def draw(data: ResultTables | RunsTables) -> Figure:
+    """Medians and 10-90 % of the repeats; beside it the same against the correspondences given.
+
+    Of several runs the points are too many for bars: a band holds 10-90 % of them.
+    """
     timings = data.table("aligner_timings").dropna(subset="elapsed_s")
     if timings.empty:
         raise NothingToDraw("no aligner was timed")
@@ -30,7 +36,8 @@ def draw(data: ResultTables) -> Figure:
         (panels[1], "n_correspondences", "correspondences given to the aligner"),
     ):
         for name in names:
-            _add_aligner(axes, timings[timings["aligner"] == name], column, data.aligners)
+            rows = timings[timings["aligner"] == name]
+            _add_aligner(axes, rows, column, data.aligners, isinstance(data, RunsTables))
         axes.set_xlabel(label)
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter(plain_numbers())
@@ -43,37 +50,49 @@ def draw(data: ResultTables) -> Figure:
     return figure
 
 
-def _add_aligner(axes: Axes, rows: pd.DataFrame, column: str, aligners: list[str]) -> None:
+def _add_aligner(
+    axes: Axes, rows: pd.DataFrame, column: str, aligners: list[str], several_runs: bool
+) -> None:
     name = rows["aligner"].iloc[0]
     style = aligner_styles(aligners)[name]
     count, elapsed = rows[column].to_numpy(), rows["elapsed_s"].to_numpy()
-    axes.vlines(
-        count,
-        rows["elapsed_low_s"],
-        rows["elapsed_high_s"],
-        color=style["color"],
-        linewidth=0.5,
-        alpha=0.5,
-        rasterized=True,
-    )
+    groups = len(count) if len(count) <= _MAX_JOINED and not several_runs else _GROUPS
+    if several_runs:
+        middle, low = binned_quantiles(count, elapsed, groups, BAND[0])
+        _, high = binned_quantiles(count, elapsed, groups, BAND[1])
+        axes.fill_between(middle, low, high, color=style["color"], alpha=0.16, linewidth=0)
+    else:
+        axes.vlines(
+            count,
+            rows["elapsed_low_s"],
+            rows["elapsed_high_s"],
+            color=style["color"],
+            linewidth=0.5,
+            alpha=0.5,
+            rasterized=True,
+        )
     axes.plot(
         count,
         elapsed,
         color=style["color"],
         marker=style["marker"],
         linestyle="none",
-        markersize=2.5,
-        alpha=0.6,
+        markersize=1.5 if several_runs else 2.5,
+        alpha=0.3 if several_runs else 0.6,
         rasterized=True,
     )
-    guide = binned_medians(count, elapsed)
+    guide = binned_quantiles(count, elapsed, groups)
     axes.plot(*guide, label=name, zorder=4 if name == ORACLE else 3, **style)
 
 
-def binned_medians(count: np.ndarray, elapsed_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Medians of both within groups of about equal size along the count; ties are never split."""
-    groups = len(count) if len(count) <= _MAX_JOINED else _GROUPS
+def binned_quantiles(
+    count: np.ndarray, elapsed_s: np.ndarray, groups: int, quantile: float = 0.5
+) -> tuple[np.ndarray, np.ndarray]:
+    """Median counts and quantiles of the times of groups of about equal size along the count.
+
+    Ties are never split.
+    """
     rank = pd.Series(count).rank(pct=True).to_numpy()
     frame = pd.DataFrame({"group": np.ceil(rank * groups), "count": count, "elapsed": elapsed_s})
-    medians = frame.groupby("group").median()
-    return medians["count"].to_numpy(), medians["elapsed"].to_numpy()
+    grouped = frame.groupby("group")
+    return grouped["count"].median().to_numpy(), grouped["elapsed"].quantile(quantile).to_numpy()

@@ -1,6 +1,7 @@
 """What a result folder holds, read when a figure asks for it."""
 
 import json
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,16 @@ class ResultTables:
             self._tables[name] = read(table_path(self.folder, name), name)
         return self._tables[name]
 
+    @property
+    def pictures(self) -> Path:
+        """The folder that figures go to."""
+        return self.folder / "figures"
+
+    @property
+    def bands_over(self) -> str:
+        """What the bands of figures 4 and 5 are quantiles of."""
+        return "repetitions"
+
     @cached_property
     def scenario(self) -> dict[str, Any]:
         """The resolved scenario."""
@@ -53,17 +64,14 @@ class ResultTables:
     @cached_property
     def pairs(self) -> list[Pair]:
         """Robot pairs that were aligned, in display order."""
-        pairs = self.table("errors")[["robot_a", "robot_b"]].drop_duplicates()
-        return [(a, b) for a, b in pairs.itertuples(index=False)]
+        return pairs_in(self.table("errors"))
 
     @cached_property
     def aligners(self) -> list[str]:
         """Aligners that were run, in the scenario's order, the oracle last."""
         found = self.table("errors")["aligner"].drop_duplicates().tolist()
         listed = [entry["name"] for entry in self.scenario["align"]["aligners"]]
-        names = [name for name in listed if name in found]
-        names += [name for name in found if name not in names and name != ORACLE]
-        return names + [ORACLE] * (ORACLE in found)
+        return in_display_order(found, listed)
 
     def label_of(self, aligner: str) -> str:
         """An aligner's name in legends, with a word where its package is not installed."""
@@ -121,6 +129,19 @@ class ResultTables:
     def _start_pose(self, robot: str) -> Float | None:
         pose = (self._world or {}).get("robots", {}).get(robot)
         return None if pose is None else np.array(pose, dtype=np.float64)
+
+
+def pairs_in(errors: pd.DataFrame) -> list[Pair]:
+    """Robot pairs in the order of their appearance."""
+    pairs = errors[["robot_a", "robot_b"]].drop_duplicates()
+    return [(a, b) for a, b in pairs.itertuples(index=False)]
+
+
+def in_display_order(found: Sequence[str], listed: Sequence[str] = ()) -> list[str]:
+    """Aligners as listed, then as found, the oracle last."""
+    names = [name for name in listed if name in found]
+    names += [name for name in found if name not in names and name != ORACLE]
+    return names + [ORACLE] * (ORACLE in found)
 
 
 def of_pair(rows: pd.DataFrame, pair: Pair) -> pd.DataFrame:

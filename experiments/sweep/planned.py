@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from experiments.fusion import map_fit_rows
+from experiments.landmark_nees import landmark_nees_rows
 from experiments.pipeline import Plan, plan, task_name, tasks_of
 from experiments.provenance import renderer
 from experiments.result import fused_map, pair_table, robot_tables
@@ -69,13 +70,16 @@ def write_rows(run: Run, laid_out: Plan, dataset: Dataset) -> None:
     dataset.path(ALIGNER_TIMINGS, run).unlink(missing_ok=True)  # of an earlier state of the run
     robots = [load_robot(robot.folders) for robot in laid_out.robots]
     made = {name: pair_table(laid_out, name) for name in ("errors", "fusion")}
-    made["robots"] = robot_tables(laid_out, robots)["robots"]
+    of_robots = robot_tables(laid_out, robots)
+    made |= {name: of_robots[name] for name in ("robots", "path_statistics")}
     last = max(max(robot.maps) for robot in robots)
     estimates, offered = (pair_table(laid_out, name) for name in ("estimates", "correspondences"))
     fused = fused_map(laid_out.scenario.merge, robots, estimates, offered, last)
     for name, rows in made.items():
         dataset.write(name, run, rows)
     dataset.write("map_fits", run, map_fit_rows(robots, fused, last))
+    radius_m = laid_out.scenario.evaluate.true_pair_radius_m
+    dataset.write("landmark_nees", run, landmark_nees_rows(robots, fused, last, radius_m))
     dataset.write(RUN_TIMES, run, _times(laid_out))
     dataset.finish(run, renderer(laid_out.scenario), stages_of(laid_out))
 
