@@ -82,6 +82,21 @@ def figures(
 
 
 @app.command()
+def report(
+    result: Annotated[Path, typer.Argument(metavar="RESULT", help="A run's result folder.")],
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="HTML file; RESULT/report.html by default."),
+    ] = None,
+) -> None:
+    """Show a result in one HTML file that works offline: `mapfusion report results/quick-0`."""
+    from experiments import screen
+    from experiments.report import write_report
+
+    screen.print_file(write_report(result, output))
+
+
+@app.command()
 def check(
     scenarios: Annotated[list[Path], typer.Argument(metavar="SCENARIO...", help="Scenario files.")],
     seeds: Annotated[str, typer.Option(help="A seed, a range 0..4 or a list 0,2,5.")] = "0",

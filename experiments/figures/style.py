@@ -73,12 +73,18 @@ def house_style() -> Iterator[None]:
 
 
 def aligner_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Line style of each aligner by its place in the display order; the oracle has its own."""
+    """Line style of each aligner by its place in the display order; the oracle has its own.
+
+    Beyond as many as there are colours, dashes and markers move on, so that no two look alike.
+    """
     estimators = [name for name in names if name != ORACLE]
-    styles = {
-        name: _ALIGNER_STYLES[place % len(_ALIGNER_STYLES)] for place, name in enumerate(estimators)
-    }
+    styles = {name: _aligner_style(place) for place, name in enumerate(estimators)}
     return styles | {ORACLE: _ORACLE_STYLE}
+
+
+def _aligner_style(place: int) -> dict[str, Any]:
+    n = len(_ALIGNER_STYLES)
+    return {**_ALIGNER_STYLES[(place + place // n) % n], "color": _ALIGNER_STYLES[place % n]["color"]}
 
 
 def robot_colours(names: Sequence[str]) -> dict[str, str]:
