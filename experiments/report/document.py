@@ -16,10 +16,11 @@ from experiments.report.standing import MIN_TRUE_PAIRS
 from experiments.report.theme import DARK, LIGHT
 from mapfusion.storage import write_whole
 
-_SCRIPTS = ("base.js", "charts.js", "map.js")
+# The map before Plotly: it can be used while the browser still reads that.
+_BEFORE_PLOTLY, _AFTER_PLOTLY = ("base.js", "map.js"), ("charts.js",)
 _FORMATS = {
     name: getattr(words, name)
-    for name in ("metres", "radians", "milliseconds", "percent", "bare", "ratio")
+    for name in ("metres", "radians", "milliseconds", "percent", "bare", "ratio", "within")
 }
 
 
@@ -57,7 +58,10 @@ def render(contents: dict[str, Any]) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    scripts = [get_plotlyjs(), "\n".join(_page_file(name) for name in _SCRIPTS)]
+    before, after = (
+        "\n".join(_page_file(name) for name in names) for names in (_BEFORE_PLOTLY, _AFTER_PLOTLY)
+    )
+    scripts = [before, get_plotlyjs(), after]
     return environment.get_template("report.html.j2").render(
         contents,
         text=_FORMATS,

@@ -25,7 +25,8 @@ class Standing:
         rate: share of them on which the refined estimate was correct (mean over repetitions).
         low: lower end of the rate's 95 % Wilson interval, pairs of maps counted once each.
         high: its upper end.
-        estimated_m: median translation error as estimated, over those pairs.
+        estimated_m: median translation error as estimated, over those pairs; infinite where more
+            than half have no estimate.
         estimated_rad: median absolute rotation error as estimated.
         refined_m: median translation error refined.
         refined_rad: median absolute rotation error refined.
@@ -101,8 +102,8 @@ def judge(errors: pd.DataFrame, timings: pd.DataFrame, order: list[str]) -> Verd
         len(maps),
         int((maps["n_true"] >= MIN_TRUE_PAIRS).sum()),
         errors["run_id"].nunique(),
-        float(oracle["refined_translation_error_m"].median()),
-        float(oracle["refined_rotation_error_rad"].abs().median()),
+        _median(oracle["refined_translation_error_m"]),
+        _median(oracle["refined_rotation_error_rad"].abs()),
     )
 
 
@@ -124,8 +125,7 @@ def _standing(
     every = judged[judged["aligner"] == name]
     share = own.groupby(MAP_PAIR)["correct"].mean()
     low, high = wilson(share.sum(), len(share)) if len(share) else (math.nan, math.nan)
-    refined_m = float(own["refined_translation_error_m"].median())
-    oracle_m = float(oracle["refined_translation_error_m"].median())
+    refined_m, oracle_m = (_median(rows["refined_translation_error_m"]) for rows in (own, oracle))
     time_s = timings[timings["aligner"] == name]["elapsed_s"] if len(timings) else pd.Series([])
     return Standing(
         aligner=name,
@@ -133,15 +133,20 @@ def _standing(
         rate=float(share.mean()) if len(share) else math.nan,
         low=float(low),
         high=float(high),
-        estimated_m=float(own["translation_error_m"].median()),
-        estimated_rad=float(own["rotation_error_rad"].abs().median()),
+        estimated_m=_median(own["translation_error_m"]),
+        estimated_rad=_median(own["rotation_error_rad"].abs()),
         refined_m=refined_m,
-        refined_rad=float(own["refined_rotation_error_rad"].abs().median()),
+        refined_rad=_median(own["refined_rotation_error_rad"].abs()),
         over_oracle=refined_m / oracle_m if oracle_m > 0 else math.nan,
         n_accepted=int(every["accepted"].sum()),
         n_false=int((every["accepted"] & ~every["correct"]).sum()),
         time_ms=1e3 * float(time_s.median()) if len(time_s) else math.nan,
     )
+
+
+def _median(values: pd.Series) -> float:
+    """The median; no estimate at all counts as worse than any."""
+    return float(values.fillna(np.inf).median()) if len(values) else math.nan
 
 
 def _ranked(

@@ -18,6 +18,8 @@ _SURFACES = {
     "sheet": ("#ffffff", "#0b0e12"),
     "raised": ("#fafaf8", "#171b21"),
     "tint": ("#edf5fb", "#17242f"),
+    "shade": ("#d9dbdf", "#343b45"),
+    "track": ("#8cbfe0", "#2f6f9f"),
     "line": ("#e2e4e7", "#2b323b"),
     "wall": ("#c8ccd2", "#4a535f"),
     "ink": ("#15181d", "#eceef1"),

@@ -1,10 +1,12 @@
-"""The verdict in plain words."""
+"""The verdict in plain words, and numbers as people read them."""
 
 import math
 from dataclasses import dataclass
 
 from experiments.report.standing import MIN_TRUE_PAIRS, Standing, Verdict
 from experiments.report.success import ROTATION_RAD, TRANSLATION_M
+
+_SPACE = "\u00a0"  # a number stays beside its unit
 
 CORRECT_TEXT = (
     f"Correct: within {TRANSLATION_M:g} m and {ROTATION_RAD:g} rad of the truth once refined. "
@@ -56,7 +58,7 @@ def words_for(verdict: Verdict, n_robot_pairs: int) -> Words:
         f"{metres(best.refined_m)} and {radians(best.refined_rad)}. "
         f"{_beside_oracle(best, verdict)}"
     )
-    remarks = (*_equals(verdict), *_runner_up(verdict), *_false(best, verdict))
+    remarks = (*_false(best, verdict), *_equals(verdict), *_runner_up(verdict))
     return Words("Use", best.aligner, lead, remarks, sure, why)
 
 
@@ -94,9 +96,12 @@ def _false(best: Standing, verdict: Verdict) -> tuple[str, ...]:
         return (f"No result of {best.aligner} was accepted.",)
     share = best.n_false / best.n_accepted
     if best.n_false == 0:
-        text = f"None of its {best.n_accepted} accepted results is wrong"
+        text = f"None of the {best.n_accepted} results that were accepted is wrong"
     else:
-        text = f"{best.n_false} of its {best.n_accepted} accepted results ({percent(share)}) are wrong"
+        text = (
+            f"Of the {best.n_accepted} results that were accepted, {best.n_false} "
+            f"({percent(share)}) are wrong: do not merge on acceptance alone"
+        )
     poor = verdict.n_maps - verdict.n_common
     if poor:
         text += f"; {poor} of the {verdict.n_maps} pairs of maps have hardly any common ground"
@@ -139,10 +144,10 @@ def percent(share: float) -> str:
         return "–"
     value = 100 * share
     if 0 < value < 1:
-        return "< 1 %"
+        return f"<{_SPACE}1{_SPACE}%"
     if 99 < value < 100:
-        return "> 99 %"
-    return f"{value:.0f} %"
+        return f">{_SPACE}99{_SPACE}%"
+    return f"{value:.0f}{_SPACE}%"
 
 
 def metres(value: float) -> str:
@@ -173,5 +178,12 @@ def ratio(value: float) -> str:
     return "–" if not math.isfinite(value) else f"{value:.2f}" if value < 10 else f"{value:.0f}"
 
 
+def within(low: float | None, high: float | None) -> str:
+    """A bound as people write it."""
+    if low is None:
+        return f"≤{_SPACE}{high:g}"
+    return f"≥{_SPACE}{low:g}" if high is None else f"{low:g} to {high:g}"
+
+
 def _with_unit(value: float, unit: str) -> str:
-    return f"{bare(value)} {unit}" if math.isfinite(value) else "–"
+    return f"{bare(value)}{_SPACE}{unit}" if math.isfinite(value) else "–"

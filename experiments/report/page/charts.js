@@ -117,10 +117,10 @@ function successChart(curves) {
   const traces = shown.map(({ name }, place) => {
     const own = curves.aligners[name];
     const shift = DODGE * (place - (shown.length - 1) / 2);
-    const gap = (from, to) => own.rate.map((rate, i) => (rate === null ? null : to(i) - from(i)));
+    const gap = (from, to) => own.rate.map((rate, i) => (rate === null ? null : 100 * (to(i) - from(i))));
     return {
       x: own.rate.map((_, i) => i + shift),
-      y: own.rate,
+      y: own.rate.map(inPercent),
       name: plain(name),
       mode: "lines+markers",
       line: { ...line(name), width: 1.5 },
@@ -140,10 +140,12 @@ function successChart(curves) {
       ...layout,
       hovermode: "closest",
       xaxis: { ...grid, showgrid: false, tickvals: curves.bins.map((_, i) => i), ticktext: curves.bins, title: { text: curves.label, standoff: 8 }, range: [-0.5, curves.bins.length - 0.5], automargin: true },
-      yaxis: { ...grid, title: { text: "correct", standoff: 6 }, range: [-0.03, 1.03], tickformat: ".0%" },
+      yaxis: { ...grid, title: { text: "correct", standoff: 6 }, range: [-3, 103], ticksuffix: " %" },
     },
   };
 }
+
+const inPercent = (share) => (share === null ? null : 100 * share);
 
 function percent(share) {
   return share === null ? "–" : `${Math.round(100 * share)} %`;
@@ -159,7 +161,7 @@ function timeChart() {
     text: own.median.map((v, i) => `${plain(name)}: ${short(v)} ms (${short(own.low[i])}–${short(own.high[i])}) for ${own.n[i]} pairs`),
     hovertemplate: "%{text}<extra></extra>",
   }));
-  const log = { ...grid, type: "log", tickformat: "~g", exponentformat: "none", dtick: 1 };
+  const log = { ...grid, type: "log", tickformat: "~g", exponentformat: "none", dtick: "D2" };
   return {
     traces,
     layout: { ...layout, hovermode: "closest", xaxis: { ...log, title: { text: "correspondences", standoff: 8 } }, yaxis: { ...log, title: { text: "time (ms)", standoff: 6 } } },

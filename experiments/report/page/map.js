@@ -138,7 +138,7 @@
     pen.beginPath();
     for (let i = 0; i < map.at.length; i += 2) pen.rect(map.at[i] - size, map.at[i + 1] - size, 2 * size, 2 * size);
     pen.fill();
-    if (shown.ellipses) drawEllipses(map, faint(name, 0.3), 0.8 * px, T[2]);
+    if (shown.ellipses) drawEllipses(map, faint(name, 0.22), 0.8 * px, T[2]);
   }
 
   const AXES = Array.from({ length: 256 }, (_, i) => {
@@ -168,7 +168,7 @@
     counts.false = right.length - frame.n_true;
     if (!maps[0] || !maps[1]) return;
     for (const [layer, wanted, style, width, dash] of [
-      ["false", 0, faint("muted", 0.5), 0.7, [4, 3]],
+      ["false", 0, faint("muted", 0.32), 0.8, [4, 3]],
       ["true", 1, faint("ink", 0.75), 1.1, []],
     ]) {
       if (!shown[layer]) continue;
@@ -192,13 +192,13 @@
     counts.fused = fused ? fused.at[1] / 2 : 0;
     if (!fused) return;
     const at = points(fused.at, MAP.robots[pair.robots[0]].step_m, pair.start);
-    const size = 2.4 * px;
-    pen.strokeStyle = faint("ink", 0.9);
-    pen.lineWidth = 1 * px;
+    const size = 2.2 * px;
+    pen.strokeStyle = faint("ink", 0.7);
+    pen.lineWidth = 0.8 * px;
     pen.beginPath();
     for (let i = 0; i < at.length; i += 2) pen.rect(at[i] - size, at[i + 1] - size, 2 * size, 2 * size);
     pen.stroke();
-    if (shown.ellipses) drawEllipses({ at, ellipses: array(fused.ellipses, "u1") }, faint("ink", 0.5), 0.8 * px, pair.start[2]);
+    if (shown.ellipses) drawEllipses({ at, ellipses: array(fused.ellipses, "u1") }, faint("ink", 0.25), 0.8 * px, pair.start[2]);
   }
 
   function drawRobots(now, px) {
@@ -390,6 +390,16 @@
     byId("layers").replaceChildren(element("legend", {}, "Layers"), ...rows);
   }
 
+  /** The slider's track is shaded where the maps share too little, as the charts are. */
+  function shadeTrack() {
+    const n = pair.frames.length;
+    const edges = pair.frames.map((frame, i) => {
+      const style = (frame.n_true || 0) < DATA.min_true_pairs ? "var(--shade)" : "var(--track)";
+      return `${style} ${(100 * i) / n}% ${(100 * (i + 1)) / n}%`;
+    });
+    byId("track").style.background = `linear-gradient(to right, ${edges.join(", ")})`;
+  }
+
   function choosePair(place) {
     const iteration = pair.frames.length ? pair.frames[Math.min(Number(slider.value), pair.frames.length - 1)].iteration : 0;
     pair = MAP.pairs[place];
@@ -397,6 +407,7 @@
     goTo(iteration);
     view = null;
     fillLayers();
+    shadeTrack();
   }
 
   /** The evaluated iteration nearest to the one asked for. */
@@ -461,5 +472,6 @@
   slider.max = pair.frames.length - 1;
   slider.value = slider.max;
   fillLayers();
+  shadeTrack();
   wish();
 })();
