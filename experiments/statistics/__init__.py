@@ -1,0 +1,1 @@
+"""What several runs say together, and how sure one can be of it."""
