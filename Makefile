@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: clean-kernels lock demo test lint check bench paper install clean
+.PHONY: browser-test clean-kernels lock demo test lint check bench paper install clean
 
 install: $(STAMP)
 
@@ -20,6 +20,10 @@ demo: $(STAMP)
 
 test: $(STAMP)
 	$(BIN)/python -m pytest
+
+# Installs Debian's chromium where it is missing (needs root for that).
+browser-test: $(STAMP)
+	PYTHON=$(BIN)/python tests/browser/run.sh $(RESULT)
 
 lint: $(STAMP)
 	$(BIN)/ruff format --check .

@@ -9,7 +9,8 @@ import pandas as pd
 
 from experiments.figures.error_curves import BAND
 from experiments.report.standing import MAP_PAIR, MIN_TRUE_PAIRS
-from experiments.report.success import correct, wilson
+from experiments.report.success import correct
+from experiments.statistics.intervals import wilson
 
 _DIGITS = 5  # significant; more than any chart can show, and a third of the bytes of all of them
 _MAX_POINTS = 400  # of a curve: a chart is about a thousand pixels wide
@@ -59,7 +60,7 @@ def _curves_of(errors: pd.DataFrame, aligner: str, iterations: np.ndarray) -> di
     for quantity, columns in _ERRORS.items():
         for stage, column in zip(("estimated", "refined"), columns, strict=True):
             # the sign of a rotation has no place on a logarithmic axis
-            values = groups[column].agg(lambda v: list(v.abs().dropna())).reindex(iterations)
+            values = groups[column].agg(lambda v: list(v[np.isfinite(v)].abs())).reindex(iterations)
             at = [v if isinstance(v, list) and v else [math.nan] for v in values]
             low, median, high = np.array([np.quantile(v, [BAND[0], 0.5, BAND[1]]) for v in at]).T
             curves[f"{quantity}_{stage}"] = {
@@ -125,18 +126,14 @@ def _binned(
         # repetitions on the same maps are one trial: they are no independent evidence
         share = rows[rows["aligner"] == aligner].groupby(["bin", *MAP_PAIR])["correct"].mean()
         by_bin = share.groupby("bin").agg(["sum", "count"]).reindex(filled)
-        rate, low, high = [], [], []
-        for successes, trials in by_bin.itertuples(index=False):
-            known = trials > 0
-            ends = wilson(successes, int(trials)) if known else (math.nan, math.nan)
-            rate.append(successes / trials if known else math.nan)
-            low.append(ends[0])
-            high.append(ends[1])
+        trials = by_bin["count"].fillna(0)
+        low, high = wilson(by_bin["sum"].fillna(0), trials)
+        known = trials > 0
         curves[aligner] = {
-            "rate": rounded(rate),
-            "low": rounded(low),
-            "high": rounded(high),
-            "n": [0 if math.isnan(n) else int(n) for n in by_bin["count"]],
+            "rate": rounded(by_bin["sum"] / trials),
+            "low": rounded(np.where(known, low, np.nan)),
+            "high": rounded(np.where(known, high, np.nan)),
+            "n": trials.astype(int).tolist(),
         }
     return {
         "label": label,

@@ -8,7 +8,8 @@ import pandas as pd
 from scipy.stats import binomtest
 
 from experiments.metrics import ORACLE
-from experiments.report.success import correct, wilson
+from experiments.report.success import correct
+from experiments.statistics.intervals import wilson
 
 MAP_PAIR = ["run_id", "robot_a", "robot_b", "iteration"]  # two maps, given to all aligners alike
 MIN_TRUE_PAIRS = 3  # fewer cannot carry an alignment: there is nothing an aligner could be right on
@@ -124,7 +125,7 @@ def _standing(
     own = used[used["aligner"] == name]
     every = judged[judged["aligner"] == name]
     share = own.groupby(MAP_PAIR)["correct"].mean()
-    low, high = wilson(share.sum(), len(share)) if len(share) else (math.nan, math.nan)
+    low, high = wilson(share.sum(), len(share))
     refined_m, oracle_m = (_median(rows["refined_translation_error_m"]) for rows in (own, oracle))
     time_s = timings[timings["aligner"] == name]["elapsed_s"] if len(timings) else pd.Series([])
     return Standing(

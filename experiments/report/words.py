@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from experiments.report.standing import MIN_TRUE_PAIRS, Standing, Verdict
 from experiments.report.success import ROTATION_RAD, TRANSLATION_M
 
+_RELIABLE = 0.5  # a method that surely fails more often than not is nothing to recommend
 _SPACE = "\u00a0"  # a number stays beside its unit
 
 CORRECT_TEXT = (
@@ -59,7 +60,9 @@ def words_for(verdict: Verdict, n_robot_pairs: int) -> Words:
         f"{_beside_oracle(best, verdict)}"
     )
     remarks = (*_false(best, verdict), *_equals(verdict), *_runner_up(verdict))
-    return Words("Use", best.aligner, lead, remarks, sure, why)
+    reliable = best.high >= _RELIABLE
+    headline = "Use" if reliable else "No method is reliable; the best is"
+    return Words(headline, best.aligner, lead, remarks, sure, why)
 
 
 def _beside_oracle(best: Standing, verdict: Verdict) -> str:

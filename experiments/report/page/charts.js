@@ -126,7 +126,7 @@ function successChart(curves) {
       line: { ...line(name), width: 1.5 },
       marker: { size: 6, symbol: styleOf.get(name).marker },
       error_y: {
-        type: "data", symmetric: false, thickness: 1.2, width: 0,
+        type: "data", symmetric: false, thickness: 1.5, width: 0, color: faint(styleOf.get(name).colour, 0.45),
         array: gap((i) => own.rate[i], (i) => own.high[i]),
         arrayminus: gap((i) => own.low[i], (i) => own.rate[i]),
       },
