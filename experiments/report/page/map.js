@@ -206,6 +206,10 @@
     pair.robots.forEach((robot, i) => {
       const own = MAP.robots[robot], T = now.T_world[i];
       if (!T || !own.paths.online) return;
+      const line = points(own.paths.online, own.step_m, T);
+      const last = Math.min(now.frame.iteration, line.length / 2 - 1);
+      const theta = own.paths.theta_rad[last] + T[2];
+      drawRobot(line[2 * last], line[2 * last + 1], theta, MAP_COLOURS(robot), px);
       const cloud = own.clouds[now.frame.map];
       if (shown.particles && cloud) {
         const at = points(cloud.at, own.step_m, T);
@@ -214,10 +218,6 @@
         const size = 1.3 * px;
         for (let j = 0; j < at.length; j += 2) pen.fillRect(at[j] - size, at[j + 1] - size, 2 * size, 2 * size);
       }
-      const line = points(own.paths.online, own.step_m, T);
-      const last = Math.min(now.frame.iteration, line.length / 2 - 1);
-      const theta = own.paths.theta_rad[last] + T[2];
-      drawRobot(line[2 * last], line[2 * last + 1], theta, MAP_COLOURS(robot), px);
     });
   }
 
