@@ -16,6 +16,8 @@ from experiments import tables
 from experiments.evaluate import EvaluatedRobot, path_columns, robot_rows
 from experiments.fusion import fused_maps, fused_truth, map_fit_rows
 from experiments.history import write_history
+from experiments.landmark_nees import landmark_nees_rows
+from experiments.path_errors import path_statistics_rows
 from experiments.pipeline import OnProgress, Plan, execute
 from experiments.provenance import provenance
 from experiments.scenario import Scenario
@@ -132,6 +134,8 @@ def _write_robot_tables(plan: Plan, robots: Sequence[EvaluatedRobot], folder: Pa
                 )
     for name, parts in (("paths", paths), ("robots", online), ("clouds", clouds)):
         tables.write(tables.table_path(folder, name), name, pd.concat(parts, ignore_index=True))
+    statistics = path_statistics_rows(pd.concat(paths, ignore_index=True))
+    tables.write(tables.table_path(folder, "path_statistics"), "path_statistics", statistics)
     tables.write(tables.table_path(folder, "timings"), "timings", timings)
 
 
@@ -149,6 +153,8 @@ def _write_maps(plan: Plan, robots: list[EvaluatedRobot], folder: Path) -> None:
     fused = _fused(plan, robots, folder, last)
     fits = map_fit_rows(robots, fused, last)
     tables.write(tables.table_path(folder, "map_fits"), "map_fits", fits)
+    nees = landmark_nees_rows(robots, fused, last, plan.scenario.evaluate.true_pair_radius_m)
+    tables.write(tables.table_path(folder, "landmark_nees"), "landmark_nees", nees)
     fused_rows = [] if fused is None else _fused_rows(fused, robots, last)
     tables.write(tables.table_path(folder, "fused"), "fused", fused_rows)
 

@@ -235,6 +235,38 @@ MAP_FITS = schema(
     _fields(map=_TEXT, n_landmarks=_INT, rmse_m=_FLOAT),
 )
 
+# Errors of whole paths with evo's seven statistics; see experiments/path_errors.py.
+PATH_STATISTICS = schema(
+    "result.path_statistics",
+    1,
+    _fields(
+        robot=_TEXT,
+        source=_TEXT,  # final, online (as in `paths`) or odometry
+        quantity=_TEXT,  # ate_m (after the best rigid fit), ate_from_start_m, rpe_m, rpe_rad
+        delta=_FLOAT,  # of the relative errors
+        delta_unit=_TEXT,  # frames or m
+        n=_INT,  # poses, or pairs of poses
+        **dict.fromkeys(("rmse", "mean", "median", "std", "min", "max", "sse"), _FLOAT),
+    ),
+)
+
+# NEES of each map's landmarks, before merging and after; see experiments/landmark_nees.py.
+LANDMARK_NEES = schema(
+    "result.landmark_nees",
+    1,
+    _fields(
+        map=_TEXT,  # a robot, or "fused"
+        # own: all of a robot's map; before fusing: those of them that were truly fused;
+        # fused: of the merged map, with several parents; carried over: with one
+        landmarks=_TEXT,
+        n_landmarks=_INT,  # with a known truth
+        degrees_of_freedom=_INT,
+        nees_mean=_FLOAT,
+        nees_median=_FLOAT,
+        share_in_gate=_FLOAT,  # of 95 %
+    ),
+)
+
 # Harris points of a few consecutive frames, for figure 1.
 TRACKS = schema(
     "result.tracks",
@@ -275,6 +307,8 @@ ALL = {
     "true_pairs": TRUE_PAIRS,
     "fusion": FUSION,
     "map_fits": MAP_FITS,
+    "path_statistics": PATH_STATISTICS,
+    "landmark_nees": LANDMARK_NEES,
     "tracks": TRACKS,
     "timings": TIMINGS,
     "aligner_timings": ALIGNER_TIMINGS,
