@@ -13,16 +13,17 @@ from ruamel.yaml import YAML
 from experiments import metrics, tables
 from experiments.checks import Outcome
 from experiments.figures.drawing import FIGURES
-from experiments.figures.error_curves import BAND
 from experiments.figures.result_tables import ResultTables, of_pair
-from experiments.figures.style import aligner_styles, robot_colours
-from experiments.report.curves import error_curves, success_curves, time_curves
+from experiments.figures.style import robot_colours
+from experiments.report.comparison import compare, reduce_errors
+from experiments.report.curves import error_curves
 from experiments.report.map_view import map_view
-from experiments.report.standing import MIN_TRUE_PAIRS, judge
-from experiments.report.theme import chart_style, css_name
-from experiments.report.words import words_for
+from experiments.report.sweep_contents import sweep_contents
+from experiments.report.theme import css_name
 from experiments.result import require_result
 from experiments.scenario import Bound
+from experiments.statistics.maps import Criteria
+from experiments.statistics.sources import Runs, find_runs
 from mapfusion.errors import InputError
 
 _CAPTIONS = {
@@ -56,29 +57,34 @@ class _Result:
 
 
 def contents_of(path: Path) -> dict[str, Any]:
-    """What the report of a result folder shows.
+    """What the report of a result folder, or of a sweep, shows.
 
     Raises:
-        InputError: no result, or a table is damaged.
+        InputError: neither, or a table is damaged.
     """
+    runs = find_runs(path)
+    contents = sweep_contents(path, runs) if runs.sweeps else _result_contents(path, runs)
+    return contents | {"sections": _sections(contents)}
+
+
+def _result_contents(path: Path, runs: Runs) -> dict[str, Any]:
     require_result(path)
     result = _Result(path)
-    data = result.data
-    errors = data.table("errors").assign(run_id=path.name)
-    if errors.empty:
-        raise InputError(f"{path}: no pair of maps was aligned, there is nothing to report on")
-    timings = result.table("aligner_timings")
-    verdict = judge(errors, pd.DataFrame() if timings is None else timings, data.aligners)
-    scenario = data.scenario
+    data, scenario = result.data, result.data.scenario
+    errors = runs.read("errors")
+    reduced = [reduce_errors(errors, Criteria.of(runs))] if len(errors) else []
+    comparison = compare(runs, reduced, data.aligners)
     rows, stages = _provenance(path)
-    contents = {
+    colours = robot_colours(data.robots)
+    charts = comparison.chart_data(_groups(errors, data)) | {
+        "robot_colours": {robot: css_name(colour) for robot, colour in colours.items()},
+        "map": map_view(data, result.table),
+    }
+    return comparison.contents() | {
         "title": f"{scenario['name']}, seed {scenario['seed']}",
         "description": scenario.get("description", ""),
-        "verdict": verdict,
-        "words": words_for(verdict, len(data.pairs)),
-        "aligners": _aligners(data.aligners),
         "spread_text": "repetitions on the same maps",
-        "data": _chart_data(result, errors, timings),
+        "data": charts,
         "outcomes": _outcomes(result),
         "robots": _robots(result),
         "fits": _records(result.table("map_fits")),
@@ -89,8 +95,19 @@ def contents_of(path: Path) -> dict[str, Any]:
         "stages": stages,
         "stage_times": _stage_times(result.table("timings")),
         "missing": result.missing,
+        "failed": [],
     }
-    return contents | {"sections": _sections(contents)}
+
+
+def _groups(errors: pd.DataFrame, data: ResultTables) -> list[dict[str, Any]]:
+    """Error curves of each robot pair, and of all together."""
+    groups = [
+        {"label": f"{a} – {b}", "curves": error_curves(of_pair(errors, (a, b)), data.aligners)}
+        for a, b in data.pairs
+    ]
+    if len(groups) > 1:
+        groups.append({"label": "all pairs", "curves": error_curves(errors, data.aligners)})
+    return groups
 
 
 def _sections(contents: dict[str, Any]) -> list[tuple[str, str]]:
@@ -107,34 +124,6 @@ def _sections(contents: dict[str, Any]) -> list[tuple[str, str]]:
         ("scenario", "Scenario", True),
     )
     return [(name, label) for name, label, there in every if there]
-
-
-def _aligners(names: list[str]) -> list[dict[str, Any]]:
-    styles = aligner_styles(names)
-    return [{"name": name, **chart_style(styles[name])} for name in names]
-
-
-def _chart_data(
-    result: _Result, errors: pd.DataFrame, timings: pd.DataFrame | None
-) -> dict[str, Any]:
-    data = result.data
-    groups = [
-        {"label": f"{a} – {b}", "curves": error_curves(of_pair(errors, (a, b)), data.aligners)}
-        for a, b in data.pairs
-    ]
-    if len(groups) > 1:
-        groups.append({"label": "all pairs", "curves": error_curves(errors, data.aligners)})
-    colours = robot_colours(data.robots)
-    return {
-        "aligners": _aligners(data.aligners),
-        "groups": groups,
-        "success": success_curves(errors, data.aligners),
-        "times": {} if timings is None else time_curves(timings, data.aligners),
-        "robot_colours": {robot: css_name(colour) for robot, colour in colours.items()},
-        "map": map_view(data, result.table),
-        "min_true_pairs": MIN_TRUE_PAIRS,
-        "band_text": f"{100 * BAND[0]:g}–{100 * BAND[1]:g} %",
-    }
 
 
 def _records(rows: pd.DataFrame | None) -> list[dict[Any, Any]]:

@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 
 from experiments.figures.error_curves import BAND
-from experiments.report.standing import MAP_PAIR, MIN_TRUE_PAIRS
-from experiments.report.success import correct
-from experiments.statistics.intervals import wilson
+from experiments.report.standing import MAP_PAIR
+from experiments.statistics.maps import ANSWERABLE_PAIRS
+from experiments.statistics.success import rates_of_maps
 
 _DIGITS = 5  # significant; more than any chart can show, and a third of the bytes of all of them
 _MAX_POINTS = 400  # of a curve: a chart is about a thousand pixels wide
@@ -18,9 +18,6 @@ _ERRORS = {
     "translation": ("translation_error_m", "refined_translation_error_m"),
     "rotation": ("rotation_error_rad", "refined_rotation_error_rad"),
 }
-_TRUE_PAIR_EDGES = (0, 1, MIN_TRUE_PAIRS, 5, 10, 20, 50, 100, 200, 500, 1000, math.inf)
-_OUTLIER_EDGES = (0.0, 0.2, 0.5, 0.8, 0.9, 0.95, 0.99, 1.0)
-_ITERATION_BINS = 12
 
 
 def rounded(values: Any) -> list[float | None]:
@@ -44,7 +41,7 @@ def error_curves(errors: pd.DataFrame, aligners: Sequence[str]) -> dict[str, Any
         iterations = iterations[picked]
         errors = errors[errors["iteration"].isin(iterations)]
     maps = errors.drop_duplicates(MAP_PAIR).groupby("iteration")
-    enough = maps["n_true"].apply(lambda n: float((n >= MIN_TRUE_PAIRS).mean()))
+    enough = maps["n_true"].apply(lambda n: float((n >= ANSWERABLE_PAIRS).mean()))
     return {
         "iteration": iterations.tolist(),
         "n_true": rounded(maps["n_true"].median()),
@@ -82,64 +79,53 @@ def _spans(iterations: np.ndarray, scarce: np.ndarray) -> list[list[float]]:
     ]
 
 
-def success_curves(errors: pd.DataFrame, aligners: Sequence[str]) -> list[dict[str, Any]]:
-    """Success rates with their intervals against true pairs, outlier share and iteration."""
-    judged = errors.assign(correct=correct(errors))
-    offered = judged["n_correspondences"].to_numpy(dtype=np.float64)
-    outliers = 1 - judged["n_true"].to_numpy() / np.where(offered > 0, offered, np.nan)
-    last = int(errors["iteration"].max())
-    by_iteration = np.linspace(0, last + 1, _ITERATION_BINS + 1).round().tolist()
-    against = (
-        ("true pairs among the correspondences", judged["n_true"], _TRUE_PAIR_EDGES, _counts),
-        ("share of false correspondences", pd.Series(outliers), _OUTLIER_EDGES, _shares),
-        ("iteration", judged["iteration"], sorted(set(by_iteration)), _counts),
-    )
-    return [
-        _binned(judged, aligners, label, values.to_numpy(dtype=np.float64), edges, name)
-        for label, values, edges, name in against
-    ]
+def success_curves(maps: pd.DataFrame, aligners: Sequence[str]) -> list[dict[str, Any]]:
+    """Success rates with their intervals against what makes an alignment hard.
+
+    Args:
+        maps: rows of `maps_of`, with or without the column overlap_share.
+        aligners: in display order.
+    """
+    curves = []
+    for by, (label, name) in _SUCCESS_AGAINST.items():
+        if by not in maps or maps[by].isna().all():
+            continue
+        rates = rates_of_maps(maps[maps[by].notna()], by)
+        bins = rates[["from", "to"]].drop_duplicates().sort_values("from")
+        labels = [name(*ends) for ends in bins.itertuples(index=False)]
+        by_bin = {aligner: _rates_of(rates, aligner, bins["from"]) for aligner in aligners}
+        curves.append({"label": label, "bins": labels, "aligners": by_bin})
+    return curves
+
+
+def _rates_of(rates: pd.DataFrame, aligner: str, starts: pd.Series) -> dict[str, Any]:
+    own = rates[rates["aligner"] == aligner].set_index("from").reindex(starts)
+    return {
+        "rate": rounded(own["refined_success"]),
+        "low": rounded(own["refined_success_low"]),
+        "high": rounded(own["refined_success_high"]),
+        "n": own["n_maps"].fillna(0).astype(int).tolist(),
+    }
 
 
 def _counts(low: float, high: float) -> str:
+    """A bin of whole numbers, which holds its lower end alone."""
     if math.isinf(high):
         return f"≥ {low:g}"
-    return f"{low:g}" if high - low == 1 else f"{low:g}–{high - 1:g}"
+    top = high - 1
+    return f"{low:g}" if top == low else f"{low:g}–{top:g}"
 
 
 def _shares(low: float, high: float) -> str:
     return f"{100 * low:g}–{100 * high:g} %"
 
 
-def _binned(
-    judged: pd.DataFrame,
-    aligners: Sequence[str],
-    label: str,
-    values: np.ndarray,
-    edges: Sequence[float],
-    name: Any,
-) -> dict[str, Any]:
-    place = np.searchsorted(np.array(edges[1:-1]), values, side="right")
-    rows = judged[np.isfinite(values)].assign(bin=place[np.isfinite(values)])
-    filled = sorted(rows["bin"].unique())
-    curves = {}
-    for aligner in aligners:
-        # repetitions on the same maps are one trial: they are no independent evidence
-        share = rows[rows["aligner"] == aligner].groupby(["bin", *MAP_PAIR])["correct"].mean()
-        by_bin = share.groupby("bin").agg(["sum", "count"]).reindex(filled)
-        trials = by_bin["count"].fillna(0)
-        low, high = wilson(by_bin["sum"].fillna(0), trials)
-        known = trials > 0
-        curves[aligner] = {
-            "rate": rounded(by_bin["sum"] / trials),
-            "low": rounded(np.where(known, low, np.nan)),
-            "high": rounded(np.where(known, high, np.nan)),
-            "n": trials.astype(int).tolist(),
-        }
-    return {
-        "label": label,
-        "bins": [name(edges[b], edges[b + 1]) for b in filled],
-        "aligners": curves,
-    }
+_SUCCESS_AGAINST = {
+    "n_true": ("true pairs among the correspondences", _counts),
+    "outlier_share": ("share of false correspondences", _shares),
+    "overlap_share": ("common landmarks, share of the smaller map", _shares),
+    "iteration": ("iteration", _counts),
+}
 
 
 def time_curves(timings: pd.DataFrame, aligners: Sequence[str]) -> dict[str, Any]:

@@ -12,8 +12,8 @@ from markupsafe import Markup
 from experiments.figures.error_curves import BAND
 from experiments.report import words
 from experiments.report.contents import contents_of
-from experiments.report.standing import MIN_TRUE_PAIRS
 from experiments.report.theme import DARK, LIGHT
+from experiments.statistics.maps import ANSWERABLE_PAIRS
 from mapfusion.storage import write_whole
 
 # The map before Plotly: it can be used while the browser still reads that.
@@ -67,8 +67,7 @@ def render(contents: dict[str, Any]) -> str:
         text=_FORMATS,
         style_of={style["name"]: style for style in contents["aligners"]},
         palette={"light": LIGHT, "dark": DARK},
-        correct_text=words.CORRECT_TEXT,
-        min_true_pairs=MIN_TRUE_PAIRS,
+        min_true_pairs=ANSWERABLE_PAIRS,
         band_text=f"{100 * BAND[0]:g}–{100 * BAND[1]:g} %",
         style=Markup(_page_file("report.css")),  # noqa: S704  # our own file
         scripts=[Markup(text) for text in scripts],  # noqa: S704  # Plotly's and our own

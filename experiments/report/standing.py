@@ -1,4 +1,4 @@
-"""How each aligner stands in the errors of one or more runs, and which one to use."""
+"""How each aligner stands on the maps of one or more runs, and which one to use."""
 
 import math
 from dataclasses import dataclass
@@ -8,11 +8,10 @@ import pandas as pd
 from scipy.stats import binomtest
 
 from experiments.metrics import ORACLE
-from experiments.report.success import correct
-from experiments.statistics.intervals import wilson
+from experiments.statistics.maps import ANSWERABLE_PAIRS, MAP_KEYS
+from experiments.statistics.success import rates_of_maps
 
-MAP_PAIR = ["run_id", "robot_a", "robot_b", "iteration"]  # two maps, given to all aligners alike
-MIN_TRUE_PAIRS = 3  # fewer cannot carry an alignment: there is nothing an aligner could be right on
+MAP_PAIR = ["run_id", *MAP_KEYS]  # two maps, given to all aligners alike
 SIGNIFICANCE = 0.05  # of the sign tests that tell aligners apart
 
 
@@ -22,9 +21,9 @@ class Standing:
 
     Attributes:
         aligner: its name.
-        n_maps: pairs of maps with common ground (MIN_TRUE_PAIRS true correspondences or more).
-        rate: share of them on which the refined estimate was correct (mean over repetitions).
-        low: lower end of the rate's 95 % Wilson interval, pairs of maps counted once each.
+        n_maps: pairs of maps with common ground (ANSWERABLE_PAIRS true correspondences or more).
+        rate: share of them on which the refined estimate was right (mean over repetitions).
+        low: lower end of the rate's 95 % Wilson interval; trials are runs, or the maps of one run.
         high: its upper end.
         estimated_m: median translation error as estimated, over those pairs; infinite where more
             than half have no estimate.
@@ -57,7 +56,7 @@ class Verdict:
     """Which aligner to use.
 
     Attributes:
-        best: the aligner, or None where no aligner was ever correct.
+        best: the aligner, or None where no aligner was ever right.
         equals: others that these data cannot tell from it, in their order of standing.
         standings: all aligners, the best first; the oracle is not among them.
         n_maps: pairs of maps, with common ground or without.
@@ -77,106 +76,106 @@ class Verdict:
     oracle_rad: float
 
 
-def judge(errors: pd.DataFrame, timings: pd.DataFrame, order: list[str]) -> Verdict:
+def judge(maps: pd.DataFrame, timings: pd.DataFrame, aligners: list[str]) -> Verdict:
     """Rank the aligners.
 
-    First by the share of correct results; among those a sign test cannot tell from the first, by
-    the error as estimated, pair of maps by pair of maps; among those still equal, by time.
+    First by the share of right results; among those a sign test cannot tell from the first, by the
+    error as estimated, pair of maps by pair of maps; among those still equal, by time.
 
     Args:
-        errors: the table `errors` with a column run_id, of one or more runs.
+        maps: rows of `maps_of`, of one or more runs.
         timings: the table `aligner_timings` likewise; may be empty.
-        order: the aligners' display order.
+        aligners: in display order.
     """
-    aligners = [name for name in order if name != ORACLE]
-    judged = errors.assign(correct=correct(errors), accepted=accepted(errors))
-    used = judged[judged["n_true"] >= MIN_TRUE_PAIRS]
+    used = maps[maps["n_true"] >= ANSWERABLE_PAIRS]
     oracle = used[used["aligner"] == ORACLE]
-    standings = {name: _standing(name, judged, used, oracle, timings) for name in aligners}
-    maps = errors.drop_duplicates(MAP_PAIR)
+    rates = _rates(used)
+    standings = [
+        _standing(name, maps, used, oracle, rates, timings) for name in aligners if name != ORACLE
+    ]
+    pairs = maps.drop_duplicates(MAP_PAIR)
     ranked, equals = _ranked(standings, used)
     best = ranked[0] if ranked and ranked[0].rate > 0 else None
     return Verdict(
         best,
         equals if best else (),
         tuple(ranked),
-        len(maps),
-        int((maps["n_true"] >= MIN_TRUE_PAIRS).sum()),
-        errors["run_id"].nunique(),
+        len(pairs),
+        int((pairs["n_true"] >= ANSWERABLE_PAIRS).sum()),
+        maps["run_id"].nunique(),
         _median(oracle["refined_translation_error_m"]),
-        _median(oracle["refined_rotation_error_rad"].abs()),
+        _median(oracle["refined_rotation_error_rad"]),
     )
 
 
-def accepted(errors: pd.DataFrame) -> pd.Series:
-    """Whether each refined estimate would be merged with."""
-    if "accepted" in errors:
-        return errors["accepted"].astype(bool)
-    return errors["refined_status"] == "accepted"
+def _rates(used: pd.DataFrame) -> dict[str, dict[str, float]]:
+    if used.empty:
+        return {}
+    rates = rates_of_maps(used, "n_true", (ANSWERABLE_PAIRS, math.inf))
+    return {row["aligner"]: row for row in rates.to_dict("records")}
 
 
 def _standing(
     name: str,
-    judged: pd.DataFrame,
+    maps: pd.DataFrame,
     used: pd.DataFrame,
     oracle: pd.DataFrame,
+    rates: dict[str, dict[str, float]],
     timings: pd.DataFrame,
 ) -> Standing:
-    own = used[used["aligner"] == name]
-    every = judged[judged["aligner"] == name]
-    share = own.groupby(MAP_PAIR)["correct"].mean()
-    low, high = wilson(share.sum(), len(share))
+    own, every = used[used["aligner"] == name], maps[maps["aligner"] == name]
+    rate = rates.get(name, {})
     refined_m, oracle_m = (_median(rows["refined_translation_error_m"]) for rows in (own, oracle))
     time_s = timings[timings["aligner"] == name]["elapsed_s"] if len(timings) else pd.Series([])
+    n_accepted, n_false = (
+        int((every[column].fillna(0) * every["n_repetitions"]).sum().round())
+        for column in ("accepted", "false_accepted")
+    )
     return Standing(
         aligner=name,
-        n_maps=len(share),
-        rate=float(share.mean()) if len(share) else math.nan,
-        low=float(low),
-        high=float(high),
+        n_maps=len(own),
+        rate=rate.get("refined_success", math.nan),
+        low=rate.get("refined_success_low", math.nan),
+        high=rate.get("refined_success_high", math.nan),
         estimated_m=_median(own["translation_error_m"]),
-        estimated_rad=_median(own["rotation_error_rad"].abs()),
+        estimated_rad=_median(own["rotation_error_rad"]),
         refined_m=refined_m,
-        refined_rad=_median(own["refined_rotation_error_rad"].abs()),
+        refined_rad=_median(own["refined_rotation_error_rad"]),
         over_oracle=refined_m / oracle_m if oracle_m > 0 else math.nan,
-        n_accepted=int(every["accepted"].sum()),
-        n_false=int((every["accepted"] & ~every["correct"]).sum()),
+        n_accepted=n_accepted,
+        n_false=n_false,
         time_ms=1e3 * float(time_s.median()) if len(time_s) else math.nan,
     )
 
 
 def _median(values: pd.Series) -> float:
-    """The median; no estimate at all counts as worse than any."""
-    return float(values.fillna(np.inf).median()) if len(values) else math.nan
+    return float(values.median()) if len(values) else math.nan
 
 
 def _ranked(
-    standings: dict[str, Standing], used: pd.DataFrame
+    standings: list[Standing], used: pd.DataFrame
 ) -> tuple[list[Standing], tuple[str, ...]]:
     """All standings, the best first, and who is equal to the best."""
-    by_map = used.groupby(["aligner", *MAP_PAIR])
-    rate = by_map["correct"].mean().unstack("aligner")
-    # no estimate at all is worse than any error
-    error = by_map["translation_error_m"].median().fillna(np.inf).unstack("aligner")
-
-    def order(one: Standing) -> tuple[float, float, float]:
-        return (-_last(one.rate, 0.0), _last(one.estimated_m), _last(one.time_ms))
-
-    by_rate = sorted(standings.values(), key=order)
-    if not by_rate or not len(rate):
+    by_rate = sorted(
+        standings, key=lambda s: (-_or_last(s.rate, 0.0), _or_last(s.estimated_m), s.time_ms)
+    )
+    if not by_rate or used.empty:
         return by_rate, ()
+    by_map = used.set_index([*MAP_PAIR, "aligner"])
+    failures = 1 - by_map["refined_success"].unstack("aligner")
+    error = by_map["translation_error_m"].unstack("aligner")
     first = by_rate[0].aligner
-    contenders = [s for s in by_rate if not _differ(-rate[first], -rate[s.aligner])]
-    contenders.sort(key=lambda one: _last(one.estimated_m))
+    contenders = [s for s in by_rate if not _differ(failures[first], failures[s.aligner])]
+    contenders.sort(key=lambda s: _or_last(s.estimated_m))
     first = contenders[0].aligner
     equal = [s for s in contenders if not _differ(error[first], error[s.aligner])]
-    equal.sort(key=lambda one: _last(one.time_ms))
+    equal.sort(key=lambda s: _or_last(s.time_ms))
     rest = [s for s in contenders if s not in equal]
     others = [s for s in by_rate if s not in contenders]
     return [*equal, *rest, *others], tuple(s.aligner for s in equal[1:])
 
 
-def _last(value: float, missing: float = math.inf) -> float:
+def _or_last(value: float, missing: float = math.inf) -> float:
     """A sorting key for what may not have been measured."""
     return missing if math.isnan(value) else value
 
@@ -184,10 +183,10 @@ def _last(value: float, missing: float = math.inf) -> float:
 def _differ(first: pd.Series, second: pd.Series) -> bool:
     """Two-sided sign test on paired figures: is one smaller more often than chance would have it?
 
-    The pairs of one run are no independent draws, so this tells aligners apart too readily; a
-    report of one run says so.
+    The maps of one run are no independent draws, so this tells aligners apart too readily; that the
+    runs are few, the report says.
     """
-    smaller, larger = int((first < second).sum()), int((first > second).sum())
+    smaller, larger = int(np.sum(first < second)), int(np.sum(first > second))
     if smaller + larger == 0:
         return False
     return binomtest(smaller, smaller + larger).pvalue < SIGNIFICANCE

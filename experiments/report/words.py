@@ -1,19 +1,24 @@
 """The verdict in plain words, and numbers as people read them."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from experiments.report.standing import MIN_TRUE_PAIRS, Standing, Verdict
-from experiments.report.success import ROTATION_RAD, TRANSLATION_M
+from experiments.report.standing import Standing, Verdict
+from experiments.statistics.maps import ANSWERABLE_PAIRS, Criteria
 
 _RELIABLE = 0.5  # a method that surely fails more often than not is nothing to recommend
 _SPACE = "\u00a0"  # a number stays beside its unit
 
-CORRECT_TEXT = (
-    f"Correct: within {TRANSLATION_M:g} m and {ROTATION_RAD:g} rad of the truth once refined. "
-    f"Common ground: at least {MIN_TRUE_PAIRS} true correspondences. Intervals are 95 % Wilson "
-    "intervals that count each pair of maps once, whatever the number of repetitions."
-)
+
+def correct_text(criteria: Criteria) -> str:
+    """What the numbers of the verdict mean."""
+    return (
+        f"Correct: within {criteria.translation_m:g}{_SPACE}m and {criteria.rotation_rad:g}{_SPACE}"
+        f"rad of the truth once refined. Common ground: at least {ANSWERABLE_PAIRS} true "
+        "correspondences. Repetitions on the same maps are one trial of a Wilson interval, and so "
+        "are, where there are several runs, all maps of a run."
+    )
 
 
 @dataclass(frozen=True)
@@ -37,13 +42,19 @@ class Words:
     sure_why: str
 
 
-def words_for(verdict: Verdict, n_robot_pairs: int) -> Words:
-    """Put a verdict into words."""
-    sure, why = _surety(verdict, n_robot_pairs)
+def words_for(verdict: Verdict, n_robot_pairs: int, settings: Sequence[str] = ()) -> Words:
+    """Put a verdict into words.
+
+    Args:
+        verdict: of the aligners.
+        n_robot_pairs: in the runs.
+        settings: what a sweep varied between them.
+    """
+    sure, why = _surety(verdict, n_robot_pairs, settings)
     best = verdict.best
     if verdict.n_common == 0:
         lead = (
-            f"On none of the {verdict.n_maps} pairs of maps did {MIN_TRUE_PAIRS} or more "
+            f"On none of the {verdict.n_maps} pairs of maps did {ANSWERABLE_PAIRS} or more "
             "correspondences turn out to be true. The only right answer is to refuse."
         )
         return Words("No common ground.", "", lead, _refusals(verdict), sure, why)
@@ -118,7 +129,7 @@ def _refusals(verdict: Verdict) -> tuple[str, ...]:
     return (f"Accepted all the same, wrongly: {listed([f'{s.aligner} ({s.n_false})' for s in merged])}.",)
 
 
-def _surety(verdict: Verdict, n_robot_pairs: int) -> tuple[str, str]:
+def _surety(verdict: Verdict, n_robot_pairs: int, settings: Sequence[str]) -> tuple[str, str]:
     if verdict.n_runs == 1:
         pairs = "one pair of robots" if n_robot_pairs == 1 else f"{n_robot_pairs} pairs of robots"
         return (
@@ -127,11 +138,16 @@ def _surety(verdict: Verdict, n_robot_pairs: int) -> tuple[str, str]:
             "landmarks, so the intervals are narrower than the truth. A sweep over seeds tells how "
             "far this holds elsewhere.",
         )
-    return (
-        f"Measured over {verdict.n_runs} runs",
-        "Within a run, maps of neighbouring iterations share most of their landmarks; between runs "
-        "nothing is shared but the scenario.",
+    why = (
+        "Intervals count each run as one trial, since the maps of a run grow from one another: they "
+        "claim nothing that other seeds would not bear out."
     )
+    if settings:
+        why += (
+            f" The runs also differ in {listed(list(settings))}; here they are taken together, and "
+            "those of one seed share their worlds."
+        )
+    return f"Measured over {verdict.n_runs} runs", why
 
 
 def listed(names: list[str] | tuple[str, ...]) -> str:

@@ -4,8 +4,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from experiments.report.comparison import reduce_errors
 from experiments.report.standing import judge
 from experiments.report.words import percent, words_for
+from experiments.statistics.maps import DEFAULT_CRITERIA
 
 
 def made_up(errors_m: dict[str, list[float]], n_true: list[int] | None = None) -> pd.DataFrame:
@@ -17,6 +19,8 @@ def made_up(errors_m: dict[str, list[float]], n_true: list[int] | None = None) -
             rows.append(
                 {
                     "run_id": "run-0",
+                    "scenario": "run",
+                    "seed": 0,
                     "robot_a": "R1",
                     "robot_b": "R2",
                     "iteration": k,
@@ -28,6 +32,7 @@ def made_up(errors_m: dict[str, list[float]], n_true: list[int] | None = None) -
                     "refined_translation_error_m": value,
                     "refined_rotation_error_rad": 0.001 if found else np.nan,
                     "n_correspondences": 50,
+                    "n_common": 60,
                     "n_true": 30 if n_true is None else n_true[k],
                 }
             )
@@ -40,7 +45,8 @@ def timings(**ms: float) -> pd.DataFrame:
 
 def verdict_of(errors: pd.DataFrame, times: pd.DataFrame | None = None):
     order = list(dict.fromkeys(errors["aligner"]))
-    return judge(errors, pd.DataFrame() if times is None else times, order)
+    maps = reduce_errors(errors, DEFAULT_CRITERIA)
+    return judge(maps, pd.DataFrame() if times is None else times, order)
 
 
 def test_the_more_often_correct_wins() -> None:
