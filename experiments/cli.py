@@ -96,6 +96,16 @@ def report(
     screen.print_file(write_report(result, output))
 
 
+@app.command("inspect")
+def inspect_command(
+    path: Annotated[Path, typer.Argument(metavar="FILE", help="A file or folder of mapfusion's.")],
+) -> None:
+    """Tell what a table, map, log, scenario, result or sweep holds: `mapfusion inspect R1.parquet`."""
+    from experiments.inspection.command import inspect
+
+    inspect(path)
+
+
 @app.command()
 def check(
     scenarios: Annotated[list[Path], typer.Argument(metavar="SCENARIO...", help="Scenario files.")],

@@ -9,8 +9,8 @@ from typing import Any
 import jinja2
 from markupsafe import Markup
 
-from experiments.figures.error_curves import BAND
 from experiments.report import words
+from experiments.report.comparison import band_text
 from experiments.report.contents import contents_of
 from experiments.report.theme import DARK, LIGHT
 from experiments.statistics.maps import ANSWERABLE_PAIRS
@@ -68,7 +68,7 @@ def render(contents: dict[str, Any]) -> str:
         style_of={style["name"]: style for style in contents["aligners"]},
         palette={"light": LIGHT, "dark": DARK},
         min_true_pairs=ANSWERABLE_PAIRS,
-        band_text=f"{100 * BAND[0]:g}–{100 * BAND[1]:g} %",
+        band_text=band_text(),
         style=Markup(_page_file("report.css")),  # noqa: S704  # our own file
         scripts=[Markup(text) for text in scripts],  # noqa: S704  # Plotly's and our own
         policy=_policy(scripts),
