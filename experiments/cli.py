@@ -100,7 +100,7 @@ def report(
 def inspect_command(
     path: Annotated[Path, typer.Argument(metavar="FILE", help="A file or folder of mapfusion's.")],
 ) -> None:
-    """Tell what a table, map, log, scenario, result or sweep holds: `mapfusion inspect R1.parquet`."""
+    """Tell what a file or folder of mapfusion's holds: `mapfusion inspect R1.parquet`."""
     from experiments.inspection.command import inspect
 
     inspect(path)

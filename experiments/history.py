@@ -8,6 +8,7 @@ landmarks that an accepted alignment joined were fused to.
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
@@ -46,7 +47,7 @@ def write_history(robots: Sequence[EvaluatedRobot], scenario: Scenario, folder: 
     offered_at = dict(iter(offered.groupby(_KEY)))
     judged, fused = [], []
     for key, group in estimates.groupby(_KEY, sort=False):
-        names = dict(zip(_KEY, key, strict=True))
+        names: dict[str, Any] = dict(zip(_KEY, cast("tuple[Any, ...]", key), strict=True))
         (map_a, points_a), (map_b, points_b) = (
             by_name[names[robot]].at(names["iteration"]) for robot in ("robot_a", "robot_b")
         )

@@ -181,11 +181,9 @@ FUSED = schema(
     ],
 )
 
-# The robots' maps at each evaluated iteration, in plan, each in its own frame. `landmark` is the row
-# of the map at that iteration, which correspondences of that iteration refer to.
-_PLAN = _fields(
-    x_m=_SINGLE, y_m=_SINGLE, cov_xx_m2=_SINGLE, cov_xy_m2=_SINGLE, cov_yy_m2=_SINGLE
-)
+# The robots' maps at each evaluated iteration, in plan, each in its own frame. `landmark` is the
+# row of the map at that iteration, which correspondences of that iteration refer to.
+_PLAN = _fields(x_m=_SINGLE, y_m=_SINGLE, cov_xx_m2=_SINGLE, cov_xy_m2=_SINGLE, cov_yy_m2=_SINGLE)
 MAP_HISTORY = schema(
     "result.map_history", 1, [*_fields(robot=_TEXT, iteration=_INT, landmark=_INT), *_PLAN]
 )

@@ -84,7 +84,10 @@ def aligner_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
 
 def _aligner_style(place: int) -> dict[str, Any]:
     n = len(_ALIGNER_STYLES)
-    return {**_ALIGNER_STYLES[(place + place // n) % n], "color": _ALIGNER_STYLES[place % n]["color"]}
+    return {
+        **_ALIGNER_STYLES[(place + place // n) % n],
+        "color": _ALIGNER_STYLES[place % n]["color"],
+    }
 
 
 def robot_colours(names: Sequence[str]) -> dict[str, str]:

@@ -169,9 +169,13 @@ def _log(path: Path) -> Description:
     duration_s = float(log.time_s[-1] - log.time_s[0]) if frames else 0.0
     travelled_m = float(np.hypot(log.odometry[:, 0], log.odometry[:, 1]).sum())
     carried = [
-        name for name in ("descriptor", "label", "uvd_px") if getattr(log.observations, name) is not None
+        name
+        for name in ("descriptor", "label", "uvd_px")
+        if getattr(log.observations, name) is not None
     ]
-    truth = [name for name in ("truth_poses", "truth_points") if (path / f"{name}.parquet").is_file()]
+    truth = [
+        name for name in ("truth_poses", "truth_points") if (path / f"{name}.parquet").is_file()
+    ]
     facts = (
         ("robot", log.robot),
         ("planar", "yes" if log.planar else "no"),

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from experiments import tables
@@ -16,6 +16,7 @@ from mapfusion.storage import read_table
 from sim import trajectory
 
 N_FIRST_ROWS = 5
+_MAX_NAMES_LENGTH = 30  # characters; more names are counted
 _KIND, _VERSION, _PREFIX = b"mapfusion.kind", b"mapfusion.schema_version", "mapfusion."
 _SCHEMAS = (
     *tables.ALL.values(),
@@ -91,7 +92,7 @@ def inspect_table(path: Path) -> Table:
         raise InputError(f"{path}: damaged or not a Parquet file ({reason})") from error
     if _KIND not in metadata:
         raise InputError(
-            f"{path}: a Parquet file, but none of mapfusion's (its metadata tells no mapfusion.kind)"
+            f"{path}: a Parquet file, but none of mapfusion's (no mapfusion.kind in its metadata)"
         )
     kind = metadata[_KIND].decode()
     known = kind in KNOWN
@@ -126,19 +127,19 @@ def _read(path: Path) -> pa.Table:
 
 
 def _column(table: pa.Table, name: str) -> Column:
-    values = table.column(name)
-    low, high, n_missing = "", "", values.null_count
-    if pa.types.is_floating(values.type):
-        known = pc.filter(values, pc.is_finite(values))
+    kind = table.schema.field(name).type
+    low, high, n_missing = "", "", table.column(name).null_count
+    if pa.types.is_floating(kind) or pa.types.is_integer(kind):
+        values = table.column(name).to_numpy().astype(np.float64)
+        known = values[np.isfinite(values)]
         n_missing = len(values) - len(known)
-        low, high = _range(known)
-    elif pa.types.is_integer(values.type):
-        low, high = _range(values)
-    elif pa.types.is_boolean(values.type):
-        high = f"{pc.sum(values).as_py() or 0} true"
-    elif pa.types.is_string(values.type):
-        high = _distinct(values)
-    return Column(name, _type_name(values.type), unit_of(name), low, high, n_missing)
+        if len(known):
+            low, high = f"{known.min():.6g}", f"{known.max():.6g}"
+    elif pa.types.is_boolean(kind):
+        high = f"{int(np.sum(table.column(name).to_numpy().astype(bool)))} true"
+    elif pa.types.is_string(kind):
+        high = _distinct(table.column(name).unique().to_pylist())
+    return Column(name, _type_name(kind), unit_of(name), low, high, n_missing)
 
 
 def _type_name(kind: pa.DataType) -> str:
@@ -147,11 +148,8 @@ def _type_name(kind: pa.DataType) -> str:
     return str(kind)
 
 
-def _range(values: Any) -> tuple[str, str]:
-    ends = pc.min_max(values).as_py() if len(values) else {"min": None, "max": None}
-    return tuple("" if ends[end] is None else f"{ends[end]:.6g}" for end in ("min", "max"))
-
-
-def _distinct(values: Any) -> str:
-    found = [str(value) for value in pc.unique(values).to_pylist()]
-    return ", ".join(found) if sum(map(len, found)) < 30 else f"{len(found)} different"
+def _distinct(found: list[str | None]) -> str:
+    names = [str(name) for name in found]
+    return (
+        ", ".join(names) if sum(map(len, names)) < _MAX_NAMES_LENGTH else f"{len(names)} different"
+    )

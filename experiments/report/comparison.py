@@ -71,7 +71,7 @@ def band_text() -> str:
 
 
 def with_acceptance(errors: pd.DataFrame) -> pd.DataFrame:
-    """Errors with a column `accepted`; before there was an acceptance test, the least squares' word."""
+    """Errors with a column `accepted`: the least squares' word, where no test was applied."""
     if "accepted" in errors:
         return errors
     return errors.assign(accepted=errors["refined_status"] == "accepted")
@@ -90,9 +90,7 @@ def compare(runs: Runs, reduced: Sequence[pd.DataFrame], aligners: list[str]) ->
         raise InputError(f"{where}: no pair of maps was aligned, there is nothing to report on")
     maps = with_overlap_share(pd.concat(reduced, ignore_index=True), runs)
     timings = runs.read("aligner_timings") if runs.has("aligner_timings") else pd.DataFrame()
-    return Comparison(
-        aligners, maps, judge(maps, timings, aligners), timings, Criteria.of(runs)
-    )
+    return Comparison(aligners, maps, judge(maps, timings, aligners), timings, Criteria.of(runs))
 
 
 def reduce_errors(errors: pd.DataFrame, criteria: Criteria) -> pd.DataFrame:

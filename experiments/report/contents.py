@@ -35,7 +35,7 @@ _CAPTIONS = {
     "fig06_aligner_time": "Time of an alignment against the number of overlapping points.",
     "fig07_correspondences": "Two maps in 3-D with the correspondences between them.",
     "fig08_fused_landmark": "One landmark: two ellipses and the fused one.",
-    "fig09_aligned_maps": "Aligned correspondences with the ellipses of both maps and of the fused.",
+    "fig09_aligned_maps": "Aligned correspondences with the ellipses of both maps and the fused.",
     "fig10_fused_map": "The fused map in plan.",
 }
 

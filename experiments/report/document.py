@@ -46,8 +46,8 @@ def write_report(path: Path, output: Path | None = None) -> Path:
 def render(contents: dict[str, Any]) -> str:
     """The report as HTML.
 
-    All names are escaped: in text by Jinja2, in data by its `tojson`, which leaves no `<` that could
-    end the script. The page carries a policy that lets it fetch nothing and run these scripts alone.
+    All names are escaped: in text by Jinja2, in data by its `tojson`, which leaves no `<` that
+    could end the script. The page's policy lets it fetch nothing and run these scripts alone.
     """
     from plotly.offline import get_plotlyjs
 

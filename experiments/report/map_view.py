@@ -87,7 +87,9 @@ def map_view(data: ResultTables, table: Callable[[str], pd.DataFrame | None]) ->
         "level": LEVEL_TEXT,
         "ellipse_m": [ELLIPSE_MIN_M, ELLIPSE_MAX_M],
         "robots": {name: robots.packed(name, shown, block) for name in data.robots},
-        "pairs": [_pair(data, pair, true_pairs, table, shown, robots, block) for pair in data.pairs],
+        "pairs": [
+            _pair(data, pair, true_pairs, table, shown, robots, block) for pair in data.pairs
+        ],
         "starts": {robot: _pose(data.start_pose(robot)) for robot in data.robots},
         "walls": [[rounded(point) for point in wall] for wall in data.walls],
         "index_bytes": robots.index_type.itemsize,
@@ -111,9 +113,9 @@ class _Robots:
     def __init__(
         self, history: pd.DataFrame, clouds: pd.DataFrame | None, paths: pd.DataFrame | None
     ) -> None:
-        self._history = dict(iter(history.groupby("robot")))
-        self._clouds = {} if clouds is None else dict(iter(clouds.groupby("robot")))
-        self._paths = {} if paths is None else dict(iter(paths.groupby("robot")))
+        self._history = _by(history, "robot")
+        self._clouds = _by(clouds, "robot")
+        self._paths = _by(paths, "robot")
         wide = history["landmark"].max() > np.iinfo(np.uint16).max
         self.index_type = np.dtype("<u4" if wide else "<u2")
         self.step_m = {robot: self._step(robot) for robot in self._history}
@@ -142,7 +144,7 @@ class _Robots:
         self, robot: str, shown: np.ndarray, step_m: float, block: Block
     ) -> list[dict[str, Any]]:
         rows = self._history[robot].sort_values(["iteration", "landmark"])
-        by_iteration = dict(iter(rows.groupby("iteration")))
+        by_iteration = _by(rows, "iteration")
         kept: dict[int, dict[str, Any]] = {}
         maps = []
         for wanted in shown.tolist():
@@ -161,7 +163,7 @@ class _Robots:
         rows = self._clouds.get(robot)
         if rows is None or rows.empty:
             return []
-        by_iteration = dict(iter(rows.groupby("iteration")))
+        by_iteration = _by(rows, "iteration")
         known = np.array(sorted(by_iteration))
         clouds = []
         for wanted in shown.tolist():
@@ -184,6 +186,10 @@ class _Robots:
         return lines
 
 
+def _by(rows: pd.DataFrame | None, column: str) -> dict[Any, pd.DataFrame]:
+    return {} if rows is None else dict(iter(rows.groupby(column)))
+
+
 def _packed_points(rows: pd.DataFrame, step_m: float, block: Block) -> dict[str, Any]:
     covariance = np.empty((len(rows), 2, 2))
     covariance[:, 0, 0], covariance[:, 1, 1] = rows["cov_xx_m2"], rows["cov_yy_m2"]
@@ -203,16 +209,20 @@ def _pair(
     robots: _Robots,
     block: Block,
 ) -> dict[str, Any]:
-    judged = of_pair(true_pairs, pair).set_index("iteration")
-    offered, fused = (_by_iteration(table(name), pair) for name in ("correspondences", "fused_history"))
+    judged = _records(of_pair(true_pairs, pair), ["iteration"])
+    offered, fused = (
+        _by(_of_pair(table(name), pair), "iteration")
+        for name in ("correspondences", "fused_history")
+    )
     T_true, start = data.true_alignment(pair), data.start_pose(pair[0])
     frames = []
     for place, k in enumerate(shown.tolist()):
-        if k not in judged.index:
+        if (k,) not in judged:
             continue
         frame: dict[str, Any] = {"iteration": k, "map": place}
         if k in offered:
-            is_true = inlier_mask(judged.at[k, "true_pair"], int(judged.at[k, "n_correspondences"]))
+            row = judged[(k,)]
+            is_true = inlier_mask(row["true_pair"], row["n_correspondences"])
             rows = offered[k][["index_a", "index_b"]].to_numpy()
             frame["pairs"] = block.add(rows.astype(robots.index_type))
             frame["true"] = block.add(is_true.astype(np.uint8))
@@ -234,10 +244,6 @@ def _pose(pose: Float | None) -> list[float | None] | None:
     return None if pose is None else rounded(pose)
 
 
-def _by_iteration(rows: pd.DataFrame | None, pair: Pair) -> dict[Any, pd.DataFrame]:
-    return {} if rows is None else dict(iter(of_pair(rows, pair).groupby("iteration")))
-
-
 def _alignments(
     data: ResultTables, pair: Pair, estimates: pd.DataFrame | None, iterations: list[int]
 ) -> dict[str, list[dict[str, Any] | None]]:
@@ -245,36 +251,38 @@ def _alignments(
     if estimates is None:
         return {}
     keys = ["aligner", "iteration"]
-    first = of_pair(estimates, pair)
-    first = first[first["repetition"] == 0].set_index(keys)
-    errors = of_pair(data.table("errors"), pair)
-    errors = errors[errors["repetition"] == 0].set_index(keys)
-    found: dict[str, list[dict[str, Any] | None]] = {}
-    for aligner in data.aligners:
-        if aligner in first.index.get_level_values("aligner"):
-            found[aligner] = [
-                _alignment(first.loc[(aligner, k)], errors.loc[(aligner, k)])
-                if (aligner, k) in first.index
-                else None
-                for k in iterations
-            ]
-    return found
-
-
-def _alignment(estimate: pd.Series, error: pd.Series) -> dict[str, Any]:
-    use = bool(error["accepted"]) if "accepted" in error else estimate["refined_status"] == "accepted"
+    first, errors = (
+        _records(rows[rows["repetition"] == 0], keys)
+        for rows in (of_pair(estimates, pair), of_pair(data.table("errors"), pair))
+    )
     return {
-        "estimated": rounded(estimate[["tx_m", "ty_m", "theta_rad"]].to_numpy(dtype=np.float64)),
-        "refined": rounded(
-            estimate[["refined_tx_m", "refined_ty_m", "refined_theta_rad"]].to_numpy(np.float64)
-        ),
-        "error": {
-            "estimated": rounded([error["translation_error_m"], error["rotation_error_rad"]]),
-            "refined": rounded(
-                [error["refined_translation_error_m"], error["refined_rotation_error_rad"]]
-            ),
-        },
-        "accepted": use,
+        name: [
+            _alignment(first[name, k], errors[name, k]) if (name, k) in first else None
+            for k in iterations
+        ]
+        for name in data.aligners
+        if any((name, k) in first for k in iterations)
+    }
+
+
+def _of_pair(rows: pd.DataFrame | None, pair: Pair) -> pd.DataFrame | None:
+    return None if rows is None else of_pair(rows, pair)
+
+
+def _records(rows: pd.DataFrame, keys: list[str]) -> dict[tuple[Any, ...], dict[Any, Any]]:
+    """Rows by their keys."""
+    return {tuple(row[key] for key in keys): row for row in rows.to_dict("records")}
+
+
+def _alignment(estimate: dict[Any, Any], error: dict[Any, Any]) -> dict[str, Any]:
+    found: dict[str, Any] = {
+        "accepted": bool(error.get("accepted", estimate["refined_status"] == "accepted")),
         "status": str(estimate["refined_status"]),
         "reason": str(estimate["refined_reason"] or estimate["reason"]),
+        "error": {},
     }
+    for stage, prefix in (("estimated", ""), ("refined", "refined_")):
+        found[stage] = rounded([estimate[f"{prefix}{n}"] for n in ("tx_m", "ty_m", "theta_rad")])
+        names = (f"{prefix}translation_error_m", f"{prefix}rotation_error_rad")
+        found["error"][stage] = rounded([error[name] for name in names])
+    return found

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -108,7 +109,7 @@ def judge(maps: pd.DataFrame, timings: pd.DataFrame, aligners: list[str]) -> Ver
     )
 
 
-def _rates(used: pd.DataFrame) -> dict[str, dict[str, float]]:
+def _rates(used: pd.DataFrame) -> dict[str, dict[Any, Any]]:
     if used.empty:
         return {}
     rates = rates_of_maps(used, "n_true", (ANSWERABLE_PAIRS, math.inf))
@@ -120,7 +121,7 @@ def _standing(
     maps: pd.DataFrame,
     used: pd.DataFrame,
     oracle: pd.DataFrame,
-    rates: dict[str, dict[str, float]],
+    rates: dict[str, dict[Any, Any]],
     timings: pd.DataFrame,
 ) -> Standing:
     own, every = used[used["aligner"] == name], maps[maps["aligner"] == name]
@@ -128,7 +129,7 @@ def _standing(
     refined_m, oracle_m = (_median(rows["refined_translation_error_m"]) for rows in (own, oracle))
     time_s = timings[timings["aligner"] == name]["elapsed_s"] if len(timings) else pd.Series([])
     n_accepted, n_false = (
-        int((every[column].fillna(0) * every["n_repetitions"]).sum().round())
+        round(float(np.nansum(every[column] * every["n_repetitions"])))
         for column in ("accepted", "false_accepted")
     )
     return Standing(
@@ -161,9 +162,12 @@ def _ranked(
     )
     if not by_rate or used.empty:
         return by_rate, ()
-    by_map = used.set_index([*MAP_PAIR, "aligner"])
-    failures = 1 - by_map["refined_success"].unstack("aligner")
-    error = by_map["translation_error_m"].unstack("aligner")
+    failures, error = (
+        used.assign(failures=1 - used["refined_success"]).pivot_table(
+            index=MAP_PAIR, columns="aligner", values=column, dropna=False
+        )
+        for column in ("failures", "translation_error_m")
+    )
     first = by_rate[0].aligner
     contenders = [s for s in by_rate if not _differ(failures[first], failures[s.aligner])]
     contenders.sort(key=lambda s: _or_last(s.estimated_m))
@@ -189,4 +193,4 @@ def _differ(first: pd.Series, second: pd.Series) -> bool:
     smaller, larger = int(np.sum(first < second)), int(np.sum(first > second))
     if smaller + larger == 0:
         return False
-    return binomtest(smaller, smaller + larger).pvalue < SIGNIFICANCE
+    return bool(binomtest(smaller, smaller + larger).pvalue < SIGNIFICANCE)

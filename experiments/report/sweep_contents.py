@@ -52,11 +52,22 @@ def sweep_contents(path: Path, runs: Runs) -> dict[str, Any]:
 def _groups(medians: pd.DataFrame, aligners: list[str]) -> list[dict[str, Any]]:
     """Error curves over the runs of each scenario and setting."""
     groups = []
-    for labels, rows in configurations(medians):
-        settings = [f"{name.rsplit('.', 1)[1]} {value}" for name, value in labels.items() if "." in name]
+    ordered = sorted(configurations(medians), key=lambda each: [*map(_natural, each[0].values())])
+    for labels, rows in ordered:
+        settings = [
+            f"{name.rsplit('.', 1)[1]} {value}" for name, value in labels.items() if "." in name
+        ]
         label = ", ".join([str(labels["scenario"]), *settings])
         groups.append({"label": label, "curves": error_curves(rows, aligners)})
     return groups
+
+
+def _natural(text: object) -> tuple[float, str]:
+    """A sorting key that puts 50 before 200."""
+    try:
+        return float(str(text)), ""
+    except ValueError:
+        return np.inf, str(text)
 
 
 def _facts(described: pd.DataFrame) -> list[tuple[str, str]]:
@@ -66,7 +77,7 @@ def _facts(described: pd.DataFrame) -> list[tuple[str, str]]:
         ("Seeds", _listed_seeds(described["seed"].to_numpy())),
     ]
     for name in setting_columns(described):
-        facts.append((name, ", ".join(str(value) for value in described[name].unique())))
+        facts.append((name, ", ".join(sorted(map(str, described[name].unique()), key=_natural))))
     return facts
 
 

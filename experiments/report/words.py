@@ -59,9 +59,8 @@ def words_for(verdict: Verdict, n_robot_pairs: int, settings: Sequence[str] = ()
         )
         return Words("No common ground.", "", lead, _refusals(verdict), sure, why)
     if best is None:
-        lead = (
-            f"No method was correct on any of the {verdict.n_common} pairs of maps with common ground."
-        )
+        lead = f"No method was correct on any of the {verdict.n_common} pairs of maps with "
+            "common ground."
         return Words("No method worked.", "", lead, (), sure, why)
     lead = (
         f"{best.aligner} put the two maps together correctly in {percent(best.rate)} of "
@@ -126,7 +125,8 @@ def _refusals(verdict: Verdict) -> tuple[str, ...]:
     merged = [s for s in verdict.standings if s.n_false]
     if not merged:
         return ("Every method refused, as it should.",)
-    return (f"Accepted all the same, wrongly: {listed([f'{s.aligner} ({s.n_false})' for s in merged])}.",)
+    names = listed([f"{s.aligner} ({s.n_false})" for s in merged])
+    return (f"Accepted all the same, wrongly: {names}.",)
 
 
 def _surety(verdict: Verdict, n_robot_pairs: int, settings: Sequence[str]) -> tuple[str, str]:
@@ -139,8 +139,8 @@ def _surety(verdict: Verdict, n_robot_pairs: int, settings: Sequence[str]) -> tu
             "far this holds elsewhere.",
         )
     why = (
-        "Intervals count each run as one trial, since the maps of a run grow from one another: they "
-        "claim nothing that other seeds would not bear out."
+        "Intervals count each run as one trial, since the maps of a run grow from one another, so "
+        "they hold for other seeds too."
     )
     if settings:
         why += (

@@ -90,7 +90,7 @@ def pixels(page: Page) -> str:
 
 def test_it_is_small_enough(report: Path) -> None:
     size = report.stat().st_size
-    print(f"\n{report}: {size / 1e6:.1f} MB")
+    print(f"\n{report}: {size / 1e6:.1f} MB")  # noqa: T201  # the figures to report
     assert size < MAX_BYTES
 
 
@@ -103,7 +103,7 @@ def test_it_opens_in_time(browser: Browser, report: Path) -> None:
             page.evaluate("performance.getEntriesByType('navigation')[0].loadEventEnd") / 1000
         )
         page.close()
-    print(f"\nloaded after {', '.join(f'{seconds:.2f}' for seconds in found)} s")
+    print(f"\nloaded after {', '.join(f'{seconds:.2f}' for seconds in found)} s")  # noqa: T201  # the figures to report
     assert min(found) < MAX_LOAD_S
 
 
@@ -113,9 +113,7 @@ def test_nothing_is_fetched_and_nothing_complains(
     browser: Browser, report: Path, width: str, theme: Any
 ) -> None:
     across, down = WIDTHS[width]
-    opened = Opened(
-        browser, report, viewport={"width": across, "height": down}, color_scheme=theme
-    )
+    opened = Opened(browser, report, viewport={"width": across, "height": down}, color_scheme=theme)
     opened.scroll_through()
     assert opened.complaints == []
     assert opened.fetched == [report.as_uri()]
@@ -131,7 +129,8 @@ def test_the_slider_moves_the_map(opened: Opened) -> None:
     seen = {}
     for place in (0, 1, int(slider.get_attribute("max") or 0)):
         slider.evaluate(
-            "(range, value) => { range.value = value; range.dispatchEvent(new Event('input')); }", place
+            "(range, value) => { range.value = value; range.dispatchEvent(new Event('input')); }",
+            place,
         )
         picture = pixels(page)
         seen[page.locator("#k").inner_text()] = picture

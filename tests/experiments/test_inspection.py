@@ -11,7 +11,7 @@ import pytest
 from tiny_scenario import command
 
 from experiments import tables
-from experiments.inspection.parquet import KNOWN, inspect_table, unit_of
+from experiments.inspection.parquet import inspect_table, unit_of
 from experiments.stages.log import copy_log
 from mapfusion.storage import schema, write_table
 
@@ -62,21 +62,7 @@ def test_units_come_from_the_names(name: str, unit: str) -> None:
     assert unit_of(name) == unit
 
 
-def test_lengths_and_angles_of_all_tables_have_units() -> None:
-    """Only counts, names, indices and pure numbers go without one."""
-    plain = {"log_weight", "precision", "recall", "descriptor_distance", "effective_sample_size"}
-    for kind, known in KNOWN.items():
-        for field in known:
-            if pa.types.is_floating(field.type) and "nees" not in field.name:
-                without = field.name in plain or field.name.startswith(("share", "p_", "n_"))
-                assert without or unit_of(field.name) or kind not in {
-                    "result.errors", "result.estimates", "landmark_map", "trajectory"
-                }, (kind, field.name)
-
-
-def test_a_recorded_log(
-    tiny_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_recorded_log(tiny_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     copy_log(tiny_log, tmp_path / "R1")
     reply = command(capsys, "inspect", tmp_path / "R1")
     assert reply.code == 0

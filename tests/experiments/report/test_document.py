@@ -159,9 +159,7 @@ def test_the_command_says_where_it_wrote(
     assert str(tmp_path) in reply.complaints[0]
 
 
-def test_a_damaged_table_is_named(
-    copied: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_damaged_table_is_named(copied: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tables.table_path(copied, "map_history").write_bytes(b"PAR1 no more")
     reply = command(capsys, "report", copied)
     assert reply.code == 2

@@ -13,7 +13,10 @@ from experiments.statistics.maps import DEFAULT_CRITERIA
 def made_up(errors_m: dict[str, list[float]], n_true: list[int] | None = None) -> pd.DataFrame:
     """One run, one pair of robots: each aligner's errors, iteration by iteration."""
     rows = []
-    for aligner, values in {**errors_m, "oracle": [0.05] * len(next(iter(errors_m.values())))}.items():
+    for aligner, values in {
+        **errors_m,
+        "oracle": [0.05] * len(next(iter(errors_m.values()))),
+    }.items():
         for k, value in enumerate(values):
             found = np.isfinite(value)
             rows.append(
@@ -61,7 +64,9 @@ def test_the_more_often_correct_wins() -> None:
 
 
 def test_of_equally_correct_ones_the_more_accurate_wins() -> None:
-    verdict = verdict_of(made_up({"coarse": [0.2] * 20, "fine": [0.1] * 20}), timings(coarse=1, fine=9))
+    verdict = verdict_of(
+        made_up({"coarse": [0.2] * 20, "fine": [0.1] * 20}), timings(coarse=1, fine=9)
+    )
     assert [s.aligner for s in verdict.standings] == ["fine", "coarse"]
     assert verdict.equals == ()
     assert verdict.best is not None
@@ -119,7 +124,8 @@ def test_a_column_accepted_decides_what_is_merged() -> None:
 
 
 @pytest.mark.parametrize(
-    ("share", "text"), [(1, "100 %"), (0.9999, "> 99 %"), (0.001, "< 1 %"), (0, "0 %"), (0.5, "50 %")]
+    ("share", "text"),
+    [(1, "100 %"), (0.9999, "> 99 %"), (0.001, "< 1 %"), (0, "0 %"), (0.5, "50 %")],
 )
 def test_percentages_claim_nothing_that_is_not_so(share: float, text: str) -> None:
     assert percent(share).replace("\u00a0", " ") == text
