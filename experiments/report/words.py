@@ -59,8 +59,7 @@ def words_for(verdict: Verdict, n_robot_pairs: int, settings: Sequence[str] = ()
         )
         return Words("No common ground.", "", lead, _refusals(verdict), sure, why)
     if best is None:
-        lead = f"No method was correct on any of the {verdict.n_common} pairs of maps with "
-            "common ground."
+        lead = f"No method was correct on any of the {verdict.n_common} pairs with common ground."
         return Words("No method worked.", "", lead, (), sure, why)
     lead = (
         f"{best.aligner} put the two maps together correctly in {percent(best.rate)} of "
