@@ -2,8 +2,9 @@
 
 import os
 import sys
+import warnings
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -223,6 +224,65 @@ def merge(
     screen.print_fused(output, fused, joined)
 
 
+@app.command()
+def benchmark(
+    methods: Annotated[
+        list[str] | None,
+        typer.Option("--method", metavar="NAME", help="Only this method; may be repeated."),
+    ] = None,
+    trials: Annotated[int, typer.Option(help="Of each method in each cell.", min=1)] = 100,
+    pairs: Annotated[
+        list[int] | None, typer.Option(help="Numbers of pairs; may be repeated.", min=3)
+    ] = None,
+    outliers: Annotated[
+        list[float] | None,
+        typer.Option(help="Shares of false pairs; may be repeated.", min=0, max=1),
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of maps and methods.", min=0)] = 0,
+    settings: Annotated[
+        Path | None, typer.Option("--scenario", help="Scenario whose `align.aligners` to measure.")
+    ] = None,
+    budget_s: Annotated[
+        float, typer.Option(help="A cell that took longer ends with the trials it has.", min=0)
+    ] = 600.0,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Folder to write.")] = None,
+    results: Results = DEFAULT_RESULTS,
+) -> None:
+    """Success, error and time of all methods on made-up maps: `mapfusion benchmark`.
+
+    Serial, so that times can be compared; finished cells are reused.
+    """
+    from experiments import benchmark as measure
+    from experiments import screen
+    from experiments.benchmark_report import write_benchmark
+    from experiments.store import Store
+
+    plan = measure.Plan(
+        measure.entries_of(methods or (), settings),
+        trials,
+        seed,
+        budget_s,
+        tuple(pairs or measure.PAIR_COUNTS),
+        tuple(outliers or measure.OUTLIER_SHARES),
+    )
+    folder = output or results / "benchmark"
+    with screen.progress() as show:
+        rows = measure.run_benchmark(
+            plan, Store(results / "store"), lambda done, total: show("benchmark", done, total)
+        )
+    summary = measure.summarise(rows)
+    write_benchmark(folder, plan, rows, summary)
+    screen.print_benchmark(folder, summary)
+
+
+@app.command()
+def aligners() -> None:
+    """List the alignment methods that scenarios can name, and whose they are."""
+    from experiments import screen
+
+    screen.print_methods()
+
+
 @import_app.command("mrclam")
 def import_mrclam_command(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="An MRCLAM recording.")],
@@ -245,6 +305,7 @@ def main() -> None:
     from experiments.kernel_cache import use_kernel_cache
     from mapfusion.errors import InputError
 
+    _tell_name_clashes()
     try:
         use_kernel_cache()
         code = app(standalone_mode=False) or 0
@@ -270,6 +331,21 @@ def main() -> None:
     if code == EXIT_INTERRUPTED:
         _complain("interrupted; what was finished is kept, the same command goes on from there")
     sys.exit(code)
+
+
+def _tell_name_clashes() -> None:
+    """In one line each; other warnings keep Python's own form."""
+    from mapfusion.errors import NameClashWarning
+
+    show = warnings.showwarning
+
+    def tell(message: Warning | str, category: type[Warning], *rest: Any) -> None:
+        if issubclass(category, NameClashWarning):
+            _complain(f"warning: {message}")
+        else:
+            show(message, category, *rest)
+
+    warnings.showwarning = tell
 
 
 def _complain(text: str) -> None:

@@ -10,11 +10,14 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from experiments import tables
 from experiments.metrics import ORACLE
+from mapfusion.align.registry import known_methods, name_clashes
+from mapfusion.align.result import NOT_RUN, Status
 
 if TYPE_CHECKING:
     from experiments.checks import Outcome
@@ -41,6 +44,7 @@ _STAGE_TEXT = {
     "judge": "compare with the truth",
     "tables": "write the tables",
     "figures": "draw the figures",
+    "benchmark": "measure the aligners",
 }
 
 
@@ -73,6 +77,8 @@ def print_result(result: Path, skipped_figures: Sequence[str]) -> None:
     timings = tables.read(tables.table_path(result, "aligner_timings"), "aligner_timings")
     console = Console()
     console.print(_aligner_table(errors, timings, _aligner_order(result)))
+    for line in not_run_lines(errors):
+        console.print(f"  {line}", soft_wrap=True, markup=False)
     console.print(_pair_table(errors, _aligner_order(result)[0]))
     robots = tables.read(tables.table_path(result, "robots"), "robots")
     console.print(_robot_table(robots))
@@ -88,6 +94,7 @@ def _aligner_order(result: Path) -> list[str]:
 def aligner_summary(errors: pd.DataFrame, timings: pd.DataFrame, order: list[str]) -> pd.DataFrame:
     """One row an aligner: medians over the iterations with three or more true pairs."""
     used = errors[errors["n_true"] >= MIN_TRUE_PAIRS_SHOWN]
+    used = used[used["status"] != Status.ABSENT]  # neither accepted nor not
     rows = []
     for aligner in order:
         own = used[used["aligner"] == aligner]
@@ -108,6 +115,19 @@ def aligner_summary(errors: pd.DataFrame, timings: pd.DataFrame, order: list[str
             }
         )
     return pd.DataFrame(rows)
+
+
+def not_run_lines(errors: pd.DataFrame) -> list[str]:
+    """One line for each aligner, and each reason, that did not run."""
+    not_run = errors[errors["status"].isin(NOT_RUN)]
+    n_rows = errors.groupby("aligner").size().to_dict()
+    lines = []
+    for (aligner, status, reason), rows in not_run.groupby(
+        ["aligner", "status", "reason"], sort=False
+    ):
+        share = "" if status == Status.ABSENT else f" in {len(rows)} of {n_rows[aligner]} rows"
+        lines.append(f"{aligner}: {status}{share}: {reason}")
+    return lines
 
 
 def _aligner_table(errors: pd.DataFrame, timings: pd.DataFrame, order: list[str]) -> Table:
@@ -240,6 +260,47 @@ def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
         if reason:
             status = row["refined_status"]
             console.print(f"  {row['aligner']}: {status}: {reason}", soft_wrap=True, markup=False)
+
+
+def print_benchmark(folder: Path, summary: pd.DataFrame) -> None:
+    """Successes and times for each number of pairs, and where the rest is."""
+    console = Console()
+    for n_pairs, rows in summary.groupby("n_pairs", sort=False):
+        table = Table(title=f"{n_pairs} pairs: success in %, time in ms", **_LAYOUT)
+        table.add_column("outliers", no_wrap=True)
+        for share in rows["outlier_share"].drop_duplicates():
+            table.add_column(f"{100 * share:g} %", justify="right", no_wrap=True)
+        for method, own in rows.groupby("method", sort=False):
+            cells = [
+                "absent"
+                if row["status"] == Status.ABSENT
+                else f"{100 * row['success']:.0f}, {_number(1e3 * row['elapsed_s'], '.3g')}"
+                for row in own.to_dict("records")
+            ]
+            table.add_row(escape(str(method)), *cells)
+        console.print(table)
+    failed = summary[summary["n_failed"] > 0]
+    for method, rows in failed.groupby("method", sort=False):
+        text = f"  {method}: failed in {rows['n_failed'].sum()} trials, see trials.parquet"
+        console.print(text, soft_wrap=True, markup=False)
+    console.print(f"Table and figure: {folder}", soft_wrap=True)
+
+
+def print_methods() -> None:
+    """Every alignment method by name, whose it is, and what is wrong where something is."""
+    table = Table(title="Alignment methods", **_LAYOUT)
+    for heading in ("method", "whose", "package", "version"):
+        table.add_column(heading)
+    methods = known_methods().values()
+    for method in methods:
+        version = "absent" if method.absence else method.version
+        cells = (method.name, method.kind, method.distribution, version)
+        table.add_row(*(escape(cell) for cell in cells))
+    console = Console()
+    console.print(table)
+    lines = [f"{method.name}: {method.absence}" for method in methods if method.absence]
+    for line in [*lines, *name_clashes().values()]:
+        console.print(f"  {line}", soft_wrap=True, markup=False)
 
 
 def print_fused(path: Path, fused: "FusedMap", names: Sequence[str]) -> None:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from experiments.aligner_calls import callable_aligner, refine_estimate
 from experiments.pipeline import OnProgress, record_logs
 from experiments.randomness import generator
 from experiments.scenario import Align, Merge, Scenario, Slam, load_section
@@ -11,7 +12,6 @@ from experiments.stages.align import estimate_row
 from experiments.stages.log import copy_log
 from experiments.store import Store
 from mapfusion.align.correspondences import match
-from mapfusion.align.registry import make_aligner
 from mapfusion.errors import InputError
 from mapfusion.fastslam.run import run_log
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map
@@ -73,9 +73,9 @@ def align(path_a: Path, path_b: Path, settings: Align, seed: int) -> list[dict[s
     pairs = match(map_a, map_b, settings.match)
     rows = []
     for entry in settings.aligners:
-        aligner = make_aligner(entry.method, **entry.parameters)
+        aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
         estimated = aligner.align(map_a, map_b, pairs, generator(seed, "align", entry.name))
-        refined = settings.refinement.refine(map_a, map_b, pairs, estimated.T_a_b)
+        refined = refine_estimate(settings.refinement, map_a, map_b, pairs, estimated)
         rows.append(
             {
                 "aligner": entry.name,
@@ -100,12 +100,13 @@ def merge(
         raise InputError(f"merge.aligner: {settings.aligner} is not among {', '.join(entries)}")
     entry = entries[settings.aligner]
     maps = [read_map(path) for path in paths]
+    aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
     alignments, offered = [], []
     for number, other in enumerate(maps[1:], start=1):
         pairs = match(maps[0], other, align_section.match)
         rng = generator(seed, "align", entry.name, number)
-        estimated = make_aligner(entry.method, **entry.parameters).align(maps[0], other, pairs, rng)
-        refined = align_section.refinement.refine(maps[0], other, pairs, estimated.T_a_b)
+        estimated = aligner.align(maps[0], other, pairs, rng)
+        refined = refine_estimate(align_section.refinement, maps[0], other, pairs, estimated)
         alignments.append(refined)
         offered.append(pairs)
     fused = merge_maps(maps, alignments, offered, settings.parameters)

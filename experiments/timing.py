@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 
 from experiments import tables
+from experiments.aligner_calls import callable_aligner
 from experiments.evaluate import EvaluatedRobot
 from experiments.randomness import generator
 from experiments.scenario import Scenario
 from experiments.truth import common_landmarks
 from mapfusion.align.correspondences import match
-from mapfusion.align.registry import make_aligner
 
 _WARM_UP_RUNS = 1  # compilation and caches
 
@@ -25,16 +25,19 @@ def time_aligners(scenario: Scenario, a: EvaluatedRobot, b: EvaluatedRobot, path
 def _time_pair(scenario: Scenario, a: EvaluatedRobot, b: EvaluatedRobot) -> list[dict[str, Any]]:
     iterations = sorted(set(a.maps) | set(b.maps))
     spread = np.linspace(0, len(iterations) - 1, scenario.evaluate.timing_points)
+    aligners = [
+        (entry.name, callable_aligner(entry.method, entry.parameters, entry.time_limit_s))
+        for entry in scenario.align.aligners
+    ]
     rows = []
     for iteration in (iterations[i] for i in sorted(set(spread.round().astype(int).tolist()))):
         (map_a, points_a), (map_b, points_b) = a.at(iteration), b.at(iteration)
         pairs = match(map_a, map_b, scenario.align.match)
         n_common = common_landmarks(points_a, points_b, scenario.evaluate.true_pair_radius_m)
-        for entry in scenario.align.aligners:
-            aligner = make_aligner(entry.method, **entry.parameters)
+        for name, aligner in aligners:
             elapsed = [
                 aligner.align(
-                    map_a, map_b, pairs, generator(scenario.seed, "timing", entry.name, repeat)
+                    map_a, map_b, pairs, generator(scenario.seed, "timing", name, repeat)
                 ).elapsed_s
                 for repeat in range(_WARM_UP_RUNS + scenario.evaluate.timing_repeats)
             ][_WARM_UP_RUNS:]
@@ -44,7 +47,7 @@ def _time_pair(scenario: Scenario, a: EvaluatedRobot, b: EvaluatedRobot) -> list
                     "robot_a": a.name,
                     "robot_b": b.name,
                     "iteration": iteration,
-                    "aligner": entry.name,
+                    "aligner": name,
                     "n_correspondences": len(pairs),
                     "n_common": n_common,
                     "elapsed_s": median,

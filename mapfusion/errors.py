@@ -6,3 +6,7 @@ class InputError(ValueError):
 
     Its text is one line that names the file, the field and what would be right.
     """
+
+
+class NameClashWarning(UserWarning):
+    """Two methods claim one name; the text says in one line which of them has it."""

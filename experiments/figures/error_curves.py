@@ -63,7 +63,7 @@ def draw_error_curves(
         panels[row, 0].set_ylabel(label)
     scale(panels[0, 0], drawn)
     figure.supxlabel("FastSLAM iteration k" + (f"\n{note}" if note else ""), fontsize=8)
-    _add_legend(figure, data.aligners)
+    _add_legend(figure, data)
     return figure
 
 
@@ -132,11 +132,11 @@ def _shade_scarce(axes: Axes, errors: pd.DataFrame) -> None:
         )
 
 
-def _add_legend(figure: Figure, aligners: list[str]) -> None:
-    styles = aligner_styles(aligners)
+def _add_legend(figure: Figure, data: ResultTables) -> None:
+    styles = aligner_styles(data.aligners)
     handles: list[Line2D | Patch] = []
-    for name in aligners:
-        handles.append(Line2D([], [], label=name, **styles[name]))
+    for name in data.aligners:
+        handles.append(Line2D([], [], label=data.label_of(name), **styles[name]))
     handles.append(
         Patch(color=BLUE, alpha=_BAND_ALPHA, linewidth=0, label="10-90 % of repetitions")
     )

@@ -4,6 +4,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from experiments.figures.result_tables import NothingToDraw, ResultTables
 from experiments.figures.style import PAGE_WIDTH_IN, aligner_styles, plain_numbers
@@ -12,6 +13,7 @@ from experiments.metrics import ORACLE
 # The line that guides the eye joins the points while they are few, else medians of so many groups.
 _MAX_JOINED = 16
 _GROUPS = 8
+_LEGEND_COLUMNS = 5
 
 
 def draw(data: ResultTables) -> Figure:
@@ -33,8 +35,11 @@ def draw(data: ResultTables) -> Figure:
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter(plain_numbers())
     panels[0].set_ylabel("time of one alignment (s)")
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), handlelength=3.2)
+    styles = aligner_styles(data.aligners)
+    shown = [name for name in data.aligners if name in found or data.label_of(name) != name]
+    handles = [Line2D([], [], label=data.label_of(name), **styles[name]) for name in shown]
+    columns = min(len(handles), _LEGEND_COLUMNS)
+    figure.legend(handles=handles, loc="outside upper center", ncols=columns, handlelength=3.2)
     return figure
 
 

@@ -11,6 +11,7 @@ import pyarrow as pa
 
 from experiments.metrics import ORACLE
 from experiments.tables import read, table_path
+from mapfusion.align.result import Status
 from mapfusion.errors import InputError
 from mapfusion.se2 import Float, between, inverse, transform_points
 from mapfusion.storage import COVARIANCE_FIELDS, POSITION_FIELDS, points_from
@@ -63,6 +64,12 @@ class ResultTables:
         names = [name for name in listed if name in found]
         names += [name for name in found if name not in names and name != ORACLE]
         return names + [ORACLE] * (ORACLE in found)
+
+    def label_of(self, aligner: str) -> str:
+        """An aligner's name in legends, with a word where its package is not installed."""
+        errors = self.table("errors")
+        status = errors["status"][errors["aligner"] == aligner]
+        return f"{aligner} (absent)" if (status == Status.ABSENT).any() else aligner
 
     def last_iteration(self, pair: Pair) -> int:
         """The last iteration at which the pair's maps were aligned: that of the stored maps."""

@@ -23,6 +23,8 @@ BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY = (
     "#E69F00",
     "#56B4E9",
 )
+# Four of Tol's (2021) muted scheme, darker or duller than those, where more methods are compared.
+INDIGO, WINE, OLIVE, TEAL = "#332288", "#882255", "#999933", "#44AA99"
 BLACK, GRAY, PALE_GRAY = "#000000", "#7F7F7F", "#C8C8C8"
 SEQUENTIAL_MAP = "viridis"
 
@@ -46,15 +48,34 @@ _RC: dict[str, Any] = {
     "svg.fonttype": "path",
     "svg.hashsalt": "mapfusion",  # else every SVG gets element ids of its own
 }
-# Lines also differ in dashes and markers, for prints in gray.
-_ALIGNER_STYLES: tuple[dict[str, Any], ...] = (
-    {"color": BLUE, "linestyle": "-", "marker": "o"},
-    {"color": VERMILLION, "linestyle": (0, (6, 1, 1, 1)), "marker": "s"},
-    {"color": ORANGE, "linestyle": (0, (1, 1)), "marker": "D"},
-    {"color": GREEN, "linestyle": (0, (5, 1)), "marker": "^"},
-    {"color": PURPLE, "linestyle": (0, (3, 1, 1, 1, 1, 1)), "marker": "v"},
-    {"color": SKY, "linestyle": "-", "marker": "P"},
+# Lines also differ in dashes and markers, for prints in gray. Each known method always looks alike.
+_ALIGNER_STYLES: dict[str, dict[str, Any]] = {
+    "ransac": {"color": BLUE, "linestyle": "-", "marker": "o"},
+    "svd": {"color": VERMILLION, "linestyle": (0, (6, 1, 1, 1)), "marker": "s"},
+    "svd-solved": {"color": ORANGE, "linestyle": (0, (1, 1)), "marker": "D"},
+    "icp": {"color": GREEN, "linestyle": (0, (5, 1)), "marker": "^"},
+    "impicp": {"color": PURPLE, "linestyle": (0, (3, 1, 1, 1, 1, 1)), "marker": "v"},
+    "gnc": {"color": SKY, "linestyle": (0, (8, 2)), "marker": "P"},
+    "clique": {"color": INDIGO, "linestyle": "-", "marker": "*"},
+    "ransac_mahalanobis": {"color": WINE, "linestyle": (0, (6, 1, 1, 1)), "marker": "X"},
+    "opencv": {"color": OLIVE, "linestyle": (0, (3, 1)), "marker": "<"},
+    "kiss_matcher": {"color": TEAL, "linestyle": (0, (3, 1, 1, 1, 1, 1)), "marker": ">"},
+}
+# All others (plug-ins, names of a scenario's own) by their place among themselves. The lengths have
+# no common factor, so 99 styles come before one repeats.
+_OTHER_COLOURS = (INDIGO, OLIVE, BLUE, WINE, TEAL, VERMILLION, SKY, ORANGE, PURPLE, GREEN, GRAY)
+_OTHER_DASHES = (
+    (0, (2, 2)),
+    (0, (9, 1, 2, 1)),
+    "-",
+    (0, (4, 1, 1, 1)),
+    (0, (1, 2)),
+    (0, (7, 3)),
+    (0, (5, 1, 1, 1, 1, 1, 1, 1)),
+    (0, (3, 3)),
+    (0, (10, 2, 4, 2)),
 )
+_OTHER_MARKERS = ("p", "h", "d", "8", "H", "1", "2", "3", "4")
 _ORACLE_STYLE: dict[str, Any] = {"color": BLACK, "linestyle": (0, (4, 2)), "marker": "x"}
 _ROBOT_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
 FUSED_COLOUR = BLACK
@@ -73,20 +94,16 @@ def house_style() -> Iterator[None]:
 
 
 def aligner_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Line style of each aligner by its place in the display order; the oracle has its own.
-
-    Beyond as many as there are colours, dashes and markers move on, so that no two look alike.
-    """
-    estimators = [name for name in names if name != ORACLE]
-    styles = {name: _aligner_style(place) for place, name in enumerate(estimators)}
-    return styles | {ORACLE: _ORACLE_STYLE}
-
-
-def _aligner_style(place: int) -> dict[str, Any]:
-    n = len(_ALIGNER_STYLES)
-    return {
-        **_ALIGNER_STYLES[(place + place // n) % n],
-        "color": _ALIGNER_STYLES[place % n]["color"],
+    """Line style of each aligner: its own if it has one, else by its place among those without."""
+    styles = _ALIGNER_STYLES | {ORACLE: _ORACLE_STYLE}
+    others = [name for name in names if name not in styles]
+    return styles | {
+        name: {
+            "color": _OTHER_COLOURS[place % len(_OTHER_COLOURS)],
+            "linestyle": _OTHER_DASHES[place % len(_OTHER_DASHES)],
+            "marker": _OTHER_MARKERS[place % len(_OTHER_MARKERS)],
+        }
+        for place, name in enumerate(others)
     }
 
 

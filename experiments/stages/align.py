@@ -9,12 +9,13 @@ import numpy as np
 import pandas as pd
 
 from experiments import tables
+from experiments.aligner_calls import CallableAligner, callable_aligner, refine_estimate
 from experiments.randomness import generator
 from experiments.scenario import AlignerEntry, Scenario
 from experiments.stages.slam import read_snapshots
 from experiments.store import StageFolder, Store
 from mapfusion.align.correspondences import Correspondences, match
-from mapfusion.align.registry import make_aligner
+from mapfusion.align.registry import find_method
 from mapfusion.align.result import Alignment, Status
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import read_log
@@ -27,6 +28,8 @@ SOURCES = (
     "mapfusion/se2.py",
 )
 SOURCES += ("experiments/stages/align.py", "experiments/tables.py", "experiments/randomness.py")
+SOURCES += ("experiments/aligner_calls.py", "experiments/isolation.py", "experiments/workers.py")
+SOURCES += ("experiments/isolated_child.py",)
 
 # Evaluated iterations a task: small enough that an interruption loses little and two cores end
 # at about the same time, large enough that reading the maps costs little beside aligning them.
@@ -49,6 +52,7 @@ def stage(
 ) -> StageFolder:
     """Where the joined estimates of this pair of robots are or will be."""
     settings = {"seed": scenario.seed, "align": scenario.align.model_dump(mode="json")}
+    settings["origins"] = [_origin(entry) for entry in scenario.align.aligners]
     return store.stage("align", settings, [slam_a, slam_b], SOURCES)
 
 
@@ -59,10 +63,20 @@ def parts(store: Store, scenario: Scenario, slam_a: StageFolder, slam_b: StageFo
     common = {"seed": scenario.seed}
     common |= {name: resolved[name] for name in ("refinement", "repetitions")}
     aligners = tuple(
-        store.stage("aligner", common | {"entry": entry}, [match_folder], SOURCES)
-        for entry in resolved["aligners"]
+        store.stage(
+            "aligner",
+            common | {"entry": entry.model_dump(mode="json"), "origin": _origin(entry)},
+            [match_folder],
+            SOURCES,
+        )
+        for entry in scenario.align.aligners
     )
     return Parts(match_folder, aligners)
+
+
+def _origin(entry: AlignerEntry) -> dict[str, str]:
+    """Package, version and files of an aligner that is not our own."""
+    return find_method(entry.method).origin()
 
 
 def batches(iterations: list[int]) -> list[list[int]]:
@@ -95,10 +109,11 @@ def run_batch(
     for entry, folder in zip(scenario.align.aligners, output.aligners, strict=True):
         path = _batch_path(folder, index)
         if not path.is_file():
+            aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
             rows = [
                 row
                 for k, (map_a, map_b) in maps.items()
-                for row in _estimate(scenario, entry, map_a, map_b, offered[k], k)
+                for row in _estimate(scenario, entry, aligner, map_a, map_b, offered[k], k)
             ]
             tables.write(path, "estimates", rows)
 
@@ -136,22 +151,24 @@ def _offered(names: dict[str, Any], pairs: Correspondences) -> pd.DataFrame:
 def _estimate(
     scenario: Scenario,
     entry: AlignerEntry,
+    aligner: CallableAligner,
     map_a: LandmarkMap,
     map_b: LandmarkMap,
     pairs: Correspondences,
     iteration: int,
 ) -> list[dict[str, Any]]:
     settings, seed = scenario.align, scenario.seed
-    aligner = make_aligner(entry.method, **entry.parameters)
     names = {"robot_a": map_a.name, "robot_b": map_b.name, "iteration": iteration}
     rows = []
-    refinements: dict[bytes, Alignment] = {}  # repetitions often come to the very same estimate
+    refinements: dict[object, Alignment] = {}  # repetitions often come to the very same estimate
     for repetition in range(settings.repetitions if aligner.randomised else 1):
         purpose = (map_a.name, map_b.name, iteration, entry.name, repetition)
         estimated = aligner.align(map_a, map_b, pairs, generator(seed, "align", *purpose))
-        known = estimated.T_a_b.tobytes()
+        known = (estimated.T_a_b.tobytes(), estimated.status, estimated.reason)
         if known not in refinements:
-            refinements[known] = settings.refinement.refine(map_a, map_b, pairs, estimated.T_a_b)
+            refinements[known] = refine_estimate(
+                settings.refinement, map_a, map_b, pairs, estimated
+            )
         rows.append(
             names
             | {"aligner": entry.name, "repetition": repetition}

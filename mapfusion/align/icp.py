@@ -19,7 +19,7 @@ from mapfusion.align.pairs import (
     why_too_few,
 )
 from mapfusion.align.result import Alignment
-from mapfusion.align.rigid import fit_rigid
+from mapfusion.align.rigid import fit_rigid, least_squares_gain
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.se2 import Float
 
@@ -64,7 +64,7 @@ class Icp:
             return undetermined(reason, len(pairs), started_s)
         start = draw_motion(pairs, np.arange(len(pairs)), rng)
         closest = ClosestPoints(map_a, map_b)
-        return closest.align(start, pairs, correspondences, self.max_rounds, started_s)
+        return closest.align(start, correspondences, self.max_rounds, started_s)
 
 
 def why_no_start(map_a: LandmarkMap, map_b: LandmarkMap, pairs: Pairs) -> str:
@@ -84,6 +84,7 @@ class ClosestPoints:
     def __init__(self, map_a: LandmarkMap, map_b: LandmarkMap) -> None:
         upright = np.array([1.0, 1.0, 0.0 if map_a.planar or map_b.planar else 1.0])
         grid = Grid.of(map_a.position_m * upright)
+        self._maps = map_a, map_b
         self._row = grid.row
         self._cells = (grid.p, grid.start, grid.corner_m, grid.cell_m, grid.shape)
         self._p_b = map_b.position_m * upright
@@ -93,18 +94,16 @@ class ClosestPoints:
         return summed_square_distance(T_a_b, self._p_b, *self._cells)
 
     def align(
-        self,
-        T_a_b: Float,
-        pairs: Pairs,
-        correspondences: Correspondences,
-        max_rounds: int,
-        started_s: float,
+        self, T_a_b: Float, correspondences: Correspondences, max_rounds: int, started_s: float
     ) -> Alignment:
         """Pair and solve from T_a_b on until the pairing repeats."""
         T_a_b, nearest, repeats = iterate(T_a_b, max_rounds, self._p_b, *self._cells)
         refusal = "" if repeats else f"pairs still changed after {max_rounds} rounds"
-        inlier = self._row[nearest][correspondences.index_b] == correspondences.index_a
-        return finish(pairs, T_a_b, inlier, started_s, refusal)
+        index_a, index_b = self._row[nearest], np.arange(len(nearest))
+        inlier = index_a[correspondences.index_b] == correspondences.index_a
+        paired = gather(*self._maps, Correspondences(index_a, index_b, np.zeros(len(nearest))))
+        gain = least_squares_gain(T_a_b, paired.p_b)
+        return finish(paired, gain, T_a_b, inlier, started_s, refusal)
 
 
 @njit(cache=True)

@@ -64,4 +64,4 @@ class ImpIcp:
         closest = ClosestPoints(map_a, map_b)
         starts = [draw_motion(pairs, best, rng) for _ in range(self.sets)]
         start = min(starts, key=closest.cost_m2)
-        return closest.align(start, pairs, correspondences, self.max_rounds, started_s)
+        return closest.align(start, correspondences, self.max_rounds, started_s)

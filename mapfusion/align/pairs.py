@@ -124,29 +124,31 @@ def why_one_place(pairs: Pairs, drift_m2: float = 0.0) -> str:
 
 
 def finish(
-    pairs: Pairs, T_a_b: Float, inlier: np.ndarray, started_s: float, refusal: str = ""
+    fitted: Pairs,
+    gain: Float,
+    T_a_b: Float,
+    inlier: np.ndarray,
+    started_s: float,
+    refusal: str = "",
 ) -> Alignment:
-    """An estimator's result: its motion with drift and covariance judged from the inliers.
+    """An estimator's result: its motion, with drift and covariance judged from what it fitted.
 
     Args:
-        pairs: all that were given to the estimator.
+        fitted: the pairs whose residuals made the estimate.
+        gain: how much each moved it (len(fitted), 3, 2), as from `rigid.least_squares_gain`.
         T_a_b: (3,).
-        inlier: (N,) bool.
+        inlier: (N,) bool over the correspondences given.
         started_s: `time.perf_counter()` at the start.
         refusal: why the estimate is not to be trusted, if so.
     """
     n_inliers = int(np.count_nonzero(inlier))
     if n_inliers < MIN_PAIRS and not refusal:
         refusal = f"{n_inliers} correspondences agree, at least {MIN_PAIRS} are needed"
-    covariance, drift = np.full((3, 3), np.nan), float("nan")
-    if n_inliers >= 2:
-        kept = pairs[inlier]
-        own = residual_covariances(T_a_b, kept.covariance_a, kept.covariance_b)
-        drift = estimate_drift_m(residuals(T_a_b, kept.p_a, kept.p_b), own)
-        covariance = motion_covariance(T_a_b, kept.p_b, own + drift**2 * np.eye(2))
+    own = residual_covariances(T_a_b, fitted.covariance_a, fitted.covariance_b)
+    drift = estimate_drift_m(residuals(T_a_b, fitted.p_a, fitted.p_b), own)
     return Alignment(
         T_a_b,
-        covariance,
+        motion_covariance(gain, own + drift**2 * np.eye(2)),
         inlier,
         time.perf_counter() - started_s,
         Status.REFUSED if refusal else Status.ACCEPTED,

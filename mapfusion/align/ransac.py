@@ -11,7 +11,7 @@ from numba import njit
 from mapfusion.align.correspondences import Correspondences, HeightGate
 from mapfusion.align.pairs import finish, gather, undetermined, why_too_few
 from mapfusion.align.result import Alignment
-from mapfusion.align.rigid import fit_rigid
+from mapfusion.align.rigid import fit_rigid, fit_two, least_squares_gain
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.se2 import Float
 
@@ -91,7 +91,9 @@ class Ransac:
             return undetermined(reason, len(pairs), started_s)
         inlier = np.zeros(len(pairs), dtype=bool)
         inlier[rows[support]] = True
-        return finish(pairs, T_a_b, inlier, started_s)
+        fitted = pairs[inlier]
+        gain = least_squares_gain(T_a_b, fitted.p_b)
+        return finish(fitted, gain, T_a_b, inlier, started_s)
 
 
 @njit(cache=True)
@@ -121,17 +123,11 @@ def _two_point_motion(
     """Fill T_a_b from pairs i and j, or return False when they cannot both support one motion."""
     ax, ay = p_a[j, 0] - p_a[i, 0], p_a[j, 1] - p_a[i, 1]
     bx, by = p_b[j, 0] - p_b[i, 0], p_b[j, 1] - p_b[i, 1]
-    length_a, length_b = math.sqrt(ax * ax + ay * ay), math.sqrt(bx * bx + by * by)
+    difference = math.sqrt(ax * ax + ay * ay) - math.sqrt(bx * bx + by * by)
     # the fit leaves half the difference at either end, so beyond 2 gates neither end is a supporter
-    if abs(length_a - length_b) > 2 * gate_m or min(length_a, length_b) < min_baseline_m:
+    if abs(difference) > 2 * gate_m:
         return False
-    theta = math.atan2(ay * bx - ax * by, ax * bx + ay * by)
-    cos, sin = math.cos(theta), math.sin(theta)
-    mid_bx, mid_by = (p_b[i, 0] + p_b[j, 0]) / 2, (p_b[i, 1] + p_b[j, 1]) / 2
-    T_a_b[0] = (p_a[i, 0] + p_a[j, 0]) / 2 - cos * mid_bx + sin * mid_by
-    T_a_b[1] = (p_a[i, 1] + p_a[j, 1]) / 2 - sin * mid_bx - cos * mid_by
-    T_a_b[2] = theta
-    return True
+    return fit_two(p_a, p_b, i, j, T_a_b) >= min_baseline_m
 
 
 @njit(cache=True)

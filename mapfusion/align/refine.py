@@ -184,8 +184,54 @@ def normal_equations(
 
 
 @njit(cache=True)
+def missing_information(
+    T_a_b: Float,
+    p_b: Float,
+    e: Float,
+    S: Float,
+    weighed_m2: float,
+    judged_m2: float,
+    truth: Float,
+) -> Float:
+    """What not knowing which pairs are true takes from the information (3, 3) (Louis 1982).
+
+    When the motion moves, so do the probabilities: d truth / de = -truth (1 - truth) C^-1 e, and a
+    normal matrix with certain weights would promise too much.
+
+    Args:
+        T_a_b: (3,).
+        p_b: (N, 2 or more).
+        e: (N, 2) residuals.
+        S: (N, 2, 2) S_a + R S_b R^T.
+        weighed_m2: s_drift^2 in the weights.
+        judged_m2: s_drift^2 in the probabilities.
+        truth: (N,) probability of being true.
+    """
+    cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+    missing = np.zeros((3, 3))
+    pull, turn = np.empty(3), np.empty(3)
+    for i in range(len(e)):
+        share = truth[i] * (1 - truth[i])
+        if share == 0:
+            continue
+        jx = -sin * p_b[i, 0] - cos * p_b[i, 1]
+        jy = cos * p_b[i, 0] - sin * p_b[i, 1]
+        for variance, force in ((weighed_m2, pull), (judged_m2, turn)):
+            xx, xy, yy = S[i, 0, 0] + variance, S[i, 0, 1], S[i, 1, 1] + variance
+            det = xx * yy - xy * xy
+            force[0] = (yy * e[i, 0] - xy * e[i, 1]) / det
+            force[1] = (xx * e[i, 1] - xy * e[i, 0]) / det
+            force[2] = jx * force[0] + jy * force[1]
+        for row in range(3):
+            for column in range(3):
+                product = pull[row] * turn[column] + turn[row] * pull[column]
+                missing[row, column] += share * product / 2
+    return missing
+
+
+@njit(cache=True)
 def invert(matrix: Float, inverse: Float) -> bool:
-    """Fill the inverse (3, 3) of a symmetric matrix by cofactors; False when it is singular.
+    """Fill the inverse (3, 3) of a symmetric matrix by cofactors; False unless positive definite.
 
     Three by three needs no LAPACK, whose wrappers take seconds to compile.
     """
@@ -198,7 +244,8 @@ def invert(matrix: Float, inverse: Float) -> bool:
     inverse[1, 2] = inverse[2, 1] = b * c - a * e
     inverse[2, 2] = a * d - b * b
     det = a * inverse[0, 0] + b * inverse[0, 1] + c * inverse[0, 2]
-    if not det > _SINGULAR * a * d * f:
+    positive = a > 0 and inverse[2, 2] > 0  # with det > 0 the leading minors (Sylvester)
+    if not (positive and det > _SINGULAR * a * d * f):
         return False
     for i in range(3):
         for j in range(3):
@@ -220,8 +267,9 @@ def iterate(
     """Expectation maximisation for motion, s_drift and share of true pairs.
 
     Returns:
-        Whether the pairs determine a motion, how far the last step moved a landmark (m), T_a_b
-        (3,), its covariance (3, 3), s_drift^2, each pair's probability of being true (N,).
+        Whether the pairs determine a motion and its covariance, how far the last step moved a
+        landmark (m), T_a_b (3,), its covariance (3, 3), s_drift^2, each pair's probability of being
+        true (N,).
     """
     n = len(p_a)
     T_a_b = T_start.copy()
@@ -231,12 +279,15 @@ def iterate(
     variance, share = widest, 0.5
     covariance, step = np.full((3, 3), np.nan), np.empty(3)
     moved = math.inf
+    judged = weighed = variance
+    normal, at = np.zeros((3, 3)), np.empty(3)
     for rounds in range(max_rounds):
         residuals_under(T_a_b, p_a, p_b, S_a, S_b, e, S)
         if rounds < _GATE_ROUNDS:
             for i in range(n):
                 inside[i] = e[i, 0] * e[i, 0] + e[i, 1] * e[i, 1] <= gate_m * gate_m
-        judged = max(variance, least_drift_m * least_drift_m)
+        at[:] = T_a_b
+        weighed, judged = variance, max(variance, least_drift_m * least_drift_m)
         truth_probabilities(e, S, judged, share, gate_m, inside, truth)
         total = np.sum(truth)
         if total < 1.0:
@@ -263,4 +314,5 @@ def iterate(
             T_a_b[k] += step[k]
         if moved <= _TOLERANCE_M:
             break
-    return True, moved, T_a_b, covariance, variance, truth
+    normal -= missing_information(at, p_b, e, S, weighed, judged, truth)
+    return invert(normal, covariance), moved, T_a_b, covariance, variance, truth

@@ -14,6 +14,11 @@ class Status(StrEnum):
     ACCEPTED = "accepted"
     REFUSED = "refused"  # an answer was found and is not to be trusted
     DEGENERATE = "degenerate"  # the data do not determine an answer
+    FAILED = "failed"  # the method raised, hung, ended its process or answered nonsense
+    ABSENT = "absent"  # the package behind the method is not installed
+
+
+NOT_RUN = frozenset({Status.FAILED, Status.ABSENT})  # nothing can be said about the maps
 
 
 @dataclass(frozen=True)
@@ -27,7 +32,7 @@ class Alignment:
             in it, so that real errors are larger: the evaluation reports the NEES.
         inlier: (N,) bool over the correspondences given.
         elapsed_s: time of the estimation.
-        status: accepted, refused or degenerate.
+        status: accepted, refused or degenerate; failed and absent come from the harness alone.
         reason: empty when accepted, else what a person can act on.
         drift_sigma_m: s_drift, the standard deviation per axis of the residuals of pairs beyond
             what the landmarks' covariances explain (both maps together); NaN when degenerate.
@@ -49,11 +54,18 @@ class Alignment:
 
 def degenerate(reason: str, n_correspondences: int, elapsed_s: float = 0.0) -> Alignment:
     """The result for data that determine no alignment."""
+    return without_answer(Status.DEGENERATE, reason, n_correspondences, elapsed_s)
+
+
+def without_answer(
+    status: Status, reason: str, n_correspondences: int, elapsed_s: float = float("nan")
+) -> Alignment:
+    """A result that holds no motion."""
     return Alignment(
         np.full(3, np.nan),
         np.full((3, 3), np.nan),
         np.zeros(n_correspondences, dtype=bool),
         elapsed_s,
-        Status.DEGENERATE,
+        status,
         reason,
     )

@@ -44,6 +44,20 @@ def fit_rigid(p_a: Float, p_b: Float, rows: np.ndarray) -> tuple[float, float, f
     return mean_ax - cos * mean_bx + sin * mean_by, mean_ay - sin * mean_bx - cos * mean_by, theta
 
 
+@njit(cache=True)
+def fit_two(p_a: Float, p_b: Float, i: int, j: int, T_a_b: Float) -> float:
+    """Fill T_a_b (3,) with the motion of pairs i and j; returns the shorter of their distances."""
+    ax, ay = p_a[j, 0] - p_a[i, 0], p_a[j, 1] - p_a[i, 1]
+    bx, by = p_b[j, 0] - p_b[i, 0], p_b[j, 1] - p_b[i, 1]
+    theta = math.atan2(ay * bx - ax * by, ax * bx + ay * by)
+    cos, sin = math.cos(theta), math.sin(theta)
+    mid_bx, mid_by = (p_b[i, 0] + p_b[j, 0]) / 2, (p_b[i, 1] + p_b[j, 1]) / 2
+    T_a_b[0] = (p_a[i, 0] + p_a[j, 0]) / 2 - cos * mid_bx + sin * mid_by
+    T_a_b[1] = (p_a[i, 1] + p_a[j, 1]) / 2 - sin * mid_bx - cos * mid_by
+    T_a_b[2] = theta
+    return math.sqrt(min(ax * ax + ay * ay, bx * bx + by * by))
+
+
 def residuals(T_a_b: Float, p_a: Float, p_b: Float) -> Float:
     """p_a - T_a_b p_b in the plane (N, 2)."""
     return (p_a - transform_points(T_a_b, p_b))[:, :2]
@@ -55,17 +69,30 @@ def residual_covariances(T_a_b: Float, covariance_a: Float, covariance_b: Float)
     return covariance_a[:, :2, :2] + R_a_b @ covariance_b[:, :2, :2] @ R_a_b.T
 
 
-def motion_covariance(T_a_b: Float, p_b: Float, covariance_m2: Float) -> Float:
-    """Covariance (3, 3) of T_a_b from the normal equations weighted with 1 / covariance_m2.
+def least_squares_gain(T_a_b: Float, p_b: Float, weight: Float | None = None) -> Float:
+    """How much each residual moves the motion that minimises sum of weight |p_a - T p_b|^2.
+
+    To first order T_a_b's error is the sum of the gains (N, 3, 2) times the residuals.
 
     Args:
         T_a_b: (3,).
-        p_b: (N, 3).
-        covariance_m2: (N, 2, 2) of the residuals, drift included.
+        p_b: (N, 2 or more); not all in one place.
+        weight: (N,); all equal by default.
     """
     jacobian = motion_jacobian(T_a_b, p_b)
-    information = np.einsum("nki,nkl,nlj->ij", jacobian, np.linalg.inv(covariance_m2), jacobian)
-    return np.linalg.inv(information)
+    if weight is None:
+        weight = np.ones(len(p_b))
+    weighted = np.swapaxes(jacobian, 1, 2) * weight[:, None, None]
+    return np.linalg.inv(np.einsum("nik,nkj->ij", weighted, jacobian)) @ weighted
+
+
+def motion_covariance(gain: Float, covariance_m2: Float) -> Float:
+    """Covariance (3, 3) of a motion from its gains (N, 3, 2) and independent residuals' (N, 2, 2).
+
+    Weights that are not the inverse covariances make it larger than the inverse of the normal
+    matrix: this is the sandwich of the two.
+    """
+    return np.einsum("nik,nkl,njl->ij", gain, covariance_m2, gain)
 
 
 def motion_jacobian(T_a_b: Float, p_b: Float) -> Float:

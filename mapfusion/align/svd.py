@@ -59,20 +59,30 @@ class Svd:
             )
         if reason:
             return undetermined(reason, len(pairs), started_s)
-        T_a_b = solve(pairs.p_a[:, :2], pairs.p_b[:, :2], self.translation)
-        return finish(pairs, T_a_b, np.ones(len(pairs), dtype=bool), started_s)
+        T_a_b, gain = solve(pairs.p_a[:, :2], pairs.p_b[:, :2], self.translation)
+        return finish(pairs, gain, T_a_b, np.ones(len(pairs), dtype=bool), started_s)
 
 
-def solve(m: Float, m_prime: Float, translation: Translation) -> Float:
-    """Algorithm 1 for points (N, 2) of frame a and b; returns (3,) tx, ty, theta.
+def solve(m: Float, m_prime: Float, translation: Translation) -> tuple[Float, Float]:
+    """Algorithm 1 for points (N, 2) of frame a and b.
 
     The listing's z = u' m, w = z / sv, T = (v w)' is the pseudo-inverse of m' times m.
+
+    Returns:
+        tx, ty, theta (3,), and to first order how much each residual moves them (N, 3, 2).
     """
-    ones = np.ones((len(m), 1))
-    T = (np.linalg.pinv(np.hstack([m_prime, ones])) @ np.hstack([m, ones])).T
-    theta = math.atan2(T[1, 0] - T[0, 1], T[0, 0] + T[1, 1])
+    inverse = np.linalg.pinv(np.hstack([m_prime, np.ones((len(m), 1))]))
+    T = (inverse @ m).T
+    A, B = T[0, 0] + T[1, 1], T[1, 0] - T[0, 1]
+    theta = math.atan2(B, A)
+    gain = np.zeros((len(m), 3, 2))
+    gain[:, 2] = (inverse[:2].T @ [[-B, A], [-A, -B]]) / (A * A + B * B)
     if translation == "printed":
         t = T[:2, 2]
+        gain[:, :2] = inverse[2][:, None, None] * np.eye(2)
     else:
-        t = m.mean(axis=0) - rotation(theta) @ m_prime.mean(axis=0)
-    return np.array([t[0], t[1], theta])
+        turned = rotation(theta) @ m_prime.mean(axis=0)
+        t = m.mean(axis=0) - turned
+        lever = np.array([turned[1], -turned[0]])  # -d turned / d theta
+        gain[:, :2] = np.eye(2) / len(m) + lever[:, None] * gain[:, 2:]
+    return np.array([t[0], t[1], theta]), gain

@@ -46,7 +46,10 @@ def assert_refused(reply: Reply, *words: str) -> None:
         ("seed=-1", ["seed", "greater than or equal to 0"]),
         ("seed=4294967296", ["seed", "less than 4294967296"]),
         ("schema_version=2", ["schema_version", "1"]),
-        ("align.aligners.0.method=magic", ["align.aligners.0", "magic", "icp, impicp, ransac"]),
+        (
+            "align.aligners.0.method=magic",
+            ["align.aligners.0", "magic", "known are ransac, svd, icp, impicp"],
+        ),
         ("align.aligners.0.parameters={bogus: 1}", ["align.aligners.0", "bogus"]),
         ("align.aligners.1.parameters={translation: no}", ["align.aligners.1", "translation"]),
         ("align.aligners.1.name=ransac", ["aligners", "two are named ransac"]),

@@ -39,6 +39,7 @@ AFTER = {stage: STAGES[i:] for i, stage in enumerate(STAGES)}
         ("evaluate.true_pair_radius_m=0.2", ["judge"]),
         ("merge.parameters.use_drift=false", ["judge"]),
         ("align.aligners.0.parameters={height: {floor_m: 0.02}}", ["align", "judge"]),
+        ("align.aligners.0.time_limit_s=5", ["align", "judge"]),
         ("align.repetitions=3", ["align", "judge"]),
         ("align.refinement.gate_m=0.3", ["align", "judge"]),
         ("slam.filter.noise_scale=2", AFTER["slam"]),

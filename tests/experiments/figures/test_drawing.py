@@ -146,11 +146,26 @@ def test_workers_draw_the_same_pictures(copied: Path, monkeypatch: pytest.Monkey
     assert {file: file.read_bytes() for file in draw_all(copied, 2)} == alone
 
 
-def test_lines_differ_in_dashes_and_markers() -> None:
-    styles = aligner_styles(["a", "b", "c", "d", "e", "oracle"])
-    assert len({str(style["linestyle"]) for style in styles.values()}) == 6
-    assert len({style["marker"] for style in styles.values()}) == 6
+KNOWN = ["ransac", "svd", "svd-solved", "icp", "impicp", "gnc", "clique", "ransac_mahalanobis"]
+KNOWN += ["opencv", "kiss_matcher", "oracle"]
+
+
+def test_known_lines_differ_in_colour_and_marker_and_keep_their_look() -> None:
+    styles = aligner_styles(KNOWN)
+    for what in ("color", "marker"):
+        assert len({styles[name][what] for name in KNOWN}) == len(KNOWN)
     assert styles["oracle"]["color"] == "#000000"
+    assert aligner_styles(["icp", "plug-in"])["icp"] == styles["icp"]
+
+
+def test_lines_of_unknown_aligners_differ_from_all() -> None:
+    others = [f"plug-in {k}" for k in range(9)]
+    styles = aligner_styles([*KNOWN, *others])
+    assert len({str(styles[name]["linestyle"]) for name in others}) == 9
+    assert len({styles[name]["marker"] for name in [*KNOWN, *others]}) == len(KNOWN) + 9
+    many = aligner_styles([f"plug-in {k}" for k in range(99)])
+    assert len({str(style) for style in many.values()}) == len(KNOWN) + 99
+    assert many["plug-in 3"] == styles["plug-in 3"]
 
 
 def spreads(robot: str, values: list[float]) -> pd.DataFrame:

@@ -6,7 +6,6 @@ from scipy.spatial.distance import cdist
 from mapfusion import se2
 from mapfusion.align.icp import ClosestPoints, Icp
 from mapfusion.align.impicp import ImpIcp
-from mapfusion.align.pairs import gather
 from mapfusion.align.registry import make_aligner
 from mapfusion.align.result import Status
 from mapfusion.align.rigid import fit_rigid
@@ -34,8 +33,7 @@ def test_kernel_equals_its_twin(offset_m, max_rounds):
     pair = given_pairs(np.random.default_rng(0), 300, 0.7, 0.05)
     start = pair.T_a_b + np.array([offset_m, -offset_m, 0.1 * offset_m])
     closest = ClosestPoints(pair.map_a, pair.map_b)
-    pairs = gather(pair.map_a, pair.map_b, pair.correspondences)
-    alignment = closest.align(start, pairs, pair.correspondences, max_rounds, 0.0)
+    alignment = closest.align(start, pair.correspondences, max_rounds, 0.0)
     T, nearest, repeats = slow_icp(pair.map_a.position_m, pair.map_b.position_m, start, max_rounds)
     np.testing.assert_allclose(alignment.T_a_b, T, atol=1e-9)
     np.testing.assert_array_equal(alignment.inlier, nearest == np.arange(300))

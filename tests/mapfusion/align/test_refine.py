@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from map_pairs import error, given_pairs, stretched
 from scipy.stats import chi2
+from scipy.stats import f as f_distribution
 
 from mapfusion import se2
 from mapfusion.align.drift import drift_step
@@ -29,10 +30,16 @@ def slow_iterate(pairs, T, gate_m, least_drift_m, rounds):
         J = motion_jacobian(T, pairs.p_b)
         normal = np.einsum("nki,nkl,nlj->ij", J, W, J)
         step = np.linalg.solve(normal, np.einsum("nki,nkl,nl->i", J, W, e))
+        Wj = np.linalg.inv(judged)
+        pull, turn = (
+            np.einsum("nki,nkl,nl->ni", J, weight, e) for weight in (np.linalg.inv(C), Wj)
+        )
+        missing = np.einsum("n,ni,nj->ij", truth * (1 - truth), pull, turn)
+        information = normal - (missing + missing.T) / 2
         share = truth.sum() / (inside.sum() + 1)
         variance = min(drift_step(e, S, truth, variance, gate_m), (gate_m / 3) ** 2)
         T = T + step
-    return T, np.linalg.inv(normal), variance, truth
+    return T, np.linalg.inv(information), variance, truth
 
 
 def offered(rng, n, true_share, drift_m, sigma_m=0.04):
@@ -136,6 +143,31 @@ def test_covariance_covers_the_error(drift_m):
     low, high = chi2.ppf([1e-4, 1 - 1e-4], 3 * 400) / 400
     assert low < np.mean(nees) < high * 1.05  # covariances are estimated, which widens the tail
     assert np.median(drifts) == pytest.approx(drift_m, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("n", "n_true", "drift_m"),
+    [(150, 150, 0.1), (150, 90, 0.15), (1000, 50, 0.1), (20, 20, 0.1), (5000, 50, 0.1)],
+)
+def test_covariance_covers_the_error_among_planar_outliers(n, n_true, drift_m):
+    """The normalised squared error of 3 parameters, also where it is open which pairs are true.
+
+    With s_drift from nu = 2 n_true - 3 numbers it has Fisher's distribution, not chi-square's.
+    """
+    nees = []
+    for seed in range(300):
+        rng = np.random.default_rng(seed)
+        pair = given_pairs(rng, n, n_true / n, 0.05, drift_m, planar=True)
+        found = Refinement().refine(pair.map_a, pair.map_b, pair.correspondences, pair.T_a_b)
+        assert found.status is Status.ACCEPTED
+        difference = found.T_a_b - pair.T_a_b
+        difference[2] = se2.wrap(difference[2])
+        nees.append(difference @ np.linalg.solve(found.covariance, difference) / 3)
+    mean, variance = f_distribution.stats(3, 2 * n_true - 3)
+    band = 4 * np.sqrt(variance / 300)
+    assert mean - band < np.mean(nees) < mean + band
+    within = np.mean(np.array(nees) < f_distribution.ppf(0.95, 3, 2 * n_true - 3))
+    assert within > 0.95 - 4 * np.sqrt(0.95 * 0.05 / 300)
 
 
 def test_a_part_that_moved_as_one_is_not_taken_for_false():

@@ -6,11 +6,14 @@ from scipy.optimize import least_squares
 from mapfusion import se2
 from mapfusion.align.rigid import (
     fit_rigid,
+    fit_two,
+    least_squares_gain,
     motion_covariance,
     motion_jacobian,
     residual_covariances,
     residuals,
 )
+from mapfusion.align.support import fit_weighted
 
 
 @pytest.fixture
@@ -59,16 +62,54 @@ def test_residual_covariance_against_monte_carlo(noisy):
     np.testing.assert_allclose(np.cov(residuals(T_a_b, a, b).T), expected, atol=2e-3)
 
 
-def test_motion_covariance_against_monte_carlo(noisy):
+@pytest.mark.parametrize("weighted", [False, True])
+def test_motion_covariance_against_monte_carlo(noisy, weighted):
+    """Noise of every size and direction: of the fit that was made, not of the best one."""
     T_a_b, _, p_b = noisy
     rng = np.random.default_rng(2)
-    sigma = 0.1
-    exact = se2.transform_points(T_a_b, p_b)
-    rows = np.arange(len(p_b))
-    fits = np.array(
-        [fit_rigid(exact + rng.normal(0, sigma, exact.shape), p_b, rows) for _ in range(4000)]
-    )
+    exact = se2.transform_points(T_a_b, p_b)[:, :2]
+    long = rng.uniform(0.02, 0.3, 30)
+    turn = se2.rotation(rng.uniform(-np.pi, np.pi, 30))
+    root = turn * np.stack([long, np.full(30, 0.02)], axis=1)[:, None]
+    covariance = root @ np.swapaxes(root, 1, 2)
+    weight = 2 / (long**2 + 0.02**2) if weighted else np.ones(30)
+    fits = np.empty((4000, 3))
+    for fit in fits:
+        p_a = exact + (root @ rng.standard_normal((30, 2, 1)))[:, :, 0]
+        fit_weighted(p_a, p_b, weight, fit)
     fits[:, 2] = se2.wrap(fits[:, 2] - T_a_b[2])
-    expected = motion_covariance(T_a_b, p_b, np.tile(np.eye(2) * sigma**2, (30, 1, 1)))
+    gain = least_squares_gain(T_a_b, p_b, weight if weighted else None)
+    expected = motion_covariance(gain, covariance)
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
     np.testing.assert_allclose(np.cov(fits.T) / scale, expected / scale, atol=0.1)
+
+
+def test_equal_weights_are_none(noisy):
+    _, p_a, p_b = noisy
+    T_a_b = np.empty(3)
+    fit_weighted(p_a, p_b, np.full(30, 7.0), T_a_b)
+    assert tuple(T_a_b) == pytest.approx(fit_rigid(p_a, p_b, np.arange(30)), abs=1e-12)
+
+
+def test_weighted_fit_minimises_what_a_general_optimiser_minimises(noisy):
+    T_a_b, p_a, p_b = noisy
+    weight = np.random.default_rng(3).uniform(0, 5, 30)
+    general = least_squares(
+        lambda T: (np.sqrt(weight)[:, None] * residuals(T, p_a, p_b)).ravel(),
+        T_a_b,
+        xtol=1e-14,
+        ftol=1e-14,
+        gtol=1e-14,
+    )
+    fitted = np.empty(3)
+    fit_weighted(p_a, p_b, weight, fitted)
+    assert error(fitted, general.x) == pytest.approx((0, 0), abs=1e-7)
+
+
+def test_two_pairs_are_fitted_as_many(noisy):
+    _, p_a, p_b = noisy
+    T_a_b = np.empty(3)
+    shorter = fit_two(p_a, p_b, 4, 17, T_a_b)
+    assert tuple(T_a_b) == pytest.approx(fit_rigid(p_a, p_b, np.array([4, 17])), abs=1e-12)
+    lengths = [np.linalg.norm(p[4, :2] - p[17, :2]) for p in (p_a, p_b)]
+    assert shorter == pytest.approx(min(lengths))

@@ -5,6 +5,7 @@ from map_pairs import error, given_pairs, landmarks, moved
 from mapfusion import se2
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.result import Status
+from mapfusion.align.rigid import motion_covariance
 from mapfusion.align.svd import Svd, solve
 
 RNG = np.random.default_rng(0)  # SVD draws nothing
@@ -25,7 +26,7 @@ def test_is_algorithm_1():
     T = listing(m, m_prime)
     u, _, vt = np.linalg.svd(T[:2, :2])
     nearest = u @ np.diag([1, np.linalg.det(u @ vt)]) @ vt
-    printed = solve(m, m_prime, "printed")
+    printed, _ = solve(m, m_prime, "printed")
     np.testing.assert_allclose(printed[:2], T[:2, 2], atol=1e-9)
     np.testing.assert_allclose(se2.rotation(printed[2]), nearest, atol=1e-9)
 
@@ -39,7 +40,7 @@ def test_result_of_the_listing_is_no_rotation():
 def test_solved_translation_brings_centroids_together():
     pair = given_pairs(np.random.default_rng(3), 50, 0.5, 0.1)
     m, m_prime = pair.map_a.position_m[:, :2], pair.map_b.position_m[:, :2]
-    T_a_b = solve(m, m_prime, "solved")
+    T_a_b, _ = solve(m, m_prime, "solved")
     centroid = se2.transform_points(T_a_b, m_prime).mean(axis=0)
     np.testing.assert_allclose(centroid, m.mean(axis=0), atol=1e-9)
 
@@ -56,6 +57,26 @@ def test_printed_translation_depends_on_where_map_b_begins():
             for b in (pair.map_b, shifted)
         )
         assert least <= error(se2.compose(second, T_new_b), first)[0] <= most
+
+
+@pytest.mark.parametrize("translation", ["printed", "solved"])
+def test_covariance_against_monte_carlo(translation):
+    """Noise in map a, of a size of its own for each landmark, which the fit does not know."""
+    pair = given_pairs(np.random.default_rng(6), 30)
+    rng = np.random.default_rng(7)
+    sigma = rng.uniform(0.01, 0.2, 30)
+    m, m_prime = pair.map_a.position_m[:, :2], pair.map_b.position_m[:, :2]
+    fits = np.array(
+        [
+            solve(m + sigma[:, None] * rng.standard_normal((30, 2)), m_prime, translation)[0]
+            for _ in range(4000)
+        ]
+    )
+    fits[:, 2] = se2.wrap(fits[:, 2] - pair.T_a_b[2])
+    _, gain = solve(m, m_prime, translation)
+    expected = motion_covariance(gain, np.eye(2) * sigma[:, None, None] ** 2)
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    np.testing.assert_allclose(np.cov(fits.T) / scale, expected / scale, atol=0.1)
 
 
 @pytest.mark.parametrize(("across_m", "status"), [(0.0, "degenerate"), (2.0, "accepted")])

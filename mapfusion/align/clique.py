@@ -1,0 +1,71 @@
+"""Maximum clique of pairwise consistent correspondences."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from scipy.stats import chi2
+
+from mapfusion.align.consistency import consistency
+from mapfusion.align.estimate import ConsensusAligner
+from mapfusion.align.max_clique import greedy_clique, larger_clique
+from mapfusion.align.rigid import fit_rigid
+from mapfusion.align.support import PlanarPairs, settle, settle_at_best_scale
+from mapfusion.se2 import Float
+
+_GREEDY_STARTS = 100  # a walk costs microseconds, and a large clique spares the search most
+
+
+@dataclass(frozen=True)
+class Clique(ConsensusAligner):
+    """The largest set of correspondences of which any two agree.
+
+    Two agree when their landmarks lie equally far apart in both maps, as far as covariances and
+    s_drift can tell (PCM: Mangelson et al. 2018; TEASER++: Yang et al. 2021; CLIPPER: Lusk et al.
+    2021). True pairs all agree; false ones rarely do by threes. Both with s_drift and without, a
+    greedy clique is fitted and its support counted, then cliques larger than that are looked for.
+
+    Attributes:
+        agreement_probability: of two true pairs to agree (chi-square, 1 degree of freedom). Closer
+            to 1 than `probability`, since a clique needs all its pairs to agree.
+        max_nodes: of branch and bound at each s_drift; beyond them the largest clique found counts.
+    """
+
+    randomised: ClassVar[bool] = False
+    agreement_probability: float = 0.999
+    max_nodes: int = 10_000
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 < self.agreement_probability < 1:
+            raise ValueError("agreement_probability: must lie between 0 and 1")
+        if not self.max_nodes > 0:
+            raise ValueError("max_nodes: must be positive")
+
+    def find(self, pairs: PlanarPairs, rng: np.random.Generator) -> Float:
+        """T_a_b (3,) under which the residuals are likeliest; nothing is drawn from `rng`."""
+        del rng
+        agreement = float(chi2.ppf(self.agreement_probability, 1))
+        scales = self.variances_m2[[0, -1]]
+        best_T, best_log, inside = np.full(3, np.nan), -np.inf, np.empty(len(pairs.p_a), np.bool_)
+        for variance, graph in zip(scales, consistency(pairs, scales, agreement), strict=True):
+            support = 0
+            for search in (_greedy, self._exact):
+                clique = search(graph, support)
+                if len(clique) < 2:
+                    continue
+                T_a_b = np.array(fit_rigid(pairs.p_a, pairs.p_b, clique))
+                log, _ = settle_at_best_scale(T_a_b, pairs, self.variances_m2, self.bound, inside)
+                if log > best_log:
+                    best_T, best_log = T_a_b, log
+                support = settle(best_T.copy(), pairs, variance, self.bound, inside)
+                support = max(support, len(clique))
+        return best_T
+
+    def _exact(self, graph: np.ndarray, at_least: int) -> np.ndarray:
+        return larger_clique(graph, at_least, self.max_nodes)[0]
+
+
+def _greedy(graph: np.ndarray, at_least: int) -> np.ndarray:
+    del at_least
+    return greedy_clique(graph, _GREEDY_STARTS)

@@ -1,0 +1,81 @@
+"""Graduated non-convexity with truncated least squares."""
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numba import njit
+
+from mapfusion.align.estimate import ConsensusAligner
+from mapfusion.align.support import PlanarPairs, fit_weighted, mean_variances
+from mapfusion.se2 import Float
+
+_MU_FACTOR = 1.4  # Yang et al. 2020, remark 5
+_MAX_ROUNDS = 1000  # from a residual of 1 km at 1 mm of noise it takes 90
+
+
+@dataclass(frozen=True)
+class Gnc(ConsensusAligner):
+    """Truncated least squares, approached from a convex cost (Yang et al. 2020).
+
+    Minimises the sum of min(r^2, c^2), r the residual over its standard deviation and c^2 a
+    chi-square quantile. It starts with all pairs and weighs down, round by round, those that do not
+    fit, so a majority of false pairs that pull one way leads it astray: no sampling, no guarantee.
+    """
+
+    randomised: ClassVar[bool] = False
+
+    def find(self, pairs: PlanarPairs, rng: np.random.Generator) -> Float:
+        """T_a_b (3,) at the largest s_drift; nothing is drawn from `rng`."""
+        del rng
+        return anneal(pairs, mean_variances(pairs, self.variances_m2[-1]), self.bound)[0]
+
+
+@njit(cache=True)
+def anneal(pairs: PlanarPairs, mean_m2: Float, bound: float) -> tuple[Float, Float]:
+    """Alternate closed-form fits and weights while the cost goes from convex to truncated.
+
+    Args:
+        pairs: N correspondences.
+        mean_m2: (N,) variance of each residual per axis.
+        bound: c^2.
+
+    Returns:
+        T_a_b (3,), NaN when all pairs lost their weight, and the weights (N,).
+    """
+    p_a, p_b = pairs.p_a, pairs.p_b
+    n = len(p_a)
+    T_a_b, weight, scaled, square = np.empty(3), np.ones(n), np.empty(n), np.empty(n)
+    mu = 0.0
+    for _ in range(_MAX_ROUNDS):
+        for i in range(n):
+            scaled[i] = weight[i] / mean_m2[i]
+        fit_weighted(p_a, p_b, scaled, T_a_b)
+        cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+        for i in range(n):
+            ex = p_a[i, 0] - T_a_b[0] - cos * p_b[i, 0] + sin * p_b[i, 1]
+            ey = p_a[i, 1] - T_a_b[1] - sin * p_b[i, 0] - cos * p_b[i, 1]
+            square[i] = (ex * ex + ey * ey) / mean_m2[i]
+        if mu == 0:  # remark 5: convex enough for the largest residual
+            largest = np.max(square)
+            if largest <= bound:
+                break
+            mu = bound / (2 * largest - bound)
+        binary, total = True, 0.0
+        for i in range(n):  # eq. 14
+            if square[i] <= mu / (mu + 1) * bound:
+                weight[i] = 1.0
+            elif square[i] >= (mu + 1) / mu * bound:
+                weight[i] = 0.0
+            else:
+                weight[i] = math.sqrt(bound / square[i] * mu * (mu + 1)) - mu
+                binary = False
+            total += weight[i]
+        if total == 0:
+            T_a_b[:] = math.nan
+            break
+        if binary:
+            break
+        mu *= _MU_FACTOR
+    return T_a_b, weight

@@ -1,0 +1,1 @@
+"""Other people's aligners: one thin adapter a file, behind the extra `[peers]`."""

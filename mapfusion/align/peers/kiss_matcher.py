@@ -1,0 +1,89 @@
+"""KISS-Matcher (Lim et al. 2024): pruning by pairwise consistency, then GNC for yaw and shift."""
+
+import importlib
+import math
+import time
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from mapfusion.align.correspondences import Correspondences
+from mapfusion.align.pairs import gather, undetermined, why_too_few
+from mapfusion.align.peers.answer import answer
+from mapfusion.align.result import Alignment
+from mapfusion.landmark_map import LandmarkMap
+from mapfusion.se2 import transform_points
+
+_SMALLEST_BOUND_M = 5e-3  # the package raises below
+
+
+@dataclass(frozen=True)
+class KissMatcher:
+    """`KISSMatcher.prune_and_solve` on given correspondences, rotation about the height axis only.
+
+    The correspondences are pruned to the maximum core of those that are pairwise equally far
+    apart in both maps (ROBIN), then solved with graduated non-convexity (Quatro's yaw-only
+    rotation, translation axis by axis). Its own features and matching are not used. It says how
+    many correspondences it kept but not which: supporters are those within the bound.
+
+    The package keeps the first noise bound that its rotation solver saw for as long as the process
+    lives; the harness gives each set of parameters a process of its own.
+
+    Attributes:
+        noise_bound_m: largest residual of a true pair: `voxel_size` with `robin_noise_bound_gain`
+            1, as RANSAC's gate.
+        solver_share: of the bound that the solver works with (`solver_noise_bound_gain`, the
+            package's default).
+    """
+
+    randomised: ClassVar[bool] = False
+    noise_bound_m: float = 0.3
+    solver_share: float = 0.75
+
+    def __post_init__(self) -> None:
+        if not self.noise_bound_m >= _SMALLEST_BOUND_M:
+            raise ValueError(f"noise_bound_m: must be {_SMALLEST_BOUND_M:g} or more")
+        if not 0 < self.solver_share <= 1:
+            raise ValueError("solver_share: must lie in (0, 1]")
+
+    def align(
+        self,
+        map_a: LandmarkMap,
+        map_b: LandmarkMap,
+        correspondences: Correspondences,
+        rng: np.random.Generator,
+    ) -> Alignment:
+        """Estimate T_a_b; nothing is drawn from `rng`.
+
+        Raises:
+            ValueError: an index of the correspondences lies outside its map.
+        """
+        package: Any = importlib.import_module("kiss_matcher")  # it carries no types
+
+        del rng
+        started_s = time.perf_counter()
+        pairs = gather(map_a, map_b, correspondences)
+        reason = why_too_few(map_a, map_b, len(pairs), needed=2)
+        if reason:
+            return undetermined(reason, len(pairs), started_s)
+        config = package.KISSMatcherConfig(
+            voxel_size=self.noise_bound_m,
+            use_voxel_sampling=False,
+            use_quatro=True,
+            robin_noise_bound_gain=1.0,
+            solver_noise_bound_gain=self.solver_share,
+        )
+        p_a, p_b = (list(p.astype(np.float32)) for p in (pairs.p_a, pairs.p_b))
+        solution = package.KISSMatcher(config).prune_and_solve(p_b, p_a)
+        if not solution.valid:
+            reason = "KISS-Matcher found no correspondences that agree"
+            return undetermined(reason, len(pairs), started_s)
+        R, t = np.asarray(solution.rotation), np.asarray(solution.translation).ravel()
+        T_a_b = np.array([t[0], t[1], math.atan2(R[1, 0], R[0, 0])])
+        if not np.isfinite(T_a_b).all():
+            return undetermined("KISS-Matcher found no motion", len(pairs), started_s)
+        dimensions = 2 if pairs.planar else 3
+        residual = (pairs.p_a - transform_points(T_a_b, pairs.p_b))[:, :dimensions]
+        inlier = np.linalg.norm(residual, axis=1) <= self.noise_bound_m
+        return answer(pairs, T_a_b, inlier, started_s)

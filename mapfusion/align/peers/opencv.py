@@ -1,0 +1,93 @@
+"""OpenCV's RANSAC for planar similarities, `estimateAffinePartial2D`."""
+
+import math
+import time
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from mapfusion.align.correspondences import Correspondences
+from mapfusion.align.pairs import gather, undetermined, why_too_few
+from mapfusion.align.peers.answer import answer
+from mapfusion.align.result import Alignment
+from mapfusion.landmark_map import LandmarkMap
+from mapfusion.se2 import rotation, transform_points
+
+
+@dataclass(frozen=True)
+class OpenCv:
+    """`cv2.estimateAffinePartial2D` on the landmarks in plan.
+
+    It fits a similarity, scale included, and our maps share their scale: theta is that of the
+    rotation nearest to its 2x2 block, and the translation is solved again for that theta on the
+    supporters it names. Those that the motion, without the scale, leaves outside the gate are no
+    supporters. Heights are not used.
+
+    Attributes:
+        gate_m: `ransacReprojThreshold`; as RANSAC of our own.
+        confidence: `confidence`.
+        max_draws: `maxIters`.
+        local_rounds: `refineIters`, Levenberg-Marquardt steps on the supporters (OpenCV's default).
+    """
+
+    randomised: ClassVar[bool] = True
+    gate_m: float = 0.3
+    confidence: float = 0.9999
+    max_draws: int = 20_000
+    local_rounds: int = 10
+
+    def __post_init__(self) -> None:
+        if not self.gate_m > 0:
+            raise ValueError("gate_m: must be positive")
+        if not 0 < self.confidence < 1:
+            raise ValueError("confidence: must lie between 0 and 1")
+        if not self.max_draws > 0:
+            raise ValueError("max_draws: must be positive")
+        if not self.local_rounds >= 0:
+            raise ValueError("local_rounds: must not be negative")
+
+    def align(
+        self,
+        map_a: LandmarkMap,
+        map_b: LandmarkMap,
+        correspondences: Correspondences,
+        rng: np.random.Generator,
+    ) -> Alignment:
+        """Estimate T_a_b.
+
+        OpenCV's RANSAC draws the same rows at every call, whatever `cv2.setRNGSeed` was told (its
+        issue 24835, intended). So that its spread can be seen, the pairs come in an order from
+        `rng`.
+
+        Raises:
+            ValueError: an index of the correspondences lies outside its map.
+        """
+        import cv2
+
+        started_s = time.perf_counter()
+        pairs = gather(map_a, map_b, correspondences)
+        reason = why_too_few(map_a, map_b, len(pairs), needed=2)
+        if reason:
+            return undetermined(reason, len(pairs), started_s)
+        order = rng.permutation(len(pairs))
+        p_a, p_b = (np.ascontiguousarray(p[order, :2]) for p in (pairs.p_a, pairs.p_b))
+        similarity, supports = cv2.estimateAffinePartial2D(
+            p_b,
+            p_a,
+            method=cv2.RANSAC,
+            ransacReprojThreshold=self.gate_m,
+            maxIters=self.max_draws,
+            confidence=self.confidence,
+            refineIters=self.local_rounds,
+        )
+        supporter = np.zeros(len(pairs), dtype=bool) if supports is None else supports.ravel() != 0
+        if similarity is None or not np.isfinite(similarity).all() or not supporter.any():
+            return undetermined("OpenCV found no similarity", len(pairs), started_s)
+        theta = math.atan2(similarity[1, 0], similarity[0, 0])
+        t = p_a[supporter].mean(axis=0) - rotation(theta) @ p_b[supporter].mean(axis=0)
+        T_a_b = np.array([*t, theta])
+        within = np.linalg.norm(p_a - transform_points(T_a_b, p_b), axis=1) <= self.gate_m
+        inlier = np.zeros(len(pairs), dtype=bool)
+        inlier[order] = supporter & within
+        return answer(pairs, T_a_b, inlier, started_s)

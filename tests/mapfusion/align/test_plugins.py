@@ -1,0 +1,127 @@
+"""Names of methods: ours, other people's, and those of installed packages."""
+
+import importlib
+import sys
+
+import pytest
+
+from mapfusion.align import plugins, registry
+from mapfusion.align.plugins import Kind, Method, clashes, fingerprint
+from mapfusion.align.registry import find_method, known_methods, make_aligner
+
+
+@pytest.fixture
+def site(tmp_path, monkeypatch):
+    """A folder on the path into which packages can be put."""
+    monkeypatch.syspath_prepend(tmp_path)
+    yield tmp_path
+    monkeypatch.undo()
+    forget()
+
+
+def forget():
+    registry.known_methods.cache_clear()
+    registry.name_clashes.cache_clear()
+    plugins.fingerprint.cache_clear()
+    importlib.invalidate_caches()
+
+
+def install(site, package, points, version="1.0"):
+    info = site / f"{package}-{version}.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: {version}\n")
+    (info / "entry_points.txt").write_text(f"[mapfusion.aligners]\n{points}\n")
+    forget()
+
+
+def test_a_declared_aligner_is_known_by_name_without_being_imported(site):
+    (site / "elsewhere.py").write_text("raise SystemExit('imported')")
+    install(site, "some_package", "theirs = elsewhere:Outer.Method [fast]")
+    method = find_method("theirs")
+    assert method == Method(
+        "theirs", Kind.PLUG_IN, "elsewhere:Outer.Method", "some_package", "elsewhere"
+    )
+    assert method.version == "1.0"
+    assert method.absence == ""
+    assert "elsewhere" not in sys.modules
+    assert list(known_methods())[:4] == ["ransac", "svd", "icp", "impicp"]
+    with pytest.raises(ValueError, match=r"unknown aligner 'nobody', known are ransac.*, theirs$"):
+        find_method("nobody")
+
+
+def test_it_is_made_with_its_parameters(site):
+    code = "class Outer:\n  class Method:\n    def __init__(self, a): self.a = a\n"
+    (site / "made_elsewhere.py").write_text(code)
+    install(site, "some_package", "theirs = made_elsewhere:Outer.Method")
+    made = make_aligner("theirs", a=3)
+    assert getattr(made, "a") == 3  # noqa: B009
+    with pytest.raises(ValueError, match=r"parameters: theirs: .*'b'"):
+        make_aligner("theirs", b=3)
+
+
+def test_our_own_names_stay_ours(site):
+    install(site, "some_package", "ransac = elsewhere:Ransac\nopencv = elsewhere:OpenCv")
+    assert find_method("ransac").kind is Kind.BUILT_IN
+    assert find_method("opencv").kind is Kind.PEER
+    assert type(make_aligner("ransac")).__module__ == "mapfusion.align.ransac"
+    assert registry.name_clashes()["ransac"] == (
+        "aligner ransac: mapfusion's own is used, the one that some_package declares under the "
+        "same name is not"
+    )
+
+
+def test_a_name_of_two_packages_is_nobodys(site):
+    install(site, "first", "theirs = elsewhere:Method")
+    install(site, "second", "theirs = elsewhere:Method")
+    assert "theirs" not in known_methods()
+    line = "aligner theirs: declared by first and by second; uninstall all but one"
+    with pytest.raises(ValueError, match=line):
+        find_method("theirs")
+
+
+def test_no_clash_without_a_second_claim():
+    assert clashes(["ransac"], [Method("theirs", Kind.PLUG_IN, "m:A", "package")]) == {}
+
+
+@pytest.mark.parametrize("points", ["theirs = nothing here!", "theirs = no.such.module:Method"])
+def test_broken_metadata_break_nothing_else(site, points):
+    install(site, "broken", points)
+    assert find_method("ransac").kind is Kind.BUILT_IN
+    assert find_method("theirs").origin()["files"] == ""
+    with pytest.raises((ImportError, AttributeError)):
+        make_aligner("theirs")
+
+
+def test_origin_changes_with_the_package(site):
+    package = site / "grown"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "method.py").write_text("a = 1")
+    install(site, "grown_package", "theirs = grown.method:Method")
+    origins = [find_method("theirs").origin()]
+    for file, text in (("method.py", "a = 2"), ("helper.py", ""), ("core.so", "1")):
+        (package / file).write_text(text)
+        fingerprint.cache_clear()
+        origins.append(find_method("theirs").origin())
+    (package / "notes.txt").write_text("of no matter")
+    fingerprint.cache_clear()
+    assert find_method("theirs").origin() == origins[-1]
+    (site / "grown_package-1.0.dist-info").rename(site / "grown_package-1.1.dist-info")
+    metadata = site / "grown_package-1.1.dist-info" / "METADATA"
+    metadata.write_text(metadata.read_text().replace("1.0", "1.1"))
+    forget()
+    origins.append(find_method("theirs").origin())
+    assert len({tuple(sorted(origin.items())) for origin in origins}) == len(origins)
+
+
+def test_ours_depend_on_nothing_but_our_source():
+    assert find_method("ransac").origin() == {}
+    assert find_method("opencv").origin()["version"]
+
+
+def test_an_absent_package_is_told_with_what_installs_it():
+    method = Method("far", Kind.PEER, "m:Far", "far-package", "no_such_module_far", "peers")
+    assert method.absence == (
+        "the package far-package is not installed; pip install 'mapfusion[peers]' installs it"
+    )
+    assert (method.version, method.origin()["files"]) == ("", "")
