@@ -15,6 +15,7 @@ from experiments.report.words import correct_text, words_for
 from experiments.statistics.maps import ANSWERABLE_PAIRS, Criteria, maps_of
 from experiments.statistics.overlap import with_overlap_share
 from experiments.statistics.sources import Runs, setting_columns
+from mapfusion.align.result import Status
 from mapfusion.errors import InputError
 
 
@@ -35,6 +36,11 @@ class Comparison:
     verdict: Verdict
     timings: pd.DataFrame
     criteria: Criteria
+
+    @property
+    def colours(self) -> list[str]:
+        """Of the aligners' lines."""
+        return [style["hex"] for style in styled(self.aligners)]
 
     def contents(self) -> dict[str, Any]:
         """The parts of a report that come from the comparison alone."""
@@ -75,6 +81,11 @@ def with_acceptance(errors: pd.DataFrame) -> pd.DataFrame:
     if "accepted" in errors:
         return errors
     return errors.assign(accepted=errors["refined_status"] == "accepted")
+
+
+def present(errors: pd.DataFrame) -> pd.DataFrame:
+    """The rows of aligners that could be run; an absent package is no failure."""
+    return errors[errors["status"] != Status.ABSENT]
 
 
 def compare(runs: Runs, reduced: Sequence[pd.DataFrame], aligners: list[str]) -> Comparison:

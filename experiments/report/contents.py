@@ -15,7 +15,7 @@ from experiments.checks import Outcome
 from experiments.figures.drawing import FIGURES
 from experiments.figures.result_tables import ResultTables, of_pair
 from experiments.figures.style import robot_colours
-from experiments.report.comparison import compare, reduce_errors
+from experiments.report.comparison import compare, present, reduce_errors
 from experiments.report.curves import error_curves
 from experiments.report.map_view import map_view
 from experiments.report.sweep_contents import sweep_contents
@@ -71,12 +71,13 @@ def _result_contents(path: Path, runs: Runs) -> dict[str, Any]:
     require_result(path)
     result = _Result(path)
     data, scenario = result.data, result.data.scenario
-    errors = runs.read("errors")
+    errors = present(runs.read("errors"))
     reduced = [reduce_errors(errors, Criteria.of(runs))] if len(errors) else []
-    comparison = compare(runs, reduced, data.aligners)
+    there = set(errors["aligner"])
+    comparison = compare(runs, reduced, [name for name in data.aligners if name in there])
     rows, stages = _provenance(path)
     colours = robot_colours(data.robots)
-    charts = comparison.chart_data(_groups(errors, data)) | {
+    charts = comparison.chart_data(_groups(errors, data, comparison.aligners)) | {
         "robot_colours": {robot: css_name(colour) for robot, colour in colours.items()},
         "map": map_view(data, result.table),
     }
@@ -96,17 +97,19 @@ def _result_contents(path: Path, runs: Runs) -> dict[str, Any]:
         "stage_times": _stage_times(result.table("timings")),
         "missing": result.missing,
         "failed": [],
+        "absent": [name for name in data.aligners if name not in there],
+        "colours": [*comparison.colours, *colours.values()],
     }
 
 
-def _groups(errors: pd.DataFrame, data: ResultTables) -> list[dict[str, Any]]:
+def _groups(errors: pd.DataFrame, data: ResultTables, aligners: list[str]) -> list[dict[str, Any]]:
     """Error curves of each robot pair, and of all together."""
     groups = [
-        {"label": f"{a} – {b}", "curves": error_curves(of_pair(errors, (a, b)), data.aligners)}
+        {"label": f"{a} – {b}", "curves": error_curves(of_pair(errors, (a, b)), aligners)}
         for a, b in data.pairs
     ]
     if len(groups) > 1:
-        groups.append({"label": "all pairs", "curves": error_curves(errors, data.aligners)})
+        groups.append({"label": "all pairs", "curves": error_curves(errors, aligners)})
     return groups
 
 

@@ -14,6 +14,7 @@ from experiments.statistics.success import rates_of_maps
 
 _DIGITS = 5  # significant; more than any chart can show, and a third of the bytes of all of them
 _MAX_POINTS = 400  # of a curve: a chart is about a thousand pixels wide
+_MAX_TIMES = 40  # points of an aligner in the chart of times
 _ERRORS = {
     "translation": ("translation_error_m", "refined_translation_error_m"),
     "rotation": ("rotation_error_rad", "refined_rotation_error_rad"),
@@ -129,13 +130,29 @@ _SUCCESS_AGAINST = {
 
 
 def time_curves(timings: pd.DataFrame, aligners: Sequence[str]) -> dict[str, Any]:
-    """Time of one alignment against the number of correspondences, in milliseconds."""
+    """Time of one alignment against the number of correspondences, in milliseconds.
+
+    Rows of similar numbers are taken together where there are too many to tell apart: their median,
+    and 10-90 % of their medians in place of the repeats' own band.
+    """
     curves = {}
     for aligner in aligners:
-        rows = timings[timings["aligner"] == aligner].sort_values("n_correspondences")
+        rows = timings[timings["aligner"] == aligner].dropna(subset="elapsed_s")
+        if len(rows) > _MAX_TIMES:
+            place = rows["n_correspondences"].rank(pct=True) * _MAX_TIMES
+            groups = rows.groupby(np.ceil(place.to_numpy()))
+            rows = pd.DataFrame(
+                {
+                    "n_correspondences": groups["n_correspondences"].median(),
+                    "elapsed_s": groups["elapsed_s"].median(),
+                    "elapsed_low_s": groups["elapsed_s"].quantile(BAND[0]),
+                    "elapsed_high_s": groups["elapsed_s"].quantile(BAND[1]),
+                }
+            )
+        rows = rows.sort_values("n_correspondences")
         if len(rows):
             curves[aligner] = {
-                "n": rows["n_correspondences"].tolist(),
+                "n": rounded(rows["n_correspondences"]),
                 "median": rounded(1e3 * rows["elapsed_s"]),
                 "low": rounded(1e3 * rows["elapsed_low_s"]),
                 "high": rounded(1e3 * rows["elapsed_high_s"]),

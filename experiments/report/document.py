@@ -12,7 +12,7 @@ from markupsafe import Markup
 from experiments.report import words
 from experiments.report.comparison import band_text
 from experiments.report.contents import contents_of
-from experiments.report.theme import DARK, LIGHT
+from experiments.report.theme import palette
 from experiments.statistics.maps import ANSWERABLE_PAIRS
 from mapfusion.storage import write_whole
 
@@ -66,7 +66,7 @@ def render(contents: dict[str, Any]) -> str:
         contents,
         text=_FORMATS,
         style_of={style["name"]: style for style in contents["aligners"]},
-        palette={"light": LIGHT, "dark": DARK},
+        palette=palette(contents["colours"]),
         min_true_pairs=ANSWERABLE_PAIRS,
         band_text=band_text(),
         style=Markup(_page_file("report.css")),  # noqa: S704  # our own file

@@ -278,7 +278,12 @@ def _alignment(estimate: dict[Any, Any], error: dict[Any, Any]) -> dict[str, Any
     found: dict[str, Any] = {
         "accepted": bool(error.get("accepted", estimate["refined_status"] == "accepted")),
         "status": str(estimate["refined_status"]),
-        "reason": str(estimate["refined_reason"] or estimate["reason"]),
+        "reason": str(
+            estimate["refined_reason"]
+            or estimate["reason"]
+            or estimate.get("acceptance_reason")
+            or ""
+        ),
         "error": {},
     }
     for stage, prefix in (("estimated", ""), ("refined", "refined_")):

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.metrics import ORACLE
-from experiments.report.comparison import compare, reduce_errors
+from experiments.report.comparison import compare, present, reduce_errors
 from experiments.report.curves import error_curves
 from experiments.statistics.bands import medians_of_run
 from experiments.statistics.maps import Criteria
@@ -21,7 +21,10 @@ def sweep_contents(path: Path, runs: Runs) -> dict[str, Any]:
     """As `contents_of`, of a sweep's folder; runs are read and reduced one by one."""
     criteria = Criteria.of(runs)
     reduced, medians, aligners = [], [], {}
-    for errors in runs.each("errors") if runs.has("errors") else ():
+    every: dict[str, None] = {}
+    for whole in runs.each("errors") if runs.has("errors") else ():
+        every |= dict.fromkeys(whole["aligner"])
+        errors = present(whole)
         reduced.append(reduce_errors(errors, criteria))
         labels = errors[[*RUN_KEYS, *setting_columns(errors)]].drop_duplicates()
         medians.append(medians_of_run(errors).reset_index().merge(labels, on="run_id"))
@@ -45,6 +48,8 @@ def sweep_contents(path: Path, runs: Runs) -> dict[str, Any]:
         "stages": [],
         "stage_times": _stage_times(runs),
         "missing": [],
+        "colours": comparison.colours,
+        "absent": [name for name in every if name not in aligners],
         "failed": runs.failed.to_dict("records"),
     }
 

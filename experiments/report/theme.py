@@ -1,18 +1,10 @@
-"""The figures' colours on the page: by name, with a lighter twin of each for a dark background."""
+"""The figures' colours on the page, with a lighter twin of each for a dark background."""
 
+from collections.abc import Iterable
 from typing import Any
 
-from experiments.figures.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION
+from experiments.figures.style import BLACK, BLUE, ORANGE
 
-_NAMES = {
-    BLUE: "blue",
-    VERMILLION: "vermillion",
-    GREEN: "green",
-    PURPLE: "purple",
-    ORANGE: "orange",
-    SKY: "sky",
-    BLACK: "ink",
-}
 _SURFACES = {
     "page": ("#ffffff", "#101317"),
     "sheet": ("#ffffff", "#0b0e12"),
@@ -27,41 +19,56 @@ _SURFACES = {
     "good": ("#00704f", "#3ecf9f"),
     "bad": ("#b3261e", "#ff8a7a"),
 }
-# The figures' hues, lightened for a dark page: each stands out from it at least 4.5 to 1 (WCAG AA).
-_LIGHTENED = {
-    "blue": "#4aa3e0",
-    "vermillion": "#f2813b",
-    "green": "#2bc79a",
-    "purple": "#e39cc6",
-    "orange": "#f0b429",
-    "sky": "#93d2f7",
-}
-LIGHT = {name: light for name, (light, _) in _SURFACES.items()}
-LIGHT |= {name: colour for colour, name in _NAMES.items() if name != "ink"}
-DARK = {name: dark for name, (_, dark) in _SURFACES.items()} | _LIGHTENED
+MIN_CONTRAST = 4.5  # WCAG 2.2, level AA, for text; lines need 3
+_LIGHTENING_STEP = 0.04  # share of white added at a time
+
 # Plotly's names of matplotlib's markers
 _MARKERS = {
     "o": "circle",
     "s": "square",
     "D": "diamond",
+    "d": "diamond-tall",
     "^": "triangle-up",
     "v": "triangle-down",
+    "<": "triangle-left",
+    ">": "triangle-right",
     "P": "cross",
-    "x": "x",
+    "X": "x",
+    "x": "x-thin-open",
+    "*": "star",
+    "p": "pentagon",
+    "h": "hexagon",
+    "H": "hexagon2",
+    "8": "octagon",
+    "1": "y-down-open",
+    "2": "y-up-open",
+    "3": "y-left-open",
+    "4": "y-right-open",
 }
 
 
+def palette(colours: Iterable[str]) -> dict[str, dict[str, str]]:
+    """All colours of a page by name, `light` and `dark`, for figures that use these."""
+    used = [colour for colour in dict.fromkeys(colours) if colour != BLACK]
+    light = {name: pair[0] for name, pair in _SURFACES.items()}
+    dark = {name: pair[1] for name, pair in _SURFACES.items()}
+    for name, colour in [("accent", BLUE), ("warm", ORANGE), *((css_name(c), c) for c in used)]:
+        light[name] = colour.lower()
+        dark[name] = lightened(colour, dark["page"])
+    return {"light": light, "dark": dark}
+
+
 def css_name(colour: str) -> str:
-    """The page's name of one of the figures' colours."""
-    return _NAMES[colour]
+    """The page's name of one of the figures' colours; black is the ink, which turns white."""
+    return "ink" if colour == BLACK else f"c{colour[1:].lower()}"
 
 
 def chart_style(style: dict[str, Any]) -> dict[str, str]:
     """An aligner's matplotlib style in the page's and Plotly's terms."""
-    marker = style["marker"]
     return {
         "colour": css_name(style["color"]),
-        "marker": _MARKERS[marker],
+        "hex": style["color"],
+        "marker": _MARKERS.get(style["marker"], "circle"),
         "dash": _dash(style["linestyle"]),
     }
 
@@ -71,3 +78,31 @@ def _dash(linestyle: Any) -> str:
     if isinstance(linestyle, str):
         return "solid"
     return ",".join(f"{2 * length:g}px" for length in linestyle[1])
+
+
+def lightened(colour: str, background: str) -> str:
+    """The hue with as much white as it needs to stand out from a dark background."""
+    channels = _channels(colour)
+    white = 0.0
+    found = colour.lower()
+    while contrast(found, background) < MIN_CONTRAST:
+        white += _LIGHTENING_STEP
+        found = "#" + "".join(f"{round(255 * (c + (1 - c) * white)):02x}" for c in channels)
+    return found
+
+
+def contrast(first: str, second: str) -> float:
+    """Contrast ratio of two colours, 1 to 21 (WCAG 2.2)."""
+    lighter, darker = sorted((_luminance(first), _luminance(second)), reverse=True)
+    return (lighter + 0.05) / (darker + 0.05)
+
+
+def _channels(colour: str) -> list[float]:
+    return [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+
+
+def _luminance(colour: str) -> float:
+    linear = [
+        c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in _channels(colour)
+    ]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]

@@ -106,7 +106,7 @@ function shade([from, to]) {
 
 function mark() {
   if (marked === null) return [];
-  return [{ type: "line", xref: "x", yref: "paper", x0: marked, x1: marked, y0: 0, y1: 1, line: { color: colour("orange"), width: 1.5 } }];
+  return [{ type: "line", xref: "x", yref: "paper", x0: marked, x1: marked, y0: 0, y1: 1, line: { color: colour("warm"), width: 1.5 } }];
 }
 
 const DODGE = 0.055; // of a bin: intervals of several methods stand side by side

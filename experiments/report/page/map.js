@@ -214,7 +214,7 @@
       if (shown.particles && cloud) {
         const at = points(cloud.at, own.step_m, T);
         counts.particles = at.length / 2;
-        pen.fillStyle = faint("orange", 0.7);
+        pen.fillStyle = faint("warm", 0.7);
         const size = 1.3 * px;
         for (let j = 0; j < at.length; j += 2) pen.fillRect(at[j] - size, at[j + 1] - size, 2 * size, 2 * size);
       }
@@ -366,7 +366,7 @@
       ellipses: () => [drawing("ellipse", { cx: 13, cy: 7, rx: 11, ry: 4, fill: "none", stroke: "var(--muted)" })],
       true: () => [stroke("var(--ink)", 1.6)],
       false: () => [stroke("var(--muted)", 1.2, "4 3")],
-      particles: () => dots("var(--orange)"),
+      particles: () => dots("var(--warm)"),
       paths: () => [stroke(robot(0), 2.2)],
       truePaths: () => [stroke("var(--muted)", 1.6, "5 3")],
       fused: () => [drawing("rect", { x: 9, y: 3, width: 8, height: 8, fill: "none", stroke: "var(--ink)", "stroke-width": 1.4 })],

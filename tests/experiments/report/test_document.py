@@ -174,3 +174,13 @@ def test_a_result_without_alignments_says_so(
     reply = command(capsys, "report", copied)
     assert reply.code == 2
     assert "no pair of maps was aligned" in reply.complaints[0]
+
+
+def test_absent_packages_are_no_failures(copied: Path) -> None:
+    rows = tables.read(tables.table_path(copied, "errors"), "errors")
+    own = rows["aligner"] == "impicp"
+    rows.loc[own, ["status", "refined_status"]] = "absent"
+    tables.write(tables.table_path(copied, "errors"), "errors", rows)
+    page = page_of(copied, copied / "r.html")
+    assert "Not installed, and so not judged: impicp." in page.words
+    assert "impicp" not in [aligner["name"] for aligner in json.loads(page.json)["aligners"]]
