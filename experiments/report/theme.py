@@ -54,7 +54,7 @@ def palette(colours: Iterable[str]) -> dict[str, dict[str, str]]:
     dark = {name: pair[1] for name, pair in _SURFACES.items()}
     for name, colour in [("accent", BLUE), ("warm", ORANGE), *((css_name(c), c) for c in used)]:
         light[name] = colour.lower()
-        dark[name] = lightened(colour, dark["page"])
+        dark[name] = lightened(colour, dark["tint"])  # the lightest surface that text is on
     return {"light": light, "dark": dark}
 
 
