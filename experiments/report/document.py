@@ -16,8 +16,8 @@ from experiments.report.theme import palette
 from experiments.statistics.maps import ANSWERABLE_PAIRS
 from mapfusion.storage import write_whole
 
-# The map before Plotly: it can be used while the browser still reads that.
-_BEFORE_PLOTLY, _AFTER_PLOTLY = ("base.js", "map.js"), ("charts.js",)
+# The page is there, and the map can be used, before the browser reads Plotly for the charts.
+_AT_ONCE = ("base.js", "map.js")
 _FORMATS = {
     name: getattr(words, name)
     for name in ("metres", "radians", "milliseconds", "percent", "bare", "ratio", "within")
@@ -58,10 +58,8 @@ def render(contents: dict[str, Any]) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    before, after = (
-        "\n".join(_page_file(name) for name in names) for names in (_BEFORE_PLOTLY, _AFTER_PLOTLY)
-    )
-    scripts = [before, get_plotlyjs(), after]
+    script = "\n".join(_page_file(name) for name in _AT_ONCE)
+    later = {"plotly": get_plotlyjs(), "charts": _page_file("charts.js")}
     return environment.get_template("report.html.j2").render(
         contents,
         text=_FORMATS,
@@ -70,8 +68,9 @@ def render(contents: dict[str, Any]) -> str:
         min_true_pairs=ANSWERABLE_PAIRS,
         band_text=band_text(),
         style=Markup(_page_file("report.css")),  # noqa: S704  # our own file
-        scripts=[Markup(text) for text in scripts],  # noqa: S704  # Plotly's and our own
-        policy=_policy(scripts),
+        script=Markup(script),  # noqa: S704  # our own files
+        **{name: Markup(text) for name, text in later.items()},  # noqa: S704  # Plotly's, our own
+        policy=_policy([script, *later.values()]),
     )
 
 

@@ -57,12 +57,18 @@ class Opened:
         self.page.on("request", lambda request: self.requests.append(request.url))
         self.page.goto(file.as_uri(), wait_until="load")
 
+    def wait_for_charts(self) -> None:
+        """The charts' script runs once the page is there."""
+        self.page.locator("#error-chart").scroll_into_view_if_needed()
+        self.page.wait_for_selector("#error-chart .main-svg", timeout=60_000)
+
     def _heard(self, message: Any) -> None:
         if message.type in {"error", "warning"}:
             self.complaints.append(message.text)
 
     def scroll_through(self) -> None:
         """Charts are drawn when they come into view."""
+        self.wait_for_charts()
         height = self.page.evaluate("document.documentElement.scrollHeight")
         for y in range(0, height, 600):
             self.page.evaluate(f"scrollTo(0, {y})")
@@ -95,14 +101,16 @@ def test_it_is_small_enough(report: Path) -> None:
 
 
 def test_it_opens_in_time(browser: Browser, report: Path) -> None:
-    """The least of three: other work on the machine can only add to it."""
-    found = []
+    """Until page and map are there; the least of three: other work can only add to it."""
+    found, charts = [], []
     for _ in range(3):
-        page = Opened(browser, report).page
-        found.append(
-            page.evaluate("performance.getEntriesByType('navigation')[0].loadEventEnd") / 1000
-        )
-        page.close()
+        opened = Opened(browser, report)
+        timing = "performance.getEntriesByType('navigation')[0].loadEventEnd"
+        found.append(opened.page.evaluate(timing) / 1000)
+        opened.wait_for_charts()
+        charts.append(opened.page.evaluate("performance.now()") / 1000)
+        opened.page.close()
+    print(f"\nfirst chart drawn after {min(charts):.2f} s")  # noqa: T201  # likewise
     print(f"\nloaded after {', '.join(f'{seconds:.2f}' for seconds in found)} s")  # noqa: T201  # the figures to report
     assert min(found) < MAX_LOAD_S
 
@@ -143,7 +151,6 @@ def test_the_slider_moves_the_map(opened: Opened) -> None:
 
 def test_each_layer_can_be_hidden(opened: Opened) -> None:
     page = opened.page
-    page.locator("#zoom-in").click()
     for box in page.locator("#layers input").all():
         name = (box.get_attribute("id") or "").removeprefix("layer-")
         if name in {"walls", "truePaths"}:  # recordings have none
@@ -206,7 +213,7 @@ def test_methods_can_be_hidden_in_all_charts(opened: Opened) -> None:
 def test_a_click_on_the_errors_shows_those_maps(opened: Opened) -> None:
     page = opened.page
     page.locator("#error-chart").scroll_into_view_if_needed()
-    page.wait_for_selector("#error-chart .main-svg")
+    opened.wait_for_charts()
     page.wait_for_timeout(300)
     iterations = page.evaluate("DATA.groups[0].curves.iteration")
     page.evaluate(
@@ -260,7 +267,9 @@ def test_hostile_names_stay_names(
     assert chart is not None
     opened.page.locator("#error-chart").scroll_into_view_if_needed()
     opened.page.locator("#error-chart .nsewdrag").first.hover()
-    opened.page.wait_for_timeout(300)
+    opened.page.wait_for_function(
+        "() => document.querySelector('#error-chart .hoverlayer').textContent !== ''"
+    )
     assert HOSTILE in opened.page.locator("h1").inner_text()
     assert HOSTILE in (opened.page.locator("#error-chart .hoverlayer").text_content() or "")
     assert opened.page.locator("img[src=x]").count() == 0

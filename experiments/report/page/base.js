@@ -100,3 +100,12 @@ byId("theme").addEventListener("click", () => {
 });
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => tell("theme"));
 matchMedia("print").addEventListener("change", () => tell("theme")); // paper is white
+
+// Plotly takes the browser longer than all the rest: it is read once the page is there.
+addEventListener("load", () => setTimeout(() => {
+  for (const id of ["plotly", "charts"]) {
+    const script = document.createElement("script");
+    script.textContent = byId(id).textContent;
+    document.head.append(script);
+  }
+}));
