@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: clean-kernels lock demo test endurance lint check bench paper install clean
+.PHONY: browser-test clean-kernels lock demo test endurance lint check bench paper install clean
 
 install: $(STAMP)
 
@@ -24,6 +24,10 @@ test: $(STAMP)
 # Ten random kills of a sweep; minutes.
 endurance: $(STAMP)
 	$(BIN)/python -m pytest tests/experiments/sweep/ten_kills.py -s
+
+# Installs Debian's chromium where it is missing (needs root for that).
+browser-test: $(STAMP)
+	PYTHON=$(BIN)/python tests/browser/run.sh $(RESULT)
 
 lint: $(STAMP)
 	$(BIN)/ruff format --check .

@@ -93,6 +93,31 @@ def figures(
 
 
 @app.command()
+def report(
+    result: Annotated[Path, typer.Argument(metavar="RESULT", help="A run's result folder.")],
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="HTML file; RESULT/report.html by default."),
+    ] = None,
+) -> None:
+    """Show a result in one HTML file that works offline: `mapfusion report results/quick-0`."""
+    from experiments import screen
+    from experiments.report import write_report
+
+    screen.print_file(write_report(result, output))
+
+
+@app.command("inspect")
+def inspect_command(
+    path: Annotated[Path, typer.Argument(metavar="FILE", help="A file or folder of mapfusion's.")],
+) -> None:
+    """Tell what a file or folder of mapfusion's holds: `mapfusion inspect R1.parquet`."""
+    from experiments.inspection.command import inspect
+
+    inspect(path)
+
+
+@app.command()
 def check(
     scenarios: ScenarioNames,
     seeds: Annotated[str, typer.Option(help="A seed, a range 0..4 or a list 0,2,5.")] = "0",

@@ -15,6 +15,7 @@ import pandas as pd
 from experiments import tables
 from experiments.evaluate import EvaluatedRobot, path_columns, robot_rows
 from experiments.fusion import fused_maps, fused_truth, map_fit_rows
+from experiments.history import write_history
 from experiments.landmark_nees import landmark_nees_rows
 from experiments.path_errors import path_statistics_rows
 from experiments.pipeline import Plan, execute
@@ -71,6 +72,7 @@ def write_result(plan: Plan, folder: Path) -> None:
     for outdated in ("maps", "keyframes"):  # of robots or frames that are no longer there
         shutil.rmtree(folder / outdated, ignore_errors=True)
     _write_maps(plan, robots, folder)
+    write_history(robots, scenario, folder)
     _write_images(plan, folder)
     _write_json(folder / "scenario.json", scenario.resolved())
     _write_json(folder / "world.json", _world(scenario, robots))

@@ -279,6 +279,11 @@ def print_paths(folder: Path, paths: Sequence[Path], skipped: Sequence[str] = ()
     _print_skipped(console, skipped)
 
 
+def print_file(path: Path) -> None:
+    """Where a file was written, and how large it is."""
+    Console().print(f"{path} ({path.stat().st_size / 1e6:.1f} MB)", soft_wrap=True, markup=False)
+
+
 def _print_skipped(console: Console, skipped: Sequence[str]) -> None:
     for line in skipped:
         console.print(f"  not drawn: {line}", soft_wrap=True)

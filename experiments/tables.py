@@ -14,6 +14,7 @@ import pyarrow as pa
 from mapfusion.storage import point_fields, read_table, schema, write_table
 
 _TEXT, _INT, _FLOAT, _BOOL = pa.string(), pa.int32(), pa.float64(), pa.bool_()
+_SINGLE = pa.float32()  # for looking at, not for computing with: hundreds of maps, half the size
 
 
 def _fields(**types: pa.DataType) -> list[pa.Field]:
@@ -186,6 +187,32 @@ FUSED = schema(
     ],
 )
 
+# The robots' maps at each evaluated iteration, in plan, each in its own frame. `landmark` is the
+# row of the map at that iteration, which correspondences of that iteration refer to.
+_PLAN = _fields(x_m=_SINGLE, y_m=_SINGLE, cov_xx_m2=_SINGLE, cov_xy_m2=_SINGLE, cov_yy_m2=_SINGLE)
+MAP_HISTORY = schema(
+    "result.map_history", 1, [*_fields(robot=_TEXT, iteration=_INT, landmark=_INT), *_PLAN]
+)
+
+# Landmarks that the merging aligner's inliers joined at that iteration, fused, in robot a's frame.
+FUSED_HISTORY = schema(
+    "result.fused_history",
+    1,
+    [
+        *_fields(robot_a=_TEXT, robot_b=_TEXT, iteration=_INT, landmark_a=_INT, landmark_b=_INT),
+        *_PLAN,
+    ],
+)
+
+# Which of the correspondences are true: one bit each, in their order in `correspondences`.
+TRUE_PAIRS = schema(
+    "result.true_pairs",
+    1,
+    _fields(
+        robot_a=_TEXT, robot_b=_TEXT, iteration=_INT, n_correspondences=_INT, true_pair=pa.binary()
+    ),
+)
+
 # One row per fused landmark with two parents, per robot pair: was fusing worth it?
 FUSION = schema(
     "result.fusion",
@@ -279,6 +306,9 @@ ALL = {
     "clouds": CLOUDS,
     "landmarks": LANDMARKS,
     "fused": FUSED,
+    "map_history": MAP_HISTORY,
+    "fused_history": FUSED_HISTORY,
+    "true_pairs": TRUE_PAIRS,
     "fusion": FUSION,
     "map_fits": MAP_FITS,
     "path_statistics": PATH_STATISTICS,

@@ -107,26 +107,31 @@ class ResultTables:
         return rows[["final_x_m", "final_y_m", "final_theta_rad"]].to_numpy()
 
     @cached_property
+    def walls(self) -> list[Float]:
+        """The walls' corner points, (n, 2) each, in the world; none where unknown."""
+        return [np.array(wall) for wall in (self._world or {}).get("walls", [])]
+
+    @cached_property
     def _world(self) -> dict[str, Any] | None:
         path = self.folder / "world.json"
         return _read_json(path) if path.is_file() else None
 
     def walls_in_frame_of(self, robot: str) -> list[Float]:
         """The walls' corner points, (n, 2) each, in a robot's map frame; none where unknown."""
-        T_world_map = self._start_pose(robot)
-        if self._world is None or T_world_map is None:
+        T_world_map = self.start_pose(robot)
+        if T_world_map is None:
             return []
-        T_map_world = inverse(T_world_map)
-        return [transform_points(T_map_world, np.array(wall)) for wall in self._world["walls"]]
+        return [transform_points(inverse(T_world_map), wall) for wall in self.walls]
 
     def true_alignment(self, pair: Pair) -> Float | None:
         """The true T_a_b (3,) of two map frames, or None where it is unknown."""
-        starts = [self._start_pose(robot) for robot in pair]
+        starts = [self.start_pose(robot) for robot in pair]
         if starts[0] is None or starts[1] is None:
             return None
         return between(starts[0], starts[1])
 
-    def _start_pose(self, robot: str) -> Float | None:
+    def start_pose(self, robot: str) -> Float | None:
+        """The true T_world_map (3,) of a robot, or None where it is unknown."""
         pose = (self._world or {}).get("robots", {}).get(robot)
         return None if pose is None else np.array(pose, dtype=np.float64)
 

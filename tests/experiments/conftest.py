@@ -2,6 +2,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from synthetic_result import write_result
 from tiny_scenario import TINY
 
 from experiments.pipeline import plan
@@ -52,3 +53,9 @@ def tiny_result(tiny_results: Path) -> Path:
 def tiny_log(tiny: Scenario, tiny_results: Path) -> Path:
     """The log of R1 in the store of that run."""
     return plan(tiny, Store(tiny_results / "store")).robots[0].log.path
+
+
+@pytest.fixture(scope="session")
+def made_up_result(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small result folder; tests must not change it."""
+    return write_result(tmp_path_factory.mktemp("result"))

@@ -80,6 +80,7 @@ def write_result(folder: Path, size: Size = SMALL, seed: int = 0, world: bool = 
         "timings": [{"stage": "slam", "name": "R1", "elapsed_s": 1.0}],
     }
     tables |= _alignment_tables(rng, maps, size)
+    tables |= _history_tables(maps, tables["correspondences"], tables["errors"])
     for name in ("fusion", "map_fits"):
         tables[name] = []
     for name, rows in tables.items():
@@ -344,6 +345,49 @@ def _estimate_columns(T_true: Float, translation: float, rotation: float) -> dic
     refined = {f"refined_{name}": value for name, value in estimate.items()}
     covariance = {f"cov_{name}": 1e-4 for name in ("xx", "xy", "xt", "yy", "yt", "tt")}
     return estimate | refined | covariance | {"drift_sigma_m": 0.05}
+
+
+def _history_tables(
+    maps: dict[str, _Map], offered: list[dict], errors: list[dict]
+) -> dict[str, pd.DataFrame]:
+    """The last maps at each evaluated iteration; the true pairs, fused half way between."""
+    pairs = pd.DataFrame(offered)
+    whole = {robot: _plan_rows(own.position_m, own.covariance_m2) for robot, own in maps.items()}
+    history = [
+        plan.assign(robot=robot, iteration=k, landmark=np.arange(len(plan)))
+        for robot, plan in whole.items()
+        for k in pairs["iteration"].unique()
+    ]
+    key = ["robot_a", "robot_b", "iteration"]
+    n_true = pd.DataFrame(errors).groupby(key)["n_true"].first()
+    judged, fused = [], []
+    for (a, b, k), rows in pairs.groupby(key):
+        index_a, index_b = rows["index_a"].to_numpy(), rows["index_b"].to_numpy()
+        is_true = np.arange(len(rows)) < n_true[a, b, k]  # as they are put together
+        names = {"robot_a": a, "robot_b": b, "iteration": k}
+        bits = np.packbits(is_true).tobytes()
+        judged.append(names | {"n_correspondences": len(rows), "true_pair": bits})
+        joined = whole[a].iloc[index_a[is_true]]
+        fused.append(
+            joined.assign(**names, landmark_a=index_a[is_true], landmark_b=index_b[is_true])
+        )
+    return {
+        "map_history": pd.concat(history),
+        "true_pairs": pd.DataFrame(judged),
+        "fused_history": pd.concat(fused),
+    }
+
+
+def _plan_rows(position_m: Float, covariance_m2: Float) -> pd.DataFrame:
+    return pd.DataFrame(
+        {
+            "x_m": position_m[:, 0],
+            "y_m": position_m[:, 1],
+            "cov_xx_m2": covariance_m2[:, 0, 0],
+            "cov_xy_m2": covariance_m2[:, 0, 1],
+            "cov_yy_m2": covariance_m2[:, 1, 1],
+        }
+    )
 
 
 def _append_timings(

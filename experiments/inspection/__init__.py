@@ -1,0 +1,1 @@
+"""What any file or folder of ours holds, told on screen."""
