@@ -16,6 +16,8 @@ _BAND_ALPHA = 0.14
 _DODGE = 0.45  # of the distance between two shares, over which the methods are spread
 _MIN_SUCCESSES = 10  # the median error of fewer says little
 _RATIO_TICKS = (1, 2, 5, 10, 20, 50, 100)
+_RATIO_RANGE = (0.9, 11.0)  # shown at least
+_MARGIN = 1.15  # about what is drawn
 _ROWS = ("success (%)", "error over the oracle's", "time of one call (ms)")
 
 
@@ -69,7 +71,10 @@ def _lay_out(panels: np.ndarray, shares: list[float]) -> None:
     for axes in panels[1:].flat:
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter(plain_numbers())
+    drawn = [line.get_ydata() for axes in panels[1] for line in axes.get_lines()]
+    ratios = np.concatenate([*drawn, _RATIO_RANGE])
     panels[1, 0].set_yticks(_RATIO_TICKS)
+    panels[1, 0].set_ylim(np.nanmin(ratios) / _MARGIN, np.nanmax(ratios) * _MARGIN)
     panels[1, 0].yaxis.set_minor_locator(NullLocator())
 
 

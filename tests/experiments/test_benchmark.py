@@ -138,6 +138,8 @@ def test_an_absent_package_is_no_failure(tmp_path: Path, monkeypatch: pytest.Mon
     assert np.isnan(far["success"])
     assert cell_text(far) == "absent"
     assert "| far      | absent " in markdown(plan, summary)
+    low, high = draw(summary).axes[1].get_ylim()  # although no ratio is drawn
+    assert 0.1 < low < 1 < high < 100
     labels = [text.get_text() for text in draw(summary).legends[0].get_texts()]
     assert labels == ["far (absent)", "ransac"]
 
