@@ -9,6 +9,7 @@ from made_up_runs import errors_of, tables_of, timings_of, write_result, write_s
 
 from experiments.statistics.compare import BETTER, NOISE, SAME, WORSE, compare
 from experiments.statistics.maps import ERROR_COLUMNS
+from experiments.statistics.paired import holm
 from mapfusion.errors import InputError
 
 Tables = dict[str, pd.DataFrame]
@@ -75,6 +76,10 @@ def test_chance_alone_is_rarely_taken_for_a_change(tmp_path: Path) -> None:
         found = compare(*two_sweeps(tmp_path / str(trial), redrawn, seeds=8))
         wrong += found.table["verdict"].isin([BETTER, WORSE]).any()
         assert (found.table["verdict"] == NOISE).any()
+        p = found.table["p"].to_numpy()
+        np.testing.assert_array_equal(found.table["p_holm"], holm(p))
+        # the smallest of m is judged at a level of 0.05 / m
+        assert np.nanmin(found.table["p_holm"]) == min(1, np.nanmin(p) * np.sum(~np.isnan(p)))
     assert wrong <= 4  # 20 trials at 5 %: more than 4 in 0.3 % of all seeds
 
 
