@@ -86,6 +86,7 @@ function errorChart() {
     layout: {
       ...layout,
       hovermode: "x unified",
+      hoverdistance: -1, // wherever the pointer is, the nearest iteration
       xaxis: { ...grid, anchor: "y3", title: title("FastSLAM iteration k"), range: padded(x), hoverformat: "d" },
       yaxis: { ...log, domain: [0.58, 1], title: title("translation error (m)") },
       yaxis2: { ...log, domain: [0.2, 0.56], title: title("rotation error (rad)") },
