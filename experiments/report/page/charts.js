@@ -3,6 +3,9 @@
 
 const CONFIG = {
   displaylogo: false,
+  // Plotly's default is a button that sends a chart's data to its maker's server.
+  showSendToCloud: false,
+  plotlyServerURL: "",
   responsive: true,
   modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"],
 };
