@@ -238,6 +238,15 @@ def test_another_pair_and_another_aligner(opened: Opened) -> None:
     assert opened.complaints == []
 
 
+def test_no_button_sends_data_away(opened: Opened) -> None:
+    opened.scroll_through()
+    titles = opened.page.evaluate(
+        "[...document.querySelectorAll('.modebar-btn')].map((button) => button.dataset.title)"
+    )
+    assert "Download plot as a PNG" in titles
+    assert not [title for title in titles if re.search("share|cloud|edit", title, re.IGNORECASE)]
+
+
 def test_the_theme_can_be_chosen(opened: Opened) -> None:
     page = opened.page
     background = "getComputedStyle(document.body).backgroundColor"

@@ -3,6 +3,9 @@
 
 const CONFIG = {
   displaylogo: false,
+  // Plotly's default is a button that sends a chart's data to its maker's server.
+  showSendToCloud: false,
+  plotlyServerURL: "",
   responsive: true,
   modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"],
 };
@@ -86,6 +89,7 @@ function errorChart() {
     layout: {
       ...layout,
       hovermode: "x unified",
+      hoverdistance: -1, // wherever the pointer is, the nearest iteration
       xaxis: { ...grid, anchor: "y3", title: title("FastSLAM iteration k"), range: padded(x), hoverformat: "d" },
       yaxis: { ...log, domain: [0.58, 1], title: title("translation error (m)") },
       yaxis2: { ...log, domain: [0.2, 0.56], title: title("rotation error (rad)") },
