@@ -10,7 +10,8 @@ import pandas as pd
 
 from experiments.benchmark import SUMMARY, TOLERANCE_M, TOLERANCE_RAD, TRIALS, Plan
 from experiments.figures.benchmark import draw
-from experiments.figures.style import PNG_DPI, SVG_DPI, house_style
+from experiments.figures.drawing import save_figure
+from experiments.figures.style import house_style
 from experiments.store import library_versions
 from experiments.synthetic import SIGMA_M, SIZE_M
 from mapfusion.align.registry import find_method
@@ -32,16 +33,7 @@ def write_benchmark(folder: Path, plan: Plan, trials: pd.DataFrame, summary: pd.
     text = markdown(plan, summary)
     write_whole(folder / "summary.md", lambda path: path.write_text(text, encoding="utf-8"))
     with house_style():
-        figure = draw(summary)
-        for suffix, dpi in (("png", PNG_DPI), ("svg", SVG_DPI)):
-            # no date: the same table gives the same bytes
-            metadata = {"Date": None} if suffix == "svg" else None
-            write_whole(
-                folder / f"benchmark.{suffix}",
-                lambda path, dpi=dpi, metadata=metadata: figure.savefig(
-                    path, dpi=dpi, metadata=metadata
-                ),
-            )
+        save_figure(draw(summary), folder, "benchmark")
     described = json.dumps(_provenance(plan), indent=1)
     write_whole(folder / "provenance.json", lambda path: path.write_text(described, "utf-8"))
 

@@ -320,7 +320,8 @@ def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
     for row in rows:
         reason = row["reason"] or row["acceptance_reason"]
         if reason:
-            status = "accepted" if row["accepted"] else "refused"
+            refused = row["status"] if row["status"] in NOT_RUN else Status.REFUSED
+            status = Status.ACCEPTED if row["accepted"] else refused
             console.print(f"  {row['aligner']}: {status}: {reason}", soft_wrap=True, markup=False)
 
 

@@ -89,6 +89,7 @@ _JSON_KINDS = (
     ({"walls", "robots"}, "world: walls and the robots' true starts"),
     ({"kind", "settings"}, "sweep"),
     ({"stage", "key"}, "finished stage"),
+    ({"elapsed_s"}, "times of a part of a stage"),
 )
 
 

@@ -351,6 +351,8 @@ def _history_tables(
     maps: dict[str, _Map], offered: list[dict], errors: list[dict]
 ) -> dict[str, pd.DataFrame]:
     """The last maps at each evaluated iteration; the true pairs, fused half way between."""
+    if not offered:  # one robot alone
+        return {}
     pairs = pd.DataFrame(offered)
     whole = {robot: _plan_rows(own.position_m, own.covariance_m2) for robot, own in maps.items()}
     history = [

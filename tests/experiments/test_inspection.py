@@ -32,7 +32,7 @@ def test_every_file_of_a_run_is_told(
 def test_ranges_and_first_rows_are_those_of_the_table(tiny_result: Path) -> None:
     path = tables.table_path(tiny_result, "errors")
     rows, found = tables.read(path, "errors"), inspect_table(path)
-    assert (found.n_rows, found.version, found.kind) == (len(rows), "1", "result.errors")
+    assert (found.n_rows, found.version, found.kind) == (len(rows), "2", "result.errors")
     assert [column.name for column in found.columns] == list(rows)
     by_name = {column.name: column for column in found.columns}
     for name in ("translation_error_m", "n_true", "refined_rotation_error_rad"):

@@ -89,7 +89,7 @@ def test_align_with_the_example(site: Path, maps: tuple[Path, Path]) -> None:
     ended = command(site, "align", *maps, "--set", entry("best_share"))
     assert (ended.code, ended.err) == (0, "")
     row = next(line for line in ended.out.splitlines() if line.strip().startswith("theirs"))
-    assert row.split()[1:4] == ["1.000", "-2.000", "0.300"]
+    assert row.split()[1:4] == ["1.00", "-2.00", "0.30"]
     assert "20/20" in row
 
 

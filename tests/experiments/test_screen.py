@@ -15,6 +15,7 @@ def rows(aligner: str, *statuses: tuple[str, str]) -> pd.DataFrame:
             "status": [status for status, _ in statuses],
             "reason": [reason for _, reason in statuses],
             "refined_status": [status for status, _ in statuses],
+            "accepted": [status == "accepted" for status, _ in statuses],
             "n_true": 5,
             "n_correspondences": 10,
         }
