@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import KDTree
-from scipy.stats import chi2
 
 from mapfusion.align.correspondences import HeightGate
 from mapfusion.aligned_landmarks import AlignedLandmarks
+from mapfusion.chi_square import chi_square_bound
 from mapfusion.robot_log import NO_LABEL
 
 
@@ -49,7 +49,7 @@ class SamePoint:
         )
 
     def _bound(self) -> float:
-        return float(chi2.ppf(self.gate_probability, 2))
+        return chi_square_bound(self.gate_probability, 2)
 
     def _neighbours(
         self, a: AlignedLandmarks, b: AlignedLandmarks

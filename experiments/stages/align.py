@@ -24,6 +24,7 @@ from mapfusion.robot_log import read_log
 
 SOURCES = (
     "mapfusion/align",
+    "mapfusion/chi_square.py",
     "mapfusion/landmark_map.py",
     "mapfusion/robot_log.py",
     "mapfusion/storage.py",
@@ -36,6 +37,7 @@ SOURCES += ("experiments/isolated_child.py",)
 # Evaluated iterations a task: small enough that an interruption loses little and two cores end
 # at about the same time, large enough that reading the maps costs little beside aligning them.
 ITERATIONS_PER_BATCH = 12
+_UPPER = np.triu_indices(3)
 _COVARIANCE_COLUMNS = ("cov_xx", "cov_xy", "cov_xt", "cov_yy", "cov_yt", "cov_tt")
 
 
@@ -193,7 +195,7 @@ def estimate_row(
     n_correspondences: int, estimated: Alignment, refined: Alignment, verdict: Verdict
 ) -> dict[str, Any]:
     """One estimate, its refinement and the verdict on it as columns of the table `estimates`."""
-    upper = refined.covariance[np.triu_indices(3)]
+    upper = refined.covariance[_UPPER]
     return {
         "n_correspondences": n_correspondences,
         "status": str(estimated.status),
@@ -224,8 +226,8 @@ def inlier_mask(bits: bytes, n_correspondences: int) -> np.ndarray:
 def alignment_of(row: Mapping[Any, Any], n_correspondences: int) -> Alignment:
     """The refined alignment a row of `estimates` tells of, refused where the verdict says so."""
     covariance = np.empty((3, 3))
-    covariance[np.triu_indices(3)] = [row[name] for name in _COVARIANCE_COLUMNS]
-    covariance.T[np.triu_indices(3)] = covariance[np.triu_indices(3)]
+    covariance[_UPPER] = [row[name] for name in _COVARIANCE_COLUMNS]
+    covariance.T[_UPPER] = covariance[_UPPER]
     verdict = Verdict(bool(row["accepted"]), row["log10_false_alarms"], row["acceptance_reason"])
     refined = Alignment(
         np.array([row["refined_tx_m"], row["refined_ty_m"], row["refined_theta_rad"]]),

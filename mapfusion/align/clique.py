@@ -4,13 +4,13 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from scipy.stats import chi2
 
 from mapfusion.align.consistency import consistency
 from mapfusion.align.estimate import ConsensusAligner
 from mapfusion.align.max_clique import greedy_clique, larger_clique
 from mapfusion.align.rigid import fit_rigid
 from mapfusion.align.support import PlanarPairs, settle, settle_at_best_scale
+from mapfusion.chi_square import chi_square_bound
 from mapfusion.se2 import Float
 
 _GREEDY_STARTS = 100  # a walk costs microseconds, and a large clique spares the search most
@@ -47,7 +47,7 @@ class Clique(ConsensusAligner):
     def find(self, pairs: PlanarPairs, rng: np.random.Generator) -> Float:
         """T_a_b (3,) under which the residuals are likeliest; nothing is drawn from `rng`."""
         del rng
-        agreement = float(chi2.ppf(self.agreement_probability, 1))
+        agreement = chi_square_bound(self.agreement_probability, 1)
         scales = self.variances_m2[[0, -1]]
         best_T, best_log, inside = np.full(3, np.nan), -np.inf, np.empty(len(pairs.p_a), np.bool_)
         for variance, graph in zip(scales, consistency(pairs, scales, agreement), strict=True):

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from scipy.stats import chi2
 
 from mapfusion.arguments import require_finite, require_shape
+from mapfusion.chi_square import chi_square_bound
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import NO_LABEL
 from mapfusion.se2 import Float
@@ -74,7 +74,7 @@ class HeightGate:
     @property
     def bound(self) -> float:
         """Most for the squared difference of two heights over its variance."""
-        return float(chi2.ppf(self.probability, 1))
+        return chi_square_bound(self.probability, 1)
 
     def agrees(self, z_a_m: Float, variance_a_m2: Float, z_b_m: Float, variance_b_m2: Float):
         """Bool array: heights that agree; arguments broadcast."""

@@ -5,7 +5,6 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.stats import chi2
 
 from mapfusion.align.correspondences import Correspondences, HeightGate
 from mapfusion.align.drift import DRIFT_FLOOR_M
@@ -13,6 +12,7 @@ from mapfusion.align.pairs import Pairs, finish, gather, undetermined, why_one_p
 from mapfusion.align.result import Alignment
 from mapfusion.align.rigid import least_squares_gain
 from mapfusion.align.support import PlanarPairs, in_plan, mean_variances, settle_at_best_scale
+from mapfusion.chi_square import chi_square_bound
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.se2 import Float
 
@@ -48,7 +48,7 @@ class ConsensusAligner(ABC):
     @property
     def bound(self) -> float:
         """Most for e^T C^-1 e of a true pair (chi-square, 2 degrees of freedom)."""
-        return float(chi2.ppf(self.probability, 2))
+        return chi_square_bound(self.probability, 2)
 
     @property
     def variances_m2(self) -> Float:

@@ -5,12 +5,12 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
 from mapfusion.align.correspondences import Correspondences, HeightGate
 from mapfusion.align.drift import estimate_drift_m
 from mapfusion.align.result import Alignment, Status, degenerate
 from mapfusion.align.rigid import motion_covariance, residual_covariances, residuals
+from mapfusion.chi_square import chi_square_bound
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.se2 import Float
 
@@ -109,7 +109,8 @@ def lacks_extent(p: Float, covariance_m2: Float, dimensions: int) -> bool:
     # rounding alone leaves this much, as in numpy.linalg.matrix_rank
     rounding = (len(p) * np.finfo(np.float64).eps * np.abs(p).max()) ** 2
     freedom = max(len(p) - dimensions, 1)
-    return spread[2 - dimensions] <= noise * chi2.ppf(1 - SHAPE_FALSE_ALARM, freedom) + rounding
+    most = noise * chi_square_bound(1 - SHAPE_FALSE_ALARM, freedom) + rounding
+    return spread[2 - dimensions] <= most
 
 
 def why_one_place(pairs: Pairs, drift_m2: float = 0.0) -> str:

@@ -6,13 +6,13 @@ from typing import ClassVar
 
 import numpy as np
 from numba import njit
-from scipy.stats import chi2
 
 from mapfusion.align.consistency import drift_needed
 from mapfusion.align.estimate import ConsensusAligner
 from mapfusion.align.ransac import draw_pair
 from mapfusion.align.rigid import fit_two
 from mapfusion.align.support import PlanarPairs, mean_variances, settle, support_of
+from mapfusion.chi_square import chi_square_bound
 from mapfusion.se2 import Float
 
 
@@ -52,7 +52,7 @@ class RansacMahalanobis(ConsensusAligner):
             pairs,
             self.variances_m2[-1],
             self.bound,
-            float(chi2.ppf(self.probability, 1)),
+            chi_square_bound(self.probability, 1),
             self.min_baseline_m,
             math.log1p(-self.confidence),
             self.max_draws,
