@@ -169,16 +169,21 @@ class Align(Section):
     """Correspondences, the aligners on them, the least squares after each, the test against chance.
 
     Randomised aligners are repeated on each pair of maps, so that their own spread can be seen.
+    `also` names aligners beside those of `aligners`, which need not be repeated then.
     """
 
     match: MatchParameters = MatchParameters()
     aligners: Annotated[list[AlignerEntry], Field(min_length=1)] = DEFAULT_ALIGNERS
+    also: list[AlignerEntry] = []
     refinement: Refinement = Refinement()
     acceptance: Acceptance = Acceptance()
     repetitions: Annotated[int, Field(ge=1, le=1000)] = 20
 
     @model_validator(mode="after")
     def _unique(self) -> Self:
+        # One list from here on; pydantic freezes models for their users, not for their validators.
+        object.__setattr__(self, "aligners", [*self.aligners, *self.also])
+        object.__setattr__(self, "also", [])
         _require_unique("aligners", [entry.name for entry in self.aligners])
         return self
 
