@@ -20,6 +20,7 @@ from scipy.stats import binomtest
 from experiments.aligner_calls import CallableAligner, callable_aligner, refine_estimate
 from experiments.randomness import generator
 from experiments.scenario import AlignerEntry, load_scenario
+from experiments.sources import imported_sources, method_sources
 from experiments.store import StageFolder, Store
 from experiments.synthetic import SyntheticPair, synthetic_pair, true_pairs_of
 from experiments.workers import single_threaded
@@ -40,19 +41,14 @@ TOLERANCE_RAD = 0.1
 _CONFIDENCE = 0.95  # of Wilson's interval
 _TIME_BAND = (0.1, 0.9)  # quantiles of the trials
 
-SOURCES = (
-    "mapfusion/align",
-    "mapfusion/landmark_map.py",
-    "mapfusion/robot_log.py",
-    "mapfusion/storage.py",
-    "mapfusion/se2.py",
+_OWN_SOURCES = (
     "experiments/aligner_calls.py",
     "experiments/benchmark.py",
     "experiments/isolated_child.py",
     "experiments/isolation.py",
     "experiments/randomness.py",
-    "experiments/synthetic.py",
     "experiments/workers.py",
+    "mapfusion/align/sanity.py",
 )
 
 
@@ -168,16 +164,19 @@ def run_benchmark(
 def _cell(
     plan: Plan, store: Store, entry: AlignerEntry, n_pairs: int, share: float
 ) -> pd.DataFrame:
+    method = find_method(entry.method)
     settings = {
         "entry": entry.model_dump(mode="json"),
-        "origin": find_method(entry.method).origin(),
+        "origin": method.origin(),
         "n_pairs": n_pairs,
         "outlier_share": share,
         "trials": plan.trials,
         "seed": plan.seed,
         "budget_s": plan.budget_s,
     }
-    folder = store.stage("benchmark", settings, [], SOURCES)
+    sources = _OWN_SOURCES + method_sources(method)
+    sources += imported_sources("experiments.synthetic", "mapfusion.align.refine")
+    folder = store.stage("benchmark", settings, [], sources)
     path = folder.path / "trials.parquet"
     if not folder.finished:
         _measure(plan, entry, n_pairs, share, folder, path)

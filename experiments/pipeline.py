@@ -111,7 +111,7 @@ def _pairs(scenario: Scenario, store: Store, robots: Sequence[RobotStages]) -> l
     pairs = []
     for a, b in itertools.combinations(robots, 2):
         parts = align.parts(store, scenario, a.slam, b.slam)
-        aligned = align.stage(store, scenario, a.slam, b.slam)
+        aligned = align.stage(store, parts)
         judged = judge.stage(store, scenario, aligned, [a.slam, b.slam])
         pairs.append(PairStages(a, b, parts, aligned, judged))
     return pairs

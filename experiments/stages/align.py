@@ -13,32 +13,47 @@ from experiments import tables
 from experiments.aligner_calls import CallableAligner, callable_aligner, refine_estimate
 from experiments.randomness import generator
 from experiments.scenario import AlignerEntry, Scenario
+from experiments.sources import imported_sources, method_sources
 from experiments.stages.slam import RobotFolders, read_snapshots
 from experiments.store import StageFolder, Store
 from mapfusion.align.acceptance import Verdict
 from mapfusion.align.correspondences import Correspondences, match
+from mapfusion.align.plugins import Method
 from mapfusion.align.registry import find_method
 from mapfusion.align.result import Alignment, Status
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import read_log
 
-SOURCES = (
-    "mapfusion/align",
-    "mapfusion/chi_square.py",
-    "mapfusion/landmark_map.py",
-    "mapfusion/robot_log.py",
-    "mapfusion/storage.py",
-    "mapfusion/se2.py",
+_OWN_SOURCES = (
+    "experiments/stages/align.py",
+    "experiments/tables.py",
+    "experiments/randomness.py",
+    "experiments/aligner_calls.py",
+    "experiments/isolation.py",
+    "experiments/isolated_child.py",
+    "experiments/workers.py",
+    "mapfusion/align/sanity.py",
 )
-SOURCES += ("experiments/stages/align.py", "experiments/tables.py", "experiments/randomness.py")
-SOURCES += ("experiments/aligner_calls.py", "experiments/isolation.py", "experiments/workers.py")
-SOURCES += ("experiments/isolated_child.py",)
 
 # Evaluated iterations a task: small enough that an interruption loses little and two cores end
 # at about the same time, large enough that reading the maps costs little beside aligning them.
 ITERATIONS_PER_BATCH = 12
 _UPPER = np.triu_indices(3)
 _COVARIANCE_COLUMNS = ("cov_xx", "cov_xy", "cov_xt", "cov_yy", "cov_yt", "cov_tt")
+
+
+def match_sources() -> tuple[str, ...]:
+    """Source behind the correspondences; not the methods', which change more often."""
+    return _OWN_SOURCES + imported_sources("mapfusion.align.correspondences", "mapfusion.robot_log")
+
+
+def aligner_sources(method: Method) -> tuple[str, ...]:
+    """Source behind one method's estimates, refined and judged; no other method's."""
+    return (
+        _OWN_SOURCES
+        + imported_sources("mapfusion.align.refine", "mapfusion.align.acceptance")
+        + method_sources(method)
+    )
 
 
 class Parts(NamedTuple):
@@ -51,36 +66,24 @@ class Parts(NamedTuple):
     aligners: tuple[StageFolder, ...]
 
 
-def stage(
-    store: Store, scenario: Scenario, slam_a: StageFolder, slam_b: StageFolder
-) -> StageFolder:
+def stage(store: Store, made: Parts) -> StageFolder:
     """Where the joined estimates of this pair of robots are or will be."""
-    settings = {"seed": scenario.seed, "align": scenario.align.model_dump(mode="json")}
-    settings["origins"] = [_origin(entry) for entry in scenario.align.aligners]
-    return store.stage("align", settings, [slam_a, slam_b], SOURCES)
+    return store.stage("align", {}, [made.match, *made.aligners], _OWN_SOURCES)
 
 
 def parts(store: Store, scenario: Scenario, slam_a: StageFolder, slam_b: StageFolder) -> Parts:
     """Where the pair's batches are or will be."""
     resolved = scenario.align.model_dump(mode="json")
-    match_folder = store.stage("match", resolved["match"], [slam_a, slam_b], SOURCES)
+    match_folder = store.stage("match", resolved["match"], [slam_a, slam_b], match_sources())
     common = {"seed": scenario.seed}
     common |= {name: resolved[name] for name in ("refinement", "acceptance", "repetitions")}
-    aligners = tuple(
-        store.stage(
-            "aligner",
-            common | {"entry": entry.model_dump(mode="json"), "origin": _origin(entry)},
-            [match_folder],
-            SOURCES,
-        )
-        for entry in scenario.align.aligners
-    )
-    return Parts(match_folder, aligners)
 
+    def of(entry: AlignerEntry) -> StageFolder:
+        method = find_method(entry.method)
+        settings = common | {"entry": entry.model_dump(mode="json"), "origin": method.origin()}
+        return store.stage("aligner", settings, [match_folder], aligner_sources(method))
 
-def _origin(entry: AlignerEntry) -> dict[str, str]:
-    """Package, version and files of an aligner that is not our own."""
-    return find_method(entry.method).origin()
+    return Parts(match_folder, tuple(of(entry) for entry in scenario.align.aligners))
 
 
 def batches(iterations: list[int]) -> list[list[int]]:

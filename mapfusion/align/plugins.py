@@ -63,7 +63,7 @@ class Method:
     def origin(self) -> dict[str, str]:
         """What else than parameters and our own source its results depend on, for stage keys."""
         if self.kind is Kind.BUILT_IN:
-            return {}
+            return {"target": self.target}
         return {
             "target": self.target,
             "distribution": self.distribution,

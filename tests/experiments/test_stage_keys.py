@@ -11,8 +11,10 @@ from tiny_scenario import TINY
 from experiments import store as store_module
 from experiments.pipeline import plan
 from experiments.scenario import load_scenario
+from experiments.sources import imported_sources
 from experiments.stages import align, drive, features, judge, log, slam
 from experiments.store import Store, source_hash
+from mapfusion.align.registry import ALIGNERS, find_method
 from mapfusion.errors import InputError
 from sim.renderer import egl_driver
 
@@ -163,8 +165,24 @@ def test_imported_logs_are_known_by_their_content(tmp_path: Path) -> None:
 
 # Settings are in the key by value, and how files get to disk does not change what is in them.
 NOT_RESULTS = {"experiments.scenario", "experiments.store", "experiments.metrics"}
+# Reads which files there are; what a name stands for is in the key as the method's target.
+NOT_RESULTS |= {"experiments.sources", "mapfusion.align.registry", "mapfusion.align.plugins"}
 # Shape checks and error texts: they refuse, they compute nothing.
 REFUSING = {"mapfusion.arguments", "mapfusion.errors"}
+OWN_METHODS = ("opencv", "kiss_matcher", *ALIGNERS)
+BUILDS_ON = {"icp": {"impicp"}, "ransac": {"ransac_mahalanobis"}}
+
+
+def reached(*modules: str, without: set[str] = NOT_RESULTS) -> set[str]:
+    """Modules of ours that these import, by another package's reading of the imports."""
+    graph: Any = grimp.build_graph("mapfusion", "sim", "experiments")
+    found, todo = set[str](), list(modules)
+    while todo:
+        name = todo.pop()
+        if name not in found | without:
+            found.add(name)
+            todo += graph.find_modules_directly_imported_by(name)
+    return found
 
 
 @pytest.mark.parametrize(
@@ -174,23 +192,42 @@ REFUSING = {"mapfusion.arguments", "mapfusion.errors"}
         ("features", features.SOURCES + drive.SOURCES),
         ("log", log.SOURCES + features.SOURCES + drive.SOURCES),
         ("slam", slam.SOURCES),
-        ("align", align.SOURCES + slam.SOURCES),
-        ("judge", judge.SOURCES + align.SOURCES + slam.SOURCES),
+        ("judge", judge.SOURCES + align.match_sources() + slam.SOURCES),
+        # the methods' own source follows below
+        ("align", slam.SOURCES + align.match_sources() + align.aligner_sources(find_method("svd"))),
     ],
 )
 def test_keys_cover_all_the_source_a_stage_runs(module: str, sources: tuple[str, ...]) -> None:
     """`sources` are the stage's own and those of stages before it, whose keys are in its key."""
-    graph: Any = grimp.build_graph("mapfusion", "sim", "experiments")
-    reached, todo = set(), [f"experiments.stages.{module}"]
-    while todo:
-        name = todo.pop()
-        if name not in reached | NOT_RESULTS:
-            reached.add(name)
-            todo += graph.find_modules_directly_imported_by(name)
     covered = [part.removesuffix(".py").replace("/", ".") for part in sources]
     missing = {
         name
-        for name in reached - REFUSING
+        for name in reached(f"experiments.stages.{module}") - REFUSING
         if not any(name == part or name.startswith(f"{part}.") for part in covered)
     }
     assert not missing
+
+
+@pytest.mark.parametrize("name", OWN_METHODS)
+def test_a_method_s_sources_are_what_its_module_imports(name: str) -> None:
+    module = find_method(name).target.partition(":")[0]
+    files = {part.removesuffix(".py").replace("/", ".") for part in imported_sources(module)}
+    packages = {name for name in files if name.endswith(".__init__")}
+    assert module in files
+    assert files - packages == reached(module, without=set()) - {"mapfusion", "mapfusion.align"}
+
+
+def test_one_method_s_source_is_not_in_another_s_key() -> None:
+    for name in OWN_METHODS:
+        own = find_method(name).target.partition(":")[0].replace(".", "/") + ".py"
+        elsewhere = {
+            other
+            for other in OWN_METHODS
+            if own in align.aligner_sources(find_method(other)) + align.match_sources()
+        }
+        assert elsewhere == {name} | BUILDS_ON.get(name, set())
+
+
+def test_sources_of_no_module_are_an_error() -> None:
+    with pytest.raises(ValueError, match=r"mapfusion\.nothing: no module"):
+        imported_sources("mapfusion.nothing")
