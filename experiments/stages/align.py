@@ -178,14 +178,14 @@ def _estimate(
     rows = []
     # repetitions often come to the very same estimate
     refinements: dict[object, tuple[Alignment, Verdict]] = {}
+    chance = settings.acceptance.against_chance(map_a, map_b, pairs)
     for repetition in range(settings.repetitions if aligner.randomised else 1):
         purpose = (map_a.name, map_b.name, iteration, entry.name, repetition)
         estimated = aligner.align(map_a, map_b, pairs, generator(seed, "align", *purpose))
         known = (estimated.T_a_b.tobytes(), estimated.status, estimated.reason)
         if known not in refinements:
             refined = refine_estimate(settings.refinement, map_a, map_b, pairs, estimated)
-            verdict = settings.acceptance.judge(map_a, map_b, pairs, refined)
-            refinements[known] = refined, verdict
+            refinements[known] = refined, chance.judge(refined)
         rows.append(
             names
             | {"aligner": entry.name, "repetition": repetition}

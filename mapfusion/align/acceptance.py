@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from mapfusion.align.correspondences import Correspondences, HeightGate
-from mapfusion.align.false_alarms import fewest_false_alarms, thin
+from mapfusion.align.false_alarms import fewest_false_alarms, possible_repairings, thin
 from mapfusion.align.pairs import MIN_PAIRS, Pairs, gather
 from mapfusion.align.result import Alignment, Status
 from mapfusion.landmark_map import LandmarkMap
@@ -97,20 +97,27 @@ class Acceptance:
         Raises:
             ValueError: an index of the correspondences lies outside its map.
         """
-        if not alignment.ok or not np.all(np.isfinite(alignment.T_a_b)):
-            return Verdict(False, math.nan, alignment.reason)
+        return self.against_chance(map_a, map_b, correspondences).judge(alignment)
+
+    def against_chance(
+        self, map_a: LandmarkMap, map_b: LandmarkMap, correspondences: Correspondences
+    ) -> "ChanceTest":
+        """The test for these correspondences, made ready for any number of alignments.
+
+        Raises:
+            ValueError: an index of the correspondences lies outside its map.
+        """
         pairs = gather(map_a, map_b, correspondences)
         pairs = pairs[self._independent(pairs, correspondences.distance)]
-        log10, gate_m, n, k = fewest_false_alarms(
+        heights = self._heights(pairs)
+        return ChanceTest(
+            self.false_alarms,
+            np.array(sorted(self.gates_m)),
             np.ascontiguousarray(pairs.p_a[:, :2]),
             np.ascontiguousarray(pairs.p_b[:, :2]),
-            self._heights(pairs),
-            alignment.T_a_b,
-            np.array(sorted(self.gates_m)),
+            heights,
+            possible_repairings(heights),
         )
-        if log10 <= math.log10(self.false_alarms):
-            return Verdict(True, log10)
-        return Verdict(False, log10, self._why(log10, gate_m, n, k))
 
     def _independent(self, pairs: Pairs, distance: Float) -> np.ndarray:
         """Rows (n,) of the pairs that count, best match first."""
@@ -134,6 +141,37 @@ class Acceptance:
         return np.stack(
             [pairs.p_a[:, 2], pairs.p_b[:, 2], bound * variance_a, bound * variance_b], axis=1
         )
+
+
+@dataclass(frozen=True)
+class ChanceTest:
+    """`Acceptance` for the n independent correspondences of two maps, best match first.
+
+    Attributes:
+        false_alarms: accepted expected number of chance alignments.
+        gates_m: (G,) ascending.
+        p_a, p_b: (n, 2) in metres, each in its own frame.
+        heights: (n, 4) as `agreeing_repairings` takes them.
+        possible: (n,) how many re-pairings among the first can have one height.
+    """
+
+    false_alarms: float
+    gates_m: Float
+    p_a: Float
+    p_b: Float
+    heights: Float
+    possible: np.ndarray
+
+    def judge(self, alignment: Alignment) -> Verdict:
+        """Hold one alignment of the correspondences against chance."""
+        if not alignment.ok or not np.all(np.isfinite(alignment.T_a_b)):
+            return Verdict(False, math.nan, alignment.reason)
+        log10, gate_m, n, k = fewest_false_alarms(
+            self.p_a, self.p_b, self.heights, self.possible, alignment.T_a_b, self.gates_m
+        )
+        if log10 <= math.log10(self.false_alarms):
+            return Verdict(True, log10)
+        return Verdict(False, log10, self._why(log10, gate_m, n, k))
 
     def _why(self, log10: float, gate_m: float, n: int, k: int) -> str:
         if n < MIN_PAIRS:

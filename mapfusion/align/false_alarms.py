@@ -202,7 +202,12 @@ def chance_of_agreeing(agreeing: np.ndarray, possible: np.ndarray) -> Float:
 
 @njit(cache=True)
 def fewest_false_alarms(
-    p_a: Float, p_b: Float, heights: Float, T_a_b: Float, gates_m: Float
+    p_a: Float,
+    p_b: Float,
+    heights: Float,
+    possible: np.ndarray,
+    T_a_b: Float,
+    gates_m: Float,
 ) -> tuple[float, float, int, int]:
     """The smallest NFA over gates and selections of the best-matching pairs.
 
@@ -210,6 +215,7 @@ def fewest_false_alarms(
         p_a: (N, 2) of independent pairs, best match first.
         p_b: (N, 2).
         heights: (N, 4), see `agreeing_repairings`.
+        possible: (N,) from `possible_repairings`, the same for every motion.
         T_a_b: (3,) to be judged.
         gates_m: (G,) ascending.
 
@@ -221,7 +227,6 @@ def fewest_false_alarms(
     while total >> selections >= _SMALLEST_SELECTION:
         selections += 1
     distance = residuals_m(T_a_b, p_a, p_b)
-    possible = possible_repairings(heights)
     best, best_gate, best_n, best_k = math.inf, 0.0, total, 0
     for s in range(selections):
         n = total >> s

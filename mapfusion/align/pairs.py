@@ -105,7 +105,7 @@ def lacks_extent(p: Float, covariance_m2: Float, dimensions: int) -> bool:
     centred = p - p.mean(axis=0)
     spread, axes = np.linalg.eigh(centred.T @ centred)  # ascending
     axis = axes[:, 2 - dimensions]
-    noise = np.mean(np.einsum("i,nij,j->n", axis, covariance_m2, axis))
+    noise = axis @ covariance_m2.mean(axis=0) @ axis
     # rounding alone leaves this much, as in numpy.linalg.matrix_rank
     rounding = (len(p) * np.finfo(np.float64).eps * np.abs(p).max()) ** 2
     freedom = max(len(p) - dimensions, 1)

@@ -82,8 +82,9 @@ def least_squares_gain(T_a_b: Float, p_b: Float, weight: Float | None = None) ->
     jacobian = motion_jacobian(T_a_b, p_b)
     if weight is None:
         weight = np.ones(len(p_b))
-    weighted = np.swapaxes(jacobian, 1, 2) * weight[:, None, None]
-    return np.linalg.inv(np.einsum("nik,nkj->ij", weighted, jacobian)) @ weighted
+    weighted = jacobian * weight[:, None, None]
+    normal = weighted.reshape(-1, 3).T @ jacobian.reshape(-1, 3)
+    return np.linalg.inv(normal) @ np.swapaxes(weighted, 1, 2)
 
 
 def motion_covariance(gain: Float, covariance_m2: Float) -> Float:
@@ -92,7 +93,8 @@ def motion_covariance(gain: Float, covariance_m2: Float) -> Float:
     Weights that are not the inverse covariances make it larger than the inverse of the normal
     matrix: this is the sandwich of the two.
     """
-    return np.einsum("nik,nkl,njl->ij", gain, covariance_m2, gain)
+    weighted = gain @ covariance_m2
+    return np.swapaxes(weighted, 0, 1).reshape(3, -1) @ np.swapaxes(gain, 0, 1).reshape(3, -1).T
 
 
 def motion_jacobian(T_a_b: Float, p_b: Float) -> Float:

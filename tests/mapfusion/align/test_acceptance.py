@@ -172,7 +172,9 @@ def test_the_whole_is_the_documented_formula(true_share):
         heights = heights_of(rng, n)
         wrong = np.array([*(p_a[0] - p_b[0]), 0.3])
         for T_a_b in (pair.T_a_b, wrong):
-            found = fewest_false_alarms(p_a, p_b, heights, T_a_b, GATES_M)[0]
+            found = fewest_false_alarms(
+                p_a, p_b, heights, possible_repairings(heights), T_a_b, GATES_M
+            )[0]
             assert found == pytest.approx(twin_nfa(p_a, p_b, heights, T_a_b), rel=1e-9)
 
 
