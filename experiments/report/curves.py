@@ -9,7 +9,7 @@ import pandas as pd
 
 from experiments.figures.error_curves import BAND
 from experiments.report.standing import MAP_PAIR
-from experiments.statistics.maps import ANSWERABLE_PAIRS
+from experiments.statistics.maps import ANSWERABLE_PAIRS, has_common_ground
 from experiments.statistics.success import rates_of_maps
 
 _DIGITS = 5  # significant; more than any chart can show, and a third of the bytes of all of them
@@ -84,9 +84,11 @@ def success_curves(maps: pd.DataFrame, aligners: Sequence[str]) -> list[dict[str
     """Success rates with their intervals against what makes an alignment hard.
 
     Args:
-        maps: rows of `maps_of`, with or without the column overlap_share.
+        maps: rows of `maps_of`, with or without the column overlap_share; those without common
+            ground are left out.
         aligners: in display order.
     """
+    maps = maps[has_common_ground(maps)]
     curves = []
     for by, (label, name) in _SUCCESS_AGAINST.items():
         if by not in maps or maps[by].isna().all():

@@ -17,7 +17,8 @@ from mapfusion.align.refine import Refinement
 # An error in rotation moves a landmark in proportion to its distance; half the width of the ground
 # that indoor maps share is about this far.
 LEVER_M = 5.0
-# As figures 4 and 5 shade: with fewer true pairs not even the oracle has much to go by.
+# As figures 4 and 5 shade: with fewer true pairs not even the oracle has much to go by, and maps
+# that share fewer landmarks have no common ground.
 ANSWERABLE_PAIRS = 3
 MAP_KEYS = ("robot_a", "robot_b", "iteration")
 _ERRORS = ("translation_error_m", "rotation_error_rad")
@@ -66,11 +67,14 @@ def maps_of(errors: pd.DataFrame, criteria: Criteria) -> pd.DataFrame:
         criteria: what counts as right.
 
     Returns:
-        The run's columns, robot_a, robot_b, iteration, aligner; n_repetitions; estimated_success,
-        refined_success, accepted and false_accepted (shares of the repetitions; NaN for runs
-        without an acceptance test); the median absolute errors, infinite where most repetitions
-        gave no estimate; n_correspondences, n_true, n_common, outlier_share.
+        The run's columns, robot_a, robot_b, iteration, aligner; n_repetitions; as shares of the
+        repetitions estimated_success and refined_success (NaN for maps without common ground, where
+        there is nothing to be right about), accepted, false_accepted (wrong, or without common
+        ground) and refused_apart (NaN for maps with common ground), the last three NaN for runs
+        without an acceptance test; the median absolute errors, infinite where most repetitions gave
+        no estimate; n_correspondences, n_true, n_common, outlier_share.
     """
+    ground = has_common_ground(errors)
     right = criteria.met(errors["translation_error_m"], errors["rotation_error_rad"])
     refined = criteria.met(
         errors["refined_translation_error_m"], errors["refined_rotation_error_rad"]
@@ -78,15 +82,17 @@ def maps_of(errors: pd.DataFrame, criteria: Criteria) -> pd.DataFrame:
     has_test = "accepted" in errors and bool(errors["accepted"].notna().any())
     accepted = errors["accepted"].astype(float) if has_test else np.nan
     judged = errors.assign(
-        estimated_success=right.astype(float),
-        refined_success=refined.astype(float),
+        estimated_success=right.astype(float).where(ground),
+        refined_success=refined.astype(float).where(ground),
         accepted=accepted,
-        false_accepted=accepted * (1.0 - refined),
+        false_accepted=accepted * (1.0 - (refined & ground)),
+        refused_apart=(1.0 - pd.Series(accepted, errors.index)).where(~ground),
         **{name: errors[name].abs().fillna(np.inf) for name in ERROR_COLUMNS},
     )
     keys = [*RUN_KEYS, *setting_columns(errors), *MAP_KEYS, "aligner"]
     groups = judged.groupby(keys, sort=False, dropna=False)
     shares = ["estimated_success", "refined_success", "accepted", "false_accepted"]
+    shares += ["refused_apart"]
     maps = pd.concat(
         [
             groups.size().rename("n_repetitions"),
@@ -100,6 +106,11 @@ def maps_of(errors: pd.DataFrame, criteria: Criteria) -> pd.DataFrame:
     return maps.assign(
         outlier_share=(1 - maps["n_true"] / n_offered.where(n_offered > 0)).fillna(1.0)
     )
+
+
+def has_common_ground(rows: pd.DataFrame) -> pd.Series:
+    """Bool per row: whether the two maps share enough landmarks for an alignment to be right."""
+    return rows["n_common"] >= ANSWERABLE_PAIRS
 
 
 def read_maps(runs: Runs, criteria: Criteria) -> pd.DataFrame:

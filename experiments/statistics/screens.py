@@ -78,23 +78,34 @@ def _print_success(console: Console, summary: Summary) -> None:
     rows, labels = _shown(summary, "success_at_the_end")
     if rows.empty:
         return
-    tested = "accepted" in rows
-    headings = ["\nmethod", "right\nas estimated", "\nrefined"]
-    headings += ["\naccepted", "accepted\nthough wrong"] if tested else []
+    shares = {
+        "estimated_success": "right\nas estimated",
+        "refined_success": "\nrefined",
+        "accepted": "\naccepted",
+        "false_accepted": "accepted\nthough wrong",
+        "refused_apart": "refused where\nnothing is common",
+    }
+    shares = {name: heading for name, heading in shares.items() if name in rows}
     limits = summary.criteria
     table = _table(
         f"Success at the end of {_runs(summary.n_runs)}",
-        headings,
+        ["\nmethod", *shares.values()],
         labels,
     )
     for row in rows.to_dict("records"):
-        shares = ["estimated_success", "refined_success"]
-        shares += ["accepted", "false_accepted"] if tested else []
         cells = [_share(row, name) for name in shares]
         table.add_row(*_cells(row, [*labels, "aligner"]), *cells)
     reach = f"{limits.translation_m:g} m and {limits.rotation_rad:g} rad"
     caption = f"right: within {reach}, the reach of the refinement; (95 %, Wilson)"
+    if rows["n_apart"].any():
+        caption += f"; {_apart(rows)} have no common ground, and no say in the first three columns"
     _show(console, table, caption)
+
+
+def _apart(rows: pd.DataFrame) -> str:
+    """How many pairs of maps have no common ground; all methods see the same maps."""
+    n_apart, n_maps = rows[["n_apart", "n_maps"]].max()
+    return f"{n_apart} of {n_maps} pairs of maps"
 
 
 def _print_where_it_fails(console: Console, summary: Summary) -> None:

@@ -13,7 +13,14 @@ import pandas as pd
 
 from experiments.statistics.bootstrap import clusters_of
 from experiments.statistics.intervals import effective_trials, wilson
-from experiments.statistics.maps import DEFAULT_CRITERIA, Criteria, at_the_end, maps_of, methods_in
+from experiments.statistics.maps import (
+    DEFAULT_CRITERIA,
+    Criteria,
+    at_the_end,
+    has_common_ground,
+    maps_of,
+    methods_in,
+)
 from mapfusion.se2 import Float
 
 LAST = "last"
@@ -28,7 +35,7 @@ EDGES: dict[str, tuple[float, ...]] = {
 }
 BY = ("iteration", *EDGES, LAST)
 _ITERATION_BINS = 8
-_SHARES = ("estimated_success", "refined_success", "accepted", "false_accepted")
+_SHARES = ("estimated_success", "refined_success", "accepted", "false_accepted", "refused_apart")
 
 
 def success_rates(
@@ -49,9 +56,11 @@ def success_rates(
         criteria: what counts as right.
 
     Returns:
-        One row per bin and method: from, to, aligner, n_runs, n_maps, unit, and for each of
-        estimated_success, refined_success, accepted and false_accepted the share and its 95 %
-        interval (_low, _high); the last two only where the runs have an acceptance test.
+        One row per bin and method: from, to, aligner, n_runs, n_maps, n_apart (those without common
+        ground), unit, and shares with their 95 % interval (_low, _high): of the maps with
+        common ground estimated_success, refined_success and accepted; of all false_accepted; of
+        those without common ground refused_apart. Without an acceptance test there are the first
+        two.
 
     Raises:
         ValueError: an unknown `by`, or edges that do not rise.
@@ -100,13 +109,15 @@ def _edges(by: str, values: Float) -> Float:
 
 def _rates(rows: pd.DataFrame, codes: np.ndarray) -> dict[str, Any]:
     """Shares of one bin and method, with their intervals."""
-    maps_per_cluster = np.unique(codes, return_counts=True)[1]
-    n = effective_trials(maps_per_cluster)
+    ground = has_common_ground(rows).to_numpy()
     found: dict[str, Any] = {"n_runs": rows["run_id"].nunique(), "n_maps": len(rows)}
+    found |= {"n_apart": int(np.count_nonzero(~ground))}
     for name in _SHARES:
-        if rows[name].isna().all():
+        known = rows[name].notna().to_numpy() & (ground if name == "accepted" else True)
+        if not known.any():
             continue
-        share = float(rows[name].mean())
+        n = effective_trials(np.unique(codes[known], return_counts=True)[1])
+        share = float(rows[name][known].mean())
         low, high = wilson(share * n, n)
         found |= {name: share, f"{name}_low": float(low), f"{name}_high": float(high)}
     return found

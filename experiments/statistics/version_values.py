@@ -84,10 +84,11 @@ def _alignment_values(maps: pd.DataFrame) -> Iterator[Values]:
         for name, label, higher in (
             ("estimated_success", "success estimated", True),
             ("refined_success", "success refined", True),
-            ("accepted", "accepted", True),
             ("false_accepted", "wrongly accepted", False),
         ):
             yield _difference(Metric(label, aligner, "share", higher), own, name)
+        ground = own[own[["n_common_a", "n_common_b"]].min(axis=1) >= ANSWERABLE_PAIRS]
+        yield _difference(Metric("accepted", aligner, "share", True), ground, "accepted")
         enough = own[scarce[own.index] >= ANSWERABLE_PAIRS]
         metric = Metric("estimated error, m", aligner, "ratio")
         yield _ratio(metric, enough, "translation_error_m")

@@ -7,6 +7,7 @@ from made_up_runs import ITERATIONS, LOST_M, errors_of, robots_of, tables_of, wr
 from scipy.stats import binomtest
 
 from experiments.statistics.bootstrap import MAPS_OF_ONE_RUN, RUN
+from experiments.statistics.intervals import wilson
 from experiments.statistics.maps import Criteria, maps_of
 from experiments.statistics.overlap import with_overlap_share
 from experiments.statistics.sources import find_runs
@@ -60,6 +61,31 @@ def test_at_the_end_the_trials_are_runs() -> None:
         [expected.low, expected.high]
     )
     assert row["n_maps"] == 24
+
+
+def test_maps_without_common_ground_are_counted_apart() -> None:
+    """Of 12 worlds 4 share 2 landmarks: by luck right there, and accepted in one of three."""
+    errors = many_errors(12, methods={"ransac": (1.1, 0.1, 0.0)}, repetitions=3)
+    apart = errors["run_id"].isin([f"world-{seed}" for seed in range(4)])
+    errors["accepted"] = ~apart | (errors["repetition"] == 0)
+    lost = (errors["run_id"] == "world-5") & (errors["aligner"] == "ransac")
+    errors.loc[lost, ["translation_error_m", "refined_translation_error_m"]] = LOST_M
+    together = success_rates(errors, LAST).set_index("aligner").loc["ransac"]
+    errors.loc[apart, "n_common"] = 2
+    row = success_rates(errors, LAST).set_index("aligner").loc["ransac"]
+    assert (together["n_apart"], row["n_apart"], row["n_maps"]) == (0, 8, 24)
+    assert together["estimated_success"] == pytest.approx(11 / 12)
+    assert row["estimated_success"] == row["refined_success"] == pytest.approx(7 / 8)
+    assert together["accepted"] == pytest.approx((8 + 4 / 3) / 12)
+    assert row["accepted"] == 1
+    assert row["refused_apart"] == pytest.approx(2 / 3)
+    assert row["false_accepted"] == pytest.approx((1 + 4 / 3) / 12)
+    low, high = map(float, wilson(4 * 2 / 3, 4))
+    assert row[["refused_apart_low", "refused_apart_high"]].tolist() == pytest.approx([low, high])
+    bins = success_rates(errors, "n_common").set_index(["aligner", "from"]).loc["ransac"]
+    assert np.isnan(bins.loc[0, "estimated_success"])
+    assert bins["n_apart"].tolist()[0] == bins["n_maps"].tolist()[0] == 32
+    assert (bins["n_apart"].iloc[1:] == 0).all()
 
 
 def test_a_single_run_says_so() -> None:
