@@ -200,8 +200,9 @@ def _pair_tasks(scenario: Scenario, pair: PairStages) -> list[Task]:
     for i, iterations in enumerate(batches):
         arguments = (scenario, (a, b), offered, i, iterations)
         parts.append(_batch_task(offered, i, align.run_match, arguments, maps))
-    for entry, output in zip(scenario.align.aligners, pair.parts.aligners, strict=True):
-        for i, iterations in enumerate(batches):
+    # Method by method within a batch: two processes then compile different methods' kernels.
+    for i, iterations in enumerate(batches):
+        for entry, output in zip(scenario.align.aligners, pair.parts.aligners, strict=True):
             arguments = (scenario, entry, (a, b), offered, output, i, iterations)
             needs = (*maps, parts[i].name)
             parts.append(_batch_task(output, i, align.run_aligner, arguments, needs))

@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 from mapfusion.align.acceptance import Acceptance
-from mapfusion.align.false_alarms import fewest_false_alarms, possible_repairings
+from mapfusion.align.false_alarms import IndependentPairs, fewest_false_alarms, independent_pairs
 from mapfusion.align.rigid import fit_rigid
 from mapfusion.se2 import Float
 
@@ -40,7 +40,8 @@ def calibrate(
     counts = np.zeros((n_pairs, len(STATED)), np.int64)
     for k in range(n_pairs):
         p_a, p_b = points_on_walls(rng, N_CORRESPONDENCES), points_on_walls(rng, N_CORRESPONDENCES)
-        counts[k] = accepted_motions(p_a, p_b, gates, bounds)
+        pairs = independent_pairs(p_a, p_b, np.zeros((N_CORRESPONDENCES, 4)))
+        counts[k] = accepted_motions(pairs, gates, bounds)
     return [
         {
             "stated": stated,
@@ -53,10 +54,9 @@ def calibrate(
 
 
 @njit(cache=True)
-def accepted_motions(p_a: Float, p_b: Float, gates_m: Float, bounds_log10: Float) -> np.ndarray:
-    """How many motions of two pairs (N, 2) each have an NFA up to each bound (S,)."""
-    heights = np.zeros((len(p_a), 4))
-    possible = possible_repairings(heights)
+def accepted_motions(pairs: IndependentPairs, gates_m: Float, bounds_log10: Float) -> np.ndarray:
+    """How many motions of two of the pairs have an NFA up to each bound (S,)."""
+    p_a, p_b = pairs.p_a, pairs.p_b
     counts = np.zeros(len(bounds_log10), np.int64)
     T_a_b = np.empty(3)
     two = np.empty(2, np.int64)
@@ -64,7 +64,7 @@ def accepted_motions(p_a: Float, p_b: Float, gates_m: Float, bounds_log10: Float
         for i in range(j):
             two[0], two[1] = i, j
             T_a_b[0], T_a_b[1], T_a_b[2] = fit_rigid(p_a, p_b, two)
-            log10, _, _, _ = fewest_false_alarms(p_a, p_b, heights, possible, T_a_b, gates_m)
+            log10, _, _, _ = fewest_false_alarms(pairs, T_a_b, gates_m)
             for s in range(len(bounds_log10)):
                 counts[s] += log10 <= bounds_log10[s]
     return counts

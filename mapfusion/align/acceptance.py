@@ -6,7 +6,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from mapfusion.align.correspondences import Correspondences, HeightGate
-from mapfusion.align.false_alarms import fewest_false_alarms, possible_repairings, thin
+from mapfusion.align.false_alarms import (
+    IndependentPairs,
+    fewest_false_alarms,
+    independent_pairs,
+    thin,
+)
 from mapfusion.align.pairs import MIN_PAIRS, Pairs, gather
 from mapfusion.align.result import Alignment, Status
 from mapfusion.landmark_map import LandmarkMap
@@ -109,14 +114,14 @@ class Acceptance:
         """
         pairs = gather(map_a, map_b, correspondences)
         pairs = pairs[self._independent(pairs, correspondences.distance)]
-        heights = self._heights(pairs)
         return ChanceTest(
             self.false_alarms,
             np.array(sorted(self.gates_m)),
-            np.ascontiguousarray(pairs.p_a[:, :2]),
-            np.ascontiguousarray(pairs.p_b[:, :2]),
-            heights,
-            possible_repairings(heights),
+            independent_pairs(
+                np.ascontiguousarray(pairs.p_a[:, :2]),
+                np.ascontiguousarray(pairs.p_b[:, :2]),
+                self._heights(pairs),
+            ),
         )
 
     def _independent(self, pairs: Pairs, distance: Float) -> np.ndarray:
@@ -132,7 +137,7 @@ class Acceptance:
         return rows[kept]
 
     def _heights(self, pairs: Pairs) -> Float:
-        """Heights (n, 4) as `agreeing_repairings` takes them; of planar maps all 0."""
+        """Heights (n, 4) as `IndependentPairs` has them; of planar maps all 0."""
         if pairs.planar:
             return np.zeros((len(pairs), 4))
         bound = self.height.bound
@@ -145,30 +150,23 @@ class Acceptance:
 
 @dataclass(frozen=True)
 class ChanceTest:
-    """`Acceptance` for the n independent correspondences of two maps, best match first.
+    """`Acceptance` for the independent correspondences of two maps.
 
     Attributes:
         false_alarms: accepted expected number of chance alignments.
         gates_m: (G,) ascending.
-        p_a, p_b: (n, 2) in metres, each in its own frame.
-        heights: (n, 4) as `agreeing_repairings` takes them.
-        possible: (n,) how many re-pairings among the first can have one height.
+        pairs: the correspondences.
     """
 
     false_alarms: float
     gates_m: Float
-    p_a: Float
-    p_b: Float
-    heights: Float
-    possible: np.ndarray
+    pairs: IndependentPairs
 
     def judge(self, alignment: Alignment) -> Verdict:
         """Hold one alignment of the correspondences against chance."""
         if not alignment.ok or not np.all(np.isfinite(alignment.T_a_b)):
             return Verdict(False, math.nan, alignment.reason)
-        log10, gate_m, n, k = fewest_false_alarms(
-            self.p_a, self.p_b, self.heights, self.possible, alignment.T_a_b, self.gates_m
-        )
+        log10, gate_m, n, k = fewest_false_alarms(self.pairs, alignment.T_a_b, self.gates_m)
         if log10 <= math.log10(self.false_alarms):
             return Verdict(True, log10)
         return Verdict(False, log10, self._why(log10, gate_m, n, k))

@@ -4,6 +4,7 @@ Pairs are independent of each other and ordered by how well they match, best fir
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -17,6 +18,30 @@ from mapfusion.se2 import Float
 _CANDIDATES = 20
 # Halving ends above this: p is not known from fewer pairs, and 8 of them could hardly be accepted.
 _SMALLEST_SELECTION = 16
+
+
+class IndependentPairs(NamedTuple):
+    """Pairs that are independent of each other, best match first, for the kernels.
+
+    Attributes:
+        p_a, p_b: (N, 2) positions in metres, each in its own frame.
+        heights: (N, 4) z of a and of b, and the most that the squared difference of two heights may
+            be, as the sum of a part of a's and one of b's.
+        possible: (N,) `possible_repairings`.
+        by_x: (N,) rows by ascending p_a[:, 0].
+    """
+
+    p_a: Float
+    p_b: Float
+    heights: Float
+    possible: np.ndarray
+    by_x: np.ndarray
+
+
+def independent_pairs(p_a: Float, p_b: Float, heights: Float) -> IndependentPairs:
+    """Of positions (N, 2) and heights (N, 4), with all that no motion changes."""
+    by_x = np.argsort(p_a[:, 0], kind="stable")
+    return IndependentPairs(p_a, p_b, heights, possible_repairings(heights), by_x)
 
 
 @njit(cache=True)
@@ -87,8 +112,43 @@ def moved_points(T_a_b: Float, p_b: Float) -> Float:
 @njit(cache=True)
 def residuals_m(T_a_b: Float, p_a: Float, p_b: Float) -> Float:
     """Distances (n,) in the plane between p_a and T p_b."""
-    apart = p_a - moved_points(T_a_b, p_b)
-    return np.sqrt(apart[:, 0] ** 2 + apart[:, 1] ** 2)
+    moved = moved_points(T_a_b, p_b)
+    distance = np.empty(len(p_a))
+    for i in range(len(p_a)):
+        distance[i] = math.hypot(p_a[i, 0] - moved[i, 0], p_a[i, 1] - moved[i, 1])
+    return distance
+
+
+@njit(cache=True)
+def nearest_first(distance: Float, n: int, gate_m: float) -> np.ndarray:
+    """Rows (k,) among the first n whose distance (N,) is within the gate, by ascending distance.
+
+    By insertion: Numba takes seconds to compile its sorts, and k is a few hundred at most.
+    """
+    rows = np.empty(n, np.int64)
+    k = 0
+    for i in range(n):
+        if distance[i] <= gate_m:
+            place = k
+            while place > 0 and distance[rows[place - 1]] > distance[i]:
+                rows[place] = rows[place - 1]
+                place -= 1
+            rows[place] = i
+            k += 1
+    return rows[:k]
+
+
+@njit(cache=True)
+def first_from(p: Float, by_x: np.ndarray, x: float) -> int:
+    """Place in by_x (N,) of the first of the points p (N, 2) that lies at x or beyond it."""
+    low, high = 0, len(by_x)
+    while low < high:
+        middle = (low + high) // 2
+        if p[by_x[middle], 0] < x:
+            low = middle + 1
+        else:
+            high = middle
+    return low
 
 
 @njit(cache=True)
@@ -147,32 +207,26 @@ def possible_repairings(heights: Float) -> np.ndarray:
 
 @njit(cache=True)
 def agreeing_repairings(
-    T_a_b: Float, p_a: Float, p_b: Float, heights: Float, gates_m: Float, first: int
+    T_a_b: Float, pairs: IndependentPairs, gates_m: Float, first: int
 ) -> np.ndarray:
     """How many (i, j), i not j, of one height agree under T_a_b within each gate.
 
     Args:
         T_a_b: (3,).
-        p_a: (N, 2).
-        p_b: (N, 2).
-        heights: (N, 4) z of a and of b, and the most that the squared difference of two heights may
-            be, as the sum of a part of a's and one of b's.
+        pairs: all N.
         gates_m: (G,) ascending.
         first: size of the selection.
 
     Returns:
         (2, G): among the first pairs only, among all.
     """
+    p_a, p_b, heights, _, by_x = pairs
     moved = moved_points(T_a_b, p_b)
-    order_a, order_b = np.argsort(p_a[:, 0]), np.argsort(moved[:, 0])
     agreeing = np.zeros((2, len(gates_m)), np.int64)
     widest = gates_m[-1]
-    low = 0
-    for j in order_b:  # from left to right, so that only landmarks in reach are looked at
-        while low < len(p_a) and p_a[order_a[low], 0] < moved[j, 0] - widest:
-            low += 1
-        for m in range(low, len(p_a)):
-            i = order_a[m]
+    for j in range(len(p_b)):
+        for m in range(first_from(p_a, by_x, moved[j, 0] - widest), len(p_a)):
+            i = by_x[m]
             if p_a[i, 0] > moved[j, 0] + widest:
                 break
             distance = math.hypot(p_a[i, 0] - moved[j, 0], p_a[i, 1] - moved[j, 1])
@@ -202,45 +256,40 @@ def chance_of_agreeing(agreeing: np.ndarray, possible: np.ndarray) -> Float:
 
 @njit(cache=True)
 def fewest_false_alarms(
-    p_a: Float,
-    p_b: Float,
-    heights: Float,
-    possible: np.ndarray,
-    T_a_b: Float,
-    gates_m: Float,
+    pairs: IndependentPairs, T_a_b: Float, gates_m: Float
 ) -> tuple[float, float, int, int]:
     """The smallest NFA over gates and selections of the best-matching pairs.
 
     Args:
-        p_a: (N, 2) of independent pairs, best match first.
-        p_b: (N, 2).
-        heights: (N, 4), see `agreeing_repairings`.
-        possible: (N,) from `possible_repairings`, the same for every motion.
+        pairs: the N at hand.
         T_a_b: (3,) to be judged.
         gates_m: (G,) ascending.
 
     Returns:
         log10 of the NFA, and the gate, number of pairs and of supporters it came from.
     """
+    p_a, p_b, _, possible, _ = pairs
     total = len(p_a)
     selections = 1
     while total >> selections >= _SMALLEST_SELECTION:
         selections += 1
     distance = residuals_m(T_a_b, p_a, p_b)
+    possible_here = np.empty(2, np.int64)
     best, best_gate, best_n, best_k = math.inf, 0.0, total, 0
     for s in range(selections):
         n = total >> s
-        order = np.argsort(distance[:n], kind="mergesort")
-        supporters = order[: np.sum(distance[:n] <= gates_m[-1])]
+        supporters = nearest_first(distance, n, gates_m[-1])
         if len(supporters) < MIN_PAIRS:
             continue
         T_two = minimal_motion(p_a, p_b, supporters, T_a_b)
-        agreeing = agreeing_repairings(T_two, p_a, p_b, heights, gates_m, n)
-        p = chance_of_agreeing(agreeing, possible[np.array([n - 1, total - 1])])
-        both = np.maximum(distance[:n], residuals_m(T_two, p_a[:n], p_b[:n]))
+        possible_here[0], possible_here[1] = possible[n - 1], possible[total - 1]
+        p = chance_of_agreeing(agreeing_repairings(T_two, pairs, gates_m, n), possible_here)
+        under_two = residuals_m(T_two, p_a, p_b)
         tests = math.log10(selections * len(gates_m)) + math.log10(n * (n - 1) / 2)
         for g in range(len(gates_m)):
-            k = int(np.sum(both <= gates_m[g]))
+            k = 0
+            for i in range(n):
+                k += distance[i] <= gates_m[g] and under_two[i] <= gates_m[g]
             if k < MIN_PAIRS:
                 continue
             log10 = tests + log10_tail(k - 2, n - 2, p[g])

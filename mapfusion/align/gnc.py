@@ -53,12 +53,13 @@ def anneal(pairs: PlanarPairs, mean_m2: Float, bound: float) -> tuple[Float, Flo
             scaled[i] = weight[i] / mean_m2[i]
         fit_weighted(p_a, p_b, scaled, T_a_b)
         cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+        largest = 0.0
         for i in range(n):
             ex = p_a[i, 0] - T_a_b[0] - cos * p_b[i, 0] + sin * p_b[i, 1]
             ey = p_a[i, 1] - T_a_b[1] - sin * p_b[i, 0] - cos * p_b[i, 1]
             square[i] = (ex * ex + ey * ey) / mean_m2[i]
+            largest = max(largest, square[i])
         if mu == 0:  # remark 5: convex enough for the largest residual
-            largest = np.max(square)
             if largest <= bound:
                 break
             mu = bound / (2 * largest - bound)

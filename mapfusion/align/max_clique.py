@@ -42,6 +42,21 @@ def members(bits: np.ndarray, into: np.ndarray) -> int:
 
 
 @njit(cache=True)
+def by_degree(degree: np.ndarray) -> np.ndarray:
+    """Vertices (N,) by ascending degree, those of one degree in their order (a counting sort)."""
+    start = np.zeros(len(degree) + 1, np.int64)
+    for v in range(len(degree)):
+        start[degree[v] + 1] += 1
+    for d in range(1, len(start)):
+        start[d] += start[d - 1]
+    order = np.empty(len(degree), np.int64)
+    for v in range(len(degree)):
+        order[start[degree[v]]] = v
+        start[degree[v]] += 1
+    return order
+
+
+@njit(cache=True)
 def degeneracy_order(graph: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Vertices in the order of taking away the one with the fewest neighbours left (N,).
 
@@ -53,7 +68,7 @@ def degeneracy_order(graph: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     n = len(graph)
     core = degrees(graph)
-    order = np.argsort(core, kind="mergesort")
+    order = by_degree(core)
     place, start = np.empty(n, np.int64), np.zeros(n + 1, np.int64)
     for k in range(n):
         place[order[k]] = k
@@ -87,7 +102,7 @@ def greedy_clique(graph: np.ndarray, starts: int) -> np.ndarray:
         (K,) its vertices; the largest of all walks, the first on a tie.
     """
     n, words = graph.shape
-    order = np.argsort(-degrees(graph), kind="mergesort")
+    order = by_degree(n - 1 - degrees(graph))
     best, clique = np.zeros(n, np.int64), np.zeros(n, np.int64)
     size_of_best = 0
     left = np.empty(words, np.uint64)

@@ -20,7 +20,7 @@ from experiments.scenario import Scenario
 from mapfusion import se2
 from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.correspondences import MatchParameters
-from mapfusion.align.false_alarms import fewest_false_alarms, possible_repairings
+from mapfusion.align.false_alarms import fewest_false_alarms, independent_pairs
 from mapfusion.align.rigid import fit_rigid
 from mapfusion.robot_log import DESCRIPTOR_LENGTH
 
@@ -137,16 +137,14 @@ def test_calibration_counts_every_motion_of_two_pairs() -> None:
     n = 30
     p_a, p_b = points_on_walls(rng, n), points_on_walls(rng, n)
     gates, bounds = np.array([0.1, 0.4]), np.array([1.0, 2.0, 2.5, 4.0])
-    heights = np.zeros((n, 4))
+    pairs = independent_pairs(p_a, p_b, np.zeros((n, 4)))
     expected = np.zeros(4, np.int64)
     for i, j in itertools.combinations(range(n), 2):
         T_a_b = np.array(fit_rigid(p_a, p_b, np.array([i, j])))
-        log10 = fewest_false_alarms(p_a, p_b, heights, possible_repairings(heights), T_a_b, gates)[
-            0
-        ]
+        log10 = fewest_false_alarms(pairs, T_a_b, gates)[0]
         expected += log10 <= bounds
     assert expected[-1] > expected[0]
-    np.testing.assert_array_equal(accepted_motions(p_a, p_b, gates, bounds), expected)
+    np.testing.assert_array_equal(accepted_motions(pairs, gates, bounds), expected)
 
 
 def test_stated_number_of_false_alarms_bounds_the_measured_one() -> None:

@@ -16,9 +16,9 @@ from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.false_alarms import (
     agreeing_repairings,
     fewest_false_alarms,
+    independent_pairs,
     log10_tail,
     minimal_motion,
-    possible_repairings,
     thin,
 )
 from mapfusion.align.ransac import Ransac
@@ -109,13 +109,14 @@ def test_repairings_are_counted_right():
     rng = np.random.default_rng(1)
     n = 90
     p_a, p_b, heights = rng.uniform(0, 3, (n, 2)), rng.uniform(0, 3, (n, 2)), heights_of(rng, n)
+    pairs = independent_pairs(p_a, p_b, heights)
     for first in (90, 45, 22):
         T_a_b = np.array([*rng.normal(0, 0.5, 2), rng.uniform(-3, 3)])
-        agreeing = agreeing_repairings(T_a_b, p_a, p_b, heights, GATES_M, first)
+        agreeing = agreeing_repairings(T_a_b, pairs, GATES_M, first)
         for row, size in ((0, first), (1, n)):
             expected, possible = twin_counts(T_a_b, p_a, p_b, heights, size)
             np.testing.assert_array_equal(agreeing[row], expected)
-            assert possible_repairings(heights)[size - 1] == possible
+            assert pairs.possible[size - 1] == possible
 
 
 def test_minimal_motion_is_the_nearest_of_all():
@@ -172,9 +173,7 @@ def test_the_whole_is_the_documented_formula(true_share):
         heights = heights_of(rng, n)
         wrong = np.array([*(p_a[0] - p_b[0]), 0.3])
         for T_a_b in (pair.T_a_b, wrong):
-            found = fewest_false_alarms(
-                p_a, p_b, heights, possible_repairings(heights), T_a_b, GATES_M
-            )[0]
+            found = fewest_false_alarms(independent_pairs(p_a, p_b, heights), T_a_b, GATES_M)[0]
             assert found == pytest.approx(twin_nfa(p_a, p_b, heights, T_a_b), rel=1e-9)
 
 
