@@ -1,7 +1,7 @@
 """What `mapfusion statistics` and `mapfusion compare` show."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import pandas as pd
@@ -60,7 +60,7 @@ def _table(title: str, headings: Sequence[str], labels: Sequence[str]) -> Table:
     for label in labels:
         table.add_column(escape(label))
     for place, heading in enumerate(headings):
-        table.add_column(heading, justify="right" if place else "left", no_wrap=place > 0)
+        table.add_column(heading, justify="right" if place else "left", no_wrap=True)
     return table
 
 
@@ -78,28 +78,36 @@ def _print_success(console: Console, summary: Summary) -> None:
     rows, labels = _shown(summary, "success_at_the_end")
     if rows.empty:
         return
-    shares = {
-        "estimated_success": "right\nas estimated",
-        "refined_success": "\nrefined",
-        "accepted": "\naccepted",
-        "false_accepted": "accepted\nthough wrong",
-        "refused_apart": "refused where\nnothing is common",
-    }
-    shares = {name: heading for name, heading in shares.items() if name in rows}
     limits = summary.criteria
-    table = _table(
-        f"Success at the end of {_runs(summary.n_runs)}",
-        ["\nmethod", *shares.values()],
-        labels,
-    )
+    reach = f"{limits.translation_m:g} m and {limits.rotation_rad:g} rad"
+    caption = f"within {reach}, the reach of the refinement"
+    apart = bool(rows["n_apart"].any())
+    if apart:
+        caption += f"; without the {_apart(rows)} that have no common ground"
+    right = {"estimated_success": "as estimated", "refined_success": "refined"}
+    title = f"Right at the end of {_runs(summary.n_runs)}, percent"
+    _show(console, _shares(rows, labels, title, right), f"{caption}; (95 %, Wilson)")
+    if "accepted" not in rows:
+        return
+    verdicts = {"accepted": "accepted", "false_accepted": "accepted\nthough wrong"}
+    if apart:
+        verdicts["accepted"] = "accepted where\nthere is common ground"
+        verdicts["refused_apart"] = "refused where\nthere is none"
+    table = _shares(rows, labels, "Verdicts at the end, percent", verdicts)
+    _show(console, table, "though wrong: of all, whatever ground; (95 %, Wilson)")
+
+
+def _shares(
+    rows: pd.DataFrame, labels: Sequence[str], title: str, shares: Mapping[str, str]
+) -> Table:
+    """Methods down, shares across: columns of `rows` and their headings."""
+    lines = max(heading.count("\n") for heading in shares.values())
+    headings = ["method", *shares.values()]
+    table = _table(title, ["\n" * (lines - h.count("\n")) + h for h in headings], labels)
     for row in rows.to_dict("records"):
         cells = [_share(row, name) for name in shares]
         table.add_row(*_cells(row, [*labels, "aligner"]), *cells)
-    reach = f"{limits.translation_m:g} m and {limits.rotation_rad:g} rad"
-    caption = f"right: within {reach}, the reach of the refinement; (95 %, Wilson)"
-    if rows["n_apart"].any():
-        caption += f"; {_apart(rows)} have no common ground, and no say in the first three columns"
-    _show(console, table, caption)
+    return table
 
 
 def _apart(rows: pd.DataFrame) -> str:
@@ -155,7 +163,7 @@ def _print_best_against_others(console: Console, summary: Summary) -> None:
     best = str(methods.groupby("aligner")["estimated_m"].median().idxmin())
     table = _table(
         f"{best} against each other method on the same maps, as estimated",
-        ["other", "its error over other's", "nearer than other", "p (Holm)"],
+        ["other", "its error over other's", "nearer, percent", "p (Holm)"],
         labels,
     )
     for row in rows[(rows["first"] == best) | (rows["second"] == best)].to_dict("records"):
@@ -307,14 +315,15 @@ def _interval(row: dict, name: str, layout: str = ".2f") -> str:
 
 def _share(row: dict, name: str) -> str:
     values = (100 * row[name], 100 * row[f"{name}_low"], 100 * row[f"{name}_high"])
-    return _bracketed(*values, ".0f", " %")
+    return _bracketed(*values, ".0f")
 
 
 def _bracketed(value: float, low: float, high: float, layout: str, unit: str = "") -> str:
     text = _number(value, layout) + (unit if not math.isnan(value) else "")
     if math.isnan(low) or math.isnan(high) or (math.isinf(low) and math.isinf(high)):
         return text
-    return f"{text} ({_number(low, layout)} to {_number(high, layout)})"
+    to = " to " if layout.startswith("+") else "–"  # signs need room between them
+    return f"{text} ({_number(low, layout)}{to}{_number(high, layout)})"
 
 
 def _number(value: float, layout: str) -> str:

@@ -28,7 +28,7 @@ def test_screen_files_and_figures(tmp_path: Path, capsys: pytest.CaptureFixture[
     sweep = write_sweep(tmp_path / "sweep", range(7))
     reply = command(capsys, "statistics", sweep, "-o", tmp_path / "out")
     assert reply.code == 0, reply.err
-    for text in ("Success at the end of 7 runs", "over the oracle", "ransac against each other"):
+    for text in ("Right at the end of 7 runs", "over the oracle", "ransac against each other"):
         assert text in reply.out
     assert "No run has: path_statistics, landmark_nees, fusion" in reply.out
     assert max(map(len, reply.out.split("All ")[0].splitlines())) <= 80
@@ -38,6 +38,22 @@ def test_screen_files_and_figures(tmp_path: Path, capsys: pytest.CaptureFixture[
     picture = matplotlib.image.imread(tmp_path / "out/figures/fig04_translation_error.png")
     assert picture.std() > 0.05
     assert len(list((tmp_path / "out/figures").iterdir())) == 6
+
+
+def test_eighty_columns_hold_everything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The longest name, verdicts, and maps without common ground: nothing is cut."""
+    methods = {"ransac_mahalanobis": (1.0, 0.1, 0.0), "icp": (8.0, 0.8, 0.4)}
+    made = {seed: tables_of(seed, methods=methods) for seed in range(8)}
+    for seed in (6, 7):
+        made[seed]["errors"]["n_common"] = 0
+    sweep = write_sweep(tmp_path / "sweep", range(8), made=made)
+    reply = command(capsys, "statistics", sweep)
+    assert "without the 4 of 16 pairs of maps that have no common ground" in " ".join(
+        reply.out.split()
+    )
+    assert "refused where" in reply.out
+    assert "\N{HORIZONTAL ELLIPSIS}" not in reply.out
+    assert "ransac_mahalanobis" in reply.out.split("Verdicts")[1].split("Right")[0]
 
 
 def test_several_scenarios_and_settings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
