@@ -1,0 +1,1 @@
+"""The commands of `mapfusion`: load, compute, show. Heavy imports sit inside of them."""
