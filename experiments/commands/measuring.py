@@ -26,18 +26,19 @@ def refusal(
 
     For example: `mapfusion refusal results/quick-0 results/quick-1 -o results/refusal`.
     """
-    from experiments import screen
     from experiments.figures.refusal import write
     from experiments.refusal.results import read
     from experiments.refusal.summary import summary
     from experiments.refusal.trial import run
+    from experiments.screen.layout import print_paths, progress
+    from experiments.screen.measuring import print_refusals
 
-    with screen.progress() as show:
+    with progress() as show:
         acceptance = run(results, output, pairs, jobs or available_cores(), show)
     refusals, calibration = read(output, "refusals"), read(output, "calibration")
     pictures = write(output, refusals, calibration, acceptance.false_alarms)
-    screen.print_refusals(summary(refusals), acceptance.false_alarms)
-    screen.print_paths(output, pictures)
+    print_refusals(summary(refusals), acceptance.false_alarms)
+    print_paths(output, pictures)
 
 
 def sweep(
@@ -153,8 +154,9 @@ def benchmark(
     Serial, so that times can be compared; finished cells are reused.
     """
     from experiments import benchmark as measure
-    from experiments import screen
     from experiments.benchmark_report import write_benchmark
+    from experiments.screen.layout import progress
+    from experiments.screen.measuring import print_benchmark
     from experiments.store import Store
 
     plan = measure.Plan(
@@ -166,17 +168,17 @@ def benchmark(
         tuple(outliers or measure.OUTLIER_SHARES),
     )
     folder = output or results / "benchmark"
-    with screen.progress() as show:
+    with progress() as show:
         rows = measure.run_benchmark(
             plan, Store(results / "store"), lambda done, total: show("benchmark", done, total)
         )
     summary = measure.summarise(rows)
     write_benchmark(folder, plan, rows, summary)
-    screen.print_benchmark(folder, summary)
+    print_benchmark(folder, summary)
 
 
 def aligners() -> None:
     """List the alignment methods that scenarios can name, and whose they are."""
-    from experiments import screen
+    from experiments.screen.measuring import print_methods
 
-    screen.print_methods()
+    print_methods()

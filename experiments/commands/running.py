@@ -30,17 +30,18 @@ def run(
 
     Finished stages are reused; an interrupted run goes on where it was.
     """
-    from experiments import screen
     from experiments.figures import draw_all
     from experiments.result import result_folder, run_scenario
     from experiments.scenario import load_scenario
+    from experiments.screen.layout import progress
+    from experiments.screen.results import print_result
     from experiments.suite import scenarios_of
 
     n_jobs = jobs or available_cores()
     for loaded in [load_scenario(s, overrides or (), seed) for s in scenarios_of(scenarios)]:
         folder = result_folder(results, loaded)
         skipped: list[str] = []
-        with screen.progress() as show:
+        with progress() as show:
             run_scenario(loaded, results, n_jobs, show, fresh)
             draw_all(
                 folder,
@@ -48,7 +49,7 @@ def run(
                 lambda done, total, show=show: show("figures", done, total),
                 skipped.append,
             )
-        screen.print_result(folder, skipped)
+        print_result(folder, skipped)
 
 
 def figures(
@@ -56,20 +57,20 @@ def figures(
     jobs: Jobs = None,
 ) -> None:
     """Draw a result's figures again, from its tables alone: `mapfusion figures results/quick-0`."""
-    from experiments import screen
     from experiments.figures import draw_all
     from experiments.result import require_result
+    from experiments.screen.layout import print_paths, progress
 
     require_result(result)
     skipped: list[str] = []
-    with screen.progress() as show:
+    with progress() as show:
         paths = draw_all(
             result,
             jobs or available_cores(),
             lambda done, total: show("figures", done, total),
             skipped.append,
         )
-    screen.print_paths(result / "figures", paths, skipped)
+    print_paths(result / "figures", paths, skipped)
 
 
 def report(
@@ -80,10 +81,10 @@ def report(
     ] = None,
 ) -> None:
     """Show a result in one HTML file that works offline: `mapfusion report results/quick-0`."""
-    from experiments import screen
     from experiments.report import write_report
+    from experiments.screen.layout import print_file
 
-    screen.print_file(write_report(result, output))
+    print_file(write_report(result, output))
 
 
 def inspect_command(
@@ -105,11 +106,12 @@ def check(
     results: Results = DEFAULT_RESULTS,
 ) -> None:
     """Hold runs to their `expect` blocks, exit code 1 if one fails: `mapfusion check ci`."""
-    from experiments import screen
     from experiments.checks import check as check_scenario
     from experiments.checks import parse_seeds, write_junit
     from experiments.result import run_scenario
     from experiments.scenario import load_scenario
+    from experiments.screen.layout import progress
+    from experiments.screen.results import print_outcomes
     from experiments.suite import scenarios_of
 
     wanted = parse_seeds(seeds)
@@ -118,13 +120,13 @@ def check(
     outcomes = []
     for per_seed in loaded:
         folders = {}
-        with screen.progress() as show:
+        with progress() as show:
             for entry in per_seed:
                 folders[entry.seed] = run_scenario(
                     entry, results, jobs or available_cores(), show, fresh
                 )
         outcomes += check_scenario(per_seed[0], folders)
-    screen.print_outcomes(outcomes)
+    print_outcomes(outcomes)
     if junit is not None:
         write_junit(junit, outcomes)
     if not all(outcome.passed for outcome in outcomes):
@@ -137,10 +139,10 @@ def list_scenarios(
     ),
 ) -> None:
     """List the suite, with the tags that `run` and `check` take: `mapfusion scenarios`."""
-    from experiments import screen
+    from experiments.screen.measuring import print_scenarios
     from experiments.suite import entries
 
-    screen.print_scenarios(entries(folder))
+    print_scenarios(entries(folder))
 
 
 def schema() -> None:

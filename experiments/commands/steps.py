@@ -25,13 +25,14 @@ def record(
     results: Results = DEFAULT_RESULTS,
 ) -> None:
     """Simulate only: one robot log (with its truth) per robot: `mapfusion record S -o logs`."""
-    from experiments import screen, single
+    from experiments import single
     from experiments.scenario import load_scenario
+    from experiments.screen.layout import print_paths, progress
 
     loaded = load_scenario(scenario, overrides or (), seed)
-    with screen.progress() as show:
+    with progress() as show:
         paths = single.record(loaded, output, results, jobs or available_cores(), show)
-    screen.print_paths(output, paths)
+    print_paths(output, paths)
 
 
 def slam(
@@ -44,13 +45,15 @@ def slam(
     seed: Annotated[int, typer.Option(help="Of the filter's randomness.", min=0)] = 0,
 ) -> None:
     """Build one robot's map from its log: `mapfusion slam logs/R1 -o R1.parquet`."""
-    from experiments import screen, single
+    from experiments import single
+    from experiments.screen.layout import progress
+    from experiments.screen.steps import print_map
 
     slam_settings = single.slam_settings(settings, overrides or ())
-    with screen.progress() as show:
+    with progress() as show:
         landmarks = single.slam(log, slam_settings, seed, show)
     single.save_map(output, landmarks)
-    screen.print_map(output, landmarks)
+    print_map(output, landmarks)
 
 
 def align(
@@ -63,10 +66,11 @@ def align(
     seed: Annotated[int, typer.Option(help="Of the aligners' randomness.", min=0)] = 0,
 ) -> None:
     """Estimate T_a_b with every aligner: `mapfusion align R1.parquet R2.parquet`."""
-    from experiments import screen, single
+    from experiments import single
+    from experiments.screen.steps import print_estimates
 
     rows = single.align(map_a, map_b, single.align_settings(settings, overrides or ()), seed)
-    screen.print_estimates(rows)
+    print_estimates(rows)
 
 
 def merge(
@@ -79,11 +83,12 @@ def merge(
     seed: Annotated[int, typer.Option(help="Of the aligner's randomness.", min=0)] = 0,
 ) -> None:
     """Fuse maps in the frame of the first: `mapfusion merge A.parquet B.parquet -o F.parquet`."""
-    from experiments import screen, single
+    from experiments import single
+    from experiments.screen.steps import print_fused
 
     fused, joined = single.merge(maps, settings, overrides or (), seed)
     single.save_map(output, fused.landmarks)
-    screen.print_fused(output, fused, joined)
+    print_fused(output, fused, joined)
 
 
 def import_mrclam_command(
@@ -91,7 +96,7 @@ def import_mrclam_command(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the logs.")],
 ) -> None:
     """UTIAS MRCLAM recordings: `mapfusion import mrclam MRCLAM_Dataset7 -o logs/mrclam7`."""
-    from experiments import screen
     from experiments.mrclam import import_mrclam
+    from experiments.screen.layout import print_paths
 
-    screen.print_paths(output, import_mrclam(folder, output))
+    print_paths(output, import_mrclam(folder, output))

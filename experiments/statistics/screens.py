@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from experiments.metrics import MIN_TRUE_PAIRS, ORACLE
-from experiments.screen import _LAYOUT as TABLE_LAYOUT
+from experiments.screen.layout import LAYOUT as TABLE_LAYOUT
 from experiments.statistics.bootstrap import MAPS_OF_ONE_RUN
 from experiments.statistics.compare import BETTER, FEW_RUNS, NOISE, SAME, UNKNOWN, WORSE, Comparison
 from experiments.statistics.summary import ALL_SCENARIOS, Summary

@@ -20,7 +20,8 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from experiments.screen import MIN_TRUE_PAIRS_SHOWN, STAGE_TEXT
+from experiments.screen.layout import STAGE_TEXT
+from experiments.screen.results import MIN_TRUE_PAIRS_SHOWN
 from experiments.sweep.dataset import Dataset
 from experiments.sweep.driver import Progress as SweepProgress
 from experiments.sweep.driver import Survey

@@ -2,7 +2,7 @@
 
 import pandas as pd
 
-from experiments.screen import aligner_summary, not_run_lines
+from experiments.screen.results import aligner_summary, not_run_lines
 
 
 def rows(aligner: str, *statuses: tuple[str, str]) -> pd.DataFrame:

@@ -1,0 +1,80 @@
+"""How tables look, and what commands show while they work and when they are done."""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+# Plain rules and narrow gaps: all columns must fit into 80 characters.
+LAYOUT: Any = {
+    "box": box.SIMPLE_HEAD,
+    "padding": (0, 1, 0, 0),
+    "title_style": "bold",
+    "title_justify": "left",
+    "caption_justify": "left",
+}
+
+STAGE_TEXT = {
+    "drive": "drive the robots",
+    "faces": "paint the walls",
+    "render": "render and find features",
+    "log": "track features",
+    "slam": "FastSLAM",
+    "align": "align the maps",
+    "judge": "compare with the truth",
+    "tables": "write the tables",
+    "figures": "draw the figures",
+    "benchmark": "measure the aligners",
+    "refusal": "cross the worlds",
+}
+
+
+@contextmanager
+def progress() -> Iterator[Callable[[str, int, int], None]]:
+    """A progress display on stderr; yields the function to tell (stage, done, total)."""
+    display = Progress(
+        TextColumn("{task.description:<26}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        console=Console(stderr=True),
+    )
+    bars: dict[str, Any] = {}
+    with display:
+
+        def show(stage: str, done: int, total: int) -> None:
+            if stage not in bars or (done == 0 and bars[stage][1]):
+                bars[stage] = [display.add_task(STAGE_TEXT.get(stage, stage), total=total), False]
+            bar, _ = bars[stage]
+            display.update(bar, completed=done, total=total)
+            bars[stage][1] = done == total
+
+        yield show
+
+
+def number(value: float, layout: str) -> str:
+    """A number in a format, or a dash for what is not known."""
+    return "-" if math.isnan(value) else format(value, layout)
+
+
+def print_paths(folder: Path, paths: Sequence[Path], skipped: Sequence[str] = ()) -> None:
+    """Where files were written."""
+    console = Console()
+    console.print(f"{len(paths)} written to {folder}", soft_wrap=True)
+    print_skipped(console, skipped)
+
+
+def print_file(path: Path) -> None:
+    """Where a file was written, and how large it is."""
+    Console().print(f"{path} ({path.stat().st_size / 1e6:.1f} MB)", soft_wrap=True, markup=False)
+
+
+def print_skipped(console: Console, skipped: Sequence[str]) -> None:
+    """A line for each figure that could not be drawn."""
+    for line in skipped:
+        console.print(f"  not drawn: {line}", soft_wrap=True)
