@@ -11,9 +11,9 @@ from experiments.metrics import ORACLE
 from experiments.report.comparison import compare, present, reduce_errors
 from experiments.report.curves import error_curves
 from experiments.statistics.bands import medians_of_run
-from experiments.statistics.maps import Criteria
+from experiments.statistics.maps import Criteria, that_ever_meet
 from experiments.statistics.sources import RUN_KEYS, Runs, setting_columns
-from experiments.statistics.summary import configurations
+from experiments.statistics.summary import ALL_SCENARIOS, configurations
 from mapfusion.errors import InputError
 
 
@@ -62,7 +62,11 @@ def _groups(medians: pd.DataFrame, aligners: list[str]) -> list[dict[str, Any]]:
         settings = [
             f"{name.rsplit('.', 1)[1]} {value}" for name, value in labels.items() if "." in name
         ]
-        label = ", ".join([str(labels["scenario"]), *settings])
+        scenario = str(labels["scenario"])
+        if scenario == ALL_SCENARIOS:
+            n_before, rows = len(rows), that_ever_meet(rows)
+            scenario = "(all)" if len(rows) == n_before else "(all with common ground)"
+        label = ", ".join([scenario, *settings])
         groups.append({"label": label, "curves": error_curves(rows, aligners)})
     return groups
 

@@ -113,6 +113,16 @@ def has_common_ground(rows: pd.DataFrame) -> pd.Series:
     return rows["n_common"] >= ANSWERABLE_PAIRS
 
 
+def that_ever_meet(rows: pd.DataFrame) -> pd.DataFrame:
+    """Rows of the robot pairs that come to share ground in their run.
+
+    Where several scenarios are pooled: errors of pairs that never meet are far off for everyone,
+    and would cover what the others have to say.
+    """
+    most = rows.groupby(["run_id", "robot_a", "robot_b"])["n_common"].transform("max")
+    return rows[most >= ANSWERABLE_PAIRS]
+
+
 def read_maps(runs: Runs, criteria: Criteria) -> pd.DataFrame:
     """The same for all runs, one run in memory at a time."""
     parts = [maps_of(errors, criteria) for errors in runs.each("errors", NEEDED, OPTIONAL)]

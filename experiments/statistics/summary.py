@@ -15,6 +15,7 @@ from experiments.statistics.maps import (
     OPTIONAL,
     Criteria,
     maps_of,
+    that_ever_meet,
 )
 from experiments.statistics.oracle_ratio import oracle_ratios
 from experiments.statistics.overlap import with_overlap_share
@@ -86,7 +87,7 @@ def summarise(runs: Runs, criteria: Criteria) -> Summary:
     """Everything there is to say about these runs; a table that none of them has is left out."""
     maps, medians = _reduced_errors(runs, criteria)
     made = _alignment_tables(maps)
-    made["errors_by_iteration"] = _each(medians, lambda rows, label: error_bands(rows))
+    made["errors_by_iteration"] = _each(medians, _error_bands)
     timings, missing = pd.DataFrame(), []
     if runs.has("aligner_timings"):
         timings = runs.read("aligner_timings", _TIMING_COLUMNS)
@@ -130,6 +131,10 @@ def _reduced_errors(runs: Runs, criteria: Criteria) -> tuple[pd.DataFrame, pd.Da
         return pd.DataFrame(columns=["scenario"]), pd.DataFrame(columns=["scenario", "run_id"])
     joined = with_overlap_share(pd.concat(maps, ignore_index=True), runs)
     return joined, pd.concat(medians, ignore_index=True)
+
+
+def _error_bands(rows: pd.DataFrame, label: tuple[str, ...]) -> pd.DataFrame:
+    return error_bands(that_ever_meet(rows) if label[0] == ALL_SCENARIOS else rows)
 
 
 def _labels(frame: pd.DataFrame) -> pd.DataFrame:

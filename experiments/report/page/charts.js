@@ -24,7 +24,7 @@ function baseLayout() {
       plot_bgcolor: "rgba(0,0,0,0)",
       font,
       showlegend: false,
-      margin: { l: 62, r: 12, t: 10, b: 44 },
+      margin: { l: 62, r: 12, t: 34, b: 44 }, // the buttons stand above the plot
       hoverlabel: { bgcolor: colour("sheet"), bordercolor: colour("line"), font: { ...font, color: colour("ink") } },
       modebar: { bgcolor: "rgba(0,0,0,0)", color: colour("muted"), activecolor: colour("ink") },
     },

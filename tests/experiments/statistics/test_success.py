@@ -8,7 +8,7 @@ from scipy.stats import binomtest
 
 from experiments.statistics.bootstrap import MAPS_OF_ONE_RUN, RUN
 from experiments.statistics.intervals import wilson
-from experiments.statistics.maps import Criteria, maps_of
+from experiments.statistics.maps import Criteria, maps_of, that_ever_meet
 from experiments.statistics.overlap import with_overlap_share
 from experiments.statistics.sources import find_runs
 from experiments.statistics.success import LAST, rates_of_maps, success_rates
@@ -86,6 +86,17 @@ def test_maps_without_common_ground_are_counted_apart() -> None:
     assert np.isnan(bins.loc[0, "estimated_success"])
     assert bins["n_apart"].tolist()[0] == bins["n_maps"].tolist()[0] == 32
     assert (bins["n_apart"].iloc[1:] == 0).all()
+
+
+def test_robots_that_meet_late_belong_to_those_that_meet() -> None:
+    errors = many_errors(3)
+    errors.loc[errors["run_id"] == "world-0", "n_common"] = 2
+    errors.loc[
+        (errors["run_id"] == "world-1") & (errors["iteration"] < ITERATIONS[-1]), "n_common"
+    ] = 0
+    kept = that_ever_meet(errors)
+    assert kept["run_id"].unique().tolist() == ["world-1", "world-2"]
+    assert len(kept) == len(errors) * 2 / 3
 
 
 def test_a_single_run_says_so() -> None:
