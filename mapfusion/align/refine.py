@@ -19,8 +19,10 @@ from mapfusion.se2 import Float, wrap
 # be told from false pairs spread over the gate.
 _GATE_SIGMAS = 3.0
 _TOLERANCE_M = 1e-8  # movement of the landmarks that counts as none
-# A pair on the gate's edge could go in and out for ever; from this round on it stays where it is.
-_GATE_ROUNDS = 50
+# A pair on the gate's edge could go in and out for ever, and s_drift swing to and fro between two
+# values; from this round on the pair stays where it is, and steps of s_drift are halved.
+_SETTLING_ROUNDS = 50
+_SWINGING = 0.9  # of the last change of s_drift^2, turned back: it hardly settles by itself
 # False pairs in the gate counted before any is seen: a share of exactly 1 could never be revised,
 # and is approached without end.
 _PRIOR_FALSE = 1.0
@@ -35,7 +37,7 @@ class Refinement:
     s_drift^2 I, and false ones spread evenly over the gate. Each round weighs the pairs by their
     probability of being true, then takes a step for the motion (Gauss-Newton on the weighted normal
     equations), for s_drift (Fisher scoring) and for the share of true ones (expectation
-    maximisation, Dempster et al. 1977).
+    maximisation, Dempster et al. 1977); steps of s_drift that swing to and fro are halved.
 
     Attributes:
         gate_m: distance in the plane under the estimate up to which a pair takes part. Between two
@@ -277,13 +279,14 @@ def iterate(
     inside, truth = np.zeros(n, np.bool_), np.zeros(n)
     widest = (gate_m / _GATE_SIGMAS) ** 2
     variance, share = widest, 0.5
+    step_share, last_change = 1.0, 0.0
     covariance, step = np.full((3, 3), np.nan), np.empty(3)
     moved = math.inf
     judged = weighed = variance
     normal, at = np.zeros((3, 3)), np.empty(3)
     for rounds in range(max_rounds):
         residuals_under(T_a_b, p_a, p_b, S_a, S_b, e, S)
-        if rounds < _GATE_ROUNDS:
+        if rounds < _SETTLING_ROUNDS:
             for i in range(n):
                 inside[i] = e[i, 0] * e[i, 0] + e[i, 1] * e[i, 1] <= gate_m * gate_m
         at[:] = T_a_b
@@ -302,7 +305,13 @@ def iterate(
                 + covariance[k, 2] * right[2]
             )
         share = total / (np.sum(inside) + _PRIOR_FALSE)
-        variance = min(drift_step(e, S, truth, variance, gate_m), widest)
+        change = min(drift_step(e, S, truth, variance, gate_m), widest) - variance
+        # few pairs far surer than the rest can throw it from one side to the other
+        turned_back = change * last_change < 0 and abs(change) > _SWINGING * abs(last_change)
+        if turned_back and rounds >= _SETTLING_ROUNDS:
+            step_share /= 2
+        variance += step_share * change
+        last_change = change
         cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
         moved = 0.0
         for i in range(n):

@@ -8,15 +8,15 @@ from scipy.stats import f as f_distribution
 
 from mapfusion import se2
 from mapfusion.align.drift import drift_step
-from mapfusion.align.pairs import gather
+from mapfusion.align.pairs import Pairs, gather
 from mapfusion.align.refine import Refinement, iterate
 from mapfusion.align.result import Status
 from mapfusion.align.rigid import motion_jacobian, residual_covariances, residuals
 
 
-def slow_iterate(pairs, T, gate_m, least_drift_m, rounds):
-    """Expectation maximisation written out with whole matrices."""
-    variance, share = (gate_m / 3) ** 2, 0.5
+def slow_iterate(pairs, T, gate_m, least_drift_m, rounds, variance=None, share=0.5):
+    """Expectation maximisation written out with whole matrices, every step a whole one."""
+    variance = (gate_m / 3) ** 2 if variance is None else variance
     for _ in range(rounds):
         e = residuals(T, pairs.p_a, pairs.p_b)
         S = residual_covariances(T, pairs.covariance_a, pairs.covariance_b)
@@ -61,6 +61,28 @@ def test_kernel_equals_its_twin(rounds):
     assert solved
     for ours, theirs in zip((T, covariance, variance, truth), twin, strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-7, atol=1e-10)
+
+
+@pytest.mark.parametrize("seed", [12, 192, 0])
+def test_few_pairs_far_surer_than_the_rest_do_not_swing_it(seed):
+    """With whole steps of s_drift seeds 12 and 192 go to and fro between two answers for ever."""
+    rng = np.random.default_rng(seed)
+    n, T_a_b = 60, np.array([1.0, 2.0, 0.5])
+    p_b = rng.uniform(-5, 5, (n, 2))
+    sigma, n_sure = np.full(n, 0.03), rng.integers(2, 8)
+    sigma[:n_sure] = 1e-4 * 10 ** rng.uniform(0, 1.5, n_sure)
+    p_a = p_b @ se2.rotation(0.5).T + T_a_b[:2] + rng.normal(size=(n, 2)) * sigma[:, None]
+    p_a[:n_sure] += rng.normal(size=(n_sure, 2)) * 0.008
+    S = np.eye(2) * (sigma**2 / 2)[:, None, None]
+    start = T_a_b + np.array([0.05, 0.05, 0.01])
+    solved, moved_m, T, _, variance, truth = iterate(p_a, p_b, S, S, start, 0.5, 0.1, 100)
+    assert solved
+    assert moved_m < 1e-8
+    pairs = Pairs(p_a, p_b, S, S, planar=True)
+    share = truth.sum() / (n + 1)
+    again, _, variance_again, _ = slow_iterate(pairs, T, 0.5, 0.1, 1, variance, share)
+    np.testing.assert_allclose(again, T, atol=1e-7)
+    assert variance_again == pytest.approx(variance, rel=1e-3, abs=1e-10)
 
 
 def test_answer_is_where_the_likelihood_is_flat():
