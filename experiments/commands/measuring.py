@@ -15,26 +15,34 @@ from experiments.commands.options import (
 
 
 def refusal(
-    results: Annotated[
-        list[Path], typer.Argument(metavar="RESULT RESULT...", help="Results of different worlds.")
+    worlds: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="WORLD...", help="Results of runs; or scenarios or tags, for each of --seeds."
+        ),
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for tables and figure.")],
     pairs: Annotated[int, typer.Option(help="Pairs of maps without common ground.", min=1)] = 500,
+    seeds: Annotated[str, typer.Option(help="Of the scenarios: a seed, 0..4 or 0,2,5.")] = "0",
     jobs: Jobs = None,
+    results: Results = DEFAULT_RESULTS,
 ) -> None:
     """Cross the maps of several worlds: are those without common ground refused, and only those?
 
-    For example: `mapfusion refusal results/quick-0 results/quick-1 -o results/refusal`.
+    For example, after a sweep of them: `mapfusion refusal full --seeds 0..2 -o results/refusal`.
     """
+    from experiments.checks import parse_seeds
     from experiments.figures.refusal import write
     from experiments.refusal.results import read
     from experiments.refusal.summary import summary
     from experiments.refusal.trial import run
+    from experiments.refusal.worlds import sources_of
     from experiments.screen.layout import print_paths, progress
     from experiments.screen.measuring import print_refusals
 
+    sources = sources_of(worlds, parse_seeds(seeds), results)
     with progress() as show:
-        acceptance = run(results, output, pairs, jobs or available_cores(), show)
+        acceptance = run(sources, output, pairs, jobs or available_cores(), show)
     refusals, calibration = read(output, "refusals"), read(output, "calibration")
     pictures = write(output, refusals, calibration, acceptance.false_alarms)
     print_refusals(summary(refusals), acceptance.false_alarms)

@@ -20,7 +20,7 @@ from experiments.figures.style import (
     house_style,
     plain_numbers,
 )
-from experiments.refusal.cases import FEW, POSTER_RADII_M
+from experiments.refusal.cases import FEW, POSTER_RADII_M, POSTERS
 from experiments.refusal.summary import Rate, mergeable, swept, without_common_ground
 
 _SUPPORT_OF = "ransac"  # whose plain number of inliers is swept for comparison
@@ -113,6 +113,11 @@ def _draw_rates(axes: Axes, refusals: pd.DataFrame, names: list[str], false_alar
         (without_common_ground(own), "no common ground", {"color": GRAY}),
         (mergeable(own), "20 or more true pairs", {"color": BLACK}),
         (own[own["ground"] == FEW], "20, in one corner", {"color": BLACK, "linestyle": "--"}),
+        (
+            own[(own["ground"] == POSTERS) & (own["n_common"] == 0)],
+            "posters all over, no common ground",
+            {"color": GRAY, "linestyle": "-."},
+        ),
         *(
             (
                 own[own["poster_radius_m"] == radius_m],

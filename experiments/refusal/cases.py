@@ -1,7 +1,8 @@
-"""Pairs of maps with and without common ground, and two kinds that real worlds rarely give.
+"""Pairs of maps with and without common ground, and kinds that most worlds do not give.
 
 APART: of two worlds; no landmark is common, whatever the walls' geometry.
 COMMON: of one world, at every evaluated iteration.
+POSTERS: the same, of a world on whose walls the same few pictures hang over and over.
 FEW: a COMMON pair of which only the 20 true correspondences around one landmark are left: the
     first corner of common ground, as hard as the bar for missed merges allows.
 REPEATED: an APART pair, but a poster of world a hangs in world b too: the landmarks of a disc of
@@ -20,7 +21,8 @@ from mapfusion.align.correspondences import Correspondences, MatchParameters, ma
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.se2 import Float
 
-APART, COMMON, FEW, REPEATED = "apart", "common", "few", "repeated"
+APART, COMMON, POSTERS = "apart", "common", "posters"
+FEW, REPEATED = "few", "repeated"
 POSTER_RADII_M = (0.5, 1.0, 2.0)  # of a poster, a mural, and half a wall
 
 
@@ -29,7 +31,7 @@ class Case:
     """Two maps with their correspondences, and what is true of them.
 
     Attributes:
-        ground: APART, COMMON, FEW or REPEATED.
+        ground: APART, COMMON, POSTERS, FEW or REPEATED.
         n_common: landmarks of both maps that are one point of the world.
         T_true: (3,) NaN without a common world.
         poster_radius_m: NaN without a poster.

@@ -15,7 +15,7 @@ def _fields(**types: pa.DataType) -> list[pa.Field]:
 
 
 # One row per (pair of maps, aligner) of the experiment `refusal`; errors are NaN for maps of two
-# worlds. Ground is apart, common, few or repeated (see experiments/refusal/cases.py).
+# worlds. Ground is apart, common, posters, few or repeated (see experiments/refusal/cases.py).
 REFUSALS = schema(
     "refusal.refusals",
     1,

@@ -7,7 +7,7 @@ import pandas as pd
 from scipy.stats import binomtest
 
 from experiments.metrics import FALSE_MERGE_M, FALSE_MERGE_RAD, MERGEABLE_TRUE_PAIRS
-from experiments.refusal.cases import APART, COMMON, FEW, POSTER_RADII_M
+from experiments.refusal.cases import APART, COMMON, FEW, POSTER_RADII_M, POSTERS
 from mapfusion.se2 import Float
 
 CONFIDENCE = 0.95
@@ -57,6 +57,8 @@ def summary(refusals: pd.DataFrame) -> list[dict[str, Any]]:
         own = refusals[refusals["aligner"] == name]
         able, few = mergeable(own), own[own["ground"] == FEW]
         some = own[(own["ground"] == COMMON) & (own["n_common"] > 0)]
+        hung = own[own["ground"] == POSTERS]
+        hung_common = hung[hung["n_common"] > 0]
         rows.append(
             {
                 "aligner": name,
@@ -66,6 +68,8 @@ def summary(refusals: pd.DataFrame) -> list[dict[str, Any]]:
                 "missed_though_right": _refused(able[is_right(able)]),
                 "few_missed_though_right": _refused(few[is_right(few)]),
                 "few_wrong": _rate(few["accepted"] & ~is_right(few)),
+                "posters_false": _accepted(hung[hung["n_common"] == 0]),
+                "posters_wrong": _rate(hung_common["accepted"] & ~is_right(hung_common)),
             }
             | {
                 f"poster_{radius_m:g}": _accepted(own[own["poster_radius_m"] == radius_m])

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,7 +14,7 @@ from experiments.randomness import generator
 from experiments.refusal import cases, results
 from experiments.refusal.calibration import calibrate
 from experiments.refusal.cases import Case
-from experiments.refusal.worlds import World, load_worlds
+from experiments.refusal.worlds import Source, World, load_worlds
 from experiments.scenario import Scenario
 from experiments.stages.align import map_at
 from experiments.stages.judge import load_robot
@@ -34,7 +35,7 @@ class Meeting(NamedTuple):
 
 
 def run(
-    folders: Sequence[Path],
+    sources: Sequence[Source],
     output: Path,
     n_apart: int,
     jobs: int,
@@ -43,13 +44,13 @@ def run(
     """Write the tables `refusals` and `calibration` into a folder; returns the test they used.
 
     Args:
-        folders: result folders of different worlds; the first one's scenario gives the methods.
+        sources: different worlds; the first one's scenario gives methods and iterations.
         output: folder.
         n_apart: pairs of maps without common ground, drawn from all there are.
         jobs: processes.
         on_progress: told (stage, done, total).
     """
-    scenario, worlds = load_worlds(folders)
+    scenario, worlds = load_worlds(sources)
     drawn = _drawn_meetings(scenario, worlds, n_apart)
     done: dict[Any, list[dict[str, Any]]] = {}
     with workers(jobs) as pool:
@@ -95,14 +96,16 @@ def _drawn_meetings(
 
 
 def common_rows(scenario: Scenario, world: World) -> list[dict[str, Any]]:
-    """COMMON and FEW pairs of one world."""
+    """COMMON and FEW pairs of one world; POSTERS of one whose pictures repeat."""
     robots = [load_robot(folders) for folders in world.robots.values()]
     rows = []
     for a, b in itertools.combinations(robots, 2):
         for iteration in _iterations(scenario):
             rng = generator(scenario.seed, "few", world.name, a.name, b.name, iteration)
             case = _common(scenario, a, b, iteration)
-            fewer = cases.few(case, rng)
+            fewer = None if world.repeats else cases.few(case, rng)
+            if world.repeats:
+                case = replace(case, ground=cases.POSTERS)
             for entry in (case, fewer):
                 if entry is not None:
                     rows += _answers(scenario, entry, (world.name, world.name), iteration)

@@ -1,17 +1,19 @@
-"""The worlds of earlier runs: robots with their maps at each evaluated iteration, and the truth."""
+"""The worlds of earlier runs and sweeps: robots with their maps by iteration, and the truth."""
 
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from pydantic import ValidationError
 
 from experiments.pipeline import plan
 from experiments.result import STORE_FOLDER, require_result
-from experiments.scenario import Scenario
+from experiments.scenario import Scenario, load_scenario
 from experiments.stages.judge import RobotFolders
 from experiments.store import Store
+from experiments.suite import scenarios_of
 from mapfusion.errors import InputError
 
 
@@ -20,34 +22,71 @@ class World:
     """One world and the robots that mapped it.
 
     Attributes:
-        name: of the result folder.
+        name: SCENARIO-SEED, or that of the result folder.
         textures: key of the painted walls: equal ones mean the same world.
+        repeats: the same few pictures hang all over it.
         robots: where each robot's log and maps lie, by name.
     """
 
     name: str
     textures: str
+    repeats: bool
     robots: dict[str, RobotFolders]
 
 
-def load_worlds(results: Sequence[Path]) -> tuple[Scenario, list[World]]:
-    """The first result's scenario, and the worlds of all of them.
+class Source(NamedTuple):
+    """Where a world comes from: how messages call it, its scenario, and what keeps its maps."""
+
+    label: str
+    name: str
+    scenario: Scenario
+    store: Store
+
+
+def sources_of(worlds: Sequence[str], seeds: Sequence[int], results: Path) -> list[Source]:
+    """What the words of a command stand for.
+
+    Args:
+        worlds: result folders of `run`; or scenario files, names or tags, for each seed, whose maps
+            a sweep or a run left in the store of `results`.
+        seeds: of the scenarios.
+        results: folder.
 
     Raises:
-        InputError: fewer than two, not results of simulations, two of one world, or maps that are
-            no longer in the store.
+        InputError: a word that is none of these.
     """
-    if len(results) < 2:
-        raise InputError("refusal: give two results or more, of different worlds")
-    scenarios = [_scenario(result) for result in results]
-    worlds = [_world(path, scenario) for path, scenario in zip(results, scenarios, strict=True)]
+    found = []
+    for word in worlds:
+        path = Path(word)
+        if path.is_dir():
+            store = Store(path.resolve().parent / STORE_FOLDER)
+            found.append(Source(str(path), path.resolve().name, _scenario(path), store))
+            continue
+        for file in scenarios_of([word]):
+            for seed in seeds:
+                scenario = load_scenario(file, (), seed)
+                name = f"{scenario.name}-{seed}"
+                found.append(Source(name, name, scenario, Store(results / STORE_FOLDER)))
+    return found
+
+
+def load_worlds(sources: Sequence[Source]) -> tuple[Scenario, list[World]]:
+    """The first source's scenario, and the worlds of all of them.
+
+    Raises:
+        InputError: fewer than two, not simulated, two of one world, or maps that are not in the
+            store.
+    """
+    if len(sources) < 2:
+        raise InputError("refusal: give two worlds or more: results, or scenarios with --seeds")
+    worlds = [_world(source) for source in sources]
     by_textures: dict[str, World] = {}
-    for path, world in zip(results, worlds, strict=True):
+    for source, world in zip(sources, worlds, strict=True):
         if world.textures in by_textures:
             other = by_textures[world.textures].name
-            raise InputError(f"{path}: the same world as {other}; give another seed's result")
+            raise InputError(f"{source.label}: the same world as {other}; give another seed's")
         by_textures[world.textures] = world
-    return scenarios[0], worlds
+    return sources[0].scenario, worlds
 
 
 def _scenario(result: Path) -> Scenario:
@@ -59,16 +98,19 @@ def _scenario(result: Path) -> Scenario:
         raise InputError(f"{path}: not a scenario of this version; make it with `run`") from error
 
 
-def _world(result: Path, scenario: Scenario) -> World:
+def _world(source: Source) -> World:
+    scenario = source.scenario
     if scenario.world is None:
-        raise InputError(f"{result}: made from recorded logs; only simulated worlds surely differ")
-    planned = plan(scenario, Store(result.resolve().parent / STORE_FOLDER))
+        raise InputError(
+            f"{source.label}: made from recorded logs; only simulated worlds surely differ"
+        )
+    planned = plan(scenario, source.store)
     for robot in planned.robots:
         if not (robot.log.finished and robot.slam.finished):
             raise InputError(
-                f"{result}: the maps of {robot.name} are not in {result.parent / STORE_FOLDER} "
-                "(made by another version?); run its scenario again"
+                f"{source.label}: the maps of {robot.name} are not in {source.store.root} (made by "
+                "another version?); run its scenario again"
             )
     assert planned.faces is not None
     folders = {robot.name: robot.folders for robot in planned.robots}
-    return World(result.name, planned.faces.key, folders)
+    return World(source.name, planned.faces.key, scenario.world.texture.posters > 0, folders)

@@ -37,14 +37,25 @@ def print_refusals(rows: Sequence[dict[str, Any]], false_alarms: float) -> None:
     table.add_column("\naligner", no_wrap=True)
     for heading in headings.values():
         table.add_column(heading, justify="right", no_wrap=True)
-    posters = Table(title="Accepted: one picture in two worlds", **LAYOUT)
-    posters.add_column("aligner", no_wrap=True)
-    radii = [name for name in rows[0] if name.startswith("poster_")]
-    for name in radii:
-        posters.add_column(f"{2 * float(name.removeprefix('poster_')):g} m wide", justify="right")
+    repeated = {
+        name: f"{2 * float(name.removeprefix('poster_')):g} m\nwide"
+        for name in rows[0]
+        if name.startswith("poster_")
+    }
+    repeated |= {"posters_false": "posters,\napart", "posters_wrong": "\nin common"}
+    repeated = {name: text for name, text in repeated.items() if rows[0][name].n}
+    posters = Table(
+        title="Accepted though wrong: texture that repeats",
+        caption="wide: one such picture in two worlds; posters: few pictures all over\n"
+        "a world, without and with common ground",
+        **LAYOUT,
+    )
+    posters.add_column("\naligner", no_wrap=True)
+    for heading in repeated.values():
+        posters.add_column(heading, justify="right", no_wrap=True)
     for row in rows:
         table.add_row(row["aligner"], *(_of_all(row[name]) for name in headings))
-        posters.add_row(row["aligner"], *(_of_all(row[name]) for name in radii))
+        posters.add_row(row["aligner"], *(_of_all(row[name]) for name in repeated))
     console = Console()
     console.print(table)
     console.print(posters)

@@ -191,11 +191,39 @@ def test_the_command_crosses_two_worlds(
         )
 
 
+def test_worlds_may_be_scenarios_with_seeds(
+    tiny: Scenario, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As a sweep leaves them: maps in the store, no result folder. Posters are told apart."""
+    assert tiny.world is not None
+    texture = replace(tiny.world.texture, posters=2)
+    worlds = [
+        tiny,
+        tiny.model_copy(update={"world": tiny.world.model_copy(update={"texture": texture})}),
+    ]
+    paths = []
+    for name, world in zip(("plain", "hung"), worlds, strict=True):
+        paths.append(tmp_path / f"{name}.yaml")
+        paths[-1].write_text(world.model_copy(update={"name": name}).model_dump_json())
+    common = ("--seeds", 5, "--results", tmp_path, "--jobs", 1)
+    missing = command(capsys, "refusal", *paths, "-o", tmp_path / "out", *common)
+    assert missing.complaints[0].startswith("mapfusion: plain-5: the maps of R1 are not in ")
+    assert command(capsys, "sweep", *paths, "-o", tmp_path / "s", *common).code == 0
+    reply = command(capsys, "refusal", *paths, "-o", tmp_path / "out", *common, "--pairs", 2)
+    assert reply.code == 0, reply.err
+    rows = results.read(tmp_path / "out", "refusals")
+    by_ground = rows.groupby("ground")["world_a"].unique()
+    assert by_ground["posters"].tolist() == ["hung-5"]
+    assert by_ground["common"].tolist() == ["plain-5"]
+    assert "few" not in by_ground or "hung-5" not in by_ground["few"]
+    assert ("posters" in reply.out) == bool((rows["ground"] == "posters").any())
+
+
 def test_wrong_results_are_named(
     tiny_result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for folders, problem in (
-        ([tiny_result], "two results or more"),
+        ([tiny_result], "two worlds or more"),
         ([tiny_result, tiny_result], "the same world"),
         ([tiny_result, tmp_path], "not a result folder"),
     ):
