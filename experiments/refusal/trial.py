@@ -79,16 +79,21 @@ def _iterations(scenario: Scenario) -> list[int]:
 def _drawn_meetings(
     scenario: Scenario, worlds: Sequence[World], n: int
 ) -> dict[tuple[int, int], list[Meeting]]:
-    """Drawn pairs of maps of different worlds, by pair of worlds; every such pair is there."""
+    """Drawn pairs of maps of worlds of different seeds, by pair of worlds; every such is there."""
+    strangers = [
+        (i, j)
+        for i, j in itertools.combinations(range(len(worlds)), 2)
+        if worlds[i].seed != worlds[j].seed
+    ]
     possible = [
         ((i, j), Meeting(a, b, iteration))
-        for i, j in itertools.combinations(range(len(worlds)), 2)
+        for i, j in strangers
         for a in worlds[i].robots
         for b in worlds[j].robots
         for iteration in _iterations(scenario)
     ]
     order = generator(scenario.seed, "refusal").permutation(len(possible))[:n]
-    meetings = {pair: [] for pair in itertools.combinations(range(len(worlds)), 2)}
+    meetings = {pair: [] for pair in strangers}
     for k in np.sort(order):
         pair, meeting = possible[k]
         meetings[pair].append(meeting)

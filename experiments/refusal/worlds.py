@@ -23,12 +23,14 @@ class World:
 
     Attributes:
         name: SCENARIO-SEED, or that of the result folder.
+        seed: of its pictures: worlds of one seed hang some of them on the same walls.
         textures: key of the painted walls: equal ones mean the same world.
         repeats: the same few pictures hang all over it.
         robots: where each robot's log and maps lie, by name.
     """
 
     name: str
+    seed: int
     textures: str
     repeats: bool
     robots: dict[str, RobotFolders]
@@ -74,8 +76,8 @@ def load_worlds(sources: Sequence[Source]) -> tuple[Scenario, list[World]]:
     """The first source's scenario, and the worlds of all of them.
 
     Raises:
-        InputError: fewer than two, not simulated, two of one world, or maps that are not in the
-            store.
+        InputError: fewer than two seeds, not simulated, two of one world, or maps that are not in
+            the store.
     """
     if len(sources) < 2:
         raise InputError("refusal: give two worlds or more: results, or scenarios with --seeds")
@@ -86,6 +88,11 @@ def load_worlds(sources: Sequence[Source]) -> tuple[Scenario, list[World]]:
             other = by_textures[world.textures].name
             raise InputError(f"{source.label}: the same world as {other}; give another seed's")
         by_textures[world.textures] = world
+    if len({world.seed for world in worlds}) < 2:
+        raise InputError(
+            f"refusal: all worlds have seed {worlds[0].seed}, and so some pictures in common; give "
+            "those of another seed too"
+        )
     return sources[0].scenario, worlds
 
 
@@ -113,4 +120,5 @@ def _world(source: Source) -> World:
             )
     assert planned.faces is not None
     folders = {robot.name: robot.folders for robot in planned.robots}
-    return World(source.name, planned.faces.key, scenario.world.texture.posters > 0, folders)
+    repeats = scenario.world.texture.posters > 0
+    return World(source.name, scenario.seed, planned.faces.key, repeats, folders)

@@ -9,8 +9,10 @@ from numba import njit
 
 from mapfusion.align.correspondences import Correspondences, HeightGate
 from mapfusion.align.drift import drift_step
+from mapfusion.align.leverage import most_leverage, why_one_pair
 from mapfusion.align.pairs import MIN_PAIRS, gather, undetermined, why_one_place
 from mapfusion.align.result import Alignment, Status
+from mapfusion.align.support import PlanarPairs, in_plan
 from mapfusion.arguments import require_shape
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.se2 import Float, wrap
@@ -38,6 +40,9 @@ class Refinement:
     probability of being true, then takes a step for the motion (Gauss-Newton on the weighted normal
     equations), for s_drift (Fisher scoring) and for the share of true ones (expectation
     maximisation, Dempster et al. 1977); steps of s_drift that swing to and fro are halved.
+
+    An answer that rests on one pair is refused: without the pair of most leverage the motion has to
+    stay within the gate.
 
     Attributes:
         gate_m: distance in the plane under the estimate up to which a pair takes part. Between two
@@ -81,16 +86,9 @@ class Refinement:
         if not np.all(np.isfinite(T_a_b)):
             return undetermined("there is no estimate to refine", len(pairs), started_s)
         rows = pairs.of_one_height(self.height)
-        solved, moved_m, T_a_b, covariance, variance, truth = iterate(
-            pairs.p_a[rows, :2],
-            pairs.p_b[rows, :2],
-            pairs.covariance_a[rows, :2, :2],
-            pairs.covariance_b[rows, :2, :2],
-            T_a_b,
-            self.gate_m,
-            self.least_drift_m,
-            self.max_rounds,
-        )
+        planar = in_plan(pairs[rows])
+        limits = (self.gate_m, self.least_drift_m, self.max_rounds)
+        solved, moved_m, T_a_b, covariance, variance, truth = iterate(*planar, T_a_b, *limits)
         if not solved:
             reason = f"the pairs within {self.gate_m:g} m of the estimate determine no motion"
             return undetermined(reason, len(pairs), started_s)
@@ -103,6 +101,11 @@ class Refinement:
             reason = f"still moved by {moved_m:.1e} m after {self.max_rounds} rounds"
         elif np.count_nonzero(inlier) < MIN_PAIRS:
             reason = f"{np.count_nonzero(inlier)} correspondences agree, {MIN_PAIRS} are needed"
+        else:
+            left_out = most_leverage(T_a_b, planar, variance, truth, covariance)
+            others = PlanarPairs(*(np.delete(part, left_out, axis=0) for part in planar))
+            solved, _, T_without, *_ = iterate(*others, T_a_b, *limits)
+            reason = why_one_pair(T_a_b, T_without if solved else None, planar, truth, self.gate_m)
         T_a_b[2] = wrap(T_a_b[2])
         return Alignment(
             T_a_b,

@@ -205,7 +205,7 @@ def test_worlds_may_be_scenarios_with_seeds(
     for name, world in zip(("plain", "hung"), worlds, strict=True):
         paths.append(tmp_path / f"{name}.yaml")
         paths[-1].write_text(world.model_copy(update={"name": name}).model_dump_json())
-    common = ("--seeds", 5, "--results", tmp_path, "--jobs", 1)
+    common = ("--seeds", "5,6", "--results", tmp_path, "--jobs", 1)
     missing = command(capsys, "refusal", *paths, "-o", tmp_path / "out", *common)
     assert missing.complaints[0].startswith("mapfusion: plain-5: the maps of R1 are not in ")
     assert command(capsys, "sweep", *paths, "-o", tmp_path / "s", *common).code == 0
@@ -213,9 +213,13 @@ def test_worlds_may_be_scenarios_with_seeds(
     assert reply.code == 0, reply.err
     rows = results.read(tmp_path / "out", "refusals")
     by_ground = rows.groupby("ground")["world_a"].unique()
-    assert by_ground["posters"].tolist() == ["hung-5"]
-    assert by_ground["common"].tolist() == ["plain-5"]
-    assert "few" not in by_ground or "hung-5" not in by_ground["few"]
+    assert by_ground["posters"].tolist() == ["hung-5", "hung-6"]
+    assert by_ground["common"].tolist() == ["plain-5", "plain-6"]
+    assert not set(by_ground.get("few", ())) & {"hung-5", "hung-6"}
+    crossed = rows[rows["world_a"] != rows["world_b"]]
+    assert (crossed["world_a"].str[-1] != crossed["world_b"].str[-1]).all()
+    alone = command(capsys, "refusal", *paths, "-o", tmp_path / "x", *common[2:], "--seeds", 5)
+    assert "all worlds have seed 5" in alone.complaints[0]
     assert ("posters" in reply.out) == bool((rows["ground"] == "posters").any())
 
 

@@ -1,0 +1,74 @@
+"""One pair against the rest: which has most leverage, and a motion that rests on it alone."""
+
+import numpy as np
+import pytest
+
+from mapfusion import se2
+from mapfusion.align.correspondences import Correspondences
+from mapfusion.align.leverage import most_leverage
+from mapfusion.align.refine import Refinement
+from mapfusion.align.result import Status
+from mapfusion.align.rigid import motion_jacobian, residual_covariances
+from mapfusion.align.support import PlanarPairs
+from mapfusion.landmark_map import LandmarkMap
+
+T_TRUE = np.array([1.0, -2.0, 0.7])
+SIGMA_M = 0.01
+
+
+def planar_map(p: np.ndarray) -> LandmarkMap:
+    n = len(p)
+    return LandmarkMap(
+        np.column_stack([p, np.zeros(n)]),
+        np.tile(np.eye(3) * SIGMA_M**2, (n, 1, 1)),
+        np.full(n, 5, np.int32),
+        np.arange(n),
+        label=np.arange(n, dtype=np.int32),
+        planar=True,
+    )
+
+
+def a_corner_and_one_far(
+    turned_rad: float, seed: int = 0
+) -> tuple[LandmarkMap, LandmarkMap, Correspondences, np.ndarray]:
+    """25 true pairs within 0.3 m, and one 7 m away that is true for a map turned about them."""
+    rng = np.random.default_rng(seed)
+    p_b = np.vstack([rng.uniform(-0.15, 0.15, (25, 2)), [[7.0, 0.5]]])
+    p_a = se2.transform_points(T_TRUE, p_b) + rng.normal(0, SIGMA_M, p_b.shape)
+    T_turned = T_TRUE + np.array([0, 0, turned_rad])
+    p_a[-1] = se2.transform_points(T_turned, p_b[-1:])[0]
+    n = np.arange(26)
+    return planar_map(p_a), planar_map(p_b), Correspondences(n, n, np.zeros(26)), T_turned
+
+
+def test_a_false_far_pair_turns_the_map_and_is_found_out() -> None:
+    map_a, map_b, pairs, T_turned = a_corner_and_one_far(0.7)
+    found = Refinement().refine(map_a, map_b, pairs, T_turned)
+    assert np.hypot(*(found.T_a_b - T_turned)[:2]) < 0.1  # it did go there: residuals fit the gate
+    assert abs(found.T_a_b[2] - T_TRUE[2]) > 0.5
+    assert found.status is Status.REFUSED
+    assert "rests on one correspondence: without it landmarks move by 4" in found.reason
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_true_far_pair_is_welcome(seed: int) -> None:
+    map_a, map_b, pairs, start = a_corner_and_one_far(0.0, seed)
+    found = Refinement().refine(map_a, map_b, pairs, start)
+    assert found.status is Status.ACCEPTED
+    assert abs(found.T_a_b[2] - T_TRUE[2]) < 0.01
+
+
+def test_leverage_is_the_hat_matrix_s_trace() -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        n = 12
+        A = rng.normal(0, 0.1, (2, n, 2, 2))
+        S_a, S_b = A @ np.swapaxes(A, 2, 3)
+        pairs = PlanarPairs(rng.normal(0, 3, (n, 2)), rng.normal(0, 3, (n, 2)), S_a, S_b)
+        T, truth, variance = rng.normal(size=3), rng.uniform(0, 1, n), 0.01
+        C = residual_covariances(T, S_a, S_b) + variance * np.eye(2)
+        W, J = truth[:, None, None] * np.linalg.inv(C), motion_jacobian(T, pairs.p_b)
+        covariance = np.linalg.inv(np.einsum("nki,nkl,nlj->ij", J, W, J))
+        hat = np.einsum("nki,ij,nlj,nlk->n", J, covariance, J, W)
+        assert hat.sum() == pytest.approx(3)  # as many as parameters
+        assert most_leverage(T, pairs, variance, truth, covariance) == np.argmax(hat)
