@@ -24,19 +24,22 @@ from experiments.refusal.cases import FEW, POSTER_RADII_M, POSTERS
 from experiments.refusal.summary import Rate, mergeable, swept, without_common_ground
 
 _SUPPORT_OF = "ransac"  # whose plain number of inliers is swept for comparison
+_LEGEND_COLUMNS = 4  # of the methods' names, as wide as the page holds
 _LEAST_DECADES = 0.5  # shares of zero are drawn so far below one in all pairs
 
 
 def draw(refusals: pd.DataFrame, calibration: pd.DataFrame, false_alarms: float) -> Figure:
     """False against missed merges; shares accepted against the threshold; the calibration."""
-    figure = Figure(figsize=(PAGE_WIDTH_IN, 5.6))
+    figure = Figure(figsize=(PAGE_WIDTH_IN, 6.2))
     (curve, rates), (calibrated, key) = figure.subplots(2, 2)
     names = refusals["aligner"].drop_duplicates().tolist()
     _draw_curves(curve, refusals, names)
     _draw_rates(rates, refusals, names, false_alarms)
     _draw_calibration(calibrated, calibration, false_alarms)
     handles, labels = curve.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), handlelength=2.6)
+    figure.legend(
+        handles, labels, loc="outside upper center", ncols=_LEGEND_COLUMNS, handlelength=2.6
+    )
     key.set_axis_off()
     key.legend(
         *rates.get_legend_handles_labels(),
