@@ -18,6 +18,7 @@ from mapfusion.align.result import NOT_RUN, Status
 if TYPE_CHECKING:
     from experiments.checks import Outcome
 
+_SEEDS_SHOWN = 3  # one by one, in a table of checks
 MIN_TRUE_PAIRS_SHOWN = 3  # as figures 4 and 5 shade: fewer cannot carry an alignment
 
 
@@ -159,9 +160,10 @@ def print_outcomes(outcomes: Sequence["Outcome"]) -> None:
     """The table of a check."""
     table = Table(title="Checks against the truth", **LAYOUT)
     for heading in ("scenario", "metric", "measured", "expected", "by seed", ""):
-        table.add_column(heading, justify="right" if heading == "measured" else "left")
+        side = "right" if heading == "measured" else "left"
+        table.add_column(heading, justify=side, overflow="fold", no_wrap=heading == "expected")
     for outcome in outcomes:
-        seeds = "  ".join(f"{value:.3g}" for value in outcome.per_seed.values())
+        seeds = _by_seed(list(outcome.per_seed.values()))
         verdict = "[green]pass[/]" if outcome.passed else "[bold red]FAIL[/]"
         table.add_row(
             outcome.scenario,
@@ -175,3 +177,10 @@ def print_outcomes(outcomes: Sequence["Outcome"]) -> None:
     console.print(table)
     failed = sum(not outcome.passed for outcome in outcomes)
     console.print(f"{len(outcomes) - failed} passed, {failed} failed")
+
+
+def _by_seed(values: Sequence[float]) -> str:
+    """Each seed's value; of more than a line holds the smallest and the largest."""
+    if len(values) <= _SEEDS_SHOWN:
+        return "  ".join(f"{value:.3g}" for value in values)
+    return f"{min(values):.3g} to {max(values):.3g}"
