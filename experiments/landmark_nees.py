@@ -9,12 +9,12 @@ pose, without a fit: what the path's drift does to a landmark is part of its err
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
 
 from experiments.evaluate import EvaluatedRobot
 from experiments.fusion import fused_truth
 from mapfusion import se2
 from mapfusion.aligned_landmarks import ABSENT
+from mapfusion.chi_square import chi_square_bound
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.merge import FusedMap
 from mapfusion.se2 import Float
@@ -46,7 +46,8 @@ def mean_nees_band(n: float, dof: int, probability: float = GATE_PROBABILITY) ->
     Their sum is chi-square with n dof degrees of freedom (Bar-Shalom et al. 2001, eq. 5.4.2-14).
     """
     tail = (1 - probability) / 2
-    return chi2.ppf([tail, 1 - tail], n * dof) / (n * dof)
+    ends = [chi_square_bound(share, n * dof) for share in (tail, 1 - tail)]
+    return np.array(ends) / (n * dof)
 
 
 def landmark_nees_rows(
@@ -105,7 +106,7 @@ def _truly_fused(
 def _row(name: str, which: str, landmarks: LandmarkMap, nees: Float) -> dict[str, Any]:
     nees = nees[np.isfinite(nees)]
     dof = degrees_of_freedom(landmarks)
-    gate = chi2.ppf(GATE_PROBABILITY, dof)
+    gate = chi_square_bound(GATE_PROBABILITY, dof)
     some = len(nees) > 0
     return {
         "map": name,

@@ -6,8 +6,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
 from matplotlib.lines import Line2D
-from scipy.stats import chi2
 
+from mapfusion.chi_square import chi_square_bound
 from mapfusion.se2 import Float
 
 LEVEL = 0.95
@@ -25,7 +25,7 @@ def semi_axes(covariance_m2: Float, level: float = LEVEL) -> tuple[Float, Float,
         Semi-major and semi-minor axes (N,) in metres and the major axis' direction (N,) in rad.
     """
     values, vectors = np.linalg.eigh(covariance_m2)
-    lengths = np.sqrt(np.maximum(values, 0.0) * chi2.ppf(level, _PLANE_DIMENSIONS))
+    lengths = np.sqrt(np.maximum(values, 0.0) * chi_square_bound(level, _PLANE_DIMENSIONS))
     direction = np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
     return lengths[:, 1], lengths[:, 0], direction
 

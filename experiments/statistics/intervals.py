@@ -2,7 +2,7 @@
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from mapfusion.se2 import Float
 
@@ -32,7 +32,7 @@ def wilson(
         raise ValueError("confidence: must lie between 0 and 1")
     if np.any(k < 0) or np.any(k > n + 1e-9 * (1 + n)):  # sums of fractions round
         raise ValueError("successes: must lie between 0 and trials")
-    z2 = norm.ppf((1 + confidence) / 2) ** 2
+    z2 = ndtri((1 + confidence) / 2) ** 2
     known = n > 0
     rate = np.minimum(np.divide(k, n, out=np.full(n.shape, 0.5), where=known), 1.0)
     centre = (n * rate + z2 / 2) / (n + z2)
