@@ -35,7 +35,8 @@ EDGES: dict[str, tuple[float, ...]] = {
 }
 BY = ("iteration", *EDGES, LAST)
 _ITERATION_BINS = 8
-_SHARES = ("estimated_success", "refined_success", "accepted", "false_accepted", "refused_apart")
+_WITHOUT_TEST = ("estimated_success", "refined_success")
+_SHARES = (*_WITHOUT_TEST, "accepted", "false_accepted", "refused_apart")
 
 
 def success_rates(
@@ -112,12 +113,15 @@ def _rates(rows: pd.DataFrame, codes: np.ndarray) -> dict[str, Any]:
     ground = has_common_ground(rows).to_numpy()
     found: dict[str, Any] = {"n_runs": rows["run_id"].nunique(), "n_maps": len(rows)}
     found |= {"n_apart": int(np.count_nonzero(~ground))}
+    has_test = bool(rows["accepted"].notna().any())
     for name in _SHARES:
         known = rows[name].notna().to_numpy() & (ground if name == "accepted" else True)
-        if not known.any():
+        share = low = high = np.nan
+        if known.any():
+            n = effective_trials(np.unique(codes[known], return_counts=True)[1])
+            share = float(rows[name][known].mean())
+            low, high = map(float, wilson(share * n, n))
+        elif name not in _WITHOUT_TEST and not has_test:
             continue
-        n = effective_trials(np.unique(codes[known], return_counts=True)[1])
-        share = float(rows[name][known].mean())
-        low, high = wilson(share * n, n)
-        found |= {name: share, f"{name}_low": float(low), f"{name}_high": float(high)}
+        found |= {name: share, f"{name}_low": low, f"{name}_high": high}
     return found
