@@ -13,10 +13,10 @@ from typing import Any
 
 import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
-from synthetic_result import Size, write_result
 
-from experiments.figures import draw_all
-from experiments.report import write_report
+from experiments.show.figures import draw_all
+from experiments.show.report import write_report
+from tests.helpers.synthetic_result import Size, write_result
 
 CHROMIUM = os.environ.get("CHROMIUM", "/usr/bin/chromium")
 MAX_LOAD_S = 3.0
@@ -266,7 +266,7 @@ def test_it_prints(opened: Opened, tmp_path: Path) -> None:
 def test_hostile_names_stay_names(
     browser: Browser, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    from test_document import HOSTILE, hostile
+    from tests.experiments.show.report.test_document import HOSTILE, hostile
 
     result = hostile(write_result(tmp_path_factory.mktemp("hostile")))
     opened = Opened(browser, write_report(result), viewport={"width": 1280, "height": 900})

@@ -2,14 +2,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from synthetic_result import write_result
-from tiny_scenario import TINY
 
-from experiments.pipeline import plan
-from experiments.result import run_scenario
-from experiments.scenario import Scenario, load_scenario
-from experiments.store import Store
-from experiments.workers import single_threaded
+from experiments.judge.pipeline import plan
+from experiments.judge.result import run_scenario
+from experiments.methods.one_thread import single_threaded
+from experiments.run.store import Store
+from experiments.scenario.settings import Scenario, load_scenario
+from tests.helpers.synthetic_result import write_result
+from tests.helpers.tiny_scenario import TINY
 
 
 @pytest.fixture(scope="session", autouse=True)

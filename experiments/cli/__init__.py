@@ -1,0 +1,1 @@
+"""The command `mapfusion`: words in, exit codes out. Heavy imports sit inside the commands."""

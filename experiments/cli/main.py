@@ -1,0 +1,94 @@
+"""The command `mapfusion`: its list of commands, and what becomes of their failures."""
+
+import sys
+import warnings
+from typing import Any
+
+import typer
+
+from experiments.cli import run_commands, step_commands, study_commands
+from experiments.cli.options import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_INTERRUPTED
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Measures how well landmark maps of independent robots can be fused.\n\n"
+    "Start with:  mapfusion run scenarios/quick.yaml",
+)
+app.command()(run_commands.run)
+app.command()(run_commands.figures)
+app.command()(run_commands.report)
+app.command("inspect")(run_commands.inspect_command)
+app.command()(run_commands.check)
+app.command("scenarios")(run_commands.list_scenarios)
+app.command()(study_commands.sweep)
+app.command()(study_commands.statistics)
+app.command()(study_commands.compare)
+app.command()(study_commands.refusal)
+app.command()(study_commands.benchmark)
+app.command()(study_commands.aligners)
+app.command()(run_commands.schema)
+app.command()(step_commands.record)
+app.command()(step_commands.slam)
+app.command()(step_commands.align)
+app.command()(step_commands.merge)
+import_app = typer.Typer(no_args_is_help=True, help="Turn recordings of others into robot logs.")
+import_app.command("mrclam")(step_commands.import_mrclam_command)
+app.add_typer(import_app, name="import")
+
+
+def main() -> None:
+    """Run the command; every failure a user can cause is one line and an exit code."""
+    from experiments.run.kernel_cache import use_kernel_cache
+    from mapfusion.errors import InputError
+
+    _tell_name_clashes()
+    try:
+        use_kernel_cache()
+        code = app(standalone_mode=False) or 0
+    except InputError as error:
+        _complain(str(error))
+        code = EXIT_BAD_INPUT
+    except BrokenPipeError:
+        code = EXIT_FAILED
+    except OSError as error:  # a full disk, a folder that is a file or not ours
+        where = "" if error.filename is None else f"{error.filename}: "
+        _complain(f"{where}cannot be read or written ({error.strerror or error})")
+        code = EXIT_BAD_INPUT
+    except KeyboardInterrupt:  # before or after what the command itself guards
+        code = EXIT_INTERRUPTED
+    except Exception as error:
+        # Typer keeps its usage errors' classes private; all of them can tell their message.
+        message = getattr(error, "format_message", None)
+        if message is None:
+            raise
+        if message():  # empty where the help was shown instead
+            _complain(f"{message()} (see mapfusion --help)")
+        code = EXIT_BAD_INPUT
+    if code == EXIT_INTERRUPTED:
+        _complain("interrupted; what was finished is kept, the same command goes on from there")
+    sys.exit(code)
+
+
+def _tell_name_clashes() -> None:
+    """In one line each; other warnings keep Python's own form."""
+    from mapfusion.errors import NameClashWarning
+
+    show = warnings.showwarning
+
+    def tell(message: Warning | str, category: type[Warning], *rest: Any) -> None:
+        if issubclass(category, NameClashWarning):
+            _complain(f"warning: {message}")
+        else:
+            show(message, category, *rest)
+
+    warnings.showwarning = tell
+
+
+def _complain(text: str) -> None:
+    typer.echo(f"mapfusion: {' '.join(text.split())}", err=True)  # one line, whatever was quoted
+
+
+if __name__ == "__main__":
+    main()

@@ -1,1 +1,0 @@
-"""The commands of `mapfusion`: load, compute, show. Heavy imports sit inside of them."""

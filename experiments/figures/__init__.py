@@ -1,5 +1,0 @@
-"""Figures 1 to 10, drawn from a result's stored tables and key frames alone."""
-
-from experiments.figures.drawing import Drawn, draw_all
-
-__all__ = ["Drawn", "draw_all"]

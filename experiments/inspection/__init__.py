@@ -1,1 +1,0 @@
-"""What any file or folder of ours holds, told on screen."""

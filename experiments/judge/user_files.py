@@ -1,0 +1,116 @@
+"""The stages one by one, on files of the user's own."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from experiments.judge.pipeline import record_logs
+from experiments.methods.aligner_calls import callable_aligner, refine_estimate
+from experiments.run.estimates import estimate_row
+from experiments.run.stages.log import copy_log
+from experiments.run.store import Store
+from experiments.run.tasks import OnProgress
+from experiments.scenario.randomness import generator
+from experiments.scenario.settings import Align, Merge, Scenario, Slam, load_section
+from mapfusion.align.correspondences import match
+from mapfusion.errors import InputError
+from mapfusion.fastslam.run import run_log
+from mapfusion.landmark_map import LandmarkMap, read_map, write_map
+from mapfusion.merge import FusedMap
+from mapfusion.merge import merge as merge_maps
+from mapfusion.robot_log import read_log
+
+
+def record(
+    scenario: Scenario, output: Path, results: Path, jobs: int, on_progress: OnProgress
+) -> list[Path]:
+    """Simulate and write one log a robot into `output`; returns their folders."""
+    if scenario.logs:
+        raise InputError(
+            f"scenario {scenario.name}: uses recorded logs, there is nothing to record"
+        )
+    logs = record_logs(scenario, Store(results / "store"), jobs, on_progress)
+    for name, folder in logs.items():
+        copy_log(folder, output / name)
+    return [output / name for name in logs]
+
+
+def slam_settings(path: Path | None, overrides: Sequence[str]) -> Slam:
+    """The `slam` section of a scenario, or the defaults, with overrides inside it."""
+    return load_section(path, "slam", Slam, overrides)
+
+
+def align_settings(path: Path | None, overrides: Sequence[str]) -> Align:
+    """The `align` section of a scenario, or the defaults, with overrides."""
+    return load_section(path, "align", Align, overrides)
+
+
+def slam(log: Path, settings: Slam, seed: int, on_progress: OnProgress) -> LandmarkMap:
+    """The most probable map at the end of a log."""
+    robot_log = read_log(log)
+    if not len(robot_log):
+        raise InputError(f"{log}: frames.parquet holds no frame")
+    last = len(robot_log) - 1
+    rng = generator(seed, "slam", robot_log.robot)
+    landmarks = None
+    for frame in run_log(robot_log, settings.filter, rng, [last], settings.min_count):
+        on_progress("slam", frame.iteration + 1, last + 1)
+        landmarks = frame.landmarks
+    assert landmarks is not None
+    return landmarks
+
+
+def save_map(path: Path, landmarks: LandmarkMap) -> None:
+    """Write a map where the user wants it; raises InputError where that is impossible."""
+    try:
+        write_map(path, landmarks)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from error
+
+
+def align(path_a: Path, path_b: Path, settings: Align, seed: int) -> list[dict[str, Any]]:
+    """Every aligner's estimate, its refinement and the verdict on it, as rows."""
+    map_a, map_b = read_map(path_a), read_map(path_b)
+    pairs = match(map_a, map_b, settings.match)
+    rows = []
+    for entry in settings.aligners:
+        aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
+        estimated = aligner.align(map_a, map_b, pairs, generator(seed, "align", entry.name))
+        refined = refine_estimate(settings.refinement, map_a, map_b, pairs, estimated)
+        verdict = settings.acceptance.judge(map_a, map_b, pairs, refined)
+        rows.append(
+            {
+                "aligner": entry.name,
+                "n_inliers": int(refined.inlier.sum()),
+                "elapsed_s": estimated.elapsed_s,
+            }
+            | estimate_row(len(pairs), estimated, refined, verdict)
+        )
+    return rows
+
+
+def merge(
+    paths: Sequence[Path], scenario: Path | None, overrides: Sequence[str], seed: int
+) -> tuple[FusedMap, list[str]]:
+    """Fuse maps in the frame of the first; returns the fused map and the maps' names."""
+    if len(paths) < 2:
+        raise InputError("merge: give two maps or more")
+    settings = load_section(scenario, "merge", Merge, overrides)
+    align_section = load_section(scenario, "align", Align, ())
+    entries = {entry.name: entry for entry in align_section.aligners}
+    if settings.aligner not in entries:
+        raise InputError(f"merge.aligner: {settings.aligner} is not among {', '.join(entries)}")
+    entry = entries[settings.aligner]
+    maps = [read_map(path) for path in paths]
+    aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
+    alignments, offered = [], []
+    for number, other in enumerate(maps[1:], start=1):
+        pairs = match(maps[0], other, align_section.match)
+        rng = generator(seed, "align", entry.name, number)
+        estimated = aligner.align(maps[0], other, pairs, rng)
+        refined = refine_estimate(align_section.refinement, maps[0], other, pairs, estimated)
+        verdict = align_section.acceptance.judge(maps[0], other, pairs, refined)
+        alignments.append(verdict.applied_to(refined))
+        offered.append(pairs)
+    fused = merge_maps(maps, alignments, offered, settings.parameters)
+    return fused, [str(path) for path in paths]

@@ -1,0 +1,84 @@
+"""The Dask cluster a sweep runs on: processes of this machine, or one that is there already."""
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import dask.config
+from distributed import Client, LocalCluster
+
+from mapfusion.errors import InputError
+
+CONNECT_TIMEOUT_S = 30
+
+_LOCAL_SETTINGS = {
+    # Dask blames every task that was assigned to a killed worker, not only the one at work; the
+    # sweep counts by itself (`worker.Terms.retries`).
+    "distributed.scheduler.allowed-failures": 1_000_000,
+    # Tasks keep nothing in Dask's memory, so there is nothing to spill, and a paused worker would
+    # wait for ever. One that fills 95 % of its share is killed and its task begun again.
+    "distributed.worker.memory.target": False,
+    "distributed.worker.memory.spill": False,
+    "distributed.worker.memory.pause": False,
+    "distributed.worker.memory.terminate": 0.95,
+    # Dask keeps the last tasks and events for developers: with thousands of them, tens of MB.
+    "distributed.admin.low-level-log-length": 100,
+    "distributed.admin.log-length": 100,
+    "distributed.admin.system-monitor.log-length": 100,
+}
+
+
+@contextmanager
+def connected(jobs: int, scheduler: str | None) -> Iterator[Client]:
+    """A client of a cluster for the length of a `with` block.
+
+    Args:
+        jobs: local processes, one thread each; of no meaning with a scheduler.
+        scheduler: address of a running scheduler, `tcp://...`.
+
+    Raises:
+        InputError: no scheduler answers there.
+    """
+    if scheduler is None:
+        with _local(jobs) as client:
+            yield client
+        return
+    try:
+        client = Client(scheduler, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
+    except (OSError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(
+            f"--scheduler {scheduler}: no Dask scheduler answers ({reason})"
+        ) from error
+    with client:
+        yield client
+
+
+@contextmanager
+def _local(jobs: int) -> Iterator[Client]:
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # the sweep tells what matters
+    with dask.config.set(_LOCAL_SETTINGS):
+        cluster = LocalCluster(
+            n_workers=jobs,
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address="localhost:0",  # any port that is free
+            silence_logs=logging.CRITICAL,
+            preload=["experiments.run.dask_worker"],
+        )
+        try:
+            with Client(cluster, set_as_default=False) as client:
+                yield client
+        except BaseException:
+            _kill_workers(cluster)
+            raise
+        finally:
+            cluster.close()
+
+
+def _kill_workers(cluster: LocalCluster) -> None:
+    """At once: what they are at is begun again by the next sweep."""
+    for nanny in cluster.workers.values():
+        process = getattr(nanny.process, "process", None)
+        if process is not None and process.is_alive():
+            cluster.sync(process.kill)

@@ -1,0 +1,114 @@
+"""What a Dask worker does with one task; also what it does when it starts."""
+
+import functools
+import pickle
+import platform
+import signal
+import threading
+import traceback
+from dataclasses import dataclass
+from pathlib import Path
+
+from experiments.run.kernel_cache import use_kernel_cache
+from experiments.run.store import library_versions, source_hash
+from mapfusion.errors import InputError
+
+SOURCES = ("mapfusion", "sim", "experiments")
+
+# Tasks keep state of their process (the open PyBullet world, OpenCV's threads), so a worker that
+# was started with several threads works with one at a time.
+_one_at_a_time = threading.Lock()
+
+
+class TaskFailedError(Exception):
+    """A task raised: its name, the reason in one line, and the traceback where it is no input's."""
+
+    def __init__(self, task: str, reason: str, details: str = "") -> None:
+        super().__init__(task, reason, details)
+        self.task, self.reason, self.details = task, reason, details
+
+
+class UnfitWorkerError(Exception):
+    """A worker that cannot take part, with the reason: nothing it did would be of use."""
+
+
+@dataclass(frozen=True)
+class Terms:
+    """What all tasks of a sweep have in common.
+
+    Attributes:
+        attempts: folder with a file for each task at work; one byte for each time it was begun.
+        retries: how often a task is begun again after the worker at it was killed.
+        code: `code_version()` of the machine that plans.
+    """
+
+    attempts: Path
+    retries: int
+    code: str
+
+
+@functools.cache
+def code_version() -> str:
+    """Source and libraries: where they differ, results would be kept under wrong keys."""
+    return f"{source_hash(SOURCES)} {sorted(library_versions().items())} {platform.machine()}"
+
+
+@functools.cache
+def _prepare() -> None:
+    """Once a process, before anything is imported that computes."""
+    use_kernel_cache()
+    from experiments.methods.one_thread import single_threaded
+
+    single_threaded()
+
+
+def dask_setup(worker: object) -> None:
+    """Local workers preload this module: Ctrl-C is for the command alone, which then ends them."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def perform(name: str, task: bytes, terms: Terms, *needs: None) -> None:
+    """Run a pickled task.
+
+    Args:
+        name: of the task.
+        task: pickled, so that it is unpacked only after this process is prepared.
+        terms: of the sweep.
+        needs: results of the tasks before it (all None), so that Dask knows the order.
+
+    Raises:
+        TaskFailedError: the task raised, or its workers were killed too often.
+        UnfitWorkerError: this machine does not see the folder or has another version installed.
+    """
+    if not terms.attempts.is_dir():
+        raise UnfitWorkerError(
+            f"worker on {platform.node()} does not see {terms.attempts.parent}: the folder of "
+            "results must be shared by all machines, under the same path"
+        )
+    if code_version() != terms.code:
+        raise UnfitWorkerError(
+            f"worker on {platform.node()} has other source or libraries than this machine: "
+            "install the same version everywhere and start the workers again"
+        )
+    with _one_at_a_time:
+        _prepare()
+        _attempt(name, task, terms)
+
+
+def _attempt(name: str, task: bytes, terms: Terms) -> None:
+    """Run it under a mark: only a killed process leaves the mark behind."""
+    mark = terms.attempts / name.replace("/", "_")
+    if mark.exists() and mark.stat().st_size > terms.retries:
+        text = f"its worker was killed {terms.retries + 1} times (out of memory?)"
+        raise TaskFailedError(name, f"{name.partition('/')[0]}: {text}")
+    with mark.open("ab") as file:
+        file.write(b".")
+    try:
+        pickle.loads(task).run()  # noqa: S301 (our own client's)
+    except InputError as error:
+        raise TaskFailedError(name, " ".join(str(error).split())) from None
+    except Exception as error:
+        text = " ".join(f"{name.partition('/')[0]}: {type(error).__name__} {error}".split())
+        raise TaskFailedError(name, text, traceback.format_exc()) from None
+    finally:
+        mark.unlink(missing_ok=True)

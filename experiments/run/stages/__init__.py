@@ -1,0 +1,1 @@
+"""The stages from world to estimates, one a file."""

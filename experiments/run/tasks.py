@@ -1,0 +1,100 @@
+"""Work as tasks: what to call, what must be done before, which files tell that it was done.
+
+`mapfusion run` gives them to processes of its own, `mapfusion sweep` to a Dask cluster.
+"""
+
+import heapq
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from experiments.run.workers import Workers
+
+OnProgress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Task:
+    """One piece of work. It gives nothing back: all that it makes goes to files.
+
+    Attributes:
+        name: STAGE/KEY or STAGE/KEY/PART; tasks of the same name do the same work.
+        kind: what progress counts it under.
+        function: called with the arguments.
+        arguments: all can be pickled.
+        outputs: files that are there once it is done; without any it is never taken for done.
+        needs: names of the tasks that must be done before.
+    """
+
+    name: str
+    kind: str
+    function: Callable[..., object]
+    arguments: tuple[Any, ...]
+    outputs: tuple[Path, ...]
+    needs: tuple[str, ...] = ()
+
+    @property
+    def finished(self) -> bool:
+        """Whether all it makes is on disk."""
+        return bool(self.outputs) and all(path.is_file() for path in self.outputs)
+
+    def run(self) -> None:
+        """Do the work, unless somebody else has done it meanwhile."""
+        if not self.finished:
+            self.function(*self.arguments)
+
+
+def unfinished(tasks: Mapping[str, Task], goals: Iterable[str]) -> list[Task]:
+    """The tasks left to do for these goals, each after those it needs.
+
+    What a finished task was made from is not asked for: it may have been deleted.
+
+    Args:
+        tasks: by name, each after those it needs.
+        goals: names of the tasks whose outputs are wanted.
+    """
+    wanted: set[str] = set()
+    stack = list(goals)
+    while stack:
+        name = stack.pop()
+        if name not in wanted and not tasks[name].finished:
+            wanted.add(name)
+            stack += tasks[name].needs
+    return [task for name, task in tasks.items() if name in wanted]
+
+
+def run_tasks(tasks: Sequence[Task], pool: Workers, on_progress: OnProgress) -> None:
+    """Run tasks in a pool, earlier ones first where there is a choice.
+
+    Args:
+        tasks: each after those it needs; what it needs beyond them is done already.
+        pool: where they run.
+        on_progress: told (kind, tasks done, tasks in all).
+    """
+    number = {task.name: i for i, task in enumerate(tasks)}
+    open_needs = [{need for need in task.needs if need in number} for task in tasks]
+    dependents: list[list[int]] = [[] for _ in tasks]
+    for i, needs in enumerate(open_needs):
+        for need in needs:
+            dependents[number[need]].append(i)
+    ready = [i for i, needs in enumerate(open_needs) if not needs]  # in order, so a heap
+    total, done = Counter(task.kind for task in tasks), Counter[str]()
+    for kind in total:
+        on_progress(kind, 0, total[kind])
+
+    def hand_out() -> None:
+        while ready and pool.has_room:
+            i = heapq.heappop(ready)
+            pool.submit(i, tasks[i].run)
+
+    hand_out()
+    for i, _ in pool.completed():
+        done[tasks[i].kind] += 1
+        on_progress(tasks[i].kind, done[tasks[i].kind], total[tasks[i].kind])
+        for dependent in dependents[i]:
+            open_needs[dependent].discard(tasks[i].name)
+            if not open_needs[dependent]:
+                heapq.heappush(ready, dependent)
+        hand_out()

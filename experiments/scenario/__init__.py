@@ -1,0 +1,1 @@
+"""Scenario files in, validated values out: settings, generated worlds, the suite."""

@@ -1,0 +1,104 @@
+"""The scenario suite: the files of one folder, found by path, by name or by tag."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from experiments.scenario.settings import load_scenario
+from experiments.scenario.yaml_input import read_mapping
+from mapfusion.errors import InputError
+
+FOLDER = Path("scenarios")
+SUFFIXES = {".yaml", ".yml", ".json"}  # a JSON file is YAML too: a result's scenario.json
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One scenario of the suite.
+
+    Attributes:
+        path: its file.
+        name, tags, description: as in the file.
+        robots: how many.
+        iterations: frames a robot; None for recorded logs.
+        overlap: of the robots' ground, None where the world was not generated.
+    """
+
+    path: Path
+    name: str
+    tags: tuple[str, ...]
+    description: str
+    robots: int
+    iterations: int | None
+    overlap: float | None
+
+
+def scenarios_of(names_or_tags: Sequence[str | Path], folder: Path = FOLDER) -> list[Path]:
+    """Scenario files, in the order asked for and each once.
+
+    Args:
+        names_or_tags: each a file, the name of a scenario in `folder`, or a tag, which stands for
+            all scenarios that carry it (in the order of their files' names).
+        folder: where the suite lies.
+
+    Raises:
+        InputError: nothing of that name; lists the names and tags there are.
+    """
+    found: list[Path] = []
+    for wanted in names_or_tags:
+        path = Path(wanted)
+        if path.suffix in SUFFIXES or len(path.parts) > 1 or path.is_file():
+            found.append(path)
+        else:
+            found += _named(str(wanted), folder)
+    return list(dict.fromkeys(found))
+
+
+def _named(wanted: str, folder: Path) -> list[Path]:
+    known = {path: read_mapping(path) for path in _files(folder)}
+    by_name = [path for path, data in known.items() if wanted in (data.get("name"), path.stem)]
+    if by_name:
+        return by_name
+    by_tag = [path for path, data in known.items() if wanted in _tags(data)]
+    if by_tag:
+        return by_tag
+    tags = sorted({tag for data in known.values() for tag in _tags(data)})
+    raise InputError(
+        f"{wanted}: neither a file, nor a scenario in {folder} "
+        f"({', '.join(path.stem for path in known) or 'there is none'}), nor a tag "
+        f"({', '.join(tags) or 'there is none'})"
+    )
+
+
+def _files(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.glob("*") if path.suffix in {".yaml", ".yml"})
+
+
+def _tags(data: dict) -> list[str]:
+    tags = data.get("tags")
+    return [str(tag) for tag in tags] if isinstance(tags, list) else []
+
+
+def entries(folder: Path = FOLDER) -> list[Entry]:
+    """All scenarios of a folder, validated, in the order of their files' names.
+
+    Raises:
+        InputError: the folder holds none, or one of them is wrong.
+    """
+    files = _files(folder)
+    if not files:
+        raise InputError(f"{folder}: holds no scenario (*.yaml); run from the project's folder")
+    return [_entry(path) for path in files]
+
+
+def _entry(path: Path) -> Entry:
+    scenario = load_scenario(path)
+    return Entry(
+        path,
+        scenario.name,
+        tuple(scenario.tags),
+        scenario.description,
+        len(scenario.robots) or len(scenario.logs),
+        None if scenario.drive is None else scenario.drive.frames,
+        None if scenario.generated is None else scenario.generated.overlap,
+    )

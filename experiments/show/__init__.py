@@ -1,0 +1,1 @@
+"""Tables and summaries in; screens, figures, reports and files out. Decides nothing."""

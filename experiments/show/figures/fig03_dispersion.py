@@ -1,0 +1,240 @@
+"""Figure 3: how the particle set spreads along the paths, and draws together again."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from experiments.show.figures.floor_plan import (
+    add_frame,
+    add_walls,
+    height_of_row,
+    label_plan,
+    set_view,
+)
+from experiments.show.figures.result_tables import NothingToDraw, ResultTables
+from experiments.show.figures.style import BLACK, GRAY, PAGE_WIDTH_IN, robot_colours
+from mapfusion.se2 import Float
+
+_MAX_ROBOTS = 3
+_MAGNIFICATIONS = (1, 2, 5, 10, 20, 50, 100)
+_WIDEST_SHARE = 1 / 10  # of the map's extent that the widest drawn particle set may take
+_ZOOM_MARGIN = 1.25
+_RECENT_ITERATIONS = 50
+_FRAME_LENGTH_M = 1.5
+_GRID_COLUMNS = 6  # holds one, two or three panels of one width
+_LOWER_ROW_IN = 2.6
+
+
+class Moments(NamedTuple):
+    """Two kept iterations of one robot."""
+
+    robot: str
+    wide: int
+    tight: int
+
+
+def draw(data: ResultTables) -> Figure:
+    """Particles along up to three paths, the spread over time, and a wide and a tight moment."""
+    clouds = data.table("clouds")
+    robots = [robot for robot in data.robots if (clouds["robot"] == robot).any()][:_MAX_ROBOTS]
+    if not robots:
+        raise NothingToDraw("no particles were kept")
+    clouds = clouds[clouds["robot"].isin(robots)]
+    spread = spread_over_time(clouds)
+    moments = choose_moments(spread)
+    figure = Figure(figsize=(PAGE_WIDTH_IN, PAGE_WIDTH_IN))
+    grid = figure.add_gridspec(2, _GRID_COLUMNS)
+    span = _GRID_COLUMNS // max(2, len(robots))
+    first = (_GRID_COLUMNS - span * len(robots)) // 2
+    panels = [
+        figure.add_subplot(grid[0, first + i * span : first + (i + 1) * span])
+        for i in range(len(robots))
+    ]
+    magnification = _magnification(data, clouds, robots)
+    for axes, robot in zip(panels, robots, strict=True):
+        _draw_path(axes, data, robot, clouds[clouds["robot"] == robot], magnification)
+        if moments is not None and robot == moments.robot:
+            _mark_on_path(axes, data, moments)
+    timeline, *zooms = (
+        figure.add_subplot(grid[1, column : column + 2]) for column in range(0, _GRID_COLUMNS, 2)
+    )
+    _draw_timeline(timeline, data, spread, moments)
+    if moments is None:
+        for axes in zooms:
+            axes.set_axis_off()
+    else:
+        _draw_zooms(zooms, data, clouds[clouds["robot"] == moments.robot], spread, moments)
+    upper = height_of_row(panels, PAGE_WIDTH_IN * span / _GRID_COLUMNS)
+    grid.set_height_ratios([upper, _LOWER_ROW_IN])
+    figure.set_figheight(upper + _LOWER_ROW_IN)
+    return figure
+
+
+def spread_over_time(clouds: pd.DataFrame) -> pd.DataFrame:
+    """Root mean square distance of the particles from their mean, all particles counted alike.
+
+    Alike, because it is the particle set that is drawn; the weights of one iteration come on top.
+
+    Returns:
+        Columns robot, iteration, spread_m.
+    """
+    groups = clouds.groupby(["robot", "iteration"], sort=False)[["x_m", "y_m"]]
+    variance = groups.var(ddof=0).sum(axis="columns")
+    return variance.pow(0.5).rename("spread_m").reset_index()
+
+
+def choose_moments(spread: pd.DataFrame) -> Moments | None:
+    """The pair of moments between which one robot's particles drew together the most.
+
+    Wide comes before tight, so the fall is what seeing old ground again did. None when no robot's
+    particles ever did.
+    """
+    best, best_ratio = None, 1.0
+    for robot, rows in spread[spread["spread_m"] > 0].groupby("robot", sort=False):
+        values, iteration = rows["spread_m"].to_numpy(), rows["iteration"].to_numpy()
+        ratio = np.maximum.accumulate(values) / values
+        tight = int(np.argmax(ratio))
+        if ratio[tight] > best_ratio:
+            best_ratio = ratio[tight]
+            wide = int(np.argmax(values[:tight]))
+            best = Moments(str(robot), int(iteration[wide]), int(iteration[tight]))
+    return best
+
+
+def _magnification(data: ResultTables, clouds: pd.DataFrame, robots: list[str]) -> int:
+    """The largest round factor at which the particle sets still look like spots on the paths."""
+    extent = min(float(np.ptp(data.path_of(robot)[:, :2], axis=0).max()) for robot in robots)
+    groups = clouds.groupby(["robot", "iteration"])[["x_m", "y_m"]]
+    widest = float((groups.max() - groups.min()).to_numpy().max())
+    fitting = [m for m in _MAGNIFICATIONS if m * widest <= _WIDEST_SHARE * extent]
+    return max(fitting, default=1)
+
+
+def _draw_path(
+    axes: Axes, data: ResultTables, robot: str, clouds: pd.DataFrame, magnification: int
+) -> None:
+    path = data.path_of(robot)
+    walls = data.walls_in_frame_of(robot)
+    add_walls(axes, walls)
+    axes.plot(path[:, 0], path[:, 1], color=GRAY, linewidth=0.7, zorder=2)
+    for _, rows in clouds.groupby("iteration"):
+        points = rows[["x_m", "y_m"]].to_numpy()
+        mean = points.mean(axis=0)
+        spot = mean + magnification * (points - mean)
+        axes.plot(
+            *spot.T,
+            linestyle="none",
+            marker=".",
+            markersize=1.0,
+            color=robot_colours(data.robots)[robot],
+            rasterized=True,
+            zorder=3,
+        )
+    add_frame(axes, _FRAME_LENGTH_M)
+    set_view(axes, np.empty((0, 3)), path, *walls)
+    label_plan(axes, robot)
+    enlarged = f", spread x{magnification}" if magnification > 1 else ""
+    axes.set_title(f"{robot}: particles{enlarged}")
+
+
+def _pose(data: ResultTables, robot: str, iteration: int) -> Float:
+    return data.path_of(robot)[iteration]
+
+
+def _mark_on_path(axes: Axes, data: ResultTables, moments: Moments) -> None:
+    for name, iteration in (("A", moments.wide), ("B", moments.tight)):
+        axes.annotate(
+            name,
+            xy=tuple(_pose(data, moments.robot, iteration)[:2]),
+            xytext=(9, 9) if name == "A" else (-15, 9),
+            textcoords="offset points",
+            fontweight="bold",
+            bbox={"boxstyle": "round,pad=0.15", "facecolor": "white", "linewidth": 0.5},
+            arrowprops={"arrowstyle": "-", "linewidth": 0.8},
+            zorder=7,
+        )
+
+
+def _draw_timeline(
+    axes: Axes, data: ResultTables, spread: pd.DataFrame, moments: Moments | None
+) -> None:
+    for robot, rows in spread.groupby("robot", sort=False):
+        axes.plot(
+            rows["iteration"],
+            rows["spread_m"],
+            color=robot_colours(data.robots)[str(robot)],
+            linewidth=0.8,
+            label=robot,
+        )
+    if moments is not None:
+        for name, iteration in (("A", moments.wide), ("B", moments.tight)):
+            value = _spread_at(spread, moments.robot, iteration)
+            axes.plot(iteration, value, "o", color=BLACK, zorder=4)
+            axes.annotate(
+                name,
+                (iteration, value),
+                xytext=(3, 3),
+                textcoords="offset points",
+                fontweight="bold",
+            )
+    axes.set_xlabel("FastSLAM iteration k")
+    axes.set_ylabel("spread of the particles (m)")
+    axes.set_ylim(bottom=0)
+    axes.margins(y=0.15)
+    axes.legend(loc="best")
+    axes.set_title("spread over time")
+
+
+def _spread_at(spread: pd.DataFrame, robot: str, iteration: int) -> float:
+    rows = spread[(spread["robot"] == robot) & (spread["iteration"] == iteration)]
+    return float(rows["spread_m"].iloc[0])
+
+
+def _draw_zooms(
+    zooms: list[Axes],
+    data: ResultTables,
+    clouds: pd.DataFrame,
+    spread: pd.DataFrame,
+    moments: Moments,
+) -> None:
+    """Both moments at one scale, so that tight looks tight."""
+    iterations = (moments.wide, moments.tight)
+    sets = [clouds[clouds["iteration"] == k] for k in iterations]
+    points = [rows[["x_m", "y_m"]].to_numpy() for rows in sets]
+    reach = max(float(np.abs(p - p.mean(axis=0)).max()) for p in points)
+    path = data.path_of(moments.robot)
+    for axes, k, particles, name in zip(
+        zooms, iterations, points, ("A, wide", "B, tight"), strict=True
+    ):
+        mean = particles.mean(axis=0)
+        axes.plot(path[:, 0], path[:, 1], color=GRAY, zorder=1)
+        axes.plot(
+            *particles.T,
+            linestyle="none",
+            marker=".",
+            markersize=2.5,
+            alpha=0.7,
+            color=robot_colours(data.robots)[moments.robot],
+            rasterized=True,
+        )
+        axes.set_xlim(mean[0] - _ZOOM_MARGIN * reach, mean[0] + _ZOOM_MARGIN * reach)
+        axes.set_ylim(mean[1] - _ZOOM_MARGIN * reach, mean[1] + _ZOOM_MARGIN * reach)
+        axes.set_aspect("equal")
+        axes.locator_params(nbins=4)
+        label_plan(axes, moments.robot)
+        grown = _new_landmarks(data, moments.robot, k)
+        axes.set_title(
+            f"{name}: k = {k}, spread {_spread_at(spread, moments.robot, k):.3f} m\n"
+            f"+{grown} landmarks in {_RECENT_ITERATIONS} iterations",
+            fontsize=7.5,
+        )
+
+
+def _new_landmarks(data: ResultTables, robot: str, iteration: int) -> int:
+    """How much the map grew of late: much in new territory, little on known ground."""
+    table = data.table("robots")
+    count = table[table["robot"] == robot].set_index("iteration")["n_landmarks"]
+    return int(count[iteration] - count[max(0, iteration - _RECENT_ITERATIONS)])

@@ -1,1 +1,0 @@
-"""What several runs say together, and how sure one can be of it."""

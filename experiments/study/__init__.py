@@ -1,0 +1,1 @@
+"""Many runs in, summaries out: sweeps, statistics, comparisons, refusal, the benchmark."""

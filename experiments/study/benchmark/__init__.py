@@ -1,0 +1,1 @@
+"""Every method on made-up pairs of maps: success, error and time."""

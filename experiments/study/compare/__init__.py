@@ -1,0 +1,1 @@
+"""Two versions of the same runs in, what got better or worse out."""

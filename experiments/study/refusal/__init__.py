@@ -1,0 +1,1 @@
+"""Maps of different worlds crossed: are those refused, and only those?"""

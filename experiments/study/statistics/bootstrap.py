@@ -1,0 +1,150 @@
+"""Bootstrap intervals that resample whole runs, since the rows of one run depend on each other."""
+
+import warnings
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+import scipy.stats
+
+from experiments.study.statistics.wilson import CONFIDENCE
+from mapfusion.se2 import Float
+
+# An interval's end at 2.5 % then rests on 50 draws (Efron & Tibshirani 1993, ch. 14.3).
+RESAMPLES = 2000
+RUN, MAPS_OF_ONE_RUN = "run", "maps of one run"
+_MAP_KEYS = ["robot_a", "robot_b", "iteration"]
+
+Statistic = Callable[[Float], Float]
+_MAX_CELLS = 1_000_000  # resamples times rows that are worked on at once: some 8 MB an array
+
+
+class Clusters(NamedTuple):
+    """Which rows are resampled together.
+
+    Attributes:
+        codes: (N,) number of each row's cluster.
+        n: how many there are.
+        unit: "run", or, where there is one run only, "maps of one run": what an interval says then
+            is nothing about other seeds.
+    """
+
+    codes: np.ndarray
+    n: int
+    unit: str
+
+
+class Interval(NamedTuple):
+    """A number and how sure it is; the ends are NaN where they cannot be known."""
+
+    value: float
+    low: float
+    high: float
+
+
+def clusters_of(frame: pd.DataFrame) -> Clusters:
+    """Rows by run; of a single run, by robot pair and iteration where the table has these."""
+    codes, runs = pd.factorize(frame["run_id"])
+    if len(runs) != 1 or not set(_MAP_KEYS) <= set(frame.columns):
+        return Clusters(codes, len(runs), RUN)
+    codes = frame.groupby(_MAP_KEYS, sort=False).ngroup().to_numpy()
+    return Clusters(codes, int(codes.max()) + 1, MAPS_OF_ONE_RUN)
+
+
+class WeightedMedian:
+    """The median of rows whose clusters are counted so many times each.
+
+    Infinite values are welcome: a method without an answer is as far off as can be.
+    """
+
+    def __init__(self, values: Float, codes: np.ndarray) -> None:
+        known = ~np.isnan(values)
+        order = np.argsort(values[known], kind="stable")
+        self._values = values[known][order]
+        self._codes = codes[known][order]
+
+    def __call__(self, counts: Float) -> Float:
+        """The medians (B,) for counts (B, n_clusters); NaN where no row counts."""
+        if not len(self._values):
+            return np.full(len(counts), np.nan)
+        found = [self._of(part) for part in np.array_split(counts, self._n_parts(len(counts)))]
+        return np.concatenate(found)
+
+    def _n_parts(self, n_counts: int) -> int:
+        """How often to cut the counts, so that memory stays bounded."""
+        return max(1, min(n_counts, n_counts * len(self._values) // _MAX_CELLS))
+
+    def _of(self, counts: Float) -> Float:
+        cumulative = np.cumsum(counts[:, self._codes], axis=1)
+        half = cumulative[:, -1:] / 2
+        last = len(self._values) - 1
+        lower = self._values[np.minimum(np.sum(cumulative < half, axis=1), last)]
+        upper = self._values[np.minimum(np.sum(cumulative <= half, axis=1), last)]
+        finite = np.isfinite(lower) & np.isfinite(upper)
+        middle = lower + np.subtract(upper, lower, out=np.zeros(len(lower)), where=finite) / 2
+        return np.where(half[:, 0] > 0, middle, np.nan)
+
+
+def percentile_interval(
+    statistic: Statistic,
+    n_clusters: int,
+    rng: np.random.Generator,
+    confidence: float = CONFIDENCE,
+    resamples: int = RESAMPLES,
+) -> Interval:
+    """Percentile interval of a statistic of cluster counts.
+
+    For medians and their ratios: BCa's correction takes its acceleration from the jackknife, which
+    is not consistent for medians (Efron & Tibshirani 1993, ch. 10.6).
+
+    Args:
+        statistic: numbers (B,) of counts (B, n_clusters): how often each cluster is in a sample.
+        n_clusters: with one there is nothing to resample, and the ends are NaN.
+        rng: decides the resamples.
+        confidence: level of the interval.
+        resamples: how many.
+    """
+    value = float(statistic(np.ones((1, max(n_clusters, 1))))[0])
+    if n_clusters < 2 or np.isnan(value):
+        return Interval(value, np.nan, np.nan)
+    counts = rng.multinomial(n_clusters, np.full(n_clusters, 1 / n_clusters), size=resamples)
+    drawn = statistic(counts.astype(np.float64))
+    drawn = drawn[~np.isnan(drawn)]  # resamples in which no row had a value
+    tail = (1 - confidence) / 2
+    # a quantile that is one of the draws: no arithmetic with infinite ones
+    low, high = np.quantile(drawn, [tail, 1 - tail], method="inverted_cdf")
+    return Interval(value, float(low), float(high))
+
+
+def mean_interval(
+    values: Float,
+    rng: np.random.Generator,
+    confidence: float = CONFIDENCE,
+    resamples: int = RESAMPLES,
+) -> Interval:
+    """BCa interval of the mean of independent values (n,), one a run (Efron 1987).
+
+    Fewer than two leave the ends NaN; equal ones make both ends the value.
+    """
+    if len(values) < 2:
+        return Interval(float(np.mean(values)) if len(values) else np.nan, np.nan, np.nan)
+    if np.ptp(values) == 0:
+        return Interval(float(values[0]), float(values[0]), float(values[0]))
+    with warnings.catch_warnings(), np.errstate(invalid="ignore"):
+        # where all jackknife values are equal BCa has no answer; the percentile then does
+        warnings.simplefilter("ignore", scipy.stats.DegenerateDataWarning)
+        result = scipy.stats.bootstrap(
+            (values,),
+            np.mean,
+            n_resamples=resamples,
+            confidence_level=confidence,
+            method="BCa",
+            vectorized=True,
+            rng=rng,
+        )
+    low, high = result.confidence_interval
+    if not np.isfinite([low, high]).all():
+        tail = (1 - confidence) / 2
+        low, high = np.quantile(result.bootstrap_distribution, [tail, 1 - tail])
+    return Interval(float(np.mean(values)), float(low), float(high))

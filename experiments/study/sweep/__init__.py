@@ -1,0 +1,1 @@
+"""All combinations of settings and seeds, on all cores or a cluster."""

@@ -1,0 +1,339 @@
+"""One tiny run from end to end: every table, every command, interruptions, reuse."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from experiments.judge import tables
+from experiments.judge.pipeline import execute, plan
+from experiments.judge.result import run_scenario
+from experiments.run.stages.align import run_aligner, run_match
+from experiments.run.stages.slam import RobotFolders, run_filter
+from experiments.run.store import StageFolder, Store
+from experiments.scenario.settings import Scenario, load_scenario
+from mapfusion.landmark_map import read_map
+from mapfusion.robot_log import read_log, read_truth, write_truth_points, write_truth_poses
+from tests.helpers.tiny_scenario import TINY, assert_same_tables, command, estimated_tables
+
+
+def quietly(stage: str, done: int, total: int) -> None:
+    """Progress nobody looks at."""
+
+
+def test_every_table_is_there(tiny_result: Path, tiny: Scenario) -> None:
+    for name in tables.ALL:
+        table = tables.read(tables.table_path(tiny_result, name), name)  # checks the schema
+        assert len(table), name
+    found = estimated_tables(tiny_result)
+    errors, estimates = found["errors"], found["estimates"]
+    repetitions = {"ransac": 2, "svd": 1, "icp": 2}  # what draws nothing at random runs once
+    for (_, aligner), rows in estimates.groupby(["iteration", "aligner"]):
+        assert len(rows) == repetitions[aligner]
+    assert estimates["aligner"].nunique() == len(repetitions)
+    assert len(errors) == len(estimates) + 5  # the oracle, once an iteration
+    assert sorted(errors["iteration"].unique()) == [10, 20, 30, 40, 43]
+    assert (errors["n_true"] <= errors["n_correspondences"]).all()
+    assert (errors["n_inliers"] <= errors["n_correspondences"]).all()
+    for name in ("precision", "recall"):
+        assert errors[name].dropna().between(0, 1).all()
+    robots = found["robots"]
+    assert (robots.groupby("robot").size() == 44).all()
+    assert robots["path_error_m"].iloc[0] == pytest.approx(0, abs=0.01)
+    assert robots["effective_sample_size"].between(1, 30).all()
+    assert set(found["tracks"]["iteration"]) == {30, 31}
+    assert set(found["map_fits"]["map"]) == {"R1", "R2", "fused"}
+
+
+def test_maps_are_those_of_the_tables(tiny_result: Path) -> None:
+    found = estimated_tables(tiny_result)
+    for robot, rows in found["landmarks"].groupby("robot"):
+        landmarks = read_map(tiny_result / "maps" / f"{robot}.parquet")
+        np.testing.assert_array_equal(landmarks.position_m, rows[["x_m", "y_m", "z_m"]])
+        assert landmarks.name == robot
+    fused = read_map(tiny_result / "maps" / "fused.parquet")
+    np.testing.assert_array_equal(fused.position_m, found["fused"][["x_m", "y_m", "z_m"]])
+
+
+def test_estimates_lie_near_the_truth(tiny_result: Path) -> None:
+    """Rough, so that it tells a broken run from a poor one: a room of 6 m, errors below 0.5 m."""
+    found = estimated_tables(tiny_result)
+    errors = found["errors"]
+    ransac = errors[(errors["aligner"] == "ransac") & (errors["iteration"] == 43)]
+    assert (ransac["refined_status"] == "accepted").all()
+    assert (ransac["refined_translation_error_m"] < 0.5).all()
+    assert (ransac["refined_rotation_error_rad"].abs() < 0.2).all()
+    landmarks = found["landmarks"]
+    off = landmarks[["x_m", "y_m"]].to_numpy() - landmarks[["truth_x_m", "truth_y_m"]].to_numpy()
+    assert np.nanmedian(np.hypot(*off.T)) < 0.3
+
+
+def test_finished_stages_are_reused_and_fresh_computes_again(
+    tiny: Scenario, tiny_results: Path, tmp_path: Path
+) -> None:
+    told: list[str] = []
+    store = Store(tiny_results / "store")
+    execute(tiny, store, 1, lambda stage, done, total: told.append(stage))
+    assert told == []
+
+    quick = tiny.model_copy(
+        update={"drive": tiny.drive and tiny.drive.model_copy(update={"frames": 4})}
+    )
+    store = Store(tmp_path)
+    execute(quick, store, 1, quietly)
+    marks = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("done.json")}
+    execute(quick, store, 1, lambda stage, done, total: told.append(stage), fresh=True)
+    assert set(told) == {"drive", "faces", "render", "log", "slam", "align", "judge"}
+    assert all(path.stat().st_mtime_ns > before for path, before in marks.items())
+
+
+def test_nothing_of_an_earlier_run_is_left(
+    tiny_path: Path, tiny_results: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(tiny_results, tmp_path, dirs_exist_ok=True)
+    result = tmp_path / "tiny-3"
+    outdated = [result / "maps" / "R3.parquet", result / "keyframes" / "R1_00099.png"]
+    for path in outdated:
+        path.write_bytes(b"of an earlier run")
+    run_scenario(load_scenario(tiny_path), tmp_path, 1, quietly)
+    assert not any(path.exists() for path in outdated)
+    assert len(list((result / "keyframes").iterdir())) == 4
+
+
+def test_ctrl_c_before_the_command_starts(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def press() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("experiments.run.kernel_cache.use_kernel_cache", press)
+    reply = command(capsys, "schema")
+    assert reply.code == 130
+    assert len(reply.err.splitlines()) == 1
+
+
+def interrupted_run(path: Path, results: Path) -> subprocess.CompletedProcess[str]:
+    """Start `mapfusion run`, press Ctrl-C once the first rendered chunk is on disk."""
+    process = subprocess.Popen(
+        [
+            *(sys.executable, "-m", "experiments.cli.main", "run", path),
+            "--jobs=2",
+            f"--results={results}",
+        ],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,  # a process group of its own, as a shell gives each command
+    )
+    deadline = time.monotonic() + 60
+    while not list(results.rglob("features_*.parquet")) and time.monotonic() < deadline:
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.005)
+    os.killpg(process.pid, signal.SIGINT)
+    out, err = process.communicate(timeout=30)
+    return subprocess.CompletedProcess(process.args, process.returncode, out, err)
+
+
+def test_interrupted_run_goes_on_and_gives_the_same_tables(
+    tiny: Scenario, tiny_path: Path, tiny_result: Path, tmp_path: Path
+) -> None:
+    ended = interrupted_run(tiny_path, tmp_path)
+    assert ended.returncode == 130
+    assert "Traceback" not in ended.stderr
+    complaints = [line for line in ended.stderr.splitlines() if line.startswith("mapfusion: ")]
+    assert len(complaints) == 1
+    assert "interrupted" in complaints[0]
+    kept = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("features_*.parquet")}
+    assert 1 <= len(kept) < 6
+    assert not (tmp_path / "tiny-3").exists()
+
+    run_scenario(tiny, tmp_path, 2, quietly)
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept
+    assert len(list(tmp_path.rglob("features_*.parquet"))) == 6
+    assert_same_tables(tmp_path / "tiny-3", tiny_result)  # which one process made in one go
+
+
+def test_truth_is_for_the_evaluation_alone(
+    tiny: Scenario, tiny_results: Path, tmp_path: Path
+) -> None:
+    rng = np.random.default_rng(1)
+    folders = []
+    for robot in plan(tiny, Store(tiny_results / "store")).robots:
+        folder = tmp_path / robot.name
+        folder.mkdir()
+        for name in ("frames.parquet", "observations.parquet"):
+            (folder / name).hardlink_to(robot.log.path / name)
+        truth = read_truth(robot.log.path)
+        write_truth_poses(folder, rng.permutation(truth.T_world_robot))
+        write_truth_points(folder, rng.permutation(truth.point_world_m) + 100)
+        folders.append(folder)
+    shuffled = Scenario.model_validate(
+        {"schema_version": 1, "name": "shuffled", "seed": tiny.seed, "logs": [*map(str, folders)]}
+        | {name: getattr(tiny, name) for name in ("slam", "align", "evaluate", "merge")}
+    )
+    result = run_scenario(shuffled, tmp_path / "results", 1, quietly)
+    before = estimated_tables(tiny_results / "tiny-3")
+    after = estimated_tables(result)
+    for name in ("estimates", "correspondences", "clouds"):
+        pd.testing.assert_frame_equal(after[name], before[name], check_exact=True, obj=name)
+    estimated = [c for c in before["landmarks"] if not c.startswith("truth")]
+    pd.testing.assert_frame_equal(after["landmarks"][estimated], before["landmarks"][estimated])
+    estimated = [c for c in before["fused"] if not c.startswith("truth")]
+    pd.testing.assert_frame_equal(after["fused"][estimated], before["fused"][estimated])
+    estimated = [c for c in before["paths"] if not c.startswith("truth")]
+    pd.testing.assert_frame_equal(after["paths"][estimated], before["paths"][estimated])
+    # the truth did change, and the judgement with it
+    assert not before["errors"]["translation_error_m"].equals(
+        after["errors"]["translation_error_m"]
+    )
+
+
+def test_estimating_opens_no_truth(tiny: Scenario, tiny_results: Path, tmp_path: Path) -> None:
+    """The filter and the aligners run where the truth is not even on disk."""
+    laid_out = plan(tiny, Store(tiny_results / "store"))
+    folders = []
+    for robot in laid_out.robots:
+        log = tmp_path / robot.name
+        log.mkdir()
+        for name in ("frames.parquet", "observations.parquet"):
+            (log / name).hardlink_to(robot.log.path / name)
+        run_filter(read_log(log), tiny.slam, tiny.seed, [10, 43], 10, log / "slam")
+        folders.append(RobotFolders(log, log / "slam"))
+    offered = StageFolder("match", "x", tmp_path / "match")
+    aligners = tuple(
+        StageFolder("aligner", entry.name, tmp_path / entry.name) for entry in tiny.align.aligners
+    )
+    robots = (folders[0], folders[1])
+    run_match(tiny, robots, offered, 0, [43])
+    for entry, folder in zip(tiny.align.aligners, aligners, strict=True):
+        run_aligner(tiny, entry, robots, offered, folder, 0, [43])
+    for folder in (offered, *aligners):
+        assert (folder.path / "batch_000.parquet").is_file()
+
+
+def test_only_the_changed_aligner_runs_again(tiny: Scenario, tiny_results: Path) -> None:
+    store = Store(tiny_results / "store")
+    changed = tiny.align.aligners[0].model_copy(update={"parameters": {"gate_m": 0.25}})
+    entries = [changed, *tiny.align.aligners[1:]]
+    other = tiny.model_copy(update={"align": tiny.align.model_copy(update={"aligners": entries})})
+    before, after = (plan(scenario, store).pairs[0].parts for scenario in (tiny, other))
+    assert after.match == before.match
+    assert after.aligners[0] != before.aligners[0]
+    assert after.aligners[1:] == before.aligners[1:]
+
+
+def test_commands_one_by_one(
+    tiny_path: Path, tiny_results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    logs, maps = tmp_path / "logs", [tmp_path / "R1.parquet", tmp_path / "R2.parquet"]
+    scenario = ("--scenario", tiny_path, "--seed", 3)
+    reply = command(capsys, "record", tiny_path, "-o", logs, "--jobs", 1, "--results", tiny_results)
+    assert reply.code == 0
+    assert sorted(path.name for path in logs.iterdir()) == ["R1", "R2"]
+    for path in maps:
+        assert command(capsys, "slam", logs / path.stem, "-o", path, *scenario).code == 0
+        of_the_run = read_map(tiny_results / "tiny-3" / "maps" / path.name)
+        np.testing.assert_array_equal(read_map(path).position_m, of_the_run.position_m)
+    reply = command(capsys, "align", *maps, *scenario)
+    assert reply.code == 0
+    assert all(name in reply.out for name in ("ransac", "svd", "icp"))
+    reply = command(capsys, "merge", *maps, "-o", tmp_path / "fused.parquet", *scenario)
+    assert reply.code == 0
+    fused, parts = read_map(tmp_path / "fused.parquet"), [read_map(path) for path in maps]
+    assert max(map(len, parts)) < len(fused) < sum(map(len, parts))
+
+
+def test_figures(tiny_result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    copy = tmp_path / "result"
+    copy.mkdir()
+    for path in tiny_result.rglob("*.*"):
+        (copy / path.relative_to(tiny_result)).parent.mkdir(exist_ok=True, parents=True)
+        (copy / path.relative_to(tiny_result)).write_bytes(path.read_bytes())
+    reply = command(capsys, "figures", copy, "--jobs", 1)
+    assert reply.code == 0
+    drawn = {path.name[:5] for path in (copy / "figures").iterdir()}
+    skipped = {line.split()[2][:5] for line in reply.out.splitlines() if "not drawn" in line}
+    assert drawn | skipped == {f"fig{number:02d}" for number in range(1, 11)}
+    assert not drawn & skipped
+
+
+@pytest.mark.parametrize(("most", "code"), [(1.0, 0), (1e-9, 1)])
+def test_check(
+    tiny_path: Path,
+    tiny_results: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    most: float,
+    code: int,
+) -> None:
+    junit = tmp_path / "junit.xml"
+    reply = command(
+        capsys,
+        *("check", tiny_path, "--jobs", 1, "--results", tiny_results, "--seeds", 3),
+        *("--set", f"expect.path_rmse_m.max={most}", "--junit", junit),
+    )
+    assert reply.code == code
+    assert ET.parse(junit).getroot().get("failures") == str(code)
+    assert f"{1 - code} passed, {code} failed" in reply.out
+
+
+def test_run_shows_the_aligners(
+    tiny_path: Path,
+    tiny_results: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("experiments.show.figures.draw_all", lambda *_: [])  # drawn in other tests
+    reply = command(capsys, "run", tiny_path, "--jobs", 1, "--results", tiny_results)
+    assert reply.code == 0
+    assert all(name in reply.out for name in ("ransac", "svd", "icp", "oracle", "R1", "R2"))
+    resolved = json.loads((tiny_results / "tiny-3" / "scenario.json").read_text())
+    assert resolved["slam"]["filter"]["n_particles"] == 30
+
+
+@pytest.mark.parametrize(
+    ("name", "overrides"),
+    [
+        ("one robot", ["robots=[{name: R1, start: [1.2, 1.2, 0.6], route: [[4.8, 1.2]]}]"]),
+        # no wall is this near: nothing is seen, all maps are empty
+        ("blind", ["vision.max_depth_m=0.01"]),
+        ("nothing alike", ["align.match.max_descriptor_distance=1e-9"]),
+        ("empty at first", ["evaluate.every=1", "drive.frames=6", "slam.min_count=4"]),
+    ],
+)
+def test_runs_with_little_to_go_on(
+    tiny_results: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    name: str,
+    overrides: list[str],
+) -> None:
+    if name == "nothing alike":  # differs from a usual run in its tables alone
+        monkeypatch.setattr("experiments.show.figures.draw_all", lambda *_: [])
+    path = tmp_path / "tiny.yaml"
+    path.write_text(TINY, encoding="utf-8")
+    changes = [part for override in overrides for part in ("--set", override)]
+    if not any("drive.frames" in override for override in overrides):
+        changes += ["--set", "drive.frames=12", "--set", "evaluate.every=5"]
+    reply = command(capsys, "run", path, "--jobs", 1, "--results", tmp_path, *changes)
+    assert reply.code == 0
+    errors = tables.read(tables.table_path(tmp_path / "tiny-3", "errors"), "errors")
+    if name == "one robot":
+        assert not len(errors)
+    else:
+        assert (errors["status"] == "degenerate").any()
+        assert (errors["reason"][errors["status"] == "degenerate"] != "").all()
+    reply = command(
+        capsys, "check", path, "--jobs", 1, "--results", tmp_path, "--seeds", 3, *changes
+    )
+    assert reply.code == 0

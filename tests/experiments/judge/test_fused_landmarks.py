@@ -1,0 +1,128 @@
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from experiments.judge.fused_landmarks import fused_maps, fused_truth, fusion_rows, map_fit_rows
+from experiments.run.estimates import estimate_row
+from experiments.scenario.settings import Merge
+from mapfusion import se2
+from mapfusion.align.acceptance import Verdict
+from mapfusion.align.result import Alignment, Status
+from mapfusion.aligned_landmarks import ABSENT
+from mapfusion.merge import FusedMap
+from tests.helpers.made_up_maps import ACCEPTED, ITERATION, offered, paired, robot
+
+T_WORLD_A = np.array([1.0, 2.0, 0.3])
+T_WORLD_B = np.array([4.0, -1.0, 3.0])
+N = 3000
+SIGMA_M = 0.02
+
+
+def fused_pairs(drift_sigma_m: float, seed: int = 6) -> pd.DataFrame:
+    """Two noisy maps of one world, aligned by the true motion; drift is noise in the plane."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(0, 200, (N, 3))
+    drift = drift_sigma_m / np.sqrt(2) * np.array([1, 1, 0])  # half of its variance in each map
+    real = np.hypot(SIGMA_M, drift)
+    a = robot("A", points, T_WORLD_A, rng.normal(0, real, (N, 3)), SIGMA_M)
+    b = robot("B", points, T_WORLD_B, rng.normal(0, real, (N, 3)), SIGMA_M)
+    T_true = se2.between(T_WORLD_A, T_WORLD_B)
+    found = Alignment(
+        T_true,
+        1e-12 * np.eye(3),
+        np.ones(N, bool),
+        0.0,
+        Status.ACCEPTED,
+        drift_sigma_m=drift_sigma_m,
+    )
+    names = {"robot_a": "A", "robot_b": "B", "iteration": ITERATION}
+    row = names | {"aligner": "ransac", "repetition": 0} | estimate_row(N, found, found, ACCEPTED)
+    pairs = offered("A", "B", paired(list(range(N)), list(range(N))))
+    return pd.DataFrame(fusion_rows(a, b, pd.DataFrame([row]), pairs, Merge(), 0.1))
+
+
+def test_fusing_equal_maps_halves_the_variance() -> None:
+    rows = fused_pairs(drift_sigma_m=0.0)
+    assert len(rows) == N
+    assert rows["true_pair"].all()
+    assert (rows["degrees_of_freedom"] == 3).all()
+    rms = {name: np.sqrt(np.mean(rows[f"error_{name}_m"] ** 2)) for name in ("a", "b", "fused")}
+    # RMS of 3 N normal errors: relative standard deviation 1 / sqrt(6 N) = 0.75 %
+    assert rms["a"] == pytest.approx(SIGMA_M * np.sqrt(3), rel=0.03)
+    assert rms["b"] == pytest.approx(SIGMA_M * np.sqrt(3), rel=0.03)
+    assert rms["fused"] == pytest.approx(SIGMA_M * np.sqrt(3 / 2), rel=0.03)
+    # equal parents: the fused landmark lies half way, so never farther off than the worse one
+    assert (rows["error_fused_m"] <= rows[["error_a_m", "error_b_m"]].max(axis=1) + 1e-12).all()
+
+
+def test_nees_is_consistent_with_drift_and_not_without() -> None:
+    rows = fused_pairs(drift_sigma_m=0.06)
+    # real variance over the landmarks' own in x and y; heights do not drift
+    share = (2 * (1 + (0.06 / np.sqrt(2) / SIGMA_M) ** 2) + 1) / 3
+    # mean of chi-square(3) / 3 over N: standard deviation sqrt(2 / 3 / N) = 1.5 %
+    per_degree = rows[["nees_with_drift", "nees_without_drift"]].mean() / 3
+    assert per_degree["nees_with_drift"] == pytest.approx(1, rel=0.06)
+    assert per_degree["nees_without_drift"] == pytest.approx(share, rel=0.06)
+
+
+@pytest.mark.parametrize("planar", [False, True])
+def test_fused_landmarks_are_judged_by_the_middle_of_two_truths(planar: bool) -> None:
+    """Corners 0.08 m apart, fused half way; their variances (sigma^2 each) halve."""
+    points = np.random.default_rng(1).uniform(0, 5, (6, 3)) * [1, 1, 0]
+    apart = np.array([0.0, 0.08, 0.0])
+    a, b = robot("A", points, np.zeros(3)), robot("B", points + apart, np.zeros(3))
+    for one in (a, b):
+        one.maps[ITERATION] = replace(one.maps[ITERATION], planar=planar)
+    found = Alignment(
+        np.zeros(3), np.eye(3), np.ones(6, bool), 0.0, Status.ACCEPTED, drift_sigma_m=0.0
+    )
+    names = {"robot_a": "A", "robot_b": "B", "iteration": ITERATION}
+    row = names | {"aligner": "ransac", "repetition": 0} | estimate_row(6, found, found, ACCEPTED)
+    pairs = offered("A", "B", paired(list(range(6)), list(range(6))))
+    rows = pd.DataFrame(fusion_rows(a, b, pd.DataFrame([row]), pairs, Merge(), 0.1))
+    assert rows["error_fused_m"].to_numpy() == pytest.approx(0, abs=1e-9)
+    assert rows["error_a_m"].to_numpy() == pytest.approx(0.04)
+    assert rows["error_b_m"].to_numpy() == pytest.approx(0.04)
+    assert rows["nees_with_drift"].to_numpy() == pytest.approx(0, abs=1e-9)
+    assert (rows["degrees_of_freedom"] == (2 if planar else 3)).all()
+
+
+def test_only_accepted_alignments_are_fused() -> None:
+    points = np.random.default_rng(1).uniform(0, 5, (6, 3))
+    maps = [robot(name, points, np.zeros(3)).maps[ITERATION] for name in ("A", "B")]
+    found = Alignment(
+        np.zeros(3), np.eye(3), np.ones(6, bool), 0.0, Status.ACCEPTED, drift_sigma_m=0.0
+    )
+    names = {"robot_a": "A", "robot_b": "B", "iteration": ITERATION}
+    pairs = offered("A", "B", paired(list(range(6)), list(range(6))))
+    for verdict, n, left_out in (
+        (ACCEPTED, 6, ()),
+        (Verdict(False, 1.0, "chance does as well"), 6, (("B", "chance does as well"),)),
+    ):
+        row = names | {"aligner": "ransac", "repetition": 0}
+        row |= estimate_row(6, found, found, verdict)
+        fused = fused_maps(maps, pd.DataFrame([row]), pairs, Merge())
+        assert fused.left_out == left_out
+        assert len(fused.landmarks) == n  # fused with B's, or A's alone
+        assert (fused.parents[:, 1] == ABSENT).all() == bool(left_out)
+
+
+def test_truth_of_fused_landmarks_and_fits() -> None:
+    points = np.arange(18, dtype=float).reshape(6, 3)
+    a, b = robot("A", points[:4], T_WORLD_A), robot("B", points[2:], T_WORLD_B)
+    a.points_world_m[ITERATION][1] = np.nan
+    parents = np.array([[0, ABSENT], [1, ABSENT], [2, 0], [3, 2], [ABSENT, 3]])
+    landmarks = robot("A", np.zeros((5, 3)), np.zeros(3)).maps[ITERATION]
+    fused = FusedMap(landmarks, parents, np.zeros((2, 3)), np.zeros(2), 0.0, ())
+    truth = fused_truth(fused, [a, b], ITERATION)
+    np.testing.assert_array_equal(truth[0], points[0])
+    assert np.isnan(truth[1]).all()
+    np.testing.assert_array_equal(truth[2], points[2])
+    np.testing.assert_array_equal(truth[3], (points[3] + points[4]) / 2)
+    np.testing.assert_array_equal(truth[4], points[5])
+    rows = pd.DataFrame(map_fit_rows([a, b], fused, ITERATION)).set_index("map")
+    assert rows["n_landmarks"].to_dict() == {"A": 3, "B": 4, "fused": 4}
+    assert rows["rmse_m"][["A", "B"]].to_numpy() == pytest.approx(0, abs=1e-9)
+    assert list(pd.DataFrame(map_fit_rows([a], None, ITERATION))["map"]) == ["A"]

@@ -1,0 +1,54 @@
+"""The kept history against the tables that hold the same at the end, and on failed alignments."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from experiments.judge import tables
+from experiments.run.estimates import inlier_mask
+
+PLAN = ["x_m", "y_m", "cov_xx_m2", "cov_xy_m2", "cov_yy_m2"]
+
+
+def read(result: Path, name: str) -> pd.DataFrame:
+    return tables.read(tables.table_path(result, name), name)
+
+
+def test_the_last_maps_are_the_landmarks(tiny_result: Path) -> None:
+    history, landmarks = read(tiny_result, "map_history"), read(tiny_result, "landmarks")
+    assert sorted(history["iteration"].unique()) == [10, 20, 30, 40, 43]
+    last = history[history["iteration"] == 43].merge(landmarks, on=["robot", "landmark"])
+    assert len(last) == len(landmarks)
+    for name in PLAN:
+        single = last[f"{name}_y"].to_numpy().astype(np.float32)
+        np.testing.assert_array_equal(last[f"{name}_x"].to_numpy(), single)
+
+
+def test_the_true_pairs_are_as_many_as_the_evaluation_counted(tiny_result: Path) -> None:
+    key = ["robot_a", "robot_b", "iteration"]
+    errors = read(tiny_result, "errors").groupby(key)[["n_true", "n_correspondences"]].first()
+    judged = read(tiny_result, "true_pairs").set_index(key)
+    assert len(judged) == len(errors)
+    for index, row in judged.iterrows():
+        bits = inlier_mask(row["true_pair"], row["n_correspondences"])
+        assert bits.sum() == errors.loc[index, "n_true"]
+        assert row["n_correspondences"] == errors.loc[index, "n_correspondences"]
+
+
+def test_what_inliers_fuse_to_is_in_the_fused_map(tiny_result: Path) -> None:
+    """The merge at the end joins these, and with its second pass some more."""
+    history, fused = read(tiny_result, "fused_history"), read(tiny_result, "fused")
+    last = history[history["iteration"] == 43]
+    both = fused[fused["n_parents"] == 2]
+    joined = last.merge(both, on=["landmark_a", "landmark_b"])
+    assert 0 < len(joined) == len(last) <= len(both)
+    np.testing.assert_allclose(joined["x_m_x"], joined["x_m_y"], atol=1e-5)
+    np.testing.assert_allclose(joined["cov_yy_m2_x"], joined["cov_yy_m2_y"], rtol=1e-5)
+
+
+def test_only_accepted_alignments_fuse(tiny_result: Path) -> None:
+    estimates = read(tiny_result, "estimates")
+    merged = estimates[(estimates["aligner"] == "ransac") & (estimates["repetition"] == 0)]
+    accepted = merged[merged["refined_status"] == "accepted"]["iteration"]
+    assert set(read(tiny_result, "fused_history")["iteration"]) <= set(accepted)

@@ -1,0 +1,126 @@
+"""Each metric on tables small enough to be worked out by hand."""
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from experiments.judge import metrics
+from experiments.judge.metrics import ALIGNER_METRICS, METRICS, compute, known_metrics
+
+
+def error(
+    aligner: str, iteration: int, translation_m: float, refined_m: float = math.nan, **more: float
+) -> dict[str, object]:
+    row = {"seed": 0, "robot_a": "A", "robot_b": "B", "iteration": iteration, "aligner": aligner}
+    row |= {"translation_error_m": translation_m, "refined_translation_error_m": refined_m}
+    row |= {"refined_rotation_error_rad": 0.0, "oracle_distance_m": 0.0, "n_true": 40}
+    row |= {"accepted": True, "n_common": 60}
+    return row | more
+
+
+@pytest.fixture
+def tables() -> dict[str, pd.DataFrame]:
+    robots = [
+        {"seed": seed, "robot": robot, "path_error_m": path, "odometry_error_m": odometry}
+        for seed, robot, errors in (
+            (0, "A", [(3, 6), (4, 8)]),  # RMS sqrt(12.5), sqrt(50)
+            (0, "B", [(1, 10), (1, 10)]),  # 1, 10
+            (1, "A", [(2, 3), (math.nan, 3)]),  # 2, 3
+        )
+        for path, odometry in errors
+    ]
+    errors = [
+        error("oracle", 10, 0.9, 0.9, n_true=2, refined_rotation_error_rad=0.9),
+        error("oracle", 20, 0.5, 0.2, n_true=40, refined_rotation_error_rad=-0.03),
+        error("oracle", 20, 0.5, 0.4, n_true=50, refined_rotation_error_rad=0.01, seed=1),
+        # few pairs: left out wherever 30 are needed, the first even where 3 are
+        error("ransac", 10, 99.0, 99.0, n_true=2, oracle_distance_m=99.0),
+        error("ransac", 15, 0.1, 99.0, n_true=3, oracle_distance_m=99.0),
+        error("ransac", 20, 0.6, 0.3, oracle_distance_m=0.01),
+        error("ransac", 20, 0.8, 0.5, oracle_distance_m=0.03),
+        error("ransac", 20, 0.7, math.nan, oracle_distance_m=math.nan, accepted=False),
+        error("svd", 20, 2.1, 0.3),
+        error("icp", 20, 1.4, 0.3),
+    ]
+    fusion = [
+        # RMS of parents sqrt((9 + 16) / 2) and 1, of fused 1
+        (0, 3.0, 1.0, 1.0, 2.0, 20.0, 2, True),
+        (0, 4.0, 1.0, 1.0, 4.0, 40.0, 2, True),
+        (0, 9.0, 9.0, 99.0, 99.0, 99.0, 2, False),
+        # another seed: 2, 2 and 1
+        (1, 2.0, 2.0, 1.0, 3.0, 30.0, 3, True),
+    ]
+    columns = ["seed", "error_a_m", "error_b_m", "error_fused_m", "nees_with_drift"]
+    columns += ["nees_without_drift", "degrees_of_freedom", "true_pair"]
+    fits = [(0, "A", 1.0), (0, "B", 3.0), (0, "fused", 7.0), (1, "A", 6.0), (1, "fused", 9.0)]
+    return {
+        "robots": pd.DataFrame(robots),
+        "errors": pd.DataFrame(errors),
+        "fusion": pd.DataFrame(fusion, columns=pd.Index(columns)).assign(robot_a="A", robot_b="B"),
+        "map_fits": pd.DataFrame(fits, columns=pd.Index(["seed", "map", "rmse_m"])),
+    }
+
+
+KNOWN = {
+    "path_rmse_m": 2.0,
+    "odometry_rmse_m": math.sqrt(50),
+    "path_over_odometry": 2 / math.sqrt(50),
+    "oracle_translation_m": 0.3,
+    "oracle_rotation_rad": 0.02,
+    "true_pairs_at_end": 45.0,
+    "fused_over_parents": (1 / ((math.sqrt(12.5) + 1) / 2) + 0.5) / 2,
+    "fused_nees_with_drift": (1 + 2 + 1) / 3,
+    "fused_nees_without_drift": (10 + 20 + 10) / 3,
+    "landmark_rmse_median_m": 4.0,
+    "landmark_rmse_worst_m": 6.0,
+    "fused_landmark_rmse_m": 8.0,
+    "ransac.refined_oracle_distance_m": 0.02,
+    "ransac.refined_over_oracle": 0.4 / 0.3,
+    "ransac.estimated_over_oracle": 0.7 / 0.3,
+    "ransac.estimated_translation_m": 0.65,
+    "ransac.lead_over_others": 2.0,
+    "svd.lead_over_others": 0.7 / 2.1,
+    "ransac.scatter_m": 0.16,
+    "svd.scatter_m": 0.0,
+    "ransac.false_merges": 2 / 5,  # those 99 m off
+    "ransac.missed_merges": 1 / 3,
+}
+
+
+@pytest.mark.parametrize(("name", "value"), KNOWN.items())
+def test_known_answer(tables: dict[str, pd.DataFrame], name: str, value: float) -> None:
+    assert compute(name, tables) == pytest.approx(value)
+
+
+@pytest.mark.parametrize(
+    ("changed", "false"),
+    [
+        ({}, False),
+        ({"refined_translation_error_m": 0.51}, True),
+        ({"refined_rotation_error_rad": -0.11}, True),
+        ({"refined_rotation_error_rad": -0.11, "accepted": False}, False),
+        ({"n_common": 0}, True),  # right by chance at best
+        ({"n_common": 0, "accepted": False}, False),
+    ],
+)
+def test_false_merge(changed: dict[str, object], false: bool) -> None:
+    rows = pd.DataFrame([error("ransac", 20, 0.3, 0.2) | changed])
+    assert metrics.is_false_merge(rows).tolist() == [false]
+
+
+def test_no_metric_is_left_untested() -> None:
+    assert set(METRICS) | set(ALIGNER_METRICS) == {name.rpartition(".")[2] for name in KNOWN}
+    assert set(known_metrics(["ransac", "svd"])) >= set(KNOWN)
+
+
+@pytest.mark.parametrize("name", [*METRICS, *(f"ransac.{name}" for name in ALIGNER_METRICS)])
+def test_nothing_to_measure_is_nan(tables: dict[str, pd.DataFrame], name: str) -> None:
+    """One robot alone, or a run in which nothing was found: no error, no warning, no pass."""
+    empty = {key: table.iloc[:0] for key, table in tables.items()}
+    assert np.isnan(compute(name, empty))
+
+
+def test_all_tables_used_are_named(tables: dict[str, pd.DataFrame]) -> None:
+    assert set(metrics.USED_TABLES) == set(tables)

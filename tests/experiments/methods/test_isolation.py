@@ -1,0 +1,225 @@
+"""Whatever a plug-in does, the harness gets an answer, and the same one every time."""
+
+import importlib
+import math
+import os
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.methods import isolation
+from experiments.methods.aligner_calls import callable_aligner, refine_estimate, require_usable
+from experiments.methods.isolation import Spec, child_for, end_children
+from experiments.scenario.randomness import generator
+from mapfusion.align.refine import Refinement
+from mapfusion.align.result import Alignment, Status
+from tests.helpers.made_up_maps import landmark_map, paired
+from tests.helpers.made_up_plugin import install, look_again
+
+LIMIT_S = 60.0
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _plug_in(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    folder = tmp_path_factory.mktemp("site")
+    install(folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(folder)
+        importlib.invalidate_caches()
+        look_again()
+        yield
+    look_again()
+    end_children()
+
+
+POINTS = np.random.default_rng(0).uniform(0, 10, (12, 3))
+MAPS = (landmark_map(POINTS, "R1"), landmark_map(POINTS + 1.0, "R2"))
+PAIRS = paired([0, 1, 2, 3, 4], [0, 1, 2, 3, 4])
+
+
+def answer(what: str, limit_s: float = LIMIT_S, seed: int = 0) -> Alignment:
+    aligner = callable_aligner("made_up", {"what": what}, limit_s)
+    return aligner.align(*MAPS, PAIRS, generator(seed, "test"))
+
+
+def test_an_answer_comes_through_as_it_was_given() -> None:
+    end_children()
+    found = answer("good", seed=5)
+    expected = np.array([2.0, 2.0, 0.5]) + generator(5, "test").normal(0, 1e-3, 3)
+    np.testing.assert_array_equal(found.T_a_b, expected)
+    np.testing.assert_array_equal(found.covariance, np.diag([1.0, 4.0, 0.01]))
+    np.testing.assert_array_equal(found.inlier, np.ones(5, bool))
+    assert found.status is Status.ACCEPTED
+    assert found.reason == ""
+    assert math.isnan(found.drift_sigma_m)
+    assert 0 < found.elapsed_s < 10  # measured where it ran: it claims 99 s
+    assert callable_aligner("made_up", {}, LIMIT_S).randomised
+
+
+def test_degenerate_is_an_answer_too() -> None:
+    found = answer("degenerate")
+    assert (found.status, found.reason) == (Status.DEGENERATE, "nothing to see")
+    assert np.isnan(found.T_a_b).all()
+
+
+@pytest.mark.parametrize(
+    ("what", "reason"),
+    [
+        ("raises", r"^raised KeyError: 'no such\\nlandmark' \(made_up_module.py:\d+\)$"),
+        ("exits", r"^raised SystemExit: 3 "),
+        ("exits at once", "^ended its process with exit code 3$"),
+        ("segfaults", "^ended its process with SIGSEGV$"),
+        ("kills itself", "^ended its process with SIGKILL$"),
+        ("wrong type", "^returned tuple, expected Alignment$"),
+        ("none", "^returned NoneType, expected Alignment$"),
+        ("NaN", "^T_a_b is not finite, but accepted$"),
+        ("list", r"^T_a_b is list, expected an array \(3,\) of float$"),
+        ("4 numbers", r"^T_a_b is an array \(4,\) of float64, expected an array \(3,\) of float$"),
+        ("theta out of range", "^theta is 4 rad, expected -pi to pi$"),
+        ("inlier of another length", r"^inlier is an array \(6,\) of bool, expected an array "),
+        ("inlier of numbers", r"^inlier is an array \(5,\) of float64, expected .* of bool$"),
+        ("infinite covariance", "^covariance is not finite$"),
+        ("asymmetric covariance", "^covariance is not symmetric$"),
+        ("negative variance", "^covariance has a negative variance$"),
+        ("covariance of the plane", r"^covariance is an array \(2, 2\)"),
+        ("claims to have failed", "^status is .*failed.*, expected one of accepted, refused"),
+        ("refuses without a reason", "^refused without a reason$"),
+        ("reason is no text", "^reason is int, expected str$"),
+        ("drift is no number", "^drift_sigma_m is NoneType, expected float$"),
+        ("degenerate with a motion", "^T_a_b is not NaN, but degenerate$"),
+    ],
+)
+def test_misbehaviour_is_a_status_with_a_reason(what: str, reason: str) -> None:
+    found = answer(what)
+    assert found.status is Status.FAILED
+    assert re.search(reason, found.reason), found.reason
+    assert np.isnan(found.T_a_b).all()
+    assert found.inlier.shape == (5,)
+    assert not found.inlier.any()
+    assert math.isnan(found.elapsed_s)
+    # and it stays what it is in the step that follows, and does not spoil the next call
+    assert refine_estimate(Refinement(), *MAPS, PAIRS, found) is found
+    assert answer("good").status is Status.ACCEPTED
+
+
+@pytest.mark.parametrize("what", ["hangs", "hangs with the lock held"])
+def test_a_hanging_plug_in_is_ended(what: str) -> None:
+    child = child_for(Spec("made_up", f'{{"what": "{what}"}}'))
+    started_s = time.monotonic()
+    found = answer(what, limit_s=0.3)
+    assert (found.status, found.reason) == (Status.FAILED, "gave no answer within 0.3 s")
+    assert time.monotonic() - started_s < 30
+    assert not child.alive
+    assert answer("good").status is Status.ACCEPTED
+
+
+def test_a_plug_in_that_cuts_the_connection_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(isolation, "_END_LIMIT_S", 0.2)
+    found = answer("closes everything")
+    assert (found.status, found.reason) == (
+        Status.FAILED,
+        "closed the connection to its process",
+    )
+
+
+def test_it_is_not_called_for_ever_after_it_hung() -> None:
+    aligner = callable_aligner("made_up", {"what": "hangs"}, 0.2)
+    others = (landmark_map(POINTS), landmark_map(POINTS))
+    reasons = [aligner.align(*MAPS, PAIRS, generator(0)).reason for _ in range(3)]
+    reasons += [aligner.align(*others, PAIRS, generator(0)).reason]
+    late = "gave no answer within 0.2 s"
+    assert reasons == [late, late, f"not called again: {late}", f"not called again: {late}"]
+
+
+def test_after_it_died_twice_on_some_maps_it_gets_the_next_ones() -> None:
+    aligner = callable_aligner("made_up", {"what": "exits at once"}, LIMIT_S)
+    others = (landmark_map(POINTS), landmark_map(POINTS))
+    reasons = [aligner.align(*MAPS, PAIRS, generator(0)).reason for _ in range(3)]
+    reasons += [aligner.align(*others, PAIRS, generator(0)).reason]
+    died = "ended its process with exit code 3"
+    assert reasons == [died, died, f"not called again: {died}", died]
+
+
+def test_maps_are_passed_whole_and_cannot_be_spoilt() -> None:
+    total = MAPS[0].position_m.sum() + MAPS[1].position_m.sum()
+    assert answer("sums").T_a_b.tolist() == [pytest.approx(total, rel=1e-15), 5.0, 0.0]
+    aligner = callable_aligner("made_up", {"what": "spoils its maps"}, LIMIT_S)
+    same = (MAPS[0], MAPS[0])  # what it spoils is what it sums
+    first, second = (aligner.align(*same, PAIRS, generator(0)).T_a_b for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+    np.testing.assert_array_equal(MAPS[0].position_m, POINTS)
+
+
+def test_one_process_serves_all_calls_of_one_method_with_its_parameters() -> None:
+    end_children()
+    first, second = answer("good"), answer("good")
+    assert second.T_a_b[0] - first.T_a_b[0] == pytest.approx(1)  # it counts its calls
+    other = callable_aligner("made_up", {"what": "good", "seconds": 0.01}, LIMIT_S)
+    assert other.align(*MAPS, PAIRS, generator(0, "test")).T_a_b[0] == pytest.approx(first.T_a_b[0])
+
+
+def test_no_more_than_a_few_processes_live() -> None:
+    children = [child_for(Spec("made_up", f'{{"seconds": {k}}}')) for k in range(6)]
+    assert [child.alive for child in children] == [False, False, True, True, True, True]
+    end_children()
+    assert not any(child.alive for child in children)
+
+
+def test_a_process_that_keeps_its_memory_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(isolation, "_MOST_GROWTH_BYTES", 2**25)
+    calls = [answer("grows").T_a_b[0] for _ in range(40)]
+    assert all(answer_ > 1 for answer_ in calls)
+    starts = np.flatnonzero(np.diff(calls) < -1)  # it counts its calls from the start again
+    assert 1 <= len(starts) <= 4
+
+
+@pytest.mark.parametrize(
+    ("parameters", "reason"),
+    [
+        ({"what": "unknown"}, "plug-in made_up: what: is unknown"),
+        ({"wat": 1}, "plug-in made_up: parameters: made_up: .*unexpected keyword argument 'wat'"),
+        ({"what": "cannot be made"}, "plug-in made_up: raised RuntimeError: no licence"),
+        ({"what": "dies when made"}, "plug-in made_up: ended its process with exit code 4"),
+        ({"what": "randomised is no bool"}, "randomised is str, expected a bool"),
+        ({"what": {1, 2}}, "parameters: made_up: .*not JSON serializable"),
+    ],
+)
+def test_parameters_are_tried_before_a_run(parameters: dict, reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        require_usable("made_up", parameters)
+
+
+PARENT = """
+from tests.helpers.made_up_maps import landmark_map, paired
+import numpy as np, sys
+from experiments.methods.aligner_calls import callable_aligner
+from experiments.methods.isolation import child_for, Spec
+points = np.random.default_rng(0).uniform(0, 10, (12, 3))
+maps = landmark_map(points), landmark_map(points)
+what = sys.argv[1]
+print(child_for(Spec("made_up", '{"what": "%s"}' % what))._process.pid, flush=True)
+callable_aligner("made_up", {"what": what}, 500.0).align(
+    *maps, paired([0, 1, 2], [0, 1, 2]), np.random.default_rng(0))
+"""
+
+
+def test_its_process_ends_with_a_killed_parent(tmp_path: Path) -> None:
+    script = tmp_path / "parent.py"
+    script.write_text(PARENT, encoding="utf-8")
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    with subprocess.Popen(
+        [sys.executable, str(script), "hangs"], env=environment, stdout=subprocess.PIPE, text=True
+    ) as run:
+        assert run.stdout is not None
+        child = int(run.stdout.readline())
+        run.kill()
+    deadline = time.monotonic() + 20
+    while Path(f"/proc/{child}").exists() and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not Path(f"/proc/{child}").exists()

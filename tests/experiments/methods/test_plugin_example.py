@@ -1,0 +1,187 @@
+"""The worked example of the documentation: installed offline, then named in scenarios."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from experiments.judge import tables
+from mapfusion import se2
+from mapfusion.landmark_map import write_map
+from tests.helpers.made_up_maps import landmark_map
+from tests.helpers.made_up_plugin import install
+from tests.helpers.tiny_scenario import TINY
+
+EXAMPLE = Path(__file__).parents[2] / "plugin_example"
+T_A_B = np.array([1.0, -2.0, 0.3])
+PLUGGED = TINY.replace("name: tiny", "name: plugged").replace(
+    "    - {name: icp, method: icp}\n",
+    """\
+    - {name: best, method: best_share, parameters: {share: 0.4}}
+    - {name: opencv, method: opencv}
+    - {name: kiss, method: kiss_matcher}
+""",
+)
+
+
+class Ended(NamedTuple):
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder into which pip installed the example, without network."""
+    folder = tmp_path_factory.mktemp("installed")
+    source = folder / "source"  # a build leaves files behind
+    shutil.copytree(EXAMPLE, source)
+    options = ["--quiet", "--no-deps", "--no-build-isolation", "--no-index", "--no-input"]
+    subprocess.run(
+        [sys.executable, "-m", "pip", "install", *options, "--target", folder / "site", source],
+        check=True,
+        capture_output=True,
+    )
+    return folder / "site"
+
+
+def command(site: Path | None, *arguments: object) -> Ended:
+    """`mapfusion ARGUMENTS` in a process of its own, with the installed packages of `site`."""
+    path = [str(site)] if site is not None else []
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([*path, *filter(None, sys.path)])}
+    environment |= {"COLUMNS": "200"}
+    ended = subprocess.run(
+        [sys.executable, "-m", "experiments.cli.main", *map(str, arguments)],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return Ended(ended.returncode, ended.stdout, ended.stderr)
+
+
+@pytest.fixture
+def maps(tmp_path: Path) -> tuple[Path, Path]:
+    """Two maps of the same twenty labelled points."""
+    p = np.random.default_rng(0).uniform(0, 10, (20, 3))
+    paths = tmp_path / "A.parquet", tmp_path / "B.parquet"
+    for path, name, position in zip(
+        paths, "AB", (p, se2.transform_points(se2.inverse(T_A_B), p)), strict=True
+    ):
+        landmarks = landmark_map(position, name)
+        object.__setattr__(landmarks, "label", np.arange(20, dtype=np.int32))
+        write_map(path, landmarks)
+    return paths
+
+
+def entry(method: str, **parameters: object) -> str:
+    text = json.dumps([{"name": "theirs", "method": method, "parameters": parameters}])
+    return f"aligners={text}"
+
+
+def test_align_with_the_example(site: Path, maps: tuple[Path, Path]) -> None:
+    ended = command(site, "align", *maps, "--set", entry("best_share"))
+    assert (ended.code, ended.err) == (0, "")
+    row = next(line for line in ended.out.splitlines() if line.strip().startswith("theirs"))
+    assert row.split()[1:4] == ["1.00", "-2.00", "0.30"]
+    assert "20/20" in row
+
+
+def test_the_example_is_listed_with_its_package(site: Path) -> None:
+    listed = command(site, "aligners")
+    row = next(line for line in listed.out.splitlines() if "best_share" in line)
+    assert row.split() == ["best_share", "plug-in", "mapfusion-best-share", "1.0"]
+    assert "best_share" not in command(None, "aligners").out
+
+
+def test_errors_name_it(site: Path, maps: tuple[Path, Path]) -> None:
+    ended = command(site, "align", *maps, "--set", entry("best_chare"))
+    assert ended.code == 2
+    assert ended.err.count("\n") == 1
+    assert "unknown aligner 'best_chare', known are ransac, svd, icp, impicp" in ended.err
+    assert "best_share" in ended.err
+    ended = command(site, "align", *maps, "--set", entry("best_share", share=2))
+    assert ended.code == 2
+    assert "plug-in best_share: share: must lie in (0, 1]" in ended.err
+    assert ended.err.count("\n") == 1
+
+
+def test_a_scenario_with_the_example_and_peers(
+    site: Path, tiny_results: Path, tmp_path: Path
+) -> None:
+    scenario = tmp_path / "plugged.yaml"
+    scenario.write_text(PLUGGED, encoding="utf-8")
+    results = tmp_path / "results"
+    shutil.copytree(tiny_results / "store", results / "store")
+    ended = command(site, "run", scenario, "--results", results, "--jobs", "2")
+    assert ended.code == 0, ended.err
+    table_row = next(line for line in ended.out.splitlines() if line.strip().startswith("best"))
+    assert table_row
+    result = results / "plugged-3"
+    for name in ("estimates", "errors", "aligner_timings"):
+        rows = tables.read(tables.table_path(result, name), name)
+        assert {"best", "opencv", "kiss"} <= set(rows["aligner"])
+    estimates = tables.read(tables.table_path(result, "estimates"), "estimates")
+    assert not estimates["status"].isin(["failed", "absent"]).any()
+    assert estimates["refined_status"].eq("accepted").any()
+    svg = (result / "figures" / "fig04_translation_error.svg").read_text(encoding="utf-8")
+    assert "best" in svg
+
+    # one process gives the same tables as two, and a changed plug-in is not taken for the old one
+    module = site / "mapfusion_best_share.py"
+    text = module.read_text(encoding="utf-8")
+    folders = set((results / "store" / "aligner").iterdir())
+    module.write_text(text + "\n# changed\n", encoding="utf-8")
+    try:
+        ended = command(site, "run", scenario, "--results", results, "--jobs", "1")
+    finally:
+        module.write_text(text, encoding="utf-8")
+    assert ended.code == 0, ended.err
+    assert len(set((results / "store" / "aligner").iterdir()) - folders) == 1  # its own alone
+    again = tables.read(tables.table_path(result, "estimates"), "estimates")
+    assert estimates.equals(again)
+
+
+def test_an_absent_package_is_shown_as_absent(tmp_path: Path, maps: tuple[Path, Path]) -> None:
+    hidden = tmp_path / "hidden"
+    hidden.mkdir()
+    (hidden / "sitecustomize.py").write_text(HIDE, encoding="utf-8")
+    listed = command(hidden, "aligners")
+    assert "kiss_matcher: the package kiss-matcher is not installed; pip install" in listed.out
+    ended = command(hidden, "align", *maps, "--set", entry("kiss_matcher"))
+    assert (ended.code, ended.err) == (0, "")
+    line = (
+        "theirs: absent: the package kiss-matcher is not installed; "
+        "pip install 'mapfusion[peers]' installs it"
+    )
+    assert line in ended.out
+
+
+HIDE = """
+import sys
+
+class Hide:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] == "kiss_matcher":
+            raise ModuleNotFoundError(name)
+        return None
+
+sys.meta_path.insert(0, Hide())
+"""
+
+
+def test_a_clash_of_names_is_one_line(tmp_path: Path, maps: tuple[Path, Path]) -> None:
+    install(tmp_path / "site", name="ransac", package="clasher")
+    line = (
+        "aligner ransac: mapfusion's own is used, the one that clasher declares under the same "
+        "name is not"
+    )
+    ended = command(tmp_path / "site", "align", *maps, "--set", entry("ransac"))
+    assert (ended.code, ended.err) == (0, f"mapfusion: warning: {line}\n")
+    assert line in command(tmp_path / "site", "aligners").out

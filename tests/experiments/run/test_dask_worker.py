@@ -1,0 +1,93 @@
+"""What a worker does with one task."""
+
+import pickle
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from experiments.run.dask_worker import (
+    TaskFailedError,
+    Terms,
+    UnfitWorkerError,
+    code_version,
+    dask_setup,
+    perform,
+)
+from experiments.run.tasks import Task
+from tests.helpers import acting
+
+
+@pytest.fixture
+def terms(tmp_path: Path) -> Terms:
+    attempts = tmp_path / "attempts"
+    attempts.mkdir()
+    return Terms(attempts, 2, code_version())
+
+
+def packed(function: object, *arguments: object, outputs: tuple[Path, ...] = ()) -> bytes:
+    return pickle.dumps(Task("drive/k", "drive", function, arguments, outputs))  # type: ignore[arg-type]
+
+
+def test_it_runs_and_leaves_no_mark(terms: Terms, tmp_path: Path) -> None:
+    task = packed(acting.write, tmp_path / "out", "text", outputs=(tmp_path / "out",))
+    perform("drive/k", task, terms)
+    assert (tmp_path / "out").read_text() == "text"
+    assert not list(terms.attempts.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("function", "reason", "with_details"),
+    [
+        (acting.collide, "scenario x: R1 drove into a wall at (1, 2)", False),
+        (acting.run_out_of_memory, "drive: MemoryError", True),
+        (acting.break_down, "drive: ZeroDivisionError a bug", True),
+    ],
+)
+def test_what_it_raises_is_a_reason(
+    terms: Terms, function: object, reason: str, with_details: bool
+) -> None:
+    with pytest.raises(TaskFailedError) as raised:
+        perform("drive/k", packed(function), terms)
+    error = pickle.loads(pickle.dumps(raised.value))  # as it travels
+    assert (error.task, error.reason) == ("drive/k", reason)
+    assert ("Traceback" in error.details) == with_details
+    assert not list(terms.attempts.iterdir())
+
+
+def test_a_task_that_kills_its_worker_is_begun_only_so_often(terms: Terms, tmp_path: Path) -> None:
+    """Only the task at work is blamed, by the mark that the killed process left behind."""
+    journal, script = tmp_path / "journal", tmp_path / "worker.py"
+    task = packed(acting.die, journal)
+    script.write_text(
+        "import pickle, sys\n"
+        f"sys.path[:0] = {sys.path!r}\n"
+        "from experiments.run.dask_worker import perform\n"
+        f"perform('drive/k', {task!r}, pickle.loads({pickle.dumps(terms)!r}))\n"
+    )
+    for _ in range(1 + terms.retries):
+        ended = subprocess.run([sys.executable, script], check=False)
+        assert ended.returncode == -signal.SIGKILL
+    with pytest.raises(TaskFailedError, match="killed 3 times"):
+        perform("drive/k", task, terms)
+    assert journal.read_text().split() == ["died"] * 3
+
+
+def test_machines_that_cannot_take_part_say_so(terms: Terms, tmp_path: Path) -> None:
+    elsewhere = Terms(tmp_path / "not shared" / "attempts", 2, terms.code)
+    with pytest.raises(UnfitWorkerError, match="must be shared"):
+        perform("drive/k", packed(acting.break_down), elsewhere)
+    outdated = Terms(terms.attempts, 2, "another version")
+    with pytest.raises(UnfitWorkerError, match="other source or libraries"):
+        perform("drive/k", packed(acting.break_down), outdated)
+
+
+def test_ctrl_c_is_for_the_command_alone() -> None:
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        dask_setup(None)
+        assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)

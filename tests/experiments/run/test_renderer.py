@@ -1,0 +1,57 @@
+"""Which renderer made a result is known; one that is not there is one clear line."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from experiments.judge.pipeline import plan
+from experiments.judge.provenance import provenance
+from experiments.run.store import Store
+from experiments.scenario.settings import load_scenario
+from sim import renderer
+from sim.renderer import egl_driver
+from tests.experiments.cli.test_bad_input import assert_refused
+from tests.helpers.tiny_scenario import command
+
+
+def test_results_record_the_renderer(tiny_result: Path) -> None:
+    assert json.loads((tiny_result / "provenance.json").read_text())["renderer"] == "TinyRenderer"
+
+
+def test_the_renderer_s_driver_is_in_the_record_and_in_the_key(
+    tiny_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scenario = load_scenario(tiny_path, ["render.renderer=egl"])
+    keys = []
+    for driver in ("llvmpipe 22", "llvmpipe 23"):
+        monkeypatch.setattr(renderer, "egl_driver", lambda driver=driver: driver)
+        laid_out = plan(scenario, Store(tmp_path))
+        assert provenance(laid_out)["renderer"] == f"OpenGL by EGL ({driver})"
+        features = laid_out.robots[0].features
+        assert features is not None
+        keys.append(features.key)
+    assert keys[0] != keys[1]
+
+
+def test_without_egl_a_run_says_what_is_missing(
+    tiny_path: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(renderer, "PLUGIN", "no_such_plug_in")
+    egl_driver.cache_clear()
+    try:
+        arguments = ["--set", "render.renderer=egl", "--results", tmp_path, "--jobs", 1]
+        reply = command(capsys, "run", tiny_path, *arguments)
+    finally:
+        egl_driver.cache_clear()
+    assert_refused(reply, "render.renderer", "egl", "libegl1", "tiny needs nothing")
+
+
+def test_an_unknown_renderer_lists_the_known(
+    tiny_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reply = command(capsys, "run", tiny_path, "--set", "render.renderer=vulkan")
+    assert_refused(reply, "render.renderer", "'tiny' or 'egl'", "'vulkan'")

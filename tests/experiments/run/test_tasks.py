@@ -1,0 +1,96 @@
+"""Tasks: what is left to do, in which order, and the same whatever the pool."""
+
+import random
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import pytest
+
+from experiments.run.tasks import Task, run_tasks, unfinished
+from experiments.run.workers import workers
+
+
+def _append(journal: Path, name: str, output: Path) -> None:
+    with journal.open("a") as file:
+        file.write(f"{name}\n")
+    output.write_text(name)
+
+
+def tasks(folder: Path, needs: Mapping[str, Sequence[str]]) -> dict[str, Task]:
+    """Tasks that note their names in a journal, one kind for each first letter."""
+    return {
+        name: Task(
+            name,
+            name[0],
+            _append,
+            (folder / "journal", name, folder / name),
+            (folder / name,),
+            tuple(before),
+        )
+        for name, before in needs.items()
+    }
+
+
+def journal(folder: Path) -> list[str]:
+    path = folder / "journal"
+    return path.read_text().split() if path.exists() else []
+
+
+DIAMOND = {"a1": (), "a2": ("a1",), "a3": ("a1",), "b": ("a2", "a3"), "c": ("b",), "d": ()}
+
+
+def test_all_that_the_goals_need_is_left_in_order(tmp_path: Path) -> None:
+    made = tasks(tmp_path, DIAMOND)
+    assert [task.name for task in unfinished(made, ["c"])] == ["a1", "a2", "a3", "b", "c"]
+    assert [task.name for task in unfinished(made, ["d", "a3"])] == ["a1", "a3", "d"]
+    assert unfinished(made, []) == []
+
+
+def test_what_a_finished_task_was_made_from_is_not_wanted(tmp_path: Path) -> None:
+    made = tasks(tmp_path, DIAMOND)
+    (tmp_path / "b").touch()
+    assert [task.name for task in unfinished(made, ["c"])] == ["c"]
+    (tmp_path / "c").touch()
+    assert unfinished(made, ["c"]) == []
+
+
+def test_a_task_without_outputs_is_never_finished(tmp_path: Path) -> None:
+    made = tasks(tmp_path, {"a": ()})["a"]
+    assert not Task("x", "x", made.function, made.arguments, ()).finished
+
+
+def test_a_task_done_by_somebody_else_is_not_done_again(tmp_path: Path) -> None:
+    made = tasks(tmp_path, {"a": ()})["a"]
+    made.run()
+    made.run()
+    assert journal(tmp_path) == ["a"]
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+@pytest.mark.parametrize("seed", range(3))
+def test_every_task_runs_once_after_those_it_needs(tmp_path: Path, jobs: int, seed: int) -> None:
+    rng = random.Random(seed)
+    names = [f"{rng.choice('xyz')}{i}" for i in range(20)]
+    needs = {name: rng.sample(names[:i], min(i, rng.randrange(4))) for i, name in enumerate(names)}
+    made = tasks(tmp_path, needs)
+    told: dict[str, tuple[int, int]] = {}
+    with workers(jobs) as pool:
+        run_tasks(
+            list(made.values()),
+            pool,
+            lambda kind, done, total: told.update({kind: (done, total)}),
+        )
+    ran = journal(tmp_path)
+    assert sorted(ran) == sorted(names)
+    for name, before in needs.items():
+        assert all(ran.index(other) < ran.index(name) for other in before)
+    assert all(done == total for done, total in told.values())
+    assert sum(total for _, total in told.values()) == len(names)
+
+
+def test_one_process_keeps_the_order_of_the_plan(tmp_path: Path) -> None:
+    """Depth first: a robot is done before the next one's images are begun."""
+    needs = {"w": (), "r1": ("w",), "s1": ("r1",), "r2": ("w",), "s2": ("r2",)}
+    with workers(1) as pool:
+        run_tasks(list(tasks(tmp_path, needs).values()), pool, lambda *_: None)
+    assert journal(tmp_path) == ["w", "r1", "s1", "r2", "s2"]

@@ -1,0 +1,122 @@
+"""The suite: found by file, name or tag; what is shipped keeps its promises."""
+
+from pathlib import Path
+
+import pytest
+
+from experiments.scenario.settings import load_scenario
+from experiments.scenario.suite import entries, scenarios_of
+from mapfusion.errors import InputError
+from tests.experiments.cli.test_bad_input import assert_refused
+from tests.helpers.tiny_scenario import command
+
+SCENARIOS = Path(__file__).parents[3] / "scenarios"
+SHIPPED = sorted(path.stem for path in SCENARIOS.glob("*.yaml"))
+WORLD = """
+schema_version: 1
+name: {name}
+description: "[bold]{name}[/bold] <b>"
+tags: [{tags}]
+world:
+  walls:
+    - points: [[0, 0], [6, 0], [6, 4], [0, 4], [0, 0]]
+robots:
+  - {{name: R1, start: [1, 1, 0], route: [[5, 1]]}}
+drive: {{frames: 5}}
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    folder = tmp_path / "scenarios"
+    folder.mkdir()
+    for name, tags in (("a", "ci, hard"), ("b", "hard"), ("c", "")):
+        (folder / f"{name}.yaml").write_text(WORLD.format(name=name, tags=tags))
+    (folder / "notes.txt").write_text("no scenario")
+    return folder
+
+
+def found(folder: Path, *wanted: str | Path) -> list[str]:
+    return [path.stem for path in scenarios_of(wanted, folder)]
+
+
+def test_scenarios_are_found_by_tag_name_and_file(folder: Path) -> None:
+    assert found(folder, "hard") == ["a", "b"]
+    assert found(folder, "ci") == ["a"]
+    assert found(folder, "c") == ["c"]
+    assert found(folder, folder / "b.yaml", "c") == ["b", "c"]
+    assert found(folder, "elsewhere/x.yaml", "y.yaml") == ["x", "y"]  # loading will complain
+
+
+def test_each_is_found_once_in_the_order_asked_for(folder: Path) -> None:
+    assert found(folder, "b", "hard", "ci") == ["b", "a"]
+
+
+def test_an_unknown_name_lists_what_there_is(folder: Path) -> None:
+    with pytest.raises(InputError, match=r"soft: neither a file.*\(a, b, c\).*\(ci, hard\)"):
+        scenarios_of(["soft"], folder)
+    with pytest.raises(InputError, match="there is none"):
+        scenarios_of(["soft"], folder / "none")
+
+
+def test_a_broken_file_is_named(folder: Path) -> None:
+    (folder / "d.yaml").write_text("- 1")
+    with pytest.raises(InputError, match=r"d\.yaml"):
+        scenarios_of(["ci"], folder)
+
+
+def test_the_listing_shows_names_as_they_are(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reply = command(capsys, "scenarios", folder)
+    assert reply.code == 0
+    assert "[bold]a[/bold] <b>" in reply.out
+    assert "ci hard" in reply.out
+
+
+def test_commands_take_tags(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder.parent)
+    for name in ("run", "check"):
+        assert_refused(command(capsys, name, "soft"), "soft", "ci, hard")
+        # found, and then refused for its own reason
+        assert_refused(command(capsys, name, "ci", "--set", "drive.frames=1"), "a.yaml", "frames")
+    assert_refused(command(capsys, "scenarios", "nowhere"), "nowhere", "holds no scenario")
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_scenarios_say_what_they_are(name: str) -> None:
+    path = SCENARIOS / f"{name}.yaml"
+    scenario = load_scenario(path)
+    assert scenario.name == name
+    assert scenario.tags
+    assert scenario.description
+    assert path.read_text().startswith("# ")
+
+
+@pytest.mark.parametrize("name", [path.stem for path in scenarios_of(["full", "hard"], SCENARIOS)])
+def test_worlds_of_the_suite_are_small(name: str) -> None:
+    scenario = load_scenario(SCENARIOS / f"{name}.yaml")
+    assert scenario.drive is not None
+    assert scenario.drive.frames <= 500
+    assert (scenario.camera.width_px, scenario.camera.height_px) == (640, 480)
+    assert scenario.render.renderer == "tiny"  # needs nothing of the system
+
+
+def test_the_default_suite_is_five_worlds_that_fit_the_hour() -> None:
+    full = scenarios_of(["full"], SCENARIOS)
+    assert len(full) == 5
+    frames = [(s.drive.frames if s.drive else 0) * len(s.robots) for s in map(load_scenario, full)]
+    # ten seeds; 0.2 s a frame for rendering, features and filter on one of two cores: half an hour
+    assert 10 * sum(frames) * 0.2 / 2 < 40 * 60
+    assert "apart" in {path.stem for path in full}
+
+
+def test_entries_hold_what_the_listing_shows() -> None:
+    known = {entry.name: entry for entry in entries(SCENARIOS)}
+    assert sorted(known) == SHIPPED
+    assert known["apart"].overlap == 0
+    assert known["quick"].overlap is None
+    assert (known["quick"].robots, known["quick"].iterations) == (2, 300)
+    assert known["mrclam7"].iterations is None

@@ -1,0 +1,53 @@
+"""Methods whose package is not installed are shown as absent."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.judge import tables
+from experiments.show.figures import (
+    fig04_translation_error,
+    fig05_rotation_error,
+    fig06_aligner_time,
+)
+from experiments.show.figures.result_tables import ResultTables
+
+MEASURED = {
+    "errors": [
+        "translation_error_m",
+        "rotation_error_rad",
+        "refined_translation_error_m",
+        "refined_rotation_error_rad",
+    ],
+    "aligner_timings": ["elapsed_s", "elapsed_low_s", "elapsed_high_s"],
+}
+
+
+@pytest.fixture
+def without_svd(made_up_result: Path, tmp_path: Path) -> ResultTables:
+    result = tmp_path / "result"
+    shutil.copytree(made_up_result, result)
+    for name, columns in MEASURED.items():
+        path = tables.table_path(result, name)
+        rows = tables.read(path, name)
+        own = rows["aligner"] == "svd"
+        assert own.any()
+        rows.loc[own, columns] = np.nan
+        if name == "errors":
+            rows.loc[own, ["status", "refined_status"]] = "absent"
+        tables.write(path, name, rows)
+    return ResultTables(result)
+
+
+@pytest.mark.parametrize(
+    "module", [fig04_translation_error, fig05_rotation_error, fig06_aligner_time]
+)
+def test_legends_say_absent(module, made_up_result: Path, without_svd: ResultTables) -> None:
+    def labels(data: ResultTables) -> list[str]:
+        return [text.get_text() for text in module.draw(data).legends[0].get_texts()]
+
+    before, after = labels(ResultTables(made_up_result)), labels(without_svd)
+    assert "svd" in before
+    assert after == ["svd (absent)" if label == "svd" else label for label in before]

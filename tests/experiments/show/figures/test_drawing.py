@@ -1,0 +1,196 @@
+"""Each figure on ordinary and on degenerate results."""
+
+import hashlib
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import matplotlib
+import matplotlib.image
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.figure import Figure
+
+from experiments.judge import tables
+from experiments.show.figures import draw_all, drawing
+from experiments.show.figures.drawing import FIGURES, draw_figure
+from experiments.show.figures.fig03_dispersion import choose_moments, spread_over_time
+from experiments.show.figures.result_tables import ResultTables
+from experiments.show.figures.style import aligner_styles, house_style
+from mapfusion.errors import InputError
+from tests.helpers.synthetic_result import SMALL, write_result
+
+MAX_SVG_BYTES = 1_000_000
+
+
+@pytest.fixture
+def copied(made_up_result: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made_up_result, tmp_path / "result"))
+
+
+def change(folder: Path, name: str, rows: pd.DataFrame) -> None:
+    tables.write(tables.table_path(folder, name), name, rows)
+
+
+def test_all_figures_are_drawn(copied: Path) -> None:
+    done, skipped = [], []
+    files = draw_all(copied, 1, lambda n, total: done.append((n, total)), skipped.append)
+    assert [file.name for file in files] == [
+        f"{name}.{kind}" for name in FIGURES for kind in ("png", "svg")
+    ]
+    assert done == [(n + 1, 10) for n in range(10)]
+    assert skipped == []
+    for file in files:
+        if file.suffix == ".png":
+            picture = matplotlib.image.imread(file)
+            assert picture.shape[1] > 800
+            assert (picture[..., :3].min(axis=2) < 0.9).mean() > 0.01  # ink
+        else:
+            assert file.stat().st_size < MAX_SVG_BYTES
+    assert sorted(file.name for file in (copied / "figures").iterdir()) == sorted(
+        file.name for file in files
+    )
+
+
+@pytest.mark.parametrize("name", ["fig01_tracks", "fig06_aligner_time", "fig08_fused_landmark"])
+def test_pictures_are_the_same_byte_for_byte(
+    name: str, made_up_result: Path, tmp_path: Path
+) -> None:
+    """Also when the user's own settings differ."""
+    digests = []
+    for i, user in enumerate(({}, {"font.size": 20, "svg.hashsalt": None, "axes.facecolor": "y"})):
+        folder = Path(shutil.copytree(made_up_result, tmp_path / str(i)))
+        with matplotlib.rc_context(user):
+            files = draw_figure(ResultTables(folder), name).files
+        digests.append([hashlib.sha256(file.read_bytes()).hexdigest() for file in files])
+    assert digests[0] == digests[1]
+
+
+def test_users_settings_come_back() -> None:
+    with matplotlib.rc_context({"font.size": 17}):
+        before = dict(matplotlib.rcParams)
+        with house_style():
+            assert matplotlib.rcParams["font.size"] < 10
+        assert dict(matplotlib.rcParams) == before
+
+
+@pytest.fixture
+def quick_save(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lay figures out, which finds what cannot be drawn, but do not write the pixels."""
+
+    def save(figure: Figure, path: Path, kind: str) -> None:
+        if kind == "png":
+            figure.draw_without_rendering()
+        path.write_bytes(b"picture")
+
+    monkeypatch.setattr(drawing, "_save", save)
+
+
+def skipped_figures(folder: Path) -> dict[str, str]:
+    lines: list[str] = []
+    files = draw_all(folder, 1, None, lines.append)
+    reasons = dict(line.split(": ", 1) for line in lines)
+    assert not any("\n" in line for line in lines)
+    drawn = {file.stem for file in files}
+    assert drawn | set(reasons) == set(FIGURES)
+    assert drawn.isdisjoint(reasons)
+    assert {file.stem for file in (folder / "figures").iterdir()} == drawn
+    return reasons
+
+
+@pytest.mark.usefixtures("quick_save")
+def test_one_robot_has_no_pairs_to_show(tmp_path: Path) -> None:
+    reasons = skipped_figures(write_result(tmp_path, replace(SMALL, robots=1)))
+    assert sorted(reasons) == [name for name in FIGURES if "04" <= name[3:5] <= "09"]
+    assert reasons["fig04_translation_error"] == "no robot pair was aligned"
+
+
+@pytest.mark.usefixtures("quick_save")
+def test_imported_logs_have_no_images_and_no_walls(tmp_path: Path) -> None:
+    size = replace(SMALL, keyframes=0, robots=2)
+    folder = write_result(tmp_path, size, world=False)
+    assert list(skipped_figures(folder)) == ["fig01_tracks"]
+
+
+@pytest.mark.usefixtures("quick_save")
+def test_nothing_is_drawn_of_what_failed(copied: Path) -> None:
+    """All alignments degenerate, nothing fused; pictures of an earlier result disappear."""
+    for name in FIGURES:
+        (copied / "figures").mkdir(exist_ok=True)
+        (copied / "figures" / f"{name}.png").write_bytes(b"old")
+    data = ResultTables(copied)
+    errors = data.table("errors").assign(status="degenerate", refined_status="degenerate")
+    numbers = [name for name in errors if str(name).endswith(("error_m", "error_rad"))]
+    change(copied, "errors", errors.assign(**dict.fromkeys(numbers, np.nan)))
+    for name in ("correspondences", "fused", "aligner_timings"):
+        change(copied, name, data.table(name).iloc[:0])
+    assert list(skipped_figures(copied)) == [name for name in FIGURES if "04" <= name[3:5] <= "10"]
+
+
+def test_missing_table_is_an_error_that_names_the_file(copied: Path) -> None:
+    tables.table_path(copied, "fused").unlink()
+    with pytest.raises(InputError, match=r"fused\.parquet: no such file"):
+        draw_figure(ResultTables(copied), "fig10_fused_map")
+
+
+def test_damaged_key_frame_is_an_error_that_names_the_file(copied: Path) -> None:
+    next((copied / "keyframes").iterdir()).write_bytes(b"no picture")
+    with pytest.raises(InputError, match=r"R1_\d{5}\.png: not a readable PNG image"):
+        draw_figure(ResultTables(copied), "fig01_tracks")
+
+
+def test_workers_draw_the_same_pictures(copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(drawing, "FIGURES", ("fig08_fused_landmark", "fig10_fused_map"))
+    alone = {file: file.read_bytes() for file in draw_all(copied, 1)}
+    assert {file: file.read_bytes() for file in draw_all(copied, 2)} == alone
+
+
+KNOWN = ["ransac", "svd", "svd-solved", "icp", "impicp", "gnc", "clique", "ransac_mahalanobis"]
+KNOWN += ["opencv", "kiss_matcher", "oracle"]
+
+
+def test_known_lines_differ_in_colour_and_marker_and_keep_their_look() -> None:
+    styles = aligner_styles(KNOWN)
+    for what in ("color", "marker"):
+        assert len({styles[name][what] for name in KNOWN}) == len(KNOWN)
+    assert styles["oracle"]["color"] == "#000000"
+    assert aligner_styles(["icp", "plug-in"])["icp"] == styles["icp"]
+
+
+def test_lines_of_unknown_aligners_differ_from_all() -> None:
+    others = [f"plug-in {k}" for k in range(9)]
+    styles = aligner_styles([*KNOWN, *others])
+    assert len({str(styles[name]["linestyle"]) for name in others}) == 9
+    assert len({styles[name]["marker"] for name in [*KNOWN, *others]}) == len(KNOWN) + 9
+    many = aligner_styles([f"plug-in {k}" for k in range(99)])
+    assert len({str(style) for style in many.values()}) == len(KNOWN) + 99
+    assert many["plug-in 3"] == styles["plug-in 3"]
+
+
+def spreads(robot: str, values: list[float]) -> pd.DataFrame:
+    iteration = 10 * np.arange(len(values))
+    return pd.DataFrame({"robot": robot, "iteration": iteration, "spread_m": values})
+
+
+def test_moments_are_the_deepest_fall_of_the_spread() -> None:
+    spread = pd.concat(
+        [spreads("R1", [0, 0.1, 0.2, 0.1, 0.3]), spreads("R2", [0, 0.3, 0.2, 0.01, 0.9, 0.8])]
+    )
+    assert choose_moments(spread) == ("R2", 10, 30)
+
+
+def test_particles_that_only_spread_have_no_such_moments() -> None:
+    assert choose_moments(spreads("R1", [0, 0.1, 0.2, 0.3])) is None
+
+
+def test_spread_is_the_root_mean_square_distance_from_the_mean() -> None:
+    x = {("R1", 0): [1.0, 1.0, 1.0, 1.0], ("R1", 10): [0.0, 2.0, 2.0, 0.0]}
+    rows = [
+        {"robot": robot, "iteration": k, "x_m": value, "y_m": 3 * value}
+        for (robot, k), values in x.items()
+        for value in values
+    ]
+    spread = spread_over_time(pd.DataFrame(rows))
+    assert spread["iteration"].tolist() == [0, 10]
+    assert spread["spread_m"].tolist() == pytest.approx([0.0, np.sqrt(1 + 9)])

@@ -1,0 +1,90 @@
+"""The curves of figures 4 and 5, read back from what was drawn."""
+
+import statistics
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from experiments.judge import tables
+from experiments.show.figures import fig04_translation_error, fig05_rotation_error
+from experiments.show.figures.error_curves import MIN_TRUE_PAIRS, summarise
+from experiments.show.figures.result_tables import ResultTables
+from tests.helpers.synthetic_result import ALIGNERS
+
+COLUMNS = {
+    fig04_translation_error: ("translation_error_m", "refined_translation_error_m"),
+    fig05_rotation_error: ("rotation_error_rad", "refined_rotation_error_rad"),
+}
+
+
+def slow_medians(rows: list[dict], aligner: str, column: str) -> dict[int, float]:
+    values: dict[int, list[float]] = {}
+    for row in rows:
+        if row["aligner"] == aligner:
+            values.setdefault(row["iteration"], []).append(row[column])
+    known = {k: [v for v in group if not np.isnan(v)] for k, group in values.items()}
+    return {k: statistics.median(group) if group else np.nan for k, group in known.items()}
+
+
+@pytest.mark.parametrize("module", COLUMNS)
+def test_drawn_lines_are_the_medians_of_the_repetitions(module, made_up_result: Path) -> None:
+    data = ResultTables(made_up_result)
+    errors = data.table("errors")
+    panels = iter(module.draw(data).axes)
+    for robot_a, robot_b in (("R1", "R2"), ("R1", "R3"), ("R2", "R3")):
+        pair = errors[(errors["robot_a"] == robot_a) & (errors["robot_b"] == robot_b)]
+        rows = pair.to_dict("records")
+        for column in COLUMNS[module]:
+            axes = next(panels)
+            assert axes.get_title().startswith(f"{robot_a} - {robot_b}")
+            drawn = {line.get_label(): line for line in axes.get_lines()}
+            assert set(drawn) == {*ALIGNERS, "oracle"}
+            for aligner, line in drawn.items():
+                expected = slow_medians(rows, aligner, column)
+                np.testing.assert_array_equal(line.get_xdata(), sorted(expected))
+                np.testing.assert_allclose(
+                    line.get_ydata(), [expected[k] for k in sorted(expected)], rtol=1e-12
+                )
+
+
+def test_band_holds_the_middle_four_fifths(made_up_result: Path) -> None:
+    errors = ResultTables(made_up_result).table("errors")
+    summary = summarise(errors, "translation_error_m")
+    for row in summary.to_dict("records"):
+        keys = ("robot_a", "robot_b", "aligner", "iteration")
+        values = errors[np.all([errors[key] == row[key] for key in keys], axis=0)]
+        expected = np.quantile(values["translation_error_m"], [0.1, 0.9])
+        np.testing.assert_allclose([row["low"], row["high"]], expected, rtol=1e-12)
+
+
+def shaded(figure: Figure, panel: int) -> list[tuple[float, float]]:
+    spans = [patch for patch in figure.axes[panel].patches if isinstance(patch, Rectangle)]
+    return [(span.get_x(), span.get_x() + span.get_width()) for span in spans]
+
+
+@pytest.mark.parametrize(
+    ("n_true", "expected"),
+    [
+        ([0, 2, 3, 9], [(-5, 15)]),
+        ([3, 3, 3, 3], []),
+        ([2, 3, 2, 2], [(-5, 5), (15, 35)]),
+        ([9, 9, 9, 1], [(25, 35)]),
+    ],
+)
+def test_iterations_with_too_few_true_pairs_are_shaded(
+    n_true: list[int], expected: list[tuple[float, float]], made_up_result: Path, tmp_path: Path
+) -> None:
+    assert MIN_TRUE_PAIRS == 3
+    errors = ResultTables(made_up_result).table("errors")
+    few = errors[(errors["robot_a"] == "R1") & (errors["robot_b"] == "R2")].copy()
+    keep = sorted(few["iteration"].unique())[: len(n_true)]
+    few = few[few["iteration"].isin(keep)]
+    place = few["iteration"].map({k: i for i, k in enumerate(keep)})
+    few = few.assign(iteration=10 * place, n_true=[n_true[i] for i in place])
+    tables.write(tables.table_path(tmp_path, "errors"), "errors", few)
+    (tmp_path / "scenario.json").write_text((made_up_result / "scenario.json").read_text())
+    figure = fig04_translation_error.draw(ResultTables(tmp_path))
+    assert np.ravel(shaded(figure, 0)) == pytest.approx(np.ravel(expected))

@@ -1,0 +1,70 @@
+"""Parents of fused landmarks, moved as the merge moved them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.show.figures.fig08_fused_landmark import choose_landmark
+from experiments.show.figures.fused_frame import FusedPairs, fused_pairs, moved_map
+from experiments.show.figures.result_tables import ResultTables
+from mapfusion.se2 import transform_points
+from tests.helpers.synthetic_result import ALIGNMENT_ERROR, DRIFT_SIGMA_M
+
+
+@pytest.mark.parametrize("robot", ["R1", "R2", "R3"])
+def test_maps_lie_where_the_merge_put_them(robot: str, made_up_result: Path) -> None:
+    data = ResultTables(made_up_result)
+    T_fused_robot = data.true_alignment(("R1", robot))
+    assert T_fused_robot is not None
+    if robot != "R1":
+        T_fused_robot = T_fused_robot + ALIGNMENT_ERROR
+    position, covariance = data.landmarks_of(robot)
+    moved, moved_covariance, own_covariance = moved_map(data, robot)
+    np.testing.assert_allclose(moved, transform_points(T_fused_robot, position), atol=1e-9)
+    # A turn changes no eigenvalue, and the drift was added in x and y.
+    np.testing.assert_allclose(
+        np.linalg.eigvalsh(own_covariance), np.linalg.eigvalsh(covariance), rtol=1e-9
+    )
+    added = moved_covariance - own_covariance
+    drift = DRIFT_SIGMA_M**2 * np.diag([1.0, 1.0, 0.0])
+    np.testing.assert_allclose(added, np.broadcast_to(drift, added.shape), atol=1e-10)
+
+
+def test_parents_fuse_into_the_stored_landmark(made_up_result: Path) -> None:
+    pairs = fused_pairs(ResultTables(made_up_result))
+    information = np.linalg.inv(pairs.covariance_m2)
+    total = information[0] + information[1]
+    np.testing.assert_allclose(total, information[2], rtol=1e-6)
+    weighted = np.einsum("knij,knj->ni", information[:2], pairs.position_m[:2])
+    fused = np.linalg.solve(total, weighted[:, :, None])[:, :, 0]
+    np.testing.assert_allclose(fused, pairs.position_m[2], atol=1e-8)
+
+
+def one_pair(separation_m: float, sigma_a: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    position = np.array([[0.0, 0.0, 1.0], [separation_m, 0.0, 1.0], [separation_m / 2, 0.0, 1.0]])
+    covariance = np.array([np.diag([*np.square(sigma_a), 1e-4]), np.diag([1e-2, 1e-2, 1e-4])] * 2)
+    covariance[2] = np.diag([4e-3, 4e-3, 5e-5])
+    return position, covariance[:3]
+
+
+def test_legible_landmark_is_chosen() -> None:
+    needle = one_pair(0.1, (0.5, 0.01))
+    on_top = one_pair(0.0, (0.1, 0.1))
+    clear = one_pair(0.12, (0.1, 0.08))
+    far = one_pair(3.0, (0.1, 0.1))
+    cases = [needle, on_top, clear, far]
+    pairs = FusedPairs(
+        ("R1", "R2"),
+        np.stack([position for position, _ in cases], axis=1),
+        np.stack([covariance for _, covariance in cases], axis=1),
+        np.zeros((2, len(cases), 3, 3)),
+    )
+    assert choose_landmark(pairs) == 2
+
+
+def test_singular_covariances_are_not_chosen() -> None:
+    flat = FusedPairs(
+        ("R1", "R2"), np.zeros((3, 2, 3)), np.zeros((3, 2, 3, 3)), np.zeros((2, 2, 3, 3))
+    )
+    assert choose_landmark(flat) is None

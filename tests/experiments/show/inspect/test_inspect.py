@@ -1,0 +1,177 @@
+"""`mapfusion inspect` on every file of a run, and on files that are not as they should be."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from experiments.judge import tables
+from experiments.run.stages.log import copy_log
+from experiments.show.inspect.parquet import inspect_table, unit_of
+from mapfusion.storage import schema, write_table
+from tests.helpers.tiny_scenario import command
+
+
+def test_every_file_of_a_run_is_told(
+    tiny_results: Path, tiny_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    paths = [tiny_path, *tiny_results.rglob("*.json")]
+    paths += [folder for folder in tiny_results.rglob("*") if list(folder.glob("*.parquet"))]
+    by_kind = {inspect_table(path).kind: path for path in tiny_results.rglob("*.parquet")}
+    assert set(by_kind) >= {t.metadata[b"mapfusion.kind"].decode() for t in tables.ALL.values()}
+    for path in [*paths, *by_kind.values(), tiny_results / "store", tiny_results / "tiny-3"]:
+        reply = command(capsys, "inspect", path)
+        assert (reply.code, reply.complaints) == (0, []), path
+        assert str(path) in reply.out.splitlines()[0]
+
+
+def test_ranges_and_first_rows_are_those_of_the_table(tiny_result: Path) -> None:
+    path = tables.table_path(tiny_result, "errors")
+    rows, found = tables.read(path, "errors"), inspect_table(path)
+    assert (found.n_rows, found.version, found.kind) == (len(rows), "2", "result.errors")
+    assert [column.name for column in found.columns] == list(rows)
+    by_name = {column.name: column for column in found.columns}
+    for name in ("translation_error_m", "n_true", "refined_rotation_error_rad"):
+        values = rows[name][np.isfinite(rows[name])]
+        told = float(by_name[name].low), float(by_name[name].high)
+        assert told == pytest.approx((values.min(), values.max()), rel=1e-5)
+        assert by_name[name].n_missing == len(rows) - len(values)
+    assert by_name["aligner"].high == "oracle, ransac, svd, icp"
+    assert found.first_rows[2]["aligner"] == rows["aligner"][2]
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [
+        ("x_m", "m"),
+        ("cov_xy_m2", "m²"),
+        ("cov_xt", "m rad"),
+        ("final_theta_rad", "rad"),
+        ("elapsed_s", "s"),
+        ("u_px", "px"),
+        ("count", ""),
+        ("status", ""),
+        ("s", ""),
+    ],
+)
+def test_units_come_from_the_names(name: str, unit: str) -> None:
+    assert unit_of(name) == unit
+
+
+def test_a_recorded_log(tiny_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    copy_log(tiny_log, tmp_path / "R1")
+    reply = command(capsys, "inspect", tmp_path / "R1")
+    assert reply.code == 0
+    assert "robot log" in reply.out
+    assert "truth_poses" in reply.out
+    assert "44" in reply.out
+    assert "folder of robot logs" in command(capsys, "inspect", tmp_path).out
+
+
+def test_a_kind_it_does_not_know_describes_itself(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "sweep.parquet"
+    fields = [pa.field("run_id", pa.string()), pa.field("elapsed_s", pa.float64())]
+    columns = {"run_id": ["[bold]a"], "elapsed_s": [np.nan]}
+    write_table(path, columns, schema("sweep.new", 7, fields))
+    reply = command(capsys, "inspect", path)
+    assert reply.code == 0
+    assert "sweep.new, schema version 7" in reply.out
+    assert "[bold]a" in reply.out  # as text, no markup
+
+
+def truncated(result: Path, folder: Path) -> Path:
+    path = folder / "cut.parquet"
+    path.write_bytes(tables.table_path(result, "errors").read_bytes()[:-100])
+    return path
+
+
+def foreign(result: Path, folder: Path) -> Path:
+    path = folder / "foreign.parquet"
+    pd.DataFrame({"a": [1]}).to_parquet(path)
+    return path
+
+
+def of_another_version(result: Path, folder: Path) -> Path:
+    path = folder / "newer.parquet"
+    table = pq.read_table(tables.table_path(result, "errors"))
+    metadata = dict(table.schema.metadata) | {b"mapfusion.schema_version": b"99"}
+    pq.write_table(table.replace_schema_metadata(metadata), path)
+    return path
+
+
+def with_a_column_less(result: Path, folder: Path) -> Path:
+    path = folder / "less.parquet"
+    table = pq.read_table(tables.table_path(result, "errors"))
+    pq.write_table(table.drop_columns(["n_true"]), path)
+    return path
+
+
+def no_json(result: Path, folder: Path) -> Path:
+    path = folder / "provenance.json"
+    path.write_text('{"schema_version": 1')
+    return path
+
+
+def other_json(result: Path, folder: Path) -> Path:
+    path = folder / "package.json"
+    path.write_text('{"name": "else"}')
+    return path
+
+
+def resolved_but_wrong(result: Path, folder: Path) -> Path:
+    path = folder / "scenario.json"
+    text = (result / "scenario.json").read_text()
+    path.write_text(text.replace('"seed": 3', '"seed": -3'))
+    return path
+
+
+def damaged_result(result: Path, folder: Path) -> Path:
+    path = Path(shutil.copytree(result, folder / "result"))
+    (path / "tables" / "clouds.parquet").write_bytes(b"")
+    return path
+
+
+def empty_folder(result: Path, folder: Path) -> Path:
+    return folder
+
+
+def absent(result: Path, folder: Path) -> Path:
+    return folder / "absent.parquet"
+
+
+def picture(result: Path, folder: Path) -> Path:
+    return next((result / "keyframes").glob("*.png"))
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (truncated, "damaged or not a Parquet file"),
+        (foreign, "none of mapfusion's"),
+        (of_another_version, "schema_version is 99"),
+        (with_a_column_less, "columns are not those of result.errors"),
+        (no_json, "damaged or no JSON"),
+        (other_json, "no file of mapfusion's"),
+        (resolved_but_wrong, "no scenario of this program"),
+        (damaged_result, "clouds.parquet: damaged"),
+        (empty_folder, "no folder of mapfusion's"),
+        (absent, "no such file"),
+        (picture, "no file of mapfusion's"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line(
+    make, said: str, tiny_result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = make(tiny_result, tmp_path)
+    reply = command(capsys, "inspect", path)
+    assert reply.code == 2
+    assert len(reply.complaints) == 1
+    assert reply.err.strip().count("\n") == 0
+    assert said in reply.complaints[0]
+    assert str(path) in reply.complaints[0]

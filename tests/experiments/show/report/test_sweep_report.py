@@ -1,0 +1,71 @@
+"""The report of a sweep: many runs, no maps."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.experiments.show.report.test_document import Page, page_of
+from tests.helpers.made_up_sweep import write_sweep
+from tests.helpers.tiny_scenario import command
+
+
+@pytest.fixture(scope="module")
+def sweep(made_up_result: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("sweeps") / "particles"
+    return write_sweep(folder, made_up_result, range(6), ("50", "200"))
+
+
+@pytest.fixture(scope="module")
+def page(sweep: Path) -> Page:
+    return page_of(sweep, sweep.parent / "report.html")
+
+
+def test_it_tells_of_all_runs(page: Page) -> None:
+    words = " ".join(page.words.split())
+    assert "Measured over 10 runs" in words
+    assert "slam.filter.n_particles" in words
+    assert "0..4" in words  # the seeds that finished
+    assert "Use ransac" in words
+
+
+def test_intervals_count_runs_and_not_maps(page: Page) -> None:
+    known = json.loads(page.json)
+    rates = known["success"][0]["aligners"]["ransac"]
+    sure = [k for k, rate in enumerate(rates["rate"]) if rate == 1]
+    assert max(rates["n"][k] for k in sure) > 10
+    # Wilson's lower end of 10 in 10 is 0.722, however many maps the ten runs hold
+    for k in sure:
+        assert rates["low"][k] == pytest.approx(0.722, abs=2e-3)
+
+
+def test_each_setting_has_its_curves(page: Page) -> None:
+    known = json.loads(page.json)
+    labels = [group["label"] for group in known["groups"]]
+    assert labels == ["made-up, n_particles 50", "made-up, n_particles 200"]
+    assert known["map"] is None
+    assert "map" not in [a.get("id") for tag, a in page.tags if tag == "section"]
+
+
+def test_failed_runs_are_named_with_their_reason(page: Page) -> None:
+    assert "made-up-5-50" in page.words
+    assert "<b>the disk</b> is full" in page.words
+    assert not [tag for tag, _ in page.tags if tag == "b" and "disk" in tag]
+
+
+def test_inspect_and_report_as_commands(
+    sweep: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reply = command(capsys, "inspect", sweep)
+    assert reply.code == 0
+    assert "10 runs" in reply.out
+    assert command(capsys, "report", sweep, "-o", tmp_path / "r.html").code == 0
+
+
+def test_a_sweep_without_a_finished_run(
+    made_up_result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write_sweep(tmp_path / "all failed", made_up_result, range(1), ("50",))
+    reply = command(capsys, "report", folder)
+    assert reply.code == 2
+    assert "nothing to report on" in reply.complaints[0]

@@ -1,0 +1,200 @@
+"""The benchmark counts rightly, repeats itself, and goes on where it was."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from experiments.run.store import Store
+from experiments.scenario.settings import AlignerEntry
+from experiments.show.benchmark_files import cell_text, markdown
+from experiments.show.figures.benchmark_figure import draw
+from experiments.study.benchmark import trials as benchmark
+from experiments.study.benchmark.trials import (
+    SUMMARY,
+    TRIALS,
+    Plan,
+    entries_of,
+    run_benchmark,
+    summarise,
+)
+from mapfusion.align import registry
+from mapfusion.align.plugins import Kind, Method
+from mapfusion.errors import InputError
+from mapfusion.storage import read_table
+from tests.helpers.tiny_scenario import command
+
+SMALL = Plan(entries_of(["ransac", "svd"]), 4, pair_counts=(60, 100), outlier_shares=(0.5, 0.9))
+
+
+def quiet(done: int, total: int) -> None:
+    del done, total
+
+
+def test_good_and_bad_methods_are_told_apart(tmp_path: Path) -> None:
+    told: list[tuple[int, int]] = []
+    trials = run_benchmark(SMALL, Store(tmp_path), lambda done, total: told.append((done, total)))
+    assert told == [(k, 8) for k in range(9)]
+    summary = summarise(trials).set_index(["method", "n_pairs", "outlier_share"])
+    assert len(summary) == 8
+    ransac = summary.loc["ransac"]
+    assert (ransac["n_success"] == 4).all()
+    assert ransac["n_true"].tolist() == [30, 6, 50, 10]
+    assert ransac["ratio_m"].between(0.5, 2).all()
+    assert ransac["refined_ratio_m"].between(0.5, 2).all()
+    assert (summary.loc["svd"]["n_success"] < 4).any()
+    assert (summary["elapsed_s"] > 0).all()
+    assert (summary["oracle_error_m"] < 0.1).all()
+
+
+def test_all_methods_get_the_same_maps_and_a_second_run_the_same_trials(tmp_path: Path) -> None:
+    first = run_benchmark(SMALL, Store(tmp_path / "a"), quiet)
+    second = run_benchmark(SMALL, Store(tmp_path / "b"), quiet)
+    pd.testing.assert_frame_equal(
+        first.drop(columns="elapsed_s"), second.drop(columns="elapsed_s"), check_exact=True
+    )
+    oracle = first.pivot_table(
+        index=["n_pairs", "outlier_share", "trial"], columns="method", values="oracle_error_m"
+    )
+    np.testing.assert_array_equal(oracle["ransac"], oracle["svd"])
+
+
+def test_finished_cells_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = run_benchmark(SMALL, Store(tmp_path), quiet)
+    measured: list[str] = []
+    measure = benchmark._measure
+    monkeypatch.setattr(benchmark, "_measure", lambda *a: (measured.append(a[1].name), measure(*a)))
+    pd.testing.assert_frame_equal(run_benchmark(SMALL, Store(tmp_path), quiet), before)
+    assert measured == []
+    more = Plan(
+        (*SMALL.aligners, AlignerEntry(name="wide", method="ransac", parameters={"gate_m": 0.4})),
+        4,
+        pair_counts=(60,),
+        outlier_shares=(0.5, 0.9),
+    )
+    run_benchmark(more, Store(tmp_path), quiet)
+    assert measured == ["wide", "wide"]
+
+
+def test_a_slow_cell_ends_with_the_trials_it_has(tmp_path: Path) -> None:
+    plan = Plan(entries_of(["svd"]), 50, budget_s=0.0, pair_counts=(60,), outlier_shares=(0.5,))
+    assert summarise(run_benchmark(plan, Store(tmp_path), quiet))["n_trials"].tolist() == [1]
+
+
+def trial(k: int, status: str = "accepted", **values: object) -> dict[str, object]:
+    row = {
+        "method": "m",
+        "n_pairs": 60,
+        "outlier_share": 0.5,
+        "trial": k,
+        "status": status,
+        "reason": "",
+        "error_m": 0.02,
+        "error_rad": 0.002,
+        "refined_status": status,
+        "refined_error_m": 0.01,
+        "refined_error_rad": 0.001,
+        "oracle_error_m": 0.01,
+        "oracle_error_rad": 0.001,
+        "elapsed_s": 0.001,
+    }
+    return row | values
+
+
+def test_what_counts_as_success() -> None:
+    nan = {"error_m": np.nan, "error_rad": np.nan, "elapsed_s": np.nan}
+    rows = [
+        trial(0),
+        trial(1, error_m=0.49),
+        trial(2, error_m=0.51),  # wrong
+        trial(3, error_rad=0.11),  # wrong
+        trial(4, "refused"),
+        trial(5, "degenerate", error_m=np.nan, error_rad=np.nan),
+        trial(6, "failed", **nan),
+        trial(7, oracle_error_m=0.5, error_m=0.04, elapsed_s=0.1),
+    ]
+    cell = summarise(pd.DataFrame(rows, columns=pd.Index(TRIALS.names))).iloc[0]
+    assert (cell["n_trials"], cell["n_success"], cell["n_wrong"], cell["n_failed"]) == (8, 3, 2, 1)
+    assert cell["success"] == 3 / 8
+    # Wilson 1927 for 3 of 8, z = 1.959964, by hand
+    assert cell["success_low"] == pytest.approx(0.13684, abs=1e-5)
+    assert cell["success_high"] == pytest.approx(0.69426, abs=1e-5)
+    assert cell["error_m"] == 0.04
+    assert cell["ratio_m"] == 4.0  # medians on the same maps: 0.04 over 0.01
+    assert cell["elapsed_s"] == 0.001
+    text = cell_text(cell)
+    assert text.startswith("**38** (14-69), 4.00 / 1.00, 1 ms")
+    assert text.endswith("2 wrong, 1 failed")
+
+
+def test_an_absent_package_is_no_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    adapter = "mapfusion.align.peers.kiss_matcher:KissMatcher"
+    absent = Method("far", Kind.PEER, adapter, "far-package", "no_such_module_far", "peers")
+    monkeypatch.setattr(registry, "_PEERS", (absent,))
+    registry.known_methods.cache_clear()
+    try:
+        plan = Plan(entries_of(["far", "ransac"]), 2, pair_counts=(60,), outlier_shares=(0.5,))
+        summary = summarise(run_benchmark(plan, Store(tmp_path), quiet))
+    finally:
+        monkeypatch.undo()
+        registry.known_methods.cache_clear()
+    far = summary.iloc[0]
+    assert (far["status"], far["n_failed"], far["n_wrong"]) == ("absent", 0, 0)
+    assert np.isnan(far["success"])
+    assert cell_text(far) == "absent"
+    assert "| far      | absent " in markdown(plan, summary)
+    low, high = draw(summary).axes[1].get_ylim()  # although no ratio is drawn
+    assert 0.1 < low < 1 < high < 100
+    labels = [text.get_text() for text in draw(summary).legends[0].get_texts()]
+    assert labels == ["far (absent)", "ransac"]
+
+
+def test_command_writes_tables_and_figure(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--trials", 2, "--pairs", 60, "--outliers", 0.5, "--results", tmp_path]
+    reply = command(capsys, "benchmark", "--method", "ransac", *options)
+    assert reply.code == 0
+    assert "60 pairs" in reply.out
+    folder = tmp_path / "benchmark"
+    assert {path.name for path in folder.iterdir()} == {
+        "benchmark.png",
+        "benchmark.svg",
+        "provenance.json",
+        "summary.csv",
+        "summary.md",
+        "summary.parquet",
+        "trials.parquet",
+    }
+    summary = read_table(folder / "summary.parquet", SUMMARY)[0].to_pandas()
+    assert pd.read_csv(folder / "summary.csv")["n_success"].tolist() == [2]
+    assert summary["n_success"].tolist() == [2]
+    assert "**100** (34-100)" in (folder / "summary.md").read_text(encoding="utf-8")
+    assert json.loads((folder / "provenance.json").read_text())["trials"] == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["--method", "ransack"], "--method: unknown aligner 'ransack', known are ransac"),
+        (["--outliers", "1.5"], "'--outliers': Input should be less than or equal to 1"),
+        (["--trials", "0"], "'--trials': Input should be greater than or equal to 1"),
+    ],
+)
+def test_bad_input_is_one_line(
+    arguments: list[str], complaint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reply = command(capsys, "benchmark", *arguments)
+    assert reply.code == 2
+    assert len(reply.complaints) == 1
+    assert complaint in reply.complaints[0]
+
+
+def test_methods_of_a_scenario(tmp_path: Path, tiny_path: Path) -> None:
+    assert [entry.name for entry in entries_of([], tiny_path)] == ["ransac", "svd", "icp"]
+    assert [entry.name for entry in entries_of(["icp"], tiny_path)] == ["icp"]
+    with pytest.raises(InputError, match=r"align\.aligners: none is named opencv"):
+        entries_of(["opencv"], tiny_path)
+    assert {"ransac", "opencv", "kiss_matcher"} <= {entry.name for entry in entries_of([])}

@@ -1,0 +1,198 @@
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from experiments.study.compare.versions import BETTER, NOISE, SAME, WORSE, compare
+from experiments.study.statistics.judged_maps import ERROR_COLUMNS
+from experiments.study.statistics.paired import holm
+from mapfusion.errors import InputError
+from tests.helpers.made_up_runs import errors_of, tables_of, timings_of, write_result, write_sweep
+
+Tables = dict[str, pd.DataFrame]
+
+
+def two_sweeps(
+    folder: Path, change: Callable[[int, Tables], Tables], seeds: int = 12
+) -> tuple[Path, Path]:
+    """The same runs, and what another version makes of them."""
+    made = {seed: tables_of(seed) for seed in range(seeds)}
+    changed = {seed: change(seed, {k: t.copy() for k, t in made[seed].items()}) for seed in made}
+    a = write_sweep(folder / "a", range(seeds), made=made)
+    return a, write_sweep(folder / "b", range(seeds), made=changed)
+
+
+def scaled(factor: float, aligner: str, scatter: float = 0.0) -> Callable[[int, Tables], Tables]:
+    def change(seed: int, made: Tables) -> Tables:
+        rng = np.random.default_rng(900 + seed)
+        own = made["errors"]["aligner"] == aligner
+        factors = factor * np.exp(scatter * rng.normal(size=(int(own.sum()), 1)))
+        made["errors"].loc[own, list(ERROR_COLUMNS)] *= factors
+        return made
+
+    return change
+
+
+def verdicts(table: pd.DataFrame) -> dict[tuple[str, str], str]:
+    return {(row["metric"], row["method"]): row["verdict"] for row in table.to_dict("records")}
+
+
+def test_the_same_tables_are_identical(tmp_path: Path) -> None:
+    found = compare(*two_sweeps(tmp_path, lambda seed, made: made))
+    assert set(found.table["verdict"]) == {SAME}
+    assert found.table["p"].isna().all()
+    assert not found.worse
+    assert found.n_runs == 12
+
+
+@pytest.mark.parametrize(("factor", "verdict"), [(1.5, WORSE), (0.7, BETTER)])
+def test_a_method_that_changed_is_found_and_no_other(
+    factor: float, verdict: str, tmp_path: Path
+) -> None:
+    found = compare(*two_sweeps(tmp_path, scaled(factor, "ransac", scatter=0.2)))
+    of = verdicts(found.table)
+    assert of[("estimated error, m", "ransac")] == verdict
+    assert of[("estimated error, m", "icp")] == SAME
+    assert of[("path RMSE, m", "")] == SAME
+    row = found.table[
+        (found.table["metric"] == "estimated error, m") & (found.table["method"] == "ransac")
+    ].iloc[0]
+    assert row["low"] < row["change"] < row["high"]
+    assert row["change"] == pytest.approx(factor, rel=0.15)
+    assert found.worse == (verdict == WORSE)
+
+
+def test_chance_alone_is_rarely_taken_for_a_change(tmp_path: Path) -> None:
+    """Other random numbers in everything: of 20 comparisons at 5 %, corrected, some 1 may err."""
+    wrong = 0
+    for trial in range(20):
+
+        def redrawn(seed: int, made: Tables, trial: int = trial) -> Tables:
+            return tables_of(1000 * (trial + 1) + seed)
+
+        found = compare(*two_sweeps(tmp_path / str(trial), redrawn, seeds=8))
+        wrong += found.table["verdict"].isin([BETTER, WORSE]).any()
+        assert (found.table["verdict"] == NOISE).any()
+        p = found.table["p"].to_numpy()
+        np.testing.assert_array_equal(found.table["p_holm"], holm(p))
+        # the smallest of m is judged at a level of 0.05 / m
+        assert np.nanmin(found.table["p_holm"]) == min(1, np.nanmin(p) * np.sum(~np.isnan(p)))
+    assert wrong <= 4  # 20 trials at 5 %: more than 4 in 0.3 % of all seeds
+
+
+def test_lost_maps_are_worse_success(tmp_path: Path) -> None:
+    def lose(seed: int, made: Tables) -> Tables:
+        lost = (made["errors"]["aligner"] == "ransac") & (made["errors"]["iteration"] > 50)
+        made["errors"].loc[lost, list(ERROR_COLUMNS)] = np.nan
+        return made
+
+    of = verdicts(compare(*two_sweeps(tmp_path, lose)).table)
+    assert of[("success estimated", "ransac")] == WORSE
+    assert of[("success estimated", "icp")] == SAME
+
+
+def test_the_other_way_round_is_the_inverse(tmp_path: Path) -> None:
+    a, b = two_sweeps(tmp_path, scaled(1.4, "icp", scatter=0.1))
+    there, back = compare(a, b).table, compare(b, a).table
+    ratio = there["scale"] == "ratio"
+    np.testing.assert_allclose(there["change"][ratio], 1 / back["change"][ratio])
+    np.testing.assert_allclose(there["change"][~ratio], -back["change"][~ratio], atol=1e-12)
+    np.testing.assert_allclose(there["p"], back["p"])
+    mirrored = there["verdict"].replace({BETTER: WORSE, WORSE: BETTER})
+    assert mirrored.tolist() == back["verdict"].tolist()
+
+
+def test_changes_of_less_than_a_percent_are_none(tmp_path: Path) -> None:
+    found = compare(*two_sweeps(tmp_path, scaled(1.005, "ransac")))
+    of = verdicts(found.table)
+    assert of[("estimated error, m", "ransac")] == NOISE
+
+
+def test_one_run_each_is_weak_and_says_so(tmp_path: Path) -> None:
+    a = write_result(tmp_path / "a", 0, tables_of(0))
+    b = write_result(tmp_path / "b", 0, scaled(2.0, "ransac", 0.1)(0, tables_of(0)))
+    found = compare(a, b)
+    assert found.unit == "maps of one run"
+    assert any(note.startswith("weak: one run each") for note in found.notes)
+    assert verdicts(found.table)[("estimated error, m", "ransac")] == WORSE
+
+
+def test_few_runs_are_weak_too(tmp_path: Path) -> None:
+    found = compare(*two_sweeps(tmp_path, lambda seed, made: made, seeds=3))
+    assert any(note.startswith("weak: 3 runs") for note in found.notes)
+
+
+def test_slower_is_told_but_never_fails(tmp_path: Path) -> None:
+    def slower(seed: int, made: Tables) -> Tables:
+        return made | {"aligner_timings": timings_of(seed, elapsed_s=5e-3)}
+
+    found = compare(*two_sweeps(tmp_path, slower))
+    assert verdicts(found.table)[("time, s", "icp")] == WORSE
+    assert not found.worse
+    assert any(note.startswith("times: all runs") for note in found.notes)
+
+
+def test_runs_of_only_one_side_are_left_out(tmp_path: Path) -> None:
+    a = write_sweep(tmp_path / "a", range(8))
+    b = write_sweep(tmp_path / "b", range(2, 10))
+    found = compare(a, b)
+    assert found.n_runs == 6
+    assert "left out: 2 runs of the first that the other has not (world seed 0, world seed 1)" in (
+        found.notes
+    )
+    assert "left out: 2 runs of the second that the other has not (world seed 8, world seed 9)" in (
+        found.notes
+    )
+
+
+def test_nothing_in_common_is_one_clear_line(tmp_path: Path) -> None:
+    a = write_result(tmp_path / "a", 0, tables_of(0))
+    other = write_result(tmp_path / "b", 0, tables_of(0), name="else")
+    with pytest.raises(InputError, match=r"no run in common .*world seed 0, the second else seed"):
+        compare(a, other)
+    settings = [{"slam.particles": "50"}]
+    with pytest.raises(InputError, match=r"slam\.particles=50"):
+        compare(a, write_sweep(tmp_path / "c", (0,), settings))
+
+
+def test_other_settings_under_the_same_name_are_told(tmp_path: Path) -> None:
+    a = write_result(tmp_path / "a", 0, tables_of(0))
+    b = write_result(tmp_path / "b", 0, tables_of(0))
+    scenario = json.loads((b / "scenario.json").read_text())
+    scenario["slam"] = {"filter": {"n_particles": 50}}
+    (b / "scenario.json").write_text(json.dumps(scenario))
+    assert (
+        "the scenarios differ: slam.filter.n_particles is absent in the first and 50 in the second"
+        in compare(a, b).notes
+    )
+
+
+def test_tables_that_one_side_lacks_are_passed_over(tmp_path: Path) -> None:
+    a = write_result(tmp_path / "a", 0, {"errors": errors_of(0)})
+    b = write_result(tmp_path / "b", 0, tables_of(0))
+    assert not compare(a, b).table["metric"].str.startswith("path").any()
+
+
+def test_nees_is_better_the_nearer_to_one(tmp_path: Path) -> None:
+    def fused(nees: float) -> Callable[[int, Tables], Tables]:
+        def change(seed: int, made: Tables) -> Tables:
+            rng = np.random.default_rng(seed)
+            rows = {"robot_a": "R1", "robot_b": "R2", "degrees_of_freedom": 3, "true_pair": True}
+            values = 3 * nees * rng.uniform(0.9, 1.1, 40)
+            return made | {"fusion": pd.DataFrame(rows | {"nees_with_drift": values})}
+
+        return change
+
+    made = [
+        {seed: fused(nees)(seed, tables_of(seed)) for seed in range(8)} for nees in (0.2, 2.0, 4.0)
+    ]
+    small, near, large = (
+        write_sweep(tmp_path / str(i), range(8), made=tables) for i, tables in enumerate(made)
+    )
+    metric = ("fused NEES / dof", "")
+    assert verdicts(compare(small, near).table)[metric] == BETTER
+    assert verdicts(compare(large, near).table)[metric] == BETTER
+    assert verdicts(compare(near, small).table)[metric] == WORSE

@@ -1,0 +1,131 @@
+"""The ranking, on errors whose right verdict is plain."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from experiments.show.report.comparison import reduce_errors
+from experiments.show.report.words import percent, words_for
+from experiments.study.statistics.judged_maps import DEFAULT_CRITERIA
+from experiments.study.statistics.standing import judge
+
+
+def made_up(errors_m: dict[str, list[float]], n_true: list[int] | None = None) -> pd.DataFrame:
+    """One run, one pair of robots: each aligner's errors, iteration by iteration."""
+    rows = []
+    for aligner, values in {
+        **errors_m,
+        "oracle": [0.05] * len(next(iter(errors_m.values()))),
+    }.items():
+        for k, value in enumerate(values):
+            found = np.isfinite(value)
+            rows.append(
+                {
+                    "run_id": "run-0",
+                    "scenario": "run",
+                    "seed": 0,
+                    "robot_a": "R1",
+                    "robot_b": "R2",
+                    "iteration": k,
+                    "aligner": aligner,
+                    "repetition": 0,
+                    "refined_status": "accepted" if found else "degenerate",
+                    "translation_error_m": value,
+                    "rotation_error_rad": 0.001,
+                    "refined_translation_error_m": value,
+                    "refined_rotation_error_rad": 0.001 if found else np.nan,
+                    "n_correspondences": 50,
+                    "n_common": 60,
+                    "n_true": 30 if n_true is None else n_true[k],
+                }
+            )
+    return pd.DataFrame(rows)
+
+
+def timings(**ms: float) -> pd.DataFrame:
+    return pd.DataFrame([{"aligner": name, "elapsed_s": 1e-3 * t} for name, t in ms.items()])
+
+
+def verdict_of(errors: pd.DataFrame, times: pd.DataFrame | None = None):
+    order = list(dict.fromkeys(errors["aligner"]))
+    maps = reduce_errors(errors, DEFAULT_CRITERIA)
+    return judge(maps, pd.DataFrame() if times is None else times, order)
+
+
+def test_the_more_often_correct_wins() -> None:
+    verdict = verdict_of(made_up({"poor": [0.01] * 4 + [9.0] * 16, "good": [0.1] * 19 + [9.0]}))
+    assert verdict.best is not None
+    assert verdict.best.aligner == "good"
+    assert verdict.equals == ()
+    assert verdict.best.rate == pytest.approx(0.95)
+    # Wilson's interval of 19 in 20, from a table
+    assert (verdict.best.low, verdict.best.high) == pytest.approx((0.764, 0.991), abs=1e-3)
+    assert verdict.best.n_false == 1
+
+
+def test_of_equally_correct_ones_the_more_accurate_wins() -> None:
+    verdict = verdict_of(
+        made_up({"coarse": [0.2] * 20, "fine": [0.1] * 20}), timings(coarse=1, fine=9)
+    )
+    assert [s.aligner for s in verdict.standings] == ["fine", "coarse"]
+    assert verdict.equals == ()
+    assert verdict.best is not None
+    assert verdict.best.over_oracle == pytest.approx(2)
+
+
+def test_of_equal_ones_the_fastest_wins_and_the_others_are_named() -> None:
+    near = [0.1 + 0.01 * (-1) ** k for k in range(20)]
+    verdict = verdict_of(made_up({"slow": near, "fast": [0.1] * 20}), timings(slow=5, fast=1))
+    assert [s.aligner for s in verdict.standings] == ["fast", "slow"]
+    assert verdict.equals == ("slow",)
+    text = " ".join(words_for(verdict, 1).remarks)
+    assert "slow does as well; fast is the fastest" in text
+
+
+def test_repetitions_are_no_trials() -> None:
+    errors = made_up({"one": [0.1] * 5})
+    repeated = pd.concat([errors.assign(repetition=r) for r in range(20)])
+    few, many = verdict_of(errors).standings[0], verdict_of(repeated).standings[0]
+    assert (many.low, many.high, many.n_maps) == (few.low, few.high, few.n_maps)
+
+
+def test_no_estimate_is_worse_than_any() -> None:
+    verdict = verdict_of(made_up({"shy": [0.01] * 8 + [np.nan] * 12, "bold": [0.3] * 20}))
+    assert verdict.best is not None
+    assert verdict.best.aligner == "bold"
+    assert np.isinf(verdict.standings[1].refined_m)
+
+
+def test_without_common_ground_no_method_is_named() -> None:
+    verdict = verdict_of(made_up({"one": [9.0] * 6}, n_true=[2] * 6))
+    assert verdict.best is None
+    words = words_for(verdict, 1)
+    assert (words.headline, words.name) == ("No common ground.", "")
+    assert "one (6)" in " ".join(words.remarks)
+
+
+def test_where_nothing_works_no_method_is_named() -> None:
+    verdict = verdict_of(made_up({"one": [9.0] * 6}))
+    assert verdict.best is None
+    assert words_for(verdict, 1).headline == "No method worked."
+
+
+def test_a_method_that_mostly_fails_is_not_recommended() -> None:
+    words = words_for(verdict_of(made_up({"one": [0.1] * 10 + [9.0] * 90})), 1)
+    assert words.headline.startswith("No method is reliable")
+    assert words.name == "one"
+
+
+def test_a_column_accepted_decides_what_is_merged() -> None:
+    errors = made_up({"one": [0.1] * 5 + [9.0] * 5})
+    judged = errors.assign(accepted=errors["refined_translation_error_m"] < 1)
+    assert verdict_of(errors).standings[0].n_false == 5
+    assert verdict_of(judged).standings[0].n_false == 0
+
+
+@pytest.mark.parametrize(
+    ("share", "text"),
+    [(1, "100 %"), (0.9999, "> 99 %"), (0.001, "< 1 %"), (0, "0 %"), (0.5, "50 %")],
+)
+def test_percentages_claim_nothing_that_is_not_so(share: float, text: str) -> None:
+    assert percent(share).replace("\u00a0", " ") == text

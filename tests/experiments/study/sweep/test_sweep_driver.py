@@ -1,0 +1,236 @@
+"""The driver on two processes, with tasks that fail in every way."""
+
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import pandas as pd
+import pytest
+from distributed import Client, LocalCluster
+
+from experiments.judge.pipeline import Plan
+from experiments.run.dask_cluster import connected
+from experiments.run.dask_worker import Terms, code_version
+from experiments.run.store import Store
+from experiments.run.tasks import Task
+from experiments.study.sweep import driver as driver_module
+from experiments.study.sweep.dataset import Dataset, open_dataset
+from experiments.study.sweep.driver import Progress, SweepDriver, survey
+from experiments.study.sweep.grid import Run
+from experiments.study.sweep.planned import PlannedRun, write_name
+from mapfusion.errors import InputError
+from tests.helpers import acting
+
+
+@pytest.fixture(scope="module")
+def client() -> Iterator[Client]:
+    with connected(2, None) as connection:
+        yield connection
+
+
+class Scene:
+    """Made-up tasks in place of a scenario's, by run."""
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.folder = folder
+        self.dataset = open_dataset(folder / "sweep", [])
+        self.terms = Terms(folder / "attempts", 3, code_version())
+        self.terms.attempts.mkdir()
+        self.tasks: dict[int, list[Task]] = {}
+        self.told: list[Progress] = []
+        monkeypatch.setattr(driver_module, "planned", self._planned)
+
+    def add(self, seed: int, name: str, function: object, *arguments: object, **more: Any) -> None:
+        outputs = (self.folder / name.replace("/", "_"),)
+        self.tasks.setdefault(seed, []).append(
+            Task(name, name.partition("/")[0], cast(Any, function), arguments, outputs, **more)
+        )
+
+    def write(self, seed: int, name: str, needs: Sequence[str] = ()) -> None:
+        output = self.folder / name.replace("/", "_")
+        self.add(seed, name, acting.write, output, name, needs=tuple(needs))
+
+    def _planned(self, run: Run, store: Store, dataset: Dataset) -> PlannedRun:
+        tasks = {task.name: task for task in self.tasks[run.seed]}
+        name = write_name(run)
+        tasks[name] = Task(name, "tables", dataset.finish, (run, "", []), (), tuple(tasks))
+        laid_out = cast(Plan, _NoPlan())
+        return PlannedRun(run, laid_out, tasks, dataset.holds(run, []))
+
+    def execute(self, client: Client) -> SweepDriver:
+        store = Store(self.folder)
+        driver = SweepDriver(client, store, self.dataset, self.terms, self.told.append)
+        driver.execute(self.runs)
+        return driver
+
+    @property
+    def runs(self) -> list[Run]:
+        return [Run(Path("x.yaml"), "x", seed) for seed in self.tasks]
+
+    def rows(self) -> dict[int, tuple[str, str]]:
+        found = pd.read_parquet(self.dataset.folder / "runs").set_index("seed")
+        rows = zip(found["status"], found["reason"], strict=True)
+        return dict(zip(found.index.tolist(), rows, strict=True))
+
+
+class _NoPlan:
+    pairs = ()
+
+    def folders(self) -> list[object]:
+        return []
+
+
+@pytest.fixture
+def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Scene:
+    return Scene(tmp_path, monkeypatch)
+
+
+def test_failed_runs_stop_no_others(scene: Scene, client: Client) -> None:
+    for seed, function in enumerate((acting.collide, acting.run_out_of_memory, acting.break_down)):
+        scene.write(seed, f"drive/{seed}")
+        scene.add(seed, f"slam/{seed}", function, needs=(f"drive/{seed}",))
+        scene.write(seed, f"judge/{seed}", [f"slam/{seed}"])
+    scene.write(3, "slam/3")
+    driver = scene.execute(client)
+    assert scene.rows() == {
+        0: ("failed", "scenario x: R1 drove into a wall at (1, 2)"),
+        1: ("failed", "slam: MemoryError"),
+        2: ("failed", "slam: ZeroDivisionError a bug"),
+        3: ("finished", ""),
+    }
+    assert sorted(driver.failed_runs) == ["x-0", "x-1", "x-2"]
+    details = (scene.dataset.folder / "failures" / "x-2.txt").read_text()
+    assert "in break_down" in details
+    assert not list(scene.terms.attempts.iterdir())
+    # what is mended is computed, what was finished stays
+    for seed in range(3):
+        scene.tasks[seed][1] = Task(
+            f"slam/{seed}", "slam", acting.write, (scene.folder / f"slam_{seed}", ""), ()
+        )
+    assert not scene.execute(client).failed_runs
+    assert set(scene.rows().values()) == {("finished", "")}
+    assert scene.told[-1].kept == 1
+    assert not list((scene.dataset.folder / "failures").iterdir())
+
+
+def test_what_runs_share_is_done_once_and_fails_once(scene: Scene, client: Client) -> None:
+    journal = scene.folder / "journal"
+    for seed in range(6):
+        scene.add(seed, "drive/good", acting.note, journal, "drive")
+        scene.write(seed, f"slam/{seed}", ["drive/good"])
+    for seed in range(6, 10):
+        scene.add(seed, "drive/bad", acting.collide)
+        scene.write(seed, f"slam/{seed}", ["drive/bad"])
+    driver = scene.execute(client)
+    assert journal.read_text().split() == ["drive"]
+    assert len(driver.failed_runs) == 4
+    assert not (scene.folder / "slam_6").exists()
+
+
+@pytest.mark.parametrize("late", [0, 1])
+def test_the_reason_is_of_the_first_failure_in_the_plan(
+    scene: Scene, client: Client, late: int
+) -> None:
+    """Whichever of the two fails first."""
+    flag = scene.folder / "flag"
+    for i, function in enumerate((acting.collide, acting.break_down)):
+        needs = ("wait/0",) if i == late else ()
+        if i == late:
+            scene.add(0, "wait/0", acting.wait_for, flag, scene.folder / "wait_0")
+        scene.add(0, f"slam/{i}", function, needs=needs)
+    scene.add(0, "flag/0", acting.write, flag, "")
+    scene.execute(client)
+    assert scene.rows()[0][1] == "scenario x: R1 drove into a wall at (1, 2)"
+
+
+def test_killed_workers_are_replaced_and_only_the_killer_gives_up(
+    scene: Scene, client: Client
+) -> None:
+    """Tasks that merely waited at a killed worker are not blamed."""
+    deaths = scene.folder / "deaths"
+    scene.add(0, "slam/killer", acting.die, deaths)
+    scene.add(1, "slam/unlucky", acting.die_first, scene.folder / "bad luck", scene.folder / "x")
+    for seed in range(2, 30):
+        scene.write(seed, f"slam/{seed}")
+    scene.execute(client)
+    rows = scene.rows()
+    assert rows.pop(0) == ("failed", "slam: its worker was killed 4 times (out of memory?)")
+    assert set(rows.values()) == {("finished", "")}
+    assert deaths.read_text().split() == ["died"] * 4
+
+
+def test_the_scheduler_holds_a_window_of_tasks_alone(
+    scene: Scene, client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(driver_module, "TASKS_PER_WORKER", 5)
+    n_runs = 60
+    for seed in range(n_runs):
+        scene.write(seed, f"slam/{seed}")
+    most = 0
+    tell = scene.told.append
+
+    def count(progress: Progress) -> None:
+        nonlocal most
+        most = max(most, sum(progress.tasks.values()) - sum(progress.tasks_done.values()))
+        tell(progress)
+
+    store = Store(scene.folder)
+    driver = SweepDriver(client, store, scene.dataset, scene.terms, count)
+    ended = driver.execute(scene.runs)
+    assert most <= 5 * driver_module.MIN_WORKERS + 2
+    assert ended.finished == n_runs
+    assert ended.tasks == ended.tasks_done == Counter({"slam": n_runs, "tables": n_runs})
+    deadline = time.monotonic() + 20
+    while client.run_on_scheduler(lambda dask_scheduler: len(dask_scheduler.tasks)):
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+
+
+def test_runs_that_cannot_be_laid_out_are_rows_too(
+    scene: Scene, client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene.write(0, "slam/0")
+    scene.write(1, "slam/1")
+    laid_out = scene._planned
+
+    def refusing(run: Run, *more: Any) -> PlannedRun:
+        if run.seed == 0:
+            raise InputError("no floor plan\nfits seed 0")
+        return laid_out(run, *more)
+
+    monkeypatch.setattr(driver_module, "planned", refusing)
+    scene.execute(client)
+    assert scene.rows() == {0: ("failed", "no floor plan fits seed 0"), 1: ("finished", "")}
+
+
+def test_survey_counts_what_is_shared_and_done(scene: Scene) -> None:
+    for seed in range(4):
+        scene.write(seed, "drive/0")
+        scene.write(seed, f"slam/{seed}", ["drive/0"])
+    acting.write(scene.folder / "slam_0", "done")
+    found = survey(scene.runs, Store(scene.folder), scene.dataset)
+    assert found.runs == 4
+    assert found.wanted == Counter(drive=4, slam=4, tables=4)
+    assert found.left == Counter(drive=1, slam=3, tables=4)
+    assert found.finished["slam"] == 1
+
+
+def test_an_existing_cluster_of_unfit_workers_ends_the_sweep(scene: Scene, tmp_path: Path) -> None:
+    scene.write(0, "slam/0")
+    with LocalCluster(
+        n_workers=1, processes=False, dashboard_address="localhost:0", silence_logs=50
+    ) as cluster:
+        assert isinstance(cluster.scheduler_address, str)
+        with connected(1, cluster.scheduler_address) as client:
+            scene.terms = Terms(tmp_path / "elsewhere" / "attempts", 3, code_version())
+            with pytest.raises(InputError, match="must be shared by all machines"):
+                scene.execute(client)
+
+
+def test_no_scheduler_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("experiments.run.dask_cluster.CONNECT_TIMEOUT_S", 0.2)
+    for address in ("tcp://127.0.0.1:1", "nonsense://x"):
+        with pytest.raises(InputError, match=f"--scheduler {address}"), connected(1, address):
+            pass
