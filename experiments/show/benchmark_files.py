@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from experiments.run.store import library_versions
+from experiments.run.code_version import library_versions
 from experiments.show.figures.benchmark_figure import draw
 from experiments.show.figures.drawing import save_figure
 from experiments.show.figures.style import house_style

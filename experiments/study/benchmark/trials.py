@@ -19,10 +19,13 @@ from scipy.stats import binomtest
 
 from experiments.methods.aligner_calls import CallableAligner, callable_aligner, refine_estimate
 from experiments.methods.one_thread import single_threaded
-from experiments.run.sources import imported_sources, method_sources
-from experiments.run.store import StageFolder, Store
+from experiments.run.job import Job
+from experiments.run.stage import Stage
+from experiments.run.store import Store
+from experiments.run.tasks import tasks_of
+from experiments.scenario.loading import load_scenario
 from experiments.scenario.randomness import generator
-from experiments.scenario.settings import AlignerEntry, load_scenario
+from experiments.scenario.settings import AlignerEntry
 from experiments.study.benchmark.synthetic_pairs import SyntheticPair, synthetic_pair, true_pairs_of
 from mapfusion import se2
 from mapfusion.align.refine import Refinement
@@ -38,18 +41,9 @@ PAIR_COUNTS = (60, 200, 1000, 5000)
 # to the oracle's answer; 0.1 rad displaces landmarks 5 m away by as much.
 TOLERANCE_M = 0.5
 TOLERANCE_RAD = 0.1
+_LABEL, _FILE = "measure the aligners", "trials.parquet"
 _CONFIDENCE = 0.95  # of Wilson's interval
 _TIME_BAND = (0.1, 0.9)  # quantiles of the trials
-
-_OWN_SOURCES = (
-    "experiments/methods/aligner_calls.py",
-    "experiments/study/benchmark/trials.py",
-    "experiments/methods/isolated_child.py",
-    "experiments/methods/isolation.py",
-    "experiments/scenario/randomness.py",
-    "experiments/methods/one_thread.py",
-    "mapfusion/align/sanity.py",
-)
 
 
 def _schema(kind: str, **types: pa.DataType) -> pa.Schema:
@@ -165,45 +159,57 @@ def _cell(
     plan: Plan, store: Store, entry: AlignerEntry, n_pairs: int, share: float
 ) -> pd.DataFrame:
     method = find_method(entry.method)
-    settings = {
-        "entry": entry.model_dump(mode="json"),
-        "origin": method.origin(),
-        "n_pairs": n_pairs,
-        "outlier_share": share,
-        "trials": plan.trials,
-        "seed": plan.seed,
-        "budget_s": plan.budget_s,
-    }
-    sources = _OWN_SOURCES + method_sources(method)
-    sources += imported_sources(
-        "experiments.study.benchmark.synthetic_pairs", "mapfusion.align.refine"
+    settings = CellSettings(
+        **dict(entry),
+        origin=method.origin(),
+        n_pairs=n_pairs,
+        outlier_share=share,
+        trials=plan.trials,
+        seed=plan.seed,
+        budget_s=plan.budget_s,
     )
-    folder = store.stage("benchmark", settings, [], sources)
-    path = folder.path / "trials.parquet"
-    if not folder.finished:
-        _measure(plan, entry, n_pairs, share, folder, path)
-    return read_table(path, TRIALS)[0].to_pandas()
+    loads = (method.target.partition(":")[0],)
+    stage = Stage("benchmark", _LABEL, settings, run_cell, (_FILE,), loads=loads)
+    for task in tasks_of([stage], store).values():
+        task.run()
+    return read_table(store.path(stage) / _FILE, TRIALS)[0].to_pandas()
 
 
-def _measure(
-    plan: Plan, entry: AlignerEntry, n_pairs: int, share: float, folder: StageFolder, path: Path
-) -> None:
+@dataclass(frozen=True)
+class CellSettings:
+    """All that one method's trials in one cell depend on."""
+
+    name: str
+    method: str
+    parameters: dict[str, Any]
+    time_limit_s: float
+    origin: dict[str, str]
+    n_pairs: int
+    outlier_share: float
+    trials: int
+    seed: int
+    budget_s: float
+
+
+def run_cell(settings: CellSettings, job: Job) -> None:
+    """Run the trials of one cell and write them."""
     started = time.perf_counter()
-    aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
+    aligner = callable_aligner(settings.method, settings.parameters, settings.time_limit_s)
     rows: list[dict[str, Any]] = []
-    for trial in range(plan.trials):
+    n_pairs, share = settings.n_pairs, settings.outlier_share
+    for trial in range(settings.trials):
         maps = ("benchmark", n_pairs, f"{share:g}", trial)
-        pair = synthetic_pair(n_pairs, share, generator(plan.seed, *maps))
-        draws = (*maps, entry.name)
+        pair = synthetic_pair(n_pairs, share, generator(settings.seed, *maps))
+        draws = (*maps, settings.name)
         if trial == 0:  # compilation, imports and caches; not counted
-            _trial(aligner, pair, generator(plan.seed, *draws))
-        cell = {"method": entry.name, "n_pairs": n_pairs, "outlier_share": share, "trial": trial}
-        rows.append(cell | _trial(aligner, pair, generator(plan.seed, *draws)))
-        if time.perf_counter() - started > plan.budget_s:
+            _trial(aligner, pair, generator(settings.seed, *draws))
+        cell = {"method": settings.name, "n_pairs": n_pairs, "outlier_share": share}
+        answer = _trial(aligner, pair, generator(settings.seed, *draws))
+        rows.append(cell | {"trial": trial} | answer)
+        if time.perf_counter() - started > settings.budget_s:
             break
     columns = pd.DataFrame(rows, columns=pd.Index(TRIALS.names))
-    write_table(path, {name: columns[name].to_numpy() for name in columns}, TRIALS)
-    folder.finish(elapsed_s=time.perf_counter() - started)
+    write_table(job.output / _FILE, {name: columns[name].to_numpy() for name in columns}, TRIALS)
 
 
 def _trial(aligner: CallableAligner, pair: SyntheticPair, rng: np.random.Generator) -> dict:

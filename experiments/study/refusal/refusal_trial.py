@@ -11,11 +11,11 @@ import numpy as np
 from experiments.judge.errors import EvaluatedRobot
 from experiments.judge.judging import load_robot
 from experiments.methods.aligner_calls import callable_aligner, refine_estimate
-from experiments.run.stages.align import map_at
+from experiments.run.stages.map_batches import map_at
 from experiments.run.stages.slam import evaluated_iterations
 from experiments.run.workers import workers
 from experiments.scenario.randomness import generator
-from experiments.scenario.settings import Scenario
+from experiments.scenario.settings import Simulation
 from experiments.study.refusal import cases
 from experiments.study.refusal import refusal_tables as results
 from experiments.study.refusal.calibration import calibrate
@@ -72,13 +72,12 @@ def run(
     return scenario.align.acceptance
 
 
-def _iterations(scenario: Scenario) -> list[int]:
-    assert scenario.drive is not None
+def _iterations(scenario: Simulation) -> list[int]:
     return evaluated_iterations(scenario.drive.frames, scenario.evaluate.every)
 
 
 def _drawn_meetings(
-    scenario: Scenario, worlds: Sequence[World], n: int
+    scenario: Simulation, worlds: Sequence[World], n: int
 ) -> dict[tuple[int, int], list[Meeting]]:
     """Drawn pairs of maps of worlds of different seeds, by pair of worlds; every such is there."""
     strangers = [
@@ -101,7 +100,7 @@ def _drawn_meetings(
     return meetings
 
 
-def common_rows(scenario: Scenario, world: World) -> list[dict[str, Any]]:
+def common_rows(scenario: Simulation, world: World) -> list[dict[str, Any]]:
     """COMMON and FEW pairs of one world; POSTERS of one whose pictures repeat."""
     robots = [load_robot(folders) for folders in world.robots.values()]
     rows = []
@@ -119,7 +118,7 @@ def common_rows(scenario: Scenario, world: World) -> list[dict[str, Any]]:
 
 
 def apart_rows(
-    scenario: Scenario, world_a: World, world_b: World, meetings: Sequence[Meeting]
+    scenario: Simulation, world_a: World, world_b: World, meetings: Sequence[Meeting]
 ) -> list[dict[str, Any]]:
     """APART and REPEATED pairs of two worlds."""
     in_a = {name: load_robot(folders) for name, folders in world_a.robots.items()}
@@ -135,7 +134,7 @@ def apart_rows(
 
 
 def _posters(
-    scenario: Scenario,
+    scenario: Simulation,
     in_a: Sequence[EvaluatedRobot],
     in_b: Sequence[EvaluatedRobot],
     names: tuple[str, str],
@@ -155,13 +154,13 @@ def _posters(
             yield iteration, case
 
 
-def _common(scenario: Scenario, a: EvaluatedRobot, b: EvaluatedRobot, iteration: int) -> Case:
+def _common(scenario: Simulation, a: EvaluatedRobot, b: EvaluatedRobot, iteration: int) -> Case:
     radius_m = scenario.evaluate.true_pair_radius_m
     return cases.common(a, b, iteration, scenario.align.match, radius_m)
 
 
 def _answers(
-    scenario: Scenario, case: Case, worlds: tuple[str, str], iteration: int
+    scenario: Simulation, case: Case, worlds: tuple[str, str], iteration: int
 ) -> list[dict[str, Any]]:
     """One row an aligner: its refined alignment, judged."""
     settings = scenario.align

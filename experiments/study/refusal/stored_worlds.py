@@ -1,20 +1,19 @@
 """The worlds of earlier runs and sweeps: robots with their maps by iteration, and the truth."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from pydantic import ValidationError
-
 from experiments.judge.expectations import load_checked
-from experiments.judge.judging import RobotFolders
-from experiments.judge.pipeline import plan
-from experiments.judge.result import STORE_FOLDER, require_result
+from experiments.judge.judged_run import JudgedRun
+from experiments.judge.result import require_result
+from experiments.run.stages.slam import RobotFolders
 from experiments.run.store import Store
-from experiments.scenario.settings import Scenario
+from experiments.scenario.loading import scenario_of
+from experiments.scenario.settings import AnyScenario, Simulation
 from experiments.scenario.suite import scenarios_of
+from experiments.scenario.yaml_input import read_mapping
 from mapfusion.errors import InputError
 
 
@@ -42,7 +41,7 @@ class Source(NamedTuple):
 
     label: str
     name: str
-    scenario: Scenario
+    scenario: AnyScenario
     store: Store
 
 
@@ -62,18 +61,18 @@ def sources_of(worlds: Sequence[str], seeds: Sequence[int], results: Path) -> li
     for word in worlds:
         path = Path(word)
         if path.is_dir():
-            store = Store(path.resolve().parent / STORE_FOLDER)
+            store = Store.of(path.resolve().parent)
             found.append(Source(str(path), path.resolve().name, _scenario(path), store))
             continue
         for file in scenarios_of([word]):
             for seed in seeds:
                 scenario = load_checked(file, (), seed)
                 name = f"{scenario.name}-{seed}"
-                found.append(Source(name, name, scenario, Store(results / STORE_FOLDER)))
+                found.append(Source(name, name, scenario, Store.of(results)))
     return found
 
 
-def load_worlds(sources: Sequence[Source]) -> tuple[Scenario, list[World]]:
+def load_worlds(sources: Sequence[Source]) -> tuple[Simulation, list[World]]:
     """The first source's scenario, and the worlds of all of them.
 
     Raises:
@@ -94,32 +93,31 @@ def load_worlds(sources: Sequence[Source]) -> tuple[Scenario, list[World]]:
             f"refusal: all worlds have seed {worlds[0].seed}, and so some pictures in common; give "
             "those of another seed too"
         )
-    return sources[0].scenario, worlds
+    first = sources[0].scenario
+    assert isinstance(first, Simulation)  # else `_world` has refused it
+    return first, worlds
 
 
-def _scenario(result: Path) -> Scenario:
+def _scenario(result: Path) -> AnyScenario:
     require_result(result)
     path = result / "scenario.json"
-    try:
-        return Scenario.model_validate(json.loads(path.read_text(encoding="utf-8")))
-    except (ValidationError, ValueError) as error:
-        raise InputError(f"{path}: not a scenario of this version; make it with `run`") from error
+    return scenario_of(read_mapping(path), str(path))
 
 
 def _world(source: Source) -> World:
     scenario = source.scenario
-    if scenario.world is None:
+    if not isinstance(scenario, Simulation):
         raise InputError(
             f"{source.label}: made from recorded logs; only simulated worlds surely differ"
         )
-    planned = plan(scenario, source.store)
-    for robot in planned.robots:
-        if not (robot.log.finished and robot.slam.finished):
+    judged = JudgedRun.of(scenario, source.store)
+    for robot in judged.pipeline.simulated:
+        if not all(source.store.folder(stage).finished for stage in (robot.log, robot.slam)):
             raise InputError(
                 f"{source.label}: the maps of {robot.name} are not in {source.store.root} (made by "
                 "another version?); run its scenario again"
             )
-    assert planned.faces is not None
-    folders = {robot.name: robot.folders for robot in planned.robots}
+    _, faces = judged.pipeline.world
+    folders = {robot.name: judged.robot_folders(robot) for robot in judged.pipeline.robots}
     repeats = scenario.world.texture.posters > 0
-    return World(source.name, scenario.seed, planned.faces.key, repeats, folders)
+    return World(source.name, scenario.seed, faces.key, repeats, folders)

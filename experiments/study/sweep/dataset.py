@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from experiments.judge import tables
-from experiments.run.store import library_versions, source_hash
+from experiments.run.code_version import library_versions, source_hash
 from experiments.study.sweep.grid import Axis, Run
 from mapfusion.errors import InputError
 from mapfusion.storage import schema, write_table, write_whole

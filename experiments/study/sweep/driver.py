@@ -33,7 +33,7 @@ class Progress:
     Attributes:
         runs: in all.
         finished, failed, kept: runs that are done; `kept` were done before.
-        tasks, tasks_done: by kind, of the runs looked at so far.
+        tasks, tasks_done: by label, of the runs looked at so far.
     """
 
     runs: int
@@ -158,7 +158,7 @@ class SweepDriver:
         """Hand a task to Dask, unless it is there for another run already."""
         if task.name in self._futures:
             return
-        self._tasks[task.kind] += 1
+        self._tasks[task.label] += 1
         self._n_submitted += 1
         needs = [self._futures[need] for need in task.needs if need in self._futures]
         future = self._client.submit(
@@ -167,7 +167,7 @@ class SweepDriver:
             pickle.dumps(task),
             self._terms,
             *needs,
-            key=f"{task.kind}-{self._suffix}-{task.name}",
+            key=f"{task.label}-{self._suffix}-{task.name}",
             pure=False,
             priority=-self._n_submitted,  # in order: a run is finished before others begin
         )
@@ -228,7 +228,7 @@ class SweepDriver:
 
 @dataclass(frozen=True)
 class Survey:
-    """What a sweep would do: tasks by kind."""
+    """What a sweep would do: tasks by label."""
 
     runs: int
     runs_finished: int
@@ -253,8 +253,8 @@ def survey(runs: Iterable[Run], store: Store, dataset: Dataset) -> Survey:
         n_finished += laid_out.finished
         todo = {task.name for task in laid_out.left()}
         for name, task in laid_out.tasks.items():
-            wanted[task.kind] += 1
+            wanted[task.label] += 1
             if name not in known:
                 known.add(name)
-                (left if name in todo else finished)[task.kind] += 1
+                (left if name in todo else finished)[task.label] += 1
     return Survey(n_runs, n_finished, n_refused, wanted, finished, left)

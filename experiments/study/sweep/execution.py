@@ -7,8 +7,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from experiments.judge.judging import load_robot
-from experiments.judge.result import STORE_FOLDER, measure_aligners, pair_table
+from experiments.judge.result import measure_aligners
 from experiments.methods.one_thread import single_threaded
 from experiments.run.dask_cluster import connected
 from experiments.run.dask_worker import Terms, code_version
@@ -44,7 +43,7 @@ class Sweep:
     @property
     def store(self) -> Store:
         """Where stages are kept, shared with `mapfusion run`."""
-        return Store(self.results / STORE_FOLDER)
+        return Store.of(self.results)
 
 
 def prepare(
@@ -119,9 +118,9 @@ def measure_times(
 
 
 def _measure(laid_out: PlannedRun, dataset: Dataset) -> None:
-    robots = [load_robot(robot.folders) for robot in laid_out.plan.robots]
-    measure_aligners(laid_out.plan, robots)
-    dataset.write(ALIGNER_TIMINGS, laid_out.run, pair_table(laid_out.plan, ALIGNER_TIMINGS))
+    judged = laid_out.judged
+    measure_aligners(judged, judged.load_robots())
+    dataset.write(ALIGNER_TIMINGS, laid_out.run, judged.pair_table(ALIGNER_TIMINGS))
 
 
 def _remove_if_old(folder: Path) -> None:

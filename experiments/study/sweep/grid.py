@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.judge.expectations import load_checked
-from experiments.scenario.settings import Scenario
+from experiments.scenario.settings import AnyScenario
 from experiments.scenario.yaml_input import parse_value
 from mapfusion.errors import InputError
 
@@ -61,7 +61,7 @@ class Run:
         digest = hashlib.sha256(values.encode()).hexdigest()[:_HASH_LENGTH]
         return f"{self.scenario}-{self.seed}-{digest}"
 
-    def load(self) -> Scenario:
+    def load(self) -> AnyScenario:
         """The scenario of this run; raises InputError."""
         return load_checked(self.path, self.overrides, self.seed)
 

@@ -4,16 +4,15 @@ from dataclasses import dataclass
 
 from experiments.judge.consistency import landmark_nees_rows
 from experiments.judge.fused_landmarks import map_fit_rows
-from experiments.judge.judging import load_robot
-from experiments.judge.pipeline import Plan, plan, task_name, tasks_of
+from experiments.judge.judged_run import JudgedRun
 from experiments.judge.provenance import renderer
-from experiments.judge.result import fused_map, pair_table, robot_tables
+from experiments.judge.result import fused_map, robot_tables
 from experiments.run.store import Store
-from experiments.run.tasks import Task, unfinished
+from experiments.run.tasks import Task, task_names, unfinished
 from experiments.study.sweep.dataset import ALIGNER_TIMINGS, RUN_TIMES, Dataset
 from experiments.study.sweep.grid import Run
 
-WRITE = "tables"  # the kind of the task that writes a run's rows
+WRITE = "write the tables"  # the kind of the task that writes a run's rows
 
 
 @dataclass(frozen=True)
@@ -22,20 +21,20 @@ class PlannedRun:
 
     Attributes:
         run: which one.
-        plan: its stages.
+        judged: its stages.
         tasks: all of them by name; the last one writes the run's rows.
         finished: whether the dataset holds it already.
     """
 
     run: Run
-    plan: Plan
+    judged: JudgedRun
     tasks: dict[str, Task]
     finished: bool
 
     @property
     def stages(self) -> list[str]:
         """STAGE/KEY of all it is made from."""
-        return stages_of(self.plan)
+        return stages_of(self.judged)
 
     def left(self) -> list[Task]:
         """Tasks that are not done yet, each after those it needs."""
@@ -47,50 +46,46 @@ def write_name(run: Run) -> str:
     return f"run/{run.run_id}"
 
 
-def stages_of(laid_out: Plan) -> list[str]:
-    """STAGE/KEY of all stages, the aligners' own among them."""
-    parts = [part for pair in laid_out.pairs for part in (pair.parts.match, *pair.parts.aligners)]
-    return [task_name(folder) for folder in (*laid_out.folders(), *parts)]
+def stages_of(judged: JudgedRun) -> list[str]:
+    """STAGE/KEY of all stages."""
+    return [f"{stage.name}/{stage.key}" for stage in judged.stages()]
 
 
 def planned(run: Run, store: Store, dataset: Dataset) -> PlannedRun:
     """Lay out a run; nothing is computed. Raises InputError for what cannot be run."""
-    laid_out = plan(run.load(), store)
-    tasks = tasks_of(laid_out)
-    before = [folder for robot in laid_out.robots for folder in (robot.log, robot.slam)]
-    before += [folder for pair in laid_out.pairs for folder in (pair.align, pair.judge)]
-    needs = tuple(name for name in map(task_name, before) if name in tasks)
+    judged = JudgedRun.of(run.load(), store)
+    tasks = dict(judged.tasks)
+    pipeline = judged.pipeline
+    before = [stage for robot in pipeline.robots for stage in (robot.log, robot.slam)]
+    before += [*(pair.estimates for pair in pipeline.pairs), *judged.judgements]
+    needs = tuple(name for stage in before for name in task_names(stage))
     name = write_name(run)
-    tasks[name] = Task(name, WRITE, write_rows, (run, laid_out, dataset), (), needs)
-    return PlannedRun(run, laid_out, tasks, dataset.holds(run, stages_of(laid_out)))
+    tasks[name] = Task(name, WRITE, write_rows, (run, judged, dataset), (), needs)
+    return PlannedRun(run, judged, tasks, dataset.holds(run, stages_of(judged)))
 
 
-def write_rows(run: Run, laid_out: Plan, dataset: Dataset) -> None:
+def write_rows(run: Run, judged: JudgedRun, dataset: Dataset) -> None:
     """Write a run's rows of all tables, `runs` last; no maps, no images."""
     dataset.path(ALIGNER_TIMINGS, run).unlink(missing_ok=True)  # of an earlier state of the run
-    robots = [load_robot(robot.folders) for robot in laid_out.robots]
-    made = {name: pair_table(laid_out, name) for name in ("errors", "fusion")}
-    of_robots = robot_tables(laid_out, robots)
+    robots = judged.load_robots()
+    made = {name: judged.pair_table(name) for name in ("errors", "fusion")}
+    of_robots = robot_tables(judged, robots)
     made |= {name: of_robots[name] for name in ("robots", "path_statistics")}
     last = max(max(robot.maps) for robot in robots)
-    estimates, offered = (pair_table(laid_out, name) for name in ("estimates", "correspondences"))
-    fused = fused_map(laid_out.scenario.merge, robots, estimates, offered, last)
+    estimates, offered = (judged.pair_table(name) for name in ("estimates", "correspondences"))
+    fused = fused_map(judged.scenario.merge, robots, estimates, offered, last)
     for name, rows in made.items():
         dataset.write(name, run, rows)
     dataset.write("map_fits", run, map_fit_rows(robots, fused, last))
-    radius_m = laid_out.scenario.evaluate.true_pair_radius_m
+    radius_m = judged.scenario.evaluate.true_pair_radius_m
     dataset.write("landmark_nees", run, landmark_nees_rows(robots, fused, last, radius_m))
-    dataset.write(RUN_TIMES, run, _times(laid_out))
-    dataset.finish(run, renderer(laid_out.scenario), stages_of(laid_out))
+    dataset.write(RUN_TIMES, run, _times(judged))
+    dataset.finish(run, renderer(judged.scenario), stages_of(judged))
 
 
-def _times(laid_out: Plan) -> list[dict[str, object]]:
-    parts = [part for pair in laid_out.pairs for part in (pair.parts.match, *pair.parts.aligners)]
-    timed = [(folder, folder.figures()) for folder in laid_out.folders() if folder.finished]
-    timed += [(part, part.noted()) for part in parts]
+def _times(judged: JudgedRun) -> list[dict[str, object]]:
     return [
-        {"stage": folder.stage, "key": folder.key, "figure": name, "seconds": figures[name]}
-        for folder, figures in timed
-        for name in ("elapsed_s", "rendering_s")
-        if name in figures
+        {"stage": folder.name, "key": folder.key, "figure": name, "seconds": seconds}
+        for folder in judged.folders()
+        for name, seconds in folder.figures().items()
     ]

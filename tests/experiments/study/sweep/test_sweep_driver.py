@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 from distributed import Client, LocalCluster
 
-from experiments.judge.pipeline import Plan
+from experiments.judge.judged_run import JudgedRun
 from experiments.run.dask_cluster import connected
 from experiments.run.dask_worker import Terms, code_version
 from experiments.run.store import Store
@@ -56,7 +56,7 @@ class Scene:
         tasks = {task.name: task for task in self.tasks[run.seed]}
         name = write_name(run)
         tasks[name] = Task(name, "tables", dataset.finish, (run, "", []), (), tuple(tasks))
-        laid_out = cast(Plan, _NoPlan())
+        laid_out = cast(JudgedRun, _NoStages())
         return PlannedRun(run, laid_out, tasks, dataset.holds(run, []))
 
     def execute(self, client: Client) -> SweepDriver:
@@ -75,10 +75,8 @@ class Scene:
         return dict(zip(found.index.tolist(), rows, strict=True))
 
 
-class _NoPlan:
-    pairs = ()
-
-    def folders(self) -> list[object]:
+class _NoStages:
+    def stages(self) -> list[object]:
         return []
 
 
