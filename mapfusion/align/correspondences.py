@@ -87,11 +87,13 @@ class MatchParameters:
     """How landmarks are paired.
 
     Attributes:
-        max_descriptor_distance: between unit vectors, so 0 is equal and sqrt(2) unrelated.
+        max_descriptor_distance: between unit vectors, so 0 is equal and sqrt(2) unrelated. The
+            default offers almost every mutual nearest neighbour, as the paper does: sorting out
+            the false ones is the aligner's part.
         height: which heights can be the same.
     """
 
-    max_descriptor_distance: float = 0.3
+    max_descriptor_distance: float = 0.6
     height: HeightGate = HeightGate()
 
     def __post_init__(self) -> None:

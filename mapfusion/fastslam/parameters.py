@@ -11,12 +11,13 @@ from mapfusion.fastslam.proposal import Proposal
 
 @dataclass(frozen=True)
 class FastSlamParameters:
-    """Settings of the filter.
+    """Settings of the filter; the defaults are the recommended ones.
 
     Attributes:
         n_particles: M.
         motion: noise of the odometry.
-        proposal: what particles are drawn from.
+        proposal: what particles are drawn from. `motion` is the paper's eq. 3, which leaves few of
+            them where observations are far sharper than the odometry.
         association: what decides among the landmarks inside the gate.
         gate_probability: share of true matches that the gate lets pass (chi-square quantile). Close
             to 1, as a landmark's covariance leaves out the drift since it was last seen; among
@@ -24,26 +25,29 @@ class FastSlamParameters:
         descriptor_threshold: largest Euclidean distance of matching descriptors (unit vectors).
         resample_fraction: resample when the effective sample size is at most this share of M;
             0 never, 1 in every step.
-        noise_scale: factor on the observations' standard deviations. Above 1 for errors that are
-            alike from frame to frame, which the filter would otherwise take for independent news.
+        noise_scale: factor on the observations' standard deviations; the paper's is 1. Above 1 for
+            errors that are alike from frame to frame, as those of a corner are. Taken as
+            independent news they make each particle's map so certain that no particle finds its
+            old landmarks again when a loop closes.
         noise_floor_m: standard deviation added to each coordinate of an observation.
         log_new_landmark_density: log of p_new in 1/m^3 (1/m^2 in planar data), the density of an
             observation that matches nothing; None: that of a match exactly at the gate, with the
             covariance of a landmark seen once.
-        planar: z carries no information; gates and weights have 2 degrees of freedom.
+        planar: z carries no information; gates and weights have 2 degrees of freedom. None: as the
+            log says; of a filter without a log, no.
     """
 
     n_particles: int = 200
     motion: MotionNoise = field(default_factory=MotionNoise)
-    proposal: Proposal = Proposal.MOTION
+    proposal: Proposal = Proposal.INFORMED
     association: Association = Association.DESCRIPTOR
     gate_probability: float = 0.9999
     descriptor_threshold: float = 0.5
     resample_fraction: float = 0.5
-    noise_scale: float = 1.0
+    noise_scale: float = 4.0
     noise_floor_m: float = 0.0
     log_new_landmark_density: float | None = None
-    planar: bool = False
+    planar: bool | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "proposal", Proposal(self.proposal))

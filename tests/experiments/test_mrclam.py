@@ -9,6 +9,7 @@ from experiments.mrclam import MrclamSettings, import_mrclam
 from mapfusion.errors import InputError
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.fastslam.parameters import FastSlamParameters
+from mapfusion.fastslam.proposal import Proposal
 from mapfusion.fastslam.run import run_log
 from mapfusion.robot_log import read_log, read_truth
 from mapfusion.se2 import between, compose, inverse, transform_points, wrap
@@ -146,6 +147,8 @@ def test_the_filter_finds_the_landmarks(recording: Path, tmp_path: Path):
     log, truth = read_log(path), read_truth(path)
     settings = FastSlamParameters(
         n_particles=20,
+        proposal=Proposal.MOTION,
+        noise_scale=1.0,
         association="label",
         motion=MotionNoise(0.005, 0, 0.005, 0, 0, lateral_slip_m_per_rad=0),
     )

@@ -24,7 +24,7 @@ from mapfusion.align.false_alarms import fewest_false_alarms, independent_pairs
 from mapfusion.align.rigid import fit_rigid
 from mapfusion.robot_log import DESCRIPTOR_LENGTH
 
-MATCHING = MatchParameters()
+MATCHING = MatchParameters(max_descriptor_distance=0.3)
 
 
 def described(name: str, points: np.ndarray, T_world_map: list[float], seed: int):
