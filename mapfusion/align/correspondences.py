@@ -76,7 +76,9 @@ class HeightGate:
         """Most for the squared difference of two heights over its variance."""
         return chi_square_bound(self.probability, 1)
 
-    def agrees(self, z_a_m: Float, variance_a_m2: Float, z_b_m: Float, variance_b_m2: Float):
+    def agrees(
+        self, z_a_m: Float, variance_a_m2: Float, z_b_m: Float, variance_b_m2: Float
+    ) -> np.ndarray:
         """Bool array: heights that agree; arguments broadcast."""
         variance = variance_a_m2 + variance_b_m2 + self.floor_m**2
         return (z_a_m - z_b_m) ** 2 <= self.bound * variance

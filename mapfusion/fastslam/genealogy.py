@@ -30,7 +30,7 @@ class Genealogy:
 
 
 @njit(cache=True)
-def _compose(table, ancestors, newest):
+def _compose(table: np.ndarray, ancestors: np.ndarray, newest: int) -> None:
     n_particles = table.shape[1]
     old = np.empty(n_particles, dtype=table.dtype)
     for row in range(len(table)):

@@ -86,13 +86,13 @@ def _empty(capacity: int) -> _Cells:
 
 
 @njit(cache=True)
-def _bucket(level, column, row, n_buckets):
+def _bucket(level: int, column: int, row: int, n_buckets: int) -> int:
     # Large odd multipliers spread neighbouring cells over the buckets (Teschner et al. 2003).
     return ((column * 73856093) ^ (row * 19349663) ^ (level * 83492791)) & (n_buckets - 1)
 
 
 @njit(cache=True)
-def _unlink(cells, name):
+def _unlink(cells: _Cells, name: int) -> None:
     level, column, row = cells.key[name]
     after, before = cells.following[name], cells.preceding[name]
     if after != _FREE:
@@ -106,7 +106,7 @@ def _unlink(cells, name):
 
 
 @njit(cache=True)
-def _place(cells, names, boxes, cell_m):
+def _place(cells: _Cells, names: np.ndarray, boxes: Float, cell_m: float) -> None:
     for name in names:
         box = boxes[name]
         extent = max(box[2] - box[0], box[3] - box[1])
@@ -131,14 +131,14 @@ def _place(cells, names, boxes, cell_m):
 
 
 @njit(cache=True)
-def _remove(cells, names):
+def _remove(cells: _Cells, names: np.ndarray) -> None:
     for name in names:
         if cells.key[name, 0] != _FREE:
             _unlink(cells, name)
 
 
 @njit(cache=True)
-def _most_cells(cells, box, cell_m):
+def _most_cells(cells: _Cells, box: Float, cell_m: float) -> float:
     """Cells that a query looks at on the finest level in use."""
     for level in range(_LEVELS):
         if cells.population[level] > 0:
@@ -148,7 +148,7 @@ def _most_cells(cells, box, cell_m):
 
 
 @njit(cache=True)
-def _near(cells, box, boxes, cell_m):
+def _near(cells: _Cells, box: Float, boxes: Float, cell_m: float) -> np.ndarray:
     found = np.empty(cells.population.sum(), dtype=np.int64)
     n = 0
     for level in range(_LEVELS):

@@ -6,36 +6,21 @@ notes who descends from whom (`genealogy.py`); a slot is brought up to date when
 Slots that no surviving particle has are freed.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 from numba import njit
 
 from mapfusion.fastslam.genealogy import MEMORY, Genealogy
 from mapfusion.fastslam.grid import Grid
 from mapfusion.fastslam.sensor import Sightings
+from mapfusion.fastslam.slots import NEVER, Slots, allocate
 from mapfusion.fastslam.update import NEW
-from mapfusion.robot_log import DESCRIPTOR_LENGTH, NO_LABEL, Observations
+from mapfusion.robot_log import Observations
 from mapfusion.se2 import Float
 
 _FIRST_CAPACITY = 256
-_NEVER = -1
 # In so many resamplings all slots are visited once, wherever they lie. Two visits of a slot are
 # then less than twice this apart, which is what the genealogy remembers.
 _ROUND = MEMORY // 2
-
-
-class Slots(NamedTuple):
-    """Landmark-major state of S slots and M particles. Rows of free slots mean nothing."""
-
-    mean_m: np.ndarray  # (S, M, 3)
-    covariance_m2: np.ndarray  # (S, M, 6) upper entries
-    count: np.ndarray  # (S, M) int32 observations; 0: the particle does not have it
-    generation: np.ndarray  # (S,) in which the particle axis was written; _NEVER: free
-    source: np.ndarray  # (S,) the observation it came from
-    box_m: np.ndarray  # (S, 4) min_x, min_y, max_x, max_y of mean and gate over all particles
-    descriptor: np.ndarray  # (S, 64) float32
-    label: np.ndarray  # (S,) int32
 
 
 class ParticleMaps:
@@ -47,7 +32,7 @@ class ParticleMaps:
     """
 
     def __init__(self, n_particles: int, gate: float) -> None:
-        self.slots = _allocate(_FIRST_CAPACITY, n_particles)
+        self.slots = allocate(_FIRST_CAPACITY, n_particles)
         self.n_landmarks = np.zeros(n_particles, dtype=np.int64)
         self._gate = gate
         self._genealogy = Genealogy(n_particles)
@@ -76,7 +61,7 @@ class ParticleMaps:
         if not alive.all():
             dead = which[~alive]
             self._grid.remove(dead)
-            self.slots.generation[dead] = _NEVER
+            self.slots.generation[dead] = NEVER
             self._free.extend(dead.tolist())
         return alive
 
@@ -121,7 +106,7 @@ class ParticleMaps:
     def of_particle(self, particle: int, min_count: int) -> tuple[np.ndarray, np.ndarray]:
         """Slots (n,) of one particle's landmarks, by age, and whose column to read them in (n,)."""
         slots, genealogy = self.slots, self._genealogy
-        used = np.flatnonzero(slots.generation[: self._n_used] != _NEVER)
+        used = np.flatnonzero(slots.generation[: self._n_used] != NEVER)
         column = genealogy.ancestors[slots.generation[used] % MEMORY, particle]
         has = slots.count[used, column] >= max(min_count, 1)
         by_age = np.argsort(slots.source[used[has]])
@@ -132,7 +117,7 @@ class ParticleMaps:
         left = _ROUND - (self._genealogy.generation - 1) % _ROUND
         stop = self._n_visited + -(-(self._n_used - self._n_visited) // left)
         which = np.arange(self._n_visited, stop)
-        which = which[self.slots.generation[which] != _NEVER]
+        which = which[self.slots.generation[which] != NEVER]
         which = which[self.bring_up_to_date(which)]
         self.moved(which)
         self._n_visited = 0 if left == 1 else stop
@@ -148,27 +133,14 @@ class ParticleMaps:
     def _grow(self) -> None:
         old = self.slots
         capacity, n_particles = old.count.shape
-        self.slots = _allocate(2 * capacity, n_particles)
+        self.slots = allocate(2 * capacity, n_particles)
         for new_column, old_column in zip(self.slots, old, strict=True):
             new_column[:capacity] = old_column
         self._grid.grow(2 * capacity, self.slots.box_m)
 
 
-def _allocate(capacity: int, n_particles: int) -> Slots:
-    return Slots(
-        np.empty((capacity, n_particles, 3)),
-        np.empty((capacity, n_particles, 6)),
-        np.empty((capacity, n_particles), dtype=np.int32),
-        np.full(capacity, _NEVER, dtype=np.int64),
-        np.full(capacity, _NEVER, dtype=np.int64),
-        np.empty((capacity, 4)),
-        np.full((capacity, DESCRIPTOR_LENGTH), np.nan, dtype=np.float32),
-        np.full(capacity, NO_LABEL, dtype=np.int32),
-    )
-
-
 @njit(cache=True)
-def _inherit(slots, which, ancestors, generation):
+def _inherit(slots: Slots, which: np.ndarray, ancestors: np.ndarray, generation: int) -> np.ndarray:
     n_particles = slots.count.shape[1]
     alive = np.zeros(len(which), dtype=np.bool_)
     mean = np.empty((n_particles, 3))
@@ -195,7 +167,14 @@ def _inherit(slots, which, ancestors, generation):
 
 
 @njit(cache=True)
-def _initialise(slots, created, rows, chosen, seen, n_landmarks):
+def _initialise(
+    slots: Slots,
+    created: np.ndarray,
+    rows: np.ndarray,
+    chosen: np.ndarray,
+    seen: Sightings,
+    n_landmarks: np.ndarray,
+) -> None:
     for i in range(len(created)):
         s, k = created[i], rows[i]
         for m in range(len(n_landmarks)):
@@ -209,7 +188,7 @@ def _initialise(slots, created, rows, chosen, seen, n_landmarks):
 
 
 @njit(cache=True)
-def _bound(slots, which, gate):
+def _bound(slots: Slots, which: np.ndarray, gate: float) -> None:
     for s in which:
         box = slots.box_m[s]
         box[:2], box[2:] = np.inf, -np.inf

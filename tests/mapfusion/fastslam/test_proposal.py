@@ -9,9 +9,10 @@ from landmark_worlds import drive, observe, unit
 from mapfusion.fastslam.filter import FastSlam
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.fastslam.parameters import FastSlamParameters
-from mapfusion.fastslam.particles import ParticleMaps, Slots
+from mapfusion.fastslam.particles import ParticleMaps
 from mapfusion.fastslam.proposal import Proposal, informed_disturbance, widened
 from mapfusion.fastslam.sensor import Sightings, sightings
+from mapfusion.fastslam.slots import Slots
 from mapfusion.robot_log import Observations
 from mapfusion.se2 import compose, transform_points
 
