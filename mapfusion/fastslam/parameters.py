@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass, field
 
-from scipy.special import chdtri
-
+from mapfusion.arguments import require_above, require_at_least, require_between
+from mapfusion.chi_square import chi_square_bound
 from mapfusion.fastslam.association import Association
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.fastslam.proposal import Proposal
@@ -52,22 +52,14 @@ class FastSlamParameters:
     def __post_init__(self) -> None:
         object.__setattr__(self, "proposal", Proposal(self.proposal))
         object.__setattr__(self, "association", Association(self.association))
-        if self.n_particles < 1:
-            raise ValueError(f"n_particles: is {self.n_particles}, must be at least 1")
-        if not 0 < self.gate_probability < 1:
-            raise ValueError(f"gate_probability: is {self.gate_probability}, must be in (0, 1)")
-        if not 0 <= self.resample_fraction <= 1:
-            raise ValueError(f"resample_fraction: is {self.resample_fraction}, must be in [0, 1]")
-        if not self.descriptor_threshold > 0:
-            raise ValueError(
-                f"descriptor_threshold: is {self.descriptor_threshold}, must be positive"
-            )
-        if not self.noise_scale > 0:
-            raise ValueError(f"noise_scale: is {self.noise_scale}, must be positive")
-        if not self.noise_floor_m >= 0:
-            raise ValueError(f"noise_floor_m: is {self.noise_floor_m}, must not be negative")
+        require_at_least(1, self, "n_particles")
+        require_between(0, 1, self, "gate_probability")
+        require_at_least(0, self, "resample_fraction", "noise_floor_m")
+        require_above(0, self, "descriptor_threshold", "noise_scale")
+        if self.resample_fraction > 1:
+            raise ValueError(f"resample_fraction: is {self.resample_fraction}, must be at most 1")
 
     @property
     def gate(self) -> float:
         """Largest squared Mahalanobis distance of a match."""
-        return float(chdtri(2 if self.planar else 3, 1 - self.gate_probability))
+        return chi_square_bound(self.gate_probability, 2 if self.planar else 3)
