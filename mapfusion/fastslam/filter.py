@@ -81,7 +81,7 @@ class FastSlam:
         self._n_observations = 0
         self._slot_of_label: dict[int, int] = {}
         self._has_descriptors = self._has_labels = False
-        self._history = History(parameters.n_particles) if keep_history else None
+        self._history = History() if keep_history else None
 
     @property
     def n_slots(self) -> int:

@@ -10,7 +10,6 @@ import numpy as np
 from numba import njit
 
 from mapfusion.fastslam.genealogy import MEMORY, Genealogy
-from mapfusion.fastslam.grid import Grid
 from mapfusion.fastslam.sensor import Sightings
 from mapfusion.fastslam.slots import NEVER, Slots, allocate
 from mapfusion.fastslam.update import NEW
@@ -18,6 +17,7 @@ from mapfusion.robot_log import Observations
 from mapfusion.se2 import Float
 
 _FIRST_CAPACITY = 256
+_NOWHERE = (np.inf, np.inf, -np.inf, -np.inf)  # a box that touches none
 # In so many resamplings all slots are visited once, wherever they lie. Two visits of a slot are
 # then less than twice this apart, which is what the genealogy remembers.
 _ROUND = MEMORY // 2
@@ -36,7 +36,6 @@ class ParticleMaps:
         self.n_landmarks = np.zeros(n_particles, dtype=np.int64)
         self._gate = gate
         self._genealogy = Genealogy(n_particles)
-        self._grid = Grid(_FIRST_CAPACITY)
         self._free: list[int] = []
         self._n_used = 0
         self._n_visited = 0
@@ -48,7 +47,7 @@ class ParticleMaps:
 
     def near(self, box_m: Float) -> np.ndarray:
         """Slots whose box touches `box_m` (4,); they may be out of date."""
-        return self._grid.near(box_m, self.slots.box_m)
+        return _near(self.slots.box_m[: self._n_used], box_m)
 
     def bring_up_to_date(self, which: np.ndarray) -> np.ndarray:
         """Write the particle axis of slots for the present generation; free those nobody has.
@@ -60,15 +59,14 @@ class ParticleMaps:
         alive = _inherit(self.slots, which, genealogy.ancestors, genealogy.generation)
         if not alive.all():
             dead = which[~alive]
-            self._grid.remove(dead)
             self.slots.generation[dead] = NEVER
+            self.slots.box_m[dead] = _NOWHERE
             self._free.extend(dead.tolist())
         return alive
 
     def moved(self, which: np.ndarray) -> None:
-        """Tell that landmarks of these slots, up to date, have changed."""
+        """Tell that landmarks of these slots, up to date, have changed: they may lie elsewhere."""
         _bound(self.slots, which, self._gate)
-        self._grid.place(which, self.slots.box_m)
 
     def create(
         self, chosen: np.ndarray, seen: Sightings, observations: Observations, first_source: int
@@ -136,7 +134,6 @@ class ParticleMaps:
         self.slots = allocate(2 * capacity, n_particles)
         for new_column, old_column in zip(self.slots, old, strict=True):
             new_column[:capacity] = old_column
-        self._grid.grow(2 * capacity, self.slots.box_m)
 
 
 @njit(cache=True)
@@ -185,6 +182,17 @@ def _initialise(
             slots.mean_m[s, m] = seen.point_m[k, m]
             slots.covariance_m2[s, m] = seen.covariance_m2[k, m]
             n_landmarks[m] += 1
+
+
+@njit(cache=True)
+def _near(boxes: Float, box: Float) -> np.ndarray:
+    """Rows of boxes (N, 4) that touch a box; looking at all costs little beside a step."""
+    touches = np.empty(len(boxes), dtype=np.bool_)
+    for s in range(len(boxes)):
+        x = (boxes[s, 0] <= box[2]) & (boxes[s, 2] >= box[0])
+        y = (boxes[s, 1] <= box[3]) & (boxes[s, 3] >= box[1])
+        touches[s] = x & y
+    return np.flatnonzero(touches)
 
 
 @njit(cache=True)
