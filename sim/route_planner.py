@@ -217,6 +217,9 @@ def _pairwise(paths: Sequence[Float]) -> Float:
 def _near(cells: Float, path_m: Float) -> np.ndarray:
     """Which cells' middles (C, 2) lie within `GROUND_HALF_WIDTH_M` of a path (N, 2)."""
     near = np.zeros(len(cells), dtype=bool)
+    reach_m = GROUND_HALF_WIDTH_M + CELL_M
     for start, end in itertools.pairwise(path_m):
-        near |= segment_distance_m(cells, start, end) <= GROUND_HALF_WIDTH_M
+        low, high = np.minimum(start, end) - reach_m, np.maximum(start, end) + reach_m
+        rows = np.flatnonzero(np.all((cells > low) & (cells < high), axis=1))
+        near[rows] |= segment_distance_m(cells[rows], start, end) <= GROUND_HALF_WIDTH_M
     return near
