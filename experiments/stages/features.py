@@ -28,7 +28,7 @@ from sim.trajectory import read_trajectory
 from sim.world import write_faces
 
 SOURCES = ("sim", "mapfusion/vision", "mapfusion/camera.py", "mapfusion/se2.py")
-SOURCES += ("mapfusion/storage.py", "mapfusion/robot_log.py")
+SOURCES += ("mapfusion/storage.py", "mapfusion/robot_log.py", "mapfusion/chi_square.py")
 SOURCES += ("experiments/stages/features.py", "experiments/randomness.py")
 
 FACES_SOURCES = ("sim", "mapfusion/se2.py", "experiments/stages/drive.py")

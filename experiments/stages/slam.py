@@ -28,6 +28,7 @@ from mapfusion.storage import (
 
 SOURCES = (
     "mapfusion/fastslam",
+    "mapfusion/chi_square.py",
     "mapfusion/landmark_map.py",
     "mapfusion/robot_log.py",
     "mapfusion/storage.py",
