@@ -2,4 +2,52 @@
 
 Frames are right-handed: x forward, y left, z up; metres, radians, seconds.
 `T_a_b` maps points given in frame b into frame a.
+
+The names below are what a user needs; each is imported when it is first used, so that
+`import mapfusion` costs nothing; `__init__.pyi` tells editors and type checkers the same. See
+`experiments/docs/library.md` for an example.
 """
+
+import importlib
+from typing import Any
+
+# Registration comes here when it exists, in place of Refinement and Acceptance.
+_NAMES_OF = {
+    "align.acceptance": ("Acceptance",),
+    "align.correspondences": ("Correspondences", "MatchParameters", "match"),
+    "align.refine": ("Refinement",),
+    "align.registry": ("Aligner", "make_aligner"),
+    "align.result": ("Alignment", "Status"),
+    "errors": ("InputError",),
+    "fastslam.association": ("Association",),
+    "fastslam.filter": ("FastSlam", "StepResult"),
+    "fastslam.motion": ("MotionNoise",),
+    "fastslam.parameters": ("FastSlamParameters",),
+    "fastslam.proposal": ("Proposal",),
+    "fastslam.run": ("build_map", "run_log"),
+    "landmark_map": ("LandmarkMap", "read_map", "write_map"),
+    "merge": ("FusedMap", "MergeParameters", "merge_maps"),
+    "recordings.registry": ("import_recording",),
+    "robot_log": ("Observations", "RobotLog", "read_log", "write_log"),
+}
+_MODULE_OF = {name: module for module, names in _NAMES_OF.items() for name in names}
+_CALLED_THERE = {"merge_maps": "merge"}
+
+__all__ = sorted(_MODULE_OF)  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("mapfusion")
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module = importlib.import_module(f"{__name__}.{_MODULE_OF[name]}")
+    value = getattr(module, _CALLED_THERE.get(name, name))
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__, "__version__"})

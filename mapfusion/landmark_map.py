@@ -4,7 +4,7 @@ One map is one Parquet file, readable with plain pandas, complete in itself: the
 label) of the observation that each landmark came from is carried with it.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,13 @@ import pyarrow as pa
 
 from mapfusion.arguments import require_finite, require_shape
 from mapfusion.errors import InputError
-from mapfusion.robot_log import DESCRIPTOR_LENGTH, NO_LABEL
+from mapfusion.robot_log import (
+    DESCRIPTOR_LENGTH,
+    LOOK_FIELDS,
+    look_columns,
+    looks_from,
+    with_rows,
+)
 from mapfusion.se2 import Float
 from mapfusion.storage import (
     column,
@@ -31,8 +37,7 @@ LANDMARKS = schema(
         *point_fields(),  # in the map's frame
         pa.field("count", pa.int32()),  # observations that went into the landmark
         pa.field("source_observation", pa.int64()),  # row of the log; -1 in a fused map
-        pa.field("label", pa.int32()),  # known identity, -1 for none
-        pa.field("descriptor", pa.list_(pa.float32(), DESCRIPTOR_LENGTH)),  # NaN for none
+        *LOOK_FIELDS,
     ],
 )
 
@@ -59,7 +64,7 @@ class LandmarkMap:
     descriptor: np.ndarray | None = None
     label: np.ndarray | None = None
     planar: bool = False
-    name: str = field(default="map")
+    name: str = "map"
 
     def __post_init__(self) -> None:
         n = len(self.position_m)
@@ -78,33 +83,18 @@ class LandmarkMap:
         return len(self.position_m)
 
     def __getitem__(self, rows: np.ndarray) -> "LandmarkMap":
-        return LandmarkMap(
-            self.position_m[rows],
-            self.covariance_m2[rows],
-            self.count[rows],
-            self.source_observation[rows],
-            None if self.descriptor is None else self.descriptor[rows],
-            None if self.label is None else self.label[rows],
-            self.planar,
-            self.name,
-        )
+        return with_rows(self, rows)
 
 
 def write_map(path: Path, landmarks: LandmarkMap) -> None:
     """Write one map to one file."""
-    n = len(landmarks)
-    descriptor = landmarks.descriptor
-    if descriptor is None:
-        descriptor = np.full((n, DESCRIPTOR_LENGTH), np.nan)
-    label = landmarks.label if landmarks.label is not None else np.full(n, NO_LABEL)
     write_table(
         path,
         {
             **point_columns(landmarks.position_m, landmarks.covariance_m2),
             "count": landmarks.count.astype(np.int32),
             "source_observation": landmarks.source_observation.astype(np.int64),
-            "label": label.astype(np.int32),
-            "descriptor": descriptor.astype(np.float32),
+            **look_columns(len(landmarks), landmarks.descriptor, landmarks.label),
         },
         LANDMARKS,
         {"name": landmarks.name, "planar": str(landmarks.planar).lower()},
@@ -115,16 +105,13 @@ def read_map(path: Path) -> LandmarkMap:
     """Read a map; raises InputError that names the file."""
     table, attributes = read_table(path, LANDMARKS)
     position, covariance = points_from(table)
-    descriptor = column(table, "descriptor")
-    label = column(table, "label")
     try:
         return LandmarkMap(
             position,
             covariance,
             column(table, "count"),
             column(table, "source_observation"),
-            None if np.isnan(descriptor).all() else descriptor,
-            None if np.all(label == NO_LABEL) else label,
+            *looks_from(table),
             attributes.get("planar") == "true",
             attributes.get("name", path.stem),
         )

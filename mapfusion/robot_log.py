@@ -7,8 +7,9 @@ A log is a folder of Parquet tables (each readable with plain pandas):
 - `truth_poses.parquet`, `truth_points.parquet`: optional; only the evaluation opens them.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -17,7 +18,12 @@ from mapfusion.arguments import require_finite, require_shape
 from mapfusion.errors import InputError
 from mapfusion.se2 import Float
 from mapfusion.storage import (
+    POSE_FIELDS,
+    POSITION_FIELDS,
     column,
+    columns,
+    float_fields,
+    named_columns,
     point_columns,
     point_fields,
     points_from,
@@ -26,19 +32,26 @@ from mapfusion.storage import (
     write_table,
 )
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
 DESCRIPTOR_LENGTH = 64
 NO_LABEL = -1
+Arrays = TypeVar("Arrays", bound="DataclassInstance")
+LOOK_FIELDS = [
+    pa.field("label", pa.int32()),  # known identity, -1 for none
+    pa.field("descriptor", pa.list_(pa.float32(), DESCRIPTOR_LENGTH)),  # NaN for none
+]
+# motion since the row before, in the robot frame of the row before
+_ODOMETRY_FIELDS = ["odometry_x_m", "odometry_y_m", "odometry_theta_rad"]
+_PIXEL_FIELDS = ["u_px", "v_px", "disparity_px"]  # left image; NaN where there are no images
 
 FRAMES = schema(
     "robot_log.frames",
     1,
     [
         pa.field("iteration", pa.int32()),
-        pa.field("time_s", pa.float64()),
-        # motion since the row before, in the robot frame of the row before
-        pa.field("odometry_x_m", pa.float64()),
-        pa.field("odometry_y_m", pa.float64()),
-        pa.field("odometry_theta_rad", pa.float64()),
+        *float_fields(["time_s", *_ODOMETRY_FIELDS]),
     ],
 )
 OBSERVATIONS = schema(
@@ -47,11 +60,8 @@ OBSERVATIONS = schema(
     [
         pa.field("iteration", pa.int32()),
         *point_fields(),  # in the robot frame
-        pa.field("u_px", pa.float32()),  # left image; NaN where there are no images
-        pa.field("v_px", pa.float32()),
-        pa.field("disparity_px", pa.float32()),
-        pa.field("label", pa.int32()),  # known identity, -1 for none
-        pa.field("descriptor", pa.list_(pa.float32(), DESCRIPTOR_LENGTH)),  # NaN for none
+        *(pa.field(name, pa.float32()) for name in _PIXEL_FIELDS),
+        *LOOK_FIELDS,
     ],
 )
 TRUTH_POSES = schema(
@@ -59,21 +69,37 @@ TRUTH_POSES = schema(
     1,
     [
         pa.field("iteration", pa.int32()),
-        pa.field("x_m", pa.float64()),  # T_world_robot; NaN where unknown
-        pa.field("y_m", pa.float64()),
-        pa.field("theta_rad", pa.float64()),
+        *float_fields(POSE_FIELDS),  # T_world_robot; NaN where unknown
     ],
 )
-TRUTH_POINTS = schema(
-    "robot_log.truth_points",
-    1,
-    [
-        # row i is the point of the world that observation i shows; NaN where unknown
-        pa.field("x_m", pa.float64()),
-        pa.field("y_m", pa.float64()),
-        pa.field("z_m", pa.float64()),
-    ],
-)
+# row i is the point of the world that observation i shows; NaN where unknown
+TRUTH_POINTS = schema("robot_log.truth_points", 1, float_fields(POSITION_FIELDS))
+
+
+def with_rows(value: Arrays, rows: slice | np.ndarray) -> Arrays:
+    """The same dataclass with each of its arrays cut to some rows."""
+    arrays = {name: v[rows] for name, v in vars(value).items() if isinstance(v, np.ndarray)}
+    return replace(value, **arrays)
+
+
+def look_columns(
+    n: int, descriptor: np.ndarray | None, label: np.ndarray | None
+) -> dict[str, np.ndarray]:
+    """By what n points are recognised, as the columns of `LOOK_FIELDS`."""
+    if descriptor is None:
+        descriptor = np.full((n, DESCRIPTOR_LENGTH), np.nan)
+    if label is None:
+        label = np.full(n, NO_LABEL)
+    return {"label": label.astype(np.int32), "descriptor": descriptor.astype(np.float32)}
+
+
+def looks_from(table: pa.Table) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Descriptors and labels of a table, None where no row has any."""
+    descriptor, label = column(table, "descriptor"), column(table, "label")
+    return (
+        None if np.isnan(descriptor).all() else descriptor,
+        None if np.all(label == NO_LABEL) else label,
+    )
 
 
 @dataclass(frozen=True)
@@ -111,13 +137,7 @@ class Observations:
         return len(self.position_m)
 
     def __getitem__(self, rows: slice | np.ndarray) -> "Observations":
-        return Observations(
-            self.position_m[rows],
-            self.covariance_m2[rows],
-            None if self.descriptor is None else self.descriptor[rows],
-            None if self.label is None else self.label[rows],
-            None if self.uvd_px is None else self.uvd_px[rows],
-        )
+        return with_rows(self, rows)
 
 
 @dataclass(frozen=True)
@@ -170,20 +190,13 @@ def write_observations(folder: Path, iteration: np.ndarray, observations: Observ
     """Write `observations.parquet` into a log's folder."""
     n = len(observations)
     uvd = observations.uvd_px if observations.uvd_px is not None else np.full((n, 3), np.nan)
-    descriptor = observations.descriptor
-    if descriptor is None:
-        descriptor = np.full((n, DESCRIPTOR_LENGTH), np.nan)
-    label = observations.label if observations.label is not None else np.full(n, NO_LABEL)
     write_table(
         folder / "observations.parquet",
         {
             "iteration": iteration.astype(np.int32),
             **point_columns(observations.position_m, observations.covariance_m2),
-            "u_px": uvd[:, 0].astype(np.float32),
-            "v_px": uvd[:, 1].astype(np.float32),
-            "disparity_px": uvd[:, 2].astype(np.float32),
-            "label": label.astype(np.int32),
-            "descriptor": descriptor.astype(np.float32),
+            **named_columns(_PIXEL_FIELDS, uvd.astype(np.float32)),
+            **look_columns(n, observations.descriptor, observations.label),
         },
         OBSERVATIONS,
     )
@@ -194,16 +207,10 @@ def read_observations(folder: Path) -> tuple[np.ndarray, Observations]:
     path = folder / "observations.parquet"
     table, _ = read_table(path, OBSERVATIONS)
     position, covariance = points_from(table)
-    uvd = np.stack([column(table, name) for name in ("u_px", "v_px", "disparity_px")], -1)
-    descriptor = column(table, "descriptor")
-    label = column(table, "label")
+    uvd = columns(table, _PIXEL_FIELDS)
     try:
         observations = Observations(
-            position,
-            covariance,
-            None if np.isnan(descriptor).all() else descriptor,
-            None if np.all(label == NO_LABEL) else label,
-            None if np.isnan(uvd).all() else uvd,
+            position, covariance, *looks_from(table), None if np.isnan(uvd).all() else uvd
         )
     except ValueError as error:
         raise InputError(f"{path}: {error}") from error
@@ -217,9 +224,7 @@ def write_frames(folder: Path, robot: str, planar: bool, time_s: Float, odometry
         {
             "iteration": np.arange(len(time_s), dtype=np.int32),
             "time_s": time_s,
-            "odometry_x_m": odometry[:, 0],
-            "odometry_y_m": odometry[:, 1],
-            "odometry_theta_rad": odometry[:, 2],
+            **named_columns(_ODOMETRY_FIELDS, odometry),
         },
         FRAMES,
         {"robot": robot, "planar": str(planar).lower()},
@@ -239,13 +244,12 @@ def read_log(folder: Path) -> RobotLog:
         raise InputError(f"{folder}: no such folder (expected a robot log with frames.parquet)")
     frames, attributes = read_table(path, FRAMES)
     iteration, observations = read_observations(folder)
-    odometry_names = ("odometry_x_m", "odometry_y_m", "odometry_theta_rad")
     try:
         return RobotLog(
             robot=attributes.get("robot", folder.name),
             planar=attributes.get("planar") == "true",
             time_s=column(frames, "time_s"),
-            odometry=np.stack([column(frames, name) for name in odometry_names], -1),
+            odometry=columns(frames, _ODOMETRY_FIELDS),
             iteration=iteration,
             observations=observations,
         )
@@ -257,7 +261,7 @@ def write_truth_points(folder: Path, point_world_m: Float) -> None:
     """Write `truth_points.parquet`: (N, 3), row i belongs to observation i."""
     write_table(
         folder / "truth_points.parquet",
-        {name: point_world_m[:, i] for i, name in enumerate(("x_m", "y_m", "z_m"))},
+        named_columns(POSITION_FIELDS, point_world_m),
         TRUTH_POINTS,
     )
 
@@ -268,7 +272,7 @@ def write_truth_poses(folder: Path, T_world_robot: Float) -> None:
         folder / "truth_poses.parquet",
         {
             "iteration": np.arange(len(T_world_robot), dtype=np.int32),
-            **{n: T_world_robot[:, i] for i, n in enumerate(("x_m", "y_m", "theta_rad"))},
+            **named_columns(POSE_FIELDS, T_world_robot),
         },
         TRUTH_POSES,
     )
@@ -278,7 +282,4 @@ def read_truth(folder: Path) -> RobotTruth:
     """Read the truth beside a log; raises InputError. For evaluation only."""
     poses, _ = read_table(folder / "truth_poses.parquet", TRUTH_POSES)
     points, _ = read_table(folder / "truth_points.parquet", TRUTH_POINTS)
-    return RobotTruth(
-        np.stack([column(poses, name) for name in ("x_m", "y_m", "theta_rad")], -1),
-        np.stack([column(points, name) for name in ("x_m", "y_m", "z_m")], -1),
-    )
+    return RobotTruth(columns(poses, POSE_FIELDS), columns(points, POSITION_FIELDS))

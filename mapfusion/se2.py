@@ -17,8 +17,11 @@ def wrap(angle_rad: ArrayLike) -> Float:
 def rotation(theta_rad: ArrayLike) -> Float:
     """Counter-clockwise rotations (..., 2, 2) by theta (...)."""
     theta = np.asarray(theta_rad, dtype=np.float64)
-    cos, sin = np.cos(theta), np.sin(theta)
-    return np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
+    matrix = np.empty((*theta.shape, 2, 2))
+    matrix[..., 0, 0] = matrix[..., 1, 1] = np.cos(theta)
+    matrix[..., 1, 0] = np.sin(theta)
+    matrix[..., 0, 1] = -matrix[..., 1, 0]
+    return matrix
 
 
 def rotation_about_z(theta_rad: ArrayLike) -> Float:

@@ -2,7 +2,7 @@
 
 import os
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -107,29 +107,41 @@ def column(table: pa.Table, name: str) -> np.ndarray:
     return values.to_numpy(zero_copy_only=False)
 
 
+def columns(table: pa.Table, names: Sequence[str]) -> np.ndarray:
+    """Several columns as one array (N, len(names))."""
+    return np.stack([column(table, name) for name in names], -1)
+
+
+def named_columns(names: Sequence[str], values: np.ndarray) -> dict[str, np.ndarray]:
+    """The inverse of `columns`."""
+    return dict(zip(names, values.T, strict=True))
+
+
+def float_fields(names: Sequence[str]) -> list[pa.Field]:
+    """Schema fields of columns of numbers."""
+    return [pa.field(name, pa.float64()) for name in names]
+
+
 COVARIANCE_FIELDS = ["cov_xx_m2", "cov_xy_m2", "cov_xz_m2", "cov_yy_m2", "cov_yz_m2", "cov_zz_m2"]
 POSITION_FIELDS = ["x_m", "y_m", "z_m"]
+POSE_FIELDS = ["x_m", "y_m", "theta_rad"]
 _UPPER = np.triu_indices(3)
 
 
 def point_columns(position_m: np.ndarray, covariance_m2: np.ndarray) -> dict[str, np.ndarray]:
     """Positions (N, 3) and covariances (N, 3, 3) as the nine flat columns they are stored in."""
     upper = covariance_m2[:, _UPPER[0], _UPPER[1]]
-    return {name: position_m[:, i] for i, name in enumerate(POSITION_FIELDS)} | {
-        name: upper[:, i] for i, name in enumerate(COVARIANCE_FIELDS)
-    }
+    return named_columns(POSITION_FIELDS, position_m) | named_columns(COVARIANCE_FIELDS, upper)
 
 
 def points_from(table: pa.Table) -> tuple[np.ndarray, np.ndarray]:
     """The inverse of `point_columns`."""
-    position = np.stack([column(table, name) for name in POSITION_FIELDS], -1)
-    covariance = np.empty((len(position), 3, 3))
-    for i, name in enumerate(COVARIANCE_FIELDS):
-        row, col = _UPPER[0][i], _UPPER[1][i]
-        covariance[:, row, col] = covariance[:, col, row] = column(table, name)
-    return position, covariance
+    upper = columns(table, COVARIANCE_FIELDS)
+    covariance = np.empty((len(upper), 3, 3))
+    covariance[:, _UPPER[0], _UPPER[1]] = covariance[:, _UPPER[1], _UPPER[0]] = upper
+    return columns(table, POSITION_FIELDS), covariance
 
 
 def point_fields() -> list[pa.Field]:
     """Schema fields of `point_columns`."""
-    return [pa.field(name, pa.float64()) for name in POSITION_FIELDS + COVARIANCE_FIELDS]
+    return float_fields(POSITION_FIELDS + COVARIANCE_FIELDS)

@@ -129,11 +129,12 @@ def _best_routes(
     choices = list(itertools.islice(itertools.product(*map(range, map(len, offered))), 200_000))
     order = rng.permutation(len(choices))[:MOST_CHOICES]
     shared = _pairwise([np.concatenate([loop, loop[:1]]) for loops in per_wing for loop in loops])
-    first = np.cumsum([0, *map(len, per_wing)]) if len(per_wing) > 1 else np.zeros(len(offered))
+    first = (
+        np.cumsum([0, *map(len, per_wing)]) if len(per_wing) > 1 else np.zeros(len(offered), int)
+    )
     best, best_miss = None, np.inf
-    for k in order:
-        rows = [int(first[robot]) + loop for robot, loop in enumerate(choices[k])]
-        overlap = _mean_pair(shared, rows)
+    overlaps = _mean_pair(shared, np.array(choices)[order] + first[: len(offered)])
+    for k, overlap in zip(order, overlaps.tolist(), strict=True):
         if abs(overlap - parameters.overlap) < best_miss:
             starts = _starts([offered[i][loop] for i, loop in enumerate(choices[k])], rng)
             if starts is not None:
@@ -142,9 +143,12 @@ def _best_routes(
     return best
 
 
-def _mean_pair(shared: Float, rows: Sequence[int]) -> float:
-    pairs = [shared[a, b] for a, b in itertools.combinations(rows, 2)]
-    return float(np.mean(pairs)) if pairs else 1.0
+def _mean_pair(shared: Float, rows: np.ndarray) -> Float:
+    """Overlap (C,) of sets of paths (C, R): the mean over the pairs in a set, 1 without any."""
+    pairs = [
+        shared[rows[:, a], rows[:, b]] for a, b in itertools.combinations(range(rows.shape[1]), 2)
+    ]
+    return np.mean(pairs, axis=0) if pairs else np.ones(len(rows))
 
 
 def _loops(wing: Wing, parameters: RouteParameters, westward: bool) -> list[Float]:
@@ -213,6 +217,9 @@ def _pairwise(paths: Sequence[Float]) -> Float:
 def _near(cells: Float, path_m: Float) -> np.ndarray:
     """Which cells' middles (C, 2) lie within `GROUND_HALF_WIDTH_M` of a path (N, 2)."""
     near = np.zeros(len(cells), dtype=bool)
+    reach_m = GROUND_HALF_WIDTH_M + CELL_M
     for start, end in itertools.pairwise(path_m):
-        near |= segment_distance_m(cells, start, end) <= GROUND_HALF_WIDTH_M
+        low, high = np.minimum(start, end) - reach_m, np.maximum(start, end) + reach_m
+        rows = np.flatnonzero(np.all((cells > low) & (cells < high), axis=1))
+        near[rows] |= segment_distance_m(cells[rows], start, end) <= GROUND_HALF_WIDTH_M
     return near

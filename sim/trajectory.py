@@ -13,8 +13,18 @@ import pyarrow as pa
 from mapfusion.arguments import require_finite, require_shape
 from mapfusion.errors import InputError
 from mapfusion.se2 import Float
-from mapfusion.storage import column, read_table, schema, write_table
+from mapfusion.storage import (
+    POSE_FIELDS,
+    column,
+    columns,
+    float_fields,
+    named_columns,
+    read_table,
+    schema,
+    write_table,
+)
 
+_WHEEL_FIELDS = ["left_wheel_rad", "right_wheel_rad"]
 TRAJECTORY = schema(
     "trajectory",
     1,
@@ -22,12 +32,8 @@ TRAJECTORY = schema(
         pa.field("robot", pa.string()),
         pa.field("iteration", pa.int32()),
         pa.field("time_s", pa.float64()),
-        pa.field("x_m", pa.float64()),  # T_world_robot
-        pa.field("y_m", pa.float64()),
-        pa.field("theta_rad", pa.float64()),
-        # encoders since the start, mean of the wheels of a side
-        pa.field("left_wheel_rad", pa.float64()),
-        pa.field("right_wheel_rad", pa.float64()),
+        *float_fields(POSE_FIELDS),  # T_world_robot
+        *float_fields(_WHEEL_FIELDS),  # encoders since the start, mean of the wheels of a side
     ],
 )
 
@@ -73,19 +79,14 @@ class Trajectory:
 def write_trajectory(path: Path, trajectory: Trajectory) -> None:
     """Write a trajectory to one file."""
     n_robots, n_frames = len(trajectory.robots), len(trajectory)
-    poses = trajectory.T_world_robot.reshape(-1, 3)
-    wheels = trajectory.wheel_rad.reshape(-1, 2)
     write_table(
         path,
         {
             "robot": np.repeat(np.array(trajectory.robots, dtype=object), n_frames),
             "iteration": np.tile(np.arange(n_frames, dtype=np.int32), n_robots),
             "time_s": np.tile(trajectory.time_s, n_robots),
-            "x_m": poses[:, 0],
-            "y_m": poses[:, 1],
-            "theta_rad": poses[:, 2],
-            "left_wheel_rad": wheels[:, 0],
-            "right_wheel_rad": wheels[:, 1],
+            **named_columns(POSE_FIELDS, trajectory.T_world_robot.reshape(-1, 3)),
+            **named_columns(_WHEEL_FIELDS, trajectory.wheel_rad.reshape(-1, 2)),
         },
         TRAJECTORY,
     )
@@ -112,14 +113,12 @@ def read_trajectory(path: Path) -> Trajectory:
             f"{path}: rows must be ordered by robot, then iteration 0, 1, 2, ..., "
             "at the same times for all robots"
         )
-    poses = np.stack([column(table, name) for name in ("x_m", "y_m", "theta_rad")], -1)
-    wheels = np.stack([column(table, name) for name in ("left_wheel_rad", "right_wheel_rad")], -1)
     try:
         return Trajectory(
             robots,
             time_s[:n_frames],
-            poses.reshape(len(robots), n_frames, 3),
-            wheels.reshape(len(robots), n_frames, 2),
+            columns(table, POSE_FIELDS).reshape(len(robots), n_frames, 3),
+            columns(table, _WHEEL_FIELDS).reshape(len(robots), n_frames, 2),
         )
     except ValueError as error:
         raise InputError(f"{path}: {error}") from error

@@ -8,6 +8,7 @@ import typer
 
 from experiments.cli import run_commands, step_commands, study_commands
 from experiments.cli.options import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_INTERRUPTED
+from mapfusion.recordings.registry import IMPORTERS
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -34,7 +35,9 @@ app.command()(step_commands.slam)
 app.command()(step_commands.align)
 app.command()(step_commands.merge)
 import_app = typer.Typer(no_args_is_help=True, help="Turn recordings of others into robot logs.")
-import_app.command("mrclam")(step_commands.import_mrclam_command)
+for name, importer in IMPORTERS.items():
+    usage = f"`mapfusion import {name} {importer.example} -o logs/{name}`"
+    import_app.command(name, help=f"{importer.what}: {usage}.")(step_commands.import_command(name))
 app.add_typer(import_app, name="import")
 
 

@@ -1,5 +1,6 @@
 """Commands that do one step on files: record, slam, align, merge, import."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -14,6 +15,7 @@ from experiments.cli.options import (
     Seed,
     available_cores,
 )
+from mapfusion.recordings.registry import import_recording
 
 
 def record(
@@ -91,12 +93,15 @@ def merge(
     print_fused(output, fused, joined)
 
 
-def import_mrclam_command(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="An MRCLAM recording.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the logs.")],
-) -> None:
-    """UTIAS MRCLAM recordings: `mapfusion import mrclam MRCLAM_Dataset7 -o logs/mrclam7`."""
-    from experiments.mrclam import import_mrclam
-    from experiments.show.terminal.layout import print_paths
+def import_command(format_name: str) -> Callable[[Path, Path], None]:
+    """The command that reads recordings of one format."""
 
-    print_paths(output, import_mrclam(folder, output))
+    def command(
+        folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="The recording.")],
+        output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the logs.")],
+    ) -> None:
+        from experiments.show.terminal.layout import print_paths
+
+        print_paths(output, import_recording(format_name, folder, output))
+
+    return command

@@ -76,7 +76,9 @@ class HeightGate:
         """Most for the squared difference of two heights over its variance."""
         return chi_square_bound(self.probability, 1)
 
-    def agrees(self, z_a_m: Float, variance_a_m2: Float, z_b_m: Float, variance_b_m2: Float):
+    def agrees(
+        self, z_a_m: Float, variance_a_m2: Float, z_b_m: Float, variance_b_m2: Float
+    ) -> np.ndarray:
         """Bool array: heights that agree; arguments broadcast."""
         variance = variance_a_m2 + variance_b_m2 + self.floor_m**2
         return (z_a_m - z_b_m) ** 2 <= self.bound * variance
@@ -87,11 +89,13 @@ class MatchParameters:
     """How landmarks are paired.
 
     Attributes:
-        max_descriptor_distance: between unit vectors, so 0 is equal and sqrt(2) unrelated.
+        max_descriptor_distance: between unit vectors, so 0 is equal and sqrt(2) unrelated. The
+            default offers almost every mutual nearest neighbour, as the paper does: sorting out
+            the false ones is the aligner's part.
         height: which heights can be the same.
     """
 
-    max_descriptor_distance: float = 0.3
+    max_descriptor_distance: float = 0.6
     height: HeightGate = HeightGate()
 
     def __post_init__(self) -> None:

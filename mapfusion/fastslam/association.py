@@ -12,7 +12,9 @@ from numba import njit
 
 from mapfusion.fastslam.particles import ParticleMaps
 from mapfusion.fastslam.sensor import Sightings, innovation, quadratic_form
+from mapfusion.fastslam.slots import Slots
 from mapfusion.fastslam.update import DROPPED, NEW
+from mapfusion.se2 import Float
 
 
 class Association(StrEnum):
@@ -31,7 +33,7 @@ class Pairs(NamedTuple):
 
 
 @njit(cache=True)
-def boxes_of(seen, gate):
+def boxes_of(seen: Sightings, gate: float) -> Float:
     """Boxes (K, 4) of observations and their gates over all particles."""
     boxes = np.empty((len(seen.point_m), 4))
     for k in range(len(boxes)):
@@ -91,7 +93,9 @@ def pairs_of_labels(
 
 
 @njit(cache=True)
-def _touching(slots, names, boxes, descriptor, threshold):
+def _touching(
+    slots: Slots, names: np.ndarray, boxes: Float, descriptor: np.ndarray, threshold: np.float32
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     observation = np.empty(len(boxes) * len(names), dtype=np.int64)
     slot = np.empty(len(observation), dtype=np.int64)
     distance = np.empty(len(observation), dtype=np.float32)
@@ -147,13 +151,22 @@ def choose(
 
 
 @njit(cache=True)
-def _distance(point, noise, mean, sigma, m, planar):
-    dx, dy, dz, ixx, ixy, ixz, iyy, iyz, izz, _ = innovation(point, noise, mean, sigma, m, planar)
-    return quadratic_form(dx, dy, dz, ixx, ixy, ixz, iyy, iyz, izz)
+def _distance(point: Float, noise: Float, mean: Float, sigma: Float, m: int, planar: bool) -> float:
+    difference, inverse, _ = innovation(point, noise, mean, sigma, m, planar)
+    return quadratic_form(difference, inverse)
 
 
 @njit(cache=True)
-def _take_in_order(slots, pairs, place, taken, seen, gate, planar, chosen):
+def _take_in_order(
+    slots: Slots,
+    pairs: Pairs,
+    place: np.ndarray,
+    taken: np.ndarray,
+    seen: Sightings,
+    gate: float,
+    planar: bool,
+    chosen: np.ndarray,
+) -> None:
     for i in range(len(place)):
         k, s, j = pairs.observation[i], pairs.slot[i], place[i]
         point, noise = seen.point_m[k], seen.covariance_m2[k]
@@ -167,7 +180,16 @@ def _take_in_order(slots, pairs, place, taken, seen, gate, planar, chosen):
 
 
 @njit(cache=True)
-def _take_nearest(slots, pairs, place, taken, seen, gate, planar, chosen):
+def _take_nearest(
+    slots: Slots,
+    pairs: Pairs,
+    place: np.ndarray,
+    taken: np.ndarray,
+    seen: Sightings,
+    gate: float,
+    planar: bool,
+    chosen: np.ndarray,
+) -> None:
     n_particles = chosen.shape[1]
     distance = np.full((n_particles, len(place)), np.inf)
     for i in range(len(place)):

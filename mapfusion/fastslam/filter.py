@@ -75,12 +75,13 @@ class FastSlam:
         self._rng = rng
         self._poses = np.zeros((parameters.n_particles, 3))
         self._log_weights = np.full(parameters.n_particles, -np.log(parameters.n_particles))
+        self._planar = bool(parameters.planar)
         self._maps = ParticleMaps(parameters.n_particles, parameters.gate)
         self._best = 0
         self._n_observations = 0
         self._slot_of_label: dict[int, int] = {}
         self._has_descriptors = self._has_labels = False
-        self._history = History(parameters.n_particles) if keep_history else None
+        self._history = History() if keep_history else None
 
     @property
     def n_slots(self) -> int:
@@ -105,7 +106,7 @@ class FastSlam:
         odometry = np.asarray(odometry, dtype=np.float64)
         self._check(odometry, observations)
         noise, log_new = self._noise(observations)
-        planar = self.parameters.planar
+        planar = self._planar
 
         self._poses, log_ratio = self._propose(odometry, observations, noise)
         seen = sightings(self._poses, observations.position_m, noise, planar)
@@ -130,7 +131,7 @@ class FastSlam:
             source_observation=slots.source[which],
             descriptor=slots.descriptor[which] if self._has_descriptors else None,
             label=slots.label[which] if self._has_labels else None,
-            planar=self.parameters.planar,
+            planar=self._planar,
         )
 
     def best_path(self) -> Float:
@@ -171,7 +172,7 @@ class FastSlam:
         settings = self.parameters
         noise = settings.noise_scale**2 * observations.covariance_m2
         noise = noise + settings.noise_floor_m**2 * np.eye(3)
-        log_new = log_density_at_gate(noise, settings.gate, settings.planar)
+        log_new = log_density_at_gate(noise, settings.gate, self._planar)
         if settings.log_new_landmark_density is not None:
             log_new[:] = settings.log_new_landmark_density
         return noise, log_new
@@ -192,7 +193,7 @@ class FastSlam:
             poses = sample_motion(self._poses, odometry, settings.motion, self._rng)
             return poses, np.zeros(settings.n_particles)
         predicted = compose(self._poses, odometry)
-        seen = sightings(predicted, observations.position_m, noise, settings.planar)
+        seen = sightings(predicted, observations.position_m, noise, self._planar)
         wide = widened(seen, predicted, odometry, sigma)
         chosen, _ = self._associate(wide, observations)
         eta, log_ratio = informed_disturbance(
@@ -203,7 +204,7 @@ class FastSlam:
             odometry[2],
             sigma,
             settings.gate,
-            settings.planar,
+            self._planar,
             self._rng.standard_normal(predicted.shape),
         )
         return compose(self._poses, odometry + sigma * eta), log_ratio
@@ -230,7 +231,7 @@ class FastSlam:
         else:
             pairs = pairs_nearby(self._maps, seen, settings.gate)
         nearest = settings.association is Association.GATE
-        return choose(self._maps, pairs, seen, may_create, settings.gate, settings.planar, nearest)
+        return choose(self._maps, pairs, seen, may_create, settings.gate, self._planar, nearest)
 
     def _start_landmarks(
         self, chosen: np.ndarray, seen: Sightings, observations: Observations

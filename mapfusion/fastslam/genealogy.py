@@ -9,7 +9,7 @@ from numba import njit
 
 # Generations that are remembered. Every landmark is written at least once in this many resamplings
 # (see `particles.py`); a longer memory costs each resampling more, a shorter one makes that
-# refreshing dearer. At 200 particles both then cost well under a tenth of a millisecond.
+# refreshing dearer.
 MEMORY = 256
 
 
@@ -30,7 +30,7 @@ class Genealogy:
 
 
 @njit(cache=True)
-def _compose(table, ancestors, newest):
+def _compose(table: np.ndarray, ancestors: np.ndarray, newest: int) -> None:
     n_particles = table.shape[1]
     old = np.empty(n_particles, dtype=table.dtype)
     for row in range(len(table)):

@@ -6,36 +6,21 @@ notes who descends from whom (`genealogy.py`); a slot is brought up to date when
 Slots that no surviving particle has are freed.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 from numba import njit
 
 from mapfusion.fastslam.genealogy import MEMORY, Genealogy
-from mapfusion.fastslam.grid import Grid
 from mapfusion.fastslam.sensor import Sightings
+from mapfusion.fastslam.slots import NEVER, Slots, allocate
 from mapfusion.fastslam.update import NEW
-from mapfusion.robot_log import DESCRIPTOR_LENGTH, NO_LABEL, Observations
+from mapfusion.robot_log import Observations
 from mapfusion.se2 import Float
 
 _FIRST_CAPACITY = 256
-_NEVER = -1
+_NOWHERE = (np.inf, np.inf, -np.inf, -np.inf)  # a box that touches none
 # In so many resamplings all slots are visited once, wherever they lie. Two visits of a slot are
 # then less than twice this apart, which is what the genealogy remembers.
 _ROUND = MEMORY // 2
-
-
-class Slots(NamedTuple):
-    """Landmark-major state of S slots and M particles. Rows of free slots mean nothing."""
-
-    mean_m: np.ndarray  # (S, M, 3)
-    covariance_m2: np.ndarray  # (S, M, 6) upper entries
-    count: np.ndarray  # (S, M) int32 observations; 0: the particle does not have it
-    generation: np.ndarray  # (S,) in which the particle axis was written; _NEVER: free
-    source: np.ndarray  # (S,) the observation it came from
-    box_m: np.ndarray  # (S, 4) min_x, min_y, max_x, max_y of mean and gate over all particles
-    descriptor: np.ndarray  # (S, 64) float32
-    label: np.ndarray  # (S,) int32
 
 
 class ParticleMaps:
@@ -47,11 +32,10 @@ class ParticleMaps:
     """
 
     def __init__(self, n_particles: int, gate: float) -> None:
-        self.slots = _allocate(_FIRST_CAPACITY, n_particles)
+        self.slots = allocate(_FIRST_CAPACITY, n_particles)
         self.n_landmarks = np.zeros(n_particles, dtype=np.int64)
         self._gate = gate
         self._genealogy = Genealogy(n_particles)
-        self._grid = Grid(_FIRST_CAPACITY)
         self._free: list[int] = []
         self._n_used = 0
         self._n_visited = 0
@@ -63,7 +47,7 @@ class ParticleMaps:
 
     def near(self, box_m: Float) -> np.ndarray:
         """Slots whose box touches `box_m` (4,); they may be out of date."""
-        return self._grid.near(box_m, self.slots.box_m)
+        return _near(self.slots.box_m[: self._n_used], box_m)
 
     def bring_up_to_date(self, which: np.ndarray) -> np.ndarray:
         """Write the particle axis of slots for the present generation; free those nobody has.
@@ -75,15 +59,14 @@ class ParticleMaps:
         alive = _inherit(self.slots, which, genealogy.ancestors, genealogy.generation)
         if not alive.all():
             dead = which[~alive]
-            self._grid.remove(dead)
-            self.slots.generation[dead] = _NEVER
+            self.slots.generation[dead] = NEVER
+            self.slots.box_m[dead] = _NOWHERE
             self._free.extend(dead.tolist())
         return alive
 
     def moved(self, which: np.ndarray) -> None:
-        """Tell that landmarks of these slots, up to date, have changed."""
+        """Tell that landmarks of these slots, up to date, have changed: they may lie elsewhere."""
         _bound(self.slots, which, self._gate)
-        self._grid.place(which, self.slots.box_m)
 
     def create(
         self, chosen: np.ndarray, seen: Sightings, observations: Observations, first_source: int
@@ -121,7 +104,7 @@ class ParticleMaps:
     def of_particle(self, particle: int, min_count: int) -> tuple[np.ndarray, np.ndarray]:
         """Slots (n,) of one particle's landmarks, by age, and whose column to read them in (n,)."""
         slots, genealogy = self.slots, self._genealogy
-        used = np.flatnonzero(slots.generation[: self._n_used] != _NEVER)
+        used = np.flatnonzero(slots.generation[: self._n_used] != NEVER)
         column = genealogy.ancestors[slots.generation[used] % MEMORY, particle]
         has = slots.count[used, column] >= max(min_count, 1)
         by_age = np.argsort(slots.source[used[has]])
@@ -132,7 +115,7 @@ class ParticleMaps:
         left = _ROUND - (self._genealogy.generation - 1) % _ROUND
         stop = self._n_visited + -(-(self._n_used - self._n_visited) // left)
         which = np.arange(self._n_visited, stop)
-        which = which[self.slots.generation[which] != _NEVER]
+        which = which[self.slots.generation[which] != NEVER]
         which = which[self.bring_up_to_date(which)]
         self.moved(which)
         self._n_visited = 0 if left == 1 else stop
@@ -148,27 +131,13 @@ class ParticleMaps:
     def _grow(self) -> None:
         old = self.slots
         capacity, n_particles = old.count.shape
-        self.slots = _allocate(2 * capacity, n_particles)
+        self.slots = allocate(2 * capacity, n_particles)
         for new_column, old_column in zip(self.slots, old, strict=True):
             new_column[:capacity] = old_column
-        self._grid.grow(2 * capacity, self.slots.box_m)
-
-
-def _allocate(capacity: int, n_particles: int) -> Slots:
-    return Slots(
-        np.empty((capacity, n_particles, 3)),
-        np.empty((capacity, n_particles, 6)),
-        np.empty((capacity, n_particles), dtype=np.int32),
-        np.full(capacity, _NEVER, dtype=np.int64),
-        np.full(capacity, _NEVER, dtype=np.int64),
-        np.empty((capacity, 4)),
-        np.full((capacity, DESCRIPTOR_LENGTH), np.nan, dtype=np.float32),
-        np.full(capacity, NO_LABEL, dtype=np.int32),
-    )
 
 
 @njit(cache=True)
-def _inherit(slots, which, ancestors, generation):
+def _inherit(slots: Slots, which: np.ndarray, ancestors: np.ndarray, generation: int) -> np.ndarray:
     n_particles = slots.count.shape[1]
     alive = np.zeros(len(which), dtype=np.bool_)
     mean = np.empty((n_particles, 3))
@@ -195,7 +164,14 @@ def _inherit(slots, which, ancestors, generation):
 
 
 @njit(cache=True)
-def _initialise(slots, created, rows, chosen, seen, n_landmarks):
+def _initialise(
+    slots: Slots,
+    created: np.ndarray,
+    rows: np.ndarray,
+    chosen: np.ndarray,
+    seen: Sightings,
+    n_landmarks: np.ndarray,
+) -> None:
     for i in range(len(created)):
         s, k = created[i], rows[i]
         for m in range(len(n_landmarks)):
@@ -209,7 +185,18 @@ def _initialise(slots, created, rows, chosen, seen, n_landmarks):
 
 
 @njit(cache=True)
-def _bound(slots, which, gate):
+def _near(boxes: Float, box: Float) -> np.ndarray:
+    """Rows of boxes (N, 4) that touch a box; looking at all costs little beside a step."""
+    touches = np.empty(len(boxes), dtype=np.bool_)
+    for s in range(len(boxes)):
+        x = (boxes[s, 0] <= box[2]) & (boxes[s, 2] >= box[0])
+        y = (boxes[s, 1] <= box[3]) & (boxes[s, 3] >= box[1])
+        touches[s] = x & y
+    return np.flatnonzero(touches)
+
+
+@njit(cache=True)
+def _bound(slots: Slots, which: np.ndarray, gate: float) -> None:
     for s in which:
         box = slots.box_m[s]
         box[:2], box[2:] = np.inf, -np.inf

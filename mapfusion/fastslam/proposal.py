@@ -17,6 +17,7 @@ import numpy as np
 from numba import njit
 
 from mapfusion.fastslam.sensor import Sightings, innovation, quadratic_form
+from mapfusion.fastslam.slots import Slots
 from mapfusion.se2 import Float
 
 # Gauss-Newton steps; the turn of a frame is off by 0.1 rad at most, which the second step makes
@@ -49,16 +50,13 @@ def widened(
 
 
 @njit(cache=True)
-def _widen(point, covariance, pose, turn, sigma):
+def _widen(point: Float, covariance: Float, pose: Float, turn: float, sigma: Float) -> None:
     for m in range(len(pose)):
         # the disturbance is added in the frame that the robot had before the motion
         cos, sin = np.cos(pose[m, 2] - turn), np.sin(pose[m, 2] - turn)
         a, b, w = sigma[0] ** 2, sigma[1] ** 2, sigma[2] ** 2
-        xx, xy, yy = (
-            cos * cos * a + sin * sin * b,
-            cos * sin * (a - b),
-            sin * sin * a + cos * cos * b,
-        )
+        xx, yy = cos * cos * a + sin * sin * b, sin * sin * a + cos * cos * b
+        xy = cos * sin * (a - b)
         for k in range(len(point)):
             dx, dy = point[k, m, 0] - pose[m, 0], point[k, m, 1] - pose[m, 1]
             covariance[k, m, 0] += xx + w * dy * dy
@@ -68,8 +66,16 @@ def _widen(point, covariance, pose, turn, sigma):
 
 @njit(cache=True)
 def informed_disturbance(
-    slots, chosen, predicted, T_map_predicted, turn, sigma, gate, planar, standard_normal
-):
+    slots: Slots,
+    chosen: np.ndarray,
+    predicted: Sightings,
+    T_map_predicted: Float,
+    turn: float,
+    sigma: Float,
+    gate: float,
+    planar: bool,
+    standard_normal: Float,
+) -> tuple[Float, Float]:
     """Draw disturbances from odometry and observations together.
 
     The observations' part is a Gaussian at the most probable eta, found by Gauss-Newton steps from
@@ -114,7 +120,15 @@ def informed_disturbance(
 
 
 @njit(cache=True)
-def _gather_pairs(slots, chosen, predicted, pose, planar, m, pairs):
+def _gather_pairs(
+    slots: Slots,
+    chosen: np.ndarray,
+    predicted: Sightings,
+    pose: Float,
+    planar: bool,
+    m: int,
+    pairs: Float,
+) -> int:
     """Fill rows of innovation (3), inverse of Z (6) and arm from robot to point (2); their number.
 
     What does not change from step to step; Z with the noise turned by the predicted heading.
@@ -125,16 +139,20 @@ def _gather_pairs(slots, chosen, predicted, pose, planar, m, pairs):
         if s < 0:
             continue
         point, row = predicted.point_m[k], pairs[n]
-        row[0], row[1], row[2], row[3], row[4], row[5], row[6], row[7], row[8], _ = innovation(
+        difference, inverse, _ = innovation(
             point, predicted.covariance_m2[k], slots.mean_m[s], slots.covariance_m2[s], m, planar
         )
+        row[0], row[1], row[2] = difference
+        row[3], row[4], row[5], row[6], row[7], row[8] = inverse
         row[9], row[10] = point[m, 0] - pose[m, 0], point[m, 1] - pose[m, 1]
         n += 1
     return n
 
 
 @njit(cache=True)
-def _normal_equations(pairs, before, sigma, gate, eta, normal, right):
+def _normal_equations(
+    pairs: Float, before: float, sigma: Float, gate: float, eta: Float, normal: Float, right: Float
+) -> None:
     """Fill the precision (3, 3) of eta and the gradient (3,) of the log density at eta."""
     ax, ay = sigma[0] * np.cos(before), sigma[0] * np.sin(before)  # d(x, y) / d eta_0
     bx, by = -sigma[1] * np.sin(before), sigma[1] * np.cos(before)  # d(x, y) / d eta_1
@@ -152,7 +170,8 @@ def _normal_equations(pairs, before, sigma, gate, eta, normal, right):
         tx, ty = cos * rx - sin * ry, sin * rx + cos * ry
         dx = pairs[n, 0] + (shift_x + tx - rx)
         dy = pairs[n, 1] + (shift_y + ty - ry)
-        weight = 1.0 / (1.0 + quadratic_form(dx, dy, dz, ixx, ixy, ixz, iyy, iyz, izz) / gate)
+        distance = quadratic_form((dx, dy, dz), (ixx, ixy, ixz, iyy, iyz, izz))
+        weight = 1.0 / (1.0 + distance / gate)
         cx, cy = -sigma[2] * ty, sigma[2] * tx  # d(point) / d eta_2
         wx = weight * (ixx * dx + ixy * dy + ixz * dz)
         wy = weight * (ixy * dx + iyy * dy + iyz * dz)
@@ -169,7 +188,7 @@ def _normal_equations(pairs, before, sigma, gate, eta, normal, right):
 
 
 @njit(cache=True)
-def _cholesky(matrix, root):
+def _cholesky(matrix: Float, root: Float) -> None:
     """Lower root (3, 3) of a positive definite matrix, of which the lower half is read."""
     for i in range(3):
         for j in range(i + 1):
@@ -180,7 +199,7 @@ def _cholesky(matrix, root):
 
 
 @njit(cache=True)
-def _solve_lower(root, vector):
+def _solve_lower(root: Float, vector: Float) -> None:
     for i in range(3):
         for k in range(i):
             vector[i] -= root[i, k] * vector[k]
@@ -188,7 +207,7 @@ def _solve_lower(root, vector):
 
 
 @njit(cache=True)
-def _solve_upper(root, vector):
+def _solve_upper(root: Float, vector: Float) -> None:
     """Solve root^T x = vector in place."""
     for i in range(2, -1, -1):
         for k in range(i + 1, 3):

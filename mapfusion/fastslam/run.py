@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mapfusion.errors import InputError
 from mapfusion.fastslam.filter import FastSlam, StepResult
 from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.landmark_map import LandmarkMap
@@ -46,9 +47,12 @@ def run_log(
 
     Yields:
         One `Frame` for each row of the log's frames.
+
+    Raises:
+        InputError: `parameters.planar` contradicts the log.
     """
     wanted = frozenset(snapshots)
-    slam = FastSlam(replace(parameters, planar=log.planar), rng)
+    slam = FastSlam(_as_the_log_says(log, parameters), rng)
     starts = log.frame_starts()
     for iteration, odometry in enumerate(log.odometry):
         frame = log.observations[starts[iteration] : starts[iteration + 1]]
@@ -57,3 +61,31 @@ def run_log(
         if iteration in wanted:
             landmarks = replace(slam.best_map(min_count), name=log.robot)
         yield Frame(iteration, result, landmarks, slam)
+
+
+def build_map(
+    log: RobotLog,
+    parameters: FastSlamParameters,
+    rng: np.random.Generator,
+    min_count: int = 3,
+) -> LandmarkMap:
+    """The most probable map at the end of a log; arguments and errors as of `run_log`.
+
+    Raises:
+        InputError: the log holds no frame.
+    """
+    last = len(log) - 1
+    for frame in run_log(log, parameters, rng, [last], min_count):
+        if frame.landmarks is not None:
+            return frame.landmarks
+    raise InputError(f"log {log.robot}: holds no frame")
+
+
+def _as_the_log_says(log: RobotLog, parameters: FastSlamParameters) -> FastSlamParameters:
+    """The settings with `planar` from the log."""
+    if parameters.planar not in (None, log.planar):
+        kind = "planar data" if log.planar else "data in three dimensions"
+        raise InputError(
+            f"planar: is {parameters.planar}, but the log of {log.robot} holds {kind}; leave it out"
+        )
+    return replace(parameters, planar=log.planar)

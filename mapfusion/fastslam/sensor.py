@@ -15,6 +15,9 @@ from numba import njit
 
 from mapfusion.se2 import Float
 
+Vector = tuple[float, float, float]
+Upper = tuple[float, float, float, float, float, float]  # xx, xy, xz, yy, yz, zz
+
 
 class Sightings(NamedTuple):
     """K observations of one frame, as each of M particles sees them in its map."""
@@ -29,16 +32,15 @@ def sightings(
     """Observations (K, 3), (K, 3, 3) of the robot frame in the maps of poses (M, 3)."""
     shape = (len(position_m), len(T_map_robot))
     seen = Sightings(np.empty((*shape, 3)), np.empty((*shape, 6)))
-    position_m, covariance_m2 = (
-        np.ascontiguousarray(position_m),
-        np.ascontiguousarray(covariance_m2),
-    )
-    _turn_into_map(T_map_robot, position_m, covariance_m2, planar, seen)
+    position, covariance = np.ascontiguousarray(position_m), np.ascontiguousarray(covariance_m2)
+    _turn_into_map(T_map_robot, position, covariance, planar, seen)
     return seen
 
 
 @njit(cache=True)
-def _turn_into_map(T_map_robot, position, covariance, planar, seen):
+def _turn_into_map(
+    T_map_robot: Float, position: Float, covariance: Float, planar: bool, seen: Sightings
+) -> None:
     cos, sin = np.cos(T_map_robot[:, 2]), np.sin(T_map_robot[:, 2])
     for k in range(len(position)):
         x, y, z = position[k]
@@ -61,26 +63,30 @@ def _turn_into_map(T_map_robot, position, covariance, planar, seen):
 
 
 @njit(cache=True)
-def inverse_and_determinant(xx, xy, xz, yy, yz, zz):
-    """Inverse (six upper entries) and determinant of a symmetric 3x3 matrix, by cofactors."""
+def inverse_and_determinant(
+    xx: float, xy: float, xz: float, yy: float, yz: float, zz: float
+) -> tuple[Upper, float]:
+    """Inverse and determinant of a symmetric 3x3 matrix, by cofactors."""
     a = yy * zz - yz * yz
     b = xz * yz - xy * zz
     c = xy * yz - xz * yy
     determinant = xx * a + xy * b + xz * c
     f = 1.0 / determinant
-    return (
+    inverse = (
         f * a,
         f * b,
         f * c,
         f * (xx * zz - xz * xz),
         f * (xy * xz - xx * yz),
         f * (xx * yy - xy * xy),
-        determinant,
     )
+    return inverse, determinant
 
 
 @njit(cache=True)
-def innovation(point, noise, mean, covariance, m, planar):
+def innovation(
+    point: Float, noise: Float, mean: Float, covariance: Float, m: int, planar: bool
+) -> tuple[Vector, Upper, float]:
     """Innovation, inverse of Z (eq. 6) and |Z| of one observation and one landmark in particle m.
 
     In planar data the height says nothing: its innovation is 0 and its variance in Z 1, so that it
@@ -95,7 +101,7 @@ def innovation(point, noise, mean, covariance, m, planar):
         planar: two degrees of freedom.
 
     Returns:
-        dx, dy, dz, six upper entries of the inverse of Z, |Z|.
+        The innovation, the inverse of Z, |Z|.
     """
     xx = covariance[m, 0] + noise[m, 0]
     xy = covariance[m, 1] + noise[m, 1]
@@ -107,14 +113,15 @@ def innovation(point, noise, mean, covariance, m, planar):
         yz = covariance[m, 4] + noise[m, 4]
         zz = covariance[m, 5] + noise[m, 5]
         dz = point[m, 2] - mean[m, 2]
-    ixx, ixy, ixz, iyy, iyz, izz, determinant = inverse_and_determinant(xx, xy, xz, yy, yz, zz)
-    dx, dy = point[m, 0] - mean[m, 0], point[m, 1] - mean[m, 1]
-    return dx, dy, dz, ixx, ixy, ixz, iyy, iyz, izz, determinant
+    inverse, determinant = inverse_and_determinant(xx, xy, xz, yy, yz, zz)
+    return (point[m, 0] - mean[m, 0], point[m, 1] - mean[m, 1], dz), inverse, determinant
 
 
 @njit(cache=True)
-def quadratic_form(dx, dy, dz, ixx, ixy, ixz, iyy, iyz, izz):
+def quadratic_form(difference: Vector, inverse: Upper) -> float:
     """Squared Mahalanobis distance: d^T Z^-1 d."""
+    dx, dy, dz = difference
+    ixx, ixy, ixz, iyy, iyz, izz = inverse
     return (
         ixx * dx * dx
         + iyy * dy * dy

@@ -3,14 +3,18 @@
 import numpy as np
 from numba import njit
 
-from mapfusion.fastslam.sensor import innovation, quadratic_form
+from mapfusion.fastslam.sensor import Sightings, Upper, Vector, innovation, quadratic_form
+from mapfusion.fastslam.slots import Slots
+from mapfusion.se2 import Float
 
 NEW = -1  # the particle has no such landmark yet
 DROPPED = -2  # the observation is used for nothing
 
 
 @njit(cache=True)
-def update_landmarks(slots, chosen, seen, log_new, planar):
+def update_landmarks(
+    slots: Slots, chosen: np.ndarray, seen: Sightings, log_new: Float, planar: bool
+) -> Float:
     """Correct the landmarks that were chosen, in place, and tell what the observations say.
 
     Args:
@@ -34,23 +38,25 @@ def update_landmarks(slots, chosen, seen, log_new, planar):
                 log_likelihood[m] += log_new[k]
                 continue
             mean, sigma = slots.mean_m[s], slots.covariance_m2[s]
-            dx, dy, dz, ixx, ixy, ixz, iyy, iyz, izz, determinant = innovation(
-                point, noise, mean, sigma, m, planar
-            )
-            distance = quadratic_form(dx, dy, dz, ixx, ixy, ixz, iyy, iyz, izz)
+            difference, inverse, determinant = innovation(point, noise, mean, sigma, m, planar)
+            distance = quadratic_form(difference, inverse)
             log_likelihood[m] -= 0.5 * (distance + log_two_pi + np.log(determinant))  # eq. 10
-            _correct(mean, sigma, noise, m, dx, dy, dz, ixx, ixy, ixz, iyy, iyz, izz)
+            _correct(mean, sigma, noise, m, difference, inverse)
             slots.count[s, m] += 1
     return log_likelihood
 
 
 @njit(cache=True)
-def _correct(mean, sigma, noise, m, dx, dy, dz, ixx, ixy, ixz, iyy, iyz, izz):
+def _correct(
+    mean: Float, sigma: Float, noise: Float, m: int, difference: Vector, inverse: Upper
+) -> None:
     """Equations 7 to 9 with G = I.
 
     Eq. 9, (I - K) Sigma, equals K R. The product has no difference of near equal numbers in it, so
     the covariance stays positive however often a landmark is seen.
     """
+    dx, dy, dz = difference
+    ixx, ixy, ixz, iyy, iyz, izz = inverse
     sxx, sxy, sxz = sigma[m, 0], sigma[m, 1], sigma[m, 2]
     syy, syz, szz = sigma[m, 3], sigma[m, 4], sigma[m, 5]
     rxx, rxy, rxz = noise[m, 0], noise[m, 1], noise[m, 2]

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from mapfusion.arguments import require_above
 from mapfusion.camera import StereoCamera
 from mapfusion.robot_log import Observations
 from mapfusion.vision.features import Features
@@ -20,8 +21,7 @@ class FrontEndParameters:
 
     Attributes:
         harris, stereo, usurf, tracks: of the parts.
-        sigma_uv_px: standard deviation of a corner's place in the image, each axis (0.4 to 0.5 in
-            rendered frames, against the median place of its track).
+        sigma_uv_px: standard deviation of a corner's place in the image, each axis.
         max_depth_m: points farther away are tracked but not observed,
         max_sigma_depth_m: nor are points whose depth has a larger standard deviation.
     """
@@ -35,9 +35,7 @@ class FrontEndParameters:
     max_sigma_depth_m: float = 0.4
 
     def __post_init__(self) -> None:
-        for name in ("sigma_uv_px", "max_depth_m", "max_sigma_depth_m"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: must be positive")
+        require_above(0, self, "sigma_uv_px", "max_depth_m", "max_sigma_depth_m")
 
 
 @dataclass(frozen=True)

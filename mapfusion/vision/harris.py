@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numba import njit
 
+from mapfusion.arguments import require_above, require_at_least, require_between
 from mapfusion.se2 import Float
 
 _SOBEL_APERTURE_PX = 3
@@ -21,9 +22,7 @@ class HarrisParameters:
         smoothing_px: standard deviation of the Gaussian that the image is smoothed with first;
             noise and the staircase edges of unfiltered textures make corners of their own. Too much
             pulls corners inwards by a share of the window, which is another point of the wall as
-            the robot draws near: over tracks of 8 frames and more the direction to the point
-            strayed by 0.27 to 0.33 px (RMS) at 1.5 px and blocks of 3 px, and by 0.46 to 0.62 px at
-            2.5 and 9 px. At 1 px it strays by 0.22 to 0.26 px, but a sixth of the corners is lost.
+            the robot draws near; too little loses corners.
         min_distance_px: no two corners nearer than this, before the sub-pixel step.
         cell_px: side of the squares of the grid that share `max_corners` evenly, so that one rich
             poster does not take all.
@@ -45,14 +44,10 @@ class HarrisParameters:
     border_px: int = 12
 
     def __post_init__(self) -> None:
-        for name in ("max_corners", "min_distance_px", "cell_px", "block_px", "border_px"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: must be at least 1")
-        if not 0 < self.k < 0.25:
-            raise ValueError("k: must lie between 0 and 0.25, where no corner can pass")
-        for name in ("smoothing_px", "min_slope"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: must be positive")
+        require_at_least(1, self, "max_corners", "min_distance_px", "cell_px", "block_px")
+        require_at_least(1, self, "border_px")
+        require_between(0, 0.25, self, "k")  # beyond, no corner can pass
+        require_above(0, self, "smoothing_px", "min_slope")
 
     @property
     def min_response(self) -> float:

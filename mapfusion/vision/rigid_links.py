@@ -7,8 +7,8 @@ links agree on one motion in the plane.
 """
 
 import numpy as np
-from scipy.special import chdtri
 
+from mapfusion.chi_square import chi_square_bound
 from mapfusion.se2 import Float, rotation, rotation_about_z
 
 _MIN_LINKS = 4  # two links determine a motion; one slip among three would be anyone's guess
@@ -48,7 +48,7 @@ def rigid_links(
     n = len(p_before_m)
     if n < _MIN_LINKS:
         return np.ones(n, dtype=bool)
-    gate = float(chdtri(3, 1 - probability))
+    gate = chi_square_bound(probability, 3)
     by_distance = np.argsort(np.argsort(np.linalg.norm(p_before_m, axis=1), kind="stable"))
     part = by_distance * _PARTS // n
     left_out = np.array([-1, *range(_PARTS)])[:, None]

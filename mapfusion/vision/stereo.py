@@ -14,7 +14,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapfusion.arguments import require_finite, require_shape
+from mapfusion.arguments import (
+    require_above,
+    require_at_least,
+    require_finite,
+    require_shape,
+)
 from mapfusion.camera import StereoCamera
 from mapfusion.se2 import Float
 from mapfusion.vision.plane_fit import disagrees, fit_planes
@@ -64,26 +69,16 @@ class StereoParameters:
     sigma_floor_px: float = 0.1
 
     def __post_init__(self) -> None:
-        for name in ("min_depth_m", "nearest_plane_m", "max_jump_px", "max_misfit_px"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: must be positive")
-        for name in (
-            "noise_grey",
-            "residual_correlation_px",
-            "sigma_floor_px",
-            "max_round_trip_px",
-        ):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name}: must not be negative")
+        require_above(0, self, "min_depth_m", "nearest_plane_m", "max_jump_px", "max_misfit_px")
+        require_at_least(0, self, "noise_grey", "residual_correlation_px", "sigma_floor_px")
+        require_at_least(0, self, "max_round_trip_px")
         for name in ("min_correlation", "max_ambiguity"):
             if not 0 < getattr(self, name) <= 1:
                 raise ValueError(f"{name}: must lie in (0, 1]")
-        if self.max_depth_m <= self.min_depth_m:
-            raise ValueError("max_depth_m: must exceed min_depth_m")
+        require_above(self.min_depth_m, self, "max_depth_m")
         if not 2 <= self.half_px <= _MAX_HALF_PX:
             raise ValueError(f"half_px: must lie in 2..{_MAX_HALF_PX}")
-        if self.silhouette_half_px < self.half_px:
-            raise ValueError("silhouette_half_px: must be at least half_px")
+        require_at_least(self.half_px, self, "silhouette_half_px")
 
 
 @dataclass(frozen=True)

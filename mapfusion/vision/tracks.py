@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from mapfusion.arguments import require_above, require_at_least, require_between
 from mapfusion.camera import StereoCamera
 from mapfusion.se2 import Float
 from mapfusion.vision.features import Features
@@ -38,15 +39,10 @@ class TrackParameters:
     rigid_probability: float = 0.999
 
     def __post_init__(self) -> None:
-        if self.min_length < 1:
-            raise ValueError("min_length: must be at least 1")
-        for name in ("max_shift_u_px", "max_shift_v_px", "max_descriptor_distance"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: must be positive")
-        if not self.max_disparity_ratio > 1:
-            raise ValueError("max_disparity_ratio: must exceed 1")
-        if not 0 < self.rigid_probability < 1:
-            raise ValueError("rigid_probability: must lie between 0 and 1")
+        require_at_least(1, self, "min_length")
+        require_above(0, self, "max_shift_u_px", "max_shift_v_px", "max_descriptor_distance")
+        require_above(1, self, "max_disparity_ratio")
+        require_between(0, 1, self, "rigid_probability")
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,12 @@ import cv2
 import numpy as np
 from numba import njit
 
-from mapfusion.arguments import require_finite, require_shape
+from mapfusion.arguments import (
+    require_above,
+    require_at_least,
+    require_finite,
+    require_shape,
+)
 from mapfusion.se2 import Float
 
 CELLS = 4
@@ -55,11 +60,8 @@ class USurfParameters:
     def __post_init__(self) -> None:
         if self.window not in ("pixels", "metric"):
             raise ValueError(f'window: is "{self.window}", expected "pixels" or "metric"')
-        for name in ("scale_px", "side_m", "min_scale_px"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: must be positive")
-        if self.max_scale_px < self.min_scale_px:
-            raise ValueError("max_scale_px: must not be below min_scale_px")
+        require_above(0, self, "scale_px", "side_m", "min_scale_px")
+        require_at_least(self.min_scale_px, self, "max_scale_px")
 
     def scales_px(self, depth_m: Float, focal_px: float) -> Float:
         """Scales (N,) for keypoints at depths (N,)."""

@@ -22,10 +22,9 @@ robots:
   - {name: R2, start: [1.2, 2.8, -0.2], route: [[3.2, 2.8], [3.2, 1.6]]}
 drive: {frames: 44}
 camera: {width_px: 160, height_px: 120, focal_px: 144.25}
-slam: {filter: {n_particles: 30}}
+slam: {filter: {n_particles: 30, proposal: motion, noise_scale: 1}}
 align:
   repetitions: 2
-  match: {max_descriptor_distance: 0.6}
   aligners:
     - {name: ransac, method: ransac}
     - {name: svd, method: svd}

@@ -1,5 +1,6 @@
 """Generated routes: overlap, clearance, and that they can be driven."""
 
+import functools
 import itertools
 
 import numpy as np
@@ -21,6 +22,7 @@ from sim.route_planner import (
 )
 
 
+@functools.cache
 def generated(seed: int, overlap: float = 0.5, robots: int = 2) -> GeneratedWorld:
     parameters = RouteParameters(robots, overlap)
     return generate_world(PlanParameters(), parameters, np.random.default_rng(seed))
@@ -115,7 +117,8 @@ def test_generated_worlds_drive_without_collision(seed: int, overlap: float) -> 
 
 
 def test_a_seed_gives_the_same_world() -> None:
-    first, second, other = generated(5), generated(5), generated(6)
+    again = generated.__wrapped__
+    first, second, other = generated(5), again(5), generated(6)
     for a, b in zip(first.routes, second.routes, strict=True):
         np.testing.assert_array_equal(a.T_world_start, b.T_world_start)
         np.testing.assert_array_equal(a.waypoints_m, b.waypoints_m)

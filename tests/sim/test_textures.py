@@ -73,9 +73,9 @@ def test_less_coverage_leaves_fewer_corners() -> None:
 
 
 def test_the_share_of_bare_walls_is_the_one_asked_for() -> None:
-    texture = Texture(bare=0.3)
+    texture, small = Texture(bare=0.3), Face(WALL.corners_m / 3, "wall")
     bare = [
-        np.ptp(paint(WALL, np.random.default_rng(seed), texture), axis=(0, 1)).max() == 0
+        np.ptp(paint(small, np.random.default_rng(seed), texture), axis=(0, 1)).max() == 0
         for seed in range(60)
     ]
     assert 8 <= sum(bare) <= 28  # 18 expected, standard deviation 3.5

@@ -230,12 +230,6 @@ def test_recorded_logs_are_known_by_their_content(tmp_path: Path) -> None:
 
 # The folder of whose modules it lies in.
 WITH_A_ROBOT = {"drive", "faces", "features", "observed", "log"}
-    "drive",
-    "faces",
-    "features",
-    "observed",
-    "log",
-}  # in the folder of whose modules it lies
 OWN_METHODS = ("opencv", "kiss_matcher", *ALIGNERS)
 BUILDS_ON = {"icp": {"impicp"}, "ransac": {"ransac_mahalanobis"}}
 

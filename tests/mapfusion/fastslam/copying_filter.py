@@ -13,7 +13,7 @@ from mapfusion.fastslam.motion import sample_motion
 from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.fastslam.resampling import systematic_ancestors
 from mapfusion.robot_log import Observations
-from mapfusion.se2 import compose, inverse, rotation_about_z, transform_points
+from mapfusion.se2 import compose, rotation_about_z, transform_points
 
 
 @dataclass
@@ -35,7 +35,8 @@ class Particle:
     associations: list
 
     def copied(self) -> "Particle":
-        landmarks = {number: copy.deepcopy(m) for number, m in self.landmarks.items()}
+        # their arrays are replaced, never written into
+        landmarks = {number: copy.copy(m) for number, m in self.landmarks.items()}
         return Particle(
             self.pose.copy(), self.weight, landmarks, list(self.path), list(self.associations)
         )
@@ -92,12 +93,15 @@ class CopyingFilter:
         turn = rotation_about_z(particle.pose[2])[:n, :n]
 
         def place(k: int, eta: np.ndarray) -> np.ndarray:
+            """Where the observation lies after disturbances eta (..., 3)."""
             pose = compose(before, odometry + sigma * eta)
-            return transform_points(pose, observations.position_m[[k]])[0][:n]
+            point = rotation_about_z(pose[..., 2]) @ observations.position_m[k]
+            point[..., :2] += pose[..., :2]
+            return point[..., :n]
 
         def slope(k: int, eta: np.ndarray) -> np.ndarray:
             h = 1e-6 * np.eye(3)
-            return np.stack([(place(k, eta + d) - place(k, eta - d)) / 2e-6 for d in h], -1)
+            return (place(k, eta + h) - place(k, eta - h)).T / 2e-6
 
         widening = []
         for k in range(len(observations)):
@@ -207,8 +211,8 @@ class CopyingFilter:
     def expectation(self, particle, landmark, z, R):
         """Innovation, Z and G in the robot frame (eq. 4-6)."""
         G = rotation_about_z(particle.pose[2]).T[: self.n_dof, : self.n_dof]
-        expected = transform_points(inverse(particle.pose), landmark.mean[None])[0]
-        return z - expected, G @ landmark.covariance @ G.T + R, G
+        place = np.array([*particle.pose[:2], 0.0])[: self.n_dof]
+        return z - G @ (landmark.mean - place), G @ landmark.covariance @ G.T + R, G
 
     @staticmethod
     def density(distance: float, Z: np.ndarray) -> float:

@@ -11,6 +11,7 @@ from mapfusion.fastslam.filter import FastSlam
 from mapfusion.fastslam.genealogy import MEMORY
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.fastslam.parameters import FastSlamParameters
+from mapfusion.fastslam.proposal import Proposal
 from mapfusion.robot_log import Observations
 from mapfusion.se2 import compose, inverse, rotation_about_z, transform_points, wrap
 
@@ -19,7 +20,11 @@ LOOSE_MOTION = MotionNoise(0.1, 0.05, 0.1, 0, 0, lateral_slip_m_per_rad=0.03)
 
 
 def parameters(**changes) -> FastSlamParameters:
-    return replace(FastSlamParameters(n_particles=15, motion=LOOSE_MOTION), **changes)
+    """The paper's own filter, with changes."""
+    plain = FastSlamParameters(
+        n_particles=15, motion=LOOSE_MOTION, proposal=Proposal.MOTION, noise_scale=1.0
+    )
+    return replace(plain, **changes)
 
 
 def assert_same(slam: FastSlam, result, twin: CopyingFilter, planar: bool) -> None:

@@ -9,9 +9,10 @@ from landmark_worlds import drive, observe, unit
 from mapfusion.fastslam.filter import FastSlam
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.fastslam.parameters import FastSlamParameters
-from mapfusion.fastslam.particles import ParticleMaps, Slots
+from mapfusion.fastslam.particles import ParticleMaps
 from mapfusion.fastslam.proposal import Proposal, informed_disturbance, widened
 from mapfusion.fastslam.sensor import Sightings, sightings
+from mapfusion.fastslam.slots import Slots
 from mapfusion.robot_log import Observations
 from mapfusion.se2 import compose, transform_points
 
@@ -21,12 +22,17 @@ POINTS = np.array([[1.5, 0.8, 0.3], [2.0, -0.7, 0.6], [2.5, 0.2, 1.0], [1.2, -0.
 DESCRIPTOR = unit(np.random.default_rng(9).standard_normal((4, 64)))
 
 
+def settings_of(proposal: Proposal) -> FastSlamParameters:
+    """The noise of the observations is what it says it is."""
+    return FastSlamParameters(n_particles=20, motion=MOTION, proposal=proposal, noise_scale=1.0)
+
+
 def after_two_frames(proposal: str, n: int, seed: int, sigma_m: float = 0.03, **changes):
     """Landmarks seen from the start, then again after a step."""
-    settings = FastSlamParameters(
-        n_particles=n, motion=MOTION, proposal=Proposal(proposal), resample_fraction=0.0
+    settings = replace(
+        settings_of(Proposal(proposal)), n_particles=n, resample_fraction=0.0, **changes
     )
-    slam = FastSlam(replace(settings, **changes), np.random.default_rng(seed))
+    slam = FastSlam(settings, np.random.default_rng(seed))
     rng = np.random.default_rng(1)
     true_step = compose(STEP, [0.02, -0.01, 0.03])
     for odometry, pose in ((np.zeros(3), np.zeros(3)), (STEP, true_step)):
@@ -133,8 +139,7 @@ def test_standing_still_and_blind_frames_are_as_with_eq_3() -> None:
     nothing = Observations(np.empty((0, 3)), np.empty((0, 3, 3)))
     clouds = []
     for proposal in Proposal:
-        settings = FastSlamParameters(n_particles=20, motion=MOTION, proposal=proposal)
-        slam = FastSlam(settings, np.random.default_rng(0))
+        slam = FastSlam(settings_of(proposal), np.random.default_rng(0))
         for odometry, frame in (
             (np.zeros(3), world.frames[0]),
             (STEP, nothing),

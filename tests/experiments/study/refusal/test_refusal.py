@@ -30,7 +30,7 @@ from mapfusion.robot_log import DESCRIPTOR_LENGTH
 from tests.helpers.made_up_maps import ITERATION, robot
 from tests.helpers.tiny_scenario import command
 
-MATCHING = MatchParameters()
+MATCHING = MatchParameters(max_descriptor_distance=0.3)
 
 
 def described(name: str, points: np.ndarray, T_world_map: list[float], seed: int):

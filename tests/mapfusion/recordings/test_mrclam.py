@@ -5,11 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.mrclam import MrclamSettings, import_mrclam
 from mapfusion.errors import InputError
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.fastslam.parameters import FastSlamParameters
+from mapfusion.fastslam.proposal import Proposal
 from mapfusion.fastslam.run import run_log
+from mapfusion.recordings.mrclam import MrclamSettings, import_mrclam
+from mapfusion.recordings.registry import import_recording
 from mapfusion.robot_log import read_log, read_truth
 from mapfusion.se2 import between, compose, inverse, transform_points, wrap
 
@@ -146,6 +148,8 @@ def test_the_filter_finds_the_landmarks(recording: Path, tmp_path: Path):
     log, truth = read_log(path), read_truth(path)
     settings = FastSlamParameters(
         n_particles=20,
+        proposal=Proposal.MOTION,
+        noise_scale=1.0,
         association="label",
         motion=MotionNoise(0.005, 0, 0.005, 0, 0, lateral_slip_m_per_rad=0),
     )
@@ -190,6 +194,15 @@ def test_damage_is_one_clear_line(recording: Path, tmp_path: Path, name, change,
     assert name in str(caught.value)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "logs").exists()
+
+
+def test_the_importer_is_found_by_its_name(recording: Path, tmp_path: Path):
+    assert import_recording("mrclam", recording, tmp_path) == [
+        tmp_path / "robot1",
+        tmp_path / "robot2",
+    ]
+    with pytest.raises(InputError, match="'nobody': unknown; known: mrclam"):
+        import_recording("nobody", recording, tmp_path)
 
 
 def test_another_folder_is_refused(tmp_path: Path):

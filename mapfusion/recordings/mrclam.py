@@ -37,9 +37,8 @@ _LAST_ROBOT_SUBJECT = 5
 class MrclamSettings:
     """How a recording becomes logs.
 
-    The noise is that of dataset 7 against its truth (ranges scatter by 0.05 m at 1 m and by 0.3 m
-    at 8 m, with biases to 0.1 m; bearings by 0.01 to 0.03 rad), about doubled: errors come from the
-    view of a barcode and stay while the view lasts, and the filter takes each for news.
+    The noise is about twice that of dataset 7 against its truth: errors come from the view of a
+    barcode and stay while the view lasts, and the filter takes each for news.
 
     Attributes:
         frame_s: time from frame to frame, on one clock for all robots. A frame keeps the last

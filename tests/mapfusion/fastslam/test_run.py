@@ -1,0 +1,65 @@
+"""A whole log through the filter."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from landmark_worlds import drive
+
+from mapfusion.errors import InputError
+from mapfusion.fastslam.filter import FastSlam
+from mapfusion.fastslam.parameters import FastSlamParameters
+from mapfusion.fastslam.run import build_map, run_log
+from mapfusion.robot_log import Observations, RobotLog
+
+SETTINGS = FastSlamParameters(n_particles=10)
+
+
+def log_of(planar: bool) -> RobotLog:
+    world = drive(2, n_frames=12, planar=planar)
+    lengths = [len(frame) for frame in world.frames]
+    names = ("position_m", "covariance_m2", "descriptor")
+    return RobotLog(
+        robot="R1",
+        planar=planar,
+        time_s=0.2 * np.arange(12),
+        odometry=np.array(world.odometry),
+        iteration=np.repeat(np.arange(12), lengths),
+        observations=Observations(
+            *(np.concatenate([getattr(frame, name) for frame in world.frames]) for name in names)
+        ),
+    )
+
+
+def test_a_log_is_its_frames_one_after_the_other():
+    log = log_of(planar=False)
+    slam = FastSlam(SETTINGS, np.random.default_rng(1))
+    frames = run_log(log, SETTINGS, np.random.default_rng(1), snapshots=[5, 11], min_count=1)
+    for frame in frames:
+        rows = log.iteration == frame.iteration
+        result = slam.step(log.odometry[frame.iteration], log.observations[rows])
+        np.testing.assert_array_equal(frame.result.cloud, result.cloud)
+        assert (frame.landmarks is not None) == (frame.iteration in (5, 11))
+    assert frame.iteration == 11
+    built = build_map(log, SETTINGS, np.random.default_rng(1), min_count=1)
+    assert built.name == "R1"
+    np.testing.assert_array_equal(built.position_m, slam.best_map(min_count=1).position_m)
+
+
+@pytest.mark.parametrize("planar", [False, True])
+def test_the_log_says_whether_data_are_planar(planar):
+    log = log_of(planar)
+    assert build_map(log, SETTINGS, np.random.default_rng(0)).planar == planar
+    stated = replace(SETTINGS, planar=planar)
+    assert build_map(log, stated, np.random.default_rng(0)).planar == planar
+    wrong = replace(SETTINGS, planar=not planar)
+    with pytest.raises(InputError, match=f"planar: is {not planar}, but the log of R1 holds"):
+        build_map(log, wrong, np.random.default_rng(0))
+
+
+def test_a_log_without_frames_is_refused():
+    nothing = Observations(np.empty((0, 3)), np.empty((0, 3, 3)))
+    no_rows = np.empty(0, dtype=np.int64)
+    log = RobotLog("R1", False, np.empty(0), np.empty((0, 3)), no_rows, nothing)
+    with pytest.raises(InputError, match="log R1: holds no frame"):
+        build_map(log, SETTINGS, np.random.default_rng(0))
