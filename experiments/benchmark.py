@@ -17,16 +17,16 @@ import pandas as pd
 import pyarrow as pa
 from scipy.stats import binomtest
 
-from experiments.aligner_calls import CallableAligner, callable_aligner, refine_estimate
+from experiments.methods.aligner_calls import callable_aligner
+from experiments.methods.catalogue import find_method, known_methods
+from experiments.methods.threads import single_threaded
 from experiments.randomness import generator
 from experiments.scenario import AlignerEntry, load_scenario
 from experiments.sources import imported_sources, method_sources
 from experiments.store import StageFolder, Store
 from experiments.synthetic import SyntheticPair, synthetic_pair, true_pairs_of
-from experiments.workers import single_threaded
 from mapfusion import se2
-from mapfusion.align.refine import Refinement
-from mapfusion.align.registry import find_method, known_methods
+from mapfusion.align.registration import Registration
 from mapfusion.align.result import NOT_RUN, Status
 from mapfusion.errors import InputError
 from mapfusion.se2 import Float
@@ -42,13 +42,9 @@ _CONFIDENCE = 0.95  # of Wilson's interval
 _TIME_BAND = (0.1, 0.9)  # quantiles of the trials
 
 _OWN_SOURCES = (
-    "experiments/aligner_calls.py",
     "experiments/benchmark.py",
-    "experiments/isolated_child.py",
-    "experiments/isolation.py",
+    "experiments/methods",
     "experiments/randomness.py",
-    "experiments/workers.py",
-    "mapfusion/align/sanity.py",
 )
 
 
@@ -175,7 +171,7 @@ def _cell(
         "budget_s": plan.budget_s,
     }
     sources = _OWN_SOURCES + method_sources(method)
-    sources += imported_sources("experiments.synthetic", "mapfusion.align.refine")
+    sources += imported_sources("experiments.synthetic", "mapfusion.align.registration")
     folder = store.stage("benchmark", settings, [], sources)
     path = folder.path / "trials.parquet"
     if not folder.finished:
@@ -188,15 +184,16 @@ def _measure(
 ) -> None:
     started = time.perf_counter()
     aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
+    registration = Registration(aligner, acceptance=None)  # methods are ranked by what they find
     rows: list[dict[str, Any]] = []
     for trial in range(plan.trials):
         maps = ("benchmark", n_pairs, f"{share:g}", trial)
         pair = synthetic_pair(n_pairs, share, generator(plan.seed, *maps))
         draws = (*maps, entry.name)
         if trial == 0:  # compilation, imports and caches; not counted
-            _trial(aligner, pair, generator(plan.seed, *draws))
+            _trial(registration, pair, generator(plan.seed, *draws))
         cell = {"method": entry.name, "n_pairs": n_pairs, "outlier_share": share, "trial": trial}
-        rows.append(cell | _trial(aligner, pair, generator(plan.seed, *draws)))
+        rows.append(cell | _trial(registration, pair, generator(plan.seed, *draws)))
         if time.perf_counter() - started > plan.budget_s:
             break
     columns = pd.DataFrame(rows, columns=pd.Index(TRIALS.names))
@@ -204,10 +201,9 @@ def _measure(
     folder.finish(elapsed_s=time.perf_counter() - started)
 
 
-def _trial(aligner: CallableAligner, pair: SyntheticPair, rng: np.random.Generator) -> dict:
-    maps = (pair.map_a, pair.map_b, pair.correspondences)
-    estimated = aligner.align(*maps, rng)
-    refined = refine_estimate(Refinement(), *maps, estimated)
+def _trial(registration: Registration, pair: SyntheticPair, rng: np.random.Generator) -> dict:
+    done = registration.register(pair.map_a, pair.map_b, pair.correspondences, rng)
+    estimated, refined = done.estimated, done.refined
     row = {
         "status": str(estimated.status),
         "reason": estimated.reason,

@@ -12,9 +12,9 @@ from experiments.benchmark import SUMMARY, TOLERANCE_M, TOLERANCE_RAD, TRIALS, P
 from experiments.figures.benchmark import draw
 from experiments.figures.drawing import save_figure
 from experiments.figures.style import house_style
+from experiments.methods.catalogue import find_method
 from experiments.store import library_versions
 from experiments.synthetic import SIGMA_M, SIZE_M
-from mapfusion.align.registry import find_method
 from mapfusion.align.result import Status
 from mapfusion.storage import write_table, write_whole
 

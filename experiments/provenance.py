@@ -4,10 +4,10 @@ import platform
 from datetime import UTC, datetime
 from typing import Any
 
+from experiments.methods.catalogue import find_method
 from experiments.pipeline import Plan
 from experiments.scenario import Scenario
 from experiments.store import library_versions
-from mapfusion.align.registry import find_method
 from sim.renderer import renderer_name
 
 RESULT_SCHEMA_VERSION = 1

@@ -19,14 +19,14 @@ from pydantic import (
     model_validator,
 )
 
-from experiments.aligner_calls import require_usable
 from experiments.generate import Generate, Generated, expanded
+from experiments.methods.aligner_calls import require_usable
+from experiments.methods.catalogue import name_clashes
 from experiments.metrics import known_metrics
 from experiments.yaml_input import apply_overrides, read_mapping
 from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.correspondences import MatchParameters
 from mapfusion.align.refine import Refinement
-from mapfusion.align.registry import name_clashes
 from mapfusion.camera import StereoCamera
 from mapfusion.errors import InputError, NameClashWarning
 from mapfusion.fastslam.parameters import FastSlamParameters

@@ -8,8 +8,8 @@ import functools
 from collections.abc import Iterator
 from pathlib import Path
 
+from experiments.methods.installed import Kind, KnownMethod
 from experiments.store import SOURCE_ROOT
-from mapfusion.align.plugins import Kind, Method
 
 
 @functools.cache
@@ -40,7 +40,7 @@ def imported_sources(*modules: str) -> tuple[str, ...]:
     return tuple(sorted(path.relative_to(SOURCE_ROOT).as_posix() for path in reached))
 
 
-def method_sources(method: Method) -> tuple[str, ...]:
+def method_sources(method: KnownMethod) -> tuple[str, ...]:
     """Our own files behind an aligner's answers, as `Store.stage` takes them."""
     if method.kind is Kind.PLUG_IN:  # it may import whatever helps it
         return ("mapfusion/align",)

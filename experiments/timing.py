@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from experiments import tables
-from experiments.aligner_calls import callable_aligner
 from experiments.evaluate import EvaluatedRobot
+from experiments.methods.aligner_calls import callable_aligner
 from experiments.randomness import generator
 from experiments.scenario import Scenario
 from experiments.truth import common_landmarks

@@ -12,21 +12,12 @@ from contextlib import contextmanager
 from multiprocessing import connection
 from typing import Any
 
-from threadpoolctl import threadpool_limits
-
+from experiments.methods.threads import single_threaded
 from mapfusion.errors import InputError
 
 # While a process works on one task, the next is there already. More of them would be begun in the
 # order they were submitted, though a later one may be what others wait for.
 TASKS_PER_PROCESS = 2
-
-
-def single_threaded() -> None:
-    """Bind BLAS and OpenCV to one thread: several would change the order of sums."""
-    import cv2
-
-    cv2.setNumThreads(1)
-    threadpool_limits(1)
 
 
 def _start_worker() -> None:

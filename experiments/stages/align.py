@@ -10,7 +10,9 @@ import numpy as np
 import pandas as pd
 
 from experiments import tables
-from experiments.aligner_calls import CallableAligner, callable_aligner, refine_estimate
+from experiments.methods.aligner_calls import callable_aligner
+from experiments.methods.catalogue import find_method
+from experiments.methods.installed import KnownMethod
 from experiments.randomness import generator
 from experiments.scenario import AlignerEntry, Scenario
 from experiments.sources import imported_sources, method_sources
@@ -18,8 +20,7 @@ from experiments.stages.slam import RobotFolders, read_snapshots
 from experiments.store import StageFolder, Store
 from mapfusion.align.acceptance import Verdict
 from mapfusion.align.correspondences import Correspondences, match
-from mapfusion.align.plugins import Method
-from mapfusion.align.registry import find_method
+from mapfusion.align.registration import Registration
 from mapfusion.align.result import Alignment, Status
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import read_log
@@ -28,11 +29,7 @@ _OWN_SOURCES = (
     "experiments/stages/align.py",
     "experiments/tables.py",
     "experiments/randomness.py",
-    "experiments/aligner_calls.py",
-    "experiments/isolation.py",
-    "experiments/isolated_child.py",
-    "experiments/workers.py",
-    "mapfusion/align/sanity.py",
+    "experiments/methods",
 )
 
 # Evaluated iterations a task: small enough that an interruption loses little and two cores end
@@ -47,13 +44,9 @@ def match_sources() -> tuple[str, ...]:
     return _OWN_SOURCES + imported_sources("mapfusion.align.correspondences", "mapfusion.robot_log")
 
 
-def aligner_sources(method: Method) -> tuple[str, ...]:
+def aligner_sources(method: KnownMethod) -> tuple[str, ...]:
     """Source behind one method's estimates, refined and judged; no other method's."""
-    return (
-        _OWN_SOURCES
-        + imported_sources("mapfusion.align.refine", "mapfusion.align.acceptance")
-        + method_sources(method)
-    )
+    return _OWN_SOURCES + imported_sources("mapfusion.align.registration") + method_sources(method)
 
 
 class Parts(NamedTuple):
@@ -140,10 +133,12 @@ def run_aligner(
     started = time.perf_counter()
     pairs = tables.read(batch_path(offered, index), "correspondences")
     aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
+    settings = scenario.align
+    registration = Registration(aligner, settings.refinement, settings.acceptance)
     rows = []
     for k, map_a, map_b in _pairs_of_maps(robots, iterations):
         offered_here = correspondences_of(pairs[pairs["iteration"] == k])
-        rows += _estimate(scenario, entry, aligner, map_a, map_b, offered_here, k)
+        rows += _estimate(scenario, entry.name, registration, map_a, map_b, offered_here, k)
     tables.write(batch_path(output, index), "estimates", rows)
     output.note(f"{index:03d}", elapsed_s=time.perf_counter() - started)
 
@@ -166,30 +161,21 @@ def _offered(names: dict[str, Any], pairs: Correspondences) -> pd.DataFrame:
 
 def _estimate(
     scenario: Scenario,
-    entry: AlignerEntry,
-    aligner: CallableAligner,
+    name: str,
+    registration: Registration,
     map_a: LandmarkMap,
     map_b: LandmarkMap,
     pairs: Correspondences,
     iteration: int,
 ) -> list[dict[str, Any]]:
-    settings, seed = scenario.align, scenario.seed
     names = {"robot_a": map_a.name, "robot_b": map_b.name, "iteration": iteration}
     rows = []
-    # repetitions often come to the very same estimate
-    refinements: dict[object, tuple[Alignment, Verdict]] = {}
-    chance = settings.acceptance.against_chance(map_a, map_b, pairs)
-    for repetition in range(settings.repetitions if aligner.randomised else 1):
-        purpose = (map_a.name, map_b.name, iteration, entry.name, repetition)
-        estimated = aligner.align(map_a, map_b, pairs, generator(seed, "align", *purpose))
-        known = (estimated.T_a_b.tobytes(), estimated.status, estimated.reason)
-        if known not in refinements:
-            refined = refine_estimate(settings.refinement, map_a, map_b, pairs, estimated)
-            refinements[known] = refined, chance.judge(refined)
+    on_pair = registration.on(map_a, map_b, pairs)
+    for repetition in range(scenario.align.repetitions if registration.randomised else 1):
+        purpose = (map_a.name, map_b.name, iteration, name, repetition)
+        done = on_pair.register(generator(scenario.seed, "align", *purpose))
         rows.append(
-            names
-            | {"aligner": entry.name, "repetition": repetition}
-            | estimate_row(len(pairs), estimated, *refinements[known])
+            names | {"aligner": name, "repetition": repetition} | estimate_row(len(pairs), *done)
         )
     return rows
 

@@ -27,7 +27,13 @@ from sim.renderer import renderer_name
 from sim.trajectory import read_trajectory
 from sim.world import write_faces
 
-SOURCES = ("sim", "mapfusion/vision", "mapfusion/camera.py", "mapfusion/se2.py")
+SOURCES = (
+    "sim",
+    "mapfusion/vision",
+    "mapfusion/camera.py",
+    "mapfusion/se2.py",
+    "mapfusion/symmetric.py",
+)
 SOURCES += ("mapfusion/storage.py", "mapfusion/robot_log.py")
 SOURCES += ("experiments/stages/features.py", "experiments/randomness.py")
 

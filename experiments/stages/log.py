@@ -25,7 +25,13 @@ from mapfusion.vision.tracks import Tracker
 from sim.odometry import add_noise, calibrated_track_m, encoder_increments
 from sim.trajectory import read_trajectory
 
-SOURCES = ("mapfusion/vision", "mapfusion/camera.py", "mapfusion/robot_log.py", "mapfusion/se2.py")
+SOURCES = (
+    "mapfusion/vision",
+    "mapfusion/camera.py",
+    "mapfusion/robot_log.py",
+    "mapfusion/se2.py",
+    "mapfusion/symmetric.py",
+)
 SOURCES += ("mapfusion/storage.py", "sim", "experiments/stages/log.py", "experiments/tables.py")
 SOURCES += ("experiments/randomness.py",)
 

@@ -32,6 +32,8 @@ SOURCES = (
     "mapfusion/robot_log.py",
     "mapfusion/storage.py",
     "mapfusion/se2.py",
+    "mapfusion/planar.py",
+    "mapfusion/symmetric.py",
 )
 SOURCES += ("experiments/stages/slam.py", "experiments/randomness.py")
 

@@ -9,12 +9,13 @@ import pytest
 from tiny_scenario import TINY
 
 from experiments import store as store_module
+from experiments.methods.catalogue import find_method
 from experiments.pipeline import plan
 from experiments.scenario import load_scenario
 from experiments.sources import imported_sources
 from experiments.stages import align, drive, features, judge, log, slam
 from experiments.store import Store, source_hash
-from mapfusion.align.registry import ALIGNERS, find_method
+from mapfusion.align.registry import ALIGNERS
 from mapfusion.errors import InputError
 from sim.renderer import egl_driver
 
@@ -166,7 +167,7 @@ def test_imported_logs_are_known_by_their_content(tmp_path: Path) -> None:
 # Settings are in the key by value, and how files get to disk does not change what is in them.
 NOT_RESULTS = {"experiments.scenario", "experiments.store", "experiments.metrics"}
 # Reads which files there are; what a name stands for is in the key as the method's target.
-NOT_RESULTS |= {"experiments.sources", "mapfusion.align.registry", "mapfusion.align.plugins"}
+NOT_RESULTS |= {"experiments.sources", "mapfusion.align.registry"}
 # Shape checks and error texts: they refuse, they compute nothing.
 REFUSING = {"mapfusion.arguments", "mapfusion.errors"}
 OWN_METHODS = ("opencv", "kiss_matcher", *ALIGNERS)

@@ -15,11 +15,11 @@ import pytest
 from made_up_maps import landmark_map, paired
 from made_up_plugin import install, look_again
 
-from experiments import isolation
-from experiments.aligner_calls import callable_aligner, refine_estimate, require_usable
-from experiments.isolation import Spec, child_for, end_children
+from experiments.methods import isolation
+from experiments.methods.aligner_calls import callable_aligner, require_usable
+from experiments.methods.isolation import Spec, child_for, end_children
 from experiments.randomness import generator
-from mapfusion.align.refine import Refinement
+from mapfusion.align.registration import Registration
 from mapfusion.align.result import Alignment, Status
 
 LIMIT_S = 60.0
@@ -103,8 +103,12 @@ def test_misbehaviour_is_a_status_with_a_reason(what: str, reason: str) -> None:
     assert found.inlier.shape == (5,)
     assert not found.inlier.any()
     assert math.isnan(found.elapsed_s)
-    # and it stays what it is in the step that follows, and does not spoil the next call
-    assert refine_estimate(Refinement(), *MAPS, PAIRS, found) is found
+    # and it stays what it is in the steps that follow, and does not spoil the next call
+    aligner = callable_aligner("made_up", {"what": what}, LIMIT_S)
+    done = Registration(aligner).register(*MAPS, PAIRS, generator(0, "test"))
+    assert done.estimated.status is Status.FAILED
+    assert done.refined is done.applied is done.estimated
+    assert (done.verdict.accepted, done.verdict.reason) == (False, done.estimated.reason)
     assert answer("good").status is Status.ACCEPTED
 
 
@@ -198,8 +202,8 @@ def test_parameters_are_tried_before_a_run(parameters: dict, reason: str) -> Non
 PARENT = """
 from made_up_maps import landmark_map, paired
 import numpy as np, sys
-from experiments.aligner_calls import callable_aligner
-from experiments.isolation import child_for, Spec
+from experiments.methods.aligner_calls import callable_aligner
+from experiments.methods.isolation import child_for, Spec
 points = np.random.default_rng(0).uniform(0, 10, (12, 3))
 maps = landmark_map(points), landmark_map(points)
 what = sys.argv[1]

@@ -18,7 +18,7 @@ from experiments import tables
 from mapfusion import se2
 from mapfusion.landmark_map import write_map
 
-EXAMPLE = Path(__file__).parent.parent / "plugin_example"
+EXAMPLE = Path(__file__).parents[2] / "plugin_example"
 T_A_B = np.array([1.0, -2.0, 0.3])
 PLUGGED = TINY.replace("name: tiny", "name: plugged").replace(
     "    - {name: icp, method: icp}\n",
