@@ -11,12 +11,12 @@ The names below are what a user needs; each is imported when it is first used, s
 import importlib
 from typing import Any
 
-# Registration comes here when it exists, in place of Refinement and Acceptance.
 _NAMES_OF = {
     "align.acceptance": ("Acceptance",),
     "align.correspondences": ("Correspondences", "MatchParameters", "match"),
     "align.refine": ("Refinement",),
-    "align.registry": ("Aligner", "make_aligner"),
+    "align.registration": ("Aligner", "Registered", "Registration"),
+    "align.registry": ("make_aligner",),
     "align.result": ("Alignment", "Status"),
     "errors": ("InputError",),
     "fastslam.association": ("Association",),

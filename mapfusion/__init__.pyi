@@ -3,7 +3,9 @@ from mapfusion.align.correspondences import Correspondences as Correspondences
 from mapfusion.align.correspondences import MatchParameters as MatchParameters
 from mapfusion.align.correspondences import match as match
 from mapfusion.align.refine import Refinement as Refinement
-from mapfusion.align.registry import Aligner as Aligner
+from mapfusion.align.registration import Aligner as Aligner
+from mapfusion.align.registration import Registered as Registered
+from mapfusion.align.registration import Registration as Registration
 from mapfusion.align.registry import make_aligner as make_aligner
 from mapfusion.align.result import Alignment as Alignment
 from mapfusion.align.result import Status as Status

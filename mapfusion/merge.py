@@ -8,7 +8,7 @@ import numpy as np
 from mapfusion.align.correspondences import Correspondences, HeightGate
 from mapfusion.align.result import Alignment
 from mapfusion.aligned_landmarks import AlignedLandmarks
-from mapfusion.arguments import require_shape
+from mapfusion.arguments import require_above, require_between, require_shape
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.same_point import SamePoint, one_to_one
 from mapfusion.se2 import IDENTITY, Float
@@ -39,10 +39,8 @@ class MergeParameters:
     use_alignment_uncertainty: bool = False
 
     def __post_init__(self) -> None:
-        if not self.max_descriptor_distance > 0:
-            raise ValueError("max_descriptor_distance: must be positive")
-        if not 0 < self.gate_probability < 1:
-            raise ValueError("gate_probability: must lie between 0 and 1")
+        require_above(0, self, "max_descriptor_distance")
+        require_between(0, 1, self, "gate_probability")
 
 
 @dataclass(frozen=True)

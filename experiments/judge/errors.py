@@ -14,6 +14,7 @@ from experiments.run.stages.map_batches import map_at
 from mapfusion import se2
 from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.oracle import Oracle
+from mapfusion.align.pairs import Pairs
 from mapfusion.align.refine import Refinement
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.se2 import Float
@@ -110,11 +111,12 @@ def error_rows(
         map_b, points_b = b.at(iteration)
         pairs = correspondences_of(correspondences[correspondences["iteration"] == iteration])
         is_true = true_pairs(points_a, points_b, pairs.index_a, pairs.index_b, radius_m)
-        oracle = Oracle(refinement).align(map_a, map_b, pairs, is_true)
+        side_by_side = Pairs(map_a, map_b, pairs)
+        oracle = Oracle(refinement).align(side_by_side, is_true)
         comparison = _Comparison(
             T_true, oracle.T_a_b, is_true, common_landmarks(points_a, points_b, radius_m)
         )
-        verdict = acceptance.judge(map_a, map_b, pairs, oracle)
+        verdict = acceptance.judge(side_by_side, oracle)
         oracle_row = {"aligner": ORACLE, "repetition": 0}
         oracle_row |= estimate_row(len(pairs), oracle, oracle, verdict)
         names = {"robot_a": a.name, "robot_b": b.name, "iteration": iteration}

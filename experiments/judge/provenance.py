@@ -5,9 +5,9 @@ from datetime import UTC, datetime
 from typing import Any
 
 from experiments.judge.judged_run import JudgedRun
+from experiments.methods.catalogue import find_method
 from experiments.run.code_version import library_versions
 from experiments.scenario.settings import AnyScenario, Simulation
-from mapfusion.align.registry import find_method
 from sim.renderer import renderer_name
 
 RESULT_SCHEMA_VERSION = 1

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.judge.judged_run import record_logs
-from experiments.methods.aligner_calls import callable_aligner, refine_estimate
+from experiments.methods.aligner_calls import callable_aligner
 from experiments.run.estimates import estimate_row
 from experiments.run.store import Store
 from experiments.run.store_files import link_or_copy
@@ -14,6 +14,7 @@ from experiments.scenario.loading import load_section
 from experiments.scenario.randomness import generator
 from experiments.scenario.settings import Align, AnyScenario, Merge, Recording, Slam
 from mapfusion.align.correspondences import match
+from mapfusion.align.registration import Registration
 from mapfusion.errors import InputError
 from mapfusion.fastslam.run import run_log
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map
@@ -77,16 +78,16 @@ def align(path_a: Path, path_b: Path, settings: Align, seed: int) -> list[dict[s
     rows = []
     for entry in settings.aligners:
         aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
-        estimated = aligner.align(map_a, map_b, pairs, generator(seed, "align", entry.name))
-        refined = refine_estimate(settings.refinement, map_a, map_b, pairs, estimated)
-        verdict = settings.acceptance.judge(map_a, map_b, pairs, refined)
+        registration = Registration(aligner, settings.refinement, settings.acceptance)
+        rng = generator(seed, "align", entry.name)
+        done = registration.register(map_a, map_b, pairs, rng)
         rows.append(
             {
                 "aligner": entry.name,
-                "n_inliers": int(refined.inlier.sum()),
-                "elapsed_s": estimated.elapsed_s,
+                "n_inliers": int(done.refined.inlier.sum()),
+                "elapsed_s": done.estimated.elapsed_s,
             }
-            | estimate_row(len(pairs), estimated, refined, verdict)
+            | estimate_row(len(pairs), *done)
         )
     return rows
 
@@ -105,14 +106,12 @@ def merge(
     entry = entries[settings.aligner]
     maps = [read_map(path) for path in paths]
     aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
+    registration = Registration(aligner, align_section.refinement, align_section.acceptance)
     alignments, offered = [], []
     for number, other in enumerate(maps[1:], start=1):
         pairs = match(maps[0], other, align_section.match)
         rng = generator(seed, "align", entry.name, number)
-        estimated = aligner.align(maps[0], other, pairs, rng)
-        refined = refine_estimate(align_section.refinement, maps[0], other, pairs, estimated)
-        verdict = align_section.acceptance.judge(maps[0], other, pairs, refined)
-        alignments.append(verdict.applied_to(refined))
+        alignments.append(registration.register(maps[0], other, pairs, rng).applied)
         offered.append(pairs)
     fused = merge_maps(maps, alignments, offered, settings.parameters)
     return fused, [str(path) for path in paths]

@@ -1,5 +1,4 @@
-"""The lowest floor: alignment methods by name, whoever wrote them.
+"""Alignment methods by name, whoever wrote them: names in, aligners out, each called safely.
 
-In come a name and parameters; out goes something that aligns two maps, here or in a process of its
-own, and cannot end a run.
+Our own are called in place, others' in a process of their own.
 """

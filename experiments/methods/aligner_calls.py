@@ -1,10 +1,12 @@
-"""How the harness calls an aligner: our own in place, others' in a process of their own."""
+"""How the harness calls a method: our own in place, others' in a process of their own."""
 
 import functools
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
+from experiments.methods.catalogue import find_method, make_method
+from experiments.methods.installed import Kind
 from experiments.methods.isolation import (
     ChildFailedError,
     IsolatedAligner,
@@ -13,19 +15,16 @@ from experiments.methods.isolation import (
     spec_of,
 )
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.plugins import Kind
-from mapfusion.align.refine import Refinement
-from mapfusion.align.registry import Aligner, find_method, make_aligner
-from mapfusion.align.result import NOT_RUN, Alignment, Status, without_answer
+from mapfusion.align.registration import Aligner, as_aligner
+from mapfusion.align.result import Alignment, Status, without_answer
 from mapfusion.landmark_map import LandmarkMap
 
 
 class AbsentAligner:
     """Stands for a method whose package is not installed: every answer says so."""
 
-    randomised: ClassVar[bool] = False
-
     def __init__(self, reason: str) -> None:
+        self.randomised = False
         self._reason = reason
 
     def align(
@@ -40,36 +39,18 @@ class AbsentAligner:
         return without_answer(Status.ABSENT, self._reason, len(correspondences))
 
 
-CallableAligner = Aligner | IsolatedAligner | AbsentAligner
-
-
-def callable_aligner(
-    method: str, parameters: dict[str, Any], time_limit_s: float
-) -> CallableAligner:
+def callable_aligner(method: str, parameters: dict[str, Any], time_limit_s: float) -> Aligner:
     """The aligner, ready to be called; raises ValueError for an unknown name or parameter."""
     found = find_method(method)
     if found.kind is Kind.BUILT_IN:
-        return make_aligner(method, **parameters)
+        return as_aligner(make_method(method, **parameters))
     if found.absence:
         return AbsentAligner(found.absence)
     return IsolatedAligner(method, parameters, time_limit_s)
 
 
-def refine_estimate(
-    refinement: Refinement,
-    map_a: LandmarkMap,
-    map_b: LandmarkMap,
-    correspondences: Correspondences,
-    estimated: Alignment,
-) -> Alignment:
-    """The common least squares after an estimate; a method that did not run stays as it is."""
-    if estimated.status in NOT_RUN:
-        return estimated
-    return refinement.refine(map_a, map_b, correspondences, estimated.T_a_b)
-
-
 def require_usable(method: str, parameters: dict[str, Any]) -> None:
-    """Have the aligner made once, a plug-in in a process of its own.
+    """Have the method made once, a plug-in in a process of its own.
 
     Raises:
         ValueError: the name or a parameter is unknown, or a parameter is out of range.
@@ -77,7 +58,7 @@ def require_usable(method: str, parameters: dict[str, Any]) -> None:
     if find_method(method).kind is Kind.PLUG_IN:
         _require_made(spec_of(method, parameters))
     else:
-        make_aligner(method, **parameters)
+        make_method(method, **parameters)
 
 
 @functools.cache  # a sweep validates the same few again and again

@@ -1,4 +1,4 @@
-"""The process in which one aligner of others runs; `experiments.methods.isolation` starts it.
+"""The process in which one method from outside runs; `experiments.methods.isolation` starts it.
 
 Every answer is checked here and sent as plain numbers, so nothing of the plug-in's making reaches
 the other side. The maps are unpacked afresh for each call: whatever it does to them, the next call
@@ -73,27 +73,26 @@ def _memory_bytes() -> int:
 
 def _make(name: str, parameters: dict[str, Any]) -> tuple[Any, tuple[str, Any]]:
     """The aligner (or None) and the answer: ("made", randomised) or ("refused", why)."""
-    from experiments.methods.one_thread import single_threaded
-    from mapfusion.align.registry import make_aligner
+    from experiments.methods.answers import checked, why_unusable
+    from experiments.methods.catalogue import make_method
+    from experiments.methods.threads import single_threaded
 
     try:
-        aligner = make_aligner(name, **parameters)
-        randomised = getattr(aligner, "randomised", None)
+        method = make_method(name, **parameters)
+        wrong = why_unusable(method)
     except ValueError as error:
         return None, ("refused", _one_line(str(error)))
     except BaseException as error:  # also SystemExit: it must not end this process
         return None, ("refused", _told(error))
     single_threaded()  # after the import, which may have brought more libraries
-    if not isinstance(randomised, bool):
-        return None, ("refused", f"randomised is {type(randomised).__name__}, expected a bool")
-    if not callable(getattr(aligner, "align", None)):
-        return None, ("refused", "has no method align")
-    return aligner, ("made", randomised)
+    if wrong:
+        return None, ("refused", wrong)
+    return checked(method), ("made", method.randomised)
 
 
 def _align(aligner: Any, maps: bytes, rng: Any) -> tuple[str, Any]:
     """("aligned", fields of the Alignment) or ("failed", why)."""
-    from mapfusion.align.sanity import why_nonsense
+    from experiments.methods.answers import NonsenseError, why_nonsense
 
     map_a, map_b, correspondences = pickle.loads(maps)  # noqa: S301  # ours, from the harness
     n = len(correspondences)
@@ -101,6 +100,8 @@ def _align(aligner: Any, maps: bytes, rng: Any) -> tuple[str, Any]:
         started_s = time.perf_counter()
         answer = aligner.align(map_a, map_b, correspondences, rng)
         elapsed_s = time.perf_counter() - started_s
+    except NonsenseError as error:
+        return "failed", _one_line(str(error))
     except BaseException as error:
         return "failed", _told(error)
     try:

@@ -3,8 +3,8 @@
 A plug-in may raise, hang, end its process or answer nonsense; the answer then is an Alignment with
 the status `failed` and a reason, and the next call starts a new process. One process serves one
 method with one set of parameters, so that no method's state (OpenCV's generator, static variables
-in C++) depends on what other methods ran before it. It lives on from call to call: a call costs
-0.1 ms and the passing of the maps, a start about a second.
+in C++) depends on what other methods ran before it. It lives on from call to call: a start costs
+many times what a call does.
 """
 
 import atexit
@@ -39,9 +39,11 @@ _MOST_GROWTH_BYTES = 2**30
 _MAX_LOST_ON_MAPS = 2
 _MAX_TIME_OUTS = 2  # in a row, on whatever maps
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-_MAIN = (
-    "import sys; from experiments.methods.isolated_child import main; main(*map(int, sys.argv[1:]))"
-)
+_MAIN = """
+import sys
+from experiments.methods.isolated_child import main
+main(*map(int, sys.argv[1:]))
+"""
 
 
 class ChildFailedError(Exception):

@@ -9,6 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from experiments.methods.catalogue import find_method
+from experiments.methods.installed import Kind
 from experiments.run.stage import RecordedLog, Stage
 from experiments.run.stages import (
     align,
@@ -32,8 +34,6 @@ from experiments.scenario.settings import (
     Scenario,
     Simulation,
 )
-from mapfusion.align.plugins import Kind
-from mapfusion.align.registry import find_method
 from mapfusion.errors import InputError
 from mapfusion.robot_log import read_log
 from mapfusion.vision.frontend import FrontEndParameters

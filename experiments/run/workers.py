@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from multiprocessing import connection
 from typing import Any
 
-from experiments.methods.one_thread import single_threaded
+from experiments.methods.threads import single_threaded
 from mapfusion.errors import InputError
 
 # While a process works on one task, the next is there already. More of them would be begun in the

@@ -9,6 +9,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import to_jsonable_python
 
+from experiments.methods.catalogue import name_clashes
 from experiments.scenario.generated import Generate, expanded
 from experiments.scenario.invalid import first_problem
 from experiments.scenario.settings import (
@@ -20,7 +21,6 @@ from experiments.scenario.settings import (
     Simulation,
 )
 from experiments.scenario.yaml_input import apply_overrides, read_mapping
-from mapfusion.align.registry import name_clashes
 from mapfusion.errors import InputError, NameClashWarning
 
 S = TypeVar("S", bound=BaseModel)

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pandas as pd
 
+from experiments.methods.catalogue import find_method
 from experiments.run.code_version import library_versions
 from experiments.show.figures.benchmark_figure import draw
 from experiments.show.figures.drawing import save_figure
 from experiments.show.figures.style import house_style
 from experiments.study.benchmark.synthetic_pairs import SIGMA_M, SIZE_M
 from experiments.study.benchmark.trials import SUMMARY, TOLERANCE_M, TOLERANCE_RAD, TRIALS, Plan
-from mapfusion.align.registry import find_method
 from mapfusion.align.result import Status
 from mapfusion.storage import write_table, write_whole
 

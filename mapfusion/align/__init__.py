@@ -1,1 +1,1 @@
-"""Map alignment: correspondences, one estimator a file, a common local refinement."""
+"""Map alignment: pairs of landmarks, a method a file, and `Registration` around them."""

@@ -5,11 +5,14 @@ from typing import ClassVar
 
 import numpy as np
 
+from mapfusion.align.consensus import Consensus
 from mapfusion.align.consistency import consistency
-from mapfusion.align.estimate import ConsensusAligner
+from mapfusion.align.mahalanobis_gate import PlanarPairs, settle, settle_at_best_scale
 from mapfusion.align.max_clique import greedy_clique, larger_clique
+from mapfusion.align.method import Fit, Undetermined
+from mapfusion.align.pairs import Pairs
 from mapfusion.align.rigid import fit_rigid
-from mapfusion.align.support import PlanarPairs, settle, settle_at_best_scale
+from mapfusion.arguments import require_above, require_between
 from mapfusion.chi_square import chi_square_bound
 from mapfusion.se2 import Float
 
@@ -17,7 +20,7 @@ _GREEDY_STARTS = 100  # a walk costs microseconds, and a large clique spares the
 
 
 @dataclass(frozen=True)
-class Clique(ConsensusAligner):
+class Clique(Consensus):
     """The largest set of correspondences of which any two agree.
 
     Two agree when their landmarks lie equally far apart in both maps, as far as covariances and
@@ -29,8 +32,7 @@ class Clique(ConsensusAligner):
         agreement_probability: of two true pairs to agree (chi-square, 1 degree of freedom). Closer
             to 1 than `probability`, since a clique needs all its pairs to agree.
         max_nodes: of branch and bound at each s_drift; beyond them the largest clique found counts.
-            At 99 % outliers a hundred do; where most pairs are true the last few vertices of a
-            clique take thousands and change nothing.
+            Where most pairs are true the last vertices of a clique take many and change nothing.
     """
 
     randomised: ClassVar[bool] = False
@@ -39,14 +41,17 @@ class Clique(ConsensusAligner):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0 < self.agreement_probability < 1:
-            raise ValueError("agreement_probability: must lie between 0 and 1")
-        if not self.max_nodes > 0:
-            raise ValueError("max_nodes: must be positive")
+        require_between(0, 1, self, "agreement_probability")
+        require_above(0, self, "max_nodes")
 
-    def find(self, pairs: PlanarPairs, rng: np.random.Generator) -> Float:
-        """T_a_b (3,) under which the residuals are likeliest; nothing is drawn from `rng`."""
+    def find(self, pairs: Pairs, rng: np.random.Generator) -> Fit | Undetermined:
+        """T_a_b under which the residuals are likeliest; nothing is drawn from `rng`."""
         del rng
+        planar = pairs.in_plan()
+        return self.settled(self._likeliest(planar), pairs, planar)
+
+    def _likeliest(self, pairs: PlanarPairs) -> Float:
+        """T_a_b (3,) of the likeliest clique, NaN when no two correspondences agree."""
         agreement = chi_square_bound(self.agreement_probability, 1)
         scales = self.variances_m2[[0, -1]]
         best_T, best_log, inside = np.full(3, np.nan), -np.inf, np.empty(len(pairs.p_a), np.bool_)

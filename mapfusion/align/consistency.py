@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 from mapfusion.align.bits import trailing_zeros
-from mapfusion.align.support import PlanarPairs
+from mapfusion.align.mahalanobis_gate import PlanarPairs
 from mapfusion.se2 import Float
 
 WORD = 64

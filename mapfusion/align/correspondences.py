@@ -5,7 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from mapfusion.arguments import require_finite, require_shape
+from mapfusion.arguments import (
+    require_above,
+    require_at_least,
+    require_between,
+    require_finite,
+    require_shape,
+)
 from mapfusion.chi_square import chi_square_bound
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import NO_LABEL
@@ -66,10 +72,8 @@ class HeightGate:
     floor_m: float = 0.035
 
     def __post_init__(self) -> None:
-        if not 0 < self.probability < 1:
-            raise ValueError(f"probability: is {self.probability}, expected between 0 and 1")
-        if not self.floor_m >= 0:
-            raise ValueError(f"floor_m: is {self.floor_m}, expected 0 or more")
+        require_between(0, 1, self, "probability")
+        require_at_least(0, self, "floor_m")
 
     @property
     def bound(self) -> float:
@@ -99,8 +103,7 @@ class MatchParameters:
     height: HeightGate = HeightGate()
 
     def __post_init__(self) -> None:
-        if not self.max_descriptor_distance > 0:
-            raise ValueError("max_descriptor_distance: must be positive")
+        require_above(0, self, "max_descriptor_distance")
 
 
 def match(

@@ -11,10 +11,10 @@ from numba import njit
 
 from mapfusion.align.pairs import MIN_PAIRS
 from mapfusion.align.rigid import fit_rigid
+from mapfusion.planar import moved_point
 from mapfusion.se2 import Float
 
-# Best supporters among whose pairs the motion to be judged is sought: of 190 pairs one reproduces
-# the alignment to a few millimetres.
+# Best supporters among whose pairs the motion to be judged is sought: of that many one is near it.
 _CANDIDATES = 20
 # Halving ends above this: p is not known from fewer pairs, and 8 of them could hardly be accepted.
 _SMALLEST_SELECTION = 16
@@ -104,8 +104,7 @@ def moved_points(T_a_b: Float, p_b: Float) -> Float:
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
     moved = np.empty((len(p_b), 2))
     for i in range(len(p_b)):
-        moved[i, 0] = T_a_b[0] + cos * p_b[i, 0] - sin * p_b[i, 1]
-        moved[i, 1] = T_a_b[1] + sin * p_b[i, 0] + cos * p_b[i, 1]
+        moved[i, 0], moved[i, 1] = moved_point(T_a_b, cos, sin, p_b[i, 0], p_b[i, 1])
     return moved
 
 

@@ -7,8 +7,12 @@ from typing import ClassVar
 import numpy as np
 from numba import njit
 
-from mapfusion.align.estimate import ConsensusAligner
-from mapfusion.align.support import PlanarPairs, fit_weighted, mean_variances
+from mapfusion.align.consensus import Consensus
+from mapfusion.align.mahalanobis_gate import PlanarPairs, mean_variances
+from mapfusion.align.method import Fit, Undetermined
+from mapfusion.align.pairs import Pairs
+from mapfusion.align.rigid import fit_weighted
+from mapfusion.planar import residual
 from mapfusion.se2 import Float
 
 _MU_FACTOR = 1.4  # Yang et al. 2020, remark 5
@@ -16,7 +20,7 @@ _MAX_ROUNDS = 1000  # from a residual of 1 km at 1 mm of noise it takes 90
 
 
 @dataclass(frozen=True)
-class Gnc(ConsensusAligner):
+class Gnc(Consensus):
     """Truncated least squares, approached from a convex cost (Yang et al. 2020).
 
     Minimises the sum of min(r^2, c^2), r the residual over its standard deviation and c^2 a
@@ -26,10 +30,12 @@ class Gnc(ConsensusAligner):
 
     randomised: ClassVar[bool] = False
 
-    def find(self, pairs: PlanarPairs, rng: np.random.Generator) -> Float:
-        """T_a_b (3,) at the largest s_drift; nothing is drawn from `rng`."""
+    def find(self, pairs: Pairs, rng: np.random.Generator) -> Fit | Undetermined:
+        """T_a_b at the largest s_drift, settled; nothing is drawn from `rng`."""
         del rng
-        return anneal(pairs, mean_variances(pairs, self.variances_m2[-1]), self.bound)[0]
+        planar = pairs.in_plan()
+        mean_m2 = mean_variances(planar, self.variances_m2[-1])
+        return self.settled(anneal(planar, mean_m2, self.bound)[0], pairs, planar)
 
 
 @njit(cache=True)
@@ -55,8 +61,7 @@ def anneal(pairs: PlanarPairs, mean_m2: Float, bound: float) -> tuple[Float, Flo
         cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
         largest = 0.0
         for i in range(n):
-            ex = p_a[i, 0] - T_a_b[0] - cos * p_b[i, 0] + sin * p_b[i, 1]
-            ey = p_a[i, 1] - T_a_b[1] - sin * p_b[i, 0] - cos * p_b[i, 1]
+            ex, ey = residual(T_a_b, cos, sin, p_a, p_b, i)
             square[i] = (ex * ex + ey * ey) / mean_m2[i]
             largest = max(largest, square[i])
         if mu == 0:  # remark 5: convex enough for the largest residual

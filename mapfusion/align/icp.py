@@ -1,7 +1,6 @@
 """ICP from a random minimal set of correspondences (section 5)."""
 
 import math
-import time
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -10,20 +9,15 @@ from numba import njit
 
 from mapfusion.align.closest import Grid, nearest_two
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.pairs import (
-    Pairs,
-    finish,
-    gather,
-    undetermined,
-    why_one_place,
-    why_too_few,
-)
-from mapfusion.align.result import Alignment
-from mapfusion.align.rigid import fit_rigid, least_squares_gain
+from mapfusion.align.method import Fit, Needs
+from mapfusion.align.pairs import Pairs
+from mapfusion.align.rigid import fit_rigid
+from mapfusion.arguments import require_above
 from mapfusion.landmark_map import LandmarkMap
+from mapfusion.planar import moved_point
 from mapfusion.se2 import Float
 
-MAX_ROUNDS = 200  # of pairing and solving; maps of 1600 landmarks take 10 to 60
+MAX_ROUNDS = 200  # of pairing and solving
 
 
 @dataclass(frozen=True)
@@ -39,37 +33,16 @@ class Icp:
     """
 
     randomised: ClassVar[bool] = True
+    needs: ClassVar[Needs] = Needs(dimensions=1)
     max_rounds: int = MAX_ROUNDS
 
     def __post_init__(self) -> None:
-        if not self.max_rounds > 0:
-            raise ValueError("max_rounds: must be positive")
+        require_above(0, self, "max_rounds")
 
-    def align(
-        self,
-        map_a: LandmarkMap,
-        map_b: LandmarkMap,
-        correspondences: Correspondences,
-        rng: np.random.Generator,
-    ) -> Alignment:
-        """Estimate T_a_b.
-
-        Raises:
-            ValueError: an index of the correspondences lies outside its map.
-        """
-        started_s = time.perf_counter()
-        pairs = gather(map_a, map_b, correspondences)
-        reason = why_no_start(map_a, map_b, pairs)
-        if reason:
-            return undetermined(reason, len(pairs), started_s)
+    def find(self, pairs: Pairs, rng: np.random.Generator) -> Fit:
+        """T_a_b of the last pairing."""
         start = draw_motion(pairs, np.arange(len(pairs)), rng)
-        closest = ClosestPoints(map_a, map_b)
-        return closest.align(start, correspondences, self.max_rounds, started_s)
-
-
-def why_no_start(map_a: LandmarkMap, map_b: LandmarkMap, pairs: Pairs) -> str:
-    """Why no minimal set gives a motion to start from; empty when one does."""
-    return why_too_few(map_a, map_b, len(pairs), needed=2) or why_one_place(pairs)
+        return ClosestPoints(pairs.map_a, pairs.map_b).descend(start, pairs, self.max_rounds)
 
 
 def draw_motion(pairs: Pairs, rows: np.ndarray, rng: np.random.Generator) -> Float:
@@ -93,17 +66,16 @@ class ClosestPoints:
         """Summed squared distance of map b's landmarks under T_a_b to their nearest in map a."""
         return summed_square_distance(T_a_b, self._p_b, *self._cells)
 
-    def align(
-        self, T_a_b: Float, correspondences: Correspondences, max_rounds: int, started_s: float
-    ) -> Alignment:
-        """Pair and solve from T_a_b on until the pairing repeats."""
-        T_a_b, nearest, repeats = iterate(T_a_b, max_rounds, self._p_b, *self._cells)
-        refusal = "" if repeats else f"pairs still changed after {max_rounds} rounds"
+    def descend(self, T_a_b: Float, pairs: Pairs, max_rounds: int) -> Fit:
+        """Pair and solve from T_a_b on until the pairing repeats; fitted to the last pairing."""
+        T_a_b, nearest, repeats = pair_and_solve(T_a_b, max_rounds, self._p_b, *self._cells)
         index_a, index_b = self._row[nearest], np.arange(len(nearest))
-        inlier = index_a[correspondences.index_b] == correspondences.index_a
-        paired = gather(*self._maps, Correspondences(index_a, index_b, np.zeros(len(nearest))))
-        gain = least_squares_gain(T_a_b, paired.p_b)
-        return finish(paired, gain, T_a_b, inlier, started_s, refusal)
+        return Fit(
+            T_a_b,
+            index_a[pairs.index_b] == pairs.index_a,
+            fitted=Pairs(*self._maps, Correspondences(index_a, index_b, np.zeros(len(nearest)))),
+            refusal="" if repeats else f"pairs still changed after {max_rounds} rounds",
+        )
 
 
 @njit(cache=True)
@@ -120,15 +92,14 @@ def summed_square_distance(
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
     total = 0.0
     for i in range(len(p_b)):
-        x = T_a_b[0] + cos * p_b[i, 0] - sin * p_b[i, 1]
-        y = T_a_b[1] + sin * p_b[i, 0] + cos * p_b[i, 1]
+        x, y = moved_point(T_a_b, cos, sin, p_b[i, 0], p_b[i, 1])
         _, distance, _ = nearest_two(x, y, p_b[i, 2], p, start, corner_m, cell_m, shape)
         total += distance * distance
     return total
 
 
 @njit(cache=True)
-def iterate(
+def pair_and_solve(
     T_start: Float,
     max_rounds: int,
     p_b: Float,
@@ -156,8 +127,7 @@ def iterate(
         cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
         changed = False
         for i in range(n):
-            x = T_a_b[0] + cos * p_b[i, 0] - sin * p_b[i, 1]
-            y = T_a_b[1] + sin * p_b[i, 0] + cos * p_b[i, 1]
+            x, y = moved_point(T_a_b, cos, sin, p_b[i, 0], p_b[i, 1])
             z = p_b[i, 2]
             clear[i] -= math.hypot(x - moved[i, 0], y - moved[i, 1])
             moved[i, 0], moved[i, 1] = x, y

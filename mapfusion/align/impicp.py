@@ -1,16 +1,14 @@
 """ImpICP: ICP from the best of a few minimal sets (section 5)."""
 
-import time
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
-from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.icp import MAX_ROUNDS, ClosestPoints, draw_motion, why_no_start
-from mapfusion.align.pairs import gather, undetermined
-from mapfusion.align.result import Alignment
-from mapfusion.landmark_map import LandmarkMap
+from mapfusion.align.icp import MAX_ROUNDS, ClosestPoints, draw_motion
+from mapfusion.align.method import Fit, Needs
+from mapfusion.align.pairs import Pairs
+from mapfusion.arguments import require_above
 
 
 @dataclass(frozen=True)
@@ -29,39 +27,22 @@ class ImpIcp:
     """
 
     randomised: ClassVar[bool] = True
+    needs: ClassVar[Needs] = Needs(dimensions=1)
     sets: int = 3
     best_share: float = 0.25
     max_rounds: int = MAX_ROUNDS
 
     def __post_init__(self) -> None:
-        if not self.sets > 0:
-            raise ValueError("sets: must be positive")
+        require_above(0, self, "sets")
         if not 0 < self.best_share <= 1:
             raise ValueError("best_share: must lie between 0 and 1")
-        if not self.max_rounds > 0:
-            raise ValueError("max_rounds: must be positive")
+        require_above(0, self, "max_rounds")
 
-    def align(
-        self,
-        map_a: LandmarkMap,
-        map_b: LandmarkMap,
-        correspondences: Correspondences,
-        rng: np.random.Generator,
-    ) -> Alignment:
-        """Estimate T_a_b.
-
-        Raises:
-            ValueError: an index of the correspondences lies outside its map.
-        """
-        started_s = time.perf_counter()
-        pairs = gather(map_a, map_b, correspondences)
-        reason = why_no_start(map_a, map_b, pairs)
-        if reason:
-            return undetermined(reason, len(pairs), started_s)
+    def find(self, pairs: Pairs, rng: np.random.Generator) -> Fit:
+        """T_a_b of the last pairing."""
         # equal distances (labels) are all as good as the last one taken
-        last = np.sort(correspondences.distance)[max(int(self.best_share * len(pairs)), 2) - 1]
-        best = np.flatnonzero(correspondences.distance <= last)
-        closest = ClosestPoints(map_a, map_b)
+        last = np.sort(pairs.distance)[max(int(self.best_share * len(pairs)), 2) - 1]
+        best = np.flatnonzero(pairs.distance <= last)
+        closest = ClosestPoints(pairs.map_a, pairs.map_b)
         starts = [draw_motion(pairs, best, rng) for _ in range(self.sets)]
-        start = min(starts, key=closest.cost_m2)
-        return closest.align(start, correspondences, self.max_rounds, started_s)
+        return closest.descend(min(starts, key=closest.cost_m2), pairs, self.max_rounds)

@@ -9,7 +9,8 @@ import math
 import numpy as np
 from numba import njit
 
-from mapfusion.align.support import PlanarPairs
+from mapfusion.align.mahalanobis_gate import PlanarPairs, residual_covariance
+from mapfusion.planar import lever
 from mapfusion.se2 import Float, transform_points
 
 
@@ -57,12 +58,8 @@ def most_leverage(
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
     most, found = -1.0, 0
     for i in range(len(p_b)):
-        bxx, bxy, byy = S_b[i, 0, 0], S_b[i, 0, 1], S_b[i, 1, 1]
-        xx = S_a[i, 0, 0] + cos * cos * bxx - 2 * cos * sin * bxy + sin * sin * byy + variance_m2
-        yy = S_a[i, 1, 1] + sin * sin * bxx + 2 * cos * sin * bxy + cos * cos * byy + variance_m2
-        xy = S_a[i, 0, 1] + cos * sin * (bxx - byy) + (cos * cos - sin * sin) * bxy
-        jx = -sin * p_b[i, 0] - cos * p_b[i, 1]
-        jy = cos * p_b[i, 0] - sin * p_b[i, 1]
+        xx, xy, yy = residual_covariance(cos, sin, S_a, S_b, i, variance_m2)
+        jx, jy = lever(cos, sin, p_b, i)
         # J cov J': what the motion's own uncertainty makes of this point
         txx = covariance[0, 0] + 2 * jx * covariance[0, 2] + jx * jx * covariance[2, 2]
         tyy = covariance[1, 1] + 2 * jy * covariance[1, 2] + jy * jy * covariance[2, 2]

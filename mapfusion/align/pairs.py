@@ -1,50 +1,101 @@
-"""The landmarks of corresponding pairs side by side, and whether they can determine a motion."""
+"""The landmarks of corresponding pairs side by side."""
 
-import math
 import time
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from mapfusion.align.correspondences import Correspondences, HeightGate
-from mapfusion.align.drift import estimate_drift_m
-from mapfusion.align.result import Alignment, Status, degenerate
-from mapfusion.align.rigid import motion_covariance, residual_covariances, residuals
-from mapfusion.chi_square import chi_square_bound
+from mapfusion.align.mahalanobis_gate import PlanarPairs
+from mapfusion.align.result import Alignment, degenerate
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.se2 import Float
 
 MIN_PAIRS = 3  # two determine a motion, the third is the first that can contradict it
-# probability that points without extent pass for a shape by their noise alone
-SHAPE_FALSE_ALARM = 1e-3
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """N pairs of landmarks.
+    """N pairs of landmarks, looked up in their maps.
 
-    Attributes:
-        p_a, p_b: (N, 3) positions in metres, each in its own frame.
-        covariance_a, covariance_b: (N, 3, 3).
-        planar: heights carry no information.
+    Raises:
+        ValueError: an index lies outside its map.
     """
 
-    p_a: Float
-    p_b: Float
-    covariance_a: Float
-    covariance_b: Float
-    planar: bool
+    map_a: LandmarkMap
+    map_b: LandmarkMap
+    correspondences: Correspondences
+
+    def __post_init__(self) -> None:
+        for name, index, landmarks in (
+            ("index_a", self.index_a, self.map_a),
+            ("index_b", self.index_b, self.map_b),
+        ):
+            if len(index) and not 0 <= index.min() <= index.max() < len(landmarks):
+                raise ValueError(f"{name}: must lie in 0..{len(landmarks) - 1}")
 
     def __len__(self) -> int:
-        return len(self.p_a)
+        return len(self.correspondences)
 
     def __getitem__(self, rows: np.ndarray) -> "Pairs":
-        return Pairs(
-            self.p_a[rows],
-            self.p_b[rows],
-            self.covariance_a[rows],
-            self.covariance_b[rows],
-            self.planar,
+        return Pairs(self.map_a, self.map_b, self.correspondences[rows])
+
+    @property
+    def index_a(self) -> np.ndarray:
+        """(N,) rows of map a."""
+        return self.correspondences.index_a
+
+    @property
+    def index_b(self) -> np.ndarray:
+        """(N,) rows of map b."""
+        return self.correspondences.index_b
+
+    @property
+    def distance(self) -> Float:
+        """(N,) of the descriptors, 0 for pairs made by label."""
+        return self.correspondences.distance
+
+    @property
+    def planar(self) -> bool:
+        """Whether heights carry no information."""
+        return self.map_a.planar or self.map_b.planar
+
+    @cached_property
+    def p_a(self) -> Float:
+        """(N, 3) positions in metres, in frame a."""
+        return self.map_a.position_m[self.index_a]
+
+    @cached_property
+    def p_b(self) -> Float:
+        """(N, 3) positions in metres, in frame b."""
+        return self.map_b.position_m[self.index_b]
+
+    @cached_property
+    def covariance_a(self) -> Float:
+        """(N, 3, 3) in frame a."""
+        return self.map_a.covariance_m2[self.index_a]
+
+    @cached_property
+    def covariance_b(self) -> Float:
+        """(N, 3, 3) in frame b."""
+        return self.map_b.covariance_m2[self.index_b]
+
+    def points(self) -> tuple[Float, Float]:
+        """Positions (N, 3) in both frames, (N, 2) where heights carry no information."""
+        dimensions = 2 if self.planar else 3
+        return (
+            np.ascontiguousarray(self.p_a[:, :dimensions]),
+            np.ascontiguousarray(self.p_b[:, :dimensions]),
+        )
+
+    def in_plan(self) -> PlanarPairs:
+        """The pairs without their heights, for the kernels."""
+        return PlanarPairs(
+            np.ascontiguousarray(self.p_a[:, :2]),
+            np.ascontiguousarray(self.p_b[:, :2]),
+            np.ascontiguousarray(self.covariance_a[:, :2, :2]),
+            np.ascontiguousarray(self.covariance_b[:, :2, :2]),
         )
 
     def of_one_height(self, gate: HeightGate) -> np.ndarray:
@@ -61,27 +112,6 @@ class Pairs:
         )
 
 
-def gather(map_a: LandmarkMap, map_b: LandmarkMap, correspondences: Correspondences) -> Pairs:
-    """Look the pairs up in their maps.
-
-    Raises:
-        ValueError: an index lies outside its map.
-    """
-    for name, index, landmarks in (
-        ("index_a", correspondences.index_a, map_a),
-        ("index_b", correspondences.index_b, map_b),
-    ):
-        if len(index) and not 0 <= index.min() <= index.max() < len(landmarks):
-            raise ValueError(f"{name}: must lie in 0..{len(landmarks) - 1}")
-    return Pairs(
-        map_a.position_m[correspondences.index_a],
-        map_b.position_m[correspondences.index_b],
-        map_a.covariance_m2[correspondences.index_a],
-        map_b.covariance_m2[correspondences.index_b],
-        map_a.planar or map_b.planar,
-    )
-
-
 def why_too_few(map_a: LandmarkMap, map_b: LandmarkMap, n_pairs: int, needed: int) -> str:
     """Why there are fewer than `needed` pairs; empty when there are enough."""
     if n_pairs >= needed:
@@ -96,71 +126,9 @@ def why_too_few(map_a: LandmarkMap, map_b: LandmarkMap, n_pairs: int, needed: in
     return f"{n_pairs} correspondences, at least {needed} are needed"
 
 
-def lacks_extent(p: Float, covariance_m2: Float, dimensions: int) -> bool:
-    """Whether points (N, 2) may lie on one point (dimensions 1) or on one line (dimensions 2).
-
-    Exact zeros never occur: the spread along the weakest of the strongest `dimensions` principal
-    axes is compared with what the landmarks' own noise (N, 2, 2) along it would give (chi-square).
-    """
-    centred = p - p.mean(axis=0)
-    spread, axes = np.linalg.eigh(centred.T @ centred)  # ascending
-    axis = axes[:, 2 - dimensions]
-    noise = axis @ covariance_m2.mean(axis=0) @ axis
-    # rounding alone leaves this much, as in numpy.linalg.matrix_rank
-    rounding = (len(p) * np.finfo(np.float64).eps * np.abs(p).max()) ** 2
-    freedom = max(len(p) - dimensions, 1)
-    most = noise * chi_square_bound(1 - SHAPE_FALSE_ALARM, freedom) + rounding
-    return spread[2 - dimensions] <= most
-
-
-def why_one_place(pairs: Pairs, drift_m2: float = 0.0) -> str:
-    """Why the angle between the maps is open: all pairs (1 or more) lie on one point of either."""
-    drift = drift_m2 * np.eye(2)
-    for name, p, covariance in (
-        ("a", pairs.p_a, pairs.covariance_a),
-        ("b", pairs.p_b, pairs.covariance_b),
-    ):
-        if lacks_extent(p[:, :2], covariance[:, :2, :2] + drift, 1):
-            return f"in plan map {name}'s landmarks lie on one point, as far as noise can tell"
-    return ""
-
-
-def finish(
-    fitted: Pairs,
-    gain: Float,
-    T_a_b: Float,
-    inlier: np.ndarray,
-    started_s: float,
-    refusal: str = "",
-    gate_m: float = math.inf,
-) -> Alignment:
-    """An estimator's result: its motion, with drift and covariance judged from what it fitted.
-
-    Args:
-        fitted: the pairs whose residuals made the estimate.
-        gain: how much each moved it (len(fitted), 3, 2), as from `rigid.least_squares_gain`.
-        T_a_b: (3,).
-        inlier: (N,) bool over the correspondences given.
-        started_s: `time.perf_counter()` at the start.
-        refusal: why the estimate is not to be trusted, if so.
-        gate_m: radius beyond which residuals were not fitted.
-    """
-    n_inliers = int(np.count_nonzero(inlier))
-    if n_inliers < MIN_PAIRS and not refusal:
-        refusal = f"{n_inliers} correspondences agree, at least {MIN_PAIRS} are needed"
-    own = residual_covariances(T_a_b, fitted.covariance_a, fitted.covariance_b)
-    drift = estimate_drift_m(residuals(T_a_b, fitted.p_a, fitted.p_b), own, gate_m)
-    return Alignment(
-        T_a_b,
-        motion_covariance(gain, own + drift**2 * np.eye(2)),
-        inlier,
-        time.perf_counter() - started_s,
-        Status.REFUSED if refusal else Status.ACCEPTED,
-        refusal,
-        drift,
-    )
-
-
 def undetermined(reason: str, n_pairs: int, started_s: float) -> Alignment:
-    """A degenerate result with its elapsed time."""
+    """A degenerate result with its elapsed time since `time.perf_counter()` was started_s."""
     return degenerate(reason, n_pairs, time.perf_counter() - started_s)
+
+
+gather = Pairs  # by this name packages with the interface `align` import it

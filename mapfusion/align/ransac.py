@@ -1,18 +1,18 @@
 """RANSAC: of the motions of random minimal sets, the one with the most support (section 5)."""
 
 import math
-import time
 from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
 from numba import njit
 
-from mapfusion.align.correspondences import Correspondences, HeightGate
-from mapfusion.align.pairs import finish, gather, undetermined, why_too_few
-from mapfusion.align.result import Alignment
-from mapfusion.align.rigid import fit_rigid, fit_two, least_squares_gain
-from mapfusion.landmark_map import LandmarkMap
+from mapfusion.align.correspondences import HeightGate
+from mapfusion.align.method import Fit, Undetermined
+from mapfusion.align.pairs import Pairs
+from mapfusion.align.rigid import fit_rigid, fit_two
+from mapfusion.arguments import require_above, require_between
+from mapfusion.planar import residual
 from mapfusion.se2 import Float
 
 _LOCAL_ROUNDS = 10  # of fit and support; two or three are the rule
@@ -43,57 +43,25 @@ class Ransac:
     height: HeightGate = field(default_factory=HeightGate)
 
     def __post_init__(self) -> None:
-        if not self.gate_m > 0:
-            raise ValueError("gate_m: must be positive")
-        if not self.min_baseline_m > 0:
-            raise ValueError("min_baseline_m: must be positive")
-        if not 0 < self.confidence < 1:
-            raise ValueError("confidence: must lie between 0 and 1")
-        if not self.max_draws > 0:
-            raise ValueError("max_draws: must be positive")
+        require_above(0, self, "gate_m", "min_baseline_m")
+        require_between(0, 1, self, "confidence")
+        require_above(0, self, "max_draws")
 
-    def align(
-        self,
-        map_a: LandmarkMap,
-        map_b: LandmarkMap,
-        correspondences: Correspondences,
-        rng: np.random.Generator,
-    ) -> Alignment:
-        """Estimate T_a_b.
-
-        Raises:
-            ValueError: an index of the correspondences lies outside its map.
-        """
-        started_s = time.perf_counter()
-        pairs = gather(map_a, map_b, correspondences)
-        rows = pairs.of_one_height(self.height)
-        reason = why_too_few(map_a, map_b, len(pairs), needed=2)
-        if not reason and len(rows) < 2:
-            reason = f"the heights of {len(rows)} correspondences agree, at least 2 are needed"
-        if reason:
-            return undetermined(reason, len(pairs), started_s)
-        dimensions = 2 if pairs.planar else 3
+    def find(self, pairs: Pairs, rng: np.random.Generator) -> Fit | Undetermined:
+        """T_a_b of the minimal set with the most support, fitted to it."""
         seed = rng.integers(1, 2**64, dtype=np.uint64)
-        _, T_a_b, support = search(
-            np.ascontiguousarray(pairs.p_a[rows, :dimensions]),
-            np.ascontiguousarray(pairs.p_b[rows, :dimensions]),
-            self.gate_m,
-            self.min_baseline_m,
-            math.log1p(-self.confidence),
-            self.max_draws,
-            seed,
+        log_miss = math.log1p(-self.confidence)
+        _, T_a_b, support = most_supported(
+            *pairs.points(), self.gate_m, self.min_baseline_m, log_miss, self.max_draws, seed
         )
         if not len(support):
-            reason = (
-                f"no two of {len(rows)} correspondences are {self.min_baseline_m:g} m or more and "
+            return Undetermined(
+                f"no two of {len(pairs)} correspondences are {self.min_baseline_m:g} m or more and "
                 "equally far apart in both maps"
             )
-            return undetermined(reason, len(pairs), started_s)
         inlier = np.zeros(len(pairs), dtype=bool)
-        inlier[rows[support]] = True
-        fitted = pairs[inlier]
-        gain = least_squares_gain(T_a_b, fitted.p_b)
-        return finish(fitted, gain, T_a_b, inlier, started_s, gate_m=self.gate_m)
+        inlier[support] = True
+        return Fit(T_a_b, inlier, gate_m=self.gate_m)
 
 
 @njit(cache=True)
@@ -131,7 +99,7 @@ def _two_point_motion(
 
 
 @njit(cache=True)
-def support_of(
+def list_supporters(
     T_a_b: Float, p_a: Float, p_b: Float, gate_m: float, to_beat: int, rows: np.ndarray
 ) -> tuple[int, float]:
     """Number of supporters, which go into `rows`, and their summed squared distance.
@@ -145,8 +113,7 @@ def support_of(
     for i in range(n):
         if count + n - i < to_beat:
             break
-        dx = p_a[i, 0] - T_a_b[0] - cos * p_b[i, 0] + sin * p_b[i, 1]
-        dy = p_a[i, 1] - T_a_b[1] - sin * p_b[i, 0] - cos * p_b[i, 1]
+        dx, dy = residual(T_a_b, cos, sin, p_a, p_b, i)
         square = dx * dx + dy * dy
         if dimensions == 3:
             dz = p_a[i, 2] - p_b[i, 2]
@@ -159,7 +126,7 @@ def support_of(
 
 
 @njit(cache=True)
-def settle(
+def refit(
     p_a: Float, p_b: Float, gate_m: float, T_a_b: Float, rows: np.ndarray, count: int
 ) -> tuple[int, float]:
     """Fit to the support and take the support again until it repeats; T_a_b and rows are changed.
@@ -174,7 +141,7 @@ def settle(
         before_count = count
         for i in range(count):
             before[i] = rows[i]
-        count, cost = support_of(T_a_b, p_a, p_b, gate_m, 0, rows)
+        count, cost = list_supporters(T_a_b, p_a, p_b, gate_m, 0, rows)
         same = count == before_count
         for i in range(count):
             same = same and rows[i] == before[i]
@@ -184,7 +151,7 @@ def settle(
 
 
 @njit(cache=True)
-def search(
+def most_supported(
     p_a: Float,
     p_b: Float,
     gate_m: float,
@@ -221,10 +188,10 @@ def search(
         state, i, j = draw_pair(state, n)
         if not _two_point_motion(p_a, p_b, i, j, gate_m, min_baseline_m, T_a_b):
             continue
-        count, _ = support_of(T_a_b, p_a, p_b, gate_m, best_count, rows)
+        count, _ = list_supporters(T_a_b, p_a, p_b, gate_m, best_count, rows)
         if count < max(best_count, 2):
             continue
-        count, cost = settle(p_a, p_b, gate_m, T_a_b, rows, count)
+        count, cost = refit(p_a, p_b, gate_m, T_a_b, rows, count)
         if count < 2:  # the motion moved away from its own support
             continue
         if count > best_count or (count == best_count and cost < best_cost):

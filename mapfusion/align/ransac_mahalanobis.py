@@ -7,17 +7,20 @@ from typing import ClassVar
 import numpy as np
 from numba import njit
 
+from mapfusion.align.consensus import Consensus
 from mapfusion.align.consistency import drift_needed
-from mapfusion.align.estimate import ConsensusAligner
+from mapfusion.align.mahalanobis_gate import PlanarPairs, mark_supporters, mean_variances, settle
+from mapfusion.align.method import Fit, Undetermined
+from mapfusion.align.pairs import Pairs
 from mapfusion.align.ransac import draw_pair
 from mapfusion.align.rigid import fit_two
-from mapfusion.align.support import PlanarPairs, mean_variances, settle, support_of
+from mapfusion.arguments import require_above, require_between
 from mapfusion.chi_square import chi_square_bound
 from mapfusion.se2 import Float
 
 
 @dataclass(frozen=True)
-class RansacMahalanobis(ConsensusAligner):
+class RansacMahalanobis(Consensus):
     """Motion of random pairs of correspondences with the least truncated squared residuals.
 
     A pair supports a motion when e^T (S_a + R S_b R^T + s_drift^2 I)^-1 e is below a chi-square
@@ -39,17 +42,15 @@ class RansacMahalanobis(ConsensusAligner):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.min_baseline_m > 0:
-            raise ValueError("min_baseline_m: must be positive")
-        if not 0 < self.confidence < 1:
-            raise ValueError("confidence: must lie between 0 and 1")
-        if not self.max_draws > 0:
-            raise ValueError("max_draws: must be positive")
+        require_above(0, self, "min_baseline_m")
+        require_between(0, 1, self, "confidence")
+        require_above(0, self, "max_draws")
 
-    def find(self, pairs: PlanarPairs, rng: np.random.Generator) -> Float:
-        """T_a_b (3,) of the best minimal set at the largest s_drift, settled on its support."""
-        _, T_a_b = search(
-            pairs,
+    def find(self, pairs: Pairs, rng: np.random.Generator) -> Fit | Undetermined:
+        """T_a_b of the best minimal set at the largest s_drift, settled on its support."""
+        planar = pairs.in_plan()
+        _, T_a_b = least_truncated_squares(
+            planar,
             self.variances_m2[-1],
             self.bound,
             chi_square_bound(self.probability, 1),
@@ -58,11 +59,11 @@ class RansacMahalanobis(ConsensusAligner):
             self.max_draws,
             rng.integers(1, 2**64, dtype=np.uint64),
         )
-        return T_a_b
+        return self.settled(T_a_b, pairs, planar)
 
 
 @njit(cache=True)
-def search(
+def least_truncated_squares(
     pairs: PlanarPairs,
     variance_m2: float,
     bound: float,
@@ -100,12 +101,12 @@ def search(
             continue
         if fit_two(p_a, p_b, i, j, T_a_b) < min_baseline_m:
             continue
-        count, score = support_of(T_a_b, pairs, mean, variance_m2, bound, inside)
+        count, score = mark_supporters(T_a_b, pairs, mean, variance_m2, bound, inside)
         if count < 2 or score <= best_raw:
             continue
         best_raw = score
         count = settle(T_a_b, pairs, variance_m2, bound, inside)
-        count, score = support_of(T_a_b, pairs, mean, variance_m2, bound, inside)
+        count, score = mark_supporters(T_a_b, pairs, mean, variance_m2, bound, inside)
         if count >= 2 and score > best_score:
             best_T[:] = T_a_b
             best_score = score

@@ -7,15 +7,17 @@ from dataclasses import dataclass, field
 import numpy as np
 from numba import njit
 
-from mapfusion.align.correspondences import Correspondences, HeightGate
+from mapfusion.align.correspondences import HeightGate
+from mapfusion.align.degeneracy import why_one_place
 from mapfusion.align.drift import drift_step
 from mapfusion.align.leverage import most_leverage, why_one_pair
-from mapfusion.align.pairs import MIN_PAIRS, gather, undetermined, why_one_place
+from mapfusion.align.mahalanobis_gate import PlanarPairs
+from mapfusion.align.pairs import MIN_PAIRS, Pairs, undetermined
 from mapfusion.align.result import Alignment, Status
-from mapfusion.align.support import PlanarPairs, in_plan
-from mapfusion.arguments import require_shape
-from mapfusion.landmark_map import LandmarkMap
+from mapfusion.arguments import require_above, require_at_least, require_shape
+from mapfusion.planar import add_turned, lever, residual
 from mapfusion.se2 import Float, wrap
+from mapfusion.symmetric import cofactors
 
 # A gate of three standard deviations keeps 99 % of a plane's residuals; a larger s_drift could not
 # be told from false pairs spread over the gate.
@@ -60,35 +62,27 @@ class Refinement:
     height: HeightGate = field(default_factory=HeightGate)
 
     def __post_init__(self) -> None:
-        if not self.gate_m > 0:
-            raise ValueError("gate_m: must be positive")
-        if not self.least_drift_m >= 0:
-            raise ValueError("least_drift_m: must not be negative")
-        if not self.max_rounds > 0:
-            raise ValueError("max_rounds: must be positive")
+        require_above(0, self, "gate_m")
+        require_at_least(0, self, "least_drift_m")
+        require_above(0, self, "max_rounds")
 
-    def refine(
-        self,
-        map_a: LandmarkMap,
-        map_b: LandmarkMap,
-        correspondences: Correspondences,
-        T_a_b: Float,
-    ) -> Alignment:
+    def refine(self, pairs: Pairs, T_a_b: Float) -> Alignment:
         """Improve T_a_b (3,); an estimate of NaN stays degenerate.
 
         Raises:
-            ValueError: T_a_b has another shape, or an index lies outside its map.
+            ValueError: T_a_b has another shape.
         """
         started_s = time.perf_counter()
         T_a_b = np.asarray(T_a_b, dtype=np.float64)
         require_shape("T_a_b", T_a_b, (3,))
-        pairs = gather(map_a, map_b, correspondences)
         if not np.all(np.isfinite(T_a_b)):
             return undetermined("there is no estimate to refine", len(pairs), started_s)
         rows = pairs.of_one_height(self.height)
-        planar = in_plan(pairs[rows])
+        planar = pairs[rows].in_plan()
         limits = (self.gate_m, self.least_drift_m, self.max_rounds)
-        solved, moved_m, T_a_b, covariance, variance, truth = iterate(*planar, T_a_b, *limits)
+        solved, moved_m, T_a_b, covariance, variance, truth = maximise_likelihood(
+            *planar, T_a_b, *limits
+        )
         if not solved:
             reason = f"the pairs within {self.gate_m:g} m of the estimate determine no motion"
             return undetermined(reason, len(pairs), started_s)
@@ -104,7 +98,7 @@ class Refinement:
         else:
             left_out = most_leverage(T_a_b, planar, variance, truth, covariance)
             others = PlanarPairs(*(np.delete(part, left_out, axis=0) for part in planar))
-            solved, _, T_without, *_ = iterate(*others, T_a_b, *limits)
+            solved, _, T_without, *_ = maximise_likelihood(*others, T_a_b, *limits)
             reason = why_one_pair(T_a_b, T_without if solved else None, planar, truth, self.gate_m)
         T_a_b[2] = wrap(T_a_b[2])
         return Alignment(
@@ -125,12 +119,10 @@ def residuals_under(
     """Fill e = p_a - T p_b (N, 2) and S = S_a + R S_b R^T (N, 2, 2)."""
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
     for i in range(len(p_a)):
-        e[i, 0] = p_a[i, 0] - T_a_b[0] - cos * p_b[i, 0] + sin * p_b[i, 1]
-        e[i, 1] = p_a[i, 1] - T_a_b[1] - sin * p_b[i, 0] - cos * p_b[i, 1]
-        xx, xy, yy = S_b[i, 0, 0], S_b[i, 0, 1], S_b[i, 1, 1]
-        S[i, 0, 0] = S_a[i, 0, 0] + cos * cos * xx - 2 * cos * sin * xy + sin * sin * yy
-        S[i, 1, 1] = S_a[i, 1, 1] + sin * sin * xx + 2 * cos * sin * xy + cos * cos * yy
-        turned_xy = cos * sin * (xx - yy) + (cos * cos - sin * sin) * xy
+        e[i, 0], e[i, 1] = residual(T_a_b, cos, sin, p_a, p_b, i)
+        S[i, 0, 0], turned_xy, S[i, 1, 1] = add_turned(
+            S_a[i, 0, 0], 0.0, S_a[i, 1, 1], cos, sin, S_b[i, 0, 0], S_b[i, 0, 1], S_b[i, 1, 1]
+        )
         S[i, 0, 1] = S[i, 1, 0] = S_a[i, 0, 1] + turned_xy
 
 
@@ -172,8 +164,7 @@ def normal_equations(
         xx, xy, yy = S[i, 0, 0] + variance_m2, S[i, 0, 1], S[i, 1, 1] + variance_m2
         scale = truth[i] / (xx * yy - xy * xy)
         wxx, wxy, wyy = scale * yy, -scale * xy, scale * xx
-        jx = -sin * p_b[i, 0] - cos * p_b[i, 1]
-        jy = cos * p_b[i, 0] - sin * p_b[i, 1]
+        jx, jy = lever(cos, sin, p_b, i)
         wx, wy = wxx * e[i, 0] + wxy * e[i, 1], wxy * e[i, 0] + wyy * e[i, 1]
         normal[0, 0] += wxx
         normal[0, 1] += wxy
@@ -219,8 +210,7 @@ def missing_information(
         share = truth[i] * (1 - truth[i])
         if share == 0:
             continue
-        jx = -sin * p_b[i, 0] - cos * p_b[i, 1]
-        jy = cos * p_b[i, 0] - sin * p_b[i, 1]
+        jx, jy = lever(cos, sin, p_b, i)
         for variance, force in ((weighed_m2, pull), (judged_m2, turn)):
             xx, xy, yy = S[i, 0, 0] + variance, S[i, 0, 1], S[i, 1, 1] + variance
             det = xx * yy - xy * xy
@@ -236,30 +226,21 @@ def missing_information(
 
 @njit(cache=True)
 def invert(matrix: Float, inverse: Float) -> bool:
-    """Fill the inverse (3, 3) of a symmetric matrix by cofactors; False unless positive definite.
-
-    Three by three needs no LAPACK, whose wrappers take seconds to compile.
-    """
-    a, b, c = matrix[0, 0], matrix[0, 1], matrix[0, 2]
-    d, e, f = matrix[1, 1], matrix[1, 2], matrix[2, 2]
-    inverse[0, 0] = d * f - e * e
-    inverse[0, 1] = inverse[1, 0] = c * e - b * f
-    inverse[0, 2] = inverse[2, 0] = b * e - c * d
-    inverse[1, 1] = a * f - c * c
-    inverse[1, 2] = inverse[2, 1] = b * c - a * e
-    inverse[2, 2] = a * d - b * b
-    det = a * inverse[0, 0] + b * inverse[0, 1] + c * inverse[0, 2]
-    positive = a > 0 and inverse[2, 2] > 0  # with det > 0 the leading minors (Sylvester)
+    """Fill the inverse (3, 3) of a symmetric matrix; False unless positive definite."""
+    a, d, f = matrix[0, 0], matrix[1, 1], matrix[2, 2]
+    axx, axy, axz, ayy, ayz, azz, det = cofactors(a, matrix[0, 1], matrix[0, 2], d, matrix[1, 2], f)
+    positive = a > 0 and azz > 0  # with det > 0 the leading minors (Sylvester)
     if not (positive and det > _SINGULAR * a * d * f):
         return False
-    for i in range(3):
-        for j in range(3):
-            inverse[i, j] /= det
+    inverse[0, 0], inverse[1, 1], inverse[2, 2] = axx / det, ayy / det, azz / det
+    inverse[0, 1] = inverse[1, 0] = axy / det
+    inverse[0, 2] = inverse[2, 0] = axz / det
+    inverse[1, 2] = inverse[2, 1] = ayz / det
     return True
 
 
 @njit(cache=True)
-def iterate(
+def maximise_likelihood(
     p_a: Float,
     p_b: Float,
     S_a: Float,
@@ -319,8 +300,8 @@ def iterate(
         moved = 0.0
         for i in range(n):
             if truth[i] > 0:
-                dx = step[0] - (sin * p_b[i, 0] + cos * p_b[i, 1]) * step[2]
-                dy = step[1] + (cos * p_b[i, 0] - sin * p_b[i, 1]) * step[2]
+                jx, jy = lever(cos, sin, p_b, i)
+                dx, dy = step[0] + jx * step[2], step[1] + jy * step[2]
                 moved = max(moved, math.sqrt(dx * dx + dy * dy))
         for k in range(3):
             T_a_b[k] += step[k]

@@ -9,39 +9,50 @@ from mapfusion.se2 import Float, rotation, transform_points
 
 
 @njit(cache=True)
-def fit_rigid(p_a: Float, p_b: Float, rows: np.ndarray) -> tuple[float, float, float]:
-    """tx, ty, theta that minimise the summed squared distance in the plane of p_a to T p_b.
+def _fit_rows(
+    p_a: Float, p_b: Float, rows: np.ndarray, weight: Float
+) -> tuple[float, float, float]:
+    """tx, ty, theta that minimise the sum of weight times |p_a - T p_b|^2 in the plane.
 
     The closed form for the plane (Arun et al. 1987): theta from the summed dot and cross products
-    about the centroids.
+    about the centroids. Rows (n,) are the pairs to use, each with its weight (n,).
+    """
+    total = ax = ay = bx = by = 0.0
+    for k in range(len(rows)):
+        i, w = rows[k], weight[k]
+        total += w
+        ax += w * p_a[i, 0]
+        ay += w * p_a[i, 1]
+        bx += w * p_b[i, 0]
+        by += w * p_b[i, 1]
+    ax, ay, bx, by = ax / total, ay / total, bx / total, by / total
+    dot = cross = 0.0
+    for k in range(len(rows)):
+        i, w = rows[k], weight[k]
+        dx, dy, ex, ey = p_a[i, 0] - ax, p_a[i, 1] - ay, p_b[i, 0] - bx, p_b[i, 1] - by
+        dot += w * (dx * ex + dy * ey)
+        cross += w * (dy * ex - dx * ey)
+    theta = math.atan2(cross, dot)
+    cos, sin = math.cos(theta), math.sin(theta)
+    return ax - cos * bx + sin * by, ay - sin * bx - cos * by, theta
+
+
+@njit(cache=True)
+def fit_rigid(p_a: Float, p_b: Float, rows: np.ndarray) -> tuple[float, float, float]:
+    """tx, ty, theta that minimise the summed squared distance in the plane of p_a to T p_b.
 
     Args:
         p_a: (N, 2 or more).
         p_b: (N, 2 or more).
         rows: (n,) the pairs to use.
     """
-    n = len(rows)
-    mean_ax = mean_ay = mean_bx = mean_by = 0.0
-    for row in rows:
-        mean_ax += p_a[row, 0]
-        mean_ay += p_a[row, 1]
-        mean_bx += p_b[row, 0]
-        mean_by += p_b[row, 1]
-    mean_ax /= n
-    mean_ay /= n
-    mean_bx /= n
-    mean_by /= n
-    dot = cross = 0.0
-    for row in rows:
-        ax = p_a[row, 0] - mean_ax
-        ay = p_a[row, 1] - mean_ay
-        bx = p_b[row, 0] - mean_bx
-        by = p_b[row, 1] - mean_by
-        dot += ax * bx + ay * by
-        cross += ay * bx - ax * by
-    theta = math.atan2(cross, dot)
-    cos, sin = math.cos(theta), math.sin(theta)
-    return mean_ax - cos * mean_bx + sin * mean_by, mean_ay - sin * mean_bx - cos * mean_by, theta
+    return _fit_rows(p_a, p_b, rows, np.ones(len(rows)))
+
+
+@njit(cache=True)
+def fit_weighted(p_a: Float, p_b: Float, weight: Float, T_a_b: Float) -> None:
+    """Fill T_a_b (3,) that minimises the sum of weight (N,) times |p_a - T p_b|^2."""
+    T_a_b[0], T_a_b[1], T_a_b[2] = _fit_rows(p_a, p_b, np.arange(len(weight)), weight)
 
 
 @njit(cache=True)

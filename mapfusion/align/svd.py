@@ -1,16 +1,13 @@
 """SVD: one linear least squares over all correspondences (algorithm 1)."""
 
 import math
-import time
 from dataclasses import dataclass
 from typing import ClassVar, Literal, get_args
 
 import numpy as np
 
-from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.pairs import MIN_PAIRS, finish, gather, lacks_extent, undetermined, why_too_few
-from mapfusion.align.result import Alignment
-from mapfusion.landmark_map import LandmarkMap
+from mapfusion.align.method import Fit, Needs
+from mapfusion.align.pairs import MIN_PAIRS, Pairs
 from mapfusion.se2 import Float, rotation
 
 Translation = Literal["printed", "solved"]
@@ -30,6 +27,7 @@ class Svd:
     """
 
     randomised: ClassVar[bool] = False
+    needs: ClassVar[Needs] = Needs(MIN_PAIRS, dimensions=2)
     translation: Translation = "printed"
 
     def __post_init__(self) -> None:
@@ -37,30 +35,11 @@ class Svd:
             known = ", ".join(get_args(Translation))
             raise ValueError(f"translation: is {self.translation!r}, expected one of {known}")
 
-    def align(
-        self,
-        map_a: LandmarkMap,
-        map_b: LandmarkMap,
-        correspondences: Correspondences,
-        rng: np.random.Generator,
-    ) -> Alignment:
-        """Estimate T_a_b; nothing is drawn from `rng`.
-
-        Raises:
-            ValueError: an index of the correspondences lies outside its map.
-        """
+    def find(self, pairs: Pairs, rng: np.random.Generator) -> Fit:
+        """T_a_b of all pairs; nothing is drawn from `rng`."""
         del rng
-        started_s = time.perf_counter()
-        pairs = gather(map_a, map_b, correspondences)
-        reason = why_too_few(map_a, map_b, len(pairs), needed=MIN_PAIRS)
-        if not reason and lacks_extent(pairs.p_b[:, :2], pairs.covariance_b[:, :2, :2], 2):
-            reason = (
-                "in plan the landmarks of map b lie on one line, as far as their noise can tell"
-            )
-        if reason:
-            return undetermined(reason, len(pairs), started_s)
         T_a_b, gain = solve(pairs.p_a[:, :2], pairs.p_b[:, :2], self.translation)
-        return finish(pairs, gain, T_a_b, np.ones(len(pairs), dtype=bool), started_s)
+        return Fit(T_a_b, np.ones(len(pairs), dtype=bool), gain=gain)
 
 
 def solve(m: Float, m_prime: Float, translation: Translation) -> tuple[Float, Float]:

@@ -19,6 +19,7 @@ from numba import njit
 from mapfusion.fastslam.sensor import Sightings, innovation, quadratic_form
 from mapfusion.fastslam.slots import Slots
 from mapfusion.se2 import Float
+from mapfusion.symmetric import cholesky, solve_lower, solve_upper
 
 # Gauss-Newton steps; the turn of a frame is off by 0.1 rad at most, which the second step makes
 # 0.005 and the third nothing.
@@ -98,20 +99,19 @@ def informed_disturbance(
     eta = np.zeros(T_map_predicted.shape)
     log_ratio = np.empty(len(eta))
     pairs = np.empty((len(chosen), _PAIR))
-    normal, root = np.empty((3, 3)), np.zeros((3, 3))
-    right, pull = np.empty(3), np.empty(3)
+    root, right, pull = np.empty((3, 3)), np.empty(3), np.empty(3)
     for m in range(len(eta)):
         n_pairs = _gather_pairs(slots, chosen, predicted, T_map_predicted, planar, m, pairs)
         before = T_map_predicted[m, 2] - turn
         for _ in range(_ROUNDS):
-            _normal_equations(pairs[:n_pairs], before, sigma, gate, eta[m], normal, right)
-            _cholesky(normal, root)
-            _solve_lower(root, right)
-            _solve_upper(root, right)
+            _normal_equations(pairs[:n_pairs], before, sigma, gate, eta[m], root, right)
+            cholesky(root, 0.0)
+            solve_lower(root, right)
+            solve_upper(root, right)
             eta[m] += right
         # the precision is root root^T, so root^-T times a standard normal has its inverse
         pull[:] = standard_normal[m]
-        _solve_upper(root, pull)
+        solve_upper(root, pull)
         eta[m] += pull
         prior = eta[m, 0] ** 2 + eta[m, 1] ** 2 + eta[m, 2] ** 2
         drawn = standard_normal[m, 0] ** 2 + standard_normal[m, 1] ** 2 + standard_normal[m, 2] ** 2
@@ -185,31 +185,3 @@ def _normal_equations(
         normal[1, 0] += ax * bx * axx + (ax * by + ay * bx) * axy + ay * by * ayy
         normal[2, 0] += ax * cx * axx + (ax * cy + ay * cx) * axy + ay * cy * ayy
         normal[2, 1] += bx * cx * axx + (bx * cy + by * cx) * axy + by * cy * ayy
-
-
-@njit(cache=True)
-def _cholesky(matrix: Float, root: Float) -> None:
-    """Lower root (3, 3) of a positive definite matrix, of which the lower half is read."""
-    for i in range(3):
-        for j in range(i + 1):
-            rest = matrix[i, j]
-            for k in range(j):
-                rest -= root[i, k] * root[j, k]
-            root[i, j] = np.sqrt(rest) if i == j else rest / root[j, j]
-
-
-@njit(cache=True)
-def _solve_lower(root: Float, vector: Float) -> None:
-    for i in range(3):
-        for k in range(i):
-            vector[i] -= root[i, k] * vector[k]
-        vector[i] /= root[i, i]
-
-
-@njit(cache=True)
-def _solve_upper(root: Float, vector: Float) -> None:
-    """Solve root^T x = vector in place."""
-    for i in range(2, -1, -1):
-        for k in range(i + 1, 3):
-            vector[i] -= root[k, i] * vector[k]
-        vector[i] /= root[i, i]

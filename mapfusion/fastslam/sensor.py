@@ -13,7 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from mapfusion.planar import add_turned
 from mapfusion.se2 import Float
+from mapfusion.symmetric import cofactors
 
 Vector = tuple[float, float, float]
 Upper = tuple[float, float, float, float, float, float]  # xx, xy, xz, yy, yz, zz
@@ -54,10 +56,8 @@ def _turn_into_map(
             point[m, 0] = T_map_robot[m, 0] + c * x - s * y
             point[m, 1] = T_map_robot[m, 1] + s * x + c * y
             point[m, 2] = z
-            turned[m, 0] = c * c * xx - 2 * c * s * xy + s * s * yy
-            turned[m, 1] = c * s * (xx - yy) + (c * c - s * s) * xy
+            turned[m, 0], turned[m, 1], turned[m, 3] = add_turned(0.0, 0.0, 0.0, c, s, xx, xy, yy)
             turned[m, 2] = c * xz - s * yz
-            turned[m, 3] = s * s * xx + 2 * c * s * xy + c * c * yy
             turned[m, 4] = s * xz + c * yz
             turned[m, 5] = zz
 
@@ -67,20 +67,9 @@ def inverse_and_determinant(
     xx: float, xy: float, xz: float, yy: float, yz: float, zz: float
 ) -> tuple[Upper, float]:
     """Inverse and determinant of a symmetric 3x3 matrix, by cofactors."""
-    a = yy * zz - yz * yz
-    b = xz * yz - xy * zz
-    c = xy * yz - xz * yy
-    determinant = xx * a + xy * b + xz * c
+    axx, axy, axz, ayy, ayz, azz, determinant = cofactors(xx, xy, xz, yy, yz, zz)
     f = 1.0 / determinant
-    inverse = (
-        f * a,
-        f * b,
-        f * c,
-        f * (xx * zz - xz * xz),
-        f * (xy * xz - xx * yz),
-        f * (xx * yy - xy * xy),
-    )
-    return inverse, determinant
+    return (f * axx, f * axy, f * axz, f * ayy, f * ayz, f * azz), determinant
 
 
 @njit(cache=True)

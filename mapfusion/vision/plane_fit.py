@@ -6,6 +6,8 @@ The disparity of a plane is linear in the image: d(x, y) = d + a x + b y around 
 import numpy as np
 from numba import njit
 
+from mapfusion.symmetric import cholesky, solve_lower, solve_upper
+
 _MAX_STEPS = 8
 _CONVERGED_PX = 0.005  # far below what noise lets one measure
 _SINGULAR = 1e-9  # pivot, as a share of its diagonal element, that is rounding error
@@ -105,17 +107,19 @@ def _fit_plane(
         factor[3, 3] += prior
         step[2] -= prior * plane[1]
         step[3] -= prior * plane[2]
-        if not _cholesky(factor):
+        if not cholesky(factor, _SINGULAR):
             plane[:] = np.nan
             return np.nan
-        _solve(factor, step)
+        solve_lower(factor, step)
+        solve_upper(factor, step)
         plane += step[1:]
         variance_grey = max(square - count * step[0] ** 2, 0.0) / (count - 4)
         if abs(step[1]) < _CONVERGED_PX:
             break
     row[0], row[1], row[2], row[3] = 0.0, 1.0, offset[0], offset[1]
     step[:] = row
-    _solve(factor, step)
+    solve_lower(factor, step)
+    solve_upper(factor, step)
     return variance_grey * np.dot(row, step)
 
 
@@ -143,36 +147,6 @@ def _residuals(
             moment[2] += slope * x * residual
             moment[3] += slope * y * residual
     return square
-
-
-@njit(cache=True)
-def _cholesky(matrix: np.ndarray) -> bool:
-    """Lower factor of a symmetric matrix in place; False when it is not positive definite."""
-    for i in range(len(matrix)):
-        for j in range(i + 1):
-            total = matrix[i, j]
-            for k in range(j):
-                total -= matrix[i, k] * matrix[j, k]
-            if i > j:
-                matrix[i, j] = total / matrix[j, j]
-            elif total > _SINGULAR * matrix[i, i]:
-                matrix[i, i] = np.sqrt(total)
-            else:
-                return False
-    return True
-
-
-@njit(cache=True)
-def _solve(factor: np.ndarray, x: np.ndarray) -> None:
-    """Solve with the lower factor in place."""
-    for i in range(len(x)):
-        for k in range(i):
-            x[i] -= factor[i, k] * x[k]
-        x[i] /= factor[i, i]
-    for i in range(len(x) - 1, -1, -1):
-        for k in range(i + 1, len(x)):
-            x[i] -= factor[k, i] * x[k]
-        x[i] /= factor[i, i]
 
 
 @njit(cache=True)

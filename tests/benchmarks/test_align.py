@@ -8,8 +8,10 @@ import pytest
 from mapfusion import se2
 from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.correspondences import Correspondences, match
+from mapfusion.align.pairs import Pairs
 from mapfusion.align.ransac import Ransac
 from mapfusion.align.refine import Refinement
+from mapfusion.align.registration import as_aligner
 from mapfusion.align.registry import ALIGNERS, make_aligner
 from mapfusion.landmark_map import LandmarkMap
 
@@ -40,7 +42,7 @@ def maps_with_pairs(n_landmarks, n_pairs, true_share):
 def test_ransac_1000_pairs(benchmark, outliers):
     """Bars: 5 ms at 95 % outliers, 50 ms at 99 %."""
     maps = maps_with_pairs(1000, 1000, 1 - outliers)
-    found = benchmark(lambda: Ransac().align(*maps, np.random.default_rng(0)))
+    found = benchmark(lambda: as_aligner(Ransac()).align(*maps, np.random.default_rng(0)))
     assert found.ok
 
 
@@ -66,7 +68,7 @@ def planar_pairs(n, n_true):
 def test_robust_aligner_on_planar_maps(benchmark, name, n, n_true):
     """Bars of the best: 20 ms at 1000 pairs and 99 % outliers, 100 ms at 5000."""
     maps = planar_pairs(n, n_true)
-    found = benchmark(lambda: make_aligner(name).align(*maps, np.random.default_rng(0)))
+    found = benchmark(lambda: as_aligner(make_aligner(name)).align(*maps, np.random.default_rng(0)))
     if name != "gnc":
         assert np.hypot(*(found.T_a_b - T_A_B)[:2]) < 0.2
 
@@ -75,19 +77,19 @@ def test_robust_aligner_on_planar_maps(benchmark, name, n, n_true):
 def test_aligner_on_maps_of_1600_landmarks(benchmark, name):
     maps = maps_with_pairs(1600, 200, 0.3)
     aligner = make_aligner(name)
-    benchmark(lambda: aligner.align(*maps, np.random.default_rng(0)))
+    benchmark(lambda: as_aligner(aligner).align(*maps, np.random.default_rng(0)))
 
 
 def test_refinement_200_pairs(benchmark):
     maps = maps_with_pairs(1600, 200, 0.3)
-    assert benchmark(lambda: Refinement().refine(*maps, T_A_B)).ok
+    assert benchmark(lambda: Refinement().refine(Pairs(*maps), T_A_B)).ok
 
 
 @pytest.mark.parametrize("n_pairs", [200, 1000, 5000])
 def test_acceptance(benchmark, n_pairs):
     maps = maps_with_pairs(n_pairs, n_pairs, 0.3)
-    refined = Refinement().refine(*maps, T_A_B)
-    assert benchmark(lambda: Acceptance().judge(*maps, refined)).accepted
+    refined = Refinement().refine(Pairs(*maps), T_A_B)
+    assert benchmark(lambda: Acceptance().judge(Pairs(*maps), refined)).accepted
 
 
 @pytest.mark.parametrize("n", [1600, 5000])

@@ -5,7 +5,7 @@ import pytest
 
 from experiments.judge.judged_run import JudgedRun
 from experiments.judge.result import run_scenario
-from experiments.methods.one_thread import single_threaded
+from experiments.methods.threads import single_threaded
 from experiments.run.store import Store
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import Simulation

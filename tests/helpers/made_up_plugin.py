@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from mapfusion.align import plugins, registry
+from experiments.methods import catalogue, installed
 
 MODULE = """
 import ctypes, os, signal, sys, time
@@ -93,21 +93,26 @@ class Method:
 
 
 def install(
-    folder: Path, name: str = "made_up", package: str = "made-up", version: str = "1.0"
+    folder: Path,
+    name: str = "made_up",
+    package: str = "made-up",
+    version: str = "1.0",
+    target: str = "made_up_module:Method",
+    code: str = MODULE,
 ) -> None:
     """Put the package into a folder that is, or will be, on the path."""
     folder.mkdir(exist_ok=True)
-    (folder / "made_up_module.py").write_text(MODULE, encoding="utf-8")
+    (folder / f"{target.partition(':')[0]}.py").write_text(code, encoding="utf-8")
     info = folder / f"{package.replace('-', '_')}-{version}.dist-info"
     info.mkdir()
     metadata = f"Metadata-Version: 2.1\nName: {package}\nVersion: {version}\n"
     (info / "METADATA").write_text(metadata, encoding="utf-8")
-    points = f"[{plugins.ENTRY_POINTS}]\n{name} = made_up_module:Method\n"
+    points = f"[{installed.ENTRY_POINTS}]\n{name} = {target}\n"
     (info / "entry_points.txt").write_text(points, encoding="utf-8")
 
 
 def look_again() -> None:
     """Forget which packages were found installed."""
-    registry.known_methods.cache_clear()
-    registry.name_clashes.cache_clear()
-    plugins.fingerprint.cache_clear()
+    catalogue.known_methods.cache_clear()
+    catalogue.name_clashes.cache_clear()
+    installed.fingerprint.cache_clear()

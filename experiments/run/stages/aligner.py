@@ -6,16 +6,16 @@ Each aligner apart, so a run in which one has changed takes all others' estimate
 from dataclasses import dataclass
 from typing import Any
 
-from experiments.methods.aligner_calls import callable_aligner, refine_estimate
+from experiments.methods.aligner_calls import callable_aligner
 from experiments.run.estimates import correspondences_of, estimate_row
 from experiments.run.frames import read_rows, write_rows
 from experiments.run.job import Job
 from experiments.run.stage_tables import CORRESPONDENCES, ESTIMATES
 from experiments.run.stages.map_batches import batch_path, pairs_of_maps
 from experiments.scenario.randomness import generator
-from mapfusion.align.acceptance import Acceptance, Verdict
+from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.refine import Refinement
-from mapfusion.align.result import Alignment
+from mapfusion.align.registration import Registration
 
 
 @dataclass(frozen=True)
@@ -38,21 +38,15 @@ def run(settings: AlignerSettings, job: Job) -> None:
     """Let the aligner estimate at one batch of iterations, on what the match stage offers."""
     offered = read_rows(batch_path(job.inputs["match"], job.part), CORRESPONDENCES)
     aligner = callable_aligner(settings.method, settings.parameters, settings.time_limit_s)
+    registration = Registration(aligner, settings.refinement, settings.acceptance)
     rows = []
     for k, map_a, map_b in pairs_of_maps(job, settings.iterations):
         pairs = correspondences_of(offered[offered["iteration"] == k])
         names = {"robot_a": map_a.name, "robot_b": map_b.name, "iteration": k}
-        # repetitions often come to the very same estimate
-        refinements: dict[object, tuple[Alignment, Verdict]] = {}
-        chance = settings.acceptance.against_chance(map_a, map_b, pairs)
-        for repetition in range(settings.repetitions if aligner.randomised else 1):
+        on_pair = registration.on(map_a, map_b, pairs)
+        for repetition in range(settings.repetitions if registration.randomised else 1):
             purpose = (map_a.name, map_b.name, k, settings.name, repetition)
-            rng = generator(settings.seed, "align", *purpose)
-            estimated = aligner.align(map_a, map_b, pairs, rng)
-            known = (estimated.T_a_b.tobytes(), estimated.status, estimated.reason)
-            if known not in refinements:
-                refined = refine_estimate(settings.refinement, map_a, map_b, pairs, estimated)
-                refinements[known] = refined, chance.judge(refined)
+            done = on_pair.register(generator(settings.seed, "align", *purpose))
             names |= {"aligner": settings.name, "repetition": repetition}
-            rows.append(names | estimate_row(len(pairs), estimated, *refinements[known]))
+            rows.append(names | estimate_row(len(pairs), *done))
     write_rows(batch_path(job.output, job.part), ESTIMATES, rows)

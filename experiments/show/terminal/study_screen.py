@@ -9,8 +9,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from experiments.methods.catalogue import known_methods, name_clashes
 from experiments.show.terminal.layout import LAYOUT, number
-from mapfusion.align.registry import known_methods, name_clashes
 from mapfusion.align.result import Status
 
 if TYPE_CHECKING:

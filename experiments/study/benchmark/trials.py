@@ -17,8 +17,9 @@ import pandas as pd
 import pyarrow as pa
 from scipy.stats import binomtest
 
-from experiments.methods.aligner_calls import CallableAligner, callable_aligner, refine_estimate
-from experiments.methods.one_thread import single_threaded
+from experiments.methods.aligner_calls import callable_aligner
+from experiments.methods.catalogue import find_method, known_methods
+from experiments.methods.threads import single_threaded
 from experiments.run.job import Job
 from experiments.run.stage import Stage
 from experiments.run.store import Store
@@ -28,8 +29,7 @@ from experiments.scenario.randomness import generator
 from experiments.scenario.settings import AlignerEntry
 from experiments.study.benchmark.synthetic_pairs import SyntheticPair, synthetic_pair, true_pairs_of
 from mapfusion import se2
-from mapfusion.align.refine import Refinement
-from mapfusion.align.registry import find_method, known_methods
+from mapfusion.align.registration import Registration
 from mapfusion.align.result import NOT_RUN, Status
 from mapfusion.errors import InputError
 from mapfusion.se2 import Float
@@ -195,6 +195,7 @@ def run_cell(settings: CellSettings, job: Job) -> None:
     """Run the trials of one cell and write them."""
     started = time.perf_counter()
     aligner = callable_aligner(settings.method, settings.parameters, settings.time_limit_s)
+    registration = Registration(aligner, acceptance=None)  # methods are ranked by what they find
     rows: list[dict[str, Any]] = []
     n_pairs, share = settings.n_pairs, settings.outlier_share
     for trial in range(settings.trials):
@@ -202,9 +203,9 @@ def run_cell(settings: CellSettings, job: Job) -> None:
         pair = synthetic_pair(n_pairs, share, generator(settings.seed, *maps))
         draws = (*maps, settings.name)
         if trial == 0:  # compilation, imports and caches; not counted
-            _trial(aligner, pair, generator(settings.seed, *draws))
+            _trial(registration, pair, generator(settings.seed, *draws))
         cell = {"method": settings.name, "n_pairs": n_pairs, "outlier_share": share}
-        answer = _trial(aligner, pair, generator(settings.seed, *draws))
+        answer = _trial(registration, pair, generator(settings.seed, *draws))
         rows.append(cell | {"trial": trial} | answer)
         if time.perf_counter() - started > settings.budget_s:
             break
@@ -212,10 +213,9 @@ def run_cell(settings: CellSettings, job: Job) -> None:
     write_table(job.output / _FILE, {name: columns[name].to_numpy() for name in columns}, TRIALS)
 
 
-def _trial(aligner: CallableAligner, pair: SyntheticPair, rng: np.random.Generator) -> dict:
-    maps = (pair.map_a, pair.map_b, pair.correspondences)
-    estimated = aligner.align(*maps, rng)
-    refined = refine_estimate(Refinement(), *maps, estimated)
+def _trial(registration: Registration, pair: SyntheticPair, rng: np.random.Generator) -> dict:
+    done = registration.register(pair.map_a, pair.map_b, pair.correspondences, rng)
+    estimated, refined = done.estimated, done.refined
     row = {
         "status": str(estimated.status),
         "reason": estimated.reason,

@@ -10,7 +10,7 @@ import numpy as np
 
 from experiments.judge.errors import EvaluatedRobot
 from experiments.judge.judging import load_robot
-from experiments.methods.aligner_calls import callable_aligner, refine_estimate
+from experiments.methods.aligner_calls import callable_aligner
 from experiments.run.stages.map_batches import map_at
 from experiments.run.stages.slam import evaluated_iterations
 from experiments.run.workers import workers
@@ -23,6 +23,7 @@ from experiments.study.refusal.cases import Case
 from experiments.study.refusal.stored_worlds import Source, World, load_worlds
 from mapfusion import se2
 from mapfusion.align.acceptance import Acceptance
+from mapfusion.align.registration import Registration
 
 REPEATED_PER_WORLDS = 9  # posters hung in each pair of worlds
 
@@ -177,11 +178,8 @@ def _answers(
     for entry in settings.aligners:
         rng = generator(scenario.seed, *map(str, names.values()), entry.name)
         aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
-        estimated = aligner.align(case.map_a, case.map_b, case.pairs, rng)
-        refined = refine_estimate(
-            settings.refinement, case.map_a, case.map_b, case.pairs, estimated
-        )
-        verdict = settings.acceptance.judge(case.map_a, case.map_b, case.pairs, refined)
+        registration = Registration(aligner, settings.refinement, settings.acceptance)
+        _, refined, verdict = registration.register(case.map_a, case.map_b, case.pairs, rng)
         error = refined.T_a_b - case.T_true
         rows.append(
             names

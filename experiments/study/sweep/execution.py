@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from experiments.judge.result import measure_aligners
-from experiments.methods.one_thread import single_threaded
+from experiments.methods.threads import single_threaded
 from experiments.run.dask_cluster import connected
 from experiments.run.dask_worker import Terms, code_version
 from experiments.run.store import Store

@@ -2,17 +2,13 @@
 
 import importlib
 import math
-import time
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
-from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.pairs import gather, undetermined, why_too_few
-from mapfusion.align.result import Alignment
-from mapfusion.align.supported import supported_by
-from mapfusion.landmark_map import LandmarkMap
+from mapfusion.align.method import Fit, Undetermined, supported
+from mapfusion.align.pairs import Pairs
 from mapfusion.se2 import transform_points
 
 _SMALLEST_BOUND_M = 5e-3  # the package raises below
@@ -47,26 +43,11 @@ class KissMatcher:
         if not 0 < self.solver_share <= 1:
             raise ValueError("solver_share: must lie in (0, 1]")
 
-    def align(
-        self,
-        map_a: LandmarkMap,
-        map_b: LandmarkMap,
-        correspondences: Correspondences,
-        rng: np.random.Generator,
-    ) -> Alignment:
-        """Estimate T_a_b; nothing is drawn from `rng`.
-
-        Raises:
-            ValueError: an index of the correspondences lies outside its map.
-        """
+    def find(self, pairs: Pairs, rng: np.random.Generator) -> Fit | Undetermined:
+        """T_a_b of the pairs it keeps; nothing is drawn from `rng`."""
         package: Any = importlib.import_module("kiss_matcher")  # it carries no types
 
         del rng
-        started_s = time.perf_counter()
-        pairs = gather(map_a, map_b, correspondences)
-        reason = why_too_few(map_a, map_b, len(pairs), needed=2)
-        if reason:
-            return undetermined(reason, len(pairs), started_s)
         config = package.KISSMatcherConfig(
             voxel_size=self.noise_bound_m,
             use_voxel_sampling=False,
@@ -77,13 +58,12 @@ class KissMatcher:
         p_a, p_b = (list(p.astype(np.float32)) for p in (pairs.p_a, pairs.p_b))
         solution = package.KISSMatcher(config).prune_and_solve(p_b, p_a)
         if not solution.valid:
-            reason = "KISS-Matcher found no correspondences that agree"
-            return undetermined(reason, len(pairs), started_s)
+            return Undetermined("KISS-Matcher found no correspondences that agree")
         R, t = np.asarray(solution.rotation), np.asarray(solution.translation).ravel()
         T_a_b = np.array([t[0], t[1], math.atan2(R[1, 0], R[0, 0])])
         if not np.isfinite(T_a_b).all():
-            return undetermined("KISS-Matcher found no motion", len(pairs), started_s)
+            return Undetermined("KISS-Matcher found no motion")
         dimensions = 2 if pairs.planar else 3
         residual = (pairs.p_a - transform_points(T_a_b, pairs.p_b))[:, :dimensions]
         inlier = np.linalg.norm(residual, axis=1) <= self.noise_bound_m
-        return supported_by(pairs, inlier, T_a_b, started_s)
+        return supported(pairs, inlier, T_a_b)

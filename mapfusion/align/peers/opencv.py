@@ -1,17 +1,14 @@
 """OpenCV's RANSAC for planar similarities, `estimateAffinePartial2D`."""
 
 import math
-import time
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
-from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.pairs import gather, undetermined, why_too_few
-from mapfusion.align.result import Alignment
-from mapfusion.align.supported import supported_by
-from mapfusion.landmark_map import LandmarkMap
+from mapfusion.align.method import Fit, Undetermined, supported
+from mapfusion.align.pairs import Pairs
+from mapfusion.arguments import require_above, require_at_least, require_between
 from mapfusion.se2 import rotation, transform_points
 
 
@@ -38,38 +35,20 @@ class OpenCv:
     local_rounds: int = 10
 
     def __post_init__(self) -> None:
-        if not self.gate_m > 0:
-            raise ValueError("gate_m: must be positive")
-        if not 0 < self.confidence < 1:
-            raise ValueError("confidence: must lie between 0 and 1")
-        if not self.max_draws > 0:
-            raise ValueError("max_draws: must be positive")
-        if not self.local_rounds >= 0:
-            raise ValueError("local_rounds: must not be negative")
+        require_above(0, self, "gate_m")
+        require_between(0, 1, self, "confidence")
+        require_above(0, self, "max_draws")
+        require_at_least(0, self, "local_rounds")
 
-    def align(
-        self,
-        map_a: LandmarkMap,
-        map_b: LandmarkMap,
-        correspondences: Correspondences,
-        rng: np.random.Generator,
-    ) -> Alignment:
-        """Estimate T_a_b.
+    def find(self, pairs: Pairs, rng: np.random.Generator) -> Fit | Undetermined:
+        """T_a_b of the similarity, without its scale.
 
         OpenCV's RANSAC draws the same rows at every call, whatever `cv2.setRNGSeed` was told (its
         issue 24835, intended). So that its spread can be seen, the pairs come in an order from
         `rng`.
-
-        Raises:
-            ValueError: an index of the correspondences lies outside its map.
         """
         import cv2
 
-        started_s = time.perf_counter()
-        pairs = gather(map_a, map_b, correspondences)
-        reason = why_too_few(map_a, map_b, len(pairs), needed=2)
-        if reason:
-            return undetermined(reason, len(pairs), started_s)
         order = rng.permutation(len(pairs))
         p_a, p_b = (np.ascontiguousarray(p[order, :2]) for p in (pairs.p_a, pairs.p_b))
         similarity, supports = cv2.estimateAffinePartial2D(
@@ -83,11 +62,11 @@ class OpenCv:
         )
         supporter = np.zeros(len(pairs), dtype=bool) if supports is None else supports.ravel() != 0
         if similarity is None or not np.isfinite(similarity).all() or not supporter.any():
-            return undetermined("OpenCV found no similarity", len(pairs), started_s)
+            return Undetermined("OpenCV found no similarity")
         theta = math.atan2(similarity[1, 0], similarity[0, 0])
         t = p_a[supporter].mean(axis=0) - rotation(theta) @ p_b[supporter].mean(axis=0)
         T_a_b = np.array([*t, theta])
         within = np.linalg.norm(p_a - transform_points(T_a_b, p_b), axis=1) <= self.gate_m
         inlier = np.zeros(len(pairs), dtype=bool)
         inlier[order] = supporter & within
-        return supported_by(pairs, inlier, T_a_b, started_s)
+        return supported(pairs, inlier, T_a_b)

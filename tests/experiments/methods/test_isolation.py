@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from experiments.methods import isolation
-from experiments.methods.aligner_calls import callable_aligner, refine_estimate, require_usable
+from experiments.methods.aligner_calls import callable_aligner, require_usable
 from experiments.methods.isolation import Spec, child_for, end_children
 from experiments.scenario.randomness import generator
-from mapfusion.align.refine import Refinement
+from mapfusion.align.registration import Registration
 from mapfusion.align.result import Alignment, Status
 from tests.helpers.made_up_maps import landmark_map, paired
 from tests.helpers.made_up_plugin import install, look_again
@@ -103,8 +103,12 @@ def test_misbehaviour_is_a_status_with_a_reason(what: str, reason: str) -> None:
     assert found.inlier.shape == (5,)
     assert not found.inlier.any()
     assert math.isnan(found.elapsed_s)
-    # and it stays what it is in the step that follows, and does not spoil the next call
-    assert refine_estimate(Refinement(), *MAPS, PAIRS, found) is found
+    # and it stays what it is in the steps that follow, and does not spoil the next call
+    aligner = callable_aligner("made_up", {"what": what}, LIMIT_S)
+    done = Registration(aligner).register(*MAPS, PAIRS, generator(0, "test"))
+    assert done.estimated.status is Status.FAILED
+    assert done.refined is done.applied is done.estimated
+    assert (done.verdict.accepted, done.verdict.reason) == (False, done.estimated.reason)
     assert answer("good").status is Status.ACCEPTED
 
 

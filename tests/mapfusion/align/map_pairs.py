@@ -116,3 +116,19 @@ def stretched(rng, landmark_map, ratio=4.0):
     long = turn @ np.diag([ratio**2, 1.0]) @ np.swapaxes(turn, 1, 2)
     covariance[:, :2, :2] = sigma2 * long
     return replace(landmark_map, covariance_m2=covariance)
+
+
+def blurred(rng, n, true_share=0.3, sigma_m=0.05):
+    """Planar pairs with noise in both maps, of all sizes and shapes, and covariances to match."""
+    pair = given_pairs(rng, n, true_share, planar=True)
+    maps = []
+    for landmarks in (pair.map_a, pair.map_b):
+        covariance = landmarks.covariance_m2.copy()
+        sigma = sigma_m * rng.uniform(0.2, 1.5, n)
+        covariance[:, :2, :2] = np.eye(2) * sigma[:, None, None] ** 2
+        known = stretched(rng, replace(landmarks, covariance_m2=covariance))
+        root = np.linalg.cholesky(known.covariance_m2[:, :2, :2])
+        position = known.position_m.copy()
+        position[:, :2] += (root @ rng.standard_normal((n, 2, 1)))[:, :, 0]
+        maps.append(replace(known, position_m=position))
+    return maps, pair

@@ -21,8 +21,10 @@ from mapfusion.align.false_alarms import (
     minimal_motion,
     thin,
 )
+from mapfusion.align.pairs import Pairs
 from mapfusion.align.ransac import Ransac
 from mapfusion.align.refine import Refinement
+from mapfusion.align.registration import as_aligner
 from mapfusion.align.result import Alignment, Status, degenerate
 
 GATES_M = np.array([0.05, 0.1, 0.2, 0.4])
@@ -35,7 +37,9 @@ def alignment(T_a_b, n):
 def judged(pair, T_a_b=None, **parameters):
     T_a_b = pair.T_a_b if T_a_b is None else T_a_b
     answer = alignment(T_a_b, len(pair.correspondences))
-    return Acceptance(**parameters).judge(pair.map_a, pair.map_b, pair.correspondences, answer)
+    return Acceptance(**parameters).judge(
+        Pairs(pair.map_a, pair.map_b, pair.correspondences), answer
+    )
 
 
 def random_pairs(rng, n, planar=True):
@@ -189,9 +193,9 @@ def test_false_alarms_are_at_most_the_stated_number(planar):
     hits = low = 0
     for _ in range(n):
         map_a, map_b, pairs = random_pairs(rng, 60, planar)
-        found = Ransac(max_draws=3000).align(map_a, map_b, pairs, rng)
-        refined = Refinement().refine(map_a, map_b, pairs, found.T_a_b)
-        verdict = test.judge(map_a, map_b, pairs, refined)
+        found = as_aligner(Ransac(max_draws=3000)).align(map_a, map_b, pairs, rng)
+        refined = Refinement().refine(Pairs(map_a, map_b, pairs), found.T_a_b)
+        verdict = test.judge(Pairs(map_a, map_b, pairs), refined)
         hits += verdict.accepted
         low += verdict.log10_false_alarms <= -1
     # a stated rate of 0.1 must not be rejected by the count of those below it
@@ -259,7 +263,7 @@ def test_verdict_does_not_depend_on_the_frames():
         T_a_b = (
             pair.T_a_b
             if true_share
-            else Ransac().align(pair.map_a, pair.map_b, pair.correspondences, rng).T_a_b
+            else as_aligner(Ransac()).align(pair.map_a, pair.map_b, pair.correspondences, rng).T_a_b
         )
         expected = judged(pair, T_a_b)
         T_new_a, T_new_b = motion(rng), motion(rng)
@@ -280,7 +284,7 @@ def test_a_few_landmarks_with_known_labels_pass_when_all_agree():
         p_b[:, :2] += rng.normal(0, 0.02, (n, 2))
         maps = landmarks(p_a, 0.02, planar=True), landmarks(p_b, 0.02, planar=True)
         pairs = Correspondences(np.arange(n), np.arange(n), np.zeros(n))
-        verdict = Acceptance().judge(*maps, pairs, alignment([1, 2, 0.5], n))
+        verdict = Acceptance().judge(Pairs(*maps, pairs), alignment([1, 2, 0.5], n))
         assert verdict.accepted is accepted, n
     assert verdict.log10_false_alarms < -15
 
@@ -303,7 +307,7 @@ def test_the_threshold_is_the_stated_number():
 def test_a_failed_alignment_is_not_judged():
     pair = given_pairs(np.random.default_rng(11), 30)
     failed = degenerate("no shape", 30)
-    verdict = Acceptance().judge(pair.map_a, pair.map_b, pair.correspondences, failed)
+    verdict = Acceptance().judge(Pairs(pair.map_a, pair.map_b, pair.correspondences), failed)
     assert (verdict.accepted, verdict.reason) == (False, "no shape")
     assert math.isnan(verdict.log10_false_alarms)
     assert verdict.applied_to(failed) is failed
@@ -347,4 +351,4 @@ def test_wrong_indices_are_named():
     pair = given_pairs(np.random.default_rng(13), 10)
     outside = replace(pair.correspondences, index_b=pair.correspondences.index_b + 1)
     with pytest.raises(ValueError, match="index_b"):
-        Acceptance().judge(pair.map_a, pair.map_b, outside, alignment(pair.T_a_b, 10))
+        Acceptance().judge(Pairs(pair.map_a, pair.map_b, outside), alignment(pair.T_a_b, 10))

@@ -9,7 +9,9 @@ from map_pairs import MapPair, error, given_pairs, landmarks, motion, moved, swa
 from mapfusion import se2
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.oracle import Oracle
+from mapfusion.align.pairs import Pairs
 from mapfusion.align.refine import Refinement
+from mapfusion.align.registration import as_aligner
 from mapfusion.align.registry import ALIGNERS, make_aligner
 from mapfusion.align.result import Status
 from mapfusion.align.svd import Svd
@@ -22,10 +24,10 @@ def estimate(name, pair, seed=0):
     """By name; "refined" is RANSAC's estimate after the refinement, "oracle" knows the truth."""
     maps = pair.map_a, pair.map_b, pair.correspondences
     if name == "oracle":
-        return Oracle().align(*maps, pair.is_true)
+        return Oracle().align(Pairs(*maps), pair.is_true)
     if name == "refined":
-        return Refinement().refine(*maps, estimate("ransac", pair, seed).T_a_b)
-    return NAMED[name].align(*maps, np.random.default_rng(seed))
+        return Refinement().refine(Pairs(*maps), estimate("ransac", pair, seed).T_a_b)
+    return as_aligner(NAMED[name]).align(*maps, np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize("planar", [False, True])
@@ -141,7 +143,7 @@ def test_degenerate_input_is_a_status(name, case):
     map_a, map_b, n, reason = degenerate_inputs()[case]
     pair = MapPair(map_a, map_b, np.zeros(3), pairs_of(n), np.ones(n, dtype=bool))
     found = estimate(name, pair)
-    refined = Refinement().refine(map_a, map_b, pairs_of(n), found.T_a_b)
+    refined = Refinement().refine(Pairs(map_a, map_b, pairs_of(n)), found.T_a_b)
     for alignment in (found, refined):
         assert alignment.status is not Status.ACCEPTED
         assert alignment.reason
@@ -165,7 +167,7 @@ def test_index_outside_its_map_is_named(name):
 def test_oracle_asks_for_one_mark_a_pair():
     full = landmarks(np.zeros((5, 3)))
     with pytest.raises(ValueError, match="is_true"):
-        Oracle().align(full, full, pairs_of(5), np.ones(4, dtype=bool))
+        Oracle().align(Pairs(full, full, pairs_of(5)), np.ones(4, dtype=bool))
 
 
 def test_oracle_ignores_false_pairs():

@@ -8,26 +8,26 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from map_pairs import error, given_pairs, landmarks, moved, swapped
+from map_pairs import blurred, error, given_pairs, landmarks, moved, swapped
 from scipy.stats import chi2
 from scipy.stats import f as f_distribution
-from test_consistency import blurred, slow_consistency
-from test_ransac import LOG_MISS, draw
-from test_support import slow_squares
+from slow_twins import draw, slow_consistency, slow_squares
 
 from mapfusion import se2
 from mapfusion.align.clique import Clique
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.gnc import Gnc
+from mapfusion.align.mahalanobis_gate import settle
 from mapfusion.align.oracle import Oracle
-from mapfusion.align.pairs import gather
-from mapfusion.align.ransac_mahalanobis import RansacMahalanobis, search
+from mapfusion.align.pairs import Pairs
+from mapfusion.align.ransac_mahalanobis import RansacMahalanobis, least_truncated_squares
+from mapfusion.align.registration import as_aligner
 from mapfusion.align.registry import make_aligner
 from mapfusion.align.result import Status
 from mapfusion.align.rigid import fit_rigid
-from mapfusion.align.support import in_plan, settle
 
 NAMES = ["gnc", "clique", "ransac_mahalanobis"]
+LOG_MISS = math.log(1e-4)
 SUCCESS_M, SUCCESS_RAD = 0.2, 0.05
 motions = st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(-3.14, 3.14)).map(np.array)
 
@@ -35,7 +35,9 @@ motions = st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(-3.14, 3.1
 def estimate(aligner, pair, seed=0):
     if isinstance(aligner, str):
         aligner = make_aligner(aligner)
-    return aligner.align(pair.map_a, pair.map_b, pair.correspondences, np.random.default_rng(seed))
+    return as_aligner(aligner).align(
+        pair.map_a, pair.map_b, pair.correspondences, np.random.default_rng(seed)
+    )
 
 
 def with_noise_in_both(seed, n, true_share, sigma_m=0.05, drift_m=0.0):
@@ -108,7 +110,7 @@ def test_the_bars(name, n, outliers, least):
     for seed in range(100):
         pair = with_noise_in_both(seed, n, 1 - outliers)
         found.append(error(estimate(name, pair, seed).T_a_b, pair.T_a_b))
-        oracle = Oracle().align(pair.map_a, pair.map_b, pair.correspondences, pair.is_true)
+        oracle = Oracle().align(Pairs(pair.map_a, pair.map_b, pair.correspondences), pair.is_true)
         best.append(error(oracle.T_a_b, pair.T_a_b))
     assert np.sum(np.all(np.array(found) < (SUCCESS_M, SUCCESS_RAD), axis=1)) >= least
     assert np.median(found, axis=0)[0] <= 1.1 * np.median(best, axis=0)[0]
@@ -137,11 +139,11 @@ def test_heights_count_unless_planar(name):
     lifted = p + np.array([0, 0, 5.0])
     pairs = Correspondences(np.arange(20), np.arange(20), np.zeros(20))
     rng = np.random.default_rng(0)
-    found = make_aligner(name).align(landmarks(p), landmarks(lifted), pairs, rng)
+    found = as_aligner(make_aligner(name)).align(landmarks(p), landmarks(lifted), pairs, rng)
     assert found.status is Status.DEGENERATE
     assert "height" in found.reason
     flat = [landmarks(x, planar=True) for x in (p, lifted)]
-    assert make_aligner(name).align(*flat, pairs, rng).ok
+    assert as_aligner(make_aligner(name)).align(*flat, pairs, rng).ok
 
 
 def test_clique_is_the_largest_set_that_agrees():
@@ -157,7 +159,7 @@ def test_clique_is_the_largest_set_that_agrees():
         agree = difference**2 <= bound * 2 * 0.05**2
         sets = (s for size in range(14, 1, -1) for s in combinations(range(14), size))
         largest = np.array(next(s for s in sets if agree[np.ix_(s, s)].all()))
-        planar = in_plan(gather(pair.map_a, pair.map_b, pair.correspondences))
+        planar = Pairs(pair.map_a, pair.map_b, pair.correspondences).in_plan()
         T, inside = np.array(fit_rigid(a, b, largest)), np.empty(14, dtype=bool)
         settle(T, planar, 1e-12, aligner.bound, inside)
         found = estimate(aligner, pair)
@@ -168,7 +170,7 @@ def test_clique_is_the_largest_set_that_agrees():
 def slow_search(pairs, variance, bound, agreement, max_draws, seed):
     """The search as its docstring has it, with the twins of what it is made of."""
     n, state, draws, needed = len(pairs), seed, 0, max_draws
-    agree, planar = slow_consistency(in_plan(pairs), variance, agreement), in_plan(pairs)
+    agree, planar = slow_consistency(pairs.in_plan(), variance, agreement), pairs.in_plan()
     best_T, best_score, best_raw = None, 0.0, 0.0
     while draws < needed:
         draws += 1
@@ -200,10 +202,10 @@ def scores(T_a_b, pairs, variance, bound):
 @pytest.mark.parametrize("seed", range(5))
 def test_search_equals_its_twin(seed):
     maps, pair = blurred(np.random.default_rng(seed), 50, 0.2)
-    pairs = gather(*maps, pair.correspondences)
+    pairs = Pairs(*maps, pair.correspondences)
     bound, agreement = float(chi2.ppf(0.99, 2)), float(chi2.ppf(0.99, 1))
-    draws, T = search(
-        in_plan(pairs), 0.0025, bound, agreement, 1.0, LOG_MISS, 3000, np.uint64(seed + 1)
+    draws, T = least_truncated_squares(
+        pairs.in_plan(), 0.0025, bound, agreement, 1.0, LOG_MISS, 3000, np.uint64(seed + 1)
     )
     slow_draws, slow_T = slow_search(pairs, 0.0025, bound, agreement, 3000, seed + 1)
     assert draws == slow_draws
@@ -224,7 +226,7 @@ def test_a_sharp_landmark_is_held_to_more_than_a_blurred_one():
     map_b = landmarks(off, 0.02, planar=True)
     pairs = Correspondences(np.arange(40), np.arange(40), np.zeros(40))
     for name in NAMES:
-        found = make_aligner(name, drift_sigma_m=0.05).align(map_a, map_b, pairs, rng)
+        found = as_aligner(make_aligner(name, drift_sigma_m=0.05)).align(map_a, map_b, pairs, rng)
         assert found.inlier[0]
         assert not found.inlier[1:3].any()
         assert found.inlier[3:].all()

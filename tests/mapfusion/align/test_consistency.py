@@ -1,32 +1,13 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from map_pairs import given_pairs, motion, moved, stretched
-from scipy.spatial.distance import cdist
+from map_pairs import blurred, given_pairs, motion, moved
 from scipy.stats import chi2
+from slow_twins import slow_consistency
 
 from mapfusion.align.consistency import consistency
-from mapfusion.align.pairs import gather
-from mapfusion.align.support import in_plan
+from mapfusion.align.pairs import Pairs
 
 BOUND = float(chi2.ppf(0.999, 1))
-
-
-def blurred(rng, n, true_share=0.3, sigma_m=0.05):
-    """Planar pairs with noise in both maps, of all sizes and shapes, and covariances to match."""
-    pair = given_pairs(rng, n, true_share, planar=True)
-    maps = []
-    for landmarks in (pair.map_a, pair.map_b):
-        covariance = landmarks.covariance_m2.copy()
-        sigma = sigma_m * rng.uniform(0.2, 1.5, n)
-        covariance[:, :2, :2] = np.eye(2) * sigma[:, None, None] ** 2
-        known = stretched(rng, replace(landmarks, covariance_m2=covariance))
-        root = np.linalg.cholesky(known.covariance_m2[:, :2, :2])
-        position = known.position_m.copy()
-        position[:, :2] += (root @ rng.standard_normal((n, 2, 1)))[:, :, 0]
-        maps.append(replace(known, position_m=position))
-    return maps, pair
 
 
 def unpacked(graphs, n):
@@ -35,26 +16,14 @@ def unpacked(graphs, n):
     return bits[:, :, :n].astype(bool)
 
 
-def slow_consistency(pairs, variance, bound=BOUND):
-    """Distances and the variances along their lines, with whole matrices."""
-    total = 2 * variance
-    for p, S in ((pairs.p_a, pairs.S_a), (pairs.p_b, pairs.S_b)):
-        line = p[None] - p[:, None]
-        length = np.linalg.norm(line, axis=2)
-        unit = line / np.where(length > 0, length, 1)[:, :, None]
-        total = total + np.einsum("ijk,ijkl,ijl->ij", unit, S[:, None] + S[None], unit)
-    difference = cdist(pairs.p_a, pairs.p_a) - cdist(pairs.p_b, pairs.p_b)
-    return (difference**2 <= bound * total) & ~np.eye(len(pairs.p_a), dtype=bool)
-
-
 @pytest.mark.parametrize("n", [2, 8, 63, 64, 65, 200])
 def test_kernel_equals_its_twin(n):
     (map_a, map_b), pair = blurred(np.random.default_rng(n), n)
-    pairs = in_plan(gather(map_a, map_b, pair.correspondences))
+    pairs = Pairs(map_a, map_b, pair.correspondences).in_plan()
     variances = np.array([1e-12, 0.0025, 0.01])
     found = unpacked(consistency(pairs, variances, BOUND), n)
     for graph, variance in zip(found, variances, strict=True):
-        np.testing.assert_array_equal(graph, slow_consistency(pairs, variance))
+        np.testing.assert_array_equal(graph, slow_consistency(pairs, variance, BOUND))
         np.testing.assert_array_equal(graph, graph.T)
 
 
@@ -65,7 +34,7 @@ def test_true_pairs_agree_with_the_probability_stated(drift_m):
         rng = np.random.default_rng(seed)
         (map_a, map_b), pair = blurred(rng, n, true_share=1.0)
         map_b.position_m[:, :2] += rng.normal(0, drift_m, (n, 2))
-        pairs = in_plan(gather(map_a, map_b, pair.correspondences))
+        pairs = Pairs(map_a, map_b, pair.correspondences).in_plan()
         graph = consistency(pairs, np.array([max(drift_m**2, 1e-12)]), BOUND)
         disagreeing.append(1 - np.sum(unpacked(graph, n)) / (n * (n - 1)))
     # one landmark is in 199 comparisons: the scatter over the maps tells how sure the mean is
@@ -77,7 +46,7 @@ def test_does_not_depend_on_the_frames():
     rng = np.random.default_rng(1)
     (map_a, map_b), pair = blurred(rng, 150)
     graphs = [
-        consistency(in_plan(gather(a, b, pair.correspondences)), np.array([0.01]), BOUND)
+        consistency(Pairs(a, b, pair.correspondences).in_plan(), np.array([0.01]), BOUND)
         for a, b in ((map_a, map_b), (moved(map_a, motion(rng)), moved(map_b, motion(rng))))
     ]
     np.testing.assert_array_equal(*graphs)
@@ -87,6 +56,6 @@ def test_exact_maps_without_covariance_agree():
     """Nothing but rounding keeps these distances apart, a kilometre from the origin."""
     rng = np.random.default_rng(2)
     pair = given_pairs(rng, 100, planar=True, T_a_b=np.array([1000.0, -700.0, 2.0]))
-    pairs = in_plan(gather(pair.map_a, pair.map_b, pair.correspondences))
+    pairs = Pairs(pair.map_a, pair.map_b, pair.correspondences).in_plan()
     graph = unpacked(consistency(pairs, np.array([1e-12]), BOUND), 100)[0]
     assert np.sum(graph) == 100 * 99

@@ -1,12 +1,13 @@
 import numpy as np
 import pytest
-from map_pairs import error, given_pairs
-from test_consistency import blurred
+from map_pairs import blurred, error, given_pairs
 
 from mapfusion import se2
 from mapfusion.align.gnc import Gnc, anneal
-from mapfusion.align.pairs import gather
-from mapfusion.align.support import fit_weighted, in_plan, mean_variances
+from mapfusion.align.mahalanobis_gate import mean_variances
+from mapfusion.align.pairs import Pairs
+from mapfusion.align.registration import as_aligner
+from mapfusion.align.rigid import fit_weighted
 
 BOUND = Gnc().bound
 
@@ -33,7 +34,7 @@ def slow_anneal(pairs, mean):
 @pytest.mark.parametrize("seed", range(5))
 def test_kernel_equals_its_twin(seed):
     (map_a, map_b), pair = blurred(np.random.default_rng(seed), 120, 0.5)
-    pairs = in_plan(gather(map_a, map_b, pair.correspondences))
+    pairs = Pairs(map_a, map_b, pair.correspondences).in_plan()
     mean = mean_variances(pairs, 0.0025)
     T, weight = anneal(pairs, mean, BOUND)
     slow_T, slow_weight = slow_anneal(pairs, mean)
@@ -43,7 +44,7 @@ def test_kernel_equals_its_twin(seed):
 
 def test_pairs_that_all_fit_end_it_at_once():
     pair = given_pairs(np.random.default_rng(1), 50, 1.0, 0.01, planar=True)
-    pairs = in_plan(gather(pair.map_a, pair.map_b, pair.correspondences))
+    pairs = Pairs(pair.map_a, pair.map_b, pair.correspondences).in_plan()
     _, weight = anneal(pairs, np.full(50, 1.0), BOUND)
     np.testing.assert_array_equal(weight, 1.0)
 
@@ -56,6 +57,8 @@ def test_breaks_down_where_it_is_known_to(outliers, least, most):
     good = 0
     for seed in range(100):
         pair = given_pairs(np.random.default_rng(seed), 60, 1 - outliers, 0.05, planar=True)
-        found = Gnc().align(pair.map_a, pair.map_b, pair.correspondences, np.random.default_rng(0))
+        found = as_aligner(Gnc()).align(
+            pair.map_a, pair.map_b, pair.correspondences, np.random.default_rng(0)
+        )
         good += bool(np.all(np.array(error(found.T_a_b, pair.T_a_b)) < (0.2, 0.05)))
     assert least <= good <= most

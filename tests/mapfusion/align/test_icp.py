@@ -6,6 +6,8 @@ from scipy.spatial.distance import cdist
 from mapfusion import se2
 from mapfusion.align.icp import ClosestPoints, Icp
 from mapfusion.align.impicp import ImpIcp
+from mapfusion.align.pairs import Pairs
+from mapfusion.align.registration import as_aligner
 from mapfusion.align.registry import make_aligner
 from mapfusion.align.result import Status
 from mapfusion.align.rigid import fit_rigid
@@ -33,11 +35,12 @@ def test_kernel_equals_its_twin(offset_m, max_rounds):
     pair = given_pairs(np.random.default_rng(0), 300, 0.7, 0.05)
     start = pair.T_a_b + np.array([offset_m, -offset_m, 0.1 * offset_m])
     closest = ClosestPoints(pair.map_a, pair.map_b)
-    alignment = closest.align(start, pair.correspondences, max_rounds, 0.0)
+    pairs = Pairs(pair.map_a, pair.map_b, pair.correspondences)
+    found = closest.descend(start, pairs, max_rounds)
     T, nearest, repeats = slow_icp(pair.map_a.position_m, pair.map_b.position_m, start, max_rounds)
-    np.testing.assert_allclose(alignment.T_a_b, T, atol=1e-9)
-    np.testing.assert_array_equal(alignment.inlier, nearest == np.arange(300))
-    assert ("still changed" in alignment.reason) == (not repeats)
+    np.testing.assert_allclose(found.T_a_b, T, atol=1e-9)
+    np.testing.assert_array_equal(found.inlier, nearest == np.arange(300))
+    assert ("still changed" in found.refusal) == (not repeats)
 
 
 def test_cost_is_the_summed_square_distance():
@@ -60,7 +63,7 @@ def share_of_good_answers(name, pair):
     for seed in range(60):
         rng = np.random.default_rng(seed)
         aligner = make_aligner(name)
-        alignment = aligner.align(pair.map_a, pair.map_b, pair.correspondences, rng)
+        alignment = as_aligner(aligner).align(pair.map_a, pair.map_b, pair.correspondences, rng)
         close += error(alignment.T_a_b, pair.T_a_b)[0] < 0.5
     return close / 60
 
@@ -77,7 +80,7 @@ def test_starts_come_from_the_best_matching():
     pair = given_pairs(np.random.default_rng(4), 100, 0.5, 0.02)
     pair.correspondences.distance[:] = np.where(pair.is_true, 0.1, 0.2)
     for seed in range(10):
-        alignment = ImpIcp(best_share=0.5).align(
+        alignment = as_aligner(ImpIcp(best_share=0.5)).align(
             pair.map_a, pair.map_b, pair.correspondences, np.random.default_rng(seed)
         )
         assert alignment.status is Status.ACCEPTED

@@ -6,10 +6,11 @@ import pytest
 from mapfusion import se2
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.leverage import most_leverage
+from mapfusion.align.mahalanobis_gate import PlanarPairs
+from mapfusion.align.pairs import Pairs
 from mapfusion.align.refine import Refinement
 from mapfusion.align.result import Status
 from mapfusion.align.rigid import motion_jacobian, residual_covariances
-from mapfusion.align.support import PlanarPairs
 from mapfusion.landmark_map import LandmarkMap
 
 T_TRUE = np.array([1.0, -2.0, 0.7])
@@ -43,7 +44,7 @@ def a_corner_and_one_far(
 
 def test_a_false_far_pair_turns_the_map_and_is_found_out() -> None:
     map_a, map_b, pairs, T_turned = a_corner_and_one_far(0.7)
-    found = Refinement().refine(map_a, map_b, pairs, T_turned)
+    found = Refinement().refine(Pairs(map_a, map_b, pairs), T_turned)
     assert np.hypot(*(found.T_a_b - T_turned)[:2]) < 0.1  # it did go there: residuals fit the gate
     assert abs(found.T_a_b[2] - T_TRUE[2]) > 0.5
     assert found.status is Status.REFUSED
@@ -53,7 +54,7 @@ def test_a_false_far_pair_turns_the_map_and_is_found_out() -> None:
 @pytest.mark.parametrize("seed", range(10))
 def test_a_true_far_pair_is_welcome(seed: int) -> None:
     map_a, map_b, pairs, start = a_corner_and_one_far(0.0, seed)
-    found = Refinement().refine(map_a, map_b, pairs, start)
+    found = Refinement().refine(Pairs(map_a, map_b, pairs), start)
     assert found.status is Status.ACCEPTED
     assert abs(found.T_a_b[2] - T_TRUE[2]) < 0.01
 

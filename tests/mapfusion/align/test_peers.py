@@ -6,6 +6,7 @@ from map_pairs import error, given_pairs, landmarks, swapped
 
 from mapfusion import se2
 from mapfusion.align.correspondences import Correspondences
+from mapfusion.align.registration import as_aligner
 from mapfusion.align.registry import make_aligner
 from mapfusion.align.result import Status
 from mapfusion.align.rigid import fit_rigid
@@ -18,7 +19,7 @@ PEERS = {"opencv": make_aligner("opencv"), "kiss_matcher": make_aligner("kiss_ma
 
 def estimate(name, pair, seed=0):
     maps = pair.map_a, pair.map_b, pair.correspondences
-    return PEERS[name].align(*maps, np.random.default_rng(seed))
+    return as_aligner(PEERS[name]).align(*maps, np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize("planar", [False, True])
@@ -58,7 +59,7 @@ def test_opencv_gives_a_motion_although_it_fits_a_scale():
     p = rng.uniform(0, 20, (40, 3))
     grown = landmarks(1.01 * p)
     rows = np.arange(40)
-    found = PEERS["opencv"].align(
+    found = as_aligner(PEERS["opencv"]).align(
         grown, landmarks(p), Correspondences(rows, rows, np.zeros(40)), np.random.default_rng(0)
     )
     assert found.inlier.all()
@@ -83,7 +84,7 @@ def test_too_few_pairs_are_a_status(name, n):
     pair = given_pairs(np.random.default_rng(5), 40)
     pair.correspondences.distance[:] = 0
     maps = pair.map_a, pair.map_b, pair.correspondences[np.arange(n)]
-    found = PEERS[name].align(*maps, np.random.default_rng(0))
+    found = as_aligner(PEERS[name]).align(*maps, np.random.default_rng(0))
     assert found.inlier.shape == (n,)
     assert (found.status is Status.ACCEPTED) == (n == 3)
     assert bool(found.reason) == (n < 3)
@@ -96,7 +97,7 @@ def test_nothing_agrees(name):
     apart = landmarks(np.diag([1.0, 10.0, 0.0])[[0, 1, 2, 2]] + rng.uniform(0, 0.1, (4, 3)))
     wide = landmarks(np.diag([300.0, 900.0, 0.0])[[0, 1, 2, 2]] * [[1], [1], [1], [-4]] + 50.0)
     pairs = Correspondences(rows, rows, np.zeros(4))
-    found = PEERS[name].align(apart, wide, pairs, np.random.default_rng(0))
+    found = as_aligner(PEERS[name]).align(apart, wide, pairs, np.random.default_rng(0))
     assert found.status is not Status.ACCEPTED
     assert found.reason
 

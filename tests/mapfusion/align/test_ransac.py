@@ -5,24 +5,19 @@ import numpy as np
 import pytest
 from map_pairs import error, given_pairs, landmarks
 from scipy.stats import chisquare
+from slow_twins import draw
 
 from mapfusion import se2
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.oracle import Oracle
-from mapfusion.align.ransac import Ransac, draw_pair, search
+from mapfusion.align.pairs import Pairs
+from mapfusion.align.ransac import Ransac, draw_pair, most_supported
 from mapfusion.align.refine import Refinement
+from mapfusion.align.registration import as_aligner
 from mapfusion.align.result import Status
 
 GATE_M, BASELINE_M = 0.3, 1.0
 LOG_MISS = math.log(1e-4)
-WORD = 2**64 - 1
-
-
-def draw(state):
-    state ^= (state << 13) & WORD
-    state ^= state >> 7
-    state ^= (state << 17) & WORD
-    return state
 
 
 def closed_form(p_a, p_b):
@@ -86,7 +81,9 @@ def test_kernel_equals_its_twin(seed, planar):
     p_a, p_b = (m.position_m[:, :dimensions].copy() for m in (pair.map_a, pair.map_b))
     if not planar:  # some pairs agree in plan only
         p_b[::7, 2] += 0.5
-    draws, T, rows = search(p_a, p_b, GATE_M, BASELINE_M, LOG_MISS, 3000, np.uint64(seed + 1))
+    draws, T, rows = most_supported(
+        p_a, p_b, GATE_M, BASELINE_M, LOG_MISS, 3000, np.uint64(seed + 1)
+    )
     twin_draws, twin_T, twin_rows = slow_search(p_a, p_b, 3000, seed + 1)
     assert draws == twin_draws
     np.testing.assert_array_equal(rows, twin_rows)
@@ -102,7 +99,7 @@ def test_no_minimal_set_of_all_has_more_support(seed):
         raw = hypothesis(p_a, p_b, i, j)
         if raw is not None and len(raw[1]) >= 2:
             most = max(most, len(settled(raw[0], raw[1], p_a, p_b)[1]))
-    _, _, rows = search(p_a, p_b, GATE_M, BASELINE_M, math.log(1e-9), 100_000, np.uint64(1))
+    _, _, rows = most_supported(p_a, p_b, GATE_M, BASELINE_M, math.log(1e-9), 100_000, np.uint64(1))
     assert len(rows) >= most
 
 
@@ -115,7 +112,7 @@ def test_of_equal_support_the_nearer_wins():
     p_a += rng.uniform(-0.05, 0.05, p_a.shape)
     p_a[::2] = se2.transform_points(exact, p_b[::2])
     for seed in range(1, 20):
-        _, T, rows = search(p_a, p_b, GATE_M, BASELINE_M, LOG_MISS, 3000, np.uint64(seed))
+        _, T, rows = most_supported(p_a, p_b, GATE_M, BASELINE_M, LOG_MISS, 3000, np.uint64(seed))
         assert len(rows) == 20
         assert error(T, exact) == pytest.approx((0, 0), abs=1e-9)
 
@@ -137,11 +134,11 @@ def test_the_bar(outliers, least):
         rng = np.random.default_rng(1000 + seed)
         pair = given_pairs(rng, 1000, 1 - outliers, 0.05)
         maps = pair.map_a, pair.map_b, pair.correspondences
-        alignment = Ransac().align(*maps, rng)
-        refinement = Refinement().refine(*maps, alignment.T_a_b)
+        alignment = as_aligner(Ransac()).align(*maps, rng)
+        refinement = Refinement().refine(Pairs(*maps), alignment.T_a_b)
         estimated.append(error(alignment.T_a_b, pair.T_a_b))
         refined.append(error(refinement.T_a_b, pair.T_a_b))
-        best.append(error(Oracle().align(*maps, pair.is_true).T_a_b, pair.T_a_b))
+        best.append(error(Oracle().align(Pairs(*maps), pair.is_true).T_a_b, pair.T_a_b))
     for errors in (np.array(estimated), np.array(refined)):
         assert np.sum(np.all(errors < (0.2, 0.05), axis=1)) >= least
         assert np.median(errors[:, 0]) <= 1.1 * np.median(np.array(best)[:, 0])
@@ -150,7 +147,7 @@ def test_the_bar(outliers, least):
 def test_false_pairs_are_left_out():
     rng = np.random.default_rng(5)
     pair = given_pairs(rng, 200, 0.4, 0.03)
-    alignment = Ransac().align(pair.map_a, pair.map_b, pair.correspondences, rng)
+    alignment = as_aligner(Ransac()).align(pair.map_a, pair.map_b, pair.correspondences, rng)
     assert alignment.status is Status.ACCEPTED
     assert np.mean(alignment.inlier[pair.is_true]) == 1.0
     assert np.sum(alignment.inlier & ~pair.is_true) <= 2
@@ -161,17 +158,19 @@ def test_heights_count_unless_planar():
     lifted = p + np.array([0, 0, 5.0])
     pairs = Correspondences(np.arange(20), np.arange(20), np.zeros(20))
     rng = np.random.default_rng(0)
-    alignment = Ransac().align(landmarks(p), landmarks(lifted), pairs, rng)
+    alignment = as_aligner(Ransac()).align(landmarks(p), landmarks(lifted), pairs, rng)
     assert alignment.status is Status.DEGENERATE
     assert "height" in alignment.reason
     flat = [landmarks(x, planar=True) for x in (p, lifted)]
-    assert Ransac().align(*flat, pairs, rng).ok
+    assert as_aligner(Ransac()).align(*flat, pairs, rng).ok
 
 
 def test_one_draw_from_the_generator_decides():
     pair = given_pairs(np.random.default_rng(7), 100, 0.3, 0.05)
     runs = [
-        Ransac().align(pair.map_a, pair.map_b, pair.correspondences, np.random.default_rng(s))
+        as_aligner(Ransac()).align(
+            pair.map_a, pair.map_b, pair.correspondences, np.random.default_rng(s)
+        )
         for s in (1, 1)
     ]
     assert runs[0].T_a_b.tobytes() == runs[1].T_a_b.tobytes()

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,8 +9,8 @@ from scipy.stats import f as f_distribution
 
 from mapfusion import se2
 from mapfusion.align.drift import drift_step
-from mapfusion.align.pairs import Pairs, gather
-from mapfusion.align.refine import Refinement, iterate
+from mapfusion.align.pairs import Pairs
+from mapfusion.align.refine import Refinement, maximise_likelihood
 from mapfusion.align.result import Status
 from mapfusion.align.rigid import motion_jacobian, residual_covariances, residuals
 
@@ -52,9 +53,9 @@ def test_kernel_equals_its_twin(rounds):
     rng = np.random.default_rng(0)
     pair, (map_a, map_b, c) = offered(rng, 80, 0.5, 0.1)
     map_a = replace(map_a, covariance_m2=map_b.covariance_m2)
-    pairs = gather(stretched(rng, map_a), stretched(rng, map_b), c)
+    pairs = Pairs(stretched(rng, map_a), stretched(rng, map_b), c)
     start = pair.T_a_b + np.array([0.1, -0.05, 0.005])
-    solved, _, T, covariance, variance, truth = iterate(
+    solved, _, T, covariance, variance, truth = maximise_likelihood(
         pairs.p_a, pairs.p_b, pairs.covariance_a, pairs.covariance_b, start, 0.5, 0.06, rounds
     )
     twin = slow_iterate(pairs, start, 0.5, 0.06, rounds)
@@ -75,10 +76,12 @@ def test_few_pairs_far_surer_than_the_rest_do_not_swing_it(seed):
     p_a[:n_sure] += rng.normal(size=(n_sure, 2)) * 0.008
     S = np.eye(2) * (sigma**2 / 2)[:, None, None]
     start = T_a_b + np.array([0.05, 0.05, 0.01])
-    solved, moved_m, T, _, variance, truth = iterate(p_a, p_b, S, S, start, 0.5, 0.1, 100)
+    solved, moved_m, T, _, variance, truth = maximise_likelihood(
+        p_a, p_b, S, S, start, 0.5, 0.1, 100
+    )
     assert solved
     assert moved_m < 1e-8
-    pairs = Pairs(p_a, p_b, S, S, planar=True)
+    pairs = SimpleNamespace(p_a=p_a, p_b=p_b, covariance_a=S, covariance_b=S)
     share = truth.sum() / (n + 1)
     again, _, variance_again, _ = slow_iterate(pairs, T, 0.5, 0.1, 1, variance, share)
     np.testing.assert_allclose(again, T, atol=1e-7)
@@ -89,8 +92,8 @@ def test_answer_is_where_the_likelihood_is_flat():
     """With round covariances, weights do not turn with theta, and the fixed point is a maximum."""
     pair, maps = offered(np.random.default_rng(1), 150, 0.4, 0.1)
     refinement = Refinement(gate_m=0.5, least_drift_m=0.0)
-    found = refinement.refine(*maps, pair.T_a_b)
-    pairs = gather(*maps)
+    found = refinement.refine(Pairs(*maps), pair.T_a_b)
+    pairs = Pairs(*maps)
     e = residuals(found.T_a_b, pairs.p_a, pairs.p_b)
     variance = 0.04**2 + found.drift_sigma_m**2
     candidates = pairs.of_one_height(refinement.height)
@@ -127,7 +130,7 @@ def test_error_falls_with_the_root_of_the_number_of_pairs():
         squares = []
         for seed in range(80):
             pair, maps = offered(np.random.default_rng(seed), n, 1.0, 0.1)
-            found = Refinement().refine(*maps, pair.T_a_b)
+            found = Refinement().refine(Pairs(*maps), pair.T_a_b)
             centre = pair.map_b.position_m.mean(axis=0)[None]
             squares.append(
                 np.sum(
@@ -156,7 +159,7 @@ def test_covariance_covers_the_error(drift_m):
         noise = np.linalg.cholesky(map_b.covariance_m2) @ rng.standard_normal((150, 3, 1))
         noise[:, :2] += rng.normal(0, drift_m, (150, 2, 1))
         map_b = replace(map_b, position_m=map_b.position_m + noise[:, :, 0])
-        found = Refinement().refine(pair.map_a, map_b, pair.correspondences, pair.T_a_b)
+        found = Refinement().refine(Pairs(pair.map_a, map_b, pair.correspondences), pair.T_a_b)
         assert found.status is Status.ACCEPTED
         difference = found.T_a_b - pair.T_a_b
         difference[2] = se2.wrap(difference[2])
@@ -180,7 +183,7 @@ def test_covariance_covers_the_error_among_planar_outliers(n, n_true, drift_m):
     for seed in range(300):
         rng = np.random.default_rng(seed)
         pair = given_pairs(rng, n, n_true / n, 0.05, drift_m, planar=True)
-        found = Refinement().refine(pair.map_a, pair.map_b, pair.correspondences, pair.T_a_b)
+        found = Refinement().refine(Pairs(pair.map_a, pair.map_b, pair.correspondences), pair.T_a_b)
         assert found.status is Status.ACCEPTED
         difference = found.T_a_b - pair.T_a_b
         difference[2] = se2.wrap(difference[2])
@@ -198,39 +201,39 @@ def test_a_part_that_moved_as_one_is_not_taken_for_false():
     aside = map_b.position_m[:, 0] > np.quantile(map_b.position_m[:, 0], 0.8)
     map_b = replace(map_b, position_m=map_b.position_m + 0.3 * aside[:, None] * np.array([0, 1, 0]))
     starts = pair.T_a_b + np.array([[0, 0, 0], [0.2, 0, 0], [0, 0.2, 0], [0, -0.2, 0]])
-    first, *others = (Refinement().refine(map_a, map_b, c, T_a_b) for T_a_b in starts)
+    first, *others = (Refinement().refine(Pairs(map_a, map_b, c), T_a_b) for T_a_b in starts)
     assert np.all(first.inlier)
     for other in others:
         assert error(other.T_a_b, first.T_a_b) == pytest.approx((0, 0), abs=1e-6)
     sure_of_little_drift = Refinement(least_drift_m=0.0)
-    answers = [sure_of_little_drift.refine(map_a, map_b, c, T_a_b) for T_a_b in starts]
+    answers = [sure_of_little_drift.refine(Pairs(map_a, map_b, c), T_a_b) for T_a_b in starts]
     assert not all(np.all(answer.inlier) for answer in answers)
 
 
 def test_stays_local():
     pair, maps = offered(np.random.default_rng(2), 100, 1.0, 0.0)
-    far = Refinement(gate_m=0.5).refine(*maps, pair.T_a_b + np.array([5.0, 0, 0]))
+    far = Refinement(gate_m=0.5).refine(Pairs(*maps), pair.T_a_b + np.array([5.0, 0, 0]))
     assert far.status is not Status.ACCEPTED or error(far.T_a_b, pair.T_a_b)[0] > 3
 
 
 def test_heights_decide_unless_planar():
     pair, (map_a, map_b, c) = offered(np.random.default_rng(3), 50, 1.0, 0.0)
     lifted = replace(map_b, position_m=map_b.position_m + np.array([0, 0, 3.0]))
-    assert Refinement().refine(map_a, lifted, c, pair.T_a_b).status is Status.DEGENERATE
+    assert Refinement().refine(Pairs(map_a, lifted, c), pair.T_a_b).status is Status.DEGENERATE
     flat = [replace(m, planar=True) for m in (map_a, lifted)]
-    assert Refinement().refine(*flat, c, pair.T_a_b).ok
+    assert Refinement().refine(Pairs(*flat, c), pair.T_a_b).ok
 
 
 def test_no_estimate_to_refine():
     _, maps = offered(np.random.default_rng(4), 50, 1.0, 0.0)
-    found = Refinement().refine(*maps, np.full(3, np.nan))
+    found = Refinement().refine(Pairs(*maps), np.full(3, np.nan))
     assert found.status is Status.DEGENERATE
     assert "no estimate" in found.reason
 
 
 def test_a_refinement_that_still_moves_is_refused():
     pair, maps = offered(np.random.default_rng(5), 50, 0.6, 0.1)
-    found = Refinement(max_rounds=2).refine(*maps, pair.T_a_b + np.array([0.2, 0.2, 0.01]))
+    found = Refinement(max_rounds=2).refine(Pairs(*maps), pair.T_a_b + np.array([0.2, 0.2, 0.01]))
     assert found.status is Status.REFUSED
     assert "moved" in found.reason
 
@@ -238,7 +241,7 @@ def test_a_refinement_that_still_moves_is_refused():
 def test_wrong_arguments_are_named():
     _, maps = offered(np.random.default_rng(6), 5, 1.0, 0.0)
     with pytest.raises(ValueError, match="T_a_b"):
-        Refinement().refine(*maps, np.zeros(2))
+        Refinement().refine(Pairs(*maps), np.zeros(2))
     with pytest.raises(ValueError, match="gate_m"):
         Refinement(gate_m=0.0)
     with pytest.raises(ValueError, match="least_drift_m"):

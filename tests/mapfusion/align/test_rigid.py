@@ -7,13 +7,13 @@ from mapfusion import se2
 from mapfusion.align.rigid import (
     fit_rigid,
     fit_two,
+    fit_weighted,
     least_squares_gain,
     motion_covariance,
     motion_jacobian,
     residual_covariances,
     residuals,
 )
-from mapfusion.align.support import fit_weighted
 
 
 @pytest.fixture

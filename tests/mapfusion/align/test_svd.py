@@ -4,6 +4,7 @@ from map_pairs import error, given_pairs, landmarks, moved
 
 from mapfusion import se2
 from mapfusion.align.correspondences import Correspondences
+from mapfusion.align.registration import as_aligner
 from mapfusion.align.result import Status
 from mapfusion.align.rigid import motion_covariance
 from mapfusion.align.svd import Svd, solve
@@ -53,7 +54,7 @@ def test_printed_translation_depends_on_where_map_b_begins():
     for translation, least, most in (("solved", 0.0, 1e-6), ("printed", 0.1, np.inf)):
         aligner = Svd(translation)
         first, second = (
-            aligner.align(pair.map_a, b, pair.correspondences, RNG).T_a_b
+            as_aligner(aligner).align(pair.map_a, b, pair.correspondences, RNG).T_a_b
             for b in (pair.map_b, shifted)
         )
         assert least <= error(se2.compose(second, T_new_b), first)[0] <= most
@@ -91,7 +92,7 @@ def test_one_common_wall_is_degenerate(across_m, status):
     map_a = landmarks(p + rng.normal(0, sigma, p.shape), sigma)
     map_b = landmarks(se2.transform_points(T_b_a, p + rng.normal(0, sigma, p.shape)), sigma)
     pairs = Correspondences(np.arange(n), np.arange(n), np.zeros(n))
-    alignment = Svd().align(map_a, map_b, pairs, RNG)
+    alignment = as_aligner(Svd()).align(map_a, map_b, pairs, RNG)
     assert alignment.status == status
     assert ("line" in alignment.reason) == (alignment.status is Status.DEGENERATE)
 

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from experiments.methods import catalogue
 from experiments.run.store import Store
 from experiments.scenario.settings import AlignerEntry
 from experiments.show.benchmark_files import cell_text, markdown
@@ -20,8 +21,7 @@ from experiments.study.benchmark.trials import (
     run_benchmark,
     summarise,
 )
-from mapfusion.align import registry
-from mapfusion.align.plugins import Kind, Method
+from mapfusion.align.peers.kiss_matcher import KissMatcher
 from mapfusion.errors import InputError
 from mapfusion.storage import read_table
 from tests.helpers.tiny_scenario import command
@@ -130,16 +130,15 @@ def test_what_counts_as_success() -> None:
 
 
 def test_an_absent_package_is_no_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    adapter = "mapfusion.align.peers.kiss_matcher:KissMatcher"
-    absent = Method("far", Kind.PEER, adapter, "far-package", "no_such_module_far", "peers")
-    monkeypatch.setattr(registry, "_PEERS", (absent,))
-    registry.known_methods.cache_clear()
+    monkeypatch.setattr(catalogue, "PEERS", {"far": KissMatcher})
+    monkeypatch.setattr(catalogue, "_PEER_PACKAGES", {"far": ("far-package", "no_such_module_far")})
+    catalogue.known_methods.cache_clear()
     try:
         plan = Plan(entries_of(["far", "ransac"]), 2, pair_counts=(60,), outlier_shares=(0.5,))
         summary = summarise(run_benchmark(plan, Store(tmp_path), quiet))
     finally:
         monkeypatch.undo()
-        registry.known_methods.cache_clear()
+        catalogue.known_methods.cache_clear()
     far = summary.iloc[0]
     assert (far["status"], far["n_failed"], far["n_wrong"]) == ("absent", 0, 0)
     assert np.isnan(far["success"])

@@ -2,44 +2,36 @@ import math
 
 import numpy as np
 import pytest
-from map_pairs import error, given_pairs, stretched
+from map_pairs import blurred, error, given_pairs, stretched
 from scipy.stats import chi2, multivariate_normal
-from test_consistency import blurred
+from slow_twins import slow_squares
 
-from mapfusion.align.pairs import gather
-from mapfusion.align.rigid import residual_covariances, residuals
-from mapfusion.align.support import (
-    fit_weighted,
-    in_plan,
+from mapfusion.align.mahalanobis_gate import (
     log_likelihood,
+    mark_supporters,
     mean_variances,
     settle,
     settle_at_best_scale,
     spread_area_m2,
-    support_of,
 )
+from mapfusion.align.pairs import Pairs
+from mapfusion.align.rigid import fit_weighted
 
 BOUND = float(chi2.ppf(0.99, 2))
-
-
-def slow_squares(T_a_b, pairs, variance):
-    e = residuals(T_a_b, pairs.p_a, pairs.p_b)
-    C = residual_covariances(T_a_b, pairs.covariance_a, pairs.covariance_b) + variance * np.eye(2)
-    return e, C, np.einsum("ni,nij,nj->n", e, np.linalg.inv(C), e)
 
 
 @pytest.fixture
 def case():
     (map_a, map_b), pair = blurred(np.random.default_rng(0), 200, 0.5)
-    return gather(map_a, map_b, pair.correspondences), pair.T_a_b
+    return Pairs(map_a, map_b, pair.correspondences), pair.T_a_b
 
 
 @pytest.mark.parametrize("variance", [1e-12, 0.01])
 def test_support_equals_its_twin(case, variance):
     pairs, T_a_b = case
-    planar, inside = in_plan(pairs), np.empty(200, dtype=bool)
+    planar, inside = pairs.in_plan(), np.empty(200, dtype=bool)
     mean = mean_variances(planar, variance)
-    count, score = support_of(T_a_b, planar, mean, variance, BOUND, inside)
+    count, score = mark_supporters(T_a_b, planar, mean, variance, BOUND, inside)
     _, C, square = slow_squares(T_a_b, pairs, variance)
     np.testing.assert_allclose(mean, np.trace(C, axis1=1, axis2=2) / 2)
     np.testing.assert_array_equal(inside, square <= BOUND)
@@ -49,9 +41,9 @@ def test_support_equals_its_twin(case, variance):
 
 def test_gate_keeps_true_pairs_with_the_probability_stated():
     (map_a, map_b), pair = blurred(np.random.default_rng(1), 20_000, 1.0)
-    planar, inside = in_plan(gather(map_a, map_b, pair.correspondences)), np.empty(20_000, bool)
+    planar, inside = Pairs(map_a, map_b, pair.correspondences).in_plan(), np.empty(20_000, bool)
     mean = mean_variances(planar, 1e-12)
-    count, _ = support_of(pair.T_a_b, planar, mean, 1e-12, BOUND, inside)
+    count, _ = mark_supporters(pair.T_a_b, planar, mean, 1e-12, BOUND, inside)
     assert count / 20_000 == pytest.approx(0.99, abs=4 * math.sqrt(0.99 * 0.01 / 20_000))
 
 
@@ -60,12 +52,12 @@ def test_likelihood_equals_its_twin(case):
     e, C, _ = slow_squares(T_a_b, pairs, 0.01)
     density = [multivariate_normal.pdf(x, cov=S) for x, S in zip(e, C, strict=True)]
     expected = np.sum(np.log(0.7 / 400 + 0.3 * np.array(density)) - np.log(1 / 400))
-    assert log_likelihood(T_a_b, in_plan(pairs), 0.01, 0.3, 400.0) == pytest.approx(expected)
+    assert log_likelihood(T_a_b, pairs.in_plan(), 0.01, 0.3, 400.0) == pytest.approx(expected)
 
 
 def test_settled_motion_fits_its_own_support(case):
     pairs, T_a_b = case
-    planar, inside = in_plan(pairs), np.empty(200, dtype=bool)
+    planar, inside = pairs.in_plan(), np.empty(200, dtype=bool)
     T = T_a_b + np.array([0.05, -0.05, 0.002])
     count = settle(T, planar, 0.0025, BOUND, inside)
     fitted = np.empty(3)
@@ -90,7 +82,7 @@ def test_the_scale_that_the_residuals_have_is_chosen(drift_m, level):
     for seed in range(10):
         rng = np.random.default_rng(seed)
         pair = given_pairs(rng, 300, 0.2, 0.03, drift_m, planar=True)
-        planar = in_plan(gather(pair.map_a, stretched(rng, pair.map_b, 1), pair.correspondences))
+        planar = Pairs(pair.map_a, stretched(rng, pair.map_b, 1), pair.correspondences).in_plan()
         T, inside = pair.T_a_b.copy(), np.empty(300, dtype=bool)
         scales = np.array([0.0, 0.05, 0.1]) ** 2 + 1e-12
         assert settle_at_best_scale(T, planar, scales, BOUND, inside)[1] == level
@@ -98,7 +90,7 @@ def test_the_scale_that_the_residuals_have_is_chosen(drift_m, level):
 
 def test_no_support_at_any_scale():
     pair = given_pairs(np.random.default_rng(3), 50, 1.0, 0.01, planar=True)
-    planar = in_plan(gather(pair.map_a, pair.map_b, pair.correspondences))
+    planar = Pairs(pair.map_a, pair.map_b, pair.correspondences).in_plan()
     T, inside = pair.T_a_b + np.array([500.0, 0, 0]), np.ones(50, dtype=bool)
     assert settle_at_best_scale(T, planar, np.array([1e-4]), BOUND, inside)[1] == -1
     assert not inside.any()

@@ -26,7 +26,7 @@ class Kind(StrEnum):
 
 
 @dataclass(frozen=True)
-class Method:
+class KnownMethod:
     """An alignment method that can be named.
 
     Attributes:
@@ -72,18 +72,18 @@ class Method:
         }
 
 
-def declared() -> tuple[Method, ...]:
+def declared() -> tuple[KnownMethod, ...]:
     """Every aligner that an installed package declares, by name and package."""
     found = []
     for entry in importlib.metadata.entry_points(group=ENTRY_POINTS):
         target = entry.value.partition("[")[0].strip()  # without the extras it may ask for
         package = entry.dist.name if entry.dist is not None else "an unnamed package"
         module = target.partition(":")[0].strip()
-        found.append(Method(entry.name, Kind.PLUG_IN, target, package, module))
+        found.append(KnownMethod(entry.name, Kind.PLUG_IN, target, package, module))
     return tuple(sorted(found, key=lambda method: (method.name, method.distribution)))
 
 
-def clashes(taken: Iterable[str], plug_ins: Iterable[Method]) -> dict[str, str]:
+def clashes(taken: Iterable[str], plug_ins: Iterable[KnownMethod]) -> dict[str, str]:
     """For each name that is not one plug-in's alone: one line that says whose it is.
 
     Names `taken` by our own methods stay theirs; a name that two packages declare is nobody's.

@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from mapfusion.align.pairs import Pairs
+from mapfusion.align.rigid import fit_weighted
+from mapfusion.planar import add_turned, residual
 from mapfusion.se2 import Float
 
 _ROUNDS = 20  # of fit and support; two to five are the rule
@@ -31,16 +32,6 @@ class PlanarPairs(NamedTuple):
     S_b: Float
 
 
-def in_plan(pairs: Pairs) -> PlanarPairs:
-    """The pairs without their heights."""
-    return PlanarPairs(
-        np.ascontiguousarray(pairs.p_a[:, :2]),
-        np.ascontiguousarray(pairs.p_b[:, :2]),
-        np.ascontiguousarray(pairs.covariance_a[:, :2, :2]),
-        np.ascontiguousarray(pairs.covariance_b[:, :2, :2]),
-    )
-
-
 @njit(cache=True)
 def mean_variances(pairs: PlanarPairs, variance_m2: float) -> Float:
     """Half the trace of C (N,): the residuals' variance per axis, the same for every theta."""
@@ -53,46 +44,25 @@ def mean_variances(pairs: PlanarPairs, variance_m2: float) -> Float:
 
 
 @njit(cache=True)
-def fit_weighted(p_a: Float, p_b: Float, weight: Float, T_a_b: Float) -> None:
-    """Fill T_a_b (3,) that minimises the sum of weight (N,) times |p_a - T p_b|^2.
-
-    As `rigid.fit_rigid`, with weights: centroids, then theta from dot and cross products.
-    """
-    total = ax = ay = bx = by = 0.0
-    for i in range(len(weight)):
-        w = weight[i]
-        total += w
-        ax += w * p_a[i, 0]
-        ay += w * p_a[i, 1]
-        bx += w * p_b[i, 0]
-        by += w * p_b[i, 1]
-    ax, ay, bx, by = ax / total, ay / total, bx / total, by / total
-    dot = cross = 0.0
-    for i in range(len(weight)):
-        w = weight[i]
-        dx, dy, ex, ey = p_a[i, 0] - ax, p_a[i, 1] - ay, p_b[i, 0] - bx, p_b[i, 1] - by
-        dot += w * (dx * ex + dy * ey)
-        cross += w * (dy * ex - dx * ey)
-    theta = math.atan2(cross, dot)
-    cos, sin = math.cos(theta), math.sin(theta)
-    T_a_b[0], T_a_b[1], T_a_b[2] = ax - cos * bx + sin * by, ay - sin * bx - cos * by, theta
+def residual_covariance(
+    cos: float, sin: float, S_a: Float, S_b: Float, i: int, variance_m2: float
+) -> tuple[float, float, float]:
+    """Entries xx, xy, yy of C = S_a + R S_b R^T + s_drift^2 I of pair i; covariances (N, 2, 2)."""
+    axx, axy, ayy = S_a[i, 0, 0], S_a[i, 0, 1], S_a[i, 1, 1]
+    bxx, bxy, byy = S_b[i, 0, 0], S_b[i, 0, 1], S_b[i, 1, 1]
+    xx, xy, yy = add_turned(axx, axy, ayy, cos, sin, bxx, bxy, byy)
+    return xx + variance_m2, xy, yy + variance_m2
 
 
 @njit(cache=True)
-def _square_and_det(
-    ex: float, ey: float, cos: float, sin: float, S_a: Float, S_b: Float, variance_m2: float
-) -> tuple[float, float]:
-    """e^T C^-1 e and |C| of one residual; covariances (2, 2)."""
-    xx, xy, yy = S_b[0, 0], S_b[0, 1], S_b[1, 1]
-    Cxx = S_a[0, 0] + cos * cos * xx - 2 * cos * sin * xy + sin * sin * yy + variance_m2
-    Cyy = S_a[1, 1] + sin * sin * xx + 2 * cos * sin * xy + cos * cos * yy + variance_m2
-    Cxy = S_a[0, 1] + cos * sin * (xx - yy) + (cos * cos - sin * sin) * xy
-    det = Cxx * Cyy - Cxy * Cxy
-    return (Cyy * ex * ex - 2 * Cxy * ex * ey + Cxx * ey * ey) / det, det
+def _square_and_det(ex: float, ey: float, xx: float, xy: float, yy: float) -> tuple[float, float]:
+    """e^T C^-1 e and |C| of one residual."""
+    det = xx * yy - xy * xy
+    return (yy * ex * ex - 2 * xy * ex * ey + xx * ey * ey) / det, det
 
 
 @njit(cache=True)
-def support_of(
+def mark_supporters(
     T_a_b: Float,
     pairs: PlanarPairs,
     mean_m2: Float,
@@ -118,13 +88,13 @@ def support_of(
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
     count, score = 0, 0.0
     for i in range(len(p_a)):
-        ex = p_a[i, 0] - T_a_b[0] - cos * p_b[i, 0] + sin * p_b[i, 1]
-        ey = p_a[i, 1] - T_a_b[1] - sin * p_b[i, 0] - cos * p_b[i, 1]
+        ex, ey = residual(T_a_b, cos, sin, p_a, p_b, i)
         inside[i] = False
         # no direction's variance is above the trace, so this loses none and spares most
         if ex * ex + ey * ey > 2 * bound * mean_m2[i]:
             continue
-        square, _ = _square_and_det(ex, ey, cos, sin, S_a[i], S_b[i], variance_m2)
+        xx, xy, yy = residual_covariance(cos, sin, S_a, S_b, i, variance_m2)
+        square, _ = _square_and_det(ex, ey, xx, xy, yy)
         if square <= bound:
             inside[i] = True
             count += 1
@@ -145,9 +115,9 @@ def log_likelihood(
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
     log = 0.0
     for i in range(len(p_a)):
-        ex = p_a[i, 0] - T_a_b[0] - cos * p_b[i, 0] + sin * p_b[i, 1]
-        ey = p_a[i, 1] - T_a_b[1] - sin * p_b[i, 0] - cos * p_b[i, 1]
-        square, det = _square_and_det(ex, ey, cos, sin, S_a[i], S_b[i], variance_m2)
+        ex, ey = residual(T_a_b, cos, sin, p_a, p_b, i)
+        xx, xy, yy = residual_covariance(cos, sin, S_a, S_b, i, variance_m2)
+        square, det = _square_and_det(ex, ey, xx, xy, yy)
         density = math.exp(-square / 2) / (2 * math.pi * math.sqrt(det))
         log += math.log(1 - share + share * area_m2 * density)
     return log
@@ -165,7 +135,7 @@ def settle(
     mean = mean_variances(pairs, variance_m2)
     n = len(mean)
     before, weight = np.empty(n, np.bool_), np.empty(n)
-    count, _ = support_of(T_a_b, pairs, mean, variance_m2, bound, inside)
+    count, _ = mark_supporters(T_a_b, pairs, mean, variance_m2, bound, inside)
     for _ in range(_ROUNDS):
         if count < 2:
             break
@@ -173,7 +143,7 @@ def settle(
             weight[i] = inside[i] / mean[i]
             before[i] = inside[i]
         fit_weighted(pairs.p_a, pairs.p_b, weight, T_a_b)
-        count, _ = support_of(T_a_b, pairs, mean, variance_m2, bound, inside)
+        count, _ = mark_supporters(T_a_b, pairs, mean, variance_m2, bound, inside)
         same = True
         for i in range(n):
             same = same and inside[i] == before[i]

@@ -1,4 +1,4 @@
-"""One thread for each process of the harness: results then do not depend on the machine's cores."""
+"""One thread for what happens inside a process."""
 
 from threadpoolctl import threadpool_limits
 

@@ -5,9 +5,9 @@ import sys
 
 import pytest
 
-from mapfusion.align import plugins, registry
-from mapfusion.align.plugins import Kind, Method, clashes, fingerprint
-from mapfusion.align.registry import find_method, known_methods, make_aligner
+from experiments.methods import catalogue, installed
+from experiments.methods.catalogue import find_method, known_methods, make_method
+from experiments.methods.installed import Kind, KnownMethod, clashes, fingerprint
 
 
 @pytest.fixture
@@ -20,9 +20,9 @@ def site(tmp_path, monkeypatch):
 
 
 def forget():
-    registry.known_methods.cache_clear()
-    registry.name_clashes.cache_clear()
-    plugins.fingerprint.cache_clear()
+    catalogue.known_methods.cache_clear()
+    catalogue.name_clashes.cache_clear()
+    installed.fingerprint.cache_clear()
     importlib.invalidate_caches()
 
 
@@ -38,7 +38,7 @@ def test_a_declared_aligner_is_known_by_name_without_being_imported(site):
     (site / "elsewhere.py").write_text("raise SystemExit('imported')")
     install(site, "some_package", "theirs = elsewhere:Outer.Method [fast]")
     method = find_method("theirs")
-    assert method == Method(
+    assert method == KnownMethod(
         "theirs", Kind.PLUG_IN, "elsewhere:Outer.Method", "some_package", "elsewhere"
     )
     assert method.version == "1.0"
@@ -53,18 +53,18 @@ def test_it_is_made_with_its_parameters(site):
     code = "class Outer:\n  class Method:\n    def __init__(self, a): self.a = a\n"
     (site / "made_elsewhere.py").write_text(code)
     install(site, "some_package", "theirs = made_elsewhere:Outer.Method")
-    made = make_aligner("theirs", a=3)
+    made = make_method("theirs", a=3)
     assert getattr(made, "a") == 3  # noqa: B009
     with pytest.raises(ValueError, match=r"parameters: theirs: .*'b'"):
-        make_aligner("theirs", b=3)
+        make_method("theirs", b=3)
 
 
 def test_our_own_names_stay_ours(site):
     install(site, "some_package", "ransac = elsewhere:Ransac\nopencv = elsewhere:OpenCv")
     assert find_method("ransac").kind is Kind.BUILT_IN
     assert find_method("opencv").kind is Kind.PEER
-    assert type(make_aligner("ransac")).__module__ == "mapfusion.align.ransac"
-    assert registry.name_clashes()["ransac"] == (
+    assert type(make_method("ransac")).__module__ == "mapfusion.align.ransac"
+    assert catalogue.name_clashes()["ransac"] == (
         "aligner ransac: mapfusion's own is used, the one that some_package declares under the "
         "same name is not"
     )
@@ -80,7 +80,7 @@ def test_a_name_of_two_packages_is_nobodys(site):
 
 
 def test_no_clash_without_a_second_claim():
-    assert clashes(["ransac"], [Method("theirs", Kind.PLUG_IN, "m:A", "package")]) == {}
+    assert clashes(["ransac"], [KnownMethod("theirs", Kind.PLUG_IN, "m:A", "package")]) == {}
 
 
 @pytest.mark.parametrize("points", ["theirs = nothing here!", "theirs = no.such.module:Method"])
@@ -89,7 +89,7 @@ def test_broken_metadata_break_nothing_else(site, points):
     assert find_method("ransac").kind is Kind.BUILT_IN
     assert find_method("theirs").origin()["files"] == ""
     with pytest.raises((ImportError, AttributeError)):
-        make_aligner("theirs")
+        make_method("theirs")
 
 
 def test_origin_changes_with_the_package(site):
@@ -120,7 +120,7 @@ def test_ours_depend_on_nothing_but_our_source():
 
 
 def test_an_absent_package_is_told_with_what_installs_it():
-    method = Method("far", Kind.PEER, "m:Far", "far-package", "no_such_module_far", "peers")
+    method = KnownMethod("far", Kind.PEER, "m:Far", "far-package", "no_such_module_far", "peers")
     assert method.absence == (
         "the package far-package is not installed; pip install 'mapfusion[peers]' installs it"
     )

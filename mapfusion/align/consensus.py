@@ -1,0 +1,63 @@
+"""What the methods that judge by covariances share: parameters, and settling on the support."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mapfusion.align.correspondences import HeightGate
+from mapfusion.align.degeneracy import why_one_place
+from mapfusion.align.drift import DRIFT_FLOOR_M
+from mapfusion.align.mahalanobis_gate import PlanarPairs, mean_variances, settle_at_best_scale
+from mapfusion.align.method import Fit, Undetermined
+from mapfusion.align.pairs import Pairs
+from mapfusion.arguments import require_at_least, require_between
+from mapfusion.chi_square import chi_square_bound
+from mapfusion.se2 import Float
+
+# Shares of the largest s_drift that are tried as well: maps without drift deserve the narrow gate
+# that their covariances allow, and half-way steps lose little between.
+_SCALES = np.array([0.0, 0.5, 1.0])
+
+
+@dataclass(frozen=True)
+class Consensus:
+    """What counts as support of a motion follows from the landmarks' covariances and s_drift.
+
+    Attributes:
+        drift_sigma_m: largest s_drift expected, per axis, of both maps together: 0.1 m is usual
+            between two maps of one loop. Half of it and none are tried, too.
+        probability: of a true pair to lie inside its gate.
+        height: which pairs can be true by their heights (not for planar maps).
+    """
+
+    drift_sigma_m: float = 0.1
+    probability: float = 0.99
+    height: HeightGate = field(default_factory=HeightGate)
+
+    def __post_init__(self) -> None:
+        require_at_least(0, self, "drift_sigma_m")
+        require_between(0, 1, self, "probability")
+
+    @property
+    def bound(self) -> float:
+        """Most for e^T C^-1 e of a true pair (chi-square, 2 degrees of freedom)."""
+        return chi_square_bound(self.probability, 2)
+
+    @property
+    def variances_m2(self) -> Float:
+        """(L,) s_drift^2 of the scales tried, ascending."""
+        return np.unique(np.maximum(self.drift_sigma_m * _SCALES, DRIFT_FLOOR_M) ** 2)
+
+    def settled(self, T_a_b: Float, pairs: Pairs, planar: PlanarPairs) -> Fit | Undetermined:
+        """T_a_b (3,) fitted to its support at the likeliest s_drift; NaN when there is none."""
+        if not np.all(np.isfinite(T_a_b)):
+            return Undetermined(f"no two of {len(pairs)} correspondences agree on a motion")
+        inlier = np.zeros(len(pairs), dtype=bool)
+        _, level = settle_at_best_scale(T_a_b, planar, self.variances_m2, self.bound, inlier)
+        if level < 0:
+            return Undetermined("fewer than 2 correspondences support the motion found")
+        variance_m2 = self.variances_m2[level]
+        reason = why_one_place(pairs[inlier], variance_m2)
+        if reason:
+            return Undetermined(reason)
+        return Fit(T_a_b, inlier, weight=1 / mean_variances(planar, variance_m2)[inlier])

@@ -1,0 +1,226 @@
+"""Registration: estimate with a method, refine by least squares, accept or refuse."""
+
+import time
+from dataclasses import dataclass, field
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from mapfusion.align.acceptance import Acceptance, ChanceTest, Verdict
+from mapfusion.align.correspondences import Correspondences, HeightGate
+from mapfusion.align.drift import estimate_drift_m
+from mapfusion.align.method import Fit, Method, Needs, Undetermined
+from mapfusion.align.pairs import MIN_PAIRS, Pairs, undetermined, why_too_few
+from mapfusion.align.refine import Refinement
+from mapfusion.align.result import NOT_RUN, Alignment, Status
+from mapfusion.align.rigid import (
+    least_squares_gain,
+    motion_covariance,
+    residual_covariances,
+    residuals,
+)
+from mapfusion.landmark_map import LandmarkMap
+
+
+class Aligner(Protocol):
+    """Whoever answers with a whole `Alignment`: a `MethodAligner`, or a process of its own."""
+
+    @property
+    def randomised(self) -> bool:
+        """Whether another generator can give another answer."""
+        ...
+
+    def align(
+        self,
+        map_a: LandmarkMap,
+        map_b: LandmarkMap,
+        correspondences: Correspondences,
+        rng: np.random.Generator,
+    ) -> Alignment:
+        """Estimate T_a_b."""
+        ...
+
+
+@dataclass(frozen=True)
+class MethodAligner:
+    """A method with all that its mathematics leaves out: gathering, refusal, covariance, time."""
+
+    method: Method
+
+    @property
+    def randomised(self) -> bool:
+        """Whether another generator can give another answer."""
+        return self.method.randomised
+
+    def align(
+        self,
+        map_a: LandmarkMap,
+        map_b: LandmarkMap,
+        correspondences: Correspondences,
+        rng: np.random.Generator,
+    ) -> Alignment:
+        """Estimate T_a_b.
+
+        Raises:
+            ValueError: an index of the correspondences lies outside its map.
+        """
+        started_s = time.perf_counter()
+        pairs = Pairs(map_a, map_b, correspondences)
+        rows = np.arange(len(pairs))
+        height = getattr(self.method, "height", None)
+        if isinstance(height, HeightGate):
+            rows = pairs.of_one_height(height)
+        needs = getattr(self.method, "needs", Needs())
+        given = pairs if len(rows) == len(pairs) else pairs[rows]
+        reason = _why_not_called(needs, pairs, given)
+        found = Undetermined(reason) if reason else self.method.find(given, rng)
+        return alignment_of_fit(found, pairs, rows, started_s)
+
+
+def _why_not_called(needs: Needs, pairs: Pairs, given: Pairs) -> str:
+    """Why the pairs given to a method are less than it needs; empty when they are not."""
+    reason = why_too_few(pairs.map_a, pairs.map_b, len(pairs), needs.pairs)
+    if not reason and len(given) < needs.pairs:
+        n, least = len(given), needs.pairs
+        reason = f"the heights of {n} correspondences agree, at least {least} are needed"
+    return reason or needs.why_without_extent(given)
+
+
+def alignment_of_fit(
+    found: Fit | Undetermined, pairs: Pairs, rows: np.ndarray, started_s: float
+) -> Alignment:
+    """A method's answer with drift and covariance judged from the residuals that it fitted.
+
+    Args:
+        found: what it found among the pairs it was given.
+        pairs: all N.
+        rows: (n,) which of them it was given.
+        started_s: `time.perf_counter()` at the start.
+    """
+    if isinstance(found, Undetermined):
+        return undetermined(found.reason, len(pairs), started_s)
+    inlier = np.zeros(len(pairs), dtype=bool)
+    inlier[rows[found.inlier]] = True
+    fitted = pairs[inlier] if found.fitted is None else found.fitted
+    refusal, n_inliers = found.refusal, int(np.count_nonzero(inlier))
+    if n_inliers < MIN_PAIRS and not refusal:
+        refusal = f"{n_inliers} correspondences agree, at least {MIN_PAIRS} are needed"
+    covariance, drift = np.full((3, 3), np.nan), np.nan
+    if len(fitted) >= 2:
+        gain = found.gain
+        if gain is None:
+            gain = least_squares_gain(found.T_a_b, fitted.p_b, found.weight)
+        own = residual_covariances(found.T_a_b, fitted.covariance_a, fitted.covariance_b)
+        e = residuals(found.T_a_b, fitted.p_a, fitted.p_b)
+        drift = estimate_drift_m(e, own, found.gate_m)
+        covariance = motion_covariance(gain, own + drift**2 * np.eye(2))
+    return Alignment(
+        found.T_a_b,
+        covariance,
+        inlier,
+        time.perf_counter() - started_s,
+        Status.REFUSED if refusal else Status.ACCEPTED,
+        refusal,
+        drift,
+    )
+
+
+def as_aligner(method: Method | Aligner) -> Aligner:
+    """The method as one that answers whole: by `align` where it has it, else around `find`."""
+    return method if hasattr(method, "align") else MethodAligner(method)  # type: ignore[return-value]
+
+
+class Registered(NamedTuple):
+    """One registration of two maps.
+
+    Attributes:
+        estimated: the method's answer.
+        refined: after the common least squares; a method that did not run leaves its answer here.
+        verdict: on the refined one.
+    """
+
+    estimated: Alignment
+    refined: Alignment
+    verdict: Verdict
+
+    @property
+    def applied(self) -> Alignment:
+        """What merging may use: the refined alignment, refused where the verdict says so."""
+        return self.verdict.applied_to(self.refined)
+
+
+@dataclass(frozen=True)
+class Registration:
+    """Estimate, refine, accept.
+
+    Attributes:
+        method: what finds the motion, or answers with a whole alignment.
+        refinement: the least squares after it.
+        acceptance: the test after that; None accepts whatever the refinement does.
+    """
+
+    method: Method | Aligner
+    refinement: Refinement = field(default_factory=Refinement)
+    acceptance: Acceptance | None = field(default_factory=Acceptance)
+
+    @property
+    def randomised(self) -> bool:
+        """Whether another generator can give another answer."""
+        return self.method.randomised
+
+    def on(
+        self, map_a: LandmarkMap, map_b: LandmarkMap, correspondences: Correspondences
+    ) -> "PairRegistration":
+        """Made ready for two maps, to be run any number of times.
+
+        Raises:
+            ValueError: an index of the correspondences lies outside its map.
+        """
+        return PairRegistration(self, Pairs(map_a, map_b, correspondences))
+
+    def register(
+        self,
+        map_a: LandmarkMap,
+        map_b: LandmarkMap,
+        correspondences: Correspondences,
+        rng: np.random.Generator,
+    ) -> Registered:
+        """Register two maps once.
+
+        Raises:
+            ValueError: an index of the correspondences lies outside its map.
+        """
+        return self.on(map_a, map_b, correspondences).register(rng)
+
+
+class PairRegistration:
+    """A `Registration` on one pair of maps; equal estimates are refined and judged once."""
+
+    def __init__(self, registration: Registration, pairs: Pairs) -> None:
+        self._registration = registration
+        self._aligner = as_aligner(registration.method)
+        self._pairs = pairs
+        self._chance: ChanceTest | None = None
+        if registration.acceptance is not None:
+            self._chance = registration.acceptance.against_chance(pairs)
+        self._completed: dict[object, tuple[Alignment, Verdict]] = {}
+
+    def register(self, rng: np.random.Generator) -> Registered:
+        """Estimate once more; refine and judge the estimate unless it was there before."""
+        pairs = self._pairs
+        estimated = self._aligner.align(pairs.map_a, pairs.map_b, pairs.correspondences, rng)
+        known = (estimated.T_a_b.tobytes(), estimated.status, estimated.reason)
+        if known not in self._completed:
+            refined = self._refined(estimated)
+            self._completed[known] = refined, self._judged(refined)
+        return Registered(estimated, *self._completed[known])
+
+    def _refined(self, estimated: Alignment) -> Alignment:
+        if estimated.status in NOT_RUN:
+            return estimated
+        return self._registration.refinement.refine(self._pairs, estimated.T_a_b)
+
+    def _judged(self, refined: Alignment) -> Verdict:
+        if self._chance is None:
+            return Verdict(refined.ok, np.nan, refined.reason)
+        return self._chance.judge(refined)

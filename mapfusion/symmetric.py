@@ -1,0 +1,56 @@
+"""Small symmetric matrices in kernels, where LAPACK's wrappers would take seconds to compile."""
+
+import math
+
+from numba import njit
+
+from mapfusion.se2 import Float
+
+
+@njit(cache=True)
+def cofactors(
+    xx: float, xy: float, xz: float, yy: float, yz: float, zz: float
+) -> tuple[float, float, float, float, float, float, float]:
+    """Cofactors (six upper entries) and determinant of a symmetric 3x3 matrix."""
+    axx, axy, axz = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+    ayy, ayz, azz = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
+    return axx, axy, axz, ayy, ayz, azz, xx * axx + xy * axy + xz * axz
+
+
+@njit(cache=True)
+def cholesky(matrix: Float, singular: float) -> bool:
+    """Lower factor of a symmetric matrix in place, of which the lower half is read.
+
+    Returns:
+        False when it is not positive definite: a pivot is `singular` of its diagonal entry or less.
+    """
+    for i in range(len(matrix)):
+        for j in range(i + 1):
+            rest = matrix[i, j]
+            for k in range(j):
+                rest -= matrix[i, k] * matrix[j, k]
+            if i > j:
+                matrix[i, j] = rest / matrix[j, j]
+            elif rest > singular * matrix[i, i]:
+                matrix[i, i] = math.sqrt(rest)
+            else:
+                return False
+    return True
+
+
+@njit(cache=True)
+def solve_lower(factor: Float, x: Float) -> None:
+    """Solve factor y = x in place."""
+    for i in range(len(x)):
+        for k in range(i):
+            x[i] -= factor[i, k] * x[k]
+        x[i] /= factor[i, i]
+
+
+@njit(cache=True)
+def solve_upper(factor: Float, x: Float) -> None:
+    """Solve factor^T y = x in place."""
+    for i in range(len(x) - 1, -1, -1):
+        for k in range(i + 1, len(x)):
+            x[i] -= factor[k, i] * x[k]
+        x[i] /= factor[i, i]

@@ -1,0 +1,35 @@
+"""Kernels that several tests share, written the slow and obvious way."""
+
+import numpy as np
+from scipy.spatial.distance import cdist
+
+from mapfusion.align.rigid import residual_covariances, residuals
+
+_WORD = 2**64 - 1
+
+
+def draw(state):
+    """Next state of the xorshift generator with 64 bits."""
+    state ^= (state << 13) & _WORD
+    state ^= state >> 7
+    state ^= (state << 17) & _WORD
+    return state
+
+
+def slow_squares(T_a_b, pairs, variance):
+    """Residuals, their covariances and their squared Mahalanobis distances."""
+    e = residuals(T_a_b, pairs.p_a, pairs.p_b)
+    C = residual_covariances(T_a_b, pairs.covariance_a, pairs.covariance_b) + variance * np.eye(2)
+    return e, C, np.einsum("ni,nij,nj->n", e, np.linalg.inv(C), e)
+
+
+def slow_consistency(pairs, variance, bound):
+    """Distances and the variances along their lines, with whole matrices."""
+    total = 2 * variance
+    for p, S in ((pairs.p_a, pairs.S_a), (pairs.p_b, pairs.S_b)):
+        line = p[None] - p[:, None]
+        length = np.linalg.norm(line, axis=2)
+        unit = line / np.where(length > 0, length, 1)[:, :, None]
+        total = total + np.einsum("ijk,ijkl,ijl->ij", unit, S[:, None] + S[None], unit)
+    difference = cdist(pairs.p_a, pairs.p_a) - cdist(pairs.p_b, pairs.p_b)
+    return (difference**2 <= bound * total) & ~np.eye(len(pairs.p_a), dtype=bool)

@@ -1,0 +1,248 @@
+"""Estimate, refine, accept: composed as by hand, and each estimate completed once."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+from map_pairs import given_pairs, landmarks
+
+from mapfusion.align.acceptance import Acceptance
+from mapfusion.align.correspondences import Correspondences, HeightGate
+from mapfusion.align.method import Fit, Needs, Undetermined, supported
+from mapfusion.align.pairs import Pairs
+from mapfusion.align.ransac import Ransac
+from mapfusion.align.refine import Refinement
+from mapfusion.align.registration import Registration, as_aligner
+from mapfusion.align.registry import ALIGNERS, make_aligner
+from mapfusion.align.result import Alignment, Status, without_answer
+from mapfusion.align.rigid import (
+    fit_rigid,
+    least_squares_gain,
+    motion_covariance,
+    motion_jacobian,
+    residual_covariances,
+)
+
+
+@dataclass
+class Answers:
+    """Says one thing after the other, and keeps what it was given."""
+
+    answers: list = field(default_factory=list)
+    randomised: bool = True
+    given: list[Pairs] = field(default_factory=list)
+
+    def find(self, pairs, rng):
+        del rng
+        self.given.append(pairs)
+        return self.answers[(len(self.given) - 1) % len(self.answers)]
+
+
+@dataclass
+class WholeAnswers:
+    """A process of its own, say: it has `align`."""
+
+    answer: Alignment
+    randomised: bool = False
+
+    def align(self, map_a, map_b, correspondences, rng):
+        del map_a, map_b, correspondences, rng
+        return self.answer
+
+
+@dataclass
+class CountedRefinement:
+    calls: list = field(default_factory=list)
+
+    def refine(self, pairs, T_a_b):
+        self.calls.append(np.array(T_a_b))
+        return Refinement().refine(pairs, T_a_b)
+
+
+def maps_of(pair):
+    return pair.map_a, pair.map_b, pair.correspondences
+
+
+def assert_same(first, second):
+    for name in ("T_a_b", "covariance", "inlier", "drift_sigma_m"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+    assert (first.status, first.reason) == (second.status, second.reason)
+
+
+@pytest.mark.parametrize("name", list(ALIGNERS))
+@pytest.mark.parametrize("true_share", [0.0, 0.6])
+def test_equals_the_steps_by_hand(name, true_share):
+    pair = given_pairs(np.random.default_rng(0), 80, true_share, 0.05)
+    method, refinement, acceptance = make_aligner(name), Refinement(gate_m=0.4), Acceptance(1e-4)
+    registration = Registration(method, refinement, acceptance)
+    done = registration.register(*maps_of(pair), np.random.default_rng(1))
+    estimated = as_aligner(method).align(*maps_of(pair), np.random.default_rng(1))
+    refined = refinement.refine(Pairs(*maps_of(pair)), estimated.T_a_b)
+    verdict = acceptance.judge(Pairs(*maps_of(pair)), refined)
+    assert_same(done.estimated, estimated)
+    assert_same(done.refined, refined)
+    assert done.verdict == pytest.approx(verdict) or done.verdict == verdict
+    assert done.applied.ok == verdict.accepted
+    assert registration.randomised == method.randomised
+    assert done.estimated.elapsed_s > 0
+
+
+def test_covariance_and_drift_come_from_the_pairs_fitted():
+    """Equal, isotropic noise s^2: (J'J)^-1 s^2, s^2 the residuals' own unbiased estimate."""
+    pair = given_pairs(np.random.default_rng(0), 4000, 0.5, 0.0, drift_m=0.1, planar=True)
+    p_a, p_b = pair.map_a.position_m, pair.map_b.position_m
+    T_a_b = np.array(fit_rigid(p_a, p_b, np.flatnonzero(pair.is_true)))
+    found = as_aligner(Answers([Fit(T_a_b, pair.is_true)])).align(
+        *maps_of(pair), np.random.default_rng(0)
+    )
+    J = motion_jacobian(T_a_b, p_b[pair.is_true]).reshape(-1, 3)
+    np.testing.assert_allclose(found.drift_sigma_m, 0.1, rtol=0.05)
+    expected = np.linalg.inv(J.T @ J) * found.drift_sigma_m**2
+    np.testing.assert_allclose(found.covariance, expected, rtol=1e-3, atol=1e-9)
+    assert (found.status, found.reason) == (Status.ACCEPTED, "")
+    np.testing.assert_array_equal(found.inlier, pair.is_true)
+    np.testing.assert_array_equal(found.T_a_b, T_a_b)
+
+
+def test_weights_gains_and_other_pairs_of_a_fit_count():
+    pair = given_pairs(np.random.default_rng(1), 30, 1.0, 0.05, planar=True)
+    pairs, everyone = Pairs(*maps_of(pair)), np.ones(30, dtype=bool)
+    weight = np.random.default_rng(2).uniform(0.1, 1, 30)
+    rng = np.random.default_rng(0)
+
+    def covariance(fit):
+        return as_aligner(Answers([fit])).align(*maps_of(pair), rng).covariance
+
+    gain = least_squares_gain(pair.T_a_b, pairs.p_b, weight)
+    weighted = covariance(Fit(pair.T_a_b, everyone, weight=weight))
+    np.testing.assert_array_equal(weighted, covariance(Fit(pair.T_a_b, everyone, gain=gain)))
+    assert not np.allclose(weighted, covariance(Fit(pair.T_a_b, everyone)), rtol=1e-3)
+    half = pairs[np.arange(15)]
+    of_half = as_aligner(Answers([Fit(pair.T_a_b, everyone, fitted=half)])).align(
+        *maps_of(pair), rng
+    )
+    own = residual_covariances(pair.T_a_b, half.covariance_a, half.covariance_b)
+    expected = motion_covariance(
+        least_squares_gain(pair.T_a_b, half.p_b), own + of_half.drift_sigma_m**2 * np.eye(2)
+    )
+    np.testing.assert_array_equal(of_half.covariance, expected)
+    assert of_half.inlier.all()
+
+
+def test_few_supporters_are_a_refusal_that_says_how_many():
+    pair = given_pairs(np.random.default_rng(1), 10)
+    pairs, rng = Pairs(*maps_of(pair)), np.random.default_rng(0)
+    for n in range(4):
+        fit = supported(pairs, np.arange(10) < n, pair.T_a_b)
+        found = as_aligner(Answers([fit])).align(*maps_of(pair), rng)
+        assert (found.status is Status.ACCEPTED) == (n == 3)
+        assert n == 3 or found.reason.startswith(f"{n} correspondences")
+        assert np.isnan(found.covariance).all() == (n < 2)
+    refused = supported(pairs, np.ones(10, bool), pair.T_a_b, "symmetric")
+    assert as_aligner(Answers([refused])).align(*maps_of(pair), rng).reason == "symmetric"
+
+
+def test_supporters_in_one_place_leave_the_angle_open():
+    place = landmarks(np.tile([[3.0, 4.0, 1.0]], (9, 1)))
+    pairs = Pairs(place, place, Correspondences(np.arange(9), np.arange(9), np.zeros(9)))
+    found = supported(pairs, np.ones(9, bool), np.zeros(3))
+    assert isinstance(found, Undetermined)
+    assert "one point" in found.reason
+
+
+def test_a_method_is_not_called_with_less_than_it_needs():
+    pair = given_pairs(np.random.default_rng(3), 12)
+    wall = replace(pair.map_b, position_m=pair.map_b.position_m * [1, 0, 1] + np.array([0, 5, 0]))
+    far = replace(pair.map_b, position_m=pair.map_b.position_m + np.array([0, 0, 50.0]))
+    for needs, height, map_b, n, reason in (
+        (Needs(), None, pair.map_b, 1, "1 correspondences, at least 2"),
+        (Needs(5), None, pair.map_b, 4, "4 correspondences, at least 5"),
+        (Needs(), HeightGate(), far, 12, "the heights of 0 correspondences agree, at least 2"),
+        (Needs(dimensions=2), None, wall, 12, "lie on one line"),
+        (Needs(dimensions=1), None, wall, 12, ""),
+    ):
+        method = Answers([Undetermined("called")])
+        method.needs, method.height = needs, height
+        pairs = pair.correspondences[np.arange(n)]
+        found = as_aligner(method).align(pair.map_a, map_b, pairs, np.random.default_rng(0))
+        assert found.status is Status.DEGENERATE
+        assert len(method.given) == (not reason)
+        assert found.reason == "called" if not reason else reason in found.reason
+
+
+def test_pairs_of_other_heights_are_kept_from_it_and_its_inliers_are_of_all_pairs():
+    pair = given_pairs(np.random.default_rng(4), 12)
+    position = pair.map_b.position_m.copy()
+    position[::3, 2] += 50
+    method = Answers([Fit(pair.T_a_b, np.arange(8) < 4)])
+    method.height = HeightGate()
+    map_b = replace(pair.map_b, position_m=position)
+    found = as_aligner(method).align(
+        pair.map_a, map_b, pair.correspondences, np.random.default_rng(0)
+    )
+    near = np.flatnonzero(np.arange(12) % 3 != 0)
+    np.testing.assert_array_equal(method.given[0].index_a, pair.correspondences.index_a[near])
+    np.testing.assert_array_equal(np.flatnonzero(found.inlier), near[:4])
+
+
+@pytest.mark.parametrize("status", [Status.FAILED, Status.ABSENT])
+def test_what_did_not_run_is_passed_through(status):
+    pair = given_pairs(np.random.default_rng(5), 40)
+    answer = without_answer(status, "the reason", 40)
+    refinement = CountedRefinement()
+    registration = Registration(WholeAnswers(answer), refinement)
+    done = registration.register(*maps_of(pair), np.random.default_rng(0))
+    assert done.estimated is done.refined is done.applied is answer
+    assert (done.verdict.accepted, done.verdict.reason) == (False, "the reason")
+    assert refinement.calls == []
+
+
+def test_degenerate_stays_degenerate_and_a_refused_estimate_is_refined():
+    pair = given_pairs(np.random.default_rng(6), 60, 1.0, 0.02)
+    rng = np.random.default_rng(0)
+    done = Registration(Answers([Undetermined("no")])).register(*maps_of(pair), rng)
+    assert (done.estimated.status, done.estimated.reason) == (Status.DEGENERATE, "no")
+    assert done.refined.status is Status.DEGENERATE
+    assert not done.applied.ok
+    refused = Fit(pair.T_a_b + np.array([0.05, 0, 0]), np.ones(60, bool), refusal="unsure")
+    done = Registration(Answers([refused])).register(*maps_of(pair), rng)
+    assert (done.estimated.status, done.estimated.reason) == (Status.REFUSED, "unsure")
+    assert done.refined.ok
+    assert done.verdict.accepted
+    assert done.applied is done.refined
+
+
+def test_what_chance_would_give_is_refused_when_applied():
+    pair = given_pairs(np.random.default_rng(7), 4, 1.0, 0.01)
+    done = Registration(Ransac()).register(*maps_of(pair), np.random.default_rng(0))
+    assert done.refined.ok
+    assert done.applied.status is Status.REFUSED
+    assert done.applied.reason == done.verdict.reason != ""
+    trusting = Registration(Ransac(), acceptance=None)
+    assert trusting.register(*maps_of(pair), np.random.default_rng(0)).applied.ok
+
+
+def test_equal_estimates_are_refined_once():
+    pair = given_pairs(np.random.default_rng(8), 60, 1.0, 0.02)
+    everyone = np.ones(60, bool)
+    motions = [pair.T_a_b, pair.T_a_b + np.array([0.01, 0, 0])]
+    fits = [Fit(motions[0], everyone), Fit(motions[1], everyone), Fit(motions[0].copy(), everyone)]
+    refinement, method = CountedRefinement(), Answers([*fits, Undetermined("a"), Undetermined("b")])
+    on_pair = Registration(method, refinement).on(*maps_of(pair))
+    rng = np.random.default_rng(0)
+    done = [on_pair.register(rng) for _ in range(10)]
+    assert len(method.given) == 10  # all were estimated and timed
+    assert len(refinement.calls) == 4  # two motions, two reasons
+    assert done[0].refined is done[2].refined is done[5].refined
+    assert done[0].refined is not done[1].refined
+    assert done[0].verdict is done[2].verdict
+    assert [d.estimated.reason for d in done[3:5]] == ["a", "b"]
+    again = Registration(Answers(fits)).register(*maps_of(pair), rng)
+    assert_same(again.refined, done[0].refined)
+
+
+def test_index_outside_its_map_is_named():
+    full = landmarks(np.zeros((5, 3)))
+    wrong = Correspondences(np.array([0, 5]), np.array([0, 1]), np.zeros(2))
+    with pytest.raises(ValueError, match="index_a"):
+        Registration(Ransac()).on(full, full, wrong)
