@@ -11,6 +11,7 @@ import pytest
 from pydantic_core import to_jsonable_python
 
 from experiments.judge.judged_run import JudgedRun
+from experiments.methods.catalogue import find_method
 from experiments.run import stage as stage_module
 from experiments.run.code_version import imported_sources
 from experiments.run.job import Job
@@ -18,7 +19,7 @@ from experiments.run.stage import RecordedLog, Stage
 from experiments.run.store import Store
 from experiments.scenario.loading import load_scenario, scenario_of
 from experiments.scenario.settings import Simulation
-from mapfusion.align.registry import ALIGNERS, find_method
+from mapfusion.align.registry import ALIGNERS
 from mapfusion.errors import InputError
 from sim.renderer import egl_driver
 from tests.helpers.tiny_scenario import TINY
