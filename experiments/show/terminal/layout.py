@@ -8,7 +8,14 @@ from typing import Any
 
 from rich import box
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+)
 
 # Plain rules and narrow gaps: all columns must fit into 80 characters.
 LAYOUT: Any = {
@@ -30,18 +37,20 @@ STAGE_TEXT = {
     "tables": "write the tables",
     "figures": "draw the figures",
     "benchmark": "measure the aligners",
+    "timings": "time the aligners",
     "refusal": "cross the worlds",
 }
 
 
 @contextmanager
-def progress() -> Iterator[Callable[[str, int, int], None]]:
+def progress(*more: ProgressColumn) -> Iterator[Callable[[str, int, int], None]]:
     """A progress display on stderr; yields the function to tell (stage, done, total)."""
     display = Progress(
         TextColumn("{task.description:<26}"),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
+        *more,
         console=Console(stderr=True),
     )
     bars: dict[str, Any] = {}

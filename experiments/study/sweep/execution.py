@@ -1,4 +1,4 @@
-"""The command `mapfusion sweep`, apart from what it shows."""
+"""A sweep from what a user asks for to its tables: prepared, run on Dask, its aligners timed."""
 
 import shutil
 import tempfile
@@ -7,16 +7,17 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from experiments.judge.judging import load_robot
-from experiments.judge.result import STORE_FOLDER, measure_aligners, pair_table
+from experiments.judge.result import STORE_FOLDER
 from experiments.methods.one_thread import single_threaded
 from experiments.run.dask_cluster import connected
 from experiments.run.dask_worker import Terms, code_version
 from experiments.run.store import Store
-from experiments.study.sweep.dataset import ALIGNER_TIMINGS, Dataset, open_dataset
-from experiments.study.sweep.driver import Progress, Survey, SweepDriver, survey
-from experiments.study.sweep.grid import Axis, Run, parse_axes, runs_of
-from experiments.study.sweep.planned import PlannedRun, planned
+from experiments.run.tasks import OnProgress
+from experiments.scenario.suite import scenarios_of
+from experiments.study.sweep.combinations import Axis, SweepRun, parse_axes, runs_of
+from experiments.study.sweep.planned_run import write_aligner_timings
+from experiments.study.sweep.sweep_dataset import ALIGNER_TIMINGS, SweepDataset, open_dataset
+from experiments.study.sweep.sweep_driver import SweepDriver, SweepProgress
 
 SWEEPS_FOLDER = "sweeps"
 # A worker may be killed for no fault of its task (a machine that goes away); four times in a row
@@ -31,15 +32,15 @@ _LONGEST_NAME = 80
 class Sweep:
     """What is to be run, and where it goes."""
 
-    runs: list[Run]
+    runs: list[SweepRun]
     axes: list[Axis]
     results: Path
     output: Path
 
     @property
-    def dataset(self) -> Dataset:
+    def dataset(self) -> SweepDataset:
         """Where its tables go."""
-        return Dataset(self.output, tuple(axis.key for axis in self.axes))
+        return SweepDataset(self.output, tuple(axis.key for axis in self.axes))
 
     @property
     def store(self) -> Store:
@@ -48,42 +49,37 @@ class Sweep:
 
 
 def prepare(
-    asked: Sequence[str],
-    paths: Sequence[Path],
+    asked: Sequence[str | Path],
     seeds: Sequence[int],
-    entries: Sequence[str],
+    settings: Sequence[str],
     results: Path,
-    output: Path | None,
+    output: Path | None = None,
 ) -> Sweep:
     """Check everything a user gave; nothing is written.
 
     Args:
-        asked: scenarios and tags as they were given; they name the sweep without `output`.
-        paths: the scenarios' files.
+        asked: scenario files, names and tags; they name the sweep without `output`.
         seeds: of all scenarios.
-        entries: of `--set`.
+        settings: entries of `--set`.
         results: folder of results; the store is in it.
         output: folder of the sweep, `RESULTS/sweeps/NAME` without.
+
+    Raises:
+        InputError: a scenario, key or value is wrong.
     """
-    axes = parse_axes(entries)
-    runs = runs_of(paths, seeds, axes)
+    axes = parse_axes(settings)
+    runs = runs_of(scenarios_of(asked), seeds, axes)
     name = "-".join(Path(part).stem for part in asked)[:_LONGEST_NAME]
     folder = output or results / SWEEPS_FOLDER / name
     # absolute: workers may have been started elsewhere
     return Sweep(runs, axes, results.resolve(), folder.resolve())
 
 
-def look_ahead(sweep: Sweep) -> Survey:
-    """What the sweep would compute; nothing is written."""
-    return survey(sweep.runs, sweep.store, sweep.dataset)
-
-
 def execute(
     sweep: Sweep,
     jobs: int,
     scheduler: str | None,
-    on_progress: Callable[[Progress], None],
-    retries: int = RETRIES,
+    on_progress: Callable[[SweepProgress], None],
 ) -> dict[str, str]:
     """Run a sweep; returns the failed runs with their reasons.
 
@@ -93,38 +89,30 @@ def execute(
     dataset = open_dataset(sweep.output, sweep.axes)
     for left_behind in sweep.output.glob(f"{_ATTEMPTS_PREFIX}*"):
         _remove_if_old(left_behind)
-    attempts = Path(tempfile.mkdtemp(prefix=_ATTEMPTS_PREFIX, dir=sweep.output))
-    try:
-        with connected(jobs, scheduler) as client:
-            terms = Terms(attempts, retries, code_version())
-            driver = SweepDriver(client, sweep.store, dataset, terms, on_progress)
-            driver.execute(sweep.runs)
-    finally:
-        shutil.rmtree(attempts, ignore_errors=True)
-    return driver.failed_runs
-
-
-def measure_times(
-    sweep: Sweep, failed: Collection[str], on_progress: Callable[[int, int], None]
-) -> None:
-    """Aligners' times, serial, for all runs without that did not fail: nothing else may run."""
-    dataset = sweep.dataset
-    single_threaded()
-    runs = [run for run in sweep.runs if run.run_id not in failed]
-    for done, run in enumerate(runs):
-        on_progress(done, len(runs))
-        if not dataset.path(ALIGNER_TIMINGS, run).is_file():
-            _measure(planned(run, sweep.store, dataset), dataset)
-    on_progress(len(runs), len(runs))
-
-
-def _measure(laid_out: PlannedRun, dataset: Dataset) -> None:
-    robots = [load_robot(robot.folders) for robot in laid_out.plan.robots]
-    measure_aligners(laid_out.plan, robots)
-    dataset.write(ALIGNER_TIMINGS, laid_out.run, pair_table(laid_out.plan, ALIGNER_TIMINGS))
+    with (
+        tempfile.TemporaryDirectory(
+            prefix=_ATTEMPTS_PREFIX, dir=sweep.output, ignore_cleanup_errors=True
+        ) as attempts,
+        connected(jobs, scheduler) as client,
+    ):
+        terms = Terms(Path(attempts), RETRIES, code_version())
+        driver = SweepDriver(client, sweep.store, dataset, terms, on_progress)
+        driver.execute(sweep.runs)
+    return driver.progress.failed
 
 
 def _remove_if_old(folder: Path) -> None:
     """Of a sweep that was killed; one that is younger may belong to a sweep that is running."""
     if time.time() - folder.stat().st_mtime > _OLD_S:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def measure_times(sweep: Sweep, failed: Collection[str], on_progress: OnProgress) -> None:
+    """Aligners' times, serial, for all runs without that did not fail: nothing else may run."""
+    single_threaded()
+    runs = [run for run in sweep.runs if run.run_id not in failed]
+    for done, run in enumerate(runs):
+        on_progress("timings", done, len(runs))
+        if not sweep.dataset.path(ALIGNER_TIMINGS, run).is_file():
+            write_aligner_timings(run, sweep.store, sweep.dataset)
+    on_progress("timings", len(runs), len(runs))

@@ -13,8 +13,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from experiments.judge import tables
-from experiments.study.sweep.dataset import RUN_TIMES
 from experiments.study.sweep.execution import execute, prepare
+from experiments.study.sweep.sweep_dataset import RUN_TIMES
 from tests.helpers.killing import KilledSweep, same_files
 from tests.helpers.tiny_scenario import TINY, command
 
@@ -38,7 +38,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def swept(short_path: Path, results: Path) -> Path:
     """A sweep of four runs on one worker, uninterrupted."""
-    asked = prepare([str(short_path)], [short_path], [0, 1], [GRID[1], GRID[3]], results, None)
+    asked = prepare([short_path], [0, 1], [GRID[1], GRID[3]], results)
     assert execute(asked, 1, None, lambda _: None) == {}
     return asked.output
 
