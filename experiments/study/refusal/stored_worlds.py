@@ -1,12 +1,10 @@
 """The worlds of earlier runs and sweeps: robots with their maps by iteration, and the truth."""
 
-import json
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
-
-from pydantic import ValidationError
 
 from experiments.judge.expectations import load_checked
 from experiments.judge.judging import RobotFolders
@@ -19,7 +17,7 @@ from mapfusion.errors import InputError
 
 
 @dataclass(frozen=True)
-class World:
+class MappedWorld:
     """One world and the robots that mapped it.
 
     Attributes:
@@ -37,7 +35,7 @@ class World:
     robots: dict[str, RobotFolders]
 
 
-class Source(NamedTuple):
+class WorldSource(NamedTuple):
     """Where a world comes from: how messages call it, its scenario, and what keeps its maps."""
 
     label: str
@@ -46,7 +44,7 @@ class Source(NamedTuple):
     store: Store
 
 
-def sources_of(worlds: Sequence[str], seeds: Sequence[int], results: Path) -> list[Source]:
+def sources_of(worlds: Sequence[str], seeds: Sequence[int], results: Path) -> list[WorldSource]:
     """What the words of a command stand for.
 
     Args:
@@ -62,18 +60,20 @@ def sources_of(worlds: Sequence[str], seeds: Sequence[int], results: Path) -> li
     for word in worlds:
         path = Path(word)
         if path.is_dir():
+            require_result(path)
+            scenario = load_checked(path / "scenario.json")
             store = Store(path.resolve().parent / STORE_FOLDER)
-            found.append(Source(str(path), path.resolve().name, _scenario(path), store))
+            found.append(WorldSource(str(path), path.resolve().name, scenario, store))
             continue
         for file in scenarios_of([word]):
             for seed in seeds:
                 scenario = load_checked(file, (), seed)
                 name = f"{scenario.name}-{seed}"
-                found.append(Source(name, name, scenario, Store(results / STORE_FOLDER)))
+                found.append(WorldSource(name, name, scenario, Store(results / STORE_FOLDER)))
     return found
 
 
-def load_worlds(sources: Sequence[Source]) -> tuple[Scenario, list[World]]:
+def load_worlds(sources: Sequence[WorldSource]) -> tuple[Scenario, list[MappedWorld]]:
     """The first source's scenario, and the worlds of all of them.
 
     Raises:
@@ -83,12 +83,13 @@ def load_worlds(sources: Sequence[Source]) -> tuple[Scenario, list[World]]:
     if len(sources) < 2:
         raise InputError("refusal: give two worlds or more: results, or scenarios with --seeds")
     worlds = [_world(source) for source in sources]
-    by_textures: dict[str, World] = {}
-    for source, world in zip(sources, worlds, strict=True):
-        if world.textures in by_textures:
-            other = by_textures[world.textures].name
-            raise InputError(f"{source.label}: the same world as {other}; give another seed's")
-        by_textures[world.textures] = world
+    for (one, first), (source, world) in itertools.combinations(
+        zip(sources, worlds, strict=True), 2
+    ):
+        if world.textures == first.textures:
+            raise InputError(f"{source.label}: the same world as {first.name}; give another seed's")
+        if world.name == first.name:
+            raise InputError(f"{source.label}: is named as {one.label} is; rename one of them")
     if len({world.seed for world in worlds}) < 2:
         raise InputError(
             f"refusal: all worlds have seed {worlds[0].seed}, and so some pictures in common; give "
@@ -97,16 +98,7 @@ def load_worlds(sources: Sequence[Source]) -> tuple[Scenario, list[World]]:
     return sources[0].scenario, worlds
 
 
-def _scenario(result: Path) -> Scenario:
-    require_result(result)
-    path = result / "scenario.json"
-    try:
-        return Scenario.model_validate(json.loads(path.read_text(encoding="utf-8")))
-    except (ValidationError, ValueError) as error:
-        raise InputError(f"{path}: not a scenario of this version; make it with `run`") from error
-
-
-def _world(source: Source) -> World:
+def _world(source: WorldSource) -> MappedWorld:
     scenario = source.scenario
     if scenario.world is None:
         raise InputError(
@@ -122,4 +114,4 @@ def _world(source: Source) -> World:
     assert planned.faces is not None
     folders = {robot.name: robot.folders for robot in planned.robots}
     repeats = scenario.world.texture.posters > 0
-    return World(source.name, scenario.seed, planned.faces.key, repeats, folders)
+    return MappedWorld(source.name, scenario.seed, planned.faces.key, repeats, folders)

@@ -11,32 +11,28 @@ from experiments.run.store import Store
 from experiments.scenario.settings import AlignerEntry
 from experiments.show.benchmark_files import cell_text, markdown
 from experiments.show.figures.benchmark_figure import draw
-from experiments.study.benchmark import trials as benchmark
-from experiments.study.benchmark.trials import (
-    SUMMARY,
-    TRIALS,
-    Plan,
-    entries_of,
-    run_benchmark,
-    summarise,
-)
+from experiments.study.benchmark import cells as benchmark
+from experiments.study.benchmark.cells import TRIALS, BenchmarkDesign, entries_of, run_benchmark
+from experiments.study.benchmark.success import SUMMARY, summarise
 from mapfusion.align import registry
 from mapfusion.align.plugins import Kind, Method
 from mapfusion.errors import InputError
 from mapfusion.storage import read_table
 from tests.helpers.tiny_scenario import command
 
-SMALL = Plan(entries_of(["ransac", "svd"]), 4, pair_counts=(60, 100), outlier_shares=(0.5, 0.9))
+SMALL = BenchmarkDesign(
+    entries_of(["ransac", "svd"]), 4, pair_counts=(60, 100), outlier_shares=(0.5, 0.9)
+)
 
 
-def quiet(done: int, total: int) -> None:
-    del done, total
+def quiet(stage: str, done: int, total: int) -> None:
+    del stage, done, total
 
 
 def test_good_and_bad_methods_are_told_apart(tmp_path: Path) -> None:
-    told: list[tuple[int, int]] = []
-    trials = run_benchmark(SMALL, Store(tmp_path), lambda done, total: told.append((done, total)))
-    assert told == [(k, 8) for k in range(9)]
+    told: list[tuple[str, int, int]] = []
+    trials = run_benchmark(SMALL, Store(tmp_path), lambda *now: told.append(now))
+    assert told == [("benchmark", k, 8) for k in range(9)]
     summary = summarise(trials).set_index(["method", "n_pairs", "outlier_share"])
     assert len(summary) == 8
     ransac = summary.loc["ransac"]
@@ -68,7 +64,7 @@ def test_finished_cells_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(benchmark, "_measure", lambda *a: (measured.append(a[1].name), measure(*a)))
     pd.testing.assert_frame_equal(run_benchmark(SMALL, Store(tmp_path), quiet), before)
     assert measured == []
-    more = Plan(
+    more = BenchmarkDesign(
         (*SMALL.aligners, AlignerEntry(name="wide", method="ransac", parameters={"gate_m": 0.4})),
         4,
         pair_counts=(60,),
@@ -79,7 +75,9 @@ def test_finished_cells_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_slow_cell_ends_with_the_trials_it_has(tmp_path: Path) -> None:
-    plan = Plan(entries_of(["svd"]), 50, budget_s=0.0, pair_counts=(60,), outlier_shares=(0.5,))
+    plan = BenchmarkDesign(
+        entries_of(["svd"]), 50, budget_s=0.0, pair_counts=(60,), outlier_shares=(0.5,)
+    )
     assert summarise(run_benchmark(plan, Store(tmp_path), quiet))["n_trials"].tolist() == [1]
 
 
@@ -135,7 +133,9 @@ def test_an_absent_package_is_no_failure(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(registry, "_PEERS", (absent,))
     registry.known_methods.cache_clear()
     try:
-        plan = Plan(entries_of(["far", "ransac"]), 2, pair_counts=(60,), outlier_shares=(0.5,))
+        plan = BenchmarkDesign(
+            entries_of(["far", "ransac"]), 2, pair_counts=(60,), outlier_shares=(0.5,)
+        )
         summary = summarise(run_benchmark(plan, Store(tmp_path), quiet))
     finally:
         monkeypatch.undo()
