@@ -82,8 +82,8 @@ def sweep(
     from experiments.scenario.seeds import parse_seeds
     from experiments.show.terminal import sweep_screen as screen
     from experiments.show.terminal.layout import progress
-    from experiments.study.sweep.execution import execute, measure_times, prepare
     from experiments.study.sweep.survey import survey
+    from experiments.study.sweep.whole_sweep import execute, measure_times, prepare
 
     asked = prepare(scenarios, parse_seeds(seeds), settings or (), results, output)
     if dry_run:

@@ -79,14 +79,13 @@ def markdown(design: BenchmarkDesign, summary: pd.DataFrame) -> str:
 
 
 def _section(rows: pd.DataFrame) -> str:
-    columns = [
-        f"{share:.0%} outliers ({n_true} true)"
-        for share, n_true in zip(rows["outlier_share"], rows["n_true"], strict=True)
-    ]
-    cells = rows.assign(text=rows.apply(cell_text, axis=1), column=columns)
-    table = cells.pivot(index="method", columns="column", values="text")
-    methods, headings = cells["method"].unique(), cells["column"].unique()
-    return to_markdown(table.reindex(index=methods, columns=headings).reset_index())
+    columns = {
+        f"{share:.0%} outliers ({cells['n_true'].iloc[0]} true)": cells.set_index("method").apply(
+            cell_text, axis=1
+        )
+        for share, cells in rows.groupby("outlier_share", sort=False)
+    }
+    return to_markdown(pd.DataFrame(columns).reset_index(names="method"))
 
 
 def cell_text(cell: pd.Series) -> str:

@@ -8,9 +8,10 @@ from rich.console import Console
 from rich.progress import TimeRemainingColumn
 from rich.table import Table
 
+from experiments.judge.criteria import ANSWERABLE_PAIRS
 from experiments.show.terminal.layout import LAYOUT, STAGE_TEXT, number, progress
 from experiments.study.sweep.combinations import SweepRun
-from experiments.study.sweep.run_medians import ERRORS, MIN_TRUE_PAIRS, medians_over_runs
+from experiments.study.sweep.run_medians import ERRORS, medians_over_runs
 from experiments.study.sweep.survey import Survey
 from experiments.study.sweep.sweep_dataset import SweepDataset
 from experiments.study.sweep.sweep_driver import SweepProgress
@@ -52,23 +53,25 @@ def print_survey(found: Survey) -> None:
 def print_sweep(dataset: SweepDataset, runs: Sequence[SweepRun], failed: Mapping[str, str]) -> None:
     """Medians over the runs, and the failures."""
     console = Console()
-    summary = medians_over_runs(dataset, [run for run in runs if run.run_id not in failed])
-    console.print(_summary_table(summary, dataset.keys))
-    if len(summary) > MAX_ROWS_SHOWN:
-        console.print(f"... and {len(summary) - MAX_ROWS_SHOWN} more rows")
+    finished = [run for run in runs if run.run_id not in failed]
+    if finished:
+        summary = medians_over_runs(dataset, finished)
+        console.print(_summary_table(summary, dataset.keys))
+        if len(summary) > MAX_ROWS_SHOWN:
+            console.print(f"... and {len(summary) - MAX_ROWS_SHOWN} more rows")
     for run_id in sorted(failed)[:MAX_FAILURES_SHOWN]:
         console.print(f"  {run_id} failed: {failed[run_id]}", soft_wrap=True, markup=False)
     if len(failed) > MAX_FAILURES_SHOWN:
         console.print(f"  ... and {len(failed) - MAX_FAILURES_SHOWN} more failed")
     console.print(
-        f"{len(runs) - len(failed)} of {len(runs)} runs finished; tables: {dataset.folder}",
+        f"{len(finished)} of {len(runs)} runs finished; tables: {dataset.folder}",
         soft_wrap=True,
     )
 
 
 def _summary_table(summary: pd.DataFrame, keys: tuple[str, ...]) -> Table:
     table = Table(
-        title=f"Median translation errors over runs, {MIN_TRUE_PAIRS}+ true pairs", **LAYOUT
+        title=f"Median translation errors over runs, {ANSWERABLE_PAIRS}+ true pairs", **LAYOUT
     )
     table.add_column(" ".join(("scenario", *(key.rpartition(".")[2] for key in keys))))
     table.add_column("aligner")

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import pandas as pd
 import pyarrow.parquet as pq
 
+from experiments.judge.criteria import answerable
 from experiments.study.sweep.combinations import SweepRun
 from experiments.study.sweep.sweep_dataset import SweepDataset
 
-MIN_TRUE_PAIRS = 3
 ERRORS = ["translation_error_m", "refined_translation_error_m"]
 
 
@@ -17,13 +17,12 @@ def medians_over_runs(dataset: SweepDataset, runs: Sequence[SweepRun]) -> pd.Dat
 
     Run by run, so that memory does not grow with the sweep.
     """
-    parts = [pd.DataFrame(columns=pd.Index(["setting", "aligner", *ERRORS]))]
+    parts = []
     for run in runs:
         columns = ["aligner", "n_true", *ERRORS]
         errors = pq.read_table(dataset.path("errors", run), columns=columns).to_pandas()
-        used = errors[errors["n_true"] >= MIN_TRUE_PAIRS]
         setting = " ".join((run.scenario, *(value for _, value in run.settings)))
-        medians = used.groupby("aligner", sort=False)[ERRORS].median()
+        medians = answerable(errors).groupby("aligner", sort=False)[ERRORS].median()
         parts.append(medians.reset_index().assign(setting=setting))
-    grouped = pd.concat(parts[1:] or parts).groupby(["setting", "aligner"], sort=False)
+    grouped = pd.concat(parts).groupby(["setting", "aligner"], sort=False)
     return grouped[ERRORS].median().assign(runs=grouped.size()).reset_index()

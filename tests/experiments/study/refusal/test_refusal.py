@@ -163,9 +163,11 @@ def test_stated_number_of_false_alarms_bounds_the_measured_one() -> None:
 
 @pytest.fixture(scope="module")
 def other_result(tiny: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The tiny scenario in another world: another seed's textures."""
+    """The tiny scenario in another world: another seed's textures; one aligner is enough here."""
     folder = tmp_path_factory.mktemp("other")
-    other = tiny.model_copy(update={"seed": 4})
+    alone = {"aligners": tiny.align.aligners[:1], "repetitions": 1}
+    align = tiny.align.model_copy(update=alone)
+    other = tiny.model_copy(update={"seed": 4, "align": align})
     return run_scenario(other, folder, 1, lambda stage, done, total: None)
 
 
@@ -202,11 +204,16 @@ def test_worlds_may_be_scenarios_with_seeds(
 ) -> None:
     """As a sweep leaves them: maps in the store, no result folder. Posters are told apart."""
     assert tiny.world is not None
+    assert tiny.drive is not None
+    short = tiny.model_copy(
+        update={
+            "drive": tiny.drive.model_copy(update={"frames": 16}),
+            "align": tiny.align.model_copy(update={"aligners": tiny.align.aligners[:2]}),
+        }
+    )
     texture = replace(tiny.world.texture, posters=2)
-    worlds = [
-        tiny,
-        tiny.model_copy(update={"world": tiny.world.model_copy(update={"texture": texture})}),
-    ]
+    hung = tiny.world.model_copy(update={"texture": texture})
+    worlds = [short, short.model_copy(update={"world": hung})]
     paths = []
     for name, world in zip(("plain", "hung"), worlds, strict=True):
         paths.append(tmp_path / f"{name}.yaml")
