@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -260,6 +261,17 @@ def test_maps_no_longer_there_are_named(
     reply = command(capsys, "refusal", tiny_result, alone, "-o", tmp_path / "out")
     assert reply.code == 2
     assert "run its scenario again" in reply.complaints[0]
+
+
+def test_worlds_of_one_name_are_refused(
+    tiny_result: Path, other_result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Rows are told apart by their worlds' names."""
+    copied = shutil.copytree(other_result.parent, tmp_path / "copy")
+    renamed = (copied / other_result.name).rename(copied / tiny_result.name)
+    reply = command(capsys, "refusal", tiny_result, renamed, "-o", tmp_path / "out")
+    assert reply.code == 2
+    assert f"is named as {tiny_result} is" in reply.complaints[0]
 
 
 def test_the_figure_is_the_same_bytes(tmp_path: Path) -> None:
