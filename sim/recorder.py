@@ -1,6 +1,6 @@
 """Frames of a recording, each on its own: any process can render any frame in any order."""
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,7 @@ class FrameSource:
     Args:
         faces: folder that `sim.world.write_faces` has filled.
         camera: of all robots.
-        noise: of each robot's images, by the robot's name.
+        robots: their names.
         renderer: see `sim.world.World`.
     """
 
@@ -33,14 +33,14 @@ class FrameSource:
         self,
         faces: Path,
         camera: StereoCamera,
-        noise: Mapping[str, RadiometricNoise],
+        robots: Sequence[str],
         renderer: Renderer = "tiny",
     ) -> None:
-        self._camera, self._noise = camera, dict(noise)
+        self._camera = camera
         self._world = World(renderer)
         self._visibility = Visibility(self._world.add_painted_faces(faces), camera)
         start = np.zeros(3)
-        self._robots = {name: P3at(self._world, start) for name in noise}
+        self._robots = {name: P3at(self._world, start) for name in robots}
 
     def __enter__(self) -> "FrameSource":
         return self
@@ -53,7 +53,11 @@ class FrameSource:
         self._world.close()
 
     def render(
-        self, T_world_robots: ArrayLike, robot: str, rng: np.random.Generator
+        self,
+        T_world_robots: ArrayLike,
+        robot: str,
+        noise: RadiometricNoise,
+        rng: np.random.Generator,
     ) -> StereoFrame:
         """What `robot` sees when the robots (in the order of their names) stand at poses (R, 3)."""
         poses = np.asarray(T_world_robots, dtype=np.float64)
@@ -64,7 +68,7 @@ class FrameSource:
         for (name, body), pose in zip(self._robots.items(), poses, strict=True):
             body.place(pose, OUT_OF_SIGHT_M if name == robot else 0.0)  # it does not see itself
         self._world.show_faces(self._visibility.seen(own_pose))
-        return render_stereo(self._world, self._camera, own_pose, self._noise[robot], rng)
+        return render_stereo(self._world, self._camera, own_pose, noise, rng)
 
 
 def truth_points(

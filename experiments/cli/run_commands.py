@@ -45,7 +45,9 @@ def _draw(
     from experiments.show.figures import draw_all
 
     skipped: list[str] = []
-    paths = draw_all(result, jobs, lambda done, total: show("figures", done, total), skipped.append)
+    paths = draw_all(
+        result, jobs, lambda done, total: show("draw the figures", done, total), skipped.append
+    )
     return paths, skipped
 
 

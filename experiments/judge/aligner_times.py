@@ -10,19 +10,19 @@ from experiments.judge.errors import EvaluatedRobot
 from experiments.judge.truth import common_landmarks
 from experiments.methods.aligner_calls import callable_aligner
 from experiments.scenario.randomness import generator
-from experiments.scenario.settings import Scenario
+from experiments.scenario.settings import AnyScenario
 from mapfusion.align.correspondences import match
 
 _WARM_UP_RUNS = 1  # compilation and caches
 
 
-def time_aligners(scenario: Scenario, a: EvaluatedRobot, b: EvaluatedRobot, path: Path) -> None:
+def time_aligners(scenario: AnyScenario, a: EvaluatedRobot, b: EvaluatedRobot, path: Path) -> None:
     """Time every aligner on a pair's maps of growing overlap; a table already there is kept."""
     if not path.is_file():
         tables.write(path, "aligner_timings", _time_pair(scenario, a, b))
 
 
-def _time_pair(scenario: Scenario, a: EvaluatedRobot, b: EvaluatedRobot) -> list[dict[str, Any]]:
+def _time_pair(scenario: AnyScenario, a: EvaluatedRobot, b: EvaluatedRobot) -> list[dict[str, Any]]:
     iterations = sorted(set(a.maps) | set(b.maps))
     spread = np.linspace(0, len(iterations) - 1, scenario.evaluate.timing_points)
     aligners = [

@@ -8,11 +8,12 @@ from pathlib import Path
 import pandas as pd
 
 from experiments.judge import metrics, tables
-from experiments.scenario.settings import Bound, Scenario, load_scenario
+from experiments.scenario.loading import load_scenario
+from experiments.scenario.settings import AnyScenario, Bound
 from mapfusion.errors import InputError
 
 
-def load_checked(path: Path, overrides: Sequence[str] = (), seed: int | None = None) -> Scenario:
+def load_checked(path: Path, overrides: Sequence[str] = (), seed: int | None = None) -> AnyScenario:
     """A scenario as `load_scenario` gives it, whose `expect` block names metrics that exist.
 
     Raises:
@@ -67,7 +68,7 @@ def pooled_tables(results: Mapping[int, Path]) -> dict[str, pd.DataFrame]:
     }
 
 
-def check(scenario: Scenario, results: Mapping[int, Path]) -> list[Outcome]:
+def check(scenario: AnyScenario, results: Mapping[int, Path]) -> list[Outcome]:
     """Measure every expectation of a scenario over its results by seed."""
     pooled = pooled_tables(results)
     outcomes = []

@@ -1,25 +1,30 @@
 """Stage: one robot pair's estimates against the truth, and whether fusing the pair was worth it."""
 
-import time
+from dataclasses import dataclass
 
 from experiments.judge import tables
 from experiments.judge.errors import EvaluatedRobot, error_rows
 from experiments.judge.fused_landmarks import fusion_rows
 from experiments.judge.truth import PathTruth, landmark_truth
+from experiments.run.job import Job
 from experiments.run.stages.slam import RobotFolders, read_associations, read_snapshots
-from experiments.run.store import StageFolder, Store
-from experiments.scenario.settings import Scenario
+from experiments.scenario.settings import Merge
+from mapfusion.align.acceptance import Acceptance
+from mapfusion.align.refine import Refinement
 from mapfusion.errors import InputError
 from mapfusion.robot_log import read_log, read_truth
 
-SOURCES = ("mapfusion", "experiments/judge/judging.py", "experiments/judge/errors.py")
-SOURCES += (
-    "experiments/judge/fused_landmarks.py",
-    "experiments/judge/truth.py",
-    "experiments/judge/tables.py",
-    "experiments/judge/metrics.py",
-    "experiments/run/estimates.py",
-)
+WRITES = ("errors.parquet", "fusion.parquet")
+
+
+@dataclass(frozen=True)
+class JudgeSettings:
+    """All that the judgement depends on, beside maps, estimates and truth."""
+
+    refinement: Refinement
+    acceptance: Acceptance
+    merge: Merge
+    true_pair_radius_m: float
 
 
 def load_robot(folders: RobotFolders) -> EvaluatedRobot:
@@ -38,40 +43,20 @@ def load_robot(folders: RobotFolders) -> EvaluatedRobot:
     return EvaluatedRobot(log.robot, maps, points, PathTruth.of(truth))
 
 
-def stage(
-    store: Store, scenario: Scenario, align: StageFolder, slams: list[StageFolder]
-) -> StageFolder:
-    """Where this pair's errors are or will be."""
-    resolved = scenario.resolved()
-    settings = {
-        "refinement": resolved["align"]["refinement"],
-        "acceptance": resolved["align"]["acceptance"],
-        "merge": resolved["merge"],
-        "radius_m": scenario.evaluate.true_pair_radius_m,
-    }
-    return store.stage("judge", settings, [align, *slams], SOURCES)
-
-
-def run(
-    scenario: Scenario, a: RobotFolders, b: RobotFolders, align: StageFolder, output: StageFolder
-) -> None:
+def run(settings: JudgeSettings, job: Job) -> None:
     """Write the pair's `errors.parquet` and `fusion.parquet`."""
-    started = time.perf_counter()
-    robot_a, robot_b = load_robot(a), load_robot(b)
-    estimates = tables.read(align.path / "estimates.parquet", "estimates")
-    correspondences = tables.read(align.path / "correspondences.parquet", "correspondences")
-    radius_m = scenario.evaluate.true_pair_radius_m
-    settings = scenario.align
-    errors = error_rows(
-        robot_a,
-        robot_b,
-        estimates,
-        correspondences,
-        settings.refinement,
-        settings.acceptance,
-        radius_m,
+    a, b = (
+        load_robot(RobotFolders(job.inputs[f"log_{side}"], job.inputs[f"slam_{side}"]))
+        for side in "ab"
     )
-    tables.write(output.path / "errors.parquet", "errors", errors)
-    fusion = fusion_rows(robot_a, robot_b, estimates, correspondences, scenario.merge, radius_m)
-    tables.write(output.path / "fusion.parquet", "fusion", fusion)
-    output.finish(elapsed_s=time.perf_counter() - started)
+    estimates, offered = (
+        tables.read(job.inputs["align"] / f"{name}.parquet", name)
+        for name in ("estimates", "correspondences")
+    )
+    radius_m = settings.true_pair_radius_m
+    errors = error_rows(
+        a, b, estimates, offered, settings.refinement, settings.acceptance, radius_m
+    )
+    tables.write(job.output / "errors.parquet", "errors", errors)
+    fusion = fusion_rows(a, b, estimates, offered, settings.merge, radius_m)
+    tables.write(job.output / "fusion.parquet", "fusion", fusion)

@@ -17,7 +17,7 @@ from experiments.judge import tables
 from experiments.judge.errors import EvaluatedRobot
 from experiments.judge.truth import true_pairs
 from experiments.run.estimates import alignment_of, correspondences_of
-from experiments.scenario.settings import Merge, Scenario
+from experiments.scenario.settings import AnyScenario, Merge
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.merge import merge
@@ -25,7 +25,7 @@ from mapfusion.merge import merge
 _KEY = ["robot_a", "robot_b", "iteration"]
 
 
-def write_history(robots: Sequence[EvaluatedRobot], scenario: Scenario, folder: Path) -> None:
+def write_history(robots: Sequence[EvaluatedRobot], scenario: AnyScenario, folder: Path) -> None:
     """Write the tables `map_history`, `fused_history` and `true_pairs` of a result.
 
     Args:

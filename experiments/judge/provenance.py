@@ -4,35 +4,37 @@ import platform
 from datetime import UTC, datetime
 from typing import Any
 
-from experiments.judge.pipeline import Plan
-from experiments.run.store import library_versions
-from experiments.scenario.settings import Scenario
+from experiments.judge.judged_run import JudgedRun
+from experiments.run.code_version import library_versions
+from experiments.scenario.settings import AnyScenario, Simulation
 from mapfusion.align.registry import find_method
 from sim.renderer import renderer_name
 
 RESULT_SCHEMA_VERSION = 1
 
 
-def renderer(scenario: Scenario) -> str:
+def renderer(scenario: AnyScenario) -> str:
     """What made the pictures."""
-    return "none (imported logs)" if scenario.logs else renderer_name(scenario.render.renderer)
+    if isinstance(scenario, Simulation):
+        return renderer_name(scenario.render.renderer)
+    return "none (imported logs)"
 
 
-def provenance(plan: Plan) -> dict[str, Any]:
+def provenance(run: JudgedRun) -> dict[str, Any]:
     """JSON-able description of a run."""
     return {
         "schema_version": RESULT_SCHEMA_VERSION,
-        "scenario": plan.scenario.name,
-        "seed": plan.scenario.seed,
-        "renderer": renderer(plan.scenario),
+        "scenario": run.scenario.name,
+        "seed": run.scenario.seed,
+        "renderer": renderer(run.scenario),
         "python": platform.python_version(),
         "machine": platform.machine(),
         "libraries": library_versions(),
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
         "others_aligners": {
             entry.name: origin
-            for entry in plan.scenario.align.aligners
+            for entry in run.scenario.align.aligners
             if (origin := find_method(entry.method).origin())
         },
-        "stages": {f"{folder.stage}/{folder.key}": folder.finished for folder in plan.folders()},
+        "stages": {f"{folder.name}/{folder.key}": folder.finished for folder in run.folders()},
     }

@@ -17,15 +17,15 @@ from experiments.judge.aligner_times import time_aligners
 from experiments.judge.consistency import landmark_nees_rows
 from experiments.judge.errors import EvaluatedRobot, path_columns, robot_rows
 from experiments.judge.fused_landmarks import fused_maps, fused_truth, map_fit_rows
-from experiments.judge.judging import load_robot
+from experiments.judge.judged_run import JudgedRun
 from experiments.judge.map_history import write_history
 from experiments.judge.path_errors import path_statistics_rows
-from experiments.judge.pipeline import Plan, execute
 from experiments.judge.provenance import provenance
 from experiments.run.stages import slam
-from experiments.run.store import Store, link_or_copy
+from experiments.run.store import Store
+from experiments.run.store_files import link_or_copy
 from experiments.run.tasks import OnProgress
-from experiments.scenario.settings import Merge, Scenario
+from experiments.scenario.settings import AnyScenario, Merge, Simulation
 from mapfusion import se2
 from mapfusion.aligned_landmarks import ABSENT
 from mapfusion.errors import InputError
@@ -35,10 +35,10 @@ from mapfusion.robot_log import read_log
 from mapfusion.se2 import Float
 from mapfusion.storage import point_columns, read_table, write_whole
 
-STORE_FOLDER = "store"
+_LABEL = "write the tables"
 
 
-def result_folder(results: Path, scenario: Scenario) -> Path:
+def result_folder(results: Path, scenario: AnyScenario) -> Path:
     """Where the result of a scenario goes: `RESULTS/NAME-SEED`."""
     return results / f"{scenario.name}-{scenario.seed}"
 
@@ -51,32 +51,35 @@ def require_result(result: Path) -> None:
 
 
 def run_scenario(
-    scenario: Scenario, results: Path, jobs: int, on_progress: OnProgress, fresh: bool = False
+    scenario: AnyScenario, results: Path, jobs: int, on_progress: OnProgress, fresh: bool = False
 ) -> Path:
     """Run a scenario and write its result folder; returns the folder."""
-    plan = execute(scenario, Store(results / STORE_FOLDER), jobs, on_progress, fresh)
+    run = JudgedRun.of(scenario, Store.of(results))
+    if fresh:
+        for stage_folder in run.folders():
+            stage_folder.discard()
+    run.execute(jobs, on_progress)
     folder = result_folder(results, scenario)
-    on_progress("tables", 0, 1)
-    write_result(plan, folder)
-    on_progress("tables", 1, 1)
+    on_progress(_LABEL, 0, 1)
+    write_result(run, folder)
+    on_progress(_LABEL, 1, 1)
     return folder
 
 
-def write_result(plan: Plan, folder: Path) -> None:
+def write_result(run: JudgedRun, folder: Path) -> None:
     """Collect a finished plan's tables, maps and images in a result folder."""
-    scenario = plan.scenario
-    robots = [load_robot(robot.folders) for robot in plan.robots]
-    measure_aligners(plan, robots)
-    _join_pair_tables(plan, folder)
-    _write_robot_tables(plan, robots, folder)
+    scenario, robots = run.scenario, run.load_robots()
+    measure_aligners(run, robots)
+    _join_pair_tables(run, folder)
+    _write_robot_tables(run, robots, folder)
     for outdated in ("maps", "keyframes"):  # of robots or frames that are no longer there
         shutil.rmtree(folder / outdated, ignore_errors=True)
-    _write_maps(plan, robots, folder)
+    _write_maps(run, robots, folder)
     write_history(robots, scenario, folder)
-    _write_images(plan, folder)
+    _write_images(run, folder)
     _write_json(folder / "scenario.json", scenario.resolved())
     _write_json(folder / "world.json", _world(scenario, robots))
-    _write_json(folder / "provenance.json", provenance(plan))
+    _write_json(folder / "provenance.json", provenance(run))
 
 
 def _write_json(path: Path, content: object) -> None:
@@ -84,49 +87,40 @@ def _write_json(path: Path, content: object) -> None:
     write_whole(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
 
 
-def _world(scenario: Scenario, robots: Sequence[EvaluatedRobot]) -> dict[str, object]:
+def _world(scenario: AnyScenario, robots: Sequence[EvaluatedRobot]) -> dict[str, object]:
     """The truth that figures show as background."""
-    walls = [] if scenario.world is None else [list(wall.points) for wall in scenario.world.walls]
+    walls = (
+        [list(wall.points) for wall in scenario.world.walls]
+        if isinstance(scenario, Simulation)
+        else []
+    )
     starts = {robot.name: robot.path.T_world_map.tolist() for robot in robots}
     return {"walls": walls, "robots": starts}
 
 
-def measure_aligners(plan: Plan, robots: Sequence[EvaluatedRobot]) -> None:
+def measure_aligners(run: JudgedRun, robots: Sequence[EvaluatedRobot]) -> None:
     """Time the aligners, serially, when all else is done: nothing else may be running."""
     by_name = {robot.name: robot for robot in robots}
-    for pair in plan.pairs:
-        path = pair.align.path / "aligner_timings.parquet"
-        time_aligners(plan.scenario, by_name[pair.a.name], by_name[pair.b.name], path)
+    for pair in run.pipeline.pairs:
+        path = run.store.path(pair.estimates) / "aligner_timings.parquet"
+        time_aligners(run.scenario, by_name[pair.a.name], by_name[pair.b.name], path)
 
 
-_JUDGED = {"errors", "fusion"}  # the other tables of pairs come from the aligners
+def _join_pair_tables(run: JudgedRun, folder: Path) -> None:
+    for name in ("aligner_timings", "estimates", "correspondences", "errors", "fusion"):
+        tables.write(tables.table_path(folder, name), name, run.pair_table(name))
 
 
-def pair_table(plan: Plan, name: str) -> pd.DataFrame:
-    """A table of robot pairs, of all pairs."""
-    parts = [
-        tables.read((pair.judge if name in _JUDGED else pair.align).path / f"{name}.parquet", name)
-        for pair in plan.pairs
-    ]
-    if not parts:
-        return pd.DataFrame(columns=pd.Index(tables.ALL[name].names))
-    return pd.concat(parts, ignore_index=True)
-
-
-def _join_pair_tables(plan: Plan, folder: Path) -> None:
-    for name in ("aligner_timings", "estimates", "correspondences", *sorted(_JUDGED)):
-        tables.write(tables.table_path(folder, name), name, pair_table(plan, name))
-
-
-def robot_tables(plan: Plan, robots: Sequence[EvaluatedRobot]) -> dict[str, pd.DataFrame]:
+def robot_tables(run: JudgedRun, robots: Sequence[EvaluatedRobot]) -> dict[str, pd.DataFrame]:
     """The tables `paths`, `path_statistics`, `robots` and `clouds`, of all robots."""
     paths, online, clouds = [], [], []
-    for stages, robot in zip(plan.robots, robots, strict=True):
-        poses = read_table(stages.slam.path / "poses.parquet", slam.POSES)[0].to_pandas()
-        joined = path_columns(poses, read_log(stages.log.path).odometry, robot.path)
+    for stages, robot in zip(run.pipeline.robots, robots, strict=True):
+        log, maps = run.robot_folders(stages)
+        poses = read_table(maps / "poses.parquet", slam.POSES)[0].to_pandas()
+        joined = path_columns(poses, read_log(log).odometry, robot.path)
         paths.append(joined.assign(robot=robot.name))
         online.append(robot_rows(poses, joined).assign(robot=robot.name))
-        cloud = read_table(stages.slam.path / "clouds.parquet", slam.CLOUDS)[0].to_pandas()
+        cloud = read_table(maps / "clouds.parquet", slam.CLOUDS)[0].to_pandas()
         clouds.append(cloud.assign(robot=robot.name))
     made = {
         name: pd.concat(parts, ignore_index=True)
@@ -135,25 +129,18 @@ def robot_tables(plan: Plan, robots: Sequence[EvaluatedRobot]) -> dict[str, pd.D
     return made | {"path_statistics": pd.DataFrame(path_statistics_rows(made["paths"]))}
 
 
-def _write_robot_tables(plan: Plan, robots: Sequence[EvaluatedRobot], folder: Path) -> None:
-    for name, rows in robot_tables(plan, robots).items():
+def _write_robot_tables(run: JudgedRun, robots: Sequence[EvaluatedRobot], folder: Path) -> None:
+    for name, rows in robot_tables(run, robots).items():
         tables.write(tables.table_path(folder, name), name, rows)
-    timings = []
-    for stage_folder in plan.folders():
-        figures = stage_folder.figures()
-        for name in ("elapsed_s", "rendering_s"):
-            if name in figures:
-                timings.append(
-                    {
-                        "stage": stage_folder.stage,
-                        "name": f"{stage_folder.key}:{name}",
-                        "elapsed_s": figures[name],
-                    }
-                )
+    timings = [
+        {"stage": stage.name, "name": f"{stage.key}:{name}", "elapsed_s": seconds}
+        for stage in run.folders()
+        for name, seconds in stage.figures().items()
+    ]
     tables.write(tables.table_path(folder, "timings"), "timings", timings)
 
 
-def _write_maps(plan: Plan, robots: list[EvaluatedRobot], folder: Path) -> None:
+def _write_maps(run: JudgedRun, robots: list[EvaluatedRobot], folder: Path) -> None:
     last = max(max(robot.maps) for robot in robots)
     landmark_rows = []
     for robot in robots:
@@ -168,12 +155,12 @@ def _write_maps(plan: Plan, robots: list[EvaluatedRobot], folder: Path) -> None:
         tables.read(tables.table_path(folder, name), name)
         for name in ("estimates", "correspondences")
     )
-    fused = fused_map(plan.scenario.merge, robots, estimates, offered, last)
+    fused = fused_map(run.scenario.merge, robots, estimates, offered, last)
     if fused is not None:
         write_map(folder / "maps" / "fused.parquet", fused.landmarks)
     fits = map_fit_rows(robots, fused, last)
     tables.write(tables.table_path(folder, "map_fits"), "map_fits", fits)
-    nees = landmark_nees_rows(robots, fused, last, plan.scenario.evaluate.true_pair_radius_m)
+    nees = landmark_nees_rows(robots, fused, last, run.scenario.evaluate.true_pair_radius_m)
     tables.write(tables.table_path(folder, "landmark_nees"), "landmark_nees", nees)
     fused_rows = [] if fused is None else _fused_rows(fused, robots, last)
     tables.write(tables.table_path(folder, "fused"), "fused", fused_rows)
@@ -226,14 +213,12 @@ def _fused_rows(fused: FusedMap, robots: list[EvaluatedRobot], iteration: int) -
     return rows
 
 
-def _write_images(plan: Plan, folder: Path) -> None:
+def _write_images(run: JudgedRun, folder: Path) -> None:
     tracks = []
-    for robot in plan.robots:
-        if robot.features is None or robot.observed is None:
-            continue
-        for path in sorted(robot.features.path.glob("image_*.png")):
+    for robot in run.pipeline.simulated:
+        for path in sorted(run.store.path(robot.features).glob("image_*.png")):
             iteration = int(path.stem.removeprefix("image_"))
             link_or_copy(path, folder / "keyframes" / f"{robot.name}_{iteration:05d}.png")
-        tracks.append(tables.read(robot.observed.path / "tracks.parquet", "tracks"))
+        tracks.append(tables.read(run.store.path(robot.observed) / "tracks.parquet", "tracks"))
     joined = pd.concat(tracks, ignore_index=True) if tracks else []
     tables.write(tables.table_path(folder, "tracks"), "tracks", joined)

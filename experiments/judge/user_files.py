@@ -4,14 +4,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.judge.pipeline import record_logs
+from experiments.judge.judged_run import record_logs
 from experiments.methods.aligner_calls import callable_aligner, refine_estimate
 from experiments.run.estimates import estimate_row
-from experiments.run.stages.log import copy_log
 from experiments.run.store import Store
+from experiments.run.store_files import link_or_copy
 from experiments.run.tasks import OnProgress
+from experiments.scenario.loading import load_section
 from experiments.scenario.randomness import generator
-from experiments.scenario.settings import Align, Merge, Scenario, Slam, load_section
+from experiments.scenario.settings import Align, AnyScenario, Merge, Recording, Slam
 from mapfusion.align.correspondences import match
 from mapfusion.errors import InputError
 from mapfusion.fastslam.run import run_log
@@ -22,16 +23,17 @@ from mapfusion.robot_log import read_log
 
 
 def record(
-    scenario: Scenario, output: Path, results: Path, jobs: int, on_progress: OnProgress
+    scenario: AnyScenario, output: Path, results: Path, jobs: int, on_progress: OnProgress
 ) -> list[Path]:
     """Simulate and write one log a robot into `output`; returns their folders."""
-    if scenario.logs:
+    if isinstance(scenario, Recording):
         raise InputError(
             f"scenario {scenario.name}: uses recorded logs, there is nothing to record"
         )
-    logs = record_logs(scenario, Store(results / "store"), jobs, on_progress)
+    logs = record_logs(scenario, Store.of(results), jobs, on_progress)
     for name, folder in logs.items():
-        copy_log(folder, output / name)
+        for path in sorted(folder.glob("*.parquet")):
+            link_or_copy(path, output / name / path.name)
     return [output / name for name in logs]
 
 
@@ -54,7 +56,7 @@ def slam(log: Path, settings: Slam, seed: int, on_progress: OnProgress) -> Landm
     rng = generator(seed, "slam", robot_log.robot)
     landmarks = None
     for frame in run_log(robot_log, settings.filter, rng, [last], settings.min_count):
-        on_progress("slam", frame.iteration + 1, last + 1)
+        on_progress("FastSLAM", frame.iteration + 1, last + 1)
         landmarks = frame.landmarks
     assert landmarks is not None
     return landmarks

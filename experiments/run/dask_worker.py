@@ -9,8 +9,8 @@ import traceback
 from dataclasses import dataclass
 from pathlib import Path
 
+from experiments.run.code_version import library_versions, source_hash
 from experiments.run.kernel_cache import use_kernel_cache
-from experiments.run.store import library_versions, source_hash
 from mapfusion.errors import InputError
 
 SOURCES = ("mapfusion", "sim", "experiments")

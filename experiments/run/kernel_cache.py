@@ -8,7 +8,7 @@ import os
 import shutil
 from pathlib import Path
 
-from experiments.run.store import source_hash
+from experiments.run.code_version import source_hash
 
 _VERSIONS_KEPT = 4  # a few megabytes each; going back and forth between branches stays fast
 

@@ -1,94 +1,45 @@
-"""Finished stages, kept under a key of all they depend on, so that nothing is computed twice.
+"""Where finished stages are kept, so that nothing is computed twice."""
 
-A key covers: the parts of the scenario the stage reads, the keys of the stages before it, the
-source code it runs, and the versions of the libraries behind it. Changed code or settings give a
-new key, so a result can be reused but never be stale.
-"""
-
-import functools
-import hashlib
-import importlib.metadata
 import json
 import shutil
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from experiments.run.stage import RecordedLog, Stage
 from mapfusion.storage import write_whole
 
-SOURCE_ROOT = Path(__file__).resolve().parents[2]
-_KEY_LENGTH = 16  # hexadecimal digits: 64 bits, no collision in any store one disk can hold
-_DONE = "done.json"
-_TIMES = "times_"  # and the part
-_NUMERICAL_LIBRARIES = (
-    "numba",
-    "numpy",
-    "opencv-python-headless",
-    "pyarrow",
-    "pybullet",
-    "scipy",
-)
-
-
-@functools.cache
-def library_versions() -> dict[str, str]:
-    """Installed versions of the libraries whose arithmetic ends up in the results."""
-    return {name: importlib.metadata.version(name) for name in _NUMERICAL_LIBRARIES}
-
-
-@functools.cache
-def source_hash(parts: tuple[str, ...]) -> str:
-    """Hash of the source files of packages or modules, given as paths below the project's root."""
-    digest = hashlib.sha256()
-    for part in parts:
-        path = SOURCE_ROOT / part
-        files = sorted(path.rglob("*")) if path.is_dir() else [path]
-        for file in files:
-            if file.suffix in {".py", ".urdf"}:
-                digest.update(str(file.relative_to(SOURCE_ROOT)).encode() + b"\0")
-                digest.update(file.read_bytes())
-    return digest.hexdigest()
+STORE_FOLDER = "store"  # in the folder of results
+_MARK = "done"
 
 
 @dataclass(frozen=True)
 class StageFolder:
     """Where one stage keeps what it made."""
 
-    stage: str
-    key: str
     path: Path
-
-    @property
-    def mark(self) -> Path:
-        """The file that says that the stage ran to its end."""
-        return self.path / _DONE
+    name: str
+    key: str
+    outputs: Mapping[str, tuple[Path, ...]]  # by part; the last of each is the mark of its end
 
     @property
     def finished(self) -> bool:
-        """Whether the stage ran to its end."""
-        return self.mark.is_file()
+        """Whether all it writes is there."""
+        return all(file.is_file() for files in self.outputs.values() for file in files)
 
-    def finish(self, **figures: Any) -> None:
-        """Mark the stage as finished, with figures about the run (times; never results)."""
-        text = json.dumps({"stage": self.stage, "key": self.key, **figures}, indent=1)
-        write_whole(self.mark, lambda file: file.write_text(text))
+    def finish(self, part: str, figures: Mapping[str, float]) -> None:
+        """Mark a part as finished, with figures about the work (times; never results)."""
+        text = json.dumps({"stage": self.name, "key": self.key, "figures": dict(figures)}, indent=1)
+        write_whole(self.outputs[part][-1], lambda file: file.write_text(text))
 
     def figures(self) -> dict[str, Any]:
-        """What `finish` was given."""
-        return json.loads(self.mark.read_text())
-
-    def note(self, part: str, **seconds: float) -> None:
-        """Keep the times of one part of the stage."""
-        text = json.dumps(seconds)
-        write_whole(self.path / f"{_TIMES}{part}.json", lambda file: file.write_text(text))
-
-    def noted(self) -> dict[str, float]:
-        """The times of all parts, added up."""
+        """What `finish` was given, summed over the parts that are finished."""
         total = Counter[str]()
-        for path in sorted(self.path.glob(f"{_TIMES}*.json")):
-            total.update(json.loads(path.read_text()))
+        for *_, mark in self.outputs.values():
+            if mark.is_file():
+                total.update(json.loads(mark.read_text())["figures"])
         return dict(total)
 
     def discard(self) -> None:
@@ -102,28 +53,24 @@ class Store:
 
     root: Path
 
-    def stage(
-        self, stage: str, settings: Any, upstream: Sequence[StageFolder], sources: tuple[str, ...]
-    ) -> StageFolder:
-        """The folder of a stage with these settings (JSON-able) after these stages."""
-        content = {
-            "stage": stage,
-            "settings": settings,
-            "upstream": [folder.key for folder in upstream],
-            "source": source_hash(sources),
-            "libraries": library_versions(),
-        }
-        text = json.dumps(content, sort_keys=True, default=str)
-        key = hashlib.sha256(text.encode()).hexdigest()[:_KEY_LENGTH]
-        return StageFolder(stage, key, self.root / stage / key)
+    @classmethod
+    def of(cls, results: Path) -> "Store":
+        """The store in a folder of results."""
+        return cls(results / STORE_FOLDER)
 
-    def imported(self, stage: str, path: Path) -> StageFolder:
-        """A folder that came from elsewhere; its key is the hash of what it holds."""
-        digest = hashlib.sha256()
-        for file in sorted(path.glob("*.parquet")):
-            digest.update(file.name.encode() + b"\0")
-            digest.update(file.read_bytes())
-        return StageFolder(stage, digest.hexdigest()[:_KEY_LENGTH], path)
+    def path(self, stage: Stage | RecordedLog) -> Path:
+        """Where what a stage made is or will be."""
+        return stage.path if isinstance(stage, RecordedLog) else self.root / stage.name / stage.key
+
+    def folder(self, stage: Stage) -> StageFolder:
+        """The same with all that is known of it."""
+        path = self.path(stage)
+        outputs = {}
+        for part in stage.parts:
+            mark = f"{_MARK}_{part}.json" if part else f"{_MARK}.json"
+            files = [*(name.format(part=part) for name in stage.writes), mark]
+            outputs[part] = tuple(path / file for file in files)
+        return StageFolder(path, stage.name, stage.key, outputs)
 
 
 def explained(reason: str, store: Store) -> str:
@@ -131,16 +78,3 @@ def explained(reason: str, store: Store) -> str:
     if str(store.root) not in reason:
         return reason
     return f"{reason}; delete its folder, then it is computed again"
-
-
-def link_or_copy(source: Path, target: Path) -> None:
-    """Put a finished, immutable file at a second place without a second copy where possible."""
-
-    def place(temporary: Path) -> None:
-        temporary.unlink()
-        try:
-            temporary.hardlink_to(source)
-        except OSError:
-            shutil.copyfile(source, temporary)
-
-    write_whole(target, place)

@@ -1,15 +1,20 @@
-"""Work as tasks: what to call, what must be done before, which files tell that it was done.
+"""Stages as tasks: what to call, what must be done before, which files tell that it was done.
 
 `mapfusion run` gives them to processes of its own, `mapfusion sweep` to a Dask cluster.
 """
 
 import heapq
+import itertools
+import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from experiments.run.job import Job
+from experiments.run.stage import RecordedLog, Stage
+from experiments.run.store import StageFolder, Store
 from experiments.run.workers import Workers
 
 OnProgress = Callable[[str, int, int], None]
@@ -21,7 +26,7 @@ class Task:
 
     Attributes:
         name: STAGE/KEY or STAGE/KEY/PART; tasks of the same name do the same work.
-        kind: what progress counts it under.
+        label: what progress counts it under.
         function: called with the arguments.
         arguments: all can be pickled.
         outputs: files that are there once it is done; without any it is never taken for done.
@@ -29,7 +34,7 @@ class Task:
     """
 
     name: str
-    kind: str
+    label: str
     function: Callable[..., object]
     arguments: tuple[Any, ...]
     outputs: tuple[Path, ...]
@@ -44,6 +49,55 @@ class Task:
         """Do the work, unless somebody else has done it meanwhile."""
         if not self.finished:
             self.function(*self.arguments)
+
+
+def tasks_of(stages: Iterable[Stage], store: Store) -> dict[str, Task]:
+    """The tasks of stages by name, each after those it needs.
+
+    Neighbours with the same parts go part by part: two processes are then at different stages,
+    and compile different kernels.
+
+    Args:
+        stages: each after those before it.
+        store: where they are kept.
+    """
+    tasks = {}
+    for parts, group in itertools.groupby(stages, key=lambda stage: stage.parts):
+        for part, stage in itertools.product(parts, list(group)):
+            task = _task(stage, part, store)
+            tasks[task.name] = task
+    return tasks
+
+
+def task_names(stage: Stage | RecordedLog) -> tuple[str, ...]:
+    """Names of the tasks that make a stage; none for what was there before."""
+    return () if isinstance(stage, RecordedLog) else tuple(_name(stage, p) for p in stage.parts)
+
+
+def _name(stage: Stage, part: str) -> str:
+    return f"{stage.name}/{stage.key}" + (f"/{part}" if part else "")
+
+
+def _task(stage: Stage, part: str, store: Store) -> Task:
+    needs: list[str] = []
+    for name, before in stage.before.items():
+        if name in stage.alongside and isinstance(before, Stage):
+            needs.append(_name(before, part))
+        else:
+            needs += task_names(before)
+    folder = store.folder(stage)
+    inputs = {name: store.path(before) for name, before in stage.before.items()}
+    arguments = (stage.work, stage.settings, Job(inputs, folder.path, part), folder)
+    return Task(
+        _name(stage, part), stage.label, _perform, arguments, folder.outputs[part], tuple(needs)
+    )
+
+
+def _perform(work: Callable[..., Any], settings: Any, job: Job, folder: StageFolder) -> None:
+    """Have a part made and mark it as finished, with how long it took."""
+    started = time.perf_counter()
+    figures = dict(work(settings, job) or {})
+    folder.finish(job.part, {"elapsed_s": time.perf_counter() - started} | figures)
 
 
 def unfinished(tasks: Mapping[str, Task], goals: Iterable[str]) -> list[Task]:
@@ -71,7 +125,7 @@ def run_tasks(tasks: Sequence[Task], pool: Workers, on_progress: OnProgress) -> 
     Args:
         tasks: each after those it needs; what it needs beyond them is done already.
         pool: where they run.
-        on_progress: told (kind, tasks done, tasks in all).
+        on_progress: told (label, tasks done, tasks in all).
     """
     number = {task.name: i for i, task in enumerate(tasks)}
     open_needs = [{need for need in task.needs if need in number} for task in tasks]
@@ -80,9 +134,9 @@ def run_tasks(tasks: Sequence[Task], pool: Workers, on_progress: OnProgress) -> 
         for need in needs:
             dependents[number[need]].append(i)
     ready = [i for i, needs in enumerate(open_needs) if not needs]  # in order, so a heap
-    total, done = Counter(task.kind for task in tasks), Counter[str]()
-    for kind in total:
-        on_progress(kind, 0, total[kind])
+    total, done = Counter(task.label for task in tasks), Counter[str]()
+    for label in total:
+        on_progress(label, 0, total[label])
 
     def hand_out() -> None:
         while ready and pool.has_room:
@@ -91,8 +145,8 @@ def run_tasks(tasks: Sequence[Task], pool: Workers, on_progress: OnProgress) -> 
 
     hand_out()
     for i, _ in pool.completed():
-        done[tasks[i].kind] += 1
-        on_progress(tasks[i].kind, done[tasks[i].kind], total[tasks[i].kind])
+        done[tasks[i].label] += 1
+        on_progress(tasks[i].label, done[tasks[i].label], total[tasks[i].label])
         for dependent in dependents[i]:
             open_needs[dependent].discard(tasks[i].name)
             if not open_needs[dependent]:

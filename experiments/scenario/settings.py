@@ -5,29 +5,24 @@ are: pydantic validates them in place, so a parameter is named and explained onc
 """
 
 import json
-import warnings
-from collections.abc import Iterator, Sequence
-from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
     AfterValidator,
     BaseModel,
     ConfigDict,
     Field,
-    ValidationError,
+    TypeAdapter,
     model_validator,
 )
 
 from experiments.methods.aligner_calls import require_usable
-from experiments.scenario.generated import Generate, Generated, expanded
-from experiments.scenario.yaml_input import apply_overrides, read_mapping
+from experiments.scenario.generated import Generate, Generated
 from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.correspondences import MatchParameters
 from mapfusion.align.refine import Refinement
-from mapfusion.align.registry import name_clashes
 from mapfusion.camera import StereoCamera
-from mapfusion.errors import InputError, NameClashWarning
 from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.merge import MergeParameters
 from mapfusion.vision.frontend import FrontEndParameters
@@ -41,8 +36,6 @@ NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,40}$"  # names become parts of file
 Name = Annotated[str, Field(pattern=NAME_PATTERN)]
 Point = tuple[float, float]
 Pose = tuple[float, float, float]
-S = TypeVar("S", bound=BaseModel)
-_MOST_SUGGESTED = 3  # keys that an error message offers
 MAX_IMAGE_SIDE_PX = 4096  # the software renderer takes seconds and 100 MB a frame at this size
 
 
@@ -219,28 +212,13 @@ class Bound(Section):
 
 
 class Scenario(Section):
-    """One experiment: simulated (world, robots, drive) or from recorded logs.
-
-    `generate` stands in place of world and robots; once loaded, these are there instead, and
-    `generated` tells where they came from.
-    """
+    """What a simulation and a recording have in common."""
 
     schema_version: Literal[1]
     name: Name
     description: str = ""
     tags: list[Name] = []
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
-    generate: Generate | None = None
-    generated: Generated | None = None
-    world: World | None = None
-    robots: list[Robot] = []
-    drive: Drive | None = None
-    logs: list[str] = []
-    render: Render = Render()
-    camera: Annotated[StereoCamera, AfterValidator(_renderable)] = StereoCamera()
-    radiometry: RadiometricNoise = RadiometricNoise()
-    odometry: OdometryNoise = OdometryNoise()
-    vision: FrontEndParameters = FrontEndParameters()
     slam: Slam = Slam()
     align: Align = Align()
     merge: Merge = Merge()
@@ -249,21 +227,58 @@ class Scenario(Section):
     expect: dict[str, Bound] = {}
 
     @model_validator(mode="after")
-    def _consistent(self) -> Self:
-        given = self.world is not None and bool(self.robots)
-        simulated = self.drive is not None and (given or self.generate is not None)
-        if simulated == bool(self.logs):
-            raise ValueError(
-                "give either world, robots and drive, or logs; generate stands for world and robots"
-            )
-        _require_unique("robots", [robot.name for robot in self.robots])
-        _require_unique("logs", self.logs)
+    def _merges_what_it_aligns(self) -> Self:
         aligners = [entry.name for entry in self.align.aligners]
         if self.merge.aligner not in aligners:
             raise ValueError(
                 f"merge.aligner: {self.merge.aligner} is not among align.aligners "
                 f"({', '.join(aligners)})"
             )
+        return self
+
+    def resolved(self) -> dict[str, Any]:
+        """All settings, defaults filled in, as JSON-able values."""
+        return self.model_dump(mode="json")
+
+
+class Recording(Scenario):
+    """An experiment on recorded logs: folders, relative to the scenario's file."""
+
+    logs: Annotated[list[str], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _unique_logs(self) -> Self:
+        _require_unique("logs", self.logs)
+        return self
+
+
+class SimulatedScenario(Scenario):
+    """What simulations have in common, whoever draws their world."""
+
+    drive: Drive
+    render: Render = Render()
+    camera: Annotated[StereoCamera, AfterValidator(_renderable)] = StereoCamera()
+    radiometry: RadiometricNoise = RadiometricNoise()
+    odometry: OdometryNoise = OdometryNoise()
+    vision: FrontEndParameters = FrontEndParameters()
+
+
+class GeneratedScenario(SimulatedScenario):
+    """A simulation as its file has it, whose world and robots the seed draws."""
+
+    generate: Generate
+
+
+class Simulation(SimulatedScenario):
+    """An experiment in a simulated world; `generated` tells where a drawn one came from."""
+
+    world: World
+    robots: Annotated[list[Robot], Field(min_length=1)]
+    generated: Generated | None = None
+
+    @model_validator(mode="after")
+    def _unique_robots(self) -> Self:
+        _require_unique("robots", [robot.name for robot in self.robots])
         return self
 
     def radiometry_of(self, robot: str) -> RadiometricNoise:
@@ -276,131 +291,11 @@ class Scenario(Section):
         own = {r.name: r.odometry for r in self.robots}[robot]
         return self.odometry if own is None else own
 
-    def resolved(self) -> dict[str, Any]:
-        """All settings, defaults filled in, as JSON-able values."""
-        return self.model_dump(mode="json")
 
-
-def load_scenario(path: Path, overrides: Sequence[str] = (), seed: int | None = None) -> Scenario:
-    """Read and validate a scenario.
-
-    Args:
-        path: YAML file.
-        overrides: entries `key.sub=value` that replace values of the file.
-        seed: replaces the file's seed.
-
-    Raises:
-        InputError: one line that names the file, the field and what would be right.
-    """
-    data = apply_overrides(read_mapping(path), overrides)
-    if seed is not None:
-        data["seed"] = seed
-    data = _expanded(str(path), data)
-    scenario = _validated(str(path), Scenario, data)
-    _warn_of_name_clashes(scenario.align)
-    logs = [str((path.parent / log).resolve()) for log in scenario.logs]
-    return scenario.model_copy(update={"logs": logs})
-
-
-def _expanded(where: str, data: dict[str, Any]) -> dict[str, Any]:
-    """The data with the world and the robots that its `generate` section stands for."""
-    if data.get("generate") is None:
-        return data
-    if data.get("world") is not None or data.get("robots") or data.get("logs"):
-        raise InputError(f"{where}: give either generate, or world and robots, or logs")
-    # the rest is judged first: what is wrong with the seed must not show as a broken plan
-    if not isinstance(data.get("seed", 0), int):
-        return data
-    settings = _validated(f"{where}: generate", Generate, data["generate"])
-    try:
-        made = expanded(settings, data.get("seed", 0))
-    except InputError as error:
-        raise InputError(f"{where}: generate.{error}") from error
-    return {key: value for key, value in data.items() if key != "generate"} | made
-
-
-def load_section(path: Path | None, name: str, kind: type[S], overrides: Sequence[str]) -> S:
-    """One section of a scenario (or its defaults, without a file), with overrides inside it.
-
-    Raises:
-        InputError: as `load_scenario`.
-    """
-    if path is None:
-        section = _validated(name, kind, apply_overrides({}, overrides))
-        if isinstance(section, Align):
-            _warn_of_name_clashes(section)
-        return section
-    load_scenario(path)
-    data = read_mapping(path).get(name) or {}
-    return _validated(f"{path}: {name}", kind, apply_overrides(data, overrides))
-
-
-def _warn_of_name_clashes(align: Align) -> None:
-    for method in dict.fromkeys(entry.method for entry in align.aligners):
-        if method in name_clashes():
-            warnings.warn(name_clashes()[method], NameClashWarning, stacklevel=3)
-
-
-def _validated(where: str, kind: type[S], data: dict[str, Any]) -> S:
-    try:
-        return kind.model_validate(data)
-    except ValidationError as error:
-        raise InputError(f"{where}: {_first_problem(kind, error)}") from error
-
-
-def _first_problem(kind: type[BaseModel], error: ValidationError) -> str:
-    problems = error.errors(include_url=False)
-    # A wrong name explains the missing one that follows from it, so it goes first.
-    unknown = [
-        p for p in problems if p["type"] in {"extra_forbidden", "unexpected_keyword_argument"}
-    ]
-    problem = (unknown or problems)[0]
-    where = ".".join(str(part) for part in problem["loc"])
-    message = problem["msg"].removeprefix("Value error, ")
-    if unknown:
-        message = f"unknown key; known here: {', '.join(_siblings(kind, problem['loc']))}"
-        elsewhere = _paths_like(kind, str(problem["loc"][-1]))
-        message += f"; did you mean {' or '.join(elsewhere)}?" if elsewhere else ""
-    elif problem["type"] != "value_error" and not isinstance(problem["input"], dict):
-        message = f"{message} (it is {problem['input']!r})"
-    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-    return f"{where}: {message}{more}" if where else f"{message}{more}"
-
-
-def _siblings(kind: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
-    """The names that would have been right beside an unknown one, from the JSON schema."""
-    root = kind.model_json_schema()
-    node: dict[str, Any] = root
-    for part in location[:-1]:
-        node = _resolved_node(root, node)
-        if isinstance(part, int):
-            node = node["items"]
-        else:  # a mapping with free keys, as `expect`, describes all its values at once
-            node = node.get("properties", {}).get(part) or node["additionalProperties"]
-    return sorted(_resolved_node(root, node)["properties"])
-
-
-def _paths_like(kind: type[BaseModel], name: str) -> list[str]:
-    """Dotted keys, wherever they are, whose last part holds this name as a word: n_particles."""
-    root = kind.model_json_schema()
-
-    def below(node: dict[str, Any], prefix: str) -> Iterator[str]:
-        for key, child in _resolved_node(root, node).get("properties", {}).items():
-            if name in key.split("_"):
-                yield prefix + key
-            yield from below(child, f"{prefix}{key}.")
-
-    return list(below(root, ""))[:_MOST_SUGGESTED]
-
-
-def _resolved_node(root: dict[str, Any], node: dict[str, Any]) -> dict[str, Any]:
-    for option in node.get("anyOf", []):
-        if "$ref" in option:
-            node = option
-    reference = node.get("$ref")
-    return root["$defs"][reference.rsplit("/", 1)[1]] if reference else node
+AnyScenario = Simulation | Recording
 
 
 def schema_text() -> str:
     """The JSON schema of scenarios, for editors."""
-    return json.dumps(Scenario.model_json_schema(), indent=2)
+    kinds = TypeAdapter[object](Simulation | GeneratedScenario | Recording)
+    return json.dumps(kinds.json_schema(), indent=2)

@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from experiments.scenario.settings import load_scenario
+from experiments.scenario.loading import load_scenario
+from experiments.scenario.settings import AnyScenario, Recording
 from experiments.scenario.yaml_input import read_mapping
 from mapfusion.errors import InputError
 
@@ -98,7 +99,13 @@ def _entry(path: Path) -> Entry:
         scenario.name,
         tuple(scenario.tags),
         scenario.description,
-        len(scenario.robots) or len(scenario.logs),
-        None if scenario.drive is None else scenario.drive.frames,
-        None if scenario.generated is None else scenario.generated.overlap,
+        *_size(scenario),
     )
+
+
+def _size(scenario: AnyScenario) -> tuple[int, int | None, float | None]:
+    """Robots, frames and overlap."""
+    if isinstance(scenario, Recording):
+        return len(scenario.logs), None, None
+    drawn = scenario.generated
+    return len(scenario.robots), scenario.drive.frames, None if drawn is None else drawn.overlap

@@ -9,15 +9,16 @@ from pathlib import Path
 import pandas as pd
 
 from experiments.judge.criteria import RIGHT_WITHIN_M, RIGHT_WITHIN_RAD
+from experiments.run.code_version import library_versions
 from experiments.run.frames import write_rows
-from experiments.run.store import library_versions
 from experiments.show.export import to_markdown
 from experiments.show.figures.benchmark_figure import draw
 from experiments.show.figures.drawing import save_figure
 from experiments.show.figures.style import house_style
-from experiments.study.benchmark.cells import TRIALS, BenchmarkDesign
+from experiments.study.benchmark.cells import BenchmarkDesign
 from experiments.study.benchmark.success import SUMMARY
 from experiments.study.benchmark.synthetic_pairs import SIGMA_M, SIZE_M
+from experiments.study.benchmark.trials import TRIALS
 from mapfusion.align.registry import find_method
 from mapfusion.align.result import Status
 from mapfusion.storage import write_whole

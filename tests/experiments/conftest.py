@@ -3,11 +3,12 @@ from pathlib import Path
 
 import pytest
 
-from experiments.judge.pipeline import plan
+from experiments.judge.judged_run import JudgedRun
 from experiments.judge.result import run_scenario
 from experiments.methods.one_thread import single_threaded
 from experiments.run.store import Store
-from experiments.scenario.settings import Scenario, load_scenario
+from experiments.scenario.loading import load_scenario
+from experiments.scenario.settings import Simulation
 from tests.helpers.synthetic_result import write_result
 from tests.helpers.tiny_scenario import TINY
 
@@ -29,13 +30,15 @@ def tiny_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def tiny(tiny_path: Path) -> Scenario:
+def tiny(tiny_path: Path) -> Simulation:
     """The tiny scenario."""
-    return load_scenario(tiny_path)
+    scenario = load_scenario(tiny_path)
+    assert isinstance(scenario, Simulation)
+    return scenario
 
 
 @pytest.fixture(scope="session")
-def tiny_results(tiny: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def tiny_results(tiny: Simulation, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Results folder of one uninterrupted run in one process; tests must not change it."""
     results = tmp_path_factory.mktemp("results")
     single_threaded()
@@ -50,9 +53,10 @@ def tiny_result(tiny_results: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def tiny_log(tiny: Scenario, tiny_results: Path) -> Path:
+def tiny_log(tiny: Simulation, tiny_results: Path) -> Path:
     """The log of R1 in the store of that run."""
-    return plan(tiny, Store(tiny_results / "store")).robots[0].log.path
+    run = JudgedRun.of(tiny, Store.of(tiny_results))
+    return run.store.path(run.pipeline.robots[0].log)
 
 
 @pytest.fixture(scope="session")

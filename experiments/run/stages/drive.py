@@ -1,83 +1,69 @@
 """Stage: physics, all robots in one world, once. Writes the trajectory."""
 
-import time
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
-from experiments.run.store import StageFolder, Store
+from experiments.run.job import Job
+from experiments.run.stages.walls import Walls
 from experiments.scenario.randomness import generator
-from experiments.scenario.settings import Scenario
-from mapfusion.errors import InputError
 from mapfusion.se2 import Float
-from sim.driver import Route, drive
-from sim.floorplan import FloorPlan, Wall
+from sim.driver import DriverSettings, Route, drive
 from sim.trajectory import write_trajectory
 
-SOURCES = ("sim", "mapfusion/se2.py", "mapfusion/storage.py")
-SOURCES += ("experiments/run/stages/drive.py", "experiments/scenario/randomness.py")
-
-_SENSORS = {"odometry", "radiometry"}  # of a robot; its way does not depend on them
+TRAJECTORY_FILE = "trajectory.parquet"
 
 
-def floor_plan(scenario: Scenario) -> FloorPlan:
-    """The scenario's walls as the simulator takes them."""
-    world = scenario.world
-    assert world is not None
-    return FloorPlan(
-        tuple(
-            Wall(np.array(wall.points), world.wall_height_m, world.wall_thickness_m)
-            for wall in world.walls
-        )
-    )
+@dataclass(frozen=True)
+class DrivenRobot:
+    """Where a robot starts (x_m, y_m, theta_rad in the world) and which points it visits."""
+
+    name: str
+    start: tuple[float, float, float]
+    route: tuple[tuple[float, float], ...]
+    loop: bool
+    tire_friction: float
 
 
-def start_poses(scenario: Scenario) -> dict[str, Float]:
+@dataclass(frozen=True)
+class DriveSettings:
+    """All that the robots' ways depend on; sensors are no part of it."""
+
+    seed: int
+    walls: Walls
+    robots: tuple[DrivenRobot, ...]
+    frames: int
+    frame_interval_s: float
+    start_jitter_m: float
+    start_jitter_rad: float
+    control: DriverSettings
+
+
+def start_poses(settings: DriveSettings) -> Mapping[str, Float]:
     """T_world_start by robot: the scenario's, moved by the seed within the jitter."""
-    drive_settings = scenario.drive
-    assert drive_settings is not None
-    span = np.array([drive_settings.start_jitter_m] * 2 + [drive_settings.start_jitter_rad])
+    span = np.array([settings.start_jitter_m] * 2 + [settings.start_jitter_rad])
     return {
         robot.name: np.array(robot.start)
-        + generator(scenario.seed, "start", robot.name).uniform(-span, span)
-        for robot in scenario.robots
+        + generator(settings.seed, "start", robot.name).uniform(-span, span)
+        for robot in settings.robots
     }
 
 
-def stage(store: Store, scenario: Scenario) -> StageFolder:
-    """Where the trajectory is or will be."""
-    world, drive_settings = scenario.world, scenario.drive
-    assert world is not None
-    assert drive_settings is not None
-    settings = {
-        "seed": scenario.seed,
-        "world": world.model_dump(mode="json", exclude={"texture"}),
-        "robots": [robot.model_dump(mode="json", exclude=_SENSORS) for robot in scenario.robots],
-        "drive": drive_settings.model_dump(mode="json"),
-    }
-    return store.stage("drive", settings, [], SOURCES)
-
-
-def run(scenario: Scenario, output: StageFolder) -> None:
-    """Drive and write `trajectory.parquet`; raises InputError for a route that fails."""
-    started = time.perf_counter()
-    drive_settings = scenario.drive
-    assert drive_settings is not None
-    starts = start_poses(scenario)
+def run(settings: DriveSettings, job: Job) -> None:
+    """Drive and write the trajectory; raises InputError for a route that fails."""
+    starts = start_poses(settings)
     routes = [
         Route(
             robot.name, starts[robot.name], np.array(robot.route), robot.loop, robot.tire_friction
         )
-        for robot in scenario.robots
+        for robot in settings.robots
     ]
-    try:
-        trajectory = drive(
-            floor_plan(scenario),
-            routes,
-            drive_settings.control,
-            drive_settings.frames,
-            drive_settings.frame_interval_s,
-        )
-    except InputError as error:
-        raise InputError(f"scenario {scenario.name}: {error}") from error
-    write_trajectory(output.path / "trajectory.parquet", trajectory)
-    output.finish(elapsed_s=time.perf_counter() - started)
+    trajectory = drive(
+        settings.walls.floor_plan(),
+        routes,
+        settings.control,
+        settings.frames,
+        settings.frame_interval_s,
+    )
+    write_trajectory(job.output / TRAJECTORY_FILE, trajectory)

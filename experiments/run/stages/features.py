@@ -1,4 +1,4 @@
-"""Stage: each robot's stereo images, rendered and turned into features, frame by frame.
+"""Stage: one robot's stereo images, rendered and turned into features, frame by frame.
 
 Frames do not depend on each other, so they are made in parallel, in chunks; a chunk on disk is
 never made again. Images are kept for a few frames only (for figure 1).
@@ -6,34 +6,26 @@ never made again. Images are kept for a few frames only (for figure 1).
 
 import time
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pyarrow as pa
 
-from experiments.run.stages.drive import floor_plan
-from experiments.run.store import StageFolder, Store
+from experiments.run.job import Job
+from experiments.run.stages.drive import TRAJECTORY_FILE
 from experiments.scenario.randomness import generator
-from experiments.scenario.settings import Scenario
+from mapfusion.camera import StereoCamera
 from mapfusion.robot_log import DESCRIPTOR_LENGTH
 from mapfusion.se2 import Float
 from mapfusion.storage import column, read_table, schema, write_table, write_whole
 from mapfusion.vision.features import Features
-from mapfusion.vision.frontend import FrontEnd
+from mapfusion.vision.frontend import FrontEnd, FrontEndParameters
 from sim.recorder import FrameSource, truth_points
-from sim.renderer import renderer_name
+from sim.renderer import Renderer
+from sim.stereo_head import RadiometricNoise
 from sim.trajectory import read_trajectory
-from sim.world import write_faces
-
-SOURCES = ("sim", "mapfusion/vision", "mapfusion/camera.py", "mapfusion/se2.py")
-SOURCES += ("mapfusion/storage.py", "mapfusion/robot_log.py")
-SOURCES += ("experiments/run/stages/features.py", "experiments/scenario/randomness.py")
-
-FACES_SOURCES = ("sim", "mapfusion/se2.py", "experiments/run/stages/drive.py")
-FACES_SOURCES += ("experiments/run/stages/features.py", "experiments/scenario/randomness.py")
-FACES_SOURCES += ("mapfusion/storage.py",)
 
 # Frames a task: about two seconds of work, so little is lost when a run is interrupted.
 FRAMES_PER_CHUNK = 20
@@ -53,116 +45,76 @@ FEATURES = schema(
 # Row i is the world point behind row i of the features. Kept apart: estimators never read it.
 TRUTH = schema("features.truth", 1, [pa.field(n, pa.float64()) for n in ("x_m", "y_m", "z_m")])
 
-
-def faces_stage(store: Store, scenario: Scenario) -> StageFolder:
-    """Where the world's textures are or will be."""
-    assert scenario.world is not None
-    settings = {"seed": scenario.seed, "world": scenario.world.model_dump(mode="json")}
-    return store.stage("faces", settings, [], FACES_SOURCES)
+WRITES = ("truth_{part}.parquet", "features_{part}.parquet")
 
 
-def run_faces(scenario: Scenario, output: StageFolder) -> None:
-    """Paint the walls, once for all processes."""
-    started = time.perf_counter()
-    assert scenario.world is not None
-    write_faces(
-        output.path,
-        floor_plan(scenario),
-        generator(scenario.seed, "textures"),
-        scenario.world.texture,
-    )
-    output.finish(elapsed_s=time.perf_counter() - started)
+@dataclass(frozen=True)
+class FeatureSettings:
+    """All that a robot's features depend on, beside the way and the walls."""
+
+    seed: int
+    robot: str
+    camera: StereoCamera
+    radiometry: RadiometricNoise
+    renderer: Renderer
+    drawn_by: str  # what the renderer is on this machine
+    vision: FrontEndParameters  # corners, stereo and descriptors; the rest stays at its defaults
+    images_at: int
+    images: int
 
 
-def stage(
-    store: Store, scenario: Scenario, drive: StageFolder, faces: StageFolder, robot: str
-) -> StageFolder:
-    """Where this robot's features are or will be."""
-    resolved = scenario.resolved()
-    keep = {"images_at": scenario.keep.images_at, "images": scenario.keep.images}
-    vision = {k: v for k, v in resolved["vision"].items() if k in {"harris", "stereo", "usurf"}}
-    settings = {"seed": scenario.seed, "robot": robot, "keep": keep, "vision": vision}
-    settings |= {
-        "camera": resolved["camera"],
-        "renderer": renderer_name(scenario.render.renderer),
-    }
-    settings |= {"radiometry": asdict(scenario.radiometry_of(robot))}
-    return store.stage("features", settings, [drive, faces], SOURCES)
+def chunks(n_frames: int) -> tuple[str, ...]:
+    """The parts of the stage: each is named after its first frame."""
+    return tuple(f"{start:06d}" for start in range(0, n_frames, FRAMES_PER_CHUNK))
 
 
-def chunks(n_frames: int) -> range:
-    """First frames of the chunks."""
-    return range(0, n_frames, FRAMES_PER_CHUNK)
-
-
-def chunk_paths(folder: Path, start: int) -> tuple[Path, Path]:
+def _chunk_paths(folder: Path, part: str) -> tuple[Path, ...]:
     """The truth and the features of one chunk; the features are written last."""
-    return folder / f"truth_{start:06d}.parquet", folder / f"features_{start:06d}.parquet"
+    return tuple(folder / name.format(part=part) for name in WRITES)
 
 
 class _OpenWorld:
     """The world this process last rendered from: loading one takes seconds, so it stays open."""
 
-    key: tuple[str, str] | None = None
+    key: tuple[object, ...] = ()
     source: FrameSource | None = None
 
     @classmethod
-    def get(cls, scenario: Scenario, faces: StageFolder) -> FrameSource:
-        key = (
-            faces.key,
-            scenario.model_dump_json(include={"camera", "radiometry", "render", "robots"}),
-        )
-        if cls.key != key:
+    def get(cls, settings: FeatureSettings, faces: Path, robots: tuple[str, ...]) -> FrameSource:
+        key = (faces, settings.camera, settings.renderer, robots)
+        if cls.source is None or cls.key != key:
             if cls.source is not None:
                 cls.source.close()
-            noise = {robot.name: scenario.radiometry_of(robot.name) for robot in scenario.robots}
-            renderer = scenario.render.renderer
-            cls.source = FrameSource(faces.path, scenario.camera, noise, renderer)
+            cls.source = FrameSource(faces, settings.camera, robots, settings.renderer)
             cls.key = key
-        assert cls.source is not None
         return cls.source
 
 
-def run_chunk(
-    scenario: Scenario,
-    drive: StageFolder,
-    faces: StageFolder,
-    output: StageFolder,
-    robot: str,
-    start: int,
-) -> None:
-    """Render and extract the frames of one chunk."""
-    chunk_started = time.perf_counter()
-    trajectory = read_trajectory(drive.path / "trajectory.parquet")
-    source = _OpenWorld.get(scenario, faces)
-    front_end = FrontEnd(scenario.camera, scenario.vision)
-    features: list[Features] = []
-    truth: list[Float] = []
-    rendering_s = 0.0
+def run(settings: FeatureSettings, job: Job) -> dict[str, float]:
+    """Render and extract the frames of one chunk; returns how long the rendering took."""
+    trajectory = read_trajectory(job.inputs["drive"] / TRAJECTORY_FILE)
+    source = _OpenWorld.get(settings, job.inputs["faces"], trajectory.robots)
+    front_end = FrontEnd(settings.camera, settings.vision)
+    robot, features, truth, rendering_s = settings.robot, [], [], 0.0
+    start = int(job.part)
     frames = range(start, min(start + FRAMES_PER_CHUNK, len(trajectory)))
     for iteration in frames:
-        rng = generator(scenario.seed, "radiometry", robot, iteration)
+        rng = generator(settings.seed, "radiometry", robot, iteration)
         poses = trajectory.T_world_robot[:, iteration]
         started = time.perf_counter()
-        frame = source.render(poses, robot, rng)
+        frame = source.render(poses, robot, settings.radiometry, rng)
         rendering_s += time.perf_counter() - started
         found = front_end.extract(frame.left, frame.right)
         own_pose = poses[trajectory.index(robot)]
         features.append(found)
-        truth.append(truth_points(scenario.camera, frame.depth_m, found.uv_px, own_pose))
-        if 0 <= iteration - scenario.keep.images_at < scenario.keep.images:
-            _write_image(output.path / f"image_{iteration:06d}.png", frame.left)
-    truth_path, features_path = chunk_paths(output.path, start)
+        truth.append(truth_points(settings.camera, frame.depth_m, found.uv_px, own_pose))
+        if 0 <= iteration - settings.images_at < settings.images:
+            _write_image(job.output / f"image_{iteration:06d}.png", frame.left)
+    truth_path, features_path = _chunk_paths(job.output, job.part)
     points = np.concatenate(truth)
     write_table(truth_path, {n: points[:, i] for i, n in enumerate(TRUTH.names)}, TRUTH)
     write_table(features_path, _columns(frames, features), FEATURES)
-    elapsed_s = time.perf_counter() - chunk_started
-    output.note(f"{start:06d}", elapsed_s=elapsed_s, rendering_s=rendering_s)
-
-
-def finish(output: StageFolder) -> None:
-    """Mark the stage as finished once all chunks are there."""
-    output.finish(**output.noted())
+    return {"rendering_s": rendering_s}
 
 
 def _write_image(path: Path, image: np.ndarray) -> None:
@@ -184,8 +136,8 @@ def _columns(frames: range, features: list[Features]) -> dict[str, np.ndarray]:
 
 def read_features(folder: Path, n_frames: int) -> Iterator[tuple[Features, Float]]:
     """Features and their true world points (N, 3), frame by frame, in order."""
-    for start in chunks(n_frames):
-        truth_path, features_path = chunk_paths(folder, start)
+    for start in range(0, n_frames, FRAMES_PER_CHUNK):
+        truth_path, features_path = _chunk_paths(folder, f"{start:06d}")
         table, _ = read_table(features_path, FEATURES)
         truth_table, _ = read_table(truth_path, TRUTH)
         truth = np.stack([column(truth_table, name) for name in TRUTH.names], -1)

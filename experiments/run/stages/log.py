@@ -1,119 +1,36 @@
-"""Stage: one robot's log, from features (tracked into observations) and noisy odometry."""
+"""Stage: one robot's log, from its observations and noisy odometry; the truth beside it."""
 
-import time
-from dataclasses import asdict
-from pathlib import Path
+from dataclasses import dataclass
 
-import numpy as np
-import pandas as pd
-
-from experiments.run.frames import write_rows
-from experiments.run.stage_tables import TRACKS
-from experiments.run.stages.features import read_features
-from experiments.run.store import StageFolder, Store, link_or_copy
+from experiments.run.job import Job
+from experiments.run.stages.drive import TRAJECTORY_FILE
+from experiments.run.store_files import link_or_copy
 from experiments.scenario.randomness import generator
-from experiments.scenario.settings import Scenario
-from mapfusion.robot_log import (
-    Observations,
-    write_frames,
-    write_observations,
-    write_truth_points,
-    write_truth_poses,
-)
-from mapfusion.se2 import Float
-from mapfusion.vision.frontend import observable, observe
-from mapfusion.vision.tracks import Tracker
-from sim.odometry import add_noise, calibrated_track_m, encoder_increments
+from mapfusion.robot_log import write_frames, write_truth_poses
+from sim.odometry import OdometryNoise, add_noise, calibrated_track_m, encoder_increments
 from sim.trajectory import read_trajectory
 
-SOURCES = ("mapfusion/vision", "mapfusion/camera.py", "mapfusion/robot_log.py", "mapfusion/se2.py")
-SOURCES += (
-    "mapfusion/storage.py",
-    "sim",
-    "experiments/run/stages/log.py",
-    "experiments/run/frames.py",
-    "experiments/run/stage_tables.py",
-)
-SOURCES += ("experiments/scenario/randomness.py",)
+_OBSERVED = ("observations.parquet", "truth_points.parquet")
+WRITES = ("frames.parquet", *_OBSERVED, "truth_poses.parquet")
 
 
-def observed_stage(store: Store, scenario: Scenario, features: StageFolder) -> StageFolder:
-    """Where this robot's observations are or will be; odometry plays no part in them."""
-    resolved = scenario.resolved()
-    settings = {"vision": resolved["vision"], "camera": resolved["camera"]}
-    return store.stage("observed", settings | {"keep": resolved["keep"]}, [features], SOURCES)
+@dataclass(frozen=True)
+class LogSettings:
+    """All that a robot's log depends on, beside its way and its observations."""
+
+    seed: int
+    robot: str
+    odometry: OdometryNoise
 
 
-def run_observed(
-    scenario: Scenario, features: StageFolder, output: StageFolder, robot: str
-) -> None:
-    """Track features over the frames and write the observations and their truth."""
-    started = time.perf_counter()
-    assert scenario.drive is not None
-    tracker = Tracker(scenario.vision.tracks, scenario.camera, scenario.vision.sigma_uv_px)
-    observed: list[Observations] = []
-    truth: list[Float] = []
-    counts: list[int] = []
-    tracks: list[pd.DataFrame] = []
-    kept = range(scenario.keep.images_at, scenario.keep.images_at + scenario.keep.images)
-    for iteration, (found, points) in enumerate(
-        read_features(features.path, scenario.drive.frames)
-    ):
-        state = tracker.update(found)
-        lasting = tracker.landmarks(state)
-        rows = observable(scenario.camera, found, lasting, scenario.vision)
-        observations = observe(scenario.camera, found, lasting, scenario.vision)
-        observed.append(observations)
-        truth.append(points[rows])
-        counts.append(len(observations))
-        if iteration in kept:
-            columns = {"track": state.track_id, "length": state.length}
-            columns |= {"u_px": found.uv_px[:, 0], "v_px": found.uv_px[:, 1]}
-            tracks.append(pd.DataFrame({"robot": robot, "iteration": iteration, **columns}))
-    iterations = np.repeat(np.arange(len(counts)), counts)
-    write_observations(output.path, iterations, _joined(observed))
-    write_truth_points(output.path, np.concatenate(truth))
-    write_rows(output.path / "tracks.parquet", TRACKS, pd.concat(tracks) if tracks else [])
-    output.finish(elapsed_s=time.perf_counter() - started)
-
-
-def _joined(parts: list[Observations]) -> Observations:
-    joined = {}
-    for name in ("position_m", "covariance_m2", "descriptor", "uvd_px"):
-        joined[name] = np.concatenate([getattr(part, name) for part in parts])
-    return Observations(**joined)
-
-
-def stage(
-    store: Store, scenario: Scenario, drive: StageFolder, observed: StageFolder, robot: str
-) -> StageFolder:
-    """Where this robot's log is or will be."""
-    settings = {
-        "seed": scenario.seed,
-        "robot": robot,
-        "odometry": asdict(scenario.odometry_of(robot)),
-    }
-    return store.stage("log", settings, [drive, observed], SOURCES)
-
-
-def run(
-    scenario: Scenario, drive: StageFolder, observed: StageFolder, output: StageFolder, robot: str
-) -> None:
+def run(settings: LogSettings, job: Job) -> None:
     """Add odometry to the observations: the log's folder, with the truth beside it."""
-    started = time.perf_counter()
-    trajectory = read_trajectory(drive.path / "trajectory.parquet")
-    index = trajectory.index(robot)
+    trajectory = read_trajectory(job.inputs["drive"] / TRAJECTORY_FILE)
+    index = trajectory.index(settings.robot)
     increments = encoder_increments(trajectory.wheel_rad[index], calibrated_track_m())
-    rng = generator(scenario.seed, "odometry", robot)
-    odometry = add_noise(increments, scenario.odometry_of(robot), rng)
-    write_frames(output.path, robot, False, trajectory.time_s, odometry)
-    for name in ("observations.parquet", "truth_points.parquet"):
-        link_or_copy(observed.path / name, output.path / name)
-    write_truth_poses(output.path, trajectory.T_world_robot[index])
-    output.finish(elapsed_s=time.perf_counter() - started)
-
-
-def copy_log(source: Path, target: Path) -> None:
-    """Put a finished log at a second place."""
-    for path in sorted(source.glob("*.parquet")):
-        link_or_copy(path, target / path.name)
+    rng = generator(settings.seed, "odometry", settings.robot)
+    odometry = add_noise(increments, settings.odometry, rng)
+    write_frames(job.output, settings.robot, False, trajectory.time_s, odometry)
+    for name in _OBSERVED:
+        link_or_copy(job.inputs["observed"] / name, job.output / name)
+    write_truth_poses(job.output, trajectory.T_world_robot[index])

@@ -1,7 +1,6 @@
 """Stage: one robot's FastSLAM over its log, with its map at each evaluated iteration."""
 
-import time
-from dataclasses import asdict
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,10 +8,10 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
-from experiments.run.store import StageFolder, Store
+from experiments.run.job import Job
 from experiments.scenario.randomness import generator
-from experiments.scenario.settings import Scenario, Slam
 from mapfusion.fastslam.filter import StepResult
+from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.fastslam.run import run_log
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import RobotLog, read_log
@@ -25,15 +24,6 @@ from mapfusion.storage import (
     schema,
     write_table,
 )
-
-SOURCES = (
-    "mapfusion/fastslam",
-    "mapfusion/landmark_map.py",
-    "mapfusion/robot_log.py",
-    "mapfusion/storage.py",
-    "mapfusion/se2.py",
-)
-SOURCES += ("experiments/run/stages/slam.py", "experiments/scenario/randomness.py")
 
 SNAPSHOTS = schema(
     "slam.snapshots",
@@ -83,6 +73,20 @@ CLOUDS = schema(
 )
 
 
+WRITES = ("snapshots.parquet", "associations.parquet", "poses.parquet", "clouds.parquet")
+
+
+@dataclass(frozen=True)
+class SlamSettings:
+    """All that a robot's maps depend on, beside its log."""
+
+    seed: int
+    filter: FastSlamParameters
+    min_count: int
+    every: int
+    clouds_every: int
+
+
 class RobotFolders(NamedTuple):
     """Where a robot's log (with its truth) and its SLAM result lie."""
 
@@ -95,27 +99,22 @@ def evaluated_iterations(n_frames: int, every: int) -> list[int]:
     return sorted({*range(every, n_frames, every), n_frames - 1})
 
 
-def stage(store: Store, scenario: Scenario, log: StageFolder) -> StageFolder:
-    """Where this robot's SLAM result is or will be."""
-    settings = {
-        "seed": scenario.seed,
-        "slam": asdict(scenario.slam.filter),
-        "min_count": scenario.slam.min_count,
-        "every": scenario.evaluate.every,
-        "clouds_every": scenario.keep.clouds_every,
-    }
-    return store.stage("slam", settings, [log], SOURCES)
-
-
-def run(scenario: Scenario, log: StageFolder, output: StageFolder) -> None:
+def run(settings: SlamSettings, job: Job) -> None:
     """Run the filter over a log and write maps, poses, associations and particle clouds."""
-    started = time.perf_counter()
-    robot_log = read_log(log.path)
-    iterations = evaluated_iterations(len(robot_log), scenario.evaluate.every)
-    run_filter(
-        robot_log, scenario.slam, scenario.seed, iterations, scenario.keep.clouds_every, output.path
-    )
-    output.finish(elapsed_s=time.perf_counter() - started)
+    log = read_log(job.inputs["log"])
+    last = len(log) - 1
+    recorder = _Recorder()
+    iterations = evaluated_iterations(len(log), settings.every)
+    rng = generator(settings.seed, "slam", log.robot)
+    for frame in run_log(log, settings.filter, rng, iterations, settings.min_count):
+        result = frame.result
+        recorder.add_step(frame.iteration, result)
+        if frame.iteration % settings.clouds_every == 0 or frame.iteration == last:
+            recorder.clouds.append((frame.iteration, result.cloud, result.log_weights))
+        if frame.landmarks is not None:
+            recorder.add_snapshot(frame.iteration, frame.landmarks, frame.slam.best_associations())
+        if frame.iteration == last:
+            recorder.write(job.output, frame.slam.best_path())
 
 
 class _Recorder:
@@ -207,31 +206,6 @@ def _cloud_columns(clouds: list[tuple[int, np.ndarray, np.ndarray]]) -> dict[str
         "theta_rad": poses[:, 2],
         "log_weight": np.concatenate([weights for _, _, weights in clouds]),
     }
-
-
-def run_filter(
-    log: RobotLog,
-    slam: Slam,
-    seed: int,
-    iterations: list[int],
-    clouds_every: int,
-    folder: Path,
-) -> LandmarkMap:
-    """Stream a log through a filter, write the tables of this stage; returns the last map."""
-    recorder = _Recorder()
-    frames = run_log(
-        log, slam.filter, generator(seed, "slam", log.robot), iterations, slam.min_count
-    )
-    for frame in frames:
-        result = frame.result
-        recorder.add_step(frame.iteration, result)
-        if frame.iteration % clouds_every == 0 or frame.iteration == len(log) - 1:
-            recorder.clouds.append((frame.iteration, result.cloud, result.log_weights))
-        if frame.landmarks is not None:
-            recorder.add_snapshot(frame.iteration, frame.landmarks, frame.slam.best_associations())
-        if frame.iteration == len(log) - 1:
-            recorder.write(folder, frame.slam.best_path())
-    return recorder.maps[-1][1]
 
 
 def read_snapshots(slam: Path, log: RobotLog) -> dict[int, LandmarkMap]:

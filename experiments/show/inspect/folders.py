@@ -10,7 +10,8 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from experiments.judge.provenance import RESULT_SCHEMA_VERSION
-from experiments.scenario.settings import Scenario, load_scenario
+from experiments.scenario.loading import load_scenario, scenario_of
+from experiments.scenario.settings import AnyScenario, Simulation
 from mapfusion.errors import InputError
 from mapfusion.robot_log import read_log
 
@@ -98,22 +99,18 @@ def inspect_scenario(path: Path) -> Description:
     return _scenario(load_scenario(path), "scenario")
 
 
-def _validated(path: Path, found: dict[str, Any]) -> Scenario:
-    try:
-        return Scenario.model_validate(found)
-    except ValueError as error:
-        reason = " ".join(str(error).splitlines()[:3])
-        raise InputError(f"{path}: no scenario of this program ({reason})") from error
+def _validated(path: Path, found: dict[str, Any]) -> AnyScenario:
+    return scenario_of(found, str(path))
 
 
-def _scenario(scenario: Scenario, kind: str) -> Description:
+def _scenario(scenario: AnyScenario, kind: str) -> Description:
     facts = [("name", scenario.name), ("description", scenario.description)]
     facts.append(("seed", str(scenario.seed)))
-    if scenario.world is not None and scenario.drive is not None:
+    if isinstance(scenario, Simulation):
         facts.append(("robots", ", ".join(robot.name for robot in scenario.robots)))
         facts.append(("walls", str(len(scenario.world.walls))))
         facts.append(("frames a robot", str(scenario.drive.frames)))
-    if scenario.logs:
+    else:
         facts.append(("logs", ", ".join(scenario.logs)))
     facts += [
         ("particles", str(scenario.slam.filter.n_particles)),

@@ -9,7 +9,7 @@ from rich.progress import TimeRemainingColumn
 from rich.table import Table
 
 from experiments.judge.criteria import ANSWERABLE_PAIRS
-from experiments.show.terminal.layout import LAYOUT, STAGE_TEXT, number, progress
+from experiments.show.terminal.layout import LAYOUT, number, progress
 from experiments.study.sweep.combinations import SweepRun
 from experiments.study.sweep.run_medians import ERRORS, medians_over_runs
 from experiments.study.sweep.survey import Survey
@@ -29,8 +29,8 @@ def sweep_progress() -> Iterator[Callable[[SweepProgress], None]]:
             show("runs", now.done, now.runs)
             if now.failed:
                 show("runs that failed", len(now.failed), now.runs)
-            for kind, total in now.tasks.items():
-                show(kind, now.tasks_done[kind], total)
+            for label, total in now.tasks.items():
+                show(label, now.tasks_done[label], total)
 
         yield show_sweep
 
@@ -43,10 +43,10 @@ def print_survey(found: Survey) -> None:
     table = Table(title="Tasks", caption="shared: wanted by several runs, done once", **LAYOUT)
     for heading in ("stage", "wanted", "shared", "finished", "to do"):
         table.add_column(heading, justify="left" if heading == "stage" else "right")
-    for kind, wanted in found.wanted.items():
-        done, left = found.finished[kind], found.left[kind]
+    for label, wanted in found.wanted.items():
+        done, left = found.finished[label], found.left[label]
         cells = (wanted, wanted - done - left, done, left)
-        table.add_row(STAGE_TEXT.get(kind, kind), *map(str, cells))
+        table.add_row(label, *map(str, cells))
     console.print(table)
 
 

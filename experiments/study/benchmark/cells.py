@@ -6,63 +6,25 @@ costs only its own.
 """
 
 import itertools
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pandas as pd
 
-from experiments.methods.aligner_calls import CallableAligner, callable_aligner, refine_estimate
-from experiments.methods.one_thread import single_threaded
-from experiments.run.frames import FLOAT, INT, TEXT, fields, read_rows, write_rows
-from experiments.run.sources import imported_sources, method_sources
-from experiments.run.store import StageFolder, Store
-from experiments.run.tasks import OnProgress
-from experiments.scenario.randomness import generator
-from experiments.scenario.settings import AlignerEntry, load_scenario
-from experiments.study.benchmark.synthetic_pairs import SyntheticPair, synthetic_pair
-from mapfusion import se2
-from mapfusion.align.refine import Refinement
+from experiments.run.frames import read_rows
+from experiments.run.stage import Stage
+from experiments.run.store import Store
+from experiments.run.tasks import OnProgress, tasks_of
+from experiments.scenario.loading import load_scenario
+from experiments.scenario.settings import AlignerEntry
+from experiments.study.benchmark.trials import TRIALS, TRIALS_FILE, CellSettings, run_cell
 from mapfusion.align.registry import find_method, known_methods
 from mapfusion.errors import InputError
-from mapfusion.se2 import Float
-from mapfusion.storage import schema
 
 OUTLIER_SHARES = (0.5, 0.8, 0.9, 0.95, 0.99)
 PAIR_COUNTS = (60, 200, 1000, 5000)
-CELL = {"method": TEXT, "n_pairs": INT, "outlier_share": FLOAT}
-_OWN_SOURCES = (
-    "experiments/methods/aligner_calls.py",
-    "experiments/study/benchmark/cells.py",
-    "experiments/methods/isolated_child.py",
-    "experiments/methods/isolation.py",
-    "experiments/scenario/randomness.py",
-    "experiments/methods/one_thread.py",
-    "mapfusion/align/sanity.py",
-)
-
-# One row a trial. All but the time are the same at every run.
-TRIALS = schema(
-    "benchmark.trials",
-    1,
-    fields(
-        **CELL,
-        trial=INT,
-        status=TEXT,
-        reason=TEXT,
-        error_m=FLOAT,  # of the translation, at the middle of the world
-        error_rad=FLOAT,
-        refined_status=TEXT,
-        refined_error_m=FLOAT,
-        refined_error_rad=FLOAT,
-        oracle_error_m=FLOAT,  # least squares on the true pairs
-        oracle_error_rad=FLOAT,
-        elapsed_s=FLOAT,
-    ),
-)
+_LABEL = "measure the aligners"
 
 
 @dataclass(frozen=True)
@@ -111,13 +73,12 @@ def entries_of(methods: Sequence[str], scenario: Path | None = None) -> tuple[Al
 
 def run_benchmark(design: BenchmarkDesign, store: Store, on_progress: OnProgress) -> pd.DataFrame:
     """All trials of all cells (TRIALS), from the store where they are there."""
-    single_threaded()
     cells = list(itertools.product(design.aligners, design.pair_counts, design.outlier_shares))
     trials = []
     for done, cell in enumerate(cells):
-        on_progress("benchmark", done, len(cells))
+        on_progress(_LABEL, done, len(cells))
         trials.append(_cell(design, store, *cell))
-    on_progress("benchmark", len(cells), len(cells))
+    on_progress(_LABEL, len(cells), len(cells))
     return pd.concat(trials, ignore_index=True)
 
 
@@ -125,70 +86,17 @@ def _cell(
     design: BenchmarkDesign, store: Store, entry: AlignerEntry, n_pairs: int, share: float
 ) -> pd.DataFrame:
     method = find_method(entry.method)
-    settings = {
-        "entry": entry.model_dump(mode="json"),
-        "origin": method.origin(),
-        "n_pairs": n_pairs,
-        "outlier_share": share,
-        "trials": design.trials,
-        "seed": design.seed,
-        "budget_s": design.budget_s,
-    }
-    sources = _OWN_SOURCES + method_sources(method)
-    sources += imported_sources(
-        "experiments.study.benchmark.synthetic_pairs", "mapfusion.align.refine"
+    settings = CellSettings(
+        **dict(entry),
+        origin=method.origin(),
+        n_pairs=n_pairs,
+        outlier_share=share,
+        trials=design.trials,
+        seed=design.seed,
+        budget_s=design.budget_s,
     )
-    folder = store.stage("benchmark", settings, [], sources)
-    path = folder.path / "trials.parquet"
-    if not folder.finished:
-        _measure(design, entry, n_pairs, share, folder, path)
-    return read_rows(path, TRIALS)
-
-
-def _measure(
-    design: BenchmarkDesign,
-    entry: AlignerEntry,
-    n_pairs: int,
-    share: float,
-    folder: StageFolder,
-    path: Path,
-) -> None:
-    started = time.perf_counter()
-    aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
-    rows: list[dict[str, Any]] = []
-    for trial in range(design.trials):
-        maps = ("benchmark", n_pairs, f"{share:g}", trial)
-        pair = synthetic_pair(n_pairs, share, generator(design.seed, *maps))
-        draws = (*maps, entry.name)
-        if trial == 0:  # compilation, imports and caches; not counted
-            _trial(aligner, pair, generator(design.seed, *draws))
-        cell = {"method": entry.name, "n_pairs": n_pairs, "outlier_share": share, "trial": trial}
-        rows.append(cell | _trial(aligner, pair, generator(design.seed, *draws)))
-        if time.perf_counter() - started > design.budget_s:
-            break
-    write_rows(path, TRIALS, rows)
-    folder.finish(elapsed_s=time.perf_counter() - started)
-
-
-def _trial(
-    aligner: CallableAligner, pair: SyntheticPair, rng: np.random.Generator
-) -> dict[str, Any]:
-    maps = (pair.map_a, pair.map_b, pair.correspondences)
-    estimated = aligner.align(*maps, rng)
-    refined = refine_estimate(Refinement(), *maps, estimated)
-    row = {
-        "status": str(estimated.status),
-        "reason": estimated.reason,
-        "refined_status": str(refined.status),
-        "elapsed_s": estimated.elapsed_s,
-    }
-    oracle = pair.least_squares() if pair.is_true.sum() >= 2 else np.full(3, np.nan)
-    for prefix, T in (("", estimated.T_a_b), ("refined_", refined.T_a_b), ("oracle_", oracle)):
-        row[f"{prefix}error_m"], row[f"{prefix}error_rad"] = _errors(T, pair.T_a_b)
-    return row
-
-
-def _errors(T_estimated: Float, T_true: Float) -> tuple[float, float]:
-    """Of the translation (m) and the rotation (rad), both 0 or more, NaN without an estimate."""
-    difference = T_estimated - T_true
-    return float(np.hypot(difference[0], difference[1])), abs(float(se2.wrap(difference[2])))
+    loads = (method.target.partition(":")[0],)
+    stage = Stage("benchmark", _LABEL, settings, run_cell, (TRIALS_FILE,), loads=loads)
+    for task in tasks_of([stage], store).values():
+        task.run()
+    return read_rows(store.path(stage) / TRIALS_FILE, TRIALS)

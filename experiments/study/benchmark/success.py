@@ -4,8 +4,8 @@ import pandas as pd
 
 from experiments.judge.criteria import is_right
 from experiments.run.frames import FLOAT, INT, TEXT, fields
-from experiments.study.benchmark.cells import CELL
 from experiments.study.benchmark.synthetic_pairs import true_pairs_of
+from experiments.study.benchmark.trials import CELL
 from experiments.study.statistics.wilson import wilson
 from mapfusion.align.result import NOT_RUN, Status
 from mapfusion.storage import schema

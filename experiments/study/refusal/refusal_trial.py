@@ -10,12 +10,12 @@ import numpy as np
 
 from experiments.judge.judging import load_robot
 from experiments.methods.aligner_calls import callable_aligner, refine_estimate
-from experiments.run.stages.align import map_at
+from experiments.run.stages.map_batches import map_at
 from experiments.run.stages.slam import evaluated_iterations
 from experiments.run.tasks import OnProgress
 from experiments.run.workers import workers
 from experiments.scenario.randomness import generator
-from experiments.scenario.settings import Scenario
+from experiments.scenario.settings import Simulation
 from experiments.study.refusal import cases
 from experiments.study.refusal import refusal_tables as results
 from experiments.study.refusal.calibration import calibrate
@@ -47,7 +47,7 @@ def run(
         output: folder.
         n_apart: pairs of maps without common ground, drawn from all there are.
         jobs: processes.
-        on_progress: told (stage, done, total).
+        on_progress: told (label, done, total).
     """
     scenario, worlds = load_worlds(sources)
     by_name = {world.name: world for world in worlds}
@@ -60,20 +60,19 @@ def run(
             pool.submit((a, b), apart_rows, scenario, by_name[a], by_name[b], meetings)
         for names, rows in pool.completed():
             done[names] = rows
-            on_progress("refusal", len(done), len(worlds) + len(drawn))
+            on_progress("cross the worlds", len(done), len(worlds) + len(drawn))
     results.write(output, "refusals", [row for names in sorted(done) for row in done[names]])
     calibrated = calibrate(scenario.align.acceptance, generator(scenario.seed, "calibration"))
     results.write(output, "calibration", calibrated)
     return scenario.align.acceptance
 
 
-def _iterations(scenario: Scenario) -> list[int]:
-    assert scenario.drive is not None
+def _iterations(scenario: Simulation) -> list[int]:
     return evaluated_iterations(scenario.drive.frames, scenario.evaluate.every)
 
 
 def _drawn_meetings(
-    scenario: Scenario, worlds: Sequence[MappedWorld], n: int
+    scenario: Simulation, worlds: Sequence[MappedWorld], n: int
 ) -> dict[tuple[str, str], list[Meeting]]:
     """Drawn pairs of maps of worlds of different seeds, by pair of worlds; every such is there."""
     strangers = [(a, b) for a, b in itertools.combinations(worlds, 2) if a.seed != b.seed]
@@ -90,7 +89,7 @@ def _drawn_meetings(
     return meetings
 
 
-def common_rows(scenario: Scenario, world: MappedWorld) -> Rows:
+def common_rows(scenario: Simulation, world: MappedWorld) -> Rows:
     """COMMON and FEW pairs of one world; POSTERS of one whose pictures repeat."""
     robots = [load_robot(folders) for folders in world.robots.values()]
     matching, radius_m = scenario.align.match, scenario.evaluate.true_pair_radius_m
@@ -110,7 +109,7 @@ def common_rows(scenario: Scenario, world: MappedWorld) -> Rows:
 
 
 def apart_rows(
-    scenario: Scenario, world_a: MappedWorld, world_b: MappedWorld, meetings: Sequence[Meeting]
+    scenario: Simulation, world_a: MappedWorld, world_b: MappedWorld, meetings: Sequence[Meeting]
 ) -> Rows:
     """APART and REPEATED pairs of two worlds."""
     in_a = {name: load_robot(folders) for name, folders in world_a.robots.items()}
@@ -132,7 +131,7 @@ def apart_rows(
 
 
 def _posters(
-    scenario: Scenario, source: Case, others: Sequence[LandmarkMap], names: tuple[str, str]
+    scenario: Simulation, source: Case, others: Sequence[LandmarkMap], names: tuple[str, str]
 ) -> Iterator[Case]:
     """Posters of one world in the other's maps."""
     n_sizes = len(cases.POSTER_RADII_M)
@@ -145,7 +144,7 @@ def _posters(
             yield case
 
 
-def _answers(scenario: Scenario, case: Case, worlds: tuple[str, str], iteration: int) -> Rows:
+def _answers(scenario: Simulation, case: Case, worlds: tuple[str, str], iteration: int) -> Rows:
     """One row an aligner: its refined alignment, judged."""
     settings = scenario.align
     maps = (case.map_a, case.map_b, case.pairs)

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from experiments.judge.expectations import load_checked
-from experiments.judge.judging import RobotFolders
-from experiments.judge.pipeline import plan
-from experiments.judge.result import STORE_FOLDER, require_result
+from experiments.judge.judged_run import JudgedRun
+from experiments.judge.result import require_result
+from experiments.run.stages.slam import RobotFolders
 from experiments.run.store import Store
-from experiments.scenario.settings import Scenario
+from experiments.scenario.settings import AnyScenario, Simulation
 from experiments.scenario.suite import scenarios_of
 from mapfusion.errors import InputError
 
@@ -40,7 +40,7 @@ class WorldSource(NamedTuple):
 
     label: str
     name: str
-    scenario: Scenario
+    scenario: AnyScenario
     store: Store
 
 
@@ -62,18 +62,18 @@ def sources_of(worlds: Sequence[str], seeds: Sequence[int], results: Path) -> li
         if path.is_dir():
             require_result(path)
             scenario = load_checked(path / "scenario.json")
-            store = Store(path.resolve().parent / STORE_FOLDER)
+            store = Store.of(path.resolve().parent)
             found.append(WorldSource(str(path), path.resolve().name, scenario, store))
             continue
         for file in scenarios_of([word]):
             for seed in seeds:
                 scenario = load_checked(file, (), seed)
                 name = f"{scenario.name}-{seed}"
-                found.append(WorldSource(name, name, scenario, Store(results / STORE_FOLDER)))
+                found.append(WorldSource(name, name, scenario, Store.of(results)))
     return found
 
 
-def load_worlds(sources: Sequence[WorldSource]) -> tuple[Scenario, list[MappedWorld]]:
+def load_worlds(sources: Sequence[WorldSource]) -> tuple[Simulation, list[MappedWorld]]:
     """The first source's scenario, and the worlds of all of them.
 
     Raises:
@@ -95,23 +95,25 @@ def load_worlds(sources: Sequence[WorldSource]) -> tuple[Scenario, list[MappedWo
             f"refusal: all worlds have seed {worlds[0].seed}, and so some pictures in common; give "
             "those of another seed too"
         )
-    return sources[0].scenario, worlds
+    first = sources[0].scenario
+    assert isinstance(first, Simulation)  # else `_world` has refused it
+    return first, worlds
 
 
 def _world(source: WorldSource) -> MappedWorld:
     scenario = source.scenario
-    if scenario.world is None:
+    if not isinstance(scenario, Simulation):
         raise InputError(
             f"{source.label}: made from recorded logs; only simulated worlds surely differ"
         )
-    planned = plan(scenario, source.store)
-    for robot in planned.robots:
-        if not (robot.log.finished and robot.slam.finished):
+    judged = JudgedRun.of(scenario, source.store)
+    for robot in judged.pipeline.simulated:
+        if not all(source.store.folder(stage).finished for stage in (robot.log, robot.slam)):
             raise InputError(
                 f"{source.label}: the maps of {robot.name} are not in {source.store.root} (made by "
                 "another version?); run its scenario again"
             )
-    assert planned.faces is not None
-    folders = {robot.name: robot.folders for robot in planned.robots}
+    _, faces = judged.pipeline.world
+    folders = {robot.name: judged.robot_folders(robot) for robot in judged.pipeline.robots}
     repeats = scenario.world.texture.posters > 0
-    return MappedWorld(source.name, scenario.seed, planned.faces.key, repeats, folders)
+    return MappedWorld(source.name, scenario.seed, faces.key, repeats, folders)

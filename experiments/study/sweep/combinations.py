@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.judge.expectations import load_checked
-from experiments.scenario.settings import Scenario
+from experiments.scenario.settings import AnyScenario
 from experiments.scenario.yaml_input import parse_value
 from mapfusion.errors import InputError
 
@@ -55,7 +55,7 @@ class SweepRun:
         digest = hashlib.sha256(json.dumps(sorted(self.settings)).encode()).hexdigest()
         return f"{self.scenario}-{self.seed}-{digest[:_HASH_LENGTH]}"
 
-    def load(self) -> Scenario:
+    def load(self) -> AnyScenario:
         """The scenario of this run; raises InputError."""
         return load_checked(
             self.path, [f"{key}={value}" for key, value in self.settings], self.seed

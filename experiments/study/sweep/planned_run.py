@@ -7,16 +7,15 @@ import pandas as pd
 
 from experiments.judge.consistency import landmark_nees_rows
 from experiments.judge.fused_landmarks import map_fit_rows
-from experiments.judge.judging import load_robot
-from experiments.judge.pipeline import Plan, plan, task_name, tasks_of
+from experiments.judge.judged_run import JudgedRun
 from experiments.judge.provenance import renderer
-from experiments.judge.result import fused_map, measure_aligners, pair_table, robot_tables
-from experiments.run.store import StageFolder, Store
-from experiments.run.tasks import Task, unfinished
+from experiments.judge.result import fused_map, measure_aligners, robot_tables
+from experiments.run.store import Store
+from experiments.run.tasks import Task, task_names, unfinished
 from experiments.study.sweep.combinations import SweepRun
 from experiments.study.sweep.sweep_dataset import ALIGNER_TIMINGS, RUN_TIMES, SweepDataset
 
-WRITE = "tables"  # the kind of the task that writes a run's rows
+WRITE = "write the tables"  # the label of the task that writes a run's rows
 
 
 @dataclass(frozen=True)
@@ -47,64 +46,54 @@ def write_name(run: SweepRun) -> str:
 
 def planned(run: SweepRun, store: Store, dataset: SweepDataset) -> PlannedRun:
     """Lay out a run; nothing is computed. Raises InputError for what cannot be run."""
-    laid_out = plan(run.load(), store)
-    tasks, stages = tasks_of(laid_out), stages_of(laid_out)
-    read = [folder for robot in laid_out.robots for folder in (robot.log, robot.slam)]
-    read += [folder for pair in laid_out.pairs for folder in (pair.align, pair.judge)]
-    needs = tuple(name for name in map(task_name, read) if name in tasks)
+    judged = JudgedRun.of(run.load(), store)
+    tasks, stages = dict(judged.tasks), stages_of(judged)
+    pipeline = judged.pipeline
+    read = [stage for robot in pipeline.robots for stage in (robot.log, robot.slam)]
+    read += [*(pair.estimates for pair in pipeline.pairs), *judged.judgements]
+    needs = tuple(name for stage in read for name in task_names(stage))
     name = write_name(run)
-    tasks[name] = Task(name, WRITE, write_rows, (run, laid_out, dataset), (), needs)
+    tasks[name] = Task(name, WRITE, write_rows, (run, judged, dataset), (), needs)
     return PlannedRun(run, stages, tasks, dataset.holds(run, stages))
 
 
-def stages_of(laid_out: Plan) -> list[str]:
-    """STAGE/KEY of all stages, the aligners' own among them."""
-    return [task_name(folder) for folder in (*laid_out.folders(), *_aligner_parts(laid_out))]
+def stages_of(judged: JudgedRun) -> list[str]:
+    """STAGE/KEY of all stages."""
+    return [f"{stage.name}/{stage.key}" for stage in judged.stages()]
 
 
-def _aligner_parts(laid_out: Plan) -> list[StageFolder]:
-    return [part for pair in laid_out.pairs for part in (pair.parts.match, *pair.parts.aligners)]
-
-
-def write_rows(run: SweepRun, laid_out: Plan, dataset: SweepDataset) -> None:
+def write_rows(run: SweepRun, judged: JudgedRun, dataset: SweepDataset) -> None:
     """Write a run's rows of all tables, `runs` last; no maps, no images."""
     dataset.path(ALIGNER_TIMINGS, run).unlink(missing_ok=True)  # of an earlier state of the run
-    for name, rows in _run_tables(laid_out).items():
+    for name, rows in _run_tables(judged).items():
         dataset.write(name, run, rows)
-    dataset.finish(run, renderer(laid_out.scenario), stages_of(laid_out))
+    dataset.finish(run, renderer(judged.scenario), stages_of(judged))
 
 
-def _run_tables(laid_out: Plan) -> dict[str, pd.DataFrame | list[dict[str, Any]]]:
-    robots = [load_robot(robot.folders) for robot in laid_out.robots]
-    of_robots = robot_tables(laid_out, robots)
+def _run_tables(judged: JudgedRun) -> dict[str, pd.DataFrame | list[dict[str, Any]]]:
+    robots = judged.load_robots()
+    of_robots = robot_tables(judged, robots)
     last = max(max(robot.maps) for robot in robots)
-    estimates, offered = (pair_table(laid_out, name) for name in ("estimates", "correspondences"))
-    fused = fused_map(laid_out.scenario.merge, robots, estimates, offered, last)
-    radius_m = laid_out.scenario.evaluate.true_pair_radius_m
+    estimates, offered = (judged.pair_table(name) for name in ("estimates", "correspondences"))
+    fused = fused_map(judged.scenario.merge, robots, estimates, offered, last)
+    radius_m = judged.scenario.evaluate.true_pair_radius_m
     return {
-        "errors": pair_table(laid_out, "errors"),
-        "fusion": pair_table(laid_out, "fusion"),
+        "errors": judged.pair_table("errors"),
+        "fusion": judged.pair_table("fusion"),
         "robots": of_robots["robots"],
         "path_statistics": of_robots["path_statistics"],
         "map_fits": map_fit_rows(robots, fused, last),
         "landmark_nees": landmark_nees_rows(robots, fused, last, radius_m),
-        RUN_TIMES: _times(laid_out),
+        RUN_TIMES: [
+            {"stage": folder.name, "key": folder.key, "figure": name, "seconds": seconds}
+            for folder in judged.folders()
+            for name, seconds in folder.figures().items()
+        ],
     }
-
-
-def _times(laid_out: Plan) -> list[dict[str, Any]]:
-    timed = [(folder, folder.figures()) for folder in laid_out.folders() if folder.finished]
-    timed += [(part, part.noted()) for part in _aligner_parts(laid_out)]
-    return [
-        {"stage": folder.stage, "key": folder.key, "figure": name, "seconds": figures[name]}
-        for folder, figures in timed
-        for name in ("elapsed_s", "rendering_s")
-        if name in figures
-    ]
 
 
 def write_aligner_timings(run: SweepRun, store: Store, dataset: SweepDataset) -> None:
     """Time a finished run's aligners, serially: nothing else may be running."""
-    laid_out = plan(run.load(), store)
-    measure_aligners(laid_out, [load_robot(robot.folders) for robot in laid_out.robots])
-    dataset.write(ALIGNER_TIMINGS, run, pair_table(laid_out, ALIGNER_TIMINGS))
+    judged = JudgedRun.of(run.load(), store)
+    measure_aligners(judged, judged.load_robots())
+    dataset.write(ALIGNER_TIMINGS, run, judged.pair_table(ALIGNER_TIMINGS))

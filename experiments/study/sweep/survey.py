@@ -13,7 +13,7 @@ from mapfusion.errors import InputError
 
 @dataclass
 class Survey:
-    """What a sweep would do: runs, and tasks by kind.
+    """What a sweep would do: runs, and tasks by label.
 
     Attributes:
         runs, runs_finished, runs_refused: refused are those that cannot be laid out.
@@ -44,8 +44,8 @@ def survey(runs: Iterable[SweepRun], store: Store, dataset: SweepDataset) -> Sur
         found.runs_finished += laid_out.finished
         todo = {task.name for task in laid_out.left()}
         for name, task in laid_out.tasks.items():
-            found.wanted[task.kind] += 1
+            found.wanted[task.label] += 1
             if name not in known:
                 known.add(name)
-                (found.left if name in todo else found.finished)[task.kind] += 1
+                (found.left if name in todo else found.finished)[task.label] += 1
     return found

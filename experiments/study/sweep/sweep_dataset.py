@@ -16,9 +16,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from experiments.judge import tables
+from experiments.run.code_version import library_versions, source_hash
 from experiments.run.dask_worker import SOURCES
 from experiments.run.frames import FLOAT, TEXT, fields
-from experiments.run.store import library_versions, source_hash
 from experiments.study.sweep.combinations import Axis, SweepRun
 from mapfusion.errors import InputError
 from mapfusion.storage import schema, write_table, write_whole

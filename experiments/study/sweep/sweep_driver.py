@@ -34,7 +34,7 @@ class SweepProgress:
         runs: in all.
         finished, kept: runs that are done; `kept` were done before.
         failed: the other runs that are done, with their reasons, by run id.
-        tasks, tasks_done: by kind, of the runs looked at so far.
+        tasks, tasks_done: by label, of the runs looked at so far.
     """
 
     runs: int = 0
@@ -139,14 +139,14 @@ class SweepDriver:
         self._end_if_over(opened)
 
     def _submit(self, task: Task) -> None:
-        self.progress.tasks[task.kind] += 1
+        self.progress.tasks[task.label] += 1
         future = self._client.submit(
             perform,
             task.name,
             pickle.dumps(task),
             self._terms,
             *(self._futures[need] for need in task.needs if need in self._futures),
-            key=f"{task.kind}-{self._suffix}-{task.name}",
+            key=f"{task.label}-{self._suffix}-{task.name}",
             pure=False,
             # in order: a run is finished before others begin
             priority=-self.progress.tasks.total(),

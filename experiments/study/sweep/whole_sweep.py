@@ -7,7 +7,6 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from experiments.judge.result import STORE_FOLDER
 from experiments.methods.one_thread import single_threaded
 from experiments.run.dask_cluster import connected
 from experiments.run.dask_worker import Terms, code_version
@@ -45,7 +44,7 @@ class Sweep:
     @property
     def store(self) -> Store:
         """Where stages are kept, shared with `mapfusion run`."""
-        return Store(self.results / STORE_FOLDER)
+        return Store.of(self.results)
 
 
 def prepare(
@@ -112,7 +111,7 @@ def measure_times(sweep: Sweep, failed: Collection[str], on_progress: OnProgress
     single_threaded()
     runs = [run for run in sweep.runs if run.run_id not in failed]
     for done, run in enumerate(runs):
-        on_progress("timings", done, len(runs))
+        on_progress("time the aligners", done, len(runs))
         if not sweep.dataset.path(ALIGNER_TIMINGS, run).is_file():
             write_aligner_timings(run, sweep.store, sweep.dataset)
-    on_progress("timings", len(runs), len(runs))
+    on_progress("time the aligners", len(runs), len(runs))

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from experiments.judge.result import run_scenario
-from experiments.scenario.settings import Scenario, load_scenario
+from experiments.scenario.loading import load_scenario
 from experiments.scenario.yaml_input import read_mapping
 from mapfusion.robot_log import read_log, write_log
 from tests.helpers.tiny_scenario import TINY, Reply, command
@@ -367,13 +367,22 @@ def test_schema(capsys: pytest.CaptureFixture[str]) -> None:
     reply = command(capsys, "schema")
     assert reply.code == 0
     schema = json.loads(reply.out)
-    assert set(schema["required"]) == {"schema_version", "name"}
-    assert schema["additionalProperties"] is False
+    kinds = {option["$ref"].rpartition("/")[2]: option for option in schema["anyOf"]}
+    assert set(kinds) == {"Simulation", "GeneratedScenario", "Recording"}
+    required = {"Simulation": {"world", "robots", "drive"}, "Recording": {"logs"}}
+    required["GeneratedScenario"] = {"generate", "drive"}
+    for name, own in required.items():
+        described = schema["$defs"][name]
+        assert set(described["required"]) == {"schema_version", "name"} | own
+        assert described["additionalProperties"] is False
     for reference in _references(schema):
         assert reference.removeprefix("#/$defs/") in schema["$defs"]
     for path in sorted(SCENARIOS.glob("*.yaml")):
-        assert set(read_mapping(path)) <= set(schema["properties"])
-        Scenario.model_validate(read_mapping(path))
+        given = read_mapping(path)
+        kind = "Recording" if "logs" in given else "Simulation"
+        kind = "GeneratedScenario" if "generate" in given else kind
+        assert set(given) <= set(schema["$defs"][kind]["properties"])
+        load_scenario(path)
 
 
 def _references(node: object) -> list[str]:

@@ -15,14 +15,15 @@ import pandas as pd
 import pytest
 
 from experiments.judge import tables
-from experiments.judge.pipeline import execute, plan
+from experiments.judge.judged_run import JudgedRun
 from experiments.judge.result import run_scenario
-from experiments.run.stages.align import run_aligner, run_match
-from experiments.run.stages.slam import RobotFolders, run_filter
-from experiments.run.store import StageFolder, Store
-from experiments.scenario.settings import Scenario, load_scenario
+from experiments.run.job import Job
+from experiments.run.pipeline import lay_out
+from experiments.run.store import Store
+from experiments.scenario.loading import load_scenario
+from experiments.scenario.settings import Recording, Simulation
 from mapfusion.landmark_map import read_map
-from mapfusion.robot_log import read_log, read_truth, write_truth_points, write_truth_poses
+from mapfusion.robot_log import read_truth, write_truth_points, write_truth_poses
 from tests.helpers.tiny_scenario import TINY, assert_same_tables, command, estimated_tables
 
 
@@ -30,7 +31,7 @@ def quietly(stage: str, done: int, total: int) -> None:
     """Progress nobody looks at."""
 
 
-def test_every_table_is_there(tiny_result: Path, tiny: Scenario) -> None:
+def test_every_table_is_there(tiny_result: Path, tiny: Simulation) -> None:
     for name in tables.ALL:
         table = tables.read(tables.table_path(tiny_result, name), name)  # checks the schema
         assert len(table), name
@@ -78,21 +79,22 @@ def test_estimates_lie_near_the_truth(tiny_result: Path) -> None:
 
 
 def test_finished_stages_are_reused_and_fresh_computes_again(
-    tiny: Scenario, tiny_results: Path, tmp_path: Path
+    tiny: Simulation, tiny_results: Path, tmp_path: Path
 ) -> None:
     told: list[str] = []
-    store = Store(tiny_results / "store")
-    execute(tiny, store, 1, lambda stage, done, total: told.append(stage))
+
+    def tell(stage: str, done: int, total: int) -> None:
+        told.append(stage)
+
+    finished = JudgedRun.of(tiny, Store.of(tiny_results))
+    finished.execute(1, tell)
     assert told == []
 
-    quick = tiny.model_copy(
-        update={"drive": tiny.drive and tiny.drive.model_copy(update={"frames": 4})}
-    )
-    store = Store(tmp_path)
-    execute(quick, store, 1, quietly)
-    marks = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("done.json")}
-    execute(quick, store, 1, lambda stage, done, total: told.append(stage), fresh=True)
-    assert set(told) == {"drive", "faces", "render", "log", "slam", "align", "judge"}
+    quick = tiny.model_copy(update={"drive": tiny.drive.model_copy(update={"frames": 4})})
+    run_scenario(quick, tmp_path, 1, quietly)
+    marks = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("done*.json")}
+    run_scenario(quick, tmp_path, 1, tell, fresh=True)
+    assert set(told) == {stage.label for stage in finished.stages()} | {"write the tables"}
     assert all(path.stat().st_mtime_ns > before for path, before in marks.items())
 
 
@@ -135,7 +137,7 @@ def interrupted_run(path: Path, results: Path) -> subprocess.CompletedProcess[st
         start_new_session=True,  # a process group of its own, as a shell gives each command
     )
     deadline = time.monotonic() + 60
-    while not list(results.rglob("features_*.parquet")) and time.monotonic() < deadline:
+    while not list(results.rglob("features/*/done_*.json")) and time.monotonic() < deadline:
         assert process.poll() is None, process.communicate()
         time.sleep(0.005)
     os.killpg(process.pid, signal.SIGINT)
@@ -144,7 +146,7 @@ def interrupted_run(path: Path, results: Path) -> subprocess.CompletedProcess[st
 
 
 def test_interrupted_run_goes_on_and_gives_the_same_tables(
-    tiny: Scenario, tiny_path: Path, tiny_result: Path, tmp_path: Path
+    tiny: Simulation, tiny_path: Path, tiny_result: Path, tmp_path: Path
 ) -> None:
     ended = interrupted_run(tiny_path, tmp_path)
     assert ended.returncode == 130
@@ -152,8 +154,10 @@ def test_interrupted_run_goes_on_and_gives_the_same_tables(
     complaints = [line for line in ended.stderr.splitlines() if line.startswith("mapfusion: ")]
     assert len(complaints) == 1
     assert "interrupted" in complaints[0]
-    kept = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("features_*.parquet")}
-    assert 1 <= len(kept) < 6
+    marks = list(tmp_path.rglob("features/*/done_*.json"))
+    chunks = [m.with_name(f"features{m.stem.removeprefix('done')}.parquet") for m in marks]
+    kept = {path: path.stat().st_mtime_ns for path in (*marks, *chunks)}
+    assert 1 <= len(marks) < 6
     assert not (tmp_path / "tiny-3").exists()
 
     run_scenario(tiny, tmp_path, 2, quietly)
@@ -163,20 +167,21 @@ def test_interrupted_run_goes_on_and_gives_the_same_tables(
 
 
 def test_truth_is_for_the_evaluation_alone(
-    tiny: Scenario, tiny_results: Path, tmp_path: Path
+    tiny: Simulation, tiny_results: Path, tmp_path: Path
 ) -> None:
     rng = np.random.default_rng(1)
     folders = []
-    for robot in plan(tiny, Store(tiny_results / "store")).robots:
-        folder = tmp_path / robot.name
+    run = JudgedRun.of(tiny, Store.of(tiny_results))
+    for robot in run.pipeline.robots:
+        folder, log = tmp_path / robot.name, run.store.path(robot.log)
         folder.mkdir()
         for name in ("frames.parquet", "observations.parquet"):
-            (folder / name).hardlink_to(robot.log.path / name)
-        truth = read_truth(robot.log.path)
+            (folder / name).hardlink_to(log / name)
+        truth = read_truth(log)
         write_truth_poses(folder, rng.permutation(truth.T_world_robot))
         write_truth_points(folder, rng.permutation(truth.point_world_m) + 100)
         folders.append(folder)
-    shuffled = Scenario.model_validate(
+    shuffled = Recording.model_validate(
         {"schema_version": 1, "name": "shuffled", "seed": tiny.seed, "logs": [*map(str, folders)]}
         | {name: getattr(tiny, name) for name in ("slam", "align", "evaluate", "merge")}
     )
@@ -197,38 +202,33 @@ def test_truth_is_for_the_evaluation_alone(
     )
 
 
-def test_estimating_opens_no_truth(tiny: Scenario, tiny_results: Path, tmp_path: Path) -> None:
+def test_estimating_opens_no_truth(tiny: Simulation, tiny_results: Path, tmp_path: Path) -> None:
     """The filter and the aligners run where the truth is not even on disk."""
-    laid_out = plan(tiny, Store(tiny_results / "store"))
-    folders = []
-    for robot in laid_out.robots:
-        log = tmp_path / robot.name
+    run = JudgedRun.of(tiny, Store.of(tiny_results))
+    folders = {}
+    for robot in run.pipeline.robots:
+        folders[robot.log.key] = log = tmp_path / robot.name
         log.mkdir()
         for name in ("frames.parquet", "observations.parquet"):
-            (log / name).hardlink_to(robot.log.path / name)
-        run_filter(read_log(log), tiny.slam, tiny.seed, [10, 43], 10, log / "slam")
-        folders.append(RobotFolders(log, log / "slam"))
-    offered = StageFolder("match", "x", tmp_path / "match")
-    aligners = tuple(
-        StageFolder("aligner", entry.name, tmp_path / entry.name) for entry in tiny.align.aligners
-    )
-    robots = (folders[0], folders[1])
-    run_match(tiny, robots, offered, 0, [43])
-    for entry, folder in zip(tiny.align.aligners, aligners, strict=True):
-        run_aligner(tiny, entry, robots, offered, folder, 0, [43])
-    for folder in (offered, *aligners):
-        assert (folder.path / "batch_000.parquet").is_file()
+            (log / name).hardlink_to(run.store.path(robot.log) / name)
+        folders[robot.slam.key] = log / "slam"
+        robot.slam.work(robot.slam.settings, Job({"log": log}, log / "slam"))
+    (pair,) = run.pipeline.pairs
+    for number, stage in enumerate((pair.match, *pair.aligners)):
+        folders[stage.key] = tmp_path / f"{stage.name}{number}"
+        inputs = {name: folders[before.key] for name, before in stage.before.items()}
+        stage.work(stage.settings, Job(inputs, folders[stage.key], "000"))
+        assert (folders[stage.key] / "batch_000.parquet").is_file()
 
 
-def test_only_the_changed_aligner_runs_again(tiny: Scenario, tiny_results: Path) -> None:
-    store = Store(tiny_results / "store")
+def test_only_the_changed_aligner_runs_again(tiny: Simulation) -> None:
     changed = tiny.align.aligners[0].model_copy(update={"parameters": {"gate_m": 0.25}})
     entries = [changed, *tiny.align.aligners[1:]]
     other = tiny.model_copy(update={"align": tiny.align.model_copy(update={"aligners": entries})})
-    before, after = (plan(scenario, store).pairs[0].parts for scenario in (tiny, other))
-    assert after.match == before.match
-    assert after.aligners[0] != before.aligners[0]
-    assert after.aligners[1:] == before.aligners[1:]
+    (before,), (after,) = (lay_out(scenario).pairs for scenario in (tiny, other))
+    assert after.match.key == before.match.key
+    same = [a.key == b.key for a, b in zip(after.aligners, before.aligners, strict=True)]
+    assert same == [False, True, True]
 
 
 def test_commands_one_by_one(

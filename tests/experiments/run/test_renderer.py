@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from experiments.judge.pipeline import plan
+from experiments.judge.judged_run import JudgedRun
 from experiments.judge.provenance import provenance
 from experiments.run.store import Store
-from experiments.scenario.settings import load_scenario
+from experiments.scenario.loading import load_scenario
 from sim import renderer
 from sim.renderer import egl_driver
 from tests.experiments.cli.test_bad_input import assert_refused
@@ -26,11 +26,9 @@ def test_the_renderer_s_driver_is_in_the_record_and_in_the_key(
     keys = []
     for driver in ("llvmpipe 22", "llvmpipe 23"):
         monkeypatch.setattr(renderer, "egl_driver", lambda driver=driver: driver)
-        laid_out = plan(scenario, Store(tmp_path))
+        laid_out = JudgedRun.of(scenario, Store(tmp_path))
         assert provenance(laid_out)["renderer"] == f"OpenGL by EGL ({driver})"
-        features = laid_out.robots[0].features
-        assert features is not None
-        keys.append(features.key)
+        keys.append(laid_out.pipeline.simulated[0].features.key)
     assert keys[0] != keys[1]
 
 

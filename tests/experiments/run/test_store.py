@@ -2,31 +2,42 @@ from pathlib import Path
 
 import pytest
 
-from experiments.run.store import Store, link_or_copy
+from experiments.run.job import Job
+from experiments.run.stage import Stage
+from experiments.run.store import Store
+from experiments.run.store_files import link_or_copy
+from experiments.run.tasks import tasks_of
 
 
-def test_a_stage_is_finished_once_it_says_so(tmp_path: Path) -> None:
-    folder = Store(tmp_path).stage("slam", {"a": 1}, [], ())
-    assert folder.path == tmp_path / "slam" / folder.key
+def work(settings: int, job: Job) -> dict[str, float]:
+    (job.output / f"half_{job.part}").write_text(str(settings))
+    return {"extra_s": 2.0}
+
+
+work.__module__ = "experiments.run.job"  # a key covers the source of the harness alone
+
+
+def test_a_stage_is_finished_once_all_its_parts_are(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    stage = Stage("slam", "FastSLAM", 1, work, ("half_{part}",), parts=("a", "b"))
+    folder = store.folder(stage)
+    assert folder.path == tmp_path / "slam" / stage.key
     assert not folder.finished
     folder.path.mkdir(parents=True)
-    (folder.path / "half.parquet").write_text("")
-    assert not folder.finished
-    folder.finish(elapsed_s=1.5)
+    tasks = tasks_of([stage], store)
+    for done, task in enumerate(tasks.values()):
+        assert folder.finished == (done == 2)
+        task.run()
     assert folder.finished
-    assert folder.figures()["elapsed_s"] == 1.5
+    assert folder.figures()["extra_s"] == 4.0
+    assert folder.figures()["elapsed_s"] > 0
+    (folder.path / "half_a").unlink()  # what a part wrote counts, not its mark alone
+    assert not folder.finished
+    assert [task.finished for task in tasks.values()] == [False, True]
     folder.discard()
     assert not folder.finished
     assert not folder.path.exists()
     folder.discard()
-
-
-def test_settings_in_another_order_are_the_same(tmp_path: Path) -> None:
-    store = Store(tmp_path)
-    one, other = ({"a": 1, "b": [1, 2]}, {"b": [1, 2], "a": 1})
-    assert store.stage("s", one, [], ()).key == store.stage("s", other, [], ()).key
-    assert store.stage("s", {"b": [2, 1], "a": 1}, [], ()).key != store.stage("s", one, [], ()).key
-    assert store.stage("t", one, [], ()).key != store.stage("s", one, [], ()).key
 
 
 def test_links_share_what_they_can_and_replace_what_was_there(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ def _append(journal: Path, name: str, output: Path) -> None:
 
 
 def tasks(folder: Path, needs: Mapping[str, Sequence[str]]) -> dict[str, Task]:
-    """Tasks that note their names in a journal, one kind for each first letter."""
+    """Tasks that note their names in a journal, one label for each first letter."""
     return {
         name: Task(
             name,
@@ -78,7 +78,7 @@ def test_every_task_runs_once_after_those_it_needs(tmp_path: Path, jobs: int, se
         run_tasks(
             list(made.values()),
             pool,
-            lambda kind, done, total: told.update({kind: (done, total)}),
+            lambda label, done, total: told.update({label: (done, total)}),
         )
     ran = journal(tmp_path)
     assert sorted(ran) == sorted(names)

@@ -5,9 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from experiments.judge.pipeline import plan
+from experiments.judge.judged_run import JudgedRun
 from experiments.run.store import Store
-from experiments.scenario.settings import Scenario, load_scenario
+from experiments.scenario.loading import load_scenario
+from experiments.scenario.settings import AnyScenario, Simulation
 from mapfusion.errors import InputError
 
 GENERATED = """
@@ -26,14 +27,13 @@ def path(tmp_path: Path) -> Path:
     return path
 
 
-def keys(scenario: Scenario, folder: Path) -> list[str]:
-    return [stage.key for stage in plan(scenario, Store(folder)).folders()]
+def keys(scenario: AnyScenario, folder: Path) -> list[str]:
+    return [stage.key for stage in JudgedRun.of(scenario, Store(folder)).stages()]
 
 
 def test_the_loaded_scenario_holds_world_and_robots(path: Path) -> None:
     scenario = load_scenario(path)
-    assert scenario.generate is None
-    assert scenario.world is not None
+    assert isinstance(scenario, Simulation)
     assert len(scenario.world.walls) > 10
     assert (scenario.world.wall_height_m, scenario.world.texture.contrast) == (2.2, 0.5)
     assert [robot.name for robot in scenario.robots] == ["R1", "R2"]

@@ -2,7 +2,8 @@
 
 import pytest
 
-from experiments.scenario.settings import DEFAULT_ALIGNERS, Align, load_section
+from experiments.scenario.loading import load_section
+from experiments.scenario.settings import DEFAULT_ALIGNERS, Align
 from mapfusion.errors import InputError
 
 ALSO = {"name": "peer", "method": "opencv"}

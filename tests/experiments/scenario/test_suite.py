@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.scenario.settings import load_scenario
+from experiments.scenario.loading import load_scenario
 from experiments.scenario.suite import entries, scenarios_of
 from mapfusion.errors import InputError
 from tests.experiments.cli.test_bad_input import assert_refused

@@ -1,5 +1,6 @@
 """The benchmark counts rightly, repeats itself, and goes on where it was."""
 
+import functools
 import json
 from pathlib import Path
 
@@ -7,13 +8,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from experiments.run.job import Job
 from experiments.run.store import Store
 from experiments.scenario.settings import AlignerEntry
 from experiments.show.benchmark_files import cell_text, markdown
 from experiments.show.figures.benchmark_figure import draw
 from experiments.study.benchmark import cells as benchmark
-from experiments.study.benchmark.cells import TRIALS, BenchmarkDesign, entries_of, run_benchmark
+from experiments.study.benchmark.cells import BenchmarkDesign, entries_of, run_benchmark
 from experiments.study.benchmark.success import SUMMARY, summarise
+from experiments.study.benchmark.trials import TRIALS, CellSettings
 from mapfusion.align import registry
 from mapfusion.align.plugins import Kind, Method
 from mapfusion.errors import InputError
@@ -32,7 +35,7 @@ def quiet(stage: str, done: int, total: int) -> None:
 def test_good_and_bad_methods_are_told_apart(tmp_path: Path) -> None:
     told: list[tuple[str, int, int]] = []
     trials = run_benchmark(SMALL, Store(tmp_path), lambda *now: told.append(now))
-    assert told == [("benchmark", k, 8) for k in range(9)]
+    assert told == [("measure the aligners", k, 8) for k in range(9)]
     summary = summarise(trials).set_index(["method", "n_pairs", "outlier_share"])
     assert len(summary) == 8
     ransac = summary.loc["ransac"]
@@ -60,8 +63,14 @@ def test_all_methods_get_the_same_maps_and_a_second_run_the_same_trials(tmp_path
 def test_finished_cells_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = run_benchmark(SMALL, Store(tmp_path), quiet)
     measured: list[str] = []
-    measure = benchmark._measure
-    monkeypatch.setattr(benchmark, "_measure", lambda *a: (measured.append(a[1].name), measure(*a)))
+    run_cell = benchmark.run_cell
+
+    @functools.wraps(run_cell)
+    def noted(settings: CellSettings, job: Job) -> None:
+        measured.append(settings.name)
+        run_cell(settings, job)
+
+    monkeypatch.setattr(benchmark, "run_cell", noted)
     pd.testing.assert_frame_equal(run_benchmark(SMALL, Store(tmp_path), quiet), before)
     assert measured == []
     more = BenchmarkDesign(

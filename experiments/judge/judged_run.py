@@ -1,0 +1,119 @@
+"""All stages of a scenario, the judgement too, with the store that keeps them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import pandas as pd
+
+from experiments.judge import judging, tables
+from experiments.judge.errors import EvaluatedRobot
+from experiments.run.pipeline import PairStages, Pipeline, RobotStages, lay_out
+from experiments.run.stage import Stage
+from experiments.run.stages.slam import RobotFolders
+from experiments.run.store import StageFolder, Store, explained
+from experiments.run.tasks import OnProgress, Task, run_tasks, task_names, tasks_of, unfinished
+from experiments.run.workers import workers
+from experiments.scenario.settings import AnyScenario
+from mapfusion.errors import InputError
+
+_JUDGED = {"errors", "fusion"}  # the other tables of pairs come from the aligners
+
+
+@dataclass(frozen=True)
+class JudgedRun:
+    """A scenario's stages in a store.
+
+    Attributes:
+        pipeline: the stages up to the estimates.
+        judgements: one of each pair of robots, in the pipeline's order.
+        store: where all of them are kept.
+    """
+
+    pipeline: Pipeline
+    judgements: tuple[Stage, ...]
+    store: Store
+
+    @classmethod
+    def of(cls, scenario: AnyScenario, store: Store) -> "JudgedRun":
+        """Lay out a scenario; nothing is computed."""
+        pipeline = lay_out(scenario)
+        judgements = tuple(_judgement(scenario, pair) for pair in pipeline.pairs)
+        return cls(pipeline, judgements, store)
+
+    @property
+    def scenario(self) -> AnyScenario:
+        """What is run."""
+        return self.pipeline.scenario
+
+    def stages(self) -> list[Stage]:
+        """All stages, each after those before it."""
+        return [*self.pipeline.stages(), *self.judgements]
+
+    def folders(self) -> list[StageFolder]:
+        """Where all stages are kept."""
+        return [self.store.folder(stage) for stage in self.stages()]
+
+    @cached_property
+    def tasks(self) -> dict[str, Task]:
+        """All tasks by name, each after those it needs."""
+        return tasks_of(self.stages(), self.store)
+
+    def robot_folders(self, robot: RobotStages) -> RobotFolders:
+        """Where a robot's log and maps are."""
+        return RobotFolders(self.store.path(robot.log), self.store.path(robot.slam))
+
+    def load_robots(self) -> list[EvaluatedRobot]:
+        """All robots' maps joined with the truth."""
+        return [judging.load_robot(self.robot_folders(robot)) for robot in self.pipeline.robots]
+
+    def pair_table(self, name: str) -> pd.DataFrame:
+        """A table of robot pairs, of all pairs."""
+        made = self.judgements if name in _JUDGED else [p.estimates for p in self.pipeline.pairs]
+        parts = [tables.read(self.store.path(s) / f"{name}.parquet", name) for s in made]
+        if not parts:
+            return pd.DataFrame(columns=pd.Index(tables.ALL[name].names))
+        return pd.concat(parts, ignore_index=True)
+
+    def execute(self, jobs: int, on_progress: OnProgress, only: Sequence[Stage] = ()) -> None:
+        """Do all that is not in the store yet.
+
+        Args:
+            jobs: processes.
+            on_progress: told (label, tasks done, tasks in all).
+            only: the stages that are wanted; all without.
+        """
+        wanted = only or self.stages()
+        left = unfinished(self.tasks, [name for stage in wanted for name in task_names(stage)])
+        try:
+            with workers(jobs) as pool:
+                run_tasks(left, pool, on_progress)
+        except InputError as error:
+            reason = explained(str(error), self.store)
+            raise InputError(f"scenario {self.scenario.name}: {reason}") from error
+        for folder in map(self.store.folder, wanted):
+            if not folder.finished:
+                raise InputError(f"{folder.path}: was removed while it was being made; run again")
+
+
+def _judgement(scenario: AnyScenario, pair: PairStages) -> Stage:
+    settings = judging.JudgeSettings(
+        scenario.align.refinement,
+        scenario.align.acceptance,
+        scenario.merge,
+        scenario.evaluate.true_pair_radius_m,
+    )
+    before = {"align": pair.estimates, "log_a": pair.a.log, "slam_a": pair.a.slam}
+    before |= {"log_b": pair.b.log, "slam_b": pair.b.slam}
+    label = "compare with the truth"
+    return Stage("judge", label, settings, judging.run, judging.WRITES, before)
+
+
+def record_logs(
+    scenario: AnyScenario, store: Store, jobs: int, on_progress: OnProgress
+) -> dict[str, Path]:
+    """Simulate only; returns each robot's log folder in the store."""
+    laid_out = JudgedRun.of(scenario, store)
+    laid_out.execute(jobs, on_progress, laid_out.pipeline.to_logs())
+    return {robot.name: store.path(robot.log) for robot in laid_out.pipeline.robots}

@@ -1,0 +1,58 @@
+"""Stage: one aligner's estimates for one pair of robots, refined and held against chance.
+
+Each aligner apart, so a run in which one has changed takes all others' estimates as they are.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+from experiments.methods.aligner_calls import callable_aligner, refine_estimate
+from experiments.run.estimates import correspondences_of, estimate_row
+from experiments.run.frames import read_rows, write_rows
+from experiments.run.job import Job
+from experiments.run.stage_tables import CORRESPONDENCES, ESTIMATES
+from experiments.run.stages.map_batches import batch_path, pairs_of_maps
+from experiments.scenario.randomness import generator
+from mapfusion.align.acceptance import Acceptance, Verdict
+from mapfusion.align.refine import Refinement
+from mapfusion.align.result import Alignment
+
+
+@dataclass(frozen=True)
+class AlignerSettings:
+    """All that an aligner's estimates depend on, beside the maps and the correspondences."""
+
+    seed: int
+    name: str
+    method: str
+    parameters: dict[str, Any]
+    time_limit_s: float
+    origin: dict[str, str]  # package, version and files of a method that is not ours
+    repetitions: int
+    refinement: Refinement
+    acceptance: Acceptance
+    iterations: tuple[int, ...]
+
+
+def run(settings: AlignerSettings, job: Job) -> None:
+    """Let the aligner estimate at one batch of iterations, on what the match stage offers."""
+    offered = read_rows(batch_path(job.inputs["match"], job.part), CORRESPONDENCES)
+    aligner = callable_aligner(settings.method, settings.parameters, settings.time_limit_s)
+    rows = []
+    for k, map_a, map_b in pairs_of_maps(job, settings.iterations):
+        pairs = correspondences_of(offered[offered["iteration"] == k])
+        names = {"robot_a": map_a.name, "robot_b": map_b.name, "iteration": k}
+        # repetitions often come to the very same estimate
+        refinements: dict[object, tuple[Alignment, Verdict]] = {}
+        chance = settings.acceptance.against_chance(map_a, map_b, pairs)
+        for repetition in range(settings.repetitions if aligner.randomised else 1):
+            purpose = (map_a.name, map_b.name, k, settings.name, repetition)
+            rng = generator(settings.seed, "align", *purpose)
+            estimated = aligner.align(map_a, map_b, pairs, rng)
+            known = (estimated.T_a_b.tobytes(), estimated.status, estimated.reason)
+            if known not in refinements:
+                refined = refine_estimate(settings.refinement, map_a, map_b, pairs, estimated)
+                refinements[known] = refined, chance.judge(refined)
+            names |= {"aligner": settings.name, "repetition": repetition}
+            rows.append(names | estimate_row(len(pairs), estimated, *refinements[known]))
+    write_rows(batch_path(job.output, job.part), ESTIMATES, rows)

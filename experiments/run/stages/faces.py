@@ -1,0 +1,24 @@
+"""Stage: the world's walls, painted once for all robots and processes."""
+
+from dataclasses import dataclass
+
+from experiments.run.job import Job
+from experiments.run.stages.walls import Walls
+from experiments.scenario.randomness import generator
+from sim.textures import Texture
+from sim.world import write_faces
+
+
+@dataclass(frozen=True)
+class FacesSettings:
+    """All that the painted walls depend on."""
+
+    seed: int
+    walls: Walls
+    texture: Texture
+
+
+def run(settings: FacesSettings, job: Job) -> None:
+    """Write meshes and pictures."""
+    rng = generator(settings.seed, "textures")
+    write_faces(job.output, settings.walls.floor_plan(), rng, settings.texture)

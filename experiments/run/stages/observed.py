@@ -1,0 +1,60 @@
+"""Stage: one robot's features, tracked into observations; odometry plays no part in them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from experiments.run.frames import write_rows
+from experiments.run.job import Job
+from experiments.run.stage_tables import TRACKS
+from experiments.run.stages.features import read_features
+from mapfusion.camera import StereoCamera
+from mapfusion.robot_log import Observations, write_observations, write_truth_points
+from mapfusion.se2 import Float
+from mapfusion.vision.frontend import FrontEndParameters, observable, observe
+from mapfusion.vision.tracks import Tracker
+
+WRITES = ("observations.parquet", "truth_points.parquet", "tracks.parquet")
+
+
+@dataclass(frozen=True)
+class ObservedSettings:
+    """All that a robot's observations depend on, beside its features."""
+
+    robot: str
+    n_frames: int
+    camera: StereoCamera
+    vision: FrontEndParameters  # tracks, noise and depths; the rest stays at its defaults
+    images_at: int
+    images: int
+
+
+def run(settings: ObservedSettings, job: Job) -> None:
+    """Track features over the frames and write the observations and their truth."""
+    camera, vision = settings.camera, settings.vision
+    tracker = Tracker(vision.tracks, camera, vision.sigma_uv_px)
+    observed: list[Observations] = []
+    truth: list[Float] = []
+    tracks: list[pd.DataFrame] = []
+    kept = range(settings.images_at, settings.images_at + settings.images)
+    frames = read_features(job.inputs["features"], settings.n_frames)
+    for iteration, (found, points) in enumerate(frames):
+        state = tracker.update(found)
+        lasting = tracker.landmarks(state)
+        observed.append(observe(camera, found, lasting, vision))
+        truth.append(points[observable(camera, found, lasting, vision)])
+        if iteration in kept:
+            columns = {"track": state.track_id, "length": state.length}
+            columns |= {"u_px": found.uv_px[:, 0], "v_px": found.uv_px[:, 1]}
+            names = {"robot": settings.robot, "iteration": iteration}
+            tracks.append(pd.DataFrame(names | columns))
+    iterations = np.repeat(np.arange(len(observed)), [len(own) for own in observed])
+    write_observations(job.output, iterations, _joined(observed))
+    write_truth_points(job.output, np.concatenate(truth))
+    write_rows(job.output / "tracks.parquet", TRACKS, pd.concat(tracks) if tracks else [])
+
+
+def _joined(parts: list[Observations]) -> Observations:
+    names = ("position_m", "covariance_m2", "descriptor", "uvd_px")
+    return Observations(**{n: np.concatenate([getattr(own, n) for own in parts]) for n in names})

@@ -1,0 +1,25 @@
+"""The walls of a world, as stages are told of them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.floorplan import FloorPlan, Wall
+
+
+@dataclass(frozen=True)
+class Walls:
+    """Polylines in world metres, all of one height and thickness."""
+
+    polylines_m: tuple[tuple[tuple[float, float], ...], ...]
+    height_m: float
+    thickness_m: float
+
+    def floor_plan(self) -> FloorPlan:
+        """As the simulator takes them."""
+        return FloorPlan(
+            tuple(
+                Wall(np.array(points), self.height_m, self.thickness_m)
+                for points in self.polylines_m
+            )
+        )

@@ -1,0 +1,132 @@
+"""Scenario files in, validated scenarios out."""
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
+from pydantic_core import to_jsonable_python
+
+from experiments.scenario.generated import Generate, expanded
+from experiments.scenario.invalid import first_problem
+from experiments.scenario.settings import (
+    Align,
+    AnyScenario,
+    GeneratedScenario,
+    Recording,
+    Scenario,
+    Simulation,
+)
+from experiments.scenario.yaml_input import apply_overrides, read_mapping
+from mapfusion.align.registry import name_clashes
+from mapfusion.errors import InputError, NameClashWarning
+
+S = TypeVar("S", bound=BaseModel)
+_WORLD = {"world", "robots", "drive"}  # what a simulation must have and a recording cannot
+_EITHER = "give either world, robots and drive, or logs; generate stands for world and robots"
+
+
+def load_scenario(
+    path: Path, overrides: Sequence[str] = (), seed: int | None = None
+) -> AnyScenario:
+    """Read and validate a scenario.
+
+    Args:
+        path: YAML file.
+        overrides: entries `key.sub=value` that replace values of the file.
+        seed: replaces the file's seed.
+
+    Raises:
+        InputError: one line that names the file, the field and what would be right.
+    """
+    data = apply_overrides(read_mapping(path), overrides)
+    if seed is not None:
+        data["seed"] = seed
+    scenario = scenario_of(data, str(path))
+    _warn_of_name_clashes(scenario.align)
+    if isinstance(scenario, Recording):
+        logs = [str((path.parent / log).resolve()) for log in scenario.logs]
+        return scenario.model_copy(update={"logs": logs})
+    return scenario
+
+
+def scenario_of(data: dict[str, Any], where: str) -> AnyScenario:
+    """The simulation or the recording that the content of a file describes.
+
+    Raises:
+        InputError: one line that begins with `where`.
+    """
+    data = _given(_expanded(where, data))
+    if "generate" in data:  # nothing can be drawn from this seed
+        _validated(where, GeneratedScenario, data)
+    recorded = "logs" in data
+    unclear = bool(data.keys() & _WORLD) if recorded else not data.keys() >= _WORLD
+    known = Simulation.model_fields.keys() | Recording.model_fields.keys()
+    if unclear and data.keys() <= known:  # a misspelt name is the better explanation
+        raise InputError(f"{where}: {_EITHER}")
+    return _validated(where, Recording if recorded else Simulation, data)
+
+
+def _given(data: dict[str, Any]) -> dict[str, Any]:
+    """Without what says nothing: resolved scenarios of earlier versions name all sections."""
+    silent = {
+        name: [None, [], *_default(field)]
+        for kind in (Simulation, Recording)
+        for name, field in kind.model_fields.items()
+        if name not in Scenario.model_fields
+    }
+    silent["generate"] = [None]
+    return {key: value for key, value in data.items() if value not in silent.get(key, [])}
+
+
+def _expanded(where: str, data: dict[str, Any]) -> dict[str, Any]:
+    """The data with the world and the robots that its `generate` section stands for."""
+    if data.get("generate") is None:
+        return data
+    if data.get("world") is not None or data.get("robots") or data.get("logs"):
+        raise InputError(f"{where}: give either generate, or world and robots, or logs")
+    # the rest is judged first: what is wrong with the seed must not show as a broken plan
+    if not isinstance(data.get("seed", 0), int):
+        return data
+    settings = _validated(f"{where}: generate", Generate, data["generate"])
+    try:
+        made = expanded(settings, data.get("seed", 0))
+    except InputError as error:
+        raise InputError(f"{where}: generate.{error}") from error
+    return {key: value for key, value in data.items() if key != "generate"} | made
+
+
+def _default(field: FieldInfo) -> list[Any]:
+    """The default of a field as a file would have it, if it has one."""
+    return [] if field.is_required() else [to_jsonable_python(field.default)]
+
+
+def load_section(path: Path | None, name: str, kind: type[S], overrides: Sequence[str]) -> S:
+    """One section of a scenario (or its defaults, without a file), with overrides inside it.
+
+    Raises:
+        InputError: as `load_scenario`.
+    """
+    if path is None:
+        section = _validated(name, kind, apply_overrides({}, overrides))
+        if isinstance(section, Align):
+            _warn_of_name_clashes(section)
+        return section
+    load_scenario(path)
+    data = read_mapping(path).get(name) or {}
+    return _validated(f"{path}: {name}", kind, apply_overrides(data, overrides))
+
+
+def _warn_of_name_clashes(align: Align) -> None:
+    for method in dict.fromkeys(entry.method for entry in align.aligners):
+        if method in name_clashes():
+            warnings.warn(name_clashes()[method], NameClashWarning, stacklevel=3)
+
+
+def _validated(where: str, kind: type[S], data: dict[str, Any]) -> S:
+    try:
+        return kind.model_validate(data)
+    except ValidationError as error:
+        raise InputError(f"{where}: {first_problem(kind, error)}") from error

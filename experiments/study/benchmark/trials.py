@@ -1,0 +1,102 @@
+"""One cell of the benchmark: a method's trials at one number of pairs and one share of outliers."""
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from experiments.methods.aligner_calls import CallableAligner, callable_aligner, refine_estimate
+from experiments.methods.one_thread import single_threaded
+from experiments.run.frames import FLOAT, INT, TEXT, fields, write_rows
+from experiments.run.job import Job
+from experiments.scenario.randomness import generator
+from experiments.study.benchmark.synthetic_pairs import SyntheticPair, synthetic_pair
+from mapfusion import se2
+from mapfusion.align.refine import Refinement
+from mapfusion.se2 import Float
+from mapfusion.storage import schema
+
+TRIALS_FILE = "trials.parquet"
+CELL = {"method": TEXT, "n_pairs": INT, "outlier_share": FLOAT}
+
+# One row a trial. All but the time are the same at every run.
+TRIALS = schema(
+    "benchmark.trials",
+    1,
+    fields(
+        **CELL,
+        trial=INT,
+        status=TEXT,
+        reason=TEXT,
+        error_m=FLOAT,  # of the translation, at the middle of the world
+        error_rad=FLOAT,
+        refined_status=TEXT,
+        refined_error_m=FLOAT,
+        refined_error_rad=FLOAT,
+        oracle_error_m=FLOAT,  # least squares on the true pairs
+        oracle_error_rad=FLOAT,
+        elapsed_s=FLOAT,
+    ),
+)
+
+
+@dataclass(frozen=True)
+class CellSettings:
+    """All that one method's trials in one cell depend on."""
+
+    name: str
+    method: str
+    parameters: dict[str, Any]
+    time_limit_s: float
+    origin: dict[str, str]
+    n_pairs: int
+    outlier_share: float
+    trials: int
+    seed: int
+    budget_s: float
+
+
+def run_cell(settings: CellSettings, job: Job) -> None:
+    """Run the trials of one cell and write them."""
+    single_threaded()
+    started = time.perf_counter()
+    aligner = callable_aligner(settings.method, settings.parameters, settings.time_limit_s)
+    rows: list[dict[str, Any]] = []
+    n_pairs, share = settings.n_pairs, settings.outlier_share
+    for trial in range(settings.trials):
+        maps = ("benchmark", n_pairs, f"{share:g}", trial)
+        pair = synthetic_pair(n_pairs, share, generator(settings.seed, *maps))
+        draws = (*maps, settings.name)
+        if trial == 0:  # compilation, imports and caches; not counted
+            _trial(aligner, pair, generator(settings.seed, *draws))
+        cell = {"method": settings.name, "n_pairs": n_pairs, "outlier_share": share}
+        answer = _trial(aligner, pair, generator(settings.seed, *draws))
+        rows.append(cell | {"trial": trial} | answer)
+        if time.perf_counter() - started > settings.budget_s:
+            break
+    write_rows(job.output / TRIALS_FILE, TRIALS, rows)
+
+
+def _trial(
+    aligner: CallableAligner, pair: SyntheticPair, rng: np.random.Generator
+) -> dict[str, Any]:
+    maps = (pair.map_a, pair.map_b, pair.correspondences)
+    estimated = aligner.align(*maps, rng)
+    refined = refine_estimate(Refinement(), *maps, estimated)
+    row = {
+        "status": str(estimated.status),
+        "reason": estimated.reason,
+        "refined_status": str(refined.status),
+        "elapsed_s": estimated.elapsed_s,
+    }
+    oracle = pair.least_squares() if pair.is_true.sum() >= 2 else np.full(3, np.nan)
+    for prefix, T in (("", estimated.T_a_b), ("refined_", refined.T_a_b), ("oracle_", oracle)):
+        row[f"{prefix}error_m"], row[f"{prefix}error_rad"] = _errors(T, pair.T_a_b)
+    return row
+
+
+def _errors(T_estimated: Float, T_true: Float) -> tuple[float, float]:
+    """Of the translation (m) and the rotation (rad), both 0 or more, NaN without an estimate."""
+    difference = T_estimated - T_true
+    return float(np.hypot(difference[0], difference[1])), abs(float(se2.wrap(difference[2])))

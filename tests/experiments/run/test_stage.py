@@ -1,0 +1,309 @@
+"""A stage's key changes with all that the stage depends on, and with nothing else."""
+
+import copy
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import grimp
+import pytest
+from pydantic_core import to_jsonable_python
+
+from experiments.judge.judged_run import JudgedRun
+from experiments.run import stage as stage_module
+from experiments.run.code_version import imported_sources
+from experiments.run.job import Job
+from experiments.run.stage import RecordedLog, Stage
+from experiments.run.store import Store
+from experiments.scenario.loading import load_scenario, scenario_of
+from experiments.scenario.settings import Simulation
+from mapfusion.align.registry import ALIGNERS, find_method
+from mapfusion.errors import InputError
+from sim.renderer import egl_driver
+from tests.helpers.tiny_scenario import TINY
+
+# Which stages are told of a setting, by the longest beginning of its path. A stage's own settings
+# are in its key, and the keys of the stages before it.
+TOLD = {
+    "schema_version": "",
+    "name": "",
+    "description": "",
+    "tags": "",
+    "seed": "drive faces features log slam aligner",
+    "world": "drive faces",
+    "world.texture": "faces",
+    "robots.name": "drive features observed log",
+    "robots.start": "drive",
+    "robots.route": "drive",
+    "robots.loop": "drive",
+    "robots.tire_friction": "drive",
+    "robots.odometry": "log",
+    "robots.radiometry": "features",
+    "drive": "drive",
+    "drive.frames": "drive observed match aligner",
+    "render": "features",
+    "camera": "features observed",
+    "radiometry": "features",
+    "odometry": "log",
+    "vision": "observed",
+    "vision.harris": "features",
+    "vision.stereo": "features",
+    "vision.usurf": "features",
+    "slam": "slam",
+    "align.match": "match",
+    "align.aligners": "aligner",
+    "align.refinement": "aligner judge",
+    "align.acceptance": "aligner judge",
+    "align.repetitions": "aligner",
+    "merge": "judge",
+    "evaluate.every": "slam match aligner",
+    "evaluate.true_pair_radius_m": "judge",
+    "evaluate.timing_points": "",
+    "evaluate.timing_repeats": "",
+    "keep": "features observed",
+    "keep.clouds_every": "slam",
+    "expect": "",
+}
+NO_OTHER_VALUE = {
+    "schema_version",  # there is one
+    "generated",  # a section that is absent; those of the first robot are there, and changed
+    "robots.1.odometry",
+    "robots.1.radiometry",
+    "render.renderer",  # EGL, where the system has none
+    # others name it, or its parameters are this method's
+    "align.aligners.0.name",
+    "align.aligners.0.method",
+    "merge.aligner",
+}
+WORDS = (
+    "motion",
+    "informed",
+    "label",
+    "descriptor",
+    "solved",
+    "ransac",
+    "svd",
+    "other",
+    "egl",
+    "pixels",
+)
+
+
+def stages_of(scenario: Simulation) -> list[Stage]:
+    return JudgedRun.of(scenario, Store(Path("nowhere"))).stages()
+
+
+@pytest.fixture(scope="module")
+def resolved(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """The tiny scenario with every setting written out, also those that are off by default."""
+    path = tmp_path_factory.mktemp("scenario") / "tiny.yaml"
+    path.write_text(TINY, encoding="utf-8")
+    data = load_scenario(path).resolved()
+    for name in ("odometry", "radiometry"):
+        data["robots"][0][name] = copy.deepcopy(data[name])
+    data["align"]["aligners"][0]["parameters"] = {"gate_m": 0.25}
+    data["expect"] = {"path_rmse_m": {"min": 0.0, "max": 1.0}}
+    return data
+
+
+def leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Paths of all settings."""
+    if isinstance(value, dict | list):
+        items = value.items() if isinstance(value, dict) else enumerate(value)
+        for key, inner in items:
+            yield from leaves(inner, (*path, key))
+    else:
+        yield path
+
+
+def others(value: Any) -> list[Any]:
+    """Values that may be right in place of this one."""
+    if isinstance(value, bool) or value is None:
+        return [not value, 1, 0.5, [0, 1]]
+    if isinstance(value, int):
+        return [value + 1, value - 1, value * 2, value // 2]
+    if isinstance(value, float):
+        return [value * 1.01 + 1e-3, value * 0.99, value + 0.01, value / 2]
+    return [word for word in (*WORDS, f"{value}x") if word != value]
+
+
+def changed(resolved: dict[str, Any], path: tuple[Any, ...]) -> Simulation | None:
+    """The scenario with one setting changed; None where no other value is allowed here."""
+    for other in others(_at(resolved, path)):
+        data = copy.deepcopy(resolved)
+        _at(data, path[:-1])[path[-1]] = other
+        try:
+            scenario = scenario_of(data, "changed")
+            assert isinstance(scenario, Simulation)
+            if scenario.resolved() != resolved:
+                return scenario
+        except InputError:
+            continue
+    return None
+
+
+def _at(data: Any, path: tuple[Any, ...]) -> Any:
+    for key in path:
+        data = data[key]
+    return data
+
+
+def told_of(path: tuple[Any, ...]) -> set[str]:
+    parts = [part for part in path if isinstance(part, str)]
+    for n in range(len(parts), 0, -1):
+        if ".".join(parts[:n]) in TOLD:
+            return set(TOLD[".".join(parts[:n])].split())
+    raise AssertionError(f"{path}: say in TOLD which stages read this setting")
+
+
+def test_every_setting_is_in_the_keys_of_the_stages_that_read_it_and_of_no_other(
+    resolved: dict[str, Any],
+) -> None:
+    scenario = scenario_of(resolved, "tiny")
+    assert isinstance(scenario, Simulation)
+    before = stages_of(scenario)
+    stuck = []
+    for path in leaves(resolved):
+        try:
+            other = changed(resolved, path)
+            after = None if other is None else stages_of(other)
+        except InputError:  # EGL, where the system has none
+            after = None
+        if after is None:
+            stuck.append(path)
+            continue
+        pairs = list(zip(before, after, strict=True))
+        told = {a.name for a, b in pairs if _settings(a) != _settings(b)}
+        assert told == told_of(path), path
+        for a, b in pairs:
+            upstream = any(
+                x.key != y.key for x, y in zip(a.before.values(), b.before.values(), strict=True)
+            )
+            assert (a.key != b.key) == (_settings(a) != _settings(b) or upstream), (path, a.name)
+    assert {".".join(map(str, path)) for path in stuck} <= NO_OTHER_VALUE
+
+
+def _settings(stage: Stage) -> Any:
+    return to_jsonable_python(stage.settings)
+
+
+def work(settings: Any, job: Job) -> None:
+    """Of made-up stages."""
+
+
+work.__module__ = "experiments.run.job"  # a key covers the source of the harness alone
+
+
+def made_up(name: str = "one", settings: Any = None, **more: Any) -> Stage:
+    return Stage(name, name, settings or {}, work, **more)
+
+
+def test_settings_in_another_order_are_the_same() -> None:
+    one, other = {"a": 1, "b": [1, 2]}, {"b": [1, 2], "a": 1}
+    assert made_up(settings=one).key == made_up(settings=other).key
+    assert made_up(settings={"b": [2, 1], "a": 1}).key != made_up(settings=one).key
+    assert made_up("two", one).key != made_up("one", one).key
+
+
+def test_source_libraries_and_stages_before_it_are_in_the_key(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    first, other = made_up(), made_up(settings={"a": 1})
+    befores: list[dict[str, Stage]] = [{}, {"x": first}, {"x": other}, {"y": first}]
+    assert len({made_up("two", before=before).key for before in befores}) == 4
+    monkeypatch.setattr(stage_module, "library_versions", lambda: {"numpy": "0.0"})
+    assert made_up().key != first.key
+    monkeypatch.undo()
+    monkeypatch.setattr(stage_module, "source_hash", lambda _: "other")
+    assert made_up().key != first.key
+
+
+def test_recorded_logs_are_known_by_their_content(tmp_path: Path) -> None:
+    (tmp_path / "frames.parquet").write_bytes(b"1")
+    before = RecordedLog(tmp_path).key
+    (tmp_path / "frames.parquet").write_bytes(b"2")
+    assert RecordedLog(tmp_path).key != before
+    (tmp_path / "frames.parquet").write_bytes(b"1")
+    assert RecordedLog(tmp_path).key == before
+
+
+# The folder of whose modules it lies in.
+WITH_A_ROBOT = {"drive", "faces", "features", "observed", "log"}
+OWN_METHODS = ("opencv", "kiss_matcher", *ALIGNERS)
+BUILDS_ON = {"icp": {"impicp"}, "ransac": {"ransac_mahalanobis"}}
+
+
+def reached(*modules: str, without: frozenset[str] = frozenset()) -> set[str]:
+    """Modules of ours that these import, by another package's reading of the imports."""
+    graph: Any = grimp.build_graph("mapfusion", "sim", "experiments")
+    found, todo = set[str](), list(modules)
+    while todo:
+        name = todo.pop()
+        if name not in found | without:
+            found.add(name)
+            todo += graph.find_modules_directly_imported_by(name)
+    return found
+
+
+def test_keys_cover_all_the_source_a_stage_runs(resolved: dict[str, Any]) -> None:
+    scenario = scenario_of(resolved, "tiny")
+    assert isinstance(scenario, Simulation)
+    for stage in stages_of(scenario):
+        covered = {part.removesuffix(".py").replace("/", ".") for part in stage.sources}
+        by_name = frozenset({"mapfusion.align.registry"})  # stands for whatever it is asked for
+        expected = reached(stage.work.__module__, *stage.loads, without=by_name)
+        packages = {name for name in expected if f"{name}.__init__" in covered or "." not in name}
+        assert expected - packages <= covered, stage.name
+        assert "experiments.scenario.loading" not in covered, stage.name
+        assert ("sim/p3at.urdf" in stage.sources) == (stage.name in WITH_A_ROBOT)
+
+
+@pytest.mark.parametrize("name", OWN_METHODS)
+def test_a_method_s_sources_are_what_its_module_imports(name: str) -> None:
+    module = find_method(name).target.partition(":")[0]
+    files = {part.removesuffix(".py").replace("/", ".") for part in imported_sources(module)}
+    assert module in files
+    assert files == reached(module) - {"mapfusion", "mapfusion.align"}
+
+
+def test_one_method_s_source_is_not_in_another_s_key(resolved: dict[str, Any]) -> None:
+    """Of the aligner stages, and of the match stage of no method at all."""
+    data = copy.deepcopy(resolved)
+    data["align"]["aligners"] = [{"name": name, "method": name} for name in OWN_METHODS]
+    scenario = scenario_of(data, "tiny")
+    assert isinstance(scenario, Simulation)
+    stages = stages_of(scenario)
+    aligners = dict(zip(OWN_METHODS, (s for s in stages if s.name == "aligner"), strict=True))
+    (match,) = (s for s in stages if s.name == "match")
+    for name in OWN_METHODS:
+        own = find_method(name).target.partition(":")[0].replace(".", "/") + ".py"
+        elsewhere = {other for other, stage in aligners.items() if own in stage.sources}
+        assert elsewhere == {name} | BUILDS_ON.get(name, set())
+        assert own not in match.sources
+
+
+def egl_works() -> bool:
+    try:
+        egl_driver()
+    except InputError:
+        return False
+    return True
+
+
+@pytest.mark.skipif(not egl_works(), reason="this system has no EGL")
+def test_the_renderer_is_in_the_key(resolved: dict[str, Any]) -> None:
+    data = copy.deepcopy(resolved)
+    data["render"]["renderer"] = "egl"
+    scenario, other = scenario_of(resolved, "tiny"), scenario_of(data, "tiny")
+    assert isinstance(scenario, Simulation)
+    assert isinstance(other, Simulation)
+    pairs = zip(stages_of(scenario), stages_of(other), strict=True)
+    assert {a.name for a, b in pairs if a.key == b.key} == {"drive", "faces"}
+
+
+def test_a_stage_is_declared_once_and_stays(resolved: dict[str, Any]) -> None:
+    """The same declaration gives the same key; a key is not carried over to a changed copy."""
+    first = made_up(settings={"a": 1})
+    assert first.key == made_up(settings={"a": 1}).key
+    assert replace(first, settings={"a": 2}).key != first.key
