@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from experiments.judge.result import run_scenario
-from experiments.scenario.settings import Scenario
+from experiments.scenario.settings import Simulation
 from experiments.show.figures.refusal_figures import write
 from experiments.study.refusal import cases
 from experiments.study.refusal import refusal_tables as results
@@ -163,7 +163,7 @@ def test_stated_number_of_false_alarms_bounds_the_measured_one() -> None:
 
 
 @pytest.fixture(scope="module")
-def other_result(tiny: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def other_result(tiny: Simulation, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The tiny scenario in another world: another seed's textures; one aligner is enough here."""
     folder = tmp_path_factory.mktemp("other")
     alone = {"aligners": tiny.align.aligners[:1], "repetitions": 1}
@@ -201,11 +201,9 @@ def test_the_command_crosses_two_worlds(
 
 
 def test_worlds_may_be_scenarios_with_seeds(
-    tiny: Scenario, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tiny: Simulation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """As a sweep leaves them: maps in the store, no result folder. Posters are told apart."""
-    assert tiny.world is not None
-    assert tiny.drive is not None
     short = tiny.model_copy(
         update={
             "drive": tiny.drive.model_copy(update={"frames": 16}),
