@@ -23,7 +23,7 @@ test: $(STAMP)
 
 # Ten random kills of a sweep; minutes.
 endurance: $(STAMP)
-	$(BIN)/python -m pytest tests/experiments/sweep/ten_kills.py -s
+	$(BIN)/python -m pytest tests/experiments/study/sweep/ten_kills.py -s
 
 # Installs Debian's chromium where it is missing (needs root for that).
 browser-test: $(STAMP)

@@ -17,24 +17,11 @@ app = typer.Typer(
     help="Measures how well landmark maps of independent robots can be fused.\n\n"
     "Start with:  mapfusion run scenarios/quick.yaml",
 )
-app.command()(run_commands.run)
-app.command()(run_commands.figures)
-app.command()(run_commands.report)
-app.command("inspect")(run_commands.inspect_command)
-app.command()(run_commands.check)
-app.command("scenarios")(run_commands.list_scenarios)
-app.command()(study_commands.sweep)
-app.command()(study_commands.statistics)
-app.command()(study_commands.compare)
-app.command()(study_commands.refusal)
-app.command()(study_commands.benchmark)
-app.command()(study_commands.aligners)
-app.command()(run_commands.schema)
-app.command()(step_commands.record)
-app.command()(step_commands.slam)
-app.command()(step_commands.align)
-app.command()(step_commands.merge)
-import_app = typer.Typer(no_args_is_help=True, help="Turn recordings of others into robot logs.")
+for commands in (run_commands, study_commands, step_commands):
+    app.add_typer(commands.app)
+import_app = typer.Typer(
+    no_args_is_help=True, help="Turn recordings in foreign formats into robot logs."
+)
 for name, importer in IMPORTERS.items():
     usage = f"`mapfusion import {name} {importer.example} -o logs/{name}`"
     import_app.command(name, help=f"{importer.what}: {usage}.")(step_commands.import_command(name))

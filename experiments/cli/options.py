@@ -7,23 +7,50 @@ from typing import Annotated
 import typer
 
 EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
-DEFAULT_RESULTS = Path("results")
-
-ScenarioNames = Annotated[
-    list[str],
-    typer.Argument(metavar="SCENARIO...", help="Scenario files, or names or tags of the suite."),
-]
-ScenarioPath = Annotated[Path, typer.Argument(metavar="SCENARIO", help="Scenario file (YAML).")]
-Seed = Annotated[int | None, typer.Option(help="Replaces the scenario's seed.", min=0)]
-Overrides = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Replaces a value, e.g. evaluate.every=1."),
-]
-Jobs = Annotated[int | None, typer.Option(help="Processes; all cores by default.", min=1)]
-Fresh = Annotated[bool, typer.Option("--fresh", help="Compute again what is stored already.")]
-Results = Annotated[Path, typer.Option(help="Folder that results go to.")]
 
 
 def available_cores() -> int:
     """Cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+# Those without a default in a command's signature have theirs here.
+ScenarioNames = Annotated[
+    list[str],
+    typer.Argument(metavar="SCENARIO...", help="Scenario files, or names or tags of the suite."),
+]
+ScenarioPath = Annotated[Path, typer.Argument(metavar="SCENARIO", help="Scenario file (YAML).")]
+SectionsOf = Annotated[
+    Path | None, typer.Option("--scenario", help="Scenario whose sections to use.")
+]
+ResultFolder = Annotated[Path, typer.Argument(metavar="RESULT", help="A run's result folder.")]
+Overrides = Annotated[
+    list[str],
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        default_factory=list,
+        show_default=False,
+        help="Replaces a value, e.g. evaluate.every=1.",
+    ),
+]
+Seed = Annotated[int | None, typer.Option(help="Replaces the scenario's seed.", min=0)]
+OwnSeed = Annotated[int, typer.Option("--seed", help="Of all that is random.", min=0)]
+Seeds = Annotated[str, typer.Option(help="A seed, a range 0..4 or a list 0,2,5.")]
+Jobs = Annotated[
+    int,
+    typer.Option(
+        help="Processes.", min=1, default_factory=available_cores, show_default="all cores"
+    ),
+]
+Fresh = Annotated[bool, typer.Option("--fresh", help="Compute again what is stored already.")]
+Results = Annotated[
+    Path,
+    typer.Option(
+        help="Folder that results go to.",
+        default_factory=lambda: Path("results"),
+        show_default="results",
+    ),
+]
+Output = Annotated[Path, typer.Option("--output", "-o", help="File or folder to write.")]
+OutputFolder = Annotated[Path | None, typer.Option("--output", "-o", help="Folder to write.")]

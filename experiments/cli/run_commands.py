@@ -1,80 +1,71 @@
 """Commands that run scenarios and show their results."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from experiments.cli.options import (
-    DEFAULT_RESULTS,
-    EXIT_FAILED,
-    Fresh,
-    Jobs,
-    Overrides,
-    Results,
-    ScenarioNames,
-    Seed,
-    available_cores,
-)
+from experiments.cli import options
+
+app = typer.Typer()
 
 
+@app.command()
 def run(
-    scenarios: ScenarioNames,
-    seed: Seed = None,
-    overrides: Overrides = None,
-    jobs: Jobs = None,
-    fresh: Fresh = False,
-    results: Results = DEFAULT_RESULTS,
+    scenarios: options.ScenarioNames,
+    *,
+    seed: options.Seed = None,
+    overrides: options.Overrides,
+    jobs: options.Jobs,
+    fresh: options.Fresh = False,
+    results: options.Results,
 ) -> None:
     """Simulate, map, align, merge, evaluate and draw: `mapfusion run scenarios/quick.yaml`.
 
     Finished stages are reused; an interrupted run goes on where it was.
     """
     from experiments.judge.expectations import load_checked
-    from experiments.judge.result import result_folder, run_scenario
+    from experiments.judge.result import run_scenario
     from experiments.scenario.suite import scenarios_of
-    from experiments.show.figures import draw_all
     from experiments.show.terminal.layout import progress
     from experiments.show.terminal.run_screen import print_result
 
-    n_jobs = jobs or available_cores()
-    for loaded in [load_checked(s, overrides or (), seed) for s in scenarios_of(scenarios)]:
-        folder = result_folder(results, loaded)
-        skipped: list[str] = []
+    for loaded in [load_checked(path, overrides, seed) for path in scenarios_of(scenarios)]:
         with progress() as show:
-            run_scenario(loaded, results, n_jobs, show, fresh)
-            draw_all(
-                folder,
-                n_jobs,
-                lambda done, total, show=show: show("figures", done, total),
-                skipped.append,
-            )
+            folder = run_scenario(loaded, results, jobs, show, fresh)
+            _, skipped = _draw(folder, jobs, show)
         print_result(folder, skipped)
 
 
-def figures(
-    result: Annotated[Path, typer.Argument(metavar="RESULT", help="A run's result folder.")],
-    jobs: Jobs = None,
-) -> None:
+def _draw(
+    result: Path, jobs: int, show: Callable[[str, int, int], None]
+) -> tuple[list[Path], list[str]]:
+    """Draw a result's figures; returns their files, and why others could not be drawn."""
+    from experiments.show.figures import draw_all
+
+    skipped: list[str] = []
+    paths = draw_all(
+        result, jobs, lambda done, total: show("draw the figures", done, total), skipped.append
+    )
+    return paths, skipped
+
+
+@app.command()
+def figures(result: options.ResultFolder, *, jobs: options.Jobs) -> None:
     """Draw a result's figures again, from its tables alone: `mapfusion figures results/quick-0`."""
     from experiments.judge.result import require_result
-    from experiments.show.figures import draw_all
     from experiments.show.terminal.layout import print_paths, progress
 
     require_result(result)
-    skipped: list[str] = []
     with progress() as show:
-        paths = draw_all(
-            result,
-            jobs or available_cores(),
-            lambda done, total: show("figures", done, total),
-            skipped.append,
-        )
+        paths, skipped = _draw(result, jobs, show)
     print_paths(result / "figures", paths, skipped)
 
 
+@app.command()
 def report(
-    result: Annotated[Path, typer.Argument(metavar="RESULT", help="A run's result folder.")],
+    result: options.ResultFolder,
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", help="HTML file; RESULT/report.html by default."),
@@ -87,6 +78,7 @@ def report(
     print_file(write_report(result, output))
 
 
+@app.command("inspect")
 def inspect_command(
     path: Annotated[Path, typer.Argument(metavar="FILE", help="A file or folder of mapfusion's.")],
 ) -> None:
@@ -96,42 +88,44 @@ def inspect_command(
     inspect(path)
 
 
+@app.command()
 def check(
-    scenarios: ScenarioNames,
-    seeds: Annotated[str, typer.Option(help="A seed, a range 0..4 or a list 0,2,5.")] = "0",
-    overrides: Overrides = None,
-    jobs: Jobs = None,
-    fresh: Fresh = False,
+    scenarios: options.ScenarioNames,
+    *,
+    seeds: options.Seeds = "0",
+    overrides: options.Overrides,
+    jobs: options.Jobs,
+    fresh: options.Fresh = False,
     junit: Annotated[Path | None, typer.Option(help="Write a JUnit report to this file.")] = None,
-    results: Results = DEFAULT_RESULTS,
+    results: options.Results,
 ) -> None:
     """Hold runs to their `expect` blocks, exit code 1 if one fails: `mapfusion check ci`."""
     from experiments.judge.expectations import check as check_scenario
-    from experiments.judge.expectations import load_checked, parse_seeds, write_junit
+    from experiments.judge.expectations import load_checked
     from experiments.judge.result import run_scenario
+    from experiments.scenario.seeds import parse_seeds
     from experiments.scenario.suite import scenarios_of
+    from experiments.show.junit import write_junit
     from experiments.show.terminal.layout import progress
     from experiments.show.terminal.run_screen import print_outcomes
 
     wanted = parse_seeds(seeds)
     paths = scenarios_of(scenarios)
-    loaded = [[load_checked(path, overrides or (), seed) for seed in wanted] for path in paths]
     outcomes = []
-    for per_seed in loaded:
-        folders = {}
+    for per_seed in [[load_checked(path, overrides, seed) for seed in wanted] for path in paths]:
         with progress() as show:
-            for entry in per_seed:
-                folders[entry.seed] = run_scenario(
-                    entry, results, jobs or available_cores(), show, fresh
-                )
+            folders = {
+                loaded.seed: run_scenario(loaded, results, jobs, show, fresh) for loaded in per_seed
+            }
         outcomes += check_scenario(per_seed[0], folders)
     print_outcomes(outcomes)
     if junit is not None:
         write_junit(junit, outcomes)
     if not all(outcome.passed for outcome in outcomes):
-        raise typer.Exit(EXIT_FAILED)
+        raise typer.Exit(options.EXIT_FAILED)
 
 
+@app.command("scenarios")
 def list_scenarios(
     folder: Annotated[Path, typer.Argument(metavar="[FOLDER]", help="Of scenario files.")] = Path(
         "scenarios"
@@ -144,6 +138,7 @@ def list_scenarios(
     print_scenarios(entries(folder))
 
 
+@app.command()
 def schema() -> None:
     """Print the JSON schema of scenarios, for editors: `mapfusion schema > schema.json`."""
     from experiments.scenario.settings import schema_text

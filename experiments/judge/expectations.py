@@ -4,7 +4,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from xml.etree import ElementTree as ET
 
 import pandas as pd
 
@@ -12,9 +11,6 @@ from experiments.judge import metrics, tables
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import AnyScenario, Bound
 from mapfusion.errors import InputError
-from mapfusion.storage import write_whole
-
-MAX_SEEDS = 1000  # days of computing: more is a slip of the keyboard
 
 
 def load_checked(path: Path, overrides: Sequence[str] = (), seed: int | None = None) -> AnyScenario:
@@ -84,38 +80,3 @@ def check(scenario: AnyScenario, results: Mapping[int, Path]) -> list[Outcome]:
         value = metrics.compute(name, pooled)
         outcomes.append(Outcome(scenario.name, name, value, bound, per_seed))
     return outcomes
-
-
-def write_junit(path: Path, outcomes: Sequence[Outcome]) -> None:
-    """One JUnit test case per expectation."""
-    failures = sum(not outcome.passed for outcome in outcomes)
-    suite = ET.Element(
-        "testsuite", name="mapfusion check", tests=str(len(outcomes)), failures=str(failures)
-    )
-    for outcome in outcomes:
-        case = ET.SubElement(suite, "testcase", classname=outcome.scenario, name=outcome.metric)
-        seeds = ", ".join(f"{seed}: {value:.4g}" for seed, value in outcome.per_seed.items())
-        text = f"{outcome.value:.6g}, expected {outcome.bound_text}; by seed {seeds}"
-        if outcome.passed:
-            ET.SubElement(case, "system-out").text = text
-        else:
-            ET.SubElement(case, "failure", message=text)
-    document = ET.ElementTree(suite)
-    write_whole(path, lambda file: document.write(file, encoding="utf-8", xml_declaration=True))
-
-
-def parse_seeds(text: str) -> list[int]:
-    """Seeds from `3`, `0..4` (both ends included) or `0,2,5`; raises InputError."""
-    try:
-        if ".." in text:
-            first, last = (int(part) for part in text.split(".."))
-            seeds = range(first, last + 1)[: MAX_SEEDS + 1]
-        else:
-            seeds = [int(part) for part in text.split(",")]
-    except ValueError:
-        seeds = []
-    if not seeds or min(seeds) < 0 or len(set(seeds)) < len(seeds):
-        raise InputError(f"--seeds {text}: expected a number, a range 0..4 or a list 0,2,5")
-    if len(seeds) > MAX_SEEDS:
-        raise InputError(f"--seeds {text}: more than {MAX_SEEDS} seeds")
-    return list(seeds)

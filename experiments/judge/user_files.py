@@ -57,7 +57,7 @@ def slam(log: Path, settings: Slam, seed: int, on_progress: OnProgress) -> Landm
     rng = generator(seed, "slam", robot_log.robot)
     landmarks = None
     for frame in run_log(robot_log, settings.filter, rng, [last], settings.min_count):
-        on_progress("slam", frame.iteration + 1, last + 1)
+        on_progress("FastSLAM", frame.iteration + 1, last + 1)
         landmarks = frame.landmarks
     assert landmarks is not None
     return landmarks

@@ -13,7 +13,7 @@ CONNECT_TIMEOUT_S = 30
 
 _LOCAL_SETTINGS = {
     # Dask blames every task that was assigned to a killed worker, not only the one at work; the
-    # sweep counts by itself (`worker.Terms.retries`).
+    # sweep counts by itself (`dask_worker.Terms.retries`).
     "distributed.scheduler.allowed-failures": 1_000_000,
     # Tasks keep nothing in Dask's memory, so there is nothing to spill, and a paused worker would
     # wait for ever. One that fills 95 % of its share is killed and its task begun again.

@@ -8,7 +8,14 @@ from typing import Any
 
 from rich import box
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+)
 
 # Plain rules and narrow gaps: all columns must fit into 80 characters.
 LAYOUT: Any = {
@@ -19,40 +26,27 @@ LAYOUT: Any = {
     "caption_justify": "left",
 }
 
-STAGE_TEXT = {
-    "drive": "drive the robots",
-    "faces": "paint the walls",
-    "render": "render and find features",
-    "log": "track features",
-    "slam": "FastSLAM",
-    "align": "align the maps",
-    "judge": "compare with the truth",
-    "tables": "write the tables",
-    "figures": "draw the figures",
-    "benchmark": "measure the aligners",
-    "refusal": "cross the worlds",
-}
-
 
 @contextmanager
-def progress() -> Iterator[Callable[[str, int, int], None]]:
-    """A progress display on stderr; yields the function to tell (stage, done, total)."""
+def progress(*more: ProgressColumn) -> Iterator[Callable[[str, int, int], None]]:
+    """A progress display on stderr; yields the function to tell (label, done, total)."""
     display = Progress(
         TextColumn("{task.description:<26}"),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
+        *more,
         console=Console(stderr=True),
     )
     bars: dict[str, Any] = {}
     with display:
 
-        def show(stage: str, done: int, total: int) -> None:
-            if stage not in bars or (done == 0 and bars[stage][1]):
-                bars[stage] = [display.add_task(STAGE_TEXT.get(stage, stage), total=total), False]
-            bar, _ = bars[stage]
+        def show(label: str, done: int, total: int) -> None:
+            if label not in bars or (done == 0 and bars[label][1]):
+                bars[label] = [display.add_task(label, total=total), False]
+            bar, _ = bars[label]
             display.update(bar, completed=done, total=total)
-            bars[stage][1] = done == total
+            bars[label][1] = done == total
 
         yield show
 

@@ -11,7 +11,7 @@ from mapfusion.align.rigid import fit_rigid
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.se2 import Float
 
-# As the table of other people's aligners that this one continues.
+# Fixed, so that the tables of different versions can be compared.
 SIZE_M = 20.0  # side of the square that holds the landmarks
 SIGMA_M = 0.05  # of a true pair's residual, per axis
 _OBSERVATIONS = 5  # that each landmark claims to be made of; no aligner asks

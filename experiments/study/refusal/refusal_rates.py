@@ -4,13 +4,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from scipy.stats import binomtest
 
-from experiments.judge.metrics import FALSE_MERGE_M, FALSE_MERGE_RAD, MERGEABLE_TRUE_PAIRS
+from experiments.judge import criteria
+from experiments.judge.criteria import has_common_ground, right_refined
 from experiments.study.refusal.cases import APART, COMMON, FEW, POSTER_RADII_M, POSTERS
+from experiments.study.statistics.wilson import wilson
 from mapfusion.se2 import Float
-
-CONFIDENCE = 0.95
 
 
 class Rate(NamedTuple):
@@ -18,6 +17,11 @@ class Rate(NamedTuple):
 
     hits: int
     n: int
+
+    @classmethod
+    def of(cls, hits: pd.Series) -> "Rate":
+        """The share of rows that hold True."""
+        return cls(int(hits.sum()), len(hits))
 
     @property
     def share(self) -> float:
@@ -27,68 +31,45 @@ class Rate(NamedTuple):
     @property
     def interval(self) -> tuple[float, float]:
         """Wilson's interval."""
-        if not self.n:
-            return np.nan, np.nan
-        found = binomtest(self.hits, self.n).proportion_ci(CONFIDENCE, "wilson")
-        return float(found.low), float(found.high)
-
-
-def is_right(rows: pd.DataFrame) -> pd.Series:
-    """Bool per row: the refined alignment is where it should be, accepted or not."""
-    return (rows["refined_translation_error_m"] <= FALSE_MERGE_M) & (
-        rows["refined_rotation_error_rad"].abs() <= FALSE_MERGE_RAD
-    )
+        low, high = wilson(self.hits, self.n)
+        return (float(low), float(high)) if self.n else (np.nan, np.nan)
 
 
 def without_common_ground(rows: pd.DataFrame) -> pd.DataFrame:
     """Pairs of maps in which every merge is false; those with repeated posters are apart."""
-    return rows[(rows["ground"] == APART) | ((rows["ground"] == COMMON) & (rows["n_common"] == 0))]
+    return rows[(rows["ground"] == APART) | ((rows["ground"] == COMMON) & ~has_common_ground(rows))]
 
 
 def mergeable(rows: pd.DataFrame) -> pd.DataFrame:
-    """Pairs of one world as they came, with 20 or more true correspondences."""
-    return rows[(rows["ground"] == COMMON) & (rows["n_true"] >= MERGEABLE_TRUE_PAIRS)]
+    """Pairs of one world as they came, with enough true correspondences for any robust method."""
+    return criteria.mergeable(rows[rows["ground"] == COMMON])
 
 
 def summary(refusals: pd.DataFrame) -> list[dict[str, Any]]:
     """One row an aligner, in their order: the rates that the operating point has."""
-    rows = []
-    for name in refusals["aligner"].drop_duplicates():
-        own = refusals[refusals["aligner"] == name]
-        able, few = mergeable(own), own[own["ground"] == FEW]
-        some = own[(own["ground"] == COMMON) & (own["n_common"] > 0)]
-        hung = own[own["ground"] == POSTERS]
-        hung_common = hung[hung["n_common"] > 0]
-        rows.append(
-            {
-                "aligner": name,
-                "false": _accepted(without_common_ground(own)),
-                "wrong": _rate(some["accepted"] & ~is_right(some)),
-                "missed": _refused(able),
-                "missed_though_right": _refused(able[is_right(able)]),
-                "few_missed_though_right": _refused(few[is_right(few)]),
-                "few_wrong": _rate(few["accepted"] & ~is_right(few)),
-                "posters_false": _accepted(hung[hung["n_common"] == 0]),
-                "posters_wrong": _rate(hung_common["accepted"] & ~is_right(hung_common)),
-            }
-            | {
-                f"poster_{radius_m:g}": _accepted(own[own["poster_radius_m"] == radius_m])
-                for radius_m in POSTER_RADII_M
-            }
-        )
-    return rows
+    return [
+        {"aligner": name} | _rates(own) for name, own in refusals.groupby("aligner", sort=False)
+    ]
 
 
-def _rate(hits: pd.Series) -> Rate:
-    return Rate(int(hits.sum()), len(hits))
-
-
-def _accepted(rows: pd.DataFrame) -> Rate:
-    return _rate(rows["accepted"])
-
-
-def _refused(rows: pd.DataFrame) -> Rate:
-    return _rate(~rows["accepted"])
+def _rates(own: pd.DataFrame) -> dict[str, Rate]:
+    accepted, right, ground = own["accepted"], right_refined(own), has_common_ground(own)
+    wrong = accepted & ~right
+    common, few, hung = (own["ground"] == kind for kind in (COMMON, FEW, POSTERS))
+    able = own.index.isin(mergeable(own).index)
+    return {
+        "false": Rate.of(without_common_ground(own)["accepted"]),
+        "wrong": Rate.of(wrong[common & ground]),
+        "missed": Rate.of(~accepted[able]),
+        "missed_though_right": Rate.of(~accepted[able & right]),
+        "few_missed_though_right": Rate.of(~accepted[few & right]),
+        "few_wrong": Rate.of(wrong[few]),
+        "posters_false": Rate.of(accepted[hung & ~ground]),
+        "posters_wrong": Rate.of(wrong[hung & ground]),
+    } | {
+        f"poster_{radius_m:g}": Rate.of(accepted[own["poster_radius_m"] == radius_m])
+        for radius_m in POSTER_RADII_M
+    }
 
 
 def swept(score: pd.Series, thresholds: Float) -> Float:

@@ -1,5 +1,6 @@
 """The worlds of earlier runs and sweeps: robots with their maps by iteration, and the truth."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,15 +11,13 @@ from experiments.judge.judged_run import JudgedRun
 from experiments.judge.result import require_result
 from experiments.run.stages.slam import RobotFolders
 from experiments.run.store import Store
-from experiments.scenario.loading import scenario_of
 from experiments.scenario.settings import AnyScenario, Simulation
 from experiments.scenario.suite import scenarios_of
-from experiments.scenario.yaml_input import read_mapping
 from mapfusion.errors import InputError
 
 
 @dataclass(frozen=True)
-class World:
+class MappedWorld:
     """One world and the robots that mapped it.
 
     Attributes:
@@ -36,7 +35,7 @@ class World:
     robots: dict[str, RobotFolders]
 
 
-class Source(NamedTuple):
+class WorldSource(NamedTuple):
     """Where a world comes from: how messages call it, its scenario, and what keeps its maps."""
 
     label: str
@@ -45,7 +44,7 @@ class Source(NamedTuple):
     store: Store
 
 
-def sources_of(worlds: Sequence[str], seeds: Sequence[int], results: Path) -> list[Source]:
+def sources_of(worlds: Sequence[str], seeds: Sequence[int], results: Path) -> list[WorldSource]:
     """What the words of a command stand for.
 
     Args:
@@ -61,18 +60,20 @@ def sources_of(worlds: Sequence[str], seeds: Sequence[int], results: Path) -> li
     for word in worlds:
         path = Path(word)
         if path.is_dir():
+            require_result(path)
+            scenario = load_checked(path / "scenario.json")
             store = Store.of(path.resolve().parent)
-            found.append(Source(str(path), path.resolve().name, _scenario(path), store))
+            found.append(WorldSource(str(path), path.resolve().name, scenario, store))
             continue
         for file in scenarios_of([word]):
             for seed in seeds:
                 scenario = load_checked(file, (), seed)
                 name = f"{scenario.name}-{seed}"
-                found.append(Source(name, name, scenario, Store.of(results)))
+                found.append(WorldSource(name, name, scenario, Store.of(results)))
     return found
 
 
-def load_worlds(sources: Sequence[Source]) -> tuple[Simulation, list[World]]:
+def load_worlds(sources: Sequence[WorldSource]) -> tuple[Simulation, list[MappedWorld]]:
     """The first source's scenario, and the worlds of all of them.
 
     Raises:
@@ -82,12 +83,13 @@ def load_worlds(sources: Sequence[Source]) -> tuple[Simulation, list[World]]:
     if len(sources) < 2:
         raise InputError("refusal: give two worlds or more: results, or scenarios with --seeds")
     worlds = [_world(source) for source in sources]
-    by_textures: dict[str, World] = {}
-    for source, world in zip(sources, worlds, strict=True):
-        if world.textures in by_textures:
-            other = by_textures[world.textures].name
-            raise InputError(f"{source.label}: the same world as {other}; give another seed's")
-        by_textures[world.textures] = world
+    for (one, first), (source, world) in itertools.combinations(
+        zip(sources, worlds, strict=True), 2
+    ):
+        if world.textures == first.textures:
+            raise InputError(f"{source.label}: the same world as {first.name}; give another seed's")
+        if world.name == first.name:
+            raise InputError(f"{source.label}: is named as {one.label} is; rename one of them")
     if len({world.seed for world in worlds}) < 2:
         raise InputError(
             f"refusal: all worlds have seed {worlds[0].seed}, and so some pictures in common; give "
@@ -98,13 +100,7 @@ def load_worlds(sources: Sequence[Source]) -> tuple[Simulation, list[World]]:
     return first, worlds
 
 
-def _scenario(result: Path) -> AnyScenario:
-    require_result(result)
-    path = result / "scenario.json"
-    return scenario_of(read_mapping(path), str(path))
-
-
-def _world(source: Source) -> World:
+def _world(source: WorldSource) -> MappedWorld:
     scenario = source.scenario
     if not isinstance(scenario, Simulation):
         raise InputError(
@@ -120,4 +116,4 @@ def _world(source: Source) -> World:
     _, faces = judged.pipeline.world
     folders = {robot.name: judged.robot_folders(robot) for robot in judged.pipeline.robots}
     repeats = scenario.world.texture.posters > 0
-    return World(source.name, scenario.seed, faces.key, repeats, folders)
+    return MappedWorld(source.name, scenario.seed, faces.key, repeats, folders)

@@ -1,14 +1,12 @@
 import math
 from pathlib import Path
-from xml.etree import ElementTree as ET
 
 import pandas as pd
 import pytest
 
 from experiments.judge import metrics, tables
-from experiments.judge.expectations import Outcome, check, parse_seeds, write_junit
+from experiments.judge.expectations import Outcome, check
 from experiments.scenario.settings import Bound, Scenario
-from mapfusion.errors import InputError
 
 
 @pytest.mark.parametrize(
@@ -34,34 +32,6 @@ def test_bound_as_a_person_writes_it() -> None:
         for bound in (Bound(min=1), Bound(max=2.5), Bound(min=1, max=2))
     ]
     assert texts == ["1 <= x", "x <= 2.5", "1 <= x <= 2"]
-
-
-def test_junit_is_read_back(tmp_path: Path) -> None:
-    path = tmp_path / "deep" / "junit.xml"
-    outcomes = [
-        Outcome("quick", "fine", 0.5, Bound(max=1), {0: 0.4, 1: 0.6}),
-        Outcome("quick", "bad <&>", 2, Bound(max=1), {0: 2}),
-        Outcome("paper", "unknown", math.nan, Bound(min=1), {0: math.nan}),
-    ]
-    write_junit(path, outcomes)
-    suite = ET.parse(path).getroot()
-    assert (suite.get("tests"), suite.get("failures")) == ("3", "2")
-    cases = {case.get("name"): case for case in suite.iter("testcase")}
-    assert cases["fine"].find("failure") is None
-    failure = cases["bad <&>"].find("failure")
-    assert failure is not None
-    assert failure.get("message") == "2, expected x <= 1; by seed 0: 2"
-    assert cases["unknown"].find("failure") is not None
-    assert cases["unknown"].get("classname") == "paper"
-
-
-def test_seeds() -> None:
-    assert parse_seeds("3") == [3]
-    assert parse_seeds("0..4") == [0, 1, 2, 3, 4]
-    assert parse_seeds("5,2,0") == [5, 2, 0]
-    assert len(parse_seeds("0..999")) == 1000
-    with pytest.raises(InputError, match="more than 1000"):
-        parse_seeds("0..1000")
 
 
 def test_check_pools_the_seeds(

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pandas as pd
 import pytest
 
 from experiments.judge.result import run_scenario
-from experiments.scenario.settings import Scenario
+from experiments.scenario.settings import Simulation
 from experiments.show.figures.refusal_figures import write
 from experiments.study.refusal import cases
 from experiments.study.refusal import refusal_tables as results
@@ -162,10 +163,12 @@ def test_stated_number_of_false_alarms_bounds_the_measured_one() -> None:
 
 
 @pytest.fixture(scope="module")
-def other_result(tiny: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The tiny scenario in another world: another seed's textures."""
+def other_result(tiny: Simulation, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The tiny scenario in another world: another seed's textures; one aligner is enough here."""
     folder = tmp_path_factory.mktemp("other")
-    other = tiny.model_copy(update={"seed": 4})
+    alone = {"aligners": tiny.align.aligners[:1], "repetitions": 1}
+    align = tiny.align.model_copy(update=alone)
+    other = tiny.model_copy(update={"seed": 4, "align": align})
     return run_scenario(other, folder, 1, lambda stage, done, total: None)
 
 
@@ -198,15 +201,18 @@ def test_the_command_crosses_two_worlds(
 
 
 def test_worlds_may_be_scenarios_with_seeds(
-    tiny: Scenario, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tiny: Simulation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """As a sweep leaves them: maps in the store, no result folder. Posters are told apart."""
-    assert tiny.world is not None
+    short = tiny.model_copy(
+        update={
+            "drive": tiny.drive.model_copy(update={"frames": 16}),
+            "align": tiny.align.model_copy(update={"aligners": tiny.align.aligners[:2]}),
+        }
+    )
     texture = replace(tiny.world.texture, posters=2)
-    worlds = [
-        tiny,
-        tiny.model_copy(update={"world": tiny.world.model_copy(update={"texture": texture})}),
-    ]
+    hung = tiny.world.model_copy(update={"texture": texture})
+    worlds = [short, short.model_copy(update={"world": hung})]
     paths = []
     for name, world in zip(("plain", "hung"), worlds, strict=True):
         paths.append(tmp_path / f"{name}.yaml")
@@ -253,6 +259,17 @@ def test_maps_no_longer_there_are_named(
     reply = command(capsys, "refusal", tiny_result, alone, "-o", tmp_path / "out")
     assert reply.code == 2
     assert "run its scenario again" in reply.complaints[0]
+
+
+def test_worlds_of_one_name_are_refused(
+    tiny_result: Path, other_result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Rows are told apart by their worlds' names."""
+    copied = shutil.copytree(other_result.parent, tmp_path / "copy")
+    renamed = (copied / other_result.name).rename(copied / tiny_result.name)
+    reply = command(capsys, "refusal", tiny_result, renamed, "-o", tmp_path / "out")
+    assert reply.code == 2
+    assert f"is named as {tiny_result} is" in reply.complaints[0]
 
 
 def test_the_figure_is_the_same_bytes(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import random
+import shutil
 import threading
 import time
 from pathlib import Path
@@ -13,8 +14,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from experiments.judge import tables
-from experiments.study.sweep.dataset import RUN_TIMES
-from experiments.study.sweep.execution import execute, prepare
+from experiments.study.sweep.sweep_dataset import RUN_TIMES
+from experiments.study.sweep.whole_sweep import execute, prepare
 from tests.helpers.killing import KilledSweep, same_files
 from tests.helpers.tiny_scenario import TINY, command
 
@@ -38,7 +39,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def swept(short_path: Path, results: Path) -> Path:
     """A sweep of four runs on one worker, uninterrupted."""
-    asked = prepare([str(short_path)], [short_path], [0, 1], [GRID[1], GRID[3]], results, None)
+    asked = prepare([short_path], [0, 1], [GRID[1], GRID[3]], results)
     assert execute(asked, 1, None, lambda _: None) == {}
     return asked.output
 
@@ -133,10 +134,17 @@ def test_other_settings_do_not_go_into_the_same_folder(
 
 
 def test_a_run_that_collides_is_a_row(
-    short_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    swept: Path,
+    short_path: Path,
+    results: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    assert swept.is_dir()
+    shutil.copytree(results / "store", tmp_path / "store")  # of the run that does not collide
     starts = "[1.2, 1.2, 0.6],[0.2, 0.2, 3.9]"  # the second one drives into the corner
-    arguments = ("sweep", short_path, "--set", f"robots.0.start={starts}", "--jobs", 2)
+    arguments = ("sweep", short_path, "--set", f"robots.0.start={starts}", "--jobs", 1)
+    arguments += ("--set", "slam.filter.n_particles=5", "--set", "align.repetitions=1")
     reply = command(capsys, *arguments, "--results", tmp_path, "--timings")
     assert reply.code == 1
     assert "1 of 2 runs finished" in reply.out.replace("\n", " ")

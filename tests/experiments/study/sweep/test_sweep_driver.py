@@ -10,16 +10,16 @@ import pandas as pd
 import pytest
 from distributed import Client, LocalCluster
 
-from experiments.judge.judged_run import JudgedRun
 from experiments.run.dask_cluster import connected
 from experiments.run.dask_worker import Terms, code_version
 from experiments.run.store import Store
 from experiments.run.tasks import Task
-from experiments.study.sweep import driver as driver_module
-from experiments.study.sweep.dataset import Dataset, open_dataset
-from experiments.study.sweep.driver import Progress, SweepDriver, survey
-from experiments.study.sweep.grid import Run
-from experiments.study.sweep.planned import PlannedRun, write_name
+from experiments.study.sweep import survey as survey_module
+from experiments.study.sweep import sweep_driver as driver_module
+from experiments.study.sweep.combinations import SweepRun
+from experiments.study.sweep.planned_run import PlannedRun, write_name
+from experiments.study.sweep.sweep_dataset import SweepDataset, open_dataset
+from experiments.study.sweep.sweep_driver import SweepDriver, SweepProgress
 from mapfusion.errors import InputError
 from tests.helpers import acting
 
@@ -39,8 +39,9 @@ class Scene:
         self.terms = Terms(folder / "attempts", 3, code_version())
         self.terms.attempts.mkdir()
         self.tasks: dict[int, list[Task]] = {}
-        self.told: list[Progress] = []
-        monkeypatch.setattr(driver_module, "planned", self._planned)
+        self.told: list[SweepProgress] = []
+        for module in (driver_module, survey_module):
+            monkeypatch.setattr(module, "planned", self._planned)
 
     def add(self, seed: int, name: str, function: object, *arguments: object, **more: Any) -> None:
         outputs = (self.folder / name.replace("/", "_"),)
@@ -52,12 +53,11 @@ class Scene:
         output = self.folder / name.replace("/", "_")
         self.add(seed, name, acting.write, output, name, needs=tuple(needs))
 
-    def _planned(self, run: Run, store: Store, dataset: Dataset) -> PlannedRun:
+    def _planned(self, run: SweepRun, store: Store, dataset: SweepDataset) -> PlannedRun:
         tasks = {task.name: task for task in self.tasks[run.seed]}
         name = write_name(run)
         tasks[name] = Task(name, "tables", dataset.finish, (run, "", []), (), tuple(tasks))
-        laid_out = cast(JudgedRun, _NoStages())
-        return PlannedRun(run, laid_out, tasks, dataset.holds(run, []))
+        return PlannedRun(run, [], tasks, dataset.holds(run, []))
 
     def execute(self, client: Client) -> SweepDriver:
         store = Store(self.folder)
@@ -66,18 +66,13 @@ class Scene:
         return driver
 
     @property
-    def runs(self) -> list[Run]:
-        return [Run(Path("x.yaml"), "x", seed) for seed in self.tasks]
+    def runs(self) -> list[SweepRun]:
+        return [SweepRun(Path("x.yaml"), "x", seed) for seed in self.tasks]
 
     def rows(self) -> dict[int, tuple[str, str]]:
         found = pd.read_parquet(self.dataset.folder / "runs").set_index("seed")
         rows = zip(found["status"], found["reason"], strict=True)
         return dict(zip(found.index.tolist(), rows, strict=True))
-
-
-class _NoStages:
-    def stages(self) -> list[object]:
-        return []
 
 
 @pytest.fixture
@@ -98,7 +93,7 @@ def test_failed_runs_stop_no_others(scene: Scene, client: Client) -> None:
         2: ("failed", "slam: ZeroDivisionError a bug"),
         3: ("finished", ""),
     }
-    assert sorted(driver.failed_runs) == ["x-0", "x-1", "x-2"]
+    assert sorted(driver.progress.failed) == ["x-0", "x-1", "x-2"]
     details = (scene.dataset.folder / "failures" / "x-2.txt").read_text()
     assert "in break_down" in details
     assert not list(scene.terms.attempts.iterdir())
@@ -107,7 +102,7 @@ def test_failed_runs_stop_no_others(scene: Scene, client: Client) -> None:
         scene.tasks[seed][1] = Task(
             f"slam/{seed}", "slam", acting.write, (scene.folder / f"slam_{seed}", ""), ()
         )
-    assert not scene.execute(client).failed_runs
+    assert not scene.execute(client).progress.failed
     assert set(scene.rows().values()) == {("finished", "")}
     assert scene.told[-1].kept == 1
     assert not list((scene.dataset.folder / "failures").iterdir())
@@ -123,7 +118,7 @@ def test_what_runs_share_is_done_once_and_fails_once(scene: Scene, client: Clien
         scene.write(seed, f"slam/{seed}", ["drive/bad"])
     driver = scene.execute(client)
     assert journal.read_text().split() == ["drive"]
-    assert len(driver.failed_runs) == 4
+    assert len(driver.progress.failed) == 4
     assert not (scene.folder / "slam_6").exists()
 
 
@@ -169,18 +164,19 @@ def test_the_scheduler_holds_a_window_of_tasks_alone(
     most = 0
     tell = scene.told.append
 
-    def count(progress: Progress) -> None:
+    def count(progress: SweepProgress) -> None:
         nonlocal most
         most = max(most, sum(progress.tasks.values()) - sum(progress.tasks_done.values()))
         tell(progress)
 
     store = Store(scene.folder)
     driver = SweepDriver(client, store, scene.dataset, scene.terms, count)
-    ended = driver.execute(scene.runs)
+    driver.execute(scene.runs)
+    ended = driver.progress
     assert most <= 5 * driver_module.MIN_WORKERS + 2
     assert ended.finished == n_runs
     assert ended.tasks == ended.tasks_done == Counter({"slam": n_runs, "tables": n_runs})
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 300
     while client.run_on_scheduler(lambda dask_scheduler: len(dask_scheduler.tasks)):
         assert time.monotonic() < deadline
         time.sleep(0.1)
@@ -193,7 +189,7 @@ def test_runs_that_cannot_be_laid_out_are_rows_too(
     scene.write(1, "slam/1")
     laid_out = scene._planned
 
-    def refusing(run: Run, *more: Any) -> PlannedRun:
+    def refusing(run: SweepRun, *more: Any) -> PlannedRun:
         if run.seed == 0:
             raise InputError("no floor plan\nfits seed 0")
         return laid_out(run, *more)
@@ -208,7 +204,7 @@ def test_survey_counts_what_is_shared_and_done(scene: Scene) -> None:
         scene.write(seed, "drive/0")
         scene.write(seed, f"slam/{seed}", ["drive/0"])
     acting.write(scene.folder / "slam_0", "done")
-    found = survey(scene.runs, Store(scene.folder), scene.dataset)
+    found = survey_module.survey(scene.runs, Store(scene.folder), scene.dataset)
     assert found.runs == 4
     assert found.wanted == Counter(drive=4, slam=4, tables=4)
     assert found.left == Counter(drive=1, slam=3, tables=4)

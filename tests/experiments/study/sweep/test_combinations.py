@@ -6,30 +6,34 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from experiments.study.sweep.grid import parse_axes, runs_of
+from experiments.scenario.yaml_input import apply_overrides
+from experiments.study.sweep.combinations import parse_axes, runs_of
 from mapfusion.errors import InputError
 from tests.helpers.tiny_scenario import TINY
 
 
 @pytest.mark.parametrize(
-    ("entry", "values", "texts"),
+    ("entry", "given", "spelled"),
     [
-        ("a.b=50,200,1000", ("50", "200", "1000"), ("50", "200", "1000")),
-        ("a=1e-3, 0.10", ("1e-3", "0.10"), ("0.001", "0.1")),
-        ("a=[1, 2],[3]", ("[1, 2]", "[3]"), ("[1, 2]", "[3]")),
-        ("a={x: 1, y: [2, 3]},{}", ("{x: 1, y: [2, 3]}", "{}"), ('{"x": 1, "y": [2, 3]}', "{}")),
-        ("a=true,yes,'true'", ("true", "yes", "'true'"), ("true", "yes", '"true"')),
-        ('a="b,c",d', ('"b,c"', "d"), ("b,c", "d")),
-        ("a=motion", ("motion",), ("motion",)),
-        ("a=b=c,null", ("b=c", "null"), ("b=c", "null")),
+        ("a.b=50,200,1000", [50, 200, 1000], ("50", "200", "1000")),
+        ("a=1e-3, 0.10", [0.001, 0.1], ("0.001", "0.1")),
+        ("a=[1, 2],[3]", [[1, 2], [3]], ("[1, 2]", "[3]")),
+        ("a={x: 1, y: [2, 3]},{}", [{"x": 1, "y": [2, 3]}, {}], ('{"x": 1, "y": [2, 3]}', "{}")),
+        ("a=true,yes,'true'", [True, "yes", "true"], ("true", "yes", '"true"')),
+        ('a="b,c",d', ["b,c", "d"], ("b,c", "d")),
+        ("a=motion", ["motion"], ("motion",)),
+        ("a=b=c,null", ["b=c", None], ("b=c", "null")),
+        ("a=../logs/R1,x-1.5", ["../logs/R1", "x-1.5"], ("../logs/R1", "x-1.5")),
     ],
 )
 def test_values_are_parted_at_commas_outside_brackets(
-    entry: str, values: tuple[str, ...], texts: tuple[str, ...]
+    entry: str, given: list[object], spelled: tuple[str, ...]
 ) -> None:
     (axis,) = parse_axes([entry])
-    assert axis.values == values
-    assert axis.texts == texts
+    assert axis.values == spelled
+    read = [apply_overrides({}, [f"key={value}"])["key"] for value in axis.values]
+    assert read == given
+    assert list(map(type, read)) == list(map(type, given))
 
 
 @pytest.mark.parametrize(
@@ -57,7 +61,7 @@ def test_wrong_entries_are_told(entries: list[str], words: list[str]) -> None:
 def test_lists_go_through_whole(lists: list[list[int]]) -> None:
     distinct = [list(values) for values in dict.fromkeys(map(tuple, lists))]
     (axis,) = parse_axes([f"a={','.join(map(str, distinct))}"])
-    assert axis.texts == tuple(map(str, distinct))
+    assert axis.values == tuple(map(str, distinct))
 
 
 def scenario(folder: Path, name: str) -> Path:
@@ -72,11 +76,12 @@ def test_all_combinations_with_names_of_their_own(tmp_path: Path) -> None:
     runs = runs_of(paths, [0, 1, 5], axes)
     assert len(runs) == 2 * 3 * 3 * 2
     assert len({run.run_id for run in runs}) == len(runs)
-    assert [run.settings for run in runs[:3]] == [("10", "1"), ("10", "2"), ("20", "1")]
+    values = [tuple(value for _, value in run.settings) for run in runs]
+    assert values[:3] == [("10", "1"), ("10", "2"), ("20", "1")]
     loaded = runs[4].load()
     assert (loaded.name, loaded.seed) == ("one", 0)
     assert (loaded.slam.filter.n_particles, loaded.align.repetitions) == (30, 1)
-    assert (runs[-1].scenario, runs[-1].seed, runs[-1].settings) == ("two", 5, ("30", "2"))
+    assert (runs[-1].scenario, runs[-1].seed, values[-1]) == ("two", 5, ("30", "2"))
 
 
 def test_names_do_not_depend_on_the_rest_of_the_sweep(tmp_path: Path) -> None:

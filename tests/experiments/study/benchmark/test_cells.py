@@ -1,5 +1,6 @@
 """The benchmark counts rightly, repeats itself, and goes on where it was."""
 
+import functools
 import json
 from pathlib import Path
 
@@ -8,35 +9,33 @@ import pandas as pd
 import pytest
 
 from experiments.methods import catalogue
+from experiments.run.job import Job
 from experiments.run.store import Store
 from experiments.scenario.settings import AlignerEntry
 from experiments.show.benchmark_files import cell_text, markdown
 from experiments.show.figures.benchmark_figure import draw
-from experiments.study.benchmark import trials as benchmark
-from experiments.study.benchmark.trials import (
-    SUMMARY,
-    TRIALS,
-    Plan,
-    entries_of,
-    run_benchmark,
-    summarise,
-)
+from experiments.study.benchmark import cells as benchmark
+from experiments.study.benchmark.cells import BenchmarkDesign, entries_of, run_benchmark
+from experiments.study.benchmark.success import SUMMARY, summarise
+from experiments.study.benchmark.trials import TRIALS, CellSettings
 from mapfusion.align.peers.kiss_matcher import KissMatcher
 from mapfusion.errors import InputError
 from mapfusion.storage import read_table
 from tests.helpers.tiny_scenario import command
 
-SMALL = Plan(entries_of(["ransac", "svd"]), 4, pair_counts=(60, 100), outlier_shares=(0.5, 0.9))
+SMALL = BenchmarkDesign(
+    entries_of(["ransac", "svd"]), 4, pair_counts=(60, 100), outlier_shares=(0.5, 0.9)
+)
 
 
-def quiet(done: int, total: int) -> None:
-    del done, total
+def quiet(stage: str, done: int, total: int) -> None:
+    del stage, done, total
 
 
 def test_good_and_bad_methods_are_told_apart(tmp_path: Path) -> None:
-    told: list[tuple[int, int]] = []
-    trials = run_benchmark(SMALL, Store(tmp_path), lambda done, total: told.append((done, total)))
-    assert told == [(k, 8) for k in range(9)]
+    told: list[tuple[str, int, int]] = []
+    trials = run_benchmark(SMALL, Store(tmp_path), lambda *now: told.append(now))
+    assert told == [("measure the aligners", k, 8) for k in range(9)]
     summary = summarise(trials).set_index(["method", "n_pairs", "outlier_share"])
     assert len(summary) == 8
     ransac = summary.loc["ransac"]
@@ -64,11 +63,17 @@ def test_all_methods_get_the_same_maps_and_a_second_run_the_same_trials(tmp_path
 def test_finished_cells_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = run_benchmark(SMALL, Store(tmp_path), quiet)
     measured: list[str] = []
-    measure = benchmark._measure
-    monkeypatch.setattr(benchmark, "_measure", lambda *a: (measured.append(a[1].name), measure(*a)))
+    run_cell = benchmark.run_cell
+
+    @functools.wraps(run_cell)
+    def noted(settings: CellSettings, job: Job) -> None:
+        measured.append(settings.name)
+        run_cell(settings, job)
+
+    monkeypatch.setattr(benchmark, "run_cell", noted)
     pd.testing.assert_frame_equal(run_benchmark(SMALL, Store(tmp_path), quiet), before)
     assert measured == []
-    more = Plan(
+    more = BenchmarkDesign(
         (*SMALL.aligners, AlignerEntry(name="wide", method="ransac", parameters={"gate_m": 0.4})),
         4,
         pair_counts=(60,),
@@ -79,7 +84,9 @@ def test_finished_cells_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_slow_cell_ends_with_the_trials_it_has(tmp_path: Path) -> None:
-    plan = Plan(entries_of(["svd"]), 50, budget_s=0.0, pair_counts=(60,), outlier_shares=(0.5,))
+    plan = BenchmarkDesign(
+        entries_of(["svd"]), 50, budget_s=0.0, pair_counts=(60,), outlier_shares=(0.5,)
+    )
     assert summarise(run_benchmark(plan, Store(tmp_path), quiet))["n_trials"].tolist() == [1]
 
 
@@ -134,7 +141,9 @@ def test_an_absent_package_is_no_failure(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(catalogue, "_PEER_PACKAGES", {"far": ("far-package", "no_such_module_far")})
     catalogue.known_methods.cache_clear()
     try:
-        plan = Plan(entries_of(["far", "ransac"]), 2, pair_counts=(60,), outlier_shares=(0.5,))
+        plan = BenchmarkDesign(
+            entries_of(["far", "ransac"]), 2, pair_counts=(60,), outlier_shares=(0.5,)
+        )
         summary = summarise(run_benchmark(plan, Store(tmp_path), quiet))
     finally:
         monkeypatch.undo()

@@ -8,28 +8,28 @@ import pyarrow.parquet as pq
 import pytest
 
 from experiments.judge import tables
-from experiments.study.sweep import dataset as dataset_module
-from experiments.study.sweep.dataset import Dataset, open_dataset
-from experiments.study.sweep.grid import Run, parse_axes
+from experiments.study.sweep import sweep_dataset as dataset_module
+from experiments.study.sweep.combinations import SweepRun, parse_axes
+from experiments.study.sweep.sweep_dataset import SweepDataset, open_dataset
 from mapfusion.errors import InputError
 
 AXES = parse_axes(["slam.min_count=2,3", "align.repetitions=1"])
 
 
-def run(seed: int, count: str = "2") -> Run:
-    overrides = (f"slam.min_count={count}", "align.repetitions=1")
-    return Run(Path("x.yaml"), "x", seed, overrides, (count, "1"))
+def run(seed: int, count: str = "2") -> SweepRun:
+    settings = (("slam.min_count", count), ("align.repetitions", "1"))
+    return SweepRun(Path("x.yaml"), "x", seed, settings)
 
 
 @pytest.fixture
-def dataset(tmp_path: Path) -> Dataset:
+def dataset(tmp_path: Path) -> SweepDataset:
     return open_dataset(tmp_path / "sweep", AXES)
 
 
 FITS = [{"map": "R1", "n_landmarks": 5, "rmse_m": 0.1}, {"map": "R2", "n_landmarks": 6}]
 
 
-def test_rows_are_preceded_by_what_run_they_are_of(dataset: Dataset) -> None:
+def test_rows_are_preceded_by_what_run_they_are_of(dataset: SweepDataset) -> None:
     dataset.write("map_fits", run(0), FITS)
     dataset.write("map_fits", run(1, "3"), FITS)
     read = pd.read_parquet(dataset.folder / "map_fits")
@@ -40,7 +40,7 @@ def test_rows_are_preceded_by_what_run_they_are_of(dataset: Dataset) -> None:
     assert read["rmse_m"].isna().tolist() == [False, True] * 2
 
 
-def test_empty_tables_keep_their_types(dataset: Dataset) -> None:
+def test_empty_tables_keep_their_types(dataset: SweepDataset) -> None:
     dataset.write("errors", run(0), [])
     dataset.write("errors", run(1), pd.DataFrame(columns=pd.Index(tables.ALL["errors"].names)))
     read = pd.read_parquet(dataset.folder / "errors")
@@ -49,7 +49,7 @@ def test_empty_tables_keep_their_types(dataset: Dataset) -> None:
 
 
 def test_files_that_are_being_written_disturb_no_reader(
-    dataset: Dataset, monkeypatch: pytest.MonkeyPatch
+    dataset: SweepDataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """DuckDB's *.parquet finds files whose names begin with a dot."""
     seen = []
@@ -76,7 +76,7 @@ def _by_duckdb(folder: Path) -> int:
     return duckdb.sql(f"SELECT count(*) FROM '{folder}/*.parquet'").fetchall()[0][0]
 
 
-def test_a_run_is_held_once_it_is_finished_from_the_same_stages(dataset: Dataset) -> None:
+def test_a_run_is_held_once_it_is_finished_from_the_same_stages(dataset: SweepDataset) -> None:
     stages = ["drive/1", "judge/2"]
     assert not dataset.holds(run(0), stages)
     dataset.finish(run(0), "TinyRenderer", stages)
@@ -87,14 +87,14 @@ def test_a_run_is_held_once_it_is_finished_from_the_same_stages(dataset: Dataset
     assert not dataset.holds(run(0), stages)
 
 
-def test_changed_source_is_not_held(dataset: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_changed_source_is_not_held(dataset: SweepDataset, monkeypatch: pytest.MonkeyPatch) -> None:
     dataset.finish(run(0), "TinyRenderer", [])
     assert dataset.holds(run(0), [])
     monkeypatch.setattr(dataset_module, "source_hash", lambda parts: "other")
     assert not dataset.holds(run(0), [])
 
 
-def test_a_failed_run_is_one_row_and_nothing_else(dataset: Dataset) -> None:
+def test_a_failed_run_is_one_row_and_nothing_else(dataset: SweepDataset) -> None:
     dataset.write("map_fits", run(0), FITS)
     dataset.finish(run(0), "TinyRenderer", [])
     dataset.fail(run(0), "R1 drove into a wall")

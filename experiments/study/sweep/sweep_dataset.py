@@ -17,37 +17,37 @@ import pyarrow.parquet as pq
 
 from experiments.judge import tables
 from experiments.run.code_version import library_versions, source_hash
-from experiments.study.sweep.grid import Axis, Run
+from experiments.run.dask_worker import SOURCES
+from experiments.run.frames import FLOAT, TEXT, fields
+from experiments.study.sweep.combinations import Axis, SweepRun
 from mapfusion.errors import InputError
 from mapfusion.storage import schema, write_table, write_whole
 
 SCHEMA_VERSION = 1
 RUNS, RUN_TIMES, ALIGNER_TIMINGS = "runs", "run_times", "aligner_timings"
 FINISHED, FAILED = "finished", "failed"
-# All that a run's rows can depend on.
-SOURCES = ("mapfusion", "sim", "experiments")
 
-_TEXT = pa.string()
-_RUNS_FIELDS = [
-    pa.field("status", _TEXT),  # finished or failed
-    pa.field("reason", _TEXT),  # of a failure, else empty
-    pa.field("renderer", _TEXT),
-    pa.field("stages", _TEXT),  # JSON list of STAGE/KEY, as folders of the store are named
-    pa.field("libraries", _TEXT),  # JSON object of versions
-    pa.field("source_hash", _TEXT),
-]
+_RUNS_FIELDS = fields(
+    status=TEXT,  # finished or failed
+    reason=TEXT,  # of a failure, else empty
+    renderer=TEXT,
+    stages=TEXT,  # JSON list of STAGE/KEY, as folders of the store are named
+    libraries=TEXT,  # JSON object of versions
+    source_hash=TEXT,
+)
 # Seconds of work behind the run, by stage: also of stages that it shares with other runs. Beside
 # `aligner_timings` the only table that differs from time to time.
-_RUN_TIMES_FIELDS = [
-    pa.field("stage", _TEXT),
-    pa.field("key", _TEXT),
-    pa.field("figure", _TEXT),  # elapsed_s, or rendering_s as a part of it
-    pa.field("seconds", pa.float64()),
-]
+_RUN_TIMES_FIELDS = fields(
+    stage=TEXT,
+    key=TEXT,
+    figure=TEXT,  # elapsed_s, or rendering_s as a part of it
+    seconds=FLOAT,
+)
+_OWN_FIELDS = {RUNS: _RUNS_FIELDS, RUN_TIMES: _RUN_TIMES_FIELDS}
 
 
 @dataclass(frozen=True)
-class Dataset:
+class SweepDataset:
     """The folder of a sweep.
 
     Attributes:
@@ -58,40 +58,35 @@ class Dataset:
     folder: Path
     keys: tuple[str, ...]
 
-    def path(self, table: str, run: Run) -> Path:
+    def path(self, table: str, run: SweepRun) -> Path:
         """Where a run's rows of a table are."""
         return self.folder / table / f"{run.run_id}.parquet"
 
-    def write(self, table: str, run: Run, rows: pd.DataFrame | Sequence[Mapping[str, Any]]) -> None:
+    def write(
+        self, table: str, run: SweepRun, rows: pd.DataFrame | Sequence[Mapping[str, Any]]
+    ) -> None:
         """Write a run's rows of one table."""
-        own = _own_fields(table)
+        own = _OWN_FIELDS[table] if table in _OWN_FIELDS else list(tables.ALL[table])
         frame = pd.DataFrame(rows, columns=pd.Index([field.name for field in own]))
-        columns: dict[str, Any] = {
-            name: [value] * len(frame) for name, value in self._described(run).items()
-        }
+        settings = dict(run.settings)
+        described = {"run_id": run.run_id, "scenario": run.scenario, "seed": run.seed} | settings
+        columns: dict[str, Any] = {name: [value] * len(frame) for name, value in described.items()}
         columns |= {str(name): frame[name].to_numpy() for name in frame}
-        fields = [
-            pa.field("run_id", _TEXT),
-            pa.field("scenario", _TEXT),
-            pa.field("seed", pa.int64()),
-            *(pa.field(key, _TEXT) for key in self.keys),
-            *own,
-        ]
-        write_table(
-            self.path(table, run), columns, schema(f"sweep.{table}", SCHEMA_VERSION, fields)
+        leading = fields(
+            run_id=TEXT, scenario=TEXT, seed=pa.int64(), **dict.fromkeys(settings, TEXT)
         )
+        table_schema = schema(f"sweep.{table}", SCHEMA_VERSION, leading + own)
+        write_table(self.path(table, run), columns, table_schema)
 
-    def _described(self, run: Run) -> dict[str, Any]:
-        settings = dict(zip(self.keys, run.settings, strict=True))
-        return {"run_id": run.run_id, "scenario": run.scenario, "seed": run.seed} | settings
-
-    def finish(self, run: Run, renderer: str, stages: Sequence[str]) -> None:
+    def finish(self, run: SweepRun, renderer: str, stages: Sequence[str]) -> None:
         """Say that all rows of a run are there."""
         row = {"status": FINISHED, "reason": "", "renderer": renderer} | _made_by(stages)
         self._details(run).unlink(missing_ok=True)
         self.write(RUNS, run, [row])
 
-    def fail(self, run: Run, reason: str, details: str = "", stages: Sequence[str] = ()) -> None:
+    def fail(
+        self, run: SweepRun, reason: str, details: str = "", stages: Sequence[str] = ()
+    ) -> None:
         """Say why a run has no rows; those of an earlier, finished one are removed."""
         row = {"status": FAILED, "reason": reason, "renderer": ""} | _made_by(stages)
         self.write(RUNS, run, [row])
@@ -102,21 +97,16 @@ class Dataset:
         if details:
             write_whole(self._details(run), lambda file: file.write_text(details, encoding="utf-8"))
 
-    def _details(self, run: Run) -> Path:
+    def _details(self, run: SweepRun) -> Path:
         return self.folder / "failures" / f"{run.run_id}.txt"
 
-    def holds(self, run: Run, stages: Sequence[str]) -> bool:
+    def holds(self, run: SweepRun, stages: Sequence[str]) -> bool:
         """Whether the run is finished, made from these stages by the source as it is now."""
         try:
             found = pq.read_table(self.path(RUNS, run), columns=["status", *_made_by(stages)])
         except (OSError, pa.ArrowInvalid):
             return False
         return found.to_pylist() == [{"status": FINISHED} | _made_by(stages)]
-
-
-def _own_fields(table: str) -> list[pa.Field]:
-    special = {RUNS: _RUNS_FIELDS, RUN_TIMES: _RUN_TIMES_FIELDS}
-    return special[table] if table in special else list(tables.ALL[table])
 
 
 def _made_by(stages: Sequence[str]) -> dict[str, str]:
@@ -127,7 +117,7 @@ def _made_by(stages: Sequence[str]) -> dict[str, str]:
     }
 
 
-def open_dataset(folder: Path, axes: Sequence[Axis]) -> Dataset:
+def open_dataset(folder: Path, axes: Sequence[Axis]) -> SweepDataset:
     """A new or an existing sweep's folder, to which more runs may be added.
 
     Raises:
@@ -150,7 +140,7 @@ def open_dataset(folder: Path, axes: Sequence[Axis]) -> Dataset:
         description = {"schema_version": SCHEMA_VERSION, "kind": "sweep", "settings": keys}
         text = json.dumps(description, indent=1)
         write_whole(path, lambda file: file.write_text(text, encoding="utf-8"))
-    return Dataset(folder, keys)
+    return SweepDataset(folder, keys)
 
 
 def _listed(keys: Sequence[str]) -> str:

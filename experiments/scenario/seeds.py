@@ -1,0 +1,22 @@
+"""The seeds a command is given: one, a range or a list."""
+
+from mapfusion.errors import InputError
+
+MAX_SEEDS = 1000  # days of computing: more is a slip of the keyboard
+
+
+def parse_seeds(text: str) -> list[int]:
+    """Seeds from `3`, `0..4` (both ends included) or `0,2,5`; raises InputError."""
+    try:
+        if ".." in text:
+            first, last = (int(part) for part in text.split(".."))
+            seeds = range(first, last + 1)[: MAX_SEEDS + 1]
+        else:
+            seeds = [int(part) for part in text.split(",")]
+    except ValueError:
+        seeds = []
+    if not seeds or min(seeds) < 0 or len(set(seeds)) < len(seeds):
+        raise InputError(f"--seeds {text}: expected a number, a range 0..4 or a list 0,2,5")
+    if len(seeds) > MAX_SEEDS:
+        raise InputError(f"--seeds {text}: more than {MAX_SEEDS} seeds")
+    return list(seeds)

@@ -1,0 +1,117 @@
+"""Which runs a sweep is made of: scenarios x seeds x the values of each `--set`."""
+
+import hashlib
+import itertools
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from experiments.judge.expectations import load_checked
+from experiments.scenario.settings import AnyScenario
+from experiments.scenario.yaml_input import parse_value
+from mapfusion.errors import InputError
+
+_HASH_LENGTH = 8  # hexadecimal digits of a run's values: 32 bits, and clashes are refused
+_EXPECTED = "expected key=value,value, for example slam.filter.n_particles=50,200"
+_FIXED = {"seed": "--seeds 0..4", "name": "one sweep for each name"}
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One setting and the values it takes.
+
+    Attributes:
+        key: dotted, as in `--set`.
+        values: YAML, in one spelling each (0.10 is 0.1).
+    """
+
+    key: str
+    values: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class SweepRun:
+    """One run of a sweep.
+
+    Attributes:
+        path: scenario file.
+        scenario: its name.
+        seed: replaces the scenario's.
+        settings: (key, value) of each axis, in their order.
+    """
+
+    path: Path
+    scenario: str
+    seed: int
+    settings: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def run_id(self) -> str:
+        """Names the run's files: the same scenario, seed and values give the same name."""
+        if not self.settings:
+            return f"{self.scenario}-{self.seed}"
+        digest = hashlib.sha256(json.dumps(sorted(self.settings)).encode()).hexdigest()
+        return f"{self.scenario}-{self.seed}-{digest[:_HASH_LENGTH]}"
+
+    def load(self) -> AnyScenario:
+        """The scenario of this run; raises InputError."""
+        return load_checked(
+            self.path, [f"{key}={value}" for key, value in self.settings], self.seed
+        )
+
+
+def parse_axes(entries: Sequence[str]) -> list[Axis]:
+    """`--set KEY=VALUE,VALUE,...` entries; raises InputError that shows how it is written."""
+    axes = [_parse_axis(entry) for entry in entries]
+    keys = [axis.key for axis in axes]
+    for key in keys:
+        if keys.count(key) > 1:
+            raise InputError(f"--set {key}: given twice; write its values as {key}=A,B")
+    return axes
+
+
+def _parse_axis(entry: str) -> Axis:
+    key, _, listed = entry.partition("=")
+    if not key or not listed.strip():
+        raise InputError(f"--set {entry}: {_EXPECTED}")
+    if key in _FIXED:
+        raise InputError(f"--set {entry}: {key} cannot be set here; use {_FIXED[key]}")
+    values = parse_value(f"[{listed}]", f"--set {entry}: {_EXPECTED}")
+    spelled = tuple(map(_one_spelling, values))
+    for value in spelled:
+        if spelled.count(value) > 1:
+            raise InputError(f"--set {entry}: {value} is given twice")
+    return Axis(key, spelled)
+
+
+def _one_spelling(value: Any) -> str:
+    """Text is itself, unless YAML would read something else in it; all else is JSON."""
+    if isinstance(value, str) and parse_value(value, "--set") == value:
+        return value
+    return json.dumps(value, default=str)
+
+
+def runs_of(paths: Sequence[Path], seeds: Sequence[int], axes: Sequence[Axis]) -> list[SweepRun]:
+    """All combinations; runs that share most come one after the other.
+
+    Every scenario is loaded once with every combination of values, so that a wrong one is told
+    before anything is computed.
+
+    Raises:
+        InputError: a scenario, key or value is wrong, or two scenarios have the same name.
+    """
+    choices = ([(axis.key, value) for value in axis.values] for axis in axes)
+    combinations = list(itertools.product(*choices))
+    runs: list[SweepRun] = []
+    names: dict[str, Path] = {}
+    for path in paths:
+        loaded = [SweepRun(path, "", seeds[0], settings).load() for settings in combinations]
+        name = loaded[0].name
+        if names.setdefault(name, path) != path:
+            raise InputError(f"{path}: is named {name}, as {names[name]} is; names must differ")
+        runs += [SweepRun(path, name, *each) for each in itertools.product(seeds, combinations)]
+    if len({run.run_id for run in runs}) < len(runs):
+        raise InputError("--set: two combinations of values have the same hash; split the sweep")
+    return runs

@@ -1,0 +1,34 @@
+"""A sweep's errors in short."""
+
+from pathlib import Path
+
+import pyarrow as pa
+
+from experiments.judge import tables
+from experiments.study.sweep.combinations import SweepRun, parse_axes
+from experiments.study.sweep.run_medians import medians_over_runs
+from experiments.study.sweep.sweep_dataset import open_dataset
+
+EMPTY = {pa.string(): "", pa.bool_(): False}
+
+
+def row(aligner: str, n_true: int, error_m: float) -> dict[str, object]:
+    blank = {field.name: EMPTY.get(field.type, 0) for field in tables.ERRORS}
+    errors = {"translation_error_m": error_m, "refined_translation_error_m": error_m / 8}
+    return blank | {"aligner": aligner, "n_true": n_true} | errors
+
+
+def test_medians_over_runs_of_the_runs_own_medians(tmp_path: Path) -> None:
+    """A run counts once, however many rows it has; maps with fewer than 3 true pairs do not."""
+    dataset = open_dataset(tmp_path / "sweep", parse_axes(["slam.min_count=2,3"]))
+    written = {
+        (0, "2"): [row("svd", 3, error) for error in (1.0, 2.0, 9.0)] + [row("svd", 2, 99.0)],
+        (1, "2"): [row("svd", 30, 4.0)],
+        (0, "3"): [row("svd", 30, 5.0), row("ransac", 2, 7.0)],
+    }
+    runs = []
+    for (seed, count), rows in written.items():
+        runs.append(SweepRun(Path("x.yaml"), "x", seed, (("slam.min_count", count),)))
+        dataset.write("errors", runs[-1], rows)
+    found = medians_over_runs(dataset, runs)
+    assert found.values.tolist() == [["x 2", "svd", 3.0, 0.375, 2], ["x 3", "svd", 5.0, 0.625, 1]]
