@@ -126,16 +126,40 @@ def _judged(
     return judged
 
 
-def fused_truth(fused: FusedMap, robots: list[EvaluatedRobot], iteration: int) -> Float:
-    """True world points (N, 3) of fused landmarks: the mean of their parents'; NaN if unknown."""
-    points = np.full((len(fused.parents), len(robots), 3), np.nan)
+def parent_points(fused: FusedMap, robots: list[EvaluatedRobot], iteration: int) -> Float:
+    """True world points (N, M, 3) of each fused landmark's parents; NaN where none or unknown."""
+    points = np.full((*fused.parents.shape, 3), np.nan)
     for k, robot in enumerate(robots):
         has = fused.parents[:, k] != ABSENT
         points[has, k] = robot.at(iteration)[1][fused.parents[has, k]]
+    return points
+
+
+def fused_truth(fused: FusedMap, robots: list[EvaluatedRobot], iteration: int) -> Float:
+    """True world points (N, 3) of fused landmarks: the mean of their parents'; NaN if unknown."""
+    points = parent_points(fused, robots, iteration)
     known = np.all(np.isfinite(points), axis=2)
     total = np.where(known[:, :, None], points, 0.0).sum(axis=1)
     count = np.count_nonzero(known, axis=1, keepdims=True)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def fused_motion_rows(
+    robots: list[EvaluatedRobot], fused: FusedMap | None, settings: Merge
+) -> list[dict[str, Any]]:
+    """Rows of the table `fused_motions`: how each robot's map was moved into the fused one."""
+    if fused is None:
+        return []
+    why = dict(fused.left_out)
+    return [
+        {
+            "robot": robot.name,
+            **dict(zip(("tx_m", "ty_m", "theta_rad"), fused.T_first_map[place], strict=True)),
+            "drift_sigma_m": fused.drift_sigma_m[place] if settings.parameters.use_drift else 0.0,
+            "left_out": why.get(robot.name, ""),
+        }
+        for place, robot in enumerate(robots)
+    ]
 
 
 def map_fit_rows(
