@@ -44,7 +44,7 @@ def finished(scenario: Scenario, results: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def tiny_result(tiny: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def tiny_result(tiny: Simulation, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Its result folder; tests must not change it."""
     return finished(tiny, tmp_path_factory.mktemp("results"))
 
