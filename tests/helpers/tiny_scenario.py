@@ -69,6 +69,15 @@ def command(capsys: pytest.CaptureFixture[str], *arguments: object) -> Reply:
     return Reply(ended.value.code, out, err)
 
 
+def assert_refused(reply: Reply, *words: str) -> None:
+    """The command ended with one line that holds these words."""
+    assert reply.code == 2
+    assert "Traceback" not in reply.err
+    assert len(reply.err.strip().splitlines()) == 1, reply.err
+    for word in words:
+        assert word in reply.err
+
+
 def estimated_tables(result: Path) -> dict[str, pd.DataFrame]:
     """All tables that must be the same in every run."""
     return {

@@ -11,29 +11,7 @@ from experiments.study.statistics.judged_maps import ERROR_COLUMNS
 from experiments.study.statistics.paired import holm
 from mapfusion.errors import InputError
 from tests.helpers.made_up_runs import errors_of, tables_of, timings_of, write_result, write_sweep
-
-Tables = dict[str, pd.DataFrame]
-
-
-def two_sweeps(
-    folder: Path, change: Callable[[int, Tables], Tables], seeds: int = 12
-) -> tuple[Path, Path]:
-    """The same runs, and what another version makes of them."""
-    made = {seed: tables_of(seed) for seed in range(seeds)}
-    changed = {seed: change(seed, {k: t.copy() for k, t in made[seed].items()}) for seed in made}
-    a = write_sweep(folder / "a", range(seeds), made=made)
-    return a, write_sweep(folder / "b", range(seeds), made=changed)
-
-
-def scaled(factor: float, aligner: str, scatter: float = 0.0) -> Callable[[int, Tables], Tables]:
-    def change(seed: int, made: Tables) -> Tables:
-        rng = np.random.default_rng(900 + seed)
-        own = made["errors"]["aligner"] == aligner
-        factors = factor * np.exp(scatter * rng.normal(size=(int(own.sum()), 1)))
-        made["errors"].loc[own, list(ERROR_COLUMNS)] *= factors
-        return made
-
-    return change
+from tests.helpers.made_up_versions import Tables, scaled, two_sweeps
 
 
 def verdicts(table: pd.DataFrame) -> dict[tuple[str, str], str]:
@@ -68,12 +46,10 @@ def test_a_method_that_changed_is_found_and_no_other(
 def test_chance_alone_is_rarely_taken_for_a_change(tmp_path: Path) -> None:
     """Other random numbers in everything: of 20 comparisons at 5 %, corrected, some 1 may err."""
     wrong = 0
+    a = write_sweep(tmp_path / "a", range(8))
     for trial in range(20):
-
-        def redrawn(seed: int, made: Tables, trial: int = trial) -> Tables:
-            return tables_of(1000 * (trial + 1) + seed)
-
-        found = compare(*two_sweeps(tmp_path / str(trial), redrawn, seeds=8))
+        redrawn = {seed: tables_of(1000 * (trial + 1) + seed) for seed in range(8)}
+        found = compare(a, write_sweep(tmp_path / str(trial), range(8), made=redrawn))
         wrong += found.table["verdict"].isin([BETTER, WORSE]).any()
         assert (found.table["verdict"] == NOISE).any()
         p = found.table["p"].to_numpy()

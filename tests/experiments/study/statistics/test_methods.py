@@ -10,7 +10,7 @@ from experiments.study.statistics.error_bands import BAND, error_bands, medians_
 from experiments.study.statistics.judged_maps import Criteria, maps_of
 from experiments.study.statistics.oracle_ratio import oracle_ratios
 from experiments.study.statistics.paired import compare_methods, holm, signed_rank_p
-from tests.experiments.study.statistics.test_success import many_errors
+from tests.helpers.made_up_runs import many_errors
 
 
 def rng() -> np.random.Generator:

@@ -14,7 +14,6 @@ from experiments.study.statistics.error_bands import medians_of_run
 from experiments.study.statistics.judged_maps import Criteria
 from experiments.study.statistics.run_tables import find_runs, read_runs
 from experiments.study.statistics.summary import ALL_SCENARIOS, summarise
-from tests.experiments.study.compare.test_compare import scaled, two_sweeps
 from tests.helpers.made_up_runs import (
     ITERATIONS,
     METHODS,
@@ -23,6 +22,7 @@ from tests.helpers.made_up_runs import (
     write_rows,
     write_sweep,
 )
+from tests.helpers.made_up_versions import scaled, two_sweeps
 from tests.helpers.tiny_scenario import command
 
 

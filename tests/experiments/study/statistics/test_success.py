@@ -14,22 +14,11 @@ from experiments.study.statistics.wilson import wilson
 from tests.helpers.made_up_runs import (
     ITERATIONS,
     LOST_M,
-    errors_of,
+    many_errors,
     robots_of,
     tables_of,
     write_result,
 )
-
-
-def many_errors(n_runs: int, **made: object) -> pd.DataFrame:
-    parts = []
-    for seed in range(n_runs):
-        rows = errors_of(seed, **made)  # type: ignore[arg-type]
-        rows.insert(0, "run_id", f"world-{seed}")
-        rows.insert(1, "scenario", "world")
-        rows.insert(2, "seed", seed)
-        parts.append(rows)
-    return pd.concat(parts, ignore_index=True)
 
 
 def slow_rate(errors: pd.DataFrame, aligner: str, low: float, high: float) -> float:
