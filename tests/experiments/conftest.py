@@ -3,6 +3,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
 
 from experiments.judge.judged_run import JudgedRun
 from experiments.judge.result import run_scenario
@@ -10,6 +11,7 @@ from experiments.methods.threads import single_threaded
 from experiments.run.store import Store
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import Scenario, Simulation
+from experiments.show.figures import drawing
 from tests.helpers.tiny_scenario import TINY, TRIO
 
 
@@ -74,3 +76,15 @@ def trio_result(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def trio_copy(trio_result: Path, tmp_path: Path) -> Path:
     """A copy of it, for a test to change."""
     return Path(shutil.copytree(trio_result, tmp_path / "result"))
+
+
+@pytest.fixture
+def quick_save(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lay figures out, which finds what cannot be drawn, but do not write the pixels."""
+
+    def save(figure: Figure, path: Path, kind: str) -> None:
+        if kind == "png":
+            figure.draw_without_rendering()
+        path.write_bytes(b"picture")
+
+    monkeypatch.setattr(drawing, "_save", save)

@@ -232,12 +232,9 @@ def test_commands_one_by_one(
     assert max(map(len, parts)) < len(fused) < sum(map(len, parts))
 
 
+@pytest.mark.usefixtures("quick_save")
 def test_figures(tiny_result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    copy = tmp_path / "result"
-    copy.mkdir()
-    for path in tiny_result.rglob("*.*"):
-        (copy / path.relative_to(tiny_result)).parent.mkdir(exist_ok=True, parents=True)
-        (copy / path.relative_to(tiny_result)).write_bytes(path.read_bytes())
+    copy = shutil.copytree(tiny_result, tmp_path / "result")
     reply = command(capsys, "figures", copy, "--jobs", 1)
     assert reply.code == 0
     drawn = {path.name[:5] for path in (copy / "figures").iterdir()}
@@ -280,6 +277,7 @@ def test_run_shows_the_aligners(
     assert resolved["slam"]["filter"]["n_particles"] == 30
 
 
+@pytest.mark.usefixtures("quick_save")
 @pytest.mark.parametrize(
     ("name", "overrides"),
     [

@@ -9,7 +9,6 @@ import matplotlib.image
 import numpy as np
 import pandas as pd
 import pytest
-from matplotlib.figure import Figure
 
 from experiments.judge import tables
 from experiments.show.figures import draw_all, drawing
@@ -64,18 +63,6 @@ def test_users_settings_come_back() -> None:
         with house_style():
             assert matplotlib.rcParams["font.size"] < 10
         assert dict(matplotlib.rcParams) == before
-
-
-@pytest.fixture
-def quick_save(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Lay figures out, which finds what cannot be drawn, but do not write the pixels."""
-
-    def save(figure: Figure, path: Path, kind: str) -> None:
-        if kind == "png":
-            figure.draw_without_rendering()
-        path.write_bytes(b"picture")
-
-    monkeypatch.setattr(drawing, "_save", save)
 
 
 def skipped_figures(folder: Path) -> dict[str, str]:
