@@ -7,8 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from made_up_maps import landmark_map, paired
-from made_up_plugin import install, look_again
 
 from experiments.methods.aligner_calls import callable_aligner, require_usable
 from experiments.methods.catalogue import make_method
@@ -16,6 +14,8 @@ from experiments.methods.isolation import end_children
 from mapfusion import se2
 from mapfusion.align.registration import Registration, as_aligner
 from mapfusion.align.result import Alignment, Status
+from tests.helpers.made_up_maps import landmark_map, paired
+from tests.helpers.made_up_plugin import install, look_again
 
 HERE = Path(__file__).parent
 NOW = HERE.parents[1] / "plugin_example" / "mapfusion_best_share.py"
