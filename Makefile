@@ -18,8 +18,10 @@ $(STAMP): requirements.lock pyproject.toml
 demo: $(STAMP)
 	$(BIN)/mapfusion run scenarios/quick.yaml
 
+# Two tests at a time, a file's tests one after another: they share what they need. Files that take
+# long come first, as they stand.
 test: $(STAMP)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 # Ten random kills of a sweep; minutes.
 endurance: $(STAMP)
@@ -27,7 +29,7 @@ endurance: $(STAMP)
 
 # Installs Debian's chromium where it is missing (needs root for that).
 browser-test: $(STAMP)
-	PYTHON=$(BIN)/python tests/browser/run.sh $(RESULT)
+	PYTHON=$(BIN)/python tests/experiments/show/report/report_in_browser.sh $(RESULT)
 
 lint: $(STAMP)
 	$(BIN)/ruff format --check .

@@ -1,16 +1,18 @@
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
 
 from experiments.judge.judged_run import JudgedRun
 from experiments.judge.result import run_scenario
 from experiments.methods.threads import single_threaded
 from experiments.run.store import Store
 from experiments.scenario.loading import load_scenario
-from experiments.scenario.settings import Simulation
-from tests.helpers.synthetic_result import write_result
-from tests.helpers.tiny_scenario import TINY
+from experiments.scenario.settings import Scenario, Simulation
+from experiments.show.figures import drawing
+from tests.helpers.tiny_scenario import TINY, TRIO
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -37,19 +39,22 @@ def tiny(tiny_path: Path) -> Simulation:
     return scenario
 
 
-@pytest.fixture(scope="session")
-def tiny_results(tiny: Simulation, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Results folder of one uninterrupted run in one process; tests must not change it."""
-    results = tmp_path_factory.mktemp("results")
+def finished(scenario: Scenario, results: Path) -> Path:
+    """The result folder of one uninterrupted run in one process."""
     single_threaded()
-    run_scenario(tiny, results, 1, lambda stage, done, total: None)
-    return results
+    return run_scenario(scenario, results, 1, lambda stage, done, total: None)
 
 
 @pytest.fixture(scope="session")
-def tiny_result(tiny_results: Path) -> Path:
-    """The result folder of that run."""
-    return tiny_results / "tiny-3"
+def tiny_result(tiny: Simulation, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its result folder; tests must not change it."""
+    return finished(tiny, tmp_path_factory.mktemp("results"))
+
+
+@pytest.fixture(scope="session")
+def tiny_results(tiny_result: Path) -> Path:
+    """The folder that result and the store lie in; tests must not change it."""
+    return tiny_result.parent
 
 
 @pytest.fixture(scope="session")
@@ -60,6 +65,26 @@ def tiny_log(tiny: Simulation, tiny_results: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def made_up_result(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A small result folder; tests must not change it."""
-    return write_result(tmp_path_factory.mktemp("result"))
+def trio_result(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The result folder of three robots; tests must not change it, see `trio_copy`."""
+    folder = tmp_path_factory.mktemp("trio")
+    (folder / "trio.yaml").write_text(TRIO, encoding="utf-8")
+    return finished(load_scenario(folder / "trio.yaml"), folder)
+
+
+@pytest.fixture
+def trio_copy(trio_result: Path, tmp_path: Path) -> Path:
+    """A copy of it, for a test to change."""
+    return Path(shutil.copytree(trio_result, tmp_path / "result"))
+
+
+@pytest.fixture
+def quick_save(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lay figures out, which finds what cannot be drawn, but do not write the pixels."""
+
+    def save(figure: Figure, path: Path, kind: str) -> None:
+        if kind == "png":
+            figure.draw_without_rendering()
+        path.write_bytes(b"picture")
+
+    monkeypatch.setattr(drawing, "_save", save)

@@ -18,7 +18,7 @@ _PATIENCE_S = 900  # kernels may have to be compiled, on a busy machine
 class KilledSweep:
     """Runs one and the same sweep again and again until nothing is left; use in a `with` block."""
 
-    def __init__(self, arguments: Sequence[object], results: Path) -> None:
+    def __init__(self, arguments: Sequence[object], results: Path, jobs: int = 2) -> None:
         self._results = results
         self._command = [
             sys.executable,
@@ -27,7 +27,7 @@ class KilledSweep:
             "sweep",
             *map(str, arguments),
         ]
-        self._command += ["--jobs", "2", "--results", str(results)]
+        self._command += ["--jobs", str(jobs), "--results", str(results)]
         self.process = self._start()
 
     def __enter__(self) -> Self:

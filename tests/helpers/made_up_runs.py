@@ -73,6 +73,18 @@ def _row(
     }
 
 
+def many_errors(n_runs: int, **made: object) -> pd.DataFrame:
+    """The tables `errors` of the runs of a sweep, in one."""
+    parts = []
+    for seed in range(n_runs):
+        rows = errors_of(seed, **made)  # type: ignore[arg-type]
+        rows.insert(0, "run_id", f"world-{seed}")
+        rows.insert(1, "scenario", "world")
+        rows.insert(2, "seed", seed)
+        parts.append(rows)
+    return pd.concat(parts, ignore_index=True)
+
+
 def robots_of(seed: int, error_m: float = 0.05) -> pd.DataFrame:
     """A table `robots`."""
     rng = np.random.default_rng(100 + seed)
@@ -109,11 +121,12 @@ def timings_of(seed: int, elapsed_s: float = 1e-3) -> pd.DataFrame:
 
 def complete(name: str, frame: pd.DataFrame) -> pd.DataFrame:
     """All columns of the table `name`; what a test does not care about is empty."""
-    for column in tables.ALL[name]:
-        if column.name not in frame:
-            floating = pa.types.is_floating(column.type)
-            frame[column.name] = np.nan if floating else _EMPTY.get(column.type, 0)
-    return frame[tables.ALL[name].names]
+    empty = {
+        column.name: np.nan if pa.types.is_floating(column.type) else _EMPTY.get(column.type, 0)
+        for column in tables.ALL[name]
+        if column.name not in frame
+    }
+    return frame.assign(**empty)[tables.ALL[name].names]
 
 
 def tables_of(seed: int, **errors: object) -> dict[str, pd.DataFrame]:
@@ -156,11 +169,11 @@ def write_sweep(
                 keys = {"run_id": run_id, "scenario": scenario, "seed": seed} | dict(setting)
                 run = {"status": "finished", "reason": ""}
                 write_rows(folder, "runs", run_id, pd.DataFrame([keys | run]))
-                for table, frame in (made or {}).get(seed, tables_of(seed)).items():
-                    rows = complete(table, frame.copy())
-                    for place, (key, value) in enumerate(keys.items()):
-                        rows.insert(place, key, value)
-                    write_rows(folder, table, run_id, rows)
+                own = made[seed] if made and seed in made else tables_of(seed)
+                for table, frame in own.items():
+                    rows = complete(table, frame)
+                    described = rows.assign(**keys)[[*keys, *rows]]
+                    write_rows(folder, table, run_id, described)
     return folder
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from test_stereo_head import CAMERA, NO_NOISE, POSE, off_surface_m, ray_cast
 
 from mapfusion.errors import InputError
 from sim import renderer
@@ -16,6 +15,7 @@ from sim.floorplan import FloorPlan
 from sim.renderer import egl_driver
 from sim.stereo_head import FAR_M, NEAR_M, StereoFrame, render_stereo
 from sim.world import World
+from tests.sim.ray_casting import CAMERA, NO_NOISE, POSE, off_surface_m, ray_cast
 
 DEPTH_BITS = 16  # of the plug-in's depth buffer, found out below
 

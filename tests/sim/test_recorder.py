@@ -14,21 +14,21 @@ from sim.recorder import FrameSource, truth_points
 from sim.stereo_head import RadiometricNoise, StereoFrame
 
 CAMERA = StereoCamera(320, 240, 288.0)
-NOISE = dict.fromkeys("ab", RadiometricNoise())
+NOISE = RadiometricNoise()
 # a looks at b, which stands broadside 2 m ahead of it, before the far wall at y = 3.95
 POSES = np.array([[1.0, 0.8, np.pi / 2], [1.0, 2.8, 0.0]])
 
 
 @pytest.fixture(scope="module")
 def source(faces: Path) -> Iterator[FrameSource]:
-    with FrameSource(faces, CAMERA, NOISE) as opened:
+    with FrameSource(faces, CAMERA, "ab") as opened:
         yield opened
 
 
 def render(source: FrameSource, k: int) -> StereoFrame:
     """Frame k of robot a: it backs off while b turns."""
     poses = POSES + k * np.array([[0, -0.05, 0.02], [0, 0, 0.1]])
-    return source.render(poses, "a", np.random.default_rng([7, k]))
+    return source.render(poses, "a", NOISE, np.random.default_rng([7, k]))
 
 
 def digest(frames: list[StereoFrame]) -> str:
@@ -38,7 +38,7 @@ def digest(frames: list[StereoFrame]) -> str:
 
 def test_any_order_and_any_process_give_the_same_bits(source: FrameSource, faces: Path) -> None:
     forth = [render(source, k) for k in range(4)]
-    source.render(POSES[::-1], "b", np.random.default_rng(1))  # something else in between
+    source.render(POSES[::-1], "b", NOISE, np.random.default_rng(1))  # something else in between
     back = [render(source, k) for k in reversed(range(4))][::-1]
     assert digest(forth) == digest(back)
     assert len({digest([frame]) for frame in forth}) == 4
@@ -46,7 +46,7 @@ def test_any_order_and_any_process_give_the_same_bits(source: FrameSource, faces
         f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
         "from pathlib import Path\n"
         "import test_recorder as t\n"
-        "s = t.FrameSource(Path(sys.argv[1]), t.CAMERA, t.NOISE)\n"
+        "s = t.FrameSource(Path(sys.argv[1]), t.CAMERA, 'ab')\n"
         "print(t.digest([t.render(s, k) for k in (2, 0, 3, 1)][1::2]))\n"
     )
     result = subprocess.run(
@@ -56,7 +56,7 @@ def test_any_order_and_any_process_give_the_same_bits(source: FrameSource, faces
 
 
 def test_robots_see_each_other_where_they_are(source: FrameSource) -> None:
-    depth = source.render(POSES, "a", np.random.default_rng(0)).depth_m
+    depth = source.render(POSES, "a", NOISE, np.random.default_rng(0)).depth_m
     center = int(CAMERA.center_px[0])
     # the deck of b begins half its width nearer than its middle; the wall shows on either side
     assert depth[148:165, center].min() == pytest.approx(2.0 - 0.15 - 0.497 / 2, abs=1e-3)
@@ -72,14 +72,14 @@ def test_a_robot_does_not_see_itself(faces: Path) -> None:
     """From the rear of the deck it would see the deck; b, behind it, is out of sight too."""
     camera = StereoCamera(320, 240, 288.0, mount_x_m=-0.3)
     poses = np.array([[2.2, 2.8, 0.3], [1.0, 2.8, 0.0]])
-    with FrameSource(faces, camera, NOISE) as source:
-        depth = source.render(poses, "a", np.random.default_rng(0)).depth_m
+    with FrameSource(faces, camera, "ab") as source:
+        depth = source.render(poses, "a", NOISE, np.random.default_rng(0)).depth_m
     lowest_ray = (camera.height_px - 1 - camera.center_px[1]) / camera.focal_px
     assert depth.min() == pytest.approx(camera.mount_z_m / lowest_ray, abs=1e-3)  # the floor
 
 
 def test_truth_points_lie_on_what_is_seen(source: FrameSource) -> None:
-    frame = source.render(POSES, "a", np.random.default_rng(0))
+    frame = source.render(POSES, "a", NOISE, np.random.default_rng(0))
     rng = np.random.default_rng(2)
     uv = rng.uniform([90, 1], [140, 100], (200, 2))  # above b: the wall at y = 3.95, sub-pixel
     points = truth_points(CAMERA, frame.depth_m, uv, POSES[0])
@@ -121,6 +121,6 @@ def test_no_pixels_no_points() -> None:
 
 def test_unknown_robots_and_wrong_shapes_are_named(source: FrameSource) -> None:
     with pytest.raises(InputError, match="robot c: unknown, there are a, b"):
-        source.render(POSES, "c", np.random.default_rng(0))
+        source.render(POSES, "c", NOISE, np.random.default_rng(0))
     with pytest.raises(ValueError, match="T_world_robots: shape"):
-        source.render(POSES[:1], "a", np.random.default_rng(0))
+        source.render(POSES[:1], "a", NOISE, np.random.default_rng(0))

@@ -26,9 +26,9 @@ square = np.array([[0, 0], [5, 0], [5, 4], [0, 4], [0, 0]])
 plan = FloorPlan((Wall(square), Wall(np.array([[3, 0], [3, 1.5]]))))
 routes = [Route("a", [1, 1, 0], [[2, 3]]), Route("b", [4, 1, 1], [[4, 3]])]
 trajectory = drive(plan, routes, DriverSettings(), 5, 0.2)
-noise = dict.fromkeys("ab", RadiometricNoise())
-with FrameSource(Path(sys.argv[1]), StereoCamera(), noise) as source:
-    source.render(trajectory.T_world_robot[:, 4], "a", np.random.default_rng(0))
+noise = RadiometricNoise()
+with FrameSource(Path(sys.argv[1]), StereoCamera(), "ab") as source:
+    source.render(trajectory.T_world_robot[:, 4], "a", noise, np.random.default_rng(0))
 """
 
 

@@ -12,17 +12,9 @@ from experiments.judge.result import run_scenario
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.yaml_input import read_mapping
 from mapfusion.robot_log import read_log, write_log
-from tests.helpers.tiny_scenario import TINY, Reply, command
+from tests.helpers.tiny_scenario import TINY, assert_refused, command
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
-
-
-def assert_refused(reply: Reply, *words: str) -> None:
-    assert reply.code == 2
-    assert "Traceback" not in reply.err
-    assert len(reply.err.strip().splitlines()) == 1, reply.err
-    for word in words:
-        assert word in reply.err
 
 
 @pytest.mark.parametrize(

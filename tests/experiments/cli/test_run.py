@@ -1,12 +1,7 @@
 """One tiny run from end to end: every table, every command, interruptions, reuse."""
 
 import json
-import os
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -24,6 +19,7 @@ from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import Recording, Simulation
 from mapfusion.landmark_map import read_map
 from mapfusion.robot_log import read_truth, write_truth_points, write_truth_poses
+from tests.helpers.interrupting import interrupted
 from tests.helpers.tiny_scenario import TINY, assert_same_tables, command, estimated_tables
 
 
@@ -123,47 +119,31 @@ def test_ctrl_c_before_the_command_starts(
     assert len(reply.err.splitlines()) == 1
 
 
-def interrupted_run(path: Path, results: Path) -> subprocess.CompletedProcess[str]:
-    """Start `mapfusion run`, press Ctrl-C once the first rendered chunk is on disk."""
-    process = subprocess.Popen(
-        [
-            *(sys.executable, "-m", "experiments.cli.main", "run", path),
-            "--jobs=2",
-            f"--results={results}",
-        ],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,  # a process group of its own, as a shell gives each command
-    )
-    deadline = time.monotonic() + 60
-    while not list(results.rglob("features/*/done_*.json")) and time.monotonic() < deadline:
-        assert process.poll() is None, process.communicate()
-        time.sleep(0.005)
-    os.killpg(process.pid, signal.SIGINT)
-    out, err = process.communicate(timeout=30)
-    return subprocess.CompletedProcess(process.args, process.returncode, out, err)
-
-
 def test_interrupted_run_goes_on_and_gives_the_same_tables(
     tiny: Simulation, tiny_path: Path, tiny_result: Path, tmp_path: Path
 ) -> None:
-    ended = interrupted_run(tiny_path, tmp_path)
+    def rendered() -> list[Path]:
+        return list(results.rglob("features/*/done_*.json"))
+
+    results, held = tmp_path / "results", tmp_path / "held"
+    held.mkdir()
+    command_line = ["run", tiny_path, "--jobs=2", f"--results={results}"]
+    ended = interrupted(command_line, held, "features_000020.parquet", lambda: bool(rendered()))
     assert ended.returncode == 130
     assert "Traceback" not in ended.stderr
     complaints = [line for line in ended.stderr.splitlines() if line.startswith("mapfusion: ")]
     assert len(complaints) == 1
     assert "interrupted" in complaints[0]
-    marks = list(tmp_path.rglob("features/*/done_*.json"))
+    marks = rendered()
     chunks = [m.with_name(f"features{m.stem.removeprefix('done')}.parquet") for m in marks]
     kept = {path: path.stat().st_mtime_ns for path in (*marks, *chunks)}
     assert 1 <= len(marks) < 6
-    assert not (tmp_path / "tiny-3").exists()
+    assert not (results / "tiny-3").exists()
 
-    run_scenario(tiny, tmp_path, 2, quietly)
+    run_scenario(tiny, results, 2, quietly)
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
-    assert len(list(tmp_path.rglob("features_*.parquet"))) == 6
-    assert_same_tables(tmp_path / "tiny-3", tiny_result)  # which one process made in one go
+    assert len(rendered()) == 6
+    assert_same_tables(results / "tiny-3", tiny_result)  # which one process made in one go
 
 
 def test_truth_is_for_the_evaluation_alone(
@@ -252,12 +232,9 @@ def test_commands_one_by_one(
     assert max(map(len, parts)) < len(fused) < sum(map(len, parts))
 
 
+@pytest.mark.usefixtures("quick_save")
 def test_figures(tiny_result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    copy = tmp_path / "result"
-    copy.mkdir()
-    for path in tiny_result.rglob("*.*"):
-        (copy / path.relative_to(tiny_result)).parent.mkdir(exist_ok=True, parents=True)
-        (copy / path.relative_to(tiny_result)).write_bytes(path.read_bytes())
+    copy = shutil.copytree(tiny_result, tmp_path / "result")
     reply = command(capsys, "figures", copy, "--jobs", 1)
     assert reply.code == 0
     drawn = {path.name[:5] for path in (copy / "figures").iterdir()}
@@ -300,6 +277,7 @@ def test_run_shows_the_aligners(
     assert resolved["slam"]["filter"]["n_particles"] == 30
 
 
+@pytest.mark.usefixtures("quick_save")
 @pytest.mark.parametrize(
     ("name", "overrides"),
     [

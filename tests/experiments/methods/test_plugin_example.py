@@ -1,22 +1,28 @@
-"""The worked example of the documentation: installed offline, then named in scenarios."""
+"""The worked example of the documentation: installed offline, then named in scenarios.
 
+Most commands run in this process, the scenario and what hides a package in ones of their own.
+"""
+
+import importlib
 import json
 import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 from experiments.judge import tables
+from experiments.methods.isolation import end_children
 from mapfusion import se2
 from mapfusion.landmark_map import write_map
 from tests.helpers.made_up_maps import landmark_map
-from tests.helpers.made_up_plugin import install
-from tests.helpers.tiny_scenario import TINY
+from tests.helpers.made_up_plugin import install, look_again
+from tests.helpers.tiny_scenario import TINY, Reply, command
 
 EXAMPLE = Path(__file__).parents[2] / "plugin_example"
 T_A_B = np.array([1.0, -2.0, 0.3])
@@ -28,12 +34,6 @@ PLUGGED = TINY.replace("name: tiny", "name: plugged").replace(
     - {name: kiss, method: kiss_matcher}
 """,
 )
-
-
-class Ended(NamedTuple):
-    code: int
-    out: str
-    err: str
 
 
 @pytest.fixture(scope="module")
@@ -51,11 +51,30 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "site"
 
 
-def command(site: Path | None, *arguments: object) -> Ended:
+@pytest.fixture
+def installed(site: Path) -> Iterator[None]:
+    """The example, for commands in this process."""
+    with found_in(site):
+        yield
+
+
+@contextmanager
+def found_in(site: Path) -> Iterator[None]:
+    """Packages in this folder count as installed."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(site)
+        patch.setenv("COLUMNS", "200")
+        importlib.invalidate_caches()
+        look_again()
+        yield
+    look_again()
+    end_children()
+
+
+def apart(site: Path, *arguments: object) -> Reply:
     """`mapfusion ARGUMENTS` in a process of its own, with the installed packages of `site`."""
-    path = [str(site)] if site is not None else []
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([*path, *filter(None, sys.path)])}
-    environment |= {"COLUMNS": "200"}
+    path = os.pathsep.join([str(site), *filter(None, sys.path)])
+    environment = os.environ | {"PYTHONPATH": path, "COLUMNS": "200"}
     ended = subprocess.run(
         [sys.executable, "-m", "experiments.cli.main", *map(str, arguments)],
         env=environment,
@@ -63,7 +82,7 @@ def command(site: Path | None, *arguments: object) -> Ended:
         text=True,
         check=False,
     )
-    return Ended(ended.returncode, ended.stdout, ended.stderr)
+    return Reply(ended.returncode, ended.stdout, ended.stderr)
 
 
 @pytest.fixture
@@ -85,28 +104,36 @@ def entry(method: str, **parameters: object) -> str:
     return f"aligners={text}"
 
 
-def test_align_with_the_example(site: Path, maps: tuple[Path, Path]) -> None:
-    ended = command(site, "align", *maps, "--set", entry("best_share"))
+@pytest.mark.usefixtures("installed")
+def test_align_with_the_example(
+    maps: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    ended = command(capsys, "align", *maps, "--set", entry("best_share"))
     assert (ended.code, ended.err) == (0, "")
     row = next(line for line in ended.out.splitlines() if line.strip().startswith("theirs"))
     assert row.split()[1:4] == ["1.00", "-2.00", "0.30"]
     assert "20/20" in row
 
 
-def test_the_example_is_listed_with_its_package(site: Path) -> None:
-    listed = command(site, "aligners")
+@pytest.mark.usefixtures("installed")
+def test_the_example_is_listed_with_its_package(capsys: pytest.CaptureFixture[str]) -> None:
+    listed = command(capsys, "aligners")
     row = next(line for line in listed.out.splitlines() if "best_share" in line)
     assert row.split() == ["best_share", "plug-in", "mapfusion-best-share", "1.0"]
-    assert "best_share" not in command(None, "aligners").out
 
 
-def test_errors_name_it(site: Path, maps: tuple[Path, Path]) -> None:
-    ended = command(site, "align", *maps, "--set", entry("best_chare"))
+def test_it_is_not_listed_where_it_is_not_installed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "best_share" not in command(capsys, "aligners").out
+
+
+@pytest.mark.usefixtures("installed")
+def test_errors_name_it(maps: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
+    ended = command(capsys, "align", *maps, "--set", entry("best_chare"))
     assert ended.code == 2
     assert ended.err.count("\n") == 1
     assert "unknown aligner 'best_chare', known are ransac, svd, icp, impicp" in ended.err
     assert "best_share" in ended.err
-    ended = command(site, "align", *maps, "--set", entry("best_share", share=2))
+    ended = command(capsys, "align", *maps, "--set", entry("best_share", share=2))
     assert ended.code == 2
     assert "plug-in best_share: share: must lie in (0, 1]" in ended.err
     assert ended.err.count("\n") == 1
@@ -119,7 +146,7 @@ def test_a_scenario_with_the_example_and_peers(
     scenario.write_text(PLUGGED, encoding="utf-8")
     results = tmp_path / "results"
     shutil.copytree(tiny_results / "store", results / "store")
-    ended = command(site, "run", scenario, "--results", results, "--jobs", "2")
+    ended = apart(site, "run", scenario, "--results", results, "--jobs", "2")
     assert ended.code == 0, ended.err
     table_row = next(line for line in ended.out.splitlines() if line.strip().startswith("best"))
     assert table_row
@@ -139,7 +166,7 @@ def test_a_scenario_with_the_example_and_peers(
     folders = set((results / "store" / "aligner").iterdir())
     module.write_text(text + "\n# changed\n", encoding="utf-8")
     try:
-        ended = command(site, "run", scenario, "--results", results, "--jobs", "1")
+        ended = apart(site, "check", scenario, "--results", results, *("--seeds", 3, "--jobs", 1))
     finally:
         module.write_text(text, encoding="utf-8")
     assert ended.code == 0, ended.err
@@ -152,9 +179,9 @@ def test_an_absent_package_is_shown_as_absent(tmp_path: Path, maps: tuple[Path, 
     hidden = tmp_path / "hidden"
     hidden.mkdir()
     (hidden / "sitecustomize.py").write_text(HIDE, encoding="utf-8")
-    listed = command(hidden, "aligners")
+    listed = apart(hidden, "aligners")
     assert "kiss_matcher: the package kiss-matcher is not installed; pip install" in listed.out
-    ended = command(hidden, "align", *maps, "--set", entry("kiss_matcher"))
+    ended = apart(hidden, "align", *maps, "--set", entry("kiss_matcher"))
     assert (ended.code, ended.err) == (0, "")
     line = (
         "theirs: absent: the package kiss-matcher is not installed; "
@@ -176,12 +203,15 @@ sys.meta_path.insert(0, Hide())
 """
 
 
-def test_a_clash_of_names_is_one_line(tmp_path: Path, maps: tuple[Path, Path]) -> None:
+def test_a_clash_of_names_is_one_line(
+    tmp_path: Path, maps: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
     install(tmp_path / "site", name="ransac", package="clasher")
     line = (
         "aligner ransac: mapfusion's own is used, the one that clasher declares under the same "
         "name is not"
     )
-    ended = command(tmp_path / "site", "align", *maps, "--set", entry("ransac"))
-    assert (ended.code, ended.err) == (0, f"mapfusion: warning: {line}\n")
-    assert line in command(tmp_path / "site", "aligners").out
+    with found_in(tmp_path / "site"):
+        ended = command(capsys, "align", *maps, "--set", entry("ransac"))
+        assert (ended.code, ended.err) == (0, f"mapfusion: warning: {line}\n")
+        assert line in command(capsys, "aligners").out

@@ -11,8 +11,7 @@ from experiments.run.store import Store
 from experiments.scenario.loading import load_scenario
 from sim import renderer
 from sim.renderer import egl_driver
-from tests.experiments.cli.test_bad_input import assert_refused
-from tests.helpers.tiny_scenario import command
+from tests.helpers.tiny_scenario import assert_refused, command
 
 
 def test_results_record_the_renderer(tiny_result: Path) -> None:

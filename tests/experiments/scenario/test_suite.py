@@ -7,8 +7,7 @@ import pytest
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.suite import entries, scenarios_of
 from mapfusion.errors import InputError
-from tests.experiments.cli.test_bad_input import assert_refused
-from tests.helpers.tiny_scenario import command
+from tests.helpers.tiny_scenario import assert_refused, command
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 SHIPPED = sorted(path.stem for path in SCENARIOS.glob("*.yaml"))

@@ -7,7 +7,6 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from map_pairs import given_pairs, landmarks, motion, moved, swapped
 from scipy.stats import binom, binomtest
 
 from mapfusion import se2
@@ -26,6 +25,7 @@ from mapfusion.align.ransac import Ransac
 from mapfusion.align.refine import Refinement
 from mapfusion.align.registration import as_aligner
 from mapfusion.align.result import Alignment, Status, degenerate
+from tests.mapfusion.align.map_pairs import given_pairs, landmarks, motion, moved, swapped
 
 GATES_M = np.array([0.05, 0.1, 0.2, 0.4])
 

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from map_pairs import MapPair, error, given_pairs, landmarks, motion, moved, swapped
 
 from mapfusion import se2
 from mapfusion.align.correspondences import Correspondences
@@ -15,6 +14,15 @@ from mapfusion.align.registration import as_aligner
 from mapfusion.align.registry import ALIGNERS, make_aligner
 from mapfusion.align.result import Status
 from mapfusion.align.svd import Svd
+from tests.mapfusion.align.map_pairs import (
+    MapPair,
+    error,
+    given_pairs,
+    landmarks,
+    motion,
+    moved,
+    swapped,
+)
 
 NAMES = list(ALIGNERS)
 NAMED = {name: make_aligner(name) for name in NAMES} | {"svd solved": Svd("solved")}

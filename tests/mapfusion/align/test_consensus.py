@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from map_pairs import blurred, error, given_pairs, landmarks, moved, swapped
 from scipy.stats import chi2
 from scipy.stats import f as f_distribution
-from slow_twins import draw, slow_consistency, slow_squares
 
 from mapfusion import se2
 from mapfusion.align.clique import Clique
@@ -25,6 +23,8 @@ from mapfusion.align.registration import as_aligner
 from mapfusion.align.registry import make_aligner
 from mapfusion.align.result import Status
 from mapfusion.align.rigid import fit_rigid
+from tests.mapfusion.align.map_pairs import blurred, error, given_pairs, landmarks, moved, swapped
+from tests.mapfusion.align.slow_twins import draw, slow_consistency, slow_squares
 
 NAMES = ["gnc", "clique", "ransac_mahalanobis"]
 LOG_MISS = math.log(1e-4)

@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
-from map_pairs import blurred, given_pairs, motion, moved
 from scipy.stats import chi2
-from slow_twins import slow_consistency
 
 from mapfusion.align.consistency import consistency
 from mapfusion.align.pairs import Pairs
+from tests.mapfusion.align.map_pairs import blurred, given_pairs, motion, moved
+from tests.mapfusion.align.slow_twins import slow_consistency
 
 BOUND = float(chi2.ppf(0.999, 1))
 

@@ -2,10 +2,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from map_pairs import landmarks, unit_vectors
 
 from mapfusion.align import correspondences as module
 from mapfusion.align.correspondences import Correspondences, HeightGate, MatchParameters, match
+from tests.mapfusion.align.map_pairs import landmarks, unit_vectors
 
 
 def two_maps(rng, n=120, noise=0.03):

@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-from map_pairs import blurred, error, given_pairs
 
 from mapfusion import se2
 from mapfusion.align.gnc import Gnc, anneal
@@ -8,6 +7,7 @@ from mapfusion.align.mahalanobis_gate import mean_variances
 from mapfusion.align.pairs import Pairs
 from mapfusion.align.registration import as_aligner
 from mapfusion.align.rigid import fit_weighted
+from tests.mapfusion.align.map_pairs import blurred, error, given_pairs
 
 BOUND = Gnc().bound
 

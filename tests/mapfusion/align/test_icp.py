@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-from map_pairs import error, given_pairs, landmarks
 from scipy.spatial.distance import cdist
 
 from mapfusion import se2
@@ -11,6 +10,7 @@ from mapfusion.align.registration import as_aligner
 from mapfusion.align.registry import make_aligner
 from mapfusion.align.result import Status
 from mapfusion.align.rigid import fit_rigid
+from tests.mapfusion.align.map_pairs import error, given_pairs, landmarks
 
 
 def slow_icp(p_a, p_b, T, max_rounds):

@@ -2,9 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from map_pairs import blurred, error, given_pairs, stretched
 from scipy.stats import chi2, multivariate_normal
-from slow_twins import slow_squares
 
 from mapfusion.align.mahalanobis_gate import (
     log_likelihood,
@@ -16,6 +14,8 @@ from mapfusion.align.mahalanobis_gate import (
 )
 from mapfusion.align.pairs import Pairs
 from mapfusion.align.rigid import fit_weighted
+from tests.mapfusion.align.map_pairs import blurred, error, given_pairs, stretched
+from tests.mapfusion.align.slow_twins import slow_squares
 
 BOUND = float(chi2.ppf(0.99, 2))
 

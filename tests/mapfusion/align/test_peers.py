@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from map_pairs import error, given_pairs, landmarks, swapped
 
 from mapfusion import se2
 from mapfusion.align.correspondences import Correspondences
@@ -10,6 +9,7 @@ from mapfusion.align.registration import as_aligner
 from mapfusion.align.registry import make_aligner
 from mapfusion.align.result import Status
 from mapfusion.align.rigid import fit_rigid
+from tests.mapfusion.align.map_pairs import error, given_pairs, landmarks, swapped
 
 pytest.importorskip("kiss_matcher")
 

@@ -3,9 +3,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from map_pairs import error, given_pairs, landmarks
 from scipy.stats import chisquare
-from slow_twins import draw
 
 from mapfusion import se2
 from mapfusion.align.correspondences import Correspondences
@@ -15,6 +13,8 @@ from mapfusion.align.ransac import Ransac, draw_pair, most_supported
 from mapfusion.align.refine import Refinement
 from mapfusion.align.registration import as_aligner
 from mapfusion.align.result import Status
+from tests.mapfusion.align.map_pairs import error, given_pairs, landmarks
+from tests.mapfusion.align.slow_twins import draw
 
 GATE_M, BASELINE_M = 0.3, 1.0
 LOG_MISS = math.log(1e-4)

@@ -3,7 +3,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from map_pairs import error, given_pairs, stretched
 from scipy.stats import chi2
 from scipy.stats import f as f_distribution
 
@@ -13,6 +12,7 @@ from mapfusion.align.pairs import Pairs
 from mapfusion.align.refine import Refinement, maximise_likelihood
 from mapfusion.align.result import Status
 from mapfusion.align.rigid import motion_jacobian, residual_covariances, residuals
+from tests.mapfusion.align.map_pairs import error, given_pairs, stretched
 
 
 def slow_iterate(pairs, T, gate_m, least_drift_m, rounds, variance=None, share=0.5):

@@ -4,7 +4,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
-from map_pairs import given_pairs, landmarks
 
 from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.correspondences import Correspondences, HeightGate
@@ -22,6 +21,7 @@ from mapfusion.align.rigid import (
     motion_jacobian,
     residual_covariances,
 )
+from tests.mapfusion.align.map_pairs import given_pairs, landmarks
 
 
 @dataclass

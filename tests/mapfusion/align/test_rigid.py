@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-from map_pairs import error, motion
 from scipy.optimize import least_squares
 
 from mapfusion import se2
@@ -14,6 +13,7 @@ from mapfusion.align.rigid import (
     residual_covariances,
     residuals,
 )
+from tests.mapfusion.align.map_pairs import error, motion
 
 
 @pytest.fixture

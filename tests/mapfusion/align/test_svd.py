@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-from map_pairs import error, given_pairs, landmarks, moved
 
 from mapfusion import se2
 from mapfusion.align.correspondences import Correspondences
@@ -8,6 +7,7 @@ from mapfusion.align.registration import as_aligner
 from mapfusion.align.result import Status
 from mapfusion.align.rigid import motion_covariance
 from mapfusion.align.svd import Svd, solve
+from tests.mapfusion.align.map_pairs import error, given_pairs, landmarks, moved
 
 RNG = np.random.default_rng(0)  # SVD draws nothing
 

@@ -4,8 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from copying_filter import CopyingFilter
-from landmark_worlds import drive, nothing, observe, unit
 
 from mapfusion.fastslam.filter import FastSlam
 from mapfusion.fastslam.genealogy import MEMORY
@@ -14,6 +12,8 @@ from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.fastslam.proposal import Proposal
 from mapfusion.robot_log import Observations
 from mapfusion.se2 import compose, inverse, rotation_about_z, transform_points, wrap
+from tests.mapfusion.fastslam.copying_filter import CopyingFilter
+from tests.mapfusion.fastslam.landmark_worlds import drive, nothing, observe, unit
 
 EXACT_MOTION = MotionNoise(0, 0, 0, 0, 0, lateral_slip_m_per_rad=0)
 LOOSE_MOTION = MotionNoise(0.1, 0.05, 0.1, 0, 0, lateral_slip_m_per_rad=0.03)

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from landmark_worlds import drive, observe, unit
 
 from mapfusion.fastslam.filter import FastSlam
 from mapfusion.fastslam.motion import MotionNoise
@@ -15,6 +14,7 @@ from mapfusion.fastslam.sensor import Sightings, sightings
 from mapfusion.fastslam.slots import Slots
 from mapfusion.robot_log import Observations
 from mapfusion.se2 import compose, transform_points
+from tests.mapfusion.fastslam.landmark_worlds import drive, observe, unit
 
 MOTION = MotionNoise(0.1, 0.05, 0.1, 0, 0, lateral_slip_m_per_rad=0.03)
 STEP = np.array([0.3, 0.0, 0.2])

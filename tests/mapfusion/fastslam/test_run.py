@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from landmark_worlds import drive
 
 from mapfusion.errors import InputError
 from mapfusion.fastslam.filter import FastSlam
 from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.fastslam.run import build_map, run_log
 from mapfusion.robot_log import Observations, RobotLog
+from tests.mapfusion.fastslam.landmark_worlds import drive
 
 SETTINGS = FastSlamParameters(n_particles=10)
 

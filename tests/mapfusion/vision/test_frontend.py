@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rendered_scene import Plane, render, wall
 
 from mapfusion.camera import StereoCamera
 from mapfusion.se2 import transform_points
@@ -12,6 +11,7 @@ from mapfusion.vision.features import Features
 from mapfusion.vision.frontend import FrontEnd, FrontEndParameters, observe
 from mapfusion.vision.tracks import Tracker, TrackParameters
 from mapfusion.vision.usurf import USurfParameters
+from tests.mapfusion.vision.rendered_scene import Plane, render, wall
 
 CAMERA = StereoCamera()
 

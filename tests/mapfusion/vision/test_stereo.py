@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rendered_scene import Plane, render, wall
 from scipy.ndimage import map_coordinates
 from scipy.optimize import least_squares
 from scipy.stats import chi2
@@ -15,6 +14,7 @@ from mapfusion.vision.plane_fit import fit_planes
 from mapfusion.vision.row_search import search_rows
 from mapfusion.vision.stereo import StereoParameters, match
 from mapfusion.vision.verdict import Verdict
+from tests.mapfusion.vision.rendered_scene import Plane, render, wall
 
 CAMERA = StereoCamera(width_px=320, height_px=240, focal_px=300.0)
 PARAMETERS = StereoParameters(min_depth_m=0.9, max_depth_m=12.0)

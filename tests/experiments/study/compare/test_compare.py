@@ -54,12 +54,10 @@ def test_a_method_that_changed_is_found_and_no_other(
 def test_chance_alone_is_rarely_taken_for_a_change(tmp_path: Path) -> None:
     """Other random numbers in everything: of 20 comparisons at 5 %, corrected, some 1 may err."""
     wrong = 0
+    a = write_sweep(tmp_path / "a", range(8))
     for trial in range(20):
-
-        def redrawn(seed: int, made: Tables, trial: int = trial) -> Tables:
-            return tables_of(1000 * (trial + 1) + seed)
-
-        found = compare(*two_sweeps(tmp_path / str(trial), redrawn, seeds=8))
+        redrawn = {seed: tables_of(1000 * (trial + 1) + seed) for seed in range(8)}
+        found = compare(a, write_sweep(tmp_path / str(trial), range(8), made=redrawn))
         wrong += found.table["verdict"].isin([BETTER, WORSE]).any()
         assert (found.table["verdict"] == NOISE).any()
         p = found.table["p"].to_numpy()

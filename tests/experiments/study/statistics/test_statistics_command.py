@@ -63,6 +63,7 @@ def test_eighty_columns_hold_everything(tmp_path: Path, capsys: pytest.CaptureFi
     assert "ransac_mahalanobis" in reply.out.split("Verdicts")[1].split("Right")[0]
 
 
+@pytest.mark.usefixtures("quick_save")
 def test_several_scenarios_and_settings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     settings = [{"slam.particles": "50"}, {"slam.particles": "200"}]
     sweep = write_sweep(tmp_path / "sweep", range(2), settings, ("hall", "maze"))

@@ -175,9 +175,7 @@ def test_killed_sweeps_go_on_and_readers_always_find_whole_runs(
     with KilledSweep((short_path, "--seeds", "0..1", *GRID), tmp_path) as killed:
         reader.start()
         try:
-            victims = killed.kill_at_random(
-                random.Random(1), ["worker", "everything", "worker", "worker"]
-            )
+            victims = killed.kill_at_random(random.Random(1), ["worker", "everything", "worker"])
             code, complaints = killed.finish()
         finally:
             stop.set()
@@ -204,8 +202,8 @@ def test_two_sweeps_at_once_on_one_store(swept: Path, short_path: Path, tmp_path
     """They do some work twice, and nothing wrong."""
     arguments = (short_path, "--seeds", "0..1", *GRID)
     with (
-        KilledSweep((*arguments, "-o", tmp_path / "one"), tmp_path) as one,
-        KilledSweep((*arguments, "-o", tmp_path / "two"), tmp_path) as two,
+        KilledSweep((*arguments, "-o", tmp_path / "one"), tmp_path, jobs=1) as one,
+        KilledSweep((*arguments, "-o", tmp_path / "two"), tmp_path, jobs=1) as two,
     ):
         for sweep in (one, two):
             code, complaints = sweep.finish()
