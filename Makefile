@@ -23,11 +23,11 @@ test: $(STAMP)
 
 # Ten random kills of a sweep; minutes.
 endurance: $(STAMP)
-	$(BIN)/python -m pytest tests/experiments/sweep/ten_kills.py -s
+	$(BIN)/python -m pytest tests/experiments/study/sweep/ten_kills.py -s
 
 # Installs Debian's chromium where it is missing (needs root for that).
 browser-test: $(STAMP)
-	PYTHON=$(BIN)/python tests/browser/run.sh $(RESULT)
+	PYTHON=$(BIN)/python tests/experiments/show/report/report_in_browser.sh $(RESULT)
 
 lint: $(STAMP)
 	$(BIN)/ruff format --check .

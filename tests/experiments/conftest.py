@@ -1,3 +1,4 @@
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -8,8 +9,7 @@ from experiments.judge.result import run_scenario
 from experiments.methods.one_thread import single_threaded
 from experiments.run.store import Store
 from experiments.scenario.settings import Scenario, load_scenario
-from tests.helpers.synthetic_result import write_result
-from tests.helpers.tiny_scenario import TINY
+from tests.helpers.tiny_scenario import TINY, TRIO
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -34,19 +34,22 @@ def tiny(tiny_path: Path) -> Scenario:
     return load_scenario(tiny_path)
 
 
-@pytest.fixture(scope="session")
-def tiny_results(tiny: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Results folder of one uninterrupted run in one process; tests must not change it."""
-    results = tmp_path_factory.mktemp("results")
+def finished(scenario: Scenario, results: Path) -> Path:
+    """The result folder of one uninterrupted run in one process."""
     single_threaded()
-    run_scenario(tiny, results, 1, lambda stage, done, total: None)
-    return results
+    return run_scenario(scenario, results, 1, lambda stage, done, total: None)
 
 
 @pytest.fixture(scope="session")
-def tiny_result(tiny_results: Path) -> Path:
-    """The result folder of that run."""
-    return tiny_results / "tiny-3"
+def tiny_result(tiny: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its result folder; tests must not change it."""
+    return finished(tiny, tmp_path_factory.mktemp("results"))
+
+
+@pytest.fixture(scope="session")
+def tiny_results(tiny_result: Path) -> Path:
+    """The folder that result and the store lie in; tests must not change it."""
+    return tiny_result.parent
 
 
 @pytest.fixture(scope="session")
@@ -56,6 +59,14 @@ def tiny_log(tiny: Scenario, tiny_results: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def made_up_result(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A small result folder; tests must not change it."""
-    return write_result(tmp_path_factory.mktemp("result"))
+def trio_result(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The result folder of three robots; tests must not change it, see `trio_copy`."""
+    folder = tmp_path_factory.mktemp("trio")
+    (folder / "trio.yaml").write_text(TRIO, encoding="utf-8")
+    return finished(load_scenario(folder / "trio.yaml"), folder)
+
+
+@pytest.fixture
+def trio_copy(trio_result: Path, tmp_path: Path) -> Path:
+    """A copy of it, for a test to change."""
+    return Path(shutil.copytree(trio_result, tmp_path / "result"))

@@ -1,4 +1,4 @@
-"""A simulated scenario that runs in seconds, and the command run in this process."""
+"""Simulated scenarios that run in seconds, and the command run in this process."""
 
 import sys
 from pathlib import Path
@@ -35,6 +35,13 @@ keep: {images_at: 30, images: 2}
 expect:
   path_rmse_m: {max: 1}
 """
+# All that figures and reports can show: three pairs of maps, and methods that scatter.
+TRIO = (
+    TINY.replace("name: tiny", "name: trio")
+    .replace("drive:", "  - {name: R3, start: [0.9, 2.0, 0.1], route: [[2.5, 2.0]]}\ndrive:")
+    .replace("repetitions: 2", "repetitions: 3")
+    .replace("evaluate:", "    - {name: impicp, method: impicp}\nevaluate:")
+)
 TIMED = ("timings", "aligner_timings")  # the only tables that may differ between two runs
 
 

@@ -1,12 +1,7 @@
 """One tiny run from end to end: every table, every command, interruptions, reuse."""
 
 import json
-import os
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -23,6 +18,7 @@ from experiments.run.store import StageFolder, Store
 from experiments.scenario.settings import Scenario, load_scenario
 from mapfusion.landmark_map import read_map
 from mapfusion.robot_log import read_log, read_truth, write_truth_points, write_truth_poses
+from tests.helpers.interrupting import interrupted
 from tests.helpers.tiny_scenario import TINY, assert_same_tables, command, estimated_tables
 
 
@@ -121,45 +117,29 @@ def test_ctrl_c_before_the_command_starts(
     assert len(reply.err.splitlines()) == 1
 
 
-def interrupted_run(path: Path, results: Path) -> subprocess.CompletedProcess[str]:
-    """Start `mapfusion run`, press Ctrl-C once the first rendered chunk is on disk."""
-    process = subprocess.Popen(
-        [
-            *(sys.executable, "-m", "experiments.cli.main", "run", path),
-            "--jobs=2",
-            f"--results={results}",
-        ],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,  # a process group of its own, as a shell gives each command
-    )
-    deadline = time.monotonic() + 60
-    while not list(results.rglob("features_*.parquet")) and time.monotonic() < deadline:
-        assert process.poll() is None, process.communicate()
-        time.sleep(0.005)
-    os.killpg(process.pid, signal.SIGINT)
-    out, err = process.communicate(timeout=30)
-    return subprocess.CompletedProcess(process.args, process.returncode, out, err)
-
-
 def test_interrupted_run_goes_on_and_gives_the_same_tables(
     tiny: Scenario, tiny_path: Path, tiny_result: Path, tmp_path: Path
 ) -> None:
-    ended = interrupted_run(tiny_path, tmp_path)
+    def rendered() -> list[Path]:
+        return list(results.rglob("features_*.parquet"))
+
+    results, held = tmp_path / "results", tmp_path / "held"
+    held.mkdir()
+    command_line = ["run", tiny_path, "--jobs=2", f"--results={results}"]
+    ended = interrupted(command_line, held, "features_000020.parquet", lambda: bool(rendered()))
     assert ended.returncode == 130
     assert "Traceback" not in ended.stderr
     complaints = [line for line in ended.stderr.splitlines() if line.startswith("mapfusion: ")]
     assert len(complaints) == 1
     assert "interrupted" in complaints[0]
-    kept = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("features_*.parquet")}
+    kept = {path: path.stat().st_mtime_ns for path in rendered()}
     assert 1 <= len(kept) < 6
-    assert not (tmp_path / "tiny-3").exists()
+    assert not (results / "tiny-3").exists()
 
-    run_scenario(tiny, tmp_path, 2, quietly)
+    run_scenario(tiny, results, 2, quietly)
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
-    assert len(list(tmp_path.rglob("features_*.parquet"))) == 6
-    assert_same_tables(tmp_path / "tiny-3", tiny_result)  # which one process made in one go
+    assert len(rendered()) == 6
+    assert_same_tables(results / "tiny-3", tiny_result)  # which one process made in one go
 
 
 def test_truth_is_for_the_evaluation_alone(

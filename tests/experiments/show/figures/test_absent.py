@@ -1,6 +1,5 @@
 """Methods whose package is not installed are shown as absent."""
 
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -26,11 +25,9 @@ MEASURED = {
 
 
 @pytest.fixture
-def without_svd(made_up_result: Path, tmp_path: Path) -> ResultTables:
-    result = tmp_path / "result"
-    shutil.copytree(made_up_result, result)
+def without_svd(trio_copy: Path) -> ResultTables:
     for name, columns in MEASURED.items():
-        path = tables.table_path(result, name)
+        path = tables.table_path(trio_copy, name)
         rows = tables.read(path, name)
         own = rows["aligner"] == "svd"
         assert own.any()
@@ -38,16 +35,16 @@ def without_svd(made_up_result: Path, tmp_path: Path) -> ResultTables:
         if name == "errors":
             rows.loc[own, ["status", "refined_status"]] = "absent"
         tables.write(path, name, rows)
-    return ResultTables(result)
+    return ResultTables(trio_copy)
 
 
 @pytest.mark.parametrize(
     "module", [fig04_translation_error, fig05_rotation_error, fig06_aligner_time]
 )
-def test_legends_say_absent(module, made_up_result: Path, without_svd: ResultTables) -> None:
+def test_legends_say_absent(module, trio_result: Path, without_svd: ResultTables) -> None:
     def labels(data: ResultTables) -> list[str]:
         return [text.get_text() for text in module.draw(data).legends[0].get_texts()]
 
-    before, after = labels(ResultTables(made_up_result)), labels(without_svd)
+    before, after = labels(ResultTables(trio_result)), labels(without_svd)
     assert "svd" in before
     assert after == ["svd (absent)" if label == "svd" else label for label in before]

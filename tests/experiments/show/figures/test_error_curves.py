@@ -12,7 +12,6 @@ from experiments.judge import tables
 from experiments.show.figures import fig04_translation_error, fig05_rotation_error
 from experiments.show.figures.error_curves import MIN_TRUE_PAIRS, summarise
 from experiments.show.figures.result_tables import ResultTables
-from tests.helpers.synthetic_result import ALIGNERS
 
 COLUMNS = {
     fig04_translation_error: ("translation_error_m", "refined_translation_error_m"),
@@ -30,8 +29,8 @@ def slow_medians(rows: list[dict], aligner: str, column: str) -> dict[int, float
 
 
 @pytest.mark.parametrize("module", COLUMNS)
-def test_drawn_lines_are_the_medians_of_the_repetitions(module, made_up_result: Path) -> None:
-    data = ResultTables(made_up_result)
+def test_drawn_lines_are_the_medians_of_the_repetitions(module, trio_result: Path) -> None:
+    data = ResultTables(trio_result)
     errors = data.table("errors")
     panels = iter(module.draw(data).axes)
     for robot_a, robot_b in (("R1", "R2"), ("R1", "R3"), ("R2", "R3")):
@@ -41,7 +40,7 @@ def test_drawn_lines_are_the_medians_of_the_repetitions(module, made_up_result: 
             axes = next(panels)
             assert axes.get_title().startswith(f"{robot_a} - {robot_b}")
             drawn = {line.get_label(): line for line in axes.get_lines()}
-            assert set(drawn) == {*ALIGNERS, "oracle"}
+            assert set(drawn) == set(data.aligners)
             for aligner, line in drawn.items():
                 expected = slow_medians(rows, aligner, column)
                 np.testing.assert_array_equal(line.get_xdata(), sorted(expected))
@@ -50,8 +49,8 @@ def test_drawn_lines_are_the_medians_of_the_repetitions(module, made_up_result: 
                 )
 
 
-def test_band_holds_the_middle_four_fifths(made_up_result: Path) -> None:
-    errors = ResultTables(made_up_result).table("errors")
+def test_band_holds_the_middle_four_fifths(trio_result: Path) -> None:
+    errors = ResultTables(trio_result).table("errors")
     summary = summarise(errors, "translation_error_m")
     for row in summary.to_dict("records"):
         keys = ("robot_a", "robot_b", "aligner", "iteration")
@@ -75,16 +74,16 @@ def shaded(figure: Figure, panel: int) -> list[tuple[float, float]]:
     ],
 )
 def test_iterations_with_too_few_true_pairs_are_shaded(
-    n_true: list[int], expected: list[tuple[float, float]], made_up_result: Path, tmp_path: Path
+    n_true: list[int], expected: list[tuple[float, float]], trio_result: Path, tmp_path: Path
 ) -> None:
     assert MIN_TRUE_PAIRS == 3
-    errors = ResultTables(made_up_result).table("errors")
+    errors = ResultTables(trio_result).table("errors")
     few = errors[(errors["robot_a"] == "R1") & (errors["robot_b"] == "R2")].copy()
     keep = sorted(few["iteration"].unique())[: len(n_true)]
     few = few[few["iteration"].isin(keep)]
     place = few["iteration"].map({k: i for i, k in enumerate(keep)})
     few = few.assign(iteration=10 * place, n_true=[n_true[i] for i in place])
     tables.write(tables.table_path(tmp_path, "errors"), "errors", few)
-    (tmp_path / "scenario.json").write_text((made_up_result / "scenario.json").read_text())
+    (tmp_path / "scenario.json").write_text((trio_result / "scenario.json").read_text())
     figure = fig04_translation_error.draw(ResultTables(tmp_path))
     assert np.ravel(shaded(figure, 0)) == pytest.approx(np.ravel(expected))

@@ -4,35 +4,39 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.distance import pdist
 
 from experiments.show.figures.fig08_fused_landmark import choose_landmark
 from experiments.show.figures.fused_frame import FusedPairs, fused_pairs, moved_map
-from experiments.show.figures.result_tables import ResultTables
-from mapfusion.se2 import transform_points
-from tests.helpers.synthetic_result import ALIGNMENT_ERROR, DRIFT_SIGMA_M
+from experiments.show.figures.result_tables import ResultTables, positions_and_covariances
 
 
 @pytest.mark.parametrize("robot", ["R1", "R2", "R3"])
-def test_maps_lie_where_the_merge_put_them(robot: str, made_up_result: Path) -> None:
-    data = ResultTables(made_up_result)
-    T_fused_robot = data.true_alignment(("R1", robot))
-    assert T_fused_robot is not None
-    if robot != "R1":
-        T_fused_robot = T_fused_robot + ALIGNMENT_ERROR
-    position, covariance = data.landmarks_of(robot)
-    moved, moved_covariance, own_covariance = moved_map(data, robot)
-    np.testing.assert_allclose(moved, transform_points(T_fused_robot, position), atol=1e-9)
-    # A turn changes no eigenvalue, and the drift was added in x and y.
+def test_maps_lie_where_the_merge_put_them(robot: str, trio_result: Path) -> None:
+    """Landmarks that no other robot had lie in the fused map just as the merge moved them."""
+    data = ResultTables(trio_result)
+    position, covariance, own_covariance = moved_map(data, robot)
+    fused = data.table("fused")
+    carried = fused[(fused["n_parents"] == 1) & (fused["robot_a"] == robot)]
+    rows = carried["landmark_a"].to_numpy()
+    assert 10 < len(rows) < len(position)
+    there, there_covariance = positions_and_covariances(carried)
+    np.testing.assert_allclose(position[rows], there, atol=1e-9)
+    np.testing.assert_allclose(covariance[rows], there_covariance, atol=1e-10)
+    # the others were moved along: all distances are those of the robot's own map
+    own, unmoved_covariance = data.landmarks_of(robot)
+    np.testing.assert_allclose(pdist(position), pdist(own), atol=1e-9)
+    # a turn changes no eigenvalue, and the drift was added in x and y, alike to all
     np.testing.assert_allclose(
-        np.linalg.eigvalsh(own_covariance), np.linalg.eigvalsh(covariance), rtol=1e-9
+        np.linalg.eigvalsh(own_covariance), np.linalg.eigvalsh(unmoved_covariance), rtol=1e-9
     )
-    added = moved_covariance - own_covariance
-    drift = DRIFT_SIGMA_M**2 * np.diag([1.0, 1.0, 0.0])
+    added = covariance - own_covariance
+    drift = added[0, 0, 0] * np.diag([1.0, 1.0, 0.0])
     np.testing.assert_allclose(added, np.broadcast_to(drift, added.shape), atol=1e-10)
 
 
-def test_parents_fuse_into_the_stored_landmark(made_up_result: Path) -> None:
-    pairs = fused_pairs(ResultTables(made_up_result))
+def test_parents_fuse_into_the_stored_landmark(trio_result: Path) -> None:
+    pairs = fused_pairs(ResultTables(trio_result))
     information = np.linalg.inv(pairs.covariance_m2)
     total = information[0] + information[1]
     np.testing.assert_allclose(total, information[2], rtol=1e-6)

@@ -4,9 +4,7 @@ import base64
 import hashlib
 import json
 import re
-import shutil
 from html import unescape
-from html.parser import HTMLParser
 from pathlib import Path
 
 import pandas as pd
@@ -14,50 +12,15 @@ import pytest
 
 from experiments.judge import tables
 from experiments.show.report import write_report
+from tests.helpers.report_page import HOSTILE, Page, hostile, page_of
 from tests.helpers.tiny_scenario import command
 
-HOSTILE = '<img src=x onerror=alert(1)></script><script>alert("2")</script>'
 MAX_BYTES = 15_000_000
 
 
-class Page(HTMLParser):
-    """Tags, text and the JSON of a report."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.tags: list[tuple[str, dict[str, str | None]]] = []
-        self.words = ""
-        self.json = ""
-        self._within = ""
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-        kind = dict(attrs).get("type")
-        self._within = "json" if kind == "application/json" else tag
-
-    def handle_endtag(self, tag: str) -> None:
-        self._within = ""
-
-    def handle_data(self, data: str) -> None:
-        if self._within == "json":
-            self.json += data
-        elif self._within not in {"script", "style"}:
-            self.words += data
-
-
-def page_of(result: Path, output: Path) -> Page:
-    return Page(write_report(result, output).read_text(encoding="utf-8"))
-
-
 @pytest.fixture(scope="module")
-def page(made_up_result: Path, tmp_path_factory: pytest.TempPathFactory) -> Page:
-    return page_of(made_up_result, tmp_path_factory.mktemp("report") / "report.html")
-
-
-@pytest.fixture
-def copied(made_up_result: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(made_up_result, tmp_path / "result"))
+def page(trio_result: Path, tmp_path_factory: pytest.TempPathFactory) -> Page:
+    return page_of(trio_result, tmp_path_factory.mktemp("report") / "report.html")
 
 
 def test_the_verdict_comes_first(page: Page) -> None:
@@ -79,8 +42,8 @@ def test_it_refers_to_nothing_outside(page: Page) -> None:
     assert sum(tag == "script" for tag, _ in page.tags) == 4  # data, Plotly, charts, the map
 
 
-def test_scripts_bear_the_hashes_of_the_policy(made_up_result: Path, tmp_path: Path) -> None:
-    text = write_report(made_up_result, tmp_path / "r.html").read_text(encoding="utf-8")
+def test_scripts_bear_the_hashes_of_the_policy(trio_result: Path, tmp_path: Path) -> None:
+    text = write_report(trio_result, tmp_path / "r.html").read_text(encoding="utf-8")
     plain = r'<script(?: type="text/plain" id="\w+")?>(.*?)</script>'
     scripts = re.findall(plain, text, re.DOTALL)
     assert len(scripts) == 3
@@ -89,23 +52,8 @@ def test_scripts_bear_the_hashes_of_the_policy(made_up_result: Path, tmp_path: P
         assert f"'sha256-{digest}'" in unescape(text)
 
 
-def hostile(result: Path) -> Path:
-    """Give an aligner, a robot and the scenario names that would like to be HTML."""
-    renamed = {"ransac": HOSTILE, "R2": f"R2{HOSTILE}"}
-    for name in tables.ALL:
-        file = tables.table_path(result, name)
-        if file.is_file():
-            tables.write(file, name, tables.read(file, name).replace(renamed))
-    text = (result / "scenario.json").read_text().replace('"ransac"', json.dumps(HOSTILE))
-    scenario = json.loads(text) | {"description": HOSTILE, "name": HOSTILE}
-    (result / "scenario.json").write_text(json.dumps(scenario))
-    world = (result / "world.json").read_text().replace('"R2"', json.dumps(f"R2{HOSTILE}"))
-    (result / "world.json").write_text(world)
-    return result
-
-
-def test_names_are_escaped_everywhere(copied: Path, page: Page) -> None:
-    harmed = page_of(hostile(copied), copied / "report.html")
+def test_names_are_escaped_everywhere(trio_copy: Path, page: Page) -> None:
+    harmed = page_of(hostile(trio_copy), trio_copy / "report.html")
     assert [tag for tag, _ in harmed.tags].count("script") == 4
     assert not [a for _, a in harmed.tags if "onerror" in a]
     assert HOSTILE in harmed.words  # as text, whole
@@ -115,11 +63,11 @@ def test_names_are_escaped_everywhere(copied: Path, page: Page) -> None:
     assert [tag for tag, _ in harmed.tags] == [tag for tag, _ in page.tags]
 
 
-def test_numbers_that_json_does_not_know_are_left_out(copied: Path) -> None:
-    rows = tables.read(tables.table_path(copied, "errors"), "errors")
+def test_numbers_that_json_does_not_know_are_left_out(trio_copy: Path) -> None:
+    rows = tables.read(tables.table_path(trio_copy, "errors"), "errors")
     rows.loc[rows["aligner"] == "icp", "translation_error_m"] = float("inf")
-    tables.write(tables.table_path(copied, "errors"), "errors", rows)
-    found = page_of(copied, copied / "r.html")
+    tables.write(tables.table_path(trio_copy, "errors"), "errors", rows)
+    found = page_of(trio_copy, trio_copy / "r.html")
 
     def refuse(constant: str) -> None:
         raise AssertionError(constant)
@@ -128,17 +76,17 @@ def test_numbers_that_json_does_not_know_are_left_out(copied: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["aligner_timings", "clouds", "fusion", "map_history"])
-def test_without_a_table_the_rest_is_shown(name: str, copied: Path) -> None:
-    tables.table_path(copied, name).unlink()
-    assert "Use ransac" in re.sub(r"\s+", " ", page_of(copied, copied / "r.html").words)
+def test_without_a_table_the_rest_is_shown(name: str, trio_copy: Path) -> None:
+    tables.table_path(trio_copy, name).unlink()
+    assert "Use ransac" in re.sub(r"\s+", " ", page_of(trio_copy, trio_copy / "r.html").words)
 
 
-def test_a_single_evaluated_iteration_is_enough(copied: Path) -> None:
+def test_a_single_evaluated_iteration_is_enough(trio_copy: Path) -> None:
     for name in ("errors", "estimates", "correspondences", "true_pairs", "fused_history"):
-        file = tables.table_path(copied, name)
+        file = tables.table_path(trio_copy, name)
         rows = tables.read(file, name)
         tables.write(file, name, rows[rows["iteration"] == rows["iteration"].max()])
-    known = json.loads(page_of(copied, copied / "r.html").json)
+    known = json.loads(page_of(trio_copy, trio_copy / "r.html").json)
     assert len(known["map"]["pairs"][0]["frames"]) == 1
 
 
@@ -149,9 +97,9 @@ def test_real_results_fit(tiny_result: Path, tmp_path: Path) -> None:
 
 
 def test_the_command_says_where_it_wrote(
-    made_up_result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    trio_result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    reply = command(capsys, "report", made_up_result, "-o", tmp_path / "r.html")
+    reply = command(capsys, "report", trio_result, "-o", tmp_path / "r.html")
     assert reply.code == 0
     assert str(tmp_path / "r.html") in reply.out.replace("\n", "")
     reply = command(capsys, "report", tmp_path)
@@ -160,28 +108,28 @@ def test_the_command_says_where_it_wrote(
     assert str(tmp_path) in reply.complaints[0]
 
 
-def test_a_damaged_table_is_named(copied: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    tables.table_path(copied, "map_history").write_bytes(b"PAR1 no more")
-    reply = command(capsys, "report", copied)
+def test_a_damaged_table_is_named(trio_copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    tables.table_path(trio_copy, "map_history").write_bytes(b"PAR1 no more")
+    reply = command(capsys, "report", trio_copy)
     assert reply.code == 2
     assert "map_history.parquet" in reply.complaints[0]
 
 
 def test_a_result_without_alignments_says_so(
-    copied: Path, capsys: pytest.CaptureFixture[str]
+    trio_copy: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     empty: list[pd.DataFrame] = []
-    tables.write(tables.table_path(copied, "errors"), "errors", empty)
-    reply = command(capsys, "report", copied)
+    tables.write(tables.table_path(trio_copy, "errors"), "errors", empty)
+    reply = command(capsys, "report", trio_copy)
     assert reply.code == 2
     assert "no pair of maps was aligned" in reply.complaints[0]
 
 
-def test_absent_packages_are_no_failures(copied: Path) -> None:
-    rows = tables.read(tables.table_path(copied, "errors"), "errors")
+def test_absent_packages_are_no_failures(trio_copy: Path) -> None:
+    rows = tables.read(tables.table_path(trio_copy, "errors"), "errors")
     own = rows["aligner"] == "impicp"
     rows.loc[own, ["status", "refined_status"]] = "absent"
-    tables.write(tables.table_path(copied, "errors"), "errors", rows)
-    page = page_of(copied, copied / "r.html")
+    tables.write(tables.table_path(trio_copy, "errors"), "errors", rows)
+    page = page_of(trio_copy, trio_copy / "r.html")
     assert "Not installed, and so not judged: impicp." in page.words
     assert "impicp" not in [aligner["name"] for aligner in json.loads(page.json)["aligners"]]

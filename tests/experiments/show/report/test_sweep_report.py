@@ -5,15 +5,15 @@ from pathlib import Path
 
 import pytest
 
-from tests.experiments.show.report.test_document import Page, page_of
 from tests.helpers.made_up_sweep import write_sweep
+from tests.helpers.report_page import Page, page_of
 from tests.helpers.tiny_scenario import command
 
 
 @pytest.fixture(scope="module")
-def sweep(made_up_result: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def sweep(trio_result: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sweeps") / "particles"
-    return write_sweep(folder, made_up_result, range(6), ("50", "200"))
+    return write_sweep(folder, trio_result, range(6), ("50", "200"))
 
 
 @pytest.fixture(scope="module")
@@ -63,9 +63,9 @@ def test_inspect_and_report_as_commands(
 
 
 def test_a_sweep_without_a_finished_run(
-    made_up_result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    trio_result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = write_sweep(tmp_path / "all failed", made_up_result, range(1), ("50",))
+    folder = write_sweep(tmp_path / "all failed", trio_result, range(1), ("50",))
     reply = command(capsys, "report", folder)
     assert reply.code == 2
     assert "nothing to report on" in reply.complaints[0]

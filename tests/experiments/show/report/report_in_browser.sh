@@ -1,8 +1,8 @@
 #!/bin/sh
 # The report in a real browser, Debian's chromium, which is installed if it is missing.
-# Usage: tests/browser/run.sh [RESULT]   (RESULT: a result folder to open as well)
+# Usage: tests/experiments/show/report/report_in_browser.sh [RESULT]   (RESULT: a result folder to open as well)
 set -eu
-cd "$(dirname "$0")/../.."
+cd "$(dirname "$0")/../../../.."
 if [ -z "${CHROMIUM:-}" ] && ! command -v chromium >/dev/null; then
     if [ "$(id -u)" != 0 ]; then
         echo "browser-test: chromium is missing; install it, or run this as root" >&2
@@ -17,5 +17,4 @@ if [ $# -gt 0 ]; then
     RESULT="$1"
     export RESULT
 fi
-exec "${PYTHON:-.venv/bin/python}" -m pytest tests/browser/report_in_browser.py -s \
-    -o "pythonpath=tests/experiments tests/experiments/report"
+exec "${PYTHON:-.venv/bin/python}" -m pytest tests/experiments/show/report/report_in_browser.py -s

@@ -1,22 +1,25 @@
 """The report in a real browser. Run by `make browser-test`; `make test` leaves it out.
 
-RESULT in the environment names a real result folder to open as well as the made-up one, which is
-as large as that of the paper's scenario.
+RESULT in the environment names a result folder to open as well as that of three robots, which is
+enlarged until it is as large as that of the paper's scenario.
 """
 
 import json
 import os
 import re
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
 
+from experiments.judge import tables
 from experiments.show.figures import draw_all
 from experiments.show.report import write_report
-from tests.helpers.synthetic_result import Size, write_result
+from tests.helpers.report_page import HOSTILE, hostile
 
 CHROMIUM = os.environ.get("CHROMIUM", "/usr/bin/chromium")
 MAX_LOAD_S = 3.0
@@ -32,16 +35,36 @@ def browser() -> Iterator[Browser]:
         found.close()
 
 
-@pytest.fixture(scope="session", params=["made-up", "RESULT"])
-def report(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def enlarge(result: Path, landmarks: int = 20, iterations: int = 10) -> None:
+    """Repeat each landmark of a history, then all that has an iteration."""
+    for name in tables.ALL:
+        file = tables.table_path(result, name)
+        rows = tables.read(file, name)
+        if name == "map_history":
+            rows = pd.concat([rows] * landmarks).sort_values(["robot", "iteration"])
+            rows["landmark"] = rows.groupby(["robot", "iteration"]).cumcount()
+        if "iteration" in rows and name != "tracks":
+            period = rows["iteration"].max() + 1
+            repeated = [
+                rows.assign(iteration=rows["iteration"] + k * period) for k in range(iterations)
+            ]
+            rows = pd.concat(repeated)
+        tables.write(file, name, rows)
+
+
+@pytest.fixture(scope="session", params=["enlarged", "RESULT"])
+def report(
+    request: pytest.FixtureRequest, trio_result: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
     """A report as large as the paper's, and that of the user's own result."""
     output = tmp_path_factory.mktemp("report") / "report.html"
     if request.param == "RESULT":
         if "RESULT" not in os.environ:
             pytest.skip("no RESULT given")
         return write_report(Path(os.environ["RESULT"]), output)
-    result = write_result(tmp_path_factory.mktemp("result"), Size())
+    result = Path(shutil.copytree(trio_result, output.with_name("result")))
     draw_all(result, 1)
+    enlarge(result)
     return write_report(result, output)
 
 
@@ -263,12 +286,8 @@ def test_it_prints(opened: Opened, tmp_path: Path) -> None:
     assert opened.complaints == []
 
 
-def test_hostile_names_stay_names(
-    browser: Browser, tmp_path_factory: pytest.TempPathFactory
-) -> None:
-    from tests.experiments.show.report.test_document import HOSTILE, hostile
-
-    result = hostile(write_result(tmp_path_factory.mktemp("hostile")))
+def test_hostile_names_stay_names(browser: Browser, trio_copy: Path) -> None:
+    result = hostile(trio_copy)
     opened = Opened(browser, write_report(result), viewport={"width": 1280, "height": 900})
     opened.page.on("dialog", lambda dialog: opened.complaints.append(dialog.message))
     opened.scroll_through()

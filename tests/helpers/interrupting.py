@@ -1,0 +1,56 @@
+"""A command that stands still at a certain moment, to be interrupted there."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+_PATIENCE_S = 900  # kernels may have to be compiled, on a busy machine
+# Read by every Python process that is started, so also by a command's workers. A finished file is
+# renamed to its name, which Python tells its audit hooks before it happens.
+_STAND_STILL = """
+import os, pathlib, sys, time
+
+def stand_still(event, arguments):
+    if event == "os.rename" and str(arguments[1]).endswith({name!r}):
+        pathlib.Path({mark!r}).touch()
+        time.sleep(100_000)
+
+sys.addaudithook(stand_still)
+"""
+
+
+def interrupted(
+    arguments: list[object], folder: Path, before_file: str, ready: Callable[[], bool]
+) -> subprocess.CompletedProcess[str]:
+    """Start `mapfusion ARGUMENTS`, and press Ctrl-C when it would put a file in place.
+
+    Args:
+        arguments: of the command.
+        folder: an empty one, for what makes it stand still.
+        before_file: how the file's name ends; each process that has finished one stands still.
+        ready: what must have come true as well, by the work of other processes.
+    """
+    mark = folder / "stands_still"
+    text = _STAND_STILL.format(name=before_file, mark=str(mark))
+    (folder / "sitecustomize.py").write_text(text, encoding="utf-8")
+    path = os.pathsep.join([str(folder), *filter(None, sys.path)])
+    process = subprocess.Popen(
+        [sys.executable, "-m", "experiments.cli.main", *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONPATH": path},
+        start_new_session=True,  # a process group of its own, as a shell gives each command
+    )
+    deadline = time.monotonic() + _PATIENCE_S
+    while not (mark.exists() and ready()):
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGINT)
+    out, err = process.communicate(timeout=_PATIENCE_S)
+    return subprocess.CompletedProcess(process.args, process.returncode, out, err)
