@@ -72,11 +72,11 @@ def draw_all(
             outcomes[name] = outcome
             if on_progress is not None:
                 on_progress(len(outcomes), len(FIGURES))
-    if on_skip is not None:
-        for name in FIGURES:
-            if outcomes[name].skipped:
-                on_skip(f"{name}: {outcomes[name].skipped}")
-    return [file for name in FIGURES for file in outcomes[name].files]
+    drawn = [outcomes[name] for name in FIGURES]
+    for each in drawn:
+        if on_skip is not None and each.skipped:
+            on_skip(f"{each.name}: {each.skipped}")
+    return [file for each in drawn for file in each.files]
 
 
 def _draw_in_worker(result: Path, name: str) -> Drawn:

@@ -1,6 +1,7 @@
 """Figure 3: how the particle set spreads along the paths, and draws together again."""
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -12,6 +13,7 @@ from experiments.show.figures.floor_plan import (
     add_points,
     height_of_row,
     label_plan,
+    set_square,
     set_view,
     start_plan,
 )
@@ -135,17 +137,17 @@ def _draw_path(axes: Axes, data: ResultTables, robot: str, magnification: int) -
 
 def _mark_on_path(axes: Axes, data: ResultTables, moments: Moments) -> None:
     path = data.path_of(moments.robot)
-    for (name, iteration), offset in zip(moments.named, ((9, 9), (-15, 9)), strict=True):
-        axes.annotate(
-            name,
-            xy=tuple(path[iteration, :2]),
-            xytext=offset,
-            textcoords="offset points",
-            fontweight="bold",
-            bbox={"boxstyle": "round,pad=0.15", "facecolor": "white", "linewidth": 0.5},
-            arrowprops={"arrowstyle": "-", "linewidth": 0.8},
-            zorder=7,
-        )
+    box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "linewidth": 0.5}
+    look = {"bbox": box, "arrowprops": {"arrowstyle": "-", "linewidth": 0.8}, "zorder": 7}
+    for (name, k), offset in zip(moments.named, ((9, 9), (-15, 9)), strict=True):
+        _annotate(axes, name, path[k, :2], offset, **look)
+
+
+def _annotate(
+    axes: Axes, name: str, at: Sequence[float], offset: tuple[int, int], **look: Any
+) -> None:
+    look |= {"textcoords": "offset points", "fontweight": "bold"}
+    axes.annotate(name, xy=(at[0], at[1]), xytext=offset, **look)
 
 
 def _draw_timeline(
@@ -154,10 +156,11 @@ def _draw_timeline(
     for robot, rows in spread.groupby("robot", sort=False):
         style = {"color": data.colours[str(robot)], "linewidth": 0.8, "label": robot}
         axes.plot(rows["iteration"], rows["spread_m"], **style)
-    for name, k in () if moments is None else moments.named:
-        at = (k, _spread_at(spread, moments.robot, k))
-        axes.plot(*at, "o", color=BLACK, zorder=4)
-        axes.annotate(name, at, xytext=(3, 3), textcoords="offset points", fontweight="bold")
+    if moments is not None:
+        for name, k in moments.named:
+            at = (k, _spread_at(spread, moments.robot, k))
+            axes.plot(*at, "o", color=BLACK, zorder=4)
+            _annotate(axes, name, at, (3, 3))
     axes.set_xlabel("FastSLAM iteration k")
     axes.set_ylabel("spread of the particles (m)")
     axes.set_ylim(bottom=0)
@@ -184,10 +187,9 @@ def _draw_zooms(
     for axes, particles, (name, k), kind in zip(
         zooms, points, moments.named, ("wide", "tight"), strict=True
     ):
-        x, y = particles.mean(axis=0)
         axes.plot(*path[:, :2].T, color=GRAY, zorder=1)
         add_points(axes, particles, **style)
-        axes.set(xlim=(x - reach, x + reach), ylim=(y - reach, y + reach), aspect="equal")
+        set_square(axes, particles.mean(axis=0), reach)
         axes.locator_params(nbins=4)
         label_plan(axes, robot)
         # much in new territory, little on known ground

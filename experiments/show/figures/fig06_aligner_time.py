@@ -35,8 +35,8 @@ def draw(data: ResultTables) -> Figure:
     for axes, (column, label) in zip(panels, _AXES.items(), strict=True):
         for name in data.aligners:
             if name in timed:
-                add_aligner = _add_band if data.several_runs else _add_points
-                add_aligner(axes, timed[name], column, data.styles[name])
+                style = data.styles[name]
+                _add_aligner(axes, timed[name], column, style, data.several_runs)
         axes.set_xlabel(label)
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter(plain_numbers())
@@ -46,32 +46,23 @@ def draw(data: ResultTables) -> Figure:
     return figure
 
 
-def _add_points(axes: Axes, rows: pd.DataFrame, column: str, style: dict[str, Any]) -> None:
-    """One run's maps with bars for the repeats, and a line through them to guide the eye."""
-    look = {"color": style["color"], "rasterized": True}
-    ends = (rows["elapsed_low_s"], rows["elapsed_high_s"])
-    axes.vlines(rows[column], *ends, linewidth=0.5, alpha=0.5, **look)
-    _add_dots(axes, rows, column, style, markersize=2.5, alpha=0.6)
-    groups = len(rows) if len(rows) <= _MAX_JOINED else TIME_GROUPS
-    _add_line(axes, time_bands(rows, column, groups), column, style)
-
-
-def _add_band(axes: Axes, rows: pd.DataFrame, column: str, style: dict[str, Any]) -> None:
-    bands = time_bands(rows, column)
-    ends = (bands["elapsed_low_s"], bands["elapsed_high_s"])
-    axes.fill_between(bands[column], *ends, color=style["color"], alpha=0.16, linewidth=0)
-    _add_dots(axes, rows, column, style, markersize=1.5, alpha=0.3)
-    _add_line(axes, bands, column, style)
-
-
-def _add_dots(
-    axes: Axes, rows: pd.DataFrame, column: str, style: dict[str, Any], **look: float
+def _add_aligner(
+    axes: Axes, rows: pd.DataFrame, column: str, style: dict[str, Any], several_runs: bool
 ) -> None:
-    look |= {"color": style["color"], "marker": style["marker"]}
-    axes.plot(rows[column], rows["elapsed_s"], linestyle="none", rasterized=True, **look)
-
-
-def _add_line(axes: Axes, bands: pd.DataFrame, column: str, style: dict[str, Any]) -> None:
-    name = bands["aligner"].iloc[0]
+    colour, x = style["color"], rows[column]
+    joined = len(rows) if len(rows) <= _MAX_JOINED and not several_runs else TIME_GROUPS
+    bands = time_bands(rows, column, joined)
+    dots: dict[str, Any]
+    if several_runs:
+        ends = (bands["elapsed_low_s"], bands["elapsed_high_s"])
+        axes.fill_between(bands[column], *ends, color=colour, alpha=0.16, linewidth=0)
+        dots = {"markersize": 1.5, "alpha": 0.3}
+    else:
+        ends = (rows["elapsed_low_s"], rows["elapsed_high_s"])
+        axes.vlines(x, *ends, color=colour, linewidth=0.5, alpha=0.5, rasterized=True)
+        dots = {"markersize": 2.5, "alpha": 0.6}
+    dots |= {"color": colour, "marker": style["marker"], "linestyle": "none"}
+    axes.plot(x, rows["elapsed_s"], rasterized=True, **dots)
+    name = rows["aligner"].iloc[0]
     zorder = 4 if name == ORACLE else 3
     axes.plot(bands[column], bands["elapsed_s"], label=name, zorder=zorder, **style)

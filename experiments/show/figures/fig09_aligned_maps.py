@@ -42,9 +42,8 @@ def _set_zoom(overview: Axes, zoom: Axes, pairs: FusedPairs) -> None:
     side = _ZOOM_SIDE * float(np.median(major))
     x, y = zoom_corner(pairs.position_m[2], side)
     zoom.set(xlim=(x, x + side), ylim=(y, y + side), aspect="equal")
-    overview.add_patch(
-        Rectangle((x, y), side, side, fill=False, edgecolor=BLACK, linestyle="--", zorder=6)
-    )
+    dashed = {"fill": False, "edgecolor": BLACK, "linestyle": "--", "zorder": 6}
+    overview.add_patch(Rectangle((x, y), side, side, **dashed))
 
 
 def _draw_landmarks(axes: Axes, data: ResultTables, pairs: FusedPairs, scale: float) -> None:
@@ -54,26 +53,12 @@ def _draw_landmarks(axes: Axes, data: ResultTables, pairs: FusedPairs, scale: fl
     style = {"colors": GRAY, "linewidths": 0.6, "rasterized": True}
     axes.add_collection(LineCollection(parents, label="correspondences", **style), autolim=False)
     for k, colour in enumerate(colours):
-        add_points(
-            axes,
-            pairs.position_m[k],
-            marker=MARKERS[k],
-            markersize=6 * scale,
-            markerfacecolor="none",
-            markeredgewidth=0.8 * scale,
-            label=names[k],
-            color=colour,
-            zorder=3 + 0.1 * k,
-        )
-        add_ellipses(
-            axes,
-            pairs.position_m[k],
-            pairs.covariance_m2[k],
-            edgecolors=colour,
-            linewidths=(1.4 if k == 2 else 0.8) * scale,
-            rasterized=True,
-            zorder=2 + 0.1 * k,
-        )
+        look = {"marker": MARKERS[k], "markersize": 6 * scale, "markeredgewidth": 0.8 * scale}
+        look |= {"markerfacecolor": "none", "color": colour, "zorder": 3 + 0.1 * k}
+        add_points(axes, pairs.position_m[k], label=names[k], **look)
+        look = {"edgecolors": colour, "linewidths": (1.4 if k == 2 else 0.8) * scale}
+        look |= {"rasterized": True, "zorder": 2 + 0.1 * k}
+        add_ellipses(axes, pairs.position_m[k], pairs.covariance_m2[k], **look)
 
 
 def zoom_corner(position_m: Float, side_m: float) -> Float:

@@ -63,12 +63,18 @@ def set_view(axes: Axes, landmarks_m: Float, *others_m: Float) -> str:
     points = np.concatenate(core) if core else np.zeros((1, 2))
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
     margin = max(_MARGIN * float((high - low).max()), _MIN_MARGIN_M)
-    axes.set_xlim(low[0] - margin, high[0] + margin)
-    axes.set_ylim(low[1] - margin, high[1] + margin)
+    low, high = low - margin, high + margin
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     axes.set_aspect("equal", adjustable="box")
     plan = landmarks_m[:, :2]
-    outside = np.any((plan < low - margin) | (plan > high + margin), axis=1).sum()
+    outside = np.any((plan < low) | (plan > high), axis=1).sum()
     return f"{len(plan)} landmarks" + (f", {outside} out of view" if outside else "")
+
+
+def set_square(axes: Axes, centre: Float, reach_m: float) -> None:
+    """Show so far around a point, at equal scales."""
+    (x0, y0), (x1, y1) = centre - reach_m, centre + reach_m
+    axes.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal")
 
 
 def height_of_row(panels: Sequence[Axes], width_in: float) -> float:

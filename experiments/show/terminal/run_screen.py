@@ -50,7 +50,7 @@ def print_result(result: Path, skipped_figures: Sequence[str]) -> None:
 def not_run_lines(errors: pd.DataFrame) -> list[str]:
     """One line for each aligner, and each reason, that did not run."""
     not_run = errors[errors["status"].isin(NOT_RUN)]
-    n_rows = errors.groupby("aligner").size()
+    n_rows = errors.groupby("aligner").size().to_dict()
     lines = []
     for (aligner, status, reason), rows in not_run.groupby(
         ["aligner", "status", "reason"], sort=False
