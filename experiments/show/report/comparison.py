@@ -6,15 +6,16 @@ from typing import Any
 
 import pandas as pd
 
-from experiments.show.figures.error_curves import BAND
+from experiments.judge.criteria import ANSWERABLE_PAIRS
+from experiments.judge.judged_maps import maps_of, setting_columns
 from experiments.show.figures.style import aligner_styles
 from experiments.show.report.curves import success_curves, time_curves
 from experiments.show.report.theme import chart_style
 from experiments.show.report.words import correct_text, words_for
-from experiments.study.statistics.judged_maps import ANSWERABLE_PAIRS, Criteria, maps_of
+from experiments.study.statistics.error_bands import BAND
 from experiments.study.statistics.overlap import with_overlap_share
-from experiments.study.statistics.run_tables import Runs, setting_columns
-from experiments.study.statistics.standing import Verdict, judge
+from experiments.study.statistics.run_tables import Runs
+from experiments.study.statistics.standing import Recommendation, recommend
 from mapfusion.align.result import Status
 from mapfusion.errors import InputError
 
@@ -28,14 +29,12 @@ class Comparison:
         maps: rows of `maps_of`.
         verdict: which aligner to use.
         timings: the table `aligner_timings`; empty where no run has it.
-        criteria: what counts as correct.
     """
 
     aligners: list[str]
     maps: pd.DataFrame
-    verdict: Verdict
+    verdict: Recommendation
     timings: pd.DataFrame
-    criteria: Criteria
 
     @property
     def colours(self) -> list[str]:
@@ -48,7 +47,7 @@ class Comparison:
         return {
             "verdict": self.verdict,
             "words": words_for(self.verdict, len(pairs), setting_columns(self.maps)),
-            "correct_text": correct_text(self.criteria),
+            "correct_text": correct_text(),
             "aligners": styled(self.aligners),
         }
 
@@ -101,9 +100,9 @@ def compare(runs: Runs, reduced: Sequence[pd.DataFrame], aligners: list[str]) ->
         raise InputError(f"{where}: no pair of maps was aligned, there is nothing to report on")
     maps = with_overlap_share(pd.concat(reduced, ignore_index=True), runs)
     timings = runs.read("aligner_timings") if runs.has("aligner_timings") else pd.DataFrame()
-    return Comparison(aligners, maps, judge(maps, timings, aligners), timings, Criteria.of(runs))
+    return Comparison(aligners, maps, recommend(maps, timings, aligners), timings)
 
 
-def reduce_errors(errors: pd.DataFrame, criteria: Criteria) -> pd.DataFrame:
+def reduce_errors(errors: pd.DataFrame) -> pd.DataFrame:
     """One row per pair of maps and aligner."""
-    return maps_of(with_acceptance(errors), criteria)
+    return maps_of(with_acceptance(errors))

@@ -22,7 +22,6 @@ from experiments.show.report.curves import error_curves
 from experiments.show.report.map_view import map_view
 from experiments.show.report.sweep_contents import sweep_contents
 from experiments.show.report.theme import css_name
-from experiments.study.statistics.judged_maps import Criteria
 from experiments.study.statistics.run_tables import Runs, find_runs
 from mapfusion.errors import InputError
 
@@ -72,7 +71,7 @@ def _result_contents(path: Path, runs: Runs) -> dict[str, Any]:
     result = _Result(path)
     data, scenario = result.data, result.data.scenario
     errors = present(runs.read("errors"))
-    reduced = [reduce_errors(errors, Criteria.of(runs))] if len(errors) else []
+    reduced = [reduce_errors(errors)] if len(errors) else []
     there = set(errors["aligner"])
     comparison = compare(runs, reduced, [name for name in data.aligners if name in there])
     rows, stages = _provenance(path)

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from experiments.judge.criteria import ANSWERABLE_PAIRS, has_common_ground
+from experiments.judge.judged_maps import MAP_PAIR
 from experiments.show.figures.error_curves import BAND
-from experiments.study.statistics.judged_maps import ANSWERABLE_PAIRS, has_common_ground
-from experiments.study.statistics.standing import MAP_PAIR
-from experiments.study.statistics.success_rates import rates_of_maps
+from experiments.study.statistics.success_rates import success_rates
 
 _DIGITS = 5  # significant; more than any chart can show, and a third of the bytes of all of them
 _MAX_POINTS = 400  # of a curve: a chart is about a thousand pixels wide
@@ -93,7 +93,7 @@ def success_curves(maps: pd.DataFrame, aligners: Sequence[str]) -> list[dict[str
     for by, (label, name) in _SUCCESS_AGAINST.items():
         if by not in maps or maps[by].isna().all():
             continue
-        rates = rates_of_maps(maps[maps[by].notna()], by)
+        rates = success_rates(maps[maps[by].notna()], by)
         bins = rates[["from", "to"]].drop_duplicates().sort_values("from")
         labels = [name(*ends) for ends in bins.itertuples(index=False)]
         by_bin = {aligner: _rates_of(rates, aligner, bins["from"]) for aligner in aligners}

@@ -9,11 +9,11 @@ from typing import Any
 import jinja2
 from markupsafe import Markup
 
+from experiments.judge.criteria import ANSWERABLE_PAIRS
 from experiments.show.report import words
 from experiments.show.report.comparison import band_text
 from experiments.show.report.contents import contents_of
 from experiments.show.report.theme import palette
-from experiments.study.statistics.judged_maps import ANSWERABLE_PAIRS
 from mapfusion.storage import write_whole
 
 # The page is there, and the map can be used, before the browser reads Plotly for the charts.

@@ -7,27 +7,25 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from experiments.judge.metrics import ORACLE
+from experiments.judge.criteria import ORACLE, that_ever_meet
+from experiments.judge.judged_maps import RUN_KEYS, setting_columns
 from experiments.show.report.comparison import compare, present, reduce_errors
 from experiments.show.report.curves import error_curves
 from experiments.study.statistics.error_bands import medians_of_run
-from experiments.study.statistics.judged_maps import Criteria, that_ever_meet
-from experiments.study.statistics.run_tables import RUN_KEYS, Runs, setting_columns
+from experiments.study.statistics.run_tables import Runs
 from experiments.study.statistics.summary import ALL_SCENARIOS, configurations
 from mapfusion.errors import InputError
 
 
 def sweep_contents(path: Path, runs: Runs) -> dict[str, Any]:
     """As `contents_of`, of a sweep's folder; runs are read and reduced one by one."""
-    criteria = Criteria.of(runs)
     reduced, medians, aligners = [], [], {}
     every: dict[str, None] = {}
     for whole in runs.each("errors") if runs.has("errors") else ():
         every |= dict.fromkeys(whole["aligner"])
         errors = present(whole)
-        reduced.append(reduce_errors(errors, criteria))
-        labels = errors[[*RUN_KEYS, *setting_columns(errors)]].drop_duplicates()
-        medians.append(medians_of_run(errors).reset_index().merge(labels, on="run_id"))
+        reduced.append(reduce_errors(errors))
+        medians.append(medians_of_run(errors))
         aligners |= dict.fromkeys(errors["aligner"])
     names = [name for name in aligners if name != ORACLE] + [ORACLE] * (ORACLE in aligners)
     comparison = compare(runs, reduced, names)

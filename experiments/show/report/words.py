@@ -4,20 +4,20 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from experiments.study.statistics.judged_maps import ANSWERABLE_PAIRS, Criteria
-from experiments.study.statistics.standing import Standing, Verdict
+from experiments.judge.criteria import COMMON_LANDMARKS, RIGHT_WITHIN_M, RIGHT_WITHIN_RAD
+from experiments.study.statistics.standing import Recommendation, Standing
 
 _RELIABLE = 0.5  # a method that surely fails more often than not is nothing to recommend
 _SPACE = "\u00a0"  # a number stays beside its unit
 
 
-def correct_text(criteria: Criteria) -> str:
+def correct_text() -> str:
     """What the numbers of the verdict mean."""
     return (
-        f"Correct: within {criteria.translation_m:g}{_SPACE}m and {criteria.rotation_rad:g}{_SPACE}"
-        f"rad of the truth once refined. Common ground: at least {ANSWERABLE_PAIRS} true "
-        "correspondences. Repetitions on the same maps are one trial of a Wilson interval, and so "
-        "are, where there are several runs, all maps of a run."
+        f"Correct: within {RIGHT_WITHIN_M:g}{_SPACE}m and {RIGHT_WITHIN_RAD:g}{_SPACE}"
+        f"rad of the truth once refined. Common ground: at least {COMMON_LANDMARKS} landmarks of "
+        "both maps are one point of the world. Repetitions on the same maps are one trial of a "
+        "Wilson interval, and so are, where there are several runs, all maps of a run."
     )
 
 
@@ -42,7 +42,7 @@ class Words:
     sure_why: str
 
 
-def words_for(verdict: Verdict, n_robot_pairs: int, settings: Sequence[str] = ()) -> Words:
+def words_for(verdict: Recommendation, n_robot_pairs: int, settings: Sequence[str] = ()) -> Words:
     """Put a verdict into words.
 
     Args:
@@ -54,8 +54,8 @@ def words_for(verdict: Verdict, n_robot_pairs: int, settings: Sequence[str] = ()
     best = verdict.best
     if verdict.n_common == 0:
         lead = (
-            f"On none of the {verdict.n_maps} pairs of maps did {ANSWERABLE_PAIRS} or more "
-            "correspondences turn out to be true. The only right answer is to refuse."
+            f"In none of the {verdict.n_maps} pairs of maps are {COMMON_LANDMARKS} or more "
+            "landmarks the same point of the world. The only right answer is to refuse."
         )
         return Words("No common ground.", "", lead, _refusals(verdict), sure, why)
     if best is None:
@@ -74,7 +74,7 @@ def words_for(verdict: Verdict, n_robot_pairs: int, settings: Sequence[str] = ()
     return Words(headline, best.aligner, lead, remarks, sure, why)
 
 
-def _beside_oracle(best: Standing, verdict: Verdict) -> str:
+def _beside_oracle(best: Standing, verdict: Recommendation) -> str:
     if math.isnan(best.over_oracle):
         return "There is no oracle to compare it with."
     return (
@@ -86,7 +86,7 @@ def _beside_oracle(best: Standing, verdict: Verdict) -> str:
     )
 
 
-def _equals(verdict: Verdict) -> tuple[str, ...]:
+def _equals(verdict: Recommendation) -> tuple[str, ...]:
     if not verdict.equals or verdict.best is None:
         return ()
     several = listed(verdict.equals)
@@ -95,7 +95,7 @@ def _equals(verdict: Verdict) -> tuple[str, ...]:
     return (f"On these maps {several} {verb} as well{faster}.",)
 
 
-def _runner_up(verdict: Verdict) -> tuple[str, ...]:
+def _runner_up(verdict: Recommendation) -> tuple[str, ...]:
     rest = [s for s in verdict.standings[1:] if s.aligner not in verdict.equals and s.n_maps]
     if not rest:
         return ()
@@ -103,7 +103,7 @@ def _runner_up(verdict: Verdict) -> tuple[str, ...]:
     return (f"{text}, {metres(rest[0].estimated_m)} off as estimated.",)
 
 
-def _false(best: Standing, verdict: Verdict) -> tuple[str, ...]:
+def _false(best: Standing, verdict: Recommendation) -> tuple[str, ...]:
     if not best.n_accepted:
         return (f"No result of {best.aligner} was accepted.",)
     share = best.n_false / best.n_accepted
@@ -120,7 +120,7 @@ def _false(best: Standing, verdict: Verdict) -> tuple[str, ...]:
     return (f"{text}.",)
 
 
-def _refusals(verdict: Verdict) -> tuple[str, ...]:
+def _refusals(verdict: Recommendation) -> tuple[str, ...]:
     merged = [s for s in verdict.standings if s.n_false]
     if not merged:
         return ("Every method refused, as it should.",)
@@ -128,7 +128,9 @@ def _refusals(verdict: Verdict) -> tuple[str, ...]:
     return (f"Accepted all the same, wrongly: {names}.",)
 
 
-def _surety(verdict: Verdict, n_robot_pairs: int, settings: Sequence[str]) -> tuple[str, str]:
+def _surety(
+    verdict: Recommendation, n_robot_pairs: int, settings: Sequence[str]
+) -> tuple[str, str]:
     if verdict.n_runs == 1:
         pairs = "one pair of robots" if n_robot_pairs == 1 else f"{n_robot_pairs} pairs of robots"
         return (
