@@ -20,8 +20,8 @@ from rich.progress import (
 )
 from rich.table import Table
 
+from experiments.judge.criteria import ANSWERABLE_PAIRS as MIN_TRUE_PAIRS_SHOWN
 from experiments.show.terminal.layout import STAGE_TEXT
-from experiments.show.terminal.run_screen import MIN_TRUE_PAIRS_SHOWN
 from experiments.study.sweep.dataset import Dataset
 from experiments.study.sweep.driver import Progress as SweepProgress
 from experiments.study.sweep.driver import Survey
