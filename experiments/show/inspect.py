@@ -55,7 +55,6 @@ _FOLDER_MARKS = {
     "*/frames.parquet": "folder of robot logs",
     "*.parquet": "folder of tables",
 }
-_LAYOUTS = {"files": "d", "rows": "d"}
 _DESCRIPTIONS = ("sweep.json", "scenario.json", "provenance.json", "done.json")
 
 
@@ -66,13 +65,13 @@ class Contents:
     Attributes:
         kind: in words.
         facts: by name, the schema's version among them.
-        headings: of the parts.
+        columns: of the parts: heading and format.
         parts: a row for each column of a table, or for what a folder holds.
     """
 
     kind: str
     facts: Mapping[str, Any] = field(default_factory=dict)
-    headings: Sequence[str] = ()
+    columns: Sequence[tuple[str, str]] = ()
     parts: Sequence[Sequence[Any]] = ()
 
 
@@ -88,7 +87,7 @@ def inspect(path: Path) -> None:
     shown = "" if version is None else f", schema version {version}"
     print_lines([f"{path}: {found.kind}{shown}", *(f"  {name}: {facts[name]}" for name in facts)])
     if found.parts:
-        print_table([(name, _LAYOUTS.get(name, "")) for name in found.headings], found.parts)
+        print_table(found.columns, found.parts)
 
 
 def contents_of(path: Path) -> Contents:
@@ -132,7 +131,7 @@ def _table(path: Path) -> Contents:
         read_table(path, _CHECKED[kind])  # raises where version or columns are others
     facts = told | {"rows": file.metadata.num_rows, "MB": f"{path.stat().st_size / 1e6:.2f}"}
     columns = [(each.name, str(each.type), unit_of(each.name)) for each in file.schema_arrow]
-    return Contents(kind, facts, ("column", "type", "unit"), columns)
+    return Contents(kind, facts, [("column", ""), ("type", ""), ("unit", "")], columns)
 
 
 def _open(path: Path) -> pq.ParquetFile:
@@ -165,7 +164,9 @@ def _brief(found: Mapping[str, Any]) -> dict[str, Any]:
     }
     facts = {name: names.get(name, value) for name, value in found.items() if name != _KIND}
     return {
-        name: value for name, value in facts.items() if isinstance(value, str | int) and value != ""
+        name: value
+        for name, value in facts.items()
+        if isinstance(value, str | float | int) and value != ""
     }
 
 
@@ -188,4 +189,4 @@ def _folder(path: Path) -> Contents:
         n_files["/".join(inside)] += 1
         n_rows["/".join(inside)] += _open(file).metadata.num_rows
     parts = [(name, n_files[name], n_rows[name]) for name in n_files]
-    return Contents(kind, facts, ("holds", "files", "rows"), parts)
+    return Contents(kind, facts, [("holds", ""), ("files", "d"), ("rows", "d")], parts)

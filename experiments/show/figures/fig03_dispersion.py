@@ -1,6 +1,5 @@
 """Figure 3: how the particle set spreads along the paths, and draws together again."""
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -140,11 +139,11 @@ def _mark_on_path(axes: Axes, data: ResultTables, moments: Moments) -> None:
     box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "linewidth": 0.5}
     look = {"bbox": box, "arrowprops": {"arrowstyle": "-", "linewidth": 0.8}, "zorder": 7}
     for (name, k), offset in zip(moments.named, ((9, 9), (-15, 9)), strict=True):
-        _annotate(axes, name, path[k, :2], offset, **look)
+        _annotate(axes, name, tuple(path[k, :2]), offset, **look)
 
 
 def _annotate(
-    axes: Axes, name: str, at: Sequence[float], offset: tuple[int, int], **look: Any
+    axes: Axes, name: str, at: tuple[Any, ...], offset: tuple[int, int], **look: Any
 ) -> None:
     look |= {"textcoords": "offset points", "fontweight": "bold"}
     axes.annotate(name, xy=(at[0], at[1]), xytext=offset, **look)

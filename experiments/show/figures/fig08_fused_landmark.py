@@ -1,5 +1,7 @@
 """Figure 8: one landmark as two robots know it, and as the merge fuses it."""
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -30,7 +32,12 @@ def draw(data: ResultTables) -> Figure:
     for k, dashes in enumerate(("--", "-.", "-")):
         here, colour = slice(k, k + 1), colours[k]
         add_ellipses(axes, position[here], covariance[here], edgecolors=colour, linestyles=dashes)
-        look = {"marker": MARKERS[k], "color": colour, "linestyle": dashes, "label": labels[k]}
+        look: dict[str, Any] = {
+            "marker": MARKERS[k],
+            "color": colour,
+            "linestyle": dashes,
+            "label": labels[k],
+        }
         axes.plot(*position[k, :2], markersize=6, **look)
     own = pairs.own_covariance_m2[:, chosen]
     add_ellipses(axes, position[:2], own, edgecolors=colours[:2], linewidths=0.6)

@@ -1,6 +1,7 @@
 """Figures 4 to 6 over several runs: medians and bands over seeds instead of repetitions."""
 
 from pathlib import Path
+from typing import Any
 
 from experiments.show.figures.drawing import draw_figure
 from experiments.show.figures.result_tables import ResultTables
@@ -19,7 +20,7 @@ def draw_over_runs(summary: Summary, folder: Path) -> list[str]:
     """
     skipped = []
     drawn = [
-        ("-".join([str(labels.pop("scenario")), *(f"{k}={v}" for k, v in labels.items())]), rows)
+        (_name(labels), rows)
         for labels, rows in configurations(summary.run_medians)
         if labels["scenario"] != ALL_SCENARIOS
     ]
@@ -35,6 +36,11 @@ def draw_over_runs(summary: Summary, folder: Path) -> list[str]:
         outcomes = [draw_figure(data, figure, target) for figure in _OVER_RUNS]
         skipped += [f"{name}, {each.name}: {each.skipped}" for each in outcomes if each.skipped]
     return skipped
+
+
+def _name(labels: dict[str, Any]) -> str:
+    (_, scenario), *settings = labels.items()
+    return "-".join([str(scenario), *(f"{key}={value}" for key, value in settings)])
 
 
 def _file_name(name: str) -> str:
