@@ -14,6 +14,7 @@ from experiments.judge.path_errors import path_rms
 from experiments.judge.tables import SHOWN
 from experiments.show.terminal.layout import print_lines, print_skipped, print_table
 from experiments.study.statistics.aligner_summary import aligner_summary
+from experiments.study.statistics.error_bands import ROBOT_PAIR, error_bands
 from mapfusion.align.result import NOT_RUN, Status
 
 if TYPE_CHECKING:
@@ -30,9 +31,9 @@ def print_result(result: Path, skipped_figures: Sequence[str]) -> None:
 
     errors = table("errors")
     aligners = methods_in(errors, oracle=True)
-    _print_aligners(errors, aligner_summary(errors, table("aligner_timings"), aligners))
-    print_lines(f"  {line}" for line in not_run_lines(errors))
-    if aligners:
+    if aligners:  # else a robot that was alone
+        _print_aligners(errors, aligner_summary(errors, table("aligner_timings"), aligners))
+        print_lines(f"  {line}" for line in not_run_lines(errors))
         _print_pairs(errors, aligners[0])
     paths = path_rms(table("robots"))
     columns = [("robot", ""), ("FastSLAM, m", ".3f"), ("odometry, m", ".3f"), ("ratio", ".2f")]
@@ -80,15 +81,13 @@ def _print_pairs(errors: pd.DataFrame, aligner: str) -> None:
     columns = [("pair", "")]
     for whose in ("error", "oracle"):
         columns += [(f"{whose}, m", ".3f"), (f"{whose}, rad", "+.4f")]
+    names = [f"refined_{quantity}" for quantity in ("translation_error_m", "rotation_error_rad")]
+    medians = at_the_end(error_bands(errors)).set_index([*ROBOT_PAIR, "aligner"])[names]
     rows = []
-    for (a, b), last in at_the_end(errors).groupby(["robot_a", "robot_b"]):
-        row = [f"{a} - {b}"]
-        for name in (aligner, ORACLE):
-            own = last[last["aligner"] == name]
-            row += [
-                own[f"refined_{x}"].median() for x in ("translation_error_m", "rotation_error_rad")
-            ]
-        rows.append([*row, f"{last['n_true'].iloc[0]} of {last['n_correspondences'].iloc[0]}"])
+    for last in at_the_end(errors).drop_duplicates(ROBOT_PAIR).to_dict("records"):
+        pair = (last["robot_a"], last["robot_b"])
+        found = (*medians.loc[(*pair, aligner)], *medians.loc[(*pair, ORACLE)])
+        rows.append([" - ".join(pair), *found, f"{last['n_true']} of {last['n_correspondences']}"])
     title = f"Pairs at the last iteration, {aligner} refined"
     print_table([*columns, ("true pairs", ">")], rows, title)
 

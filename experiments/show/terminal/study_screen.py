@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
+from experiments.judge.criteria import MERGEABLE_PAIRS, RIGHT_WITHIN_M, RIGHT_WITHIN_RAD
 from experiments.show.terminal.layout import milliseconds, print_lines, print_table
 from mapfusion.align.registry import known_methods, name_clashes
 from mapfusion.align.result import Status
@@ -30,7 +31,8 @@ def print_refusals(rows: Sequence[dict[str, Any]], false_alarms: float) -> None:
         _REFUSAL_HEADINGS,
         f"Accepted where chance gives at most {false_alarms:g} a pair of maps",
         "false: accepted without common ground; wrong: accepted with some,\n"
-        "0.5 m or 0.1 rad off; missed: refused with 20 or more true pairs, of\n"
+        f"{RIGHT_WITHIN_M:g} m or {RIGHT_WITHIN_RAD:g} rad off; missed: refused with "
+        f"{MERGEABLE_PAIRS} or more true pairs, of\n"
         "all and of those right; 20 true: just 20 in one corner are left",
     )
     repeated = {
