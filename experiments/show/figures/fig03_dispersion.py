@@ -156,8 +156,9 @@ def _draw_timeline(
         style = {"color": data.colours[str(robot)], "linewidth": 0.8, "label": robot}
         axes.plot(rows["iteration"], rows["spread_m"], **style)
     if moments is not None:
+        spread_m = spread[spread["robot"] == moments.robot].set_index("iteration")["spread_m"]
         for name, k in moments.named:
-            at = (k, _spread_at(spread, moments.robot, k))
+            at = (k, spread_m[k])
             axes.plot(*at, "o", color=BLACK, zorder=4)
             _annotate(axes, name, at, (3, 3))
     axes.set_xlabel("FastSLAM iteration k")
@@ -168,17 +169,13 @@ def _draw_timeline(
     axes.set_title("spread over time")
 
 
-def _spread_at(spread: pd.DataFrame, robot: str, iteration: int) -> float:
-    rows = spread[(spread["robot"] == robot) & (spread["iteration"] == iteration)]
-    return float(rows["spread_m"].iloc[0])
-
-
 def _draw_zooms(
     zooms: list[Axes], data: ResultTables, spread: pd.DataFrame, moments: Moments
 ) -> None:
     """Both moments at one scale, so that tight looks tight."""
     robot, path = moments.robot, data.path_of(moments.robot)
     clouds, slam = data.clouds_of(robot), data.table("robots")
+    spread_m = spread[spread["robot"] == robot].set_index("iteration")["spread_m"]
     n_landmarks = slam[slam["robot"] == robot].set_index("iteration")["n_landmarks"]
     points = [clouds[clouds["iteration"] == k][["x_m", "y_m"]].to_numpy() for k in moments[1:]]
     reach = _ZOOM_MARGIN * max(float(np.abs(p - p.mean(axis=0)).max()) for p in points)
@@ -194,7 +191,7 @@ def _draw_zooms(
         # much in new territory, little on known ground
         grown = n_landmarks[k] - n_landmarks[max(0, k - _RECENT_ITERATIONS)]
         axes.set_title(
-            f"{name}, {kind}: k = {k}, spread {_spread_at(spread, robot, k):.3f} m\n"
+            f"{name}, {kind}: k = {k}, spread {spread_m[k]:.3f} m\n"
             f"+{grown} landmarks in {_RECENT_ITERATIONS} iterations",
             fontsize=7.5,
         )

@@ -41,23 +41,16 @@ class ResultTables:
                 result has one per repetition.
         """
         self.folder = folder
-        self._of_runs = of_runs
-        self._tables: dict[str, pd.DataFrame] = {}
+        self.several_runs = of_runs is not None
+        self._tables = dict(of_runs or {})
 
     def table(self, name: str) -> pd.DataFrame:
         """The table of that name (see experiments.judge.tables)."""
-        if self._of_runs is not None:
-            if name not in self._of_runs or self._of_runs[name].columns.empty:
-                raise NothingToDraw(f"no run has a table {name}")
-            return self._of_runs[name]
         if name not in self._tables:
             self._tables[name] = read(table_path(self.folder, name), name)
+        if self._tables[name].columns.empty:
+            raise NothingToDraw(f"no run has a table {name}")
         return self._tables[name]
-
-    @property
-    def several_runs(self) -> bool:
-        """Whether rows are those of several runs."""
-        return self._of_runs is not None
 
     @cached_property
     def scenario(self) -> dict[str, Any]:
@@ -77,8 +70,7 @@ class ResultTables:
     @cached_property
     def pairs(self) -> list[Pair]:
         """Robot pairs that were aligned, in display order."""
-        pairs = self.table("errors")[["robot_a", "robot_b"]].drop_duplicates()
-        return [(a, b) for a, b in pairs.itertuples(index=False)]
+        return pairs_in(self.table("errors"))
 
     @cached_property
     def aligners(self) -> list[str]:
@@ -151,6 +143,12 @@ class ResultTables:
         """The true T_world_map (3,) of a robot, or None where it is unknown."""
         pose = (self._world or {}).get("robots", {}).get(robot)
         return None if pose is None else np.array(pose, dtype=np.float64)
+
+
+def pairs_in(errors: pd.DataFrame) -> list[Pair]:
+    """Robot pairs in the order of their appearance."""
+    pairs = errors[["robot_a", "robot_b"]].drop_duplicates()
+    return list(pairs.itertuples(index=False, name=None))
 
 
 def of_pair(rows: pd.DataFrame, pair: Pair) -> pd.DataFrame:
