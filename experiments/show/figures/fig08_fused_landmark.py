@@ -32,13 +32,8 @@ def draw(data: ResultTables) -> Figure:
     for k, dashes in enumerate(("--", "-.", "-")):
         here, colour = slice(k, k + 1), colours[k]
         add_ellipses(axes, position[here], covariance[here], edgecolors=colour, linestyles=dashes)
-        look: dict[str, Any] = {
-            "marker": MARKERS[k],
-            "color": colour,
-            "linestyle": dashes,
-            "label": labels[k],
-        }
-        axes.plot(*position[k, :2], markersize=6, **look)
+        look: dict[str, Any] = {"marker": MARKERS[k], "markersize": 6, "label": labels[k]}
+        axes.plot(*position[k, :2], color=colour, linestyle=dashes, **look)
     own = pairs.own_covariance_m2[:, chosen]
     add_ellipses(axes, position[:2], own, edgecolors=colours[:2], linewidths=0.6)
     axes.plot(*position[:2, :2].T, color="gray", linewidth=0.6, linestyle=":", zorder=1)

@@ -82,11 +82,12 @@ def _print_pairs(errors: pd.DataFrame, aligner: str) -> None:
     for whose in ("error", "oracle"):
         columns += [(f"{whose}, m", ".3f"), (f"{whose}, rad", "+.4f")]
     names = [f"refined_{quantity}" for quantity in ("translation_error_m", "rotation_error_rad")]
-    medians = at_the_end(error_bands(errors)).set_index([*ROBOT_PAIR, "aligner"])[names]
+    bands = at_the_end(error_bands(errors)).set_index([*ROBOT_PAIR, "aligner"])
+    medians = bands[names].T.to_dict("list")
     rows = []
     for last in at_the_end(errors).drop_duplicates(ROBOT_PAIR).to_dict("records"):
         pair = (last["robot_a"], last["robot_b"])
-        found = (*medians.loc[(*pair, aligner)], *medians.loc[(*pair, ORACLE)])
+        found = (*medians[(*pair, aligner)], *medians[(*pair, ORACLE)])
         rows.append([" - ".join(pair), *found, f"{last['n_true']} of {last['n_correspondences']}"])
     title = f"Pairs at the last iteration, {aligner} refined"
     print_table([*columns, ("true pairs", ">")], rows, title)
