@@ -83,7 +83,7 @@ def inspect_command(
     path: Annotated[Path, typer.Argument(metavar="FILE", help="A file or folder of mapfusion's.")],
 ) -> None:
     """Tell what a file or folder of mapfusion's holds: `mapfusion inspect R1.parquet`."""
-    from experiments.show.inspect.description import inspect
+    from experiments.show.inspect import inspect
 
     inspect(path)
 

@@ -73,18 +73,6 @@ def _row(
     }
 
 
-def many_errors(n_runs: int, **made: object) -> pd.DataFrame:
-    """The tables `errors` of the runs of a sweep, in one."""
-    parts = []
-    for seed in range(n_runs):
-        rows = errors_of(seed, **made)  # type: ignore[arg-type]
-        rows.insert(0, "run_id", f"world-{seed}")
-        rows.insert(1, "scenario", "world")
-        rows.insert(2, "seed", seed)
-        parts.append(rows)
-    return pd.concat(parts, ignore_index=True)
-
-
 def robots_of(seed: int, error_m: float = 0.05) -> pd.DataFrame:
     """A table `robots`."""
     rng = np.random.default_rng(100 + seed)

@@ -4,10 +4,14 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.ticker import NullLocator
 
-from experiments.show.figures.style import PAGE_WIDTH_IN, aligner_styles, plain_numbers
+from experiments.show.figures.style import (
+    PAGE_WIDTH_IN,
+    aligner_legend,
+    aligner_styles,
+    plain_numbers,
+)
 from mapfusion.align.result import Status
 
 _HEIGHT_IN = 6.6
@@ -29,6 +33,7 @@ def draw(summary: pd.DataFrame) -> Figure:
     """
     counts = summary["n_pairs"].drop_duplicates().tolist()
     methods = summary["method"].drop_duplicates().tolist()
+    styles = aligner_styles(methods)
     shares = sorted(summary["outlier_share"].unique())
     figure = Figure(figsize=(PAGE_WIDTH_IN, _HEIGHT_IN))
     panels = figure.subplots(len(_ROWS), len(counts), sharex=True, sharey="row", squeeze=False)
@@ -38,11 +43,13 @@ def draw(summary: pd.DataFrame) -> Figure:
             own = own[own["status"] != Status.ABSENT].sort_values("outlier_share")
             offset = _DODGE * ((place + 0.5) / len(methods) - 0.5)
             x = np.searchsorted(shares, own["outlier_share"].to_numpy()) + offset
-            _add_method(panels[:, column], x, own, aligner_styles(methods)[method])
+            _add_method(panels[:, column], x, own, styles[method])
         panels[0, column].set_title(f"{count} pairs")
         panels[-1, column].set_xlabel("outliers (%)")
     _lay_out(panels, shares)
-    _add_legend(figure, summary, methods)
+    absent = set(summary["method"][summary["status"] == Status.ABSENT])
+    labels = {name: f"{name} (absent)" if name in absent else name for name in methods}
+    aligner_legend(figure, labels, styles, _LEGEND_COLUMNS)
     return figure
 
 
@@ -76,14 +83,3 @@ def _lay_out(panels: np.ndarray, shares: list[float]) -> None:
     panels[1, 0].set_yticks(_RATIO_TICKS)
     panels[1, 0].set_ylim(np.nanmin(ratios) / _MARGIN, np.nanmax(ratios) * _MARGIN)
     panels[1, 0].yaxis.set_minor_locator(NullLocator())
-
-
-def _add_legend(figure: Figure, summary: pd.DataFrame, methods: list[str]) -> None:
-    absent = set(summary["method"][summary["status"] == Status.ABSENT])
-    styles = aligner_styles(methods)
-    handles = [
-        Line2D([], [], label=f"{name} (absent)" if name in absent else name, **styles[name])
-        for name in methods
-    ]
-    columns = min(len(handles), _LEGEND_COLUMNS)
-    figure.legend(handles=handles, loc="outside upper center", ncols=columns, handlelength=3.2)

@@ -1,4 +1,4 @@
-"""All figures of one result, each from stored tables and key frames alone."""
+"""All figures of a result, each from stored tables and key frames alone."""
 
 import importlib
 from collections.abc import Callable
@@ -9,7 +9,6 @@ from matplotlib.figure import Figure
 
 from experiments.run.workers import workers
 from experiments.show.figures.result_tables import NothingToDraw, ResultTables
-from experiments.show.figures.runs_tables import RunsTables
 from experiments.show.figures.style import PNG_DPI, SVG_DPI, house_style
 from mapfusion.storage import write_whole
 
@@ -73,21 +72,27 @@ def draw_all(
             outcomes[name] = outcome
             if on_progress is not None:
                 on_progress(len(outcomes), len(FIGURES))
-    if on_skip is not None:
-        for name in FIGURES:
-            if outcomes[name].skipped:
-                on_skip(f"{name}: {outcomes[name].skipped}")
-    return [file for name in FIGURES for file in outcomes[name].files]
+    drawn = [outcomes[name] for name in FIGURES]
+    for each in drawn:
+        if on_skip is not None and each.skipped:
+            on_skip(f"{each.name}: {each.skipped}")
+    return [file for each in drawn for file in each.files]
 
 
 def _draw_in_worker(result: Path, name: str) -> Drawn:
     return draw_figure(ResultTables(result), name)
 
 
-def draw_figure(data: ResultTables | RunsTables, name: str) -> Drawn:
-    """Draw one figure and write its pictures, or remove old ones when there is nothing to draw."""
+def draw_figure(data: ResultTables, name: str, folder: Path | None = None) -> Drawn:
+    """Draw one figure and write its pictures, or remove old ones when there is nothing to draw.
+
+    Args:
+        data: what it is drawn from.
+        name: one of `FIGURES`.
+        folder: for the pictures; `figures` in the result's by default.
+    """
     module = importlib.import_module(f"experiments.show.figures.{name}")
-    folder = data.pictures
+    folder = folder or data.folder / "figures"
     with house_style():
         try:
             figure: Figure = module.draw(data)

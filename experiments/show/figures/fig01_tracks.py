@@ -2,12 +2,14 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import matplotlib.image
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection, PathCollection
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
@@ -23,59 +25,45 @@ _KEY_FRAME = re.compile(r"(?P<robot>.+)_(?P<iteration>\d+)\.png")
 
 def draw(data: ResultTables) -> Figure:
     """The last consecutive key frames of one robot, points coloured by the age of their track."""
-    tracks = data.table("tracks")
     robot, frames = _consecutive_frames(data)
-    shown = tracks[tracks["robot"] == robot]
-    if shown["iteration"].isin(list(frames)).sum() == 0:
+    tracks = data.table("tracks")
+    tracks = tracks[tracks["robot"] == robot]
+    shown = tracks[tracks["iteration"].isin(list(frames))]
+    if shown.empty:
         raise NothingToDraw(f"no tracked points at {robot}'s key frames")
     columns = min(2, len(frames))
     rows = -(-len(frames) // columns)
     figure = Figure(figsize=(PAGE_WIDTH_IN, 2.55 * rows * 2 / columns + 0.5))
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    oldest = shown.loc[shown["iteration"].isin(list(frames)), "length"].max()
-    colours = Normalize(1, max(2, oldest))
-    points = None
+    colours = ScalarMappable(Normalize(1, max(2, shown["length"].max())), SEQUENTIAL_MAP)
     for axes, (iteration, path) in zip(panels, frames.items(), strict=False):
         _show_image(axes, path)
-        points = _add_tracks(axes, shown, iteration, colours)
+        _add_tracks(axes, tracks, iteration, {"cmap": colours.cmap, "norm": colours.norm})
         axes.set_title(f"{robot}, k = {iteration}")
     for axes in panels[len(frames) :]:
         axes.set_axis_off()
     figure.supxlabel("u (pixels)", fontsize=8)
     figure.supylabel("v (pixels)", fontsize=8)
-    if points is not None:
-        figure.colorbar(
-            points,
-            ax=list(panels),
-            label="age of the track (frames)",
-            ticks=MaxNLocator(integer=True),
-            shrink=0.8,
-            aspect=30,
-        )
+    ages = {"label": "age of the track (frames)", "ticks": MaxNLocator(integer=True)}
+    figure.colorbar(colours, ax=list(panels), shrink=0.8, aspect=30, **ages)
     return figure
 
 
 def _consecutive_frames(data: ResultTables) -> tuple[str, dict[int, Path]]:
     """The robot with the longest run of consecutive key frames, and the end of that run."""
     best: tuple[str, dict[int, Path]] = ("", {})
+    named = [(_KEY_FRAME.fullmatch(p.name), p) for p in (data.folder / "keyframes").glob("*.png")]
     for robot in data.robots:
-        frames = _key_frames(data.folder / "keyframes", robot)
+        frames = {int(m["iteration"]): path for m, path in named if m and m["robot"] == robot}
         run: dict[int, Path] = {}
-        for iteration, path in sorted(frames.items()):
-            if iteration - 1 not in run:
-                run = {}
-            run[iteration] = path
+        for iteration in sorted(frames):
+            run = (run if iteration - 1 in run else {}) | {iteration: frames[iteration]}
             if len(run) > len(best[1]):
-                best = robot, dict(run)
+                best = robot, run
     robot, frames = best
     if not frames:
         raise NothingToDraw("no key frames were kept (logs without images)")
     return robot, dict(list(frames.items())[-_MAX_FRAMES:])
-
-
-def _key_frames(folder: Path, robot: str) -> dict[int, Path]:
-    matches = [(_KEY_FRAME.fullmatch(path.name), path) for path in folder.glob("*.png")]
-    return {int(m["iteration"]): path for m, path in matches if m and m["robot"] == robot}
 
 
 def _show_image(axes: Axes, path: Path) -> None:
@@ -88,27 +76,14 @@ def _show_image(axes: Axes, path: Path) -> None:
     axes.grid(visible=False)
 
 
-def _add_tracks(
-    axes: Axes, tracks: pd.DataFrame, iteration: int, colours: Normalize
-) -> PathCollection:
+def _add_tracks(axes: Axes, tracks: pd.DataFrame, iteration: int, colours: dict[str, Any]) -> None:
     now = tracks[tracks["iteration"] == iteration]
-    recent = tracks[
-        tracks["track"].isin(now["track"])
-        & tracks["iteration"].between(iteration - _TRAIL_FRAMES, iteration)
-    ].sort_values("iteration")
+    since = tracks["iteration"].between(iteration - _TRAIL_FRAMES, iteration)
+    recent = tracks[tracks["track"].isin(now["track"]) & since].sort_values("iteration")
     groups = [rows for _, rows in recent.groupby("track")]
     trails = [rows[["u_px", "v_px"]].to_numpy() for rows in groups]
-    lines = LineCollection(trails, cmap=SEQUENTIAL_MAP, norm=colours, linewidths=1.2, zorder=2)
+    lines = LineCollection(trails, linewidths=1.2, zorder=2, **colours)
     lines.set_array(np.array([rows["length"].iloc[-1] for rows in groups], dtype=np.float64))
     axes.add_collection(lines, autolim=False)
-    return axes.scatter(
-        now["u_px"],
-        now["v_px"],
-        c=now["length"],
-        cmap=SEQUENTIAL_MAP,
-        norm=colours,
-        s=14,
-        edgecolors="white",
-        linewidths=0.5,
-        zorder=3,
-    )
+    rim = {"s": 14, "edgecolors": "white", "linewidths": 0.5, "zorder": 3}
+    axes.scatter(now["u_px"], now["v_px"], c=now["length"], **rim, **colours)

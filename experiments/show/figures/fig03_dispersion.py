@@ -1,6 +1,6 @@
 """Figure 3: how the particle set spreads along the paths, and draws together again."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -9,14 +9,15 @@ from matplotlib.figure import Figure
 
 from experiments.show.figures.floor_plan import (
     add_frame,
-    add_walls,
+    add_points,
     height_of_row,
     label_plan,
+    set_square,
     set_view,
+    start_plan,
 )
 from experiments.show.figures.result_tables import NothingToDraw, ResultTables
-from experiments.show.figures.style import BLACK, GRAY, PAGE_WIDTH_IN, robot_colours
-from mapfusion.se2 import Float
+from experiments.show.figures.style import BLACK, GRAY, PAGE_WIDTH_IN
 
 _MAX_ROBOTS = 3
 _MAGNIFICATIONS = (1, 2, 5, 10, 20, 50, 100)
@@ -26,6 +27,7 @@ _RECENT_ITERATIONS = 50
 _FRAME_LENGTH_M = 1.5
 _GRID_COLUMNS = 6  # holds one, two or three panels of one width
 _LOWER_ROW_IN = 2.6
+_NO_LANDMARKS = np.empty((0, 3))
 
 
 class Moments(NamedTuple):
@@ -35,6 +37,11 @@ class Moments(NamedTuple):
     wide: int
     tight: int
 
+    @property
+    def named(self) -> tuple[tuple[str, int], ...]:
+        """As they are marked in the figure."""
+        return ("A", self.wide), ("B", self.tight)
+
 
 def draw(data: ResultTables) -> Figure:
     """Particles along up to three paths, the spread over time, and a wide and a tight moment."""
@@ -42,8 +49,7 @@ def draw(data: ResultTables) -> Figure:
     robots = [robot for robot in data.robots if (clouds["robot"] == robot).any()][:_MAX_ROBOTS]
     if not robots:
         raise NothingToDraw("no particles were kept")
-    clouds = clouds[clouds["robot"].isin(robots)]
-    spread = spread_over_time(clouds)
+    spread = spread_over_time(clouds[clouds["robot"].isin(robots)])
     moments = choose_moments(spread)
     figure = Figure(figsize=(PAGE_WIDTH_IN, PAGE_WIDTH_IN))
     grid = figure.add_gridspec(2, _GRID_COLUMNS)
@@ -53,9 +59,9 @@ def draw(data: ResultTables) -> Figure:
         figure.add_subplot(grid[0, first + i * span : first + (i + 1) * span])
         for i in range(len(robots))
     ]
-    magnification = _magnification(data, clouds, robots)
+    magnification = _magnification(data, robots)
     for axes, robot in zip(panels, robots, strict=True):
-        _draw_path(axes, data, robot, clouds[clouds["robot"] == robot], magnification)
+        _draw_path(axes, data, robot, magnification)
         if moments is not None and robot == moments.robot:
             _mark_on_path(axes, data, moments)
     timeline, *zooms = (
@@ -66,7 +72,7 @@ def draw(data: ResultTables) -> Figure:
         for axes in zooms:
             axes.set_axis_off()
     else:
-        _draw_zooms(zooms, data, clouds[clouds["robot"] == moments.robot], spread, moments)
+        _draw_zooms(zooms, data, spread, moments)
     upper = height_of_row(panels, PAGE_WIDTH_IN * span / _GRID_COLUMNS)
     grid.set_height_ratios([upper, _LOWER_ROW_IN])
     figure.set_figheight(upper + _LOWER_ROW_IN)
@@ -104,82 +110,57 @@ def choose_moments(spread: pd.DataFrame) -> Moments | None:
     return best
 
 
-def _magnification(data: ResultTables, clouds: pd.DataFrame, robots: list[str]) -> int:
+def _magnification(data: ResultTables, robots: list[str]) -> int:
     """The largest round factor at which the particle sets still look like spots on the paths."""
     extent = min(float(np.ptp(data.path_of(robot)[:, :2], axis=0).max()) for robot in robots)
-    groups = clouds.groupby(["robot", "iteration"])[["x_m", "y_m"]]
-    widest = float((groups.max() - groups.min()).to_numpy().max())
+    sets = [data.clouds_of(robot).groupby("iteration")[["x_m", "y_m"]] for robot in robots]
+    widest = max(float((each.max() - each.min()).to_numpy().max()) for each in sets)
     fitting = [m for m in _MAGNIFICATIONS if m * widest <= _WIDEST_SHARE * extent]
     return max(fitting, default=1)
 
 
-def _draw_path(
-    axes: Axes, data: ResultTables, robot: str, clouds: pd.DataFrame, magnification: int
-) -> None:
+def _draw_path(axes: Axes, data: ResultTables, robot: str, magnification: int) -> None:
     path = data.path_of(robot)
-    walls = data.walls_in_frame_of(robot)
-    add_walls(axes, walls)
-    axes.plot(path[:, 0], path[:, 1], color=GRAY, linewidth=0.7, zorder=2)
-    for _, rows in clouds.groupby("iteration"):
+    walls = start_plan(axes, data, robot)
+    axes.plot(*path[:, :2].T, color=GRAY, linewidth=0.7, zorder=2)
+    style = {"marker": ".", "markersize": 1.0, "color": data.colours[robot], "zorder": 3}
+    for _, rows in data.clouds_of(robot).groupby("iteration"):
         points = rows[["x_m", "y_m"]].to_numpy()
         mean = points.mean(axis=0)
-        spot = mean + magnification * (points - mean)
-        axes.plot(
-            *spot.T,
-            linestyle="none",
-            marker=".",
-            markersize=1.0,
-            color=robot_colours(data.robots)[robot],
-            rasterized=True,
-            zorder=3,
-        )
+        add_points(axes, mean + magnification * (points - mean), **style)
     add_frame(axes, _FRAME_LENGTH_M)
-    set_view(axes, np.empty((0, 3)), path, *walls)
-    label_plan(axes, robot)
+    set_view(axes, _NO_LANDMARKS, path, *walls)
     enlarged = f", spread x{magnification}" if magnification > 1 else ""
     axes.set_title(f"{robot}: particles{enlarged}")
 
 
-def _pose(data: ResultTables, robot: str, iteration: int) -> Float:
-    return data.path_of(robot)[iteration]
-
-
 def _mark_on_path(axes: Axes, data: ResultTables, moments: Moments) -> None:
-    for name, iteration in (("A", moments.wide), ("B", moments.tight)):
-        axes.annotate(
-            name,
-            xy=tuple(_pose(data, moments.robot, iteration)[:2]),
-            xytext=(9, 9) if name == "A" else (-15, 9),
-            textcoords="offset points",
-            fontweight="bold",
-            bbox={"boxstyle": "round,pad=0.15", "facecolor": "white", "linewidth": 0.5},
-            arrowprops={"arrowstyle": "-", "linewidth": 0.8},
-            zorder=7,
-        )
+    path = data.path_of(moments.robot)
+    box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "linewidth": 0.5}
+    look = {"bbox": box, "arrowprops": {"arrowstyle": "-", "linewidth": 0.8}, "zorder": 7}
+    for (name, k), offset in zip(moments.named, ((9, 9), (-15, 9)), strict=True):
+        _annotate(axes, name, tuple(path[k, :2]), offset, **look)
+
+
+def _annotate(
+    axes: Axes, name: str, at: tuple[Any, ...], offset: tuple[int, int], **look: Any
+) -> None:
+    look |= {"textcoords": "offset points", "fontweight": "bold"}
+    axes.annotate(name, xy=(at[0], at[1]), xytext=offset, **look)
 
 
 def _draw_timeline(
     axes: Axes, data: ResultTables, spread: pd.DataFrame, moments: Moments | None
 ) -> None:
     for robot, rows in spread.groupby("robot", sort=False):
-        axes.plot(
-            rows["iteration"],
-            rows["spread_m"],
-            color=robot_colours(data.robots)[str(robot)],
-            linewidth=0.8,
-            label=robot,
-        )
+        style = {"color": data.colours[str(robot)], "linewidth": 0.8, "label": robot}
+        axes.plot(rows["iteration"], rows["spread_m"], **style)
     if moments is not None:
-        for name, iteration in (("A", moments.wide), ("B", moments.tight)):
-            value = _spread_at(spread, moments.robot, iteration)
-            axes.plot(iteration, value, "o", color=BLACK, zorder=4)
-            axes.annotate(
-                name,
-                (iteration, value),
-                xytext=(3, 3),
-                textcoords="offset points",
-                fontweight="bold",
-            )
+        spread_m = spread[spread["robot"] == moments.robot].set_index("iteration")["spread_m"]
+        for name, k in moments.named:
+            at = (k, spread_m[k])
+            axes.plot(*at, "o", color=BLACK, zorder=4)
+            _annotate(axes, name, at, (3, 3))
     axes.set_xlabel("FastSLAM iteration k")
     axes.set_ylabel("spread of the particles (m)")
     axes.set_ylim(bottom=0)
@@ -188,53 +169,29 @@ def _draw_timeline(
     axes.set_title("spread over time")
 
 
-def _spread_at(spread: pd.DataFrame, robot: str, iteration: int) -> float:
-    rows = spread[(spread["robot"] == robot) & (spread["iteration"] == iteration)]
-    return float(rows["spread_m"].iloc[0])
-
-
 def _draw_zooms(
-    zooms: list[Axes],
-    data: ResultTables,
-    clouds: pd.DataFrame,
-    spread: pd.DataFrame,
-    moments: Moments,
+    zooms: list[Axes], data: ResultTables, spread: pd.DataFrame, moments: Moments
 ) -> None:
     """Both moments at one scale, so that tight looks tight."""
-    iterations = (moments.wide, moments.tight)
-    sets = [clouds[clouds["iteration"] == k] for k in iterations]
-    points = [rows[["x_m", "y_m"]].to_numpy() for rows in sets]
-    reach = max(float(np.abs(p - p.mean(axis=0)).max()) for p in points)
-    path = data.path_of(moments.robot)
-    for axes, k, particles, name in zip(
-        zooms, iterations, points, ("A, wide", "B, tight"), strict=True
+    robot, path = moments.robot, data.path_of(moments.robot)
+    clouds, slam = data.clouds_of(robot), data.table("robots")
+    spread_m = spread[spread["robot"] == robot].set_index("iteration")["spread_m"]
+    n_landmarks = slam[slam["robot"] == robot].set_index("iteration")["n_landmarks"]
+    points = [clouds[clouds["iteration"] == k][["x_m", "y_m"]].to_numpy() for k in moments[1:]]
+    reach = _ZOOM_MARGIN * max(float(np.abs(p - p.mean(axis=0)).max()) for p in points)
+    style = {"marker": ".", "markersize": 2.5, "alpha": 0.7, "color": data.colours[robot]}
+    for axes, particles, (name, k), kind in zip(
+        zooms, points, moments.named, ("wide", "tight"), strict=True
     ):
-        mean = particles.mean(axis=0)
-        axes.plot(path[:, 0], path[:, 1], color=GRAY, zorder=1)
-        axes.plot(
-            *particles.T,
-            linestyle="none",
-            marker=".",
-            markersize=2.5,
-            alpha=0.7,
-            color=robot_colours(data.robots)[moments.robot],
-            rasterized=True,
-        )
-        axes.set_xlim(mean[0] - _ZOOM_MARGIN * reach, mean[0] + _ZOOM_MARGIN * reach)
-        axes.set_ylim(mean[1] - _ZOOM_MARGIN * reach, mean[1] + _ZOOM_MARGIN * reach)
-        axes.set_aspect("equal")
+        axes.plot(*path[:, :2].T, color=GRAY, zorder=1)
+        add_points(axes, particles, **style)
+        set_square(axes, particles.mean(axis=0), reach)
         axes.locator_params(nbins=4)
-        label_plan(axes, moments.robot)
-        grown = _new_landmarks(data, moments.robot, k)
+        label_plan(axes, robot)
+        # much in new territory, little on known ground
+        grown = n_landmarks[k] - n_landmarks[max(0, k - _RECENT_ITERATIONS)]
         axes.set_title(
-            f"{name}: k = {k}, spread {_spread_at(spread, moments.robot, k):.3f} m\n"
+            f"{name}, {kind}: k = {k}, spread {spread_m[k]:.3f} m\n"
             f"+{grown} landmarks in {_RECENT_ITERATIONS} iterations",
             fontsize=7.5,
         )
-
-
-def _new_landmarks(data: ResultTables, robot: str, iteration: int) -> int:
-    """How much the map grew of late: much in new territory, little on known ground."""
-    table = data.table("robots")
-    count = table[table["robot"] == robot].set_index("iteration")["n_landmarks"]
-    return int(count[iteration] - count[max(0, iteration - _RECENT_ITERATIONS)])

@@ -5,22 +5,15 @@ from matplotlib.figure import Figure
 
 from experiments.show.figures.error_curves import draw_error_curves
 from experiments.show.figures.result_tables import ResultTables
-from experiments.show.figures.runs_tables import RunsTables
 from experiments.show.figures.style import plain_numbers
 from mapfusion.se2 import Float
 
 _FLOOR_M = 1e-4  # a tenth of a millimetre: anything below is exact for a robot
 
 
-def draw(data: ResultTables | RunsTables) -> Figure:
+def draw(data: ResultTables) -> Figure:
     """Median and 10-90 % band of the repetitions or the runs, log axis, per robot pair."""
-    return draw_error_curves(
-        data,
-        ("translation_error_m", "refined_translation_error_m"),
-        "translation error (m)",
-        "",
-        _log_axis,
-    )
+    return draw_error_curves(data, "translation_error_m", "translation error (m)", "", _log_axis)
 
 
 def _log_axis(axes: Axes, drawn: Float) -> None:

@@ -6,7 +6,6 @@ from matplotlib.figure import Figure
 
 from experiments.show.figures.error_curves import draw_error_curves
 from experiments.show.figures.result_tables import ResultTables
-from experiments.show.figures.runs_tables import RunsTables
 from experiments.show.figures.style import plain_numbers
 from mapfusion.se2 import Float
 
@@ -15,11 +14,11 @@ from mapfusion.se2 import Float
 _LINEAR_RAD = 0.01
 
 
-def draw(data: ResultTables | RunsTables) -> Figure:
+def draw(data: ResultTables) -> Figure:
     """Median and 10-90 % band of the repetitions or the runs, per robot pair."""
     return draw_error_curves(
         data,
-        ("rotation_error_rad", "refined_rotation_error_rad"),
+        "rotation_error_rad",
         "rotation error (rad)",
         "error = estimate - truth, counter-clockwise positive (the paper's sign is the opposite); "
         f"axis linear within ±{_LINEAR_RAD} rad",

@@ -8,11 +8,10 @@ from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
-from experiments.judge.metrics import ORACLE
-from experiments.judge.truth import true_pairs
+from experiments.run.estimates import inlier_mask
 from experiments.show.figures.result_tables import NothingToDraw, Pair, ResultTables, of_pair
-from experiments.show.figures.style import BLACK, GRAY, PAGE_WIDTH_IN, robot_colours
-from mapfusion.se2 import Float, transform_points
+from experiments.show.figures.style import BLACK, GRAY, PAGE_WIDTH_IN
+from mapfusion.se2 import Float
 
 # Strays must not shrink the picture: beyond this share on each side, widened by some of the extent.
 _STRAY_SHARE, _STRAY_MARGIN = 0.005, 0.05
@@ -32,26 +31,16 @@ def draw(data: ResultTables) -> Figure:
     position_a, position_b = (_clipped(data.landmarks_of(robot)[0]) for robot in pair)
     shift = np.array([np.nanmax(position_a[:, 0]) - np.nanmin(position_b[:, 0]), 0.0, 0.0])
     shift[0] += _GAP * np.ptp(position_a[np.isfinite(position_a[:, 0]), 0])
+    ends = {pair[0]: position_a, pair[1]: position_b + shift}
     figure = Figure(figsize=(PAGE_WIDTH_IN, 3.9))
     axes: Axes3D = figure.add_subplot(projection="3d")
-    colours = robot_colours(data.robots)
-    for robot, points, marker in ((pair[0], position_a, "*"), (pair[1], position_b + shift, "^")):
-        axes.plot(
-            *points.T,
-            linestyle="none",
-            marker=marker,
-            markersize=2.0,
-            markeredgewidth=0.2,
-            color=colours[robot],
-            **_BEYOND_AXES,
-            label=f"{robot}: {len(points)} landmarks",
-            rasterized=True,
-        )
-    _add_correspondences(axes, data, pair, position_a, position_b + shift)
-    _set_space(axes, np.concatenate([position_a, position_b + shift]))
-    axes.set_xlabel("x (m)")
-    axes.set_ylabel("y (m)")
-    axes.set_zlabel("z (m)")
+    for (robot, points), marker in zip(ends.items(), "*^", strict=True):
+        look = {"marker": marker, "markersize": 2.0, "markeredgewidth": 0.2, "linestyle": "none"}
+        look |= {"color": data.colours[robot], "label": f"{robot}: {len(points)} landmarks"}
+        axes.plot(*points.T, rasterized=True, **look, **_BEYOND_AXES)
+    _add_correspondences(axes, data, pair, *ends.values())
+    _set_space(axes, np.concatenate(list(ends.values())))
+    axes.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)")
     figure.legend(
         loc="outside upper center",
         ncols=2,
@@ -81,27 +70,19 @@ def judge_correspondences(data: ResultTables, pair: Pair) -> tuple[np.ndarray, t
 
     By the truth where it is known, else by the refined inliers of the first aligner that has any.
     """
-    rows = data.last_correspondences(pair)
-    T_a_b = data.true_alignment(pair)
-    if T_a_b is not None:
-        points_a, points_b = (data.true_points_of(robot) for robot in pair)
-        true = true_pairs(
-            points_a,
-            transform_points(T_a_b, points_b),
-            rows["index_a"].to_numpy(),
-            rows["index_b"].to_numpy(),
-            data.scenario["evaluate"]["true_pair_radius_m"],
-        )
-        return true, ("true correspondences", "false correspondences")
+    n_offered, last = len(data.last_correspondences(pair)), data.last_iteration(pair)
+    if data.start_pose(pair[0]) is not None:
+        judged = of_pair(data.table("true_pairs"), pair).set_index("iteration")["true_pair"]
+        names = ("true correspondences", "false correspondences")
+        return inlier_mask(judged[last], n_offered), names
     estimates = of_pair(data.table("estimates"), pair)
-    estimates = estimates[estimates["iteration"] == data.last_iteration(pair)]
+    found = estimates[(estimates["iteration"] == last) & estimates["accepted"]]
     for name in data.aligners:
-        accepted = estimates[(estimates["aligner"] == name) & estimates["accepted"]]
-        if name != ORACLE and len(accepted):
-            packed = np.frombuffer(accepted["refined_inliers"].iloc[0], dtype=np.uint8)
-            bits = np.unpackbits(packed, count=len(rows)).astype(bool)
-            return bits, (f"{name}'s refined inliers", "other correspondences")
-    return np.zeros(len(rows), dtype=bool), ("inliers", "correspondences")
+        inliers = found[found["aligner"] == name]["refined_inliers"]
+        if len(inliers):
+            names = (f"{name}'s refined inliers", "other correspondences")
+            return inlier_mask(inliers.iloc[0], n_offered), names
+    return np.zeros(n_offered, dtype=bool), ("inliers", "correspondences")
 
 
 def _add_correspondences(
@@ -121,25 +102,18 @@ def _add_correspondences(
         n_drawn = min(len(candidates), _MAX_LINES)
         drawn = candidates[np.linspace(0, len(candidates) - 1, n_drawn).astype(int)]
         some = f", {n_drawn} drawn" if n_drawn < chosen.sum() else ""
-        lines = Line3DCollection(
-            list(ends[drawn]),
-            label=f"{name}: {chosen.sum()}{some}",
-            rasterized=True,
-            **_BEYOND_AXES,
-            **style,
-        )
+        style |= {"label": f"{name}: {chosen.sum()}{some}", "rasterized": True}
+        lines = Line3DCollection(list(ends[drawn]), **style, **_BEYOND_AXES)
         axes.add_collection3d(lines, autolim=False)
 
 
 def _set_space(axes: Axes3D, points: Float) -> None:
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
-    axes.set_xlim(low[0], high[0])
-    axes.set_ylim(low[1], high[1])
     bottom, top = min(0.0, low[2]), max(high[2], low[2] + 0.1)
-    axes.set_zlim(bottom, top)
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(bottom, top))
     length, width = (high - low)[:2]
     box = (length, width, max(top - bottom, _MIN_HEIGHT * max(length, width)))
     axes.set_box_aspect(box, zoom=_ZOOM)  # pyright: ignore[reportArgumentType]  # takes floats
-    axes.yaxis.set_major_locator(MaxNLocator(_SHORT_AXIS_TICKS))
-    axes.zaxis.set_major_locator(MaxNLocator(_SHORT_AXIS_TICKS))
+    for axis in (axes.yaxis, axes.zaxis):
+        axis.set_major_locator(MaxNLocator(_SHORT_AXIS_TICKS))
     axes.view_init(elev=_ELEVATION_DEG, azim=_AZIMUTH_DEG)

@@ -1,15 +1,16 @@
 """Figure 8: one landmark as two robots know it, and as the merge fuses it."""
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
 from experiments.show.figures.ellipses import LEVEL_TEXT, add_ellipses, semi_axes
-from experiments.show.figures.floor_plan import label_plan
-from experiments.show.figures.fused_frame import FusedPairs, fused_pairs
+from experiments.show.figures.floor_plan import label_plan, set_square
+from experiments.show.figures.fused_pairs import MARKERS, FusedPairs, fused_pairs
 from experiments.show.figures.result_tables import NothingToDraw, ResultTables
-from experiments.show.figures.style import FUSED_COLOUR, robot_colours
 
 _MAX_ELONGATION = 3.0  # beyond, an ellipse is a needle in print
 _MIN_SEPARATION = 0.25  # of the parents, in semi-major axes: nearer, their labels collide
@@ -25,22 +26,14 @@ def draw(data: ResultTables) -> Figure:
     position, covariance = pairs.position_m[:, chosen], pairs.covariance_m2[:, chosen]
     figure = Figure(figsize=(4.6, 4.4))
     axes = figure.subplots()
-    colours = [robot_colours(data.robots)[robot] for robot in pairs.robots] + [FUSED_COLOUR]
+    colours = pairs.colours(data)
     labels = [f"{robot}'s landmark $L_{i}$" for robot, i in zip(pairs.robots, "ij", strict=True)]
     labels.append("fused landmark $L_F$")
-    for k, (marker, dashes) in enumerate((("*", "--"), ("^", "-."), ("s", "-"))):
-        here = slice(k, k + 1)
-        add_ellipses(
-            axes, position[here], covariance[here], edgecolors=colours[k], linestyles=dashes
-        )
-        axes.plot(
-            *position[k, :2],
-            marker=marker,
-            markersize=6,
-            color=colours[k],
-            linestyle=dashes,
-            label=labels[k],
-        )
+    for k, dashes in enumerate(("--", "-.", "-")):
+        here, colour = slice(k, k + 1), colours[k]
+        add_ellipses(axes, position[here], covariance[here], edgecolors=colour, linestyles=dashes)
+        look: dict[str, Any] = {"marker": MARKERS[k], "markersize": 6, "label": labels[k]}
+        axes.plot(*position[k, :2], color=colour, linestyle=dashes, **look)
     own = pairs.own_covariance_m2[:, chosen]
     add_ellipses(axes, position[:2], own, edgecolors=colours[:2], linewidths=0.6)
     axes.plot(*position[:2, :2].T, color="gray", linewidth=0.6, linestyle=":", zorder=1)
@@ -84,24 +77,15 @@ def _name_points(axes: Axes, position_m: np.ndarray) -> None:
     length = float(np.linalg.norm(along))
     along = along / length if length > 0 else np.array([1.0, 0.0])
     across = np.array([-along[1], along[0]])
-    for name, point, side in zip("ijF", position_m, (-along, along, across), strict=True):
-        axes.annotate(
-            f"$L_{name}$",
-            xy=(point[0], point[1]),
-            xytext=tuple(14 * side),
-            textcoords="offset points",
-            ha="center",
-            va="center",
-            fontsize=10,
-            path_effects=[withStroke(linewidth=2.5, foreground="white")],
-            zorder=5,
-        )
+    look = {"ha": "center", "va": "center", "fontsize": 10, "zorder": 5}
+    look |= {"path_effects": [withStroke(linewidth=2.5, foreground="white")]}
+    for name, (x, y, _), side in zip("ijF", position_m, (-along, along, across), strict=True):
+        offset = {"xytext": tuple(14 * side), "textcoords": "offset points"}
+        axes.annotate(f"$L_{name}$", xy=(x, y), **offset, **look)
 
 
 def _set_view(axes: Axes, position_m: np.ndarray, covariance_m2: np.ndarray) -> None:
     major, _, _ = semi_axes(covariance_m2[:, :2, :2])
     centre = position_m[2, :2]
-    reach = _MARGIN * float((np.abs(position_m[:, :2] - centre).max(axis=1) + major).max())
-    axes.set_xlim(centre[0] - reach, centre[0] + reach)
-    axes.set_ylim(centre[1] - reach, centre[1] + reach)
-    axes.set_aspect("equal")
+    reach = float((np.abs(position_m[:, :2] - centre).max(axis=1) + major).max())
+    set_square(axes, centre, _MARGIN * reach)

@@ -4,21 +4,17 @@ from matplotlib.figure import Figure
 
 from experiments.show.figures.floor_plan import (
     add_frame,
-    add_walls,
-    height_of_row,
-    label_plan,
-    legend_height,
+    add_points,
+    finish_plans,
     set_view,
+    start_plan,
 )
-from experiments.show.figures.result_tables import (
-    NothingToDraw,
-    ResultTables,
-    positions_and_covariances,
-)
-from experiments.show.figures.style import FUSED_COLOUR, PAGE_WIDTH_IN, robot_colours
+from experiments.show.figures.result_tables import NothingToDraw, ResultTables
+from experiments.show.figures.style import FUSED_COLOUR, PAGE_WIDTH_IN
+from mapfusion.storage import POSITION_FIELDS
 
-_LEGEND_COLUMNS = 4
 _ROBOT_MARKERS = ("*", "^", "v", "x", "d")
+_FUSED_STYLE = {"marker": "s", "markersize": 2.8, "markerfacecolor": "none", "color": FUSED_COLOUR}
 
 
 def draw(data: ResultTables) -> Figure:
@@ -26,48 +22,21 @@ def draw(data: ResultTables) -> Figure:
     fused = data.table("fused")
     if fused.empty:
         raise NothingToDraw("the fused map is empty")
-    frame = data.robots[0]
     figure = Figure(figsize=(PAGE_WIDTH_IN, PAGE_WIDTH_IN))
     axes = figure.subplots()
-    walls = data.walls_in_frame_of(frame)
-    add_walls(axes, walls)
-    for place, (robot, colour) in enumerate(robot_colours(data.robots).items()):
-        rows = fused[(fused["n_parents"] == 1) & (fused["robot_a"] == robot)]
-        if rows.empty:
-            continue
-        axes.plot(
-            rows["x_m"],
-            rows["y_m"],
-            linestyle="none",
-            marker=_ROBOT_MARKERS[place % len(_ROBOT_MARKERS)],
-            markersize=3,
-            markeredgewidth=0.3,
-            color=colour,
-            label=f"from {robot} alone ({len(rows)})",
-            rasterized=True,
-        )
-    rows = fused[fused["n_parents"] > 1]
-    if len(rows):
-        axes.plot(
-            rows["x_m"],
-            rows["y_m"],
-            linestyle="none",
-            marker="s",
-            markersize=2.8,
-            markerfacecolor="none",
-            markeredgewidth=0.6,
-            color=FUSED_COLOUR,
-            label=f"fused from two or more ({len(rows)})",
-            rasterized=True,
-        )
+    walls = start_plan(axes, data, data.robots[0])
+    position = fused[POSITION_FIELDS].to_numpy()
+    for place, (robot, colour) in enumerate(data.colours.items()):
+        own = ((fused["n_parents"] == 1) & (fused["robot_a"] == robot)).to_numpy()
+        if own.any():
+            marker = _ROBOT_MARKERS[place % len(_ROBOT_MARKERS)]
+            style = {"marker": marker, "markersize": 3, "markeredgewidth": 0.3, "color": colour}
+            add_points(axes, position[own], label=f"from {robot} alone ({own.sum()})", **style)
+    several = (fused["n_parents"] > 1).to_numpy()
+    if several.any():
+        label = f"fused from two or more ({several.sum()})"
+        add_points(axes, position[several], label=label, markeredgewidth=0.6, **_FUSED_STYLE)
     add_frame(axes)
-    position, _ = positions_and_covariances(fused)
-    outside = set_view(axes, position, *walls)
-    label_plan(axes, frame)
-    note = f", {outside} out of view" if outside else ""
-    axes.set_title(f"fused map: {len(fused)} landmarks{note}")
-    handles, _ = axes.get_legend_handles_labels()
-    legend_in = legend_height(len(handles), _LEGEND_COLUMNS)
-    figure.set_figheight(height_of_row([axes], PAGE_WIDTH_IN) + legend_in)
-    figure.legend(loc="outside lower center", ncols=_LEGEND_COLUMNS, markerscale=1.6)
+    axes.set_title(f"fused map: {set_view(axes, position, *walls)}")
+    finish_plans(figure, [axes], axes.get_legend_handles_labels()[0], 4, markerscale=1.6)
     return figure

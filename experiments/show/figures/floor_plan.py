@@ -1,11 +1,15 @@
 """What all maps seen from above share: equal scales, walls, frames, and a view without strays."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-from experiments.show.figures.style import BLACK, PALE_GRAY
+from experiments.show.figures.result_tables import ResultTables
+from experiments.show.figures.style import BLACK, PAGE_WIDTH_IN, PALE_GRAY
 from mapfusion.se2 import Float
 
 _STRAY_SHARE = 0.005  # a stray landmark tens of metres off, on each side, must not shrink the map
@@ -15,10 +19,23 @@ _LABELS_WIDTH_IN, _LABELS_HEIGHT_IN = 0.55, 0.65  # what labels and titles take 
 _LEGEND_ROW_IN, _LEGEND_FRAME_IN = 0.16, 0.2
 
 
-def add_walls(axes: Axes, walls: Sequence[Float]) -> None:
-    """Draw the true walls faintly, as context."""
+def start_plan(axes: Axes, data: ResultTables, robot: str) -> list[Float]:
+    """Label a plan in a robot's map frame and draw the true walls faintly; returns the walls."""
+    label_plan(axes, robot)
+    walls = data.walls_in_frame_of(robot)
     for wall in walls:
-        axes.plot(wall[:, 0], wall[:, 1], color=PALE_GRAY, linewidth=2.0, zorder=0.8)
+        axes.plot(*wall.T, color=PALE_GRAY, linewidth=2.0, zorder=0.8)
+    return walls
+
+
+def label_plan(axes: Axes, frame: str) -> None:
+    """Label both axes with their unit and the frame they belong to."""
+    axes.set(xlabel=f"x in {frame}'s frame (m)", ylabel=f"y in {frame}'s frame (m)")
+
+
+def add_points(axes: Axes, points: Float, **style: Any) -> None:
+    """Draw points (N, 2 or more) as pixels: as outlines they would make an SVG of megabytes."""
+    axes.plot(*points[:, :2].T, linestyle="none", rasterized=True, **style)
 
 
 def add_frame(axes: Axes, length_m: float = _AXIS_LENGTH_M) -> None:
@@ -34,11 +51,11 @@ def add_frame(axes: Axes, length_m: float = _AXIS_LENGTH_M) -> None:
         axes.annotate(name, xy=tip, xytext=(3, -4), textcoords="offset points", zorder=6)
 
 
-def set_view(axes: Axes, landmarks_m: Float, *others_m: Float) -> int:
+def set_view(axes: Axes, landmarks_m: Float, *others_m: Float) -> str:
     """Show all of `others_m` and the landmarks but for strays, at equal scales.
 
     Returns:
-        How many landmarks lie outside the view.
+        How many landmarks there are, and how many of them are out of view, in words.
     """
     core = [points[:, :2] for points in others_m if len(points)]
     if len(landmarks_m):
@@ -46,11 +63,18 @@ def set_view(axes: Axes, landmarks_m: Float, *others_m: Float) -> int:
     points = np.concatenate(core) if core else np.zeros((1, 2))
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
     margin = max(_MARGIN * float((high - low).max()), _MIN_MARGIN_M)
-    axes.set_xlim(low[0] - margin, high[0] + margin)
-    axes.set_ylim(low[1] - margin, high[1] + margin)
+    low, high = low - margin, high + margin
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     axes.set_aspect("equal", adjustable="box")
-    inside = np.all((landmarks_m[:, :2] >= low - margin) & (landmarks_m[:, :2] <= high + margin), 1)
-    return int(len(landmarks_m) - inside.sum())
+    plan = landmarks_m[:, :2]
+    outside = np.any((plan < low) | (plan > high), axis=1).sum()
+    return f"{len(plan)} landmarks" + (f", {outside} out of view" if outside else "")
+
+
+def set_square(axes: Axes, centre: Float, reach_m: float) -> None:
+    """Show so far around a point, at equal scales."""
+    (x0, y0), (x1, y1) = centre - reach_m, centre + reach_m
+    axes.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal")
 
 
 def height_of_row(panels: Sequence[Axes], width_in: float) -> float:
@@ -59,13 +83,11 @@ def height_of_row(panels: Sequence[Axes], width_in: float) -> float:
     return (width_in - _LABELS_WIDTH_IN) * float(ratio) + _LABELS_HEIGHT_IN
 
 
-def legend_height(n_entries: int, n_columns: int, title: bool = False) -> float:
-    """Inches that a legend below or above a figure takes."""
-    rows = -(-n_entries // n_columns) + title
-    return _LEGEND_ROW_IN * rows + _LEGEND_FRAME_IN
-
-
-def label_plan(axes: Axes, frame: str) -> None:
-    """Label both axes with their unit and the frame they belong to."""
-    axes.set_xlabel(f"x in {frame}'s frame (m)")
-    axes.set_ylabel(f"y in {frame}'s frame (m)")
+def finish_plans(
+    figure: Figure, panels: Sequence[Axes], handles: Sequence[Artist], columns: int, **legend: Any
+) -> None:
+    """Put a legend below one row of plans and make the figure as high as both need."""
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns, **legend)
+    rows = -(-len(handles) // columns) + ("title" in legend)
+    plans_in = height_of_row(panels, PAGE_WIDTH_IN / len(panels))
+    figure.set_figheight(plans_in + (_LEGEND_ROW_IN * rows + _LEGEND_FRAME_IN))

@@ -1,12 +1,13 @@
 """Figures 4 to 6 over several runs: medians and bands over seeds instead of repetitions."""
 
 from pathlib import Path
+from typing import Any
 
 from experiments.show.figures.drawing import draw_figure
-from experiments.show.figures.runs_tables import RunsTables
+from experiments.show.figures.result_tables import ResultTables
 from experiments.study.statistics.summary import ALL_SCENARIOS, Summary, configurations
 
-FIGURES = ("fig04_translation_error", "fig05_rotation_error", "fig06_aligner_time")
+_OVER_RUNS = ("fig04_translation_error", "fig05_rotation_error", "fig06_aligner_time")
 
 
 def draw_over_runs(summary: Summary, folder: Path) -> list[str]:
@@ -19,14 +20,11 @@ def draw_over_runs(summary: Summary, folder: Path) -> list[str]:
     """
     skipped = []
     drawn = [
-        (labels, medians)
-        for labels, medians in configurations(summary.run_medians)
+        (_name(labels), rows)
+        for labels, rows in configurations(summary.run_medians)
         if labels["scenario"] != ALL_SCENARIOS
     ]
-    for labels, medians in drawn:
-        name = "-".join(
-            [str(labels["scenario"]), *(f"{k}={v}" for k, v in list(labels.items())[1:])]
-        )
+    for name, medians in drawn:
         if medians["run_id"].nunique() < 2:
             skipped.append(f"{name}: one run alone; `mapfusion figures` draws it")
             continue
@@ -34,12 +32,15 @@ def draw_over_runs(summary: Summary, folder: Path) -> list[str]:
         if len(timings):
             timings = timings[timings["run_id"].isin(medians["run_id"].unique())]
         target = folder if len(drawn) == 1 else folder / _file_name(name)
-        data = RunsTables(target, medians, timings)
-        for figure in FIGURES:
-            outcome = draw_figure(data, figure)
-            if outcome.skipped:
-                skipped.append(f"{name}, {figure}: {outcome.skipped}")
+        data = ResultTables(target, {"errors": medians, "aligner_timings": timings})
+        outcomes = [draw_figure(data, figure, target) for figure in _OVER_RUNS]
+        skipped += [f"{name}, {each.name}: {each.skipped}" for each in outcomes if each.skipped]
     return skipped
+
+
+def _name(labels: dict[str, Any]) -> str:
+    (_, scenario), *settings = labels.items()
+    return "-".join([str(scenario), *(f"{key}={value}" for key, value in settings)])
 
 
 def _file_name(name: str) -> str:

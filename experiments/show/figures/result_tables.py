@@ -1,7 +1,7 @@
 """What a result folder holds, read when a figure asks for it."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -10,8 +10,9 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
-from experiments.judge.metrics import ORACLE
+from experiments.judge.judged_maps import methods_in
 from experiments.judge.tables import read, table_path
+from experiments.show.figures.style import aligner_styles, robot_colours
 from mapfusion.align.result import Status
 from mapfusion.errors import InputError
 from mapfusion.se2 import Float, between, inverse, transform_points
@@ -25,31 +26,31 @@ class NothingToDraw(Exception):  # noqa: N818  # no error: the result simply hol
 
 
 class ResultTables:
-    """The tables, key frames and descriptions of one result folder.
+    """The tables, key frames and descriptions of one result folder, or what several runs share.
 
     Every access raises InputError that names the file when it is missing or damaged; only
     `world.json` (the walls, known in simulation alone) and the key frames may be absent.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, of_runs: Mapping[str, pd.DataFrame] | None = None) -> None:
+        """Read from a result folder, or show rows of several runs that are in memory already.
+
+        Args:
+            folder: written by `run`; of several runs where their figures go.
+            of_runs: rows of tables, by name, with `run_id`: `errors` with one row per run where a
+                result has one per repetition.
+        """
         self.folder = folder
-        self._tables: dict[str, pd.DataFrame] = {}
+        self.several_runs = of_runs is not None
+        self._tables = dict(of_runs or {})
 
     def table(self, name: str) -> pd.DataFrame:
         """The table of that name (see experiments.judge.tables)."""
         if name not in self._tables:
             self._tables[name] = read(table_path(self.folder, name), name)
+        if self._tables[name].columns.empty:
+            raise NothingToDraw(f"no run has a table {name}")
         return self._tables[name]
-
-    @property
-    def pictures(self) -> Path:
-        """The folder that figures go to."""
-        return self.folder / "figures"
-
-    @property
-    def bands_over(self) -> str:
-        """What the bands of figures 4 and 5 are quantiles of."""
-        return "repetitions"
 
     @cached_property
     def scenario(self) -> dict[str, Any]:
@@ -62,22 +63,31 @@ class ResultTables:
         return self.table("robots")["robot"].drop_duplicates().tolist()
 
     @cached_property
+    def colours(self) -> dict[str, str]:
+        """Each robot's colour, in display order."""
+        return robot_colours(self.robots)
+
+    @cached_property
     def pairs(self) -> list[Pair]:
         """Robot pairs that were aligned, in display order."""
         return pairs_in(self.table("errors"))
 
     @cached_property
     def aligners(self) -> list[str]:
-        """Aligners that were run, in the scenario's order, the oracle last."""
-        found = self.table("errors")["aligner"].drop_duplicates().tolist()
-        listed = [entry["name"] for entry in self.scenario["align"]["aligners"]]
-        return in_display_order(found, listed)
+        """Aligners that were run, in the scenario's order as the table has it, the oracle last."""
+        return methods_in(self.table("errors"), oracle=True)
 
-    def label_of(self, aligner: str) -> str:
-        """An aligner's name in legends, with a word where its package is not installed."""
+    @cached_property
+    def styles(self) -> dict[str, dict[str, Any]]:
+        """Each aligner's line style."""
+        return aligner_styles(self.aligners)
+
+    @cached_property
+    def labels(self) -> dict[str, str]:
+        """Each aligner's name in legends, with a word where its package is not installed."""
         errors = self.table("errors")
-        status = errors["status"][errors["aligner"] == aligner]
-        return f"{aligner} (absent)" if (status == Status.ABSENT).any() else aligner
+        absent = errors["aligner"][errors["status"] == Status.ABSENT] if "status" in errors else ()
+        return {name: f"{name} (absent)" if name in set(absent) else name for name in self.aligners}
 
     def last_iteration(self, pair: Pair) -> int:
         """The last iteration at which the pair's maps were aligned: that of the stored maps."""
@@ -90,21 +100,20 @@ class ResultTables:
 
     def landmarks_of(self, robot: str) -> tuple[Float, Float]:
         """Positions (N, 3) and covariances (N, 3, 3) of the last map, by landmark number."""
-        landmarks = self.table("landmarks")
-        rows = landmarks[landmarks["robot"] == robot].sort_values("landmark")
-        return positions_and_covariances(rows)
-
-    def true_points_of(self, robot: str) -> Float:
-        """True points (N, 3) of the last map's landmarks, in the robot's frame; NaN if unknown."""
-        landmarks = self.table("landmarks")
-        rows = landmarks[landmarks["robot"] == robot].sort_values("landmark")
-        return rows[["truth_x_m", "truth_y_m", "truth_z_m"]].to_numpy()
+        return positions_and_covariances(self._own_rows("landmarks", robot, "landmark"))
 
     def path_of(self, robot: str) -> Float:
         """Poses (T, 3) of the best particle's whole path at the end, in the robot's frame."""
-        paths = self.table("paths")
-        rows = paths[paths["robot"] == robot].sort_values("iteration")
+        rows = self._own_rows("paths", robot, "iteration")
         return rows[["final_x_m", "final_y_m", "final_theta_rad"]].to_numpy()
+
+    def clouds_of(self, robot: str) -> pd.DataFrame:
+        """A robot's particles at the kept iterations."""
+        return self._own_rows("clouds", robot, "iteration")
+
+    def _own_rows(self, name: str, robot: str, order: str) -> pd.DataFrame:
+        table = self.table(name)
+        return table[table["robot"] == robot].sort_values(order, kind="stable")
 
     @cached_property
     def walls(self) -> list[Float]:
@@ -139,14 +148,7 @@ class ResultTables:
 def pairs_in(errors: pd.DataFrame) -> list[Pair]:
     """Robot pairs in the order of their appearance."""
     pairs = errors[["robot_a", "robot_b"]].drop_duplicates()
-    return [(a, b) for a, b in pairs.itertuples(index=False)]
-
-
-def in_display_order(found: Sequence[str], listed: Sequence[str] = ()) -> list[str]:
-    """Aligners as listed, then as found, the oracle last."""
-    names = [name for name in listed if name in found]
-    names += [name for name in found if name not in names and name != ORACLE]
-    return names + [ORACLE] * (ORACLE in found)
+    return list(pairs.itertuples(index=False, name=None))
 
 
 def of_pair(rows: pd.DataFrame, pair: Pair) -> pd.DataFrame:

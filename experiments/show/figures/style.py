@@ -1,13 +1,16 @@
 """One look for all figures: legible in print, safe for colour-blind readers, reproducible."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 import matplotlib.style
+from matplotlib.artist import Artist
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
-from experiments.judge.metrics import ORACLE
+from experiments.judge.criteria import ORACLE
 
 PAGE_WIDTH_IN = 7.2  # two columns of a journal page
 PNG_DPI = 200
@@ -105,6 +108,31 @@ def aligner_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
         }
         for place, name in enumerate(others)
     }
+
+
+def aligner_legend(
+    figure: Figure,
+    labels: Mapping[str, str],
+    styles: Mapping[str, dict[str, Any]],
+    columns: int,
+    others: Sequence[Artist] = (),
+) -> None:
+    """Put a legend of aligners above a figure.
+
+    Args:
+        figure: to which it belongs.
+        labels: text of each aligner shown, by name.
+        styles: of all aligners.
+        columns: at most so many.
+        others: what else the legend explains.
+    """
+    handles = [Line2D([], [], label=text, **styles[name]) for name, text in labels.items()]
+    figure.legend(
+        handles=[*handles, *others],
+        loc="outside upper center",
+        ncols=min(len(handles) + len(others), columns),
+        handlelength=3.2,
+    )
 
 
 def robot_colours(names: Sequence[str]) -> dict[str, str]:

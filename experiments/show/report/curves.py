@@ -9,7 +9,7 @@ import pandas as pd
 
 from experiments.judge.criteria import ANSWERABLE_PAIRS, has_common_ground
 from experiments.judge.judged_maps import MAP_PAIR
-from experiments.show.figures.error_curves import BAND
+from experiments.study.statistics.error_bands import BAND
 from experiments.study.statistics.success_rates import success_rates
 
 _DIGITS = 5  # significant; more than any chart can show, and a third of the bytes of all of them

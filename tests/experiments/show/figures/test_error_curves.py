@@ -9,9 +9,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from experiments.judge import tables
+from experiments.judge.criteria import ANSWERABLE_PAIRS
 from experiments.show.figures import fig04_translation_error, fig05_rotation_error
-from experiments.show.figures.error_curves import MIN_TRUE_PAIRS, summarise
 from experiments.show.figures.result_tables import ResultTables
+from experiments.study.statistics.error_bands import error_bands
 
 COLUMNS = {
     fig04_translation_error: ("translation_error_m", "refined_translation_error_m"),
@@ -51,12 +52,12 @@ def test_drawn_lines_are_the_medians_of_the_repetitions(module, trio_result: Pat
 
 def test_band_holds_the_middle_four_fifths(trio_result: Path) -> None:
     errors = ResultTables(trio_result).table("errors")
-    summary = summarise(errors, "translation_error_m")
-    for row in summary.to_dict("records"):
+    for row in error_bands(errors).to_dict("records"):
         keys = ("robot_a", "robot_b", "aligner", "iteration")
         values = errors[np.all([errors[key] == row[key] for key in keys], axis=0)]
         expected = np.quantile(values["translation_error_m"], [0.1, 0.9])
-        np.testing.assert_allclose([row["low"], row["high"]], expected, rtol=1e-12)
+        found = [row["translation_error_m_low"], row["translation_error_m_high"]]
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
 def shaded(figure: Figure, panel: int) -> list[tuple[float, float]]:
@@ -76,7 +77,7 @@ def shaded(figure: Figure, panel: int) -> list[tuple[float, float]]:
 def test_iterations_with_too_few_true_pairs_are_shaded(
     n_true: list[int], expected: list[tuple[float, float]], trio_result: Path, tmp_path: Path
 ) -> None:
-    assert MIN_TRUE_PAIRS == 3
+    assert ANSWERABLE_PAIRS == 3
     errors = ResultTables(trio_result).table("errors")
     few = errors[(errors["robot_a"] == "R1") & (errors["robot_b"] == "R2")].copy()
     keep = sorted(few["iteration"].unique())[: len(n_true)]
@@ -84,6 +85,5 @@ def test_iterations_with_too_few_true_pairs_are_shaded(
     place = few["iteration"].map({k: i for i, k in enumerate(keep)})
     few = few.assign(iteration=10 * place, n_true=[n_true[i] for i in place])
     tables.write(tables.table_path(tmp_path, "errors"), "errors", few)
-    (tmp_path / "scenario.json").write_text((trio_result / "scenario.json").read_text())
     figure = fig04_translation_error.draw(ResultTables(tmp_path))
     assert np.ravel(shaded(figure, 0)) == pytest.approx(np.ravel(expected))

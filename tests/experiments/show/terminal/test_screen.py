@@ -1,8 +1,13 @@
-"""What the screen says about aligners that did not run."""
+"""How tables look on the screen, and what it says about aligners that did not run."""
+
+import math
 
 import pandas as pd
+import pytest
 
-from experiments.show.terminal.run_screen import aligner_summary, not_run_lines
+from experiments.show.terminal.layout import print_table
+from experiments.show.terminal.run_screen import not_run_lines
+from experiments.study.statistics.aligner_summary import aligner_summary
 
 
 def rows(aligner: str, *statuses: tuple[str, str]) -> pd.DataFrame:
@@ -16,6 +21,8 @@ def rows(aligner: str, *statuses: tuple[str, str]) -> pd.DataFrame:
             "reason": [reason for _, reason in statuses],
             "refined_status": [status for status, _ in statuses],
             "accepted": [status == "accepted" for status, _ in statuses],
+            "repetition": 0,
+            "n_common": 5,
             "n_true": 5,
             "n_correspondences": 10,
         }
@@ -53,4 +60,20 @@ def test_absent_is_neither_accepted_nor_not() -> None:
     assert summary["accepted"]["good"] == 0.5
     assert abs(summary["accepted"]["ill"] - 1 / 3) < 1e-12
     assert pd.isna(summary["accepted"]["far"])
-    assert pd.isna(summary["estimated_m"]["far"])
+    assert pd.isna(summary["translation_error_m"]["far"])
+
+
+def test_text_gives_way_before_numbers_on_a_narrow_screen(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "40")
+    columns = [("method", ""), ("a\nm", ".3f"), ("b\nrad", "+.4f"), ("of", ">")]
+    long = "a_method_with_a_[bold]_long_name"
+    print_table(columns, [(long, 1234.5, math.nan, "480/480"), ("short", 1.0, 0.5, None)], "Title")
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 40
+    text = "".join(lines)
+    for shown in ("1234.500", "480/480", "+0.5000", " - ", "Title"):
+        assert shown in text
+    assert "…" not in text
+    assert "".join(line[1:11].strip() for line in lines[5:9]) == long

@@ -8,9 +8,8 @@ import pandas as pd
 import pytest
 
 from experiments.show.export import to_latex, to_markdown, write_tables
-from experiments.show.figures.fig06_aligner_time import binned_quantiles
-from experiments.show.figures.runs_tables import RunsTables
-from experiments.study.statistics.error_bands import medians_of_run
+from experiments.show.figures.result_tables import ResultTables
+from experiments.study.statistics.error_bands import medians_of_run, time_bands
 from experiments.study.statistics.run_tables import find_runs
 from experiments.study.statistics.summary import ALL_SCENARIOS, summarise
 from tests.helpers.made_up_runs import (
@@ -152,7 +151,7 @@ def test_curves_over_runs_are_medians_of_run_medians(tmp_path: Path) -> None:
     errors = find_runs(folders).read("errors")
     medians = pd.concat([medians_of_run(own) for _, own in errors.groupby("run_id")])
     timings = find_runs(folders).read("aligner_timings")
-    data = RunsTables(tmp_path, medians, timings)
+    data = ResultTables(tmp_path, {"errors": medians, "aligner_timings": timings})
     assert data.aligners == [*METHODS, "oracle"]
     axes = fig04_translation_error.draw(data).axes[0]
     line = next(line for line in axes.get_lines() if line.get_label() == "icp")
@@ -167,10 +166,11 @@ def test_curves_over_runs_are_medians_of_run_medians(tmp_path: Path) -> None:
 
 def test_quantiles_of_groups_along_the_count() -> None:
     count, elapsed = np.repeat(np.arange(8), 10), np.tile(np.arange(10.0), 8)
-    middle, median = binned_quantiles(count, elapsed, 8)
-    np.testing.assert_array_equal(middle, np.arange(8))
-    np.testing.assert_array_equal(median, np.full(8, 4.5))
-    np.testing.assert_allclose(binned_quantiles(count, elapsed, 8, 0.9)[1], 8.1)
+    timings = pd.DataFrame({"aligner": "icp", "n_common": count, "elapsed_s": elapsed})
+    bands = time_bands(timings, groups=8)
+    np.testing.assert_array_equal(bands["n_common"], np.arange(8))
+    np.testing.assert_array_equal(bands["elapsed_s"], np.full(8, 4.5))
+    np.testing.assert_allclose(bands["elapsed_high_s"], 8.1)
 
 
 def test_memory_does_not_grow_with_the_rows_of_a_run(tmp_path: Path) -> None:

@@ -6,9 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import pdist
 
+from experiments.judge import tables
 from experiments.show.figures.fig08_fused_landmark import choose_landmark
-from experiments.show.figures.fused_frame import FusedPairs, fused_pairs, moved_map
-from experiments.show.figures.result_tables import ResultTables, positions_and_covariances
+from experiments.show.figures.fused_pairs import FusedPairs, fused_pairs, moved_map
+from experiments.show.figures.result_tables import (
+    NothingToDraw,
+    ResultTables,
+    positions_and_covariances,
+)
 
 
 @pytest.mark.parametrize("robot", ["R1", "R2", "R3"])
@@ -43,6 +48,12 @@ def test_parents_fuse_into_the_stored_landmark(trio_result: Path) -> None:
     weighted = np.einsum("knij,knj->ni", information[:2], pairs.position_m[:2])
     fused = np.linalg.solve(total, weighted[:, :, None])[:, :, 0]
     np.testing.assert_allclose(fused, pairs.position_m[2], atol=1e-8)
+
+
+def test_a_result_made_before_motions_were_stored_says_so(trio_copy: Path) -> None:
+    tables.table_path(trio_copy, "fused_motions").unlink()
+    with pytest.raises(NothingToDraw, match="made before fused motions were stored"):
+        fused_pairs(ResultTables(trio_copy))
 
 
 def one_pair(separation_m: float, sigma_a: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:

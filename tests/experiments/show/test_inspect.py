@@ -3,7 +3,6 @@
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -11,7 +10,7 @@ import pytest
 
 from experiments.judge import tables
 from experiments.run.stages.log import copy_log
-from experiments.show.inspect.parquet import inspect_table, unit_of
+from experiments.show.inspect import contents_of, unit_of
 from mapfusion.storage import schema, write_table
 from tests.helpers.tiny_scenario import command
 
@@ -21,7 +20,7 @@ def test_every_file_of_a_run_is_told(
 ) -> None:
     paths = [tiny_path, *tiny_results.rglob("*.json")]
     paths += [folder for folder in tiny_results.rglob("*") if list(folder.glob("*.parquet"))]
-    by_kind = {inspect_table(path).kind: path for path in tiny_results.rglob("*.parquet")}
+    by_kind = {contents_of(path).kind: path for path in tiny_results.rglob("*.parquet")}
     assert set(by_kind) >= {t.metadata[b"mapfusion.kind"].decode() for t in tables.ALL.values()}
     for path in [*paths, *by_kind.values(), tiny_results / "store", tiny_results / "tiny-3"]:
         reply = command(capsys, "inspect", path)
@@ -29,19 +28,27 @@ def test_every_file_of_a_run_is_told(
         assert str(path) in reply.out.splitlines()[0]
 
 
-def test_ranges_and_first_rows_are_those_of_the_table(tiny_result: Path) -> None:
+def test_kind_version_rows_and_columns_are_those_of_the_table(tiny_result: Path) -> None:
     path = tables.table_path(tiny_result, "errors")
-    rows, found = tables.read(path, "errors"), inspect_table(path)
-    assert (found.n_rows, found.version, found.kind) == (len(rows), "2", "result.errors")
-    assert [column.name for column in found.columns] == list(rows)
-    by_name = {column.name: column for column in found.columns}
-    for name in ("translation_error_m", "n_true", "refined_rotation_error_rad"):
-        values = rows[name][np.isfinite(rows[name])]
-        told = float(by_name[name].low), float(by_name[name].high)
-        assert told == pytest.approx((values.min(), values.max()), rel=1e-5)
-        assert by_name[name].n_missing == len(rows) - len(values)
-    assert by_name["aligner"].high == "oracle, ransac, svd, icp"
-    assert found.first_rows[2]["aligner"] == rows["aligner"][2]
+    rows, found = tables.read(path, "errors"), contents_of(path)
+    assert (found.kind, found.facts["schema_version"]) == ("result.errors", "2")
+    assert found.facts["rows"] == len(rows)
+    assert [name for name, _, _ in found.parts] == list(rows)
+    told = {name: (kind, unit) for name, kind, unit in found.parts}
+    assert told["translation_error_m"] == ("double", "m")
+    assert told["refined_rotation_error_rad"] == ("double", "rad")
+    assert told["n_true"] == ("int32", "")
+
+
+def test_a_result_tells_its_scenario_provenance_and_tables(tiny_result: Path) -> None:
+    found = contents_of(tiny_result)
+    assert found.kind == "result of a run"
+    assert (found.facts["name"], found.facts["seed"]) == ("tiny", 3)
+    assert {"renderer", "python", "written"} <= set(found.facts)
+    rows = {name: n for name, _, n in found.parts}
+    for name in tables.ALL:
+        table = tables.read(tables.table_path(tiny_result, name), name)
+        assert rows[f"tables/{name}"] == len(table)
 
 
 @pytest.mark.parametrize(
@@ -76,13 +83,13 @@ def test_a_kind_it_does_not_know_describes_itself(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "sweep.parquet"
-    fields = [pa.field("run_id", pa.string()), pa.field("elapsed_s", pa.float64())]
-    columns = {"run_id": ["[bold]a"], "elapsed_s": [np.nan]}
+    fields = [pa.field("[bold]", pa.string()), pa.field("elapsed_s", pa.float64())]
+    columns = {"[bold]": ["a"], "elapsed_s": [0.1]}
     write_table(path, columns, schema("sweep.new", 7, fields))
     reply = command(capsys, "inspect", path)
     assert reply.code == 0
     assert "sweep.new, schema version 7" in reply.out
-    assert "[bold]a" in reply.out  # as text, no markup
+    assert "[bold]" in reply.out  # as text, no markup
 
 
 def truncated(result: Path, folder: Path) -> Path:
@@ -158,7 +165,7 @@ def picture(result: Path, folder: Path) -> Path:
         (with_a_column_less, "columns are not those of result.errors"),
         (no_json, "damaged or no JSON"),
         (other_json, "no file of mapfusion's"),
-        (resolved_but_wrong, "no scenario of this program"),
+        (resolved_but_wrong, "seed"),
         (damaged_result, "clouds.parquet: damaged"),
         (empty_folder, "no folder of mapfusion's"),
         (absent, "no such file"),

@@ -1,1 +1,0 @@
-"""What a file or folder of ours holds."""
