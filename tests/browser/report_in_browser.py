@@ -16,6 +16,7 @@ from playwright.sync_api import Browser, Page, sync_playwright
 
 from experiments.show.figures import draw_all
 from experiments.show.report import write_report
+from tests.helpers.report_page import HOSTILE, hostile
 from tests.helpers.synthetic_result import Size, write_result
 
 CHROMIUM = os.environ.get("CHROMIUM", "/usr/bin/chromium")
@@ -266,8 +267,6 @@ def test_it_prints(opened: Opened, tmp_path: Path) -> None:
 def test_hostile_names_stay_names(
     browser: Browser, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    from tests.experiments.show.report.test_document import HOSTILE, hostile
-
     result = hostile(write_result(tmp_path_factory.mktemp("hostile")))
     opened = Opened(browser, write_report(result), viewport={"width": 1280, "height": 900})
     opened.page.on("dialog", lambda dialog: opened.complaints.append(dialog.message))

@@ -17,5 +17,4 @@ if [ $# -gt 0 ]; then
     RESULT="$1"
     export RESULT
 fi
-exec "${PYTHON:-.venv/bin/python}" -m pytest tests/browser/report_in_browser.py -s \
-    -o "pythonpath=tests/experiments tests/experiments/report"
+exec "${PYTHON:-.venv/bin/python}" -m pytest tests/browser/report_in_browser.py -s

@@ -6,7 +6,6 @@ import json
 import re
 import shutil
 from html import unescape
-from html.parser import HTMLParser
 from pathlib import Path
 
 import pandas as pd
@@ -14,40 +13,10 @@ import pytest
 
 from experiments.judge import tables
 from experiments.show.report import write_report
+from tests.helpers.report_page import HOSTILE, Page, hostile, page_of
 from tests.helpers.tiny_scenario import command
 
-HOSTILE = '<img src=x onerror=alert(1)></script><script>alert("2")</script>'
 MAX_BYTES = 15_000_000
-
-
-class Page(HTMLParser):
-    """Tags, text and the JSON of a report."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.tags: list[tuple[str, dict[str, str | None]]] = []
-        self.words = ""
-        self.json = ""
-        self._within = ""
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-        kind = dict(attrs).get("type")
-        self._within = "json" if kind == "application/json" else tag
-
-    def handle_endtag(self, tag: str) -> None:
-        self._within = ""
-
-    def handle_data(self, data: str) -> None:
-        if self._within == "json":
-            self.json += data
-        elif self._within not in {"script", "style"}:
-            self.words += data
-
-
-def page_of(result: Path, output: Path) -> Page:
-    return Page(write_report(result, output).read_text(encoding="utf-8"))
 
 
 @pytest.fixture(scope="module")
@@ -87,21 +56,6 @@ def test_scripts_bear_the_hashes_of_the_policy(made_up_result: Path, tmp_path: P
     for script in scripts:
         digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
         assert f"'sha256-{digest}'" in unescape(text)
-
-
-def hostile(result: Path) -> Path:
-    """Give an aligner, a robot and the scenario names that would like to be HTML."""
-    renamed = {"ransac": HOSTILE, "R2": f"R2{HOSTILE}"}
-    for name in tables.ALL:
-        file = tables.table_path(result, name)
-        if file.is_file():
-            tables.write(file, name, tables.read(file, name).replace(renamed))
-    text = (result / "scenario.json").read_text().replace('"ransac"', json.dumps(HOSTILE))
-    scenario = json.loads(text) | {"description": HOSTILE, "name": HOSTILE}
-    (result / "scenario.json").write_text(json.dumps(scenario))
-    world = (result / "world.json").read_text().replace('"R2"', json.dumps(f"R2{HOSTILE}"))
-    (result / "world.json").write_text(world)
-    return result
 
 
 def test_names_are_escaped_everywhere(copied: Path, page: Page) -> None:
@@ -183,5 +137,5 @@ def test_absent_packages_are_no_failures(copied: Path) -> None:
     rows.loc[own, ["status", "refined_status"]] = "absent"
     tables.write(tables.table_path(copied, "errors"), "errors", rows)
     page = page_of(copied, copied / "r.html")
-    assert "Not installed, and so not judged: impicp." in page.words
+    assert "Not installed, so not evaluated: impicp." in page.words
     assert "impicp" not in [aligner["name"] for aligner in json.loads(page.json)["aligners"]]

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.experiments.show.report.test_document import Page, page_of
 from tests.helpers.made_up_sweep import write_sweep
+from tests.helpers.report_page import Page, page_of
 from tests.helpers.tiny_scenario import command
 
 

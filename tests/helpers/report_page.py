@@ -1,0 +1,55 @@
+"""Written reports taken apart, and a result whose names would like to be HTML."""
+
+import json
+from html.parser import HTMLParser
+from pathlib import Path
+
+from experiments.judge import tables
+from experiments.show.report import write_report
+
+HOSTILE = '<img src=x onerror=alert(1)></script><script>alert("2")</script>'
+
+
+class Page(HTMLParser):
+    """Tags, text and the JSON of a report."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.words = ""
+        self.json = ""
+        self._within = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        kind = dict(attrs).get("type")
+        self._within = "json" if kind == "application/json" else tag
+
+    def handle_endtag(self, tag: str) -> None:
+        self._within = ""
+
+    def handle_data(self, data: str) -> None:
+        if self._within == "json":
+            self.json += data
+        elif self._within not in {"script", "style"}:
+            self.words += data
+
+
+def page_of(result: Path, output: Path) -> Page:
+    return Page(write_report(result, output).read_text(encoding="utf-8"))
+
+
+def hostile(result: Path) -> Path:
+    """Give an aligner, a robot and the scenario names that would like to be HTML."""
+    renamed = {"ransac": HOSTILE, "R2": f"R2{HOSTILE}"}
+    for name in tables.ALL:
+        file = tables.table_path(result, name)
+        if file.is_file():
+            tables.write(file, name, tables.read(file, name).replace(renamed))
+    text = (result / "scenario.json").read_text().replace('"ransac"', json.dumps(HOSTILE))
+    scenario = json.loads(text) | {"description": HOSTILE, "name": HOSTILE}
+    (result / "scenario.json").write_text(json.dumps(scenario))
+    world = (result / "world.json").read_text().replace('"R2"', json.dumps(f"R2{HOSTILE}"))
+    (result / "world.json").write_text(world)
+    return result
