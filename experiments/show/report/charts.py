@@ -49,27 +49,23 @@ def error_curves(rows: pd.DataFrame, aligners: Sequence[str]) -> dict[str, Any]:
         name: bands[bands["aligner"] == name].set_index("iteration").reindex(iterations)
         for name in aligners
     }
-    maps = rows.drop_duplicates(MAP_PAIR)
-    offered = maps.groupby("iteration")[["n_true", "n_correspondences"]].median()
+    offered = rows.drop_duplicates(MAP_PAIR).groupby("iteration")
     return {
         "iteration": iterations.tolist(),
-        **{name: rounded(offered[name]) for name in offered},
+        "n_true": rounded(offered["n_true"].median()),
+        "n_correspondences": rounded(offered["n_correspondences"].median()),
         "scarce": scarce_spans(rows),
         "aligners": {
-            name: {curve: _band_of(own, column) for curve, column in _ERRORS.items()}
+            name: {curve: _band(own, f"{column}{{}}") for curve, column in _ERRORS.items()}
             for name, own in of_aligner.items()
         },
     }
 
 
-def _band_of(bands: pd.DataFrame, column: str) -> dict[str, list[float | None]]:
-    """One column of `error_bands` as low, median and high."""
-    low, median, high = (f"{column}{end}" for end in ("_low", "", "_high"))
-    return {
-        "low": rounded(bands[low]),
-        "median": rounded(bands[median]),
-        "high": rounded(bands[high]),
-    }
+def _band(rows: pd.DataFrame, column: str, scale: float = 1.0) -> dict[str, list[float | None]]:
+    """Low, median and high, from columns named with "_low", "" and "_high" in their braces."""
+    ends = {"low": "_low", "median": "", "high": "_high"}
+    return {name: rounded(scale * rows[column.format(end)]) for name, end in ends.items()}
 
 
 def success_curves(maps: pd.DataFrame, aligners: Sequence[str]) -> list[dict[str, Any]]:
@@ -96,12 +92,9 @@ def success_curves(maps: pd.DataFrame, aligners: Sequence[str]) -> list[dict[str
 
 def _rates_of(rates: pd.DataFrame, aligner: str, starts: pd.Series) -> dict[str, Any]:
     own = rates[rates["aligner"] == aligner].set_index("from").reindex(starts)
-    return {
-        "rate": rounded(own["refined_success"]),
-        "low": rounded(own["refined_success_low"]),
-        "high": rounded(own["refined_success_high"]),
-        "n": (own["n_maps"] - own["n_apart"]).fillna(0).astype(int).tolist(),
-    }
+    band = _band(own, "refined_success{}")
+    n_maps = (own["n_maps"] - own["n_apart"]).fillna(0).astype(int)
+    return {"rate": band.pop("median"), **band, "n": n_maps.tolist()}
 
 
 def _counts(low: float, high: float) -> str:
@@ -137,10 +130,6 @@ def time_curves(timings: pd.DataFrame, aligners: Sequence[str]) -> dict[str, Any
             rows = time_bands(rows, "n_correspondences", _MAX_TIMES)
         if len(rows):
             rows = rows.sort_values("n_correspondences")
-            curves[aligner] = {
-                "n": rounded(rows["n_correspondences"]),
-                "median": rounded(1e3 * rows["elapsed_s"]),
-                "low": rounded(1e3 * rows["elapsed_low_s"]),
-                "high": rounded(1e3 * rows["elapsed_high_s"]),
-            }
+            band = _band(rows, "elapsed{}_s", scale=1e3)
+            curves[aligner] = band | {"n": rounded(rows["n_correspondences"])}
     return curves

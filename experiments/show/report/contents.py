@@ -18,7 +18,7 @@ from experiments.show.figures.result_tables import (
 )
 from experiments.show.figures.style import aligner_styles
 from experiments.show.report.charts import error_curves, success_curves, time_curves
-from experiments.show.report.one_run_sections import NO_SECTIONS, one_run_sections
+from experiments.show.report.one_run_sections import one_run_sections
 from experiments.show.report.origin import natural, provenance_of, stage_times
 from experiments.show.report.recommendation_text import recommendation_text
 from experiments.show.report.theme import chart_style
@@ -61,15 +61,14 @@ def contents_of(path: Path) -> dict[str, Any]:
         data = ResultTables(path)
     judged = _read_judged(runs, data)
     provenance, stages = provenance_of(path, runs)
-    origin = {
+    contents = {
         "provenance": provenance,
         "stages": stages,
         "stage_times": stage_times(runs),
         "failed": runs.failed.to_dict("records"),
+        **_comparison(runs, judged, one_run=data is not None),
     }
-    own = NO_SECTIONS if data is None else one_run_sections(data)
-    heading = _heading(path, judged, data)
-    return heading | _comparison(runs, judged, one_run=data is not None) | own | origin
+    return contents | (_of_sweep(path, judged) if data is None else one_run_sections(data))
 
 
 def _read_judged(runs: Runs, data: ResultTables | None) -> _JudgedRuns:
@@ -96,17 +95,16 @@ def _read_judged(runs: Runs, data: ResultTables | None) -> _JudgedRuns:
     )
 
 
-def _heading(path: Path, judged: _JudgedRuns, data: ResultTables | None) -> dict[str, str]:
-    if data is not None:
-        return {
-            "title": f"{data.scenario['name']}, seed {data.scenario['seed']}",
-            "description": data.scenario.get("description", ""),
-            "spread_text": "repetitions on the same maps",
-        }
-    return {
+def _of_sweep(path: Path, judged: _JudgedRuns) -> dict[str, Any]:
+    """Title of a sweep, and the sections that it has not."""
+    none: dict[str, Any] = dict.fromkeys(("outcomes", "robots", "fits", "figures", "missing"), ())
+    return none | {
         "title": f"{path.name}, {judged.maps['run_id'].nunique()} runs",
         "description": ", ".join(judged.maps["scenario"].unique()),
         "spread_text": "runs; each run is the median of its repetitions",
+        "map": None,
+        "robot_colours": {},
+        "scenario_text": "",
     }
 
 

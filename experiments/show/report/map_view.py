@@ -130,7 +130,7 @@ class _View:
         """The latest map at each shown iteration; an empty map has no rows."""
         rows = self._of_robot("map_history", robot).sort_values(["iteration", "landmark"])
         by_iteration = _by_iteration(rows)
-        known = np.array(sorted(by_iteration))
+        known = np.array(list(by_iteration))  # rising
         latest = np.searchsorted(known, self._shown, side="right") - 1
         packed = {
             place: self._points(by_iteration[known[place]], robot)
@@ -141,12 +141,11 @@ class _View:
     def _clouds(self, robot: str) -> list[dict[str, Any]]:
         """The particles nearest in time; they may be a few frames off."""
         by_iteration = _by_iteration(self._of_robot("clouds", robot))
-        known = np.array(sorted(by_iteration))
-        clouds = []
-        for wanted in self._shown if len(known) else ():
-            k = int(known[np.argmin(np.abs(known - wanted))])
-            clouds.append({"iteration": k, "at": self._plan(by_iteration[k], robot)})
-        return clouds
+        if not by_iteration:
+            return []
+        known = np.array(list(by_iteration))
+        nearest = known[np.abs(known[:, None] - self._shown).argmin(axis=0)]
+        return [{"at": self._plan(by_iteration[k], robot)} for k in nearest.tolist()]
 
     def _lines(self, robot: str) -> dict[str, Any]:
         rows = self._of_robot("paths", robot)

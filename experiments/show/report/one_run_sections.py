@@ -22,31 +22,22 @@ from experiments.show.report.map_view import TABLES as MAP_TABLES
 from experiments.show.report.map_view import map_view
 
 _TABLES = tuple(dict.fromkeys((*MAP_TABLES, *metrics.USED_TABLES, "timings")))
-# Of several runs there are none of these.
-NO_SECTIONS: dict[str, Any] = {
-    "map": None,
-    "robot_colours": {},
-    "outcomes": [],
-    "robots": [],
-    "fits": [],
-    "figures": [],
-    "scenario_text": "",
-    "missing": [],
-}
 
 
 def one_run_sections(data: ResultTables) -> dict[str, Any]:
-    """The values of NO_SECTIONS for a result; what builds on tables it does not hold is empty."""
+    """Title and sections of a result; what builds on tables that it does not hold is empty."""
     held = {
         name: data.table(name) for name in _TABLES if tables.table_path(data.folder, name).is_file()
     }
-    nothing = pd.DataFrame()
     return {
+        "title": f"{data.scenario['name']}, seed {data.scenario['seed']}",
+        "description": data.scenario.get("description", ""),
+        "spread_text": "repetitions on the same maps",
         "map": map_view(data, held),
         "robot_colours": robot_colours(data.robots),
         "outcomes": _outcomes(data.scenario, held),
         "robots": path_rms(held["robots"]).to_dict("records") if "robots" in held else [],
-        "fits": held.get("map_fits", nothing).to_dict("records"),
+        "fits": held["map_fits"].to_dict("records") if "map_fits" in held else [],
         "figures": list(_pictures(data.folder)),
         "scenario_text": _as_yaml(data.scenario),
         "missing": [name for name in _TABLES if name not in held],

@@ -4,8 +4,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from experiments.judge.criteria import COMMON_LANDMARKS
-from experiments.show.numbers import listed, metres, percent, radians
+from experiments.judge.criteria import COMMON_LANDMARKS, RICH_PAIRS
+from experiments.show.numbers import listed, metres, percent, radians, ratio
 from experiments.study.statistics.standing import Recommendation, Standing
 
 _RELIABLE = 0.5  # a method that surely fails more often than not is nothing to recommend
@@ -66,17 +66,16 @@ def recommendation_text(
 
 
 def _beside_oracle(best: Standing, ranking: Recommendation) -> str:
-    if math.isnan(best.over_oracle):
+    if math.isnan(ranking.oracle_m):
         return "There is no oracle to compare it with."
     oracle = f"{metres(ranking.oracle_m)} and {radians(ranking.oracle_rad)}"
-    if best.over_oracle < _SAME_AS_ORACLE:
-        return (
-            f"The oracle, which is given the true pairs, reaches {oracle} on the same maps: the "
-            "remaining error is the drift of the maps."
-        )
+    text = f"The oracle, which is given the true pairs, reaches {oracle}"
+    if math.isnan(best.over_oracle):
+        return f"{text}."
+    drift = ": the rest is the drift of the maps" if best.over_oracle < _SAME_AS_ORACLE else ""
     return (
-        f"The oracle, which is given the true pairs, reaches {oracle}: {best.over_oracle:.1f} "
-        "times less."
+        f"{text}; on maps with {RICH_PAIRS} or more true pairs the error is "
+        f"{ratio(best.over_oracle)} times the oracle's{drift}."
     )
 
 

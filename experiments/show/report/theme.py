@@ -88,7 +88,8 @@ def lightened(colour: str, background: str) -> str:
     found = colour.lower()
     while contrast(found, background) < MIN_CONTRAST:
         white += _LIGHTENING_STEP
-        found = to_hex([c + (1 - c) * white for c in to_rgb(colour)])
+        red, green, blue = (c + (1 - c) * white for c in to_rgb(colour))
+        found = to_hex((red, green, blue))
     return found
 
 

@@ -102,6 +102,15 @@ def test_real_results_fit(tiny_result: Path, tmp_path: Path) -> None:
     assert "path_rmse_m" in page.words
 
 
+def test_an_expectation_that_is_not_met_is_said(copied: Path) -> None:
+    scenario = json.loads((copied / "scenario.json").read_text())
+    scenario["expect"] = {"path_rmse_m": {"max": 0}, "odometry_rmse_m": {"min": 0}}
+    (copied / "scenario.json").write_text(json.dumps(scenario))
+    words = page_of(copied, copied / "r.html").words
+    assert "1 of 2 expectations of the scenario are not met" in words
+    assert "Runs that failed" not in words
+
+
 def test_the_command_says_where_it_wrote(
     made_up_result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

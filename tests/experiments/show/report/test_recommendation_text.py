@@ -1,5 +1,6 @@
 """What the report says first, of rankings whose message is plain."""
 
+import math
 from dataclasses import replace
 
 from experiments.show.report.recommendation_text import recommendation_text
@@ -45,18 +46,22 @@ def test_the_best_is_recommended_with_its_numbers() -> None:
     assert text.startswith("Use good good aligned 95 % of 20 pairs of maps")
     assert "95 % interval 76 % to 99 %" in text
     assert "median error of 0.10 m and 0.0050 rad" in text
-    assert "the remaining error is the drift of the maps" in text
+    assert "the error is 1.05 times the oracle's: the rest is the drift of the maps" in text
     assert "None of its 40 accepted results is wrong" in text
     assert "4 of the 24 pairs of maps have too little common ground" in text
     assert "Next is poor, correct in 20 %" in text
 
 
 def test_a_method_worse_than_the_oracle_is_told_by_how_much() -> None:
-    worse = replace(ONE_RUN, best=replace(GOOD, over_oracle=2.34))
-    assert "2.3 times less" in sentences(worse)
-    assert "no oracle to compare" in sentences(
-        replace(ONE_RUN, best=replace(GOOD, over_oracle=float("nan")))
-    )
+    text = sentences(replace(ONE_RUN, best=replace(GOOD, over_oracle=2.34)))
+    assert "the error is 2.34 times the oracle's." in text
+
+
+def test_what_cannot_be_compared_is_not() -> None:
+    few = sentences(replace(ONE_RUN, best=replace(GOOD, over_oracle=math.nan)))
+    assert "reaches 0.095 m and 0.0050 rad. None" in few
+    alone = replace(ONE_RUN, oracle_m=math.nan, best=replace(GOOD, over_oracle=math.nan))
+    assert "There is no oracle to compare it with." in sentences(alone)
 
 
 def test_false_merges_warn() -> None:
