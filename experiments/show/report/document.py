@@ -78,11 +78,8 @@ def render(contents: dict[str, Any]) -> str:
 
 
 def _page_file(name: str) -> str:
-    return (
-        resources.files("experiments.show.report")
-        .joinpath("page", name)
-        .read_text(encoding="utf-8")
-    )
+    folder = resources.files("experiments.show.report")
+    return folder.joinpath("page", name).read_text(encoding="utf-8")
 
 
 def _policy(scripts: list[str]) -> str:

@@ -50,7 +50,9 @@ def recommendation_text(
             f"None of the {ranking.n_maps} pairs of maps has {COMMON_LANDMARKS} or more landmarks "
             "in common. The only correct answer is to refuse."
         )
-        return RecommendationText("No common ground.", "", lead, _refusals(ranking), *evidence)
+        merges = listed([f"{s.aligner} ({s.n_false})" for s in ranking.standings if s.n_false])
+        remark = f"False merges: {merges}." if merges else "Every method refused, which is correct."
+        return RecommendationText("No common ground.", "", lead, (remark,), *evidence)
     if best is None:
         lead = f"No method was correct on any of the {ranking.n_common} pairs with common ground."
         return RecommendationText("No method worked.", "", lead, (), *evidence)
@@ -110,13 +112,6 @@ def _false_merges(best: Standing, ranking: Recommendation) -> tuple[str, ...]:
     if poor:
         text += f"; {poor} of the {ranking.n_maps} pairs of maps have too little common ground"
     return (f"{text}.",)
-
-
-def _refusals(ranking: Recommendation) -> tuple[str, ...]:
-    merged = [s for s in ranking.standings if s.n_false]
-    if not merged:
-        return ("Every method refused, which is correct.",)
-    return (f"False merges: {listed([f'{s.aligner} ({s.n_false})' for s in merged])}.",)
 
 
 def _evidence(

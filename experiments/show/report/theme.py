@@ -67,19 +67,13 @@ def css_name(colour: str) -> str:
 
 def chart_style(style: dict[str, Any]) -> dict[str, str]:
     """An aligner's matplotlib style in the page's and Plotly's terms."""
+    line = style["linestyle"]  # Plotly takes dashes as lengths in pixels, or a name
     return {
         "colour": css_name(style["color"]),
         "hex": style["color"],
         "marker": _MARKERS.get(style["marker"], "circle"),
-        "dash": _dash(style["linestyle"]),
+        "dash": "solid" if isinstance(line, str) else ",".join(f"{2 * n:g}px" for n in line[1]),
     }
-
-
-def _dash(linestyle: Any) -> str:
-    """Plotly takes dashes as lengths in pixels, or a name."""
-    if isinstance(linestyle, str):
-        return "solid"
-    return ",".join(f"{2 * length:g}px" for length in linestyle[1])
 
 
 def lightened(colour: str, background: str) -> str:
