@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from experiments.judge.metrics import ORACLE
+from experiments.judge.criteria import ORACLE
 from experiments.judge.truth import PathTruth, common_landmarks, true_pairs
 from experiments.run.estimates import alignment_of, correspondences_of, estimate_row
 from experiments.run.stages.align import map_at
@@ -45,8 +45,8 @@ class EvaluatedRobot:
 
 
 @dataclass(frozen=True)
-class _Comparison:
-    """All aligners on the maps of one pair at one iteration."""
+class _MapsOfPair:
+    """What is true of the maps of one pair at one iteration, for all aligners alike."""
 
     T_true: Float
     T_oracle: Float
@@ -111,7 +111,7 @@ def error_rows(
         pairs = correspondences_of(correspondences[correspondences["iteration"] == iteration])
         is_true = true_pairs(points_a, points_b, pairs.index_a, pairs.index_b, radius_m)
         oracle = Oracle(refinement).align(map_a, map_b, pairs, is_true)
-        comparison = _Comparison(
+        of_pair = _MapsOfPair(
             T_true, oracle.T_a_b, is_true, common_landmarks(points_a, points_b, radius_m)
         )
         verdict = acceptance.judge(map_a, map_b, pairs, oracle)
@@ -119,7 +119,7 @@ def error_rows(
         oracle_row |= estimate_row(len(pairs), oracle, oracle, verdict)
         names = {"robot_a": a.name, "robot_b": b.name, "iteration": iteration}
         for estimate in [oracle_row, *group.to_dict("records")]:
-            rows.append(names | comparison.row(estimate))
+            rows.append(names | of_pair.row(estimate))
     return rows
 
 

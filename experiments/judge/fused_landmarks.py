@@ -138,6 +138,24 @@ def fused_truth(fused: FusedMap, robots: list[EvaluatedRobot], iteration: int) -
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
+def fused_motion_rows(
+    robots: list[EvaluatedRobot], fused: FusedMap | None, settings: Merge
+) -> list[dict[str, Any]]:
+    """Rows of the table `fused_motions`: how each robot's map was moved into the fused one."""
+    if fused is None:
+        return []
+    why = dict(fused.left_out)
+    return [
+        {
+            "robot": robot.name,
+            **dict(zip(("tx_m", "ty_m", "theta_rad"), fused.T_first_map[place], strict=True)),
+            "drift_sigma_m": fused.drift_sigma_m[place] if settings.parameters.use_drift else 0.0,
+            "left_out": why.get(robot.name, ""),
+        }
+        for place, robot in enumerate(robots)
+    ]
+
+
 def map_fit_rows(
     robots: list[EvaluatedRobot], fused: FusedMap | None, iteration: int
 ) -> list[dict[str, Any]]:

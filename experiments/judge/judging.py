@@ -17,7 +17,7 @@ SOURCES += (
     "experiments/judge/fused_landmarks.py",
     "experiments/judge/truth.py",
     "experiments/judge/tables.py",
-    "experiments/judge/metrics.py",
+    "experiments/judge/criteria.py",
     "experiments/run/estimates.py",
 )
 

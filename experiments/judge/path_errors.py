@@ -4,6 +4,7 @@ ATE and RPE as Sturm et al. (2012) define them, in the plane; numbers equal evo'
 and `evo_rpe --pairs_from_reference`), which the tests hold them to.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,31 @@ def seven_statistics(errors: Float) -> dict[str, float]:
         "max": float(errors.max()),
         "sse": float(squared.sum()),
     }
+
+
+def rms(values: pd.Series) -> float:
+    """Root mean square of what is known; NaN of nothing."""
+    return float(np.sqrt(np.mean(np.square(values.dropna())))) if values.notna().any() else np.nan
+
+
+def path_rms(robots: pd.DataFrame, by: Sequence[str] = ("robot",)) -> pd.DataFrame:
+    """RMS position errors over a run, of FastSLAM's online path and of odometry alone.
+
+    Args:
+        robots: the table of that name, of one run, or of several that columns of `by` tell apart.
+        by: columns that name a robot of a run.
+
+    Returns:
+        The columns of `by`; path_m, odometry_m, over_odometry (their ratio); n_landmarks at the
+        end and n_frames.
+    """
+    groups = robots.groupby(list(by), sort=False)
+    path_m, odometry_m = (groups[f"{of}_error_m"].agg(rms) for of in ("path", "odometry"))
+    found = {"path_m": path_m, "odometry_m": odometry_m, "n_frames": groups.size()}
+    found |= {"over_odometry": path_m / odometry_m.where(odometry_m > 0)}
+    if "n_landmarks" in robots:
+        found |= {"n_landmarks": groups["n_landmarks"].last()}
+    return pd.DataFrame(found).reset_index()
 
 
 def ate_m(path: Float, truth: Float, fit: bool = True) -> Float:

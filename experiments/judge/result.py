@@ -16,7 +16,12 @@ from experiments.judge import tables
 from experiments.judge.aligner_times import time_aligners
 from experiments.judge.consistency import landmark_nees_rows
 from experiments.judge.errors import EvaluatedRobot, path_columns, robot_rows
-from experiments.judge.fused_landmarks import fused_maps, fused_truth, map_fit_rows
+from experiments.judge.fused_landmarks import (
+    fused_maps,
+    fused_motion_rows,
+    fused_truth,
+    map_fit_rows,
+)
 from experiments.judge.judging import load_robot
 from experiments.judge.map_history import write_history
 from experiments.judge.path_errors import path_statistics_rows
@@ -171,6 +176,8 @@ def _write_maps(plan: Plan, robots: list[EvaluatedRobot], folder: Path) -> None:
     fused = fused_map(plan.scenario.merge, robots, estimates, offered, last)
     if fused is not None:
         write_map(folder / "maps" / "fused.parquet", fused.landmarks)
+    motions = fused_motion_rows(robots, fused, plan.scenario.merge)
+    tables.write(tables.table_path(folder, "fused_motions"), "fused_motions", motions)
     fits = map_fit_rows(robots, fused, last)
     tables.write(tables.table_path(folder, "map_fits"), "map_fits", fits)
     nees = landmark_nees_rows(robots, fused, last, plan.scenario.evaluate.true_pair_radius_m)

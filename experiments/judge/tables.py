@@ -6,27 +6,36 @@ bit for bit, whenever the scenario and the seed are.
 """
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import pandas as pd
 import pyarrow as pa
 
-from experiments.run.frames import BOOL as _BOOL
-from experiments.run.frames import FLOAT as _FLOAT
-from experiments.run.frames import INT as _INT
-from experiments.run.frames import TEXT as _TEXT
-from experiments.run.frames import fields as _fields
-from experiments.run.frames import read_rows, write_rows
+from experiments.run import frames
 from experiments.run.stage_tables import CORRESPONDENCES, ESTIMATES, TRACKS
 from mapfusion.storage import point_fields, schema
 
+_BOOL, _FLOAT, _INT, _TEXT = frames.BOOL, frames.FLOAT, frames.INT, frames.TEXT
+_fields = frames.fields
 _SINGLE = pa.float32()  # for looking at, not for computing with: hundreds of maps, half the size
+
+
+ALL: dict[str, pa.Schema] = {
+    "estimates": ESTIMATES,
+    "correspondences": CORRESPONDENCES,
+    "tracks": TRACKS,
+}
+
+
+def _table(name: str, version: int, columns: list[pa.Field]) -> None:
+    """Declare a table of results."""
+    ALL[name] = schema(f"result.{name}", version, columns)
 
 
 # One row per (robot pair, iteration, aligner, repetition), the estimates joined with the truth.
 # The aligner named "oracle" was given the true pairs; it has one repetition.
-ERRORS = schema(
-    "result.errors",
+_table(
+    "errors",
     2,
     _fields(
         robot_a=_TEXT,
@@ -55,9 +64,33 @@ ERRORS = schema(
     ),
 )
 
+
+class Shown(NamedTuple):
+    """How screens and reports show a column of `errors`, one figure a method.
+
+    Attributes:
+        label: heading; what follows a line break goes to its second line.
+        layout: of the figure.
+        kind: an `error` is shown as the median of its absolute value over answerable maps, where no
+            estimate is infinitely far off; a `share` as the mean over maps with common ground.
+    """
+
+    label: str
+    layout: str
+    kind: Literal["error", "share"]
+
+
+SHOWN = {
+    "translation_error_m": Shown("estim.\nm", ".3f", "error"),
+    "rotation_error_rad": Shown("estim.\nrad", ".4f", "error"),
+    "refined_translation_error_m": Shown("refined\nm", ".3f", "error"),
+    "refined_rotation_error_rad": Shown("refined\nrad", ".4f", "error"),
+    "accepted": Shown("ok\n", ".0%", "share"),
+}
+
 # One row per (robot, iteration); best particle online, anchored at the start, no fit.
-ROBOTS = schema(
-    "result.robots",
+_table(
+    "robots",
     1,
     _fields(
         robot=_TEXT,
@@ -75,8 +108,8 @@ ROBOTS = schema(
 
 # Paths in the robot's own frame: the best particle's whole path at the end, the online estimate,
 # odometry alone, and the truth.
-PATHS = schema(
-    "result.paths",
+_table(
+    "paths",
     1,
     _fields(
         robot=_TEXT,
@@ -90,8 +123,8 @@ PATHS = schema(
 )
 
 # Particles at the kept iterations, in the robot's own frame.
-CLOUDS = schema(
-    "result.clouds",
+_table(
+    "clouds",
     1,
     _fields(
         robot=_TEXT,
@@ -105,8 +138,8 @@ CLOUDS = schema(
 )
 
 # The robots' last maps, each in its own frame; the true point is given in the same frame.
-LANDMARKS = schema(
-    "result.landmarks",
+_table(
+    "landmarks",
     1,
     [
         pa.field("robot", _TEXT),
@@ -117,8 +150,8 @@ LANDMARKS = schema(
 )
 
 # The fused map in the frame of the first robot. Parents are rows of the robots' last maps.
-FUSED = schema(
-    "result.fused",
+_table(
+    "fused",
     1,
     [
         pa.field("landmark", _INT),
@@ -136,16 +169,28 @@ FUSED = schema(
     ],
 )
 
+# How each robot's last map was moved into the fused map, the first robot's own among them.
+_table(
+    "fused_motions",
+    1,
+    _fields(
+        robot=_TEXT,
+        tx_m=_FLOAT,  # NaN for a map that was left out
+        ty_m=_FLOAT,
+        theta_rad=_FLOAT,
+        drift_sigma_m=_FLOAT,  # as added to the landmarks' covariance, in x and y
+        left_out=_TEXT,  # why; empty for a map that was fused
+    ),
+)
+
 # The robots' maps at each evaluated iteration, in plan, each in its own frame. `landmark` is the
 # row of the map at that iteration, which correspondences of that iteration refer to.
 _PLAN = _fields(x_m=_SINGLE, y_m=_SINGLE, cov_xx_m2=_SINGLE, cov_xy_m2=_SINGLE, cov_yy_m2=_SINGLE)
-MAP_HISTORY = schema(
-    "result.map_history", 1, [*_fields(robot=_TEXT, iteration=_INT, landmark=_INT), *_PLAN]
-)
+_table("map_history", 1, [*_fields(robot=_TEXT, iteration=_INT, landmark=_INT), *_PLAN])
 
 # Landmarks that the merging aligner's inliers joined at that iteration, fused, in robot a's frame.
-FUSED_HISTORY = schema(
-    "result.fused_history",
+_table(
+    "fused_history",
     1,
     [
         *_fields(robot_a=_TEXT, robot_b=_TEXT, iteration=_INT, landmark_a=_INT, landmark_b=_INT),
@@ -154,8 +199,8 @@ FUSED_HISTORY = schema(
 )
 
 # Which of the correspondences are true: one bit each, in their order in `correspondences`.
-TRUE_PAIRS = schema(
-    "result.true_pairs",
+_table(
+    "true_pairs",
     1,
     _fields(
         robot_a=_TEXT, robot_b=_TEXT, iteration=_INT, n_correspondences=_INT, true_pair=pa.binary()
@@ -163,8 +208,8 @@ TRUE_PAIRS = schema(
 )
 
 # One row per fused landmark with two parents, per robot pair: was fusing worth it?
-FUSION = schema(
-    "result.fusion",
+_table(
+    "fusion",
     1,
     _fields(
         robot_a=_TEXT,
@@ -182,15 +227,15 @@ FUSION = schema(
 )
 
 # Per map, after the best rigid fit to the truth; "fused" is the fused map.
-MAP_FITS = schema(
-    "result.map_fits",
+_table(
+    "map_fits",
     1,
     _fields(map=_TEXT, n_landmarks=_INT, rmse_m=_FLOAT),
 )
 
 # Errors of whole paths with evo's seven statistics; see experiments/judge/path_errors.py.
-PATH_STATISTICS = schema(
-    "result.path_statistics",
+_table(
+    "path_statistics",
     1,
     _fields(
         robot=_TEXT,
@@ -204,8 +249,8 @@ PATH_STATISTICS = schema(
 )
 
 # NEES of each map's landmarks, before merging and after; see experiments/judge/consistency.py.
-LANDMARK_NEES = schema(
-    "result.landmark_nees",
+_table(
+    "landmark_nees",
     1,
     _fields(
         map=_TEXT,  # a robot, or "fused"
@@ -220,11 +265,11 @@ LANDMARK_NEES = schema(
     ),
 )
 
-TIMINGS = schema("result.timings", 1, _fields(stage=_TEXT, name=_TEXT, elapsed_s=_FLOAT))
+_table("timings", 1, _fields(stage=_TEXT, name=_TEXT, elapsed_s=_FLOAT))
 
 # Serial, warmed, repeated: figure 6.
-ALIGNER_TIMINGS = schema(
-    "result.aligner_timings",
+_table(
+    "aligner_timings",
     1,
     _fields(
         robot_a=_TEXT,
@@ -239,27 +284,6 @@ ALIGNER_TIMINGS = schema(
     ),
 )
 
-ALL = {
-    "estimates": ESTIMATES,
-    "correspondences": CORRESPONDENCES,
-    "errors": ERRORS,
-    "robots": ROBOTS,
-    "paths": PATHS,
-    "clouds": CLOUDS,
-    "landmarks": LANDMARKS,
-    "fused": FUSED,
-    "map_history": MAP_HISTORY,
-    "fused_history": FUSED_HISTORY,
-    "true_pairs": TRUE_PAIRS,
-    "fusion": FUSION,
-    "map_fits": MAP_FITS,
-    "path_statistics": PATH_STATISTICS,
-    "landmark_nees": LANDMARK_NEES,
-    "tracks": TRACKS,
-    "timings": TIMINGS,
-    "aligner_timings": ALIGNER_TIMINGS,
-}
-
 
 def table_path(result: Path, name: str) -> Path:
     """Where a result folder keeps the table of that name."""
@@ -268,9 +292,9 @@ def table_path(result: Path, name: str) -> Path:
 
 def write(path: Path, name: str, rows: pd.DataFrame | list[dict[str, Any]]) -> None:
     """Write rows as the table of that name."""
-    write_rows(path, ALL[name], rows)
+    frames.write_rows(path, ALL[name], rows)
 
 
 def read(path: Path, name: str) -> pd.DataFrame:
     """Read the table of that name; raises InputError that names the file."""
-    return read_rows(path, ALL[name])
+    return frames.read_rows(path, ALL[name])

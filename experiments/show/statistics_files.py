@@ -7,7 +7,6 @@ from experiments.show.export import write_tables
 from experiments.show.figures.over_runs import draw_over_runs
 from experiments.show.terminal.statistics_screen import print_comparison, print_summary
 from experiments.study.compare.versions import compare
-from experiments.study.statistics.judged_maps import Criteria
 from experiments.study.statistics.run_tables import find_runs
 from experiments.study.statistics.summary import summarise
 
@@ -18,8 +17,7 @@ def run_statistics(paths: Sequence[Path], output: Path | None) -> None:
     Raises:
         InputError: a path that holds no runs, or a damaged table.
     """
-    runs = find_runs(paths)
-    summary = summarise(runs, Criteria.of(runs))
+    summary = summarise(find_runs(paths))
     skipped: list[str] = []
     if output is not None:
         write_tables(output, summary.tables)

@@ -1,7 +1,7 @@
 """Tables of many made-up runs, as result folders and as a sweep; for tests alone."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +10,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from experiments.judge import tables
+from experiments.judge.judged_maps import ERROR_COLUMNS
 
+Tables = dict[str, pd.DataFrame]
 ITERATIONS = (25, 50, 75, 100)
 PAIRS = (("R1", "R2"), ("R1", "R3"))
 # Factor on the oracle's error, how much it scatters, and the share of maps it is lost on.
@@ -46,6 +48,16 @@ def errors_of(
                         values = (own, 0.01, oracle * 1.01, 0.002)
                     rows.append(names | _row(method, repetition, *values))
     return pd.DataFrame(rows)
+
+
+def many_errors(n_runs: int, **made: object) -> pd.DataFrame:
+    """Tables `errors` of many runs, the runs' columns in front."""
+    parts = []
+    for seed in range(n_runs):
+        run = {"run_id": f"world-{seed}", "scenario": "world", "seed": seed}
+        rows = errors_of(seed, **made)  # type: ignore[arg-type]
+        parts.append(rows.assign(**run)[[*run, *rows.columns]])
+    return pd.concat(parts, ignore_index=True)
 
 
 def _row(
@@ -121,7 +133,7 @@ def write_result(
     folder = results / f"{name}-{seed}"
     for table, frame in made.items():
         tables.write(tables.table_path(folder, table), table, complete(table, frame.copy()))
-    align = {"aligners": [{"name": method} for method in METHODS], "refinement": {"gate_m": 0.5}}
+    align = {"aligners": [{"name": method} for method in METHODS]}
     scenario = {"name": name, "seed": seed, "align": align}
     (folder / "scenario.json").write_text(json.dumps(scenario), encoding="utf-8")
     return folder
@@ -157,3 +169,26 @@ def write_rows(sweep: Path, table: str, run_id: str, rows: pd.DataFrame) -> None
     (sweep / table).mkdir(exist_ok=True)
     data = pa.Table.from_pandas(rows, preserve_index=False)
     pq.write_table(data.replace_schema_metadata(None), sweep / table / f"{run_id}.parquet")
+
+
+def two_sweeps(
+    folder: Path, change: Callable[[int, Tables], Tables], seeds: int = 12
+) -> tuple[Path, Path]:
+    """The same runs, and what another version makes of them."""
+    made = {seed: tables_of(seed) for seed in range(seeds)}
+    changed = {seed: change(seed, {k: t.copy() for k, t in made[seed].items()}) for seed in made}
+    a = write_sweep(folder / "a", range(seeds), made=made)
+    return a, write_sweep(folder / "b", range(seeds), made=changed)
+
+
+def scaled(factor: float, aligner: str, scatter: float = 0.0) -> Callable[[int, Tables], Tables]:
+    """A change of one aligner's errors by a factor, with scatter."""
+
+    def change(seed: int, made: Tables) -> Tables:
+        rng = np.random.default_rng(900 + seed)
+        own = made["errors"]["aligner"] == aligner
+        factors = factor * np.exp(scatter * rng.normal(size=(int(own.sum()), 1)))
+        made["errors"].loc[own, list(ERROR_COLUMNS)] *= factors
+        return made
+
+    return change

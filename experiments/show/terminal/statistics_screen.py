@@ -1,28 +1,31 @@
 """What `mapfusion statistics` and `mapfusion compare` show."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from experiments.judge.metrics import MIN_TRUE_PAIRS, ORACLE
-from experiments.show.terminal.layout import LAYOUT as TABLE_LAYOUT
+from experiments.judge.criteria import ORACLE, RICH_PAIRS, RIGHT_WITHIN_M, RIGHT_WITHIN_RAD
+from experiments.show.terminal.layout import LAYOUT
 from experiments.study.compare.versions import (
     BETTER,
-    FEW_RUNS,
     NOISE,
     SAME,
     UNKNOWN,
     WORSE,
-    Comparison,
+    VersionComparison,
 )
+from experiments.study.statistics.better import FEW_RUNS
 from experiments.study.statistics.bootstrap import MAPS_OF_ONE_RUN
 from experiments.study.statistics.summary import ALL_SCENARIOS, Summary
 
+Row = dict[Any, Any]
+Cells = Mapping[str, Callable[[Row], str]]  # by heading, what stands below it
 _COLOURS = {BETTER: "green", WORSE: "bold red", UNKNOWN: "yellow"}
 _MAX_CONFIGURATIONS = 6  # more would fill screens; the files hold all
 _SHORT = {NOISE: "noise", SAME: "same", UNKNOWN: "unknown"}
@@ -63,65 +66,76 @@ def _shown(summary: Summary, name: str) -> tuple[pd.DataFrame, list[str]]:
     return table, [str(c) for c in labels if len(table[c].unique()) > 1]
 
 
-def _table(title: str, headings: Sequence[str], labels: Sequence[str]) -> Table:
-    table = Table(title=title, **TABLE_LAYOUT)
+def _print_table(
+    console: Console,
+    shown: tuple[pd.DataFrame, Sequence[str]],
+    title: str,
+    cells: Cells,
+    caption: str,
+    words: Sequence[str] = (),
+) -> None:
+    """A row of cells for each row shown; below, what they mean, unbroken at the table's width.
+
+    `words` are the headings of further columns that are no numbers, and may wrap.
+    """
+    rows, labels = shown
+    if rows.empty:
+        return
+    table = Table(title=title, **LAYOUT)
     for label in labels:
         table.add_column(escape(label))
-    for place, heading in enumerate(headings):
-        table.add_column(heading, justify="right" if place else "left", no_wrap=True)
-    return table
-
-
-def _show(console: Console, table: Table, caption: str) -> None:
-    """A table and what its columns mean; as a caption rich would break it at the table's width."""
+    lines = max(heading.count("\n") for heading in cells)
+    for place, heading in enumerate(cells):
+        lower = "\n" * (lines - heading.count("\n")) + heading
+        side = "left" if heading in words or not place else "right"
+        table.add_column(lower, justify=side, no_wrap=heading not in words)
+    for row in rows.to_dict("records"):
+        own = [escape(str(row[label])) for label in labels]
+        table.add_row(*own, *(cell(row) for cell in cells.values()))
     console.print(table)
     console.print(f"[dim]{escape(caption)}[/]\n", highlight=False)
 
 
-def _cells(row: dict, labels: Sequence[str]) -> list[str]:
-    return [escape(str(row[label])) for label in labels]
+def _text(name: str) -> Callable[[Row], str]:
+    return lambda row: escape(str(row[name]))
+
+
+def _figure(name: str, layout: str) -> Callable[[Row], str]:
+    return lambda row: _number(row[name], layout)
+
+
+def _interval(name: str, layout: str = ".2f") -> Callable[[Row], str]:
+    """A number with its interval in brackets, from the columns NAME_low and NAME_high."""
+    return lambda row: _bracketed(row[name], row[f"{name}_low"], row[f"{name}_high"], layout)
+
+
+def _share(name: str) -> Callable[[Row], str]:
+    low, high = f"{name}_low", f"{name}_high"
+    return lambda row: _bracketed(100 * row[name], 100 * row[low], 100 * row[high], ".0f")
 
 
 def _print_success(console: Console, summary: Summary) -> None:
-    rows, labels = _shown(summary, "success_at_the_end")
+    rows, labels = shown = _shown(summary, "success_at_the_end")
     if rows.empty:
         return
-    limits = summary.criteria
-    reach = f"{limits.translation_m:g} m and {limits.rotation_rad:g} rad"
-    caption = f"within {reach}, the reach of the refinement"
-    apart = bool(rows["n_apart"].any())
-    if apart:
-        caption += f"; without the {_apart(rows)} that have no common ground"
-    right = {"estimated_success": "as estimated", "refined_success": "refined"}
+    within = f"within {RIGHT_WITHIN_M:g} m and {RIGHT_WITHIN_RAD:g} rad"
+    caption = f"{within}, the reach of the refinement"
+    n_apart, n_maps = rows[["n_apart", "n_maps"]].max()  # all methods see the same maps
+    if n_apart:
+        caption += f"; without the {n_apart} of {n_maps} pairs of maps that have no common ground"
+    cells = {"method": _text("aligner"), "as estimated": _share("estimated_success")}
+    cells["refined"] = _share("refined_success")
     title = f"Right at the end of {_runs(summary.n_runs)}, percent"
-    _show(console, _shares(rows, labels, title, right), f"{caption}; (95 %, Wilson)")
+    _print_table(console, shown, title, cells, f"{caption}; (95 %, Wilson)")
     if "accepted" not in rows:
         return
-    verdicts = {"accepted": "accepted", "false_accepted": "accepted\nthough wrong"}
-    if apart:
-        verdicts["accepted"] = "accepted where\nthere is common ground"
-        verdicts["refused_apart"] = "refused where\nthere is none"
-    table = _shares(rows, labels, "Verdicts at the end, percent", verdicts)
-    _show(console, table, "though wrong: of all, whatever ground; (95 %, Wilson)")
-
-
-def _shares(
-    rows: pd.DataFrame, labels: Sequence[str], title: str, shares: Mapping[str, str]
-) -> Table:
-    """Methods down, shares across: columns of `rows` and their headings."""
-    lines = max(heading.count("\n") for heading in shares.values())
-    headings = ["method", *shares.values()]
-    table = _table(title, ["\n" * (lines - h.count("\n")) + h for h in headings], labels)
-    for row in rows.to_dict("records"):
-        cells = [_share(row, name) for name in shares]
-        table.add_row(*_cells(row, [*labels, "aligner"]), *cells)
-    return table
-
-
-def _apart(rows: pd.DataFrame) -> str:
-    """How many pairs of maps have no common ground; all methods see the same maps."""
-    n_apart, n_maps = rows[["n_apart", "n_maps"]].max()
-    return f"{n_apart} of {n_maps} pairs of maps"
+    heading = "accepted where\nthere is common ground" if n_apart else "accepted"
+    cells = {"method": _text("aligner"), heading: _share("accepted")}
+    cells["accepted\nthough wrong"] = _share("false_accepted")
+    if n_apart:
+        cells["refused where\nthere is none"] = _share("refused_apart")
+    caption = "though wrong: of all, whatever ground; (95 %, Wilson)"
+    _print_table(console, (rows, labels), "Verdicts at the end, percent", cells, caption)
 
 
 def _print_where_it_fails(console: Console, summary: Summary) -> None:
@@ -129,36 +143,29 @@ def _print_where_it_fails(console: Console, summary: Summary) -> None:
     rows, labels = _shown(summary, "success_by_true_pairs")
     if rows.empty:
         return
-    bins = rows[["from", "to"]].drop_duplicates().sort_values("from").to_dict("records")
-    headings = [f"{b['from']:.0f}+" if math.isinf(b["to"]) else f"{b['from']:.0f}" for b in bins]
-    table = _table("Right as estimated, percent of the maps", ["method", *headings], labels)
-    for keys, own in rows.groupby([*labels, "aligner"], sort=False):
-        shares = own.set_index("from")["estimated_success"]
-        cells = [_number(100 * shares.get(b["from"], math.nan), ".0f") for b in bins]
-        table.add_row(*(escape(str(key)) for key in keys), *cells)
-    _show(
-        console,
-        table,
-        "by the number of true pairs, from the one given up; intervals are in the files",
+    last = rows["to"].map(lambda end: "+" if math.isinf(end) else "")
+    rows = rows.assign(bin=rows["from"].map("{:.0f}".format) + last)
+    shares = rows.assign(percent=100 * rows["estimated_success"]).pivot_table(
+        "percent", [*labels, "aligner"], "bin", sort=False
     )
+    names = [str(name) for name in rows.sort_values("from")["bin"].unique() if name in shares]
+    cells = {"method": _text("aligner")} | {name: _figure(name, ".0f") for name in names}
+    title = "Right as estimated, percent of the maps"
+    caption = "by the number of true pairs, from the one given up; intervals are in the files"
+    _print_table(console, (shares.reset_index(), labels), title, cells, caption)
 
 
 def _print_oracle_ratios(console: Console, summary: Summary) -> None:
-    rows, labels = _shown(summary, "error_over_oracle")
-    if rows.empty:
-        return
-    table = _table(
-        "Median translation error, and its ratio to the oracle's",
-        ["\nmethod", "estim.\nm", "\nover the oracle", "refined\nm", "\nover the oracle"],
-        labels,
-    )
-    for row in rows.to_dict("records"):
-        cells = []
-        for stage in ("estimated", "refined"):
-            cells += [_number(row[f"{stage}_m"], ".3f"), _interval(row, f"{stage}_ratio")]
-        table.add_row(*_cells(row, [*labels, "aligner"]), *cells)
-    caption = f"maps with {MIN_TRUE_PAIRS}+ true pairs; inf: no estimate on most; (95 %, bootstrap)"
-    _show(console, table, caption)
+    cells = {
+        "method": _text("aligner"),
+        "estim.\nm": _figure("estimated_m", ".3f"),
+        "over the oracle": _interval("estimated_ratio"),
+        "refined\nm": _figure("refined_m", ".3f"),
+        "over the oracle ": _interval("refined_ratio"),
+    }
+    title = "Median translation error, and its ratio to the oracle's"
+    caption = f"maps with {RICH_PAIRS}+ true pairs; inf: no estimate on most; (95 %, bootstrap)"
+    _print_table(console, _shown(summary, "error_over_oracle"), title, cells, caption)
 
 
 def _print_best_against_others(console: Console, summary: Summary) -> None:
@@ -169,20 +176,23 @@ def _print_best_against_others(console: Console, summary: Summary) -> None:
     ratios, _ = _shown(summary, "error_over_oracle")
     methods = ratios[ratios["aligner"] != ORACLE]
     best = str(methods.groupby("aligner")["estimated_m"].median().idxmin())
-    table = _table(
-        f"{best} against each other method on the same maps, as estimated",
-        ["other", "its error over other's", "nearer, percent", "p (Holm)"],
-        labels,
-    )
-    for row in rows[(rows["first"] == best) | (rows["second"] == best)].to_dict("records"):
-        if row["second"] == best:
-            row = _swapped(row)
-        cells = [_interval(row, "ratio"), _share(row, "first_wins"), _number(row["p_holm"], ".2g")]
-        table.add_row(*_cells(row, [*labels, "second"]), *cells)
-    _show(console, table, "median ratio, and share of the maps; (95 %, bootstrap)")
+    of_best = [
+        _swapped(row) if row["second"] == best else row
+        for row in rows.to_dict("records")
+        if best in (row["first"], row["second"])
+    ]
+    cells = {
+        "other": _text("second"),
+        "its error over other's": _interval("ratio"),
+        "nearer, percent": _share("first_wins"),
+        "p (Holm)": _figure("p_holm", ".2g"),
+    }
+    title = f"{best} against each other method on the same maps, as estimated"
+    caption = "median ratio, and share of the maps; (95 %, bootstrap)"
+    _print_table(console, (pd.DataFrame(of_best), labels), title, cells, caption)
 
 
-def _swapped(row: dict) -> dict:
+def _swapped(row: Row) -> Row:
     """The same comparison with the methods in the other order."""
     swapped = row | {"first": row["second"], "second": row["first"]}
     for end, other in (("", ""), ("_low", "_high"), ("_high", "_low")):
@@ -194,79 +204,77 @@ def _swapped(row: dict) -> dict:
 
 def _print_paths(console: Console, summary: Summary) -> None:
     rows, labels = _shown(summary, "paths")
-    if rows.empty:
-        return
-    shown = rows["quantity"].isin(list(_PATH_NAMES)) & (rows["delta_unit"] != "frames")
-    table = _table(
-        "Path errors, median over robots and runs",
-        ["path", "error", "RMSE", "median", "max"],
-        labels,
-    )
-    for row in rows[shown].to_dict("records"):
-        cells = [_PATH_NAMES[row["quantity"]], _interval(row, "rmse", ".3g")]
-        cells += [_number(row["median"], ".3g"), _number(row["max"], ".3g")]
-        table.add_row(*_cells(row, [*labels, "source"]), *cells)
+    if len(rows):
+        rows = rows[rows["quantity"].isin(list(_PATH_NAMES)) & (rows["delta_unit"] != "frames")]
+    cells = {
+        "path": _text("source"),
+        "error": lambda row: _PATH_NAMES[row["quantity"]],
+        "RMSE": _interval("rmse", ".3g"),
+        "median": _figure("median", ".3g"),
+        "max": _figure("max", ".3g"),
+    }
+    title = "Path errors, median over robots and runs"
     caption = "ATE: after the best rigid fit; RPE: relative, along a metre; (95 %, bootstrap)"
-    _show(console, table, caption)
+    _print_table(console, (rows, labels), title, cells, caption)
 
 
 def _print_nees(console: Console, summary: Summary) -> None:
-    rows, labels = _shown(summary, "nees")
-    if rows.empty:
-        return
-    table = _table(
-        "Landmark NEES per degree of freedom: 1 is consistent, more is too sure",
-        ["landmarks", "n", "NEES", "chi-square", "in gate"],
-        labels,
-    )
-    for row in rows.to_dict("records"):
-        band = f"{row['band_low']:.2f}-{row['band_high']:.2f}"
-        inside = _number(100 * row["share_in_gate"], ".0f")
-        cells = [str(row["n_landmarks"]), _interval(row, "nees_per_dof", ".3g"), band]
-        cells.append(inside if inside == "-" else f"{inside} %")
-        table.add_row(*_cells(row, [*labels, "landmarks"]), *cells)
+    cells = {
+        "landmarks": _text("landmarks"),
+        "n": _text("n_landmarks"),
+        "NEES": _interval("nees_per_dof", ".3g"),
+        "chi-square": lambda row: f"{row['band_low']:.2f}-{row['band_high']:.2f}",
+        "in gate": _figure("share_in_gate", ".0%"),
+    }
+    title = "Landmark NEES per degree of freedom: 1 is consistent, more is too sure"
     caption = "chi-square: 95 % band of a consistent mean; in gate: of 95 %; (95 %, bootstrap)"
-    _show(console, table, caption)
+    _print_table(console, _shown(summary, "nees"), title, cells, caption)
 
 
 def _print_caveats(console: Console, summary: Summary) -> None:
+    lines = []
     if summary.n_runs == 1:
-        console.print(
+        lines.append(
             f"One run: the brackets tell of the {MAPS_OF_ONE_RUN}, which depend on each other, and "
-            "nothing of other seeds.",
-            soft_wrap=True,
+            "nothing of other seeds."
         )
     elif summary.n_runs < FEW_RUNS:
-        console.print(
+        lines.append(
             f"{summary.n_runs} runs: bootstrap intervals of so few are too narrow; take {FEW_RUNS} "
-            "seeds or more.",
-            soft_wrap=True,
+            "seeds or more."
         )
     n_settings = summary.n_configurations
     if n_settings > _MAX_CONFIGURATIONS:
-        console.print(
-            f"Shown are {_MAX_CONFIGURATIONS} of {n_settings} settings; `-o FOLDER` writes all.",
-            soft_wrap=True,
+        lines.append(
+            f"Shown are {_MAX_CONFIGURATIONS} of {n_settings} settings; `-o FOLDER` writes all."
         )
     for row in summary.failed.to_dict("records"):
-        text = f"failed, left out: {row['scenario']} seed {row['seed']}: {row['reason']}"
-        console.print(text, soft_wrap=True, markup=False)
+        lines.append(f"failed, left out: {row['scenario']} seed {row['seed']}: {row['reason']}")
     if summary.missing:
-        console.print(f"No run has: {', '.join(summary.missing)}", soft_wrap=True)
+        lines.append(f"No run has: {', '.join(summary.missing)}")
+    for line in lines:
+        console.print(line, soft_wrap=True, markup=False)
 
 
-def print_comparison(found: Comparison, show_all: bool, written: Path | None) -> None:
+def print_comparison(found: VersionComparison, show_all: bool, written: Path | None) -> None:
     """What got better or worse, how sure that is, and what must be known beside it."""
     console = Console()
     counts = found.table["verdict"].value_counts()
     shown = found.table if show_all else found.table[found.table["verdict"].isin([BETTER, WORSE])]
-    if len(shown):
-        _show(
-            console,
-            _comparison_table(shown),
-            "change: factor, or difference; (95 %, bootstrap); "
-            f"verdict: 5 % over {found.table['p'].notna().sum()} tests",
-        )
+    order = [WORSE, BETTER, UNKNOWN, NOISE, SAME]
+    shown = shown.sort_values("verdict", key=lambda names: names.map(order.index), kind="stable")
+    cells = {
+        "method": _text("method"),
+        "metric": _text("metric"),
+        "first": lambda row: _value(row["a"], row["scale"]),
+        "second": lambda row: _value(row["b"], row["scale"]),
+        "change": _change,
+        "verdict": _verdict,
+    }
+    caption = "change: factor, or difference; (95 %, Student's t); "
+    caption += f"verdict: 5 % over {found.table['p'].notna().sum()} tests"
+    title, words = "Second version against the first", ("metric", "verdict")
+    _print_table(console, (shown, []), title, cells, caption, words)
     tally = ", ".join(
         f"{counts.get(verdict, 0)} {verdict}"
         for verdict in (WORSE, BETTER, NOISE, SAME, UNKNOWN)
@@ -281,49 +289,22 @@ def print_comparison(found: Comparison, show_all: bool, written: Path | None) ->
         console.print(f"All rows (CSV, Markdown, LaTeX): {written}", soft_wrap=True)
 
 
-def _comparison_table(shown: pd.DataFrame) -> Table:
-    order = [WORSE, BETTER, UNKNOWN, NOISE, SAME]
-    rows = shown.sort_values("verdict", key=lambda names: names.map(order.index), kind="stable")
-    headings = ["method", "metric", "first", "second", "change", "verdict"]
-    table = _table("Second version against the first", headings, [])
-    for column in (table.columns[1], table.columns[-1]):
-        column.justify = "left"
-    table.columns[0].no_wrap, table.columns[1].no_wrap = True, False
-    for row in rows.to_dict("records"):
-        colour = _COLOURS.get(row["verdict"], "dim")
-        table.add_row(
-            escape(row["method"]),
-            escape(row["metric"]),
-            *(_value(row[side], row["scale"]) for side in "ab"),
-            "" if row["verdict"] == SAME else _change(row),
-            f"[{colour}]{_SHORT.get(row['verdict'], row['verdict'])}[/]",
-        )
-    return table
-
-
 def _value(value: float, scale: str) -> str:
     return f"{100 * value:.0f} %" if scale == "share" else _number(value, ".3g")
 
 
-def _change(row: dict) -> str:
-    if row["scale"] == "ratio":
-        return _interval(row, "change")
+def _change(row: Row) -> str:
+    if row["verdict"] == SAME:
+        return ""
+    value, low, high = row["change"], row["low"], row["high"]
     if row["scale"] == "share":
-        points = {name: 100 * row[name] for name in ("change", "low", "high")}
-        return _bracketed(points["change"], points["low"], points["high"], "+.0f", " %")
-    return _bracketed(row["change"], row["low"], row["high"], "+.2f")
+        return _bracketed(100 * value, 100 * low, 100 * high, "+.0f", " %")
+    return _bracketed(value, low, high, ".2f" if row["scale"] == "ratio" else "+.2f")
 
 
-def _interval(row: dict, name: str, layout: str = ".2f") -> str:
-    """A number with its interval in brackets; columns NAME_low and NAME_high, or low and high."""
-    low = row.get(f"{name}_low", row.get("low", math.nan))
-    high = row.get(f"{name}_high", row.get("high", math.nan))
-    return _bracketed(row[name], low, high, layout)
-
-
-def _share(row: dict, name: str) -> str:
-    values = (100 * row[name], 100 * row[f"{name}_low"], 100 * row[f"{name}_high"])
-    return _bracketed(*values, ".0f")
+def _verdict(row: Row) -> str:
+    colour = _COLOURS.get(row["verdict"], "dim")
+    return f"[{colour}]{_SHORT.get(row['verdict'], row['verdict'])}[/]"
 
 
 def _bracketed(value: float, low: float, high: float, layout: str, unit: str = "") -> str:

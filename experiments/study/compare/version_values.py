@@ -3,21 +3,25 @@
 Only what both have counts: the same scenario, seed and settings, robot pair, iteration and aligner.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from experiments.judge.metrics import MIN_TRUE_PAIRS, ORACLE
-from experiments.study.statistics.judged_maps import (
-    ANSWERABLE_PAIRS,
+from experiments.judge.criteria import ORACLE, answerable, has_common_ground, rich
+from experiments.judge.judged_maps import (
     MAP_KEYS,
-    Criteria,
+    NEEDED,
+    OPTIONAL,
+    RUN_KEYS,
+    maps_of,
     methods_in,
-    read_maps,
+    setting_columns,
 )
-from experiments.study.statistics.run_tables import RUN_KEYS, Runs, match_names, setting_columns
+from experiments.judge.path_errors import path_rms
+from experiments.study.statistics.better import log_ratio
+from experiments.study.statistics.run_tables import Runs, match_names
 
 MATCH = "match"
 # How a change is told: as a ratio b / a, as a difference of shares, or as a difference of distances
@@ -50,71 +54,67 @@ class Values(NamedTuple):
     rows: pd.DataFrame
 
 
-def all_values(a: Runs, b: Runs, criteria: Criteria) -> Iterator[Values]:
+def all_values(a: Runs, b: Runs) -> Iterator[Values]:
     """All metrics that both versions have tables for."""
-    if a.has("errors") and b.has("errors"):
-        yield from _alignment_values(_matched_maps(a, b, criteria))
-    for table, build in (("robots", _paths), ("map_fits", _fits), ("fusion", _nees)):
+    for table, build in _BUILT_FROM.items():
         if a.has(table) and b.has(table):
             yield from build(a, b)
-    if a.has("aligner_timings") and b.has("aligner_timings"):
-        yield from _times(a, b)
 
 
-def _matched_maps(a: Runs, b: Runs, criteria: Criteria) -> pd.DataFrame:
-    first, second = (read_maps(runs, criteria) for runs in (a, b))
-    return _joined(first, second, [*MAP_KEYS, "aligner"])
-
-
-def _joined(a: pd.DataFrame, b: pd.DataFrame, keys: Sequence[str]) -> pd.DataFrame:
+def _joined(
+    a: Runs, b: Runs, keys: Sequence[str], read: Callable[[Runs], Iterator[pd.DataFrame]]
+) -> pd.DataFrame:
     """Rows of both by run and keys, values with the suffixes _a and _b."""
     frames = []
-    for frame in (a, b):
+    for runs in (a, b):
+        # a run of one robot has no rows, and must not decide the columns' types
+        parts = list(read(runs))
+        frame = pd.concat([part for part in parts if len(part)] or parts[:1], ignore_index=True)
         dropped = [*RUN_KEYS, *setting_columns(frame)]
         frames.append(frame.assign(match=match_names(frame)).drop(columns=dropped))
     return frames[0].merge(frames[1], on=[MATCH, *keys], suffixes=("_a", "_b"))
 
 
-def _alignment_values(maps: pd.DataFrame) -> Iterator[Values]:
-    keys = [MATCH, *MAP_KEYS]
-    oracle = maps[maps["aligner"] == ORACLE].set_index(keys)
-    scarce = maps[["n_true_a", "n_true_b"]].min(axis=1)
-    for aligner in methods_in(maps, oracle=True):
+def _in_both(rows: pd.DataFrame, kept: Callable[[pd.DataFrame], pd.DataFrame]) -> pd.DataFrame:
+    """The rows whose true pairs and common landmarks are enough in both versions."""
+    counts = {name: rows[[f"{name}_a", f"{name}_b"]].min(axis=1) for name in ("n_true", "n_common")}
+    return rows.loc[kept(pd.DataFrame(counts)).index]
+
+
+def _of_alignments(a: Runs, b: Runs) -> Iterator[Values]:
+    keys = [*MAP_KEYS, "aligner"]
+    maps = _joined(a, b, keys, lambda runs: map(maps_of, runs.each("errors", NEEDED, OPTIONAL)))
+    refined = "refined_translation_error_m"
+    oracle = maps[maps["aligner"] == ORACLE]
+    sides = [f"{refined}_a", f"{refined}_b"]
+    reference = oracle.set_index([MATCH, *MAP_KEYS])[sides].add_prefix("oracle_")
+    maps = maps.join(reference, on=[MATCH, *MAP_KEYS])
+    for side in "ab":
+        maps[f"over_oracle_{side}"] = maps[f"{refined}_{side}"] / maps[f"oracle_{refined}_{side}"]
+    for aligner in methods_in(maps):
         own = maps[maps["aligner"] == aligner]
-        if aligner == ORACLE:
-            enough = own[scarce[own.index] >= ANSWERABLE_PAIRS]
-            metric = Metric("refined error, m", aligner, "ratio")
-            yield _ratio(metric, enough, "refined_translation_error_m")
-            yield _ratio(Metric("true pairs", "", "ratio", True), enough, "n_true")
-            continue
         for name, label, higher in (
             ("estimated_success", "success estimated", True),
             ("refined_success", "success refined", True),
             ("false_accepted", "wrongly accepted", False),
         ):
             yield _difference(Metric(label, aligner, "share", higher), own, name)
-        ground = own[own[["n_common_a", "n_common_b"]].min(axis=1) >= ANSWERABLE_PAIRS]
+        ground = _in_both(own, lambda rows: rows[has_common_ground(rows)])
         yield _difference(Metric("accepted", aligner, "share", True), ground, "accepted")
-        enough = own[scarce[own.index] >= ANSWERABLE_PAIRS]
         metric = Metric("estimated error, m", aligner, "ratio")
-        yield _ratio(metric, enough, "translation_error_m")
-        rich = own[scarce[own.index] >= MIN_TRUE_PAIRS].set_index(keys)
-        for side in "ab":
-            column = f"refined_translation_error_m_{side}"
-            rich[f"over_oracle_{side}"] = rich[column] / oracle[column].reindex(rich.index)
+        yield _ratio(metric, _in_both(own, answerable), "translation_error_m")
         metric = Metric("refined / oracle", aligner, "ratio")
-        yield _ratio(metric, rich.reset_index(), "over_oracle")
+        yield _ratio(metric, _in_both(own, rich), "over_oracle")
+    enough = _in_both(oracle, answerable)
+    yield _ratio(Metric("refined error, m", ORACLE, "ratio"), enough, refined)
+    yield _ratio(Metric("true pairs", "", "ratio", True), enough, "n_true")
 
 
 def _ratio(metric: Metric, rows: pd.DataFrame, column: str) -> Values:
-    """Log ratios, where both versions have a positive, finite value."""
+    """Log ratios, where both versions have a positive, finite value; success tells the rest."""
     a, b = (rows[f"{column}_{side}"].to_numpy(dtype=np.float64) for side in "ab")
-    usable = np.isfinite(a) & np.isfinite(b) & (a > 0) & (b > 0)
-    equal = np.isfinite(a) & (a == b)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        change = np.where(equal, 0.0, np.log(b) - np.log(a))
-    frame = pd.DataFrame({MATCH: rows[MATCH].to_numpy(), "a": a, "b": b, "change": change})
-    return Values(metric, frame[usable | equal])
+    frame = pd.DataFrame({MATCH: rows[MATCH].to_numpy(), "a": a, "b": b, "change": log_ratio(b, a)})
+    return Values(metric, frame[np.isfinite(a) & np.isfinite(frame["change"])])
 
 
 def _difference(metric: Metric, rows: pd.DataFrame, column: str) -> Values:
@@ -123,64 +123,54 @@ def _difference(metric: Metric, rows: pd.DataFrame, column: str) -> Values:
     return Values(metric, frame.dropna())
 
 
-def _path_rms(runs: Runs, column: str) -> pd.DataFrame:
-    """Root mean square of an error per run and robot, one run in memory at a time."""
-    parts = []
-    for rows in runs.each("robots", ["robot", column]):
-        keys = [*RUN_KEYS, *setting_columns(rows), "robot"]
-        squares = rows.assign(**{column: rows[column] ** 2}).groupby(keys, sort=False)[column]
-        parts.append((squares.mean() ** 0.5).reset_index())
-    return pd.concat(parts, ignore_index=True)
+def _of_paths(a: Runs, b: Runs) -> Iterator[Values]:
+    def read(runs: Runs) -> Iterator[pd.DataFrame]:
+        for rows in runs.each("robots", ["robot", "path_error_m", "odometry_error_m"]):
+            yield path_rms(rows, [*RUN_KEYS, *setting_columns(rows), "robot"])
+
+    rows = _joined(a, b, ["robot"], read)
+    yield _ratio(Metric("path RMSE, m", "", "ratio"), rows, "path_m")
+    yield _ratio(Metric("odometry RMSE, m", "", "ratio"), rows, "odometry_m")
 
 
-def _paths(a: Runs, b: Runs) -> Iterator[Values]:
-    for column, label in (
-        ("path_error_m", "path RMSE, m"),
-        ("odometry_error_m", "odometry RMSE, m"),
-    ):
-        first, second = (_path_rms(runs, column) for runs in (a, b))
-        yield _ratio(Metric(label, "", "ratio"), _joined(first, second, ["robot"]), column)
-
-
-def _fits(a: Runs, b: Runs) -> Iterator[Values]:
-    first, second = (runs.read("map_fits", ["map", "rmse_m"]) for runs in (a, b))
-    rows = _joined(first, second, ["map"])
+def _of_fits(a: Runs, b: Runs) -> Iterator[Values]:
+    rows = _joined(a, b, ["map"], lambda runs: runs.each("map_fits", ["map", "rmse_m"]))
     is_fused = rows["map"] == "fused"
-    for label, own in (
-        ("landmark RMSE, m", rows[~is_fused]),
-        ("fused RMSE, m", rows[is_fused]),
-    ):
-        yield _ratio(Metric(label, "", "ratio"), own, "rmse_m")
+    yield _ratio(Metric("landmark RMSE, m", "", "ratio"), rows[~is_fused], "rmse_m")
+    yield _ratio(Metric("fused RMSE, m", "", "ratio"), rows[is_fused], "rmse_m")
 
 
-def _nees(a: Runs, b: Runs) -> Iterator[Values]:
+def _of_consistency(a: Runs, b: Runs) -> Iterator[Values]:
     """Distance from consistency: too small a covariance is as wrong as one too large."""
-    first, second = (_nees_of_pairs(runs) for runs in (a, b))
-    rows = _joined(first, second, ["robot_a", "robot_b"])
+
+    def read(runs: Runs) -> Iterator[pd.DataFrame]:
+        columns = ["robot_a", "robot_b", "nees_with_drift", "degrees_of_freedom", "true_pair"]
+        for rows in runs.each("fusion", columns):
+            true = rows[rows["true_pair"]]
+            per_dof = true.assign(nees=true["nees_with_drift"] / true["degrees_of_freedom"])
+            keys = [*RUN_KEYS, *setting_columns(rows), "robot_a", "robot_b"]
+            yield per_dof.groupby(keys, sort=False)["nees"].mean().reset_index()
+
+    rows = _joined(a, b, ["robot_a", "robot_b"], read)
     rows = rows[(rows["nees_a"] > 0) & (rows["nees_b"] > 0)]
-    change = np.abs(np.log(rows["nees_b"])) - np.abs(np.log(rows["nees_a"]))
-    frame = pd.DataFrame(
-        {MATCH: rows[MATCH], "a": rows["nees_a"], "b": rows["nees_b"], "change": change}
-    )
-    yield Values(Metric("fused NEES / dof", "", "ln"), frame)
+    off = {side: np.abs(np.log(rows[f"nees_{side}"])) for side in "ab"}
+    frame = rows.rename(columns={"nees_a": "a", "nees_b": "b"})[[MATCH, "a", "b"]]
+    metric = Metric("fused NEES / dof", "", "ln")
+    yield Values(metric, frame.assign(change=off["b"] - off["a"]))
 
 
-def _nees_of_pairs(runs: Runs) -> pd.DataFrame:
-    """Mean NEES per degree of freedom of truly fused landmarks, per run and robot pair."""
-    columns = ["robot_a", "robot_b", "nees_with_drift", "degrees_of_freedom", "true_pair"]
-    parts = []
-    for rows in runs.each("fusion", columns):
-        true = rows[rows["true_pair"]]
-        per_dof = true.assign(nees=true["nees_with_drift"] / true["degrees_of_freedom"])
-        keys = [*RUN_KEYS, *setting_columns(rows), "robot_a", "robot_b"]
-        parts.append(per_dof.groupby(keys, sort=False)["nees"].mean().reset_index())
-    return pd.concat(parts, ignore_index=True)
-
-
-def _times(a: Runs, b: Runs) -> Iterator[Values]:
+def _of_times(a: Runs, b: Runs) -> Iterator[Values]:
     keys = [*MAP_KEYS, "aligner"]
-    first, second = (runs.read("aligner_timings", [*keys, "elapsed_s"]) for runs in (a, b))
-    rows = _joined(first, second, keys)
+    rows = _joined(a, b, keys, lambda runs: runs.each("aligner_timings", [*keys, "elapsed_s"]))
     for aligner in methods_in(rows):
         metric = Metric("time, s", aligner, "ratio", timed=True)
         yield _ratio(metric, rows[rows["aligner"] == aligner], "elapsed_s")
+
+
+_BUILT_FROM = {
+    "errors": _of_alignments,
+    "robots": _of_paths,
+    "map_fits": _of_fits,
+    "fusion": _of_consistency,
+    "aligner_timings": _of_times,
+}

@@ -1,12 +1,6 @@
-"""Two versions on the same runs: what got better or worse, and whether that is more than noise.
-
-A run is the unit: what its maps, pairs and repetitions share they share with chance. Each metric
-becomes one change a run; their mean is tested by Student's t over the runs, all tests together are
-corrected by Holm's rule, and BCa's bootstrap over the runs gives the interval.
-"""
+"""Two versions on the same runs: what got better or worse, and whether that is more than noise."""
 
 import json
-import warnings
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -14,23 +8,21 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import scipy.stats
 
-from experiments.scenario.randomness import generator
-from experiments.study.compare.version_values import MATCH, Metric, Values, all_values
-from experiments.study.statistics.bootstrap import MAPS_OF_ONE_RUN, RUN, mean_interval
-from experiments.study.statistics.judged_maps import Criteria
-from experiments.study.statistics.paired import holm
+from experiments.study.compare.version_values import MATCH, Values, all_values
+from experiments.study.statistics.better import (
+    FEW_RUNS,
+    SIGNIFICANCE,
+    change_of_each_run,
+    holm,
+    mean_change,
+)
+from experiments.study.statistics.bootstrap import MAPS_OF_ONE_RUN, RUN
 from experiments.study.statistics.run_tables import Runs, find_runs
 from mapfusion.errors import InputError
-from mapfusion.se2 import Float
 
-SIGNIFICANCE = 0.05
 # A change of less than one percent (or percentage point) matters to nobody who picks a method.
 LEAST_CHANGE = 0.01
-# A t test of fewer runs rests on the normal distribution alone: with five, signs all alike would
-# not reach 5 % (2 / 2^5 = 6 %), with six they do.
-FEW_RUNS = 6
 BETTER, WORSE, SAME, NOISE, UNKNOWN = (
     "better",
     "worse",
@@ -42,7 +34,7 @@ _SHOWN_NAMES = 3
 
 
 @dataclass(frozen=True)
-class Comparison:
+class VersionComparison:
     """What two versions differ in.
 
     Attributes:
@@ -64,7 +56,7 @@ class Comparison:
         return bool(((self.table["verdict"] == WORSE) & ~self.table["timed"]).any())
 
 
-def compare(path_a: Path, path_b: Path) -> Comparison:
+def compare(path_a: Path, path_b: Path) -> VersionComparison:
     """Compare version a with version b.
 
     Args:
@@ -83,8 +75,7 @@ def compare(path_a: Path, path_b: Path) -> Comparison:
             f"the first has {_some(runs_a)}, the second {_some(runs_b)}"
         )
     unit = RUN if len(common) > 1 else MAPS_OF_ONE_RUN
-    criteria = min((Criteria.of(runs) for runs in (a, b)), key=lambda c: c.translation_m)
-    rows = [_judged(values, unit) for values in all_values(a, b, criteria) if len(values.rows)]
+    rows = [_judged(values, len(common)) for values in all_values(a, b) if len(values.rows)]
     if not rows:
         raise InputError(f"{path_a} and {path_b}: their common runs have no rows in common")
     table = pd.DataFrame(rows)
@@ -96,53 +87,41 @@ def compare(path_a: Path, path_b: Path) -> Comparison:
         *_left_out(runs_b - runs_a, "second"),
         *_notes_on(table, unit, len(common)),
     ]
-    return Comparison(table.drop(columns="higher_is_better"), unit, len(common), tuple(notes))
+    return VersionComparison(
+        table.drop(columns="higher_is_better"), unit, len(common), tuple(notes)
+    )
 
 
-def _judged(values: Values, unit: str) -> dict[str, Any]:
+def _judged(values: Values, n_runs: int) -> dict[str, Any]:
     """One row of the table, verdict and correction apart."""
     metric, rows = values
-    changes = _per_unit(metric, rows, unit)
-    rng = generator(0, "compare", metric.name, metric.aligner)
-    value, low, high = mean_interval(changes, rng)
-    if metric.scale == "ratio":
-        value, low, high = np.exp([value, low, high])
+    is_share = metric.scale == "share"
+    changes = change_of_each_run(
+        rows["change"].to_numpy(), rows[MATCH].to_numpy(), n_runs, is_share
+    )
+    found = mean_change(changes)
+    change = [found.change, found.low, found.high]
+    a, b = rows[["a", "b"]].mean() if is_share else rows[["a", "b"]].median()
     return {
         "metric": metric.name,
         "method": metric.aligner,
-        "a": rows["a"].median() if metric.scale != "share" else rows["a"].mean(),
-        "b": rows["b"].median() if metric.scale != "share" else rows["b"].mean(),
+        "a": a,
+        "b": b,
         "scale": metric.scale,
-        "change": value,
-        "low": low,
-        "high": high,
+        **dict(
+            zip(
+                ("change", "low", "high"),
+                np.exp(change) if metric.scale == "ratio" else change,
+                strict=True,
+            )
+        ),
         "n_units": len(changes),
         "n_rows": len(rows),
-        "p": _p_value(changes),
+        "p": found.p,
         "identical": not rows["change"].any(),
         "timed": metric.timed,
         "higher_is_better": metric.higher_is_better,
     }
-
-
-def _per_unit(metric: Metric, rows: pd.DataFrame, unit: str) -> Float:
-    """One change a run: the mean of shares, the median of log ratios (some maps are just lost)."""
-    if unit == MAPS_OF_ONE_RUN:
-        return rows["change"].to_numpy(dtype=np.float64)
-    groups = rows.groupby(MATCH)["change"]
-    return (groups.mean() if metric.scale == "share" else groups.median()).to_numpy(np.float64)
-
-
-def _p_value(changes: Float) -> float:
-    """Two-sided p of Student's t test that the mean change is 0; NaN where nothing changed."""
-    if len(changes) < 2 or not changes.any():
-        return np.nan
-    if np.ptp(changes) == 0:  # all alike: t is infinite; what is left is that all signs agree
-        return float(2.0 ** (1 - len(changes)))
-    with warnings.catch_warnings():  # changes alike but for rounding
-        warnings.simplefilter("ignore", RuntimeWarning)
-        tested: Any = scipy.stats.ttest_1samp(changes, 0.0)
-    return float(tested.pvalue)
 
 
 def _verdict(row: dict[Any, Any]) -> str:
@@ -150,9 +129,9 @@ def _verdict(row: dict[Any, Any]) -> str:
         return SAME
     if row["n_units"] < 2:
         return UNKNOWN
-    ratio = row["scale"] == "ratio"
-    change = np.log(row["change"]) if ratio else row["change"]
-    least = np.log1p(LEAST_CHANGE) if ratio else LEAST_CHANGE
+    change, least = row["change"], LEAST_CHANGE
+    if row["scale"] == "ratio":
+        change, least = np.log(change), np.log1p(least)
     if np.isnan(row["p_holm"]) or row["p_holm"] > SIGNIFICANCE or abs(change) < least:
         return NOISE
     return BETTER if (change > 0) == row["higher_is_better"] else WORSE
@@ -208,15 +187,6 @@ def _differing_settings(a: Runs, b: Runs) -> list[str]:
 
 
 def _flat(path: Path) -> dict[str, str]:
-    """Settings by dotted name."""
-    flat: dict[str, str] = {}
-
-    def add(prefix: str, value: object) -> None:
-        if isinstance(value, dict):
-            for key, inner in value.items():
-                add(f"{prefix}.{key}" if prefix else str(key), inner)
-        else:
-            flat[prefix] = json.dumps(value)
-
-    add("", json.loads(path.read_text(encoding="utf-8")))
-    return flat
+    """Settings by dotted name, as JSON."""
+    settings = pd.json_normalize(json.loads(path.read_text(encoding="utf-8"))).to_dict("records")[0]
+    return {str(name): json.dumps(value) for name, value in settings.items()}

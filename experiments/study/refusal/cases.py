@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from experiments.judge.criteria import MERGEABLE_PAIRS
 from experiments.judge.errors import EvaluatedRobot
-from experiments.judge.metrics import MERGEABLE_TRUE_PAIRS
 from experiments.judge.truth import common_landmarks, true_pairs
 from mapfusion import se2
 from mapfusion.align.correspondences import Correspondences, MatchParameters, match
@@ -78,11 +78,11 @@ def common(
 def few(case: Case, rng: np.random.Generator) -> Case | None:
     """A common case with 20 true correspondences left, about one of them; None with fewer."""
     true = np.flatnonzero(case.is_true)
-    if len(true) <= MERGEABLE_TRUE_PAIRS:
+    if len(true) <= MERGEABLE_PAIRS:
         return None
     position = case.map_a.position_m[case.pairs.index_a[true]]
     distance = np.linalg.norm(position - position[rng.integers(len(true))], axis=1)
-    nearest = true[np.argsort(distance, kind="stable")[:MERGEABLE_TRUE_PAIRS]]
+    nearest = true[np.argsort(distance, kind="stable")[:MERGEABLE_PAIRS]]
     kept = np.sort(np.concatenate([np.flatnonzero(~case.is_true), nearest]))
     return replace(case, ground=FEW, pairs=case.pairs[kept], is_true=case.is_true[kept])
 

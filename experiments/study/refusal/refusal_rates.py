@@ -6,7 +6,8 @@ import numpy as np
 import pandas as pd
 from scipy.stats import binomtest
 
-from experiments.judge.metrics import FALSE_MERGE_M, FALSE_MERGE_RAD, MERGEABLE_TRUE_PAIRS
+from experiments.judge import criteria
+from experiments.judge.criteria import has_common_ground, right_refined
 from experiments.study.refusal.cases import APART, COMMON, FEW, POSTER_RADII_M, POSTERS
 from mapfusion.se2 import Float
 
@@ -33,21 +34,14 @@ class Rate(NamedTuple):
         return float(found.low), float(found.high)
 
 
-def is_right(rows: pd.DataFrame) -> pd.Series:
-    """Bool per row: the refined alignment is where it should be, accepted or not."""
-    return (rows["refined_translation_error_m"] <= FALSE_MERGE_M) & (
-        rows["refined_rotation_error_rad"].abs() <= FALSE_MERGE_RAD
-    )
-
-
 def without_common_ground(rows: pd.DataFrame) -> pd.DataFrame:
     """Pairs of maps in which every merge is false; those with repeated posters are apart."""
-    return rows[(rows["ground"] == APART) | ((rows["ground"] == COMMON) & (rows["n_common"] == 0))]
+    return rows[(rows["ground"] == APART) | ((rows["ground"] == COMMON) & ~has_common_ground(rows))]
 
 
 def mergeable(rows: pd.DataFrame) -> pd.DataFrame:
     """Pairs of one world as they came, with 20 or more true correspondences."""
-    return rows[(rows["ground"] == COMMON) & (rows["n_true"] >= MERGEABLE_TRUE_PAIRS)]
+    return criteria.mergeable(rows[rows["ground"] == COMMON])
 
 
 def summary(refusals: pd.DataFrame) -> list[dict[str, Any]]:
@@ -56,20 +50,20 @@ def summary(refusals: pd.DataFrame) -> list[dict[str, Any]]:
     for name in refusals["aligner"].drop_duplicates():
         own = refusals[refusals["aligner"] == name]
         able, few = mergeable(own), own[own["ground"] == FEW]
-        some = own[(own["ground"] == COMMON) & (own["n_common"] > 0)]
+        some = own[(own["ground"] == COMMON) & has_common_ground(own)]
         hung = own[own["ground"] == POSTERS]
-        hung_common = hung[hung["n_common"] > 0]
+        hung_common = hung[has_common_ground(hung)]
         rows.append(
             {
                 "aligner": name,
                 "false": _accepted(without_common_ground(own)),
-                "wrong": _rate(some["accepted"] & ~is_right(some)),
+                "wrong": _rate(some["accepted"] & ~right_refined(some)),
                 "missed": _refused(able),
-                "missed_though_right": _refused(able[is_right(able)]),
-                "few_missed_though_right": _refused(few[is_right(few)]),
-                "few_wrong": _rate(few["accepted"] & ~is_right(few)),
-                "posters_false": _accepted(hung[hung["n_common"] == 0]),
-                "posters_wrong": _rate(hung_common["accepted"] & ~is_right(hung_common)),
+                "missed_though_right": _refused(able[right_refined(able)]),
+                "few_missed_though_right": _refused(few[right_refined(few)]),
+                "few_wrong": _rate(few["accepted"] & ~right_refined(few)),
+                "posters_false": _accepted(hung[~has_common_ground(hung)]),
+                "posters_wrong": _rate(hung_common["accepted"] & ~right_refined(hung_common)),
             }
             | {
                 f"poster_{radius_m:g}": _accepted(own[own["poster_radius_m"] == radius_m])

@@ -1,20 +1,18 @@
 """Bootstrap intervals that resample whole runs, since the rows of one run depend on each other."""
 
-import warnings
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-import scipy.stats
 
+from experiments.judge.judged_maps import MAP_KEYS
 from experiments.study.statistics.wilson import CONFIDENCE
 from mapfusion.se2 import Float
 
 # An interval's end at 2.5 % then rests on 50 draws (Efron & Tibshirani 1993, ch. 14.3).
 RESAMPLES = 2000
 RUN, MAPS_OF_ONE_RUN = "run", "maps of one run"
-_MAP_KEYS = ["robot_a", "robot_b", "iteration"]
 
 Statistic = Callable[[Float], Float]
 _MAX_CELLS = 1_000_000  # resamples times rows that are worked on at once: some 8 MB an array
@@ -42,13 +40,17 @@ class Interval(NamedTuple):
     low: float
     high: float
 
+    def columns(self, name: str) -> dict[str, float]:
+        """As columns NAME, NAME_low and NAME_high of a table."""
+        return {name: self.value, f"{name}_low": self.low, f"{name}_high": self.high}
+
 
 def clusters_of(frame: pd.DataFrame) -> Clusters:
     """Rows by run; of a single run, by robot pair and iteration where the table has these."""
     codes, runs = pd.factorize(frame["run_id"])
-    if len(runs) != 1 or not set(_MAP_KEYS) <= set(frame.columns):
+    if len(runs) != 1 or not set(MAP_KEYS) <= set(frame.columns):
         return Clusters(codes, len(runs), RUN)
-    codes = frame.groupby(_MAP_KEYS, sort=False).ngroup().to_numpy()
+    codes = frame.groupby(list(MAP_KEYS), sort=False).ngroup().to_numpy()
     return Clusters(codes, int(codes.max()) + 1, MAPS_OF_ONE_RUN)
 
 
@@ -117,34 +119,15 @@ def percentile_interval(
     return Interval(value, float(low), float(high))
 
 
-def mean_interval(
-    values: Float,
-    rng: np.random.Generator,
-    confidence: float = CONFIDENCE,
-    resamples: int = RESAMPLES,
+def weighted_mean_interval(
+    values: Float, weights: Float, codes: np.ndarray, n_clusters: int, rng: np.random.Generator
 ) -> Interval:
-    """BCa interval of the mean of independent values (n,), one a run (Efron 1987).
+    """Weighted mean of rows (N,) whose cluster codes are (N,), whole clusters resampled."""
+    sums = np.bincount(codes, values * weights, minlength=n_clusters)
+    totals = np.bincount(codes, weights, minlength=n_clusters)
 
-    Fewer than two leave the ends NaN; equal ones make both ends the value.
-    """
-    if len(values) < 2:
-        return Interval(float(np.mean(values)) if len(values) else np.nan, np.nan, np.nan)
-    if np.ptp(values) == 0:
-        return Interval(float(values[0]), float(values[0]), float(values[0]))
-    with warnings.catch_warnings(), np.errstate(invalid="ignore"):
-        # where all jackknife values are equal BCa has no answer; the percentile then does
-        warnings.simplefilter("ignore", scipy.stats.DegenerateDataWarning)
-        result = scipy.stats.bootstrap(
-            (values,),
-            np.mean,
-            n_resamples=resamples,
-            confidence_level=confidence,
-            method="BCa",
-            vectorized=True,
-            rng=rng,
-        )
-    low, high = result.confidence_interval
-    if not np.isfinite([low, high]).all():
-        tail = (1 - confidence) / 2
-        low, high = np.quantile(result.bootstrap_distribution, [tail, 1 - tail])
-    return Interval(float(np.mean(values)), float(low), float(high))
+    def mean(counts: Float) -> Float:
+        total = counts @ totals
+        return counts @ sums / np.where(total > 0, total, np.nan)
+
+    return percentile_interval(mean, n_clusters, rng)

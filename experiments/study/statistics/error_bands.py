@@ -1,26 +1,42 @@
-"""Medians with the 10-90 % of the runs around them: the numbers of figures 4, 5 and 6."""
+"""Medians with the 10-90 % around them: the numbers of figures 4, 5 and 6, and of the charts."""
+
+from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
 
-from experiments.study.statistics.judged_maps import ERROR_COLUMNS, methods_in
+from experiments.judge.criteria import ANSWERABLE_PAIRS
+from experiments.judge.judged_maps import (
+    COUNTS,
+    ERROR_COLUMNS,
+    MAP_KEYS,
+    RUN_KEYS,
+    methods_in,
+    setting_columns,
+)
 
 BAND = (0.1, 0.9)
-_TIME_GROUPS = 8  # as figure 6 joins its points
+ROBOT_PAIR = ("robot_a", "robot_b")
+TIME_GROUPS = 8
 
 
-def error_bands(run_medians: pd.DataFrame) -> pd.DataFrame:
-    """Errors against the iteration: median and 10-90 % over the runs that gave an estimate.
+def error_bands(
+    rows: pd.DataFrame, by: Sequence[str] = ROBOT_PAIR, absolute: bool = False
+) -> pd.DataFrame:
+    """Errors against the iteration: median and 10-90 % of the rows that have an estimate.
 
     Args:
-        run_medians: rows of `medians_of_run`.
+        rows: of `errors`, for a band over the repetitions; of `medians_of_run`, for one over runs.
+        by: further columns to keep apart; none pools the robot pairs.
+        absolute: drop the sign of rotations first.
 
     Returns:
-        robot_a, robot_b, aligner, iteration, n_runs, and for each error _low, the median, _high.
+        The columns of `by`, aligner, iteration, n_runs where runs are named, and for each error
+        NAME_low, NAME (the median) and NAME_high.
     """
-    keys = ["robot_a", "robot_b", "aligner", "iteration"]
-    groups = run_medians.groupby(keys, sort=False)
-    parts = [groups["run_id"].nunique().rename("n_runs")]
+    rows = rows.assign(**{c: rows[c].abs() for c in ERROR_COLUMNS}) if absolute else rows
+    groups = rows.groupby([*by, "aligner", "iteration"], sort=False)
+    parts = [groups["run_id"].nunique().rename("n_runs")] if "run_id" in rows else []
     for column in ERROR_COLUMNS:
         low, high = (groups[column].quantile(q) for q in BAND)
         parts += [low.rename(f"{column}_low"), groups[column].median()]
@@ -33,31 +49,52 @@ def medians_of_run(errors: pd.DataFrame) -> pd.DataFrame:
 
     The band of several runs is then over the runs, each of which counts once.
     """
-    keys = ["run_id", "robot_a", "robot_b", "aligner", "iteration"]
-    groups = errors.groupby(keys, sort=False)
-    counts = ["n_correspondences", "n_true", "n_common"]
-    return pd.concat([groups[list(ERROR_COLUMNS)].median(), groups[counts].first()], axis=1)
+    keys = [name for name in RUN_KEYS if name in errors] + setting_columns(errors)
+    groups = errors.groupby([*keys, *MAP_KEYS, "aligner"], sort=False, dropna=False)
+    parts = [groups[list(ERROR_COLUMNS)].median(), groups[list(COUNTS)].first()]
+    return pd.concat(parts, axis=1).reset_index()
 
 
-def time_bands(timings: pd.DataFrame) -> pd.DataFrame:
+def scarce_spans(rows: pd.DataFrame) -> list[tuple[float, float]]:
+    """Stretches of iterations at which most maps have too few true pairs for an answer.
+
+    All methods see the same maps, so any rows of `errors` or `medians_of_run` will do. Each stretch
+    reaches half way to the next iteration.
+    """
+    maps = rows.drop_duplicates([name for name in ("run_id", *MAP_KEYS) if name in rows])
+    scarce = (maps["n_true"] < ANSWERABLE_PAIRS).groupby(maps["iteration"]).mean() > 0.5
+    at = scarce.index.to_numpy(dtype=np.float64)
+    half = np.diff(at) / 2 if len(at) > 1 else np.array([0.5])
+    start = at - np.concatenate([half[:1], half])[: len(at)]
+    stop = at + np.concatenate([half, half[-1:]])[: len(at)]
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], scarce.to_numpy().astype(int), [0]])))
+    return [(float(start[first]), float(stop[end - 1])) for first, end in edges.reshape(-1, 2)]
+
+
+def time_bands(
+    timings: pd.DataFrame, column: str = "n_common", groups: int = TIME_GROUPS
+) -> pd.DataFrame:
     """Time of one alignment against the overlap, in groups of about equal size.
 
     Args:
         timings: the table `aligner_timings` of some runs; each row is a median of repeats.
+        column: what to group by: n_common or n_correspondences; equal ones stay together.
+        groups: how many at the most.
 
     Returns:
-        aligner, n_common_low, n_common_high, n_runs, n_maps, and the 10 %, 50 % and 90 % of the
-        maps' times: elapsed_low_s, elapsed_s, elapsed_high_s.
+        aligner; COLUMN_low, COLUMN (the median) and COLUMN_high of the group; n_runs where runs
+        are named, n_maps; the maps' times: 10 % elapsed_low_s, median elapsed_s, 90 %
+        elapsed_high_s.
     """
-    rows = []
     timed = timings.dropna(subset="elapsed_s")
-    for aligner in methods_in(timed):
-        own = timed[timed["aligner"] == aligner]
-        group = np.ceil(own["n_common"].rank(pct=True) * _TIME_GROUPS)  # ties stay together
-        for _, part in own.groupby(group):
-            low, high = part["elapsed_s"].quantile(BAND[0]), part["elapsed_s"].quantile(BAND[1])
-            row = {"aligner": aligner, "n_common_low": part["n_common"].min()}
-            row |= {"n_common_high": part["n_common"].max(), "n_runs": part["run_id"].nunique()}
-            row |= {"n_maps": len(part), "elapsed_low_s": low}
-            rows.append(row | {"elapsed_s": part["elapsed_s"].median(), "elapsed_high_s": high})
-    return pd.DataFrame(rows)
+    rank = timed.groupby("aligner")[column].rank(pct=True)
+    grouped = timed.assign(group=np.ceil(rank * groups)).groupby(["aligner", "group"])
+    count, elapsed = grouped[column], grouped["elapsed_s"]
+    found = {f"{column}_low": count.min(), column: count.median(), f"{column}_high": count.max()}
+    found |= {"n_runs": grouped["run_id"].nunique()} if "run_id" in timed else {}
+    found |= {"n_maps": grouped.size(), "elapsed_low_s": elapsed.quantile(BAND[0])}
+    found |= {"elapsed_s": elapsed.median(), "elapsed_high_s": elapsed.quantile(BAND[1])}
+    bands = pd.DataFrame(found).reset_index().drop(columns="group")
+    return bands.sort_values(
+        "aligner", key=lambda names: names.map(methods_in(timed, oracle=True).index), kind="stable"
+    ).reset_index(drop=True)

@@ -6,8 +6,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.judge.consistency import mean_nees_band
-from experiments.study.statistics.bootstrap import Interval, percentile_interval
-from mapfusion.se2 import Float
+from experiments.study.statistics.bootstrap import Interval, weighted_mean_interval
 
 FUSION_COLUMNS = ("nees_with_drift", "nees_without_drift", "degrees_of_freedom", "true_pair")
 
@@ -32,8 +31,11 @@ def nees_of_maps(landmark_nees: pd.DataFrame, rng: np.random.Generator) -> pd.Da
         codes, runs = pd.factorize(own["run_id"])
         weight = own["n_landmarks"].to_numpy(dtype=np.float64)
         dof = own["degrees_of_freedom"].to_numpy()
-        nees = _weighted(own["nees_mean"].to_numpy() * weight, dof * weight, codes, rng)
-        inside = _weighted(own["share_in_gate"].to_numpy() * weight, weight, codes, rng)
+        per_dof = own["nees_mean"].to_numpy() / dof
+        nees = weighted_mean_interval(per_dof, dof * weight, codes, len(runs), rng)
+        inside = weighted_mean_interval(
+            own["share_in_gate"].to_numpy(), weight, codes, len(runs), rng
+        )
         row = {"landmarks": kind, "n_runs": len(runs), "n_landmarks": int(weight.sum())}
         rows.append(row | _columns(nees, inside, float(dof @ weight)))
     return pd.DataFrame(rows)
@@ -52,28 +54,15 @@ def nees_of_pairs(fusion: pd.DataFrame, rng: np.random.Generator) -> pd.DataFram
             continue
         codes, runs = pd.factorize(own["run_id"])
         dof = own["degrees_of_freedom"].to_numpy(dtype=np.float64)
-        nees = _weighted(own[f"nees_{name}"].to_numpy(), dof, codes, rng)
+        per_dof = own[f"nees_{name}"].to_numpy() / dof
+        nees = weighted_mean_interval(per_dof, dof, codes, len(runs), rng)
         label = f"fused in pairs, {name.replace('_', ' ')}"
         row = {"landmarks": label, "n_runs": len(runs), "n_landmarks": len(own)}
         rows.append(row | _columns(nees, Interval(np.nan, np.nan, np.nan), float(dof.sum())))
     return pd.DataFrame(rows)
 
 
-def _weighted(sums: Float, weights: Float, codes: np.ndarray, rng: np.random.Generator) -> Interval:
-    """Summed values over summed weights, whole runs resampled."""
-    n_runs = int(codes.max()) + 1
-    sum_of_run = np.bincount(codes, sums, minlength=n_runs)
-    weight_of_run = np.bincount(codes, weights, minlength=n_runs)
-
-    def mean(counts: Float) -> Float:
-        return counts @ sum_of_run / (counts @ weight_of_run)
-
-    return percentile_interval(mean, n_runs, rng)
-
-
 def _columns(nees: Interval, inside: Interval, total_dof: float) -> dict[str, Any]:
     band_low, band_high = mean_nees_band(total_dof, 1)  # the sum's degrees of freedom add up
-    found = {"nees_per_dof": nees.value, "nees_per_dof_low": nees.low}
-    found |= {"nees_per_dof_high": nees.high, "band_low": band_low, "band_high": band_high}
-    found |= {"share_in_gate": inside.value, "share_in_gate_low": inside.low}
-    return found | {"share_in_gate_high": inside.high}
+    band = {"band_low": band_low, "band_high": band_high}
+    return nees.columns("nees_per_dof") | band | inside.columns("share_in_gate")

@@ -17,15 +17,15 @@ import pyarrow as pa
 import pyarrow.dataset as ds
 
 from experiments.judge import tables
+from experiments.judge.judged_maps import RUN_KEYS, setting_columns
 from mapfusion.errors import InputError
 
-RUN_KEYS = ("run_id", "scenario", "seed")
 _KIND, _VERSION = b"mapfusion.kind", b"mapfusion.schema_version"
 _DAMAGED = (pa.ArrowInvalid, pa.ArrowTypeError, pa.ArrowKeyError, OSError)
 
 
 @dataclass(frozen=True)
-class _File:
+class _RunFile:
     """One run's rows of a table. Results carry their run's name, sweeps say it in the rows."""
 
     path: Path
@@ -33,13 +33,12 @@ class _File:
 
 
 @dataclass(frozen=True)
-class Result:
+class ResultFolder:
     """One result folder of `run`."""
 
     folder: Path
     scenario: str
     seed: int
-    gate_m: float | None
 
     @property
     def run_id(self) -> str:
@@ -56,20 +55,22 @@ class Runs:
         sweeps: sweep folders.
     """
 
-    results: tuple[Result, ...]
+    results: tuple[ResultFolder, ...]
     sweeps: tuple[Path, ...]
 
-    def files(self, table: str) -> list[_File]:
+    def files(self, table: str) -> list[_RunFile]:
         """The files of one table, one a run, in a fixed order; none where no run has it."""
         found = [
-            _File(path, {"run_id": result.run_id, "scenario": result.scenario, "seed": result.seed})
+            _RunFile(
+                path, {"run_id": result.run_id, "scenario": result.scenario, "seed": result.seed}
+            )
             for result in self.results
             if (path := tables.table_path(result.folder, table)).is_file()
         ]
         for sweep in self.sweeps:
             finished = self._finished.get(sweep)
             found += [
-                _File(path)
+                _RunFile(path)
                 for path in _whole_files(sweep / table)
                 if finished is None or path.stem in finished
             ]
@@ -82,7 +83,7 @@ class Runs:
     def each(
         self, table: str, columns: Sequence[str] | None = None, optional: Sequence[str] = ()
     ) -> Iterator[pd.DataFrame]:
-        """Each run's rows; arguments and columns as in `read_runs`."""
+        """Each run's rows; see `read`."""
         files = self.files(table)
         if not files:
             where = ", ".join(str(path) for path in self.folders)
@@ -101,7 +102,21 @@ class Runs:
     def read(
         self, table: str, columns: Sequence[str] | None = None, optional: Sequence[str] = ()
     ) -> pd.DataFrame:
-        """All runs' rows in one table; see `read_runs`."""
+        """One table of all runs.
+
+        Args:
+            table: its name (see experiments.judge.tables).
+            columns: of the table; all by default.
+            optional: further columns, NaN for runs made before these were introduced.
+
+        Returns:
+            Columns run_id, scenario, seed, then what a sweep varied (one text column a setting),
+            then those of the table.
+
+        Raises:
+            InputError: no such table, a damaged file, one made by a newer program, a missing
+                column, or a run given twice.
+        """
         return pd.concat(list(self.each(table, columns, optional)), ignore_index=True)
 
     @property
@@ -125,7 +140,7 @@ class Runs:
         said = {}
         for sweep in self.sweeps:
             parts = [
-                _read(_File(path), "runs", ["status", "reason"], ())
+                _read(_RunFile(path), "runs", ["status", "reason"], ())
                 for path in _whole_files(sweep / "runs")
             ]
             if parts:
@@ -170,31 +185,6 @@ def find_runs(paths: Path | Sequence[Path]) -> Runs:
     return Runs(tuple(results), tuple(sweeps))
 
 
-def read_runs(
-    paths: Path | Sequence[Path],
-    table: str,
-    columns: Sequence[str] | None = None,
-    optional: Sequence[str] = (),
-) -> pd.DataFrame:
-    """One table of all runs at these paths.
-
-    Args:
-        paths: result folders, sweep folders, or one of them.
-        table: name of the table (see experiments.judge.tables).
-        columns: of the table; all by default.
-        optional: further columns, NaN for runs made before these were introduced.
-
-    Returns:
-        Columns run_id, scenario, seed, then what a sweep varied (one text column a setting), then
-        those of the table.
-
-    Raises:
-        InputError: no such folder or table, a damaged file, one made by a newer program, a missing
-            column, or a run given twice.
-    """
-    return find_runs(paths).read(table, columns, optional)
-
-
 def match_names(frame: pd.DataFrame) -> pd.Series:
     """What a run is matched by: scenario, seed, settings."""
     names = frame["scenario"].astype(str) + " seed " + frame["seed"].astype(str)
@@ -208,24 +198,18 @@ def _whole_files(folder: Path) -> list[Path]:
     return [path for path in sorted(folder.glob("*.parquet")) if not path.name.startswith(".")]
 
 
-def setting_columns(frame: pd.DataFrame) -> list[str]:
-    """What the sweeps varied: columns that are named as settings are, with a dot."""
-    return [name for name in frame.columns if "." in name]
-
-
-def _result(folder: Path) -> Result:
+def _result(folder: Path) -> ResultFolder:
     path = folder / "scenario.json"
     try:
         scenario = json.loads(path.read_text(encoding="utf-8"))
         name, seed = str(scenario["name"]), int(scenario["seed"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: not a resolved scenario with name and seed ({error})") from error
-    gate_m = scenario.get("align", {}).get("refinement", {}).get("gate_m")
-    return Result(folder, name, seed, gate_m)
+    return ResultFolder(folder, name, seed)
 
 
 def _read(
-    file: _File, table: str, columns: Sequence[str] | None, optional: Sequence[str]
+    file: _RunFile, table: str, columns: Sequence[str] | None, optional: Sequence[str]
 ) -> pd.DataFrame:
     try:
         data = ds.dataset(file.path, format="parquet")
@@ -244,7 +228,7 @@ def _read(
 
 
 def _wanted(
-    file: _File,
+    file: _RunFile,
     table: str,
     found: Sequence[str],
     columns: Sequence[str] | None,

@@ -11,15 +11,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from experiments.judge.criteria import at_the_end, has_common_ground
+from experiments.judge.judged_maps import methods_in
 from experiments.study.statistics.bootstrap import clusters_of
-from experiments.study.statistics.judged_maps import (
-    DEFAULT_CRITERIA,
-    Criteria,
-    at_the_end,
-    has_common_ground,
-    maps_of,
-    methods_in,
-)
 from experiments.study.statistics.wilson import effective_trials, wilson
 from mapfusion.se2 import Float
 
@@ -40,21 +34,17 @@ _SHARES = (*_WITHOUT_TEST, "accepted", "false_accepted", "refused_apart")
 
 
 def success_rates(
-    errors: pd.DataFrame,
-    by: str,
-    edges: tuple[float, ...] | None = None,
-    criteria: Criteria = DEFAULT_CRITERIA,
+    maps: pd.DataFrame, by: str, edges: tuple[float, ...] | None = None
 ) -> pd.DataFrame:
     """Success rates of each method, binned.
 
     Args:
-        errors: the table `errors` of some runs, with the columns of `read_runs` in front.
+        maps: rows of `maps_of`.
         by: iteration, n_common (landmarks that truly correspond), overlap_share (n_common over
             the smaller map's landmarks; only for rows that `with_overlap_share` went over), n_true
             (true pairs among the correspondences), outlier_share (1 - n_true / n_correspondences)
             or last (the last iteration of each robot pair alone).
         edges: of the bins, rising; each holds its lower edge, the last one both.
-        criteria: what counts as right.
 
     Returns:
         One row per bin and method: from, to, aligner, n_runs, n_maps, n_apart (those without common
@@ -66,13 +56,6 @@ def success_rates(
     Raises:
         ValueError: an unknown `by`, or edges that do not rise.
     """
-    return rates_of_maps(maps_of(errors, criteria), by, edges)
-
-
-def rates_of_maps(
-    maps: pd.DataFrame, by: str, edges: tuple[float, ...] | None = None
-) -> pd.DataFrame:
-    """The same from rows of `maps_of`."""
     if by not in BY:
         raise ValueError(f"by: is {by}, expected one of {', '.join(BY)}")
     if by != LAST and by not in maps:

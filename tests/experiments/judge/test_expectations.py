@@ -71,7 +71,7 @@ def test_check_pools_the_seeds(
     results = {}
     for seed, error_m in ((4, 1.0), (9, 3.0)):
         results[seed] = tmp_path / str(seed)
-        row = dict.fromkeys(tables.ROBOTS.names, 0.0) | {"robot": "R1", "resampled": False}
+        row = dict.fromkeys(tables.ALL["robots"].names, 0.0) | {"robot": "R1", "resampled": False}
         rows = [row | {"path_error_m": error_m, "iteration": i} for i in range(3)]
         frame = pd.DataFrame(rows).astype({"n_landmarks": int})
         tables.write(tables.table_path(results[seed], "robots"), "robots", frame)

@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 
 from experiments.judge import metrics
+from experiments.judge.criteria import is_false_merge
 from experiments.judge.metrics import ALIGNER_METRICS, METRICS, compute, known_metrics
 
 
@@ -16,7 +17,7 @@ def error(
     row = {"seed": 0, "robot_a": "A", "robot_b": "B", "iteration": iteration, "aligner": aligner}
     row |= {"translation_error_m": translation_m, "refined_translation_error_m": refined_m}
     row |= {"refined_rotation_error_rad": 0.0, "oracle_distance_m": 0.0, "n_true": 40}
-    row |= {"accepted": True, "n_common": 60}
+    row |= {"accepted": True, "n_common": 60, "n_correspondences": 80, "rotation_error_rad": 0.0}
     return row | more
 
 
@@ -77,9 +78,9 @@ KNOWN = {
     "landmark_rmse_worst_m": 6.0,
     "fused_landmark_rmse_m": 8.0,
     "ransac.refined_oracle_distance_m": 0.02,
-    "ransac.refined_over_oracle": 0.4 / 0.3,
+    "ransac.refined_over_oracle": 0.5 / 0.3,  # no estimate is infinitely far off
     "ransac.estimated_over_oracle": 0.7 / 0.3,
-    "ransac.estimated_translation_m": 0.65,
+    "ransac.estimated_translation_m": (0.1 + 0.7) / 2,  # two maps, one of them thrice
     "ransac.lead_over_others": 2.0,
     "svd.lead_over_others": 0.7 / 2.1,
     "ransac.scatter_m": 0.16,
@@ -101,13 +102,14 @@ def test_known_answer(tables: dict[str, pd.DataFrame], name: str, value: float) 
         ({"refined_translation_error_m": 0.51}, True),
         ({"refined_rotation_error_rad": -0.11}, True),
         ({"refined_rotation_error_rad": -0.11, "accepted": False}, False),
-        ({"n_common": 0}, True),  # right by chance at best
+        ({"n_common": 2}, True),  # right by chance at best
+        ({"n_common": 3}, False),
         ({"n_common": 0, "accepted": False}, False),
     ],
 )
 def test_false_merge(changed: dict[str, object], false: bool) -> None:
     rows = pd.DataFrame([error("ransac", 20, 0.3, 0.2) | changed])
-    assert metrics.is_false_merge(rows).tolist() == [false]
+    assert is_false_merge(rows).tolist() == [false]
 
 
 def test_no_metric_is_left_untested() -> None:

@@ -6,34 +6,20 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from experiments.judge.judged_maps import ERROR_COLUMNS
 from experiments.study.compare.versions import BETTER, NOISE, SAME, WORSE, compare
-from experiments.study.statistics.judged_maps import ERROR_COLUMNS
-from experiments.study.statistics.paired import holm
+from experiments.study.statistics.better import holm
 from mapfusion.errors import InputError
-from tests.helpers.made_up_runs import errors_of, tables_of, timings_of, write_result, write_sweep
-
-Tables = dict[str, pd.DataFrame]
-
-
-def two_sweeps(
-    folder: Path, change: Callable[[int, Tables], Tables], seeds: int = 12
-) -> tuple[Path, Path]:
-    """The same runs, and what another version makes of them."""
-    made = {seed: tables_of(seed) for seed in range(seeds)}
-    changed = {seed: change(seed, {k: t.copy() for k, t in made[seed].items()}) for seed in made}
-    a = write_sweep(folder / "a", range(seeds), made=made)
-    return a, write_sweep(folder / "b", range(seeds), made=changed)
-
-
-def scaled(factor: float, aligner: str, scatter: float = 0.0) -> Callable[[int, Tables], Tables]:
-    def change(seed: int, made: Tables) -> Tables:
-        rng = np.random.default_rng(900 + seed)
-        own = made["errors"]["aligner"] == aligner
-        factors = factor * np.exp(scatter * rng.normal(size=(int(own.sum()), 1)))
-        made["errors"].loc[own, list(ERROR_COLUMNS)] *= factors
-        return made
-
-    return change
+from tests.helpers.made_up_runs import (
+    Tables,
+    errors_of,
+    scaled,
+    tables_of,
+    timings_of,
+    two_sweeps,
+    write_result,
+    write_sweep,
+)
 
 
 def verdicts(table: pd.DataFrame) -> dict[tuple[str, str], str]:

@@ -8,8 +8,8 @@ from experiments.study.statistics.bootstrap import (
     RUN,
     WeightedMedian,
     clusters_of,
-    mean_interval,
     percentile_interval,
+    weighted_mean_interval,
 )
 
 
@@ -76,33 +76,17 @@ def test_resampling_runs_covers_and_resampling_rows_does_not() -> None:
     assert coverage(resample_runs=False) < 0.5
 
 
-def test_mean_interval_covers_a_skewed_mean() -> None:
+def test_weighted_mean_is_of_rows_in_resampled_clusters() -> None:
     rng = np.random.default_rng(6)
-    inside = 0
-    for _ in range(400):
-        _, low, high = mean_interval(rng.exponential(size=25), rng, resamples=500)
-        inside += low <= 1 <= high
-    assert inside / 400 > 0.88  # known to fall short of 95 % by a few percent at 25 values
-
-
-def test_same_generator_same_interval() -> None:
-    values = np.random.default_rng(7).normal(size=15)
-    first, again = (mean_interval(values, np.random.default_rng(8)) for _ in range(2))
-    assert first == again
-
-
-@pytest.mark.parametrize(
-    ("values", "expected"),
-    [([], (np.nan,) * 3), ([2.0], (2.0, np.nan, np.nan)), ([3.0, 3.0], (3.0, 3.0, 3.0))],
-)
-def test_too_little_to_resample(values: list[float], expected: tuple) -> None:
-    found = mean_interval(np.array(values), np.random.default_rng(0))
-    np.testing.assert_array_equal(found, expected)
-
-
-def test_two_clusters_with_equal_jackknife_values_still_have_an_interval() -> None:
-    _, low, high = mean_interval(np.array([0.0] * 9 + [1.0]), np.random.default_rng(0))
-    assert 0 <= low < 0.1 < high <= 1
+    values, weights, codes = rng.normal(size=60), rng.uniform(size=60), np.repeat(np.arange(6), 10)
+    found = weighted_mean_interval(values, weights, codes, 6, np.random.default_rng(8))
+    assert found.value == pytest.approx(np.average(values, weights=weights))
+    assert found.low < found.value < found.high
+    again = weighted_mean_interval(values, weights, codes, 6, np.random.default_rng(8))
+    assert again == found  # the same generator, the same interval
+    assert found.columns("x") == {"x": found[0], "x_low": found[1], "x_high": found[2]}
+    alone = weighted_mean_interval(values, weights, np.zeros(60, int), 1, rng)
+    assert np.isnan([alone.low, alone.high]).all()
 
 
 def test_clusters_are_runs_or_the_maps_of_a_single_one() -> None:

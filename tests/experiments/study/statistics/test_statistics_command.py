@@ -11,14 +11,14 @@ from experiments.show.export import to_latex, to_markdown, write_tables
 from experiments.show.figures.fig06_aligner_time import binned_quantiles
 from experiments.show.figures.runs_tables import RunsTables
 from experiments.study.statistics.error_bands import medians_of_run
-from experiments.study.statistics.judged_maps import Criteria
-from experiments.study.statistics.run_tables import find_runs, read_runs
+from experiments.study.statistics.run_tables import find_runs
 from experiments.study.statistics.summary import ALL_SCENARIOS, summarise
-from tests.experiments.study.compare.test_compare import scaled, two_sweeps
 from tests.helpers.made_up_runs import (
     ITERATIONS,
     METHODS,
+    scaled,
     tables_of,
+    two_sweeps,
     write_result,
     write_rows,
     write_sweep,
@@ -129,8 +129,7 @@ def test_same_runs_same_files_whatever_their_order(tmp_path: Path) -> None:
     folders = [write_result(tmp_path, seed, tables_of(seed)) for seed in range(4)]
     written = []
     for order in (folders, folders):
-        runs = find_runs(order)
-        made = summarise(runs, Criteria.of(runs)).tables
+        made = summarise(find_runs(order)).tables
         written.append({name: table.to_csv() for name, table in made.items()})
     assert written[0] == written[1]
 
@@ -149,9 +148,9 @@ def test_curves_over_runs_are_medians_of_run_medians(tmp_path: Path) -> None:
     from experiments.show.figures import fig04_translation_error, fig06_aligner_time
 
     folders = [write_result(tmp_path, seed, tables_of(seed)) for seed in range(5)]
-    errors = read_runs(folders, "errors")
-    medians = pd.concat([medians_of_run(own).reset_index() for _, own in errors.groupby("run_id")])
-    timings = read_runs(folders, "aligner_timings")
+    errors = find_runs(folders).read("errors")
+    medians = pd.concat([medians_of_run(own) for _, own in errors.groupby("run_id")])
+    timings = find_runs(folders).read("aligner_timings")
     data = RunsTables(tmp_path, medians, timings)
     assert data.aligners == [*METHODS, "oracle"]
     axes = fig04_translation_error.draw(data).axes[0]
@@ -176,7 +175,7 @@ def test_quantiles_of_groups_along_the_count() -> None:
 def test_memory_does_not_grow_with_the_rows_of_a_run(tmp_path: Path) -> None:
     """What is kept of a run is one row per map and method, however often it was repeated."""
     folder = write_result(tmp_path, 0, tables_of(0, repetitions=50))
-    runs = find_runs(folder)
-    summary = summarise(runs, Criteria.of(runs))
-    n_rows = len(read_runs(folder, "errors"))
+    runs = find_runs([folder])
+    summary = summarise(runs)
+    n_rows = len(runs.read("errors"))
     assert len(summary.run_medians) * 30 < n_rows
