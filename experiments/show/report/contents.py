@@ -9,12 +9,7 @@ import pandas as pd
 from experiments.judge.criteria import that_ever_meet
 from experiments.judge.judged_maps import methods_in, setting_columns
 from experiments.judge.result import require_result
-from experiments.show.figures.result_tables import (
-    ResultTables,
-    in_display_order,
-    of_pair,
-    pairs_in,
-)
+from experiments.show.figures.result_tables import ResultTables, of_pair, pairs_in
 from experiments.show.figures.style import aligner_styles
 from experiments.show.report.charts import error_curves, success_curves, time_curves
 from experiments.show.report.one_run_sections import one_run_sections
@@ -40,11 +35,11 @@ def contents_of(path: Path) -> dict[str, Any]:
         data = ResultTables(path)
     if not runs.has("errors") or (reduced := reduced_errors(runs)).maps.empty:
         raise InputError(f"{path}: no pair of maps was aligned, there is nothing to report on")
-    listed = [] if data is None else data.aligners
-    aligners = in_display_order(methods_in(reduced.maps, oracle=True), listed)
+    aligners = methods_in(reduced.maps, oracle=True)
     if data is None:
         own, groups = _of_sweep(path, reduced.maps), _by_configuration(reduced.medians)
     else:
+        aligners = [name for name in data.aligners if name in aligners]
         own, groups = one_run_sections(data), _by_robots(runs.read("errors"))
     provenance, stages = provenance_of(path, runs)
     return own | {
