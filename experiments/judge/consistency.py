@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from experiments.judge.errors import EvaluatedRobot
-from experiments.judge.fused_landmarks import fused_truth
+from experiments.judge.fused_landmarks import fused_truth, parent_points
 from mapfusion import se2
 from mapfusion.aligned_landmarks import ABSENT
 from mapfusion.chi_square import chi_square_bound
@@ -92,10 +92,7 @@ def _truly_fused(
     fused: FusedMap, robots: list[EvaluatedRobot], iteration: int, radius_m: float
 ) -> np.ndarray:
     """Rows of the fused map with several parents, all of which show one true point."""
-    points = np.full((*fused.parents.shape, 3), np.nan)
-    for place, robot in enumerate(robots):
-        has = fused.parents[:, place] != ABSENT
-        points[has, place] = robot.at(iteration)[1][fused.parents[has, place]]
+    points = parent_points(fused, robots, iteration)
     has = fused.parents != ABSENT
     apart = np.linalg.norm(points[:, :, None] - points[:, None], axis=3)
     both = has[:, :, None] & has[:, None]

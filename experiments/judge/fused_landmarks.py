@@ -126,12 +126,18 @@ def _judged(
     return judged
 
 
-def fused_truth(fused: FusedMap, robots: list[EvaluatedRobot], iteration: int) -> Float:
-    """True world points (N, 3) of fused landmarks: the mean of their parents'; NaN if unknown."""
-    points = np.full((len(fused.parents), len(robots), 3), np.nan)
+def parent_points(fused: FusedMap, robots: list[EvaluatedRobot], iteration: int) -> Float:
+    """True world points (N, M, 3) of each fused landmark's parents; NaN where none or unknown."""
+    points = np.full((*fused.parents.shape, 3), np.nan)
     for k, robot in enumerate(robots):
         has = fused.parents[:, k] != ABSENT
         points[has, k] = robot.at(iteration)[1][fused.parents[has, k]]
+    return points
+
+
+def fused_truth(fused: FusedMap, robots: list[EvaluatedRobot], iteration: int) -> Float:
+    """True world points (N, 3) of fused landmarks: the mean of their parents'; NaN if unknown."""
+    points = parent_points(fused, robots, iteration)
     known = np.all(np.isfinite(points), axis=2)
     total = np.where(known[:, :, None], points, 0.0).sum(axis=1)
     count = np.count_nonzero(known, axis=1, keepdims=True)

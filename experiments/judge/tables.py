@@ -2,7 +2,8 @@
 
 All are Parquet, in `RESULT/tables/`. Units are in the names; rotations are counter-clockwise.
 `elapsed_s` columns live in `timings` and `aligner_timings` alone: every other table is the same,
-bit for bit, whenever the scenario and the seed are.
+bit for bit, whenever the scenario and the seed are. A column's type follows from its name, which
+means the same in all tables: what is not listed in `_NAMES` is a float.
 """
 
 from pathlib import Path
@@ -15,10 +16,15 @@ from experiments.run import frames
 from experiments.run.stage_tables import CORRESPONDENCES, ESTIMATES, TRACKS
 from mapfusion.storage import point_fields, schema
 
-_BOOL, _FLOAT, _INT, _TEXT = frames.BOOL, frames.FLOAT, frames.INT, frames.TEXT
-_fields = frames.fields
-_SINGLE = pa.float32()  # for looking at, not for computing with: hundreds of maps, half the size
-
+# Names that are no floats.
+_NAMES = {
+    frames.TEXT: """aligner delta_unit landmarks left_out map name quantity reason refined_status
+        robot robot_a robot_b source stage status""",
+    frames.INT: """count degrees_of_freedom iteration landmark landmark_a landmark_b n n_common
+        n_correspondences n_inliers n_landmarks n_parents n_true particle repetition""",
+    frames.BOOL: "accepted resampled true_pair",
+}
+_TYPES = {name: kind for kind, names in _NAMES.items() for name in names.split()}
 
 ALL: dict[str, pa.Schema] = {
     "estimates": ESTIMATES,
@@ -27,41 +33,31 @@ ALL: dict[str, pa.Schema] = {
 }
 
 
-def _table(name: str, version: int, columns: list[pa.Field]) -> None:
-    """Declare a table of results."""
-    ALL[name] = schema(f"result.{name}", version, columns)
+def _table(name: str, version: int, *columns: str | list[pa.Field]) -> None:
+    """Declare a table of results: names of columns, and fields of other types, in their order."""
+    fields = []
+    for each in columns:
+        if isinstance(each, str):
+            types = {column: _TYPES.get(column, frames.FLOAT) for column in each.split()}
+            each = frames.fields(**types)
+        fields += each
+    ALL[name] = schema(f"result.{name}", version, fields)
 
 
 # One row per (robot pair, iteration, aligner, repetition), the estimates joined with the truth.
-# The aligner named "oracle" was given the true pairs; it has one repetition.
+# The aligner named "oracle" was given the true pairs; it has one repetition. rotation_error_rad is
+# signed, estimate minus truth; accepted and log10_false_alarms are of the refined alignment, by the
+# test against chance; oracle_distance: of the refined alignment from the oracle's; n_true: true
+# ones among the correspondences; n_common: landmarks of the two maps that truly correspond;
+# precision and recall: of the refined inliers; alignment_nees: refined, 3 degrees of freedom.
 _table(
     "errors",
     2,
-    _fields(
-        robot_a=_TEXT,
-        robot_b=_TEXT,
-        iteration=_INT,
-        aligner=_TEXT,
-        repetition=_INT,
-        status=_TEXT,
-        reason=_TEXT,
-        translation_error_m=_FLOAT,
-        rotation_error_rad=_FLOAT,  # signed: estimate minus truth
-        refined_status=_TEXT,
-        refined_translation_error_m=_FLOAT,
-        refined_rotation_error_rad=_FLOAT,
-        accepted=_BOOL,  # the refined alignment, by the test against chance
-        log10_false_alarms=_FLOAT,
-        oracle_distance_m=_FLOAT,  # refined translation against the oracle's
-        oracle_distance_rad=_FLOAT,
-        n_correspondences=_INT,
-        n_true=_INT,  # true ones among the correspondences
-        n_common=_INT,  # landmarks of the two maps that truly correspond
-        n_inliers=_INT,
-        precision=_FLOAT,  # of the refined inliers
-        recall=_FLOAT,
-        alignment_nees=_FLOAT,  # of the refined alignment, 3 degrees of freedom
-    ),
+    "robot_a robot_b iteration aligner repetition status reason",
+    "translation_error_m rotation_error_rad",
+    "refined_status refined_translation_error_m refined_rotation_error_rad",
+    "accepted log10_false_alarms oracle_distance_m oracle_distance_rad",
+    "n_correspondences n_true n_common n_inliers precision recall alignment_nees",
 )
 
 
@@ -88,22 +84,13 @@ SHOWN = {
     "accepted": Shown("ok\n", ".0%", "share"),
 }
 
-# One row per (robot, iteration); best particle online, anchored at the start, no fit.
+# One row per (robot, iteration); best particle online, anchored at the start, no fit. spread_m:
+# root of the trace of the particles' weighted position covariance.
 _table(
     "robots",
     1,
-    _fields(
-        robot=_TEXT,
-        iteration=_INT,
-        path_error_m=_FLOAT,
-        path_error_rad=_FLOAT,
-        odometry_error_m=_FLOAT,
-        odometry_error_rad=_FLOAT,
-        effective_sample_size=_FLOAT,
-        resampled=_BOOL,
-        n_landmarks=_INT,
-        spread_m=_FLOAT,  # root of the trace of the particles' weighted position covariance
-    ),
+    "robot iteration path_error_m path_error_rad odometry_error_m odometry_error_rad",
+    "effective_sample_size resampled n_landmarks spread_m",
 )
 
 # Paths in the robot's own frame: the best particle's whole path at the end, the online estimate,
@@ -111,177 +98,92 @@ _table(
 _table(
     "paths",
     1,
-    _fields(
-        robot=_TEXT,
-        iteration=_INT,
-        **{
-            f"{source}_{field}": _FLOAT
-            for source in ("final", "online", "odometry", "truth")
-            for field in ("x_m", "y_m", "theta_rad")
-        },
-    ),
+    "robot iteration final_x_m final_y_m final_theta_rad online_x_m online_y_m online_theta_rad",
+    "odometry_x_m odometry_y_m odometry_theta_rad truth_x_m truth_y_m truth_theta_rad",
 )
 
 # Particles at the kept iterations, in the robot's own frame.
-_table(
-    "clouds",
-    1,
-    _fields(
-        robot=_TEXT,
-        iteration=_INT,
-        particle=_INT,
-        x_m=_FLOAT,
-        y_m=_FLOAT,
-        theta_rad=_FLOAT,
-        log_weight=_FLOAT,
-    ),
-)
+_table("clouds", 1, "robot iteration particle x_m y_m theta_rad log_weight")
 
 # The robots' last maps, each in its own frame; the true point is given in the same frame.
-_table(
-    "landmarks",
-    1,
-    [
-        pa.field("robot", _TEXT),
-        pa.field("landmark", _INT),
-        *point_fields(),
-        *_fields(count=_INT, truth_x_m=_FLOAT, truth_y_m=_FLOAT, truth_z_m=_FLOAT),
-    ],
-)
+_TRUE_POINT = "truth_x_m truth_y_m truth_z_m"
+_table("landmarks", 1, "robot landmark", point_fields(), "count", _TRUE_POINT)
 
-# The fused map in the frame of the first robot. Parents are rows of the robots' last maps.
+# The fused map in the frame of the first robot. The parents are rows of the robots' last maps;
+# robot_b is empty for a landmark that was carried over from one map.
 _table(
     "fused",
     1,
-    [
-        pa.field("landmark", _INT),
-        *point_fields(),
-        *_fields(
-            n_parents=_INT,
-            robot_a=_TEXT,  # first parent
-            landmark_a=_INT,
-            robot_b=_TEXT,  # second parent, empty when carried over from one map
-            landmark_b=_INT,
-            truth_x_m=_FLOAT,
-            truth_y_m=_FLOAT,
-            truth_z_m=_FLOAT,
-        ),
-    ],
+    "landmark",
+    point_fields(),
+    "n_parents robot_a landmark_a robot_b landmark_b",
+    _TRUE_POINT,
 )
 
-# How each robot's last map was moved into the fused map, the first robot's own among them.
-_table(
-    "fused_motions",
-    1,
-    _fields(
-        robot=_TEXT,
-        tx_m=_FLOAT,  # NaN for a map that was left out
-        ty_m=_FLOAT,
-        theta_rad=_FLOAT,
-        drift_sigma_m=_FLOAT,  # as added to the landmarks' covariance, in x and y
-        left_out=_TEXT,  # why; empty for a map that was fused
-    ),
-)
+# How each robot's last map was moved into the fused map, the first robot's own among them; NaN for
+# a map that was left out, with the reason (else empty). drift_sigma_m: as added to the landmarks'
+# covariance in x and y.
+_table("fused_motions", 1, "robot tx_m ty_m theta_rad drift_sigma_m left_out")
 
 # The robots' maps at each evaluated iteration, in plan, each in its own frame. `landmark` is the
-# row of the map at that iteration, which correspondences of that iteration refer to.
-_PLAN = _fields(x_m=_SINGLE, y_m=_SINGLE, cov_xx_m2=_SINGLE, cov_xy_m2=_SINGLE, cov_yy_m2=_SINGLE)
-_table("map_history", 1, [*_fields(robot=_TEXT, iteration=_INT, landmark=_INT), *_PLAN])
+# row of the map at that iteration, which correspondences of that iteration refer to. Single
+# precision, for looking at and not for computing with: hundreds of maps take half the size.
+_PLAN = frames.fields(
+    **dict.fromkeys(("x_m", "y_m", "cov_xx_m2", "cov_xy_m2", "cov_yy_m2"), pa.float32())
+)
+_table("map_history", 1, "robot iteration landmark", _PLAN)
 
 # Landmarks that the merging aligner's inliers joined at that iteration, fused, in robot a's frame.
-_table(
-    "fused_history",
-    1,
-    [
-        *_fields(robot_a=_TEXT, robot_b=_TEXT, iteration=_INT, landmark_a=_INT, landmark_b=_INT),
-        *_PLAN,
-    ],
-)
+_table("fused_history", 1, "robot_a robot_b iteration landmark_a landmark_b", _PLAN)
 
 # Which of the correspondences are true: one bit each, in their order in `correspondences`.
 _table(
     "true_pairs",
     1,
-    _fields(
-        robot_a=_TEXT, robot_b=_TEXT, iteration=_INT, n_correspondences=_INT, true_pair=pa.binary()
-    ),
+    "robot_a robot_b iteration n_correspondences",
+    [pa.field("true_pair", pa.binary())],
 )
 
-# One row per fused landmark with two parents, per robot pair: was fusing worth it?
+# One row per fused landmark with two parents, per robot pair: was fusing worth it? error_b_m is
+# moved into frame a by the estimate.
 _table(
     "fusion",
     1,
-    _fields(
-        robot_a=_TEXT,
-        robot_b=_TEXT,
-        landmark_a=_INT,
-        landmark_b=_INT,
-        error_a_m=_FLOAT,
-        error_b_m=_FLOAT,  # moved into frame a by the estimate
-        error_fused_m=_FLOAT,
-        nees_with_drift=_FLOAT,
-        nees_without_drift=_FLOAT,
-        degrees_of_freedom=_INT,
-        true_pair=_BOOL,
-    ),
+    "robot_a robot_b landmark_a landmark_b error_a_m error_b_m error_fused_m",
+    "nees_with_drift nees_without_drift degrees_of_freedom true_pair",
 )
 
 # Per map, after the best rigid fit to the truth; "fused" is the fused map.
-_table(
-    "map_fits",
-    1,
-    _fields(map=_TEXT, n_landmarks=_INT, rmse_m=_FLOAT),
-)
+_table("map_fits", 1, "map n_landmarks rmse_m")
 
 # Errors of whole paths with evo's seven statistics; see experiments/judge/path_errors.py.
+# source: final, online (as in `paths`) or odometry; quantity: ate_m (after the best rigid fit),
+# ate_from_start_m, rpe_m or rpe_rad, these over delta (frames or m); n: poses, or pairs of poses.
 _table(
     "path_statistics",
     1,
-    _fields(
-        robot=_TEXT,
-        source=_TEXT,  # final, online (as in `paths`) or odometry
-        quantity=_TEXT,  # ate_m (after the best rigid fit), ate_from_start_m, rpe_m, rpe_rad
-        delta=_FLOAT,  # of the relative errors
-        delta_unit=_TEXT,  # frames or m
-        n=_INT,  # poses, or pairs of poses
-        **dict.fromkeys(("rmse", "mean", "median", "std", "min", "max", "sse"), _FLOAT),
-    ),
+    "robot source quantity delta delta_unit n rmse mean median std min max sse",
 )
 
-# NEES of each map's landmarks, before merging and after; see experiments/judge/consistency.py.
+# NEES of each map's landmarks (map: a robot, or "fused"), before merging and after; see
+# experiments/judge/consistency.py. landmarks: own, all of a robot's map; before fusing, those of
+# them that were truly fused; fused, of the merged map, with several parents; carried over, with
+# one. n_landmarks: with a known truth. share_in_gate: of 95 %.
 _table(
     "landmark_nees",
     1,
-    _fields(
-        map=_TEXT,  # a robot, or "fused"
-        # own: all of a robot's map; before fusing: those of them that were truly fused;
-        # fused: of the merged map, with several parents; carried over: with one
-        landmarks=_TEXT,
-        n_landmarks=_INT,  # with a known truth
-        degrees_of_freedom=_INT,
-        nees_mean=_FLOAT,
-        nees_median=_FLOAT,
-        share_in_gate=_FLOAT,  # of 95 %
-    ),
+    "map landmarks n_landmarks degrees_of_freedom nees_mean nees_median share_in_gate",
 )
 
-_table("timings", 1, _fields(stage=_TEXT, name=_TEXT, elapsed_s=_FLOAT))
+# Seconds of work by stage.
+_table("timings", 1, "stage name elapsed_s")
 
-# Serial, warmed, repeated: figure 6.
+# Serial, warmed, repeated: figure 6. Median of the repeats, 10th and 90th percentile.
 _table(
     "aligner_timings",
     1,
-    _fields(
-        robot_a=_TEXT,
-        robot_b=_TEXT,
-        iteration=_INT,
-        aligner=_TEXT,
-        n_correspondences=_INT,
-        n_common=_INT,
-        elapsed_s=_FLOAT,  # median of the repeats
-        elapsed_low_s=_FLOAT,  # 10th and 90th percentile
-        elapsed_high_s=_FLOAT,
-    ),
+    "robot_a robot_b iteration aligner n_correspondences n_common",
+    "elapsed_s elapsed_low_s elapsed_high_s",
 )
 
 

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from rich.console import Console
 from rich.markup import escape
@@ -143,7 +144,7 @@ def _print_where_it_fails(console: Console, summary: Summary) -> None:
     rows, labels = _shown(summary, "success_by_true_pairs")
     if rows.empty:
         return
-    last = rows["to"].map(lambda end: "+" if math.isinf(end) else "")
+    last = np.where(rows["to"] == math.inf, "+", "")
     rows = rows.assign(bin=rows["from"].map("{:.0f}".format) + last)
     shares = rows.assign(percent=100 * rows["estimated_success"]).pivot_table(
         "percent", [*labels, "aligner"], "bin", sort=False

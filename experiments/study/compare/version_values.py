@@ -29,33 +29,33 @@ MATCH = "match"
 Scale = Literal["ratio", "share", "ln"]
 
 
-class Metric(NamedTuple):
-    """A quantity that two versions are compared in.
+class Quantity(NamedTuple):
+    """What two versions are compared in.
 
     Attributes:
-        name: of the quantity, with its unit.
-        aligner: whose, or empty.
+        metric: its name, with its unit.
+        method: the aligner, or empty.
         scale: how its change is told.
         higher_is_better: else lower is.
         timed: depends on the machine and its load, which runs share.
     """
 
-    name: str
-    aligner: str
+    metric: str
+    method: str
     scale: Scale
     higher_is_better: bool = False
     timed: bool = False
 
 
 class Values(NamedTuple):
-    """One metric in both versions: columns match (the run), a, b, change."""
+    """One quantity in both versions: columns match (the run), a, b, change."""
 
-    metric: Metric
+    quantity: Quantity
     rows: pd.DataFrame
 
 
 def all_values(a: Runs, b: Runs) -> Iterator[Values]:
-    """All metrics that both versions have tables for."""
+    """All quantities that both versions have tables for."""
     for table, build in _BUILT_FROM.items():
         if a.has(table) and b.has(table):
             yield from build(a, b)
@@ -98,29 +98,29 @@ def _of_alignments(a: Runs, b: Runs) -> Iterator[Values]:
             ("refined_success", "success refined", True),
             ("false_accepted", "wrongly accepted", False),
         ):
-            yield _difference(Metric(label, aligner, "share", higher), own, name)
+            yield _difference(Quantity(label, aligner, "share", higher), own, name)
         ground = _in_both(own, lambda rows: rows[has_common_ground(rows)])
-        yield _difference(Metric("accepted", aligner, "share", True), ground, "accepted")
-        metric = Metric("estimated error, m", aligner, "ratio")
-        yield _ratio(metric, _in_both(own, answerable), "translation_error_m")
-        metric = Metric("refined / oracle", aligner, "ratio")
-        yield _ratio(metric, _in_both(own, rich), "over_oracle")
+        yield _difference(Quantity("accepted", aligner, "share", True), ground, "accepted")
+        quantity = Quantity("estimated error, m", aligner, "ratio")
+        yield _ratio(quantity, _in_both(own, answerable), "translation_error_m")
+        quantity = Quantity("refined / oracle", aligner, "ratio")
+        yield _ratio(quantity, _in_both(own, rich), "over_oracle")
     enough = _in_both(oracle, answerable)
-    yield _ratio(Metric("refined error, m", ORACLE, "ratio"), enough, refined)
-    yield _ratio(Metric("true pairs", "", "ratio", True), enough, "n_true")
+    yield _ratio(Quantity("refined error, m", ORACLE, "ratio"), enough, refined)
+    yield _ratio(Quantity("true pairs", "", "ratio", True), enough, "n_true")
 
 
-def _ratio(metric: Metric, rows: pd.DataFrame, column: str) -> Values:
+def _ratio(quantity: Quantity, rows: pd.DataFrame, column: str) -> Values:
     """Log ratios, where both versions have a positive, finite value; success tells the rest."""
     a, b = (rows[f"{column}_{side}"].to_numpy(dtype=np.float64) for side in "ab")
     frame = pd.DataFrame({MATCH: rows[MATCH].to_numpy(), "a": a, "b": b, "change": log_ratio(b, a)})
-    return Values(metric, frame[np.isfinite(a) & np.isfinite(frame["change"])])
+    return Values(quantity, frame[np.isfinite(a) & np.isfinite(frame["change"])])
 
 
-def _difference(metric: Metric, rows: pd.DataFrame, column: str) -> Values:
+def _difference(quantity: Quantity, rows: pd.DataFrame, column: str) -> Values:
     a, b = (rows[f"{column}_{side}"].to_numpy(dtype=np.float64) for side in "ab")
     frame = pd.DataFrame({MATCH: rows[MATCH].to_numpy(), "a": a, "b": b, "change": b - a})
-    return Values(metric, frame.dropna())
+    return Values(quantity, frame.dropna())
 
 
 def _of_paths(a: Runs, b: Runs) -> Iterator[Values]:
@@ -129,15 +129,15 @@ def _of_paths(a: Runs, b: Runs) -> Iterator[Values]:
             yield path_rms(rows, [*RUN_KEYS, *setting_columns(rows), "robot"])
 
     rows = _joined(a, b, ["robot"], read)
-    yield _ratio(Metric("path RMSE, m", "", "ratio"), rows, "path_m")
-    yield _ratio(Metric("odometry RMSE, m", "", "ratio"), rows, "odometry_m")
+    yield _ratio(Quantity("path RMSE, m", "", "ratio"), rows, "path_m")
+    yield _ratio(Quantity("odometry RMSE, m", "", "ratio"), rows, "odometry_m")
 
 
 def _of_fits(a: Runs, b: Runs) -> Iterator[Values]:
     rows = _joined(a, b, ["map"], lambda runs: runs.each("map_fits", ["map", "rmse_m"]))
     is_fused = rows["map"] == "fused"
-    yield _ratio(Metric("landmark RMSE, m", "", "ratio"), rows[~is_fused], "rmse_m")
-    yield _ratio(Metric("fused RMSE, m", "", "ratio"), rows[is_fused], "rmse_m")
+    yield _ratio(Quantity("landmark RMSE, m", "", "ratio"), rows[~is_fused], "rmse_m")
+    yield _ratio(Quantity("fused RMSE, m", "", "ratio"), rows[is_fused], "rmse_m")
 
 
 def _of_consistency(a: Runs, b: Runs) -> Iterator[Values]:
@@ -155,16 +155,16 @@ def _of_consistency(a: Runs, b: Runs) -> Iterator[Values]:
     rows = rows[(rows["nees_a"] > 0) & (rows["nees_b"] > 0)]
     off = {side: np.abs(np.log(rows[f"nees_{side}"])) for side in "ab"}
     frame = rows.rename(columns={"nees_a": "a", "nees_b": "b"})[[MATCH, "a", "b"]]
-    metric = Metric("fused NEES / dof", "", "ln")
-    yield Values(metric, frame.assign(change=off["b"] - off["a"]))
+    quantity = Quantity("fused NEES / dof", "", "ln")
+    yield Values(quantity, frame.assign(change=off["b"] - off["a"]))
 
 
 def _of_times(a: Runs, b: Runs) -> Iterator[Values]:
     keys = [*MAP_KEYS, "aligner"]
     rows = _joined(a, b, keys, lambda runs: runs.each("aligner_timings", [*keys, "elapsed_s"]))
     for aligner in methods_in(rows):
-        metric = Metric("time, s", aligner, "ratio", timed=True)
-        yield _ratio(metric, rows[rows["aligner"] == aligner], "elapsed_s")
+        quantity = Quantity("time, s", aligner, "ratio", timed=True)
+        yield _ratio(quantity, rows[rows["aligner"] == aligner], "elapsed_s")
 
 
 _BUILT_FROM = {

@@ -38,8 +38,9 @@ class VersionComparison:
     """What two versions differ in.
 
     Attributes:
-        table: one row a metric: metric, method, a and b (medians over all rows), scale, change (a
-            factor b / a, or a difference), low, high, n_units, n_rows, p, p_holm, timed, verdict.
+        table: one row a metric: metric, method, scale, timed, a and b (medians over all rows),
+            change (a factor b / a, or a difference), low, high, n_units, n_rows, identical, p,
+            p_holm, verdict.
         unit: what n_units counts, "run" or "maps of one run".
         n_runs: matched.
         notes: what a reader must know, one line each.
@@ -94,34 +95,17 @@ def compare(path_a: Path, path_b: Path) -> VersionComparison:
 
 def _judged(values: Values, n_runs: int) -> dict[str, Any]:
     """One row of the table, verdict and correction apart."""
-    metric, rows = values
-    is_share = metric.scale == "share"
-    changes = change_of_each_run(
-        rows["change"].to_numpy(), rows[MATCH].to_numpy(), n_runs, is_share
-    )
+    quantity, rows = values
+    is_share, is_ratio = quantity.scale == "share", quantity.scale == "ratio"
+    match = rows[MATCH].to_numpy()
+    changes = change_of_each_run(rows["change"].to_numpy(), match, n_runs, is_share)
     found = mean_change(changes)
-    change = [found.change, found.low, found.high]
+    told = np.exp(found[:3]) if is_ratio else found[:3]
     a, b = rows[["a", "b"]].mean() if is_share else rows[["a", "b"]].median()
-    return {
-        "metric": metric.name,
-        "method": metric.aligner,
-        "a": a,
-        "b": b,
-        "scale": metric.scale,
-        **dict(
-            zip(
-                ("change", "low", "high"),
-                np.exp(change) if metric.scale == "ratio" else change,
-                strict=True,
-            )
-        ),
-        "n_units": len(changes),
-        "n_rows": len(rows),
-        "p": found.p,
-        "identical": not rows["change"].any(),
-        "timed": metric.timed,
-        "higher_is_better": metric.higher_is_better,
-    }
+    row = quantity._asdict() | {"a": a, "b": b}
+    row |= dict(zip(("change", "low", "high"), told, strict=True))
+    row |= {"n_units": len(changes), "n_rows": len(rows), "p": found.p}
+    return row | {"identical": not rows["change"].any()}
 
 
 def _verdict(row: dict[Any, Any]) -> str:

@@ -59,7 +59,7 @@ def change_of_each_run(changes: Float, run_id: Any, n_runs: int, mean: bool = Fa
     if n_runs == 1:
         return changes
     groups = pd.Series(changes).groupby(np.asarray(run_id), sort=False)
-    return (groups.mean() if mean else groups.median()).to_numpy()
+    return np.asarray(groups.mean() if mean else groups.median(), dtype=np.float64)
 
 
 def mean_change(changes: Float) -> BetterTest:

@@ -41,9 +41,10 @@ class ResultFolder:
     seed: int
 
     @property
-    def run_id(self) -> str:
-        """As the folder is named by `run`; the folder itself may have been renamed."""
-        return f"{self.scenario}-{self.seed}"
+    def run(self) -> dict[str, Any]:
+        """The run's columns. The folder was named so by `run`; it may have been renamed since."""
+        run_id = f"{self.scenario}-{self.seed}"
+        return {"run_id": run_id, "scenario": self.scenario, "seed": self.seed}
 
 
 @dataclass(frozen=True)
@@ -61,9 +62,7 @@ class Runs:
     def files(self, table: str) -> list[_RunFile]:
         """The files of one table, one a run, in a fixed order; none where no run has it."""
         found = [
-            _RunFile(
-                path, {"run_id": result.run_id, "scenario": result.scenario, "seed": result.seed}
-            )
+            _RunFile(path, result.run)
             for result in self.results
             if (path := tables.table_path(result.folder, table)).is_file()
         ]
@@ -84,14 +83,12 @@ class Runs:
         self, table: str, columns: Sequence[str] | None = None, optional: Sequence[str] = ()
     ) -> Iterator[pd.DataFrame]:
         """Each run's rows; see `read`."""
-        files = self.files(table)
-        if not files:
+        if not self.has(table):
             where = ", ".join(str(path) for path in self.folders)
-            raise InputError(
-                f"{where}: no table {table} (expected the results of `run` or `sweep`)"
-            )
+            what = f"no table {table} (expected the results of `run` or `sweep`)"
+            raise InputError(f"{where}: {what}")
         seen: dict[str, Path] = {}
-        for file in files:
+        for file in self.files(table):
             rows = _read(file, table, columns, optional)
             for run_id in rows["run_id"].unique():
                 if run_id in seen:

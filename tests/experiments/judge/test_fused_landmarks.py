@@ -4,7 +4,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.judge.fused_landmarks import fused_maps, fused_truth, fusion_rows, map_fit_rows
+from experiments.judge.fused_landmarks import (
+    fused_maps,
+    fused_motion_rows,
+    fused_truth,
+    fusion_rows,
+    map_fit_rows,
+)
 from experiments.run.estimates import estimate_row
 from experiments.scenario.settings import Merge
 from mapfusion import se2
@@ -91,7 +97,8 @@ def test_fused_landmarks_are_judged_by_the_middle_of_two_truths(planar: bool) ->
 
 def test_only_accepted_alignments_are_fused() -> None:
     points = np.random.default_rng(1).uniform(0, 5, (6, 3))
-    maps = [robot(name, points, np.zeros(3)).maps[ITERATION] for name in ("A", "B")]
+    robots = [robot(name, points, np.zeros(3)) for name in ("A", "B")]
+    maps = [one.maps[ITERATION] for one in robots]
     found = Alignment(
         np.zeros(3), np.eye(3), np.ones(6, bool), 0.0, Status.ACCEPTED, drift_sigma_m=0.0
     )
@@ -107,6 +114,9 @@ def test_only_accepted_alignments_are_fused() -> None:
         assert fused.left_out == left_out
         assert len(fused.landmarks) == n  # fused with B's, or A's alone
         assert (fused.parents[:, 1] == ABSENT).all() == bool(left_out)
+        motions = pd.DataFrame(fused_motion_rows(robots, fused, Merge())).set_index("robot")
+        assert motions["left_out"].to_dict() == {"A": "", "B": dict(left_out).get("B", "")}
+        assert np.isnan(motions.loc["B", "tx_m"]) == bool(left_out)
 
 
 def test_truth_of_fused_landmarks_and_fits() -> None:

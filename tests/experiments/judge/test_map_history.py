@@ -7,6 +7,7 @@ import pandas as pd
 
 from experiments.judge import tables
 from experiments.run.estimates import inlier_mask
+from mapfusion import se2
 
 PLAN = ["x_m", "y_m", "cov_xx_m2", "cov_xy_m2", "cov_yy_m2"]
 
@@ -52,3 +53,22 @@ def test_only_accepted_alignments_fuse(tiny_result: Path) -> None:
     merged = estimates[(estimates["aligner"] == "ransac") & (estimates["repetition"] == 0)]
     accepted = merged[merged["refined_status"] == "accepted"]["iteration"]
     assert set(read(tiny_result, "fused_history")["iteration"]) <= set(accepted)
+
+
+def test_the_fused_motions_are_those_that_moved_the_landmarks(tiny_result: Path) -> None:
+    """A landmark that one robot alone saw lies in the fused map where its motion puts it."""
+    fused, landmarks = read(tiny_result, "fused"), read(tiny_result, "landmarks")
+    carried = fused[fused["n_parents"] == 1].merge(
+        landmarks, left_on=["robot_a", "landmark_a"], right_on=["robot", "landmark"]
+    )
+    for row in read(tiny_result, "fused_motions").to_dict("records"):
+        own = carried[carried["robot"] == row["robot"]]
+        T_first_robot = np.array([row["tx_m"], row["ty_m"], row["theta_rad"]])
+        moved = se2.transform_points(T_first_robot, own[["x_m_y", "y_m_y", "z_m_y"]].to_numpy())
+        np.testing.assert_allclose(moved, own[["x_m_x", "y_m_x", "z_m_x"]], atol=1e-9)
+        assert (row["left_out"] == "") == bool(len(own))
+        added = [
+            own[[f"cov_xx_m2_{side}", f"cov_yy_m2_{side}"]].to_numpy().sum() for side in "xy"
+        ]  # a turn changes no trace
+        expected = 2 * len(own) * row["drift_sigma_m"] ** 2
+        np.testing.assert_allclose(added[0] - added[1], expected, atol=1e-9)

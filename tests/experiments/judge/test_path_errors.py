@@ -9,6 +9,7 @@ from experiments.judge.path_errors import (
     ate_m,
     pairs_by_frames,
     pairs_by_length,
+    path_rms,
     path_statistics_rows,
     rpe,
     seven_statistics,
@@ -114,3 +115,14 @@ def test_hardly_any_truth(known: int) -> None:
     rows = pd.DataFrame(path_statistics_rows(paths_table(truth, path)))
     assert (rows[rows["quantity"] == "ate_m"]["n"] == known).all()
     assert rows[rows["delta_unit"] == "m"]["rmse"].isna().all()
+
+
+def test_rms_over_a_run_is_of_what_is_known() -> None:
+    rows = [("A", 3.0, 6.0), ("A", 4.0, 8.0), ("B", 2.0, 0.0), ("B", np.nan, 0.0)]
+    robots = pd.DataFrame(rows, columns=["robot", "path_error_m", "odometry_error_m"])
+    found = path_rms(robots.assign(n_landmarks=[1, 5, 2, 7])).set_index("robot")
+    assert found["path_m"].tolist() == [np.sqrt(12.5), 2.0]
+    assert found["odometry_m"].tolist() == [np.sqrt(50), 0.0]
+    assert found.loc["A", "over_odometry"] == pytest.approx(0.5)
+    assert np.isnan(found.loc["B", "over_odometry"])
+    assert found[["n_landmarks", "n_frames"]].to_numpy().tolist() == [[5, 2], [7, 2]]

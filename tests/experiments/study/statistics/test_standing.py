@@ -5,6 +5,8 @@ import pandas as pd
 import pytest
 
 from experiments.judge.judged_maps import maps_of
+from experiments.judge.tables import SHOWN, Shown
+from experiments.study.statistics.aligner_summary import aligner_summary
 from experiments.study.statistics.standing import recommend
 from tests.helpers.made_up_runs import many_errors
 
@@ -143,3 +145,22 @@ def test_few_runs_that_prove_nothing_do_not_make_a_poor_method_equal() -> None:
     verdict = verdict_of(errors, timings(good=9, poor=1))
     assert [s.aligner for s in verdict.standings] == ["good", "poor"]
     assert verdict.equals == ()
+
+
+def test_a_further_column_is_shown_by_naming_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Declared in SHOWN, a column of `errors` reaches the screens' and the reports' rows."""
+    errors = many_errors(2, repetitions=3).assign(accepted=True, precision=0.25)
+    monkeypatch.setitem(SHOWN, "precision", Shown("prec.", ".0%", "share"))
+    summary = aligner_summary(errors, timings(icp=2), ["icp", "oracle", "absent"])
+    assert list(summary["aligner"]) == ["icp", "oracle", "absent"]
+    rows = summary.set_index("aligner")
+    assert rows.loc["icp", ["precision", "time_ms"]].tolist() == [0.25, 2]
+    assert rows.loc["absent"].isna().all()
+    standing = verdict_of(errors).standings[0]
+    assert standing.shown["precision"] == 0.25
+    for column, value in (
+        ("translation_error_m", standing.estimated_m),
+        ("refined_rotation_error_rad", standing.refined_rad),
+    ):
+        found = aligner_summary(errors, timings(), [standing.aligner])[column][0]
+        assert found == value
