@@ -9,19 +9,16 @@ from typing import Any
 import jinja2
 from markupsafe import Markup
 
-from experiments.judge.criteria import ANSWERABLE_PAIRS
-from experiments.show.report import words
-from experiments.show.report.comparison import band_text
+from experiments.judge import criteria, tables
+from experiments.show import numbers
 from experiments.show.report.contents import contents_of
-from experiments.show.report.theme import palette
+from experiments.show.report.theme import css_name, palette
+from experiments.study.statistics.error_bands import BAND
 from mapfusion.storage import write_whole
 
 # The page is there, and the map can be used, before the browser reads Plotly for the charts.
 _AT_ONCE = ("base.js", "map.js")
-_FORMATS = {
-    name: getattr(words, name)
-    for name in ("metres", "radians", "milliseconds", "percent", "bare", "ratio", "within")
-}
+_DRAWN_BY_SCRIPTS = ("aligners", "groups", "success", "times", "map")
 
 
 def write_report(path: Path, output: Path | None = None) -> Path:
@@ -60,13 +57,19 @@ def render(contents: dict[str, Any]) -> str:
     )
     script = "\n".join(_page_file(name) for name in _AT_ONCE)
     later = {"plotly": get_plotlyjs(), "charts": _page_file("charts.js")}
+    robots, aligners = contents["robot_colours"], contents["aligners"]
+    data = {name: contents[name] for name in _DRAWN_BY_SCRIPTS}
+    data["min_true_pairs"] = criteria.ANSWERABLE_PAIRS
+    data["robot_colours"] = {robot: css_name(colour) for robot, colour in robots.items()}
     return environment.get_template("report.html.j2").render(
         contents,
-        text=_FORMATS,
-        style_of={style["name"]: style for style in contents["aligners"]},
-        palette=palette(contents["colours"]),
-        min_true_pairs=ANSWERABLE_PAIRS,
-        band_text=band_text(),
+        data=data,
+        text=numbers,
+        criteria=criteria,
+        shown=tables.SHOWN,
+        style_of={style["name"]: style for style in aligners},
+        palette=palette([*(style["hex"] for style in aligners), *robots.values()]),
+        band_text=f"{100 * BAND[0]:g}–{100 * BAND[1]:g}\u00a0%",
         style=Markup(_page_file("report.css")),  # noqa: S704  # our own file
         script=Markup(script),  # noqa: S704  # our own files
         **{name: Markup(text) for name, text in later.items()},  # noqa: S704  # Plotly's, our own
@@ -75,11 +78,8 @@ def render(contents: dict[str, Any]) -> str:
 
 
 def _page_file(name: str) -> str:
-    return (
-        resources.files("experiments.show.report")
-        .joinpath("page", name)
-        .read_text(encoding="utf-8")
-    )
+    folder = resources.files("experiments.show.report")
+    return folder.joinpath("page", name).read_text(encoding="utf-8")
 
 
 def _policy(scripts: list[str]) -> str:

@@ -3,6 +3,8 @@
 from collections.abc import Iterable
 from typing import Any
 
+from matplotlib.colors import to_hex, to_rgb
+
 from experiments.show.figures.style import BLACK, BLUE, ORANGE
 
 _SURFACES = {
@@ -65,44 +67,32 @@ def css_name(colour: str) -> str:
 
 def chart_style(style: dict[str, Any]) -> dict[str, str]:
     """An aligner's matplotlib style in the page's and Plotly's terms."""
+    line = style["linestyle"]  # Plotly takes dashes as lengths in pixels, or a name
     return {
         "colour": css_name(style["color"]),
         "hex": style["color"],
         "marker": _MARKERS.get(style["marker"], "circle"),
-        "dash": _dash(style["linestyle"]),
+        "dash": "solid" if isinstance(line, str) else ",".join(f"{2 * n:g}px" for n in line[1]),
     }
-
-
-def _dash(linestyle: Any) -> str:
-    """Plotly takes dashes as lengths in pixels, or a name."""
-    if isinstance(linestyle, str):
-        return "solid"
-    return ",".join(f"{2 * length:g}px" for length in linestyle[1])
 
 
 def lightened(colour: str, background: str) -> str:
     """The hue with as much white as it needs to stand out from a dark background."""
-    channels = _channels(colour)
     white = 0.0
     found = colour.lower()
     while contrast(found, background) < MIN_CONTRAST:
         white += _LIGHTENING_STEP
-        found = "#" + "".join(f"{round(255 * (c + (1 - c) * white)):02x}" for c in channels)
+        red, green, blue = (c + (1 - c) * white for c in to_rgb(colour))
+        found = to_hex((red, green, blue))
     return found
 
 
 def contrast(first: str, second: str) -> float:
     """Contrast ratio of two colours, 1 to 21 (WCAG 2.2)."""
-    lighter, darker = sorted((_luminance(first), _luminance(second)), reverse=True)
+    darker, lighter = sorted((_luminance(first), _luminance(second)))
     return (lighter + 0.05) / (darker + 0.05)
 
 
-def _channels(colour: str) -> list[float]:
-    return [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
-
-
 def _luminance(colour: str) -> float:
-    linear = [
-        c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in _channels(colour)
-    ]
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in to_rgb(colour)]
     return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]

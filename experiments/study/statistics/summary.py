@@ -18,6 +18,7 @@ from experiments.study.statistics.paired import compare_methods
 from experiments.study.statistics.path_summary import path_summary
 from experiments.study.statistics.run_tables import Runs
 from experiments.study.statistics.success_rates import LAST, success_rates
+from mapfusion.align.result import Status
 
 ALL_SCENARIOS = "(all)"
 _TIMING_COLUMNS = (*MAP_KEYS, "aligner", "n_correspondences", "n_common", "elapsed_s")
@@ -74,7 +75,8 @@ def configurations(frame: pd.DataFrame) -> Iterator[tuple[dict[str, Any], pd.Dat
 
 def summarise(runs: Runs) -> Summary:
     """Everything there is to say about these runs; a table that none of them has is left out."""
-    maps, medians = _reduced_errors(runs)
+    reduced = reduced_errors(runs)
+    maps, medians = reduced.maps, reduced.medians
     made = {
         name: _each(maps, lambda rows, _, by=by: success_rates(rows, by))
         for by, name in _FILE_NAMES.items()
@@ -100,17 +102,38 @@ def summarise(runs: Runs) -> Summary:
     return Summary(len(runs.names), made, medians, timings, missing, runs.failed)
 
 
-def _reduced_errors(runs: Runs) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Rows of `maps_of`, and each run's medians, read run by run."""
+@dataclass(frozen=True)
+class ReducedErrors:
+    """The errors of some runs, read and reduced run by run.
+
+    Attributes:
+        maps: rows of `maps_of`, with the overlap.
+        medians: rows of `medians_of_run`.
+        absent: aligners whose package is not installed, which is no failure.
+    """
+
+    maps: pd.DataFrame
+    medians: pd.DataFrame
+    absent: list[str]
+
+
+def reduced_errors(runs: Runs) -> ReducedErrors:
+    """All that statistics, figures and reports say of errors starts from these rows."""
     maps, medians = [], []
-    for errors in runs.each("errors", NEEDED, OPTIONAL):
+    every: dict[str, None] = {}
+    for whole in runs.each("errors", NEEDED, ("status", *OPTIONAL)):
+        every |= dict.fromkeys(whole["aligner"])
+        errors = whole[whole["status"] != Status.ABSENT]
         if len(errors):
             maps.append(maps_of(errors))
             medians.append(medians_of_run(errors))
     if not maps:  # robots that were alone
-        return pd.DataFrame(columns=["scenario"]), pd.DataFrame(columns=["scenario", "run_id"])
+        nothing = pd.DataFrame(columns=["run_id", "scenario", "aligner"])
+        return ReducedErrors(nothing, nothing, list(every))
     joined = with_overlap_share(pd.concat(maps, ignore_index=True), runs)
-    return joined, pd.concat(medians, ignore_index=True)
+    there = set(joined["aligner"])
+    absent = [name for name in every if name not in there]
+    return ReducedErrors(joined, pd.concat(medians, ignore_index=True), absent)
 
 
 def _error_bands(rows: pd.DataFrame, label: tuple[str, ...]) -> pd.DataFrame:

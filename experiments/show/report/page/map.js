@@ -263,8 +263,8 @@
     if (placed !== "") {
       const error = alignment && alignment.error[stage];
       facts.push(["error", error && error[0] !== null ? `${short(error[0])} m, ${short(error[1])} rad` : "no estimate"]);
-      facts.push(["judged", alignment ? (alignment.accepted ? "accepted" : alignment.status === "accepted" ? "refused" : alignment.status) : "–"]);
-      if (alignment && alignment.reason) facts.push(["why", alignment.reason]);
+      facts.push(["status", alignment ? (alignment.accepted ? "accepted" : alignment.status === "accepted" ? "refused" : alignment.status) : "–"]);
+      if (alignment && alignment.reason) facts.push(["reason", alignment.reason]);
     }
     const list = byId("plan-facts");
     list.replaceChildren(...facts.map(([term, value]) => {

@@ -96,6 +96,15 @@ def test_real_results_fit(tiny_result: Path, tmp_path: Path) -> None:
     assert "path_rmse_m" in page.words
 
 
+def test_an_expectation_that_is_not_met_is_said(trio_copy: Path) -> None:
+    scenario = json.loads((trio_copy / "scenario.json").read_text())
+    scenario["expect"] = {"path_rmse_m": {"max": 0}, "odometry_rmse_m": {"min": 0}}
+    (trio_copy / "scenario.json").write_text(json.dumps(scenario))
+    words = page_of(trio_copy, trio_copy / "r.html").words
+    assert "1 of 2 expectations of the scenario are not met" in words
+    assert "Runs that failed" not in words
+
+
 def test_the_command_says_where_it_wrote(
     trio_result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -131,5 +140,5 @@ def test_absent_packages_are_no_failures(trio_copy: Path) -> None:
     rows.loc[own, ["status", "refined_status"]] = "absent"
     tables.write(tables.table_path(trio_copy, "errors"), "errors", rows)
     page = page_of(trio_copy, trio_copy / "r.html")
-    assert "Not installed, and so not judged: impicp." in page.words
+    assert "Not installed, so not evaluated: impicp." in page.words
     assert "impicp" not in [aligner["name"] for aligner in json.loads(page.json)["aligners"]]

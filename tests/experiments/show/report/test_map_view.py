@@ -10,7 +10,13 @@ import pytest
 from experiments.show.figures.ellipses import semi_axes
 from experiments.show.figures.result_tables import ResultTables, of_pair
 from experiments.show.report import map_view as module
-from experiments.show.report.map_view import ELLIPSE_MAX_M, ELLIPSE_MIN_M, map_view, packed_ellipses
+from experiments.show.report.map_view import (
+    ELLIPSE_MAX_M,
+    ELLIPSE_MIN_M,
+    TABLES,
+    map_view,
+    packed_ellipses,
+)
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +26,11 @@ def data(trio_result: Path) -> ResultTables:
 
 @pytest.fixture(scope="module")
 def view(data: ResultTables) -> dict[str, Any]:
-    found = map_view(data, data.table)
+    return view_of(data)
+
+
+def view_of(data: ResultTables) -> dict[str, Any]:
+    found = map_view(data, {name: data.table(name) for name in TABLES})
     assert found is not None
     return found
 
@@ -67,11 +77,9 @@ def test_ellipses_keep_their_shape_to_a_few_percent() -> None:
 def test_too_many_iterations_are_thinned_and_the_last_stays(
     data: ResultTables, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = map_view(data, data.table)
-    assert whole is not None
+    whole = view_of(data)
     monkeypatch.setattr(module, "MAX_BYTES", len(whole["block"]) // 3)
-    thinned = map_view(data, data.table)
-    assert thinned is not None
+    thinned = view_of(data)
     frames = thinned["pairs"][0]["frames"]
     assert thinned["left_out"] == len(whole["pairs"][0]["frames"]) - len(frames) > 0
     assert frames[-1]["iteration"] == whole["pairs"][0]["frames"][-1]["iteration"]
@@ -79,4 +87,4 @@ def test_too_many_iterations_are_thinned_and_the_last_stays(
 
 
 def test_without_histories_there_is_no_map(data: ResultTables) -> None:
-    assert map_view(data, lambda name: None) is None
+    assert map_view(data, {"paths": data.table("paths")}) is None

@@ -1,0 +1,57 @@
+"""Numbers as text: the one place that says how a share, a length or an interval is written."""
+
+import math
+from collections.abc import Sequence
+
+_SPACE = "\u00a0"  # a number stays beside its unit
+UNKNOWN = "–"
+
+
+def percent(share: float) -> str:
+    """A share as a percentage; 100 % and 0 % only where they are exact."""
+    if math.isnan(share):
+        return UNKNOWN
+    value = 100 * share
+    if 0 < value < 1:
+        return f"<{_SPACE}1{_SPACE}%"
+    if 99 < value < 100:
+        return f">{_SPACE}99{_SPACE}%"
+    return with_unit(f"{value:.0f}", "%")
+
+
+def metres(value: float) -> str:
+    """A length with about two significant digits."""
+    return with_unit(two_digits(value), "m")
+
+
+def radians(value: float) -> str:
+    """An angle likewise."""
+    return with_unit(two_digits(value), "rad")
+
+
+def milliseconds(value: float) -> str:
+    """A time likewise."""
+    return with_unit(two_digits(value), "ms")
+
+
+def two_digits(value: float) -> str:
+    """A figure with about two significant digits; its unit stands in the heading."""
+    if not math.isfinite(value):
+        return UNKNOWN
+    digits = 0 if value >= 100 else max(0, min(5, 1 - math.floor(math.log10(abs(value) or 1))))
+    return f"{value:.{digits}f}"
+
+
+def ratio(value: float) -> str:
+    """How many times larger."""
+    return UNKNOWN if not math.isfinite(value) else f"{value:.2f}" if value < 10 else f"{value:.0f}"
+
+
+def with_unit(text: str, unit: str) -> str:
+    """A number and its unit; a number that is not known has none."""
+    return text if text == UNKNOWN else f"{text}{_SPACE}{unit}"
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names in a sentence: "a, b and c"."""
+    return f"{', '.join(names[:-1])} and {names[-1]}" if len(names) > 1 else "".join(names)
