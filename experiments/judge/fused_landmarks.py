@@ -9,13 +9,12 @@ import pandas as pd
 from experiments.judge.errors import EvaluatedRobot
 from experiments.judge.truth import fit_rmse_m
 from experiments.run.estimates import alignment_of, correspondences_of
-from experiments.scenario.settings import Merge
 from mapfusion import se2
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.result import Alignment, degenerate
 from mapfusion.aligned_landmarks import ABSENT
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.merge import FusedMap, merge
+from mapfusion.merge import FusedMap, MergeParameters, merge
 from mapfusion.se2 import Float
 
 
@@ -23,17 +22,19 @@ def fused_maps(
     maps: list[LandmarkMap],
     estimates: pd.DataFrame,
     correspondences: pd.DataFrame,
-    settings: Merge,
+    aligner: str,
+    parameters: MergeParameters,
 ) -> FusedMap:
-    """Fuse maps in the frame of the first by the chosen aligner's first repetition.
+    """Fuse maps in the frame of the first by an aligner's first repetition.
 
     Args:
         maps: of the robots, the first's first.
         estimates: rows of the table `estimates` at one iteration, of any pairs.
         correspondences: the pairs offered there.
-        settings: which aligner, and how to merge.
+        aligner: whose refined estimates to merge by.
+        parameters: how to merge.
     """
-    chosen = estimates[(estimates["aligner"] == settings.aligner) & (estimates["repetition"] == 0)]
+    chosen = first_repetition(estimates, aligner)
     alignments: list[Alignment] = []
     offered: list[Correspondences] = []
     for other in maps[1:]:
@@ -45,7 +46,12 @@ def fused_maps(
             alignments.append(alignment_of(rows.iloc[0].to_dict(), len(pairs)))
         else:
             alignments.append(degenerate("was never aligned", len(pairs)))
-    return merge(maps, alignments, offered, settings.parameters)
+    return merge(maps, alignments, offered, parameters)
+
+
+def first_repetition(estimates: pd.DataFrame, aligner: str) -> pd.DataFrame:
+    """What maps are merged by: repetitions are for the spread of a method, not for the map."""
+    return estimates[(estimates["aligner"] == aligner) & (estimates["repetition"] == 0)]
 
 
 def _of_pair(rows: pd.DataFrame, names: dict[str, str]) -> pd.DataFrame:
@@ -58,7 +64,8 @@ def fusion_rows(
     b: EvaluatedRobot,
     estimates: pd.DataFrame,
     correspondences: pd.DataFrame,
-    settings: Merge,
+    aligner: str,
+    parameters: MergeParameters,
     radius_m: float,
 ) -> list[dict[str, Any]]:
     """Rows of the table `fusion`: landmarks of one pair fused at the last iteration."""
@@ -71,9 +78,8 @@ def fusion_rows(
             [map_a, map_b],
             estimates,
             correspondences,
-            settings.model_copy(
-                update={"parameters": replace(settings.parameters, use_drift=use_drift)}
-            ),
+            aligner,
+            replace(parameters, use_drift=use_drift),
         )
         for use_drift in (True, False)
     )
@@ -145,7 +151,7 @@ def fused_truth(fused: FusedMap, robots: list[EvaluatedRobot], iteration: int) -
 
 
 def fused_motion_rows(
-    robots: list[EvaluatedRobot], fused: FusedMap | None, settings: Merge
+    robots: list[EvaluatedRobot], fused: FusedMap | None, parameters: MergeParameters
 ) -> list[dict[str, Any]]:
     """Rows of the table `fused_motions`: how each robot's map was moved into the fused one."""
     if fused is None:
@@ -155,7 +161,7 @@ def fused_motion_rows(
         {
             "robot": robot.name,
             **dict(zip(("tx_m", "ty_m", "theta_rad"), fused.T_first_map[place], strict=True)),
-            "drift_sigma_m": fused.drift_sigma_m[place] if settings.parameters.use_drift else 0.0,
+            "drift_sigma_m": fused.drift_sigma_m[place] if parameters.use_drift else 0.0,
             "left_out": why.get(robot.name, ""),
         }
         for place, robot in enumerate(robots)

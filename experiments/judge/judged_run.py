@@ -101,7 +101,8 @@ def _judgement(scenario: AnyScenario, pair: PairStages) -> Stage:
     settings = judging.JudgeSettings(
         scenario.align.refinement,
         scenario.align.acceptance,
-        scenario.merge,
+        scenario.merge.aligner,
+        scenario.merge.parameters,
         scenario.evaluate.true_pair_radius_m,
     )
     before = {"align": pair.estimates, "log_a": pair.a.log, "slam_a": pair.a.slam}

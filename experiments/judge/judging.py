@@ -8,10 +8,10 @@ from experiments.judge.fused_landmarks import fusion_rows
 from experiments.judge.truth import PathTruth, landmark_truth
 from experiments.run.job import Job
 from experiments.run.stages.slam import RobotFolders, read_associations, read_snapshots
-from experiments.scenario.settings import Merge
 from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.refine import Refinement
 from mapfusion.errors import InputError
+from mapfusion.merge import MergeParameters
 from mapfusion.robot_log import read_log, read_truth
 
 WRITES = ("errors.parquet", "fusion.parquet")
@@ -23,7 +23,8 @@ class JudgeSettings:
 
     refinement: Refinement
     acceptance: Acceptance
-    merge: Merge
+    merge_aligner: str
+    merge: MergeParameters
     true_pair_radius_m: float
 
 
@@ -58,5 +59,5 @@ def run(settings: JudgeSettings, job: Job) -> None:
         a, b, estimates, offered, settings.refinement, settings.acceptance, radius_m
     )
     tables.write(job.output / "errors.parquet", "errors", errors)
-    fusion = fusion_rows(a, b, estimates, offered, settings.merge, radius_m)
+    fusion = fusion_rows(a, b, estimates, offered, settings.merge_aligner, settings.merge, radius_m)
     tables.write(job.output / "fusion.parquet", "fusion", fusion)

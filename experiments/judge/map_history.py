@@ -15,6 +15,7 @@ import pandas as pd
 
 from experiments.judge import tables
 from experiments.judge.errors import EvaluatedRobot
+from experiments.judge.fused_landmarks import first_repetition
 from experiments.judge.truth import true_pairs
 from experiments.run.estimates import alignment_of, correspondences_of
 from experiments.scenario.settings import AnyScenario, Merge
@@ -93,7 +94,7 @@ def _joined_rows(
     Only they are given to the merge: its second pass, which looks for what they missed, takes ten
     times as long as all the rest of this table.
     """
-    chosen = estimates[(estimates["aligner"] == settings.aligner) & (estimates["repetition"] == 0)]
+    chosen = first_repetition(estimates, settings.aligner)
     rows_a = rows_b = np.empty(0, dtype=np.int64)
     fused = map_a[rows_a]
     if len(chosen):

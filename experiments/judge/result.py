@@ -163,7 +163,7 @@ def _write_maps(run: JudgedRun, robots: list[EvaluatedRobot], folder: Path) -> N
     fused = fused_map(run.scenario.merge, robots, estimates, offered, last)
     if fused is not None:
         write_map(folder / "maps" / "fused.parquet", fused.landmarks)
-    motions = fused_motion_rows(robots, fused, run.scenario.merge)
+    motions = fused_motion_rows(robots, fused, run.scenario.merge.parameters)
     tables.write(tables.table_path(folder, "fused_motions"), "fused_motions", motions)
     fits = map_fit_rows(robots, fused, last)
     tables.write(tables.table_path(folder, "map_fits"), "map_fits", fits)
@@ -191,7 +191,13 @@ def fused_map(
         ].drop_duplicates()
     )
     maps = [robot.at(last)[0] for robot in robots]
-    return fused_maps(maps, estimates[estimates["iteration"] == ends], offered_ends, settings)
+    return fused_maps(
+        maps,
+        estimates[estimates["iteration"] == ends],
+        offered_ends,
+        settings.aligner,
+        settings.parameters,
+    )
 
 
 def _landmark_columns(landmarks: LandmarkMap, truth: Float) -> dict[str, np.ndarray]:

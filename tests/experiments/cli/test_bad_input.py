@@ -217,7 +217,7 @@ def test_wrong_tables(
         "align": (tmp_path / "map.parquet", (whole, tmp_path / "map.parquet")),
         "merge": (tmp_path / "map.parquet", (whole, tmp_path / "map.parquet", "-o", "f.parquet")),
         "slam": (tmp_path / "observations.parquet", (tmp_path, "-o", tmp_path / "m.parquet")),
-        "figures": (tmp_path / "tables" / "tracks.parquet", (tmp_path, "--jobs", 1)),
+        "figures": (tmp_path / "tables" / "landmarks.parquet", (tmp_path, "--jobs", 1)),
     }[name]
     (tmp_path / "tables").mkdir()
     for table in sorted((tiny_result / "tables").glob("*.parquet")):

@@ -12,12 +12,11 @@ from experiments.judge.fused_landmarks import (
     map_fit_rows,
 )
 from experiments.run.estimates import estimate_row
-from experiments.scenario.settings import Merge
 from mapfusion import se2
 from mapfusion.align.acceptance import Verdict
 from mapfusion.align.result import Alignment, Status
 from mapfusion.aligned_landmarks import ABSENT
-from mapfusion.merge import FusedMap
+from mapfusion.merge import FusedMap, MergeParameters
 from tests.helpers.made_up_maps import ACCEPTED, ITERATION, offered, paired, robot
 
 T_WORLD_A = np.array([1.0, 2.0, 0.3])
@@ -46,7 +45,9 @@ def fused_pairs(drift_sigma_m: float, seed: int = 6) -> pd.DataFrame:
     names = {"robot_a": "A", "robot_b": "B", "iteration": ITERATION}
     row = names | {"aligner": "ransac", "repetition": 0} | estimate_row(N, found, found, ACCEPTED)
     pairs = offered("A", "B", paired(list(range(N)), list(range(N))))
-    return pd.DataFrame(fusion_rows(a, b, pd.DataFrame([row]), pairs, Merge(), 0.1))
+    return pd.DataFrame(
+        fusion_rows(a, b, pd.DataFrame([row]), pairs, "ransac", MergeParameters(), 0.1)
+    )
 
 
 def test_fusing_equal_maps_halves_the_variance() -> None:
@@ -87,7 +88,9 @@ def test_fused_landmarks_are_judged_by_the_middle_of_two_truths(planar: bool) ->
     names = {"robot_a": "A", "robot_b": "B", "iteration": ITERATION}
     row = names | {"aligner": "ransac", "repetition": 0} | estimate_row(6, found, found, ACCEPTED)
     pairs = offered("A", "B", paired(list(range(6)), list(range(6))))
-    rows = pd.DataFrame(fusion_rows(a, b, pd.DataFrame([row]), pairs, Merge(), 0.1))
+    rows = pd.DataFrame(
+        fusion_rows(a, b, pd.DataFrame([row]), pairs, "ransac", MergeParameters(), 0.1)
+    )
     assert rows["error_fused_m"].to_numpy() == pytest.approx(0, abs=1e-9)
     assert rows["error_a_m"].to_numpy() == pytest.approx(0.04)
     assert rows["error_b_m"].to_numpy() == pytest.approx(0.04)
@@ -110,11 +113,13 @@ def test_only_accepted_alignments_are_fused() -> None:
     ):
         row = names | {"aligner": "ransac", "repetition": 0}
         row |= estimate_row(6, found, found, verdict)
-        fused = fused_maps(maps, pd.DataFrame([row]), pairs, Merge())
+        fused = fused_maps(maps, pd.DataFrame([row]), pairs, "ransac", MergeParameters())
         assert fused.left_out == left_out
         assert len(fused.landmarks) == n  # fused with B's, or A's alone
         assert (fused.parents[:, 1] == ABSENT).all() == bool(left_out)
-        motions = pd.DataFrame(fused_motion_rows(robots, fused, Merge())).set_index("robot")
+        motions = pd.DataFrame(fused_motion_rows(robots, fused, MergeParameters())).set_index(
+            "robot"
+        )
         assert motions["left_out"].to_dict() == {"A": "", "B": dict(left_out).get("B", "")}
         assert np.isnan(motions.loc["B", "tx_m"]) == bool(left_out)
 

@@ -23,10 +23,10 @@ SUCCESS_TABLES = {
 
 
 @pytest.fixture(scope="module")
-def result(made_up_result: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def result(trio_result: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Maps without common ground, others with too few true pairs, and an aligner not installed."""
     folder = tmp_path_factory.mktemp("same") / "result"
-    shutil.copytree(made_up_result, folder)
+    shutil.copytree(trio_result, folder)
     path = tables.table_path(folder, "errors")
     rows = tables.read(path, "errors")
     first, second, third = np.unique(rows["iteration"])[:3]

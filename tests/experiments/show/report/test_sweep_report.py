@@ -58,7 +58,7 @@ def test_inspect_and_report_as_commands(
 ) -> None:
     reply = command(capsys, "inspect", sweep)
     assert reply.code == 0
-    assert "10 runs" in reply.out
+    assert ["errors", "10", "1650"] in [line.split() for line in reply.out.splitlines()]
     assert command(capsys, "report", sweep, "-o", tmp_path / "r.html").code == 0
 
 

@@ -13,7 +13,7 @@ EMPTY = {pa.string(): "", pa.bool_(): False}
 
 
 def row(aligner: str, n_true: int, error_m: float) -> dict[str, object]:
-    blank = {field.name: EMPTY.get(field.type, 0) for field in tables.ERRORS}
+    blank = {field.name: EMPTY.get(field.type, 0) for field in tables.ALL["errors"]}
     errors = {"translation_error_m": error_m, "refined_translation_error_m": error_m / 8}
     return blank | {"aligner": aligner, "n_true": n_true} | errors
 
