@@ -6,24 +6,33 @@ import platform
 from datetime import UTC, datetime
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
 
 from experiments.judge.criteria import RIGHT_WITHIN_M, RIGHT_WITHIN_RAD
 from experiments.methods.catalogue import find_method
 from experiments.run.code_version import library_versions
 from experiments.run.frames import write_rows
-from experiments.show.export import to_markdown
-from experiments.show.figures.benchmark_figure import draw
+from experiments.show.export import to_markdown, write_text
+from experiments.show.figures import style
 from experiments.show.figures.drawing import save_figure
-from experiments.show.figures.style import house_style
 from experiments.study.benchmark.cells import BenchmarkDesign
 from experiments.study.benchmark.success import SUMMARY
 from experiments.study.benchmark.synthetic_pairs import SIGMA_M, SIZE_M
 from experiments.study.benchmark.trials import TRIALS
 from mapfusion.align.result import Status
-from mapfusion.storage import write_whole
 
 SCHEMA_VERSION = 1
+_BAND_ALPHA = 0.14
+_DODGE = 0.45  # of the distance between two shares, over which the methods are spread
+_MIN_SUCCESSES = 10  # the median error of fewer says little
+_RATIO_TICKS = (1, 2, 5, 10, 20, 50, 100)
+_RATIO_RANGE = (0.9, 11.0)  # shown at least
+_MARGIN = 1.15  # about what is drawn
+_ROWS = ("success (%)", "error over the oracle's", "time of one call (ms)")
 
 
 def write_benchmark(
@@ -32,18 +41,9 @@ def write_benchmark(
     """Write `trials`, `summary` (Parquet and CSV), `summary.md`, `benchmark.*` and provenance."""
     write_rows(folder / "trials.parquet", TRIALS, trials)
     write_rows(folder / "summary.parquet", SUMMARY, summary)
-    for name, text in (
-        ("summary.csv", summary.to_csv(index=False)),
-        ("summary.md", markdown(design, summary)),
-        ("provenance.json", json.dumps(_provenance(design), indent=1)),
-    ):
-        write_whole(folder / name, lambda path, text=text: path.write_text(text, encoding="utf-8"))
-    with house_style():
-        save_figure(draw(summary), folder, "benchmark")
-
-
-def _provenance(design: BenchmarkDesign) -> dict[str, object]:
-    return {
+    write_text(folder / "summary.csv", summary.to_csv(index=False))
+    write_text(folder / "summary.md", markdown(design, summary))
+    provenance = {
         "schema_version": SCHEMA_VERSION,
         "seed": design.seed,
         "trials": design.trials,
@@ -57,6 +57,9 @@ def _provenance(design: BenchmarkDesign) -> dict[str, object]:
         "libraries": library_versions(),
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
     }
+    write_text(folder / "provenance.json", json.dumps(provenance, indent=1))
+    with style.house_style():
+        save_figure(draw(summary), folder, "benchmark")
 
 
 def markdown(design: BenchmarkDesign, summary: pd.DataFrame) -> str:
@@ -75,18 +78,15 @@ def markdown(design: BenchmarkDesign, summary: pd.DataFrame) -> str:
         "is a refusal.\n"
     ]
     for n_pairs, rows in summary.groupby("n_pairs", sort=False):
-        parts += [f"## {n_pairs} pairs\n", _section(rows)]
+        columns = {
+            f"{share:.0%} outliers ({cells['n_true'].iloc[0]} true)": cells.set_index(
+                "method"
+            ).apply(cell_text, axis=1)
+            for share, cells in rows.groupby("outlier_share", sort=False)
+        }
+        table = pd.DataFrame(columns).reset_index(names="method")
+        parts += [f"## {n_pairs} pairs\n", to_markdown(table)]
     return "\n".join(parts)
-
-
-def _section(rows: pd.DataFrame) -> str:
-    columns = {
-        f"{share:.0%} outliers ({cells['n_true'].iloc[0]} true)": cells.set_index("method").apply(
-            cell_text, axis=1
-        )
-        for share, cells in rows.groupby("outlier_share", sort=False)
-    }
-    return to_markdown(pd.DataFrame(columns).reset_index(names="method"))
 
 
 def cell_text(cell: pd.Series) -> str:
@@ -103,3 +103,61 @@ def cell_text(cell: pd.Series) -> str:
         parts.append(f"{elapsed_ms:.0f} ms" if elapsed_ms >= 100 else f"{elapsed_ms:.3g} ms")
     parts += [f"{cell[f'n_{what}']} {what}" for what in ("wrong", "failed") if cell[f"n_{what}"]]
     return ", ".join(parts)
+
+
+def draw(summary: pd.DataFrame) -> Figure:
+    """One column of panels for each number of pairs; the rows as in `_ROWS`.
+
+    Bands: Wilson's 95 % interval of the success, 10-90 % of the trials' times. The shares are
+    spaced evenly and the methods set a little apart, as most lie on one another.
+    """
+    counts = summary["n_pairs"].unique()
+    methods = summary["method"].unique().tolist()
+    styles = style.aligner_styles(methods)
+    shares = sorted(summary["outlier_share"].unique())
+    figure = Figure(figsize=(style.PAGE_WIDTH_IN, 6.6))
+    panels = figure.subplots(len(_ROWS), len(counts), sharex=True, sharey="row", squeeze=False)
+    ran = summary[summary["status"] != Status.ABSENT].sort_values("outlier_share")
+    for column, count in zip(panels.T, counts, strict=True):
+        for place, method in enumerate(methods):
+            own = ran[(ran["n_pairs"] == count) & (ran["method"] == method)]
+            offset = _DODGE * ((place + 0.5) / len(methods) - 0.5)
+            x = np.searchsorted(shares, own["outlier_share"]) + offset
+            _add_method(column, x, own, styles[method])
+        column[0].set_title(f"{count} pairs")
+        column[-1].set_xlabel("outliers (%)")
+    _lay_out(panels, shares)
+    absent = set(summary["method"][summary["status"] == Status.ABSENT])
+    labels = {name: f"{name} (absent)" if name in absent else name for name in methods}
+    style.aligner_legend(figure, labels, styles, columns=5)
+    return figure
+
+
+def _add_method(axes: np.ndarray, x: np.ndarray, own: pd.DataFrame, line: dict) -> None:
+    success, ratio, elapsed = axes
+    line = line | {"linewidth": 0.8, "markersize": 2.8}
+    ends = (100 * own["success_low"], 100 * own["success_high"])
+    success.vlines(x, *ends, color=line["color"], linewidth=2.2, alpha=0.35)
+    success.plot(x, 100 * own["success"], **line)
+    ratio.plot(x, own["ratio_m"].where(own["n_success"] >= _MIN_SUCCESSES), **line)
+    ends = (1e3 * own["elapsed_low_s"], 1e3 * own["elapsed_high_s"])
+    elapsed.fill_between(x, *ends, color=line["color"], alpha=_BAND_ALPHA, linewidth=0)
+    elapsed.plot(x, 1e3 * own["elapsed_s"], **line)
+
+
+def _lay_out(panels: np.ndarray, shares: list[float]) -> None:
+    axes: Axes
+    for row, label in zip(panels, _ROWS, strict=True):
+        row[0].set_ylabel(label)
+        for axes in row:
+            axes.set_xticks(range(len(shares)), [f"{100 * share:g}" for share in shares])
+            axes.grid(visible=False, axis="x")
+    panels[0, 0].set_ylim(-3, 103)
+    for axes in panels[1:].flat:
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter(style.plain_numbers())
+    drawn = [line.get_ydata() for axes in panels[1] for line in axes.get_lines()]
+    ratios = np.concatenate([*drawn, _RATIO_RANGE])
+    panels[1, 0].set_yticks(_RATIO_TICKS)
+    panels[1, 0].set_ylim(np.nanmin(ratios) / _MARGIN, np.nanmax(ratios) * _MARGIN)
+    panels[1, 0].yaxis.set_minor_locator(NullLocator())

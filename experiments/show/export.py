@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 
 from mapfusion.storage import write_whole
@@ -11,32 +10,24 @@ from mapfusion.storage import write_whole
 _SIGNIFICANT_DIGITS = 4
 
 
-def write_tables(folder: Path, tables: dict[str, pd.DataFrame]) -> list[Path]:
-    """Write each table as NAME.csv, NAME.md and NAME.tex; returns the files."""
-    written = []
+def write_tables(folder: Path, tables: dict[str, pd.DataFrame]) -> None:
+    """Write each table as NAME.csv, NAME.md and NAME.tex."""
     for name, table in tables.items():
-        for suffix, text in (
-            ("csv", table.to_csv(index=False)),
-            ("md", to_markdown(table)),
-            ("tex", to_latex(table)),
-        ):
-            path = folder / f"{name}.{suffix}"
-            write_whole(path, lambda file, text=text: file.write_text(text, encoding="utf-8"))
-            written.append(path)
-    return written
+        write_text(folder / f"{name}.csv", table.to_csv(index=False))
+        write_text(folder / f"{name}.md", to_markdown(table))
+        write_text(folder / f"{name}.tex", to_latex(table))
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file as a whole."""
+    write_whole(path, lambda file: file.write_text(text, encoding="utf-8"))
 
 
 def to_markdown(table: pd.DataFrame) -> str:
     """A pipe table; pipes inside names are escaped."""
     shown = rounded(table).map(lambda text: text.replace("|", "\\|"))
-    return (
-        shown.to_markdown(
-            index=False,
-            disable_numparse=True,
-            colalign=["right" if name in _numbers(table) else "left" for name in table],
-        )
-        + "\n"
-    )
+    alignment = ["right" if name in _numbers(table) else "left" for name in table]
+    return shown.to_markdown(index=False, disable_numparse=True, colalign=alignment) + "\n"
 
 
 def to_latex(table: pd.DataFrame) -> str:
@@ -47,7 +38,7 @@ def to_latex(table: pd.DataFrame) -> str:
 
 def rounded(table: pd.DataFrame) -> pd.DataFrame:
     """All cells as text: four significant digits, a dash for what is not known."""
-    return table.astype(object).map(_text)
+    return table.astype(object).map(_text).where(table.notna(), "-")
 
 
 def _numbers(table: pd.DataFrame) -> set[str]:
@@ -55,6 +46,4 @@ def _numbers(table: pd.DataFrame) -> set[str]:
 
 
 def _text(value: object) -> str:
-    if isinstance(value, float | np.floating):
-        return "-" if np.isnan(value) else f"{value:.{_SIGNIFICANT_DIGITS}g}"
-    return "-" if value is None else str(value)
+    return f"{value:.{_SIGNIFICANT_DIGITS}g}" if isinstance(value, float) else str(value)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from functools import partial
 
 _SPACE = "\u00a0"  # a number stays beside its unit
 UNKNOWN = "–"
@@ -16,22 +17,7 @@ def percent(share: float) -> str:
         return f"<{_SPACE}1{_SPACE}%"
     if 99 < value < 100:
         return f">{_SPACE}99{_SPACE}%"
-    return with_unit(f"{value:.0f}", "%")
-
-
-def metres(value: float) -> str:
-    """A length with about two significant digits."""
-    return with_unit(two_digits(value), "m")
-
-
-def radians(value: float) -> str:
-    """An angle likewise."""
-    return with_unit(two_digits(value), "rad")
-
-
-def milliseconds(value: float) -> str:
-    """A time likewise."""
-    return with_unit(two_digits(value), "ms")
+    return f"{value:.0f}{_SPACE}%"
 
 
 def two_digits(value: float) -> str:
@@ -42,14 +28,17 @@ def two_digits(value: float) -> str:
     return f"{value:.{digits}f}"
 
 
+def with_unit(unit: str, value: float) -> str:
+    """Two digits and the unit; what is not known has none."""
+    return f"{two_digits(value)}{_SPACE}{unit}" if math.isfinite(value) else UNKNOWN
+
+
+metres, radians, milliseconds = (partial(with_unit, unit) for unit in ("m", "rad", "ms"))
+
+
 def ratio(value: float) -> str:
     """How many times larger."""
     return UNKNOWN if not math.isfinite(value) else f"{value:.2f}" if value < 10 else f"{value:.0f}"
-
-
-def with_unit(text: str, unit: str) -> str:
-    """A number and its unit; a number that is not known has none."""
-    return text if text == UNKNOWN else f"{text}{_SPACE}{unit}"
 
 
 def listed(names: Sequence[str]) -> str:

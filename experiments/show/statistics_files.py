@@ -1,35 +1,62 @@
 """The commands `statistics` and `compare`: load, compute, write, show."""
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from experiments.show.export import write_tables
-from experiments.show.figures.over_runs import draw_over_runs
+from experiments.show.figures.drawing import draw_figure
+from experiments.show.figures.result_tables import ResultTables
 from experiments.show.terminal.statistics_screen import print_comparison, print_summary
 from experiments.study.compare.versions import compare
 from experiments.study.statistics.run_tables import find_runs
-from experiments.study.statistics.summary import summarise
+from experiments.study.statistics.summary import ALL_SCENARIOS, Summary, configurations, summarise
+
+_FIGURES = ("fig04_translation_error", "fig05_rotation_error", "fig06_aligner_time")
 
 
 def run_statistics(paths: Sequence[Path], output: Path | None) -> None:
     """Show the main tables; write all, and figures 4 to 6, where an output folder is given.
 
-    Raises:
-        InputError: a path that holds no runs, or a damaged table.
+    Raises InputError where a path holds no runs, or a table is damaged.
     """
     summary = summarise(find_runs(paths))
     skipped: list[str] = []
     if output is not None:
         write_tables(output, summary.tables)
-        skipped = draw_over_runs(summary, output / "figures")
+        skipped += _draw_over_runs(summary, output / "figures")
     print_summary(summary, output, skipped)
+
+
+def _draw_over_runs(summary: Summary, folder: Path) -> Iterator[str]:
+    """Draw what several runs of each scenario and setting share; yields what was not drawn.
+
+    With one such configuration the pictures go to `folder`, with more to a folder each in it.
+    """
+    drawn = {
+        "-".join([labels.pop("scenario"), *(f"{key}={labels[key]}" for key in labels)]): medians
+        for labels, medians in configurations(summary.run_medians)
+        if labels["scenario"] != ALL_SCENARIOS
+    }
+    for name, medians in drawn.items():
+        runs, timings = medians["run_id"].unique(), summary.timings
+        if len(runs) < 2:
+            yield f"{name}: one run alone; `mapfusion figures` draws it"
+            continue
+        if len(timings):
+            timings = timings[timings["run_id"].isin(runs)]
+        # Settings may hold anything; file names may not.
+        target = folder if len(drawn) == 1 else folder / re.sub(r"[^\w.=-]", "_", name)[:120]
+        data = ResultTables(target, {"errors": medians, "aligner_timings": timings})
+        for figure in _FIGURES:
+            if reason := draw_figure(data, figure, target).skipped:
+                yield f"{name}, {figure}: {reason}"
 
 
 def run_compare(first: Path, second: Path, show_all: bool, output: Path | None) -> bool:
     """Show what changed; returns whether anything got worse.
 
-    Raises:
-        InputError: a path that holds no runs, or runs that have nothing in common.
+    Raises InputError where a path holds no runs, or the runs have nothing in common.
     """
     found = compare(first, second)
     if output is not None:

@@ -1,7 +1,5 @@
 """Errors against the iteration, for all aligners and robot pairs: figures 4 and 5."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
@@ -12,12 +10,9 @@ from experiments.judge.criteria import ANSWERABLE_PAIRS, ORACLE
 from experiments.show.figures.result_tables import NothingToDraw, ResultTables, of_pair
 from experiments.show.figures.style import BLUE, PAGE_WIDTH_IN, PALE_GRAY, aligner_legend
 from experiments.study.statistics.error_bands import error_bands, scarce_spans
-from mapfusion.se2 import Float
 
-_PANEL_HEIGHT_IN = 1.9
-_EXTRA_HEIGHT_IN = 0.9  # legend and the common x label
+_PANEL_HEIGHT_IN, _EXTRA_HEIGHT_IN = 1.9, 0.9  # the latter of legend and common x label
 _MARKERS_PER_LINE = 8
-_LEGEND_COLUMNS = 4
 _BAND_STYLE = {"alpha": 0.16, "linewidth": 0}
 _SCARCE_STYLE = {"color": PALE_GRAY, "alpha": 0.5, "linewidth": 0}
 # Bands, and lines of more points, are drawn as pixels: evaluated at each iteration, their outlines
@@ -25,21 +20,11 @@ _SCARCE_STYLE = {"color": PALE_GRAY, "alpha": 0.5, "linewidth": 0}
 _MAX_VECTOR_POINTS = 200
 
 
-def draw_error_curves(
-    data: ResultTables,
-    quantity: str,
-    label: str,
-    note: str,
-    scale: Callable[[Axes, Float], None],
-) -> Figure:
+def draw_error_curves(data: ResultTables, quantity: str, label: str) -> tuple[Figure, np.ndarray]:
     """One row of panels per robot pair: as estimated on the left, refined on the right.
 
-    Args:
-        data: the result, or several runs.
-        quantity: column of the `errors` table as estimated; `refined_` in front, as refined.
-        label: the y axis' label, with its unit.
-        note: a line below the x axis; may be empty.
-        scale: sets the y axis' scale and limits from all values drawn.
+    `quantity` is a column of the `errors` table. Also returns all values drawn, by which the y axis
+    that all panels share is to be set.
     """
     if not data.pairs:
         raise NothingToDraw("no robot pair was aligned")
@@ -61,32 +46,27 @@ def draw_error_curves(
             _draw_panel(axes, data, of_pair(bands, pair), column)
             axes.set_title(f"{pair[0]} - {pair[1]}, {kind}")
         row[0].set_ylabel(label)
-    scale(panels[0, 0], drawn)
-    figure.supxlabel("FastSLAM iteration k" + (f"\n{note}" if note else ""), fontsize=8)
+    figure.supxlabel("FastSLAM iteration k", fontsize=8)
     over = f"{errors['run_id'].nunique()} runs" if data.several_runs else "repetitions"
     explained = (
         Patch(color=BLUE, label=f"10-90 % of {over}", **_BAND_STYLE),
         Patch(label=f"< {ANSWERABLE_PAIRS} true pairs", **_SCARCE_STYLE),
     )
-    aligner_legend(figure, data.labels, data.styles, _LEGEND_COLUMNS, explained)
-    return figure
+    aligner_legend(figure, data.labels, data.styles, 4, explained)
+    return figure, drawn
 
 
 def _draw_panel(axes: Axes, data: ResultTables, bands: pd.DataFrame, column: str) -> None:
     for place, name in enumerate(data.aligners):
-        style = data.styles[name]
-        curve = bands[bands["aligner"] == name].sort_values("iteration")
-        iteration = curve["iteration"].to_numpy()
-        low, median, high = (curve[f"{column}{end}"].to_numpy() for end in ("_low", "", "_high"))
-        band = {"color": style["color"], "zorder": 1, "rasterized": True}
-        axes.fill_between(iteration, low, high, **band, **_BAND_STYLE)
+        curve = bands[bands["aligner"] == name].sort_values("iteration").set_index("iteration")
+        ends = (curve[f"{column}_low"], curve[f"{column}_high"])
+        band = {"color": data.styles[name]["color"], "zorder": 1, "rasterized": True}
+        axes.fill_between(curve.index, *ends, **band, **_BAND_STYLE)
         step = max(1, len(curve) // _MARKERS_PER_LINE)
-        axes.plot(
-            iteration,
-            median,
-            label=name,
-            markevery=(place * step // len(data.aligners), step),
-            zorder=3 if name == ORACLE else 2,
-            rasterized=len(curve) > _MAX_VECTOR_POINTS,
-            **style,
-        )
+        line = data.styles[name] | {
+            "label": name,
+            "markevery": (place * step // len(data.aligners), step),
+            "zorder": 3 if name == ORACLE else 2,
+            "rasterized": len(curve) > _MAX_VECTOR_POINTS,
+        }
+        axes.plot(curve.index, curve[column], **line)

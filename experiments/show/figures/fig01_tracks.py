@@ -15,19 +15,17 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from experiments.show.figures.result_tables import NothingToDraw, ResultTables
-from experiments.show.figures.style import PAGE_WIDTH_IN, SEQUENTIAL_MAP
+from experiments.show.figures.style import PAGE_WIDTH_IN
 from mapfusion.errors import InputError
 
-_MAX_FRAMES = 4
-_TRAIL_FRAMES = 5
+_MAX_FRAMES, _TRAIL_FRAMES = 4, 5
 _KEY_FRAME = re.compile(r"(?P<robot>.+)_(?P<iteration>\d+)\.png")
 
 
 def draw(data: ResultTables) -> Figure:
     """The last consecutive key frames of one robot, points coloured by the age of their track."""
     robot, frames = _consecutive_frames(data)
-    tracks = data.table("tracks")
-    tracks = tracks[tracks["robot"] == robot]
+    tracks = data.of_robot("tracks", robot)
     shown = tracks[tracks["iteration"].isin(list(frames))]
     if shown.empty:
         raise NothingToDraw(f"no tracked points at {robot}'s key frames")
@@ -35,7 +33,7 @@ def draw(data: ResultTables) -> Figure:
     rows = -(-len(frames) // columns)
     figure = Figure(figsize=(PAGE_WIDTH_IN, 2.55 * rows * 2 / columns + 0.5))
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    colours = ScalarMappable(Normalize(1, max(2, shown["length"].max())), SEQUENTIAL_MAP)
+    colours = ScalarMappable(Normalize(1, max(2, shown["length"].max())), "viridis")
     for axes, (iteration, path) in zip(panels, frames.items(), strict=False):
         _show_image(axes, path)
         _add_tracks(axes, tracks, iteration, {"cmap": colours.cmap, "norm": colours.norm})
@@ -51,19 +49,18 @@ def draw(data: ResultTables) -> Figure:
 
 def _consecutive_frames(data: ResultTables) -> tuple[str, dict[int, Path]]:
     """The robot with the longest run of consecutive key frames, and the end of that run."""
-    best: tuple[str, dict[int, Path]] = ("", {})
+    robot, best = "", {}
     named = [(_KEY_FRAME.fullmatch(p.name), p) for p in (data.folder / "keyframes").glob("*.png")]
-    for robot in data.robots:
-        frames = {int(m["iteration"]): path for m, path in named if m and m["robot"] == robot}
+    for each in data.robots:
         run: dict[int, Path] = {}
-        for iteration in sorted(frames):
-            run = (run if iteration - 1 in run else {}) | {iteration: frames[iteration]}
-            if len(run) > len(best[1]):
-                best = robot, run
-    robot, frames = best
-    if not frames:
+        frames = {int(m["iteration"]): path for m, path in named if m and m["robot"] == each}
+        for iteration, path in sorted(frames.items()):
+            run = (run if iteration - 1 in run else {}) | {iteration: path}
+            if len(run) > len(best):
+                robot, best = each, run
+    if not best:
         raise NothingToDraw("no key frames were kept (logs without images)")
-    return robot, dict(list(frames.items())[-_MAX_FRAMES:])
+    return robot, dict(list(best.items())[-_MAX_FRAMES:])
 
 
 def _show_image(axes: Axes, path: Path) -> None:
@@ -79,11 +76,10 @@ def _show_image(axes: Axes, path: Path) -> None:
 def _add_tracks(axes: Axes, tracks: pd.DataFrame, iteration: int, colours: dict[str, Any]) -> None:
     now = tracks[tracks["iteration"] == iteration]
     since = tracks["iteration"].between(iteration - _TRAIL_FRAMES, iteration)
-    recent = tracks[tracks["track"].isin(now["track"]) & since].sort_values("iteration")
-    groups = [rows for _, rows in recent.groupby("track")]
-    trails = [rows[["u_px", "v_px"]].to_numpy() for rows in groups]
-    lines = LineCollection(trails, linewidths=1.2, zorder=2, **colours)
-    lines.set_array(np.array([rows["length"].iloc[-1] for rows in groups], dtype=np.float64))
+    recent = tracks[tracks["track"].isin(now["track"]) & since].groupby("track")
+    trails = [rows[["u_px", "v_px"]].to_numpy() for _, rows in recent]
+    lengths = recent["length"].last().to_numpy(np.float64)
+    lines = LineCollection(trails, array=lengths, linewidths=1.2, zorder=2, **colours)
     axes.add_collection(lines, autolim=False)
     rim = {"s": 14, "edgecolors": "white", "linewidths": 0.5, "zorder": 3}
     axes.scatter(now["u_px"], now["v_px"], c=now["length"], **rim, **colours)

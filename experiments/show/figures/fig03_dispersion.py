@@ -1,21 +1,13 @@
 """Figure 3: how the particle set spreads along the paths, and draws together again."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from experiments.show.figures.floor_plan import (
-    add_frame,
-    add_points,
-    height_of_row,
-    label_plan,
-    set_square,
-    set_view,
-    start_plan,
-)
+from experiments.show.figures import floor_plan as plan
 from experiments.show.figures.result_tables import NothingToDraw, ResultTables
 from experiments.show.figures.style import BLACK, GRAY, PAGE_WIDTH_IN
 
@@ -24,23 +16,12 @@ _MAGNIFICATIONS = (1, 2, 5, 10, 20, 50, 100)
 _WIDEST_SHARE = 1 / 10  # of the map's extent that the widest drawn particle set may take
 _ZOOM_MARGIN = 1.25
 _RECENT_ITERATIONS = 50
-_FRAME_LENGTH_M = 1.5
 _GRID_COLUMNS = 6  # holds one, two or three panels of one width
 _LOWER_ROW_IN = 2.6
-_NO_LANDMARKS = np.empty((0, 3))
+_PLANE = ["x_m", "y_m"]
 
 
-class Moments(NamedTuple):
-    """Two kept iterations of one robot."""
-
-    robot: str
-    wide: int
-    tight: int
-
-    @property
-    def named(self) -> tuple[tuple[str, int], ...]:
-        """As they are marked in the figure."""
-        return ("A", self.wide), ("B", self.tight)
+Moments = tuple[str, int, int]  # a robot, and a wide and a tight iteration of it: A and B
 
 
 def draw(data: ResultTables) -> Figure:
@@ -50,53 +31,47 @@ def draw(data: ResultTables) -> Figure:
     if not robots:
         raise NothingToDraw("no particles were kept")
     spread = spread_over_time(clouds[clouds["robot"].isin(robots)])
-    moments = choose_moments(spread)
     figure = Figure(figsize=(PAGE_WIDTH_IN, PAGE_WIDTH_IN))
     grid = figure.add_gridspec(2, _GRID_COLUMNS)
     span = _GRID_COLUMNS // max(2, len(robots))
-    first = (_GRID_COLUMNS - span * len(robots)) // 2
-    panels = [
-        figure.add_subplot(grid[0, first + i * span : first + (i + 1) * span])
-        for i in range(len(robots))
-    ]
+    start = (_GRID_COLUMNS - span * len(robots)) // 2
     magnification = _magnification(data, robots)
-    for axes, robot in zip(panels, robots, strict=True):
-        _draw_path(axes, data, robot, magnification)
-        if moments is not None and robot == moments.robot:
-            _mark_on_path(axes, data, moments)
-    timeline, *zooms = (
-        figure.add_subplot(grid[1, column : column + 2]) for column in range(0, _GRID_COLUMNS, 2)
-    )
-    _draw_timeline(timeline, data, spread, moments)
+    panels: dict[str, Axes] = {}
+    for robot in robots:
+        panels[robot] = figure.add_subplot(grid[0, start : start + span])
+        _draw_path(panels[robot], data, robot, magnification)
+        start += span
+    timeline, *zooms = (figure.add_subplot(grid[1, start : start + 2]) for start in (0, 2, 4))
+    _draw_timeline(timeline, data, spread)
+    moments = choose_moments(spread)
     if moments is None:
         for axes in zooms:
             axes.set_axis_off()
     else:
-        _draw_zooms(zooms, data, spread, moments)
-    upper = height_of_row(panels, PAGE_WIDTH_IN * span / _GRID_COLUMNS)
+        robot = moments[0]
+        spread_m = spread[spread["robot"] == robot].set_index("iteration")["spread_m"]
+        _mark(panels[robot], timeline, data.path_of(robot), spread_m, moments)
+        _draw_zooms(zooms, data, spread_m, moments)
+    upper = plan.height_of_row(list(panels.values()), PAGE_WIDTH_IN * span / _GRID_COLUMNS)
     grid.set_height_ratios([upper, _LOWER_ROW_IN])
     figure.set_figheight(upper + _LOWER_ROW_IN)
     return figure
 
 
 def spread_over_time(clouds: pd.DataFrame) -> pd.DataFrame:
-    """Root mean square distance of the particles from their mean, all particles counted alike.
+    """Root mean square distance of the particles from their mean: robot, iteration, spread_m.
 
-    Alike, because it is the particle set that is drawn; the weights of one iteration come on top.
-
-    Returns:
-        Columns robot, iteration, spread_m.
+    All particles counted alike, as it is the particle set that is drawn; the weights of one
+    iteration come on top.
     """
-    groups = clouds.groupby(["robot", "iteration"], sort=False)[["x_m", "y_m"]]
-    variance = groups.var(ddof=0).sum(axis="columns")
-    return variance.pow(0.5).rename("spread_m").reset_index()
+    variance = clouds.groupby(["robot", "iteration"], sort=False)[_PLANE].var(ddof=0)
+    return variance.sum(axis="columns").pow(0.5).rename("spread_m").reset_index()
 
 
 def choose_moments(spread: pd.DataFrame) -> Moments | None:
-    """The pair of moments between which one robot's particles drew together the most.
+    """The moments between which one robot's particles drew together the most; None if none did.
 
-    Wide comes before tight, so the fall is what seeing old ground again did. None when no robot's
-    particles ever did.
+    Wide comes before tight, so the fall is what seeing old ground again did.
     """
     best, best_ratio = None, 1.0
     for robot, rows in spread[spread["spread_m"] > 0].groupby("robot", sort=False):
@@ -106,92 +81,76 @@ def choose_moments(spread: pd.DataFrame) -> Moments | None:
         if ratio[tight] > best_ratio:
             best_ratio = ratio[tight]
             wide = int(np.argmax(values[:tight]))
-            best = Moments(str(robot), int(iteration[wide]), int(iteration[tight]))
+            best = (str(robot), int(iteration[wide]), int(iteration[tight]))
     return best
 
 
 def _magnification(data: ResultTables, robots: list[str]) -> int:
     """The largest round factor at which the particle sets still look like spots on the paths."""
-    extent = min(float(np.ptp(data.path_of(robot)[:, :2], axis=0).max()) for robot in robots)
-    sets = [data.clouds_of(robot).groupby("iteration")[["x_m", "y_m"]] for robot in robots]
-    widest = max(float((each.max() - each.min()).to_numpy().max()) for each in sets)
-    fitting = [m for m in _MAGNIFICATIONS if m * widest <= _WIDEST_SHARE * extent]
-    return max(fitting, default=1)
+    extent = min(np.ptp(data.path_of(robot), axis=0).max() for robot in robots)
+    clouds = data.table("clouds")
+    sets = clouds[clouds["robot"].isin(robots)].groupby(["robot", "iteration"])[_PLANE]
+    widest = (sets.max() - sets.min()).to_numpy().max()
+    return max((m for m in _MAGNIFICATIONS if m * widest <= _WIDEST_SHARE * extent), default=1)
 
 
 def _draw_path(axes: Axes, data: ResultTables, robot: str, magnification: int) -> None:
-    path = data.path_of(robot)
-    walls = start_plan(axes, data, robot)
-    axes.plot(*path[:, :2].T, color=GRAY, linewidth=0.7, zorder=2)
+    path, walls = data.path_of(robot), plan.start_plan(axes, data, robot)
+    axes.plot(*path.T, color=GRAY, linewidth=0.7, zorder=2)
     style = {"marker": ".", "markersize": 1.0, "color": data.colours[robot], "zorder": 3}
-    for _, rows in data.clouds_of(robot).groupby("iteration"):
-        points = rows[["x_m", "y_m"]].to_numpy()
+    for _, rows in data.of_robot("clouds", robot).groupby("iteration"):
+        points = rows[_PLANE].to_numpy()
         mean = points.mean(axis=0)
-        add_points(axes, mean + magnification * (points - mean), **style)
-    add_frame(axes, _FRAME_LENGTH_M)
-    set_view(axes, _NO_LANDMARKS, path, *walls)
+        plan.add_points(axes, mean + magnification * (points - mean), **style)
+    plan.add_frame(axes, length_m=1.5)
+    plan.set_view(axes, path[:0], path, *walls)
     enlarged = f", spread x{magnification}" if magnification > 1 else ""
     axes.set_title(f"{robot}: particles{enlarged}")
 
 
-def _mark_on_path(axes: Axes, data: ResultTables, moments: Moments) -> None:
-    path = data.path_of(moments.robot)
-    box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "linewidth": 0.5}
-    look = {"bbox": box, "arrowprops": {"arrowstyle": "-", "linewidth": 0.8}, "zorder": 7}
-    for (name, k), offset in zip(moments.named, ((9, 9), (-15, 9)), strict=True):
-        _annotate(axes, name, tuple(path[k, :2]), offset, **look)
-
-
-def _annotate(
-    axes: Axes, name: str, at: tuple[Any, ...], offset: tuple[int, int], **look: Any
-) -> None:
-    look |= {"textcoords": "offset points", "fontweight": "bold"}
-    axes.annotate(name, xy=(at[0], at[1]), xytext=offset, **look)
-
-
-def _draw_timeline(
-    axes: Axes, data: ResultTables, spread: pd.DataFrame, moments: Moments | None
-) -> None:
+def _draw_timeline(axes: Axes, data: ResultTables, spread: pd.DataFrame) -> None:
     for robot, rows in spread.groupby("robot", sort=False):
         style = {"color": data.colours[str(robot)], "linewidth": 0.8, "label": robot}
         axes.plot(rows["iteration"], rows["spread_m"], **style)
-    if moments is not None:
-        spread_m = spread[spread["robot"] == moments.robot].set_index("iteration")["spread_m"]
-        for name, k in moments.named:
-            at = (k, spread_m[k])
-            axes.plot(*at, "o", color=BLACK, zorder=4)
-            _annotate(axes, name, at, (3, 3))
-    axes.set_xlabel("FastSLAM iteration k")
-    axes.set_ylabel("spread of the particles (m)")
+    axes.set(xlabel="FastSLAM iteration k", ylabel="spread of the particles (m)")
     axes.set_ylim(bottom=0)
     axes.margins(y=0.15)
     axes.legend(loc="best")
     axes.set_title("spread over time")
 
 
+def _mark(
+    on_path: Axes, timeline: Axes, path: np.ndarray, spread_m: pd.Series, moments: Moments
+) -> None:
+    box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "linewidth": 0.5}
+    look: dict[str, Any] = {"textcoords": "offset points", "fontweight": "bold"}
+    boxed = {"bbox": box, "arrowprops": {"arrowstyle": "-", "linewidth": 0.8}, "zorder": 7}
+    for name, k, side in zip("AB", moments[1:], (9, -15), strict=True):
+        x, y = path[k]
+        on_path.annotate(name, xy=(x, y), xytext=(side, 9), **look, **boxed)
+        timeline.plot(k, spread_m[k], "o", color=BLACK, zorder=4)
+        timeline.annotate(name, xy=(k, spread_m[k]), xytext=(3, 3), **look)
+
+
 def _draw_zooms(
-    zooms: list[Axes], data: ResultTables, spread: pd.DataFrame, moments: Moments
+    zooms: list[Axes], data: ResultTables, spread_m: pd.Series, moments: Moments
 ) -> None:
     """Both moments at one scale, so that tight looks tight."""
-    robot, path = moments.robot, data.path_of(moments.robot)
-    clouds, slam = data.clouds_of(robot), data.table("robots")
-    spread_m = spread[spread["robot"] == robot].set_index("iteration")["spread_m"]
-    n_landmarks = slam[slam["robot"] == robot].set_index("iteration")["n_landmarks"]
-    points = [clouds[clouds["iteration"] == k][["x_m", "y_m"]].to_numpy() for k in moments[1:]]
-    reach = _ZOOM_MARGIN * max(float(np.abs(p - p.mean(axis=0)).max()) for p in points)
+    robot, *iterations = moments
+    clouds = data.of_robot("clouds", robot).set_index("iteration")[_PLANE]
+    n_landmarks = data.of_robot("robots", robot).set_index("iteration")["n_landmarks"]
+    sets = [clouds.loc[[k]].to_numpy() for k in iterations]
+    reach = _ZOOM_MARGIN * max(float(np.abs(p - p.mean(axis=0)).max()) for p in sets)
     style = {"marker": ".", "markersize": 2.5, "alpha": 0.7, "color": data.colours[robot]}
-    for axes, particles, (name, k), kind in zip(
-        zooms, points, moments.named, ("wide", "tight"), strict=True
-    ):
-        axes.plot(*path[:, :2].T, color=GRAY, zorder=1)
-        add_points(axes, particles, **style)
-        set_square(axes, particles.mean(axis=0), reach)
+    names = ("A, wide", "B, tight")
+    for axes, name, k, particles in zip(zooms, names, iterations, sets, strict=True):
+        axes.plot(*data.path_of(robot).T, color=GRAY, zorder=1)
+        plan.add_points(axes, particles, **style)
+        plan.set_square(axes, particles.mean(axis=0), reach)
         axes.locator_params(nbins=4)
-        label_plan(axes, robot)
+        plan.label_plan(axes, robot)
         # much in new territory, little on known ground
         grown = n_landmarks[k] - n_landmarks[max(0, k - _RECENT_ITERATIONS)]
-        axes.set_title(
-            f"{name}, {kind}: k = {k}, spread {spread_m[k]:.3f} m\n"
-            f"+{grown} landmarks in {_RECENT_ITERATIONS} iterations",
-            fontsize=7.5,
-        )
+        title = f"{name}: k = {k}, spread {spread_m[k]:.3f} m\n"
+        title += f"+{grown} landmarks in {_RECENT_ITERATIONS} iterations"
+        axes.set_title(title, fontsize=7.5)

@@ -1,23 +1,19 @@
 """Figure 4: error of the alignments' translation against the iteration."""
 
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.show.figures.error_curves import draw_error_curves
 from experiments.show.figures.result_tables import ResultTables
 from experiments.show.figures.style import plain_numbers
-from mapfusion.se2 import Float
 
 _FLOOR_M = 1e-4  # a tenth of a millimetre: anything below is exact for a robot
 
 
 def draw(data: ResultTables) -> Figure:
     """Median and 10-90 % band of the repetitions or the runs, log axis, per robot pair."""
-    return draw_error_curves(data, "translation_error_m", "translation error (m)", "", _log_axis)
-
-
-def _log_axis(axes: Axes, drawn: Float) -> None:
+    figure, drawn = draw_error_curves(data, "translation_error_m", "translation error (m)")
+    axes = figure.axes[0]
     axes.set_yscale("log", nonpositive="clip")
-    low, high = max(float(drawn.min()), _FLOOR_M), max(float(drawn.max()), 2 * _FLOOR_M)
     axes.yaxis.set_major_formatter(plain_numbers())
-    axes.set_ylim(low / 1.3, high * 1.3)
+    axes.set_ylim(max(drawn.min(), _FLOOR_M) / 1.3, max(drawn.max(), 2 * _FLOOR_M) * 1.3)
+    return figure

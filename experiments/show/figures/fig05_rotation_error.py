@@ -1,33 +1,27 @@
 """Figure 5: signed error of the alignments' rotation against the iteration."""
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.show.figures.error_curves import draw_error_curves
 from experiments.show.figures.result_tables import ResultTables
 from experiments.show.figures.style import plain_numbers
-from mapfusion.se2 import Float
 
 # The axis is linear up to here and logarithmic beyond: good alignments err by a few thousandths of
 # a radian, bad ones by tenths or more, and both must be legible.
 _LINEAR_RAD = 0.01
+_NOTE = f"""FastSLAM iteration k
+error = estimate - truth, counter-clockwise positive (the paper's sign is the opposite); \
+axis linear within ±{_LINEAR_RAD} rad"""
 
 
 def draw(data: ResultTables) -> Figure:
     """Median and 10-90 % band of the repetitions or the runs, per robot pair."""
-    return draw_error_curves(
-        data,
-        "rotation_error_rad",
-        "rotation error (rad)",
-        "error = estimate - truth, counter-clockwise positive (the paper's sign is the opposite); "
-        f"axis linear within ±{_LINEAR_RAD} rad",
-        _symmetric_axis,
-    )
-
-
-def _symmetric_axis(axes: Axes, drawn: Float) -> None:
+    figure, drawn = draw_error_curves(data, "rotation_error_rad", "rotation error (rad)")
+    axes = figure.axes[0]
     axes.set_yscale("symlog", linthresh=_LINEAR_RAD, linscale=1.0)
     axes.yaxis.set_major_formatter(plain_numbers())
-    largest = max(float(np.abs(drawn).max()), _LINEAR_RAD)
+    largest = max(np.abs(drawn).max(), _LINEAR_RAD)
     axes.set_ylim(-1.3 * largest, 1.3 * largest)
+    figure.supxlabel(_NOTE, fontsize=8)
+    return figure

@@ -7,10 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
-from experiments.show.figures.ellipses import LEVEL_TEXT, add_ellipses, semi_axes
-from experiments.show.figures.floor_plan import label_plan, set_square
-from experiments.show.figures.fused_pairs import MARKERS, FusedPairs, fused_pairs
-from experiments.show.figures.result_tables import NothingToDraw, ResultTables
+from experiments.show.figures import floor_plan as plan
+from experiments.show.figures.result_tables import FusedPairs, NothingToDraw, ResultTables
 
 _MAX_ELONGATION = 3.0  # beyond, an ellipse is a needle in print
 _MIN_SEPARATION = 0.25  # of the parents, in semi-major axes: nearer, their labels collide
@@ -19,30 +17,33 @@ _MARGIN = 1.15
 
 def draw(data: ResultTables) -> Figure:
     """The fused landmark whose three ellipses are the easiest to tell apart."""
-    pairs = fused_pairs(data)
+    pairs = data.fused_pairs()
     chosen = choose_landmark(pairs)
     if chosen is None:
         raise NothingToDraw("no fused landmark has a regular covariance")
     position, covariance = pairs.position_m[:, chosen], pairs.covariance_m2[:, chosen]
     figure = Figure(figsize=(4.6, 4.4))
     axes = figure.subplots()
-    colours = pairs.colours(data)
-    labels = [f"{robot}'s landmark $L_{i}$" for robot, i in zip(pairs.robots, "ij", strict=True)]
-    labels.append("fused landmark $L_F$")
-    for k, dashes in enumerate(("--", "-.", "-")):
-        here, colour = slice(k, k + 1), colours[k]
-        add_ellipses(axes, position[here], covariance[here], edgecolors=colour, linestyles=dashes)
-        look: dict[str, Any] = {"marker": MARKERS[k], "markersize": 6, "label": labels[k]}
-        axes.plot(*position[k, :2], color=colour, linestyle=dashes, **look)
+    parts = data.parents_and_fused(pairs.robots)
+    for k, (name, marker, colour) in enumerate(parts):
+        here, dashes = slice(k, k + 1), ("--", "-.", "-")[k]
+        plan.add_ellipses(
+            axes, position[here], covariance[here], edgecolors=colour, linestyles=dashes
+        )
+        whose = "fused" if k == 2 else f"{name}'s"
+        look: dict[str, Any] = {"marker": marker, "markersize": 6, "linestyle": dashes}
+        axes.plot(*position[k, :2], color=colour, label=f"{whose} landmark $L_{'ijF'[k]}$", **look)
     own = pairs.own_covariance_m2[:, chosen]
-    add_ellipses(axes, position[:2], own, edgecolors=colours[:2], linewidths=0.6)
+    thin = {"edgecolors": [colour for *_, colour in parts[:2]], "linewidths": 0.6}
+    plan.add_ellipses(axes, position[:2], own, **thin)
     axes.plot(*position[:2, :2].T, color="gray", linewidth=0.6, linestyle=":", zorder=1)
     _name_points(axes, position)
-    _set_view(axes, position, covariance)
-    label_plan(axes, data.robots[0])
-    axes.set_title(
-        f"{LEVEL_TEXT} ellipses, to scale\n(thin: the maps' own covariances, before drift is added)"
-    )
+    centre = position[2, :2]
+    reach = (np.abs(position[:, :2] - centre).max(axis=1) + plan.semi_axes(covariance)[0]).max()
+    plan.set_square(axes, centre, _MARGIN * reach)
+    plan.label_plan(axes, data.robots[0])
+    thin_ones = "thin: the maps' own covariances, before drift is added"
+    axes.set_title(f"{plan.LEVEL_TEXT} ellipses, to scale\n({thin_ones})")
     figure.legend(loc="outside lower center", ncols=3)
     return figure
 
@@ -53,8 +54,8 @@ def choose_landmark(pairs: FusedPairs) -> int | None:
     Among those the one whose parents' ellipses cross the most, which is where fusing gains the
     most over the better parent. When none is that clear, the best of all regular ones.
     """
-    semi = [semi_axes(covariance[:, :2, :2]) for covariance in pairs.covariance_m2]
-    major, minor = np.stack([s[0] for s in semi]), np.stack([s[1] for s in semi])
+    axes = [plan.semi_axes(covariance)[:2] for covariance in pairs.covariance_m2]
+    major, minor = np.stack(axes, axis=1)
     regular = np.all(minor > 0, axis=0)
     if not regular.any():
         return None
@@ -82,10 +83,3 @@ def _name_points(axes: Axes, position_m: np.ndarray) -> None:
     for name, (x, y, _), side in zip("ijF", position_m, (-along, along, across), strict=True):
         offset = {"xytext": tuple(14 * side), "textcoords": "offset points"}
         axes.annotate(f"$L_{name}$", xy=(x, y), **offset, **look)
-
-
-def _set_view(axes: Axes, position_m: np.ndarray, covariance_m2: np.ndarray) -> None:
-    major, _, _ = semi_axes(covariance_m2[:, :2, :2])
-    centre = position_m[2, :2]
-    reach = float((np.abs(position_m[:, :2] - centre).max(axis=1) + major).max())
-    set_square(axes, centre, _MARGIN * reach)

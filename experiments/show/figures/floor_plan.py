@@ -1,4 +1,4 @@
-"""What all maps seen from above share: equal scales, walls, frames, and a view without strays."""
+"""What maps seen from above share: equal scales, walls, error ellipses, a view without strays."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -6,15 +6,19 @@ from typing import Any
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from experiments.show.figures.result_tables import ResultTables
 from experiments.show.figures.style import BLACK, PAGE_WIDTH_IN, PALE_GRAY
+from mapfusion.chi_square import chi_square_bound
 from mapfusion.se2 import Float
 
+LEVEL_TEXT = "95 %"
+_LEVEL, _PLANE_DIMENSIONS = 0.95, 2
 _STRAY_SHARE = 0.005  # a stray landmark tens of metres off, on each side, must not shrink the map
 _MARGIN, _MIN_MARGIN_M = 0.05, 0.3  # of the view's extent
-_AXIS_LENGTH_M = 1.0
 _LABELS_WIDTH_IN, _LABELS_HEIGHT_IN = 0.55, 0.65  # what labels and titles take beside each panel
 _LEGEND_ROW_IN, _LEGEND_FRAME_IN = 0.16, 0.2
 
@@ -38,35 +42,56 @@ def add_points(axes: Axes, points: Float, **style: Any) -> None:
     axes.plot(*points[:, :2].T, linestyle="none", rasterized=True, **style)
 
 
-def add_frame(axes: Axes, length_m: float = _AXIS_LENGTH_M) -> None:
+def add_frame(axes: Axes, length_m: float = 1.0) -> None:
     """Draw the frame's x and y axis at its origin, the robot's start pose."""
+    arrow = {"arrowstyle": "-|>", "color": BLACK, "linewidth": 1.2, "shrinkA": 0}
     for tip, name in (((length_m, 0.0), "x"), ((0.0, length_m), "y")):
-        axes.annotate(
-            "",
-            xy=tip,
-            xytext=(0.0, 0.0),
-            arrowprops={"arrowstyle": "-|>", "color": BLACK, "linewidth": 1.2, "shrinkA": 0},
-            zorder=6,
-        )
+        axes.annotate("", xy=tip, xytext=(0.0, 0.0), arrowprops=arrow, zorder=6)
         axes.annotate(name, xy=tip, xytext=(3, -4), textcoords="offset points", zorder=6)
+
+
+def semi_axes(covariance_m2: Float, level: float = _LEVEL) -> tuple[Float, Float, Float]:
+    """Ellipses of covariances (N, 2+, 2+) that hold `level` of a plane normal distribution.
+
+    The squared Mahalanobis distance of a normal point is chi-square with two degrees of freedom, so
+    the semi-axes are sqrt(eigenvalue * quantile), along the eigenvectors. Returns semi-major and
+    semi-minor axes (N,) in metres and the major axis' direction (N,) in rad.
+    """
+    values, vectors = np.linalg.eigh(covariance_m2[:, :2, :2])
+    lengths = np.sqrt(np.maximum(values, 0.0) * chi_square_bound(level, _PLANE_DIMENSIONS))
+    direction = np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
+    return lengths[:, 1], lengths[:, 0], direction
+
+
+def add_ellipses(axes: Axes, position_m: Float, covariance_m2: Float, **style: Any) -> None:
+    """Draw 95 % ellipses to scale, from positions (N, 2+) and covariances (N, 2+, 2+)."""
+    major, minor, direction = semi_axes(covariance_m2)
+    place = {"units": "xy", "offsets": position_m[:, :2], "offset_transform": axes.transData}
+    sizes = (2 * major, 2 * minor, np.degrees(direction))
+    collection = EllipseCollection(*sizes, facecolors="none", **place, **style)
+    axes.add_collection(collection, autolim=False)
+
+
+def ellipse_handle(colour: str) -> Line2D:
+    """What stands for the ellipses in a legend, and says their level."""
+    style = {"marker": "o", "markerfacecolor": "none", "markersize": 7, "linestyle": "none"}
+    return Line2D([], [], color=colour, label=f"{LEVEL_TEXT} ellipses, to scale", **style)
 
 
 def set_view(axes: Axes, landmarks_m: Float, *others_m: Float) -> str:
     """Show all of `others_m` and the landmarks but for strays, at equal scales.
 
-    Returns:
-        How many landmarks there are, and how many of them are out of view, in words.
+    Returns in words how many landmarks there are, and how many of them are out of view.
     """
     core = [points[:, :2] for points in others_m if len(points)]
-    if len(landmarks_m):
-        core.append(np.quantile(landmarks_m[:, :2], [_STRAY_SHARE, 1 - _STRAY_SHARE], axis=0))
+    plan = landmarks_m[:, :2]
+    if len(plan):
+        core.append(np.quantile(plan, [_STRAY_SHARE, 1 - _STRAY_SHARE], axis=0))
     points = np.concatenate(core) if core else np.zeros((1, 2))
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
     margin = max(_MARGIN * float((high - low).max()), _MIN_MARGIN_M)
     low, high = low - margin, high + margin
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    axes.set_aspect("equal", adjustable="box")
-    plan = landmarks_m[:, :2]
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     outside = np.any((plan < low) | (plan > high), axis=1).sum()
     return f"{len(plan)} landmarks" + (f", {outside} out of view" if outside else "")
 

@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -12,10 +12,10 @@ import pyarrow as pa
 
 from experiments.judge.judged_maps import methods_in
 from experiments.judge.tables import read, table_path
-from experiments.show.figures.style import aligner_styles, robot_colours
+from experiments.show.figures.style import FUSED_COLOUR, aligner_styles, robot_colours
 from mapfusion.align.result import Status
 from mapfusion.errors import InputError
-from mapfusion.se2 import Float, between, inverse, transform_points
+from mapfusion.se2 import Float, between, inverse, transform_covariances, transform_points
 from mapfusion.storage import COVARIANCE_FIELDS, POSITION_FIELDS, points_from
 
 Pair = tuple[str, str]
@@ -23,6 +23,18 @@ Pair = tuple[str, str]
 
 class NothingToDraw(Exception):  # noqa: N818  # no error: the result simply holds no such data
     """A figure has nothing to show; the text says why, in one line."""
+
+
+class FusedPairs(NamedTuple):
+    """N landmarks fused from one of each of two robots: both parents', then the fused one's values.
+
+    The parents' covariances are as the merge weighed them, so with what it added for drift.
+    """
+
+    robots: Pair
+    position_m: Float  # (3, N, 3)
+    covariance_m2: Float  # (3, N, 3, 3)
+    own_covariance_m2: Float  # (2, N, 3, 3) of the parents, without the drift
 
 
 class ResultTables:
@@ -33,12 +45,9 @@ class ResultTables:
     """
 
     def __init__(self, folder: Path, of_runs: Mapping[str, pd.DataFrame] | None = None) -> None:
-        """Read from a result folder, or show rows of several runs that are in memory already.
+        """Read from a result folder, or show rows `of_runs`, tables by name with a `run_id`.
 
-        Args:
-            folder: written by `run`; of several runs where their figures go.
-            of_runs: rows of tables, by name, with `run_id`: `errors` with one row per run where a
-                result has one per repetition.
+        Of runs, `errors` has one row per run where a result has one per repetition.
         """
         self.folder = folder
         self.several_runs = of_runs is not None
@@ -98,32 +107,64 @@ class ResultTables:
         rows = of_pair(self.table("correspondences"), pair)
         return rows[rows["iteration"] == self.last_iteration(pair)]
 
-    def landmarks_of(self, robot: str) -> tuple[Float, Float]:
-        """Positions (N, 3) and covariances (N, 3, 3) of the last map, by landmark number."""
-        return positions_and_covariances(self._own_rows("landmarks", robot, "landmark"))
-
-    def path_of(self, robot: str) -> Float:
-        """Poses (T, 3) of the best particle's whole path at the end, in the robot's frame."""
-        rows = self._own_rows("paths", robot, "iteration")
-        return rows[["final_x_m", "final_y_m", "final_theta_rad"]].to_numpy()
-
-    def clouds_of(self, robot: str) -> pd.DataFrame:
-        """A robot's particles at the kept iterations."""
-        return self._own_rows("clouds", robot, "iteration")
-
-    def _own_rows(self, name: str, robot: str, order: str) -> pd.DataFrame:
+    def of_robot(self, name: str, robot: str, order: str = "iteration") -> pd.DataFrame:
+        """A robot's rows of the table of that name, in the order of a column."""
         table = self.table(name)
         return table[table["robot"] == robot].sort_values(order, kind="stable")
+
+    def landmarks_of(self, robot: str) -> tuple[Float, Float]:
+        """Positions (N, 3) and covariances (N, 3, 3) of the last map, by landmark number."""
+        return positions_and_covariances(self.of_robot("landmarks", robot, "landmark"))
+
+    def path_of(self, robot: str) -> Float:
+        """Positions (T, 2) of the best particle's whole path at the end, in the robot's frame."""
+        return self.of_robot("paths", robot)[["final_x_m", "final_y_m"]].to_numpy()
+
+    def moved_map(self, robot: str) -> tuple[Float, Float, Float]:
+        """A robot's last map as it went into the merge.
+
+        Positions (N, 3), covariances (N, 3, 3), and these before the drift widened them.
+        """
+        if not table_path(self.folder, "fused_motions").is_file():
+            raise NothingToDraw("made before fused motions were stored: run it again")
+        motions = self.table("fused_motions").set_index("robot").loc[robot]
+        T_fused_robot = motions[["tx_m", "ty_m", "theta_rad"]].to_numpy(dtype=np.float64)
+        position, covariance = self.landmarks_of(robot)
+        turned = transform_covariances(T_fused_robot, covariance)
+        drift_m2 = motions["drift_sigma_m"] ** 2 * np.diag([1.0, 1.0, 0.0])  # heights do not drift
+        return transform_points(T_fused_robot, position), turned + drift_m2, turned
+
+    def fused_pairs(self) -> FusedPairs:
+        """The fused landmarks of the robot pair that shares most; NothingToDraw where none."""
+        fused = self.table("fused")
+        rows = fused[(fused["n_parents"] == 2) & (fused["robot_b"] != "")]
+        if rows.empty:
+            raise NothingToDraw("no two landmarks were fused")
+        robots: Any = rows.groupby(["robot_a", "robot_b"], sort=False).size().idxmax()
+        rows = of_pair(rows, robots)
+        parents = [
+            [values[rows[index].to_numpy()] for values in self.moved_map(robot)]
+            for robot, index in zip(robots, ("landmark_a", "landmark_b"), strict=True)
+        ]
+        moved, widened, own = (np.stack(values) for values in zip(*parents, strict=True))
+        position, covariance = positions_and_covariances(rows)
+        three = np.concatenate([moved, position[None]])
+        return FusedPairs(robots, three, np.concatenate([widened, covariance[None]]), own)
+
+    def parents_and_fused(self, robots: Pair) -> list[tuple[str, str, str]]:
+        """Robot name or "fused", marker and colour of two parents and the fused landmark."""
+        colours = [self.colours[robot] for robot in robots] + [FUSED_COLOUR]
+        return list(zip([*robots, "fused"], "*^s", colours, strict=True))
 
     @cached_property
     def walls(self) -> list[Float]:
         """The walls' corner points, (n, 2) each, in the world; none where unknown."""
-        return [np.array(wall) for wall in (self._world or {}).get("walls", [])]
+        return [np.array(wall) for wall in self._world.get("walls", [])]
 
     @cached_property
-    def _world(self) -> dict[str, Any] | None:
+    def _world(self) -> dict[str, Any]:
         path = self.folder / "world.json"
-        return _read_json(path) if path.is_file() else None
+        return _read_json(path) if path.is_file() else {}
 
     def walls_in_frame_of(self, robot: str) -> list[Float]:
         """The walls' corner points, (n, 2) each, in a robot's map frame; none where unknown."""
@@ -134,14 +175,12 @@ class ResultTables:
 
     def true_alignment(self, pair: Pair) -> Float | None:
         """The true T_a_b (3,) of two map frames, or None where it is unknown."""
-        starts = [self.start_pose(robot) for robot in pair]
-        if starts[0] is None or starts[1] is None:
-            return None
-        return between(starts[0], starts[1])
+        start_a, start_b = (self.start_pose(robot) for robot in pair)
+        return None if start_a is None or start_b is None else between(start_a, start_b)
 
     def start_pose(self, robot: str) -> Float | None:
         """The true T_world_map (3,) of a robot, or None where it is unknown."""
-        pose = (self._world or {}).get("robots", {}).get(robot)
+        pose = self._world.get("robots", {}).get(robot)
         return None if pose is None else np.array(pose, dtype=np.float64)
 
 

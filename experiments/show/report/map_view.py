@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.run.estimates import inlier_mask
-from experiments.show.figures.ellipses import LEVEL_TEXT, semi_axes
+from experiments.show.figures.floor_plan import LEVEL_TEXT, semi_axes
 from experiments.show.figures.result_tables import Pair, ResultTables, of_pair
 from experiments.show.report.charts import rounded
 from mapfusion.se2 import Float

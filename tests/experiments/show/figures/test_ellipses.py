@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from experiments.show.figures.ellipses import add_ellipses, semi_axes
+from experiments.show.figures.floor_plan import add_ellipses, semi_axes
 
 LEVEL = 0.95
 # Chi-square with two degrees of freedom is an exponential: its quantile needs no table.
@@ -51,7 +51,7 @@ def test_ellipses_are_drawn_to_scale_at_their_place() -> None:
     axes.set_ylim(-2, 2)  # 100 pixels a metre
     S = np.zeros((1, 3, 3))
     S[0, :2, :2] = covariance(0.5, 0.2, np.pi / 2)
-    add_ellipses(axes, np.array([[0.5, -0.3, 7.0]]), S, LEVEL, edgecolors="black", linewidths=0.5)
+    add_ellipses(axes, np.array([[0.5, -0.3, 7.0]]), S, edgecolors="black", linewidths=0.5)
     picture = io.BytesIO()
     figure.savefig(picture, format="rgba", dpi=100)
     dark = np.frombuffer(picture.getvalue(), np.uint8).reshape(400, 400, 4)[..., 0] < 200

@@ -8,8 +8,8 @@ from scipy.spatial.distance import pdist
 
 from experiments.judge import tables
 from experiments.show.figures.fig08_fused_landmark import choose_landmark
-from experiments.show.figures.fused_pairs import FusedPairs, fused_pairs, moved_map
 from experiments.show.figures.result_tables import (
+    FusedPairs,
     NothingToDraw,
     ResultTables,
     positions_and_covariances,
@@ -20,7 +20,7 @@ from experiments.show.figures.result_tables import (
 def test_maps_lie_where_the_merge_put_them(robot: str, trio_result: Path) -> None:
     """Landmarks that no other robot had lie in the fused map just as the merge moved them."""
     data = ResultTables(trio_result)
-    position, covariance, own_covariance = moved_map(data, robot)
+    position, covariance, own_covariance = data.moved_map(robot)
     fused = data.table("fused")
     carried = fused[(fused["n_parents"] == 1) & (fused["robot_a"] == robot)]
     rows = carried["landmark_a"].to_numpy()
@@ -41,7 +41,7 @@ def test_maps_lie_where_the_merge_put_them(robot: str, trio_result: Path) -> Non
 
 
 def test_parents_fuse_into_the_stored_landmark(trio_result: Path) -> None:
-    pairs = fused_pairs(ResultTables(trio_result))
+    pairs = ResultTables(trio_result).fused_pairs()
     information = np.linalg.inv(pairs.covariance_m2)
     total = information[0] + information[1]
     np.testing.assert_allclose(total, information[2], rtol=1e-6)
@@ -53,7 +53,7 @@ def test_parents_fuse_into_the_stored_landmark(trio_result: Path) -> None:
 def test_a_result_made_before_motions_were_stored_says_so(trio_copy: Path) -> None:
     tables.table_path(trio_copy, "fused_motions").unlink()
     with pytest.raises(NothingToDraw, match="made before fused motions were stored"):
-        fused_pairs(ResultTables(trio_copy))
+        ResultTables(trio_copy).fused_pairs()
 
 
 def one_pair(separation_m: float, sigma_a: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments.show.figures.ellipses import semi_axes
+from experiments.show.figures.floor_plan import semi_axes
 from experiments.show.figures.result_tables import ResultTables, of_pair
 from experiments.show.report import map_view as module
 from experiments.show.report.map_view import (

@@ -12,8 +12,7 @@ from experiments.methods import catalogue
 from experiments.run.job import Job
 from experiments.run.store import Store
 from experiments.scenario.settings import AlignerEntry
-from experiments.show.benchmark_files import cell_text, markdown
-from experiments.show.figures.benchmark_figure import draw
+from experiments.show.benchmark_files import cell_text, draw, markdown
 from experiments.study.benchmark import cells as benchmark
 from experiments.study.benchmark.cells import BenchmarkDesign, entries_of, run_benchmark
 from experiments.study.benchmark.success import SUMMARY, summarise
