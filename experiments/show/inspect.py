@@ -60,10 +60,9 @@ class Contents:
 def inspect(path: Path) -> None:
     """Print what a file or folder is and holds; raises InputError as `contents_of` does."""
     found = contents_of(path)
-    version = found.facts.pop(_VERSION, None)
-    shown = "" if version is None else f", schema version {version}"
-    facts = [f"  {name}: {value}" for name, value in found.facts.items()]
-    print_lines([f"{path}: {found.kind}{shown}", *facts])
+    facts = {name: f"  {name}: {value}" for name, value in found.facts.items()}
+    version = f", schema version {found.facts[_VERSION]}" if facts.pop(_VERSION, "") else ""
+    print_lines([f"{path}: {found.kind}{version}", *facts.values()])
     if len(found.parts):
         numbers = set(found.parts.select_dtypes("number"))
         columns = [(str(name), "d" if name in numbers else "") for name in found.parts]

@@ -143,13 +143,11 @@ class _View:
         rows = self._of_robot("paths", robot).sort_values("iteration")
         if rows.empty:
             return {}
-        known = [
-            path
-            for path in ("online", "truth")
-            if np.isfinite(rows[[f"{path}_x_m", f"{path}_y_m"]]).all(axis=None)
-        ]
-        paths: Json = {path: self._positions(rows, robot, f"{path}_") for path in known}
-        return paths | {"theta_rad": rounded(rows["online_theta_rad"])}
+        paths: Json = {"theta_rad": rounded(rows["online_theta_rad"])}
+        for path in ("online", "truth"):
+            if np.isfinite(rows[[f"{path}_x_m", f"{path}_y_m"]]).all(axis=None):
+                paths[path] = self._positions(rows, robot, f"{path}_")
+        return paths
 
     def pair(self, pair: Pair) -> Json:
         """Correspondences, fused landmarks and alignments of two robots, iteration by iteration."""
@@ -187,9 +185,8 @@ class _View:
         errors = of_pair(self._data.table("errors"), pair)
         new = [name for name in errors if name in _ANSWER or name not in estimates]
         joined = estimates[estimates["repetition"] == 0].merge(errors[new], on=_ANSWER)
-        found = {
-            (row["aligner"], row["iteration"]): _alignment(row) for row in joined.to_dict("records")
-        }
+        rows = joined.to_dict("records")
+        found = {(row["aligner"], row["iteration"]): _alignment(row) for row in rows}
         return {
             name: [found.get((name, k)) for k in iterations]
             for name in self._data.aligners

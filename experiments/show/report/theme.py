@@ -53,11 +53,10 @@ def palette(colours: Iterable[str]) -> dict[str, dict[str, str]]:
     """All colours of a page by name, `light` and `dark`, for figures that use these."""
     light, dark = ({name: pair[k] for name, pair in _SURFACES.items()} for k in (0, 1))
     used = {"accent": BLUE, "warm": ORANGE} | {css_name(c): c for c in colours if c != BLACK}
-    text_on = dark["tint"]  # the lightest surface
-    return {
-        "light": light | {name: colour.lower() for name, colour in used.items()},
-        "dark": dark | {name: lightened(colour, text_on) for name, colour in used.items()},
-    }
+    light |= {name: colour.lower() for name, colour in used.items()}
+    # the tint is the lightest surface that text is on
+    dark |= {name: lightened(colour, dark["tint"]) for name, colour in used.items()}
+    return {"light": light, "dark": dark}
 
 
 def css_name(colour: str) -> str:
