@@ -14,6 +14,7 @@ from experiments.study.statistics.success_rates import success_rates
 _DIGITS = 5  # significant; more than any chart can show, and a third of the bytes of all of them
 _MAX_POINTS = 400  # of a curve: a chart is about a thousand pixels wide
 _MAX_TIMES = 40  # points of an aligner in the chart of times
+_OFFERED = ["n_true", "n_correspondences"]
 _ERRORS = {
     "translation_estimated": "translation_error_m",
     "translation_refined": "refined_translation_error_m",
@@ -27,39 +28,10 @@ def rounded(values: Any) -> list[float | None]:
     return [float(f"{v:.{_DIGITS}g}") if math.isfinite(v) else None for v in np.ravel(values)]
 
 
-def error_curves(rows: pd.DataFrame, aligners: Sequence[str]) -> dict[str, Any]:
-    """Median and band of the errors of each aligner against the iteration.
-
-    Args:
-        rows: of the table `errors`, or of `medians_of_run`; those of one iteration are pooled.
-        aligners: in display order.
-
-    Returns:
-        `iteration`, what was offered there, `scarce` spans, and for each aligner the curves.
-    """
-    iterations = np.unique(rows["iteration"].to_numpy())
-    if len(iterations) > _MAX_POINTS:
-        iterations = iterations[
-            np.linspace(0, len(iterations) - 1, _MAX_POINTS).round().astype(int)
-        ]
-        rows = rows[rows["iteration"].isin(iterations)]
-    # the sign of a rotation has no place on a logarithmic axis
-    bands = error_bands(rows, by=(), absolute=True)
-    of_aligner = {
-        name: bands[bands["aligner"] == name].set_index("iteration").reindex(iterations)
-        for name in aligners
-    }
-    offered = rows.drop_duplicates(MAP_PAIR).groupby("iteration")
-    return {
-        "iteration": iterations.tolist(),
-        "n_true": rounded(offered["n_true"].median()),
-        "n_correspondences": rounded(offered["n_correspondences"].median()),
-        "scarce": scarce_spans(rows),
-        "aligners": {
-            name: {curve: _band(own, f"{column}{{}}") for curve, column in _ERRORS.items()}
-            for name, own in of_aligner.items()
-        },
-    }
+def thinned(values: np.ndarray, n: int) -> np.ndarray:
+    """At most n of some values, evenly spread; the last one stays."""
+    last = len(values) - 1
+    return values[np.linspace(last, 0, min(n, last + 1)).round().astype(int)[::-1]]
 
 
 def _band(rows: pd.DataFrame, column: str, scale: float = 1.0) -> dict[str, list[float | None]]:
@@ -68,14 +40,33 @@ def _band(rows: pd.DataFrame, column: str, scale: float = 1.0) -> dict[str, list
     return {name: rounded(scale * rows[column.format(end)]) for name, end in ends.items()}
 
 
+def error_curves(rows: pd.DataFrame, aligners: Sequence[str]) -> dict[str, Any]:
+    """Median and band of the errors of each aligner against the iteration, and what was offered.
+
+    Of rows of the table `errors`, or of `medians_of_run`; those of one iteration are pooled.
+    """
+    iterations = thinned(np.unique(rows["iteration"]), _MAX_POINTS)
+    rows = rows[rows["iteration"].isin(iterations)]
+    offered = rows.drop_duplicates(MAP_PAIR).groupby("iteration")[_OFFERED].median()
+    # the sign of a rotation has no place on a logarithmic axis
+    bands = error_bands(rows, by=(), absolute=True).set_index("iteration")
+    of_aligner = {name: bands[bands["aligner"] == name].reindex(iterations) for name in aligners}
+    return {
+        "iteration": iterations.tolist(),
+        **{name: rounded(offered[name]) for name in _OFFERED},
+        "scarce": scarce_spans(rows),
+        "aligners": {
+            name: {curve: _band(own, f"{column}{{}}") for curve, column in _ERRORS.items()}
+            for name, own in of_aligner.items()
+        },
+    }
+
+
 def success_curves(maps: pd.DataFrame, aligners: Sequence[str]) -> list[dict[str, Any]]:
     """Success rates with their intervals against what makes an alignment hard.
 
-    Bins whose maps have no common ground, where there is nothing to be right about, are left out.
-
-    Args:
-        maps: rows of `maps_of` with the column overlap_share, which may be unknown.
-        aligners: in display order.
+    Of rows of `maps_of` with the column overlap_share, which may be unknown. Bins whose maps have
+    no common ground, where there is nothing to be right about, are left out.
     """
     curves = []
     for by, (label, name) in _SUCCESS_AGAINST.items():
@@ -84,25 +75,22 @@ def success_curves(maps: pd.DataFrame, aligners: Sequence[str]) -> list[dict[str
             continue
         rates = rates[rates["n_maps"] > rates["n_apart"]]
         bins = rates[["from", "to"]].drop_duplicates().sort_values("from")
+        by_aligner = {}
+        for aligner in aligners:
+            own = rates[rates["aligner"] == aligner].set_index("from").reindex(bins["from"])
+            band = _band(own, "refined_success{}")
+            n_maps = (own["n_maps"] - own["n_apart"]).fillna(0).astype(int)
+            by_aligner[aligner] = {"rate": band.pop("median"), **band, "n": n_maps.tolist()}
         labels = [name(*ends) for ends in bins.itertuples(index=False)]
-        by_bin = {aligner: _rates_of(rates, aligner, bins["from"]) for aligner in aligners}
-        curves.append({"label": label, "bins": labels, "aligners": by_bin})
+        curves.append({"label": label, "bins": labels, "aligners": by_aligner})
     return curves
-
-
-def _rates_of(rates: pd.DataFrame, aligner: str, starts: pd.Series) -> dict[str, Any]:
-    own = rates[rates["aligner"] == aligner].set_index("from").reindex(starts)
-    band = _band(own, "refined_success{}")
-    n_maps = (own["n_maps"] - own["n_apart"]).fillna(0).astype(int)
-    return {"rate": band.pop("median"), **band, "n": n_maps.tolist()}
 
 
 def _counts(low: float, high: float) -> str:
     """A bin of whole numbers, which holds its lower end alone."""
     if math.isinf(high):
         return f"≥ {low:g}"
-    top = high - 1
-    return f"{low:g}" if top == low else f"{low:g}–{top:g}"
+    return f"{low:g}" if high == low + 1 else f"{low:g}–{high - 1:g}"
 
 
 def _shares(low: float, high: float) -> str:

@@ -1,25 +1,37 @@
 """All that a report shows of one or several runs, as values for the template; nothing is drawn."""
 
+import base64
+import importlib
+import io
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from PIL import Image
+from ruamel.yaml import YAML
 
+from experiments.judge import metrics, tables
 from experiments.judge.criteria import that_ever_meet
+from experiments.judge.expectations import Outcome
 from experiments.judge.judged_maps import methods_in, setting_columns
+from experiments.judge.path_errors import path_rms
 from experiments.judge.result import require_result
+from experiments.scenario.settings import Bound
+from experiments.show.figures.drawing import FIGURES
 from experiments.show.figures.result_tables import ResultTables, of_pair, pairs_in
 from experiments.show.figures.style import aligner_styles
 from experiments.show.report.charts import error_curves, success_curves, time_curves
-from experiments.show.report.one_run_sections import one_run_sections
+from experiments.show.report.map_view import TABLES as MAP_TABLES
+from experiments.show.report.map_view import map_view
 from experiments.show.report.origin import natural, provenance_of, stage_times
-from experiments.show.report.recommendation_text import recommendation_text
 from experiments.show.report.theme import chart_style
-from experiments.study.statistics.run_tables import Runs, find_runs
+from experiments.study.statistics.run_tables import find_runs
 from experiments.study.statistics.standing import recommend
 from experiments.study.statistics.summary import ALL_SCENARIOS, configurations, reduced_errors
 from mapfusion.errors import InputError
+
+_TABLES = tuple(dict.fromkeys((*MAP_TABLES, *metrics.USED_TABLES, "timings")))
 
 
 def contents_of(path: Path) -> dict[str, Any]:
@@ -29,22 +41,27 @@ def contents_of(path: Path) -> dict[str, Any]:
         InputError: neither, or a table is damaged.
     """
     runs = find_runs(path)
-    data = None
     if not runs.sweeps:
         require_result(path)
-        data = ResultTables(path)
     if not runs.has("errors") or (reduced := reduced_errors(runs)).maps.empty:
         raise InputError(f"{path}: no pair of maps was aligned, there is nothing to report on")
-    aligners = methods_in(reduced.maps, oracle=True)
-    if data is None:
-        own, groups = _of_sweep(path, reduced.maps), _by_configuration(reduced.medians)
+    maps = reduced.maps
+    if runs.sweeps:
+        own, groups = _of_sweep(path, maps), _by_configuration(reduced.medians)
     else:
-        aligners = [name for name in data.aligners if name in aligners]
-        own, groups = one_run_sections(data), _by_robots(runs.read("errors"))
+        own, groups = _of_result(ResultTables(path)), _by_robots(runs.read("errors"))
+    aligners = methods_in(maps, oracle=True)
+    styles = aligner_styles(aligners)
+    timings = runs.read("aligner_timings") if runs.has("aligner_timings") else pd.DataFrame()
     provenance, stages = provenance_of(path, runs)
     return own | {
-        **_ranking(runs, reduced.maps, aligners),
+        "ranking": recommend(maps, timings, aligners),
+        "n_robot_pairs": len(maps[["scenario", "robot_a", "robot_b"]].drop_duplicates()),
+        "settings": setting_columns(maps),
+        "aligners": [{"name": name, **chart_style(styles[name])} for name in aligners],
         "groups": [{"label": label, "curves": error_curves(r, aligners)} for label, r in groups],
+        "success": success_curves(maps, aligners),
+        "times": time_curves(timings, aligners) if len(timings) else {},
         "absent": reduced.absent,
         "provenance": provenance,
         "stages": stages,
@@ -55,39 +72,14 @@ def contents_of(path: Path) -> dict[str, Any]:
 
 def _of_sweep(path: Path, maps: pd.DataFrame) -> dict[str, Any]:
     """Title of a sweep, and the sections that it has not."""
-    none: dict[str, Any] = dict.fromkeys(("outcomes", "robots", "fits", "figures", "missing"), ())
-    return none | {
+    none = ("outcomes", "robots", "fits", "figures", "missing", "scenario_text")
+    return dict.fromkeys(none, ()) | {
         "title": f"{path.name}, {maps['run_id'].nunique()} runs",
         "description": ", ".join(maps["scenario"].unique()),
         "spread_text": "runs; each run is the median of its repetitions",
         "map": None,
         "robot_colours": {},
-        "scenario_text": "",
     }
-
-
-def _ranking(runs: Runs, maps: pd.DataFrame, aligners: list[str]) -> dict[str, Any]:
-    """The aligners compared on all maps: words, table and charts."""
-    timings = runs.read("aligner_timings") if runs.has("aligner_timings") else pd.DataFrame()
-    ranking = recommend(maps, timings, aligners)
-    n_robot_pairs = len(maps[["scenario", "robot_a", "robot_b"]].drop_duplicates())
-    styles = aligner_styles(aligners)
-    return {
-        "ranking": ranking,
-        "words": recommendation_text(ranking, n_robot_pairs, setting_columns(maps)),
-        "aligners": [{"name": name, **chart_style(styles[name])} for name in aligners],
-        "success": success_curves(maps, aligners),
-        "times": time_curves(timings, aligners) if len(timings) else {},
-    }
-
-
-def _by_robots(errors: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Errors of each pair of robots, and of all together, with a label each."""
-    pairs = pairs_in(errors)
-    for a, b in pairs:
-        yield f"{a} – {b}", of_pair(errors, (a, b))
-    if len(pairs) > 1:
-        yield "all pairs", errors
 
 
 def _by_configuration(spread: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
@@ -100,3 +92,67 @@ def _by_configuration(spread: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]
             scenario = "(all)" if len(rows) == n_before else "(all with common ground)"
         settings = [f"{name.rpartition('.')[2]} {value}" for name, value in labels.items()]
         yield ", ".join([scenario, *settings]), rows
+
+
+def _of_result(data: ResultTables) -> dict[str, Any]:
+    """Title and sections of a result; what builds on tables that it does not hold is empty."""
+    held = {
+        name: data.table(name) for name in _TABLES if tables.table_path(data.folder, name).is_file()
+    }
+    return {
+        "title": f"{data.scenario['name']}, seed {data.scenario['seed']}",
+        "description": data.scenario.get("description", ""),
+        "spread_text": "repetitions on the same maps",
+        "map": map_view(data, held),
+        "robot_colours": data.colours,
+        "outcomes": _outcomes(data.scenario, held),
+        "robots": path_rms(held["robots"]).to_dict("records") if "robots" in held else [],
+        "fits": held["map_fits"].to_dict("records") if "map_fits" in held else [],
+        "figures": list(_pictures(data.folder)),
+        "scenario_text": _as_yaml(data.scenario),
+        "missing": [name for name in _TABLES if name not in held],
+    }
+
+
+def _by_robots(errors: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Errors of each pair of robots, and of all together, with a label each."""
+    pairs = pairs_in(errors)
+    for a, b in pairs:
+        yield f"{a} – {b}", of_pair(errors, (a, b))
+    if len(pairs) > 1:
+        yield "all pairs", errors
+
+
+def _outcomes(scenario: dict[str, Any], held: dict[str, pd.DataFrame]) -> list[Outcome]:
+    """The scenario's expectations, measured on this run alone."""
+    if not set(metrics.USED_TABLES) <= set(held):
+        return []
+    used = {name: held[name].assign(seed=0) for name in metrics.USED_TABLES}
+    outcomes = []
+    for metric, bound in scenario.get("expect", {}).items():
+        value = metrics.compute(metric, used)
+        limits = Bound.model_validate(bound)
+        outcomes.append(Outcome(scenario["name"], metric, value, limits, {0: value}))
+    return outcomes
+
+
+def _pictures(folder: Path) -> Iterator[dict[str, Any]]:
+    """The drawn figures; a reference folder keeps them beside its tables."""
+    for name in FIGURES:
+        files = (folder / "figures" / f"{name}.png", folder / f"{name}.png")
+        if file := next(filter(Path.is_file, files), None):
+            about = importlib.import_module(f"experiments.show.figures.{name}").__doc__ or name
+            with Image.open(file) as picture:  # so that the page does not jump as pictures load
+                size = dict(zip(("width", "height"), picture.size, strict=True))
+            png = base64.b64encode(file.read_bytes()).decode()
+            yield {"about": about.splitlines()[0], "png": png, **size}
+
+
+def _as_yaml(scenario: dict[str, Any]) -> str:
+    stream = io.StringIO()
+    yaml = YAML(typ="safe", pure=True)
+    yaml.default_flow_style = None
+    yaml.width = 100
+    yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
+    yaml.dump(scenario, stream)
+    return stream.getvalue()

@@ -51,12 +51,11 @@ _MARKERS = {
 
 def palette(colours: Iterable[str]) -> dict[str, dict[str, str]]:
     """All colours of a page by name, `light` and `dark`, for figures that use these."""
-    used = [colour for colour in dict.fromkeys(colours) if colour != BLACK]
-    light = {name: pair[0] for name, pair in _SURFACES.items()}
-    dark = {name: pair[1] for name, pair in _SURFACES.items()}
-    for name, colour in [("accent", BLUE), ("warm", ORANGE), *((css_name(c), c) for c in used)]:
-        light[name] = colour.lower()
-        dark[name] = lightened(colour, dark["tint"])  # the lightest surface that text is on
+    light, dark = ({name: pair[k] for name, pair in _SURFACES.items()} for k in (0, 1))
+    used = {"accent": BLUE, "warm": ORANGE} | {css_name(c): c for c in colours if c != BLACK}
+    light |= {name: colour.lower() for name, colour in used.items()}
+    # the tint is the lightest surface that text is on
+    dark |= {name: lightened(colour, dark["tint"]) for name, colour in used.items()}
     return {"light": light, "dark": dark}
 
 
@@ -78,8 +77,7 @@ def chart_style(style: dict[str, Any]) -> dict[str, str]:
 
 def lightened(colour: str, background: str) -> str:
     """The hue with as much white as it needs to stand out from a dark background."""
-    white = 0.0
-    found = colour.lower()
+    white, found = 0.0, colour.lower()
     while contrast(found, background) < MIN_CONTRAST:
         white += _LIGHTENING_STEP
         red, green, blue = (c + (1 - c) * white for c in to_rgb(colour))

@@ -3,7 +3,9 @@
 import math
 from dataclasses import replace
 
-from experiments.show.report.recommendation_text import recommendation_text
+from markupsafe import Markup
+
+from experiments.show.report.document import templates
 from experiments.study.statistics.standing import Recommendation, Standing
 
 GOOD = Standing(
@@ -36,9 +38,9 @@ ONE_RUN = Recommendation(
 
 
 def sentences(ranking: Recommendation, settings: tuple[str, ...] = ()) -> str:
-    text = recommendation_text(ranking, 1, settings)
-    parts = (f"{text.headline} {text.name}".strip(), text.lead, *text.remarks, text.sure)
-    return " ".join((*parts, text.sure_why)).replace("\u00a0", " ")
+    page = templates().get_template("verdict.html.j2")
+    html = page.render(ranking=ranking, n_robot_pairs=1, settings=settings)
+    return Markup(html).striptags().replace("\u00a0", " ")
 
 
 def test_the_best_is_recommended_with_its_numbers() -> None:
@@ -76,9 +78,9 @@ def test_equal_methods_are_named() -> None:
 
 def test_without_common_ground_no_method_is_named() -> None:
     nowhere = replace(ONE_RUN, best=None, n_common=0)
-    text = recommendation_text(nowhere, 1)
-    assert (text.headline, text.name) == ("No common ground.", "")
-    assert "False merges: poor (8)." in text.remarks
+    text = sentences(nowhere)
+    assert text.startswith("No common ground. None of the 24 pairs of maps")
+    assert "False merges: poor (8)." in text
 
 
 def test_where_nothing_works_no_method_is_named() -> None:
