@@ -13,8 +13,8 @@ from experiments.judge.judged_maps import methods_in
 from experiments.judge.path_errors import path_rms
 from experiments.judge.tables import SHOWN
 from experiments.show.terminal.layout import print_lines, print_skipped, print_table
-from experiments.study.statistics.aligner_summary import aligner_summary
 from experiments.study.statistics.error_bands import ROBOT_PAIR, error_bands
+from experiments.study.statistics.standing import aligner_summary
 from mapfusion.align.result import NOT_RUN, Status
 
 if TYPE_CHECKING:

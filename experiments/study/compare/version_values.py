@@ -9,9 +9,11 @@ from typing import Literal, NamedTuple
 import numpy as np
 import pandas as pd
 
-from experiments.judge.criteria import ORACLE, answerable, has_common_ground, rich
+from experiments.judge.criteria import ANSWERABLE_PAIRS, COMMON_LANDMARKS, ORACLE, RICH_PAIRS
 from experiments.judge.judged_maps import (
+    COUNTS,
     MAP_KEYS,
+    MAP_PAIR,
     NEEDED,
     OPTIONAL,
     RUN_KEYS,
@@ -21,156 +23,124 @@ from experiments.judge.judged_maps import (
 )
 from experiments.judge.path_errors import path_rms
 from experiments.study.statistics.better import log_ratio
+from experiments.study.statistics.error_bands import ROBOT_PAIR
 from experiments.study.statistics.run_tables import Runs, match_names
 
-MATCH = "match"
-# How a change is told: as a ratio b / a, as a difference of shares, or as a difference of distances
-# from consistency |ln(NEES per degree of freedom)|.
-Scale = Literal["ratio", "share", "ln"]
+_KEYS = (*MAP_PAIR, "aligner", "robot", "map")
+_NEES, _REFINED = "nees_with_drift", "refined_translation_error_m"
+_EACH = "each method"
 
 
 class Quantity(NamedTuple):
-    """What two versions are compared in.
+    """What two versions are compared in: a column of the rows of a table, or of those `where`.
 
-    Attributes:
-        metric: its name, with its unit.
-        method: the aligner, or empty.
-        scale: how its change is told.
-        higher_is_better: else lower is.
-        timed: depends on the machine and its load, which runs share.
+    Their counts are the lesser ones of the two versions. A change is told as a ratio b / a, as a
+    difference of shares, or as one of distances from consistency |ln(NEES per degree of freedom)|.
+    It is `of` each method, of the oracle, or of no aligner. What is timed depends on the machine
+    and its load, which runs share.
     """
 
+    table: str
     metric: str
-    method: str
-    scale: Scale
+    column: str
+    scale: Literal["ratio", "share", "ln"] = "ratio"
+    of: str = ""
     higher_is_better: bool = False
+    where: str = ""
     timed: bool = False
 
 
-class Values(NamedTuple):
-    """One quantity in both versions: columns match (the run), a, b, change."""
+def all_values(a: Runs, b: Runs) -> Iterator[tuple[Quantity, str, pd.DataFrame]]:
+    """All quantities that both have tables for, the method, and columns run_id, a, b, change."""
+    for table in _READ:
+        if not (a.has(table) and b.has(table)):
+            continue
+        rows = _joined(a, b, table)
+        for method in [*(methods_in(rows, oracle=True) if "aligner" in rows else []), ""]:
+            own = rows[rows["aligner"] == method] if method else rows
+            of = method if method in ("", ORACLE) else _EACH
+            for quantity in _QUANTITIES:
+                if (quantity.table, quantity.of) == (table, of):
+                    yield quantity, method, _changes(quantity, own)
 
-    quantity: Quantity
-    rows: pd.DataFrame
 
-
-def all_values(a: Runs, b: Runs) -> Iterator[Values]:
-    """All quantities that both versions have tables for."""
-    for table, build in _BUILT_FROM.items():
-        if a.has(table) and b.has(table):
-            yield from build(a, b)
-
-
-def _joined(
-    a: Runs, b: Runs, keys: Sequence[str], read: Callable[[Runs], Iterator[pd.DataFrame]]
-) -> pd.DataFrame:
-    """Rows of both by run and keys, values with the suffixes _a and _b."""
+def _joined(a: Runs, b: Runs, table: str) -> pd.DataFrame:
+    """Rows of both by run and keys, values with the suffixes _a and _b; the lesser counts."""
     frames = []
     for runs in (a, b):
+        parts = list(_reduced(runs, table))
         # a run of one robot has no rows, and must not decide the columns' types
-        parts = list(read(runs))
-        frame = pd.concat([part for part in parts if len(part)] or parts[:1], ignore_index=True)
-        dropped = [*RUN_KEYS, *setting_columns(frame)]
-        frames.append(frame.assign(match=match_names(frame)).drop(columns=dropped))
-    return frames[0].merge(frames[1], on=[MATCH, *keys], suffixes=("_a", "_b"))
+        parts = [part for part in parts if len(part)] or parts[:1]
+        frames.append(pd.concat(parts, ignore_index=True))
+    keys = [name for name in _KEYS if name in frames[0]]
+    joined = frames[0].merge(frames[1], on=keys, suffixes=("_a", "_b"))
+    lesser = {name: joined.filter(like=name).min(axis=1) for name in COUNTS if name in frames[0]}
+    return joined.assign(**lesser)
 
 
-def _in_both(rows: pd.DataFrame, kept: Callable[[pd.DataFrame], pd.DataFrame]) -> pd.DataFrame:
-    """The rows whose true pairs and common landmarks are enough in both versions."""
-    counts = {name: rows[[f"{name}_a", f"{name}_b"]].min(axis=1) for name in ("n_true", "n_common")}
-    return rows.loc[kept(pd.DataFrame(counts)).index]
+def _reduced(runs: Runs, table: str) -> Iterator[pd.DataFrame]:
+    """Each run's rows, the run named by what it is matched by."""
+    columns, optional, reduce = _READ[table]
+    for rows in runs.each(table, columns, optional):
+        named = rows.drop(columns=[*RUN_KEYS, *setting_columns(rows)])
+        yield reduce(named.assign(run_id=match_names(rows)))
 
 
-def _of_alignments(a: Runs, b: Runs) -> Iterator[Values]:
-    keys = [*MAP_KEYS, "aligner"]
-    maps = _joined(a, b, keys, lambda runs: map(maps_of, runs.each("errors", NEEDED, OPTIONAL)))
-    refined = "refined_translation_error_m"
-    oracle = maps[maps["aligner"] == ORACLE]
-    sides = [f"{refined}_a", f"{refined}_b"]
-    reference = oracle.set_index([MATCH, *MAP_KEYS])[sides].add_prefix("oracle_")
-    maps = maps.join(reference, on=[MATCH, *MAP_KEYS])
-    for side in "ab":
-        maps[f"over_oracle_{side}"] = maps[f"{refined}_{side}"] / maps[f"oracle_{refined}_{side}"]
-    for aligner in methods_in(maps):
-        own = maps[maps["aligner"] == aligner]
-        for name, label, higher in (
-            ("estimated_success", "success estimated", True),
-            ("refined_success", "success refined", True),
-            ("false_accepted", "wrongly accepted", False),
-        ):
-            yield _difference(Quantity(label, aligner, "share", higher), own, name)
-        ground = _in_both(own, lambda rows: rows[has_common_ground(rows)])
-        yield _difference(Quantity("accepted", aligner, "share", True), ground, "accepted")
-        quantity = Quantity("estimated error, m", aligner, "ratio")
-        yield _ratio(quantity, _in_both(own, answerable), "translation_error_m")
-        quantity = Quantity("refined / oracle", aligner, "ratio")
-        yield _ratio(quantity, _in_both(own, rich), "over_oracle")
-    enough = _in_both(oracle, answerable)
-    yield _ratio(Quantity("refined error, m", ORACLE, "ratio"), enough, refined)
-    yield _ratio(Quantity("true pairs", "", "ratio", True), enough, "n_true")
+def _changes(quantity: Quantity, rows: pd.DataFrame) -> pd.DataFrame:
+    """Where both versions have a value and the change is finite; success tells the rest."""
+    rows = rows.query(quantity.where) if quantity.where else rows
+    a, b = (rows[f"{quantity.column}_{side}"].to_numpy(dtype=np.float64) for side in "ab")
+    if quantity.scale == "ln":  # too small a covariance is as wrong as one too large
+        change = np.abs(log_ratio(b, np.ones(1))) - np.abs(log_ratio(a, np.ones(1)))
+    else:
+        change = b - a if quantity.scale == "share" else log_ratio(b, a)
+    frame = pd.DataFrame({"run_id": rows["run_id"], "a": a, "b": b, "change": change})
+    return frame[np.isfinite(a) & np.isfinite(change)]
 
 
-def _ratio(quantity: Quantity, rows: pd.DataFrame, column: str) -> Values:
-    """Log ratios, where both versions have a positive, finite value; success tells the rest."""
-    a, b = (rows[f"{column}_{side}"].to_numpy(dtype=np.float64) for side in "ab")
-    frame = pd.DataFrame({MATCH: rows[MATCH].to_numpy(), "a": a, "b": b, "change": log_ratio(b, a)})
-    return Values(quantity, frame[np.isfinite(a) & np.isfinite(frame["change"])])
+def _maps_over_oracle(errors: pd.DataFrame) -> pd.DataFrame:
+    """Rows of `maps_of`, with each map's refined error over the oracle's there."""
+    maps = maps_of(errors)
+    of_oracle = maps.assign(oracle=maps[_REFINED].where(maps["aligner"] == ORACLE))
+    reference = of_oracle.groupby(MAP_PAIR)["oracle"].transform("first")
+    return maps.assign(over_oracle=maps[_REFINED] / reference)
 
 
-def _difference(quantity: Quantity, rows: pd.DataFrame, column: str) -> Values:
-    a, b = (rows[f"{column}_{side}"].to_numpy(dtype=np.float64) for side in "ab")
-    frame = pd.DataFrame({MATCH: rows[MATCH].to_numpy(), "a": a, "b": b, "change": b - a})
-    return Values(quantity, frame.dropna())
+def _path_rms(robots: pd.DataFrame) -> pd.DataFrame:
+    return path_rms(robots, ("run_id", "robot"))
 
 
-def _of_paths(a: Runs, b: Runs) -> Iterator[Values]:
-    def read(runs: Runs) -> Iterator[pd.DataFrame]:
-        for rows in runs.each("robots", ["robot", "path_error_m", "odometry_error_m"]):
-            yield path_rms(rows, [*RUN_KEYS, *setting_columns(rows), "robot"])
-
-    rows = _joined(a, b, ["robot"], read)
-    yield _ratio(Quantity("path RMSE, m", "", "ratio"), rows, "path_m")
-    yield _ratio(Quantity("odometry RMSE, m", "", "ratio"), rows, "odometry_m")
+def _nees_per_dof(fusion: pd.DataFrame) -> pd.DataFrame:
+    true = fusion[fusion["true_pair"]]
+    per_dof = true.assign(nees=true[_NEES] / true["degrees_of_freedom"])
+    return per_dof.groupby(["run_id", *ROBOT_PAIR], sort=False)["nees"].mean().reset_index()
 
 
-def _of_fits(a: Runs, b: Runs) -> Iterator[Values]:
-    rows = _joined(a, b, ["map"], lambda runs: runs.each("map_fits", ["map", "rmse_m"]))
-    is_fused = rows["map"] == "fused"
-    yield _ratio(Quantity("landmark RMSE, m", "", "ratio"), rows[~is_fused], "rmse_m")
-    yield _ratio(Quantity("fused RMSE, m", "", "ratio"), rows[is_fused], "rmse_m")
-
-
-def _of_consistency(a: Runs, b: Runs) -> Iterator[Values]:
-    """Distance from consistency: too small a covariance is as wrong as one too large."""
-
-    def read(runs: Runs) -> Iterator[pd.DataFrame]:
-        columns = ["robot_a", "robot_b", "nees_with_drift", "degrees_of_freedom", "true_pair"]
-        for rows in runs.each("fusion", columns):
-            true = rows[rows["true_pair"]]
-            per_dof = true.assign(nees=true["nees_with_drift"] / true["degrees_of_freedom"])
-            keys = [*RUN_KEYS, *setting_columns(rows), "robot_a", "robot_b"]
-            yield per_dof.groupby(keys, sort=False)["nees"].mean().reset_index()
-
-    rows = _joined(a, b, ["robot_a", "robot_b"], read)
-    rows = rows[(rows["nees_a"] > 0) & (rows["nees_b"] > 0)]
-    off = {side: np.abs(np.log(rows[f"nees_{side}"])) for side in "ab"}
-    frame = rows.rename(columns={"nees_a": "a", "nees_b": "b"})[[MATCH, "a", "b"]]
-    quantity = Quantity("fused NEES / dof", "", "ln")
-    yield Values(quantity, frame.assign(change=off["b"] - off["a"]))
-
-
-def _of_times(a: Runs, b: Runs) -> Iterator[Values]:
-    keys = [*MAP_KEYS, "aligner"]
-    rows = _joined(a, b, keys, lambda runs: runs.each("aligner_timings", [*keys, "elapsed_s"]))
-    for aligner in methods_in(rows):
-        quantity = Quantity("time, s", aligner, "ratio", timed=True)
-        yield _ratio(quantity, rows[rows["aligner"] == aligner], "elapsed_s")
-
-
-_BUILT_FROM = {
-    "errors": _of_alignments,
-    "robots": _of_paths,
-    "map_fits": _of_fits,
-    "fusion": _of_consistency,
-    "aligner_timings": _of_times,
+# What is read of each table, what older runs may lack of it, and how a run's rows are reduced.
+_Reduce = Callable[[pd.DataFrame], pd.DataFrame]
+_READ: dict[str, tuple[Sequence[str], Sequence[str], _Reduce]] = {
+    "errors": (NEEDED, OPTIONAL, _maps_over_oracle),
+    "robots": (["robot", "path_error_m", "odometry_error_m"], (), _path_rms),
+    "map_fits": (["map", "rmse_m"], (), pd.DataFrame),
+    "fusion": ([*ROBOT_PAIR, "true_pair", _NEES, "degrees_of_freedom"], (), _nees_per_dof),
+    "aligner_timings": ([*MAP_KEYS, "aligner", "elapsed_s"], (), pd.DataFrame),
 }
+_GROUND = f"n_common >= {COMMON_LANDMARKS}"
+_ENOUGH, _RICH = f"n_true >= {ANSWERABLE_PAIRS}", f"n_true >= {RICH_PAIRS}"
+_OFFERED = f"aligner == '{ORACLE}' and {_ENOUGH}"
+_QUANTITIES = (
+    Quantity("errors", "success estimated", "estimated_success", "share", _EACH, True),
+    Quantity("errors", "success refined", "refined_success", "share", _EACH, True),
+    Quantity("errors", "wrongly accepted", "false_accepted", "share", _EACH),
+    Quantity("errors", "accepted", "accepted", "share", _EACH, True, _GROUND),
+    Quantity("errors", "estimated error, m", "translation_error_m", of=_EACH, where=_ENOUGH),
+    Quantity("errors", "refined / oracle", "over_oracle", of=_EACH, where=_RICH),
+    Quantity("errors", "refined error, m", _REFINED, of=ORACLE, where=_ENOUGH),
+    Quantity("errors", "true pairs", "n_true", higher_is_better=True, where=_OFFERED),
+    Quantity("robots", "path RMSE, m", "path_m"),
+    Quantity("robots", "odometry RMSE, m", "odometry_m"),
+    Quantity("map_fits", "landmark RMSE, m", "rmse_m", where="map != 'fused'"),
+    Quantity("map_fits", "fused RMSE, m", "rmse_m", where="map == 'fused'"),
+    Quantity("fusion", "fused NEES / dof", "nees", "ln"),
+    Quantity("aligner_timings", "time, s", "elapsed_s", of=_EACH, timed=True),
+)

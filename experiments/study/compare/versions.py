@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from experiments.study.compare.version_values import MATCH, Values, all_values
+from experiments.study.compare.version_values import Quantity, all_values
 from experiments.study.statistics.better import (
     FEW_RUNS,
     SIGNIFICANCE,
@@ -18,19 +18,15 @@ from experiments.study.statistics.better import (
     mean_change,
 )
 from experiments.study.statistics.bootstrap import MAPS_OF_ONE_RUN, RUN
-from experiments.study.statistics.run_tables import Runs, find_runs
+from experiments.study.statistics.run_tables import RunPath, Runs, find_runs
 from mapfusion.errors import InputError
 
 # A change of less than one percent (or percentage point) matters to nobody who picks a method.
 LEAST_CHANGE = 0.01
-BETTER, WORSE, SAME, NOISE, UNKNOWN = (
-    "better",
-    "worse",
-    "identical",
-    "no difference beyond noise",
-    "cannot be judged",
-)
+BETTER, WORSE, SAME = "better", "worse", "identical"
+NOISE, UNKNOWN = "no difference beyond noise", "cannot be judged"
 _SHOWN_NAMES = 3
+_NOT_SHOWN = ["table", "column", "of", "where", "higher_is_better"]
 
 
 @dataclass(frozen=True)
@@ -38,9 +34,8 @@ class VersionComparison:
     """What two versions differ in.
 
     Attributes:
-        table: one row a metric: metric, method, scale, timed, a and b (medians over all rows),
-            change (a factor b / a, or a difference), low, high, n_units, n_rows, identical, p,
-            p_holm, verdict.
+        table: one row a metric; a and b are medians over all rows, means of shares; change is a
+            factor b / a, or a difference.
         unit: what n_units counts, "run" or "maps of one run".
         n_runs: matched.
         notes: what a reader must know, one line each.
@@ -58,11 +53,7 @@ class VersionComparison:
 
 
 def compare(path_a: Path, path_b: Path) -> VersionComparison:
-    """Compare version a with version b.
-
-    Args:
-        path_a: result or sweep folder of the first version.
-        path_b: of the second.
+    """Compare the result or sweep folders of two versions.
 
     Raises:
         InputError: the two have no run in common, or no table.
@@ -76,7 +67,11 @@ def compare(path_a: Path, path_b: Path) -> VersionComparison:
             f"the first has {_some(runs_a)}, the second {_some(runs_b)}"
         )
     unit = RUN if len(common) > 1 else MAPS_OF_ONE_RUN
-    rows = [_judged(values, len(common)) for values in all_values(a, b) if len(values.rows)]
+    rows = [
+        _judged(quantity, method, values, len(common))
+        for quantity, method, values in all_values(a, b)
+        if len(values)
+    ]
     if not rows:
         raise InputError(f"{path_a} and {path_b}: their common runs have no rows in common")
     table = pd.DataFrame(rows)
@@ -88,24 +83,20 @@ def compare(path_a: Path, path_b: Path) -> VersionComparison:
         *_left_out(runs_b - runs_a, "second"),
         *_notes_on(table, unit, len(common)),
     ]
-    return VersionComparison(
-        table.drop(columns="higher_is_better"), unit, len(common), tuple(notes)
-    )
+    return VersionComparison(table.drop(columns=_NOT_SHOWN), unit, len(common), tuple(notes))
 
 
-def _judged(values: Values, n_runs: int) -> dict[str, Any]:
+def _judged(quantity: Quantity, method: str, values: pd.DataFrame, n_runs: int) -> dict[str, Any]:
     """One row of the table, verdict and correction apart."""
-    quantity, rows = values
-    is_share, is_ratio = quantity.scale == "share", quantity.scale == "ratio"
-    match = rows[MATCH].to_numpy()
-    changes = change_of_each_run(rows["change"].to_numpy(), match, n_runs, is_share)
+    is_share = quantity.scale == "share"
+    changes = change_of_each_run(values["change"].to_numpy(), values["run_id"], n_runs, is_share)
     found = mean_change(changes)
-    told = np.exp(found[:3]) if is_ratio else found[:3]
-    a, b = rows[["a", "b"]].mean() if is_share else rows[["a", "b"]].median()
-    row = quantity._asdict() | {"a": a, "b": b}
+    told = np.exp(found[:3]) if quantity.scale == "ratio" else found[:3]
+    a, b = values[["a", "b"]].agg("mean" if is_share else "median")
+    row = {"metric": quantity.metric, "method": method} | quantity._asdict() | {"a": a, "b": b}
     row |= dict(zip(("change", "low", "high"), told, strict=True))
-    row |= {"n_units": len(changes), "n_rows": len(rows), "p": found.p}
-    return row | {"identical": not rows["change"].any()}
+    row |= {"n_units": len(changes), "n_rows": len(values), "p": found.p}
+    return row | {"identical": not values["change"].any()}
 
 
 def _verdict(row: dict[Any, Any]) -> str:
@@ -156,21 +147,19 @@ def _notes_on(table: pd.DataFrame, unit: str, n_runs: int) -> list[str]:
 def _differing_settings(a: Runs, b: Runs) -> list[str]:
     """Settings in which the scenarios of matched results differ."""
     found: dict[str, str] = {}
-    others = {(result.scenario, result.seed): result for result in b.results}
-    for result in a.results:
-        other = others.get((result.scenario, result.seed))
-        if other is not None:
-            first, second = (_flat(r.folder / "scenario.json") for r in (result, other))
-            for key in sorted(first.keys() | second.keys()):
-                old, new = first.get(key, "absent"), second.get(key, "absent")
-                if old != new:
-                    found[key] = f"{key} is {old} in the first and {new} in the second"
+    pairs = [(_flat(x), _flat(y)) for x in a.results for y in b.results if x.run == y.run]
+    for first, second in pairs:
+        for key in sorted(first.keys() | second.keys()):
+            old, new = first.get(key, "absent"), second.get(key, "absent")
+            if old != new:
+                found[key] = f"{key} is {old} in the first and {new} in the second"
     shown = [f"the scenarios differ: {text}" for text in islice(found.values(), _SHOWN_NAMES)]
     more = len(found) - len(shown)
     return [*shown, f"the scenarios differ in {more} more settings"] if more else shown
 
 
-def _flat(path: Path) -> dict[str, str]:
+def _flat(result: RunPath) -> dict[str, str]:
     """Settings by dotted name, as JSON."""
-    settings = pd.json_normalize(json.loads(path.read_text(encoding="utf-8"))).to_dict("records")[0]
+    scenario = json.loads((result.path / "scenario.json").read_text(encoding="utf-8"))
+    settings = pd.json_normalize(scenario).to_dict("records")[0]
     return {str(name): json.dumps(value) for name, value in settings.items()}

@@ -48,13 +48,10 @@ def log_ratio(over: Float, under: Float) -> Float:
 
 
 def change_of_each_run(changes: Float, run_id: Any, n_runs: int, mean: bool = False) -> Float:
-    """One change a run: the median over its maps (some are just lost), or the mean of shares.
+    """One change a run of changes (N,): the median over its maps (some are just lost), or the mean.
 
-    Args:
-        changes: (N,) of pairs of maps; log ratios may be infinite.
-        run_id: (N,) the maps' runs.
-        n_runs: that are compared in all; of a single one the maps stand in for runs.
-        mean: take the mean.
+    Medians are for log ratios, which may be infinite, means for differences of shares. Where only a
+    single run is compared, its maps stand in for runs.
     """
     if n_runs == 1:
         return changes

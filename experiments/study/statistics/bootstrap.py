@@ -19,13 +19,10 @@ _MAX_CELLS = 1_000_000  # resamples times rows that are worked on at once: some 
 
 
 class Clusters(NamedTuple):
-    """Which rows are resampled together.
+    """Which rows are resampled together: codes (N,) of rows' clusters, and how many there are.
 
-    Attributes:
-        codes: (N,) number of each row's cluster.
-        n: how many there are.
-        unit: "run", or, where there is one run only, "maps of one run": what an interval says then
-            is nothing about other seeds.
+    The unit is a run, or, where there is one only, its maps: what an interval says then is nothing
+    about other seeds.
     """
 
     codes: np.ndarray
@@ -70,12 +67,8 @@ class WeightedMedian:
         """The medians (B,) for counts (B, n_clusters); NaN where no row counts."""
         if not len(self._values):
             return np.full(len(counts), np.nan)
-        found = [self._of(part) for part in np.array_split(counts, self._n_parts(len(counts)))]
-        return np.concatenate(found)
-
-    def _n_parts(self, n_counts: int) -> int:
-        """How often to cut the counts, so that memory stays bounded."""
-        return max(1, min(n_counts, n_counts * len(self._values) // _MAX_CELLS))
+        n_parts = max(1, min(len(counts), len(counts) * len(self._values) // _MAX_CELLS))
+        return np.concatenate([self._of(part) for part in np.array_split(counts, n_parts)])
 
     def _of(self, counts: Float) -> Float:
         cumulative = np.cumsum(counts[:, self._codes], axis=1)
@@ -89,23 +82,13 @@ class WeightedMedian:
 
 
 def percentile_interval(
-    statistic: Statistic,
-    n_clusters: int,
-    rng: np.random.Generator,
-    confidence: float = CONFIDENCE,
-    resamples: int = RESAMPLES,
+    statistic: Statistic, n_clusters: int, rng: np.random.Generator, resamples: int = RESAMPLES
 ) -> Interval:
-    """Percentile interval of a statistic of cluster counts.
+    """Percentile interval of numbers (B,) of counts (B, n_clusters), how often each is in a sample.
 
     For medians and their ratios: BCa's correction takes its acceleration from the jackknife, which
-    is not consistent for medians (Efron & Tibshirani 1993, ch. 10.6).
-
-    Args:
-        statistic: numbers (B,) of counts (B, n_clusters): how often each cluster is in a sample.
-        n_clusters: with one there is nothing to resample, and the ends are NaN.
-        rng: decides the resamples.
-        confidence: level of the interval.
-        resamples: how many.
+    is not consistent for medians (Efron & Tibshirani 1993, ch. 10.6). With one cluster there is
+    nothing to resample, and the ends are NaN.
     """
     value = float(statistic(np.ones((1, max(n_clusters, 1))))[0])
     if n_clusters < 2 or np.isnan(value):
@@ -113,7 +96,7 @@ def percentile_interval(
     counts = rng.multinomial(n_clusters, np.full(n_clusters, 1 / n_clusters), size=resamples)
     drawn = statistic(counts.astype(np.float64))
     drawn = drawn[~np.isnan(drawn)]  # resamples in which no row had a value
-    tail = (1 - confidence) / 2
+    tail = (1 - CONFIDENCE) / 2
     # a quantile that is one of the draws: no arithmetic with infinite ones
     low, high = np.quantile(drawn, [tail, 1 - tail], method="inverted_cdf")
     return Interval(value, float(low), float(high))

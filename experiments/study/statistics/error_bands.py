@@ -25,10 +25,8 @@ def error_bands(
 ) -> pd.DataFrame:
     """Errors against the iteration: median and 10-90 % of the rows that have an estimate.
 
-    Args:
-        rows: of `errors`, for a band over the repetitions; of `medians_of_run`, for one over runs.
-        by: further columns to keep apart; none pools the robot pairs.
-        absolute: drop the sign of rotations first.
+    Over the repetitions for rows of `errors`, over the runs for rows of `medians_of_run`; apart for
+    each robot pair, or whatever `by` names; `absolute` drops the sign of rotations first.
 
     Returns:
         The columns of `by`, aligner, iteration, n_runs where runs are named, and for each error
@@ -76,14 +74,11 @@ def time_bands(
 ) -> pd.DataFrame:
     """Time of one alignment against the overlap, in groups of about equal size.
 
-    Args:
-        timings: the table `aligner_timings` of some runs; each row is a median of repeats.
-        column: what to group by: n_common or n_correspondences; equal ones stay together.
-        groups: how many at the most.
+    Of rows of `aligner_timings`, by n_common or n_correspondences; equal ones stay together.
 
     Returns:
         aligner; COLUMN_low, COLUMN (the median) and COLUMN_high of the group; n_runs where runs
-        are named, n_maps; the maps' times: 10 % elapsed_low_s, median elapsed_s, 90 %
+        are named, n_maps; of the maps' times 10 % elapsed_low_s, median elapsed_s and 90 %
         elapsed_high_s.
     """
     timed = timings.dropna(subset="elapsed_s")

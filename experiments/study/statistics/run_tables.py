@@ -6,11 +6,11 @@ going on holds one run in memory, however many there are.
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import takewhile
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pandas as pd
 import pyarrow as pa
@@ -22,57 +22,35 @@ from mapfusion.errors import InputError
 
 _KIND, _VERSION = b"mapfusion.kind", b"mapfusion.schema_version"
 _DAMAGED = (pa.ArrowInvalid, pa.ArrowTypeError, pa.ArrowKeyError, OSError)
+_TOLD = ("status", "reason")  # of each run of a sweep
 
 
-@dataclass(frozen=True)
-class _RunFile:
-    """One run's rows of a table. Results carry their run's name, sweeps say it in the rows."""
+class RunPath(NamedTuple):
+    """A result folder or a table of one run, and the run's columns where the rows lack them."""
 
     path: Path
-    run: dict[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class ResultFolder:
-    """One result folder of `run`."""
-
-    folder: Path
-    scenario: str
-    seed: int
-
-    @property
-    def run(self) -> dict[str, Any]:
-        """The run's columns. The folder was named so by `run`; it may have been renamed since."""
-        run_id = f"{self.scenario}-{self.seed}"
-        return {"run_id": run_id, "scenario": self.scenario, "seed": self.seed}
+    run: dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Runs:
-    """The runs of some result and sweep folders.
+    """The runs of some result and sweep folders."""
 
-    Attributes:
-        results: result folders.
-        sweeps: sweep folders.
-    """
-
-    results: tuple[ResultFolder, ...]
+    results: tuple[RunPath, ...]
     sweeps: tuple[Path, ...]
 
-    def files(self, table: str) -> list[_RunFile]:
-        """The files of one table, one a run, in a fixed order; none where no run has it."""
-        found = [
-            _RunFile(path, result.run)
-            for result in self.results
-            if (path := tables.table_path(result.folder, table)).is_file()
-        ]
+    def files(self, table: str) -> list[RunPath]:
+        """The files of one table, one a run, in a fixed order; none where no run has it.
+
+        Of a sweep that goes on, rows of unfinished runs are not complete, and left out.
+        """
+        paths = [RunPath(tables.table_path(path, table), run) for path, run in self.results]
+        found = [file for file in paths if file.path.is_file()]
         for sweep in self.sweeps:
-            finished = self._finished.get(sweep)
-            found += [
-                _RunFile(path)
-                for path in _whole_files(sweep / table)
-                if finished is None or path.stem in finished
-            ]
+            told = self._told[self._told["sweep"] == str(sweep)]
+            finished = set(told.loc[told["status"] == "finished", "run_id"])
+            whole = _whole_files(sweep / table)
+            found += [file for file in whole if told.empty or file.path.stem in finished]
         return found
 
     def has(self, table: str) -> bool:
@@ -83,12 +61,13 @@ class Runs:
         self, table: str, columns: Sequence[str] | None = None, optional: Sequence[str] = ()
     ) -> Iterator[pd.DataFrame]:
         """Each run's rows; see `read`."""
-        if not self.has(table):
-            where = ", ".join(str(path) for path in self.folders)
+        files = self.files(table)
+        if not files:
+            where = ", ".join(str(path) for path in [r.path for r in self.results] + [*self.sweeps])
             what = f"no table {table} (expected the results of `run` or `sweep`)"
             raise InputError(f"{where}: {what}")
         seen: dict[str, Path] = {}
-        for file in self.files(table):
+        for file in files:
             rows = _read(file, table, columns, optional)
             for run_id in rows["run_id"].unique():
                 if run_id in seen:
@@ -117,49 +96,32 @@ class Runs:
         return pd.concat(list(self.each(table, columns, optional)), ignore_index=True)
 
     @property
-    def folders(self) -> list[Path]:
-        """All folders, results first."""
-        return [result.folder for result in self.results] + list(self.sweeps)
-
-    @cached_property
     def names(self) -> set[str]:
         """All runs that have errors or paths, by scenario, seed and settings."""
-        found: set[str] = set()
-        for table in ("errors", "robots"):
-            if self.has(table):
-                for rows in self.each(table, ["iteration"]):
-                    found |= set(match_names(rows.drop_duplicates("run_id")))
-        return found
-
-    @cached_property
-    def _said_of_runs(self) -> dict[Path, pd.DataFrame]:
-        """The table `runs` of each sweep that has one."""
-        said = {}
-        for sweep in self.sweeps:
-            parts = [
-                _read(_RunFile(path), "runs", ["status", "reason"], ())
-                for path in _whole_files(sweep / "runs")
-            ]
-            if parts:
-                said[sweep] = pd.concat(parts, ignore_index=True)
-        return said
-
-    @cached_property
-    def _finished(self) -> dict[Path, set[str]]:
-        """Runs of each sweep whose rows are complete; of a sweep that goes on, others are not."""
         return {
-            sweep: set(rows.loc[rows["status"] == "finished", "run_id"])
-            for sweep, rows in self._said_of_runs.items()
+            name
+            for table in ("errors", "robots")
+            if self.has(table)
+            for rows in self.each(table, ["iteration"])
+            for name in match_names(rows.drop_duplicates("run_id"))
         }
+
+    @cached_property
+    def _told(self) -> pd.DataFrame:
+        """The tables `runs` of all sweeps that have one, with the sweep's folder."""
+        parts = [
+            _read(file, "runs", _TOLD, ()).assign(sweep=str(sweep))
+            for sweep in self.sweeps
+            for file in _whole_files(sweep / "runs")
+        ]
+        none = pd.DataFrame(columns=["sweep", *RUN_KEYS, *_TOLD])
+        return pd.concat(parts, ignore_index=True) if parts else none
 
     @property
     def failed(self) -> pd.DataFrame:
         """Runs of sweeps that failed: run_id, scenario, seed, reason."""
-        columns = [*RUN_KEYS, "reason"]
-        parts = [
-            rows.loc[rows["status"] == "failed", columns] for rows in self._said_of_runs.values()
-        ]
-        return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=columns)
+        is_failed = self._told["status"] == "failed"
+        return self._told.loc[is_failed, [*RUN_KEYS, "reason"]].reset_index(drop=True)
 
 
 def find_runs(paths: Path | Sequence[Path]) -> Runs:
@@ -173,7 +135,7 @@ def find_runs(paths: Path | Sequence[Path]) -> Runs:
         if (path / "sweep.json").is_file():
             sweeps.append(path)
         elif (path / "scenario.json").is_file():
-            results.append(_result(path))
+            results.append(RunPath(path, _run_of(path / "scenario.json")))
         else:
             what = "no such folder" if not path.is_dir() else "no scenario.json and no sweep.json"
             raise InputError(
@@ -190,23 +152,23 @@ def match_names(frame: pd.DataFrame) -> pd.Series:
     return names
 
 
-def _whole_files(folder: Path) -> list[Path]:
+def _whole_files(folder: Path) -> list[RunPath]:
     """The tables in a folder; names with a dot in front are files still being written."""
-    return [path for path in sorted(folder.glob("*.parquet")) if not path.name.startswith(".")]
+    return [RunPath(path, {}) for path in sorted(folder.glob("[!.]*.parquet"))]
 
 
-def _result(folder: Path) -> ResultFolder:
-    path = folder / "scenario.json"
+def _run_of(path: Path) -> dict[str, Any]:
+    """The run's columns, by its scenario: the folder may have been renamed since."""
     try:
         scenario = json.loads(path.read_text(encoding="utf-8"))
         name, seed = str(scenario["name"]), int(scenario["seed"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: not a resolved scenario with name and seed ({error})") from error
-    return ResultFolder(folder, name, seed)
+    return {"run_id": f"{name}-{seed}", "scenario": name, "seed": seed}
 
 
 def _read(
-    file: _RunFile, table: str, columns: Sequence[str] | None, optional: Sequence[str]
+    file: RunPath, table: str, columns: Sequence[str] | None, optional: Sequence[str]
 ) -> pd.DataFrame:
     try:
         data = ds.dataset(file.path, format="parquet")
@@ -218,28 +180,25 @@ def _read(
         raise InputError(f"{file.path}: damaged or not a Parquet file ({reason})") from error
     for place, (name, value) in enumerate(file.run.items()):
         rows.insert(place, name, value)
-    for name in optional:
-        if name not in rows:
-            rows[name] = float("nan")
-    return rows
+    return rows.assign(**{name: float("nan") for name in optional if name not in rows})
 
 
 def _wanted(
-    file: _RunFile,
+    file: RunPath,
     table: str,
-    found: Sequence[str],
+    found: list[str],
     columns: Sequence[str] | None,
     optional: Sequence[str],
 ) -> list[str]:
     """The columns to read of those found: the run's, then the table's."""
-    own = set(tables.ALL[table].names) if table in tables.ALL else {"status", "reason"}
+    own = set(tables.ALL[table].names) if table in tables.ALL else set(_TOLD)
     leading = [] if file.run else list(takewhile(lambda name: name not in own, found))
-    required = [] if file.run else list(RUN_KEYS)
-    missing = [name for name in [*required, *(columns or [])] if name not in found]
+    required = [*([] if file.run else RUN_KEYS), *(columns or [])]
+    missing = [name for name in required if name not in found]
     if missing:
         raise InputError(f"{file.path}: has no column {', '.join(missing)} (a table {table})")
     if columns is None:
-        return list(found)
+        return found
     chosen = [*leading, *columns, *(name for name in optional if name in found)]
     return list(dict.fromkeys(chosen))
 

@@ -1,15 +1,17 @@
 """How each aligner stands on the maps of one or more runs, and which one to use."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from experiments.judge.criteria import ORACLE, answerable, has_common_ground, rich
-from experiments.judge.judged_maps import MAP_PAIR, error_over_oracle
-from experiments.study.statistics.aligner_summary import median_time_ms, shown_columns
+from experiments.judge.judged_maps import ERROR_COLUMNS, MAP_PAIR, error_over_oracle, maps_of
+from experiments.judge.metrics import repetition_spread_m
+from experiments.judge.tables import SHOWN
 from experiments.study.statistics.better import (
     SIGNIFICANCE,
     change_of_each_run,
@@ -17,8 +19,9 @@ from experiments.study.statistics.better import (
     log_ratio,
     mean_change,
 )
-from experiments.study.statistics.paired import paired_values
+from experiments.study.statistics.methods_compared import paired_values
 from experiments.study.statistics.success_rates import success_rates
+from mapfusion.align.result import Status
 from mapfusion.se2 import Float
 
 # Aligners are equal if the test does not tell them apart and what was measured lies no farther
@@ -27,26 +30,22 @@ _EQUAL_SHARE = 0.05
 _EQUAL_LOG_RATIO = math.log(1.1)
 
 
+# The names that a `Standing` has for columns of `SHOWN`, and for the rates' of `success_rates`.
+_ERRORS = dict(
+    zip(ERROR_COLUMNS, ("estimated_m", "estimated_rad", "refined_m", "refined_rad"), strict=True)
+)
+_RATES = {"refined_success": "rate", "refined_success_low": "low", "refined_success_high": "high"}
+
+
 @dataclass(frozen=True)
 class Standing:
     """One aligner's record.
 
-    Attributes:
-        aligner: its name.
-        n_maps: pairs of maps with common ground.
-        rate: share of them on which the refined estimate was right (mean over repetitions).
-        low: lower end of the rate's 95 % Wilson interval; trials are runs, or the maps of one run.
-        high: its upper end.
-        estimated_m: median translation error as estimated, over answerable maps; infinite where
-            more than half have no estimate.
-        estimated_rad: median absolute rotation error as estimated.
-        refined_m: median translation error refined.
-        refined_rad: median absolute rotation error refined.
-        over_oracle: median refined translation error over the oracle's, on rich maps.
-        n_accepted: estimates that were accepted, on all pairs of maps.
-        n_false: accepted ones that were wrong.
-        time_ms: median time of one alignment; NaN where it was not measured.
-        shown: further columns of `errors` that are shown (`tables.SHOWN`), reduced.
+    On `n_maps` pairs of maps with common ground it was right, refined, at the `rate`, with its 95 %
+    Wilson interval (trials are runs, or the maps of one run). Errors are medians over answerable
+    maps, infinite where more than half have no estimate; over the oracle's refined ones on rich
+    maps. On all maps `n_accepted` estimates were accepted, `n_false` of them wrongly. `shown` are
+    the further columns of `SHOWN`.
     """
 
     aligner: str
@@ -69,15 +68,9 @@ class Standing:
 class Recommendation:
     """Which aligner to use.
 
-    Attributes:
-        best: the aligner, or None where no aligner was ever right.
-        equals: others that these data cannot tell from it, in their order of standing.
-        standings: all aligners, the best first; the oracle is not among them.
-        n_maps: pairs of maps, with common ground or without.
-        n_common: those with common ground.
-        n_runs: worlds and seeds, the only things here that are independent of each other.
-        oracle_m: the oracle's median translation error on answerable maps.
-        oracle_rad: its median absolute rotation error.
+    `best` is None where no aligner was ever right; these data cannot tell the `equals` from it.
+    `standings` are all aligners but the oracle, the best first. Of `n_maps` pairs of maps
+    `n_common` have common ground; runs are the only things here that are independent of each other.
     """
 
     best: Standing | None
@@ -90,17 +83,42 @@ class Recommendation:
     oracle_rad: float
 
 
+def aligner_summary(
+    errors: pd.DataFrame, timings: pd.DataFrame, aligners: Sequence[str]
+) -> pd.DataFrame:
+    """The shown columns of the table `errors`, reduced as `tables.Shown` says, for each aligner.
+
+    With spread_m, the 10-90 % range of the repetitions, and time_ms, where there are timings.
+    """
+    errors = errors[errors["status"] != Status.ABSENT]
+    own = {name: answerable(errors[errors["aligner"] == name]) for name in aligners}
+    shown = _shown_columns(maps_of(errors)).reindex(pd.Index(aligners, name="aligner"))
+    spread_m = [repetition_spread_m(rows) for rows in own.values()]
+    return shown.assign(spread_m=spread_m, time_ms=_median_times_ms(timings)).reset_index()
+
+
+def _shown_columns(maps: pd.DataFrame) -> pd.DataFrame:
+    """By aligner, the columns of `SHOWN` from rows of `maps_of`; NaN where these have none."""
+    off = [name for name, how in SHOWN.items() if how.kind == "error" and name in maps]
+    shares = [name for name, how in SHOWN.items() if how.kind == "share" and name in maps]
+    errors = answerable(maps).groupby("aligner", sort=False)[off].median()
+    means = maps[has_common_ground(maps)].groupby("aligner", sort=False)[shares].mean()
+    return pd.concat([errors, means], axis=1).reindex(columns=list(SHOWN))
+
+
+def _median_times_ms(timings: pd.DataFrame) -> pd.Series:
+    """Median time of one alignment, by aligner."""
+    if timings.empty:
+        return pd.Series(dtype=np.float64)
+    return 1e3 * timings.groupby("aligner")["elapsed_s"].median()
+
+
 def recommend(maps: pd.DataFrame, timings: pd.DataFrame, aligners: list[str]) -> Recommendation:
-    """Rank the aligners.
+    """Rank the aligners, given in display order, by rows of `maps_of` and of `aligner_timings`.
 
     First by the share of right results; among those equal to the first, by the error as estimated,
-    pair of maps by pair of maps; among those still equal, by time. `better` tells what the test
-    takes for a unit; of a single run the ranking is a hint.
-
-    Args:
-        maps: rows of `maps_of`, of one or more runs.
-        timings: the table `aligner_timings` likewise; may be empty.
-        aligners: in display order.
+    pair of maps by pair of maps; among those still equal, by time, where there are timings.
+    `better` tells what the test takes for a unit; of a single run the ranking is a hint.
     """
     ground = maps[has_common_ground(maps)]
     standings = _standings(maps, timings, [name for name in aligners if name != ORACLE])
@@ -120,38 +138,23 @@ def recommend(maps: pd.DataFrame, timings: pd.DataFrame, aligners: list[str]) ->
 
 
 def _standings(maps: pd.DataFrame, timings: pd.DataFrame, aligners: list[str]) -> list[Standing]:
-    ground = maps[has_common_ground(maps)]
-    rates = success_rates(ground, "n_common", (0, math.inf)) if len(ground) else pd.DataFrame()
-    rate_of = {row["aligner"]: row for row in rates.to_dict("records")}
-    shown = shown_columns(maps)
-    over_oracle = error_over_oracle(rich(maps), "refined_translation_error_m")
-    standings = []
-    for name in aligners:
-        own = maps[maps["aligner"] == name]
-        rate, row = rate_of.get(name, {}), shown.get(name, {})
-        n_accepted, n_false = (
-            round(float(np.nansum(own[column] * own["n_repetitions"])))
-            for column in ("accepted", "false_accepted")
-        )
-        standings.append(
-            Standing(
-                aligner=name,
-                n_maps=int(has_common_ground(own).sum()),
-                rate=rate.get("refined_success", math.nan),
-                low=rate.get("refined_success_low", math.nan),
-                high=rate.get("refined_success_high", math.nan),
-                estimated_m=row.pop("translation_error_m", math.nan),
-                estimated_rad=row.pop("rotation_error_rad", math.nan),
-                refined_m=row.pop("refined_translation_error_m", math.nan),
-                refined_rad=row.pop("refined_rotation_error_rad", math.nan),
-                over_oracle=float(over_oracle.get(name, math.nan)),
-                n_accepted=n_accepted,
-                n_false=n_false,
-                time_ms=median_time_ms(timings, name),
-                shown=row,
-            )
-        )
-    return standings
+    is_ground = has_common_ground(maps)
+    times = maps[["accepted", "false_accepted"]].mul(maps["n_repetitions"], axis=0)
+    counted = times.set_axis(["n_accepted", "n_false"], axis=1).assign(n_maps=is_ground)
+    counts = counted.groupby(maps["aligner"]).sum().round()
+    shown = _shown_columns(maps)
+    found = shown[list(_ERRORS)].rename(columns=_ERRORS).reindex(aligners)
+    found = found.assign(
+        over_oracle=error_over_oracle(rich(maps), "refined_translation_error_m"),
+        time_ms=_median_times_ms(timings),
+        **dict.fromkeys(_RATES.values(), math.nan),
+    )
+    if is_ground.any():
+        rates = success_rates(maps[is_ground], "n_common", (0, math.inf)).set_index("aligner")
+        found = found.assign(**{name: rates[column] for column, name in _RATES.items()})
+    rows: Any = found.join(counts.reindex(aligners, fill_value=0).astype(int)).to_dict("index")
+    further: Any = shown.drop(columns=list(_ERRORS)).to_dict("index")
+    return [Standing(aligner=name, shown=further.get(name, {}), **rows[name]) for name in aligners]
 
 
 def _ranked(
@@ -189,12 +192,12 @@ def _equal_to_first(
     first = values[standings[0].aligner].to_numpy()
     run_id = values.index.get_level_values("run_id")
     tests = []
-    n_runs, mean = run_id.nunique(), change_of is np.subtract
     for standing in standings[1:]:
         changes = change_of(values[standing.aligner].to_numpy(), first)
         known = ~np.isnan(changes)
-        changes = change_of_each_run(changes[known], run_id[known], n_runs, mean)
-        tests.append(mean_change(changes))
+        mean = change_of is np.subtract
+        of_runs = change_of_each_run(changes[known], run_id[known], run_id.nunique(), mean)
+        tests.append(mean_change(of_runs))
     p_holm = holm(np.array([test.p for test in tests]))
     return [standings[0]] + [
         standing

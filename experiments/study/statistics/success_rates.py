@@ -36,22 +36,21 @@ _SHARES = (*_WITHOUT_TEST, "accepted", "false_accepted", "refused_apart")
 def success_rates(
     maps: pd.DataFrame, by: str, edges: tuple[float, ...] | None = None
 ) -> pd.DataFrame:
-    """Success rates of each method, binned.
+    """Success rates of each method over rows of `maps_of`, binned.
 
     Args:
-        maps: rows of `maps_of`.
+        maps: for overlap_share, only rows that `with_overlap_share` went over.
         by: iteration, n_common (landmarks that truly correspond), overlap_share (n_common over
-            the smaller map's landmarks; only for rows that `with_overlap_share` went over), n_true
-            (true pairs among the correspondences), outlier_share (1 - n_true / n_correspondences)
-            or last (the last iteration of each robot pair alone).
+            the smaller map's landmarks), n_true (true pairs among the correspondences),
+            outlier_share (1 - n_true / n_correspondences) or last (the last iteration of each
+            robot pair alone).
         edges: of the bins, rising; each holds its lower edge, the last one both.
 
     Returns:
         One row per bin and method: from, to, aligner, n_runs, n_maps, n_apart (those without common
         ground), unit, and shares with their 95 % interval (_low, _high): of the maps with
         common ground estimated_success, refined_success and accepted; of all false_accepted; of
-        those without common ground refused_apart. Without an acceptance test there are the first
-        two.
+        those without common ground refused_apart. Without a test of acceptance the first two.
 
     Raises:
         ValueError: an unknown `by`, or edges that do not rise.

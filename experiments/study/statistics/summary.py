@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,19 +11,24 @@ import pandas as pd
 from experiments.judge.criteria import that_ever_meet
 from experiments.judge.judged_maps import MAP_KEYS, NEEDED, OPTIONAL, maps_of, setting_columns
 from experiments.scenario.randomness import generator
-from experiments.study.statistics.error_bands import error_bands, medians_of_run, time_bands
-from experiments.study.statistics.nees_over_runs import FUSION_COLUMNS, nees_of_maps, nees_of_pairs
-from experiments.study.statistics.oracle_ratio import oracle_ratios
-from experiments.study.statistics.overlap import with_overlap_share
-from experiments.study.statistics.paired import compare_methods
-from experiments.study.statistics.path_summary import path_summary
+from experiments.study.statistics.error_bands import (
+    ROBOT_PAIR,
+    error_bands,
+    medians_of_run,
+    time_bands,
+)
+from experiments.study.statistics.methods_compared import compare_methods, oracle_ratios
+from experiments.study.statistics.paths_and_nees import (
+    FUSION_COLUMNS,
+    nees_of_maps,
+    nees_of_pairs,
+    path_summary,
+)
 from experiments.study.statistics.run_tables import Runs
 from experiments.study.statistics.success_rates import LAST, success_rates
 from mapfusion.align.result import Status
 
 ALL_SCENARIOS = "(all)"
-_TIMING_COLUMNS = (*MAP_KEYS, "aligner", "n_correspondences", "n_common", "elapsed_s")
-_FURTHER_TABLES = ("aligner_timings", "path_statistics", "landmark_nees", "fusion")
 _FILE_NAMES = {
     "n_common": "success_by_overlap",
     "overlap_share": "success_by_overlap_share",
@@ -31,6 +37,14 @@ _FILE_NAMES = {
     "iteration": "success_by_iteration",
     LAST: "success_at_the_end",
 }
+_TIMING_COLUMNS = (*MAP_KEYS, "aligner", "n_correspondences", "n_common", "elapsed_s")
+# Of tables that not every run has: what is read, under what name which statistics go, their seed.
+_FURTHER: dict[str, tuple[Any, str, Callable[..., pd.DataFrame], str]] = {
+    "aligner_timings": (_TIMING_COLUMNS, "time_by_overlap", time_bands, ""),
+    "path_statistics": (None, "paths", path_summary, "paths"),
+    "landmark_nees": (None, "nees", nees_of_maps, "nees"),
+    "fusion": (FUSION_COLUMNS, "nees", nees_of_pairs, "fusion"),
+}
 
 
 @dataclass(frozen=True)
@@ -38,7 +52,6 @@ class Summary:
     """Statistics over some runs.
 
     Attributes:
-        n_runs: how many runs.
         tables: by file name, each with scenario and settings in front; "(all)" is all scenarios.
         run_medians: each run's medians over its repetitions, for figures 4 and 5.
         timings: the rows of figure 6.
@@ -61,11 +74,7 @@ class Summary:
 
 
 def configurations(frame: pd.DataFrame) -> Iterator[tuple[dict[str, Any], pd.DataFrame]]:
-    """Rows by scenario and settings; with several scenarios, also all of them together.
-
-    Yields:
-        The label columns, and the rows. Where all scenarios are together, they are named so.
-    """
+    """Labels and rows by scenario and settings; also of all scenarios, if several."""
     names = ["scenario", *setting_columns(frame)]
     several = len(frame["scenario"].unique()) > 1
     for each in [frame, *([frame.assign(scenario=ALL_SCENARIOS)] if several else [])]:
@@ -77,39 +86,27 @@ def summarise(runs: Runs) -> Summary:
     """Everything there is to say about these runs; a table that none of them has is left out."""
     reduced = reduced_errors(runs)
     maps, medians = reduced.maps, reduced.medians
-    made = {
-        name: _each(maps, lambda rows, _, by=by: success_rates(rows, by))
-        for by, name in _FILE_NAMES.items()
-    }
-    made["error_over_oracle"] = _each(maps, _drawn(oracle_ratios, "oracle"))
-    made["methods_compared"] = _each(maps, _drawn(compare_methods, "paired"))
+    made = {name: _each(maps, partial(success_rates, by=by)) for by, name in _FILE_NAMES.items()}
+    made["error_over_oracle"] = _each(maps, oracle_ratios, "oracle")
+    made["methods_compared"] = _each(maps, compare_methods, "paired")
     made["errors_by_iteration"] = _each(medians, _error_bands)
-    timings, parts = pd.DataFrame(), []
-    if runs.has("aligner_timings"):
-        timings = runs.read("aligner_timings", _TIMING_COLUMNS)
-        made["time_by_overlap"] = _each(timings, lambda rows, _: time_bands(rows))
-    if runs.has("path_statistics"):
-        made["paths"] = _each(runs.read("path_statistics"), _drawn(path_summary, "paths"))
-    if runs.has("landmark_nees"):
-        parts.append(_each(runs.read("landmark_nees"), _drawn(nees_of_maps, "nees")))
-    if runs.has("fusion"):
-        fusion = runs.read("fusion", FUSION_COLUMNS)
-        parts.append(_each(fusion, _drawn(nees_of_pairs, "fusion")))
-    if parts:
-        made["nees"] = pd.concat(parts, ignore_index=True)
+    timings = pd.DataFrame()
+    there = {name: how for name, how in _FURTHER.items() if runs.has(name)}
+    for table, (columns, name, made_of, seed) in there.items():
+        rows = runs.read(table, columns)
+        before = [made[name]] if name in made else []
+        made[name] = pd.concat([*before, _each(rows, made_of, seed)], ignore_index=True)
+        timings = rows if table == "aligner_timings" else timings
     made = {name: table for name, table in made.items() if len(table)}
-    missing = tuple(name for name in _FURTHER_TABLES if not runs.has(name))
+    missing = tuple(name for name in _FURTHER if name not in there)
     return Summary(len(runs.names), made, medians, timings, missing, runs.failed)
 
 
 @dataclass(frozen=True)
 class ReducedErrors:
-    """The errors of some runs, read and reduced run by run.
+    """The errors of some runs, read and reduced run by run to `maps_of` and `medians_of_run`.
 
-    Attributes:
-        maps: rows of `maps_of`, with the overlap.
-        medians: rows of `medians_of_run`.
-        absent: aligners whose package is not installed, which is no failure.
+    The absent aligners are those whose package is not installed, which is no failure.
     """
 
     maps: pd.DataFrame
@@ -136,24 +133,43 @@ def reduced_errors(runs: Runs) -> ReducedErrors:
     return ReducedErrors(joined, pd.concat(medians, ignore_index=True), absent)
 
 
-def _error_bands(rows: pd.DataFrame, label: tuple[str, ...]) -> pd.DataFrame:
-    return error_bands(that_ever_meet(rows) if label[0] == ALL_SCENARIOS else rows)
+def with_overlap_share(maps: pd.DataFrame, runs: Runs) -> pd.DataFrame:
+    """Rows of `maps_of` with overlap_share: n_common over the landmarks of the smaller map.
+
+    NaN where the runs have no table `robots`. A robot whose log ended earlier keeps its last map.
+    """
+    if not runs.has("robots"):
+        return maps.assign(overlap_share=np.nan)
+    iterations, parts = np.unique(maps["iteration"]), []
+    for rows in runs.each("robots", ["robot", "iteration", "n_landmarks"]):
+        sizes = rows.pivot_table("n_landmarks", "iteration", ["run_id", "robot"]).ffill()
+        at = sizes.reindex(pd.Index(iterations, name="iteration"), method="ffill")
+        parts.append(at.melt(ignore_index=False).set_index(["run_id", "robot"], append=True))
+    sizes = pd.concat(parts)["value"]
+    places = (maps[["iteration", "run_id", robot]] for robot in ROBOT_PAIR)
+    a, b = (sizes.reindex(pd.MultiIndex.from_frame(own)).to_numpy() for own in places)
+    smaller = pd.Series(np.fmin(a, b), maps.index)
+    # a common landmark at least is in both; maps without any have nothing in common
+    share = (maps["n_common"] / smaller.where(smaller > 0)).where(smaller != 0, 0.0)
+    return maps.assign(overlap_share=share)
 
 
-def _drawn(
-    made_of: Callable[[pd.DataFrame, np.random.Generator], pd.DataFrame], name: str
-) -> Callable[[pd.DataFrame, tuple[str, ...]], pd.DataFrame]:
-    """A statistic with a generator of its own for each configuration."""
-    return lambda rows, label: made_of(rows, generator(0, name, *label))
+def _error_bands(rows: pd.DataFrame) -> pd.DataFrame:
+    is_pooled = (rows["scenario"] == ALL_SCENARIOS).all()
+    return error_bands(that_ever_meet(rows) if is_pooled else rows)
 
 
 def _each(
-    frame: pd.DataFrame, made_of: Callable[[pd.DataFrame, tuple[str, ...]], pd.DataFrame]
+    frame: pd.DataFrame, made_of: Callable[..., pd.DataFrame], seed: str = ""
 ) -> pd.DataFrame:
-    """A table of each configuration, one below the other, its labels in front."""
+    """A table of each configuration, one below the other, its labels in front.
+
+    A statistic that draws, and so has a seed, gets a generator of its own for each.
+    """
     parts = []
     for labels, rows in configurations(frame):
-        part = made_of(rows, tuple(str(value) for value in labels.values()))
+        drawn = [generator(0, seed, *map(str, labels.values()))] if seed else []
+        part = made_of(rows, *drawn)
         for place, (name, value) in enumerate(labels.items()):
             part.insert(place, name, value)
         parts.append(part)

@@ -12,20 +12,13 @@ CONFIDENCE = 0.95
 def wilson(
     successes: ArrayLike, trials: ArrayLike, confidence: float = CONFIDENCE
 ) -> tuple[Float, Float]:
-    """Score interval of a binomial proportion (Wilson 1927).
+    """Lower and upper ends of the score interval of a binomial proportion (Wilson 1927).
 
     Unlike the textbook interval it keeps its level for few trials and for rates near 0 and 1.
-
-    Args:
-        successes: any shape; need not be whole numbers.
-        trials: likewise; where it is 0, nothing is known and the interval is [0, 1].
-        confidence: level of the interval, in (0, 1).
-
-    Returns:
-        Lower and upper ends.
+    Counts need not be whole; where there are no trials, nothing is known: [0, 1].
 
     Raises:
-        ValueError: negative counts, more successes than trials, or an impossible level.
+        ValueError: negative counts, more successes than trials, or a level not in (0, 1).
     """
     k, n = np.broadcast_arrays(np.asarray(successes, float), np.asarray(trials, float))
     if not 0 < confidence < 1:

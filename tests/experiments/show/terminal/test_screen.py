@@ -7,7 +7,7 @@ import pytest
 
 from experiments.show.terminal.layout import print_table
 from experiments.show.terminal.run_screen import not_run_lines
-from experiments.study.statistics.aligner_summary import aligner_summary
+from experiments.study.statistics.standing import aligner_summary
 
 
 def rows(aligner: str, *statuses: tuple[str, str]) -> pd.DataFrame:

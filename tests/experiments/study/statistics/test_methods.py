@@ -16,8 +16,7 @@ from experiments.study.statistics.error_bands import (
     scarce_spans,
     time_bands,
 )
-from experiments.study.statistics.oracle_ratio import oracle_ratios
-from experiments.study.statistics.paired import compare_methods
+from experiments.study.statistics.methods_compared import compare_methods, oracle_ratios
 from tests.helpers.made_up_runs import many_errors
 
 

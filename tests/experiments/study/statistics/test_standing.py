@@ -6,8 +6,7 @@ import pytest
 
 from experiments.judge.judged_maps import maps_of
 from experiments.judge.tables import SHOWN, Shown
-from experiments.study.statistics.aligner_summary import aligner_summary
-from experiments.study.statistics.standing import recommend
+from experiments.study.statistics.standing import aligner_summary, recommend
 from tests.helpers.made_up_runs import many_errors
 
 
