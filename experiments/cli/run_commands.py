@@ -1,6 +1,7 @@
 """Commands that run scenarios and show their results."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -28,14 +29,13 @@ def run(
     from experiments.judge.expectations import load_checked
     from experiments.judge.result import run_scenario
     from experiments.scenario.suite import scenarios_of
-    from experiments.show.terminal.layout import progress
-    from experiments.show.terminal.run_screen import print_result
+    from experiments.show.terminal import layout, run_screen
 
     for loaded in [load_checked(path, overrides, seed) for path in scenarios_of(scenarios)]:
-        with progress() as show:
+        with layout.progress() as show:
             folder = run_scenario(loaded, results, jobs, show, fresh)
             _, skipped = _draw(folder, jobs, show)
-        print_result(folder, skipped)
+        run_screen.print_result(folder, skipped)
 
 
 def _draw(
@@ -45,22 +45,20 @@ def _draw(
     from experiments.show.figures import draw_all
 
     skipped: list[str] = []
-    paths = draw_all(
-        result, jobs, lambda done, total: show("draw the figures", done, total), skipped.append
-    )
-    return paths, skipped
+    told = partial(show, "draw the figures")
+    return draw_all(result, jobs, told, skipped.append), skipped
 
 
 @app.command()
 def figures(result: options.ResultFolder, *, jobs: options.Jobs) -> None:
     """Draw a result's figures again, from its tables alone: `mapfusion figures results/quick-0`."""
     from experiments.judge.result import require_result
-    from experiments.show.terminal.layout import print_paths, progress
+    from experiments.show.terminal import layout
 
     require_result(result)
-    with progress() as show:
+    with layout.progress() as show:
         paths, skipped = _draw(result, jobs, show)
-    print_paths(result / "figures", paths, skipped)
+    layout.print_paths(result / "figures", paths, skipped)
 
 
 @app.command()
@@ -100,25 +98,24 @@ def check(
     results: options.Results,
 ) -> None:
     """Hold runs to their `expect` blocks, exit code 1 if one fails: `mapfusion check ci`."""
-    from experiments.judge.expectations import check as check_scenario
-    from experiments.judge.expectations import load_checked
+    from experiments.judge import expectations
     from experiments.judge.result import run_scenario
     from experiments.scenario.seeds import parse_seeds
     from experiments.scenario.suite import scenarios_of
     from experiments.show.junit import write_junit
-    from experiments.show.terminal.layout import progress
-    from experiments.show.terminal.run_screen import print_outcomes
+    from experiments.show.terminal import layout, run_screen
 
     wanted = parse_seeds(seeds)
-    paths = scenarios_of(scenarios)
+    checked = [
+        [expectations.load_checked(path, overrides, seed) for seed in wanted]
+        for path in scenarios_of(scenarios)
+    ]
     outcomes = []
-    for per_seed in [[load_checked(path, overrides, seed) for seed in wanted] for path in paths]:
-        with progress() as show:
-            folders = {
-                loaded.seed: run_scenario(loaded, results, jobs, show, fresh) for loaded in per_seed
-            }
-        outcomes += check_scenario(per_seed[0], folders)
-    print_outcomes(outcomes)
+    for runs in checked:
+        with layout.progress() as show:
+            folders = {run.seed: run_scenario(run, results, jobs, show, fresh) for run in runs}
+        outcomes += expectations.check(runs[0], folders)
+    run_screen.print_outcomes(outcomes)
     if junit is not None:
         write_junit(junit, outcomes)
     if not all(outcome.passed for outcome in outcomes):

@@ -44,14 +44,13 @@ def slam(
 ) -> None:
     """Build one robot's map from its log: `mapfusion slam logs/R1 -o R1.parquet`."""
     from experiments.judge import user_files as single
-    from experiments.show.terminal.layout import progress
-    from experiments.show.terminal.step_screen import print_map
+    from experiments.show.terminal import layout, step_screen
 
     slam_settings = single.slam_settings(settings, overrides)
-    with progress() as show:
+    with layout.progress() as show:
         landmarks = single.slam(log, slam_settings, seed, show)
     single.save_map(output, landmarks)
-    print_map(output, landmarks)
+    step_screen.print_map(output, landmarks)
 
 
 @app.command()

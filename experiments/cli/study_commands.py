@@ -31,17 +31,16 @@ def refusal(
     """
     from experiments.scenario.seeds import parse_seeds
     from experiments.show.figures.refusal_figures import write
-    from experiments.show.terminal.layout import print_paths, progress
-    from experiments.show.terminal.study_screen import print_refusals
+    from experiments.show.terminal import layout, study_screen
     from experiments.study.refusal import refusal_rates, refusal_tables, refusal_trial
     from experiments.study.refusal.stored_worlds import sources_of
 
     sources = sources_of(worlds, parse_seeds(seeds), results)
-    with progress() as show:
+    with layout.progress() as show:
         false_alarms = refusal_trial.run(sources, output, pairs, jobs, show).false_alarms
     refusals, calibration = (refusal_tables.read(output, name) for name in refusal_tables.ALL)
-    print_refusals(refusal_rates.summary(refusals), false_alarms)
-    print_paths(output, write(output, refusals, calibration, false_alarms))
+    study_screen.print_refusals(refusal_rates.summary(refusals), false_alarms)
+    layout.print_paths(output, write(output, refusals, calibration, false_alarms))
 
 
 @app.command()
@@ -80,21 +79,18 @@ def sweep(
     with more seeds or values adds to the same tables. Exit code 1 if a run failed.
     """
     from experiments.scenario.seeds import parse_seeds
-    from experiments.show.terminal import sweep_screen as screen
-    from experiments.show.terminal.layout import progress
-    from experiments.study.sweep.survey import survey
-    from experiments.study.sweep.whole_sweep import execute, measure_times, prepare
+    from experiments.show.terminal import layout, sweep_screen
+    from experiments.study.sweep import survey, whole_sweep
 
-    asked = prepare(scenarios, parse_seeds(seeds), settings or (), results, output)
+    asked = whole_sweep.prepare(scenarios, parse_seeds(seeds), settings or (), results, output)
     if dry_run:
-        screen.print_survey(survey(asked.runs, asked.store, asked.dataset))
+        sweep_screen.print_survey(survey.survey(asked.runs, asked.store, asked.dataset))
         return
-    with screen.sweep_progress() as show:
-        failed = execute(asked, jobs, scheduler, show)
-    if timings:
-        with progress() as show:
-            measure_times(asked, failed, show)
-    screen.print_sweep(asked.dataset, asked.runs, failed)
+    with layout.progress() as show:
+        failed = whole_sweep.execute(asked, jobs, scheduler, sweep_screen.shown_by(show))
+        if timings:
+            whole_sweep.measure_times(asked, failed, show)
+    sweep_screen.print_sweep(asked.dataset, asked.runs, failed)
     if failed:
         raise typer.Exit(options.EXIT_FAILED)
 
@@ -161,8 +157,7 @@ def benchmark(
     """
     from experiments.run.store import Store
     from experiments.show.benchmark_files import write_benchmark
-    from experiments.show.terminal.layout import progress
-    from experiments.show.terminal.study_screen import print_benchmark
+    from experiments.show.terminal import layout, study_screen
     from experiments.study.benchmark import cells
     from experiments.study.benchmark.success import summarise
 
@@ -175,11 +170,11 @@ def benchmark(
         tuple(outliers or cells.OUTLIER_SHARES),
     )
     folder = output or results / "benchmark"
-    with progress() as show:
+    with layout.progress() as show:
         rows = cells.run_benchmark(design, Store(results / "store"), show)
     summary = summarise(rows)
     write_benchmark(folder, design, rows, summary)
-    print_benchmark(folder, summary)
+    study_screen.print_benchmark(folder, summary)
 
 
 @app.command()

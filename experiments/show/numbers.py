@@ -41,6 +41,25 @@ def ratio(value: float) -> str:
     return UNKNOWN if not math.isfinite(value) else f"{value:.2f}" if value < 10 else f"{value:.0f}"
 
 
+def number(value: float, layout: str) -> str:
+    """A number in a format."""
+    return UNKNOWN if math.isnan(value) else format(value, layout)
+
+
+def interval(value: float, low: float, high: float, layout: str) -> str:
+    """A number with its interval, where that says anything, in brackets that repeat no unit."""
+    text = number(value, layout)
+    if math.isnan(low) or math.isnan(high) or (math.isinf(low) and math.isinf(high)):
+        return text
+    to = " to " if layout.startswith("+") else "–"  # signs need room between them
+    return f"{text} ({to.join(number(end, layout) for end in (low, high)).replace('%', '')})"
+
+
+def with_unit(text: str, unit: str) -> str:
+    """A number and its unit; a number that is not known has none."""
+    return text if text == UNKNOWN else f"{text}{_SPACE}{unit}"
+
+
 def listed(names: Sequence[str]) -> str:
     """Names in a sentence: "a, b and c"."""
     return f"{', '.join(names[:-1])} and {names[-1]}" if len(names) > 1 else "".join(names)

@@ -1,102 +1,96 @@
 """How tables look, and what commands show while they work and when they are done."""
 
-import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 from rich import box
 from rich.console import Console
-from rich.markup import escape
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    TextColumn,
-    TimeElapsedColumn,
-)
+from rich.progress import BarColumn, Progress, TaskID, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
-# Plain rules and narrow gaps: all columns must fit into 80 characters.
-LAYOUT: Any = {
-    "box": box.SIMPLE_HEAD,
-    "padding": (0, 1, 0, 0),
-    "title_style": "bold",
-    "title_justify": "left",
-    "caption_justify": "left",
-}
+from experiments.show.numbers import UNKNOWN, interval, number
+
+Column = tuple[str, str]  # heading and format
 
 
 @contextmanager
-def progress(*more: ProgressColumn) -> Iterator[Callable[[str, int, int], None]]:
+def progress() -> Iterator[Callable[[str, int, int], None]]:
     """A progress display on stderr; yields the function to tell (label, done, total)."""
-    display = Progress(
-        TextColumn("{task.description:<26}"),
+    bars: dict[str, TaskID] = {}
+    with Progress(
+        "{task.description:<26}",
         BarColumn(),
-        MofNCompleteColumn(),
+        "{task.completed:.0f}/{task.total:.0f}",
         TimeElapsedColumn(),
-        *more,
+        TimeRemainingColumn(),
         console=Console(stderr=True),
-    )
-    bars: dict[str, Any] = {}
-    with display:
+    ) as display:
 
         def show(label: str, done: int, total: int) -> None:
-            if label not in bars or (done == 0 and bars[label][1]):
-                bars[label] = [display.add_task(label, total=total), False]
-            bar, _ = bars[label]
-            display.update(bar, completed=done, total=total)
-            bars[label][1] = done == total
+            if label not in bars or (done == 0 and display.tasks[bars[label]].finished):
+                bars[label] = display.add_task(label, total=total)
+            display.update(bars[label], completed=done, total=total)
 
         yield show
 
 
 def print_table(
-    columns: Sequence[tuple[str, str]],
-    rows: Iterable[Sequence[Any]],
-    title: str = "",
-    note: str = "",
+    columns: Collection[Column], rows: Iterable[Sequence[Any]], title: str = "", note: str = ""
 ) -> None:
-    """Print a table of text and numbers.
+    """Print a table, if it has any rows, with a title above and a note below.
 
-    Args:
-        columns: heading, which may have two lines, and format; without one, text to the left.
-        rows: their cells; what is not known is None or NaN. Styled text is taken as it is.
-        title: above.
-        note: below.
+    A heading may have two lines; without a format its column is text. A cell is None or NaN where
+    nothing is known, (value, low, high) with an interval, or styled text.
     """
-    table = Table(title=title or None, caption=note or None, **LAYOUT)
+    # Plain rules and narrow gaps: all columns must fit into 80 characters.
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for heading, layout in columns:
         if layout:
-            table.add_column(heading, justify="right", no_wrap=True)
+            table.add_column(Text(heading), justify="right", no_wrap=True)
         else:  # where the screen is narrow, text gives way before numbers do
-            table.add_column(heading, overflow="fold")
+            table.add_column(Text(heading), overflow="fold")
+    layouts = [layout for _, layout in columns]
     for row in rows:
-        cells = zip(row, columns, strict=True)
-        table.add_row(*(_cell(value, layout) for value, (_, layout) in cells))
-    Console().print(table)
+        table.add_row(*map(_cell, row, layouts))
+    if table.row_count:
+        console = Console()
+        if title:
+            console.print(Text(title, "bold"))
+        console.print(table)
+        if note:
+            console.print(Text(f"{note}\n", "dim"))
 
 
-def _cell(value: Any, layout: str) -> str | Text:
+def columns(layout: str, **headings: str) -> dict[str, Column]:
+    """Columns of one format, by their names in a frame."""
+    return {name: (heading, layout) for name, heading in headings.items()}
+
+
+def print_frame(
+    frame: pd.DataFrame, shown: Mapping[str, Column], title: str = "", note: str = ""
+) -> None:
+    """Print columns of a frame by name, with the intervals in their NAME_low and NAME_high."""
+    cells = [
+        frame[[name, f"{name}_low", f"{name}_high"]].itertuples(index=False, name=None)
+        if f"{name}_low" in frame
+        else frame[name]
+        for name in shown
+    ]
+    print_table(shown.values(), zip(*cells, strict=True), title, note)
+
+
+def _cell(value: Any, layout: str) -> Text:
     if isinstance(value, Text):
         return value
-    if value is None or (isinstance(value, float) and math.isnan(value)):
-        return "-"
-    return escape(format(value, layout))
-
-
-def number(value: float, layout: str) -> str:
-    """A number in a format, or a dash for what is not known."""
-    return "-" if math.isnan(value) else format(value, layout)
-
-
-def milliseconds(elapsed_s: float) -> str:
-    """Two digits or all before the point: 0.23, 4.6, 31, 1710."""
-    elapsed_ms = 1e3 * elapsed_s
-    return number(elapsed_ms, ".0f" if elapsed_ms >= 10 else ".2g")
+    if value is None:
+        return Text(UNKNOWN)
+    if isinstance(value, tuple):
+        return Text(interval(*value, layout=layout))
+    return Text(number(value, layout) if isinstance(value, float) else format(value, layout))
 
 
 def print_lines(lines: Iterable[str]) -> None:

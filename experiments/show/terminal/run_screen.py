@@ -2,23 +2,26 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pandas as pd
 from rich.text import Text
 
 from experiments.judge import tables
 from experiments.judge.criteria import ANSWERABLE_PAIRS, ORACLE, answerable, at_the_end
+from experiments.judge.expectations import Outcome
 from experiments.judge.judged_maps import methods_in
 from experiments.judge.path_errors import path_rms
 from experiments.judge.tables import SHOWN
-from experiments.show.terminal.layout import print_lines, print_skipped, print_table
+from experiments.show.terminal.layout import (
+    columns,
+    print_frame,
+    print_lines,
+    print_skipped,
+    print_table,
+)
 from experiments.study.statistics.error_bands import ROBOT_PAIR, error_bands
 from experiments.study.statistics.standing import aligner_summary
 from mapfusion.align.result import NOT_RUN, Status
-
-if TYPE_CHECKING:
-    from experiments.judge.expectations import Outcome
 
 _SEEDS_SHOWN = 3  # one by one, in a table of checks
 
@@ -35,15 +38,12 @@ def print_result(result: Path, skipped_figures: Sequence[str]) -> None:
         _print_aligners(errors, aligner_summary(errors, table("aligner_timings"), aligners))
         print_lines(f"  {line}" for line in not_run_lines(errors))
         _print_pairs(errors, aligners[0])
-    paths = path_rms(table("robots"))
-    columns = [("robot", ""), ("FastSLAM, m", ".3f"), ("odometry, m", ".3f"), ("ratio", ".2f")]
-    names = ["robot", "path_m", "odometry_m", "over_odometry", "n_landmarks"]
-    rows = paths[names].itertuples(index=False)
-    print_table([*columns, ("landmarks", "d")], rows, "Position errors (RMS)")
-    for motion in table("fused_motions").to_dict("records"):
-        if motion["left_out"]:
-            reason = f"is left out of the fused map: {motion['left_out']}"
-            print_lines([f"  {motion['robot']} {reason}"])
+    shown = columns("", robot="robot") | columns(".3f", path_m="FastSLAM, m")
+    shown |= columns(".3f", odometry_m="odometry, m") | columns(".2f", over_odometry="ratio")
+    shown |= columns("d", n_landmarks="landmarks")
+    print_frame(path_rms(table("robots")), shown, "Position errors (RMS)")
+    left_out = table("fused_motions")[["robot", "left_out"]].itertuples(index=False)
+    print_lines(f"  {robot} is left out of the fused map: {why}" for robot, why in left_out if why)
     print_lines([f"Figures: {result / 'figures'}   tables: {result / 'tables'}"])
     print_skipped(skipped_figures)
 
@@ -62,25 +62,24 @@ def not_run_lines(errors: pd.DataFrame) -> list[str]:
 
 
 def _print_aligners(errors: pd.DataFrame, summary: pd.DataFrame) -> None:
-    columns = {"aligner": ("\naligner", "")}
-    columns |= {name: (shown.label, shown.layout) for name, shown in SHOWN.items()}
-    columns |= {"spread_m": ("spread\nm", ".3f"), "time_ms": ("time\nms", ".2f")}
+    shown = columns("", aligner="aligner")
+    shown |= {name: (column.label, column.layout) for name, column in SHOWN.items()}
+    shown |= columns(".3f", spread_m="spread\nm") | columns(".2f", time_ms="time\nms")
     maps = answerable(errors)
     note = "spread: 10-90 % of the repetitions; ok: accepted as more than chance"
     if len(maps):
         n_offered = maps["n_correspondences"]
         share = (maps["n_true"] / n_offered).median()
         note += f"\npairs offered: {n_offered.median():.0f}, {share:.0%} of them true"
-    rows = summary[list(columns)].itertuples(index=False)
     title = f"Alignment errors: medians over iterations with {ANSWERABLE_PAIRS}+ true pairs"
-    print_table(list(columns.values()), rows, title, note)
+    print_frame(summary, shown, title, note)
 
 
 def _print_pairs(errors: pd.DataFrame, aligner: str) -> None:
     """Each pair at its last iteration: the first aligner, refined, beside the oracle."""
-    columns = [("pair", "")]
+    shown = [("pair", "")]
     for whose in ("error", "oracle"):
-        columns += [(f"{whose}, m", ".3f"), (f"{whose}, rad", "+.4f")]
+        shown += [(f"{whose}, m", ".3f"), (f"{whose}, rad", "+.4f")]
     names = [f"refined_{quantity}" for quantity in ("translation_error_m", "rotation_error_rad")]
     bands = at_the_end(error_bands(errors)).set_index([*ROBOT_PAIR, "aligner"])
     medians = bands[names].T.to_dict("list")
@@ -90,10 +89,10 @@ def _print_pairs(errors: pd.DataFrame, aligner: str) -> None:
         found = (*medians[(*pair, aligner)], *medians[(*pair, ORACLE)])
         rows.append([" - ".join(pair), *found, f"{last['n_true']} of {last['n_correspondences']}"])
     title = f"Pairs at the last iteration, {aligner} refined"
-    print_table([*columns, ("true pairs", ">")], rows, title)
+    print_table([*shown, ("true pairs", ">")], rows, title)
 
 
-def print_outcomes(outcomes: Sequence["Outcome"]) -> None:
+def print_outcomes(outcomes: Sequence[Outcome]) -> None:
     """The table of a check."""
     headings = ("scenario", "metric", "measured", "expected", "by seed", "")
     rows = [

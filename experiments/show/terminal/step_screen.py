@@ -3,45 +3,39 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from experiments.show.terminal.layout import milliseconds, print_lines, print_table
+import pandas as pd
+
+from experiments.show.numbers import two_digits
+from experiments.show.terminal.layout import columns, print_frame, print_lines
 from mapfusion.align.result import NOT_RUN, Status
+from mapfusion.landmark_map import LandmarkMap
+from mapfusion.merge import FusedMap
 
-if TYPE_CHECKING:
-    from mapfusion.landmark_map import LandmarkMap
-    from mapfusion.merge import FusedMap
-
-_ESTIMATE_COLUMNS = {
-    "aligner": ("\naligner", ""),
-    "tx_m": ("tx\nm", ".2f"),
-    "ty_m": ("ty\nm", ".2f"),
-    "theta_rad": ("theta\nrad", ".2f"),
-    "refined_tx_m": ("refined\nm", ".2f"),
-    "refined_ty_m": ("ty\nm", ".2f"),
-    "refined_theta_rad": ("theta\nrad", ".3f"),
-    "inliers": ("\ninliers", ">"),
-    "log10_false_alarms": ("NFA\nlog10", ".0f"),
-    "time": ("time\nms", ">"),
-}
+_ESTIMATES = (
+    columns("", aligner="aligner")
+    | columns(".2f", tx_m="tx\nm", ty_m="ty\nm", theta_rad="theta\nrad")
+    | columns(".2f", refined_tx_m="refined\nm", refined_ty_m="ty\nm")
+    | columns(".3f", refined_theta_rad="theta\nrad")
+    | columns(">", inliers="inliers")
+    | columns(".0f", log10_false_alarms="NFA\nlog10")
+    | columns(">", time="time\nms")
+)
 
 
-def print_map(path: Path, landmarks: "LandmarkMap") -> None:
+def print_map(path: Path, landmarks: LandmarkMap) -> None:
     """What a map holds and where it is."""
     print_lines([f"{len(landmarks)} landmarks of {landmarks.name} in {path}"])
 
 
 def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
     """Estimates of all aligners on two maps, and why those were not accepted that were not."""
-    shown = [
-        row
-        | {"inliers": f"{row['n_inliers']}/{row['n_correspondences']}"}
-        | {"time": milliseconds(row["elapsed_s"])}
-        for row in rows
-    ]
-    print_table(
-        list(_ESTIMATE_COLUMNS.values()),
-        [[row[name] for name in _ESTIMATE_COLUMNS] for row in shown],
+    found = pd.DataFrame(rows)
+    inliers = found["n_inliers"].map(str) + "/" + found["n_correspondences"].map(str)
+    print_frame(
+        found.assign(inliers=inliers, time=(1e3 * found["elapsed_s"]).map(two_digits)),
+        _ESTIMATES,
         "T_a_b, as estimated and refined",
         "NFA: expected number of alignments that chance alone supports as well",
     )
@@ -53,7 +47,7 @@ def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
             print_lines([f"  {row['aligner']}: {status}: {reason}"])
 
 
-def print_fused(path: Path, fused: "FusedMap", names: Sequence[str]) -> None:
+def print_fused(path: Path, fused: FusedMap, names: Sequence[str]) -> None:
     """What a fused map was made of."""
     several = int(((fused.parents >= 0).sum(axis=1) > 1).sum())
     lines = [

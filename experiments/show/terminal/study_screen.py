@@ -2,74 +2,73 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pandas as pd
 
 from experiments.judge.criteria import MERGEABLE_PAIRS, RIGHT_WITHIN_M, RIGHT_WITHIN_RAD
 from experiments.methods.catalogue import known_methods, name_clashes
-from experiments.show.terminal.layout import milliseconds, print_lines, print_table
+from experiments.scenario.suite import Entry
+from experiments.show.numbers import two_digits
+from experiments.show.terminal.layout import Column, columns, print_frame, print_lines, print_table
 from mapfusion.align.result import Status
 
-if TYPE_CHECKING:
-    from experiments.scenario.suite import Entry
-
-_REFUSAL_HEADINGS = {
-    "false": "false\nmerges",
-    "wrong": "wrong\n",
-    "missed": "missed\nof all",
-    "missed_though_right": "\nof right",
-    "few_missed_though_right": "20 true:\nmissed",
-    "few_wrong": "\nwrong",
-}
+_RATES = columns(
+    ">",
+    false="false\nmerges",
+    wrong="wrong\n",
+    missed="missed\nof all",
+    missed_though_right="of right",
+    few_missed_though_right="20 true:\nmissed",
+    few_wrong="wrong",
+)
 
 
 def print_refusals(rows: Sequence[dict[str, Any]], false_alarms: float) -> None:
     """False and missed merges of each aligner (rows of `refusal_rates`)."""
     _print_rates(
         rows,
-        _REFUSAL_HEADINGS,
+        _RATES,
         f"Accepted where chance gives at most {false_alarms:g} a pair of maps",
-        "false: accepted without common ground; wrong: accepted with some,\n"
+        "false: accepted without common ground; wrong: accepted with some, "
         f"{RIGHT_WITHIN_M:g} m or {RIGHT_WITHIN_RAD:g} rad off; missed: refused with "
-        f"{MERGEABLE_PAIRS} or more true pairs, of\n"
-        "all and of those right; 20 true: just 20 in one corner are left",
+        f"{MERGEABLE_PAIRS} or more true pairs, of all and of those right; 20 true: just 20 in "
+        "one corner are left",
     )
-    repeated = {
+    wide = {
         name: f"{2 * float(name.removeprefix('poster_')):g} m\nwide"
         for name in rows[0]
         if name.startswith("poster_")
     }
-    repeated |= {"posters_false": "posters,\napart", "posters_wrong": "\nin common"}
+    repeated = columns(">", **wide, posters_false="posters,\napart", posters_wrong="in common")
     _print_rates(
         rows,
-        {name: text for name, text in repeated.items() if rows[0][name].n},
+        {name: column for name, column in repeated.items() if rows[0][name].n},
         "Accepted though wrong: texture that repeats",
-        "wide: one such picture in two worlds; posters: few pictures all over\n"
-        "a world, without and with common ground",
+        "wide: one such picture in two worlds; posters: few pictures all over a world, without "
+        "and with common ground",
     )
 
 
 def _print_rates(
-    rows: Sequence[dict[str, Any]], headings: Mapping[str, str], title: str, note: str
+    rows: Sequence[dict[str, Any]], shown: Mapping[str, Column], title: str, note: str
 ) -> None:
-    columns = [("\naligner", ""), *((heading, ">") for heading in headings.values())]
     cells = [
-        [row["aligner"], *(f"{row[name].hits}/{row[name].n}" for name in headings)] for row in rows
+        [row["aligner"], *(f"{row[name].hits}/{row[name].n}" for name in shown)] for row in rows
     ]
-    print_table(columns, cells, title, note)
+    print_table([("aligner", ""), *shown.values()], cells, title, note)
 
 
 def print_benchmark(folder: Path, summary: pd.DataFrame) -> None:
     """Successes and times for each number of pairs, and where the rest is."""
     for n_pairs, rows in summary.groupby("n_pairs", sort=False):
         shares = rows["outlier_share"].drop_duplicates()
-        columns = [("outliers", ""), *((f"{100 * share:g} %", ">") for share in shares)]
+        shown = [("outliers", ""), *((f"{100 * share:g} %", ">") for share in shares)]
         cells = [
             [method, *(_benchmark_cell(row) for row in own.to_dict("records"))]
             for method, own in rows.groupby("method", sort=False)
         ]
-        print_table(columns, cells, f"{n_pairs} pairs: success in %, time in ms")
+        print_table(shown, cells, f"{n_pairs} pairs: success in %, time in ms")
     failed = summary.groupby("method", sort=False)["n_failed"].sum()
     print_lines(
         f"  {method}: failed in {n} trials, see trials.parquet"
@@ -81,7 +80,7 @@ def print_benchmark(folder: Path, summary: pd.DataFrame) -> None:
 def _benchmark_cell(row: dict[Any, Any]) -> str:
     if row["status"] == Status.ABSENT:
         return "absent"
-    return f"{100 * row['success']:.0f}, {milliseconds(row['elapsed_s'])}"
+    return f"{100 * row['success']:.0f}, {two_digits(1e3 * row['elapsed_s'])}"
 
 
 def print_methods() -> None:
@@ -91,25 +90,17 @@ def print_methods() -> None:
         (each.name, each.kind, each.distribution, "absent" if each.absence else each.version)
         for each in methods
     ]
-    columns = [(heading, "") for heading in ("method", "whose", "package", "version")]
-    print_table(columns, rows, "Alignment methods")
-    lines = [f"{each.name}: {each.absence}" for each in methods if each.absence]
-    print_lines(f"  {line}" for line in [*lines, *name_clashes().values()])
+    headings = ("method", "whose", "package", "version")
+    print_table([(heading, "") for heading in headings], rows, "Alignment methods")
+    absent = [f"{each.name}: {each.absence}" for each in methods if each.absence]
+    print_lines(f"  {line}" for line in (*absent, *name_clashes().values()))
 
 
-def print_scenarios(entries: "Sequence[Entry]") -> None:
+def print_scenarios(entries: Sequence[Entry]) -> None:
     """The scenarios of a folder."""
-    columns = [("scenario", ""), ("tags", ""), ("robots", "d"), ("iterations", ">")]
-    columns += [("overlap", ">"), ("what it is", "")]
-    rows = [
-        (
-            entry.name,
-            " ".join(entry.tags),
-            entry.robots,
-            "recorded" if entry.iterations is None else entry.iterations,
-            "" if entry.overlap is None else f"{entry.overlap:.2f}",
-            entry.description,
-        )
-        for entry in entries
-    ]
-    print_table(columns, rows)
+    shown = columns("", name="scenario", tags="tags") | columns("d", robots="robots")
+    shown |= columns(">", iterations="iterations") | columns(".2f", overlap="overlap")
+    shown |= columns("", description="what it is")
+    frame = pd.DataFrame(entries)
+    recorded = ["recorded" if each.iterations is None else str(each.iterations) for each in entries]
+    print_frame(frame.assign(tags=frame["tags"].map(" ".join), iterations=recorded), shown)

@@ -73,7 +73,7 @@ def test_text_gives_way_before_numbers_on_a_narrow_screen(
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 40
     text = "".join(lines)
-    for shown in ("1234.500", "480/480", "+0.5000", " - ", "Title"):
+    for shown in ("1234.500", "480/480", "+0.5000", " – ", "Title"):
         assert shown in text
     assert "…" not in text
     assert "".join(line[1:11].strip() for line in lines[5:9]) == long
