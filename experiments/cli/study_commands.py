@@ -33,13 +33,13 @@ def refusal(
     from experiments.show.figures.refusal_figures import write
     from experiments.show.terminal.layout import print_paths, progress
     from experiments.show.terminal.study_screen import print_refusals
-    from experiments.study.refusal import refusal_rates, refusal_tables, refusal_trial
-    from experiments.study.refusal.stored_worlds import sources_of
+    from experiments.study.refusal import refusal_rates, refusal_trial
+    from experiments.study.refusal.stored_worlds import worlds_of
 
-    sources = sources_of(worlds, parse_seeds(seeds), results)
+    mapped = worlds_of(worlds, parse_seeds(seeds), results)
     with progress() as show:
-        false_alarms = refusal_trial.run(sources, output, pairs, jobs, show).false_alarms
-    refusals, calibration = (refusal_tables.read(output, name) for name in refusal_tables.ALL)
+        false_alarms = refusal_trial.run(mapped, output, pairs, jobs, show)
+    refusals, calibration = (refusal_trial.read(output, name) for name in refusal_trial.TABLES)
     print_refusals(refusal_rates.summary(refusals), false_alarms)
     print_paths(output, write(output, refusals, calibration, false_alarms))
 
@@ -82,12 +82,12 @@ def sweep(
     from experiments.scenario.seeds import parse_seeds
     from experiments.show.terminal import sweep_screen as screen
     from experiments.show.terminal.layout import progress
-    from experiments.study.sweep.survey import survey
-    from experiments.study.sweep.whole_sweep import execute, measure_times, prepare
+    from experiments.study.sweep.sweep_driver import execute, measure_times
+    from experiments.study.sweep.sweep_plan import prepare, survey
 
     asked = prepare(scenarios, parse_seeds(seeds), settings or (), results, output)
     if dry_run:
-        screen.print_survey(survey(asked.runs, asked.store, asked.dataset))
+        screen.print_survey(survey(asked))
         return
     with screen.sweep_progress() as show:
         failed = execute(asked, jobs, scheduler, show)
@@ -164,7 +164,6 @@ def benchmark(
     from experiments.show.terminal.layout import progress
     from experiments.show.terminal.study_screen import print_benchmark
     from experiments.study.benchmark import cells
-    from experiments.study.benchmark.success import summarise
 
     design = cells.BenchmarkDesign(
         cells.entries_of(methods or (), settings),
@@ -177,7 +176,7 @@ def benchmark(
     folder = output or results / "benchmark"
     with progress() as show:
         rows = cells.run_benchmark(design, Store(results / "store"), show)
-    summary = summarise(rows)
+    summary = cells.summarise(rows)
     write_benchmark(folder, design, rows, summary)
     print_benchmark(folder, summary)
 

@@ -16,8 +16,7 @@ from experiments.show.export import to_markdown
 from experiments.show.figures.benchmark_figure import draw
 from experiments.show.figures.drawing import save_figure
 from experiments.show.figures.style import house_style
-from experiments.study.benchmark.cells import BenchmarkDesign
-from experiments.study.benchmark.success import SUMMARY
+from experiments.study.benchmark.cells import SUMMARY, BenchmarkDesign
 from experiments.study.benchmark.synthetic_pairs import SIGMA_M, SIZE_M
 from experiments.study.benchmark.trials import TRIALS
 from mapfusion.align.result import Status
