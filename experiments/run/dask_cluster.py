@@ -15,6 +15,8 @@ _LOCAL_SETTINGS = {
     # Dask blames every task that was assigned to a killed worker, not only the one at work; the
     # sweep counts by itself (`dask_worker.Terms.retries`).
     "distributed.scheduler.allowed-failures": 1_000_000,
+    # A killed worker is begun again, which a busy machine may take long for: Dask must not give up.
+    "distributed.deploy.lost-worker-timeout": "1 day",
     # Tasks keep nothing in Dask's memory, so there is nothing to spill, and a paused worker would
     # wait for ever. One that fills 95 % of its share is killed and its task begun again.
     "distributed.worker.memory.target": False,

@@ -40,9 +40,8 @@ class SweepRun:
 
     def load(self) -> AnyScenario:
         """The scenario of this run; raises InputError."""
-        return load_checked(
-            self.path, [f"{key}={value}" for key, value in self.settings], self.seed
-        )
+        overrides = [f"{key}={value}" for key, value in self.settings]
+        return load_checked(self.path, overrides, self.seed)
 
 
 def parse_axes(entries: Sequence[str]) -> Axes:

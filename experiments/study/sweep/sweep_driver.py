@@ -15,14 +15,8 @@ from distributed import Client, Future, as_completed
 from distributed.scheduler import KilledWorker
 
 from experiments.methods.threads import single_threaded
+from experiments.run import dask_worker
 from experiments.run.dask_cluster import connected
-from experiments.run.dask_worker import (
-    TaskFailedError,
-    Terms,
-    UnfitWorkerError,
-    code_version,
-    perform,
-)
 from experiments.run.store import explained
 from experiments.run.tasks import OnProgress, Task
 from experiments.study.sweep.combinations import SweepRun
@@ -67,7 +61,7 @@ class SweepDriver:
         self,
         client: Client,
         sweep: Sweep,
-        terms: Terms,
+        terms: dask_worker.Terms,
         on_progress: Callable[[SweepProgress], None],
     ) -> None:
         self._client, self._sweep, self._terms = client, sweep, terms
@@ -77,7 +71,7 @@ class SweepDriver:
         self._ended = as_completed(loop=client.loop)
         self._futures: dict[str, Future] = {}  # by name of the task
         self._open: dict[PlannedRun, set[str]] = {}  # with the tasks at Dask that each waits for
-        self._failures: dict[str, TaskFailedError] = {}  # by task, for runs that follow too
+        self._failures: dict[str, dask_worker.TaskFailedError] = {}  # by task
         self._n_workers, self._counted_at = 0, -_COUNT_WORKERS_EVERY_S
         self.progress = SweepProgress(len(sweep.runs))
 
@@ -125,7 +119,7 @@ class SweepDriver:
     def _submit(self, task: Task) -> None:
         self.progress.tasks[task.label] += 1
         future = self._client.submit(
-            perform,
+            dask_worker.perform,
             task.name,
             pickle.dumps(task),
             self._terms,
@@ -149,7 +143,7 @@ class SweepDriver:
             self._open[laid_out].remove(name)
             self._end_if_over(laid_out)
 
-    def _failure(self, future: Future, name: str) -> TaskFailedError:
+    def _failure(self, future: Future, name: str) -> dask_worker.TaskFailedError:
         """Which task failed and why: those that needed it fail like it."""
         if future.status != "error":
             raise InputError(
@@ -157,14 +151,14 @@ class SweepDriver:
                 "same command goes on from there"
             )
         error = future.exception()
-        if isinstance(error, TaskFailedError):
+        if isinstance(error, dask_worker.TaskFailedError):
             return error
         if isinstance(error, KilledWorker):
             _, cause = _label_and_name(error.task)
             stage, times = cause.partition("/")[0], error.allowed_failures + 1
             reason = f"{stage}: Dask gave it up after {times} of its workers died"
-            return TaskFailedError(cause, reason)
-        if isinstance(error, UnfitWorkerError):
+            return dask_worker.TaskFailedError(cause, reason)
+        if isinstance(error, dask_worker.UnfitWorkerError):
             raise InputError(str(error))
         raise InputError(f"a worker cannot run {name}: {type(error).__name__}: {error}")
 
@@ -217,7 +211,7 @@ def execute(
         ) as attempts,
         connected(jobs, scheduler) as client,
     ):
-        terms = Terms(Path(attempts), RETRIES, code_version())
+        terms = dask_worker.Terms(Path(attempts), RETRIES, dask_worker.code_version())
         driver = SweepDriver(client, sweep, terms, on_progress)
         driver.execute()
     return driver.progress.failed

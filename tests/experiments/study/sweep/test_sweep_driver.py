@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, cast
 
+import dask.config
 import pandas as pd
 import pytest
 from distributed import Client, LocalCluster
@@ -26,7 +27,9 @@ from tests.helpers import acting
 
 @pytest.fixture(scope="module")
 def client() -> Iterator[Client]:
-    with connected(2, None) as connection:
+    """On a machine so busy that Dask would take a killed worker for lost before it is back."""
+    busy = {"distributed.deploy.lost-worker-timeout": "0.1s"}
+    with dask.config.set(busy), connected(2, None) as connection:
         yield connection
 
 
