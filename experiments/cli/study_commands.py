@@ -32,13 +32,13 @@ def refusal(
     from experiments.scenario.seeds import parse_seeds
     from experiments.show.figures.refusal_figures import write
     from experiments.show.terminal import layout, study_screen
-    from experiments.study.refusal import refusal_rates, refusal_tables, refusal_trial
-    from experiments.study.refusal.stored_worlds import sources_of
+    from experiments.study.refusal import refusal_rates, refusal_trial
+    from experiments.study.refusal.stored_worlds import worlds_of
 
-    sources = sources_of(worlds, parse_seeds(seeds), results)
+    mapped = worlds_of(worlds, parse_seeds(seeds), results)
     with layout.progress() as show:
-        false_alarms = refusal_trial.run(sources, output, pairs, jobs, show).false_alarms
-    refusals, calibration = (refusal_tables.read(output, name) for name in refusal_tables.ALL)
+        false_alarms = refusal_trial.run(mapped, output, pairs, jobs, show)
+    refusals, calibration = (refusal_trial.read(output, name) for name in refusal_trial.TABLES)
     study_screen.print_refusals(refusal_rates.summary(refusals), false_alarms)
     layout.print_paths(output, write(output, refusals, calibration, false_alarms))
 
@@ -80,16 +80,16 @@ def sweep(
     """
     from experiments.scenario.seeds import parse_seeds
     from experiments.show.terminal import layout, sweep_screen
-    from experiments.study.sweep import survey, whole_sweep
+    from experiments.study.sweep import sweep_driver, sweep_plan
 
-    asked = whole_sweep.prepare(scenarios, parse_seeds(seeds), settings or (), results, output)
+    asked = sweep_plan.prepare(scenarios, parse_seeds(seeds), settings or (), results, output)
     if dry_run:
-        sweep_screen.print_survey(survey.survey(asked.runs, asked.store, asked.dataset))
+        sweep_screen.print_survey(sweep_plan.survey(asked))
         return
     with layout.progress() as show:
-        failed = whole_sweep.execute(asked, jobs, scheduler, sweep_screen.shown_by(show))
+        failed = sweep_driver.execute(asked, jobs, scheduler, sweep_screen.shown_by(show))
         if timings:
-            whole_sweep.measure_times(asked, failed, show)
+            sweep_driver.measure_times(asked, failed, show)
     sweep_screen.print_sweep(asked.dataset, asked.runs, failed)
     if failed:
         raise typer.Exit(options.EXIT_FAILED)
@@ -159,7 +159,6 @@ def benchmark(
     from experiments.show.benchmark_files import write_benchmark
     from experiments.show.terminal import layout, study_screen
     from experiments.study.benchmark import cells
-    from experiments.study.benchmark.success import summarise
 
     design = cells.BenchmarkDesign(
         cells.entries_of(methods or (), settings),
@@ -172,7 +171,7 @@ def benchmark(
     folder = output or results / "benchmark"
     with layout.progress() as show:
         rows = cells.run_benchmark(design, Store(results / "store"), show)
-    summary = summarise(rows)
+    summary = cells.summarise(rows)
     write_benchmark(folder, design, rows, summary)
     study_screen.print_benchmark(folder, summary)
 

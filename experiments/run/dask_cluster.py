@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 
 import dask.config
 from distributed import Client, LocalCluster
@@ -15,6 +15,8 @@ _LOCAL_SETTINGS = {
     # Dask blames every task that was assigned to a killed worker, not only the one at work; the
     # sweep counts by itself (`dask_worker.Terms.retries`).
     "distributed.scheduler.allowed-failures": 1_000_000,
+    # A killed worker is begun again, which a busy machine may take long for: Dask must not give up.
+    "distributed.deploy.lost-worker-timeout": "1 day",
     # Tasks keep nothing in Dask's memory, so there is nothing to spill, and a paused worker would
     # wait for ever. One that fills 95 % of its share is killed and its task begun again.
     "distributed.worker.memory.target": False,
@@ -28,30 +30,21 @@ _LOCAL_SETTINGS = {
 }
 
 
-@contextmanager
-def connected(jobs: int, scheduler: str | None) -> Iterator[Client]:
-    """A client of a cluster for the length of a `with` block.
-
-    Args:
-        jobs: local processes, one thread each; of no meaning with a scheduler.
-        scheduler: address of a running scheduler, `tcp://...`.
+def connected(jobs: int, scheduler: str | None) -> AbstractContextManager[Client]:
+    """A client for a `with` block: of the scheduler at `tcp://...`, else of `jobs` processes.
 
     Raises:
         InputError: no scheduler answers there.
     """
     if scheduler is None:
-        with _local(jobs) as client:
-            yield client
-        return
+        return _local(jobs)
     try:
-        client = Client(scheduler, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
+        return Client(scheduler, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
     except (OSError, ValueError) as error:
         reason = str(error).splitlines()[0]
         raise InputError(
             f"--scheduler {scheduler}: no Dask scheduler answers ({reason})"
         ) from error
-    with client:
-        yield client
 
 
 @contextmanager
@@ -69,16 +62,11 @@ def _local(jobs: int) -> Iterator[Client]:
         try:
             with Client(cluster, set_as_default=False) as client:
                 yield client
-        except BaseException:
-            _kill_workers(cluster)
+        except BaseException:  # end workers at once: the next sweep begins their tasks again
+            for nanny in cluster.workers.values():
+                process = getattr(nanny.process, "process", None)
+                if process is not None and process.is_alive():
+                    cluster.sync(process.kill)
             raise
         finally:
             cluster.close()
-
-
-def _kill_workers(cluster: LocalCluster) -> None:
-    """At once: what they are at is begun again by the next sweep."""
-    for nanny in cluster.workers.values():
-        process = getattr(nanny.process, "process", None)
-        if process is not None and process.is_alive():
-            cluster.sync(process.kill)

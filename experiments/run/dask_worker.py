@@ -13,8 +13,6 @@ from experiments.run.code_version import library_versions, source_hash
 from experiments.run.kernel_cache import use_kernel_cache
 from mapfusion.errors import InputError
 
-SOURCES = ("mapfusion", "sim", "experiments")
-
 # Tasks keep state of their process (the open PyBullet world, OpenCV's threads), so a worker that
 # was started with several threads works with one at a time.
 _one_at_a_time = threading.Lock()
@@ -50,7 +48,7 @@ class Terms:
 @functools.cache
 def code_version() -> str:
     """Source and libraries: where they differ, results would be kept under wrong keys."""
-    return f"{source_hash(SOURCES)} {sorted(library_versions().items())} {platform.machine()}"
+    return f"{source_hash()} {sorted(library_versions().items())} {platform.machine()}"
 
 
 @functools.cache
@@ -68,13 +66,9 @@ def dask_setup(worker: object) -> None:
 
 
 def perform(name: str, task: bytes, terms: Terms, *needs: None) -> None:
-    """Run a pickled task.
+    """Run a task, pickled so that it is unpacked only after this process is prepared.
 
-    Args:
-        name: of the task.
-        task: pickled, so that it is unpacked only after this process is prepared.
-        terms: of the sweep.
-        needs: results of the tasks before it (all None), so that Dask knows the order.
+    `needs` are results of the tasks before it (all None), so that Dask knows the order.
 
     Raises:
         TaskFailedError: the task raised, or its workers were killed too often.
@@ -97,10 +91,13 @@ def perform(name: str, task: bytes, terms: Terms, *needs: None) -> None:
 
 def _attempt(name: str, task: bytes, terms: Terms) -> None:
     """Run it under a mark: only a killed process leaves the mark behind."""
+    stage = name.partition("/")[0]
     mark = terms.attempts / name.replace("/", "_")
     if mark.exists() and mark.stat().st_size > terms.retries:
-        text = f"its worker was killed {terms.retries + 1} times (out of memory?)"
-        raise TaskFailedError(name, f"{name.partition('/')[0]}: {text}")
+        times = terms.retries + 1
+        raise TaskFailedError(
+            name, f"{stage}: its worker was killed {times} times (out of memory?)"
+        )
     with mark.open("ab") as file:
         file.write(b".")
     try:
@@ -108,7 +105,7 @@ def _attempt(name: str, task: bytes, terms: Terms) -> None:
     except InputError as error:
         raise TaskFailedError(name, " ".join(str(error).split())) from None
     except Exception as error:
-        text = " ".join(f"{name.partition('/')[0]}: {type(error).__name__} {error}".split())
-        raise TaskFailedError(name, text, traceback.format_exc()) from None
+        reason = " ".join(f"{stage}: {type(error).__name__} {error}".split())
+        raise TaskFailedError(name, reason, traceback.format_exc()) from None
     finally:
         mark.unlink(missing_ok=True)

@@ -19,8 +19,7 @@ from experiments.run.frames import write_rows
 from experiments.show.export import to_markdown, write_text
 from experiments.show.figures import style
 from experiments.show.figures.drawing import save_figure
-from experiments.study.benchmark.cells import BenchmarkDesign
-from experiments.study.benchmark.success import SUMMARY
+from experiments.study.benchmark.cells import SUMMARY, BenchmarkDesign
 from experiments.study.benchmark.synthetic_pairs import SIGMA_M, SIZE_M
 from experiments.study.benchmark.trials import TRIALS
 from mapfusion.align.result import Status

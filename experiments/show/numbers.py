@@ -55,11 +55,6 @@ def interval(value: float, low: float, high: float, layout: str) -> str:
     return f"{text} ({to.join(number(end, layout) for end in (low, high)).replace('%', '')})"
 
 
-def with_unit(text: str, unit: str) -> str:
-    """A number and its unit; a number that is not known has none."""
-    return text if text == UNKNOWN else f"{text}{_SPACE}{unit}"
-
-
 def listed(names: Sequence[str]) -> str:
     """Names in a sentence: "a, b and c"."""
     return f"{', '.join(names[:-1])} and {names[-1]}" if len(names) > 1 else "".join(names)

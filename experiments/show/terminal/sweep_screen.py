@@ -5,10 +5,9 @@ from collections.abc import Callable, Mapping, Sequence
 from experiments.judge.criteria import ANSWERABLE_PAIRS
 from experiments.show.terminal.layout import columns, print_frame, print_lines, print_table
 from experiments.study.sweep.combinations import SweepRun
-from experiments.study.sweep.run_medians import ERRORS, medians_over_runs
-from experiments.study.sweep.survey import Survey
-from experiments.study.sweep.sweep_dataset import SweepDataset
+from experiments.study.sweep.sweep_dataset import ERRORS, SweepDataset, medians_over_runs
 from experiments.study.sweep.sweep_driver import SweepProgress
+from experiments.study.sweep.sweep_plan import Survey
 
 MAX_ROWS_SHOWN = 60
 MAX_FAILURES_SHOWN = 10

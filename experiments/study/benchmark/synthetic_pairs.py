@@ -19,11 +19,9 @@ _OBSERVATIONS = 5  # that each landmark claims to be made of; no aligner asks
 
 @dataclass(frozen=True)
 class SyntheticPair:
-    """Two planar maps of N landmarks each and N correspondences between them.
+    """Two planar maps of N landmarks each and N correspondences between them, in no order.
 
     Attributes:
-        map_a, map_b: the maps.
-        correspondences: one for each landmark, in no order; descriptor distances tell nothing.
         T_a_b: (3,) the truth.
         is_true: (N,) bool, which correspondences are one point of the world.
     """
@@ -46,31 +44,24 @@ def true_pairs_of(n_pairs: int, outlier_share: float) -> int:
     return round((1 - outlier_share) * n_pairs)
 
 
-def synthetic_pair(
-    n_pairs: int,
-    outlier_share: float,
-    rng: np.random.Generator,
-    sigma_m: float = SIGMA_M,
-    size_m: float = SIZE_M,
-) -> SyntheticPair:
+def synthetic_pair(n_pairs: int, outlier_share: float, rng: np.random.Generator) -> SyntheticPair:
     """Draw a world, two maps of it, the motion between them and the correspondences.
 
     Landmarks are uniform in a square about the origin of frame b, so the translation's error is the
     displacement of the world's middle. Both landmarks of a false pair are uniform, independently.
     The residual's variance is shared equally between the maps, whose covariances say so.
     """
-    half_m = size_m / 2
+    half_m = SIZE_M / 2
     T_a_b = np.array([*rng.uniform(-half_m, half_m, 2), rng.uniform(-math.pi, math.pi)])
     p_b = rng.uniform(-half_m, half_m, (n_pairs, 2))
     p_a = p_b.copy()
     is_true = np.arange(n_pairs) < true_pairs_of(n_pairs, outlier_share)
     p_a[~is_true] = rng.uniform(-half_m, half_m, (np.count_nonzero(~is_true), 2))
-    own_m = sigma_m / math.sqrt(2)
+    own_m = SIGMA_M / math.sqrt(2)
     p_a = se2.transform_points(T_a_b, p_a) + rng.normal(0, own_m, p_a.shape)
     p_b = p_b + rng.normal(0, own_m, p_b.shape)
-    index_a, index_b = rng.permutation(n_pairs), rng.permutation(n_pairs)
-    order = rng.permutation(n_pairs)
-    distance = rng.uniform(0, 0.3, n_pairs)  # as what matching lets through
+    index_a, index_b, order = (rng.permutation(n_pairs) for _ in range(3))
+    distance = rng.uniform(0, 0.3, n_pairs)  # as what matching lets through: they tell nothing
     return SyntheticPair(
         _map(p_a, index_a, own_m, "a"),
         _map(p_b, index_b, own_m, "b"),

@@ -4,9 +4,8 @@ All correspondences are false and independent: what the bound promises can be co
 that two correspondences determine is judged, which is more than any estimator tries.
 """
 
-from typing import Any
-
 import numpy as np
+import pandas as pd
 from numba import njit
 
 from mapfusion.align.acceptance import Acceptance
@@ -33,7 +32,7 @@ def points_on_walls(rng: np.random.Generator, n: int) -> Float:
 
 def calibrate(
     acceptance: Acceptance, rng: np.random.Generator, n_pairs: int = N_PAIRS_OF_MAPS
-) -> list[dict[str, Any]]:
+) -> pd.DataFrame:
     """Rows of the table `calibration`."""
     gates = np.array(sorted(acceptance.gates_m))
     bounds = np.log10(STATED)
@@ -42,15 +41,14 @@ def calibrate(
         p_a, p_b = points_on_walls(rng, N_CORRESPONDENCES), points_on_walls(rng, N_CORRESPONDENCES)
         pairs = independent_pairs(p_a, p_b, np.zeros((N_CORRESPONDENCES, 4)))
         counts[k] = accepted_motions(pairs, gates, bounds)
-    return [
+    return pd.DataFrame(
         {
-            "stated": stated,
-            "motions_a_pair": counts[:, s].mean(),
-            "n_accepted": int(np.count_nonzero(counts[:, s])),
+            "stated": STATED,
+            "motions_a_pair": counts.mean(axis=0),
+            "n_accepted": np.count_nonzero(counts, axis=0),
             "n_pairs": n_pairs,
         }
-        for s, stated in enumerate(STATED)
-    ]
+    )
 
 
 @njit(cache=True)

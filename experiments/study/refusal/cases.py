@@ -47,24 +47,16 @@ class Case:
     poster_radius_m: float = np.nan
 
 
-def apart(map_a: LandmarkMap, map_b: LandmarkMap, matching: MatchParameters) -> Case:
-    """Maps of two worlds."""
-    return _without_truth(APART, map_a, map_b, matching)
-
-
-def _without_truth(
-    ground: str, map_a: LandmarkMap, map_b: LandmarkMap, matching: MatchParameters
+def apart(
+    map_a: LandmarkMap, map_b: LandmarkMap, matching: MatchParameters, ground: str = APART
 ) -> Case:
+    """Maps of two worlds."""
     pairs = match(map_a, map_b, matching)
     return Case(ground, map_a, map_b, pairs, np.zeros(len(pairs), bool), 0, np.full(3, np.nan))
 
 
 def common(
-    a: EvaluatedRobot,
-    b: EvaluatedRobot,
-    iteration: int,
-    matching: MatchParameters,
-    radius_m: float,
+    a: EvaluatedRobot, b: EvaluatedRobot, iteration: int, matching: MatchParameters, radius_m: float
 ) -> Case:
     """Maps of one world (which may have nothing in common yet)."""
     (map_a, points_a), (map_b, points_b) = a.at(iteration), b.at(iteration)
@@ -112,19 +104,11 @@ def repeated(
         position_m=se2.transform_points(T_other_b, poster.position_m),
         covariance_m2=se2.transform_covariances(T_other_b, poster.covariance_m2),
     )
-    case = _without_truth(REPEATED, source.map_a, _joined(other, hung), matching)
+    case = apart(source.map_a, _joined(other, hung), matching, REPEATED)
     return replace(case, poster_radius_m=radius_m)
 
 
 def _joined(first: LandmarkMap, second: LandmarkMap) -> LandmarkMap:
-    assert first.descriptor is not None
-    assert second.descriptor is not None
-    return LandmarkMap(
-        np.concatenate([first.position_m, second.position_m]),
-        np.concatenate([first.covariance_m2, second.covariance_m2]),
-        np.concatenate([first.count, second.count]),
-        np.concatenate([first.source_observation, second.source_observation]),
-        np.concatenate([first.descriptor, second.descriptor]),
-        planar=first.planar,
-        name=first.name,
-    )
+    columns = ("position_m", "covariance_m2", "count", "source_observation", "descriptor")
+    both = {name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in columns}
+    return replace(first, **both)

@@ -25,7 +25,7 @@ class Rate(NamedTuple):
 
     @property
     def share(self) -> float:
-        """The share itself."""
+        """Of n."""
         return self.hits / self.n if self.n else np.nan
 
     @property

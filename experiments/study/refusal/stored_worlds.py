@@ -1,13 +1,14 @@
 """The worlds of earlier runs and sweeps: robots with their maps by iteration, and the truth."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
+from experiments.judge.errors import EvaluatedRobot
 from experiments.judge.expectations import load_checked
 from experiments.judge.judged_run import JudgedRun
+from experiments.judge.judging import load_robot
 from experiments.judge.result import require_result
 from experiments.run.stages.slam import RobotFolders
 from experiments.run.store import Store
@@ -21,99 +22,73 @@ class MappedWorld:
     """One world and the robots that mapped it.
 
     Attributes:
+        label: how messages call it.
         name: SCENARIO-SEED, or that of the result folder.
-        seed: of its pictures: worlds of one seed hang some of them on the same walls.
+        scenario: what it was made from; worlds of one seed have some of their pictures in common.
         textures: key of the painted walls: equal ones mean the same world.
-        repeats: the same few pictures hang all over it.
-        robots: where each robot's log and maps lie, by name.
+        folders: where each robot's log and maps lie, by name.
     """
-
-    name: str
-    seed: int
-    textures: str
-    repeats: bool
-    robots: dict[str, RobotFolders]
-
-
-class WorldSource(NamedTuple):
-    """Where a world comes from: how messages call it, its scenario, and what keeps its maps."""
 
     label: str
     name: str
-    scenario: AnyScenario
-    store: Store
+    scenario: Simulation
+    textures: str
+    folders: dict[str, RobotFolders]
+
+    def robots(self) -> list[EvaluatedRobot]:
+        """All robots' maps joined with the truth."""
+        return [load_robot(folders) for folders in self.folders.values()]
 
 
-def sources_of(worlds: Sequence[str], seeds: Sequence[int], results: Path) -> list[WorldSource]:
-    """What the words of a command stand for.
+def worlds_of(words: Sequence[str], seeds: Sequence[int], results: Path) -> list[MappedWorld]:
+    """The worlds that the words of a command stand for, all different.
 
-    Args:
-        worlds: result folders of `run`; or scenario files, names or tags, for each seed, whose maps
-            a sweep or a run left in the store of `results`.
-        seeds: of the scenarios.
-        results: folder.
-
-    Raises:
-        InputError: a word that is none of these.
-    """
-    found = []
-    for word in worlds:
-        path = Path(word)
-        if path.is_dir():
-            require_result(path)
-            scenario = load_checked(path / "scenario.json")
-            store = Store.of(path.resolve().parent)
-            found.append(WorldSource(str(path), path.resolve().name, scenario, store))
-            continue
-        for file in scenarios_of([word]):
-            for seed in seeds:
-                scenario = load_checked(file, (), seed)
-                name = f"{scenario.name}-{seed}"
-                found.append(WorldSource(name, name, scenario, Store.of(results)))
-    return found
-
-
-def load_worlds(sources: Sequence[WorldSource]) -> tuple[Simulation, list[MappedWorld]]:
-    """The first source's scenario, and the worlds of all of them.
+    A word is a result folder of `run`; or a scenario file, name or tag, for each of the seeds,
+    whose maps a sweep or a run left in the store of `results`.
 
     Raises:
-        InputError: fewer than two seeds, not simulated, two of one world, or maps that are not in
-            the store.
+        InputError: a word that is none of these, fewer than two seeds, not simulated, two of one
+            world, or maps that are not in the store.
     """
-    if len(sources) < 2:
+    worlds = [world for word in words for world in _worlds(word, seeds, results)]
+    if len(worlds) < 2:
         raise InputError("refusal: give two worlds or more: results, or scenarios with --seeds")
-    worlds = [_world(source) for source in sources]
-    for (one, first), (source, world) in itertools.combinations(
-        zip(sources, worlds, strict=True), 2
-    ):
+    for first, world in itertools.combinations(worlds, 2):
         if world.textures == first.textures:
-            raise InputError(f"{source.label}: the same world as {first.name}; give another seed's")
+            raise InputError(f"{world.label}: the same world as {first.name}; give another seed's")
         if world.name == first.name:
-            raise InputError(f"{source.label}: is named as {one.label} is; rename one of them")
-    if len({world.seed for world in worlds}) < 2:
+            raise InputError(f"{world.label}: is named as {first.label} is; rename one of them")
+    if len({world.scenario.seed for world in worlds}) < 2:
         raise InputError(
-            f"refusal: all worlds have seed {worlds[0].seed}, and so some pictures in common; give "
-            "those of another seed too"
+            f"refusal: all worlds have seed {worlds[0].scenario.seed}, and so some pictures in "
+            "common; give those of another seed too"
         )
-    first = sources[0].scenario
-    assert isinstance(first, Simulation)  # else `_world` has refused it
-    return first, worlds
+    return worlds
 
 
-def _world(source: WorldSource) -> MappedWorld:
-    scenario = source.scenario
+def _worlds(word: str, seeds: Sequence[int], results: Path) -> Iterator[MappedWorld]:
+    path = Path(word)
+    if path.is_dir():
+        require_result(path)
+        scenario, folder = load_checked(path / "scenario.json"), path.resolve()
+        yield _world(str(path), folder.name, scenario, Store.of(folder.parent))
+        return
+    for file, seed in itertools.product(scenarios_of([word]), seeds):
+        scenario = load_checked(file, (), seed)
+        name = f"{scenario.name}-{seed}"
+        yield _world(name, name, scenario, Store.of(results))
+
+
+def _world(label: str, name: str, scenario: AnyScenario, store: Store) -> MappedWorld:
     if not isinstance(scenario, Simulation):
-        raise InputError(
-            f"{source.label}: made from recorded logs; only simulated worlds surely differ"
-        )
-    judged = JudgedRun.of(scenario, source.store)
+        raise InputError(f"{label}: made from recorded logs; only simulated worlds surely differ")
+    judged = JudgedRun.of(scenario, store)
     for robot in judged.pipeline.simulated:
-        if not all(source.store.folder(stage).finished for stage in (robot.log, robot.slam)):
+        if not all(store.folder(stage).finished for stage in (robot.log, robot.slam)):
             raise InputError(
-                f"{source.label}: the maps of {robot.name} are not in {source.store.root} (made by "
+                f"{label}: the maps of {robot.name} are not in {store.root} (made by "
                 "another version?); run its scenario again"
             )
     _, faces = judged.pipeline.world
     folders = {robot.name: judged.robot_folders(robot) for robot in judged.pipeline.robots}
-    repeats = scenario.world.texture.posters > 0
-    return MappedWorld(source.name, scenario.seed, faces.key, repeats, folders)
+    return MappedWorld(label, name, scenario, faces.key, folders)

@@ -3,7 +3,7 @@
 import hashlib
 import itertools
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,30 +17,13 @@ _HASH_LENGTH = 8  # hexadecimal digits of a run's values: 32 bits, and clashes a
 _EXPECTED = "expected key=value,value, for example slam.filter.n_particles=50,200"
 _FIXED = {"seed": "--seeds 0..4", "name": "one sweep for each name"}
 
-
-@dataclass(frozen=True)
-class Axis:
-    """One setting and the values it takes.
-
-    Attributes:
-        key: dotted, as in `--set`.
-        values: YAML, in one spelling each (0.10 is 0.1).
-    """
-
-    key: str
-    values: tuple[str, ...]
+# The values that each dotted key takes: YAML, in one spelling each (0.10 is 0.1).
+Axes = Mapping[str, tuple[str, ...]]
 
 
 @dataclass(frozen=True)
 class SweepRun:
-    """One run of a sweep.
-
-    Attributes:
-        path: scenario file.
-        scenario: its name.
-        seed: replaces the scenario's.
-        settings: (key, value) of each axis, in their order.
-    """
+    """One run of a sweep: a scenario's file and name, a seed, and the value of each key."""
 
     path: Path
     scenario: str
@@ -57,33 +40,27 @@ class SweepRun:
 
     def load(self) -> AnyScenario:
         """The scenario of this run; raises InputError."""
-        return load_checked(
-            self.path, [f"{key}={value}" for key, value in self.settings], self.seed
-        )
+        overrides = [f"{key}={value}" for key, value in self.settings]
+        return load_checked(self.path, overrides, self.seed)
 
 
-def parse_axes(entries: Sequence[str]) -> list[Axis]:
+def parse_axes(entries: Sequence[str]) -> Axes:
     """`--set KEY=VALUE,VALUE,...` entries; raises InputError that shows how it is written."""
-    axes = [_parse_axis(entry) for entry in entries]
-    keys = [axis.key for axis in axes]
-    for key in keys:
-        if keys.count(key) > 1:
+    axes: dict[str, tuple[str, ...]] = {}
+    for entry in entries:
+        key, _, listed = entry.partition("=")
+        if not key or not listed.strip():
+            raise InputError(f"--set {entry}: {_EXPECTED}")
+        if key in _FIXED:
+            raise InputError(f"--set {entry}: {key} cannot be set here; use {_FIXED[key]}")
+        if key in axes:
             raise InputError(f"--set {key}: given twice; write its values as {key}=A,B")
+        values = parse_value(f"[{listed}]", f"--set {entry}: {_EXPECTED}")
+        axes[key] = tuple(map(_one_spelling, values))
+        for value in axes[key]:
+            if axes[key].count(value) > 1:
+                raise InputError(f"--set {entry}: {value} is given twice")
     return axes
-
-
-def _parse_axis(entry: str) -> Axis:
-    key, _, listed = entry.partition("=")
-    if not key or not listed.strip():
-        raise InputError(f"--set {entry}: {_EXPECTED}")
-    if key in _FIXED:
-        raise InputError(f"--set {entry}: {key} cannot be set here; use {_FIXED[key]}")
-    values = parse_value(f"[{listed}]", f"--set {entry}: {_EXPECTED}")
-    spelled = tuple(map(_one_spelling, values))
-    for value in spelled:
-        if spelled.count(value) > 1:
-            raise InputError(f"--set {entry}: {value} is given twice")
-    return Axis(key, spelled)
 
 
 def _one_spelling(value: Any) -> str:
@@ -93,7 +70,7 @@ def _one_spelling(value: Any) -> str:
     return json.dumps(value, default=str)
 
 
-def runs_of(paths: Sequence[Path], seeds: Sequence[int], axes: Sequence[Axis]) -> list[SweepRun]:
+def runs_of(paths: Sequence[Path], seeds: Sequence[int], axes: Axes) -> list[SweepRun]:
     """All combinations; runs that share most come one after the other.
 
     Every scenario is loaded once with every combination of values, so that a wrong one is told
@@ -102,7 +79,7 @@ def runs_of(paths: Sequence[Path], seeds: Sequence[int], axes: Sequence[Axis]) -
     Raises:
         InputError: a scenario, key or value is wrong, or two scenarios have the same name.
     """
-    choices = ([(axis.key, value) for value in axis.values] for axis in axes)
+    choices = ([(key, value) for value in values] for key, values in axes.items())
     combinations = list(itertools.product(*choices))
     runs: list[SweepRun] = []
     names: dict[str, Path] = {}

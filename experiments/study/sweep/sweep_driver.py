@@ -1,22 +1,27 @@
-"""Gives a sweep's tasks to Dask, a window of runs at a time, and records how each run ended."""
+"""Runs a sweep: its tasks on Dask, a window of runs at a time, and then its aligners' times."""
 
 import pickle
+import shutil
+import tempfile
 import time
 import uuid
 from collections import Counter
-from collections.abc import Callable, Iterator, Sized
+from collections.abc import Callable, Collection, Sequence, Sized
 from dataclasses import dataclass, field
-from typing import NamedTuple, cast
+from pathlib import Path
+from typing import cast
 
 from distributed import Client, Future, as_completed
 from distributed.scheduler import KilledWorker
 
-from experiments.run.dask_worker import TaskFailedError, Terms, UnfitWorkerError, perform
-from experiments.run.store import Store, explained
-from experiments.run.tasks import Task
+from experiments.methods.threads import single_threaded
+from experiments.run import dask_worker
+from experiments.run.dask_cluster import connected
+from experiments.run.store import explained
+from experiments.run.tasks import OnProgress, Task
 from experiments.study.sweep.combinations import SweepRun
-from experiments.study.sweep.planned_run import PlannedRun, planned
-from experiments.study.sweep.sweep_dataset import SweepDataset
+from experiments.study.sweep.sweep_dataset import ALIGNER_TIMINGS, open_dataset
+from experiments.study.sweep.sweep_plan import PlannedRun, Sweep, planned, write_aligner_timings
 from mapfusion.errors import InputError
 
 # Tasks at Dask for each worker. Enough that none waits while this process plans the next run; few
@@ -24,6 +29,11 @@ from mapfusion.errors import InputError
 TASKS_PER_WORKER = 30
 MIN_WORKERS = 4  # counted, while a cluster is still starting
 _COUNT_WORKERS_EVERY_S = 10.0
+# A worker may be killed for no fault of its task (a machine that goes away); four times in a row
+# while at the same task it is the task.
+RETRIES = 3
+_ATTEMPTS_PREFIX = ".attempts-"
+_OLD_S = 24 * 3600  # in a sweep that runs, tasks begin and end in the meantime
 
 
 @dataclass
@@ -32,36 +42,16 @@ class SweepProgress:
 
     Attributes:
         runs: in all.
-        finished, kept: runs that are done; `kept` were done before.
-        failed: the other runs that are done, with their reasons, by run id.
+        done: runs that need nothing more.
+        failed: those of them that failed, with their reasons, by run id.
         tasks, tasks_done: by label, of the runs looked at so far.
     """
 
-    runs: int = 0
-    finished: int = 0
-    kept: int = 0
+    runs: int
+    done: int = 0
     failed: dict[str, str] = field(default_factory=dict)
     tasks: Counter[str] = field(default_factory=Counter)
     tasks_done: Counter[str] = field(default_factory=Counter)
-
-    @property
-    def done(self) -> int:
-        """Runs that need nothing more."""
-        return self.finished + self.kept + len(self.failed)
-
-
-class Failure(NamedTuple):
-    """Why a task failed; details are a traceback, where there is one."""
-
-    reason: str
-    details: str = ""
-
-
-@dataclass
-class _OpenRun:
-    planned: PlannedRun
-    left: list[str]  # names of its tasks, in order
-    waiting: set[str]  # those of them at Dask
 
 
 class SweepDriver:
@@ -70,78 +60,66 @@ class SweepDriver:
     def __init__(
         self,
         client: Client,
-        store: Store,
-        dataset: SweepDataset,
-        terms: Terms,
+        sweep: Sweep,
+        terms: dask_worker.Terms,
         on_progress: Callable[[SweepProgress], None],
     ) -> None:
-        self._client, self._store, self._dataset, self._terms = client, store, dataset, terms
+        self._client, self._sweep, self._terms = client, sweep, terms
         self._on_progress = on_progress
         # Of this sweep alone: another client's tasks of the same key might write elsewhere.
         self._suffix = uuid.uuid4().hex[:8]
         self._ended = as_completed(loop=client.loop)
         self._futures: dict[str, Future] = {}  # by name of the task
-        self._waiting_for: dict[str, set[str]] = {}  # run ids by name of a task at Dask
-        self._open: dict[str, _OpenRun] = {}
-        self._failures: dict[str, Failure] = {}  # by name of the task, for runs that follow too
+        self._open: dict[PlannedRun, set[str]] = {}  # with the tasks at Dask that each waits for
+        self._failures: dict[str, dask_worker.TaskFailedError] = {}  # by task
         self._n_workers, self._counted_at = 0, -_COUNT_WORKERS_EVERY_S
-        self.progress = SweepProgress()
+        self.progress = SweepProgress(len(sweep.runs))
 
-    def execute(self, runs: list[SweepRun]) -> None:
+    def execute(self) -> None:
         """Bring all runs to an end; how they ended is in `progress`.
 
         Raises:
             InputError: workers cannot take part, or the scheduler was lost.
         """
-        todo = iter(runs)
-        self.progress.runs = len(runs)
-        self._fill(todo)
-        while self._open:
+        todo = iter(self._sweep.runs)
+        while True:
+            while self._has_room() and (run := next(todo, None)) is not None:
+                self._begin(run)
+            self._on_progress(self.progress)
+            if not self._open:
+                return
             self._task_ended(next(self._ended))
-            self._fill(todo)
 
-    def _fill(self, todo: Iterator[SweepRun]) -> None:
-        """Begin further runs, in their order, while there is room."""
-        while len(self._futures) < TASKS_PER_WORKER * self._workers():
-            run = next(todo, None)
-            if run is None:
-                break
-            self._begin(run)
-        self._on_progress(self.progress)
-
-    def _workers(self) -> int:
+    def _has_room(self) -> bool:
         if time.monotonic() - self._counted_at > _COUNT_WORKERS_EVERY_S:
             self._n_workers = len(cast(Sized, self._client.nthreads()))
             self._counted_at = time.monotonic()
-        return max(self._n_workers, MIN_WORKERS)
+        return len(self._futures) < TASKS_PER_WORKER * max(self._n_workers, MIN_WORKERS)
 
     def _begin(self, run: SweepRun) -> None:
         try:
-            laid_out = planned(run, self._store, self._dataset)
+            laid_out = planned(run, self._sweep.store, self._sweep.dataset)
         except InputError as error:  # no world can be made from this seed, a log is damaged, ...
-            self._fail(run, Failure(" ".join(str(error).split())))
+            self._fail(run, " ".join(str(error).split()))
             return
-        if laid_out.finished:
-            self.progress.kept += 1
+        if not laid_out.left:
+            self.progress.done += 1
             return
-        left = laid_out.left()
-        opened = _OpenRun(laid_out, [task.name for task in left], set())
-        self._open[run.run_id] = opened
+        self._open[laid_out] = set()
         blocked: set[str] = set()
-        for task in left:
+        for task in laid_out.left:
             if task.name in self._failures or blocked.intersection(task.needs):
                 blocked.add(task.name)
                 continue
             if task.name not in self._futures:  # else it is there for another run already
                 self._submit(task)
-            opened.waiting.add(task.name)
-            self._waiting_for.setdefault(task.name, set()).add(run.run_id)
-        self._end_if_over(opened)
+            self._open[laid_out].add(task.name)
+        self._end_if_over(laid_out)
 
     def _submit(self, task: Task) -> None:
         self.progress.tasks[task.label] += 1
         future = self._client.submit(
-            perform,
+            dask_worker.perform,
             task.name,
             pickle.dumps(task),
             self._terms,
@@ -155,57 +133,96 @@ class SweepDriver:
         self._ended.add(future)
 
     def _task_ended(self, future: Future) -> None:
-        kind, name = _kind_and_name(future.key)
-        failed = self._failure(future, name)
-        if failed is not None:
-            cause, failure = failed
-            self._failures[cause] = failure
+        label, name = _label_and_name(future.key)
+        if future.status != "finished":
+            failure = self._failure(future, name)
+            self._failures[failure.task] = failure
         del self._futures[name]
-        self.progress.tasks_done[kind] += 1
-        for run_id in self._waiting_for.pop(name):
-            opened = self._open[run_id]
-            opened.waiting.discard(name)
-            self._end_if_over(opened)
+        self.progress.tasks_done[label] += 1
+        for laid_out in [each for each, waits_for in self._open.items() if name in waits_for]:
+            self._open[laid_out].remove(name)
+            self._end_if_over(laid_out)
 
-    def _failure(self, future: Future, name: str) -> tuple[str, Failure] | None:
-        """Which task failed and why; None if it did not. Those that needed it fail like it."""
-        if future.status == "finished":
-            return None
+    def _failure(self, future: Future, name: str) -> dask_worker.TaskFailedError:
+        """Which task failed and why: those that needed it fail like it."""
         if future.status != "error":
             raise InputError(
                 "the connection to the Dask scheduler was lost; what was finished is kept, the "
                 "same command goes on from there"
             )
         error = future.exception()
-        if isinstance(error, TaskFailedError):
-            return error.task, Failure(explained(error.reason, self._store), error.details)
+        if isinstance(error, dask_worker.TaskFailedError):
+            return error
         if isinstance(error, KilledWorker):
-            _, cause = _kind_and_name(error.task)
+            _, cause = _label_and_name(error.task)
             stage, times = cause.partition("/")[0], error.allowed_failures + 1
-            return cause, Failure(f"{stage}: Dask gave it up after {times} of its workers died")
-        if isinstance(error, UnfitWorkerError):
+            reason = f"{stage}: Dask gave it up after {times} of its workers died"
+            return dask_worker.TaskFailedError(cause, reason)
+        if isinstance(error, dask_worker.UnfitWorkerError):
             raise InputError(str(error))
         raise InputError(f"a worker cannot run {name}: {type(error).__name__}: {error}")
 
-    def _end_if_over(self, opened: _OpenRun) -> None:
-        if opened.waiting:
+    def _end_if_over(self, laid_out: PlannedRun) -> None:
+        if self._open[laid_out]:
             return
-        run = opened.planned.run
-        del self._open[run.run_id]
+        del self._open[laid_out]
         # All tasks that could be done were done, so which comes first does not depend on chance.
-        failures = (self._failures[name] for name in opened.left if name in self._failures)
-        first = next(failures, None)
+        failures = (self._failures.get(task.name) for task in laid_out.left)
+        first = next(filter(None, failures), None)
         if first is None:
-            self.progress.finished += 1
+            self.progress.done += 1
         else:
-            self._fail(run, first, opened.planned.stages)
+            reason = explained(first.reason, self._sweep.store)
+            self._fail(laid_out.run, reason, first.details, laid_out.stages)
 
-    def _fail(self, run: SweepRun, failure: Failure, stages: list[str] | None = None) -> None:
-        self.progress.failed[run.run_id] = failure.reason
-        self._dataset.fail(run, failure.reason, failure.details, stages or [])
+    def _fail(
+        self, run: SweepRun, reason: str, details: str = "", stages: Sequence[str] = ()
+    ) -> None:
+        self.progress.done += 1
+        self.progress.failed[run.run_id] = reason
+        self._sweep.dataset.fail(run, reason, details, stages)
 
 
-def _kind_and_name(key: object) -> tuple[str, str]:
+def _label_and_name(key: object) -> tuple[str, str]:
     """Of the task that Dask knows under this key."""
-    kind, _, name = str(key).split("-", 2)
-    return kind, name
+    label, _, name = str(key).split("-", 2)
+    return label, name
+
+
+def execute(
+    sweep: Sweep,
+    jobs: int,
+    scheduler: str | None,
+    on_progress: Callable[[SweepProgress], None],
+) -> dict[str, str]:
+    """Run a sweep; returns the failed runs with their reasons.
+
+    Raises:
+        InputError: the output folder is of another sweep, no scheduler or no worker is of use.
+    """
+    folder = sweep.dataset.folder
+    open_dataset(folder, sweep.dataset.keys)
+    for left_behind in folder.glob(f"{_ATTEMPTS_PREFIX}*"):  # by a sweep that was killed
+        if time.time() - left_behind.stat().st_mtime > _OLD_S:  # else another one may be running
+            shutil.rmtree(left_behind, ignore_errors=True)
+    with (
+        tempfile.TemporaryDirectory(
+            prefix=_ATTEMPTS_PREFIX, dir=folder, ignore_cleanup_errors=True
+        ) as attempts,
+        connected(jobs, scheduler) as client,
+    ):
+        terms = dask_worker.Terms(Path(attempts), RETRIES, dask_worker.code_version())
+        driver = SweepDriver(client, sweep, terms, on_progress)
+        driver.execute()
+    return driver.progress.failed
+
+
+def measure_times(sweep: Sweep, failed: Collection[str], on_progress: OnProgress) -> None:
+    """Aligners' times, serial, for all runs without that did not fail: nothing else may run."""
+    single_threaded()
+    runs = [run for run in sweep.runs if run.run_id not in failed]
+    for done, run in enumerate(runs):
+        on_progress("time the aligners", done, len(runs))
+        if not sweep.dataset.path(ALIGNER_TIMINGS, run).is_file():
+            write_aligner_timings(run, sweep.store, sweep.dataset)
+    on_progress("time the aligners", len(runs), len(runs))

@@ -14,8 +14,13 @@ from experiments.run.store import Store
 from experiments.scenario.settings import AlignerEntry
 from experiments.show.benchmark_files import cell_text, draw, markdown
 from experiments.study.benchmark import cells as benchmark
-from experiments.study.benchmark.cells import BenchmarkDesign, entries_of, run_benchmark
-from experiments.study.benchmark.success import SUMMARY, summarise
+from experiments.study.benchmark.cells import (
+    SUMMARY,
+    BenchmarkDesign,
+    entries_of,
+    run_benchmark,
+    summarise,
+)
 from experiments.study.benchmark.trials import TRIALS, CellSettings
 from mapfusion.align.peers.kiss_matcher import KissMatcher
 from mapfusion.errors import InputError

@@ -14,7 +14,7 @@ from experiments.judge.result import run_scenario
 from experiments.scenario.settings import Simulation
 from experiments.show.figures.refusal_figures import write
 from experiments.study.refusal import cases
-from experiments.study.refusal import refusal_tables as results
+from experiments.study.refusal import refusal_trial as results
 from experiments.study.refusal.calibration import (
     STATED,
     accepted_motions,
@@ -157,9 +157,9 @@ def test_calibration_counts_every_motion_of_two_pairs() -> None:
 def test_stated_number_of_false_alarms_bounds_the_measured_one() -> None:
     """Every motion of 150 pairs of random maps: its mean number stays below the stated one."""
     rows = calibrate(Acceptance(), np.random.default_rng(4), n_pairs=150)
-    assert [row["stated"] for row in rows] == list(STATED)
-    assert all(row["motions_a_pair"] <= row["stated"] for row in rows)
-    assert rows[-1]["n_accepted"] > 0  # a hundred false alarms stated: some are there
+    assert rows["stated"].tolist() == list(STATED)
+    assert (rows["motions_a_pair"] <= rows["stated"]).all()
+    assert rows["n_accepted"].iloc[-1] > 0  # a hundred false alarms stated: some are there
 
 
 @pytest.fixture(scope="module")
@@ -194,7 +194,7 @@ def test_the_command_crosses_two_worlds(
 
     again = command(capsys, "refusal", *both, "-o", tmp_path / "two", "--pairs", 6, "--jobs", 2)
     assert again.code == 0, again.err
-    for name in results.ALL:
+    for name in results.TABLES:
         pd.testing.assert_frame_equal(
             results.read(tmp_path / "one", name), results.read(tmp_path / "two", name)
         )
@@ -273,7 +273,7 @@ def test_worlds_of_one_name_are_refused(
 
 
 def test_the_figure_is_the_same_bytes(tmp_path: Path) -> None:
-    calibration = pd.DataFrame(calibrate(Acceptance(), np.random.default_rng(0), n_pairs=20))
+    calibration = calibrate(Acceptance(), np.random.default_rng(0), n_pairs=20)
     first = write(tmp_path / "a", TABLE, calibration, 1e-3)
     second = write(tmp_path / "b", TABLE, calibration, 1e-3)
     for one, other in zip(first, second, strict=True):

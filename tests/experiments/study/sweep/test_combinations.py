@@ -29,9 +29,9 @@ from tests.helpers.tiny_scenario import TINY
 def test_values_are_parted_at_commas_outside_brackets(
     entry: str, given: list[object], spelled: tuple[str, ...]
 ) -> None:
-    (axis,) = parse_axes([entry])
-    assert axis.values == spelled
-    read = [apply_overrides({}, [f"key={value}"])["key"] for value in axis.values]
+    (values,) = parse_axes([entry]).values()
+    assert values == spelled
+    read = [apply_overrides({}, [f"key={value}"])["key"] for value in values]
     assert read == given
     assert list(map(type, read)) == list(map(type, given))
 
@@ -60,8 +60,8 @@ def test_wrong_entries_are_told(entries: list[str], words: list[str]) -> None:
 @given(st.lists(st.lists(st.integers(), min_size=1, max_size=3), min_size=1, max_size=4))
 def test_lists_go_through_whole(lists: list[list[int]]) -> None:
     distinct = [list(values) for values in dict.fromkeys(map(tuple, lists))]
-    (axis,) = parse_axes([f"a={','.join(map(str, distinct))}"])
-    assert axis.values == tuple(map(str, distinct))
+    axes = parse_axes([f"a={','.join(map(str, distinct))}"])
+    assert axes["a"] == tuple(map(str, distinct))
 
 
 def scenario(folder: Path, name: str) -> Path:
@@ -86,7 +86,7 @@ def test_all_combinations_with_names_of_their_own(tmp_path: Path) -> None:
 
 def test_names_do_not_depend_on_the_rest_of_the_sweep(tmp_path: Path) -> None:
     path = scenario(tmp_path, "one")
-    assert runs_of([path], [7], [])[0].run_id == "one-7"
+    assert runs_of([path], [7], {})[0].run_id == "one-7"
     few = runs_of([path], [7], parse_axes(["slam.min_count=2", "evaluate.every=5"]))
     more = runs_of([path], [6, 7], parse_axes(["evaluate.every=10,5", "slam.min_count=3,2"]))
     assert few[0].run_id in {run.run_id for run in more}
@@ -116,4 +116,4 @@ def test_two_scenarios_of_one_name_are_refused(tmp_path: Path) -> None:
     other = tmp_path / "other.yaml"
     other.write_text(scenario(tmp_path, "one").read_text())
     with pytest.raises(InputError, match=r"other\.yaml: is named one, as .*one\.yaml"):
-        runs_of([tmp_path / "one.yaml", other], [0], [])
+        runs_of([tmp_path / "one.yaml", other], [0], {})

@@ -6,8 +6,7 @@ import pyarrow as pa
 
 from experiments.judge import tables
 from experiments.study.sweep.combinations import SweepRun, parse_axes
-from experiments.study.sweep.run_medians import medians_over_runs
-from experiments.study.sweep.sweep_dataset import open_dataset
+from experiments.study.sweep.sweep_dataset import medians_over_runs, open_dataset
 
 EMPTY = {pa.string(): "", pa.bool_(): False}
 

@@ -15,7 +15,8 @@ import pytest
 
 from experiments.judge import tables
 from experiments.study.sweep.sweep_dataset import RUN_TIMES
-from experiments.study.sweep.whole_sweep import execute, prepare
+from experiments.study.sweep.sweep_driver import execute
+from experiments.study.sweep.sweep_plan import prepare
 from tests.helpers.killing import KilledSweep, same_files
 from tests.helpers.tiny_scenario import TINY, command
 
@@ -41,7 +42,7 @@ def swept(short_path: Path, results: Path) -> Path:
     """A sweep of four runs on one worker, uninterrupted."""
     asked = prepare([short_path], [0, 1], [GRID[1], GRID[3]], results)
     assert execute(asked, 1, None, lambda _: None) == {}
-    return asked.output
+    return asked.dataset.folder
 
 
 TABLES = ("runs", "errors", "robots", "fusion", "map_fits", "run_times")

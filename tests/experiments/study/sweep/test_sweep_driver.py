@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, cast
 
+import dask.config
 import pandas as pd
 import pytest
 from distributed import Client, LocalCluster
@@ -13,20 +14,22 @@ from distributed import Client, LocalCluster
 from experiments.run.dask_cluster import connected
 from experiments.run.dask_worker import Terms, code_version
 from experiments.run.store import Store
-from experiments.run.tasks import Task
-from experiments.study.sweep import survey as survey_module
+from experiments.run.tasks import Task, unfinished
 from experiments.study.sweep import sweep_driver as driver_module
+from experiments.study.sweep import sweep_plan as plan_module
 from experiments.study.sweep.combinations import SweepRun
-from experiments.study.sweep.planned_run import PlannedRun, write_name
 from experiments.study.sweep.sweep_dataset import SweepDataset, open_dataset
 from experiments.study.sweep.sweep_driver import SweepDriver, SweepProgress
+from experiments.study.sweep.sweep_plan import PlannedRun, Sweep
 from mapfusion.errors import InputError
 from tests.helpers import acting
 
 
 @pytest.fixture(scope="module")
 def client() -> Iterator[Client]:
-    with connected(2, None) as connection:
+    """On a machine so busy that Dask would take a killed worker for lost before it is back."""
+    busy = {"distributed.deploy.lost-worker-timeout": "0.1s"}
+    with dask.config.set(busy), connected(2, None) as connection:
         yield connection
 
 
@@ -40,7 +43,7 @@ class Scene:
         self.terms.attempts.mkdir()
         self.tasks: dict[int, list[Task]] = {}
         self.told: list[SweepProgress] = []
-        for module in (driver_module, survey_module):
+        for module in (driver_module, plan_module):
             monkeypatch.setattr(module, "planned", self._planned)
 
     def add(self, seed: int, name: str, function: object, *arguments: object, **more: Any) -> None:
@@ -55,19 +58,20 @@ class Scene:
 
     def _planned(self, run: SweepRun, store: Store, dataset: SweepDataset) -> PlannedRun:
         tasks = {task.name: task for task in self.tasks[run.seed]}
-        name = write_name(run)
+        name = f"run/{run.run_id}"
         tasks[name] = Task(name, "tables", dataset.finish, (run, "", []), (), tuple(tasks))
-        return PlannedRun(run, [], tasks, dataset.holds(run, []))
+        left = [] if dataset.holds(run, []) else unfinished(tasks, [name])
+        return PlannedRun(run, [], tasks, left)
 
     def execute(self, client: Client) -> SweepDriver:
-        store = Store(self.folder)
-        driver = SweepDriver(client, store, self.dataset, self.terms, self.told.append)
-        driver.execute(self.runs)
+        driver = SweepDriver(client, self.sweep, self.terms, self.told.append)
+        driver.execute()
         return driver
 
     @property
-    def runs(self) -> list[SweepRun]:
-        return [SweepRun(Path("x.yaml"), "x", seed) for seed in self.tasks]
+    def sweep(self) -> Sweep:
+        runs = [SweepRun(Path("x.yaml"), "x", seed) for seed in self.tasks]
+        return Sweep(runs, Store(self.folder), self.dataset)
 
     def rows(self) -> dict[int, tuple[str, str]]:
         found = pd.read_parquet(self.dataset.folder / "runs").set_index("seed")
@@ -104,7 +108,7 @@ def test_failed_runs_stop_no_others(scene: Scene, client: Client) -> None:
         )
     assert not scene.execute(client).progress.failed
     assert set(scene.rows().values()) == {("finished", "")}
-    assert scene.told[-1].kept == 1
+    assert scene.told[-1].tasks == Counter(slam=3, judge=3, tables=3)
     assert not list((scene.dataset.folder / "failures").iterdir())
 
 
@@ -169,12 +173,11 @@ def test_the_scheduler_holds_a_window_of_tasks_alone(
         most = max(most, sum(progress.tasks.values()) - sum(progress.tasks_done.values()))
         tell(progress)
 
-    store = Store(scene.folder)
-    driver = SweepDriver(client, store, scene.dataset, scene.terms, count)
-    driver.execute(scene.runs)
+    driver = SweepDriver(client, scene.sweep, scene.terms, count)
+    driver.execute()
     ended = driver.progress
     assert most <= 5 * driver_module.MIN_WORKERS + 2
-    assert ended.finished == n_runs
+    assert (ended.done, ended.failed) == (n_runs, {})
     assert ended.tasks == ended.tasks_done == Counter({"slam": n_runs, "tables": n_runs})
     deadline = time.monotonic() + 300
     while client.run_on_scheduler(lambda dask_scheduler: len(dask_scheduler.tasks)):
@@ -204,7 +207,7 @@ def test_survey_counts_what_is_shared_and_done(scene: Scene) -> None:
         scene.write(seed, "drive/0")
         scene.write(seed, f"slam/{seed}", ["drive/0"])
     acting.write(scene.folder / "slam_0", "done")
-    found = survey_module.survey(scene.runs, Store(scene.folder), scene.dataset)
+    found = plan_module.survey(scene.sweep)
     assert found.runs == 4
     assert found.wanted == Counter(drive=4, slam=4, tables=4)
     assert found.left == Counter(drive=1, slam=3, tables=4)

@@ -1,0 +1,160 @@
+"""What a sweep is to do: its runs as tasks of their stages, and one that writes the run's rows."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pandas as pd
+
+from experiments.judge.consistency import landmark_nees_rows
+from experiments.judge.fused_landmarks import map_fit_rows
+from experiments.judge.judged_run import JudgedRun
+from experiments.judge.provenance import renderer
+from experiments.judge.result import fused_map, measure_aligners, robot_tables
+from experiments.run.store import Store
+from experiments.run.tasks import Task, task_names, unfinished
+from experiments.scenario.suite import scenarios_of
+from experiments.study.sweep.combinations import SweepRun, parse_axes, runs_of
+from experiments.study.sweep.sweep_dataset import ALIGNER_TIMINGS, RUN_TIMES, SweepDataset
+from mapfusion.errors import InputError
+
+_LONGEST_NAME = 80
+
+
+class Sweep(NamedTuple):
+    """What is to be run, the store that it shares with `mapfusion run`, and where tables go."""
+
+    runs: list[SweepRun]
+    store: Store
+    dataset: SweepDataset
+
+
+def prepare(
+    asked: Sequence[str | Path],
+    seeds: Sequence[int],
+    settings: Sequence[str],
+    results: Path,
+    output: Path | None = None,
+) -> Sweep:
+    """Check everything a user gave, `settings` as in `--set`; nothing is written.
+
+    The scenario files, names and tags asked for name the sweep's folder, unless there is `output`.
+
+    Raises:
+        InputError: a scenario, key or value is wrong.
+    """
+    axes = parse_axes(settings)
+    runs = runs_of(scenarios_of(asked), seeds, axes)
+    name = "-".join(Path(part).stem for part in asked)[:_LONGEST_NAME]
+    folder = output or results / "sweeps" / name
+    # absolute: workers may have been started elsewhere
+    return Sweep(runs, Store.of(results.resolve()), SweepDataset(folder.resolve(), tuple(axes)))
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedRun:
+    """A run and its tasks.
+
+    Attributes:
+        run: which one.
+        stages: STAGE/KEY of all it is made from.
+        tasks: all of them by name; the last one writes the run's rows.
+        left: those to be done, each after those it needs; none if the dataset holds the run.
+    """
+
+    run: SweepRun
+    stages: list[str]
+    tasks: dict[str, Task]
+    left: list[Task]
+
+
+def planned(run: SweepRun, store: Store, dataset: SweepDataset) -> PlannedRun:
+    """Lay out a run; nothing is computed. Raises InputError for what cannot be run."""
+    judged = JudgedRun.of(run.load(), store)
+    pipeline, stages = judged.pipeline, _stages_of(judged)
+    read = [stage for robot in pipeline.robots for stage in (robot.log, robot.slam)]
+    read += [*(pair.estimates for pair in pipeline.pairs), *judged.judgements]
+    needs = tuple(name for stage in read for name in task_names(stage))
+    name, arguments = f"run/{run.run_id}", (run, judged, dataset)
+    tasks = dict(judged.tasks)
+    tasks[name] = Task(name, "write the tables", write_rows, arguments, (), needs)
+    left = [] if dataset.holds(run, stages) else unfinished(tasks, [name])
+    return PlannedRun(run, stages, tasks, left)
+
+
+def _stages_of(judged: JudgedRun) -> list[str]:
+    return [f"{stage.name}/{stage.key}" for stage in judged.stages()]
+
+
+def write_rows(run: SweepRun, judged: JudgedRun, dataset: SweepDataset) -> None:
+    """Write a run's rows of all tables, `runs` last; no maps, no images."""
+    dataset.path(ALIGNER_TIMINGS, run).unlink(missing_ok=True)  # of an earlier state of the run
+    for name, rows in _run_tables(judged).items():
+        dataset.write(name, run, rows)
+    dataset.finish(run, renderer(judged.scenario), _stages_of(judged))
+
+
+def _run_tables(judged: JudgedRun) -> dict[str, pd.DataFrame | list[dict[str, Any]]]:
+    robots = judged.load_robots()
+    of_robots = robot_tables(judged, robots)
+    last = max(max(robot.maps) for robot in robots)
+    estimates, offered = (judged.pair_table(name) for name in ("estimates", "correspondences"))
+    fused = fused_map(judged.scenario.merge, robots, estimates, offered, last)
+    radius_m = judged.scenario.evaluate.true_pair_radius_m
+    return {
+        **{name: judged.pair_table(name) for name in ("errors", "fusion")},
+        **{name: of_robots[name] for name in ("robots", "path_statistics")},
+        "map_fits": map_fit_rows(robots, fused, last),
+        "landmark_nees": landmark_nees_rows(robots, fused, last, radius_m),
+        RUN_TIMES: [
+            {"stage": folder.name, "key": folder.key, "figure": name, "seconds": seconds}
+            for folder in judged.folders()
+            for name, seconds in folder.figures().items()
+        ],
+    }
+
+
+def write_aligner_timings(run: SweepRun, store: Store, dataset: SweepDataset) -> None:
+    """Time a finished run's aligners, serially: nothing else may be running."""
+    judged = JudgedRun.of(run.load(), store)
+    measure_aligners(judged, judged.load_robots())
+    dataset.write(ALIGNER_TIMINGS, run, judged.pair_table(ALIGNER_TIMINGS))
+
+
+@dataclass
+class Survey:
+    """What a sweep would do: runs in all, finished, and that cannot be laid out; tasks by label.
+
+    Attributes:
+        wanted: over all runs, as if nothing were shared.
+        finished: on disk.
+        left: to be computed.
+    """
+
+    runs: int
+    runs_finished: int = 0
+    runs_refused: int = 0
+    wanted: Counter[str] = field(default_factory=Counter)
+    finished: Counter[str] = field(default_factory=Counter)
+    left: Counter[str] = field(default_factory=Counter)
+
+
+def survey(sweep: Sweep) -> Survey:
+    """Count the tasks of runs, how many are shared between runs and how many are done."""
+    found = Survey(len(sweep.runs))
+    known: set[str] = set()
+    for run in sweep.runs:
+        try:
+            laid_out = planned(run, sweep.store, sweep.dataset)
+        except InputError:
+            found.runs_refused += 1
+            continue
+        found.runs_finished += not laid_out.left
+        left = {task.name for task in laid_out.left}
+        found.wanted.update(task.label for task in laid_out.tasks.values())
+        for name in laid_out.tasks.keys() - known:
+            (found.left if name in left else found.finished)[laid_out.tasks[name].label] += 1
+        known.update(laid_out.tasks)
+    return found
