@@ -1,184 +1,203 @@
 """Fused landmarks against the truth: was fusing worth it, and do the covariances say so?"""
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from experiments.judge.errors import EvaluatedRobot
-from experiments.judge.truth import fit_rmse_m
-from experiments.run.estimates import alignment_of, correspondences_of
+from experiments.judge.errors import EvaluatedRobot, MetMaps
+from experiments.judge.truth import degrees_of_freedom, fit_rmse_m, squared_mahalanobis
 from mapfusion import se2
-from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.result import Alignment, degenerate
 from mapfusion.aligned_landmarks import ABSENT
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.merge import FusedMap, MergeParameters, merge
 from mapfusion.se2 import Float
+from mapfusion.storage import named_columns, point_columns
 
 
-def fused_maps(
-    maps: list[LandmarkMap],
-    estimates: pd.DataFrame,
-    correspondences: pd.DataFrame,
-    aligner: str,
-    parameters: MergeParameters,
-) -> FusedMap:
-    """Fuse maps in the frame of the first by an aligner's first repetition.
+@dataclass(frozen=True)
+class MergeSettings:
+    """Whose alignments maps are merged by, and how."""
 
-    Args:
-        maps: of the robots, the first's first.
-        estimates: rows of the table `estimates` at one iteration, of any pairs.
-        correspondences: the pairs offered there.
-        aligner: whose refined estimates to merge by.
-        parameters: how to merge.
+    aligner: str
+    parameters: MergeParameters
+
+
+@dataclass(frozen=True)
+class FusedTeam:
+    """Robots' maps at one iteration, and what they were merged into.
+
+    Attributes:
+        robots: the first one's frame is the fused map's.
+        met: their maps pair by pair, at all iterations.
+        iteration: of the merged maps.
+        fused: None for a single robot.
     """
-    chosen = first_repetition(estimates, aligner)
-    alignments: list[Alignment] = []
-    offered: list[Correspondences] = []
-    for other in maps[1:]:
-        names = {"robot_a": maps[0].name, "robot_b": other.name}
-        rows = _of_pair(chosen, names)
-        pairs = correspondences_of(_of_pair(correspondences, names))
-        offered.append(pairs)
-        if len(rows):
-            alignments.append(alignment_of(rows.iloc[0].to_dict(), len(pairs)))
-        else:
-            alignments.append(degenerate("was never aligned", len(pairs)))
-    return merge(maps, alignments, offered, parameters)
 
+    robots: Sequence[EvaluatedRobot]
+    met: Sequence[MetMaps]
+    iteration: int
+    fused: FusedMap | None
 
-def first_repetition(estimates: pd.DataFrame, aligner: str) -> pd.DataFrame:
-    """What maps are merged by: repetitions are for the spread of a method, not for the map."""
-    return estimates[(estimates["aligner"] == aligner) & (estimates["repetition"] == 0)]
+    @classmethod
+    def of(
+        cls, robots: Sequence[EvaluatedRobot], met: Sequence[MetMaps], settings: MergeSettings
+    ) -> "FusedTeam":
+        """Merge the robots' last maps by their last alignments with the first one's."""
+        last = max(max(robot.maps) for robot in robots)
+        if len(robots) < 2:
+            return cls(robots, met, last, None)
+        first, *others = robots
+        # a pair's last iteration is at the later of its two robots' last frames
+        ends = {each.b.name: each for each in met if each.a is first}
+        fused = merge(
+            [robot.at(last)[0] for robot in robots],
+            [ends[other.name].alignment(settings.aligner) for other in others],
+            [ends[other.name].offered for other in others],
+            settings.parameters,
+        )
+        return cls(robots, met, last, fused)
 
+    def truth_of(self, fused: FusedMap) -> Float:
+        """True points (N, 3) of fused landmarks: the mean of their parents'; NaN if unknown."""
+        points = self.parent_points(fused)
+        known = np.all(np.isfinite(points), axis=2)
+        total = np.where(known[:, :, None], points, 0.0).sum(axis=1)
+        count = np.count_nonzero(known, axis=1, keepdims=True)
+        return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
-def _of_pair(rows: pd.DataFrame, names: dict[str, str]) -> pd.DataFrame:
-    keep = (rows["robot_a"] == names["robot_a"]) & (rows["robot_b"] == names["robot_b"])
-    return rows[keep]
+    def parent_points(self, fused: FusedMap) -> Float:
+        """True points (N, M, 3) of each fused landmark's parents; NaN where none or unknown."""
+        points = np.full((*fused.parents.shape, 3), np.nan)
+        for k, robot in enumerate(self.robots):
+            has = fused.parents[:, k] != ABSENT
+            points[has, k] = robot.at(self.iteration)[1][fused.parents[has, k]]
+        return points
+
+    def judged(self) -> list[tuple[str, LandmarkMap, Float]]:
+        """Name, map and true points (N, 3) in the world of each robot's map and the fused one."""
+        found = [(robot.name, *robot.at(self.iteration)) for robot in self.robots]
+        if self.fused is not None:
+            found.append(("fused", self.fused.landmarks, self.truth_of(self.fused)))
+        return found
 
 
 def fusion_rows(
-    a: EvaluatedRobot,
-    b: EvaluatedRobot,
-    estimates: pd.DataFrame,
-    correspondences: pd.DataFrame,
-    aligner: str,
-    parameters: MergeParameters,
+    robots: Sequence[EvaluatedRobot],
+    met: Sequence[MetMaps],
+    settings: MergeSettings,
     radius_m: float,
-) -> list[dict[str, Any]]:
+) -> pd.DataFrame:
     """Rows of the table `fusion`: landmarks of one pair fused at the last iteration."""
-    last = int(estimates["iteration"].max())
-    estimates = estimates[estimates["iteration"] == last]
-    correspondences = correspondences[correspondences["iteration"] == last]
-    (map_a, points_a), (map_b, points_b) = a.at(last), b.at(last)
     with_drift, without_drift = (
-        fused_maps(
-            [map_a, map_b],
-            estimates,
-            correspondences,
-            aligner,
-            replace(parameters, use_drift=use_drift),
+        _pair_rows(FusedTeam.of(robots, met, replace(settings, parameters=parameters)))
+        for parameters in (
+            replace(settings.parameters, use_drift=use_drift) for use_drift in (True, False)
         )
-        for use_drift in (True, False)
     )
-    nees_without = {
-        (int(i), int(j)): value for i, j, value, _ in _judged(without_drift, a, points_a, points_b)
-    }
-    T_a_b = with_drift.T_first_map[1]
-    dof = 2 if map_a.planar else 3
-    rows = []
-    for i, j, nees, error_m in _judged(with_drift, a, points_a, points_b):
-        truth = _truth_in_a(a, points_a[i], points_b[j])
-        moved_b = se2.transform_points(T_a_b, map_b.position_m[j][None])[0]
-        rows.append(
-            {
-                "robot_a": a.name,
-                "robot_b": b.name,
-                "landmark_a": i,
-                "landmark_b": j,
-                "error_a_m": np.linalg.norm(map_a.position_m[i] - truth),
-                "error_b_m": np.linalg.norm(moved_b - truth),
-                "error_fused_m": error_m,
-                "nees_with_drift": nees,
-                "nees_without_drift": nees_without.get((i, j), np.nan),
-                "degrees_of_freedom": dof,
-                "true_pair": bool(np.linalg.norm(points_a[i] - points_b[j]) <= radius_m),
-            }
-        )
-    return rows
+    parents = ["landmark_a", "landmark_b"]
+    without_drift = without_drift[[*parents, "nees"]]
+    rows = with_drift.merge(
+        without_drift, how="left", on=parents, suffixes=("_with_drift", "_without_drift")
+    )
+    return rows.assign(true_pair=rows["apart_m"] <= radius_m)
 
 
-def _truth_in_a(a: EvaluatedRobot, point_a: Float, point_b: Float) -> Float:
-    """The true point (3,) in robot a's map frame: the middle of what both landmarks show."""
-    middle = ((point_a + point_b) / 2)[None]
-    return se2.transform_points(se2.inverse(a.path.T_world_map), middle)[0]
-
-
-def _judged(
-    fused: FusedMap, a: EvaluatedRobot, points_a: Float, points_b: Float
-) -> list[tuple[int, int, float, float]]:
-    """(row of a, row of b, NEES, error in m) of each landmark with two parents."""
+def _pair_rows(pair: FusedTeam) -> pd.DataFrame:
+    """Landmarks with two parents, held against the middle of what both of these show."""
+    (a, b), fused = pair.robots, pair.fused
+    assert fused is not None
+    (map_a, points_a), (map_b, points_b) = a.at(pair.iteration), b.at(pair.iteration)
     both = np.flatnonzero((fused.parents != ABSENT).all(axis=1))
-    judged = []
-    for row in both:
-        i, j = (int(parent) for parent in fused.parents[row])
-        error = fused.landmarks.position_m[row] - _truth_in_a(a, points_a[i], points_b[j])
-        used = 2 if fused.landmarks.planar else 3
-        covariance = fused.landmarks.covariance_m2[row, :used, :used]
-        nees = float(error[:used] @ np.linalg.solve(covariance, error[:used]))
-        judged.append((i, j, nees, float(np.linalg.norm(error))))
-    return judged
+    i, j = fused.parents[both].T
+    # points one by one, [:, None]: products of matrices differ in their last bits from these
+    truth = a.in_map_frame(((points_a[i] + points_b[j]) / 2)[:, None])[:, 0]
+    moved_b = se2.transform_points(fused.T_first_map[1], map_b.position_m[j][:, None])[:, 0]
+    error = fused.landmarks.position_m[both] - truth
+    used = degrees_of_freedom(fused.landmarks)
+    covariance = fused.landmarks.covariance_m2[both, :used, :used]
+    return pd.DataFrame(
+        {
+            "robot_a": a.name,
+            "robot_b": b.name,
+            "landmark_a": i,
+            "landmark_b": j,
+            "error_a_m": _lengths(map_a.position_m[i] - truth),
+            "error_b_m": _lengths(moved_b - truth),
+            "error_fused_m": _lengths(error),
+            "nees": squared_mahalanobis(error[:, :used], covariance),
+            "degrees_of_freedom": used,
+            "apart_m": _lengths(points_a[i] - points_b[j]),
+        }
+    )
 
 
-def parent_points(fused: FusedMap, robots: list[EvaluatedRobot], iteration: int) -> Float:
-    """True world points (N, M, 3) of each fused landmark's parents; NaN where none or unknown."""
-    points = np.full((*fused.parents.shape, 3), np.nan)
-    for k, robot in enumerate(robots):
-        has = fused.parents[:, k] != ABSENT
-        points[has, k] = robot.at(iteration)[1][fused.parents[has, k]]
-    return points
+def _lengths(vectors: Float) -> Float:
+    return np.sqrt(np.vecdot(vectors, vectors))
 
 
-def fused_truth(fused: FusedMap, robots: list[EvaluatedRobot], iteration: int) -> Float:
-    """True world points (N, 3) of fused landmarks: the mean of their parents'; NaN if unknown."""
-    points = parent_points(fused, robots, iteration)
-    known = np.all(np.isfinite(points), axis=2)
-    total = np.where(known[:, :, None], points, 0.0).sum(axis=1)
-    count = np.count_nonzero(known, axis=1, keepdims=True)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+def landmark_rows(team: FusedTeam) -> pd.DataFrame:
+    """Rows of the table `landmarks`."""
+    parts = []
+    for robot in team.robots:
+        landmarks, points = robot.at(team.iteration)
+        rows = _landmark_columns(landmarks, robot.in_map_frame(points))
+        parts.append(rows.assign(robot=robot.name, count=landmarks.count))
+    return pd.concat(parts, ignore_index=True)
 
 
-def fused_motion_rows(
-    robots: list[EvaluatedRobot], fused: FusedMap | None, parameters: MergeParameters
-) -> list[dict[str, Any]]:
-    """Rows of the table `fused_motions`: how each robot's map was moved into the fused one."""
+def _landmark_columns(landmarks: LandmarkMap, truth: Float) -> pd.DataFrame:
+    columns = point_columns(landmarks.position_m, landmarks.covariance_m2)
+    columns |= named_columns(("truth_x_m", "truth_y_m", "truth_z_m"), truth)
+    return pd.DataFrame({"landmark": np.arange(len(landmarks)), **columns})
+
+
+def fused_rows(team: FusedTeam) -> pd.DataFrame:
+    """Rows of the table `fused`; none for a single robot."""
+    fused, first_robot = team.fused, team.robots[0]
     if fused is None:
+        return pd.DataFrame()
+    rows = _landmark_columns(fused.landmarks, first_robot.in_map_frame(team.truth_of(fused)))
+    has = fused.parents != ABSENT
+    names = np.array([robot.name for robot in team.robots], dtype=object)
+    first = np.argmax(has, axis=1)
+    later = has & (np.arange(len(names)) > first[:, None])
+    second, several = np.argmax(later, axis=1), later.any(axis=1)
+    each = np.arange(len(rows))
+    return rows.assign(
+        n_parents=has.sum(axis=1),
+        robot_a=names[first],
+        landmark_a=fused.parents[each, first],
+        robot_b=np.where(several, names[second], ""),
+        landmark_b=np.where(several, fused.parents[each, second], ABSENT),
+    )
+
+
+def fused_motion_rows(team: FusedTeam, use_drift: bool) -> list[dict[str, Any]]:
+    """Rows of the table `fused_motions`: how each robot's map was moved into the fused one."""
+    if team.fused is None:
         return []
-    why = dict(fused.left_out)
+    why = dict(team.fused.left_out)
+    drift_sigma_m = team.fused.drift_sigma_m if use_drift else np.zeros(len(team.robots))
     return [
         {
             "robot": robot.name,
-            **dict(zip(("tx_m", "ty_m", "theta_rad"), fused.T_first_map[place], strict=True)),
-            "drift_sigma_m": fused.drift_sigma_m[place] if parameters.use_drift else 0.0,
+            **dict(zip(("tx_m", "ty_m", "theta_rad"), motion, strict=True)),
+            "drift_sigma_m": sigma_m,
             "left_out": why.get(robot.name, ""),
         }
-        for place, robot in enumerate(robots)
+        for robot, motion, sigma_m in zip(
+            team.robots, team.fused.T_first_map, drift_sigma_m, strict=True
+        )
     ]
 
 
-def map_fit_rows(
-    robots: list[EvaluatedRobot], fused: FusedMap | None, iteration: int
-) -> list[dict[str, Any]]:
+def map_fit_rows(team: FusedTeam) -> list[dict[str, Any]]:
     """Rows of the table `map_fits`: each robot's map, and the fused one, against the truth."""
     rows = []
-    for robot in robots:
-        landmarks, points = robot.at(iteration)
+    for name, landmarks, points in team.judged():
         n, rmse_m = fit_rmse_m(landmarks.position_m, points)
-        rows.append({"map": robot.name, "n_landmarks": n, "rmse_m": rmse_m})
-    if fused is not None:
-        truth = fused_truth(fused, robots, iteration)
-        n, rmse_m = fit_rmse_m(fused.landmarks.position_m, truth)
-        rows.append({"map": "fused", "n_landmarks": n, "rmse_m": rmse_m})
+        rows.append({"map": name, "n_landmarks": n, "rmse_m": rmse_m})
     return rows

@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 import pandas as pd
 
 from experiments.judge import judging, tables
-from experiments.judge.errors import EvaluatedRobot
+from experiments.judge.errors import EvaluatedRobot, met_maps
+from experiments.judge.fused_landmarks import FusedTeam, MergeSettings
 from experiments.run.pipeline import PairStages, Pipeline, RobotStages, lay_out
 from experiments.run.stage import Stage
 from experiments.run.stages.slam import RobotFolders
@@ -68,6 +68,13 @@ class JudgedRun:
         """All robots' maps joined with the truth."""
         return [judging.load_robot(self.robot_folders(robot)) for robot in self.pipeline.robots]
 
+    def load_team(self) -> FusedTeam:
+        """The same, their last maps merged."""
+        robots = self.load_robots()
+        estimates, offered = (self.pair_table(name) for name in ("estimates", "correspondences"))
+        met = met_maps(robots, estimates, offered)
+        return FusedTeam.of(robots, met, MergeSettings(**dict(self.scenario.merge)))
+
     def pair_table(self, name: str) -> pd.DataFrame:
         """A table of robot pairs, of all pairs."""
         made = self.judgements if name in _JUDGED else [p.estimates for p in self.pipeline.pairs]
@@ -101,20 +108,9 @@ def _judgement(scenario: AnyScenario, pair: PairStages) -> Stage:
     settings = judging.JudgeSettings(
         scenario.align.refinement,
         scenario.align.acceptance,
-        scenario.merge.aligner,
-        scenario.merge.parameters,
+        MergeSettings(**dict(scenario.merge)),
         scenario.evaluate.true_pair_radius_m,
     )
-    before = {"align": pair.estimates, "log_a": pair.a.log, "slam_a": pair.a.slam}
-    before |= {"log_b": pair.b.log, "slam_b": pair.b.slam}
+    before = {**pair.match.before, "align": pair.estimates}
     label = "compare with the truth"
     return Stage("judge", label, settings, judging.run, judging.WRITES, before)
-
-
-def record_logs(
-    scenario: AnyScenario, store: Store, jobs: int, on_progress: OnProgress
-) -> dict[str, Path]:
-    """Simulate only; returns each robot's log folder in the store."""
-    laid_out = JudgedRun.of(scenario, store)
-    laid_out.execute(jobs, on_progress, laid_out.pipeline.to_logs())
-    return {robot.name: store.path(robot.log) for robot in laid_out.pipeline.robots}

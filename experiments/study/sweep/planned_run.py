@@ -5,16 +5,15 @@ from typing import Any
 
 import pandas as pd
 
-from experiments.judge.consistency import landmark_nees_rows
-from experiments.judge.fused_landmarks import map_fit_rows
+from experiments.judge.aligner_times import measure_aligners
 from experiments.judge.judged_run import JudgedRun
-from experiments.judge.provenance import renderer
-from experiments.judge.result import fused_map, measure_aligners, robot_tables
+from experiments.judge.result import all_tables, renderer
 from experiments.run.store import Store
 from experiments.run.tasks import Task, task_names, unfinished
 from experiments.study.sweep.combinations import SweepRun
 from experiments.study.sweep.sweep_dataset import ALIGNER_TIMINGS, RUN_TIMES, SweepDataset
 
+_TABLES = ("errors", "fusion", "robots", "path_statistics", "map_fits", "landmark_nees")
 WRITE = "write the tables"  # the label of the task that writes a run's rows
 
 
@@ -71,19 +70,8 @@ def write_rows(run: SweepRun, judged: JudgedRun, dataset: SweepDataset) -> None:
 
 
 def _run_tables(judged: JudgedRun) -> dict[str, pd.DataFrame | list[dict[str, Any]]]:
-    robots = judged.load_robots()
-    of_robots = robot_tables(judged, robots)
-    last = max(max(robot.maps) for robot in robots)
-    estimates, offered = (judged.pair_table(name) for name in ("estimates", "correspondences"))
-    fused = fused_map(judged.scenario.merge, robots, estimates, offered, last)
-    radius_m = judged.scenario.evaluate.true_pair_radius_m
-    return {
-        "errors": judged.pair_table("errors"),
-        "fusion": judged.pair_table("fusion"),
-        "robots": of_robots["robots"],
-        "path_statistics": of_robots["path_statistics"],
-        "map_fits": map_fit_rows(robots, fused, last),
-        "landmark_nees": landmark_nees_rows(robots, fused, last, radius_m),
+    made = all_tables(judged, judged.load_team())
+    return {name: made[name] for name in _TABLES} | {
         RUN_TIMES: [
             {"stage": folder.name, "key": folder.key, "figure": name, "seconds": seconds}
             for folder in judged.folders()
