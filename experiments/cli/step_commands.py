@@ -47,9 +47,8 @@ def slam(
     from experiments.show.terminal.layout import progress
     from experiments.show.terminal.step_screen import print_map
 
-    slam_settings = single.slam_settings(settings, overrides)
     with progress() as show:
-        landmarks = single.slam(log, slam_settings, seed, show)
+        landmarks = single.slam(log, settings, overrides, seed, show)
     single.save_map(output, landmarks)
     print_map(output, landmarks)
 
@@ -67,7 +66,7 @@ def align(
     from experiments.judge import user_files as single
     from experiments.show.terminal.step_screen import print_estimates
 
-    print_estimates(single.align(map_a, map_b, single.align_settings(settings, overrides), seed))
+    print_estimates(single.align((map_a, map_b), settings, overrides, seed))
 
 
 @app.command()

@@ -10,7 +10,6 @@ import pandas as pd
 from experiments.judge.criteria import ORACLE
 from experiments.judge.truth import PathTruth, common_landmarks, squared_mahalanobis, true_pairs
 from experiments.run.estimates import alignment_of, correspondences_of, estimate_row
-from experiments.run.stages.map_batches import map_at
 from mapfusion import se2
 from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.correspondences import Correspondences
@@ -26,25 +25,17 @@ _MEETING = ["robot_a", "robot_b", "iteration"]
 
 @dataclass(frozen=True)
 class EvaluatedRobot:
-    """What is known of one robot when its maps are judged.
-
-    Attributes:
-        name: of the robot.
-        maps: by iteration.
-        points_world_m: true point (N, 3) of each landmark of each map, by iteration.
-        path: true poses.
-    """
+    """What is known of one robot when its maps are judged; maps and true points by iteration."""
 
     name: str
     maps: dict[int, LandmarkMap]
-    points_world_m: dict[int, Float]
+    points_world_m: dict[int, Float]  # (N, 3) for each map
     path: PathTruth
 
     def at(self, iteration: int) -> tuple[LandmarkMap, Float]:
         """Map and true points at an iteration (the last ones of a log that ended earlier)."""
-        landmarks = map_at(self.maps, iteration)
         known = max((k for k in self.maps if k <= iteration), default=min(self.maps))
-        return landmarks, self.points_world_m[known]
+        return self.maps[known], self.points_world_m[known]
 
     def in_map_frame(self, points_world_m: Float) -> Float:
         """Points (..., 3) of the world in the frame of this robot's maps."""
@@ -53,19 +44,13 @@ class EvaluatedRobot:
 
 @dataclass(frozen=True)
 class MetMaps:
-    """Maps of two robots at one iteration: what aligners were offered, and what they answered.
-
-    Attributes:
-        a: robot a.
-        b: robot b.
-        iteration: of the maps.
-        offered: rows of the two maps.
-        estimates: rows of the table `estimates`.
-    """
+    """Maps of two robots at one iteration, what aligners were offered, and what they answered."""
 
     a: EvaluatedRobot
     b: EvaluatedRobot
     iteration: int
+    maps: tuple[LandmarkMap, LandmarkMap]
+    points_world_m: tuple[Float, Float]
     offered: Correspondences
     estimates: pd.DataFrame
 
@@ -73,16 +58,6 @@ class MetMaps:
     def names(self) -> dict[str, Any]:
         """Columns that tell it from others."""
         return dict(zip(_MEETING, (self.a.name, self.b.name, self.iteration), strict=True))
-
-    @property
-    def maps(self) -> tuple[LandmarkMap, LandmarkMap]:
-        """Of robot a and of robot b."""
-        return self.a.at(self.iteration)[0], self.b.at(self.iteration)[0]
-
-    @property
-    def points_world_m(self) -> tuple[Float, Float]:
-        """True points of the landmarks of robot a and of robot b."""
-        return self.a.at(self.iteration)[1], self.b.at(self.iteration)[1]
 
     def is_true(self, radius_m: float) -> np.ndarray:
         """Which of the correspondences are true."""
@@ -103,9 +78,12 @@ def met_maps(
     offered = dict(iter(correspondences.groupby(_MEETING)))
     met = []
     for key, rows in estimates.groupby(_MEETING, sort=False):
-        a, b, iteration = cast("tuple[str, str, int]", key)
+        name_a, name_b, iteration = cast("tuple[str, str, int]", key)
+        a, b = by_name[name_a], by_name[name_b]
+        (map_a, points_a), (map_b, points_b) = a.at(iteration), b.at(iteration)
         pairs = correspondences_of(offered.get(key, correspondences.iloc[:0]))
-        met.append(MetMaps(by_name[a], by_name[b], iteration, pairs, rows))
+        maps, points = (map_a, map_b), (points_a, points_b)
+        met.append(MetMaps(a, b, iteration, maps, points, pairs, rows))
     return met
 
 

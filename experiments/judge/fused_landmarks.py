@@ -1,4 +1,10 @@
-"""Fused landmarks against the truth: was fusing worth it, and do the covariances say so?"""
+"""Landmarks against the truth, before merging and after: was it worth it, do covariances say so?
+
+The normalised estimation error squared (NEES; Bar-Shalom, Li, Kirubarajan 2001, ch. 5.4) of a
+landmark is chi-square distributed, with as many degrees of freedom as it has coordinates, if its
+covariance is right. Maps are compared with the truth in their own frame, the robot's true start
+pose, without a fit: what the path's drift does to a landmark is part of its error.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,10 +17,13 @@ from experiments.judge.errors import EvaluatedRobot, MetMaps
 from experiments.judge.truth import degrees_of_freedom, fit_rmse_m, squared_mahalanobis
 from mapfusion import se2
 from mapfusion.aligned_landmarks import ABSENT
+from mapfusion.chi_square import chi_square_bound
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.merge import FusedMap, MergeParameters, merge
 from mapfusion.se2 import Float
 from mapfusion.storage import named_columns, point_columns
+
+GATE_PROBABILITY = 0.95
 
 
 @dataclass(frozen=True)
@@ -27,19 +36,12 @@ class MergeSettings:
 
 @dataclass(frozen=True)
 class FusedTeam:
-    """Robots' maps at one iteration, and what they were merged into.
-
-    Attributes:
-        robots: the first one's frame is the fused map's.
-        met: their maps pair by pair, at all iterations.
-        iteration: of the merged maps.
-        fused: None for a single robot.
-    """
+    """Robots' maps at one iteration, and what they were merged into, in the first one's frame."""
 
     robots: Sequence[EvaluatedRobot]
-    met: Sequence[MetMaps]
+    met: Sequence[MetMaps]  # at all iterations
     iteration: int
-    fused: FusedMap | None
+    fused: FusedMap | None  # None for a single robot
 
     @classmethod
     def of(
@@ -63,9 +65,8 @@ class FusedTeam:
     def truth_of(self, fused: FusedMap) -> Float:
         """True points (N, 3) of fused landmarks: the mean of their parents'; NaN if unknown."""
         points = self.parent_points(fused)
-        known = np.all(np.isfinite(points), axis=2)
-        total = np.where(known[:, :, None], points, 0.0).sum(axis=1)
-        count = np.count_nonzero(known, axis=1, keepdims=True)
+        known = np.all(np.isfinite(points), axis=2, keepdims=True)
+        total, count = np.where(known, points, 0.0).sum(axis=1), np.count_nonzero(known, axis=1)
         return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
     def parent_points(self, fused: FusedMap) -> Float:
@@ -84,23 +85,17 @@ class FusedTeam:
         return found
 
 
-def fusion_rows(
-    robots: Sequence[EvaluatedRobot],
-    met: Sequence[MetMaps],
-    settings: MergeSettings,
-    radius_m: float,
-) -> pd.DataFrame:
+def fusion_rows(met: Sequence[MetMaps], settings: MergeSettings, radius_m: float) -> pd.DataFrame:
     """Rows of the table `fusion`: landmarks of one pair fused at the last iteration."""
+    robots = met[0].a, met[0].b
+    parameters = (replace(settings.parameters, use_drift=use_drift) for use_drift in (True, False))
     with_drift, without_drift = (
-        _pair_rows(FusedTeam.of(robots, met, replace(settings, parameters=parameters)))
-        for parameters in (
-            replace(settings.parameters, use_drift=use_drift) for use_drift in (True, False)
-        )
+        _pair_rows(FusedTeam.of(robots, met, replace(settings, parameters=each)))
+        for each in parameters
     )
-    parents = ["landmark_a", "landmark_b"]
-    without_drift = without_drift[[*parents, "nees"]]
+    other = without_drift[["landmark_a", "landmark_b", "nees"]]
     rows = with_drift.merge(
-        without_drift, how="left", on=parents, suffixes=("_with_drift", "_without_drift")
+        other, "left", ["landmark_a", "landmark_b"], suffixes=("_with_drift", "_without_drift")
     )
     return rows.assign(true_pair=rows["apart_m"] <= radius_m)
 
@@ -140,26 +135,25 @@ def _lengths(vectors: Float) -> Float:
 
 def landmark_rows(team: FusedTeam) -> pd.DataFrame:
     """Rows of the table `landmarks`."""
-    parts = []
-    for robot in team.robots:
-        landmarks, points = robot.at(team.iteration)
-        rows = _landmark_columns(landmarks, robot.in_map_frame(points))
-        parts.append(rows.assign(robot=robot.name, count=landmarks.count))
+    parts = [_landmark_columns(robot, *robot.at(team.iteration)) for robot in team.robots]
     return pd.concat(parts, ignore_index=True)
 
 
-def _landmark_columns(landmarks: LandmarkMap, truth: Float) -> pd.DataFrame:
+def _landmark_columns(owner: EvaluatedRobot, landmarks: LandmarkMap, points: Float) -> pd.DataFrame:
+    """Landmarks of a map and their true points in the frame of the robot's maps."""
     columns = point_columns(landmarks.position_m, landmarks.covariance_m2)
-    columns |= named_columns(("truth_x_m", "truth_y_m", "truth_z_m"), truth)
-    return pd.DataFrame({"landmark": np.arange(len(landmarks)), **columns})
+    columns |= named_columns(("truth_x_m", "truth_y_m", "truth_z_m"), owner.in_map_frame(points))
+    return pd.DataFrame({"landmark": np.arange(len(landmarks)), **columns}).assign(
+        robot=owner.name, count=landmarks.count
+    )
 
 
 def fused_rows(team: FusedTeam) -> pd.DataFrame:
     """Rows of the table `fused`; none for a single robot."""
-    fused, first_robot = team.fused, team.robots[0]
+    fused = team.fused
     if fused is None:
         return pd.DataFrame()
-    rows = _landmark_columns(fused.landmarks, first_robot.in_map_frame(team.truth_of(fused)))
+    rows = _landmark_columns(team.robots[0], fused.landmarks, team.truth_of(fused))
     has = fused.parents != ABSENT
     names = np.array([robot.name for robot in team.robots], dtype=object)
     first = np.argmax(has, axis=1)
@@ -175,29 +169,79 @@ def fused_rows(team: FusedTeam) -> pd.DataFrame:
     )
 
 
-def fused_motion_rows(team: FusedTeam, use_drift: bool) -> list[dict[str, Any]]:
+def fused_motion_rows(team: FusedTeam, use_drift: bool) -> pd.DataFrame:
     """Rows of the table `fused_motions`: how each robot's map was moved into the fused one."""
     if team.fused is None:
-        return []
-    why = dict(team.fused.left_out)
-    drift_sigma_m = team.fused.drift_sigma_m if use_drift else np.zeros(len(team.robots))
-    return [
-        {
-            "robot": robot.name,
-            **dict(zip(("tx_m", "ty_m", "theta_rad"), motion, strict=True)),
-            "drift_sigma_m": sigma_m,
-            "left_out": why.get(robot.name, ""),
-        }
-        for robot, motion, sigma_m in zip(
-            team.robots, team.fused.T_first_map, drift_sigma_m, strict=True
-        )
-    ]
+        return pd.DataFrame()
+    names, why = [robot.name for robot in team.robots], dict(team.fused.left_out)
+    motions = named_columns(("tx_m", "ty_m", "theta_rad"), team.fused.T_first_map)
+    return pd.DataFrame({"robot": names, **motions}).assign(
+        drift_sigma_m=team.fused.drift_sigma_m if use_drift else 0.0,
+        left_out=[why.get(name, "") for name in names],
+    )
 
 
-def map_fit_rows(team: FusedTeam) -> list[dict[str, Any]]:
+def map_fit_rows(team: FusedTeam) -> pd.DataFrame:
     """Rows of the table `map_fits`: each robot's map, and the fused one, against the truth."""
-    rows = []
-    for name, landmarks, points in team.judged():
-        n, rmse_m = fit_rmse_m(landmarks.position_m, points)
-        rows.append({"map": name, "n_landmarks": n, "rmse_m": rmse_m})
+    fits = ((name, *fit_rmse_m(own.position_m, points)) for name, own, points in team.judged())
+    return pd.DataFrame(fits, columns=["map", "n_landmarks", "rmse_m"])
+
+
+def landmark_nees(landmarks: LandmarkMap, point_m: Float) -> Float:
+    """NEES (N,) of landmarks by true points (N, 3) in the map's frame; NaN where unknown."""
+    used = degrees_of_freedom(landmarks)
+    error = (landmarks.position_m - point_m)[:, :used]
+    covariance = landmarks.covariance_m2[:, :used, :used]
+    return np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[..., None])[..., 0])
+
+
+def mean_nees_band(n: float, dof: int, probability: float = GATE_PROBABILITY) -> Float:
+    """Where the mean of n independent NEES over their degrees of freedom lies, if consistent.
+
+    Their sum is chi-square with n dof degrees of freedom (Bar-Shalom et al. 2001, eq. 5.4.2-14).
+    """
+    tail = (1 - probability) / 2
+    ends = [chi_square_bound(share, n * dof) for share in (tail, 1 - tail)]
+    return np.array(ends) / (n * dof)
+
+
+def landmark_nees_rows(team: FusedTeam, radius_m: float) -> list[dict[str, Any]]:
+    """Rows of the table `landmark_nees`: each robot's map, and what became of it when merged.
+
+    Landmarks whose true points lie within the radius are one; fused ones whose parents are not have
+    no single truth and are left out of "fused" and "before fusing".
+    """
+    rows, fused = [], team.fused
+    true_rows = np.zeros(0, np.int64) if fused is None else _truly_fused(team, fused, radius_m)
+    for place, robot in enumerate(team.robots):
+        landmarks, points = robot.at(team.iteration)
+        nees = landmark_nees(landmarks, robot.in_map_frame(points))
+        rows.append(_row(robot.name, "own", landmarks, nees))
+        if fused is not None:
+            parents = fused.parents[true_rows, place]
+            fused_nees = nees[parents[parents != ABSENT]]
+            rows.append(_row(robot.name, "before fusing", landmarks, fused_nees))
+    if fused is not None:
+        nees = landmark_nees(fused.landmarks, team.robots[0].in_map_frame(team.truth_of(fused)))
+        single = np.count_nonzero(fused.parents != ABSENT, axis=1) == 1
+        rows.append(_row("fused", "fused", fused.landmarks, nees[true_rows]))
+        rows.append(_row("fused", "carried over", fused.landmarks, nees[single]))
     return rows
+
+
+def _truly_fused(team: FusedTeam, fused: FusedMap, radius_m: float) -> np.ndarray:
+    """Rows of the fused map with several parents, all of which show one true point."""
+    points, has = team.parent_points(fused), fused.parents != ABSENT
+    apart = np.linalg.norm(points[:, :, None] - points[:, None], axis=3)
+    both = has[:, :, None] & has[:, None]
+    together = np.all(~both | (apart <= radius_m), axis=(1, 2))  # NaN is not together
+    return np.flatnonzero(together & (has.sum(axis=1) > 1))
+
+
+def _row(name: str, which: str, landmarks: LandmarkMap, nees: Float) -> dict[str, Any]:
+    nees, dof = nees[np.isfinite(nees)], degrees_of_freedom(landmarks)
+    row = {"map": name, "landmarks": which, "n_landmarks": len(nees), "degrees_of_freedom": dof}
+    if len(nees):
+        row |= {"nees_mean": nees.mean(), "nees_median": np.median(nees)}
+        row |= {"share_in_gate": np.mean(nees <= chi_square_bound(GATE_PROBABILITY, dof))}
+    return row

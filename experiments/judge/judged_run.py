@@ -23,16 +23,10 @@ _JUDGED = {"errors", "fusion"}  # the other tables of pairs come from the aligne
 
 @dataclass(frozen=True)
 class JudgedRun:
-    """A scenario's stages in a store.
-
-    Attributes:
-        pipeline: the stages up to the estimates.
-        judgements: one of each pair of robots, in the pipeline's order.
-        store: where all of them are kept.
-    """
+    """A scenario's stages in a store: those up to the estimates, and a judgement of each pair."""
 
     pipeline: Pipeline
-    judgements: tuple[Stage, ...]
+    judgements: tuple[Stage, ...]  # in the order of the pipeline's pairs
     store: Store
 
     @classmethod
@@ -84,13 +78,7 @@ class JudgedRun:
         return pd.concat(parts, ignore_index=True)
 
     def execute(self, jobs: int, on_progress: OnProgress, only: Sequence[Stage] = ()) -> None:
-        """Do all that is not in the store yet.
-
-        Args:
-            jobs: processes.
-            on_progress: told (label, tasks done, tasks in all).
-            only: the stages that are wanted; all without.
-        """
+        """Do what is not in the store yet, in `jobs` processes; of `only` these stages, if any."""
         wanted = only or self.stages()
         left = unfinished(self.tasks, [name for stage in wanted for name in task_names(stage)])
         try:

@@ -55,5 +55,5 @@ def run(settings: JudgeSettings, job: Job) -> None:
     met, radius_m = met_maps(robots, estimates, offered), settings.true_pair_radius_m
     errors = error_rows(met, settings.refinement, settings.acceptance, radius_m)
     tables.write(job.output / "errors.parquet", "errors", errors)
-    fusion = fusion_rows(robots, met, settings.merge, radius_m)
+    fusion = fusion_rows(met, settings.merge, radius_m)
     tables.write(job.output / "fusion.parquet", "fusion", fusion)

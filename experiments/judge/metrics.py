@@ -4,7 +4,7 @@ Each takes the tables of one or more runs, pooled, with a column `seed`, and giv
 where the tables hold no row it could be computed from. Errors are compared as medians over seeds,
 robot pairs and iterations, after the repetitions on the same maps: single ratios exceed their bound
 by chance. A new metric is a function with `@metric()`; one that takes a further argument `aligner`
-is of each aligner; several of one shape are one function with `@metric(NAME=COLUMN, ...)`.
+is of each aligner; several of one shape are one function with `@metric(NAME=WHICH, ...)`.
 """
 
 import inspect
@@ -14,14 +14,8 @@ from functools import partial
 import numpy as np
 import pandas as pd
 
-from experiments.judge.criteria import (
-    ORACLE,
-    answerable,
-    at_the_end,
-    is_false_merge,
-    mergeable,
-    rich,
-)
+from experiments.judge import criteria
+from experiments.judge.criteria import ORACLE, rich
 from experiments.judge.judged_maps import error_over_oracle, maps_of
 from experiments.judge.path_errors import path_rms, rms
 
@@ -36,13 +30,13 @@ ALIGNER_METRICS: dict[str, Metric] = {}  # named ALIGNER.NAME, of each aligner
 _PAIR = ["seed", "robot_a", "robot_b"]
 
 
-def metric(**columns: str) -> Callable[[Metric], Metric]:
+def metric(**which: str) -> Callable[[Metric], Metric]:
     """Let scenarios expect this number by the function's name, or one number by each name given."""
 
     def register(function: Metric) -> Metric:
         of_aligner = "aligner" in inspect.signature(function).parameters
         known = ALIGNER_METRICS if of_aligner else METRICS
-        variants = {name: partial(function, column=column) for name, column in columns.items()}
+        variants = {name: partial(function, which=value) for name, value in which.items()}
         known.update(variants or {function.__name__: function})
         return function
 
@@ -54,9 +48,9 @@ def _of(errors: pd.DataFrame, aligner: str) -> pd.DataFrame:
 
 
 @metric(path_rmse_m="path_m", odometry_rmse_m="odometry_m")
-def _path_rmse_m(tables: Tables, column: str) -> float:
+def _path_rmse_m(tables: Tables, which: str) -> float:
     """Error of FastSLAM's online path, or of odometry, RMS over iterations, median over robots."""
-    return path_rms(tables["robots"], ("seed", "robot"))[column].median()
+    return path_rms(tables["robots"], ("seed", "robot"))[which].median()
 
 
 @metric()
@@ -70,9 +64,9 @@ def path_over_odometry(tables: Tables) -> float:
     oracle_rotation_rad="refined_rotation_error_rad",
     true_pairs_at_end="n_true",
 )
-def _oracle_at_the_end(tables: Tables, column: str) -> float:
+def _oracle_at_the_end(tables: Tables, which: str) -> float:
     """The oracle's errors and true pairs at the last iteration, median over seeds and pairs."""
-    return at_the_end(_of(tables["errors"], ORACLE))[column].abs().median()
+    return criteria.at_the_end(_of(tables["errors"], ORACLE))[which].abs().median()
 
 
 def _truly_fused(tables: Tables) -> pd.DataFrame:
@@ -90,34 +84,23 @@ def fused_over_parents(tables: Tables) -> float:
 
 
 @metric(fused_nees_with_drift="nees_with_drift", fused_nees_without_drift="nees_without_drift")
-def _nees_per_dof(tables: Tables, column: str) -> float:
+def _nees_per_dof(tables: Tables, which: str) -> float:
     """Mean NEES per degree of freedom of fused landmarks; 1 is consistent."""
     rows = _truly_fused(tables)
-    return (rows[column] / rows["degrees_of_freedom"]).mean()
+    return (rows[which] / rows["degrees_of_freedom"]).mean()
 
 
-def _fits(tables: Tables, fused: bool) -> pd.DataFrame:
-    """Landmark RMSE after the best rigid fit, of the fused maps or of the robots' own."""
+@metric(landmark_rmse_median_m="median", landmark_rmse_worst_m="max")
+def _landmark_rmse_m(tables: Tables, which: str) -> float:
+    """Robots' landmark RMSE after the best rigid fit: median or worst robot, then seed."""
     fits = tables["map_fits"]
-    return fits[(fits["map"] == "fused") == fused]
-
-
-@metric()
-def landmark_rmse_median_m(tables: Tables) -> float:
-    """Median over robots, then over seeds."""
-    return _fits(tables, fused=False).groupby("seed")["rmse_m"].median().median()
-
-
-@metric()
-def landmark_rmse_worst_m(tables: Tables) -> float:
-    """The worst robot of the worst seed."""
-    return _fits(tables, fused=False)["rmse_m"].max()
+    return fits[fits["map"] != "fused"].groupby("seed")["rmse_m"].agg(which).agg(which)
 
 
 @metric()
 def fused_landmark_rmse_m(tables: Tables) -> float:
-    """The fused map's, median over the seeds."""
-    return _fits(tables, fused=True)["rmse_m"].median()
+    """The fused map's landmark RMSE after the best rigid fit, median over the seeds."""
+    return tables["map_fits"].query("map == 'fused'")["rmse_m"].median()
 
 
 @metric()
@@ -129,17 +112,18 @@ def refined_oracle_distance_m(tables: Tables, aligner: str) -> float:
 @metric(
     refined_over_oracle="refined_translation_error_m", estimated_over_oracle="translation_error_m"
 )
-def _over_oracle(tables: Tables, aligner: str, column: str) -> float:
+def _over_oracle(tables: Tables, aligner: str, which: str) -> float:
     """Median translation error over the oracle's, 30 or more true pairs."""
     errors = rich(tables["errors"])
     maps = maps_of(errors[errors["aligner"].isin([aligner, ORACLE])])
-    return error_over_oracle(maps, column).get(aligner, np.nan)
+    return error_over_oracle(maps, which).get(aligner, np.nan)
 
 
 @metric()
 def estimated_translation_m(tables: Tables, aligner: str) -> float:
     """Median translation error as estimated, iterations with three or more true pairs."""
-    return maps_of(answerable(_of(tables["errors"], aligner)))["translation_error_m"].median()
+    maps = maps_of(criteria.answerable(_of(tables["errors"], aligner)))
+    return maps["translation_error_m"].median()
 
 
 @metric()
@@ -172,13 +156,13 @@ def repetition_spread_m(rows: pd.DataFrame) -> float:
 @metric()
 def false_merges(tables: Tables, aligner: str) -> float:
     """Share of false merges among all of an aligner's answers (pairs, iterations, repetitions)."""
-    return is_false_merge(_of(tables["errors"], aligner)).mean()
+    return criteria.is_false_merge(_of(tables["errors"], aligner)).mean()
 
 
 @metric()
 def missed_merges(tables: Tables, aligner: str) -> float:
     """Share refused of an aligner's answers where there are 20 or more true correspondences."""
-    return (~mergeable(_of(tables["errors"], aligner))["accepted"]).mean()
+    return (~criteria.mergeable(_of(tables["errors"], aligner))["accepted"]).mean()
 
 
 def known_metrics(aligners: list[str]) -> list[str]:

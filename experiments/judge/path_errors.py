@@ -19,7 +19,7 @@ from mapfusion.storage import POSE_FIELDS
 
 SOURCES = ("final", "online", "odometry")
 # From frame to frame, and along a metre of the way: what a filter step and a short drive add.
-RPE_DELTAS = ((1.0, "frames"), (1.0, "m"))
+RPE_DELTA = 1
 # Those between the first and the last are named as numpy's functions are.
 STATISTICS = ("rmse", "mean", "median", "std", "min", "max", "sse")
 
@@ -92,8 +92,8 @@ def pairs_by_frames(known: np.ndarray, delta: int) -> np.ndarray:
 
 def pairs_by_length(positions_m: Float, delta_m: float) -> np.ndarray:
     """Rows (P, 2) between which the way is at least `delta_m` long, one after the other."""
-    steps = np.linalg.norm(np.diff(positions_m, axis=0), axis=1)
     ends, gone = [0], 0.0
+    steps = np.linalg.norm(np.diff(positions_m, axis=0), axis=1)
     for row, step in enumerate(steps, start=1):
         gone += step
         if gone >= delta_m:
@@ -105,10 +105,7 @@ def pairs_by_length(positions_m: Float, delta_m: float) -> np.ndarray:
 def robot_paths(poses: pd.DataFrame, odometry: Float, truth: PathTruth) -> pd.DataFrame:
     """Rows of the tables `paths` and `robots` of one robot, from what the SLAM stage tells.
 
-    Args:
-        poses: final and online ones, and how the filter fared, by frame.
-        odometry: motions (T, 3) from frame to frame.
-        truth: of the robot.
+    Odometry (T, 3) are the motions from frame to frame.
     """
     dead_reckoned = np.array([*accumulate(odometry[1:], se2.compose, initial=np.zeros(3))])
     rows = poses.copy()
@@ -143,11 +140,11 @@ def _errors(
     """What is measured of one path, over how many of which unit, and the errors."""
     yield "ate_m", np.nan, "", ate_m(path, truth)
     yield "ate_from_start_m", np.nan, "", ate_m(path, truth, fit=False)
-    for delta, unit in RPE_DELTAS:
-        if unit == "frames":
-            pairs = pairs_by_frames(known, int(delta))
-        else:
-            pairs = pairs_by_length(truth[:, :2], delta)
+    by_frames, by_length = (
+        pairs_by_frames(known, RPE_DELTA),
+        pairs_by_length(truth[:, :2], RPE_DELTA),
+    )
+    for unit, pairs in (("frames", by_frames), ("m", by_length)):
         length_m, angle_rad = rpe(path, truth, pairs)
-        yield "rpe_m", delta, unit, length_m
-        yield "rpe_rad", delta, unit, angle_rad
+        yield "rpe_m", RPE_DELTA, unit, length_m
+        yield "rpe_rad", RPE_DELTA, unit, angle_rad

@@ -8,41 +8,40 @@ import json
 import platform
 import shutil
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
-from experiments.judge import tables
-from experiments.judge.aligner_times import measure_aligners
-from experiments.judge.consistency import landmark_nees_rows
-from experiments.judge.errors import EvaluatedRobot
-from experiments.judge.fused_landmarks import (
-    FusedTeam,
-    fused_motion_rows,
-    fused_rows,
-    landmark_rows,
-    map_fit_rows,
-)
+from experiments.judge import fused_landmarks, tables
+from experiments.judge.errors import EvaluatedRobot, MetMaps
+from experiments.judge.fused_landmarks import FusedTeam
 from experiments.judge.judged_run import JudgedRun
-from experiments.judge.map_history import history_tables
 from experiments.judge.path_errors import path_statistics_rows, robot_paths
+from experiments.judge.truth import common_landmarks
+from experiments.methods.aligner_calls import callable_aligner
 from experiments.methods.catalogue import find_method
 from experiments.run.code_version import library_versions
 from experiments.run.stages import slam
 from experiments.run.store import Store
 from experiments.run.store_files import link_or_copy
 from experiments.run.tasks import OnProgress
-from experiments.scenario.settings import AnyScenario, Simulation
+from experiments.scenario.randomness import generator
+from experiments.scenario.settings import AnyScenario, Merge, Simulation
+from mapfusion.align.correspondences import Correspondences, match
 from mapfusion.errors import InputError
-from mapfusion.landmark_map import write_map
+from mapfusion.landmark_map import LandmarkMap, write_map
+from mapfusion.merge import merge
 from mapfusion.robot_log import read_log
-from mapfusion.storage import read_table, write_whole
+from mapfusion.storage import point_columns, read_table, write_whole
 from sim.renderer import renderer_name
 
 RESULT_SCHEMA_VERSION = 1
 _LABEL = "write the tables"
+_WARM_UP_RUNS = 1  # compilation and caches
 
 
 def require_result(result: Path) -> None:
@@ -86,6 +85,49 @@ def write_result(run: JudgedRun, folder: Path) -> None:
     _write_json(folder / "provenance.json", provenance(run))
 
 
+def measure_aligners(run: JudgedRun, robots: Sequence[EvaluatedRobot]) -> None:
+    """Time every aligner on each pair's maps of growing overlap; a table already there is kept.
+
+    Serially, when all else is done: nothing else may be running.
+    """
+    by_name = {robot.name: robot for robot in robots}
+    for pair in run.pipeline.pairs:
+        path = run.store.path(pair.estimates) / "aligner_timings.parquet"
+        if not path.is_file():
+            rows = _time_pair(run.scenario, by_name[pair.a.name], by_name[pair.b.name])
+            tables.write(path, "aligner_timings", rows)
+
+
+def _time_pair(scenario: AnyScenario, a: EvaluatedRobot, b: EvaluatedRobot) -> list[dict[str, Any]]:
+    settings, iterations = scenario.evaluate, np.array(sorted({*a.maps, *b.maps}))
+    spread = np.linspace(0, len(iterations) - 1, settings.timing_points)
+    aligners = {
+        entry.name: callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
+        for entry in scenario.align.aligners
+    }
+    rows = []
+    for iteration in iterations[np.unique(spread.round().astype(int))].tolist():
+        (map_a, points_a), (map_b, points_b) = a.at(iteration), b.at(iteration)
+        pairs = match(map_a, map_b, scenario.align.match)
+        maps = {
+            "robot_a": a.name,
+            "robot_b": b.name,
+            "iteration": iteration,
+            "n_correspondences": len(pairs),
+            "n_common": common_landmarks(points_a, points_b, settings.true_pair_radius_m),
+        }
+        for name, aligner in aligners.items():
+            rngs = (
+                generator(scenario.seed, "timing", name, repeat)
+                for repeat in range(_WARM_UP_RUNS + settings.timing_repeats)
+            )
+            elapsed = [aligner.align(map_a, map_b, pairs, rng).elapsed_s for rng in rngs]
+            low, median, high = np.percentile(elapsed[_WARM_UP_RUNS:], [10, 50, 90])
+            times = {"elapsed_s": median, "elapsed_low_s": low, "elapsed_high_s": high}
+            rows.append({**maps, "aligner": name, **times})
+    return rows
+
+
 def all_tables(run: JudgedRun, team: FusedTeam) -> dict[str, pd.DataFrame]:
     """The tables of a finished run's last maps, paths, estimates and errors, by their names."""
     paths, clouds = [], []
@@ -97,16 +139,18 @@ def all_tables(run: JudgedRun, team: FusedTeam) -> dict[str, pd.DataFrame]:
         cloud = read_table(maps / "clouds.parquet", slam.CLOUDS)[0].to_pandas()
         clouds.append(cloud.assign(robot=robot.name))
     joined = pd.concat(paths, ignore_index=True)
+    use_drift = run.scenario.merge.parameters.use_drift
+    radius_m = run.scenario.evaluate.true_pair_radius_m
     rows = {
         "paths": joined,
         "robots": joined,
         "path_statistics": path_statistics_rows(joined),
         "clouds": pd.concat(clouds, ignore_index=True),
-        "landmarks": landmark_rows(team),
-        "fused": fused_rows(team),
-        "fused_motions": fused_motion_rows(team, run.scenario.merge.parameters.use_drift),
-        "map_fits": map_fit_rows(team),
-        "landmark_nees": landmark_nees_rows(team, run.scenario.evaluate.true_pair_radius_m),
+        "landmarks": fused_landmarks.landmark_rows(team),
+        "fused": fused_landmarks.fused_rows(team),
+        "fused_motions": fused_landmarks.fused_motion_rows(team, use_drift),
+        "map_fits": fused_landmarks.map_fit_rows(team),
+        "landmark_nees": fused_landmarks.landmark_nees_rows(team, radius_m),
         "timings": [
             {"stage": stage.name, "name": f"{stage.key}:{name}", "elapsed_s": seconds}
             for stage in run.folders()
@@ -116,6 +160,59 @@ def all_tables(run: JudgedRun, team: FusedTeam) -> dict[str, pd.DataFrame]:
     of_pairs = ("estimates", "correspondences", "errors", "fusion")
     made = {name: pd.DataFrame(rows[name], columns=tables.ALL[name].names) for name in rows}
     return made | {name: run.pair_table(name) for name in of_pairs}
+
+
+def history_tables(team: FusedTeam, scenario: AnyScenario) -> dict[str, pd.DataFrame]:
+    """The tables `map_history`, `true_pairs` and `fused_history`.
+
+    The stages keep the maps whole in the store; what leaves with the result is what one needs to
+    look at them in plan.
+    """
+    maps = [
+        _plan_rows(landmarks).assign(robot=robot.name, iteration=k)
+        for robot in team.robots
+        for k, landmarks in robot.maps.items()
+    ]
+    radius_m = scenario.evaluate.true_pair_radius_m
+    true_pairs = [
+        {
+            **met.names,
+            "n_correspondences": len(met.offered),
+            "true_pair": np.packbits(met.is_true(radius_m)).tobytes(),
+        }
+        for met in team.met
+    ]
+    fused = [_joined_rows(met, scenario.merge) for met in team.met]
+    return {
+        "map_history": pd.concat(maps, ignore_index=True),
+        "true_pairs": pd.DataFrame(true_pairs),
+        "fused_history": pd.concat(fused, ignore_index=True) if fused else pd.DataFrame(),
+    }
+
+
+def _plan_rows(landmarks: LandmarkMap) -> pd.DataFrame:
+    columns = point_columns(landmarks.position_m, landmarks.covariance_m2)
+    return pd.DataFrame({"landmark": np.arange(len(landmarks)), **columns})
+
+
+def _joined_rows(met: MetMaps, settings: Merge) -> pd.DataFrame:
+    """The inliers of the merging aligner's first repetition, fused; none where it was refused.
+
+    Only they are given to the merge: its second pass, which looks for what they missed, takes ten
+    times as long as all the rest of this table.
+    """
+    (map_a, map_b), alignment = met.maps, met.alignment(settings.aligner)
+    pairs = met.offered[np.flatnonzero(alignment.inlier & alignment.ok)]
+    fused, each = map_a[pairs.index_a], np.arange(len(pairs))
+    if alignment.ok:
+        fused = merge(
+            [fused, map_b[pairs.index_b]],
+            [replace(alignment, inlier=np.ones(len(each), dtype=bool))],
+            [Correspondences(each, each, pairs.distance)],
+            settings.parameters,
+        ).landmarks
+    joined = {"landmark_a": pairs.index_a, "landmark_b": pairs.index_b}
+    return _plan_rows(fused).assign(**met.names, **joined)
 
 
 def _write_json(path: Path, content: object) -> None:

@@ -48,8 +48,7 @@ def true_pairs(
 
 def common_landmarks(points_a: Float, points_b: Float, radius_m: float) -> int:
     """How many landmarks of two maps truly correspond: mutual nearest true points within radius."""
-    known_a = points_a[np.isfinite(points_a).all(axis=1)]
-    known_b = points_b[np.isfinite(points_b).all(axis=1)]
+    known_a, known_b = (own[np.isfinite(own).all(axis=1)] for own in (points_a, points_b))
     if not len(known_a) or not len(known_b):
         return 0
     distance, nearest_b = KDTree(known_b).query(known_a)
@@ -67,10 +66,7 @@ class PathTruth:
 
     @classmethod
     def of(cls, truth: RobotTruth) -> "PathTruth":
-        """From poses in the world; the first known pose is taken for the start.
-
-        Recordings may begin a moment before their truth does; the robots stand still by then.
-        """
+        """The start is the first known pose: robots stand still until their truth begins."""
         known = np.isfinite(truth.T_world_robot).all(axis=1)
         start = truth.T_world_robot[int(np.argmax(known))]
         return cls(se2.between(start, truth.T_world_robot), start)

@@ -12,14 +12,7 @@ from experiments.run.store_files import link_or_copy
 from experiments.run.tasks import OnProgress
 from experiments.scenario.loading import load_section
 from experiments.scenario.randomness import generator
-from experiments.scenario.settings import (
-    Align,
-    AlignerEntry,
-    AnyScenario,
-    Merge,
-    Recording,
-    Slam,
-)
+from experiments.scenario.settings import Align, AlignerEntry, AnyScenario, Merge, Recording, Slam
 from mapfusion.align.correspondences import match
 from mapfusion.align.registration import Registration
 from mapfusion.errors import InputError
@@ -46,26 +39,18 @@ def record(
     return [output / robot.name for robot in run.pipeline.robots]
 
 
-def slam_settings(path: Path | None, overrides: Sequence[str]) -> Slam:
-    """The `slam` section of a scenario, or the defaults, with overrides inside it."""
-    return load_section(path, "slam", Slam, overrides)
-
-
-def align_settings(path: Path | None, overrides: Sequence[str]) -> Align:
-    """The `align` section of a scenario, or the defaults, with overrides."""
-    return load_section(path, "align", Align, overrides)
-
-
-def slam(log: Path, settings: Slam, seed: int, on_progress: OnProgress) -> LandmarkMap:
-    """The most probable map at the end of a log."""
+def slam(
+    log: Path, scenario: Path | None, overrides: Sequence[str], seed: int, on_progress: OnProgress
+) -> LandmarkMap:
+    """The most probable map at the end of a log, by the `slam` section of a scenario if given."""
+    settings = load_section(scenario, "slam", Slam, overrides)
     robot_log = read_log(log)
     if not len(robot_log):
         raise InputError(f"{log}: frames.parquet holds no frame")
-    last = len(robot_log) - 1
-    rng = generator(seed, "slam", robot_log.robot)
+    n_frames, rng = len(robot_log), generator(seed, "slam", robot_log.robot)
     landmarks = None
-    for frame in run_log(robot_log, settings.filter, rng, [last], settings.min_count):
-        on_progress("FastSLAM", frame.iteration + 1, last + 1)
+    for frame in run_log(robot_log, settings.filter, rng, [n_frames - 1], settings.min_count):
+        on_progress("FastSLAM", frame.iteration + 1, n_frames)
         landmarks = frame.landmarks
     assert landmarks is not None
     return landmarks
@@ -84,9 +69,12 @@ def _registration(entry: AlignerEntry, settings: Align) -> Registration:
     return Registration(aligner, settings.refinement, settings.acceptance)
 
 
-def align(path_a: Path, path_b: Path, settings: Align, seed: int) -> list[dict[str, Any]]:
+def align(
+    paths: tuple[Path, Path], scenario: Path | None, overrides: Sequence[str], seed: int
+) -> list[dict[str, Any]]:
     """Every aligner's estimate, its refinement and the verdict on it, as rows."""
-    map_a, map_b = read_map(path_a), read_map(path_b)
+    settings = load_section(scenario, "align", Align, overrides)
+    map_a, map_b = map(read_map, paths)
     pairs = match(map_a, map_b, settings.match)
     rows = []
     for entry in settings.aligners:

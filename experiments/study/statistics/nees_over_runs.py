@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from experiments.judge.consistency import mean_nees_band
+from experiments.judge.fused_landmarks import mean_nees_band
 from experiments.study.statistics.bootstrap import Interval, weighted_mean_interval
 
 FUSION_COLUMNS = ("nees_with_drift", "nees_without_drift", "degrees_of_freedom", "true_pair")

@@ -5,9 +5,8 @@ from typing import Any
 
 import pandas as pd
 
-from experiments.judge.aligner_times import measure_aligners
 from experiments.judge.judged_run import JudgedRun
-from experiments.judge.result import all_tables, renderer
+from experiments.judge.result import all_tables, measure_aligners, renderer
 from experiments.run.store import Store
 from experiments.run.tasks import Task, task_names, unfinished
 from experiments.study.sweep.combinations import SweepRun

@@ -3,9 +3,13 @@ import pandas as pd
 import pytest
 from scipy.stats import chi2
 
-from experiments.judge.consistency import landmark_nees, landmark_nees_rows, mean_nees_band
 from experiments.judge.errors import EvaluatedRobot
-from experiments.judge.fused_landmarks import FusedTeam
+from experiments.judge.fused_landmarks import (
+    FusedTeam,
+    landmark_nees,
+    landmark_nees_rows,
+    mean_nees_band,
+)
 from mapfusion import se2
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.result import Alignment, Status

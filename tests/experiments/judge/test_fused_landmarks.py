@@ -55,7 +55,7 @@ def fused_pairs(drift_sigma_m: float, seed: int = 6) -> pd.DataFrame:
         Status.ACCEPTED,
         drift_sigma_m=drift_sigma_m,
     )
-    return fusion_rows([a, b], met(a, b, found), BY_RANSAC, 0.1)
+    return fusion_rows(met(a, b, found), BY_RANSAC, 0.1)
 
 
 def test_fusing_equal_maps_halves_the_variance() -> None:
@@ -93,7 +93,7 @@ def test_fused_landmarks_are_judged_by_the_middle_of_two_truths(planar: bool) ->
     found = Alignment(
         np.zeros(3), np.eye(3), np.ones(6, bool), 0.0, Status.ACCEPTED, drift_sigma_m=0.0
     )
-    rows = fusion_rows([a, b], met(a, b, found), BY_RANSAC, 0.1)
+    rows = fusion_rows(met(a, b, found), BY_RANSAC, 0.1)
     assert rows["error_fused_m"].to_numpy() == pytest.approx(0, abs=1e-9)
     assert rows["error_a_m"].to_numpy() == pytest.approx(0.04)
     assert rows["error_b_m"].to_numpy() == pytest.approx(0.04)
