@@ -74,7 +74,7 @@ class JudgedRun:
         made = self.judgements if name in _JUDGED else [p.estimates for p in self.pipeline.pairs]
         parts = [tables.read(self.store.path(s) / f"{name}.parquet", name) for s in made]
         if not parts:
-            return pd.DataFrame(columns=pd.Index(tables.ALL[name].names))
+            return tables.framed(name, [])
         return pd.concat(parts, ignore_index=True)
 
     def execute(self, jobs: int, on_progress: OnProgress, only: Sequence[Stage] = ()) -> None:

@@ -141,7 +141,7 @@ def all_tables(run: JudgedRun, team: FusedTeam) -> dict[str, pd.DataFrame]:
     joined = pd.concat(paths, ignore_index=True)
     use_drift = run.scenario.merge.parameters.use_drift
     radius_m = run.scenario.evaluate.true_pair_radius_m
-    rows = {
+    rows: dict[str, Any] = {
         "paths": joined,
         "robots": joined,
         "path_statistics": path_statistics_rows(joined),
@@ -158,7 +158,7 @@ def all_tables(run: JudgedRun, team: FusedTeam) -> dict[str, pd.DataFrame]:
         ],
     }
     of_pairs = ("estimates", "correspondences", "errors", "fusion")
-    made = {name: pd.DataFrame(rows[name], columns=tables.ALL[name].names) for name in rows}
+    made = {name: tables.framed(name, table) for name, table in rows.items()}
     return made | {name: run.pair_table(name) for name in of_pairs}
 
 

@@ -143,9 +143,14 @@ def table_path(result: Path, name: str) -> Path:
     return result / "tables" / f"{name}.parquet"
 
 
+def framed(name: str, rows: pd.DataFrame | list[dict[str, Any]]) -> pd.DataFrame:
+    """Rows with the columns of the table of that name alone; of no rows, columns of any type."""
+    return pd.DataFrame(rows if len(rows) else [], columns=pd.Index(ALL[name].names))
+
+
 def write(path: Path, name: str, rows: pd.DataFrame | list[dict[str, Any]]) -> None:
     """Write rows as the table of that name."""
-    frames.write_rows(path, ALL[name], rows)
+    frames.write_rows(path, ALL[name], framed(name, rows))
 
 
 def read(path: Path, name: str) -> pd.DataFrame:
