@@ -46,9 +46,8 @@ def slam(
     from experiments.judge import user_files as single
     from experiments.show.terminal import layout, step_screen
 
-    slam_settings = single.slam_settings(settings, overrides)
     with layout.progress() as show:
-        landmarks = single.slam(log, slam_settings, seed, show)
+        landmarks = single.slam(log, settings, overrides, seed, show)
     single.save_map(output, landmarks)
     step_screen.print_map(output, landmarks)
 
@@ -66,7 +65,7 @@ def align(
     from experiments.judge import user_files as single
     from experiments.show.terminal.step_screen import print_estimates
 
-    print_estimates(single.align(map_a, map_b, single.align_settings(settings, overrides), seed))
+    print_estimates(single.align((map_a, map_b), settings, overrides, seed))
 
 
 @app.command()

@@ -14,11 +14,7 @@ from mapfusion.errors import InputError
 
 
 def load_checked(path: Path, overrides: Sequence[str] = (), seed: int | None = None) -> AnyScenario:
-    """A scenario as `load_scenario` gives it, whose `expect` block names metrics that exist.
-
-    Raises:
-        InputError: as `load_scenario`; an unknown metric, with the known ones.
-    """
+    """A scenario as `load_scenario` gives it; raises InputError also for unknown metrics."""
     scenario = load_scenario(path, overrides, seed)
     known = metrics.known_metrics([entry.name for entry in scenario.align.aligners])
     unknown = sorted(set(scenario.expect) - set(known))
@@ -54,29 +50,26 @@ class Outcome:
         return f"{low}x{high}"
 
 
-def pooled_tables(results: Mapping[int, Path]) -> dict[str, pd.DataFrame]:
-    """The tables that metrics read, of result folders by seed, with a column `seed`."""
-    return {
-        name: pd.concat(
-            [
-                tables.read(tables.table_path(result, name), name).assign(seed=seed)
-                for seed, result in results.items()
-            ],
-            ignore_index=True,
-        )
-        for name in metrics.USED_TABLES
-    }
-
-
 def check(scenario: AnyScenario, results: Mapping[int, Path]) -> list[Outcome]:
     """Measure every expectation of a scenario over its results by seed."""
-    pooled = pooled_tables(results)
-    outcomes = []
-    for name, bound in scenario.expect.items():
-        per_seed = {
-            seed: metrics.compute(name, {k: t[t["seed"] == seed] for k, t in pooled.items()})
-            for seed in results
+    own = {
+        seed: {
+            name: tables.read(tables.table_path(result, name), name).assign(seed=seed)
+            for name in metrics.USED_TABLES
         }
-        value = metrics.compute(name, pooled)
-        outcomes.append(Outcome(scenario.name, name, value, bound, per_seed))
-    return outcomes
+        for seed, result in results.items()
+    }
+    pooled = {
+        name: pd.concat([held[name] for held in own.values()], ignore_index=True)
+        for name in metrics.USED_TABLES
+    }
+    return [
+        Outcome(
+            scenario.name,
+            name,
+            metrics.compute(name, pooled),
+            bound,
+            {seed: metrics.compute(name, held) for seed, held in own.items()},
+        )
+        for name, bound in scenario.expect.items()
+    ]

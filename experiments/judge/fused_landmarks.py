@@ -1,184 +1,247 @@
-"""Fused landmarks against the truth: was fusing worth it, and do the covariances say so?"""
+"""Landmarks against the truth, before merging and after: was it worth it, do covariances say so?
 
-from dataclasses import replace
+The normalised estimation error squared (NEES; Bar-Shalom, Li, Kirubarajan 2001, ch. 5.4) of a
+landmark is chi-square distributed, with as many degrees of freedom as it has coordinates, if its
+covariance is right. Maps are compared with the truth in their own frame, the robot's true start
+pose, without a fit: what the path's drift does to a landmark is part of its error.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from experiments.judge.errors import EvaluatedRobot
-from experiments.judge.truth import fit_rmse_m
-from experiments.run.estimates import alignment_of, correspondences_of
+from experiments.judge.errors import EvaluatedRobot, MetMaps
+from experiments.judge.truth import degrees_of_freedom, fit_rmse_m, squared_mahalanobis
 from mapfusion import se2
-from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.result import Alignment, degenerate
 from mapfusion.aligned_landmarks import ABSENT
+from mapfusion.chi_square import chi_square_bound
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.merge import FusedMap, MergeParameters, merge
 from mapfusion.se2 import Float
+from mapfusion.storage import named_columns, point_columns
+
+GATE_PROBABILITY = 0.95
 
 
-def fused_maps(
-    maps: list[LandmarkMap],
-    estimates: pd.DataFrame,
-    correspondences: pd.DataFrame,
-    aligner: str,
-    parameters: MergeParameters,
-) -> FusedMap:
-    """Fuse maps in the frame of the first by an aligner's first repetition.
+@dataclass(frozen=True)
+class MergeSettings:
+    """Whose alignments maps are merged by, and how."""
 
-    Args:
-        maps: of the robots, the first's first.
-        estimates: rows of the table `estimates` at one iteration, of any pairs.
-        correspondences: the pairs offered there.
-        aligner: whose refined estimates to merge by.
-        parameters: how to merge.
-    """
-    chosen = first_repetition(estimates, aligner)
-    alignments: list[Alignment] = []
-    offered: list[Correspondences] = []
-    for other in maps[1:]:
-        names = {"robot_a": maps[0].name, "robot_b": other.name}
-        rows = _of_pair(chosen, names)
-        pairs = correspondences_of(_of_pair(correspondences, names))
-        offered.append(pairs)
-        if len(rows):
-            alignments.append(alignment_of(rows.iloc[0].to_dict(), len(pairs)))
-        else:
-            alignments.append(degenerate("was never aligned", len(pairs)))
-    return merge(maps, alignments, offered, parameters)
+    aligner: str
+    parameters: MergeParameters
 
 
-def first_repetition(estimates: pd.DataFrame, aligner: str) -> pd.DataFrame:
-    """What maps are merged by: repetitions are for the spread of a method, not for the map."""
-    return estimates[(estimates["aligner"] == aligner) & (estimates["repetition"] == 0)]
+@dataclass(frozen=True)
+class FusedTeam:
+    """Robots' maps at one iteration, and what they were merged into, in the first one's frame."""
+
+    robots: Sequence[EvaluatedRobot]
+    met: Sequence[MetMaps]  # at all iterations
+    iteration: int
+    fused: FusedMap | None  # None for a single robot
+
+    @classmethod
+    def of(
+        cls, robots: Sequence[EvaluatedRobot], met: Sequence[MetMaps], settings: MergeSettings
+    ) -> "FusedTeam":
+        """Merge the robots' last maps by their last alignments with the first one's."""
+        last = max(max(robot.maps) for robot in robots)
+        if len(robots) < 2:
+            return cls(robots, met, last, None)
+        first, *others = robots
+        # a pair's last iteration is at the later of its two robots' last frames
+        ends = {each.b.name: each for each in met if each.a is first}
+        fused = merge(
+            [robot.at(last)[0] for robot in robots],
+            [ends[other.name].alignment(settings.aligner) for other in others],
+            [ends[other.name].offered for other in others],
+            settings.parameters,
+        )
+        return cls(robots, met, last, fused)
+
+    def truth_of(self, fused: FusedMap) -> Float:
+        """True points (N, 3) of fused landmarks: the mean of their parents'; NaN if unknown."""
+        points = self.parent_points(fused)
+        known = np.all(np.isfinite(points), axis=2, keepdims=True)
+        total, count = np.where(known, points, 0.0).sum(axis=1), np.count_nonzero(known, axis=1)
+        return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+    def parent_points(self, fused: FusedMap) -> Float:
+        """True points (N, M, 3) of each fused landmark's parents; NaN where none or unknown."""
+        points = np.full((*fused.parents.shape, 3), np.nan)
+        for k, robot in enumerate(self.robots):
+            has = fused.parents[:, k] != ABSENT
+            points[has, k] = robot.at(self.iteration)[1][fused.parents[has, k]]
+        return points
+
+    def judged(self) -> list[tuple[str, LandmarkMap, Float]]:
+        """Name, map and true points (N, 3) in the world of each robot's map and the fused one."""
+        found = [(robot.name, *robot.at(self.iteration)) for robot in self.robots]
+        if self.fused is not None:
+            found.append(("fused", self.fused.landmarks, self.truth_of(self.fused)))
+        return found
 
 
-def _of_pair(rows: pd.DataFrame, names: dict[str, str]) -> pd.DataFrame:
-    keep = (rows["robot_a"] == names["robot_a"]) & (rows["robot_b"] == names["robot_b"])
-    return rows[keep]
-
-
-def fusion_rows(
-    a: EvaluatedRobot,
-    b: EvaluatedRobot,
-    estimates: pd.DataFrame,
-    correspondences: pd.DataFrame,
-    aligner: str,
-    parameters: MergeParameters,
-    radius_m: float,
-) -> list[dict[str, Any]]:
+def fusion_rows(met: Sequence[MetMaps], settings: MergeSettings, radius_m: float) -> pd.DataFrame:
     """Rows of the table `fusion`: landmarks of one pair fused at the last iteration."""
-    last = int(estimates["iteration"].max())
-    estimates = estimates[estimates["iteration"] == last]
-    correspondences = correspondences[correspondences["iteration"] == last]
-    (map_a, points_a), (map_b, points_b) = a.at(last), b.at(last)
+    robots = met[0].a, met[0].b
+    parameters = (replace(settings.parameters, use_drift=use_drift) for use_drift in (True, False))
     with_drift, without_drift = (
-        fused_maps(
-            [map_a, map_b],
-            estimates,
-            correspondences,
-            aligner,
-            replace(parameters, use_drift=use_drift),
-        )
-        for use_drift in (True, False)
+        _pair_rows(FusedTeam.of(robots, met, replace(settings, parameters=each)))
+        for each in parameters
     )
-    nees_without = {
-        (int(i), int(j)): value for i, j, value, _ in _judged(without_drift, a, points_a, points_b)
-    }
-    T_a_b = with_drift.T_first_map[1]
-    dof = 2 if map_a.planar else 3
-    rows = []
-    for i, j, nees, error_m in _judged(with_drift, a, points_a, points_b):
-        truth = _truth_in_a(a, points_a[i], points_b[j])
-        moved_b = se2.transform_points(T_a_b, map_b.position_m[j][None])[0]
-        rows.append(
-            {
-                "robot_a": a.name,
-                "robot_b": b.name,
-                "landmark_a": i,
-                "landmark_b": j,
-                "error_a_m": np.linalg.norm(map_a.position_m[i] - truth),
-                "error_b_m": np.linalg.norm(moved_b - truth),
-                "error_fused_m": error_m,
-                "nees_with_drift": nees,
-                "nees_without_drift": nees_without.get((i, j), np.nan),
-                "degrees_of_freedom": dof,
-                "true_pair": bool(np.linalg.norm(points_a[i] - points_b[j]) <= radius_m),
-            }
-        )
-    return rows
+    other = without_drift[["landmark_a", "landmark_b", "nees"]]
+    rows = with_drift.merge(
+        other, "left", ["landmark_a", "landmark_b"], suffixes=("_with_drift", "_without_drift")
+    )
+    return rows.assign(true_pair=rows["apart_m"] <= radius_m)
 
 
-def _truth_in_a(a: EvaluatedRobot, point_a: Float, point_b: Float) -> Float:
-    """The true point (3,) in robot a's map frame: the middle of what both landmarks show."""
-    middle = ((point_a + point_b) / 2)[None]
-    return se2.transform_points(se2.inverse(a.path.T_world_map), middle)[0]
-
-
-def _judged(
-    fused: FusedMap, a: EvaluatedRobot, points_a: Float, points_b: Float
-) -> list[tuple[int, int, float, float]]:
-    """(row of a, row of b, NEES, error in m) of each landmark with two parents."""
+def _pair_rows(pair: FusedTeam) -> pd.DataFrame:
+    """Landmarks with two parents, held against the middle of what both of these show."""
+    (a, b), fused = pair.robots, pair.fused
+    assert fused is not None
+    (map_a, points_a), (map_b, points_b) = a.at(pair.iteration), b.at(pair.iteration)
     both = np.flatnonzero((fused.parents != ABSENT).all(axis=1))
-    judged = []
-    for row in both:
-        i, j = (int(parent) for parent in fused.parents[row])
-        error = fused.landmarks.position_m[row] - _truth_in_a(a, points_a[i], points_b[j])
-        used = 2 if fused.landmarks.planar else 3
-        covariance = fused.landmarks.covariance_m2[row, :used, :used]
-        nees = float(error[:used] @ np.linalg.solve(covariance, error[:used]))
-        judged.append((i, j, nees, float(np.linalg.norm(error))))
-    return judged
-
-
-def parent_points(fused: FusedMap, robots: list[EvaluatedRobot], iteration: int) -> Float:
-    """True world points (N, M, 3) of each fused landmark's parents; NaN where none or unknown."""
-    points = np.full((*fused.parents.shape, 3), np.nan)
-    for k, robot in enumerate(robots):
-        has = fused.parents[:, k] != ABSENT
-        points[has, k] = robot.at(iteration)[1][fused.parents[has, k]]
-    return points
-
-
-def fused_truth(fused: FusedMap, robots: list[EvaluatedRobot], iteration: int) -> Float:
-    """True world points (N, 3) of fused landmarks: the mean of their parents'; NaN if unknown."""
-    points = parent_points(fused, robots, iteration)
-    known = np.all(np.isfinite(points), axis=2)
-    total = np.where(known[:, :, None], points, 0.0).sum(axis=1)
-    count = np.count_nonzero(known, axis=1, keepdims=True)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
-
-
-def fused_motion_rows(
-    robots: list[EvaluatedRobot], fused: FusedMap | None, parameters: MergeParameters
-) -> list[dict[str, Any]]:
-    """Rows of the table `fused_motions`: how each robot's map was moved into the fused one."""
-    if fused is None:
-        return []
-    why = dict(fused.left_out)
-    return [
+    i, j = fused.parents[both].T
+    # points one by one, [:, None]: products of matrices differ in their last bits from these
+    truth = a.in_map_frame(((points_a[i] + points_b[j]) / 2)[:, None])[:, 0]
+    moved_b = se2.transform_points(fused.T_first_map[1], map_b.position_m[j][:, None])[:, 0]
+    error = fused.landmarks.position_m[both] - truth
+    used = degrees_of_freedom(fused.landmarks)
+    covariance = fused.landmarks.covariance_m2[both, :used, :used]
+    return pd.DataFrame(
         {
-            "robot": robot.name,
-            **dict(zip(("tx_m", "ty_m", "theta_rad"), fused.T_first_map[place], strict=True)),
-            "drift_sigma_m": fused.drift_sigma_m[place] if parameters.use_drift else 0.0,
-            "left_out": why.get(robot.name, ""),
+            "robot_a": a.name,
+            "robot_b": b.name,
+            "landmark_a": i,
+            "landmark_b": j,
+            "error_a_m": _lengths(map_a.position_m[i] - truth),
+            "error_b_m": _lengths(moved_b - truth),
+            "error_fused_m": _lengths(error),
+            "nees": squared_mahalanobis(error[:, :used], covariance),
+            "degrees_of_freedom": used,
+            "apart_m": _lengths(points_a[i] - points_b[j]),
         }
-        for place, robot in enumerate(robots)
-    ]
+    )
 
 
-def map_fit_rows(
-    robots: list[EvaluatedRobot], fused: FusedMap | None, iteration: int
-) -> list[dict[str, Any]]:
+def _lengths(vectors: Float) -> Float:
+    return np.sqrt(np.vecdot(vectors, vectors))
+
+
+def landmark_rows(team: FusedTeam) -> pd.DataFrame:
+    """Rows of the table `landmarks`."""
+    parts = [_landmark_columns(robot, *robot.at(team.iteration)) for robot in team.robots]
+    return pd.concat(parts, ignore_index=True)
+
+
+def _landmark_columns(owner: EvaluatedRobot, landmarks: LandmarkMap, points: Float) -> pd.DataFrame:
+    """Landmarks of a map and their true points in the frame of the robot's maps."""
+    columns = point_columns(landmarks.position_m, landmarks.covariance_m2)
+    columns |= named_columns(("truth_x_m", "truth_y_m", "truth_z_m"), owner.in_map_frame(points))
+    return pd.DataFrame({"landmark": np.arange(len(landmarks)), **columns}).assign(
+        robot=owner.name, count=landmarks.count
+    )
+
+
+def fused_rows(team: FusedTeam) -> pd.DataFrame:
+    """Rows of the table `fused`; none for a single robot."""
+    fused = team.fused
+    if fused is None:
+        return pd.DataFrame()
+    rows = _landmark_columns(team.robots[0], fused.landmarks, team.truth_of(fused))
+    has = fused.parents != ABSENT
+    names = np.array([robot.name for robot in team.robots], dtype=object)
+    first = np.argmax(has, axis=1)
+    later = has & (np.arange(len(names)) > first[:, None])
+    second, several = np.argmax(later, axis=1), later.any(axis=1)
+    each = np.arange(len(rows))
+    return rows.assign(
+        n_parents=has.sum(axis=1),
+        robot_a=names[first],
+        landmark_a=fused.parents[each, first],
+        robot_b=np.where(several, names[second], ""),
+        landmark_b=np.where(several, fused.parents[each, second], ABSENT),
+    )
+
+
+def fused_motion_rows(team: FusedTeam, use_drift: bool) -> pd.DataFrame:
+    """Rows of the table `fused_motions`: how each robot's map was moved into the fused one."""
+    if team.fused is None:
+        return pd.DataFrame()
+    names, why = [robot.name for robot in team.robots], dict(team.fused.left_out)
+    motions = named_columns(("tx_m", "ty_m", "theta_rad"), team.fused.T_first_map)
+    return pd.DataFrame({"robot": names, **motions}).assign(
+        drift_sigma_m=team.fused.drift_sigma_m if use_drift else 0.0,
+        left_out=[why.get(name, "") for name in names],
+    )
+
+
+def map_fit_rows(team: FusedTeam) -> pd.DataFrame:
     """Rows of the table `map_fits`: each robot's map, and the fused one, against the truth."""
-    rows = []
-    for robot in robots:
-        landmarks, points = robot.at(iteration)
-        n, rmse_m = fit_rmse_m(landmarks.position_m, points)
-        rows.append({"map": robot.name, "n_landmarks": n, "rmse_m": rmse_m})
+    fits = ((name, *fit_rmse_m(own.position_m, points)) for name, own, points in team.judged())
+    return pd.DataFrame(fits, columns=["map", "n_landmarks", "rmse_m"])
+
+
+def landmark_nees(landmarks: LandmarkMap, point_m: Float) -> Float:
+    """NEES (N,) of landmarks by true points (N, 3) in the map's frame; NaN where unknown."""
+    used = degrees_of_freedom(landmarks)
+    error = (landmarks.position_m - point_m)[:, :used]
+    covariance = landmarks.covariance_m2[:, :used, :used]
+    return np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[..., None])[..., 0])
+
+
+def mean_nees_band(n: float, dof: int, probability: float = GATE_PROBABILITY) -> Float:
+    """Where the mean of n independent NEES over their degrees of freedom lies, if consistent.
+
+    Their sum is chi-square with n dof degrees of freedom (Bar-Shalom et al. 2001, eq. 5.4.2-14).
+    """
+    tail = (1 - probability) / 2
+    ends = [chi_square_bound(share, n * dof) for share in (tail, 1 - tail)]
+    return np.array(ends) / (n * dof)
+
+
+def landmark_nees_rows(team: FusedTeam, radius_m: float) -> list[dict[str, Any]]:
+    """Rows of the table `landmark_nees`: each robot's map, and what became of it when merged.
+
+    Landmarks whose true points lie within the radius are one; fused ones whose parents are not have
+    no single truth and are left out of "fused" and "before fusing".
+    """
+    rows, fused = [], team.fused
+    true_rows = np.zeros(0, np.int64) if fused is None else _truly_fused(team, fused, radius_m)
+    for place, robot in enumerate(team.robots):
+        landmarks, points = robot.at(team.iteration)
+        nees = landmark_nees(landmarks, robot.in_map_frame(points))
+        rows.append(_row(robot.name, "own", landmarks, nees))
+        if fused is not None:
+            parents = fused.parents[true_rows, place]
+            fused_nees = nees[parents[parents != ABSENT]]
+            rows.append(_row(robot.name, "before fusing", landmarks, fused_nees))
     if fused is not None:
-        truth = fused_truth(fused, robots, iteration)
-        n, rmse_m = fit_rmse_m(fused.landmarks.position_m, truth)
-        rows.append({"map": "fused", "n_landmarks": n, "rmse_m": rmse_m})
+        nees = landmark_nees(fused.landmarks, team.robots[0].in_map_frame(team.truth_of(fused)))
+        single = np.count_nonzero(fused.parents != ABSENT, axis=1) == 1
+        rows.append(_row("fused", "fused", fused.landmarks, nees[true_rows]))
+        rows.append(_row("fused", "carried over", fused.landmarks, nees[single]))
     return rows
+
+
+def _truly_fused(team: FusedTeam, fused: FusedMap, radius_m: float) -> np.ndarray:
+    """Rows of the fused map with several parents, all of which show one true point."""
+    points, has = team.parent_points(fused), fused.parents != ABSENT
+    apart = np.linalg.norm(points[:, :, None] - points[:, None], axis=3)
+    both = has[:, :, None] & has[:, None]
+    together = np.all(~both | (apart <= radius_m), axis=(1, 2))  # NaN is not together
+    return np.flatnonzero(together & (has.sum(axis=1) > 1))
+
+
+def _row(name: str, which: str, landmarks: LandmarkMap, nees: Float) -> dict[str, Any]:
+    nees, dof = nees[np.isfinite(nees)], degrees_of_freedom(landmarks)
+    row = {"map": name, "landmarks": which, "n_landmarks": len(nees), "degrees_of_freedom": dof}
+    if len(nees):
+        row |= {"nees_mean": nees.mean(), "nees_median": np.median(nees)}
+        row |= {"share_in_gate": np.mean(nees <= chi_square_bound(GATE_PROBABILITY, dof))}
+    return row

@@ -27,19 +27,14 @@ OPTIONAL = tuple(name for name in SHOWN if name not in NEEDED)  # older runs may
 
 
 def maps_of(errors: pd.DataFrame) -> pd.DataFrame:
-    """One row per run, pair of maps and aligner.
+    """One row per run, pair of maps and aligner, from the tables `errors` of some runs.
 
-    Args:
-        errors: the table `errors` of some runs, with the run's columns in front.
-
-    Returns:
-        The run's columns, robot_a, robot_b, iteration, aligner; n_repetitions; as shares of the
-        repetitions estimated_success and refined_success (NaN for maps without common ground, where
-        there is nothing to be right about), accepted, false_accepted (see `is_false_merge`) and
-        refused_apart (NaN for maps with common ground), the last three NaN for runs without an
-        acceptance test; the median absolute errors, infinite where most repetitions gave no
-        estimate; further columns that are shown; n_correspondences, n_true, n_common,
-        outlier_share.
+    Columns: the run's, robot_a, robot_b, iteration, aligner; n_repetitions; as shares of the
+    repetitions estimated_success and refined_success (NaN for maps without common ground, where
+    there is nothing to be right about), accepted, false_accepted (see `is_false_merge`) and
+    refused_apart (NaN for maps with common ground), the last three NaN for runs without an
+    acceptance test; the median absolute errors, infinite where most repetitions gave no estimate;
+    further columns that are shown; n_correspondences, n_true, n_common, outlier_share.
     """
     ground = has_common_ground(errors)
     accepted = errors.get("accepted", pd.Series(np.nan, errors.index)).astype(float)

@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 import pandas as pd
 
 from experiments.judge import judging, tables
-from experiments.judge.errors import EvaluatedRobot
+from experiments.judge.errors import EvaluatedRobot, met_maps
+from experiments.judge.fused_landmarks import FusedTeam, MergeSettings
 from experiments.run.pipeline import PairStages, Pipeline, RobotStages, lay_out
 from experiments.run.stage import Stage
 from experiments.run.stages.slam import RobotFolders
@@ -23,16 +23,10 @@ _JUDGED = {"errors", "fusion"}  # the other tables of pairs come from the aligne
 
 @dataclass(frozen=True)
 class JudgedRun:
-    """A scenario's stages in a store.
-
-    Attributes:
-        pipeline: the stages up to the estimates.
-        judgements: one of each pair of robots, in the pipeline's order.
-        store: where all of them are kept.
-    """
+    """A scenario's stages in a store: those up to the estimates, and a judgement of each pair."""
 
     pipeline: Pipeline
-    judgements: tuple[Stage, ...]
+    judgements: tuple[Stage, ...]  # in the order of the pipeline's pairs
     store: Store
 
     @classmethod
@@ -68,22 +62,23 @@ class JudgedRun:
         """All robots' maps joined with the truth."""
         return [judging.load_robot(self.robot_folders(robot)) for robot in self.pipeline.robots]
 
+    def load_team(self) -> FusedTeam:
+        """The same, their last maps merged."""
+        robots = self.load_robots()
+        estimates, offered = (self.pair_table(name) for name in ("estimates", "correspondences"))
+        met = met_maps(robots, estimates, offered)
+        return FusedTeam.of(robots, met, MergeSettings(**dict(self.scenario.merge)))
+
     def pair_table(self, name: str) -> pd.DataFrame:
         """A table of robot pairs, of all pairs."""
         made = self.judgements if name in _JUDGED else [p.estimates for p in self.pipeline.pairs]
         parts = [tables.read(self.store.path(s) / f"{name}.parquet", name) for s in made]
         if not parts:
-            return pd.DataFrame(columns=pd.Index(tables.ALL[name].names))
+            return tables.framed(name, [])
         return pd.concat(parts, ignore_index=True)
 
     def execute(self, jobs: int, on_progress: OnProgress, only: Sequence[Stage] = ()) -> None:
-        """Do all that is not in the store yet.
-
-        Args:
-            jobs: processes.
-            on_progress: told (label, tasks done, tasks in all).
-            only: the stages that are wanted; all without.
-        """
+        """Do what is not in the store yet, in `jobs` processes; of `only` these stages, if any."""
         wanted = only or self.stages()
         left = unfinished(self.tasks, [name for stage in wanted for name in task_names(stage)])
         try:
@@ -101,20 +96,9 @@ def _judgement(scenario: AnyScenario, pair: PairStages) -> Stage:
     settings = judging.JudgeSettings(
         scenario.align.refinement,
         scenario.align.acceptance,
-        scenario.merge.aligner,
-        scenario.merge.parameters,
+        MergeSettings(**dict(scenario.merge)),
         scenario.evaluate.true_pair_radius_m,
     )
-    before = {"align": pair.estimates, "log_a": pair.a.log, "slam_a": pair.a.slam}
-    before |= {"log_b": pair.b.log, "slam_b": pair.b.slam}
+    before = {**pair.match.before, "align": pair.estimates}
     label = "compare with the truth"
     return Stage("judge", label, settings, judging.run, judging.WRITES, before)
-
-
-def record_logs(
-    scenario: AnyScenario, store: Store, jobs: int, on_progress: OnProgress
-) -> dict[str, Path]:
-    """Simulate only; returns each robot's log folder in the store."""
-    laid_out = JudgedRun.of(scenario, store)
-    laid_out.execute(jobs, on_progress, laid_out.pipeline.to_logs())
-    return {robot.name: store.path(robot.log) for robot in laid_out.pipeline.robots}

@@ -3,15 +3,14 @@
 from dataclasses import dataclass
 
 from experiments.judge import tables
-from experiments.judge.errors import EvaluatedRobot, error_rows
-from experiments.judge.fused_landmarks import fusion_rows
+from experiments.judge.errors import EvaluatedRobot, error_rows, met_maps
+from experiments.judge.fused_landmarks import MergeSettings, fusion_rows
 from experiments.judge.truth import PathTruth, landmark_truth
 from experiments.run.job import Job
 from experiments.run.stages.slam import RobotFolders, read_associations, read_snapshots
 from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.refine import Refinement
 from mapfusion.errors import InputError
-from mapfusion.merge import MergeParameters
 from mapfusion.robot_log import read_log, read_truth
 
 WRITES = ("errors.parquet", "fusion.parquet")
@@ -23,8 +22,7 @@ class JudgeSettings:
 
     refinement: Refinement
     acceptance: Acceptance
-    merge_aligner: str
-    merge: MergeParameters
+    merge: MergeSettings
     true_pair_radius_m: float
 
 
@@ -46,18 +44,16 @@ def load_robot(folders: RobotFolders) -> EvaluatedRobot:
 
 def run(settings: JudgeSettings, job: Job) -> None:
     """Write the pair's `errors.parquet` and `fusion.parquet`."""
-    a, b = (
+    robots = [
         load_robot(RobotFolders(job.inputs[f"log_{side}"], job.inputs[f"slam_{side}"]))
         for side in "ab"
-    )
+    ]
     estimates, offered = (
         tables.read(job.inputs["align"] / f"{name}.parquet", name)
         for name in ("estimates", "correspondences")
     )
-    radius_m = settings.true_pair_radius_m
-    errors = error_rows(
-        a, b, estimates, offered, settings.refinement, settings.acceptance, radius_m
-    )
+    met, radius_m = met_maps(robots, estimates, offered), settings.true_pair_radius_m
+    errors = error_rows(met, settings.refinement, settings.acceptance, radius_m)
     tables.write(job.output / "errors.parquet", "errors", errors)
-    fusion = fusion_rows(a, b, estimates, offered, settings.merge_aligner, settings.merge, radius_m)
+    fusion = fusion_rows(met, settings.merge, radius_m)
     tables.write(job.output / "fusion.parquet", "fusion", fusion)

@@ -5,47 +5,43 @@
 """
 
 import json
+import platform
 import shutil
 from collections.abc import Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from experiments.judge import tables
-from experiments.judge.aligner_times import time_aligners
-from experiments.judge.consistency import landmark_nees_rows
-from experiments.judge.errors import EvaluatedRobot, path_columns, robot_rows
-from experiments.judge.fused_landmarks import (
-    fused_maps,
-    fused_motion_rows,
-    fused_truth,
-    map_fit_rows,
-)
+from experiments.judge import fused_landmarks, tables
+from experiments.judge.errors import EvaluatedRobot, MetMaps
+from experiments.judge.fused_landmarks import FusedTeam
 from experiments.judge.judged_run import JudgedRun
-from experiments.judge.map_history import write_history
-from experiments.judge.path_errors import path_statistics_rows
-from experiments.judge.provenance import provenance
+from experiments.judge.path_errors import path_statistics_rows, robot_paths
+from experiments.judge.truth import common_landmarks
+from experiments.methods.aligner_calls import callable_aligner
+from experiments.methods.catalogue import find_method
+from experiments.run.code_version import library_versions
 from experiments.run.stages import slam
 from experiments.run.store import Store
 from experiments.run.store_files import link_or_copy
 from experiments.run.tasks import OnProgress
+from experiments.scenario.randomness import generator
 from experiments.scenario.settings import AnyScenario, Merge, Simulation
-from mapfusion import se2
-from mapfusion.aligned_landmarks import ABSENT
+from mapfusion.align.correspondences import Correspondences, match
 from mapfusion.errors import InputError
 from mapfusion.landmark_map import LandmarkMap, write_map
-from mapfusion.merge import FusedMap
+from mapfusion.merge import merge
 from mapfusion.robot_log import read_log
-from mapfusion.se2 import Float
 from mapfusion.storage import point_columns, read_table, write_whole
+from sim.renderer import renderer_name
 
+RESULT_SCHEMA_VERSION = 1
 _LABEL = "write the tables"
-
-
-def result_folder(results: Path, scenario: AnyScenario) -> Path:
-    """Where the result of a scenario goes: `RESULTS/NAME-SEED`."""
-    return results / f"{scenario.name}-{scenario.seed}"
+_WARM_UP_RUNS = 1  # compilation and caches
 
 
 def require_result(result: Path) -> None:
@@ -58,13 +54,13 @@ def require_result(result: Path) -> None:
 def run_scenario(
     scenario: AnyScenario, results: Path, jobs: int, on_progress: OnProgress, fresh: bool = False
 ) -> Path:
-    """Run a scenario and write its result folder; returns the folder."""
+    """Run a scenario and write its result folder `RESULTS/NAME-SEED`; returns the folder."""
     run = JudgedRun.of(scenario, Store.of(results))
     if fresh:
         for stage_folder in run.folders():
             stage_folder.discard()
     run.execute(jobs, on_progress)
-    folder = result_folder(results, scenario)
+    folder = results / f"{scenario.name}-{scenario.seed}"
     on_progress(_LABEL, 0, 1)
     write_result(run, folder)
     on_progress(_LABEL, 1, 1)
@@ -73,18 +69,150 @@ def run_scenario(
 
 def write_result(run: JudgedRun, folder: Path) -> None:
     """Collect a finished plan's tables, maps and images in a result folder."""
-    scenario, robots = run.scenario, run.load_robots()
-    measure_aligners(run, robots)
-    _join_pair_tables(run, folder)
-    _write_robot_tables(run, robots, folder)
+    team = run.load_team()
+    measure_aligners(run, team.robots)
+    rows = all_tables(run, team) | history_tables(team, run.scenario)
+    rows |= {"aligner_timings": run.pair_table("aligner_timings"), "tracks": _tracks(run)}
+    for name, table in rows.items():
+        tables.write(tables.table_path(folder, name), name, table)
     for outdated in ("maps", "keyframes"):  # of robots or frames that are no longer there
         shutil.rmtree(folder / outdated, ignore_errors=True)
-    _write_maps(run, robots, folder)
-    write_history(robots, scenario, folder)
+    for name, landmarks, _ in team.judged():
+        write_map(folder / "maps" / f"{name}.parquet", landmarks)
     _write_images(run, folder)
-    _write_json(folder / "scenario.json", scenario.resolved())
-    _write_json(folder / "world.json", _world(scenario, robots))
+    _write_json(folder / "scenario.json", run.scenario.resolved())
+    _write_json(folder / "world.json", _world(run.scenario, team.robots))
     _write_json(folder / "provenance.json", provenance(run))
+
+
+def measure_aligners(run: JudgedRun, robots: Sequence[EvaluatedRobot]) -> None:
+    """Time every aligner on each pair's maps of growing overlap; a table already there is kept.
+
+    Serially, when all else is done: nothing else may be running.
+    """
+    by_name = {robot.name: robot for robot in robots}
+    for pair in run.pipeline.pairs:
+        path = run.store.path(pair.estimates) / "aligner_timings.parquet"
+        if not path.is_file():
+            rows = _time_pair(run.scenario, by_name[pair.a.name], by_name[pair.b.name])
+            tables.write(path, "aligner_timings", rows)
+
+
+def _time_pair(scenario: AnyScenario, a: EvaluatedRobot, b: EvaluatedRobot) -> list[dict[str, Any]]:
+    settings, iterations = scenario.evaluate, np.array(sorted({*a.maps, *b.maps}))
+    spread = np.linspace(0, len(iterations) - 1, settings.timing_points)
+    aligners = {
+        entry.name: callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
+        for entry in scenario.align.aligners
+    }
+    rows = []
+    for iteration in iterations[np.unique(spread.round().astype(int))].tolist():
+        (map_a, points_a), (map_b, points_b) = a.at(iteration), b.at(iteration)
+        pairs = match(map_a, map_b, scenario.align.match)
+        maps = {
+            "robot_a": a.name,
+            "robot_b": b.name,
+            "iteration": iteration,
+            "n_correspondences": len(pairs),
+            "n_common": common_landmarks(points_a, points_b, settings.true_pair_radius_m),
+        }
+        for name, aligner in aligners.items():
+            rngs = (
+                generator(scenario.seed, "timing", name, repeat)
+                for repeat in range(_WARM_UP_RUNS + settings.timing_repeats)
+            )
+            elapsed = [aligner.align(map_a, map_b, pairs, rng).elapsed_s for rng in rngs]
+            low, median, high = np.percentile(elapsed[_WARM_UP_RUNS:], [10, 50, 90])
+            times = {"elapsed_s": median, "elapsed_low_s": low, "elapsed_high_s": high}
+            rows.append({**maps, "aligner": name, **times})
+    return rows
+
+
+def all_tables(run: JudgedRun, team: FusedTeam) -> dict[str, pd.DataFrame]:
+    """The tables of a finished run's last maps, paths, estimates and errors, by their names."""
+    paths, clouds = [], []
+    for stages, robot in zip(run.pipeline.robots, team.robots, strict=True):
+        log, maps = run.robot_folders(stages)
+        poses = read_table(maps / "poses.parquet", slam.POSES)[0].to_pandas()
+        own = robot_paths(poses, read_log(log).odometry, robot.path)
+        paths.append(own.assign(robot=robot.name))
+        cloud = read_table(maps / "clouds.parquet", slam.CLOUDS)[0].to_pandas()
+        clouds.append(cloud.assign(robot=robot.name))
+    joined = pd.concat(paths, ignore_index=True)
+    use_drift = run.scenario.merge.parameters.use_drift
+    radius_m = run.scenario.evaluate.true_pair_radius_m
+    rows: dict[str, Any] = {
+        "paths": joined,
+        "robots": joined,
+        "path_statistics": path_statistics_rows(joined),
+        "clouds": pd.concat(clouds, ignore_index=True),
+        "landmarks": fused_landmarks.landmark_rows(team),
+        "fused": fused_landmarks.fused_rows(team),
+        "fused_motions": fused_landmarks.fused_motion_rows(team, use_drift),
+        "map_fits": fused_landmarks.map_fit_rows(team),
+        "landmark_nees": fused_landmarks.landmark_nees_rows(team, radius_m),
+        "timings": [
+            {"stage": stage.name, "name": f"{stage.key}:{name}", "elapsed_s": seconds}
+            for stage in run.folders()
+            for name, seconds in stage.figures().items()
+        ],
+    }
+    of_pairs = ("estimates", "correspondences", "errors", "fusion")
+    made = {name: tables.framed(name, table) for name, table in rows.items()}
+    return made | {name: run.pair_table(name) for name in of_pairs}
+
+
+def history_tables(team: FusedTeam, scenario: AnyScenario) -> dict[str, pd.DataFrame]:
+    """The tables `map_history`, `true_pairs` and `fused_history`.
+
+    The stages keep the maps whole in the store; what leaves with the result is what one needs to
+    look at them in plan.
+    """
+    maps = [
+        _plan_rows(landmarks).assign(robot=robot.name, iteration=k)
+        for robot in team.robots
+        for k, landmarks in robot.maps.items()
+    ]
+    radius_m = scenario.evaluate.true_pair_radius_m
+    true_pairs = [
+        {
+            **met.names,
+            "n_correspondences": len(met.offered),
+            "true_pair": np.packbits(met.is_true(radius_m)).tobytes(),
+        }
+        for met in team.met
+    ]
+    fused = [_joined_rows(met, scenario.merge) for met in team.met]
+    return {
+        "map_history": pd.concat(maps, ignore_index=True),
+        "true_pairs": pd.DataFrame(true_pairs),
+        "fused_history": pd.concat(fused, ignore_index=True) if fused else pd.DataFrame(),
+    }
+
+
+def _plan_rows(landmarks: LandmarkMap) -> pd.DataFrame:
+    columns = point_columns(landmarks.position_m, landmarks.covariance_m2)
+    return pd.DataFrame({"landmark": np.arange(len(landmarks)), **columns})
+
+
+def _joined_rows(met: MetMaps, settings: Merge) -> pd.DataFrame:
+    """The inliers of the merging aligner's first repetition, fused; none where it was refused.
+
+    Only they are given to the merge: its second pass, which looks for what they missed, takes ten
+    times as long as all the rest of this table.
+    """
+    (map_a, map_b), alignment = met.maps, met.alignment(settings.aligner)
+    pairs = met.offered[np.flatnonzero(alignment.inlier & alignment.ok)]
+    fused, each = map_a[pairs.index_a], np.arange(len(pairs))
+    if alignment.ok:
+        fused = merge(
+            [fused, map_b[pairs.index_b]],
+            [replace(alignment, inlier=np.ones(len(each), dtype=bool))],
+            [Correspondences(each, each, pairs.distance)],
+            settings.parameters,
+        ).landmarks
+    joined = {"landmark_a": pairs.index_a, "landmark_b": pairs.index_b}
+    return _plan_rows(fused).assign(**met.names, **joined)
 
 
 def _write_json(path: Path, content: object) -> None:
@@ -94,144 +222,45 @@ def _write_json(path: Path, content: object) -> None:
 
 def _world(scenario: AnyScenario, robots: Sequence[EvaluatedRobot]) -> dict[str, object]:
     """The truth that figures show as background."""
-    walls = (
-        [list(wall.points) for wall in scenario.world.walls]
-        if isinstance(scenario, Simulation)
-        else []
-    )
+    walls = scenario.world.walls if isinstance(scenario, Simulation) else []
     starts = {robot.name: robot.path.T_world_map.tolist() for robot in robots}
-    return {"walls": walls, "robots": starts}
+    return {"walls": [list(wall.points) for wall in walls], "robots": starts}
 
 
-def measure_aligners(run: JudgedRun, robots: Sequence[EvaluatedRobot]) -> None:
-    """Time the aligners, serially, when all else is done: nothing else may be running."""
-    by_name = {robot.name: robot for robot in robots}
-    for pair in run.pipeline.pairs:
-        path = run.store.path(pair.estimates) / "aligner_timings.parquet"
-        time_aligners(run.scenario, by_name[pair.a.name], by_name[pair.b.name], path)
+def renderer(scenario: AnyScenario) -> str:
+    """What made the pictures."""
+    if isinstance(scenario, Simulation):
+        return renderer_name(scenario.render.renderer)
+    return "none (imported logs)"
 
 
-def _join_pair_tables(run: JudgedRun, folder: Path) -> None:
-    for name in ("aligner_timings", "estimates", "correspondences", "errors", "fusion"):
-        tables.write(tables.table_path(folder, name), name, run.pair_table(name))
-
-
-def robot_tables(run: JudgedRun, robots: Sequence[EvaluatedRobot]) -> dict[str, pd.DataFrame]:
-    """The tables `paths`, `path_statistics`, `robots` and `clouds`, of all robots."""
-    paths, online, clouds = [], [], []
-    for stages, robot in zip(run.pipeline.robots, robots, strict=True):
-        log, maps = run.robot_folders(stages)
-        poses = read_table(maps / "poses.parquet", slam.POSES)[0].to_pandas()
-        joined = path_columns(poses, read_log(log).odometry, robot.path)
-        paths.append(joined.assign(robot=robot.name))
-        online.append(robot_rows(poses, joined).assign(robot=robot.name))
-        cloud = read_table(maps / "clouds.parquet", slam.CLOUDS)[0].to_pandas()
-        clouds.append(cloud.assign(robot=robot.name))
-    made = {
-        name: pd.concat(parts, ignore_index=True)
-        for name, parts in (("paths", paths), ("robots", online), ("clouds", clouds))
-    }
-    return made | {"path_statistics": pd.DataFrame(path_statistics_rows(made["paths"]))}
-
-
-def _write_robot_tables(run: JudgedRun, robots: Sequence[EvaluatedRobot], folder: Path) -> None:
-    for name, rows in robot_tables(run, robots).items():
-        tables.write(tables.table_path(folder, name), name, rows)
-    timings = [
-        {"stage": stage.name, "name": f"{stage.key}:{name}", "elapsed_s": seconds}
-        for stage in run.folders()
-        for name, seconds in stage.figures().items()
-    ]
-    tables.write(tables.table_path(folder, "timings"), "timings", timings)
-
-
-def _write_maps(run: JudgedRun, robots: list[EvaluatedRobot], folder: Path) -> None:
-    last = max(max(robot.maps) for robot in robots)
-    landmark_rows = []
-    for robot in robots:
-        landmarks, points = robot.at(last)
-        write_map(folder / "maps" / f"{robot.name}.parquet", landmarks)
-        truth = se2.transform_points(se2.inverse(robot.path.T_world_map), points)
-        rows = _landmark_columns(landmarks, truth) | {"count": landmarks.count}
-        landmark_rows.append(pd.DataFrame({"robot": robot.name} | rows))
-    joined = pd.concat(landmark_rows, ignore_index=True)
-    tables.write(tables.table_path(folder, "landmarks"), "landmarks", joined)
-    estimates, offered = (
-        tables.read(tables.table_path(folder, name), name)
-        for name in ("estimates", "correspondences")
-    )
-    fused = fused_map(run.scenario.merge, robots, estimates, offered, last)
-    if fused is not None:
-        write_map(folder / "maps" / "fused.parquet", fused.landmarks)
-    motions = fused_motion_rows(robots, fused, run.scenario.merge.parameters)
-    tables.write(tables.table_path(folder, "fused_motions"), "fused_motions", motions)
-    fits = map_fit_rows(robots, fused, last)
-    tables.write(tables.table_path(folder, "map_fits"), "map_fits", fits)
-    nees = landmark_nees_rows(robots, fused, last, run.scenario.evaluate.true_pair_radius_m)
-    tables.write(tables.table_path(folder, "landmark_nees"), "landmark_nees", nees)
-    fused_rows = [] if fused is None else _fused_rows(fused, robots, last)
-    tables.write(tables.table_path(folder, "fused"), "fused", fused_rows)
-
-
-def fused_map(
-    settings: Merge,
-    robots: Sequence[EvaluatedRobot],
-    estimates: pd.DataFrame,
-    offered: pd.DataFrame,
-    last: int,
-) -> FusedMap | None:
-    """All robots' last maps fused, from all pairs' estimates; None for a single robot."""
-    if len(robots) < 2:
-        return None
-    # a pair's last estimates are at the later of its two robots' last frames
-    ends = estimates.groupby(["robot_a", "robot_b"])["iteration"].transform("max")
-    offered_ends = offered.merge(
-        estimates[["robot_a", "robot_b", "iteration"]][
-            estimates["iteration"] == ends
-        ].drop_duplicates()
-    )
-    maps = [robot.at(last)[0] for robot in robots]
-    return fused_maps(
-        maps,
-        estimates[estimates["iteration"] == ends],
-        offered_ends,
-        settings.aligner,
-        settings.parameters,
-    )
-
-
-def _landmark_columns(landmarks: LandmarkMap, truth: Float) -> dict[str, np.ndarray]:
+def provenance(run: JudgedRun) -> dict[str, Any]:
+    """JSON-able description of a run: enough to make it again, or to see why it cannot be."""
     return {
-        "landmark": np.arange(len(landmarks)),
-        **point_columns(landmarks.position_m, landmarks.covariance_m2),
-        **{f"truth_{axis}_m": truth[:, i] for i, axis in enumerate("xyz")},
+        "schema_version": RESULT_SCHEMA_VERSION,
+        "scenario": run.scenario.name,
+        "seed": run.scenario.seed,
+        "renderer": renderer(run.scenario),
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "libraries": library_versions(),
+        "written": datetime.now(UTC).isoformat(timespec="seconds"),
+        "others_aligners": {
+            entry.name: origin
+            for entry in run.scenario.align.aligners
+            if (origin := find_method(entry.method).origin())
+        },
+        "stages": {f"{folder.name}/{folder.key}": folder.finished for folder in run.folders()},
     }
 
 
-def _fused_rows(fused: FusedMap, robots: list[EvaluatedRobot], iteration: int) -> pd.DataFrame:
-    truth = fused_truth(fused, robots, iteration)
-    truth = se2.transform_points(se2.inverse(robots[0].path.T_world_map), truth)
-    rows = pd.DataFrame(_landmark_columns(fused.landmarks, truth))
-    has = fused.parents != ABSENT
-    names = np.array([robot.name for robot in robots], dtype=object)
-    first = np.argmax(has, axis=1)
-    later = has & (np.arange(len(robots)) > first[:, None])
-    second = np.where(later.any(axis=1), np.argmax(later, axis=1), ABSENT)
-    each = np.arange(len(rows))
-    rows["n_parents"] = has.sum(axis=1)
-    rows["robot_a"] = names[first]
-    rows["landmark_a"] = fused.parents[each, first]
-    rows["robot_b"] = np.where(second != ABSENT, names[second], "")
-    rows["landmark_b"] = np.where(second != ABSENT, fused.parents[each, second], ABSENT)
-    return rows
+def _tracks(run: JudgedRun) -> pd.DataFrame:
+    files = [run.store.path(robot.observed) / "tracks.parquet" for robot in run.pipeline.simulated]
+    return pd.concat([pd.DataFrame(), *(tables.read(file, "tracks") for file in files)])
 
 
 def _write_images(run: JudgedRun, folder: Path) -> None:
-    tracks = []
     for robot in run.pipeline.simulated:
         for path in sorted(run.store.path(robot.features).glob("image_*.png")):
             iteration = int(path.stem.removeprefix("image_"))
             link_or_copy(path, folder / "keyframes" / f"{robot.name}_{iteration:05d}.png")
-        tracks.append(tables.read(run.store.path(robot.observed) / "tracks.parquet", "tracks"))
-    joined = pd.concat(tracks, ignore_index=True) if tracks else []
-    tables.write(tables.table_path(folder, "tracks"), "tracks", joined)

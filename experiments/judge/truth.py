@@ -18,12 +18,8 @@ def landmark_truth(
 ) -> dict[int, Float]:
     """The true world point (N, 3) of each landmark of each evaluated map; NaN where unknown.
 
-    It is the median of the true points of all observations that went into the landmark.
-
-    Args:
-        truth: of the robot that built the maps.
-        associations: changes by iteration, as the SLAM stage lists them.
-        maps: by iteration.
+    It is the median of the true points of all observations that went into the landmark;
+    `associations` are changes by iteration, as the SLAM stage lists them.
     """
     owner = np.full(len(truth.point_world_m), -1, dtype=np.int64)
     changes = dict(iter(associations.groupby("from_iteration")))
@@ -52,8 +48,7 @@ def true_pairs(
 
 def common_landmarks(points_a: Float, points_b: Float, radius_m: float) -> int:
     """How many landmarks of two maps truly correspond: mutual nearest true points within radius."""
-    known_a = points_a[np.isfinite(points_a).all(axis=1)]
-    known_b = points_b[np.isfinite(points_b).all(axis=1)]
+    known_a, known_b = (own[np.isfinite(own).all(axis=1)] for own in (points_a, points_b))
     if not len(known_a) or not len(known_b):
         return 0
     distance, nearest_b = KDTree(known_b).query(known_a)
@@ -71,18 +66,10 @@ class PathTruth:
 
     @classmethod
     def of(cls, truth: RobotTruth) -> "PathTruth":
-        """From poses in the world; the first known pose is taken for the start.
-
-        Recordings may begin a moment before their truth does; the robots stand still by then.
-        """
-        start = first_known_pose(truth)
+        """The start is the first known pose: robots stand still until their truth begins."""
+        known = np.isfinite(truth.T_world_robot).all(axis=1)
+        start = truth.T_world_robot[int(np.argmax(known))]
         return cls(se2.between(start, truth.T_world_robot), start)
-
-
-def first_known_pose(truth: RobotTruth) -> Float:
-    """T_world_map (3,): the first pose that is known."""
-    known = np.isfinite(truth.T_world_robot).all(axis=1)
-    return truth.T_world_robot[int(np.argmax(known))]
 
 
 def fit_rmse_m(position_m: Float, point_world_m: Float) -> tuple[int, float]:
@@ -94,3 +81,13 @@ def fit_rmse_m(position_m: Float, point_world_m: Float) -> tuple[int, float]:
     T_world_map = np.array(fit_rigid(target, points, np.arange(len(points))))
     residual = se2.transform_points(T_world_map, points) - target
     return int(known.sum()), float(np.sqrt(np.mean(np.sum(residual**2, axis=1))))
+
+
+def degrees_of_freedom(landmarks: LandmarkMap) -> int:
+    """Coordinates that a landmark was estimated in."""
+    return 2 if landmarks.planar else 3
+
+
+def squared_mahalanobis(error: Float, covariance: Float) -> Float:
+    """Of errors (..., D) by their covariances (..., D, D)."""
+    return np.vecdot(error, np.linalg.solve(covariance, error[..., None])[..., 0])

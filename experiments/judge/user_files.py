@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.judge.judged_run import record_logs
+from experiments.judge.judged_run import JudgedRun
 from experiments.methods.aligner_calls import callable_aligner
 from experiments.run.estimates import estimate_row
 from experiments.run.store import Store
@@ -12,7 +12,7 @@ from experiments.run.store_files import link_or_copy
 from experiments.run.tasks import OnProgress
 from experiments.scenario.loading import load_section
 from experiments.scenario.randomness import generator
-from experiments.scenario.settings import Align, AnyScenario, Merge, Recording, Slam
+from experiments.scenario.settings import Align, AlignerEntry, AnyScenario, Merge, Recording, Slam
 from mapfusion.align.correspondences import match
 from mapfusion.align.registration import Registration
 from mapfusion.errors import InputError
@@ -31,33 +31,26 @@ def record(
         raise InputError(
             f"scenario {scenario.name}: uses recorded logs, there is nothing to record"
         )
-    logs = record_logs(scenario, Store.of(results), jobs, on_progress)
-    for name, folder in logs.items():
-        for path in sorted(folder.glob("*.parquet")):
-            link_or_copy(path, output / name / path.name)
-    return [output / name for name in logs]
+    run = JudgedRun.of(scenario, Store.of(results))
+    run.execute(jobs, on_progress, run.pipeline.to_logs())
+    for robot in run.pipeline.robots:
+        for path in sorted(run.store.path(robot.log).glob("*.parquet")):
+            link_or_copy(path, output / robot.name / path.name)
+    return [output / robot.name for robot in run.pipeline.robots]
 
 
-def slam_settings(path: Path | None, overrides: Sequence[str]) -> Slam:
-    """The `slam` section of a scenario, or the defaults, with overrides inside it."""
-    return load_section(path, "slam", Slam, overrides)
-
-
-def align_settings(path: Path | None, overrides: Sequence[str]) -> Align:
-    """The `align` section of a scenario, or the defaults, with overrides."""
-    return load_section(path, "align", Align, overrides)
-
-
-def slam(log: Path, settings: Slam, seed: int, on_progress: OnProgress) -> LandmarkMap:
-    """The most probable map at the end of a log."""
+def slam(
+    log: Path, scenario: Path | None, overrides: Sequence[str], seed: int, on_progress: OnProgress
+) -> LandmarkMap:
+    """The most probable map at the end of a log, by the `slam` section of a scenario if given."""
+    settings = load_section(scenario, "slam", Slam, overrides)
     robot_log = read_log(log)
     if not len(robot_log):
         raise InputError(f"{log}: frames.parquet holds no frame")
-    last = len(robot_log) - 1
-    rng = generator(seed, "slam", robot_log.robot)
+    n_frames, rng = len(robot_log), generator(seed, "slam", robot_log.robot)
     landmarks = None
-    for frame in run_log(robot_log, settings.filter, rng, [last], settings.min_count):
-        on_progress("FastSLAM", frame.iteration + 1, last + 1)
+    for frame in run_log(robot_log, settings.filter, rng, [n_frames - 1], settings.min_count):
+        on_progress("FastSLAM", frame.iteration + 1, n_frames)
         landmarks = frame.landmarks
     assert landmarks is not None
     return landmarks
@@ -71,24 +64,25 @@ def save_map(path: Path, landmarks: LandmarkMap) -> None:
         raise InputError(f"{path}: cannot be written ({error.strerror})") from error
 
 
-def align(path_a: Path, path_b: Path, settings: Align, seed: int) -> list[dict[str, Any]]:
+def _registration(entry: AlignerEntry, settings: Align) -> Registration:
+    aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
+    return Registration(aligner, settings.refinement, settings.acceptance)
+
+
+def align(
+    paths: tuple[Path, Path], scenario: Path | None, overrides: Sequence[str], seed: int
+) -> list[dict[str, Any]]:
     """Every aligner's estimate, its refinement and the verdict on it, as rows."""
-    map_a, map_b = read_map(path_a), read_map(path_b)
+    settings = load_section(scenario, "align", Align, overrides)
+    map_a, map_b = map(read_map, paths)
     pairs = match(map_a, map_b, settings.match)
     rows = []
     for entry in settings.aligners:
-        aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
-        registration = Registration(aligner, settings.refinement, settings.acceptance)
         rng = generator(seed, "align", entry.name)
-        done = registration.register(map_a, map_b, pairs, rng)
-        rows.append(
-            {
-                "aligner": entry.name,
-                "n_inliers": int(done.refined.inlier.sum()),
-                "elapsed_s": done.estimated.elapsed_s,
-            }
-            | estimate_row(len(pairs), *done)
-        )
+        done = _registration(entry, settings).register(map_a, map_b, pairs, rng)
+        n_inliers, elapsed_s = int(done.refined.inlier.sum()), done.estimated.elapsed_s
+        row = {"aligner": entry.name, "n_inliers": n_inliers, "elapsed_s": elapsed_s}
+        rows.append(row | estimate_row(len(pairs), *done))
     return rows
 
 
@@ -103,15 +97,14 @@ def merge(
     entries = {entry.name: entry for entry in align_section.aligners}
     if settings.aligner not in entries:
         raise InputError(f"merge.aligner: {settings.aligner} is not among {', '.join(entries)}")
-    entry = entries[settings.aligner]
-    maps = [read_map(path) for path in paths]
-    aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
-    registration = Registration(aligner, align_section.refinement, align_section.acceptance)
-    alignments, offered = [], []
-    for number, other in enumerate(maps[1:], start=1):
-        pairs = match(maps[0], other, align_section.match)
-        rng = generator(seed, "align", entry.name, number)
-        alignments.append(registration.register(maps[0], other, pairs, rng).applied)
-        offered.append(pairs)
+    first, *others = maps = [read_map(path) for path in paths]
+    registration = _registration(entries[settings.aligner], align_section)
+    offered = [match(first, other, align_section.match) for other in others]
+    alignments = [
+        registration.register(
+            first, other, pairs, generator(seed, "align", settings.aligner, number)
+        ).applied
+        for number, (other, pairs) in enumerate(zip(others, offered, strict=True), start=1)
+    ]
     fused = merge_maps(maps, alignments, offered, settings.parameters)
     return fused, [str(path) for path in paths]

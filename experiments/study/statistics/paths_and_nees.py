@@ -3,7 +3,7 @@
 import numpy as np
 import pandas as pd
 
-from experiments.judge.consistency import mean_nees_band
+from experiments.judge.fused_landmarks import mean_nees_band
 from experiments.judge.path_errors import STATISTICS
 from experiments.study.statistics.bootstrap import (
     WeightedMedian,

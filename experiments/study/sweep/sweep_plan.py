@@ -8,11 +8,8 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from experiments.judge.consistency import landmark_nees_rows
-from experiments.judge.fused_landmarks import map_fit_rows
 from experiments.judge.judged_run import JudgedRun
-from experiments.judge.provenance import renderer
-from experiments.judge.result import fused_map, measure_aligners, robot_tables
+from experiments.judge.result import all_tables, measure_aligners, renderer
 from experiments.run.store import Store
 from experiments.run.tasks import Task, task_names, unfinished
 from experiments.scenario.suite import scenarios_of
@@ -51,6 +48,9 @@ def prepare(
     folder = output or results / "sweeps" / name
     # absolute: workers may have been started elsewhere
     return Sweep(runs, Store.of(results.resolve()), SweepDataset(folder.resolve(), tuple(axes)))
+
+
+_TABLES = ("errors", "fusion", "robots", "path_statistics", "map_fits", "landmark_nees")
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,17 +97,8 @@ def write_rows(run: SweepRun, judged: JudgedRun, dataset: SweepDataset) -> None:
 
 
 def _run_tables(judged: JudgedRun) -> dict[str, pd.DataFrame | list[dict[str, Any]]]:
-    robots = judged.load_robots()
-    of_robots = robot_tables(judged, robots)
-    last = max(max(robot.maps) for robot in robots)
-    estimates, offered = (judged.pair_table(name) for name in ("estimates", "correspondences"))
-    fused = fused_map(judged.scenario.merge, robots, estimates, offered, last)
-    radius_m = judged.scenario.evaluate.true_pair_radius_m
-    return {
-        **{name: judged.pair_table(name) for name in ("errors", "fusion")},
-        **{name: of_robots[name] for name in ("robots", "path_statistics")},
-        "map_fits": map_fit_rows(robots, fused, last),
-        "landmark_nees": landmark_nees_rows(robots, fused, last, radius_m),
+    made = all_tables(judged, judged.load_team())
+    return {name: made[name] for name in _TABLES} | {
         RUN_TIMES: [
             {"stage": folder.name, "key": folder.key, "figure": name, "seconds": seconds}
             for folder in judged.folders()

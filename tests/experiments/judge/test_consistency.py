@@ -3,12 +3,17 @@ import pandas as pd
 import pytest
 from scipy.stats import chi2
 
-from experiments.judge.consistency import landmark_nees, landmark_nees_rows, mean_nees_band
 from experiments.judge.errors import EvaluatedRobot
+from experiments.judge.fused_landmarks import (
+    FusedTeam,
+    landmark_nees,
+    landmark_nees_rows,
+    mean_nees_band,
+)
 from mapfusion import se2
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.result import Alignment, Status
-from mapfusion.merge import FusedMap, MergeParameters, merge
+from mapfusion.merge import MergeParameters, merge
 from mapfusion.se2 import Float
 from tests.helpers.made_up_maps import ITERATION, landmark_map, robot
 
@@ -44,13 +49,14 @@ def test_band_narrows_as_one_over_the_root_of_n() -> None:
         assert high - low == pytest.approx(2 * 1.96 * np.sqrt(2 / (n * dof)), rel=0.02)
 
 
-def merged(a: EvaluatedRobot, b: EvaluatedRobot, pairs: np.ndarray) -> FusedMap:
+def merged(a: EvaluatedRobot, b: EvaluatedRobot, pairs: np.ndarray) -> FusedTeam:
     T_a_b = se2.between(T_WORLD_A, T_WORLD_B)
     n = len(pairs)
     found = Alignment(T_a_b, np.eye(3), np.ones(n, bool), 0.0, Status.ACCEPTED, drift_sigma_m=0.0)
     offered = Correspondences(pairs[:, 0], pairs[:, 1], np.zeros(n))
     maps = [a.maps[ITERATION], b.maps[ITERATION]]
-    return merge(maps, [found], [offered], MergeParameters())
+    fused = merge(maps, [found], [offered], MergeParameters())
+    return FusedTeam([a, b], [], ITERATION, fused)
 
 
 def two_robots(points_a: Float, points_b: Float) -> tuple[EvaluatedRobot, EvaluatedRobot]:
@@ -65,7 +71,7 @@ def test_before_and_after_merging_consistent_maps() -> None:
     # only the first 1200 are common ground
     a, b = two_robots(points, np.where(np.arange(2000)[:, None] < 1200, points, points + 500))
     pairs = np.stack([np.arange(1200)] * 2, axis=1)
-    rows = pd.DataFrame(landmark_nees_rows([a, b], merged(a, b, pairs), ITERATION, 0.1))
+    rows = pd.DataFrame(landmark_nees_rows(merged(a, b, pairs), 0.1))
     counts = rows.set_index(["map", "landmarks"])["n_landmarks"].to_dict()
     assert counts == {
         ("A", "own"): 2000,
@@ -89,8 +95,8 @@ def test_false_pairs_have_no_truth_and_unknown_landmarks_no_nees() -> None:
     a, b = two_robots(points, elsewhere)
     a.points_world_m[ITERATION] = points.copy()
     a.points_world_m[ITERATION][1] = np.nan
-    fused = merged(a, b, np.stack([np.arange(4)] * 2, axis=1))
-    rows = pd.DataFrame(landmark_nees_rows([a, b], fused, ITERATION, 0.1))
+    team = merged(a, b, np.stack([np.arange(4)] * 2, axis=1))
+    rows = pd.DataFrame(landmark_nees_rows(team, 0.1))
     counts = rows.set_index(["map", "landmarks"])["n_landmarks"].to_dict()
     assert counts[("fused", "fused")] == counts[("A", "before fusing")] == 2
     assert counts[("A", "own")] == 5
@@ -98,5 +104,5 @@ def test_false_pairs_have_no_truth_and_unknown_landmarks_no_nees() -> None:
 
 def test_one_robot_alone() -> None:
     a, _ = two_robots(np.zeros((0, 3)), np.zeros((0, 3)))
-    rows = landmark_nees_rows([a], None, ITERATION, 0.1)
+    rows = landmark_nees_rows(FusedTeam([a], [], ITERATION, None), 0.1)
     assert [(row["landmarks"], row["n_landmarks"]) for row in rows] == [("own", 0)]

@@ -7,9 +7,9 @@ from experiments.judge.errors import (
     EvaluatedRobot,
     alignment_nees,
     error_rows,
-    path_columns,
-    robot_rows,
+    met_maps,
 )
+from experiments.judge.path_errors import robot_paths
 from experiments.judge.truth import PathTruth
 from experiments.run.estimates import alignment_of, estimate_row, inlier_mask
 from mapfusion import se2
@@ -30,9 +30,8 @@ def judged(estimated: Alignment, refined: Alignment, index_b: list[int]) -> pd.D
     row = names | {"aligner": "ransac", "repetition": 0}
     estimates = pd.DataFrame([row | estimate_row(len(pairs), estimated, refined, ACCEPTED)])
     a, b = robot("A", POINTS, T_WORLD_A), robot("B", POINTS, T_WORLD_B)
-    offers = offered("A", "B", pairs)
-    rows = error_rows(a, b, estimates, offers, Refinement(), Acceptance(), 0.1)
-    return pd.DataFrame(rows).set_index("aligner")
+    met = met_maps([a, b], estimates, offered("A", "B", pairs))
+    return error_rows(met, Refinement(), Acceptance(), 0.1).set_index("aligner")
 
 
 def alignment(T_a_b: np.ndarray, inlier: list[bool]) -> Alignment:
@@ -172,13 +171,12 @@ def test_paths_and_their_errors() -> None:
         poses[f"online_{name}"] = truth[:, i] + (0.3, 0.3, 2 * np.pi)[i]
     for name in ("effective_sample_size", "resampled", "n_landmarks", "spread_m"):
         poses[name] = 1
-    paths = path_columns(poses, odometry, PathTruth(truth, np.zeros(3)))
-    dead_reckoned = paths[["odometry_x_m", "odometry_y_m"]].to_numpy()
+    rows = robot_paths(poses, odometry, PathTruth(truth, np.zeros(3)))
+    dead_reckoned = rows[["odometry_x_m", "odometry_y_m"]].to_numpy()
     turn = quarter + 0.1
     expected = [[0, 0], [1, 0], [1 + np.cos(turn), np.sin(turn)]]
     np.testing.assert_allclose(dead_reckoned[:3], expected, atol=1e-12)
-    np.testing.assert_array_equal(paths["final_x_m"], truth[:, 0])
-    rows = robot_rows(poses, paths)
+    np.testing.assert_array_equal(rows["final_x_m"], truth[:, 0])
     np.testing.assert_allclose(rows["path_error_m"], np.hypot(0.3, 0.3))
     np.testing.assert_allclose(rows["path_error_rad"], 0, atol=1e-12)  # a whole turn is none
     np.testing.assert_allclose(rows["odometry_error_rad"], [0, 0.1, 0.1, 0.1], atol=1e-12)

@@ -4,10 +4,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from experiments.judge.errors import EvaluatedRobot, MetMaps, met_maps
 from experiments.judge.fused_landmarks import (
-    fused_maps,
+    FusedTeam,
+    MergeSettings,
     fused_motion_rows,
-    fused_truth,
     fusion_rows,
     map_fit_rows,
 )
@@ -23,6 +24,18 @@ T_WORLD_A = np.array([1.0, 2.0, 0.3])
 T_WORLD_B = np.array([4.0, -1.0, 3.0])
 N = 3000
 SIGMA_M = 0.02
+BY_RANSAC = MergeSettings("ransac", MergeParameters())
+
+
+def met(
+    a: EvaluatedRobot, b: EvaluatedRobot, found: Alignment, verdict: Verdict = ACCEPTED
+) -> list[MetMaps]:
+    """Two maps whose landmarks correspond row by row, all of them inliers of what was found."""
+    n = len(found.inlier)
+    row = {"robot_a": "A", "robot_b": "B", "iteration": ITERATION, "aligner": "ransac"}
+    row |= {"repetition": 0} | estimate_row(n, found, found, verdict)
+    pairs = paired(list(range(n)), list(range(n)))
+    return met_maps([a, b], pd.DataFrame([row]), offered("A", "B", pairs))
 
 
 def fused_pairs(drift_sigma_m: float, seed: int = 6) -> pd.DataFrame:
@@ -42,12 +55,7 @@ def fused_pairs(drift_sigma_m: float, seed: int = 6) -> pd.DataFrame:
         Status.ACCEPTED,
         drift_sigma_m=drift_sigma_m,
     )
-    names = {"robot_a": "A", "robot_b": "B", "iteration": ITERATION}
-    row = names | {"aligner": "ransac", "repetition": 0} | estimate_row(N, found, found, ACCEPTED)
-    pairs = offered("A", "B", paired(list(range(N)), list(range(N))))
-    return pd.DataFrame(
-        fusion_rows(a, b, pd.DataFrame([row]), pairs, "ransac", MergeParameters(), 0.1)
-    )
+    return fusion_rows(met(a, b, found), BY_RANSAC, 0.1)
 
 
 def test_fusing_equal_maps_halves_the_variance() -> None:
@@ -85,12 +93,7 @@ def test_fused_landmarks_are_judged_by_the_middle_of_two_truths(planar: bool) ->
     found = Alignment(
         np.zeros(3), np.eye(3), np.ones(6, bool), 0.0, Status.ACCEPTED, drift_sigma_m=0.0
     )
-    names = {"robot_a": "A", "robot_b": "B", "iteration": ITERATION}
-    row = names | {"aligner": "ransac", "repetition": 0} | estimate_row(6, found, found, ACCEPTED)
-    pairs = offered("A", "B", paired(list(range(6)), list(range(6))))
-    rows = pd.DataFrame(
-        fusion_rows(a, b, pd.DataFrame([row]), pairs, "ransac", MergeParameters(), 0.1)
-    )
+    rows = fusion_rows(met(a, b, found), BY_RANSAC, 0.1)
     assert rows["error_fused_m"].to_numpy() == pytest.approx(0, abs=1e-9)
     assert rows["error_a_m"].to_numpy() == pytest.approx(0.04)
     assert rows["error_b_m"].to_numpy() == pytest.approx(0.04)
@@ -100,26 +103,21 @@ def test_fused_landmarks_are_judged_by_the_middle_of_two_truths(planar: bool) ->
 
 def test_only_accepted_alignments_are_fused() -> None:
     points = np.random.default_rng(1).uniform(0, 5, (6, 3))
-    robots = [robot(name, points, np.zeros(3)) for name in ("A", "B")]
-    maps = [one.maps[ITERATION] for one in robots]
+    a, b = (robot(name, points, np.zeros(3)) for name in ("A", "B"))
     found = Alignment(
         np.zeros(3), np.eye(3), np.ones(6, bool), 0.0, Status.ACCEPTED, drift_sigma_m=0.0
     )
-    names = {"robot_a": "A", "robot_b": "B", "iteration": ITERATION}
-    pairs = offered("A", "B", paired(list(range(6)), list(range(6))))
     for verdict, n, left_out in (
         (ACCEPTED, 6, ()),
         (Verdict(False, 1.0, "chance does as well"), 6, (("B", "chance does as well"),)),
     ):
-        row = names | {"aligner": "ransac", "repetition": 0}
-        row |= estimate_row(6, found, found, verdict)
-        fused = fused_maps(maps, pd.DataFrame([row]), pairs, "ransac", MergeParameters())
+        team = FusedTeam.of([a, b], met(a, b, found, verdict), BY_RANSAC)
+        fused = team.fused
+        assert fused is not None
         assert fused.left_out == left_out
         assert len(fused.landmarks) == n  # fused with B's, or A's alone
         assert (fused.parents[:, 1] == ABSENT).all() == bool(left_out)
-        motions = pd.DataFrame(fused_motion_rows(robots, fused, MergeParameters())).set_index(
-            "robot"
-        )
+        motions = pd.DataFrame(fused_motion_rows(team, use_drift=True)).set_index("robot")
         assert motions["left_out"].to_dict() == {"A": "", "B": dict(left_out).get("B", "")}
         assert np.isnan(motions.loc["B", "tx_m"]) == bool(left_out)
 
@@ -131,13 +129,14 @@ def test_truth_of_fused_landmarks_and_fits() -> None:
     parents = np.array([[0, ABSENT], [1, ABSENT], [2, 0], [3, 2], [ABSENT, 3]])
     landmarks = robot("A", np.zeros((5, 3)), np.zeros(3)).maps[ITERATION]
     fused = FusedMap(landmarks, parents, np.zeros((2, 3)), np.zeros(2), 0.0, ())
-    truth = fused_truth(fused, [a, b], ITERATION)
+    team = FusedTeam([a, b], [], ITERATION, fused)
+    truth = team.truth_of(fused)
     np.testing.assert_array_equal(truth[0], points[0])
     assert np.isnan(truth[1]).all()
     np.testing.assert_array_equal(truth[2], points[2])
     np.testing.assert_array_equal(truth[3], (points[3] + points[4]) / 2)
     np.testing.assert_array_equal(truth[4], points[5])
-    rows = pd.DataFrame(map_fit_rows([a, b], fused, ITERATION)).set_index("map")
+    rows = pd.DataFrame(map_fit_rows(team)).set_index("map")
     assert rows["n_landmarks"].to_dict() == {"A": 3, "B": 4, "fused": 4}
     assert rows["rmse_m"][["A", "B"]].to_numpy() == pytest.approx(0, abs=1e-9)
-    assert list(pd.DataFrame(map_fit_rows([a], None, ITERATION))["map"]) == ["A"]
+    assert list(pd.DataFrame(map_fit_rows(FusedTeam([a], [], ITERATION, None)))["map"]) == ["A"]

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from experiments.judge.judged_run import JudgedRun
-from experiments.judge.provenance import provenance
+from experiments.judge.result import provenance
 from experiments.run.store import Store
 from experiments.scenario.loading import load_scenario
 from sim import renderer
