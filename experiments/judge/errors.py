@@ -10,7 +10,7 @@ import pandas as pd
 from experiments.judge.criteria import ORACLE
 from experiments.judge.truth import PathTruth, common_landmarks, true_pairs
 from experiments.run.estimates import alignment_of, correspondences_of, estimate_row
-from experiments.run.stages.map_batches import map_at
+from experiments.run.stages.match import map_at
 from mapfusion import se2
 from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.oracle import Oracle

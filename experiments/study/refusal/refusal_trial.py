@@ -10,7 +10,7 @@ import numpy as np
 
 from experiments.judge.judging import load_robot
 from experiments.methods.aligner_calls import callable_aligner
-from experiments.run.stages.map_batches import map_at
+from experiments.run.stages.match import map_at
 from experiments.run.stages.slam import evaluated_iterations
 from experiments.run.tasks import OnProgress
 from experiments.run.workers import workers

@@ -113,7 +113,7 @@ def _world(source: WorldSource) -> MappedWorld:
                 f"{source.label}: the maps of {robot.name} are not in {source.store.root} (made by "
                 "another version?); run its scenario again"
             )
-    _, faces = judged.pipeline.world
+    faces = judged.pipeline.simulated[0].features.before["faces"]
     folders = {robot.name: judged.robot_folders(robot) for robot in judged.pipeline.robots}
     repeats = scenario.world.texture.posters > 0
     return MappedWorld(source.name, scenario.seed, faces.key, repeats, folders)
