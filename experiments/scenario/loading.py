@@ -1,7 +1,7 @@
-"""Scenario files in, validated scenarios out."""
+"""Scenario files in, validated scenarios out, or one line: the field, and what would be right."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -10,7 +10,6 @@ from pydantic_core import to_jsonable_python
 
 from experiments.methods.catalogue import name_clashes
 from experiments.scenario.generated import Generate, expanded
-from experiments.scenario.invalid import first_problem
 from experiments.scenario.settings import (
     Align,
     AnyScenario,
@@ -23,6 +22,8 @@ from experiments.scenario.yaml_input import apply_overrides, read_mapping
 from mapfusion.errors import InputError, NameClashWarning
 
 S = TypeVar("S")
+_MOST_SUGGESTED = 3  # keys that an error message offers
+_UNKNOWN = {"extra_forbidden", "unexpected_keyword_argument"}
 _WORLD = {"world", "robots", "drive"}  # what a simulation must have and a recording cannot
 _EITHER = "give either world, robots and drive, or logs; generate stands for world and robots"
 _FIELDS = Simulation.model_fields | Recording.model_fields
@@ -114,4 +115,49 @@ def _validated(where: str, kind: type[S], data: dict[str, Any]) -> S:
     try:
         return known.validate_python(data)
     except ValidationError as error:
-        raise InputError(f"{where}: {first_problem(known.json_schema(), error)}") from error
+        raise InputError(f"{where}: {_first_problem(known.json_schema(), error)}") from error
+
+
+def _first_problem(schema: dict[str, Any], error: ValidationError) -> str:
+    """The first thing wrong with a section of that JSON schema, and how many more there are."""
+    problems = error.errors(include_url=False)
+    # A wrong name explains the missing one that follows from it, so it goes first.
+    unknown = [problem for problem in problems if problem["type"] in _UNKNOWN]
+    problem = (unknown or problems)[0]
+    location = problem["loc"]
+    message = problem["msg"].removeprefix("Value error, ")
+    if unknown:
+        message = f"unknown key; known here: {', '.join(_siblings(schema, location))}"
+        elsewhere = list(_paths_like(schema, schema, str(location[-1])))[:_MOST_SUGGESTED]
+        message += f"; did you mean {' or '.join(elsewhere)}?" if elsewhere else ""
+    elif problem["type"] != "value_error" and not isinstance(problem["input"], dict):
+        message = f"{message} (it is {problem['input']!r})"
+    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+    where = f"{'.'.join(map(str, location))}: " if location else ""
+    return f"{where}{message}{more}"
+
+
+def _siblings(root: dict[str, Any], location: Sequence[int | str]) -> list[str]:
+    """The names that would have been right beside an unknown one."""
+    node = root
+    for part in location[:-1]:
+        node = _resolved(root, node)
+        if isinstance(part, int):
+            node = node["items"]
+        else:  # a mapping with free keys, as `expect`, describes all its values at once
+            node = node.get("properties", {}).get(part) or node["additionalProperties"]
+    return sorted(_resolved(root, node)["properties"])
+
+
+def _paths_like(root: dict[str, Any], node: dict[str, Any], name: str) -> Iterator[str]:
+    """Dotted keys below a node whose last part holds this name as a word: n_particles."""
+    for key, child in _resolved(root, node).get("properties", {}).items():
+        if name in key.split("_"):
+            yield key
+        yield from (f"{key}.{path}" for path in _paths_like(root, child, name))
+
+
+def _resolved(root: dict[str, Any], node: dict[str, Any]) -> dict[str, Any]:
+    node = next((option for option in node.get("anyOf", []) if "$ref" in option), node)
+    reference = node.get("$ref")
+    return root["$defs"][reference.rsplit("/", 1)[1]] if reference else node
