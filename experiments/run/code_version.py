@@ -16,14 +16,7 @@ PACKAGES = ("mapfusion", "sim", "experiments")
 # is in a stage's settings, and its source in `Stage.loads`.
 _FINDS_BY_NAME = frozenset({"mapfusion.align.registry"})
 _DATA_SUFFIXES = {".urdf"}  # files that a module reads from its own folder
-_NUMERICAL_LIBRARIES = (
-    "numba",
-    "numpy",
-    "opencv-python-headless",
-    "pyarrow",
-    "pybullet",
-    "scipy",
-)
+_NUMERICAL_LIBRARIES = ("numba", "numpy", "opencv-python-headless", "pyarrow", "pybullet", "scipy")
 
 
 @functools.cache
@@ -48,10 +41,9 @@ def source_hash(parts: tuple[str, ...] = PACKAGES) -> str:
 
 @functools.cache
 def imported_sources(*modules: str) -> tuple[str, ...]:
-    """Files of these modules or packages of ours and of all they import of ours, directly or not.
+    """Files of these modules of ours and of all they import of ours, directly or not.
 
-    Args:
-        modules: dotted names; of a package, all that is in it.
+    A package stands for all that is in it.
 
     Returns:
         Paths below the project's root, sorted, data files of the modules' folders among them.
@@ -60,7 +52,12 @@ def imported_sources(*modules: str) -> tuple[str, ...]:
         ValueError: a name that is no module of ours.
     """
     reached: set[Path] = set()
-    todo = [path for module in modules for path in _files_named(module)]
+    todo: list[Path] = []
+    for module in modules:
+        path = _file_of(module)
+        if path is None:
+            raise ValueError(f"{module}: no module below {SOURCE_ROOT}")
+        todo += path.parent.rglob("*.py") if path.name == "__init__.py" else [path]
     while todo:
         path = todo.pop()
         if path not in reached:
@@ -75,13 +72,6 @@ def imported_sources(*modules: str) -> tuple[str, ...]:
     return tuple(sorted(path.relative_to(SOURCE_ROOT).as_posix() for path in reached | data))
 
 
-def _files_named(module: str) -> list[Path]:
-    path = _file_of(module)
-    if path is None:
-        raise ValueError(f"{module}: no module below {SOURCE_ROOT}")
-    return sorted(path.parent.rglob("*.py")) if path.name == "__init__.py" else [path]
-
-
 def _imports(path: Path) -> Iterator[Path]:
     """Files of ours that the file imports, those imported inside of functions too."""
     if path in {_file_of(module) for module in _FINDS_BY_NAME}:
@@ -91,8 +81,7 @@ def _imports(path: Path) -> Iterator[Path]:
             yield from filter(None, (_file_of(alias.name) for alias in node.names))
         elif isinstance(node, ast.ImportFrom) and node.module:
             for alias in node.names:  # what is imported from a package may be a module in it
-                found = _file_of(f"{node.module}.{alias.name}") or _file_of(node.module)
-                if found is not None:
+                if found := _file_of(f"{node.module}.{alias.name}") or _file_of(node.module):
                     yield found
 
 
@@ -101,7 +90,5 @@ def _file_of(module: str) -> Path | None:
     if package not in PACKAGES:
         return None
     path = SOURCE_ROOT.joinpath(*names)
-    for candidate in (path.with_suffix(".py"), path / "__init__.py"):
-        if candidate.is_file():
-            return candidate
-    return None
+    candidates = (path.with_suffix(".py"), path / "__init__.py")
+    return next((candidate for candidate in candidates if candidate.is_file()), None)

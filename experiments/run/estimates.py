@@ -6,39 +6,31 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from experiments.run.stage_tables import COVARIANCE, MOTION
 from mapfusion.align.acceptance import Verdict
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.result import Alignment, Status
 
 _UPPER = np.triu_indices(3)
-_COVARIANCE_COLUMNS = ("cov_xx", "cov_xy", "cov_xt", "cov_yy", "cov_yt", "cov_tt")
 
 
 def estimate_row(
     n_correspondences: int, estimated: Alignment, refined: Alignment, verdict: Verdict
 ) -> dict[str, Any]:
     """One estimate, its refinement and the verdict on it as columns of the table `estimates`."""
-    upper = refined.covariance[_UPPER]
-    return {
+    row = {
         "n_correspondences": n_correspondences,
-        "status": str(estimated.status),
-        "reason": estimated.reason,
-        "tx_m": estimated.T_a_b[0],
-        "ty_m": estimated.T_a_b[1],
-        "theta_rad": estimated.T_a_b[2],
-        "refined_status": str(refined.status),
-        "refined_reason": refined.reason,
-        "refined_tx_m": refined.T_a_b[0],
-        "refined_ty_m": refined.T_a_b[1],
-        "refined_theta_rad": refined.T_a_b[2],
         "accepted": verdict.accepted,
         "log10_false_alarms": verdict.log10_false_alarms,
         "acceptance_reason": verdict.reason,
         "drift_sigma_m": refined.drift_sigma_m,
-        **dict(zip(_COVARIANCE_COLUMNS, upper, strict=True)),
-        "inliers": np.packbits(estimated.inlier).tobytes(),
-        "refined_inliers": np.packbits(refined.inlier).tobytes(),
+        **dict(zip(COVARIANCE, refined.covariance[_UPPER], strict=True)),
     }
+    for prefix, found in (("", estimated), ("refined_", refined)):
+        row |= {f"{prefix}status": str(found.status), f"{prefix}reason": found.reason}
+        row |= {f"{prefix}{name}": x for name, x in zip(MOTION, found.T_a_b, strict=True)}
+        row[f"{prefix}inliers"] = np.packbits(found.inlier).tobytes()
+    return row
 
 
 def inlier_mask(bits: bytes, n_correspondences: int) -> np.ndarray:
@@ -49,11 +41,10 @@ def inlier_mask(bits: bytes, n_correspondences: int) -> np.ndarray:
 def alignment_of(row: Mapping[Any, Any], n_correspondences: int) -> Alignment:
     """The refined alignment a row of `estimates` tells of, refused where the verdict says so."""
     covariance = np.empty((3, 3))
-    covariance[_UPPER] = [row[name] for name in _COVARIANCE_COLUMNS]
-    covariance.T[_UPPER] = covariance[_UPPER]
+    covariance[_UPPER] = covariance.T[_UPPER] = [row[name] for name in COVARIANCE]
     verdict = Verdict(bool(row["accepted"]), row["log10_false_alarms"], row["acceptance_reason"])
     refined = Alignment(
-        np.array([row["refined_tx_m"], row["refined_ty_m"], row["refined_theta_rad"]]),
+        np.array([row[f"refined_{name}"] for name in MOTION]),
         covariance,
         inlier_mask(row["refined_inliers"], n_correspondences),
         np.nan,

@@ -1,5 +1,6 @@
 """Tables on disk as pandas frames, each by its schema."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +18,15 @@ def fields(**types: pa.DataType) -> list[pa.Field]:
 
 
 def write_rows(
-    path: Path, table_schema: pa.Schema, rows: pd.DataFrame | list[dict[str, Any]]
+    path: Path,
+    table_schema: pa.Schema,
+    rows: pd.DataFrame | list[dict[str, Any]],
+    attributes: Mapping[str, str] | None = None,
 ) -> None:
-    """Write rows as a table of that schema."""
+    """Write rows as a table of that schema, with further text attributes."""
     frame = pd.DataFrame(rows, columns=pd.Index(table_schema.names))
-    write_table(path, {column: frame[column].to_numpy() for column in frame}, table_schema)
+    columns = {column: frame[column].to_numpy() for column in frame}
+    write_table(path, columns, table_schema, attributes)
 
 
 def read_rows(path: Path, table_schema: pa.Schema) -> pd.DataFrame:

@@ -5,13 +5,15 @@ Each stage is handed its own settings, taken from the scenario here and nowhere 
 
 import itertools
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from types import ModuleType
+from typing import Any, TypeVar
 
 from experiments.methods.catalogue import find_method
 from experiments.methods.installed import Kind
-from experiments.run.stage import RecordedLog, Stage
+from experiments.run.stage import WHOLE, RecordedLog, Stage, with_those_before
 from experiments.run.stages import (
     align,
     aligner,
@@ -23,15 +25,13 @@ from experiments.run.stages import (
     observed,
     slam,
 )
-from experiments.run.stages.map_batches import WRITES as BATCH
-from experiments.run.stages.map_batches import batches
 from experiments.run.stages.walls import Walls
 from experiments.scenario.settings import (
     NAME_PATTERN,
-    AlignerEntry,
     AnyScenario,
     Recording,
     Scenario,
+    Section,
     Simulation,
 )
 from mapfusion.errors import InputError
@@ -39,7 +39,7 @@ from mapfusion.robot_log import read_log
 from mapfusion.vision.frontend import FrontEndParameters
 from sim.renderer import renderer_name
 
-_ALIGNING = "align the maps"
+S = TypeVar("S")
 
 
 @dataclass(frozen=True)
@@ -51,10 +51,6 @@ class RobotStages:
     log: Stage | RecordedLog
     slam: Stage
 
-    def to_log(self) -> list[Stage]:
-        """What must be done for the log, each stage after those before it."""
-        return []
-
 
 @dataclass(frozen=True)
 class SimulatedRobotStages(RobotStages):
@@ -64,35 +60,21 @@ class SimulatedRobotStages(RobotStages):
     features: Stage
     observed: Stage
 
-    def to_log(self) -> list[Stage]:
-        """From images to the log."""
-        return [self.features, self.observed, self.log]
-
 
 @dataclass(frozen=True)
 class PairStages:
-    """From two robots' maps to the aligners' estimates."""
+    """Two robots, and the aligners' estimates from their maps."""
 
     a: RobotStages
     b: RobotStages
-    match: Stage
-    aligners: tuple[Stage, ...]
     estimates: Stage
 
 
 @dataclass(frozen=True)
 class Pipeline:
-    """A scenario's stages.
-
-    Attributes:
-        scenario: what they were laid out from.
-        world: stages that all robots share; none for recorded logs.
-        robots: in the scenario's order.
-        pairs: every two robots.
-    """
+    """What a scenario's stages lead to: the maps of each robot, the estimates of every two."""
 
     scenario: AnyScenario
-    world: tuple[Stage, ...]
     robots: tuple[RobotStages, ...]
     pairs: tuple[PairStages, ...]
 
@@ -103,16 +85,12 @@ class Pipeline:
 
     def to_logs(self) -> list[Stage]:
         """What must be done for the robots' logs, each stage after those before it."""
-        return [*self.world, *(s for robot in self.simulated for s in robot.to_log())]
+        return with_those_before(robot.log for robot in self.robots)
 
     def stages(self) -> list[Stage]:
         """All stages, each after those before it; a robot is done before the next one's images."""
-        found = list(self.world)
-        for robot in self.robots:
-            found += [*robot.to_log(), robot.slam]
-        for pair in self.pairs:
-            found += [pair.match, *pair.aligners, pair.estimates]
-        return found
+        maps = (robot.slam for robot in self.robots)
+        return with_those_before([*maps, *(pair.estimates for pair in self.pairs)])
 
 
 def lay_out(scenario: AnyScenario) -> Pipeline:
@@ -121,168 +99,105 @@ def lay_out(scenario: AnyScenario) -> Pipeline:
     Raises:
         InputError: a recorded log that cannot be read, or names that cannot be used together.
     """
-    world: tuple[Stage, ...] = ()
-    if isinstance(scenario, Recording):
-        robots = [_recorded(scenario, Path(folder)) for folder in scenario.logs]
-        _require_usable_names(robots)
-    else:
-        world = driven, painted = _drive(scenario), _faces(scenario)
-        robots = [_simulated(scenario, driven, painted, robot.name) for robot in scenario.robots]
-    pairs = [_pair(scenario, a, b) for a, b in itertools.combinations(robots, 2)]
-    return Pipeline(scenario, world, tuple(robots), tuple(pairs))
+    recorded = isinstance(scenario, Recording)
+    robots = tuple(_recorded(scenario) if recorded else _simulated(scenario))
+    pairs = tuple(_pair(scenario, a, b) for a, b in itertools.combinations(robots, 2))
+    return Pipeline(scenario, robots, pairs)
 
 
-def _walls(scenario: Simulation) -> Walls:
-    world = scenario.world
+def _stage(
+    module: ModuleType,
+    settings: object,
+    before: Mapping[str, Stage | RecordedLog] | None = None,
+    parts: tuple[str, ...] = WHOLE,
+    **more: Any,
+) -> Stage:
+    """The stage that a module of `experiments.run.stages` does the work of, under its name."""
+    name = module.__name__.rpartition(".")[2]
+    return Stage(
+        name, module.LABEL, settings, module.run, module.WRITES, before or {}, parts, **more
+    )
+
+
+def _filled(kind: type[S], *sections: Section, **own: Any) -> S:
+    """A stage's settings: its own, and the others by their names in these sections."""
+    known = {name: value for section in sections for name, value in section} | own
+    return kind(**{field.name: known[field.name] for field in fields(kind)})  # type: ignore[arg-type]
+
+
+def _simulated(scenario: Simulation) -> Iterable[RobotStages]:
+    world, render, keep = scenario.world, scenario.render, scenario.keep
     lines = tuple(tuple(wall.points) for wall in world.walls)
-    return Walls(lines, world.wall_height_m, world.wall_thickness_m)
-
-
-def _drive(scenario: Simulation) -> Stage:
-    settings = drive.DriveSettings(
-        seed=scenario.seed,
-        walls=_walls(scenario),
-        robots=tuple(
-            drive.DrivenRobot(r.name, r.start, tuple(r.route), r.loop, r.tire_friction)
-            for r in scenario.robots
-        ),
-        **dict(scenario.drive),
+    walls = Walls(lines, world.wall_height_m, world.wall_thickness_m)
+    routes = tuple(_filled(drive.DrivenRobot, robot) for robot in scenario.robots)
+    driven = _stage(
+        drive, _filled(drive.DriveSettings, scenario, scenario.drive, walls=walls, robots=routes)
     )
-    return Stage("drive", "drive the robots", settings, drive.run, (drive.TRAJECTORY_FILE,))
-
-
-def _faces(scenario: Simulation) -> Stage:
-    settings = faces.FacesSettings(scenario.seed, _walls(scenario), scenario.world.texture)
-    return Stage("faces", "paint the walls", settings, faces.run)
-
-
-def _simulated(
-    scenario: Simulation, driven: Stage, painted: Stage, robot: str
-) -> SimulatedRobotStages:
-    n_frames, vision, keep = scenario.drive.frames, scenario.vision, scenario.keep
-    unread = FrontEndParameters()
-    seen = Stage(
-        "features",
-        "render and find features",
-        features.FeatureSettings(
-            scenario.seed,
-            robot,
-            scenario.camera,
-            scenario.radiometry_of(robot),
-            scenario.render.renderer,
-            renderer_name(scenario.render.renderer),
-            replace(unread, harris=vision.harris, stereo=vision.stereo, usurf=vision.usurf),
-            keep.images_at,
-            keep.images,
-        ),
-        features.run,
-        features.WRITES,
-        {"drive": driven, "faces": painted},
-        features.chunks(n_frames),
-    )
+    painted = _stage(faces, _filled(faces.FacesSettings, scenario, world, walls=walls))
+    n_frames, vision, unread = scenario.drive.frames, scenario.vision, FrontEndParameters()
+    finding = replace(unread, harris=vision.harris, stereo=vision.stereo, usurf=vision.usurf)
     tracking = replace(vision, harris=unread.harris, stereo=unread.stereo, usurf=unread.usurf)
-    seen_points = Stage(
-        "observed",
-        "track features",
-        observed.ObservedSettings(
-            robot, n_frames, scenario.camera, tracking, keep.images_at, keep.images
-        ),
-        observed.run,
-        observed.WRITES,
-        {"features": seen},
-    )
-    logged = Stage(
-        "log",
-        "track features",
-        log.LogSettings(scenario.seed, robot, scenario.odometry_of(robot)),
-        log.run,
-        log.WRITES,
-        {"drive": driven, "observed": seen_points},
-    )
-    return SimulatedRobotStages(robot, n_frames, logged, _slam(scenario, logged), seen, seen_points)
+    for robot in scenario.robots:
+        to_find = _filled(
+            features.FeatureSettings,
+            *(scenario, render, keep),
+            robot=robot.name,
+            radiometry=robot.radiometry or scenario.radiometry,
+            drawn_by=renderer_name(render.renderer),
+            vision=finding,
+        )
+        world_stages = {"drive": driven, "faces": painted}
+        found = _stage(features, to_find, world_stages, features.chunks(n_frames))
+        own = {"robot": robot.name, "n_frames": n_frames, "vision": tracking}
+        to_track = _filled(observed.ObservedSettings, scenario, keep, **own)
+        tracked = _stage(observed, to_track, {"features": found})
+        odometry = robot.odometry or scenario.odometry
+        to_log = _filled(log.LogSettings, scenario, robot=robot.name, odometry=odometry)
+        logged = _stage(log, to_log, {"drive": driven, "observed": tracked})
+        mapped = _slam(scenario, logged)
+        yield SimulatedRobotStages(robot.name, n_frames, logged, mapped, found, tracked)
 
 
-def _recorded(scenario: Recording, folder: Path) -> RobotStages:
-    known = read_log(folder)
-    if not len(known):
-        raise InputError(f"{folder}: frames.parquet holds no frame")
-    recorded = RecordedLog(folder)
-    return RobotStages(known.robot, len(known), recorded, _slam(scenario, recorded))
-
-
-def _require_usable_names(robots: Sequence[RobotStages]) -> None:
+def _recorded(scenario: Recording) -> Iterable[RobotStages]:
     """Robots of recorded logs give their names to files, as those of scenarios do."""
-    known: set[str] = set()
-    for robot in robots:
-        assert isinstance(robot.log, RecordedLog)
-        frames = robot.log.path / "frames.parquet"
-        if not re.fullmatch(NAME_PATTERN, robot.name):
-            raise InputError(f"{frames}: robot is named {robot.name!r}, expected {NAME_PATTERN}")
-        if robot.name in known:
-            raise InputError(f"{frames}: robot {robot.name} is in another log already")
-        known.add(robot.name)
+    robots: dict[str, RobotStages] = {}
+    for folder in map(Path, scenario.logs):
+        known, frames = read_log(folder), folder / "frames.parquet"
+        name = known.robot
+        if not len(known):
+            raise InputError(f"{folder}: frames.parquet holds no frame")
+        if not re.fullmatch(NAME_PATTERN, name):
+            raise InputError(f"{frames}: robot is named {name!r}, expected {NAME_PATTERN}")
+        if name in robots:
+            raise InputError(f"{frames}: robot {name} is in another log already")
+        recorded = RecordedLog(folder)
+        robots[name] = RobotStages(name, len(known), recorded, _slam(scenario, recorded))
+    return robots.values()
 
 
 def _slam(scenario: Scenario, logged: Stage | RecordedLog) -> Stage:
-    settings = slam.SlamSettings(
-        scenario.seed,
-        scenario.slam.filter,
-        scenario.slam.min_count,
-        scenario.evaluate.every,
-        scenario.keep.clouds_every,
-    )
-    return Stage("slam", "FastSLAM", settings, slam.run, slam.WRITES, {"log": logged})
+    sections = (scenario, scenario.slam, scenario.evaluate, scenario.keep)
+    return _stage(slam, _filled(slam.SlamSettings, *sections), {"log": logged})
 
 
 def _pair(scenario: Scenario, a: RobotStages, b: RobotStages) -> PairStages:
     n_frames = max(a.n_frames, b.n_frames)
     iterations = tuple(slam.evaluated_iterations(n_frames, scenario.evaluate.every))
-    parts = batches(iterations)
+    parts = match.batches(iterations)
     maps = {"log_a": a.log, "slam_a": a.slam, "log_b": b.log, "slam_b": b.slam}
-    settings = match.MatchSettings(scenario.align.match, iterations)
-    offered = Stage("match", _ALIGNING, settings, match.run, BATCH, maps, parts)
-    aligners = tuple(
-        _aligner(scenario, entry, maps | {"match": offered}, iterations, parts)
-        for entry in scenario.align.aligners
-    )
-    joined = Stage(
-        "align",
-        _ALIGNING,
-        align.JoinSettings(parts),
-        align.run,
-        align.WRITES,
-        {"match": offered} | {f"aligner {i}": stage for i, stage in enumerate(aligners)},
-    )
-    return PairStages(a, b, offered, aligners, joined)
-
-
-def _aligner(
-    scenario: Scenario,
-    entry: AlignerEntry,
-    before: dict[str, Stage | RecordedLog],
-    iterations: tuple[int, ...],
-    parts: tuple[str, ...],
-) -> Stage:
-    method = find_method(entry.method)
-    settings = aligner.AlignerSettings(
-        seed=scenario.seed,
-        **dict(entry),
-        origin=method.origin(),
-        repetitions=scenario.align.repetitions,
-        refinement=scenario.align.refinement,
-        acceptance=scenario.align.acceptance,
-        iterations=iterations,
-    )
-    # a plug-in may import whatever helps it
-    loads = "mapfusion.align" if method.kind is Kind.PLUG_IN else method.target.partition(":")[0]
-    return Stage(
-        "aligner",
-        _ALIGNING,
-        settings,
-        aligner.run,
-        BATCH,
-        before,
-        parts,
-        frozenset({"match"}),
-        (loads,),
-    )
+    to_match = _filled(match.MatchSettings, scenario.align, iterations=iterations)
+    before = {"match": _stage(match, to_match, maps, parts)}
+    for i, entry in enumerate(scenario.align.aligners):
+        method = find_method(entry.method)
+        module = method.target.partition(":")[0]
+        own = {"origin": method.origin(), "iterations": iterations}
+        before[f"aligner {i}"] = _stage(
+            aligner,
+            _filled(aligner.AlignerSettings, scenario, scenario.align, entry, **own),
+            maps | {"match": before["match"]},
+            parts,
+            alongside=frozenset({"match"}),
+            # a plug-in may import whatever helps it
+            loads=("mapfusion.align" if method.kind is Kind.PLUG_IN else module,),
+        )
+    return PairStages(a, b, _stage(align, align.JoinSettings(parts), before))

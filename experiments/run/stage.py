@@ -8,7 +8,7 @@ its job, nothing else: what is not in the key it cannot read.
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -87,3 +87,13 @@ class RecordedLog:
             digest.update(file.name.encode() + b"\0")
             digest.update(file.read_bytes())
         return digest.hexdigest()[:_KEY_LENGTH]
+
+
+def with_those_before(goals: "Iterable[Stage | RecordedLog]") -> list[Stage]:
+    """Stages and all that come before them, each once and after those before it."""
+    found: dict[int, Stage] = {}
+    for goal in goals:
+        if isinstance(goal, Stage):
+            found |= {id(stage): stage for stage in with_those_before(goal.before.values())}
+            found[id(goal)] = goal
+    return list(found.values())

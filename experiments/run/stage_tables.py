@@ -5,39 +5,29 @@ import pyarrow as pa
 from experiments.run.frames import BOOL, FLOAT, INT, TEXT, fields
 from mapfusion.storage import schema
 
+MOTION = ("tx_m", "ty_m", "theta_rad")
+COVARIANCE = ("cov_xx", "cov_xy", "cov_xt", "cov_yy", "cov_yt", "cov_tt")  # m2, m rad, rad2
+_MAPS = {"robot_a": TEXT, "robot_b": TEXT, "iteration": INT}
+_ANSWER = {"status": TEXT, "reason": TEXT} | dict.fromkeys(MOTION, FLOAT)
+
 # What the aligners said, without any truth: the align stage writes it.
 ESTIMATES = schema(
     "result.estimates",
     2,
     fields(
-        robot_a=TEXT,
-        robot_b=TEXT,
-        iteration=INT,
+        **_MAPS,
         aligner=TEXT,
         repetition=INT,
         n_correspondences=INT,
-        status=TEXT,
-        reason=TEXT,
-        tx_m=FLOAT,
-        ty_m=FLOAT,
-        theta_rad=FLOAT,
-        refined_status=TEXT,
-        refined_reason=TEXT,
-        refined_tx_m=FLOAT,
-        refined_ty_m=FLOAT,
-        refined_theta_rad=FLOAT,
+        **_ANSWER,
+        **{f"refined_{name}": kind for name, kind in _ANSWER.items()},
         # of the refined alignment, against chance; NaN where there was none to judge
         accepted=BOOL,
         log10_false_alarms=FLOAT,
         acceptance_reason=TEXT,
         drift_sigma_m=FLOAT,
-        # upper triangle of the refined alignment's covariance (m2, m rad, rad2)
-        cov_xx=FLOAT,
-        cov_xy=FLOAT,
-        cov_xt=FLOAT,
-        cov_yy=FLOAT,
-        cov_yt=FLOAT,
-        cov_tt=FLOAT,
+        # upper triangle of the refined alignment's covariance
+        **dict.fromkeys(COVARIANCE, FLOAT),
         # one bit a correspondence, most significant first (numpy.packbits)
         inliers=pa.binary(),
         refined_inliers=pa.binary(),
@@ -48,14 +38,7 @@ ESTIMATES = schema(
 CORRESPONDENCES = schema(
     "result.correspondences",
     1,
-    fields(
-        robot_a=TEXT,
-        robot_b=TEXT,
-        iteration=INT,
-        index_a=INT,
-        index_b=INT,
-        descriptor_distance=FLOAT,
-    ),
+    fields(**_MAPS, index_a=INT, index_b=INT, descriptor_distance=FLOAT),
 )
 
 # Harris points of a few consecutive frames, for figure 1.

@@ -9,6 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import Any
 
@@ -56,10 +57,6 @@ def tasks_of(stages: Iterable[Stage], store: Store) -> dict[str, Task]:
 
     Neighbours with the same parts go part by part: two processes are then at different stages,
     and compile different kernels.
-
-    Args:
-        stages: each after those before it.
-        store: where they are kept.
     """
     tasks = {}
     for parts, group in itertools.groupby(stages, key=lambda stage: stage.parts):
@@ -88,9 +85,8 @@ def _task(stage: Stage, part: str, store: Store) -> Task:
     folder = store.folder(stage)
     inputs = {name: store.path(before) for name, before in stage.before.items()}
     arguments = (stage.work, stage.settings, Job(inputs, folder.path, part), folder)
-    return Task(
-        _name(stage, part), stage.label, _perform, arguments, folder.outputs[part], tuple(needs)
-    )
+    outputs = folder.outputs[part]
+    return Task(_name(stage, part), stage.label, _perform, arguments, outputs, tuple(needs))
 
 
 def _perform(work: Callable[..., Any], settings: Any, job: Job, folder: StageFolder) -> None:
@@ -101,13 +97,9 @@ def _perform(work: Callable[..., Any], settings: Any, job: Job, folder: StageFol
 
 
 def unfinished(tasks: Mapping[str, Task], goals: Iterable[str]) -> list[Task]:
-    """The tasks left to do for these goals, each after those it needs.
+    """The tasks left to do for the outputs of those named, in the order of `tasks`.
 
     What a finished task was made from is not asked for: it may have been deleted.
-
-    Args:
-        tasks: by name, each after those it needs.
-        goals: names of the tasks whose outputs are wanted.
     """
     wanted: set[str] = set()
     stack = list(goals)
@@ -122,23 +114,21 @@ def unfinished(tasks: Mapping[str, Task], goals: Iterable[str]) -> list[Task]:
 def run_tasks(tasks: Sequence[Task], pool: Workers, on_progress: OnProgress) -> None:
     """Run tasks in a pool, earlier ones first where there is a choice.
 
-    Args:
-        tasks: each after those it needs; what it needs beyond them is done already.
-        pool: where they run.
-        on_progress: told (label, tasks done, tasks in all).
+    What a task needs beyond these is done already. `on_progress` is told (label, tasks done, tasks
+    in all).
     """
     number = {task.name: i for i, task in enumerate(tasks)}
-    open_needs = [{need for need in task.needs if need in number} for task in tasks]
-    dependents: list[list[int]] = [[] for _ in tasks]
-    for i, needs in enumerate(open_needs):
-        for need in needs:
-            dependents[number[need]].append(i)
-    ready = [i for i, needs in enumerate(open_needs) if not needs]  # in order, so a heap
+    needs = [[number[need] for need in task.needs if need in number] for task in tasks]
+    order = TopologicalSorter(dict(enumerate(needs)))
+    order.prepare()
+    ready: list[int] = []
     total, done = Counter(task.label for task in tasks), Counter[str]()
     for label in total:
         on_progress(label, 0, total[label])
 
     def hand_out() -> None:
+        for i in order.get_ready():
+            heapq.heappush(ready, i)
         while ready and pool.has_room:
             i = heapq.heappop(ready)
             pool.submit(i, tasks[i].run)
@@ -147,8 +137,5 @@ def run_tasks(tasks: Sequence[Task], pool: Workers, on_progress: OnProgress) -> 
     for i, _ in pool.completed():
         done[tasks[i].label] += 1
         on_progress(tasks[i].label, done[tasks[i].label], total[tasks[i].label])
-        for dependent in dependents[i]:
-            open_needs[dependent].discard(tasks[i].name)
-            if not open_needs[dependent]:
-                heapq.heappush(ready, dependent)
+        order.done(i)
         hand_out()

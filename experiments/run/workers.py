@@ -1,10 +1,10 @@
 """Processes that share out tasks; results do not depend on how many there are."""
 
+import functools
 import multiprocessing
 import os
 import signal
 import threading
-from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -36,80 +36,66 @@ def _end_with_parent() -> None:
 
 
 class Workers:
-    """A pool of processes, or this process alone when one job is enough.
+    """A pool of processes, or this process alone without one.
 
     Tasks are submitted with a tag; `completed` gives (tag, result) as they end, and more tasks may
     be submitted meanwhile.
     """
 
-    def __init__(self, jobs: int) -> None:
-        self._jobs = jobs
-        self._queue: deque[tuple[Any, Callable[..., Any], tuple]] = deque()
-        self._pending: dict[Future, Any] = {}
-        self._pool: ProcessPoolExecutor | None = None
-        if jobs > 1:
-            # Spawned, not forked: OpenCV's and Numba's threads do not survive a fork.
-            context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(jobs, context, initializer=_start_worker)
+    def __init__(self, jobs: int, pool: ProcessPoolExecutor | None) -> None:
+        self._pool = pool
+        self._wanted = 1 if pool is None else TASKS_PER_PROCESS * jobs
+        self._pending: dict[Any, Any] = {}  # tags, by futures or what is to be called
 
     def submit(self, tag: Any, function: Callable[..., Any], *arguments: Any) -> None:
         """Have `function(*arguments)` called, after what was submitted before."""
-        if self._pool is None:
-            self._queue.append((tag, function, arguments))
-        else:
-            self._pending[self._pool.submit(function, *arguments)] = tag
+        submit = functools.partial if self._pool is None else self._pool.submit
+        self._pending[submit(function, *arguments)] = tag
 
     @property
     def has_room(self) -> bool:
         """Whether a process would have to wait for its next task unless one is submitted."""
-        if self._pool is None:
-            return not self._queue
-        return len(self._pending) < TASKS_PER_PROCESS * self._jobs
+        return len(self._pending) < self._wanted
 
     def completed(self) -> Iterator[tuple[Any, Any]]:
         """(tag, result) of each task as it ends; a task's error is raised here."""
-        while self._queue or self._pending:
-            if self._queue:
-                tag, function, arguments = self._queue.popleft()
-                yield tag, function(*arguments)
+        while self._pending:
+            if self._pool is None:
+                task = next(iter(self._pending))
+                yield self._pending.pop(task), task()
                 continue
             done, _ = wait(self._pending, return_when=FIRST_COMPLETED)
             # In order of submission: what follows from them is then submitted in a fixed order.
-            for future in [f for f in self._pending if f in done]:
-                tag = self._pending.pop(future)
-                try:
-                    result = future.result()
-                except BrokenProcessPool as error:
-                    raise InputError(
-                        "a worker process was killed from outside (out of memory?); what was "
-                        "finished is kept, the same command goes on from there (--jobs 1 needs "
-                        "least memory)"
-                    ) from error
-                yield tag, result
+            for future in [future for future in self._pending if future in done]:
+                yield self._pending.pop(future), _result(future)
 
-    def stop(self) -> None:
-        """End all processes at once, also those at work."""
-        if self._pool is None:
-            return
-        processes = list((self._pool._processes or {}).values())
-        self._pool.shutdown(wait=False, cancel_futures=True)
-        for process in processes:
-            process.kill()
 
-    def close(self) -> None:
-        """Wait for the processes to end."""
-        if self._pool is not None:
-            self._pool.shutdown()
+def _result(future: Future) -> Any:
+    try:
+        return future.result()
+    except BrokenProcessPool as error:
+        raise InputError(
+            "a worker process was killed from outside (out of memory?); what was finished is kept, "
+            "the same command goes on from there (--jobs 1 needs least memory)"
+        ) from error
 
 
 @contextmanager
 def workers(jobs: int) -> Iterator[Workers]:
     """A pool for the length of a `with` block; an error or Ctrl-C ends it at once."""
     single_threaded()
-    pool = Workers(jobs)
+    if jobs == 1:
+        yield Workers(1, None)
+        return
+    # Spawned, not forked: OpenCV's and Numba's threads do not survive a fork.
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(jobs, context, initializer=_start_worker)
     try:
-        yield pool
+        yield Workers(jobs, pool)
     except BaseException:
-        pool.stop()
+        processes = list((pool._processes or {}).values())
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in processes:  # also those at work
+            process.kill()
         raise
-    pool.close()
+    pool.shutdown()

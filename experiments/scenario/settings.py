@@ -8,17 +8,10 @@ import json
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    Field,
-    TypeAdapter,
-    model_validator,
-)
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, model_validator
 
 from experiments.methods.aligner_calls import require_usable
-from experiments.scenario.generated import Generate, Generated
+from experiments.scenario.generated import Generate
 from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.correspondences import MatchParameters
 from mapfusion.align.refine import Refinement
@@ -46,14 +39,12 @@ def _require_unique(field: str, names: Sequence[str]) -> None:
 
 
 def _renderable(camera: StereoCamera) -> StereoCamera:
-    for name in ("width_px", "height_px"):
-        if not 1 <= getattr(camera, name) <= MAX_IMAGE_SIDE_PX:
-            raise ValueError(
-                f"{name}: is {getattr(camera, name)}, must be in [1, {MAX_IMAGE_SIDE_PX}]"
-            )
-    for name in ("focal_px", "baseline_m", "mount_z_m"):
-        if not getattr(camera, name) > 0:
-            raise ValueError(f"{name}: is {getattr(camera, name)}, must be positive")
+    most = MAX_IMAGE_SIDE_PX
+    for name, value in vars(camera).items():
+        if name in {"width_px", "height_px"} and not 1 <= value <= most:
+            raise ValueError(f"{name}: is {value}, must be in [1, {most}]")
+        if name in {"focal_px", "baseline_m", "mount_z_m"} and not value > 0:
+            raise ValueError(f"{name}: is {value}, must be positive")
     return camera
 
 
@@ -230,10 +221,8 @@ class Scenario(Section):
     def _merges_what_it_aligns(self) -> Self:
         aligners = [entry.name for entry in self.align.aligners]
         if self.merge.aligner not in aligners:
-            raise ValueError(
-                f"merge.aligner: {self.merge.aligner} is not among align.aligners "
-                f"({', '.join(aligners)})"
-            )
+            known = f"is not among align.aligners ({', '.join(aligners)})"
+            raise ValueError(f"merge.aligner: {self.merge.aligner} {known}")
         return self
 
     def resolved(self) -> dict[str, Any]:
@@ -269,6 +258,18 @@ class GeneratedScenario(SimulatedScenario):
     generate: Generate
 
 
+class Generated(Section):
+    """Where a generated world came from; written by the program, read by nobody but people.
+
+    `overlap` is the one achieved: ground that two robots both visit over the ground that either
+    visits, mean over pairs.
+    """
+
+    plan_seed: int
+    overlap_asked: float
+    overlap: float
+
+
 class Simulation(SimulatedScenario):
     """An experiment in a simulated world; `generated` tells where a drawn one came from."""
 
@@ -280,16 +281,6 @@ class Simulation(SimulatedScenario):
     def _unique_robots(self) -> Self:
         _require_unique("robots", [robot.name for robot in self.robots])
         return self
-
-    def radiometry_of(self, robot: str) -> RadiometricNoise:
-        """The noise of a robot's images."""
-        own = {r.name: r.radiometry for r in self.robots}[robot]
-        return self.radiometry if own is None else own
-
-    def odometry_of(self, robot: str) -> OdometryNoise:
-        """The noise of a robot's odometry."""
-        own = {r.name: r.odometry for r in self.robots}[robot]
-        return self.odometry if own is None else own
 
 
 AnyScenario = Simulation | Recording

@@ -1,11 +1,11 @@
 """The scenario suite: the files of one folder, found by path, by name or by tag."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from experiments.scenario.loading import load_scenario
-from experiments.scenario.settings import AnyScenario, Recording
+from experiments.scenario.settings import Recording
 from experiments.scenario.yaml_input import read_mapping
 from mapfusion.errors import InputError
 
@@ -13,34 +13,26 @@ FOLDER = Path("scenarios")
 SUFFIXES = {".yaml", ".yml", ".json"}  # a JSON file is YAML too: a result's scenario.json
 
 
-@dataclass(frozen=True)
-class Entry:
+class Entry(NamedTuple):
     """One scenario of the suite.
 
-    Attributes:
-        path: its file.
-        name, tags, description: as in the file.
-        robots: how many.
-        iterations: frames a robot; None for recorded logs.
-        overlap: of the robots' ground, None where the world was not generated.
+    `iterations` are frames a robot, None for recorded logs; `overlap` is that of the robots'
+    ground, None where the world was not generated.
     """
 
-    path: Path
     name: str
     tags: tuple[str, ...]
     description: str
     robots: int
-    iterations: int | None
-    overlap: float | None
+    iterations: int | None = None
+    overlap: float | None = None
 
 
 def scenarios_of(names_or_tags: Sequence[str | Path], folder: Path = FOLDER) -> list[Path]:
     """Scenario files, in the order asked for and each once.
 
-    Args:
-        names_or_tags: each a file, the name of a scenario in `folder`, or a tag, which stands for
-            all scenarios that carry it (in the order of their files' names).
-        folder: where the suite lies.
+    Each is asked for by its path, by the name of a scenario in `folder`, or by a tag, which stands
+    for all scenarios that carry it (in the order of their files' names).
 
     Raises:
         InputError: nothing of that name; lists the names and tags there are.
@@ -58,17 +50,15 @@ def scenarios_of(names_or_tags: Sequence[str | Path], folder: Path = FOLDER) -> 
 def _named(wanted: str, folder: Path) -> list[Path]:
     known = {path: read_mapping(path) for path in _files(folder)}
     by_name = [path for path, data in known.items() if wanted in (data.get("name"), path.stem)]
-    if by_name:
-        return by_name
     by_tag = [path for path, data in known.items() if wanted in _tags(data)]
-    if by_tag:
-        return by_tag
-    tags = sorted({tag for data in known.values() for tag in _tags(data)})
-    raise InputError(
-        f"{wanted}: neither a file, nor a scenario in {folder} "
-        f"({', '.join(path.stem for path in known) or 'there is none'}), nor a tag "
-        f"({', '.join(tags) or 'there is none'})"
-    )
+    if not by_name and not by_tag:
+        tags = sorted({tag for data in known.values() for tag in _tags(data)})
+        raise InputError(
+            f"{wanted}: neither a file, nor a scenario in {folder} "
+            f"({', '.join(path.stem for path in known) or 'there is none'}), nor a tag "
+            f"({', '.join(tags) or 'there is none'})"
+        )
+    return by_name or by_tag
 
 
 def _files(folder: Path) -> list[Path]:
@@ -94,18 +84,8 @@ def entries(folder: Path = FOLDER) -> list[Entry]:
 
 def _entry(path: Path) -> Entry:
     scenario = load_scenario(path)
-    return Entry(
-        path,
-        scenario.name,
-        tuple(scenario.tags),
-        scenario.description,
-        *_size(scenario),
-    )
-
-
-def _size(scenario: AnyScenario) -> tuple[int, int | None, float | None]:
-    """Robots, frames and overlap."""
+    told = (scenario.name, tuple(scenario.tags), scenario.description)
     if isinstance(scenario, Recording):
-        return len(scenario.logs), None, None
-    drawn = scenario.generated
-    return len(scenario.robots), scenario.drive.frames, None if drawn is None else drawn.overlap
+        return Entry(*told, len(scenario.logs))
+    overlap = scenario.generated.overlap if scenario.generated else None
+    return Entry(*told, len(scenario.robots), scenario.drive.frames, overlap)

@@ -63,17 +63,17 @@ def _assign(data: dict[str, Any], dotted: str, value: Any) -> None:
     node: Any = data
     *parents, last = dotted.split(".")
     for name in parents:
-        if isinstance(node, list) and name.isdigit() and int(name) < len(node):
-            node = node[int(name)]
-        elif isinstance(node, dict):
-            if node.get(name) is None:
-                node[name] = {}
-            node = node[name]
-        else:
-            raise InputError(f"--set {dotted}: {name} is not a key here")
-    if isinstance(node, list) and last.isdigit() and int(last) < len(node):
-        node[int(last)] = value
-    elif isinstance(node, dict):
-        node[last] = value
-    else:
-        raise InputError(f"--set {dotted}: {last} is not a key here")
+        key = _key(node, name, dotted)
+        if isinstance(node, dict) and node.get(key) is None:
+            node[key] = {}
+        node = node[key]
+    node[_key(node, last, dotted)] = value
+
+
+def _key(node: Any, name: str, dotted: str) -> str | int:
+    """What a part of a dotted name stands for: a mapping's key, or the place in a list."""
+    if isinstance(node, dict):
+        return name
+    if isinstance(node, list) and name.isdigit() and int(name) < len(node):
+        return int(name)
+    raise InputError(f"--set {dotted}: {name} is not a key here")

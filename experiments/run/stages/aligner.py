@@ -11,11 +11,13 @@ from experiments.run.estimates import correspondences_of, estimate_row
 from experiments.run.frames import read_rows, write_rows
 from experiments.run.job import Job
 from experiments.run.stage_tables import CORRESPONDENCES, ESTIMATES
-from experiments.run.stages.map_batches import batch_path, pairs_of_maps
+from experiments.run.stages import match
 from experiments.scenario.randomness import generator
 from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.refine import Refinement
 from mapfusion.align.registration import Registration
+
+LABEL, WRITES = match.LABEL, match.WRITES
 
 
 @dataclass(frozen=True)
@@ -36,11 +38,11 @@ class AlignerSettings:
 
 def run(settings: AlignerSettings, job: Job) -> None:
     """Let the aligner estimate at one batch of iterations, on what the match stage offers."""
-    offered = read_rows(batch_path(job.inputs["match"], job.part), CORRESPONDENCES)
+    offered = read_rows(match.batch_path(job.inputs["match"], job.part), CORRESPONDENCES)
     aligner = callable_aligner(settings.method, settings.parameters, settings.time_limit_s)
     registration = Registration(aligner, settings.refinement, settings.acceptance)
     rows = []
-    for k, map_a, map_b in pairs_of_maps(job, settings.iterations):
+    for k, map_a, map_b in match.pairs_of_maps(job, settings.iterations):
         pairs = correspondences_of(offered[offered["iteration"] == k])
         names = {"robot_a": map_a.name, "robot_b": map_b.name, "iteration": k}
         on_pair = registration.on(map_a, map_b, pairs)
@@ -49,4 +51,4 @@ def run(settings: AlignerSettings, job: Job) -> None:
             done = on_pair.register(generator(settings.seed, "align", *purpose))
             names |= {"aligner": settings.name, "repetition": repetition}
             rows.append(names | estimate_row(len(pairs), *done))
-    write_rows(batch_path(job.output, job.part), ESTIMATES, rows)
+    write_rows(match.batch_path(job.output, job.part), ESTIMATES, rows)

@@ -1,6 +1,6 @@
 """Stage: physics, all robots in one world, once. Writes the trajectory."""
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,11 +8,12 @@ import numpy as np
 from experiments.run.job import Job
 from experiments.run.stages.walls import Walls
 from experiments.scenario.randomness import generator
-from mapfusion.se2 import Float
 from sim.driver import DriverSettings, Route, drive
 from sim.trajectory import write_trajectory
 
+LABEL = "drive the robots"
 TRAJECTORY_FILE = "trajectory.parquet"
+WRITES = (TRAJECTORY_FILE,)
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,7 @@ class DrivenRobot:
 
     name: str
     start: tuple[float, float, float]
-    route: tuple[tuple[float, float], ...]
+    route: Sequence[tuple[float, float]]
     loop: bool
     tire_friction: float
 
@@ -40,30 +41,19 @@ class DriveSettings:
     control: DriverSettings
 
 
-def start_poses(settings: DriveSettings) -> Mapping[str, Float]:
-    """T_world_start by robot: the scenario's, moved by the seed within the jitter."""
-    span = np.array([settings.start_jitter_m] * 2 + [settings.start_jitter_rad])
-    return {
-        robot.name: np.array(robot.start)
-        + generator(settings.seed, "start", robot.name).uniform(-span, span)
-        for robot in settings.robots
-    }
-
-
 def run(settings: DriveSettings, job: Job) -> None:
-    """Drive and write the trajectory; raises InputError for a route that fails."""
-    starts = start_poses(settings)
-    routes = [
-        Route(
-            robot.name, starts[robot.name], np.array(robot.route), robot.loop, robot.tire_friction
-        )
-        for robot in settings.robots
-    ]
-    trajectory = drive(
-        settings.walls.floor_plan(),
-        routes,
-        settings.control,
-        settings.frames,
-        settings.frame_interval_s,
-    )
+    """Drive, from the scenario's starts moved by the seed within the jitter.
+
+    Raises:
+        InputError: a route that fails.
+    """
+    span = np.array([settings.start_jitter_m] * 2 + [settings.start_jitter_rad])
+    routes = []
+    for robot in settings.robots:
+        jitter = generator(settings.seed, "start", robot.name).uniform(-span, span)
+        start = np.array(robot.start) + jitter
+        route = np.array(robot.route)
+        routes.append(Route(robot.name, start, route, robot.loop, robot.tire_friction))
+    plan, interval_s = settings.walls.floor_plan(), settings.frame_interval_s
+    trajectory = drive(plan, routes, settings.control, settings.frames, interval_s)
     write_trajectory(job.output / TRAJECTORY_FILE, trajectory)

@@ -8,6 +8,9 @@ from experiments.scenario.randomness import generator
 from sim.textures import Texture
 from sim.world import write_faces
 
+LABEL = "paint the walls"
+WRITES = ()
+
 
 @dataclass(frozen=True)
 class FacesSettings:

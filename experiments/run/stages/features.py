@@ -17,9 +17,19 @@ from experiments.run.job import Job
 from experiments.run.stages.drive import TRAJECTORY_FILE
 from experiments.scenario.randomness import generator
 from mapfusion.camera import StereoCamera
-from mapfusion.robot_log import DESCRIPTOR_LENGTH
+from mapfusion.robot_log import DESCRIPTOR_LENGTH, with_rows
 from mapfusion.se2 import Float
-from mapfusion.storage import column, read_table, schema, write_table, write_whole
+from mapfusion.storage import (
+    POSITION_FIELDS,
+    column,
+    columns,
+    float_fields,
+    named_columns,
+    read_table,
+    schema,
+    write_table,
+    write_whole,
+)
 from mapfusion.vision.features import Features
 from mapfusion.vision.frontend import FrontEnd, FrontEndParameters
 from sim.recorder import FrameSource, truth_points
@@ -30,21 +40,21 @@ from sim.trajectory import read_trajectory
 # Frames a task: about two seconds of work, so little is lost when a run is interrupted.
 FRAMES_PER_CHUNK = 20
 
+_PIXEL = ["u_px", "v_px"]
+_ONE_EACH = ["disparity_px", "sigma_disparity_px", "descriptor"]
 FEATURES = schema(
     "features",
     1,
     [
         pa.field("iteration", pa.int32()),
-        pa.field("u_px", pa.float64()),
-        pa.field("v_px", pa.float64()),
-        pa.field("disparity_px", pa.float64()),
-        pa.field("sigma_disparity_px", pa.float64()),
+        *float_fields([*_PIXEL, "disparity_px", "sigma_disparity_px"]),
         pa.field("descriptor", pa.list_(pa.float32(), DESCRIPTOR_LENGTH)),
     ],
 )
 # Row i is the world point behind row i of the features. Kept apart: estimators never read it.
-TRUTH = schema("features.truth", 1, [pa.field(n, pa.float64()) for n in ("x_m", "y_m", "z_m")])
+TRUTH = schema("features.truth", 1, float_fields(POSITION_FIELDS))
 
+LABEL = "render and find features"
 WRITES = ("truth_{part}.parquet", "features_{part}.parquet")
 
 
@@ -66,6 +76,10 @@ class FeatureSettings:
 def chunks(n_frames: int) -> tuple[str, ...]:
     """The parts of the stage: each is named after its first frame."""
     return tuple(f"{start:06d}" for start in range(0, n_frames, FRAMES_PER_CHUNK))
+
+
+def _chunk(part: str, n_frames: int) -> range:
+    return range(int(part), min(int(part) + FRAMES_PER_CHUNK, n_frames))
 
 
 def _chunk_paths(folder: Path, part: str) -> tuple[Path, ...]:
@@ -96,8 +110,7 @@ def run(settings: FeatureSettings, job: Job) -> dict[str, float]:
     source = _OpenWorld.get(settings, job.inputs["faces"], trajectory.robots)
     front_end = FrontEnd(settings.camera, settings.vision)
     robot, features, truth, rendering_s = settings.robot, [], [], 0.0
-    start = int(job.part)
-    frames = range(start, min(start + FRAMES_PER_CHUNK, len(trajectory)))
+    frames = _chunk(job.part, len(trajectory))
     for iteration in frames:
         rng = generator(settings.seed, "radiometry", robot, iteration)
         poses = trajectory.T_world_robot[:, iteration]
@@ -109,45 +122,28 @@ def run(settings: FeatureSettings, job: Job) -> dict[str, float]:
         features.append(found)
         truth.append(truth_points(settings.camera, frame.depth_m, found.uv_px, own_pose))
         if 0 <= iteration - settings.images_at < settings.images:
-            _write_image(job.output / f"image_{iteration:06d}.png", frame.left)
+            encoded = cv2.imencode(".png", frame.left)[1].tobytes()
+            image = job.output / f"image_{iteration:06d}.png"
+            write_whole(image, lambda temporary, encoded=encoded: temporary.write_bytes(encoded))
     truth_path, features_path = _chunk_paths(job.output, job.part)
-    points = np.concatenate(truth)
-    write_table(truth_path, {n: points[:, i] for i, n in enumerate(TRUTH.names)}, TRUTH)
-    write_table(features_path, _columns(frames, features), FEATURES)
-    return {"rendering_s": rendering_s}
-
-
-def _write_image(path: Path, image: np.ndarray) -> None:
-    encoded = cv2.imencode(".png", image)[1].tobytes()
-    write_whole(path, lambda temporary: temporary.write_bytes(encoded))
-
-
-def _columns(frames: range, features: list[Features]) -> dict[str, np.ndarray]:
-    uv = np.concatenate([f.uv_px for f in features])
-    return {
-        "iteration": np.repeat(np.array(frames), [len(f) for f in features]),
-        "u_px": uv[:, 0],
-        "v_px": uv[:, 1],
-        "disparity_px": np.concatenate([f.disparity_px for f in features]),
-        "sigma_disparity_px": np.concatenate([f.sigma_disparity_px for f in features]),
-        "descriptor": np.concatenate([f.descriptor for f in features]),
+    joined = {
+        name: np.concatenate([getattr(found, name) for found in features])
+        for name in ("uv_px", *_ONE_EACH)
     }
+    joined |= named_columns(_PIXEL, joined["uv_px"])
+    joined["iteration"] = np.repeat(np.array(frames), [len(found) for found in features])
+    write_table(truth_path, named_columns(TRUTH.names, np.concatenate(truth)), TRUTH)
+    write_table(features_path, joined, FEATURES)
+    return {"rendering_s": rendering_s}
 
 
 def read_features(folder: Path, n_frames: int) -> Iterator[tuple[Features, Float]]:
     """Features and their true world points (N, 3), frame by frame, in order."""
-    for start in range(0, n_frames, FRAMES_PER_CHUNK):
-        truth_path, features_path = _chunk_paths(folder, f"{start:06d}")
+    for part in chunks(n_frames):
+        truth_path, features_path = _chunk_paths(folder, part)
         table, _ = read_table(features_path, FEATURES)
-        truth_table, _ = read_table(truth_path, TRUTH)
-        truth = np.stack([column(truth_table, name) for name in TRUTH.names], -1)
-        iteration = column(table, "iteration")
-        uv = np.stack([column(table, "u_px"), column(table, "v_px")], -1)
-        disparity, sigma = column(table, "disparity_px"), column(table, "sigma_disparity_px")
-        descriptor = column(table, "descriptor")
-        for k in range(start, min(start + FRAMES_PER_CHUNK, n_frames)):
-            rows = slice(*np.searchsorted(iteration, [k, k + 1]))
-            yield (
-                Features(uv[rows], disparity[rows], sigma[rows], descriptor[rows]),
-                truth[rows],
-            )
+        found = Features(columns(table, _PIXEL), *(column(table, name) for name in _ONE_EACH))
+        truth = columns(read_table(truth_path, TRUTH)[0], TRUTH.names)
+        for k in _chunk(part, n_frames):
+            rows = slice(*np.searchsorted(column(table, "iteration"), [k, k + 1]))
+            yield with_rows(found, rows), truth[rows]

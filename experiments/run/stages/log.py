@@ -10,6 +10,7 @@ from mapfusion.robot_log import write_frames, write_truth_poses
 from sim.odometry import OdometryNoise, add_noise, calibrated_track_m, encoder_increments
 from sim.trajectory import read_trajectory
 
+LABEL = "track features"
 _OBSERVED = ("observations.parquet", "truth_points.parquet")
 WRITES = ("frames.parquet", *_OBSERVED, "truth_poses.parquet")
 

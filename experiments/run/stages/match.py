@@ -1,14 +1,28 @@
-"""Stage: the correspondences of two robots' maps, at each evaluated iteration."""
+"""Stage: the correspondences of two robots' maps, a batch of evaluated iterations at a time.
 
+What matching and aligning read, they read here.
+"""
+
+import functools
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import pandas as pd
 
 from experiments.run.frames import write_rows
 from experiments.run.job import Job
 from experiments.run.stage_tables import CORRESPONDENCES
-from experiments.run.stages.map_batches import batch_path, pairs_of_maps
+from experiments.run.stages.slam import read_snapshots
 from mapfusion.align.correspondences import MatchParameters, match
+from mapfusion.landmark_map import LandmarkMap
+from mapfusion.robot_log import read_log
+
+# Evaluated iterations a part: small enough that an interruption loses little and two cores end
+# at about the same time, large enough that reading the maps costs little beside aligning them.
+_ITERATIONS_PER_BATCH = 12
+LABEL = "align the maps"
+WRITES = ("batch_{part}.parquet",)
 
 
 @dataclass(frozen=True)
@@ -28,3 +42,34 @@ def run(settings: MatchSettings, job: Job) -> None:
         columns |= {"index_a": pairs.index_a, "index_b": pairs.index_b}
         made.append(pd.DataFrame(columns | {"descriptor_distance": pairs.distance}))
     write_rows(batch_path(job.output, job.part), CORRESPONDENCES, pd.concat(made))
+
+
+def batches(iterations: tuple[int, ...]) -> tuple[str, ...]:
+    """The parts of the stage and of the aligners', numbered."""
+    return tuple(f"{i:03d}" for i in range(-(-len(iterations) // _ITERATIONS_PER_BATCH)))
+
+
+def batch_path(folder: Path, part: str) -> Path:
+    """Where a stage keeps one batch."""
+    return folder / WRITES[0].format(part=part)
+
+
+# The maps of one pair of robots stay in memory: each aligner of the pair wants the same.
+@functools.lru_cache(maxsize=2)
+def _maps(log: Path, slam: Path) -> dict[int, LandmarkMap]:
+    return read_snapshots(slam, read_log(log))
+
+
+def pairs_of_maps(
+    job: Job, iterations: tuple[int, ...]
+) -> Iterator[tuple[int, LandmarkMap, LandmarkMap]]:
+    """(iteration, map a, map b) of the job's batch."""
+    a, b = (_maps(job.inputs[f"log_{side}"], job.inputs[f"slam_{side}"]) for side in "ab")
+    start = int(job.part) * _ITERATIONS_PER_BATCH
+    for k in iterations[start : start + _ITERATIONS_PER_BATCH]:
+        yield k, map_at(a, k), map_at(b, k)
+
+
+def map_at(maps: Mapping[int, LandmarkMap], iteration: int) -> LandmarkMap:
+    """A robot's map at an iteration; a robot whose log ended earlier keeps its last map."""
+    return maps[max((k for k in maps if k <= iteration), default=min(maps))]

@@ -11,10 +11,10 @@ from experiments.run.stage_tables import TRACKS
 from experiments.run.stages.features import read_features
 from mapfusion.camera import StereoCamera
 from mapfusion.robot_log import Observations, write_observations, write_truth_points
-from mapfusion.se2 import Float
 from mapfusion.vision.frontend import FrontEndParameters, observable, observe
 from mapfusion.vision.tracks import Tracker
 
+LABEL = "track features"
 WRITES = ("observations.parquet", "truth_points.parquet", "tracks.parquet")
 
 
@@ -34,9 +34,7 @@ def run(settings: ObservedSettings, job: Job) -> None:
     """Track features over the frames and write the observations and their truth."""
     camera, vision = settings.camera, settings.vision
     tracker = Tracker(vision.tracks, camera, vision.sigma_uv_px)
-    observed: list[Observations] = []
-    truth: list[Float] = []
-    tracks: list[pd.DataFrame] = []
+    observed, truth, tracks = [], [], []
     kept = range(settings.images_at, settings.images_at + settings.images)
     frames = read_features(job.inputs["features"], settings.n_frames)
     for iteration, (found, points) in enumerate(frames):
@@ -50,11 +48,8 @@ def run(settings: ObservedSettings, job: Job) -> None:
             names = {"robot": settings.robot, "iteration": iteration}
             tracks.append(pd.DataFrame(names | columns))
     iterations = np.repeat(np.arange(len(observed)), [len(own) for own in observed])
-    write_observations(job.output, iterations, _joined(observed))
+    seen = ("position_m", "covariance_m2", "descriptor", "uvd_px")
+    joined = {name: np.concatenate([getattr(own, name) for own in observed]) for name in seen}
+    write_observations(job.output, iterations, Observations(**joined))
     write_truth_points(job.output, np.concatenate(truth))
     write_rows(job.output / "tracks.parquet", TRACKS, pd.concat(tracks) if tracks else [])
-
-
-def _joined(parts: list[Observations]) -> Observations:
-    names = ("position_m", "covariance_m2", "descriptor", "uvd_px")
-    return Observations(**{n: np.concatenate([getattr(own, n) for own in parts]) for n in names})

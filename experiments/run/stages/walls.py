@@ -17,9 +17,5 @@ class Walls:
 
     def floor_plan(self) -> FloorPlan:
         """As the simulator takes them."""
-        return FloorPlan(
-            tuple(
-                Wall(np.array(points), self.height_m, self.thickness_m)
-                for points in self.polylines_m
-            )
-        )
+        lines = map(np.array, self.polylines_m)
+        return FloorPlan(tuple(Wall(line, self.height_m, self.thickness_m) for line in lines))

@@ -12,7 +12,7 @@ import pandas as pd
 from experiments.judge.tables import table_path
 from experiments.methods.aligner_calls import callable_aligner
 from experiments.run.frames import BOOL, FLOAT, INT, TEXT, fields, read_rows, write_rows
-from experiments.run.stages.map_batches import map_at
+from experiments.run.stages.match import map_at
 from experiments.run.stages.slam import evaluated_iterations
 from experiments.run.tasks import OnProgress
 from experiments.run.workers import workers

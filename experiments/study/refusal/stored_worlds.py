@@ -89,6 +89,6 @@ def _world(label: str, name: str, scenario: AnyScenario, store: Store) -> Mapped
                 f"{label}: the maps of {robot.name} are not in {store.root} (made by "
                 "another version?); run its scenario again"
             )
-    _, faces = judged.pipeline.world
+    faces = judged.pipeline.simulated[0].features.before["faces"]
     folders = {robot.name: judged.robot_folders(robot) for robot in judged.pipeline.robots}
     return MappedWorld(label, name, scenario, faces.key, folders)

@@ -194,7 +194,7 @@ def test_estimating_opens_no_truth(tiny: Simulation, tiny_results: Path, tmp_pat
         folders[robot.slam.key] = log / "slam"
         robot.slam.work(robot.slam.settings, Job({"log": log}, log / "slam"))
     (pair,) = run.pipeline.pairs
-    for number, stage in enumerate((pair.match, *pair.aligners)):
+    for number, stage in enumerate(pair.estimates.before.values()):
         folders[stage.key] = tmp_path / f"{stage.name}{number}"
         inputs = {name: folders[before.key] for name, before in stage.before.items()}
         stage.work(stage.settings, Job(inputs, folders[stage.key], "000"))
@@ -205,10 +205,9 @@ def test_only_the_changed_aligner_runs_again(tiny: Simulation) -> None:
     changed = tiny.align.aligners[0].model_copy(update={"parameters": {"gate_m": 0.25}})
     entries = [changed, *tiny.align.aligners[1:]]
     other = tiny.model_copy(update={"align": tiny.align.model_copy(update={"aligners": entries})})
-    (before,), (after,) = (lay_out(scenario).pairs for scenario in (tiny, other))
-    assert after.match.key == before.match.key
-    same = [a.key == b.key for a, b in zip(after.aligners, before.aligners, strict=True)]
-    assert same == [False, True, True]
+    before, after = (lay_out(scenario).pairs[0].estimates.before for scenario in (tiny, other))
+    same = {name: after[name].key == stage.key for name, stage in before.items()}
+    assert same == {"match": True, "aligner 0": False, "aligner 1": True, "aligner 2": True}
 
 
 def test_commands_one_by_one(
