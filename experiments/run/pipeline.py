@@ -9,8 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from experiments.methods.catalogue import find_method
-from experiments.methods.installed import Kind
+from experiments.methods.catalogue import Kind, find_method
 from experiments.run.stage import RecordedLog, Stage
 from experiments.run.stages import (
     align,
