@@ -7,7 +7,7 @@ import numpy as np
 
 from mapfusion.align.rigid import motion_jacobian
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.robot_log import DESCRIPTOR_LENGTH, NO_LABEL
+from mapfusion.robot_log import DESCRIPTOR_LENGTH, NO_LABEL, with_rows
 from mapfusion.se2 import Float, transform_covariances, transform_points
 
 ABSENT = -1
@@ -20,14 +20,7 @@ def fuse(
 
     Eq. 13 is printed with L_i - L_j, which moves the result away from L_j; the sign here is right.
 
-    Args:
-        position_i: (N, D).
-        covariance_i: (N, D, D).
-        position_j: (N, D).
-        covariance_j: (N, D, D).
-
-    Returns:
-        Positions (N, D) and covariances (N, D, D).
+    Positions are (N, D), covariances (N, D, D), those returned as well.
     """
     # S_i and S_i + S_j are symmetric, so K^T solves (S_i + S_j) K^T = S_i
     gain = np.swapaxes(np.linalg.solve(covariance_i + covariance_j, covariance_i), 1, 2)  # eq. 12
@@ -70,13 +63,8 @@ class AlignedLandmarks:
     ) -> "AlignedLandmarks":
         """Map k of `maps` in the fused frame.
 
-        Args:
-            maps: all that are merged.
-            k: which of them.
-            T_first_map: (3,) its motion into the fused frame.
-            covariance_T: (3, 3) of that motion, to be added; None leaves it out.
-            drift_sigma_m: the map's share in s_drift.
-            use_drift: whether the covariances get that share.
+        The covariance of the motion (3, 3) is added to the landmarks' unless it is None, the map's
+        share in s_drift if `use_drift` is set.
         """
         source = maps[k]
         n = len(source)
@@ -103,15 +91,7 @@ class AlignedLandmarks:
         return len(self.position_m)
 
     def __getitem__(self, rows: np.ndarray) -> "AlignedLandmarks":
-        return AlignedLandmarks(
-            self.position_m[rows],
-            self.covariance_m2[rows],
-            self.drift_m2[rows],
-            self.count[rows],
-            self.descriptor[rows],
-            self.label[rows],
-            self.parents[rows],
-        )
+        return with_rows(self, rows)
 
     def joined(
         self, other: "AlignedLandmarks", rows: np.ndarray, others: np.ndarray, dimensions: int

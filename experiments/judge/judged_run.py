@@ -99,6 +99,7 @@ def _judgement(scenario: AnyScenario, pair: PairStages) -> Stage:
         MergeSettings(**dict(scenario.merge)),
         scenario.evaluate.true_pair_radius_m,
     )
-    before = {**pair.match.before, "align": pair.estimates}
+    before = {"align": pair.estimates, "log_a": pair.a.log, "slam_a": pair.a.slam}
+    before |= {"log_b": pair.b.log, "slam_b": pair.b.slam}
     label = "compare with the truth"
     return Stage("judge", label, settings, judging.run, judging.WRITES, before)

@@ -1,4 +1,1 @@
-"""Alignment methods by name, whoever wrote them: names in, aligners out, each called safely.
-
-Our own are called in place, others' in a process of their own.
-"""
+"""Alignment methods by name: names in, aligners out, our own in place, others' in a process."""

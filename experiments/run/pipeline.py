@@ -11,8 +11,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
 
-from experiments.methods.catalogue import find_method
-from experiments.methods.installed import Kind
+from experiments.methods.catalogue import Kind, find_method
 from experiments.run.stage import WHOLE, RecordedLog, Stage, with_those_before
 from experiments.run.stages import (
     align,

@@ -1,7 +1,7 @@
 """The nearest landmark of a map: a grid over the plane, searched ring by ring."""
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -11,9 +11,8 @@ from mapfusion.se2 import Float
 _LANDMARKS_PER_CELL = 2.0  # on average; few enough to look at all, enough to skip empty space
 
 
-@dataclass(frozen=True)
-class Grid:
-    """N points sorted into square cells of the plane.
+class Grid(NamedTuple):
+    """N points sorted into square cells of the plane, for the kernels.
 
     Attributes:
         p: (N, 3) the points, cell by cell.
@@ -48,23 +47,15 @@ class Grid:
 
 
 @njit(cache=True)
-def nearest_two(
-    qx: float,
-    qy: float,
-    qz: float,
-    p: Float,
-    start: np.ndarray,
-    corner_m: Float,
-    cell_m: float,
-    shape: np.ndarray,
-) -> tuple[int, float, float]:
-    """Index into p of the point nearest to q, its distance, and the distance of the next one.
+def nearest_two(qx: float, qy: float, qz: float, grid: Grid) -> tuple[int, float, float]:
+    """Index into grid.p of the point nearest to q, its distance, and that of the next one.
 
     The last is infinite when there is one point only.
     """
+    p, start, corner_m, cell_m = grid.p, grid.start, grid.corner_m, grid.cell_m
     at_x = math.floor((qx - corner_m[0]) / cell_m)
     at_y = math.floor((qy - corner_m[1]) / cell_m)
-    nx, ny = shape[0], shape[1]
+    nx, ny = grid.shape[0], grid.shape[1]
     first, square1, square2 = -1, math.inf, math.inf
     ring = max(0, -at_x, at_x - nx + 1, -at_y, at_y - ny + 1)  # the first that meets the grid
     last = max(at_x, nx - 1 - at_x, at_y, ny - 1 - at_y)

@@ -1,6 +1,7 @@
 """Pairs of landmarks, one of each map, that may be the same point of the world."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -155,75 +156,53 @@ def _nearest_both_ways(
     assert map_b.descriptor is not None
     descriptor_a = np.nan_to_num(map_a.descriptor.astype(np.float32), nan=_ABSENT)
     descriptor_b = np.nan_to_num(map_b.descriptor.astype(np.float32), nan=-_ABSENT)
-    square_a = np.einsum("ij,ij->i", descriptor_a, descriptor_a)
-    square_b = np.einsum("ij,ij->i", descriptor_b, descriptor_b)
-    planar = map_a.planar or map_b.planar
-    height_bound = np.inf if planar else parameters.height.bound
-    nearest_b, best_of_a = np.zeros(len(map_a), np.int64), np.full(len(map_a), np.inf)
-    nearest_a, best_of_b = np.zeros(len(map_b), np.int64), np.full(len(map_b), np.inf)
+    a = _Side.of(map_a, descriptor_a, 0.0)
+    b = _Side.of(map_b, descriptor_b, parameters.height.floor_m**2)
+    height_bound = np.inf if map_a.planar or map_b.planar else parameters.height.bound
     for start in range(0, len(map_a), _BLOCK_ROWS):
-        rows = slice(start, start + _BLOCK_ROWS)
-        take_nearer(
-            descriptor_a[rows] @ descriptor_b.T,
-            start,
-            square_a,
-            square_b,
-            map_a.position_m[:, 2],
-            map_b.position_m[:, 2],
-            map_a.covariance_m2[:, 2, 2],
-            map_b.covariance_m2[:, 2, 2] + parameters.height.floor_m**2,
-            height_bound,
-            nearest_b,
-            best_of_a,
-            nearest_a,
-            best_of_b,
+        product = descriptor_a[start : start + _BLOCK_ROWS] @ descriptor_b.T
+        _take_nearer(product, start, a, b, height_bound)
+    return a.nearest, a.distance2, b.nearest
+
+
+class _Side(NamedTuple):
+    """The N landmarks of one map, and the nearest of the other map so far, for the kernel."""
+
+    square: np.ndarray  # (N,) squared norms of the descriptors
+    z_m: Float  # (N,)
+    variance_m2: Float  # (N,) of the heights
+    nearest: np.ndarray  # (N,)
+    distance2: Float  # (N,) to that
+
+    @classmethod
+    def of(cls, landmarks: LandmarkMap, descriptor: np.ndarray, floor_m2: float) -> "_Side":
+        n = len(landmarks)
+        return cls(
+            np.einsum("ij,ij->i", descriptor, descriptor),
+            landmarks.position_m[:, 2],
+            landmarks.covariance_m2[:, 2, 2] + floor_m2,
+            np.zeros(n, np.int64),
+            np.full(n, np.inf),
         )
-    return nearest_b, best_of_a, nearest_a
 
 
 @njit(cache=True)
-def take_nearer(
-    product: np.ndarray,
-    start: int,
-    square_a: np.ndarray,
-    square_b: np.ndarray,
-    z_a: Float,
-    z_b: Float,
-    variance_a: Float,
-    variance_b: Float,
-    height_bound: float,
-    nearest_b: np.ndarray,
-    best_of_a: Float,
-    nearest_a: np.ndarray,
-    best_of_b: Float,
-) -> None:
-    """Update the nearest both ways, with squared distances, from scalar products of descriptors.
+def _take_nearer(product: np.ndarray, start: int, a: _Side, b: _Side, height_bound: float) -> None:
+    """Update the nearest both ways from scalar products of descriptors.
 
-    Args:
-        product: (n, N_b) of rows start to start + n of map a with all of map b.
-        start: first of these rows.
-        square_a: (N_a,) squared norms of the descriptors.
-        square_b: (N_b,) squared norms of the descriptors.
-        z_a: (N_a,) heights.
-        z_b: (N_b,) heights.
-        variance_a: (N_a,) of the heights.
-        variance_b: (N_b,) of the heights.
-        height_bound: most for the squared difference of heights over its variance.
-        nearest_b: (N_a,) updated.
-        best_of_a: (N_a,) updated.
-        nearest_a: (N_b,) updated.
-        best_of_b: (N_b,) updated.
+    `product` (n, N_b) is of rows `start` to `start` + n of map a with all of map b, `height_bound`
+    the most for the squared difference of heights over its variance.
     """
     for k in range(product.shape[0]):
         i = start + k
         for j in range(product.shape[1]):
-            distance2 = square_a[i] + square_b[j] - 2 * product[k, j]
-            if distance2 >= best_of_a[i] and distance2 >= best_of_b[j]:
+            distance2 = a.square[i] + b.square[j] - 2 * product[k, j]
+            if distance2 >= a.distance2[i] and distance2 >= b.distance2[j]:
                 continue
-            dz = z_a[i] - z_b[j]
-            if dz * dz > height_bound * (variance_a[i] + variance_b[j]):
+            dz = a.z_m[i] - b.z_m[j]
+            if dz * dz > height_bound * (a.variance_m2[i] + b.variance_m2[j]):
                 continue
-            if distance2 < best_of_a[i]:
-                nearest_b[i], best_of_a[i] = j, distance2
-            if distance2 < best_of_b[j]:
-                nearest_a[j], best_of_b[j] = i, distance2
+            if distance2 < a.distance2[i]:
+                a.nearest[i], a.distance2[i] = j, distance2
+            if distance2 < b.distance2[j]:
+                b.nearest[j], b.distance2[j] = i, distance2

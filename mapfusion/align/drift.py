@@ -28,16 +28,8 @@ def drift_step(
     radius g, is -log|C|/2 - e' C^-1 e/2 - log(1 - exp(-g^2 / 2v)) with v = tr C / 2. The last term
     is exact for isotropic C and small otherwise, since a gate is wide. The three parameters that
     the fitted motion took from the 2N numbers are made good by their share.
-
-    Args:
-        residual_m: (N, 2) about a fitted motion.
-        covariance_m2: (N, 2, 2) S = S_a + R S_b R^T.
-        weight: (N,) 0 to 1, how surely each pair is true.
-        variance_m2: s_drift^2 to step from.
-        gate_m: g, infinite for no gate.
-
-    Returns:
-        The next s_drift^2, at least DRIFT_FLOOR_M squared.
+    S = S_a + R S_b R^T is (N, 2, 2), `weight` (N,) 0 to 1 how surely each pair is true. The next
+    s_drift^2 is at least DRIFT_FLOOR_M squared.
     """
     numbers = 2 * np.sum(weight)
     share = numbers / max(numbers - _MOTION_PARAMETERS, 1.0)
@@ -74,13 +66,8 @@ def _climb(residual_m: Float, covariance_m2: Float, variance_m2: float, gate_m: 
 def estimate_drift_m(residual_m: Float, covariance_m2: Float, gate_m: float = math.inf) -> float:
     """Most likely s_drift in metres for the residuals of pairs about a fitted motion.
 
-    Args:
-        residual_m: (N, 2).
-        covariance_m2: (N, 2, 2) S_a + R S_b R^T.
-        gate_m: radius beyond which residuals were dropped.
-
-    Returns:
-        s_drift; DRIFT_FLOOR_M where the covariances explain the residuals, or there are none.
+    Residuals are (N, 2), S_a + R S_b R^T (N, 2, 2), those beyond `gate_m` were dropped. It is
+    DRIFT_FLOOR_M where the covariances explain the residuals, or there are none.
     """
     if len(residual_m) == 0:
         return DRIFT_FLOOR_M

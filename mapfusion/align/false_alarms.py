@@ -154,11 +154,7 @@ def first_from(p: Float, by_x: np.ndarray, x: float) -> int:
 def minimal_motion(p_a: Float, p_b: Float, supporters: np.ndarray, T_a_b: Float) -> Float:
     """The motion (3,) of two pairs nearest to T_a_b: least displacement of the supporters (RMS).
 
-    Args:
-        p_a: (n, 2).
-        p_b: (n, 2).
-        supporters: (k,) rows of the pairs, those that T_a_b fits best first.
-        T_a_b: (3,).
+    Supporters (k,) are rows of the pairs (n, 2), those that T_a_b fits best first.
     """
     k = len(supporters)
     mean_x = mean_y = square = 0.0
@@ -210,14 +206,7 @@ def agreeing_repairings(
 ) -> np.ndarray:
     """How many (i, j), i not j, of one height agree under T_a_b within each gate.
 
-    Args:
-        T_a_b: (3,).
-        pairs: all N.
-        gates_m: (G,) ascending.
-        first: size of the selection.
-
-    Returns:
-        (2, G): among the first pairs only, among all.
+    Counts (2, G), for ascending gates: among the `first` pairs only, among all.
     """
     p_a, p_b, heights, _, by_x = pairs
     moved = moved_points(T_a_b, p_b)
@@ -259,13 +248,8 @@ def fewest_false_alarms(
 ) -> tuple[float, float, int, int]:
     """The smallest NFA over gates and selections of the best-matching pairs.
 
-    Args:
-        pairs: the N at hand.
-        T_a_b: (3,) to be judged.
-        gates_m: (G,) ascending.
-
-    Returns:
-        log10 of the NFA, and the gate, number of pairs and of supporters it came from.
+    Gates (G,) are ascending. Returns log10 of the NFA, and the gate, number of pairs and of
+    supporters it came from.
     """
     p_a, p_b, _, possible, _ = pairs
     total = len(p_a)

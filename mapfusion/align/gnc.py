@@ -42,13 +42,8 @@ class Gnc(Consensus):
 def anneal(pairs: PlanarPairs, mean_m2: Float, bound: float) -> tuple[Float, Float]:
     """Alternate closed-form fits and weights while the cost goes from convex to truncated.
 
-    Args:
-        pairs: N correspondences.
-        mean_m2: (N,) variance of each residual per axis.
-        bound: c^2.
-
-    Returns:
-        T_a_b (3,), NaN when all pairs lost their weight, and the weights (N,).
+    `mean_m2` (N,) is the variance of each residual per axis, `bound` c^2. Returns T_a_b (3,), NaN
+    when all pairs lost their weight, and the weights (N,).
     """
     p_a, p_b = pairs.p_a, pairs.p_b
     n = len(p_a)

@@ -56,20 +56,18 @@ class ClosestPoints:
 
     def __init__(self, map_a: LandmarkMap, map_b: LandmarkMap) -> None:
         upright = np.array([1.0, 1.0, 0.0 if map_a.planar or map_b.planar else 1.0])
-        grid = Grid.of(map_a.position_m * upright)
+        self._grid = Grid.of(map_a.position_m * upright)
         self._maps = map_a, map_b
-        self._row = grid.row
-        self._cells = (grid.p, grid.start, grid.corner_m, grid.cell_m, grid.shape)
         self._p_b = map_b.position_m * upright
 
     def cost_m2(self, T_a_b: Float) -> float:
         """Summed squared distance of map b's landmarks under T_a_b to their nearest in map a."""
-        return summed_square_distance(T_a_b, self._p_b, *self._cells)
+        return summed_square_distance(T_a_b, self._p_b, self._grid)
 
     def descend(self, T_a_b: Float, pairs: Pairs, max_rounds: int) -> Fit:
         """Pair and solve from T_a_b on until the pairing repeats; fitted to the last pairing."""
-        T_a_b, nearest, repeats = pair_and_solve(T_a_b, max_rounds, self._p_b, *self._cells)
-        index_a, index_b = self._row[nearest], np.arange(len(nearest))
+        T_a_b, nearest, repeats = pair_and_solve(T_a_b, max_rounds, self._p_b, self._grid)
+        index_a, index_b = self._grid.row[nearest], np.arange(len(nearest))
         return Fit(
             T_a_b,
             index_a[pairs.index_b] == pairs.index_a,
@@ -79,37 +77,22 @@ class ClosestPoints:
 
 
 @njit(cache=True)
-def summed_square_distance(
-    T_a_b: Float,
-    p_b: Float,
-    p: Float,
-    start: np.ndarray,
-    corner_m: Float,
-    cell_m: float,
-    shape: np.ndarray,
-) -> float:
-    """Sum over p_b (N, 3) of the squared distance under T_a_b to the nearest point of a Grid."""
+def summed_square_distance(T_a_b: Float, p_b: Float, grid: Grid) -> float:
+    """Sum over p_b (N, 3) of the squared distance under T_a_b to the nearest point of the grid."""
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
     total = 0.0
     for i in range(len(p_b)):
         x, y = moved_point(T_a_b, cos, sin, p_b[i, 0], p_b[i, 1])
-        _, distance, _ = nearest_two(x, y, p_b[i, 2], p, start, corner_m, cell_m, shape)
+        _, distance, _ = nearest_two(x, y, p_b[i, 2], grid)
         total += distance * distance
     return total
 
 
 @njit(cache=True)
 def pair_and_solve(
-    T_start: Float,
-    max_rounds: int,
-    p_b: Float,
-    p: Float,
-    start: np.ndarray,
-    corner_m: Float,
-    cell_m: float,
-    shape: np.ndarray,
+    T_start: Float, max_rounds: int, p_b: Float, grid: Grid
 ) -> tuple[Float, np.ndarray, bool]:
-    """Pair p_b (N, 3) with the nearest points of a Grid and solve, until no pair changes.
+    """Pair p_b (N, 3) with the nearest points of a grid and solve, until no pair changes.
 
     A landmark that moved less than its neighbours' distances differ keeps its neighbour (triangle
     inequality), and is not looked up again.
@@ -117,7 +100,7 @@ def pair_and_solve(
     Returns:
         T_a_b (3,), index into the grid's points of each one's nearest (N,), whether it repeats.
     """
-    n = len(p_b)
+    n, p = len(p_b), grid.p
     T_a_b = T_start.copy()
     nearest = np.full(n, -1)
     clear = np.zeros(n)  # no other point of the grid is nearer than this
@@ -136,7 +119,7 @@ def pair_and_solve(
                 dx, dy, dz = x - p[k, 0], y - p[k, 1], z - p[k, 2]
                 if clear[i] > 0 and dx * dx + dy * dy + dz * dz < clear[i] * clear[i]:
                     continue
-            found, _, clear[i] = nearest_two(x, y, z, p, start, corner_m, cell_m, shape)
+            found, _, clear[i] = nearest_two(x, y, z, grid)
             if found != k:
                 changed = True
                 nearest[i] = found

@@ -20,13 +20,8 @@ def why_one_pair(
     """Why the motion rests on the pair of most leverage; empty when it does not.
 
     Left out, it must not let the motion go further than the gate: other pairs would be true then.
-
-    Args:
-        T_a_b: (3,) from all pairs.
-        T_without: (3,) from there without the pair of most leverage; None where there is none.
-        pairs: all N.
-        truth: (N,) probability of being true.
-        gate_m: distance up to which pairs take part.
+    T_without is None where the others determine no motion; `truth` (N,) is the probability of being
+    true, `gate_m` the distance up to which pairs take part.
     """
     if T_without is None:
         return "rests on one correspondence: without it there is no motion"
@@ -46,13 +41,7 @@ def most_leverage(
 
     The hat matrix of weighted least squares (Hoaglin and Welsch 1978), with W = truth C^-1 and
     C = S_a + R S_b R^T + s_drift^2 I.
-
-    Args:
-        T_a_b: (3,).
-        pairs: N correspondences, at least 1.
-        variance_m2: s_drift^2.
-        truth: (N,) probability of being true.
-        covariance: (3, 3) of T_a_b.
+    `truth` (N,) is the probability of being true, `covariance` (3, 3) that of T_a_b.
     """
     _, p_b, S_a, S_b = pairs
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])

@@ -72,17 +72,8 @@ def mark_supporters(
 ) -> tuple[int, float]:
     """Mark the pairs with e^T C^-1 e <= bound in `inside` (N,).
 
-    Args:
-        T_a_b: (3,).
-        pairs: N correspondences.
-        mean_m2: (N,) `mean_variances` for this s_drift.
-        variance_m2: s_drift^2.
-        bound: chi-square of 2 degrees of freedom.
-        inside: (N,) bool, filled.
-
-    Returns:
-        Number of supporters, and the sum of what each stays below the bound: up to a constant,
-        minus the truncated squares of all.
+    `mean_m2` are the `mean_variances` for this s_drift. Returns the number of supporters, and the
+    sum of what each stays below the bound: up to a constant, minus the truncated squares of all.
     """
     p_a, p_b, S_a, S_b = pairs
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
@@ -129,8 +120,7 @@ def settle(
 ) -> int:
     """Fit to the support and take the support again until it repeats; T_a_b, inside are changed.
 
-    Returns:
-        Number of supporters; below two T_a_b is not fitted again.
+    Returns the number of supporters; below two T_a_b is not fitted again.
     """
     mean = mean_variances(pairs, variance_m2)
     n = len(mean)
@@ -175,16 +165,8 @@ def settle_at_best_scale(
     """Settle T_a_b at every scale, coarse to fine, and keep the likeliest.
 
     T_a_b (3,) and inside (N,) are changed.
-
-    Args:
-        T_a_b: (3,) to start from.
-        pairs: N correspondences.
-        variances_m2: (L,) s_drift^2, ascending.
-        bound: chi-square of 2 degrees of freedom.
-        inside: (N,) bool, filled with the support at the scale chosen.
-
-    Returns:
-        The log-likelihood, and the scale chosen; -1 when fewer than two pairs support any.
+    Scales (L,) are s_drift^2, ascending. Returns the log-likelihood and the scale chosen; -1 when
+    fewer than two pairs support any.
     """
     n = len(pairs.p_a)
     area = max(spread_area_m2(pairs.p_a), spread_area_m2(pairs.p_b))

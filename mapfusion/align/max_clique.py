@@ -94,12 +94,7 @@ def degeneracy_order(graph: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def greedy_clique(graph: np.ndarray, starts: int) -> np.ndarray:
     """A large clique: from each of the vertices of most neighbours, add the next of most that fits.
 
-    Args:
-        graph: (N, W) symmetric.
-        starts: number of vertices to begin from.
-
-    Returns:
-        (K,) its vertices; the largest of all walks, the first on a tie.
+    From `starts` vertices; of all walks (K,) the largest, the first on a tie.
     """
     n, words = graph.shape
     order = by_degree(n - 1 - degrees(graph))
@@ -134,17 +129,9 @@ def colour(
 ) -> int:
     """Colour candidates so that neighbours differ; a clique holds at most one of each colour.
 
-    Args:
-        graph: (n, W).
-        candidates: (W,) the set to colour.
-        at_least: vertices of this colour number or less cannot lead on and are not listed.
-        vertex: filled with the others, by ascending colour.
-        number: filled with their colours, counted from 1.
-        uncoloured: (W,) work space.
-        same: (W,) work space.
-
-    Returns:
-        How many are listed.
+    Candidates (W,) are a set of the graph's (n, W) vertices. Those of a colour number `at_least` or
+    less cannot lead on; the others are listed in `vertex`, by ascending colour, with their colours,
+    counted from 1, in `number`. `uncoloured` and `same` (W,) are work space. Returns how many.
     """
     words = len(candidates)
     uncoloured[:] = candidates
@@ -257,13 +244,9 @@ def larger_clique(graph: np.ndarray, at_least: int, budget: int) -> tuple[np.nda
     Vertices are taken from the densest core outwards; each with its neighbours that come later in
     degeneracy order, which are few, so that every clique is looked for where its first vertex is.
 
-    Args:
-        graph: (N, W) symmetric, bit j of row i for an edge, no diagonal.
-        at_least: size to exceed, 1 or more.
-        budget: nodes of the search, after which the largest found so far is returned.
-
-    Returns:
-        (K,) its vertices, none when no clique is larger; and whether the search came to its end.
+    The graph (N, W) is symmetric, bit j of row i for an edge, no diagonal. After `budget` nodes of
+    the search the largest found so far is returned. Returns (K,) vertices, none when no clique is
+    larger; and whether the search came to its end.
     """
     n, words = graph.shape
     order, core = degeneracy_order(graph)

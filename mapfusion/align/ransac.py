@@ -163,18 +163,9 @@ def most_supported(
     """Draw minimal sets until two supporters of the best motion would have come up by now.
 
     A motion with as much support as the best so far is settled on its support before it counts.
-
-    Args:
-        p_a: (N, 2 or 3), N at least 2.
-        p_b: (N, 2 or 3).
-        gate_m: distance up to which a pair supports a motion.
-        min_baseline_m: smallest distance within a minimal set.
-        log_miss: logarithm of the chance accepted of never drawing two supporters.
-        max_draws: end of the search in any case.
-        seed: of the draws, not 0.
-
-    Returns:
-        Number of draws, T_a_b (3,), rows of its supporters; none when no motion was found.
+    Points are (N, 2 or 3), N at least 2, `seed` is not 0, `log_miss` the logarithm of the chance
+    accepted of never drawing two supporters. Returns the number of draws, T_a_b (3,), rows of its
+    supporters; none when no motion was found.
     """
     n = len(p_a)
     best_T, T_a_b = np.full(3, np.nan), np.empty(3)

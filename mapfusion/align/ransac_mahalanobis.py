@@ -75,18 +75,9 @@ def least_truncated_squares(
 ) -> tuple[int, Float]:
     """Draw minimal sets until two supporters of the best motion would have come up by now.
 
-    Args:
-        pairs: N correspondences, at least 2.
-        variance_m2: s_drift^2.
-        bound: most for e^T C^-1 e of a supporter.
-        agreement: most for the squared difference of a set's two lengths over its variance.
-        min_baseline_m: smallest distance within a minimal set.
-        log_miss: logarithm of the chance accepted of never drawing two supporters.
-        max_draws: end of the search in any case.
-        seed: of the draws, not 0.
-
-    Returns:
-        Number of draws and T_a_b (3,), NaN when no motion was found.
+    `bound` is the most for e^T C^-1 e of a supporter, `agreement` for the squared difference of a
+    set's two lengths over its variance, `log_miss` the logarithm of the chance accepted of never
+    drawing two supporters, `seed` not 0. Returns the number of draws and T_a_b (3,), NaN for none.
     """
     p_a, p_b = pairs.p_a, pairs.p_b
     n = len(p_a)

@@ -81,7 +81,7 @@ class Refinement:
         planar = pairs[rows].in_plan()
         limits = (self.gate_m, self.least_drift_m, self.max_rounds)
         solved, moved_m, T_a_b, covariance, variance, truth = maximise_likelihood(
-            *planar, T_a_b, *limits
+            planar, T_a_b, *limits
         )
         if not solved:
             reason = f"the pairs within {self.gate_m:g} m of the estimate determine no motion"
@@ -98,7 +98,7 @@ class Refinement:
         else:
             left_out = most_leverage(T_a_b, planar, variance, truth, covariance)
             others = PlanarPairs(*(np.delete(part, left_out, axis=0) for part in planar))
-            solved, _, T_without, *_ = maximise_likelihood(*others, T_a_b, *limits)
+            solved, _, T_without, *_ = maximise_likelihood(others, T_a_b, *limits)
             reason = why_one_pair(T_a_b, T_without if solved else None, planar, truth, self.gate_m)
         T_a_b[2] = wrap(T_a_b[2])
         return Alignment(
@@ -113,10 +113,9 @@ class Refinement:
 
 
 @njit(cache=True)
-def residuals_under(
-    T_a_b: Float, p_a: Float, p_b: Float, S_a: Float, S_b: Float, e: Float, S: Float
-) -> None:
+def residuals_under(T_a_b: Float, pairs: PlanarPairs, e: Float, S: Float) -> None:
     """Fill e = p_a - T p_b (N, 2) and S = S_a + R S_b R^T (N, 2, 2)."""
+    p_a, p_b, S_a, S_b = pairs
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
     for i in range(len(p_a)):
         e[i, 0], e[i, 1] = residual(T_a_b, cos, sin, p_a, p_b, i)
@@ -192,16 +191,8 @@ def missing_information(
     """What not knowing which pairs are true takes from the information (3, 3) (Louis 1982).
 
     When the motion moves, so do the probabilities: d truth / de = -truth (1 - truth) C^-1 e, and a
-    normal matrix with certain weights would promise too much.
-
-    Args:
-        T_a_b: (3,).
-        p_b: (N, 2 or more).
-        e: (N, 2) residuals.
-        S: (N, 2, 2) S_a + R S_b R^T.
-        weighed_m2: s_drift^2 in the weights.
-        judged_m2: s_drift^2 in the probabilities.
-        truth: (N,) probability of being true.
+    normal matrix with certain weights would promise too much. `weighed_m2` is s_drift^2 in the
+    weights, `judged_m2` in the probabilities; e and S are those of `residuals_under`.
     """
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
     missing = np.zeros((3, 3))
@@ -241,14 +232,7 @@ def invert(matrix: Float, inverse: Float) -> bool:
 
 @njit(cache=True)
 def maximise_likelihood(
-    p_a: Float,
-    p_b: Float,
-    S_a: Float,
-    S_b: Float,
-    T_start: Float,
-    gate_m: float,
-    least_drift_m: float,
-    max_rounds: int,
+    pairs: PlanarPairs, T_start: Float, gate_m: float, least_drift_m: float, max_rounds: int
 ) -> tuple[bool, float, Float, np.ndarray, float, Float]:
     """Expectation maximisation for motion, s_drift and share of true pairs.
 
@@ -257,7 +241,7 @@ def maximise_likelihood(
         landmark (m), T_a_b (3,), its covariance (3, 3), s_drift^2, each pair's probability of being
         true (N,).
     """
-    n = len(p_a)
+    n, p_b = len(pairs.p_a), pairs.p_b
     T_a_b = T_start.copy()
     e, S = np.empty((n, 2)), np.empty((n, 2, 2))
     inside, truth = np.zeros(n, np.bool_), np.zeros(n)
@@ -269,7 +253,7 @@ def maximise_likelihood(
     judged = weighed = variance
     normal, at = np.zeros((3, 3)), np.empty(3)
     for rounds in range(max_rounds):
-        residuals_under(T_a_b, p_a, p_b, S_a, S_b, e, S)
+        residuals_under(T_a_b, pairs, e, S)
         if rounds < _SETTLING_ROUNDS:
             for i in range(n):
                 inside[i] = e[i, 0] * e[i, 0] + e[i, 1] * e[i, 1] <= gate_m * gate_m

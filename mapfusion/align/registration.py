@@ -70,7 +70,7 @@ class MethodAligner:
         height = getattr(self.method, "height", None)
         if isinstance(height, HeightGate):
             rows = pairs.of_one_height(height)
-        needs = getattr(self.method, "needs", Needs())
+        needs = getattr(self.method, "needs", None) or Needs()
         given = pairs if len(rows) == len(pairs) else pairs[rows]
         reason = _why_not_called(needs, pairs, given)
         found = Undetermined(reason) if reason else self.method.find(given, rng)
@@ -91,11 +91,7 @@ def alignment_of_fit(
 ) -> Alignment:
     """A method's answer with drift and covariance judged from the residuals that it fitted.
 
-    Args:
-        found: what it found among the pairs it was given.
-        pairs: all N.
-        rows: (n,) which of them it was given.
-        started_s: `time.perf_counter()` at the start.
+    It was given `rows` (n,) of all N pairs, at `time.perf_counter()` `started_s`.
     """
     if isinstance(found, Undetermined):
         return undetermined(found.reason, len(pairs), started_s)

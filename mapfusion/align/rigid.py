@@ -41,10 +41,7 @@ def _fit_rows(
 def fit_rigid(p_a: Float, p_b: Float, rows: np.ndarray) -> tuple[float, float, float]:
     """tx, ty, theta that minimise the summed squared distance in the plane of p_a to T p_b.
 
-    Args:
-        p_a: (N, 2 or more).
-        p_b: (N, 2 or more).
-        rows: (n,) the pairs to use.
+    Points are (N, 2 or more), rows (n,) the pairs to use.
     """
     return _fit_rows(p_a, p_b, rows, np.ones(len(rows)))
 
@@ -84,11 +81,7 @@ def least_squares_gain(T_a_b: Float, p_b: Float, weight: Float | None = None) ->
     """How much each residual moves the motion that minimises sum of weight |p_a - T p_b|^2.
 
     To first order T_a_b's error is the sum of the gains (N, 3, 2) times the residuals.
-
-    Args:
-        T_a_b: (3,).
-        p_b: (N, 2 or more); not all in one place.
-        weight: (N,); all equal by default.
+    p_b are (N, 2 or more), not all in one place; weights (N,) are all equal by default.
     """
     jacobian = motion_jacobian(T_a_b, p_b)
     if weight is None:

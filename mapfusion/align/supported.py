@@ -14,12 +14,8 @@ def supported_by(
 ) -> Alignment:
     """The answer of a method whose motion is the least squares, equally weighted, of some pairs.
 
-    Args:
-        pairs: all that were given.
-        inlier: (N,) bool, which of them the motion was fitted to.
-        T_a_b: (3,) finite.
-        started_s: `time.perf_counter()` at the start.
-        refusal: why the estimate is not to be trusted, if so.
+    `inlier` (N,) marks those it was fitted to; `started_s` is `time.perf_counter()` at the start,
+    `refusal` why the estimate is not to be trusted, if so.
     """
     found = supported(pairs, inlier, T_a_b, refusal)
     return alignment_of_fit(found, pairs, np.arange(len(pairs)), started_s)

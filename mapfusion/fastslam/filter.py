@@ -145,8 +145,7 @@ class FastSlam:
     def best_associations(self) -> np.ndarray:
         """For each observation so far the source of the heaviest particle's landmark it went into.
 
-        Returns:
-            (n,) int64, -1 where the observation was dropped.
+        (n,) int64, -1 where the observation was dropped.
 
         Raises:
             ValueError: the history was not kept.
@@ -182,8 +181,7 @@ class FastSlam:
     ) -> tuple[Float, Float]:
         """Where the particles are after a motion.
 
-        Returns:
-            Poses (M, 3), and (M,) log of eq. 3's density over the density they were drawn from.
+        Poses (M, 3), and (M,) log of eq. 3's density over the density they were drawn from.
         """
         settings = self.parameters
         sigma = settings.motion.standard_deviations(odometry)

@@ -26,9 +26,7 @@ _ROUND = MEMORY // 2
 class ParticleMaps:
     """Landmarks of M particles.
 
-    Args:
-        n_particles: M.
-        gate: squared Mahalanobis distance that a match may have.
+    `gate` is the squared Mahalanobis distance that a match may have.
     """
 
     def __init__(self, n_particles: int, gate: float) -> None:
@@ -73,14 +71,8 @@ class ParticleMaps:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Start a slot for each observation that is NEW in some particle.
 
-        Args:
-            chosen: (K, M) as `association` decides.
-            seen: the K observations in the particles' maps.
-            observations: the K observations.
-            first_source: running number of the first of them.
-
-        Returns:
-            (n,) the new slots, and the rows of their observations.
+        `first_source` is the running number of the first observation. Returns the new slots (n,),
+        and the rows of their observations.
         """
         rows = np.flatnonzero(np.any(chosen == NEW, axis=1))
         created = np.array([self._take_slot() for _ in rows], dtype=np.int64)

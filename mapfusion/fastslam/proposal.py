@@ -39,11 +39,7 @@ def widened(
 ) -> Sightings:
     """Sightings at the predicted poses with the odometry's uncertainty in their covariances.
 
-    Args:
-        predicted: K observations as seen from the predicted poses of M particles.
-        T_map_predicted: (M, 3).
-        odometry: (3,) that led there.
-        sigma: (3,) its standard deviations.
+    Poses are (M, 3), odometry and its standard deviations `sigma` (3,).
     """
     covariance = predicted.covariance_m2.copy()
     _widen(predicted.point_m, covariance, T_map_predicted, odometry[2], sigma)
@@ -81,20 +77,9 @@ def informed_disturbance(
 
     The observations' part is a Gaussian at the most probable eta, found by Gauss-Newton steps from
     zero. Pairs weigh 1 / (1 + d^2 / gate) (Cauchy), since a wide gate lets false ones in.
-
-    Args:
-        slots: landmarks, up to date.
-        chosen: (K, M) slot that each observation shows in each particle; negative for none.
-        predicted: sightings, K observations as seen from the predicted poses.
-        T_map_predicted: (M, 3) undisturbed.
-        turn: heading part of the odometry, rad.
-        sigma: (3,) standard deviations of the odometry.
-        gate: squared Mahalanobis distance at which a pair weighs half.
-        planar: two degrees of freedom.
-        standard_normal: (M, 3) independent draws.
-
-    Returns:
-        (M, 3) eta, and (M,) log of its prior density over the density it was drawn from.
+    `chosen` (K, M) is negative for none, `turn` the heading part of the odometry, `sigma` (3,) its
+    standard deviations, `standard_normal` (M, 3) independent draws. Returns (M, 3) eta, and (M,)
+    log of its prior density over the density it was drawn from.
     """
     eta = np.zeros(T_map_predicted.shape)
     log_ratio = np.empty(len(eta))

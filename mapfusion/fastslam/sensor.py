@@ -80,17 +80,7 @@ def innovation(
 
     In planar data the height says nothing: its innovation is 0 and its variance in Z 1, so that it
     leaves the Mahalanobis distance and the determinant alone.
-
-    Args:
-        point: (M, 3) the observation in the maps.
-        noise: (M, 6) its covariances.
-        mean: (M, 3) of the landmark.
-        covariance: (M, 6) of the landmark.
-        m: the particle. (Rows are not passed: making a view costs more than the arithmetic.)
-        planar: two degrees of freedom.
-
-    Returns:
-        The innovation, the inverse of Z, |Z|.
+    Points are (M, 3), covariances (M, 6): passing rows would cost more than the arithmetic.
     """
     xx = covariance[m, 0] + noise[m, 0]
     xy = covariance[m, 1] + noise[m, 1]

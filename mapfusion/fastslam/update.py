@@ -17,15 +17,8 @@ def update_landmarks(
 ) -> Float:
     """Correct the landmarks that were chosen, in place, and tell what the observations say.
 
-    Args:
-        slots: landmarks, up to date.
-        chosen: (K, M) slot of each observation in each particle, or NEW, or DROPPED.
-        seen: sightings, K observations in M particles.
-        log_new: (K,) log density of an observation that matches nothing.
-        planar: two degrees of freedom.
-
-    Returns:
-        (M,) log likelihood of the frame: the product of eq. 10 over its observations.
+    `chosen` (K, M) is a slot, NEW or DROPPED, `log_new` (K,) the log density of an observation that
+    matches nothing. Returns (M,) log likelihood: the product of eq. 10 over the observations.
     """
     n_observations, n_particles = chosen.shape
     log_two_pi = (2.0 if planar else 3.0) * np.log(2.0 * np.pi)

@@ -73,13 +73,7 @@ def import_mrclam(
 ) -> list[Path]:
     """Write one log, with its truth, for each robot of a recording.
 
-    Args:
-        folder: the unpacked recording.
-        destination: where the logs go, each a folder `robotN`.
-        settings: frame rate and noise.
-
-    Returns:
-        The logs' folders, by robot.
+    Logs go to folders `robotN` of `destination`; they are returned by robot.
 
     Raises:
         InputError: a file is missing, damaged or foreign; names file and line. Nothing is written

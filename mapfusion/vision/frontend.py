@@ -48,9 +48,7 @@ class FrontEnd:
     def extract(self, left: np.ndarray, right: np.ndarray) -> Features:
         """Corners of the left image that have a match in the right one, described.
 
-        Args:
-            left: (H, W) uint8, rectified, of the camera's size.
-            right: likewise.
+        Images are (H, W) uint8, rectified, of the camera's size.
 
         Raises:
             ValueError: wrong shape or type; names the argument.

@@ -62,10 +62,6 @@ class HarrisParameters:
 def detect(image: np.ndarray, parameters: HarrisParameters) -> Float:
     """Corners (N, 2), u and v in pixels at sub-pixel precision, strongest first.
 
-    Args:
-        image: (H, W) uint8.
-        parameters: see there.
-
     Raises:
         ValueError: the image has another shape or type.
     """

@@ -34,16 +34,8 @@ def rigid_links(
     not always of another robot nearby: some points known to a millimetre pull at one end, where a
     wall at one distance leaves open whether the robot turned or slid. So there are four starts, of
     all links and without the near, the middle and the far third; that with most links wins.
-
-    Args:
-        p_before_m: (N, 3) points in the robot frame of the first frame.
-        covariance_before_m2: (N, 3, 3).
-        p_after_m: (N, 3) the same points in the robot frame of the second.
-        covariance_after_m2: (N, 3, 3).
-        probability: share of true links that the gate lets pass (chi-square, 3 degrees of freedom).
-
-    Returns:
-        All True where fewer than four links leave nothing to compare.
+    Points (N, 3) are in the robot frame of either frame; all True where fewer than four links leave
+    nothing to compare.
     """
     n = len(p_before_m)
     if n < _MIN_LINKS:

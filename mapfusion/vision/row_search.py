@@ -22,20 +22,9 @@ def search_rows(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Search there and back for each window.
 
-    Args:
-        left: (H, W) uint8.
-        right: (H, W) uint8.
-        pixel: (N, 2) int64 centres (u, v) in the left image; a window with less than one column to
-            spare is OUTSIDE.
-        min_disparity: whole pixels, not negative.
-        max_disparity: whole pixels.
-        half: half side of the window, pixels.
-        min_correlation: weakest zero-mean normalised correlation that counts.
-        max_ambiguity: 1 - correlation must stay below this share of the best rival's.
-        max_round_trip: largest difference between start and end, pixels.
-
-    Returns:
-        Disparities (N,) int64, meaningful where the verdict is MATCHED; verdicts (N,) int8.
+    Centres (u, v) (N, 2) with less than one column to spare are OUTSIDE. 1 - correlation must stay
+    below `max_ambiguity` of the best rival's, start and end differ by `max_round_trip` at most.
+    Returns disparities (N,), meaningful where the verdict is MATCHED, and verdicts (N,) int8.
     """
     height, width = left.shape
     scores = np.empty(width)

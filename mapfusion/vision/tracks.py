@@ -61,10 +61,7 @@ class Tracks:
 class Tracker:
     """Links each frame's features to those of the frame before; frames come in their order.
 
-    Args:
-        parameters: see there.
-        camera: that took the frames.
-        sigma_uv_px: standard deviation of a feature's place in the image.
+    `sigma_uv_px` is the standard deviation of a feature's place in the image.
     """
 
     def __init__(

@@ -1,8 +1,8 @@
-"""Plug-ins made up for a test: a module and the metadata by which it counts as installed."""
+"""Plug-ins made up for a test: a module and the metadata by which it counts as catalogue."""
 
 from pathlib import Path
 
-from experiments.methods import catalogue, installed
+from experiments.methods import catalogue
 
 MODULE = """
 import ctypes, os, signal, sys, time
@@ -107,12 +107,11 @@ def install(
     info.mkdir()
     metadata = f"Metadata-Version: 2.1\nName: {package}\nVersion: {version}\n"
     (info / "METADATA").write_text(metadata, encoding="utf-8")
-    points = f"[{installed.ENTRY_POINTS}]\n{name} = {target}\n"
+    points = f"[{catalogue.ENTRY_POINTS}]\n{name} = {target}\n"
     (info / "entry_points.txt").write_text(points, encoding="utf-8")
 
 
 def look_again() -> None:
-    """Forget which packages were found installed."""
-    catalogue.known_methods.cache_clear()
-    catalogue.name_clashes.cache_clear()
-    installed.fingerprint.cache_clear()
+    """Forget which packages were found catalogue."""
+    catalogue.declared.cache_clear()
+    catalogue.fingerprint.cache_clear()

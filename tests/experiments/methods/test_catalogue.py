@@ -5,9 +5,15 @@ import sys
 
 import pytest
 
-from experiments.methods import catalogue, installed
-from experiments.methods.catalogue import find_method, known_methods, make_method
-from experiments.methods.installed import Kind, KnownMethod, clashes, fingerprint
+from experiments.methods import catalogue
+from experiments.methods.catalogue import (
+    Kind,
+    KnownMethod,
+    find_method,
+    fingerprint,
+    known_methods,
+    make_method,
+)
 
 
 @pytest.fixture
@@ -20,9 +26,8 @@ def site(tmp_path, monkeypatch):
 
 
 def forget():
-    catalogue.known_methods.cache_clear()
-    catalogue.name_clashes.cache_clear()
-    installed.fingerprint.cache_clear()
+    catalogue.declared.cache_clear()
+    catalogue.fingerprint.cache_clear()
     importlib.invalidate_caches()
 
 
@@ -79,8 +84,9 @@ def test_a_name_of_two_packages_is_nobodys(site):
         find_method("theirs")
 
 
-def test_no_clash_without_a_second_claim():
-    assert clashes(["ransac"], [KnownMethod("theirs", Kind.PLUG_IN, "m:A", "package")]) == {}
+def test_no_clash_without_a_second_claim(site):
+    install(site, "package", "theirs = m:A")
+    assert catalogue.name_clashes() == {}
 
 
 @pytest.mark.parametrize("points", ["theirs = nothing here!", "theirs = no.such.module:Method"])
@@ -120,7 +126,7 @@ def test_ours_depend_on_nothing_but_our_source():
 
 
 def test_an_absent_package_is_told_with_what_installs_it():
-    method = KnownMethod("far", Kind.PEER, "m:Far", "far-package", "no_such_module_far", "peers")
+    method = KnownMethod("far", Kind.PEER, "m:Far", "far-package", "no_such_module_far")
     assert method.absence == (
         "the package far-package is not installed; pip install 'mapfusion[peers]' installs it"
     )

@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.methods.aligner_calls import callable_aligner, require_usable
+from experiments.methods.aligner_calls import callable_aligner, end_children, require_usable
 from experiments.methods.catalogue import make_method
-from experiments.methods.isolation import end_children
 from mapfusion import se2
 from mapfusion.align.registration import Registration, as_aligner
 from mapfusion.align.result import Alignment, Status

@@ -13,9 +13,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.methods import isolation
-from experiments.methods.aligner_calls import callable_aligner, require_usable
-from experiments.methods.isolation import Spec, child_for, end_children
+from experiments.methods import aligner_calls
+from experiments.methods.aligner_calls import (
+    Spec,
+    callable_aligner,
+    child_for,
+    end_children,
+    require_usable,
+)
 from experiments.scenario.randomness import generator
 from mapfusion.align.registration import Registration
 from mapfusion.align.result import Alignment, Status
@@ -124,7 +129,7 @@ def test_a_hanging_plug_in_is_ended(what: str) -> None:
 
 
 def test_a_plug_in_that_cuts_the_connection_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(isolation, "_END_LIMIT_S", 0.2)
+    monkeypatch.setattr(aligner_calls, "_END_LIMIT_S", 0.2)
     found = answer("closes everything")
     assert (found.status, found.reason) == (
         Status.FAILED,
@@ -176,7 +181,7 @@ def test_no_more_than_a_few_processes_live() -> None:
 
 
 def test_a_process_that_keeps_its_memory_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(isolation, "_MOST_GROWTH_BYTES", 2**25)
+    monkeypatch.setattr(aligner_calls, "_MOST_GROWTH_BYTES", 2**25)
     calls = [answer("grows").T_a_b[0] for _ in range(40)]
     assert all(answer_ > 1 for answer_ in calls)
     starts = np.flatnonzero(np.diff(calls) < -1)  # it counts its calls from the start again
@@ -202,8 +207,7 @@ def test_parameters_are_tried_before_a_run(parameters: dict, reason: str) -> Non
 PARENT = """
 from tests.helpers.made_up_maps import landmark_map, paired
 import numpy as np, sys
-from experiments.methods.aligner_calls import callable_aligner
-from experiments.methods.isolation import child_for, Spec
+from experiments.methods.aligner_calls import Spec, callable_aligner, child_for
 points = np.random.default_rng(0).uniform(0, 10, (12, 3))
 maps = landmark_map(points), landmark_map(points)
 what = sys.argv[1]

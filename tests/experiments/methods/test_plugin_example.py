@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from experiments.judge import tables
-from experiments.methods.isolation import end_children
+from experiments.methods.aligner_calls import end_children
 from mapfusion import se2
 from mapfusion.landmark_map import write_map
 from tests.helpers.made_up_maps import landmark_map

@@ -24,16 +24,12 @@ def test_finds_what_looking_at_all_finds(kind):
     all_distances = cdist(queries, p)
     two = np.sort(all_distances, axis=1)[:, :2]
     for q, distances, (d1, d2) in zip(queries, all_distances, two, strict=True):
-        k, first, second = nearest_two(
-            *q, grid.p, grid.start, grid.corner_m, grid.cell_m, grid.shape
-        )
+        k, first, second = nearest_two(*q, grid)
         assert (first, second) == pytest.approx((d1, d2), abs=1e-12)
         assert distances[grid.row[k]] == pytest.approx(d1, abs=1e-12)
 
 
 def test_one_point_has_no_second():
     grid = Grid.of(np.zeros((1, 3)))
-    k, first, second = nearest_two(
-        3.0, 4.0, 0.0, grid.p, grid.start, grid.corner_m, grid.cell_m, grid.shape
-    )
+    k, first, second = nearest_two(3.0, 4.0, 0.0, grid)
     assert (k, first, second) == (0, 5.0, np.inf)

@@ -8,6 +8,7 @@ from scipy.stats import f as f_distribution
 
 from mapfusion import se2
 from mapfusion.align.drift import drift_step
+from mapfusion.align.mahalanobis_gate import PlanarPairs
 from mapfusion.align.pairs import Pairs
 from mapfusion.align.refine import Refinement, maximise_likelihood
 from mapfusion.align.result import Status
@@ -56,7 +57,7 @@ def test_kernel_equals_its_twin(rounds):
     pairs = Pairs(stretched(rng, map_a), stretched(rng, map_b), c)
     start = pair.T_a_b + np.array([0.1, -0.05, 0.005])
     solved, _, T, covariance, variance, truth = maximise_likelihood(
-        pairs.p_a, pairs.p_b, pairs.covariance_a, pairs.covariance_b, start, 0.5, 0.06, rounds
+        pairs.in_plan(), start, 0.5, 0.06, rounds
     )
     twin = slow_iterate(pairs, start, 0.5, 0.06, rounds)
     assert solved
@@ -77,7 +78,7 @@ def test_few_pairs_far_surer_than_the_rest_do_not_swing_it(seed):
     S = np.eye(2) * (sigma**2 / 2)[:, None, None]
     start = T_a_b + np.array([0.05, 0.05, 0.01])
     solved, moved_m, T, _, variance, truth = maximise_likelihood(
-        p_a, p_b, S, S, start, 0.5, 0.1, 100
+        PlanarPairs(p_a, p_b, S, S), start, 0.5, 0.1, 100
     )
     assert solved
     assert moved_m < 1e-8
