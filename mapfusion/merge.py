@@ -88,13 +88,7 @@ def merge(
     """
     _require_fitting(maps, alignments, correspondences)
     kept = [k for k, alignment in enumerate(alignments, start=1) if alignment.ok]
-    T_first_map = np.full((len(maps), 3), np.nan)
-    T_first_map[0] = IDENTITY
-    drift = np.full(len(maps), np.nan)
-    for k in kept:
-        T_first_map[k] = alignments[k - 1].T_a_b
-        drift[k] = alignments[k - 1].drift_sigma_m / np.sqrt(2)
-    drift[0] = np.sqrt(np.mean(drift[kept] ** 2)) if kept else 0.0
+    T_first_map, drift = _motions(alignments, kept)
     planar = any(landmarks.planar for landmarks in maps)
     test = SamePoint(
         parameters.max_descriptor_distance, parameters.gate_probability, parameters.height, planar
@@ -107,15 +101,7 @@ def merge(
         other = AlignedLandmarks.of(
             maps, k, T_first_map[k], sigma_T, drift[k], parameters.use_drift
         )
-        # the first map's landmarks are the first rows of the fused map, in their order
-        rows, others = pairs.index_a[alignment.inlier], pairs.index_b[alignment.inlier]
-        missed_rows = np.setdiff1d(np.arange(len(fused)), rows)
-        missed_others = np.setdiff1d(np.arange(len(other)), others)
-        more_rows, more_others = one_to_one(
-            *test.candidates(fused[missed_rows], other[missed_others])
-        )
-        rows = np.concatenate([rows, missed_rows[more_rows]])
-        others = np.concatenate([others, missed_others[more_others]])
+        rows, others = _paired(fused, other, pairs[alignment.inlier], test)
         fused = fused.joined(other, rows, others, 2 if planar else 3)
 
     first, second, _ = test.candidates(fused, fused)
@@ -132,6 +118,33 @@ def merge(
         drift,
         len(duplicates) / max(len(fused), 1),
         left_out,
+    )
+
+
+def _motions(alignments: Sequence[Alignment], kept: Sequence[int]) -> tuple[Float, Float]:
+    """T_first_map (M, 3) and s_drift (M,) of each map; NaN for those that are left out."""
+    T_first_map = np.full((len(alignments) + 1, 3), np.nan)
+    T_first_map[0] = IDENTITY
+    drift = np.full(len(alignments) + 1, np.nan)
+    for k in kept:
+        T_first_map[k] = alignments[k - 1].T_a_b
+        drift[k] = alignments[k - 1].drift_sigma_m / np.sqrt(2)
+    drift[0] = np.sqrt(np.mean(drift[kept] ** 2)) if kept else 0.0
+    return T_first_map, drift
+
+
+def _paired(
+    fused: AlignedLandmarks, other: AlignedLandmarks, inliers: Correspondences, test: SamePoint
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of the fused and of the other map that are one: the inliers, then what they missed."""
+    # the first map's landmarks are the first rows of the fused map, in their order
+    rows, others = inliers.index_a, inliers.index_b
+    missed_rows = np.setdiff1d(np.arange(len(fused)), rows)
+    missed_others = np.setdiff1d(np.arange(len(other)), others)
+    more_rows, more_others = one_to_one(*test.candidates(fused[missed_rows], other[missed_others]))
+    return (
+        np.concatenate([rows, missed_rows[more_rows]]),
+        np.concatenate([others, missed_others[more_others]]),
     )
 
 

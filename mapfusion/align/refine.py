@@ -231,6 +231,19 @@ def invert(matrix: Float, inverse: Float) -> bool:
 
 
 @njit(cache=True)
+def _farthest_moved(T_a_b: Float, step: Float, p_b: Float, truth: Float) -> float:
+    """How far a step (3,) moves the landmark that it moves farthest, in m."""
+    cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+    moved = 0.0
+    for i in range(len(truth)):
+        if truth[i] > 0:
+            jx, jy = lever(cos, sin, p_b, i)
+            dx, dy = step[0] + jx * step[2], step[1] + jy * step[2]
+            moved = max(moved, math.sqrt(dx * dx + dy * dy))
+    return moved
+
+
+@njit(cache=True)
 def maximise_likelihood(
     pairs: PlanarPairs, T_start: Float, gate_m: float, least_drift_m: float, max_rounds: int
 ) -> tuple[bool, float, Float, np.ndarray, float, Float]:
@@ -280,13 +293,7 @@ def maximise_likelihood(
             step_share /= 2
         variance += step_share * change
         last_change = change
-        cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
-        moved = 0.0
-        for i in range(n):
-            if truth[i] > 0:
-                jx, jy = lever(cos, sin, p_b, i)
-                dx, dy = step[0] + jx * step[2], step[1] + jy * step[2]
-                moved = max(moved, math.sqrt(dx * dx + dy * dy))
+        moved = _farthest_moved(T_a_b, step, p_b, truth)
         for k in range(3):
             T_a_b[k] += step[k]
         if moved <= _TOLERANCE_M:
