@@ -2,82 +2,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from mapfusion import se2
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.result import Alignment, Status, degenerate
-from mapfusion.aligned_landmarks import ABSENT, fuse
+from mapfusion.aligned_landmarks import ABSENT
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.merge import MergeParameters, merge
 from mapfusion.same_point import one_to_one
+from tests.mapfusion.align.map_pairs import covariances
 
 DRIFT_M = 0.05
-
-
-def covariances(rng, n, dimensions=3):
-    root = rng.normal(0, 0.1, (n, dimensions, dimensions))
-    return root @ np.swapaxes(root, 1, 2) + 1e-4 * np.eye(dimensions)
-
-
-def pairs_to_fuse(seed=0, n=50):
-    rng = np.random.default_rng(seed)
-    L_i, L_j = rng.uniform(-5, 5, (2, n, 3))
-    return L_i, covariances(rng, n), L_j, covariances(rng, n)
-
-
-def test_fusion_equals_the_information_form():
-    L_i, S_i, L_j, S_j = pairs_to_fuse()
-    W_i, W_j = np.linalg.inv(S_i), np.linalg.inv(S_j)
-    expected = np.linalg.inv(W_i + W_j)
-    weighted = (W_i @ L_i[:, :, None] + W_j @ L_j[:, :, None])[:, :, 0]
-    position, covariance = fuse(L_i, S_i, L_j, S_j)
-    np.testing.assert_allclose(covariance, expected, atol=1e-12)
-    np.testing.assert_allclose(
-        position, np.einsum("nij,nj->ni", expected, weighted), rtol=1e-9, atol=1e-9
-    )
-
-
-def test_fused_covariance_is_below_both_parents():
-    _, S_i, _, S_j = pairs = pairs_to_fuse(1)
-    _, covariance = fuse(*pairs)
-    for parent in (S_i, S_j):
-        assert np.linalg.eigvalsh(parent - covariance).min() > -1e-15
-
-
-def test_fusion_does_not_care_who_is_first():
-    L_i, S_i, L_j, S_j = pairs_to_fuse(2)
-    for ours, other in zip(fuse(L_i, S_i, L_j, S_j), fuse(L_j, S_j, L_i, S_i), strict=True):
-        np.testing.assert_allclose(ours, other, atol=1e-12)
-
-
-def as_printed(L_i, S_i, L_j, S_j):
-    """Eq. 12 to 14 letter by letter."""
-    K = S_i @ np.linalg.inv(S_i + S_j)
-    return L_i + np.einsum("nij,nj->ni", K, L_i - L_j), (np.eye(3) - K) @ S_i
-
-
-@pytest.mark.parametrize(("form", "holds"), [(fuse, True), (as_printed, False)])
-def test_round_landmarks_meet_between_their_parents(form, holds):
-    L_i, _, L_j, _ = pairs_to_fuse(3)
-    rng = np.random.default_rng(3)
-    s_i, s_j = rng.uniform(0.01, 1, (2, len(L_i), 1, 1))
-    position, _ = form(L_i, s_i * np.eye(3), L_j, s_j * np.eye(3))
-    along = np.einsum("ni,ni->n", position - L_i, L_j - L_i) / np.sum((L_j - L_i) ** 2, axis=1)
-    between = np.all((along > 0) & (along < 1))
-    on_line = np.allclose(L_i + along[:, None] * (L_j - L_i), position, atol=1e-9)
-    assert (between and on_line) == holds
-
-
-@given(st.floats(1e-3, 1e3), st.floats(1e-3, 1e3))
-def test_round_landmarks_share_by_their_certainty(s_i, s_j):
-    position, covariance = fuse(
-        np.zeros((1, 3)), s_i * np.eye(3)[None], np.ones((1, 3)), s_j * np.eye(3)[None]
-    )
-    assert position[0] == pytest.approx(s_i / (s_i + s_j))
-    assert covariance[0] == pytest.approx(np.eye(3) * s_i * s_j / (s_i + s_j))
 
 
 class Robots:

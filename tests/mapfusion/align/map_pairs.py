@@ -132,3 +132,9 @@ def blurred(rng, n, true_share=0.3, sigma_m=0.05):
         position[:, :2] += (root @ rng.standard_normal((n, 2, 1)))[:, :, 0]
         maps.append(replace(known, position_m=position))
     return maps, pair
+
+
+def covariances(rng, n, dimensions=3):
+    """(n, d, d) random symmetric positive definite matrices of about a decimetre."""
+    root = rng.normal(0, 0.1, (n, dimensions, dimensions))
+    return root @ np.swapaxes(root, 1, 2) + 1e-4 * np.eye(dimensions)

@@ -1,13 +1,18 @@
 """Small worlds with landmarks, a robot that drives in them and what it measures."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mapfusion.fastslam.motion import MotionNoise
+from mapfusion.fastslam.parameters import FastSlamParameters
+from mapfusion.fastslam.proposal import Proposal
 from mapfusion.robot_log import Observations
 from mapfusion.se2 import compose, inverse, transform_points
 
 SIGMA_M = 0.03
+EXACT_MOTION = MotionNoise(0, 0, 0, 0, 0, lateral_slip_m_per_rad=0)
+LOOSE_MOTION = MotionNoise(0.1, 0.05, 0.1, 0, 0, lateral_slip_m_per_rad=0.03)
 
 
 @dataclass
@@ -70,3 +75,11 @@ def unit(vectors: np.ndarray) -> np.ndarray:
 
 def nothing() -> Observations:
     return Observations(np.empty((0, 3)), np.empty((0, 3, 3)))
+
+
+def parameters(**changes) -> FastSlamParameters:
+    """The paper's own filter, with changes."""
+    plain = FastSlamParameters(
+        n_particles=15, motion=LOOSE_MOTION, proposal=Proposal.MOTION, noise_scale=1.0
+    )
+    return replace(plain, **changes)

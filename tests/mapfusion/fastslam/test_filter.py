@@ -6,104 +6,16 @@ import numpy as np
 import pytest
 
 from mapfusion.fastslam.filter import FastSlam
-from mapfusion.fastslam.genealogy import MEMORY
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.fastslam.parameters import FastSlamParameters
-from mapfusion.fastslam.proposal import Proposal
 from mapfusion.robot_log import Observations
 from mapfusion.se2 import compose, inverse, rotation_about_z, transform_points, wrap
-from tests.mapfusion.fastslam.copying_filter import CopyingFilter
-from tests.mapfusion.fastslam.landmark_worlds import drive, nothing, observe, unit
-
-EXACT_MOTION = MotionNoise(0, 0, 0, 0, 0, lateral_slip_m_per_rad=0)
-LOOSE_MOTION = MotionNoise(0.1, 0.05, 0.1, 0, 0, lateral_slip_m_per_rad=0.03)
-
-
-def parameters(**changes) -> FastSlamParameters:
-    """The paper's own filter, with changes."""
-    plain = FastSlamParameters(
-        n_particles=15, motion=LOOSE_MOTION, proposal=Proposal.MOTION, noise_scale=1.0
-    )
-    return replace(plain, **changes)
-
-
-def assert_same(slam: FastSlam, result, twin: CopyingFilter, planar: bool) -> None:
-    np.testing.assert_allclose(np.exp(result.log_weights), twin.weights, rtol=1e-6, atol=1e-12)
-    # the twin differentiates numerically
-    tolerance = 1e-7 if slam.parameters.proposal == "informed" else 0
-    np.testing.assert_allclose(result.cloud, twin.cloud, rtol=0, atol=tolerance)
-    landmarks, expected = slam.best_map(min_count=1), twin.best_landmarks()
-    n = 2 if planar else 3
-    assert len(landmarks) == result.n_landmarks == len(expected)
-    assert landmarks.source_observation.tolist() == [m.source for m in expected]
-    assert landmarks.count.tolist() == [m.count for m in expected]
-    np.testing.assert_allclose(slam.best_path(), twin.best.path, rtol=0, atol=tolerance)
-    assert slam.best_associations().tolist() == twin.best.associations
-    if not expected:
-        return
-    np.testing.assert_allclose(
-        landmarks.position_m[:, :n], [m.mean for m in expected], rtol=1e-9, atol=1e-9 + tolerance
-    )
-    np.testing.assert_allclose(
-        landmarks.covariance_m2[:, :n, :n],
-        [m.covariance for m in expected],
-        rtol=1e-9,
-        atol=1e-9 + tolerance,
-    )
-    np.testing.assert_array_equal(landmarks.descriptor, [m.descriptor for m in expected])
-    np.testing.assert_array_equal(landmarks.label, [m.label for m in expected])
-
-
-@pytest.mark.parametrize("association", ["descriptor", "label", "gate"])
-@pytest.mark.parametrize("planar", [False, True])
-@pytest.mark.parametrize("resample_fraction", [0.0, 0.5, 1.0])
-@pytest.mark.parametrize("proposal", ["motion", "informed"])
-def test_equals_the_filter_that_copies(association, planar, resample_fraction, proposal):
-    # A tight gate makes particles disagree about what they see.
-    world = drive(7, planar=planar, n_landmarks=8, n_frames=20, per_frame=4)
-    settings = parameters(
-        n_particles=8,
-        proposal=proposal,
-        association=association,
-        planar=planar,
-        resample_fraction=resample_fraction,
-        gate_probability=0.9,
-        descriptor_threshold=0.6,
-        noise_scale=1.1,
-        noise_floor_m=0.005,
-    )
-    slam = FastSlam(settings, np.random.default_rng(5))
-    twin = CopyingFilter(settings, np.random.default_rng(5))
-    n_resampled, n_sizes = 0, set()
-    for odometry, frame in zip(world.odometry, world.frames, strict=True):
-        result = slam.step(odometry, frame)
-        twin.step(odometry, frame)
-        assert_same(slam, result, twin, planar)
-        n_resampled += result.resampled
-        n_sizes.update(len(p.landmarks) for p in twin.particles)
-    assert n_resampled == {0.0: 0, 1.0: len(world.frames)}.get(resample_fraction, n_resampled)
-    if association != "label":
-        assert max(n_sizes) > len(world.landmarks), "no particle ever started a second landmark"
-
-
-def test_equals_the_filter_that_copies_longer_than_the_genealogy_remembers():
-    # A landmark seen at the start, then not for several rounds of refreshing, then again.
-    world = drive(3, n_landmarks=4, per_frame=4, n_frames=2)
-    settings = parameters(n_particles=4, association="label", resample_fraction=1.0)
-    slam = FastSlam(settings, np.random.default_rng(1))
-    twin = CopyingFilter(settings, np.random.default_rng(1))
-    pose = world.path[-1]
-    rng = np.random.default_rng(2)
-    for odometry, frame in zip(world.odometry, world.frames, strict=True):
-        slam.step(odometry, frame)
-        twin.step(odometry, frame)
-    for _ in range(3 * MEMORY + 17):
-        slam.step(np.zeros(3), nothing())
-        twin.step(np.zeros(3), nothing())
-    frame = observe(pose, world.landmarks, world.descriptor, np.arange(4), rng)
-    result = slam.step(np.zeros(3), frame)
-    twin.step(np.zeros(3), frame)
-    assert_same(slam, result, twin, planar=False)
+from tests.mapfusion.fastslam.landmark_worlds import (
+    EXACT_MOTION,
+    drive,
+    nothing,
+    parameters,
+)
 
 
 def test_with_exact_odometry_the_map_is_the_least_squares_solution():
@@ -243,97 +155,6 @@ def test_localises_better_than_odometry():
         errors.append(slam.best_path()[:, :2] - world.path[:, :2])
         odometry_errors.append(np.array(path)[:, :2] - world.path[:, :2])
     assert np.std(errors) < 0.5 * np.std(odometry_errors)
-
-
-@pytest.mark.parametrize("association", ["descriptor", "gate"])
-def test_one_landmark_takes_one_observation_a_frame(association):
-    point = np.array([[1.0, 0.0, 0.5], [1.0, 0.01, 0.5]])
-    descriptor = unit(np.ones((2, 64))).astype(np.float32)
-    both = Observations(point, np.tile(1e-2 * np.eye(3), (2, 1, 1)), descriptor)
-    settings = parameters(motion=EXACT_MOTION, association=association)
-    slam = FastSlam(settings, np.random.default_rng(0))
-    slam.step(np.zeros(3), both[:1])
-    slam.step(np.zeros(3), both)
-    assert slam.best_map(min_count=1).count.tolist() == [2, 1]
-    assert slam.best_associations().tolist() == [0, 0, 2]
-
-
-@pytest.mark.parametrize("direction", [(1, 0), (-1, 0), (0, 1), (0, -1)])
-@pytest.mark.parametrize("sigmas_m", [(0.3, 0.01), (0.01, 0.3)])
-def test_the_gate_reaches_as_far_as_the_uncertainties_do(direction, sigmas_m):
-    """Just inside and just outside the gate, with the landmark or the observation uncertain."""
-    descriptor = unit(np.ones((1, 64))).astype(np.float32)
-    settings = parameters(n_particles=2, motion=EXACT_MOTION)
-    reach_m = np.sqrt(settings.gate * (sigmas_m[0] ** 2 + sigmas_m[1] ** 2))
-    for share, n_expected in ((0.999, 1), (1.001, 2)):
-        slam = FastSlam(settings, np.random.default_rng(0))
-        point = np.array([[5.0, 2.0, 1.0]])
-        for sigma_m in sigmas_m:
-            slam.step(np.zeros(3), Observations(point, sigma_m**2 * np.eye(3)[None], descriptor))
-            point = point + share * reach_m * np.array([*direction, 0])
-        assert len(slam.best_map(min_count=1)) == n_expected
-
-
-def test_descriptors_farther_apart_than_the_threshold_are_different_landmarks():
-    first, other = np.eye(64)[:2]
-    settings = parameters(n_particles=2, motion=EXACT_MOTION, descriptor_threshold=0.5)
-    for apart, n_expected in ((0.499, 1), (0.501, 2)):
-        angle = 2 * np.arcsin(apart / 2)
-        slam = FastSlam(settings, np.random.default_rng(0))
-        for vector in (first, np.cos(angle) * first + np.sin(angle) * other):
-            descriptor = vector[None].astype(np.float32)
-            frame = Observations(np.ones((1, 3)), 0.01 * np.eye(3)[None], descriptor)
-            slam.step(np.zeros(3), frame)
-        assert len(slam.best_map(min_count=1)) == n_expected
-
-
-def test_the_nearest_descriptor_wins_over_the_nearest_place():
-    descriptor = np.eye(64)[:2]
-    R = np.tile(0.01 * np.eye(3), (2, 1, 1))
-    settings = parameters(n_particles=2, motion=EXACT_MOTION, descriptor_threshold=1.5)
-    slam = FastSlam(settings, np.random.default_rng(0))
-    places = np.array([[1.0, 0.0, 0.0], [1.2, 0.0, 0.0]])
-    slam.step(np.zeros(3), Observations(places, R, descriptor.astype(np.float32)))
-    # Seen where the first stands, with the looks of the second.
-    slam.step(np.zeros(3), Observations(places[:1], R[:1], descriptor[1:].astype(np.float32)))
-    assert slam.best_associations().tolist() == [0, 1, 1]
-
-
-@pytest.mark.parametrize("association", ["descriptor", "gate"])
-def test_a_landmark_that_creeps_is_followed(association):
-    """Each observation lies inside the gate, on the same side: the sum of 2 / n has no bound."""
-    sigma_m, n_frames = 0.01, 300
-    descriptor = unit(np.ones((1, 64))).astype(np.float32)
-    settings = parameters(n_particles=1, motion=EXACT_MOTION, association=association)
-    slam = FastSlam(settings, np.random.default_rng(0))
-    expected_x = 1.0
-    for n in range(n_frames):
-        point = np.array([[expected_x + 2 * sigma_m * (n > 0), 0.0, 0.0]])
-        slam.step(np.zeros(3), Observations(point, sigma_m**2 * np.eye(3)[None], descriptor))
-        expected_x += (point[0, 0] - expected_x) / (n + 1)
-    landmarks = slam.best_map(min_count=1)
-    assert landmarks.count.tolist() == [n_frames]
-    np.testing.assert_allclose(landmarks.position_m, [[expected_x, 0, 0]])
-
-
-def test_a_new_label_twice_in_a_frame_starts_one_landmark():
-    point = np.array([[1.0, 0.0, 0.0], [1.1, 0.0, 0.0]])
-    label = np.array([4, 4], dtype=np.int32)
-    slam = FastSlam(parameters(association="label"), np.random.default_rng(0))
-    slam.step(np.zeros(3), Observations(point, np.tile(np.eye(3), (2, 1, 1)), label=label))
-    assert slam.best_map(min_count=1).position_m.tolist() == [[1.0, 0.0, 0.0]]
-    assert slam.best_associations().tolist() == [0, -1]
-
-
-def test_a_known_label_outside_the_gate_is_dropped():
-    label = np.array([3], dtype=np.int32)
-    R = 1e-4 * np.eye(3)[None]
-    slam = FastSlam(parameters(motion=EXACT_MOTION, association="label"), np.random.default_rng(0))
-    slam.step(np.zeros(3), Observations(np.array([[1.0, 0, 0]]), R, label=label))
-    slam.step(np.zeros(3), Observations(np.array([[1.5, 0, 0]]), R, label=label))
-    landmarks = slam.best_map(min_count=1)
-    assert landmarks.position_m.tolist() == [[1.0, 0.0, 0.0]]
-    assert slam.best_associations().tolist() == [0, -1]
 
 
 def test_headings_wrap():
