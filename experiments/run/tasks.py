@@ -3,13 +3,11 @@
 `mapfusion run` gives them to processes of its own, `mapfusion sweep` to a Dask cluster.
 """
 
-import heapq
 import itertools
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import Any
 
@@ -66,27 +64,24 @@ def tasks_of(stages: Iterable[Stage], store: Store) -> dict[str, Task]:
     return tasks
 
 
-def task_names(stage: Stage | RecordedLog) -> tuple[str, ...]:
-    """Names of the tasks that make a stage; none for what was there before."""
-    return () if isinstance(stage, RecordedLog) else tuple(_name(stage, p) for p in stage.parts)
-
-
-def _name(stage: Stage, part: str) -> str:
-    return f"{stage.name}/{stage.key}" + (f"/{part}" if part else "")
+def task_names(stage: Stage | RecordedLog, parts: Sequence[str] = ()) -> tuple[str, ...]:
+    """Names of the tasks that make a stage, or these parts of it; none for a recorded log."""
+    if isinstance(stage, RecordedLog):
+        return ()
+    folder = f"{stage.name}/{stage.key}"
+    return tuple(f"{folder}/{part}" if part else folder for part in parts or stage.parts)
 
 
 def _task(stage: Stage, part: str, store: Store) -> Task:
     needs: list[str] = []
+    inputs: dict[str, Path] = {}
     for name, before in stage.before.items():
-        if name in stage.alongside and isinstance(before, Stage):
-            needs.append(_name(before, part))
-        else:
-            needs += task_names(before)
+        needs += task_names(before, (part,) if name in stage.alongside else ())
+        inputs[name] = store.path(before)
     folder = store.folder(stage)
-    inputs = {name: store.path(before) for name, before in stage.before.items()}
     arguments = (stage.work, stage.settings, Job(inputs, folder.path, part), folder)
-    outputs = folder.outputs[part]
-    return Task(_name(stage, part), stage.label, _perform, arguments, outputs, tuple(needs))
+    (name,) = task_names(stage, (part,))
+    return Task(name, stage.label, _perform, arguments, folder.outputs[part], tuple(needs))
 
 
 def _perform(work: Callable[..., Any], settings: Any, job: Job, folder: StageFolder) -> None:
@@ -117,25 +112,20 @@ def run_tasks(tasks: Sequence[Task], pool: Workers, on_progress: OnProgress) -> 
     What a task needs beyond these is done already. `on_progress` is told (label, tasks done, tasks
     in all).
     """
-    number = {task.name: i for i, task in enumerate(tasks)}
-    needs = [[number[need] for need in task.needs if need in number] for task in tasks]
-    order = TopologicalSorter(dict(enumerate(needs)))
-    order.prepare()
-    ready: list[int] = []
+    waiting, undone = list(tasks), {task.name for task in tasks}
     total, done = Counter(task.label for task in tasks), Counter[str]()
     for label in total:
         on_progress(label, 0, total[label])
 
     def hand_out() -> None:
-        for i in order.get_ready():
-            heapq.heappush(ready, i)
-        while ready and pool.has_room:
-            i = heapq.heappop(ready)
-            pool.submit(i, tasks[i].run)
+        ready = (task for task in waiting if undone.isdisjoint(task.needs))
+        for task in list(itertools.islice(ready, pool.room)):
+            waiting.remove(task)
+            pool.submit(task, task.run)
 
     hand_out()
-    for i, _ in pool.completed():
-        done[tasks[i].label] += 1
-        on_progress(tasks[i].label, done[tasks[i].label], total[tasks[i].label])
-        order.done(i)
+    for task, _ in pool.completed():
+        undone.remove(task.name)
+        done[task.label] += 1
+        on_progress(task.label, done[task.label], total[task.label])
         hand_out()

@@ -87,27 +87,23 @@ def _chunk_paths(folder: Path, part: str) -> tuple[Path, ...]:
     return tuple(folder / name.format(part=part) for name in WRITES)
 
 
-class _OpenWorld:
-    """The world this process last rendered from: loading one takes seconds, so it stays open."""
+# The world this process last rendered from: loading one takes seconds, so it stays open.
+_open: dict[tuple[object, ...], FrameSource] = {}
 
-    key: tuple[object, ...] = ()
-    source: FrameSource | None = None
 
-    @classmethod
-    def get(cls, settings: FeatureSettings, faces: Path, robots: tuple[str, ...]) -> FrameSource:
-        key = (faces, settings.camera, settings.renderer, robots)
-        if cls.source is None or cls.key != key:
-            if cls.source is not None:
-                cls.source.close()
-            cls.source = FrameSource(faces, settings.camera, robots, settings.renderer)
-            cls.key = key
-        return cls.source
+def _world(settings: FeatureSettings, faces: Path, robots: tuple[str, ...]) -> FrameSource:
+    world = (faces, settings.camera, robots, settings.renderer)
+    if world not in _open:
+        while _open:
+            _open.popitem()[1].close()
+        _open[world] = FrameSource(*world)
+    return _open[world]
 
 
 def run(settings: FeatureSettings, job: Job) -> dict[str, float]:
     """Render and extract the frames of one chunk; returns how long the rendering took."""
     trajectory = read_trajectory(job.inputs["drive"] / TRAJECTORY_FILE)
-    source = _OpenWorld.get(settings, job.inputs["faces"], trajectory.robots)
+    source = _world(settings, job.inputs["faces"], trajectory.robots)
     front_end = FrontEnd(settings.camera, settings.vision)
     robot, features, truth, rendering_s = settings.robot, [], [], 0.0
     frames = _chunk(job.part, len(trajectory))
