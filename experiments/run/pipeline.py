@@ -5,7 +5,7 @@ Each stage is handed its own settings, taken from the scenario here and nowhere 
 
 import itertools
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from types import ModuleType
@@ -98,7 +98,7 @@ def lay_out(scenario: AnyScenario) -> Pipeline:
     return Pipeline(scenario, robots, pairs)
 
 
-def _stage(module: ModuleType, *sections: Section, own: Mapping[str, Any], **more: Any) -> Stage:
+def _stage(module: ModuleType, *sections: Section, own: dict[str, Any], **more: Any) -> Stage:
     """The stage that a module of `experiments.run.stages` does the work of, under its name.
 
     It is told the fields of its settings and no others: its own, and from the sections by name.
@@ -166,7 +166,7 @@ def _pair(scenario: Scenario, a: RobotStages, b: RobotStages) -> PairStages:
     iterations = tuple(slam.evaluated_iterations(n_frames, scenario.evaluate.every))
     parts = match.batches(iterations)
     maps = {"log_a": a.log, "slam_a": a.slam, "log_b": b.log, "slam_b": b.slam}
-    own: dict[str, Any] = {"iterations": iterations}
+    own = {"iterations": iterations}
     matched = {"match": _stage(match, scenario.align, own=own, before=maps, parts=parts)}
     estimates: dict[str, Stage] = {}
     for i, entry in enumerate(scenario.align.aligners):
@@ -180,7 +180,6 @@ def _pair(scenario: Scenario, a: RobotStages, b: RobotStages) -> PairStages:
             own=own | {"origin": method.origin()},
             before=maps | matched,
             parts=parts,
-            alongside=frozenset(matched),
             loads=(module,),
         )
     joined = _stage(align, own={"batches": parts}, before=matched | estimates)

@@ -6,7 +6,7 @@
 import itertools
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -64,24 +64,27 @@ def tasks_of(stages: Iterable[Stage], store: Store) -> dict[str, Task]:
     return tasks
 
 
-def task_names(stage: Stage | RecordedLog, parts: Sequence[str] = ()) -> tuple[str, ...]:
-    """Names of the tasks that make a stage, or these parts of it; none for a recorded log."""
-    if isinstance(stage, RecordedLog):
-        return ()
-    folder = f"{stage.name}/{stage.key}"
-    return tuple(f"{folder}/{part}" if part else folder for part in parts or stage.parts)
+def task_names(stage: Stage | RecordedLog) -> list[str]:
+    """Names of the tasks that make a stage; none for what was there before."""
+    return [] if isinstance(stage, RecordedLog) else [_name(stage, part) for part in stage.parts]
+
+
+def _name(stage: Stage, part: str) -> str:
+    return f"{stage.name}/{stage.key}" + (f"/{part}" if part else "")
 
 
 def _task(stage: Stage, part: str, store: Store) -> Task:
     needs: list[str] = []
-    inputs: dict[str, Path] = {}
-    for name, before in stage.before.items():
-        needs += task_names(before, (part,) if name in stage.alongside else ())
-        inputs[name] = store.path(before)
+    for before in stage.before.values():
+        if isinstance(before, Stage) and before.parts == stage.parts:
+            needs.append(_name(before, part))
+        else:
+            needs += task_names(before)
     folder = store.folder(stage)
+    inputs = {name: store.path(before) for name, before in stage.before.items()}
     arguments = (stage.work, stage.settings, Job(inputs, folder.path, part), folder)
-    (name,) = task_names(stage, (part,))
-    return Task(name, stage.label, _perform, arguments, folder.outputs[part], tuple(needs))
+    outputs = folder.outputs[part]
+    return Task(_name(stage, part), stage.label, _perform, arguments, outputs, tuple(needs))
 
 
 def _perform(work: Callable[..., Any], settings: Any, job: Job, folder: StageFolder) -> None:
@@ -91,19 +94,17 @@ def _perform(work: Callable[..., Any], settings: Any, job: Job, folder: StageFol
     folder.finish(job.part, {"elapsed_s": time.perf_counter() - started} | figures)
 
 
-def unfinished(tasks: Mapping[str, Task], goals: Iterable[str]) -> list[Task]:
+def unfinished(tasks: dict[str, Task], goals: Iterable[str]) -> list[Task]:
     """The tasks left to do for the outputs of those named, in the order of `tasks`.
 
     What a finished task was made from is not asked for: it may have been deleted.
     """
-    wanted: set[str] = set()
-    stack = list(goals)
-    while stack:
-        name = stack.pop()
-        if name not in wanted and not tasks[name].finished:
-            wanted.add(name)
-            stack += tasks[name].needs
-    return [task for name, task in tasks.items() if name in wanted]
+    wanted, left = set(goals), list[Task]()
+    for task in reversed(tasks.values()):  # what a task needs comes before it
+        if task.name in wanted and not task.finished:
+            wanted.update(task.needs)
+            left.append(task)
+    return left[::-1]
 
 
 def run_tasks(tasks: Sequence[Task], pool: Workers, on_progress: OnProgress) -> None:

@@ -42,10 +42,9 @@ def _different(items: list[T], prefix: str = "") -> list[T]:
 
 
 def _renderable(camera: StereoCamera) -> StereoCamera:
-    most = MAX_IMAGE_SIDE_PX
     for name, value in vars(camera).items():
-        if name in {"width_px", "height_px"} and not 1 <= value <= most:
-            raise ValueError(f"{name}: is {value}, must be in [1, {most}]")
+        if name in {"width_px", "height_px"} and not 1 <= value <= MAX_IMAGE_SIDE_PX:
+            raise ValueError(f"{name}: is {value}, must be in [1, {MAX_IMAGE_SIDE_PX}]")
         if name in {"focal_px", "baseline_m", "mount_z_m"} and not value > 0:
             raise ValueError(f"{name}: is {value}, must be positive")
     return camera

@@ -15,9 +15,8 @@ def read_mapping(path: Path) -> dict[str, Any]:
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise InputError(
-            f"{path}: no such file (expected a scenario, for example quick.yaml)"
-        ) from None
+        expected = "expected a scenario, for example quick.yaml"
+        raise InputError(f"{path}: no such file ({expected})") from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read as UTF-8 text ({error})") from error
     data = parse_value(text, str(path))

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
-from experiments.run.frames import BOOL, FLOAT, INT, fields, read_rows, write_rows
+from experiments.run.frames import BOOL, FLOAT, INT, fields, write_rows
 from experiments.run.job import Job
 from experiments.scenario.randomness import generator
 from mapfusion.fastslam.filter import StepResult
@@ -38,11 +38,8 @@ ASSOCIATIONS = schema(
 )
 _STEP = fields(effective_sample_size=FLOAT, resampled=BOOL, n_landmarks=INT, spread_m=FLOAT)
 POSES = schema("slam.poses", 1, [*_ITERATION, *float_fields(_ONLINE + _FINAL), *_STEP])
-CLOUDS = schema(
-    "slam.clouds",
-    1,
-    [*fields(iteration=INT, particle=INT), *float_fields([*POSE_FIELDS, "log_weight"])],
-)
+_PARTICLE = fields(iteration=INT, particle=INT)
+CLOUDS = schema("slam.clouds", 1, [*_PARTICLE, *float_fields([*POSE_FIELDS, "log_weight"])])
 
 LABEL = "FastSLAM"
 WRITES = ("snapshots.parquet", "associations.parquet", "poses.parquet", "clouds.parquet")
@@ -103,8 +100,7 @@ def run(settings: SlamSettings, job: Job) -> None:
     tables = (pd.concat(maps), pd.concat(associations), poses, pd.concat(clouds))
     schemas = (SNAPSHOTS, ASSOCIATIONS, POSES, CLOUDS)
     for file, table_schema, rows in zip(WRITES, schemas, tables, strict=True):
-        attributes = evaluated if table_schema is SNAPSHOTS else None
-        write_rows(job.output / file, table_schema, rows, attributes)
+        write_rows(job.output / file, table_schema, rows, evaluated)
 
 
 def _step(result: StepResult) -> dict[str, float]:
@@ -139,8 +135,3 @@ def read_snapshots(slam: Path, log: RobotLog) -> dict[int, LandmarkMap]:
     evaluated = map(int, attributes["iterations"].split(","))
     rows = {k: slice(*np.searchsorted(iteration, [k, k + 1])) for k in evaluated}
     return {k: with_rows(landmarks, own) for k, own in rows.items()}
-
-
-def read_associations(slam: Path) -> pd.DataFrame:
-    """Changes of which landmark each observation counts for, in order of iteration."""
-    return read_rows(slam / "associations.parquet", ASSOCIATIONS)
