@@ -142,9 +142,8 @@ class Child:
         code = self._process.returncode
         if not ended:
             return "closed the connection to its process"
-        if code < 0:
-            return f"ended its process with {signal.Signals(-code).name}"
-        return f"ended its process with exit code {code}"
+        how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+        return f"ended its process with {how}"
 
     def _has_ended(self) -> bool:
         """Without collecting its exit code: until then its number is nobody else's."""

@@ -123,9 +123,8 @@ def name_clashes() -> dict[str, str]:
                 "declares under the same name is not"
             )
         elif len(packages) > 1:
-            lines[name] = (
-                f"aligner {name}: declared by {' and by '.join(packages)}; uninstall all but one"
-            )
+            they = " and by ".join(packages)
+            lines[name] = f"aligner {name}: declared by {they}; uninstall all but one"
     return lines
 
 

@@ -119,7 +119,7 @@ def _simulated(scenario: Simulation) -> Iterable[RobotStages]:
         for robot in scenario.robots
     )
     driven = _stage(drive, scenario, scenario.drive, own={"walls": walls, "robots": routes})
-    world_stages = {"drive": driven, "faces": _stage(faces, scenario, world, own={"walls": walls})}
+    before = {"drive": driven, "faces": _stage(faces, scenario, world, own={"walls": walls})}
     n_frames, drawn_by = scenario.drive.frames, renderer_name(render.renderer)
     vision, unread = scenario.vision, FrontEndParameters()
     finding = replace(unread, harris=vision.harris, stereo=vision.stereo, usurf=vision.usurf)
@@ -129,9 +129,7 @@ def _simulated(scenario: Simulation) -> Iterable[RobotStages]:
         own["radiometry"] = robot.radiometry or scenario.radiometry
         own["odometry"] = robot.odometry or scenario.odometry
         chunks, to_find = features.chunks(n_frames), own | {"vision": finding}
-        found = _stage(
-            features, scenario, render, keep, own=to_find, before=world_stages, parts=chunks
-        )
+        found = _stage(features, scenario, render, keep, own=to_find, before=before, parts=chunks)
         to_track, images = own | {"vision": tracking}, {"features": found}
         tracked = _stage(observed, scenario, keep, own=to_track, before=images)
         logged = _stage(log, scenario, own=own, before={"drive": driven, "observed": tracked})

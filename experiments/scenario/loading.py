@@ -121,9 +121,8 @@ def _validated(where: str, kind: type[S], data: dict[str, Any]) -> S:
 def _first_problem(schema: dict[str, Any], error: ValidationError) -> str:
     """The first thing wrong with a section of that JSON schema, and how many more there are."""
     # A wrong name explains the missing one that follows from it, so it goes first.
-    problem, *more = sorted(
-        error.errors(include_url=False), key=lambda each: each["type"] not in _UNKNOWN
-    )
+    problems = error.errors(include_url=False)
+    problem, *more = sorted(problems, key=lambda each: each["type"] not in _UNKNOWN)
     location = problem["loc"]
     message = problem["msg"].removeprefix("Value error, ")
     if problem["type"] in _UNKNOWN:
@@ -145,16 +144,14 @@ def _about_unknown(location: tuple[int | str, ...], known: list[tuple[str, ...]]
     return message + (f"; did you mean {' or '.join(like[:_MOST_SUGGESTED])}?" if like else "")
 
 
-def _keys(
-    root: dict[str, Any], node: dict[str, Any], above: tuple[str, ...] = ()
-) -> Iterator[tuple[str, ...]]:
+def _keys(root: dict[str, Any], node: dict[str, Any], *above: str) -> Iterator[tuple[str, ...]]:
     """All keys below a node; `*` stands for places in lists and for free keys, as in `expect`."""
     node = next((option for option in node.get("anyOf", []) if "$ref" in option), node)
     if "$ref" in node:
         node = root["$defs"][node["$ref"].rsplit("/", 1)[1]]
     for key, child in node.get("properties", {}).items():
         yield (*above, key)
-        yield from _keys(root, child, (*above, key))
+        yield from _keys(root, child, *above, key)
     for children in (node.get("items"), node.get("additionalProperties")):
         if isinstance(children, dict):
-            yield from _keys(root, children, (*above, "*"))
+            yield from _keys(root, children, *above, "*")

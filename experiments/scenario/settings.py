@@ -28,7 +28,6 @@ NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,40}$"  # names become parts of file
 T = TypeVar("T")
 Name = Annotated[str, Field(pattern=NAME_PATTERN)]
 Point = tuple[float, float]
-Pose = tuple[float, float, float]
 MAX_IMAGE_SIDE_PX = 4096  # the software renderer takes seconds and 100 MB a frame at this size
 
 
@@ -79,7 +78,7 @@ class Robot(Section):
     """
 
     name: Name
-    start: Pose
+    start: tuple[float, float, float]
     route: Annotated[list[Point], Field(min_length=1)]
     loop: bool = True
     odometry: OdometryNoise | None = None

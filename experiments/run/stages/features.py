@@ -82,11 +82,6 @@ def _chunk(part: str, n_frames: int) -> range:
     return range(int(part), min(int(part) + FRAMES_PER_CHUNK, n_frames))
 
 
-def _chunk_paths(folder: Path, part: str) -> tuple[Path, ...]:
-    """The truth and the features of one chunk; the features are written last."""
-    return tuple(folder / name.format(part=part) for name in WRITES)
-
-
 # The world this process last rendered from: loading one takes seconds, so it stays open.
 _open: dict[tuple[object, ...], FrameSource] = {}
 
@@ -121,7 +116,7 @@ def run(settings: FeatureSettings, job: Job) -> dict[str, float]:
             encoded = cv2.imencode(".png", frame.left)[1].tobytes()
             image = job.output / f"image_{iteration:06d}.png"
             write_whole(image, lambda temporary, encoded=encoded: temporary.write_bytes(encoded))
-    truth_path, features_path = _chunk_paths(job.output, job.part)
+    truth_path, features_path = (job.output / name.format(part=job.part) for name in WRITES)
     joined = {
         name: np.concatenate([getattr(found, name) for found in features])
         for name in ("uv_px", *_ONE_EACH)
@@ -136,7 +131,7 @@ def run(settings: FeatureSettings, job: Job) -> dict[str, float]:
 def read_features(folder: Path, n_frames: int) -> Iterator[tuple[Features, Float]]:
     """Features and their true world points (N, 3), frame by frame, in order."""
     for part in chunks(n_frames):
-        truth_path, features_path = _chunk_paths(folder, part)
+        truth_path, features_path = (folder / name.format(part=part) for name in WRITES)
         table, _ = read_table(features_path, FEATURES)
         found = Features(columns(table, _PIXEL), *(column(table, name) for name in _ONE_EACH))
         truth = columns(read_table(truth_path, TRUTH)[0], TRUTH.names)

@@ -84,7 +84,10 @@ def run(settings: SlamSettings, job: Job) -> None:
             cloud = cloud.assign(iteration=k, log_weight=result.log_weights)
             clouds.append(cloud.rename_axis("particle").reset_index())
         if frame.landmarks is not None:
-            maps.append(_rows(frame.landmarks).assign(iteration=k))
+            seen, origin = frame.landmarks, frame.landmarks.source_observation
+            points = point_columns(seen.position_m, seen.covariance_m2)
+            points |= {"count": seen.count, "source_observation": origin}
+            maps.append(pd.DataFrame(points).assign(iteration=k))
             counts_for = frame.slam.best_associations()
             new = np.full(len(counts_for) - len(counted), -1)
             changed = np.flatnonzero(counts_for != np.concatenate([counted, new]))
@@ -117,19 +120,12 @@ def _step(result: StepResult) -> dict[str, float]:
     }
 
 
-def _rows(landmarks: LandmarkMap) -> pd.DataFrame:
-    points = point_columns(landmarks.position_m, landmarks.covariance_m2)
-    own = {"count": landmarks.count, "source_observation": landmarks.source_observation}
-    return pd.DataFrame(points | own)
-
-
 def read_snapshots(slam: Path, log: RobotLog) -> dict[int, LandmarkMap]:
     """The robot's map at each evaluated iteration, with descriptors and labels from its log."""
     table, attributes = read_table(slam / "snapshots.parquet", SNAPSHOTS)
-    origin, seen = column(table, "source_observation"), log.observations
-    descriptor = None if seen.descriptor is None else seen.descriptor[origin]
-    label = None if seen.label is None else seen.label[origin]
-    about = (column(table, "count"), origin, descriptor, label, log.planar, log.robot)
+    origin = column(table, "source_observation")
+    seen = log.observations[origin]
+    about = (column(table, "count"), origin, seen.descriptor, seen.label, log.planar, log.robot)
     landmarks = LandmarkMap(*points_from(table), *about)
     iteration = column(table, "iteration")
     evaluated = map(int, attributes["iterations"].split(","))
