@@ -175,11 +175,10 @@ def child_for(spec: Spec) -> Child:
     """The living process for a spec, started where there is none; the one unused longest ends."""
     with _one_at_a_time:
         child = _children.pop(spec, None)
-        if child is None or not child.alive:
-            if child is not None:
-                child.kill()
-            child = Child(spec)
-        _children[spec] = child
+        if child is not None and not child.alive:
+            child.kill()
+            child = None
+        child = _children[spec] = child or Child(spec)
         while len(_children) > _MAX_CHILDREN:
             _children.popitem(last=False)[1].kill()
         return child

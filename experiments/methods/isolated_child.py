@@ -135,10 +135,8 @@ class _CheckedMethod:
         _require_array("inlier", found.inlier, (len(pairs),), "bool")
         no_motion = "T_a_b is not finite, expected Undetermined where there is no motion"
         _require(np.isfinite(found.T_a_b).all(), no_motion)
-        n = int(found.inlier.sum())
-        if found.fitted is not None:
-            _require_type("fitted is", found.fitted, "Pairs", Pairs)
-            n = len(found.fitted)
+        _require_type("fitted is", found.fitted, "Pairs", Pairs, type(None))
+        n = int(found.inlier.sum()) if found.fitted is None else len(found.fitted)
         if found.weight is not None:
             _require_array("weight", found.weight, (n,))
         if found.gain is not None:

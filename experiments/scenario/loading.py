@@ -89,11 +89,7 @@ def _expanded(where: str, data: dict[str, Any]) -> dict[str, Any]:
 
 
 def load_section(path: Path | None, name: str, kind: type[S], overrides: Sequence[str]) -> S:
-    """One section of a scenario (or its defaults, without a file), with overrides inside it.
-
-    Raises:
-        InputError: as `load_scenario`.
-    """
+    """One section of a scenario, or its defaults, with overrides inside it; raises InputError."""
     where, data = name, {}
     if path is not None:
         load_scenario(path)
