@@ -6,8 +6,9 @@ from experiments.judge import tables
 from experiments.judge.errors import EvaluatedRobot, error_rows, met_maps
 from experiments.judge.fused_landmarks import MergeSettings, fusion_rows
 from experiments.judge.truth import PathTruth, landmark_truth
+from experiments.run.frames import read_rows
 from experiments.run.job import Job
-from experiments.run.stages.slam import RobotFolders, read_associations, read_snapshots
+from experiments.run.stages.slam import ASSOCIATIONS, RobotFolders, read_snapshots
 from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.refine import Refinement
 from mapfusion.errors import InputError
@@ -38,7 +39,8 @@ def load_robot(folders: RobotFolders) -> EvaluatedRobot:
                 f"{folders.log / file}.parquet: {len(rows)} rows, the log has {expected} of them"
             )
     maps = read_snapshots(folders.slam, log)
-    points = landmark_truth(truth, read_associations(folders.slam), maps)
+    associations = read_rows(folders.slam / "associations.parquet", ASSOCIATIONS)
+    points = landmark_truth(truth, associations, maps)
     return EvaluatedRobot(log.robot, maps, points, PathTruth.of(truth))
 
 

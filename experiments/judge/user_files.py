@@ -32,7 +32,7 @@ def record(
             f"scenario {scenario.name}: uses recorded logs, there is nothing to record"
         )
     run = JudgedRun.of(scenario, Store.of(results))
-    run.execute(jobs, on_progress, run.pipeline.to_logs())
+    run.execute(jobs, on_progress, [robot.log for robot in run.pipeline.simulated])
     for robot in run.pipeline.robots:
         for path in sorted(run.store.path(robot.log).glob("*.parquet")):
             link_or_copy(path, output / robot.name / path.name)

@@ -142,9 +142,8 @@ class Child:
         code = self._process.returncode
         if not ended:
             return "closed the connection to its process"
-        if code < 0:
-            return f"ended its process with {signal.Signals(-code).name}"
-        return f"ended its process with exit code {code}"
+        how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+        return f"ended its process with {how}"
 
     def _has_ended(self) -> bool:
         """Without collecting its exit code: until then its number is nobody else's."""
@@ -176,11 +175,10 @@ def child_for(spec: Spec) -> Child:
     """The living process for a spec, started where there is none; the one unused longest ends."""
     with _one_at_a_time:
         child = _children.pop(spec, None)
-        if child is None or not child.alive:
-            if child is not None:
-                child.kill()
-            child = Child(spec)
-        _children[spec] = child
+        if child is not None and not child.alive:
+            child.kill()
+            child = None
+        child = _children[spec] = child or Child(spec)
         while len(_children) > _MAX_CHILDREN:
             _children.popitem(last=False)[1].kill()
         return child

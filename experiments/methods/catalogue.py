@@ -71,27 +71,22 @@ class KnownMethod:
 
     def origin(self) -> dict[str, str]:
         """What else than parameters and our own source its results depend on, for stage keys."""
-        if self.kind is Kind.BUILT_IN:
-            return {"target": self.target}
-        return {
-            "target": self.target,
-            "distribution": self.distribution,
-            "version": self.version,
-            "files": fingerprint(self.package),
-        }
+        origin = {"target": self.target}
+        if self.kind is not Kind.BUILT_IN:
+            origin |= {"distribution": self.distribution, "version": self.version}
+            origin["files"] = fingerprint(self.package)
+        return origin
 
 
-def _own_methods() -> dict[str, KnownMethod]:
-    """Built-in ones and peers."""
-    return {
-        name: KnownMethod(
-            name,
-            Kind.PEER if name in PEERS else Kind.BUILT_IN,
-            f"{method.__module__}:{method.__name__}",
-            *_PEER_PACKAGES.get(name, ()),
-        )
-        for name, method in (ALIGNERS | PEERS).items()
-    }
+_OWN_METHODS = {
+    name: KnownMethod(
+        name,
+        Kind.PEER if name in PEERS else Kind.BUILT_IN,
+        f"{method.__module__}:{method.__name__}",
+        *_PEER_PACKAGES.get(name, ()),
+    )
+    for name, method in (ALIGNERS | PEERS).items()
+}
 
 
 @functools.cache
@@ -111,7 +106,7 @@ def known_methods() -> dict[str, KnownMethod]:
     """Every method that can be named, built-in ones first."""
     clashes = name_clashes()
     plug_ins = {name: methods[0] for name, methods in declared().items() if name not in clashes}
-    return _own_methods() | plug_ins
+    return _OWN_METHODS | plug_ins
 
 
 def name_clashes() -> dict[str, str]:
@@ -119,26 +114,24 @@ def name_clashes() -> dict[str, str]:
 
     Our own names stay ours; a name that two packages declare is nobody's.
     """
-    own = _own_methods()
     lines = {}
     for name, methods in declared().items():
         packages = [method.distribution for method in methods]
-        if name in own:
+        if name in _OWN_METHODS:
             lines[name] = (
                 f"aligner {name}: mapfusion's own is used, the one that {', '.join(packages)} "
                 "declares under the same name is not"
             )
         elif len(packages) > 1:
-            lines[name] = (
-                f"aligner {name}: declared by {' and by '.join(packages)}; uninstall all but one"
-            )
+            they = " and by ".join(packages)
+            lines[name] = f"aligner {name}: declared by {they}; uninstall all but one"
     return lines
 
 
 def find_method(name: str) -> KnownMethod:
     """The method of that name; raises ValueError for nobody's, or that of several plug-ins."""
-    own = _own_methods()
-    known = own if name in own else known_methods()  # ours need no look at installed packages
+    # ours need no look at installed packages
+    known = _OWN_METHODS if name in _OWN_METHODS else known_methods()
     if name not in known:
         unknown = f"unknown aligner {name!r}, known are {', '.join(known)}"
         raise ValueError(name_clashes().get(name, unknown))

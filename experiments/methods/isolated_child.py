@@ -111,8 +111,7 @@ def _checked_aligner(method: Any) -> Aligner:
         return method
     if not callable(getattr(method, "find", None)):
         raise NonsenseError("has neither a method find nor a method align")
-    if getattr(method, "needs", None) is not None:
-        _require_type("needs is", method.needs, "Needs", Needs)
+    _require_type("needs is", getattr(method, "needs", None), "Needs", Needs, type(None))
     return MethodAligner(_CheckedMethod(method))  # type: ignore[arg-type]
 
 
@@ -136,10 +135,8 @@ class _CheckedMethod:
         _require_array("inlier", found.inlier, (len(pairs),), "bool")
         no_motion = "T_a_b is not finite, expected Undetermined where there is no motion"
         _require(np.isfinite(found.T_a_b).all(), no_motion)
-        n = int(found.inlier.sum())
-        if found.fitted is not None:
-            _require_type("fitted is", found.fitted, "Pairs", Pairs)
-            n = len(found.fitted)
+        _require_type("fitted is", found.fitted, "Pairs", Pairs, type(None))
+        n = int(found.inlier.sum()) if found.fitted is None else len(found.fitted)
         if found.weight is not None:
             _require_array("weight", found.weight, (n,))
         if found.gain is not None:
@@ -177,15 +174,9 @@ def _checked_answer(answer: Any, n_correspondences: int, elapsed_s: float) -> Al
         _require(asymmetry <= _ASYMMETRY * largest, "covariance is not symmetric")
         least = np.linalg.eigvalsh(symmetric)[0]
         _require(least >= _LEAST_EIGENVALUE * largest, "covariance has a negative variance")
-    return Alignment(
-        T_a_b,
-        covariance,
-        np.array(answer.inlier, dtype=bool),
-        elapsed_s,
-        Status(status),
-        _shortened(answer.reason),
-        float(answer.drift_sigma_m),
-    )
+    inlier = np.array(answer.inlier, dtype=bool)
+    reason, drift_sigma_m = _shortened(answer.reason), float(answer.drift_sigma_m)
+    return Alignment(T_a_b, covariance, inlier, elapsed_s, Status(status), reason, drift_sigma_m)
 
 
 def _require(holds: Any, wrong: str) -> None:

@@ -15,7 +15,7 @@ PACKAGES = ("mapfusion", "sim", "experiments")
 # These find methods by name, so their imports reach every method there is. What a name stands for
 # is in a stage's settings, and its source in `Stage.loads`.
 _FINDS_BY_NAME = frozenset({"mapfusion.align.registry"})
-_DATA_SUFFIXES = {".urdf"}  # files that a module reads from its own folder
+_DATA = "*.urdf"  # files that a module reads from its own folder
 _NUMERICAL_LIBRARIES = ("numba", "numpy", "opencv-python-headless", "pyarrow", "pybullet", "scipy")
 
 
@@ -33,7 +33,7 @@ def source_hash(parts: tuple[str, ...] = PACKAGES) -> str:
         path = SOURCE_ROOT / part
         files = sorted(path.rglob("*")) if path.is_dir() else [path]
         for file in files:
-            if file.suffix in {".py", *_DATA_SUFFIXES}:
+            if file.match("*.py") or file.match(_DATA):
                 digest.update(str(file.relative_to(SOURCE_ROOT)).encode() + b"\0")
                 digest.update(file.read_bytes())
     return digest.hexdigest()
@@ -63,12 +63,7 @@ def imported_sources(*modules: str) -> tuple[str, ...]:
         if path not in reached:
             reached.add(path)
             todo += _imports(path)
-    data = {
-        file
-        for folder in {path.parent for path in reached}
-        for file in folder.iterdir()
-        if file.suffix in _DATA_SUFFIXES
-    }
+    data = {file for folder in {path.parent for path in reached} for file in folder.glob(_DATA)}
     return tuple(sorted(path.relative_to(SOURCE_ROOT).as_posix() for path in reached | data))
 
 

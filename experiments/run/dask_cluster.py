@@ -41,10 +41,8 @@ def connected(jobs: int, scheduler: str | None) -> AbstractContextManager[Client
     try:
         return Client(scheduler, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
     except (OSError, ValueError) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(
-            f"--scheduler {scheduler}: no Dask scheduler answers ({reason})"
-        ) from error
+        reason = f"no Dask scheduler answers ({str(error).splitlines()[0]})"
+        raise InputError(f"--scheduler {scheduler}: {reason}") from error
 
 
 @contextmanager

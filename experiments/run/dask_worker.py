@@ -94,10 +94,8 @@ def _attempt(name: str, task: bytes, terms: Terms) -> None:
     stage = name.partition("/")[0]
     mark = terms.attempts / name.replace("/", "_")
     if mark.exists() and mark.stat().st_size > terms.retries:
-        times = terms.retries + 1
-        raise TaskFailedError(
-            name, f"{stage}: its worker was killed {times} times (out of memory?)"
-        )
+        killed = f"its worker was killed {terms.retries + 1} times (out of memory?)"
+        raise TaskFailedError(name, f"{stage}: {killed}")
     with mark.open("ab") as file:
         file.write(b".")
     try:

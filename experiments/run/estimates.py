@@ -43,16 +43,10 @@ def alignment_of(row: Mapping[Any, Any], n_correspondences: int) -> Alignment:
     covariance = np.empty((3, 3))
     covariance[_UPPER] = covariance.T[_UPPER] = [row[name] for name in COVARIANCE]
     verdict = Verdict(bool(row["accepted"]), row["log10_false_alarms"], row["acceptance_reason"])
-    refined = Alignment(
-        np.array([row[f"refined_{name}"] for name in MOTION]),
-        covariance,
-        inlier_mask(row["refined_inliers"], n_correspondences),
-        np.nan,
-        Status(row["refined_status"]),
-        row["refined_reason"],
-        row["drift_sigma_m"],
-    )
-    return verdict.applied_to(refined)
+    T_a_b = np.array([row[f"refined_{name}"] for name in MOTION])
+    inlier = inlier_mask(row["refined_inliers"], n_correspondences)
+    outcome = (Status(row["refined_status"]), row["refined_reason"], row["drift_sigma_m"])
+    return verdict.applied_to(Alignment(T_a_b, covariance, inlier, np.nan, *outcome))
 
 
 def correspondences_of(rows: pd.DataFrame) -> Correspondences:

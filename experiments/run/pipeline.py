@@ -5,14 +5,14 @@ Each stage is handed its own settings, taken from the scenario here and nowhere 
 
 import itertools
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any, TypeVar
+from typing import Any
 
 from experiments.methods.catalogue import Kind, find_method
-from experiments.run.stage import WHOLE, RecordedLog, Stage, with_those_before
+from experiments.run.stage import RecordedLog, Stage, with_those_before
 from experiments.run.stages import (
     align,
     aligner,
@@ -37,8 +37,6 @@ from mapfusion.errors import InputError
 from mapfusion.robot_log import read_log
 from mapfusion.vision.frontend import FrontEndParameters
 from sim.renderer import renderer_name
-
-S = TypeVar("S")
 
 
 @dataclass(frozen=True)
@@ -82,10 +80,6 @@ class Pipeline:
         """Robots with images."""
         return [robot for robot in self.robots if isinstance(robot, SimulatedRobotStages)]
 
-    def to_logs(self) -> list[Stage]:
-        """What must be done for the robots' logs, each stage after those before it."""
-        return with_those_before(robot.log for robot in self.robots)
-
     def stages(self) -> list[Stage]:
         """All stages, each after those before it; a robot is done before the next one's images."""
         maps = (robot.slam for robot in self.robots)
@@ -104,55 +98,41 @@ def lay_out(scenario: AnyScenario) -> Pipeline:
     return Pipeline(scenario, robots, pairs)
 
 
-def _stage(
-    module: ModuleType,
-    settings: object,
-    before: Mapping[str, Stage | RecordedLog] | None = None,
-    parts: tuple[str, ...] = WHOLE,
-    **more: Any,
-) -> Stage:
-    """The stage that a module of `experiments.run.stages` does the work of, under its name."""
-    name = module.__name__.rpartition(".")[2]
-    return Stage(
-        name, module.LABEL, settings, module.run, module.WRITES, before or {}, parts, **more
-    )
+def _stage(module: ModuleType, *sections: Section, own: dict[str, Any], **more: Any) -> Stage:
+    """The stage that a module of `experiments.run.stages` does the work of, under its name.
 
-
-def _filled(kind: type[S], *sections: Section, **own: Any) -> S:
-    """A stage's settings: its own, and the others by their names in these sections."""
+    It is told the fields of its settings and no others: its own, and from the sections by name.
+    """
+    kind = module.run.__annotations__["settings"]
     known = {name: value for section in sections for name, value in section} | own
-    return kind(**{field.name: known[field.name] for field in fields(kind)})  # type: ignore[arg-type]
+    settings = kind(**{field.name: known[field.name] for field in fields(kind)})
+    name = module.__name__.rpartition(".")[2]
+    return Stage(name, module.LABEL, settings, module.run, module.WRITES, **more)
 
 
 def _simulated(scenario: Simulation) -> Iterable[RobotStages]:
     world, render, keep = scenario.world, scenario.render, scenario.keep
     lines = tuple(tuple(wall.points) for wall in world.walls)
     walls = Walls(lines, world.wall_height_m, world.wall_thickness_m)
-    routes = tuple(_filled(drive.DrivenRobot, robot) for robot in scenario.robots)
-    driven = _stage(
-        drive, _filled(drive.DriveSettings, scenario, scenario.drive, walls=walls, robots=routes)
+    routes = tuple(
+        drive.DrivenRobot(robot.name, robot.start, robot.route, robot.loop, robot.tire_friction)
+        for robot in scenario.robots
     )
-    painted = _stage(faces, _filled(faces.FacesSettings, scenario, world, walls=walls))
-    n_frames, vision, unread = scenario.drive.frames, scenario.vision, FrontEndParameters()
+    driven = _stage(drive, scenario, scenario.drive, own={"walls": walls, "robots": routes})
+    before = {"drive": driven, "faces": _stage(faces, scenario, world, own={"walls": walls})}
+    n_frames, drawn_by = scenario.drive.frames, renderer_name(render.renderer)
+    vision, unread = scenario.vision, FrontEndParameters()
     finding = replace(unread, harris=vision.harris, stereo=vision.stereo, usurf=vision.usurf)
     tracking = replace(vision, harris=unread.harris, stereo=unread.stereo, usurf=unread.usurf)
     for robot in scenario.robots:
-        to_find = _filled(
-            features.FeatureSettings,
-            *(scenario, render, keep),
-            robot=robot.name,
-            radiometry=robot.radiometry or scenario.radiometry,
-            drawn_by=renderer_name(render.renderer),
-            vision=finding,
-        )
-        world_stages = {"drive": driven, "faces": painted}
-        found = _stage(features, to_find, world_stages, features.chunks(n_frames))
-        own = {"robot": robot.name, "n_frames": n_frames, "vision": tracking}
-        to_track = _filled(observed.ObservedSettings, scenario, keep, **own)
-        tracked = _stage(observed, to_track, {"features": found})
-        odometry = robot.odometry or scenario.odometry
-        to_log = _filled(log.LogSettings, scenario, robot=robot.name, odometry=odometry)
-        logged = _stage(log, to_log, {"drive": driven, "observed": tracked})
+        own = {"robot": robot.name, "n_frames": n_frames, "drawn_by": drawn_by}
+        own["radiometry"] = robot.radiometry or scenario.radiometry
+        own["odometry"] = robot.odometry or scenario.odometry
+        chunks, to_find = features.chunks(n_frames), own | {"vision": finding}
+        found = _stage(features, scenario, render, keep, own=to_find, before=before, parts=chunks)
+        to_track, images = own | {"vision": tracking}, {"features": found}
+        tracked = _stage(observed, scenario, keep, own=to_track, before=images)
+        logged = _stage(log, scenario, own=own, before={"drive": driven, "observed": tracked})
         mapped = _slam(scenario, logged)
         yield SimulatedRobotStages(robot.name, n_frames, logged, mapped, found, tracked)
 
@@ -176,7 +156,7 @@ def _recorded(scenario: Recording) -> Iterable[RobotStages]:
 
 def _slam(scenario: Scenario, logged: Stage | RecordedLog) -> Stage:
     sections = (scenario, scenario.slam, scenario.evaluate, scenario.keep)
-    return _stage(slam, _filled(slam.SlamSettings, *sections), {"log": logged})
+    return _stage(slam, *sections, own={}, before={"log": logged})
 
 
 def _pair(scenario: Scenario, a: RobotStages, b: RobotStages) -> PairStages:
@@ -184,19 +164,21 @@ def _pair(scenario: Scenario, a: RobotStages, b: RobotStages) -> PairStages:
     iterations = tuple(slam.evaluated_iterations(n_frames, scenario.evaluate.every))
     parts = match.batches(iterations)
     maps = {"log_a": a.log, "slam_a": a.slam, "log_b": b.log, "slam_b": b.slam}
-    to_match = _filled(match.MatchSettings, scenario.align, iterations=iterations)
-    before = {"match": _stage(match, to_match, maps, parts)}
+    own = {"iterations": iterations}
+    matched = {"match": _stage(match, scenario.align, own=own, before=maps, parts=parts)}
+    estimates: dict[str, Stage] = {}
     for i, entry in enumerate(scenario.align.aligners):
         method = find_method(entry.method)
         module = method.target.partition(":")[0]
-        own = {"origin": method.origin(), "iterations": iterations}
-        before[f"aligner {i}"] = _stage(
+        if method.kind is Kind.PLUG_IN:
+            module = "mapfusion.align"  # it may import whatever helps it
+        estimates[f"aligner {i}"] = _stage(
             aligner,
-            _filled(aligner.AlignerSettings, scenario, scenario.align, entry, **own),
-            maps | {"match": before["match"]},
-            parts,
-            alongside=frozenset({"match"}),
-            # a plug-in may import whatever helps it
-            loads=("mapfusion.align" if method.kind is Kind.PLUG_IN else module,),
+            *(scenario, scenario.align, entry),
+            own=own | {"origin": method.origin()},
+            before=maps | matched,
+            parts=parts,
+            loads=(module,),
         )
-    return PairStages(a, b, _stage(align, align.JoinSettings(parts), before))
+    joined = _stage(align, own={"batches": parts}, before=matched | estimates)
+    return PairStages(a, b, joined)

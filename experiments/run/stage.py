@@ -26,7 +26,7 @@ WHOLE = ("",)  # the parts of a stage that is made in one piece
 Work = Callable[[Any, Job], Mapping[str, float] | None]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Stage:
     """One declared step from inputs to files.
 
@@ -37,9 +37,8 @@ class Stage:
         work: a function of a module, `work(settings, job)`; the module's imports are its source.
         writes: names of files that are there once a part is made, `{part}` in place of its name.
         before: stages whose folders it reads, by the names it knows them by.
-        parts: made apart from each other, in any order.
-        alongside: names in `before` of stages with the same parts, of which each part needs its
-            own counterpart alone.
+        parts: made apart from each other, in any order; each needs all of the stages before it,
+            but of one with the same parts its own counterpart alone.
         loads: modules that it finds by name, which no import shows.
     """
 
@@ -50,7 +49,6 @@ class Stage:
     writes: tuple[str, ...] = ()
     before: Mapping[str, "Stage | RecordedLog"] = field(default_factory=dict)
     parts: tuple[str, ...] = WHOLE
-    alongside: frozenset[str] = frozenset()
     loads: tuple[str, ...] = ()
 
     @cached_property
@@ -77,7 +75,6 @@ class RecordedLog:
     """A robot log that was there before: a stage that is finished; its key is what it holds."""
 
     path: Path
-    name: str = "log"
 
     @cached_property
     def key(self) -> str:
@@ -91,9 +88,8 @@ class RecordedLog:
 
 def with_those_before(goals: "Iterable[Stage | RecordedLog]") -> list[Stage]:
     """Stages and all that come before them, each once and after those before it."""
-    found: dict[int, Stage] = {}
+    found: dict[Stage, None] = {}
     for goal in goals:
         if isinstance(goal, Stage):
-            found |= {id(stage): stage for stage in with_those_before(goal.before.values())}
-            found[id(goal)] = goal
-    return list(found.values())
+            found |= dict.fromkeys([*with_those_before(goal.before.values()), goal])
+    return list(found)

@@ -35,15 +35,9 @@ ESTIMATES = schema(
 )
 
 # The pairs offered to the aligners; rows of the two maps at that iteration.
-CORRESPONDENCES = schema(
-    "result.correspondences",
-    1,
-    fields(**_MAPS, index_a=INT, index_b=INT, descriptor_distance=FLOAT),
-)
+_OFFERED = fields(**_MAPS, index_a=INT, index_b=INT, descriptor_distance=FLOAT)
+CORRESPONDENCES = schema("result.correspondences", 1, _OFFERED)
 
 # Harris points of a few consecutive frames, for figure 1.
-TRACKS = schema(
-    "result.tracks",
-    1,
-    fields(robot=TEXT, iteration=INT, track=pa.int64(), length=INT, u_px=FLOAT, v_px=FLOAT),
-)
+_POINT = fields(robot=TEXT, iteration=INT, track=pa.int64(), length=INT, u_px=FLOAT, v_px=FLOAT)
+TRACKS = schema("result.tracks", 1, _POINT)

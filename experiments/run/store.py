@@ -11,7 +11,6 @@ from typing import Any
 from experiments.run.stage import RecordedLog, Stage
 from mapfusion.storage import write_whole
 
-STORE_FOLDER = "store"  # in the folder of results
 _MARK = "done"
 
 
@@ -56,7 +55,7 @@ class Store:
     @classmethod
     def of(cls, results: Path) -> "Store":
         """The store in a folder of results."""
-        return cls(results / STORE_FOLDER)
+        return cls(results / "store")
 
     def path(self, stage: Stage | RecordedLog) -> Path:
         """Where what a stage made is or will be."""

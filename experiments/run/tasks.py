@@ -3,13 +3,11 @@
 `mapfusion run` gives them to processes of its own, `mapfusion sweep` to a Dask cluster.
 """
 
-import heapq
 import itertools
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import Any
 
@@ -66,9 +64,9 @@ def tasks_of(stages: Iterable[Stage], store: Store) -> dict[str, Task]:
     return tasks
 
 
-def task_names(stage: Stage | RecordedLog) -> tuple[str, ...]:
+def task_names(stage: Stage | RecordedLog) -> list[str]:
     """Names of the tasks that make a stage; none for what was there before."""
-    return () if isinstance(stage, RecordedLog) else tuple(_name(stage, p) for p in stage.parts)
+    return [] if isinstance(stage, RecordedLog) else [_name(stage, part) for part in stage.parts]
 
 
 def _name(stage: Stage, part: str) -> str:
@@ -77,8 +75,8 @@ def _name(stage: Stage, part: str) -> str:
 
 def _task(stage: Stage, part: str, store: Store) -> Task:
     needs: list[str] = []
-    for name, before in stage.before.items():
-        if name in stage.alongside and isinstance(before, Stage):
+    for before in stage.before.values():
+        if isinstance(before, Stage) and before.parts == stage.parts:
             needs.append(_name(before, part))
         else:
             needs += task_names(before)
@@ -96,19 +94,17 @@ def _perform(work: Callable[..., Any], settings: Any, job: Job, folder: StageFol
     folder.finish(job.part, {"elapsed_s": time.perf_counter() - started} | figures)
 
 
-def unfinished(tasks: Mapping[str, Task], goals: Iterable[str]) -> list[Task]:
+def unfinished(tasks: dict[str, Task], goals: Iterable[str]) -> list[Task]:
     """The tasks left to do for the outputs of those named, in the order of `tasks`.
 
     What a finished task was made from is not asked for: it may have been deleted.
     """
-    wanted: set[str] = set()
-    stack = list(goals)
-    while stack:
-        name = stack.pop()
-        if name not in wanted and not tasks[name].finished:
-            wanted.add(name)
-            stack += tasks[name].needs
-    return [task for name, task in tasks.items() if name in wanted]
+    wanted, left = set(goals), list[Task]()
+    for task in reversed(tasks.values()):  # what a task needs comes before it
+        if task.name in wanted and not task.finished:
+            wanted.update(task.needs)
+            left.append(task)
+    return left[::-1]
 
 
 def run_tasks(tasks: Sequence[Task], pool: Workers, on_progress: OnProgress) -> None:
@@ -117,25 +113,20 @@ def run_tasks(tasks: Sequence[Task], pool: Workers, on_progress: OnProgress) -> 
     What a task needs beyond these is done already. `on_progress` is told (label, tasks done, tasks
     in all).
     """
-    number = {task.name: i for i, task in enumerate(tasks)}
-    needs = [[number[need] for need in task.needs if need in number] for task in tasks]
-    order = TopologicalSorter(dict(enumerate(needs)))
-    order.prepare()
-    ready: list[int] = []
+    waiting, undone = list(tasks), {task.name for task in tasks}
     total, done = Counter(task.label for task in tasks), Counter[str]()
     for label in total:
         on_progress(label, 0, total[label])
 
     def hand_out() -> None:
-        for i in order.get_ready():
-            heapq.heappush(ready, i)
-        while ready and pool.has_room:
-            i = heapq.heappop(ready)
-            pool.submit(i, tasks[i].run)
+        ready = (task for task in waiting if undone.isdisjoint(task.needs))
+        for task in list(itertools.islice(ready, pool.room)):
+            waiting.remove(task)
+            pool.submit(task, task.run)
 
     hand_out()
-    for i, _ in pool.completed():
-        done[tasks[i].label] += 1
-        on_progress(tasks[i].label, done[tasks[i].label], total[tasks[i].label])
-        order.done(i)
+    for task, _ in pool.completed():
+        undone.remove(task.name)
+        done[task.label] += 1
+        on_progress(task.label, done[task.label], total[task.label])
         hand_out()

@@ -53,9 +53,9 @@ class Workers:
         self._pending[submit(function, *arguments)] = tag
 
     @property
-    def has_room(self) -> bool:
-        """Whether a process would have to wait for its next task unless one is submitted."""
-        return len(self._pending) < self._wanted
+    def room(self) -> int:
+        """How many more tasks are wanted, so that no process has to wait for its next one."""
+        return max(self._wanted - len(self._pending), 0)
 
     def completed(self) -> Iterator[tuple[Any, Any]]:
         """(tag, result) of each task as it ends; a task's error is raised here."""

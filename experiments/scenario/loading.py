@@ -89,11 +89,7 @@ def _expanded(where: str, data: dict[str, Any]) -> dict[str, Any]:
 
 
 def load_section(path: Path | None, name: str, kind: type[S], overrides: Sequence[str]) -> S:
-    """One section of a scenario (or its defaults, without a file), with overrides inside it.
-
-    Raises:
-        InputError: as `load_scenario`.
-    """
+    """One section of a scenario, or its defaults, with overrides inside it; raises InputError."""
     where, data = name, {}
     if path is not None:
         load_scenario(path)
@@ -120,44 +116,38 @@ def _validated(where: str, kind: type[S], data: dict[str, Any]) -> S:
 
 def _first_problem(schema: dict[str, Any], error: ValidationError) -> str:
     """The first thing wrong with a section of that JSON schema, and how many more there are."""
-    problems = error.errors(include_url=False)
     # A wrong name explains the missing one that follows from it, so it goes first.
-    unknown = [problem for problem in problems if problem["type"] in _UNKNOWN]
-    problem = (unknown or problems)[0]
+    problems = error.errors(include_url=False)
+    problem, *more = sorted(problems, key=lambda each: each["type"] not in _UNKNOWN)
     location = problem["loc"]
     message = problem["msg"].removeprefix("Value error, ")
-    if unknown:
-        message = f"unknown key; known here: {', '.join(_siblings(schema, location))}"
-        elsewhere = list(_paths_like(schema, schema, str(location[-1])))[:_MOST_SUGGESTED]
-        message += f"; did you mean {' or '.join(elsewhere)}?" if elsewhere else ""
+    if problem["type"] in _UNKNOWN:
+        message = _about_unknown(location, list(_keys(schema, schema)))
     elif problem["type"] != "value_error" and not isinstance(problem["input"], dict):
         message = f"{message} (it is {problem['input']!r})"
-    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
     where = f"{'.'.join(map(str, location))}: " if location else ""
-    return f"{where}{message}{more}"
+    return f"{where}{message}" + (f" (and {len(more)} more)" if more else "")
 
 
-def _siblings(root: dict[str, Any], location: Sequence[int | str]) -> list[str]:
-    """The names that would have been right beside an unknown one."""
-    node = root
-    for part in location[:-1]:
-        node = _resolved(root, node)
-        if isinstance(part, int):
-            node = node["items"]
-        else:  # a mapping with free keys, as `expect`, describes all its values at once
-            node = node.get("properties", {}).get(part) or node["additionalProperties"]
-    return sorted(_resolved(root, node)["properties"])
+def _about_unknown(location: tuple[int | str, ...], known: list[tuple[str, ...]]) -> str:
+    """The names that would have been right there, and keys of which the wrong one is a word."""
+    *above, name = location
+    beside = [path for path in known if len(path) == len(location)]
+    for i, part in enumerate(above):
+        beside = [path for path in beside if path[i] in {"*", part}]
+    like = [".".join(path) for path in known if name in path[-1].split("_") and "*" not in path]
+    message = f"unknown key; known here: {', '.join(sorted(path[-1] for path in beside))}"
+    return message + (f"; did you mean {' or '.join(like[:_MOST_SUGGESTED])}?" if like else "")
 
 
-def _paths_like(root: dict[str, Any], node: dict[str, Any], name: str) -> Iterator[str]:
-    """Dotted keys below a node whose last part holds this name as a word: n_particles."""
-    for key, child in _resolved(root, node).get("properties", {}).items():
-        if name in key.split("_"):
-            yield key
-        yield from (f"{key}.{path}" for path in _paths_like(root, child, name))
-
-
-def _resolved(root: dict[str, Any], node: dict[str, Any]) -> dict[str, Any]:
+def _keys(root: dict[str, Any], node: dict[str, Any], *above: str) -> Iterator[tuple[str, ...]]:
+    """All keys below a node; `*` stands for places in lists and for free keys, as in `expect`."""
     node = next((option for option in node.get("anyOf", []) if "$ref" in option), node)
-    reference = node.get("$ref")
-    return root["$defs"][reference.rsplit("/", 1)[1]] if reference else node
+    if "$ref" in node:
+        node = root["$defs"][node["$ref"].rsplit("/", 1)[1]]
+    for key, child in node.get("properties", {}).items():
+        yield (*above, key)
+        yield from _keys(root, child, *above, key)
+    for children in (node.get("items"), node.get("additionalProperties")):
+        if isinstance(children, dict):
+            yield from _keys(root, children, *above, "*")

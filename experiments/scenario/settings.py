@@ -5,8 +5,7 @@ are: pydantic validates them in place, so a parameter is named and explained onc
 """
 
 import json
-from collections.abc import Sequence
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, model_validator
 
@@ -26,23 +25,25 @@ from sim.stereo_head import RadiometricNoise
 from sim.textures import Texture
 
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,40}$"  # names become parts of file names
+T = TypeVar("T")
 Name = Annotated[str, Field(pattern=NAME_PATTERN)]
 Point = tuple[float, float]
-Pose = tuple[float, float, float]
 MAX_IMAGE_SIDE_PX = 4096  # the software renderer takes seconds and 100 MB a frame at this size
 
 
-def _require_unique(field: str, names: Sequence[str]) -> None:
+def _different(items: list[T], prefix: str = "") -> list[T]:
+    """Refuse two of one name; the items are names or have one."""
+    names = [getattr(item, "name", item) for item in items]
     for name in names:
         if names.count(name) > 1:
-            raise ValueError(f"{field}: two are named {name}; names must differ")
+            raise ValueError(f"{prefix}two are named {name}; names must differ")
+    return items
 
 
 def _renderable(camera: StereoCamera) -> StereoCamera:
-    most = MAX_IMAGE_SIDE_PX
     for name, value in vars(camera).items():
-        if name in {"width_px", "height_px"} and not 1 <= value <= most:
-            raise ValueError(f"{name}: is {value}, must be in [1, {most}]")
+        if name in {"width_px", "height_px"} and not 1 <= value <= MAX_IMAGE_SIDE_PX:
+            raise ValueError(f"{name}: is {value}, must be in [1, {MAX_IMAGE_SIDE_PX}]")
         if name in {"focal_px", "baseline_m", "mount_z_m"} and not value > 0:
             raise ValueError(f"{name}: is {value}, must be positive")
     return camera
@@ -77,7 +78,7 @@ class Robot(Section):
     """
 
     name: Name
-    start: Pose
+    start: tuple[float, float, float]
     route: Annotated[list[Point], Field(min_length=1)]
     loop: bool = True
     odometry: OdometryNoise | None = None
@@ -165,9 +166,9 @@ class Align(Section):
     @model_validator(mode="after")
     def _unique(self) -> Self:
         # One list from here on; pydantic freezes models for their users, not for their validators.
-        object.__setattr__(self, "aligners", [*self.aligners, *self.also])
+        aligners = _different([*self.aligners, *self.also], "aligners: ")
+        object.__setattr__(self, "aligners", aligners)
         object.__setattr__(self, "also", [])
-        _require_unique("aligners", [entry.name for entry in self.aligners])
         return self
 
 
@@ -233,12 +234,7 @@ class Scenario(Section):
 class Recording(Scenario):
     """An experiment on recorded logs: folders, relative to the scenario's file."""
 
-    logs: Annotated[list[str], Field(min_length=1)]
-
-    @model_validator(mode="after")
-    def _unique_logs(self) -> Self:
-        _require_unique("logs", self.logs)
-        return self
+    logs: Annotated[list[str], Field(min_length=1), AfterValidator(_different)]
 
 
 class SimulatedScenario(Scenario):
@@ -274,13 +270,8 @@ class Simulation(SimulatedScenario):
     """An experiment in a simulated world; `generated` tells where a drawn one came from."""
 
     world: World
-    robots: Annotated[list[Robot], Field(min_length=1)]
+    robots: Annotated[list[Robot], Field(min_length=1), AfterValidator(_different)]
     generated: Generated | None = None
-
-    @model_validator(mode="after")
-    def _unique_robots(self) -> Self:
-        _require_unique("robots", [robot.name for robot in self.robots])
-        return self
 
 
 AnyScenario = Simulation | Recording

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import Recording
@@ -11,21 +11,6 @@ from mapfusion.errors import InputError
 
 FOLDER = Path("scenarios")
 SUFFIXES = {".yaml", ".yml", ".json"}  # a JSON file is YAML too: a result's scenario.json
-
-
-class Entry(NamedTuple):
-    """One scenario of the suite.
-
-    `iterations` are frames a robot, None for recorded logs; `overlap` is that of the robots'
-    ground, None where the world was not generated.
-    """
-
-    name: str
-    tags: tuple[str, ...]
-    description: str
-    robots: int
-    iterations: int | None = None
-    overlap: float | None = None
 
 
 def scenarios_of(names_or_tags: Sequence[str | Path], folder: Path = FOLDER) -> list[Path]:
@@ -70,8 +55,11 @@ def _tags(data: dict) -> list[str]:
     return [str(tag) for tag in tags] if isinstance(tags, list) else []
 
 
-def entries(folder: Path = FOLDER) -> list[Entry]:
-    """All scenarios of a folder, validated, in the order of their files' names.
+def entries(folder: Path = FOLDER) -> list[dict[str, Any]]:
+    """What a listing tells of all scenarios of a folder, in the order of their files' names.
+
+    `iterations` are frames a robot, None for recorded logs; `overlap` is that of the robots'
+    ground, None where the world was not generated.
 
     Raises:
         InputError: the folder holds none, or one of them is wrong.
@@ -82,10 +70,11 @@ def entries(folder: Path = FOLDER) -> list[Entry]:
     return [_entry(path) for path in files]
 
 
-def _entry(path: Path) -> Entry:
+def _entry(path: Path) -> dict[str, Any]:
     scenario = load_scenario(path)
-    told = (scenario.name, tuple(scenario.tags), scenario.description)
+    row = {name: getattr(scenario, name) for name in ("name", "tags", "description")}
     if isinstance(scenario, Recording):
-        return Entry(*told, len(scenario.logs))
+        return row | {"robots": len(scenario.logs), "iterations": None, "overlap": None}
     overlap = scenario.generated.overlap if scenario.generated else None
-    return Entry(*told, len(scenario.robots), scenario.drive.frames, overlap)
+    frames = scenario.drive.frames
+    return row | {"robots": len(scenario.robots), "iterations": frames, "overlap": overlap}

@@ -15,9 +15,8 @@ def read_mapping(path: Path) -> dict[str, Any]:
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise InputError(
-            f"{path}: no such file (expected a scenario, for example quick.yaml)"
-        ) from None
+        expected = "expected a scenario, for example quick.yaml"
+        raise InputError(f"{path}: no such file ({expected})") from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read as UTF-8 text ({error})") from error
     data = parse_value(text, str(path))
@@ -31,13 +30,11 @@ def parse_value(text: str, where: str) -> Any:
     """Read one YAML value; raises InputError that begins with `where`."""
     try:
         return _copied(YAML(typ="safe", pure=True).load(text))
-    except YAMLError as error:
+    except (YAMLError, ValueError) as error:  # the latter for example of an impossible date
         mark = getattr(error, "problem_mark", None)
         line = f", line {mark.line + 1}" if mark is not None else ""
         problem = str(getattr(error, "problem", None) or error).splitlines()[0]
         raise InputError(f"{where}{line}: not plain YAML ({problem})") from error
-    except ValueError as error:  # for example an impossible date
-        raise InputError(f"{where}: not plain YAML ({error})") from error
     except RecursionError as error:
         raise InputError(f"{where}: nested too deeply, or holds itself") from error
 

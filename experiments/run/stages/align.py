@@ -22,9 +22,8 @@ class JoinSettings:
 
 def run(settings: JoinSettings, job: Job) -> None:
     """Write one table of estimates and one of correspondences."""
-    offered = [job.inputs["match"]]
     aligners = [folder for name, folder in job.inputs.items() if name != "match"]
-    tables = ((ESTIMATES, aligners), (CORRESPONDENCES, offered))
+    tables = ((ESTIMATES, aligners), (CORRESPONDENCES, [job.inputs["match"]]))
     for file, (schema, folders) in zip(WRITES, tables, strict=True):
         paths = [match.batch_path(folder, part) for part in settings.batches for folder in folders]
         joined = pd.concat([read_rows(path, schema) for path in paths], ignore_index=True)

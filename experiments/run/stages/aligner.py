@@ -44,11 +44,10 @@ def run(settings: AlignerSettings, job: Job) -> None:
     rows = []
     for k, map_a, map_b in match.pairs_of_maps(job, settings.iterations):
         pairs = correspondences_of(offered[offered["iteration"] == k])
-        names = {"robot_a": map_a.name, "robot_b": map_b.name, "iteration": k}
         on_pair = registration.on(map_a, map_b, pairs)
         for repetition in range(settings.repetitions if registration.randomised else 1):
-            purpose = (map_a.name, map_b.name, k, settings.name, repetition)
-            done = on_pair.register(generator(settings.seed, "align", *purpose))
+            names = {"robot_a": map_a.name, "robot_b": map_b.name, "iteration": k}
             names |= {"aligner": settings.name, "repetition": repetition}
+            done = on_pair.register(generator(settings.seed, "align", *names.values()))
             rows.append(names | estimate_row(len(pairs), *done))
     write_rows(match.batch_path(job.output, job.part), ESTIMATES, rows)

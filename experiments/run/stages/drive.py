@@ -51,8 +51,7 @@ def run(settings: DriveSettings, job: Job) -> None:
     routes = []
     for robot in settings.robots:
         jitter = generator(settings.seed, "start", robot.name).uniform(-span, span)
-        start = np.array(robot.start) + jitter
-        route = np.array(robot.route)
+        start, route = np.array(robot.start) + jitter, np.array(robot.route)
         routes.append(Route(robot.name, start, route, robot.loop, robot.tire_friction))
     plan, interval_s = settings.walls.floor_plan(), settings.frame_interval_s
     trajectory = drive(plan, routes, settings.control, settings.frames, interval_s)

@@ -82,32 +82,23 @@ def _chunk(part: str, n_frames: int) -> range:
     return range(int(part), min(int(part) + FRAMES_PER_CHUNK, n_frames))
 
 
-def _chunk_paths(folder: Path, part: str) -> tuple[Path, ...]:
-    """The truth and the features of one chunk; the features are written last."""
-    return tuple(folder / name.format(part=part) for name in WRITES)
+# The world this process last rendered from: loading one takes seconds, so it stays open.
+_open: dict[tuple[object, ...], FrameSource] = {}
 
 
-class _OpenWorld:
-    """The world this process last rendered from: loading one takes seconds, so it stays open."""
-
-    key: tuple[object, ...] = ()
-    source: FrameSource | None = None
-
-    @classmethod
-    def get(cls, settings: FeatureSettings, faces: Path, robots: tuple[str, ...]) -> FrameSource:
-        key = (faces, settings.camera, settings.renderer, robots)
-        if cls.source is None or cls.key != key:
-            if cls.source is not None:
-                cls.source.close()
-            cls.source = FrameSource(faces, settings.camera, robots, settings.renderer)
-            cls.key = key
-        return cls.source
+def _world(settings: FeatureSettings, faces: Path, robots: tuple[str, ...]) -> FrameSource:
+    world = (faces, settings.camera, robots, settings.renderer)
+    if world not in _open:
+        while _open:
+            _open.popitem()[1].close()
+        _open[world] = FrameSource(*world)
+    return _open[world]
 
 
 def run(settings: FeatureSettings, job: Job) -> dict[str, float]:
     """Render and extract the frames of one chunk; returns how long the rendering took."""
     trajectory = read_trajectory(job.inputs["drive"] / TRAJECTORY_FILE)
-    source = _OpenWorld.get(settings, job.inputs["faces"], trajectory.robots)
+    source = _world(settings, job.inputs["faces"], trajectory.robots)
     front_end = FrontEnd(settings.camera, settings.vision)
     robot, features, truth, rendering_s = settings.robot, [], [], 0.0
     frames = _chunk(job.part, len(trajectory))
@@ -125,7 +116,7 @@ def run(settings: FeatureSettings, job: Job) -> dict[str, float]:
             encoded = cv2.imencode(".png", frame.left)[1].tobytes()
             image = job.output / f"image_{iteration:06d}.png"
             write_whole(image, lambda temporary, encoded=encoded: temporary.write_bytes(encoded))
-    truth_path, features_path = _chunk_paths(job.output, job.part)
+    truth_path, features_path = (job.output / name.format(part=job.part) for name in WRITES)
     joined = {
         name: np.concatenate([getattr(found, name) for found in features])
         for name in ("uv_px", *_ONE_EACH)
@@ -140,7 +131,7 @@ def run(settings: FeatureSettings, job: Job) -> dict[str, float]:
 def read_features(folder: Path, n_frames: int) -> Iterator[tuple[Features, Float]]:
     """Features and their true world points (N, 3), frame by frame, in order."""
     for part in chunks(n_frames):
-        truth_path, features_path = _chunk_paths(folder, part)
+        truth_path, features_path = (folder / name.format(part=part) for name in WRITES)
         table, _ = read_table(features_path, FEATURES)
         found = Features(columns(table, _PIXEL), *(column(table, name) for name in _ONE_EACH))
         truth = columns(read_table(truth_path, TRUTH)[0], TRUTH.names)

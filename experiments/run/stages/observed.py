@@ -43,13 +43,12 @@ def run(settings: ObservedSettings, job: Job) -> None:
         observed.append(observe(camera, found, lasting, vision))
         truth.append(points[observable(camera, found, lasting, vision)])
         if iteration in kept:
-            columns = {"track": state.track_id, "length": state.length}
-            columns |= {"u_px": found.uv_px[:, 0], "v_px": found.uv_px[:, 1]}
-            names = {"robot": settings.robot, "iteration": iteration}
-            tracks.append(pd.DataFrame(names | columns))
+            seen = pd.DataFrame(found.uv_px, columns=pd.Index(["u_px", "v_px"]))
+            seen = seen.assign(robot=settings.robot, iteration=iteration)
+            tracks.append(seen.assign(track=state.track_id, length=state.length))
     iterations = np.repeat(np.arange(len(observed)), [len(own) for own in observed])
-    seen = ("position_m", "covariance_m2", "descriptor", "uvd_px")
-    joined = {name: np.concatenate([getattr(own, name) for own in observed]) for name in seen}
+    names = ("position_m", "covariance_m2", "descriptor", "uvd_px")
+    joined = {name: np.concatenate([getattr(own, name) for own in observed]) for name in names}
     write_observations(job.output, iterations, Observations(**joined))
     write_truth_points(job.output, np.concatenate(truth))
     write_rows(job.output / "tracks.parquet", TRACKS, pd.concat(tracks) if tracks else [])

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
-from experiments.run.frames import BOOL, FLOAT, INT, fields, read_rows, write_rows
+from experiments.run.frames import BOOL, FLOAT, INT, fields, write_rows
 from experiments.run.job import Job
 from experiments.scenario.randomness import generator
 from mapfusion.fastslam.filter import StepResult
@@ -38,11 +38,8 @@ ASSOCIATIONS = schema(
 )
 _STEP = fields(effective_sample_size=FLOAT, resampled=BOOL, n_landmarks=INT, spread_m=FLOAT)
 POSES = schema("slam.poses", 1, [*_ITERATION, *float_fields(_ONLINE + _FINAL), *_STEP])
-CLOUDS = schema(
-    "slam.clouds",
-    1,
-    [*fields(iteration=INT, particle=INT), *float_fields([*POSE_FIELDS, "log_weight"])],
-)
+_PARTICLE = fields(iteration=INT, particle=INT)
+CLOUDS = schema("slam.clouds", 1, [*_PARTICLE, *float_fields([*POSE_FIELDS, "log_weight"])])
 
 LABEL = "FastSLAM"
 WRITES = ("snapshots.parquet", "associations.parquet", "poses.parquet", "clouds.parquet")
@@ -87,7 +84,10 @@ def run(settings: SlamSettings, job: Job) -> None:
             cloud = cloud.assign(iteration=k, log_weight=result.log_weights)
             clouds.append(cloud.rename_axis("particle").reset_index())
         if frame.landmarks is not None:
-            maps.append(_rows(frame.landmarks).assign(iteration=k))
+            seen, origin = frame.landmarks, frame.landmarks.source_observation
+            points = point_columns(seen.position_m, seen.covariance_m2)
+            points |= {"count": seen.count, "source_observation": origin}
+            maps.append(pd.DataFrame(points).assign(iteration=k))
             counts_for = frame.slam.best_associations()
             new = np.full(len(counts_for) - len(counted), -1)
             changed = np.flatnonzero(counts_for != np.concatenate([counted, new]))
@@ -103,8 +103,7 @@ def run(settings: SlamSettings, job: Job) -> None:
     tables = (pd.concat(maps), pd.concat(associations), poses, pd.concat(clouds))
     schemas = (SNAPSHOTS, ASSOCIATIONS, POSES, CLOUDS)
     for file, table_schema, rows in zip(WRITES, schemas, tables, strict=True):
-        attributes = evaluated if table_schema is SNAPSHOTS else None
-        write_rows(job.output / file, table_schema, rows, attributes)
+        write_rows(job.output / file, table_schema, rows, evaluated)
 
 
 def _step(result: StepResult) -> dict[str, float]:
@@ -121,26 +120,14 @@ def _step(result: StepResult) -> dict[str, float]:
     }
 
 
-def _rows(landmarks: LandmarkMap) -> pd.DataFrame:
-    points = point_columns(landmarks.position_m, landmarks.covariance_m2)
-    own = {"count": landmarks.count, "source_observation": landmarks.source_observation}
-    return pd.DataFrame(points | own)
-
-
 def read_snapshots(slam: Path, log: RobotLog) -> dict[int, LandmarkMap]:
     """The robot's map at each evaluated iteration, with descriptors and labels from its log."""
     table, attributes = read_table(slam / "snapshots.parquet", SNAPSHOTS)
-    origin, seen = column(table, "source_observation"), log.observations
-    descriptor = None if seen.descriptor is None else seen.descriptor[origin]
-    label = None if seen.label is None else seen.label[origin]
-    about = (column(table, "count"), origin, descriptor, label, log.planar, log.robot)
+    origin = column(table, "source_observation")
+    seen = log.observations[origin]
+    about = (column(table, "count"), origin, seen.descriptor, seen.label, log.planar, log.robot)
     landmarks = LandmarkMap(*points_from(table), *about)
     iteration = column(table, "iteration")
     evaluated = map(int, attributes["iterations"].split(","))
     rows = {k: slice(*np.searchsorted(iteration, [k, k + 1])) for k in evaluated}
     return {k: with_rows(landmarks, own) for k, own in rows.items()}
-
-
-def read_associations(slam: Path) -> pd.DataFrame:
-    """Changes of which landmark each observation counts for, in order of iteration."""
-    return read_rows(slam / "associations.parquet", ASSOCIATIONS)

@@ -8,7 +8,6 @@ import pandas as pd
 
 from experiments.judge.criteria import MERGEABLE_PAIRS, RIGHT_WITHIN_M, RIGHT_WITHIN_RAD
 from experiments.methods.catalogue import known_methods, name_clashes
-from experiments.scenario.suite import Entry
 from experiments.show.numbers import two_digits
 from experiments.show.terminal.layout import Column, columns, print_frame, print_lines, print_table
 from mapfusion.align.result import Status
@@ -96,11 +95,11 @@ def print_methods() -> None:
     print_lines(f"  {line}" for line in (*absent, *name_clashes().values()))
 
 
-def print_scenarios(entries: Sequence[Entry]) -> None:
+def print_scenarios(entries: Sequence[dict[str, Any]]) -> None:
     """The scenarios of a folder."""
     shown = columns("", name="scenario", tags="tags") | columns("d", robots="robots")
     shown |= columns(">", iterations="iterations") | columns(".2f", overlap="overlap")
     shown |= columns("", description="what it is")
     frame = pd.DataFrame(entries)
-    recorded = ["recorded" if each.iterations is None else str(each.iterations) for each in entries]
-    print_frame(frame.assign(tags=frame["tags"].map(" ".join), iterations=recorded), shown)
+    iterations = [str(each["iterations"] or "recorded") for each in entries]
+    print_frame(frame.assign(tags=frame["tags"].map(" ".join), iterations=iterations), shown)
