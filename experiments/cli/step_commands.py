@@ -81,9 +81,9 @@ def merge(
     from experiments.judge import user_files as single
     from experiments.show.terminal.step_screen import print_fused
 
-    fused, joined = single.merge(maps, settings, overrides, seed)
+    fused = single.merge(maps, settings, overrides, seed)
     single.save_map(output, fused.landmarks)
-    print_fused(output, fused, joined)
+    print_fused(output, fused, maps)
 
 
 def import_command(format_name: str) -> Callable[[Path, Path], None]:

@@ -87,16 +87,13 @@ class FusedTeam:
 
 def fusion_rows(met: Sequence[MetMaps], settings: MergeSettings, radius_m: float) -> pd.DataFrame:
     """Rows of the table `fusion`: landmarks of one pair fused at the last iteration."""
-    robots = met[0].a, met[0].b
-    parameters = (replace(settings.parameters, use_drift=use_drift) for use_drift in (True, False))
-    with_drift, without_drift = (
-        _pair_rows(FusedTeam.of(robots, met, replace(settings, parameters=each)))
-        for each in parameters
-    )
-    other = without_drift[["landmark_a", "landmark_b", "nees"]]
-    rows = with_drift.merge(
-        other, "left", ["landmark_a", "landmark_b"], suffixes=("_with_drift", "_without_drift")
-    )
+    robots, keys, fused = (met[0].a, met[0].b), ["landmark_a", "landmark_b"], []
+    for use_drift in (True, False):
+        parameters = replace(settings.parameters, use_drift=use_drift)
+        fused.append(FusedTeam.of(robots, met, replace(settings, parameters=parameters)))
+    with_drift, without_drift = map(_pair_rows, fused)
+    other, suffixes = without_drift[[*keys, "nees"]], ("_with_drift", "_without_drift")
+    rows = with_drift.merge(other, "left", keys, suffixes=suffixes)
     return rows.assign(true_pair=rows["apart_m"] <= radius_m)
 
 
@@ -133,14 +130,8 @@ def _lengths(vectors: Float) -> Float:
     return np.sqrt(np.vecdot(vectors, vectors))
 
 
-def landmark_rows(team: FusedTeam) -> pd.DataFrame:
-    """Rows of the table `landmarks`."""
-    parts = [_landmark_columns(robot, *robot.at(team.iteration)) for robot in team.robots]
-    return pd.concat(parts, ignore_index=True)
-
-
-def _landmark_columns(owner: EvaluatedRobot, landmarks: LandmarkMap, points: Float) -> pd.DataFrame:
-    """Landmarks of a map and their true points in the frame of the robot's maps."""
+def landmark_rows(owner: EvaluatedRobot, landmarks: LandmarkMap, points: Float) -> pd.DataFrame:
+    """Rows of the table `landmarks` of one map; true points in the frame of its owner's maps."""
     columns = point_columns(landmarks.position_m, landmarks.covariance_m2)
     columns |= named_columns(("truth_x_m", "truth_y_m", "truth_z_m"), owner.in_map_frame(points))
     return pd.DataFrame({"landmark": np.arange(len(landmarks)), **columns}).assign(
@@ -153,7 +144,7 @@ def fused_rows(team: FusedTeam) -> pd.DataFrame:
     fused = team.fused
     if fused is None:
         return pd.DataFrame()
-    rows = _landmark_columns(team.robots[0], fused.landmarks, team.truth_of(fused))
+    rows = landmark_rows(team.robots[0], fused.landmarks, team.truth_of(fused))
     has = fused.parents != ABSENT
     names = np.array([robot.name for robot in team.robots], dtype=object)
     first = np.argmax(has, axis=1)

@@ -47,14 +47,14 @@ def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
             print_lines([f"  {row['aligner']}: {status}: {reason}"])
 
 
-def print_fused(path: Path, fused: FusedMap, names: Sequence[str]) -> None:
+def print_fused(path: Path, fused: FusedMap, maps: Sequence[Path]) -> None:
     """What a fused map was made of."""
     several = int(((fused.parents >= 0).sum(axis=1) > 1).sum())
     lines = [
         f"{len(fused.landmarks)} landmarks in {path}, {several} of them fused from several maps; "
         f"{fused.duplicate_share:.1%} look like duplicates that remain"
     ]
-    for name, (x_m, y_m, theta_rad) in zip(names, fused.T_first_map, strict=True):
+    for name, (x_m, y_m, theta_rad) in zip(maps, fused.T_first_map, strict=True):
         if not math.isnan(x_m):
             lines.append(f"  {name}: T_first_map = ({x_m:.3f} m, {y_m:.3f} m, {theta_rad:.4f} rad)")
     for name, reason in fused.left_out:
