@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
+RESULTS = Path("results")
 
 
 def available_cores() -> int:
@@ -44,13 +45,6 @@ Jobs = Annotated[
     ),
 ]
 Fresh = Annotated[bool, typer.Option("--fresh", help="Compute again what is stored already.")]
-Results = Annotated[
-    Path,
-    typer.Option(
-        help="Folder that results go to.",
-        default_factory=lambda: Path("results"),
-        show_default="results",
-    ),
-]
+Results = Annotated[Path, typer.Option(help="Folder that results go to.")]
 Output = Annotated[Path, typer.Option("--output", "-o", help="File or folder to write.")]
 OutputFolder = Annotated[Path | None, typer.Option("--output", "-o", help="Folder to write.")]

@@ -20,7 +20,7 @@ def record(
     seed: options.Seed = None,
     overrides: options.Overrides,
     jobs: options.Jobs,
-    results: options.Results,
+    results: options.Results = options.RESULTS,
 ) -> None:
     """Simulate only: one robot log (with its truth) per robot: `mapfusion record S -o logs`."""
     from experiments.judge import user_files as single
@@ -44,12 +44,12 @@ def slam(
 ) -> None:
     """Build one robot's map from its log: `mapfusion slam logs/R1 -o R1.parquet`."""
     from experiments.judge import user_files as single
-    from experiments.show.terminal import layout, step_screen
+    from experiments.show.terminal import layout
 
     with layout.progress() as show:
         landmarks = single.slam(log, settings, overrides, seed, show)
     single.save_map(output, landmarks)
-    step_screen.print_map(output, landmarks)
+    layout.print_lines([f"{len(landmarks)} landmarks of {landmarks.name} in {output}"])
 
 
 @app.command()

@@ -134,9 +134,8 @@ def landmark_rows(owner: EvaluatedRobot, landmarks: LandmarkMap, points: Float) 
     """Rows of the table `landmarks` of one map; true points in the frame of its owner's maps."""
     columns = point_columns(landmarks.position_m, landmarks.covariance_m2)
     columns |= named_columns(("truth_x_m", "truth_y_m", "truth_z_m"), owner.in_map_frame(points))
-    return pd.DataFrame({"landmark": np.arange(len(landmarks)), **columns}).assign(
-        robot=owner.name, count=landmarks.count
-    )
+    columns |= {"landmark": np.arange(len(landmarks)), "count": landmarks.count}
+    return pd.DataFrame(columns).assign(robot=owner.name)
 
 
 def fused_rows(team: FusedTeam) -> pd.DataFrame:
@@ -164,12 +163,11 @@ def fused_motion_rows(team: FusedTeam, use_drift: bool) -> pd.DataFrame:
     """Rows of the table `fused_motions`: how each robot's map was moved into the fused one."""
     if team.fused is None:
         return pd.DataFrame()
-    names, why = [robot.name for robot in team.robots], dict(team.fused.left_out)
-    motions = named_columns(("tx_m", "ty_m", "theta_rad"), team.fused.T_first_map)
-    return pd.DataFrame({"robot": names, **motions}).assign(
-        drift_sigma_m=team.fused.drift_sigma_m if use_drift else 0.0,
-        left_out=[why.get(name, "") for name in names],
-    )
+    why = dict(team.fused.left_out)
+    rows = pd.DataFrame(team.fused.T_first_map, columns=["tx_m", "ty_m", "theta_rad"])
+    rows["drift_sigma_m"] = team.fused.drift_sigma_m if use_drift else 0.0
+    rows["robot"] = [robot.name for robot in team.robots]
+    return rows.assign(left_out=[why.get(name, "") for name in rows["robot"]])
 
 
 def map_fit_rows(team: FusedTeam) -> pd.DataFrame:

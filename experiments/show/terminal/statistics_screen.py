@@ -33,19 +33,18 @@ _PATH_NAMES = {"ate_m": "ATE, m", "rpe_m": "RPE, m", "rpe_rad": "RPE, rad"}
 # Columns of tables; intervals, where there are any, stand beside the numbers.
 _METHOD = columns("", aligner="method")
 _SUCCESS = _METHOD | columns(".0%", estimated_success="as estimated", refined_success="refined")
-_OVER_ORACLE = (
-    _METHOD
-    | columns(".3f", estimated_m="estim.\nm")
-    | columns(".2f", estimated_ratio="over the oracle")
-    | columns(".3f", refined_m="refined\nm")
-    | columns(".2f", refined_ratio="over the oracle")
-)
-_AGAINST = (
-    columns("", second="other")
-    | columns(".2f", ratio="its error over other's")
-    | columns(".0%", first_wins="nearer")
-    | columns(".2g", p_holm="p (Holm)")
-)
+_OVER_ORACLE = _METHOD | {
+    "estimated_m": ("estim.\nm", ".3f"),
+    "estimated_ratio": ("over the oracle", ".2f"),
+    "refined_m": ("refined\nm", ".3f"),
+    "refined_ratio": ("over the oracle", ".2f"),
+}
+_AGAINST = {
+    "second": ("other", ""),
+    "ratio": ("its error over other's", ".2f"),
+    "first_wins": ("nearer", ".0%"),
+    "p_holm": ("p (Holm)", ".2g"),
+}
 _PATHS = columns("", source="path", error="error")
 _PATHS |= columns(".3g", rmse="RMSE", median="median", max="max")
 _NEES = (
@@ -62,12 +61,9 @@ def print_summary(summary: Summary, written: Path | None, skipped: Sequence[str]
     _print_success(summary)
     _print_by_true_pairs(summary)
     ratios = _rows(summary, "error_over_oracle")
-    _print(
-        ratios,
-        _OVER_ORACLE,
-        "Median translation error, and its ratio to the oracle's",
-        f"maps with {RICH_PAIRS}+ true pairs; inf: no estimate on most; (95 %, bootstrap)",
-    )
+    title = "Median translation error, and its ratio to the oracle's"
+    note = f"maps with {RICH_PAIRS}+ true pairs; inf: no estimate on most; (95 %, bootstrap)"
+    _print(ratios, _OVER_ORACLE, title, note)
     _print_best_against_others(_rows(summary, "methods_compared"), ratios)
     _print_paths(_rows(summary, "paths"))
     _print_nees(_rows(summary, "nees"))
@@ -173,17 +169,16 @@ def _print_nees(rows: pd.DataFrame) -> None:
 
 
 def _caveats(summary: Summary) -> list[str]:
-    lines = []
-    if summary.n_runs == 1:
+    lines, n_runs, n_settings = [], summary.n_runs, summary.n_configurations
+    if n_runs == 1:
         depend = "which depend on each other, and nothing of other seeds"
         lines.append(f"One run: the brackets tell of the {MAPS_OF_ONE_RUN}, {depend}.")
-    elif summary.n_runs < FEW_RUNS:
-        few = f"{summary.n_runs} runs: bootstrap intervals of so few are too narrow"
-        lines.append(f"{few}; take {FEW_RUNS} seeds or more.")
-    n_settings = summary.n_configurations
+    elif n_runs < FEW_RUNS:
+        too_narrow = f"bootstrap intervals of so few are too narrow; take {FEW_RUNS} seeds or more"
+        lines.append(f"{n_runs} runs: {too_narrow}.")
     if n_settings > _MAX_CONFIGURATIONS:
-        settings = f"{_MAX_CONFIGURATIONS} of {n_settings} settings"
-        lines.append(f"Shown are {settings}; `-o FOLDER` writes all.")
+        shown = f"{_MAX_CONFIGURATIONS} of {n_settings} settings"
+        lines.append(f"Shown are {shown}; `-o FOLDER` writes all.")
     for row in summary.failed.to_dict("records"):
         lines.append(f"failed, left out: {row['scenario']} seed {row['seed']}: {row['reason']}")
     if summary.missing:

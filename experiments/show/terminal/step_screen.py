@@ -1,4 +1,4 @@
-"""What `slam`, `align` and `merge` show."""
+"""What `align` and `merge` show."""
 
 import math
 from collections.abc import Sequence
@@ -10,7 +10,6 @@ import pandas as pd
 from experiments.show.numbers import two_digits
 from experiments.show.terminal.layout import columns, print_frame, print_lines
 from mapfusion.align.result import NOT_RUN, Status
-from mapfusion.landmark_map import LandmarkMap
 from mapfusion.merge import FusedMap
 
 _ESTIMATES = (
@@ -24,11 +23,6 @@ _ESTIMATES = (
 )
 
 
-def print_map(path: Path, landmarks: LandmarkMap) -> None:
-    """What a map holds and where it is."""
-    print_lines([f"{len(landmarks)} landmarks of {landmarks.name} in {path}"])
-
-
 def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
     """Estimates of all aligners on two maps, and why those were not accepted that were not."""
     found = pd.DataFrame(rows)
@@ -40,8 +34,7 @@ def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
         "NFA: expected number of alignments that chance alone supports as well",
     )
     for row in rows:
-        reason = row["reason"] or row["acceptance_reason"]
-        if reason:
+        if reason := row["reason"] or row["acceptance_reason"]:
             refused = row["status"] if row["status"] in NOT_RUN else Status.REFUSED
             status = Status.ACCEPTED if row["accepted"] else refused
             print_lines([f"  {row['aligner']}: {status}: {reason}"])
