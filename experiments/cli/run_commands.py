@@ -19,7 +19,7 @@ def run(
     *,
     seed: options.Seed = None,
     overrides: options.Overrides,
-    jobs: options.Jobs,
+    jobs: options.Jobs = options.ALL_CORES,
     fresh: options.Fresh = False,
     results: options.Results = options.RESULTS,
 ) -> None:
@@ -42,7 +42,7 @@ def run(
 
 
 @app.command()
-def figures(result: options.ResultFolder, *, jobs: options.Jobs) -> None:
+def figures(result: options.ResultFolder, *, jobs: options.Jobs = options.ALL_CORES) -> None:
     """Draw a result's figures again, from its tables alone: `mapfusion figures results/quick-0`."""
     from experiments.judge.result import require_result
     from experiments.show.figures import draw_all
@@ -87,7 +87,7 @@ def check(
     *,
     seeds: options.Seeds = "0",
     overrides: options.Overrides,
-    jobs: options.Jobs,
+    jobs: options.Jobs = options.ALL_CORES,
     fresh: options.Fresh = False,
     junit: Annotated[Path | None, typer.Option(help="Write a JUnit report to this file.")] = None,
     results: options.Results = options.RESULTS,

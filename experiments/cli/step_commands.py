@@ -19,7 +19,7 @@ def record(
     output: options.Output,
     seed: options.Seed = None,
     overrides: options.Overrides,
-    jobs: options.Jobs,
+    jobs: options.Jobs = options.ALL_CORES,
     results: options.Results = options.RESULTS,
 ) -> None:
     """Simulate only: one robot log (with its truth) per robot: `mapfusion record S -o logs`."""

@@ -22,7 +22,7 @@ def refusal(
     output: options.Output,
     pairs: Annotated[int, typer.Option(help="Pairs of maps without common ground.", min=1)] = 500,
     seeds: options.Seeds = "0",
-    jobs: options.Jobs,
+    jobs: options.Jobs = options.ALL_CORES,
     results: options.Results = options.RESULTS,
 ) -> None:
     """Cross the maps of several worlds: are those without common ground refused, and only those?
@@ -59,7 +59,7 @@ def sweep(
             "combinations. Commas inside brackets part nothing.",
         ),
     ] = None,
-    jobs: options.Jobs,
+    jobs: options.Jobs = options.ALL_CORES,
     scheduler: Annotated[
         str | None,
         typer.Option(help="A running Dask scheduler, tcp://HOST:PORT, in place of --jobs."),

@@ -110,24 +110,21 @@ def _pair_rows(pair: FusedTeam) -> pd.DataFrame:
     error = fused.landmarks.position_m[both] - truth
     used = degrees_of_freedom(fused.landmarks)
     covariance = fused.landmarks.covariance_m2[both, :used, :used]
-    return pd.DataFrame(
-        {
-            "robot_a": a.name,
-            "robot_b": b.name,
-            "landmark_a": i,
-            "landmark_b": j,
-            "error_a_m": _lengths(map_a.position_m[i] - truth),
-            "error_b_m": _lengths(moved_b - truth),
-            "error_fused_m": _lengths(error),
-            "nees": squared_mahalanobis(error[:, :used], covariance),
-            "degrees_of_freedom": used,
-            "apart_m": _lengths(points_a[i] - points_b[j]),
-        }
+    lengths = {
+        "error_a_m": map_a.position_m[i] - truth,
+        "error_b_m": moved_b - truth,
+        "error_fused_m": error,
+        "apart_m": points_a[i] - points_b[j],
+    }
+    rows = pd.DataFrame({name: np.sqrt(np.vecdot(x, x)) for name, x in lengths.items()})
+    return rows.assign(
+        robot_a=a.name,
+        robot_b=b.name,
+        landmark_a=i,
+        landmark_b=j,
+        nees=squared_mahalanobis(error[:, :used], covariance),
+        degrees_of_freedom=used,
     )
-
-
-def _lengths(vectors: Float) -> Float:
-    return np.sqrt(np.vecdot(vectors, vectors))
 
 
 def landmark_rows(owner: EvaluatedRobot, landmarks: LandmarkMap, points: Float) -> pd.DataFrame:
@@ -201,7 +198,7 @@ def landmark_nees_rows(team: FusedTeam, radius_m: float) -> list[dict[str, Any]]
     no single truth and are left out of "fused" and "before fusing".
     """
     rows, fused = [], team.fused
-    true_rows = np.zeros(0, np.int64) if fused is None else _truly_fused(team, fused, radius_m)
+    true_rows = [] if fused is None else _truly_fused(team, fused, radius_m)
     for place, robot in enumerate(team.robots):
         landmarks, points = robot.at(team.iteration)
         nees = landmark_nees(landmarks, robot.in_map_frame(points))

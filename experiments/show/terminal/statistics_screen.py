@@ -47,19 +47,15 @@ _AGAINST = {
 }
 _PATHS = columns("", source="path", error="error")
 _PATHS |= columns(".3g", rmse="RMSE", median="median", max="max")
-_NEES = (
-    columns("", landmarks="landmarks")
-    | columns("d", n_landmarks="n")
-    | columns(".3g", nees_per_dof="NEES")
-    | columns(">", band="chi-square")
-    | columns(".0%", share_in_gate="in gate")
-)
+_NEES = columns("", landmarks="landmarks") | columns("d", n_landmarks="n")
+_NEES |= columns(".3g", nees_per_dof="NEES") | columns(">", band="chi-square")
+_NEES |= columns(".0%", share_in_gate="in gate")
 
 
 def print_summary(summary: Summary, written: Path | None, skipped: Sequence[str]) -> None:
     """The main tables, and where all of them are."""
-    _print_success(summary)
-    _print_by_true_pairs(summary)
+    _print_success(_rows(summary, "success_at_the_end"), summary.n_runs)
+    _print_by_true_pairs(_rows(summary, "success_by_true_pairs"))
     ratios = _rows(summary, "error_over_oracle")
     title = "Median translation error, and its ratio to the oracle's"
     note = f"maps with {RICH_PAIRS}+ true pairs; inf: no estimate on most; (95 %, bootstrap)"
@@ -93,8 +89,7 @@ def _print(rows: pd.DataFrame, shown: Mapping[str, layout.Column], title: str, n
     layout.print_frame(rows, {**apart, **shown}, title, note)
 
 
-def _print_success(summary: Summary) -> None:
-    rows = _rows(summary, "success_at_the_end")
+def _print_success(rows: pd.DataFrame, n_runs: int) -> None:
     if rows.empty:
         return
     within = f"within {RIGHT_WITHIN_M:g} m and {RIGHT_WITHIN_RAD:g} rad"
@@ -102,7 +97,7 @@ def _print_success(summary: Summary) -> None:
     n_apart, n_maps = rows[["n_apart", "n_maps"]].max()  # all methods see the same maps
     if n_apart:
         caption += f"; without the {n_apart} of {n_maps} pairs of maps that have no common ground"
-    title = f"Right at the end of {_runs(summary.n_runs)}"
+    title = f"Right at the end of {_runs(n_runs)}"
     _print(rows, _SUCCESS, title, f"{caption}; (95 %, Wilson)")
     if "accepted" not in rows:
         return
@@ -114,9 +109,8 @@ def _print_success(summary: Summary) -> None:
     _print(rows, shown, "Verdicts at the end", caption)
 
 
-def _print_by_true_pairs(summary: Summary) -> None:
+def _print_by_true_pairs(rows: pd.DataFrame) -> None:
     """Success as estimated by the number of true pairs: methods down, bins across."""
-    rows = _rows(summary, "success_by_true_pairs")
     if rows.empty:
         return
     last = np.where(rows["to"] == math.inf, "+", "")
@@ -195,15 +189,11 @@ def print_comparison(
     rows = (table if show_all else table[changed]).sort_values(
         "verdict", key=lambda names: names.map(order.index), kind="stable"
     )
-    shown = columns("", method="method", metric="metric")
-    shown |= columns(">", first="first", second="second", change="change")
-    layout.print_table(
-        [*shown.values(), ("verdict", "")],
-        map(_compared, rows.to_dict("records")),
-        "Second version against the first",
-        "change: factor, or difference; (95 %, Student's t); verdict: 5 % over "
-        f"{table['p'].notna().sum()} tests",
-    )
+    shown = [("method", ""), ("metric", ""), ("first", ">"), ("second", ">"), ("change", ">")]
+    cells, title = map(_compared, rows.to_dict("records")), "Second version against the first"
+    note = "change: factor, or difference; (95 %, Student's t); verdict: 5 % over "
+    note += f"{table['p'].notna().sum()} tests"
+    layout.print_table([*shown, ("verdict", "")], cells, title, note)
     counts = table["verdict"].value_counts().reindex(order, fill_value=0)
     tally = (f"{n} {verdict}" for verdict, n in counts.items() if n or verdict != versions.UNKNOWN)
     ways = f"{_runs(found.n_runs)} compared in {len(table)} ways: {', '.join(tally)}"

@@ -12,15 +12,11 @@ from experiments.show.terminal.layout import columns, print_frame, print_lines
 from mapfusion.align.result import NOT_RUN, Status
 from mapfusion.merge import FusedMap
 
-_ESTIMATES = (
-    columns("", aligner="aligner")
-    | columns(".2f", tx_m="tx\nm", ty_m="ty\nm", theta_rad="theta\nrad")
-    | columns(".2f", refined_tx_m="refined\nm", refined_ty_m="ty\nm")
-    | columns(".3f", refined_theta_rad="theta\nrad")
-    | columns(">", inliers="inliers")
-    | columns(".0f", log10_false_alarms="NFA\nlog10")
-    | columns(">", time="time\nms")
-)
+_ESTIMATES = columns("", aligner="aligner")
+_ESTIMATES |= columns(".2f", tx_m="tx\nm", ty_m="ty\nm", theta_rad="theta\nrad")
+_ESTIMATES |= columns(".2f", refined_tx_m="refined\nm", refined_ty_m="ty\nm")
+_ESTIMATES |= columns(".3f", refined_theta_rad="theta\nrad") | columns(">", inliers="inliers")
+_ESTIMATES |= columns(".0f", log10_false_alarms="NFA\nlog10") | columns(">", time="time\nms")
 
 
 def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
