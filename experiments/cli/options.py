@@ -7,12 +7,11 @@ from typing import Annotated
 import typer
 
 EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
-
-
-def available_cores() -> int:
-    """Cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
+RESULTS = Path("results")
+# Those that this process may use.
+ALL_CORES = (
+    len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+)
 
 # Those without a default in a command's signature have theirs here.
 ScenarioNames = Annotated[
@@ -37,20 +36,8 @@ Overrides = Annotated[
 Seed = Annotated[int | None, typer.Option(help="Replaces the scenario's seed.", min=0)]
 OwnSeed = Annotated[int, typer.Option("--seed", help="Of all that is random.", min=0)]
 Seeds = Annotated[str, typer.Option(help="A seed, a range 0..4 or a list 0,2,5.")]
-Jobs = Annotated[
-    int,
-    typer.Option(
-        help="Processes.", min=1, default_factory=available_cores, show_default="all cores"
-    ),
-]
+Jobs = Annotated[int, typer.Option(help="Processes.", min=1, show_default="all cores")]
 Fresh = Annotated[bool, typer.Option("--fresh", help="Compute again what is stored already.")]
-Results = Annotated[
-    Path,
-    typer.Option(
-        help="Folder that results go to.",
-        default_factory=lambda: Path("results"),
-        show_default="results",
-    ),
-]
+Results = Annotated[Path, typer.Option(help="Folder that results go to.", show_default="results")]
 Output = Annotated[Path, typer.Option("--output", "-o", help="File or folder to write.")]
 OutputFolder = Annotated[Path | None, typer.Option("--output", "-o", help="Folder to write.")]

@@ -1,6 +1,5 @@
 """Commands that run scenarios and show their results."""
 
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -10,6 +9,8 @@ import typer
 from experiments.cli import options
 
 app = typer.Typer()
+_DRAWING = "draw the figures"
+_SUITE = Path("scenarios")
 
 
 @app.command()
@@ -18,9 +19,9 @@ def run(
     *,
     seed: options.Seed = None,
     overrides: options.Overrides,
-    jobs: options.Jobs,
+    jobs: options.Jobs = options.ALL_CORES,
     fresh: options.Fresh = False,
-    results: options.Results,
+    results: options.Results = options.RESULTS,
 ) -> None:
     """Simulate, map, align, merge, evaluate and draw: `mapfusion run scenarios/quick.yaml`.
 
@@ -29,35 +30,28 @@ def run(
     from experiments.judge.expectations import load_checked
     from experiments.judge.result import run_scenario
     from experiments.scenario.suite import scenarios_of
+    from experiments.show.figures import draw_all
     from experiments.show.terminal import layout, run_screen
 
     for loaded in [load_checked(path, overrides, seed) for path in scenarios_of(scenarios)]:
+        skipped: list[str] = []
         with layout.progress() as show:
             folder = run_scenario(loaded, results, jobs, show, fresh)
-            _, skipped = _draw(folder, jobs, show)
+            draw_all(folder, jobs, partial(show, _DRAWING), skipped.append)
         run_screen.print_result(folder, skipped)
 
 
-def _draw(
-    result: Path, jobs: int, show: Callable[[str, int, int], None]
-) -> tuple[list[Path], list[str]]:
-    """Draw a result's figures; returns their files, and why others could not be drawn."""
-    from experiments.show.figures import draw_all
-
-    skipped: list[str] = []
-    told = partial(show, "draw the figures")
-    return draw_all(result, jobs, told, skipped.append), skipped
-
-
 @app.command()
-def figures(result: options.ResultFolder, *, jobs: options.Jobs) -> None:
+def figures(result: options.ResultFolder, *, jobs: options.Jobs = options.ALL_CORES) -> None:
     """Draw a result's figures again, from its tables alone: `mapfusion figures results/quick-0`."""
     from experiments.judge.result import require_result
+    from experiments.show.figures import draw_all
     from experiments.show.terminal import layout
 
     require_result(result)
+    skipped: list[str] = []
     with layout.progress() as show:
-        paths, skipped = _draw(result, jobs, show)
+        paths = draw_all(result, jobs, partial(show, _DRAWING), skipped.append)
     layout.print_paths(result / "figures", paths, skipped)
 
 
@@ -71,9 +65,10 @@ def report(
 ) -> None:
     """Show a result in one HTML file that works offline: `mapfusion report results/quick-0`."""
     from experiments.show.report import write_report
-    from experiments.show.terminal.layout import print_file
+    from experiments.show.terminal.layout import print_lines
 
-    print_file(write_report(result, output))
+    path = write_report(result, output)
+    print_lines([f"{path} ({path.stat().st_size / 1e6:.1f} MB)"])
 
 
 @app.command("inspect")
@@ -92,10 +87,10 @@ def check(
     *,
     seeds: options.Seeds = "0",
     overrides: options.Overrides,
-    jobs: options.Jobs,
+    jobs: options.Jobs = options.ALL_CORES,
     fresh: options.Fresh = False,
     junit: Annotated[Path | None, typer.Option(help="Write a JUnit report to this file.")] = None,
-    results: options.Results,
+    results: options.Results = options.RESULTS,
 ) -> None:
     """Hold runs to their `expect` blocks, exit code 1 if one fails: `mapfusion check ci`."""
     from experiments.judge import expectations
@@ -124,9 +119,7 @@ def check(
 
 @app.command("scenarios")
 def list_scenarios(
-    folder: Annotated[Path, typer.Argument(metavar="[FOLDER]", help="Of scenario files.")] = Path(
-        "scenarios"
-    ),
+    folder: Annotated[Path, typer.Argument(metavar="[FOLDER]", help="Of scenario files.")] = _SUITE,
 ) -> None:
     """List the suite, with the tags that `run` and `check` take: `mapfusion scenarios`."""
     from experiments.scenario.suite import entries

@@ -19,8 +19,8 @@ def record(
     output: options.Output,
     seed: options.Seed = None,
     overrides: options.Overrides,
-    jobs: options.Jobs,
-    results: options.Results,
+    jobs: options.Jobs = options.ALL_CORES,
+    results: options.Results = options.RESULTS,
 ) -> None:
     """Simulate only: one robot log (with its truth) per robot: `mapfusion record S -o logs`."""
     from experiments.judge import user_files as single
@@ -44,12 +44,12 @@ def slam(
 ) -> None:
     """Build one robot's map from its log: `mapfusion slam logs/R1 -o R1.parquet`."""
     from experiments.judge import user_files as single
-    from experiments.show.terminal import layout, step_screen
+    from experiments.show.terminal import layout
 
     with layout.progress() as show:
         landmarks = single.slam(log, settings, overrides, seed, show)
     single.save_map(output, landmarks)
-    step_screen.print_map(output, landmarks)
+    layout.print_lines([f"{len(landmarks)} landmarks of {landmarks.name} in {output}"])
 
 
 @app.command()
@@ -81,9 +81,9 @@ def merge(
     from experiments.judge import user_files as single
     from experiments.show.terminal.step_screen import print_fused
 
-    fused, joined = single.merge(maps, settings, overrides, seed)
+    fused = single.merge(maps, settings, overrides, seed)
     single.save_map(output, fused.landmarks)
-    print_fused(output, fused, joined)
+    print_fused(output, fused, maps)
 
 
 def import_command(format_name: str) -> Callable[[Path, Path], None]:

@@ -22,8 +22,8 @@ def refusal(
     output: options.Output,
     pairs: Annotated[int, typer.Option(help="Pairs of maps without common ground.", min=1)] = 500,
     seeds: options.Seeds = "0",
-    jobs: options.Jobs,
-    results: options.Results,
+    jobs: options.Jobs = options.ALL_CORES,
+    results: options.Results = options.RESULTS,
 ) -> None:
     """Cross the maps of several worlds: are those without common ground refused, and only those?
 
@@ -59,7 +59,7 @@ def sweep(
             "combinations. Commas inside brackets part nothing.",
         ),
     ] = None,
-    jobs: options.Jobs,
+    jobs: options.Jobs = options.ALL_CORES,
     scheduler: Annotated[
         str | None,
         typer.Option(help="A running Dask scheduler, tcp://HOST:PORT, in place of --jobs."),
@@ -71,7 +71,7 @@ def sweep(
     timings: Annotated[
         bool, typer.Option("--timings", help="At the end, time the aligners one after the other.")
     ] = False,
-    results: options.Results,
+    results: options.Results = options.RESULTS,
 ) -> None:
     """Run all combinations: `mapfusion sweep scenarios/quick.yaml --seeds 0..9 --set KEY=A,B`.
 
@@ -149,7 +149,7 @@ def benchmark(
         float, typer.Option(help="A cell that took longer ends with the trials it has.", min=0)
     ] = 600.0,
     output: options.OutputFolder = None,
-    results: options.Results,
+    results: options.Results = options.RESULTS,
 ) -> None:
     """Success, error and time of all methods on made-up maps: `mapfusion benchmark`.
 
@@ -160,14 +160,9 @@ def benchmark(
     from experiments.show.terminal import layout, study_screen
     from experiments.study.benchmark import cells
 
-    design = cells.BenchmarkDesign(
-        cells.entries_of(methods or (), settings),
-        trials,
-        seed,
-        budget_s,
-        tuple(pairs or cells.PAIR_COUNTS),
-        tuple(outliers or cells.OUTLIER_SHARES),
-    )
+    entries = cells.entries_of(methods or (), settings)
+    counts, shares = tuple(pairs or cells.PAIR_COUNTS), tuple(outliers or cells.OUTLIER_SHARES)
+    design = cells.BenchmarkDesign(entries, trials, seed, budget_s, counts, shares)
     folder = output or results / "benchmark"
     with layout.progress() as show:
         rows = cells.run_benchmark(design, Store(results / "store"), show)

@@ -1,6 +1,6 @@
 """Estimates joined with the truth: the rows of the table `errors`."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -82,8 +82,7 @@ def met_maps(
         a, b = by_name[name_a], by_name[name_b]
         (map_a, points_a), (map_b, points_b) = a.at(iteration), b.at(iteration)
         pairs = correspondences_of(offered.get(key, correspondences.iloc[:0]))
-        maps, points = (map_a, map_b), (points_a, points_b)
-        met.append(MetMaps(a, b, iteration, maps, points, pairs, rows))
+        met.append(MetMaps(a, b, iteration, (map_a, map_b), (points_a, points_b), pairs, rows))
     return met
 
 
@@ -97,17 +96,9 @@ def alignment_nees(T_estimate: Float, covariance: Float, T_true: Float) -> float
 
 
 def error_rows(
-    met: Iterable[MetMaps], refinement: Refinement, acceptance: Acceptance, radius_m: float
-) -> pd.DataFrame:
-    """Rows of the table `errors`, the oracle's among them."""
-    return pd.concat(
-        [_errors_at(maps, refinement, acceptance, radius_m) for maps in met], ignore_index=True
-    )
-
-
-def _errors_at(
     met: MetMaps, refinement: Refinement, acceptance: Acceptance, radius_m: float
 ) -> pd.DataFrame:
+    """Rows of the table `errors` of one pair of maps, the oracle's first."""
     is_true, pairs = met.is_true(radius_m), Pairs(*met.maps, met.offered)
     oracle = Oracle(refinement).align(pairs, is_true)
     row = met.names | {"aligner": ORACLE, "repetition": 0}

@@ -36,11 +36,9 @@ class Outcome:
     @property
     def passed(self) -> bool:
         """Whether the value was measured and lies within the bound."""
-        return (
-            math.isfinite(self.value)
-            and (self.bound.min is None or self.value >= self.bound.min)
-            and (self.bound.max is None or self.value <= self.bound.max)
-        )
+        low = -math.inf if self.bound.min is None else self.bound.min
+        high = math.inf if self.bound.max is None else self.bound.max
+        return math.isfinite(self.value) and low <= self.value <= high
 
     @property
     def bound_text(self) -> str:
@@ -52,24 +50,16 @@ class Outcome:
 
 def check(scenario: AnyScenario, results: Mapping[int, Path]) -> list[Outcome]:
     """Measure every expectation of a scenario over its results by seed."""
-    own = {
-        seed: {
-            name: tables.read(tables.table_path(result, name), name).assign(seed=seed)
-            for name in metrics.USED_TABLES
-        }
-        for seed, result in results.items()
-    }
-    pooled = {
-        name: pd.concat([held[name] for held in own.values()], ignore_index=True)
-        for name in metrics.USED_TABLES
-    }
-    return [
-        Outcome(
-            scenario.name,
-            name,
-            metrics.compute(name, pooled),
-            bound,
-            {seed: metrics.compute(name, held) for seed, held in own.items()},
-        )
-        for name, bound in scenario.expect.items()
-    ]
+    own: dict[int, dict[str, pd.DataFrame]] = {seed: {} for seed in results}
+    for seed, result in results.items():
+        for name in metrics.USED_TABLES:
+            rows = tables.read(tables.table_path(result, name), name)
+            own[seed][name] = rows.assign(seed=seed)
+    parts = {name: [held[name] for held in own.values()] for name in metrics.USED_TABLES}
+    pooled = {name: pd.concat(each, ignore_index=True) for name, each in parts.items()}
+    outcomes = []
+    for name, bound in scenario.expect.items():
+        per_seed = {seed: metrics.compute(name, held) for seed, held in own.items()}
+        value = metrics.compute(name, pooled)
+        outcomes.append(Outcome(scenario.name, name, value, bound, per_seed))
+    return outcomes

@@ -87,16 +87,13 @@ class FusedTeam:
 
 def fusion_rows(met: Sequence[MetMaps], settings: MergeSettings, radius_m: float) -> pd.DataFrame:
     """Rows of the table `fusion`: landmarks of one pair fused at the last iteration."""
-    robots = met[0].a, met[0].b
-    parameters = (replace(settings.parameters, use_drift=use_drift) for use_drift in (True, False))
-    with_drift, without_drift = (
-        _pair_rows(FusedTeam.of(robots, met, replace(settings, parameters=each)))
-        for each in parameters
-    )
-    other = without_drift[["landmark_a", "landmark_b", "nees"]]
-    rows = with_drift.merge(
-        other, "left", ["landmark_a", "landmark_b"], suffixes=("_with_drift", "_without_drift")
-    )
+    robots, keys, fused = (met[0].a, met[0].b), ["landmark_a", "landmark_b"], []
+    for use_drift in (True, False):
+        parameters = replace(settings.parameters, use_drift=use_drift)
+        fused.append(FusedTeam.of(robots, met, replace(settings, parameters=parameters)))
+    with_drift, without_drift = map(_pair_rows, fused)
+    other, suffixes = without_drift[[*keys, "nees"]], ("_with_drift", "_without_drift")
+    rows = with_drift.merge(other, "left", keys, suffixes=suffixes)
     return rows.assign(true_pair=rows["apart_m"] <= radius_m)
 
 
@@ -113,39 +110,29 @@ def _pair_rows(pair: FusedTeam) -> pd.DataFrame:
     error = fused.landmarks.position_m[both] - truth
     used = degrees_of_freedom(fused.landmarks)
     covariance = fused.landmarks.covariance_m2[both, :used, :used]
-    return pd.DataFrame(
-        {
-            "robot_a": a.name,
-            "robot_b": b.name,
-            "landmark_a": i,
-            "landmark_b": j,
-            "error_a_m": _lengths(map_a.position_m[i] - truth),
-            "error_b_m": _lengths(moved_b - truth),
-            "error_fused_m": _lengths(error),
-            "nees": squared_mahalanobis(error[:, :used], covariance),
-            "degrees_of_freedom": used,
-            "apart_m": _lengths(points_a[i] - points_b[j]),
-        }
+    lengths = {
+        "error_a_m": map_a.position_m[i] - truth,
+        "error_b_m": moved_b - truth,
+        "error_fused_m": error,
+        "apart_m": points_a[i] - points_b[j],
+    }
+    rows = pd.DataFrame({name: np.sqrt(np.vecdot(x, x)) for name, x in lengths.items()})
+    return rows.assign(
+        robot_a=a.name,
+        robot_b=b.name,
+        landmark_a=i,
+        landmark_b=j,
+        nees=squared_mahalanobis(error[:, :used], covariance),
+        degrees_of_freedom=used,
     )
 
 
-def _lengths(vectors: Float) -> Float:
-    return np.sqrt(np.vecdot(vectors, vectors))
-
-
-def landmark_rows(team: FusedTeam) -> pd.DataFrame:
-    """Rows of the table `landmarks`."""
-    parts = [_landmark_columns(robot, *robot.at(team.iteration)) for robot in team.robots]
-    return pd.concat(parts, ignore_index=True)
-
-
-def _landmark_columns(owner: EvaluatedRobot, landmarks: LandmarkMap, points: Float) -> pd.DataFrame:
-    """Landmarks of a map and their true points in the frame of the robot's maps."""
+def landmark_rows(owner: EvaluatedRobot, landmarks: LandmarkMap, points: Float) -> pd.DataFrame:
+    """Rows of the table `landmarks` of one map; true points in the frame of its owner's maps."""
     columns = point_columns(landmarks.position_m, landmarks.covariance_m2)
     columns |= named_columns(("truth_x_m", "truth_y_m", "truth_z_m"), owner.in_map_frame(points))
-    return pd.DataFrame({"landmark": np.arange(len(landmarks)), **columns}).assign(
-        robot=owner.name, count=landmarks.count
-    )
+    columns |= {"landmark": np.arange(len(landmarks)), "count": landmarks.count}
+    return pd.DataFrame(columns).assign(robot=owner.name)
 
 
 def fused_rows(team: FusedTeam) -> pd.DataFrame:
@@ -153,7 +140,7 @@ def fused_rows(team: FusedTeam) -> pd.DataFrame:
     fused = team.fused
     if fused is None:
         return pd.DataFrame()
-    rows = _landmark_columns(team.robots[0], fused.landmarks, team.truth_of(fused))
+    rows = landmark_rows(team.robots[0], fused.landmarks, team.truth_of(fused))
     has = fused.parents != ABSENT
     names = np.array([robot.name for robot in team.robots], dtype=object)
     first = np.argmax(has, axis=1)
@@ -173,12 +160,11 @@ def fused_motion_rows(team: FusedTeam, use_drift: bool) -> pd.DataFrame:
     """Rows of the table `fused_motions`: how each robot's map was moved into the fused one."""
     if team.fused is None:
         return pd.DataFrame()
-    names, why = [robot.name for robot in team.robots], dict(team.fused.left_out)
-    motions = named_columns(("tx_m", "ty_m", "theta_rad"), team.fused.T_first_map)
-    return pd.DataFrame({"robot": names, **motions}).assign(
-        drift_sigma_m=team.fused.drift_sigma_m if use_drift else 0.0,
-        left_out=[why.get(name, "") for name in names],
-    )
+    why = dict(team.fused.left_out)
+    rows = pd.DataFrame(team.fused.T_first_map, columns=["tx_m", "ty_m", "theta_rad"])
+    rows["drift_sigma_m"] = team.fused.drift_sigma_m if use_drift else 0.0
+    rows["robot"] = [robot.name for robot in team.robots]
+    return rows.assign(left_out=[why.get(name, "") for name in rows["robot"]])
 
 
 def map_fit_rows(team: FusedTeam) -> pd.DataFrame:
@@ -212,7 +198,7 @@ def landmark_nees_rows(team: FusedTeam, radius_m: float) -> list[dict[str, Any]]
     no single truth and are left out of "fused" and "before fusing".
     """
     rows, fused = [], team.fused
-    true_rows = np.zeros(0, np.int64) if fused is None else _truly_fused(team, fused, radius_m)
+    true_rows = [] if fused is None else _truly_fused(team, fused, radius_m)
     for place, robot in enumerate(team.robots):
         landmarks, points = robot.at(team.iteration)
         nees = landmark_nees(landmarks, robot.in_map_frame(points))

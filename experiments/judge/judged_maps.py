@@ -7,13 +7,8 @@ repeated on it, and the table of a run shrinks to a tenth before the next is rea
 import numpy as np
 import pandas as pd
 
-from experiments.judge.criteria import (
-    ORACLE,
-    has_common_ground,
-    is_false_merge,
-    right_as_estimated,
-    right_refined,
-)
+from experiments.judge import criteria
+from experiments.judge.criteria import ORACLE
 from experiments.judge.tables import SHOWN
 
 RUN_KEYS = ("run_id", "scenario", "seed")
@@ -36,12 +31,12 @@ def maps_of(errors: pd.DataFrame) -> pd.DataFrame:
     acceptance test; the median absolute errors, infinite where most repetitions gave no estimate;
     further columns that are shown; n_correspondences, n_true, n_common, outlier_share.
     """
-    ground = has_common_ground(errors)
+    ground = criteria.has_common_ground(errors)
     accepted = errors.get("accepted", pd.Series(np.nan, errors.index)).astype(float)
-    false = is_false_merge(errors.assign(accepted=accepted))
+    false = criteria.is_false_merge(errors.assign(accepted=accepted))
     shares = {
-        "estimated_success": right_as_estimated(errors).astype(float).where(ground),
-        "refined_success": right_refined(errors).astype(float).where(ground),
+        "estimated_success": criteria.right_as_estimated(errors).astype(float).where(ground),
+        "refined_success": criteria.right_refined(errors).astype(float).where(ground),
         "accepted": accepted,
         "false_accepted": false.astype(float).where(accepted.notna()),
         "refused_apart": (1.0 - accepted).where(~ground),

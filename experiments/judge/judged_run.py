@@ -9,6 +9,7 @@ import pandas as pd
 from experiments.judge import judging, tables
 from experiments.judge.errors import EvaluatedRobot, met_maps
 from experiments.judge.fused_landmarks import FusedTeam, MergeSettings
+from experiments.judge.judging import JudgeSettings
 from experiments.run.pipeline import PairStages, Pipeline, RobotStages, lay_out
 from experiments.run.stage import Stage
 from experiments.run.stages.slam import RobotFolders
@@ -26,15 +27,18 @@ class JudgedRun:
     """A scenario's stages in a store: those up to the estimates, and a judgement of each pair."""
 
     pipeline: Pipeline
+    settings: JudgeSettings
     judgements: tuple[Stage, ...]  # in the order of the pipeline's pairs
     store: Store
 
     @classmethod
     def of(cls, scenario: AnyScenario, store: Store) -> "JudgedRun":
         """Lay out a scenario; nothing is computed."""
-        pipeline = lay_out(scenario)
-        judgements = tuple(_judgement(scenario, pair) for pair in pipeline.pairs)
-        return cls(pipeline, judgements, store)
+        pipeline, merge = lay_out(scenario), MergeSettings(**dict(scenario.merge))
+        align, radius_m = scenario.align, scenario.evaluate.true_pair_radius_m
+        settings = JudgeSettings(align.refinement, align.acceptance, merge, radius_m)
+        judgements = tuple(_judgement(settings, pair) for pair in pipeline.pairs)
+        return cls(pipeline, settings, judgements, store)
 
     @property
     def scenario(self) -> AnyScenario:
@@ -65,17 +69,14 @@ class JudgedRun:
     def load_team(self) -> FusedTeam:
         """The same, their last maps merged."""
         robots = self.load_robots()
-        estimates, offered = (self.pair_table(name) for name in ("estimates", "correspondences"))
-        met = met_maps(robots, estimates, offered)
-        return FusedTeam.of(robots, met, MergeSettings(**dict(self.scenario.merge)))
+        met = met_maps(robots, self.pair_table("estimates"), self.pair_table("correspondences"))
+        return FusedTeam.of(robots, met, self.settings.merge)
 
     def pair_table(self, name: str) -> pd.DataFrame:
         """A table of robot pairs, of all pairs."""
         made = self.judgements if name in _JUDGED else [p.estimates for p in self.pipeline.pairs]
         parts = [tables.read(self.store.path(s) / f"{name}.parquet", name) for s in made]
-        if not parts:
-            return tables.framed(name, [])
-        return pd.concat(parts, ignore_index=True)
+        return pd.concat(parts, ignore_index=True) if parts else tables.framed(name, [])
 
     def execute(self, jobs: int, on_progress: OnProgress, only: Sequence[Stage] = ()) -> None:
         """Do what is not in the store yet, in `jobs` processes; of `only` these stages, if any."""
@@ -92,13 +93,7 @@ class JudgedRun:
                 raise InputError(f"{folder.path}: was removed while it was being made; run again")
 
 
-def _judgement(scenario: AnyScenario, pair: PairStages) -> Stage:
-    settings = judging.JudgeSettings(
-        scenario.align.refinement,
-        scenario.align.acceptance,
-        MergeSettings(**dict(scenario.merge)),
-        scenario.evaluate.true_pair_radius_m,
-    )
+def _judgement(settings: JudgeSettings, pair: PairStages) -> Stage:
     before = {"align": pair.estimates, "log_a": pair.a.log, "slam_a": pair.a.slam}
     before |= {"log_b": pair.b.log, "slam_b": pair.b.slam}
     label = "compare with the truth"

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+import pandas as pd
+
 from experiments.judge import tables
 from experiments.judge.errors import EvaluatedRobot, error_rows, met_maps
 from experiments.judge.fused_landmarks import MergeSettings, fusion_rows
@@ -30,14 +32,11 @@ class JudgeSettings:
 def load_robot(folders: RobotFolders) -> EvaluatedRobot:
     """A robot's maps joined with the truth."""
     log, truth = read_log(folders.log), read_truth(folders.log)
-    for file, rows, expected in (
-        ("truth_poses", truth.T_world_robot, len(log)),
-        ("truth_points", truth.point_world_m, len(log.observations)),
-    ):
-        if len(rows) != expected:
-            raise InputError(
-                f"{folders.log / file}.parquet: {len(rows)} rows, the log has {expected} of them"
-            )
+    poses, points = (truth.T_world_robot, log), (truth.point_world_m, log.observations)
+    for file, (true, logged) in (("truth_poses", poses), ("truth_points", points)):
+        if len(true) != len(logged):
+            counts = f"{len(true)} rows, the log has {len(logged)} of them"
+            raise InputError(f"{folders.log / file}.parquet: {counts}")
     maps = read_snapshots(folders.slam, log)
     associations = read_rows(folders.slam / "associations.parquet", ASSOCIATIONS)
     points = landmark_truth(truth, associations, maps)
@@ -55,7 +54,8 @@ def run(settings: JudgeSettings, job: Job) -> None:
         for name in ("estimates", "correspondences")
     )
     met, radius_m = met_maps(robots, estimates, offered), settings.true_pair_radius_m
-    errors = error_rows(met, settings.refinement, settings.acceptance, radius_m)
+    judged_by = settings.refinement, settings.acceptance, radius_m
+    errors = pd.concat([error_rows(maps, *judged_by) for maps in met])
     tables.write(job.output / "errors.parquet", "errors", errors)
     fusion = fusion_rows(met, settings.merge, radius_m)
     tables.write(job.output / "fusion.parquet", "fusion", fusion)

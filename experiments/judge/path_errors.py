@@ -4,7 +4,7 @@ ATE and RPE as Sturm et al. (2012) define them, in the plane; numbers equal evo'
 and `evo_rpe --pairs_from_reference`), which the tests hold them to.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import accumulate
 from typing import Any
 
@@ -20,19 +20,16 @@ from mapfusion.storage import POSE_FIELDS
 SOURCES = ("final", "online", "odometry")
 # From frame to frame, and along a metre of the way: what a filter step and a short drive add.
 RPE_DELTA = 1
-# Those between the first and the last are named as numpy's functions are.
-STATISTICS = ("rmse", "mean", "median", "std", "min", "max", "sse")
+STATISTICS: dict[str, Callable[[Float], float]] = {
+    "rmse": lambda errors: np.sqrt(np.mean(errors**2)),
+    **{of.__name__: of for of in (np.mean, np.median, np.std, np.min, np.max)},
+    "sse": lambda errors: np.sum(errors**2),
+}
 
 
 def seven_statistics(errors: Float) -> dict[str, float]:
     """Evo's statistics of errors (N,); NaN where there is none. `std` is the population's."""
-    if not len(errors):
-        return dict.fromkeys(STATISTICS, np.nan)
-    squared = errors**2
-    of_errors = {
-        name: getattr(np, name)(errors) for name in ("mean", "median", "std", "min", "max")
-    }
-    return {"rmse": np.sqrt(squared.mean()), **of_errors, "sse": squared.sum()}
+    return {name: of(errors) if len(errors) else np.nan for name, of in STATISTICS.items()}
 
 
 def rms(values: pd.Series) -> float:
@@ -93,8 +90,7 @@ def pairs_by_frames(known: np.ndarray, delta: int) -> np.ndarray:
 def pairs_by_length(positions_m: Float, delta_m: float) -> np.ndarray:
     """Rows (P, 2) between which the way is at least `delta_m` long, one after the other."""
     ends, gone = [0], 0.0
-    steps = np.linalg.norm(np.diff(positions_m, axis=0), axis=1)
-    for row, step in enumerate(steps, start=1):
+    for row, step in enumerate(np.linalg.norm(np.diff(positions_m, axis=0), axis=1), start=1):
         gone += step
         if gone >= delta_m:
             ends.append(row)
@@ -140,11 +136,8 @@ def _errors(
     """What is measured of one path, over how many of which unit, and the errors."""
     yield "ate_m", np.nan, "", ate_m(path, truth)
     yield "ate_from_start_m", np.nan, "", ate_m(path, truth, fit=False)
-    by_frames, by_length = (
-        pairs_by_frames(known, RPE_DELTA),
-        pairs_by_length(truth[:, :2], RPE_DELTA),
-    )
-    for unit, pairs in (("frames", by_frames), ("m", by_length)):
+    by_frames, along = pairs_by_frames(known, RPE_DELTA), pairs_by_length(truth[:, :2], RPE_DELTA)
+    for unit, pairs in (("frames", by_frames), ("m", along)):
         length_m, angle_rad = rpe(path, truth, pairs)
         yield "rpe_m", RPE_DELTA, unit, length_m
         yield "rpe_rad", RPE_DELTA, unit, angle_rad

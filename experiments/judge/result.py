@@ -18,25 +18,27 @@ import pandas as pd
 
 from experiments.judge import fused_landmarks, tables
 from experiments.judge.errors import EvaluatedRobot, MetMaps
-from experiments.judge.fused_landmarks import FusedTeam
+from experiments.judge.fused_landmarks import FusedTeam, MergeSettings
 from experiments.judge.judged_run import JudgedRun
+from experiments.judge.judging import JudgeSettings
 from experiments.judge.path_errors import path_statistics_rows, robot_paths
 from experiments.judge.truth import common_landmarks
 from experiments.methods.aligner_calls import callable_aligner
 from experiments.methods.catalogue import find_method
 from experiments.run.code_version import library_versions
+from experiments.run.frames import read_rows
 from experiments.run.stages import slam
 from experiments.run.store import Store
 from experiments.run.store_files import link_or_copy
 from experiments.run.tasks import OnProgress
 from experiments.scenario.randomness import generator
-from experiments.scenario.settings import AnyScenario, Merge, Simulation
+from experiments.scenario.settings import AnyScenario, Simulation
 from mapfusion.align.correspondences import Correspondences, match
 from mapfusion.errors import InputError
 from mapfusion.landmark_map import LandmarkMap, write_map
 from mapfusion.merge import merge
 from mapfusion.robot_log import read_log
-from mapfusion.storage import point_columns, read_table, write_whole
+from mapfusion.storage import point_columns, write_whole
 from sim.renderer import renderer_name
 
 RESULT_SCHEMA_VERSION = 1
@@ -71,7 +73,7 @@ def write_result(run: JudgedRun, folder: Path) -> None:
     """Collect a finished plan's tables, maps and images in a result folder."""
     team = run.load_team()
     measure_aligners(run, team.robots)
-    rows = all_tables(run, team) | history_tables(team, run.scenario)
+    rows = all_tables(run, team) | history_tables(team, run.settings)
     rows |= {"aligner_timings": run.pair_table("aligner_timings"), "tracks": _tracks(run)}
     for name, table in rows.items():
         tables.write(tables.table_path(folder, name), name, table)
@@ -101,6 +103,7 @@ def measure_aligners(run: JudgedRun, robots: Sequence[EvaluatedRobot]) -> None:
 def _time_pair(scenario: AnyScenario, a: EvaluatedRobot, b: EvaluatedRobot) -> list[dict[str, Any]]:
     settings, iterations = scenario.evaluate, np.array(sorted({*a.maps, *b.maps}))
     spread = np.linspace(0, len(iterations) - 1, settings.timing_points)
+    repeats = range(_WARM_UP_RUNS + settings.timing_repeats)
     aligners = {
         entry.name: callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
         for entry in scenario.align.aligners
@@ -109,18 +112,11 @@ def _time_pair(scenario: AnyScenario, a: EvaluatedRobot, b: EvaluatedRobot) -> l
     for iteration in iterations[np.unique(spread.round().astype(int))].tolist():
         (map_a, points_a), (map_b, points_b) = a.at(iteration), b.at(iteration)
         pairs = match(map_a, map_b, scenario.align.match)
-        maps = {
-            "robot_a": a.name,
-            "robot_b": b.name,
-            "iteration": iteration,
-            "n_correspondences": len(pairs),
-            "n_common": common_landmarks(points_a, points_b, settings.true_pair_radius_m),
-        }
+        n_common = common_landmarks(points_a, points_b, settings.true_pair_radius_m)
+        maps = {"robot_a": a.name, "robot_b": b.name, "iteration": iteration}
+        maps |= {"n_correspondences": len(pairs), "n_common": n_common}
         for name, aligner in aligners.items():
-            rngs = (
-                generator(scenario.seed, "timing", name, repeat)
-                for repeat in range(_WARM_UP_RUNS + settings.timing_repeats)
-            )
+            rngs = (generator(scenario.seed, "timing", name, repeat) for repeat in repeats)
             elapsed = [aligner.align(map_a, map_b, pairs, rng).elapsed_s for rng in rngs]
             low, median, high = np.percentile(elapsed[_WARM_UP_RUNS:], [10, 50, 90])
             times = {"elapsed_s": median, "elapsed_low_s": low, "elapsed_high_s": high}
@@ -130,39 +126,38 @@ def _time_pair(scenario: AnyScenario, a: EvaluatedRobot, b: EvaluatedRobot) -> l
 
 def all_tables(run: JudgedRun, team: FusedTeam) -> dict[str, pd.DataFrame]:
     """The tables of a finished run's last maps, paths, estimates and errors, by their names."""
-    paths, clouds = [], []
+    paths, clouds, landmarks = [], [], []
     for stages, robot in zip(run.pipeline.robots, team.robots, strict=True):
         log, maps = run.robot_folders(stages)
-        poses = read_table(maps / "poses.parquet", slam.POSES)[0].to_pandas()
-        own = robot_paths(poses, read_log(log).odometry, robot.path)
-        paths.append(own.assign(robot=robot.name))
-        cloud = read_table(maps / "clouds.parquet", slam.CLOUDS)[0].to_pandas()
-        clouds.append(cloud.assign(robot=robot.name))
-    joined = pd.concat(paths, ignore_index=True)
-    use_drift = run.scenario.merge.parameters.use_drift
-    radius_m = run.scenario.evaluate.true_pair_radius_m
+        poses = read_rows(maps / "poses.parquet", slam.POSES).assign(robot=robot.name)
+        paths.append(robot_paths(poses, read_log(log).odometry, robot.path))
+        clouds.append(read_rows(maps / "clouds.parquet", slam.CLOUDS).assign(robot=robot.name))
+        landmarks.append(fused_landmarks.landmark_rows(robot, *robot.at(team.iteration)))
+    joined, settings = pd.concat(paths, ignore_index=True), run.settings
     rows: dict[str, Any] = {
         "paths": joined,
         "robots": joined,
         "path_statistics": path_statistics_rows(joined),
         "clouds": pd.concat(clouds, ignore_index=True),
-        "landmarks": fused_landmarks.landmark_rows(team),
+        "landmarks": pd.concat(landmarks, ignore_index=True),
         "fused": fused_landmarks.fused_rows(team),
-        "fused_motions": fused_landmarks.fused_motion_rows(team, use_drift),
+        "fused_motions": fused_landmarks.fused_motion_rows(
+            team, settings.merge.parameters.use_drift
+        ),
         "map_fits": fused_landmarks.map_fit_rows(team),
-        "landmark_nees": fused_landmarks.landmark_nees_rows(team, radius_m),
+        "landmark_nees": fused_landmarks.landmark_nees_rows(team, settings.true_pair_radius_m),
         "timings": [
             {"stage": stage.name, "name": f"{stage.key}:{name}", "elapsed_s": seconds}
             for stage in run.folders()
             for name, seconds in stage.figures().items()
         ],
     }
-    of_pairs = ("estimates", "correspondences", "errors", "fusion")
-    made = {name: tables.framed(name, table) for name, table in rows.items()}
-    return made | {name: run.pair_table(name) for name in of_pairs}
+    for name in ("estimates", "correspondences", "errors", "fusion"):
+        rows[name] = run.pair_table(name)
+    return {name: tables.framed(name, table) for name, table in rows.items()}
 
 
-def history_tables(team: FusedTeam, scenario: AnyScenario) -> dict[str, pd.DataFrame]:
+def history_tables(team: FusedTeam, settings: JudgeSettings) -> dict[str, pd.DataFrame]:
     """The tables `map_history`, `true_pairs` and `fused_history`.
 
     The stages keep the maps whole in the store; what leaves with the result is what one needs to
@@ -173,16 +168,11 @@ def history_tables(team: FusedTeam, scenario: AnyScenario) -> dict[str, pd.DataF
         for robot in team.robots
         for k, landmarks in robot.maps.items()
     ]
-    radius_m = scenario.evaluate.true_pair_radius_m
-    true_pairs = [
-        {
-            **met.names,
-            "n_correspondences": len(met.offered),
-            "true_pair": np.packbits(met.is_true(radius_m)).tobytes(),
-        }
-        for met in team.met
-    ]
-    fused = [_joined_rows(met, scenario.merge) for met in team.met]
+    true_pairs, fused = [], []
+    for met in team.met:
+        bits = np.packbits(met.is_true(settings.true_pair_radius_m)).tobytes()
+        true_pairs.append(met.names | {"n_correspondences": len(met.offered), "true_pair": bits})
+        fused.append(_joined_rows(met, settings.merge))
     return {
         "map_history": pd.concat(maps, ignore_index=True),
         "true_pairs": pd.DataFrame(true_pairs),
@@ -195,7 +185,7 @@ def _plan_rows(landmarks: LandmarkMap) -> pd.DataFrame:
     return pd.DataFrame({"landmark": np.arange(len(landmarks)), **columns})
 
 
-def _joined_rows(met: MetMaps, settings: Merge) -> pd.DataFrame:
+def _joined_rows(met: MetMaps, settings: MergeSettings) -> pd.DataFrame:
     """The inliers of the merging aligner's first repetition, fused; none where it was refused.
 
     Only they are given to the merge: its second pass, which looks for what they missed, takes ten

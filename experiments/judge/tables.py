@@ -108,12 +108,8 @@ def _schema(name: str) -> pa.Schema:
     return schema(f"result.{name}", _VERSIONS.get(name, 1), frames.fields(**columns))
 
 
-ALL: dict[str, pa.Schema] = {
-    "estimates": ESTIMATES,
-    "correspondences": CORRESPONDENCES,
-    "tracks": TRACKS,
-    **{name: _schema(name) for name in _COLUMNS},
-}
+ALL = {"estimates": ESTIMATES, "correspondences": CORRESPONDENCES, "tracks": TRACKS}
+ALL |= {name: _schema(name) for name in _COLUMNS}
 
 
 class Shown(NamedTuple):

@@ -21,21 +21,18 @@ def landmark_truth(
     It is the median of the true points of all observations that went into the landmark;
     `associations` are changes by iteration, as the SLAM stage lists them.
     """
-    owner = np.full(len(truth.point_world_m), -1, dtype=np.int64)
+    point_m, has_point = truth.point_world_m, np.isfinite(truth.point_world_m).all(axis=1)
+    owner = np.full(len(point_m), -1, dtype=np.int64)
     changes = dict(iter(associations.groupby("from_iteration")))
     points = {}
-    for iteration in sorted(maps):
+    for iteration, landmarks in sorted(maps.items()):
         if iteration in changes:
             rows = changes[iteration]
             owner[rows["observation"].to_numpy()] = rows["source_observation"].to_numpy()
-        points[iteration] = _medians(owner, truth.point_world_m, maps[iteration].source_observation)
+        known = has_point & (owner >= 0)
+        medians = pd.DataFrame(point_m[known]).groupby(owner[known]).median()
+        points[iteration] = medians.reindex(landmarks.source_observation).to_numpy(np.float64)
     return points
-
-
-def _medians(owner: np.ndarray, point_world_m: Float, landmarks: np.ndarray) -> Float:
-    known = (owner >= 0) & np.isfinite(point_world_m).all(axis=1)
-    medians = pd.DataFrame(point_world_m[known]).groupby(owner[known]).median()
-    return medians.reindex(landmarks).to_numpy(dtype=np.float64)
 
 
 def true_pairs(
@@ -75,12 +72,12 @@ class PathTruth:
 def fit_rmse_m(position_m: Float, point_world_m: Float) -> tuple[int, float]:
     """How many landmarks have a known truth, and their RMSE after the best rigid fit to it."""
     known = np.isfinite(point_world_m).all(axis=1)
-    if known.sum() < 2:
-        return int(known.sum()), np.nan
     points, target = position_m[known], point_world_m[known]
+    if len(points) < 2:
+        return len(points), np.nan
     T_world_map = np.array(fit_rigid(target, points, np.arange(len(points))))
     residual = se2.transform_points(T_world_map, points) - target
-    return int(known.sum()), float(np.sqrt(np.mean(np.sum(residual**2, axis=1))))
+    return len(points), float(np.sqrt(np.mean(np.sum(residual**2, axis=1))))
 
 
 def degrees_of_freedom(landmarks: LandmarkMap) -> int:

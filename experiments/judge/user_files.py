@@ -28,9 +28,8 @@ def record(
 ) -> list[Path]:
     """Simulate and write one log a robot into `output`; returns their folders."""
     if isinstance(scenario, Recording):
-        raise InputError(
-            f"scenario {scenario.name}: uses recorded logs, there is nothing to record"
-        )
+        reason = "uses recorded logs, there is nothing to record"
+        raise InputError(f"scenario {scenario.name}: {reason}")
     run = JudgedRun.of(scenario, Store.of(results))
     run.execute(jobs, on_progress, [robot.log for robot in run.pipeline.simulated])
     for robot in run.pipeline.robots:
@@ -80,16 +79,16 @@ def align(
     for entry in settings.aligners:
         rng = generator(seed, "align", entry.name)
         done = _registration(entry, settings).register(map_a, map_b, pairs, rng)
-        n_inliers, elapsed_s = int(done.refined.inlier.sum()), done.estimated.elapsed_s
-        row = {"aligner": entry.name, "n_inliers": n_inliers, "elapsed_s": elapsed_s}
-        rows.append(row | estimate_row(len(pairs), *done))
+        row = {"aligner": entry.name, "elapsed_s": done.estimated.elapsed_s}
+        row |= {"n_inliers": int(done.refined.inlier.sum())} | estimate_row(len(pairs), *done)
+        rows.append(row)
     return rows
 
 
 def merge(
     paths: Sequence[Path], scenario: Path | None, overrides: Sequence[str], seed: int
-) -> tuple[FusedMap, list[str]]:
-    """Fuse maps in the frame of the first; returns the fused map and the maps' names."""
+) -> FusedMap:
+    """Fuse maps in the frame of the first."""
     if len(paths) < 2:
         raise InputError("merge: give two maps or more")
     settings = load_section(scenario, "merge", Merge, overrides)
@@ -99,12 +98,9 @@ def merge(
         raise InputError(f"merge.aligner: {settings.aligner} is not among {', '.join(entries)}")
     first, *others = maps = [read_map(path) for path in paths]
     registration = _registration(entries[settings.aligner], align_section)
-    offered = [match(first, other, align_section.match) for other in others]
-    alignments = [
-        registration.register(
-            first, other, pairs, generator(seed, "align", settings.aligner, number)
-        ).applied
-        for number, (other, pairs) in enumerate(zip(others, offered, strict=True), start=1)
-    ]
-    fused = merge_maps(maps, alignments, offered, settings.parameters)
-    return fused, [str(path) for path in paths]
+    offered, alignments = [], []
+    for number, other in enumerate(others, start=1):
+        rng = generator(seed, "align", settings.aligner, number)
+        offered.append(match(first, other, align_section.match))
+        alignments.append(registration.register(first, other, offered[-1], rng).applied)
+    return merge_maps(maps, alignments, offered, settings.parameters)

@@ -105,11 +105,6 @@ def print_paths(folder: Path, paths: Sequence[Path], skipped: Sequence[str] = ()
     print_skipped(skipped)
 
 
-def print_file(path: Path) -> None:
-    """Where a file was written, and how large it is."""
-    print_lines([f"{path} ({path.stat().st_size / 1e6:.1f} MB)"])
-
-
 def print_skipped(skipped: Sequence[str]) -> None:
     """A line for each figure that could not be drawn."""
     print_lines(f"  not drawn: {line}" for line in skipped)

@@ -52,10 +52,8 @@ def not_run_lines(errors: pd.DataFrame) -> list[str]:
     """One line for each aligner, and each reason, that did not run."""
     not_run = errors[errors["status"].isin(NOT_RUN)]
     n_rows = errors.groupby("aligner").size().to_dict()
-    lines = []
-    for (aligner, status, reason), rows in not_run.groupby(
-        ["aligner", "status", "reason"], sort=False
-    ):
+    lines, causes = [], ["aligner", "status", "reason"]
+    for (aligner, status, reason), rows in not_run.groupby(causes, sort=False):
         share = "" if status == Status.ABSENT else f" in {len(rows)} of {n_rows[aligner]} rows"
         lines.append(f"{aligner}: {status}{share}: {reason}")
     return lines
@@ -94,20 +92,15 @@ def _print_pairs(errors: pd.DataFrame, aligner: str) -> None:
 
 def print_outcomes(outcomes: Sequence[Outcome]) -> None:
     """The table of a check."""
-    headings = ("scenario", "metric", "measured", "expected", "by seed", "")
-    rows = [
-        (
-            outcome.scenario,
-            outcome.metric,
-            outcome.value,
-            outcome.bound_text,
-            _by_seed(list(outcome.per_seed.values())),
-            Text("pass", "green") if outcome.passed else Text("FAIL", "bold red"),
-        )
-        for outcome in outcomes
-    ]
-    columns = [(name, ".4g" if name == "measured" else "") for name in headings]
-    print_table(columns, rows, "Checks against the truth")
+    shown = columns("", scenario="scenario", metric="metric") | columns(".4g", value="measured")
+    shown |= columns("", bound_text="expected", seeds="by seed", verdict="")
+    rows = []
+    for outcome in outcomes:
+        seeds = _by_seed(list(outcome.per_seed.values()))
+        verdict = Text("pass", "green") if outcome.passed else Text("FAIL", "bold red")
+        what = (outcome.scenario, outcome.metric, outcome.value, outcome.bound_text)
+        rows.append((*what, seeds, verdict))
+    print_table(shown.values(), rows, "Checks against the truth")
     failed = sum(not outcome.passed for outcome in outcomes)
     print_lines([f"{len(outcomes) - failed} passed, {failed} failed"])
 

@@ -33,41 +33,33 @@ _PATH_NAMES = {"ate_m": "ATE, m", "rpe_m": "RPE, m", "rpe_rad": "RPE, rad"}
 # Columns of tables; intervals, where there are any, stand beside the numbers.
 _METHOD = columns("", aligner="method")
 _SUCCESS = _METHOD | columns(".0%", estimated_success="as estimated", refined_success="refined")
-_OVER_ORACLE = (
-    _METHOD
-    | columns(".3f", estimated_m="estim.\nm")
-    | columns(".2f", estimated_ratio="over the oracle")
-    | columns(".3f", refined_m="refined\nm")
-    | columns(".2f", refined_ratio="over the oracle")
-)
-_AGAINST = (
-    columns("", second="other")
-    | columns(".2f", ratio="its error over other's")
-    | columns(".0%", first_wins="nearer")
-    | columns(".2g", p_holm="p (Holm)")
-)
+_OVER_ORACLE = _METHOD | {
+    "estimated_m": ("estim.\nm", ".3f"),
+    "estimated_ratio": ("over the oracle", ".2f"),
+    "refined_m": ("refined\nm", ".3f"),
+    "refined_ratio": ("over the oracle", ".2f"),
+}
+_AGAINST = {
+    "second": ("other", ""),
+    "ratio": ("its error over other's", ".2f"),
+    "first_wins": ("nearer", ".0%"),
+    "p_holm": ("p (Holm)", ".2g"),
+}
 _PATHS = columns("", source="path", error="error")
 _PATHS |= columns(".3g", rmse="RMSE", median="median", max="max")
-_NEES = (
-    columns("", landmarks="landmarks")
-    | columns("d", n_landmarks="n")
-    | columns(".3g", nees_per_dof="NEES")
-    | columns(">", band="chi-square")
-    | columns(".0%", share_in_gate="in gate")
-)
+_NEES = columns("", landmarks="landmarks") | columns("d", n_landmarks="n")
+_NEES |= columns(".3g", nees_per_dof="NEES") | columns(">", band="chi-square")
+_NEES |= columns(".0%", share_in_gate="in gate")
 
 
 def print_summary(summary: Summary, written: Path | None, skipped: Sequence[str]) -> None:
     """The main tables, and where all of them are."""
-    _print_success(summary)
-    _print_by_true_pairs(summary)
+    _print_success(_rows(summary, "success_at_the_end"), summary.n_runs)
+    _print_by_true_pairs(_rows(summary, "success_by_true_pairs"))
     ratios = _rows(summary, "error_over_oracle")
-    _print(
-        ratios,
-        _OVER_ORACLE,
-        "Median translation error, and its ratio to the oracle's",
-        f"maps with {RICH_PAIRS}+ true pairs; inf: no estimate on most; (95 %, bootstrap)",
-    )
+    title = "Median translation error, and its ratio to the oracle's"
+    note = f"maps with {RICH_PAIRS}+ true pairs; inf: no estimate on most; (95 %, bootstrap)"
+    _print(ratios, _OVER_ORACLE, title, note)
     _print_best_against_others(_rows(summary, "methods_compared"), ratios)
     _print_paths(_rows(summary, "paths"))
     _print_nees(_rows(summary, "nees"))
@@ -97,8 +89,7 @@ def _print(rows: pd.DataFrame, shown: Mapping[str, layout.Column], title: str, n
     layout.print_frame(rows, {**apart, **shown}, title, note)
 
 
-def _print_success(summary: Summary) -> None:
-    rows = _rows(summary, "success_at_the_end")
+def _print_success(rows: pd.DataFrame, n_runs: int) -> None:
     if rows.empty:
         return
     within = f"within {RIGHT_WITHIN_M:g} m and {RIGHT_WITHIN_RAD:g} rad"
@@ -106,7 +97,7 @@ def _print_success(summary: Summary) -> None:
     n_apart, n_maps = rows[["n_apart", "n_maps"]].max()  # all methods see the same maps
     if n_apart:
         caption += f"; without the {n_apart} of {n_maps} pairs of maps that have no common ground"
-    title = f"Right at the end of {_runs(summary.n_runs)}"
+    title = f"Right at the end of {_runs(n_runs)}"
     _print(rows, _SUCCESS, title, f"{caption}; (95 %, Wilson)")
     if "accepted" not in rows:
         return
@@ -118,9 +109,8 @@ def _print_success(summary: Summary) -> None:
     _print(rows, shown, "Verdicts at the end", caption)
 
 
-def _print_by_true_pairs(summary: Summary) -> None:
+def _print_by_true_pairs(rows: pd.DataFrame) -> None:
     """Success as estimated by the number of true pairs: methods down, bins across."""
-    rows = _rows(summary, "success_by_true_pairs")
     if rows.empty:
         return
     last = np.where(rows["to"] == math.inf, "+", "")
@@ -173,17 +163,16 @@ def _print_nees(rows: pd.DataFrame) -> None:
 
 
 def _caveats(summary: Summary) -> list[str]:
-    lines = []
-    if summary.n_runs == 1:
+    lines, n_runs, n_settings = [], summary.n_runs, summary.n_configurations
+    if n_runs == 1:
         depend = "which depend on each other, and nothing of other seeds"
         lines.append(f"One run: the brackets tell of the {MAPS_OF_ONE_RUN}, {depend}.")
-    elif summary.n_runs < FEW_RUNS:
-        few = f"{summary.n_runs} runs: bootstrap intervals of so few are too narrow"
-        lines.append(f"{few}; take {FEW_RUNS} seeds or more.")
-    n_settings = summary.n_configurations
+    elif n_runs < FEW_RUNS:
+        too_narrow = f"bootstrap intervals of so few are too narrow; take {FEW_RUNS} seeds or more"
+        lines.append(f"{n_runs} runs: {too_narrow}.")
     if n_settings > _MAX_CONFIGURATIONS:
-        settings = f"{_MAX_CONFIGURATIONS} of {n_settings} settings"
-        lines.append(f"Shown are {settings}; `-o FOLDER` writes all.")
+        shown = f"{_MAX_CONFIGURATIONS} of {n_settings} settings"
+        lines.append(f"Shown are {shown}; `-o FOLDER` writes all.")
     for row in summary.failed.to_dict("records"):
         lines.append(f"failed, left out: {row['scenario']} seed {row['seed']}: {row['reason']}")
     if summary.missing:
@@ -200,15 +189,11 @@ def print_comparison(
     rows = (table if show_all else table[changed]).sort_values(
         "verdict", key=lambda names: names.map(order.index), kind="stable"
     )
-    shown = columns("", method="method", metric="metric")
-    shown |= columns(">", first="first", second="second", change="change")
-    layout.print_table(
-        [*shown.values(), ("verdict", "")],
-        map(_compared, rows.to_dict("records")),
-        "Second version against the first",
-        "change: factor, or difference; (95 %, Student's t); verdict: 5 % over "
-        f"{table['p'].notna().sum()} tests",
-    )
+    shown = [("method", ""), ("metric", ""), ("first", ">"), ("second", ">"), ("change", ">")]
+    cells, title = map(_compared, rows.to_dict("records")), "Second version against the first"
+    note = "change: factor, or difference; (95 %, Student's t); verdict: 5 % over "
+    note += f"{table['p'].notna().sum()} tests"
+    layout.print_table([*shown, ("verdict", "")], cells, title, note)
     counts = table["verdict"].value_counts().reindex(order, fill_value=0)
     tally = (f"{n} {verdict}" for verdict, n in counts.items() if n or verdict != versions.UNKNOWN)
     ways = f"{_runs(found.n_runs)} compared in {len(table)} ways: {', '.join(tally)}"

@@ -30,7 +30,7 @@ def judged(estimated: Alignment, refined: Alignment, index_b: list[int]) -> pd.D
     row = names | {"aligner": "ransac", "repetition": 0}
     estimates = pd.DataFrame([row | estimate_row(len(pairs), estimated, refined, ACCEPTED)])
     a, b = robot("A", POINTS, T_WORLD_A), robot("B", POINTS, T_WORLD_B)
-    met = met_maps([a, b], estimates, offered("A", "B", pairs))
+    (met,) = met_maps([a, b], estimates, offered("A", "B", pairs))
     return error_rows(met, Refinement(), Acceptance(), 0.1).set_index("aligner")
 
 
