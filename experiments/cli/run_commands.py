@@ -1,6 +1,5 @@
 """Commands that run scenarios and show their results."""
 
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -29,36 +28,27 @@ def run(
     from experiments.judge.expectations import load_checked
     from experiments.judge.result import run_scenario
     from experiments.scenario.suite import scenarios_of
+    from experiments.show.figures.drawing import draw_all
     from experiments.show.terminal import layout, run_screen
 
     for loaded in [load_checked(path, overrides, seed) for path in scenarios_of(scenarios)]:
         with layout.progress() as show:
             folder = run_scenario(loaded, results, jobs, show, fresh)
-            _, skipped = _draw(folder, jobs, show)
-        run_screen.print_result(folder, skipped)
-
-
-def _draw(
-    result: Path, jobs: int, show: Callable[[str, int, int], None]
-) -> tuple[list[Path], list[str]]:
-    """Draw a result's figures; returns their files, and why others could not be drawn."""
-    from experiments.show.figures import draw_all
-
-    skipped: list[str] = []
-    told = partial(show, "draw the figures")
-    return draw_all(result, jobs, told, skipped.append), skipped
+            drawn = draw_all(folder, jobs, partial(show, "draw the figures"))
+        run_screen.print_result(folder, drawn.skipped)
 
 
 @app.command()
 def figures(result: options.ResultFolder, *, jobs: options.Jobs) -> None:
     """Draw a result's figures again, from its tables alone: `mapfusion figures results/quick-0`."""
     from experiments.judge.result import require_result
+    from experiments.show.figures.drawing import draw_all
     from experiments.show.terminal import layout
 
     require_result(result)
     with layout.progress() as show:
-        paths, skipped = _draw(result, jobs, show)
-    layout.print_paths(result / "figures", paths, skipped)
+        drawn = draw_all(result, jobs, partial(show, "draw the figures"))
+    layout.print_paths(result / "figures", *drawn)
 
 
 @app.command()
@@ -70,7 +60,7 @@ def report(
     ] = None,
 ) -> None:
     """Show a result in one HTML file that works offline: `mapfusion report results/quick-0`."""
-    from experiments.show.report import write_report
+    from experiments.show.report.document import write_report
     from experiments.show.terminal.layout import print_file
 
     print_file(write_report(result, output))

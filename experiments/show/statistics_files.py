@@ -49,8 +49,7 @@ def _draw_over_runs(summary: Summary, folder: Path) -> Iterator[str]:
         target = folder if len(drawn) == 1 else folder / re.sub(r"[^\w.=-]", "_", name)[:120]
         data = ResultTables(target, {"errors": medians, "aligner_timings": timings})
         for figure in _FIGURES:
-            if reason := draw_figure(data, figure, target).skipped:
-                yield f"{name}, {figure}: {reason}"
+            yield from (f"{name}, {line}" for line in draw_figure(data, figure, target).skipped)
 
 
 def run_compare(first: Path, second: Path, show_all: bool, output: Path | None) -> bool:
