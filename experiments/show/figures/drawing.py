@@ -22,7 +22,7 @@ _DPI = {"png": 200, "svg": 150}
 
 
 class Drawn(NamedTuple):
-    """The pictures written, and a line for each figure that there is no data for: which, and why."""
+    """The pictures written, and one line each which figures there is no data for, and why."""
 
     files: list[Path]
     skipped: list[str]

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping
 from functools import cached_property
+from itertools import cycle
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,8 +12,8 @@ import pandas as pd
 import pyarrow as pa
 
 from experiments.judge.judged_maps import methods_in
-from experiments.judge.tables import read, table_path
-from experiments.show.figures.style import FUSED_COLOUR, aligner_styles, robot_colours
+from experiments.judge.tables import ALL, read, table_path
+from experiments.show.figures.style import FUSED_COLOUR, ROBOT_COLOURS, aligner_styles
 from mapfusion.align.result import Status
 from mapfusion.errors import InputError
 from mapfusion.se2 import Float, between, inverse, transform_covariances, transform_points
@@ -61,6 +62,14 @@ class ResultTables:
             raise NothingToDraw(f"no run has a table {name}")
         return self._tables[name]
 
+    def has(self, name: str) -> bool:
+        """Whether there is a table of that name; older results lack some."""
+        return name in self._tables or table_path(self.folder, name).is_file()
+
+    def rows(self, name: str) -> pd.DataFrame:
+        """The table of that name; without rows where there is none."""
+        return self.table(name) if self.has(name) else ALL[name].empty_table().to_pandas()
+
     @cached_property
     def scenario(self) -> dict[str, Any]:
         """The resolved scenario."""
@@ -74,7 +83,7 @@ class ResultTables:
     @cached_property
     def colours(self) -> dict[str, str]:
         """Each robot's colour, in display order."""
-        return robot_colours(self.robots)
+        return dict(zip(self.robots, cycle(ROBOT_COLOURS), strict=False))
 
     @cached_property
     def pairs(self) -> list[Pair]:
@@ -125,7 +134,7 @@ class ResultTables:
 
         Positions (N, 3), covariances (N, 3, 3), and these before the drift widened them.
         """
-        if not table_path(self.folder, "fused_motions").is_file():
+        if not self.has("fused_motions"):
             raise NothingToDraw("made before fused motions were stored: run it again")
         motions = self.table("fused_motions").set_index("robot").loc[robot]
         T_fused_robot = motions[["tx_m", "ty_m", "theta_rad"]].to_numpy(dtype=np.float64)
@@ -202,9 +211,14 @@ def positions_and_covariances(rows: pd.DataFrame) -> tuple[Float, Float]:
 
 
 def _read_json(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        raise InputError(f"{path}: no such file (expected a result folder of `run`)")
+    return json_object(path.read_text(encoding="utf-8", errors="replace"), path)
+
+
+def json_object(text: str, where: Path) -> dict[str, Any]:
+    """What a text holds; raises InputError, which says where it stands, if that is no object."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file (expected a result folder of `run`)") from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read as JSON ({error})") from error
+        return {} | json.loads(text)
+    except (ValueError, TypeError) as error:  # of JSON, or of another value than an object
+        raise InputError(f"{where}: cannot be read as a JSON object ({error})") from error

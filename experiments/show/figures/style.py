@@ -21,7 +21,6 @@ PURPLE, ORANGE, SKY = "#CC79A7", "#E69F00", "#56B4E9"
 # Four of Tol's (2021) muted scheme, darker or duller than those, where more methods are compared.
 INDIGO, WINE, OLIVE, TEAL = "#332288", "#882255", "#999933", "#44AA99"
 BLACK, GRAY, PALE_GRAY = "#000000", "#7F7F7F", "#C8C8C8"
-SEQUENTIAL_MAP = "viridis"
 
 _RC: dict[str, Any] = {
     "font.family": "DejaVu Sans",  # comes with matplotlib: the same on every machine
@@ -72,7 +71,7 @@ _OTHER_DASHES = (
     (0, (10, 2, 4, 2)),
 )
 _OTHER_MARKERS = ("p", "h", "d", "8", "H", "1", "2", "3", "4")
-_ROBOT_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
+ROBOT_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
 FUSED_COLOUR = BLACK
 
 
@@ -111,8 +110,3 @@ def aligner_legend(
     handles = [*lines, *others]
     place = {"loc": "outside upper center", "ncols": min(len(handles), columns)}
     figure.legend(handles=handles, handlelength=3.2, **place)
-
-
-def robot_colours(names: Sequence[str]) -> dict[str, str]:
-    """Colour of each robot by its place in the display order."""
-    return dict(zip(names, cycle(_ROBOT_COLOURS), strict=False))

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from experiments.judge.tables import ALL
 from experiments.run.estimates import inlier_mask
 from experiments.show.figures.floor_plan import LEVEL_TEXT, semi_axes
 from experiments.show.figures.result_tables import Pair, ResultTables, of_pair
@@ -31,7 +30,6 @@ _STAGES = {"estimated": "", "refined": "refined_"}
 _MOTION = ("tx_m", "ty_m", "theta_rad")
 _ERROR = ("translation_error_m", "rotation_error_rad")
 
-Tables = dict[str, pd.DataFrame]
 Json = dict[Any, Any]
 
 
@@ -45,14 +43,11 @@ def packed_ellipses(covariance_m2: Float) -> np.ndarray:
     return np.stack(columns, -1).round().astype(np.int64).astype(np.uint8)  # 256 wraps to 0
 
 
-def map_view(data: ResultTables, tables: Tables) -> Json | None:
-    """Index and block (in base64) of the map view; None where the result keeps no maps.
-
-    `tables` are those of TABLES that the result holds.
-    """
-    if not {"map_history", "true_pairs"} <= set(tables) or not data.pairs:
+def map_view(data: ResultTables) -> Json | None:
+    """Index and block (in base64) of the map view; None where the result keeps no maps."""
+    if not (data.has("map_history") and data.has("true_pairs") and data.pairs):
         return None
-    view = _View(data, {name: ALL[name].empty_table().to_pandas() for name in TABLES} | tables)
+    view = _View(data)
     starts = {robot: data.start_pose(robot) for robot in data.robots}
     return {
         "level": LEVEL_TEXT,
@@ -71,11 +66,10 @@ def map_view(data: ResultTables, tables: Tables) -> Json | None:
 class _View:
     """Packs robots and pairs of robots into one block, one after the other."""
 
-    def __init__(self, data: ResultTables, tables: Tables) -> None:
+    def __init__(self, data: ResultTables) -> None:
         self.block = bytearray()
         self._data = data
-        self._tables = tables
-        history, true_pairs = tables["map_history"], tables["true_pairs"]
+        history, true_pairs = data.table("map_history"), data.table("true_pairs")
         iterations = np.unique(true_pairs["iteration"])
         bytes_in_all = 7 * len(history) + 5 * int(true_pairs["n_correspondences"].sum())
         n_affordable = int(len(iterations) * MAX_BYTES / max(bytes_in_all, 1))
@@ -86,7 +80,7 @@ class _View:
         self._step_m = {name: self._finest_step(name) for name in data.robots}
 
     def _of_robot(self, table: str, robot: str) -> pd.DataFrame:
-        rows = self._tables[table]
+        rows = self._data.rows(table)
         return rows[rows["robot"] == robot]
 
     def _finest_step(self, robot: str) -> float:
@@ -151,9 +145,9 @@ class _View:
 
     def pair(self, pair: Pair) -> Json:
         """Correspondences, fused landmarks and alignments of two robots, iteration by iteration."""
-        judged = of_pair(self._tables["true_pairs"], pair).set_index("iteration")
+        judged = of_pair(self._data.rows("true_pairs"), pair).set_index("iteration")
         offered, fused = (
-            _by_iteration(of_pair(self._tables[name], pair))
+            _by_iteration(of_pair(self._data.rows(name), pair))
             for name in ("correspondences", "fused_history")
         )
         frames = []
@@ -181,7 +175,7 @@ class _View:
 
     def _alignments(self, pair: Pair, iterations: list[int]) -> dict[str, list[Json | None]]:
         """By aligner and iteration: the first repetition's motion, as estimated and refined."""
-        estimates = of_pair(self._tables["estimates"], pair)
+        estimates = of_pair(self._data.rows("estimates"), pair)
         errors = of_pair(self._data.table("errors"), pair)
         new = [name for name in errors if name in _ANSWER or name not in estimates]
         joined = estimates[estimates["repetition"] == 0].merge(errors[new], on=_ANSWER)
