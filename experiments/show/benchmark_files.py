@@ -57,8 +57,7 @@ def write_benchmark(
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
     }
     write_text(folder / "provenance.json", json.dumps(provenance, indent=1))
-    with style.house_style():
-        save_figure(draw(summary), folder, "benchmark")
+    save_figure(folder, "benchmark", draw, summary)
 
 
 def markdown(design: BenchmarkDesign, summary: pd.DataFrame) -> str:

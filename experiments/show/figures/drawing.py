@@ -5,7 +5,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 from pkgutil import iter_modules
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from matplotlib.figure import Figure
 
@@ -56,22 +56,22 @@ def draw_figure(data: ResultTables, name: str, folder: Path | None = None) -> Dr
     """
     module = importlib.import_module(f"experiments.show.figures.{name}")
     folder = folder or data.folder / "figures"
+    try:
+        return Drawn(save_figure(folder, name, module.draw, data), [])
+    except NothingToDraw as reason:
+        for kind in _DPI:
+            (folder / f"{name}.{kind}").unlink(missing_ok=True)
+        return Drawn([], [f"{name}: {reason}"])
+
+
+def save_figure(folder: Path, name: str, draw: Callable[..., Figure], *data: Any) -> list[Path]:
+    """Write the figure `draw(*data)`, in the house style, in all formats; returns the pictures."""
+    files = [folder / f"{name}.{kind}" for kind in _DPI]
     with house_style():
-        try:
-            return Drawn(save_figure(module.draw(data), folder, name), [])
-        except NothingToDraw as reason:
-            for kind in _DPI:
-                (folder / f"{name}.{kind}").unlink(missing_ok=True)
-            return Drawn([], [f"{name}: {reason}"])
-
-
-def save_figure(figure: Figure, folder: Path, name: str) -> list[Path]:
-    """Write a figure in all formats (inside `house_style`); returns the pictures."""
-    files = []
-    for kind in _DPI:
-        files.append(folder / f"{name}.{kind}")
-        write_whole(files[-1], lambda path, kind=kind: _save(figure, path, kind))
-        figure.set_layout_engine("none")  # as laid out for the first; once is enough
+        figure = draw(*data)
+        for file, kind in zip(files, _DPI, strict=True):
+            write_whole(file, lambda path, kind=kind: _save(figure, path, kind))
+            figure.set_layout_engine("none")  # as laid out for the first; once is enough
     return files
 
 

@@ -88,7 +88,8 @@ class ResultTables:
     @cached_property
     def pairs(self) -> list[Pair]:
         """Robot pairs that were aligned, in display order."""
-        return pairs_in(self.table("errors"))
+        pairs = self.table("errors")[["robot_a", "robot_b"]].drop_duplicates()
+        return list(pairs.itertuples(index=False, name=None))
 
     @cached_property
     def aligners(self) -> list[str]:
@@ -193,12 +194,6 @@ class ResultTables:
         return None if pose is None else np.array(pose, dtype=np.float64)
 
 
-def pairs_in(errors: pd.DataFrame) -> list[Pair]:
-    """Robot pairs in the order of their appearance."""
-    pairs = errors[["robot_a", "robot_b"]].drop_duplicates()
-    return list(pairs.itertuples(index=False, name=None))
-
-
 def of_pair(rows: pd.DataFrame, pair: Pair) -> pd.DataFrame:
     """The rows of one robot pair."""
     return rows[(rows["robot_a"] == pair[0]) & (rows["robot_b"] == pair[1])]
@@ -206,8 +201,7 @@ def of_pair(rows: pd.DataFrame, pair: Pair) -> pd.DataFrame:
 
 def positions_and_covariances(rows: pd.DataFrame) -> tuple[Float, Float]:
     """Positions (N, 3) and covariances (N, 3, 3) of rows with the columns of a map."""
-    columns = rows[POSITION_FIELDS + COVARIANCE_FIELDS]
-    return points_from(pa.Table.from_pandas(columns, preserve_index=False))
+    return points_from(pa.Table.from_pandas(rows[POSITION_FIELDS + COVARIANCE_FIELDS]))
 
 
 def _read_json(path: Path) -> dict[str, Any]:

@@ -89,13 +89,9 @@ def aligner_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Line style of each aligner: its own if it has one, else by its place among those without."""
     others = [name for name in names if name not in _KNOWN_ALIGNERS]
     looks = zip(cycle(_OTHER_COLOURS), cycle(_OTHER_DASHES), cycle(_OTHER_MARKERS), strict=False)
-    return {
-        name: {"color": colour, "linestyle": dashes, "marker": marker}
-        for name, (colour, dashes, marker) in (
-            *_KNOWN_ALIGNERS.items(),
-            *zip(others, looks, strict=False),
-        )
-    }
+    chosen = _KNOWN_ALIGNERS | dict(zip(others, looks, strict=False))
+    parts = ("color", "linestyle", "marker")
+    return {name: dict(zip(parts, look, strict=True)) for name, look in chosen.items()}
 
 
 def aligner_legend(

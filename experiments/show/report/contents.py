@@ -19,11 +19,10 @@ from experiments.judge.path_errors import path_rms
 from experiments.judge.result import require_result
 from experiments.scenario.settings import Bound
 from experiments.show.figures.drawing import FIGURES
-from experiments.show.figures.result_tables import ResultTables, of_pair, pairs_in
+from experiments.show.figures.result_tables import Pair, ResultTables, of_pair
 from experiments.show.figures.style import aligner_styles
 from experiments.show.report.charts import error_curves, success_curves, time_curves
-from experiments.show.report.map_view import TABLES as MAP_TABLES
-from experiments.show.report.map_view import map_view
+from experiments.show.report.map_view import MAP_TABLES, map_view
 from experiments.show.report.origin import natural, provenance_of, stage_times
 from experiments.show.report.theme import chart_style
 from experiments.study.statistics.run_tables import find_runs
@@ -48,7 +47,8 @@ def contents_of(path: Path) -> dict[str, Any]:
     if runs.sweeps:
         own, groups = _of_sweep(path, maps), _by_configuration(reduced.medians)
     else:
-        own, groups = _of_result(ResultTables(path)), _by_robots(runs.read("errors"))
+        data = ResultTables(path)
+        own, groups = _of_result(data), _by_robots(runs.read("errors"), data.pairs)
     aligners = methods_in(maps, oracle=True)
     styles = aligner_styles(aligners)
     timings = runs.read("aligner_timings") if runs.has("aligner_timings") else pd.DataFrame()
@@ -110,9 +110,8 @@ def _of_result(data: ResultTables) -> dict[str, Any]:
     }
 
 
-def _by_robots(errors: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
+def _by_robots(errors: pd.DataFrame, pairs: list[Pair]) -> Iterator[tuple[str, pd.DataFrame]]:
     """Errors of each pair of robots, and of all together, with a label each."""
-    pairs = pairs_in(errors)
     for a, b in pairs:
         yield f"{a} – {b}", of_pair(errors, (a, b))
     if len(pairs) > 1:

@@ -55,8 +55,8 @@ def _render(contents: dict[str, Any]) -> str:
         (_PAGE / name).read_text(encoding="utf-8")
         for name in ("report.css", "base.js", "map.js", "charts.js")
     )
-    script, plotly = f"{base}\n{map_view}", get_plotlyjs()
-    digests = [hashlib.sha256(text.encode()).digest() for text in (script, plotly, charts)]
+    scripts = {"script": f"{base}\n{map_view}", "plotly": get_plotlyjs(), "charts": charts}
+    digests = [hashlib.sha256(text.encode()).digest() for text in scripts.values()]
     robots, aligners = contents["robot_colours"], contents["aligners"]
     data = {name: contents[name] for name in _DRAWN_BY_SCRIPTS} | {
         "min_true_pairs": criteria.ANSWERABLE_PAIRS,
@@ -64,14 +64,11 @@ def _render(contents: dict[str, Any]) -> str:
     }
     template = templates().get_template("report.html.j2")
     return template.render(
-        contents,
+        contents | scripts,
         data=data,
         style_of={style["name"]: style for style in aligners},
         palette=palette([*(style["hex"] for style in aligners), *robots.values()]),
         band=BAND,
         style=style,
-        script=script,
-        plotly=plotly,
-        charts=charts,
         script_hashes=[base64.b64encode(digest).decode() for digest in digests],
     )

@@ -17,8 +17,8 @@ from experiments.show.figures.result_tables import Pair, ResultTables, of_pair
 from experiments.show.report.charts import rounded, thinned
 from mapfusion.se2 import Float
 
-TABLES = ("map_history", "true_pairs", "clouds", "paths")
-TABLES += ("correspondences", "fused_history", "estimates")
+MAP_TABLES = ("map_history", "true_pairs", "clouds", "paths")
+MAP_TABLES += ("correspondences", "fused_history", "estimates")
 MAX_BYTES = 4_000_000  # of the block: with Plotly and the pictures the report stays under 15 MB
 _FINEST_STEP_M = 0.001  # a screen never shows a millimetre of a map
 # Semi-axes from 1 mm to 100 m: 255 steps of 4.6 % each, which no eye tells apart.
@@ -26,7 +26,7 @@ ELLIPSE_MIN_M, ELLIPSE_MAX_M = 1e-3, 100.0
 _COVARIANCE = ["cov_xx_m2", "cov_xy_m2", "cov_xy_m2", "cov_yy_m2"]
 _NO_LANDMARKS = {"at": [0, 0], "ellipses": [0, 0]}
 _ANSWER = ["aligner", "iteration", "repetition"]
-_STAGES = {"estimated": "", "refined": "refined_"}
+_STAGES = (("estimated", ""), ("refined", "refined_"))
 _MOTION = ("tx_m", "ty_m", "theta_rad")
 _ERROR = ("translation_error_m", "rotation_error_rad")
 
@@ -48,13 +48,12 @@ def map_view(data: ResultTables) -> Json | None:
     if not (data.has("map_history") and data.has("true_pairs") and data.pairs):
         return None
     view = _View(data)
-    starts = {robot: data.start_pose(robot) for robot in data.robots}
     return {
         "level": LEVEL_TEXT,
         "ellipse_m": [ELLIPSE_MIN_M, ELLIPSE_MAX_M],
         "robots": {name: view.robot(name) for name in data.robots},
         "pairs": [view.pair(pair) for pair in data.pairs],
-        "starts": {robot: _pose(start) for robot, start in starts.items()},
+        "starts": {robot: _pose(data.start_pose(robot)) for robot in data.robots},
         "walls": [[rounded(point) for point in wall] for wall in data.walls],
         "index_bytes": view.index_type.itemsize,
         "merge_aligner": data.scenario.get("merge", {}).get("aligner", ""),
@@ -146,10 +145,8 @@ class _View:
     def pair(self, pair: Pair) -> Json:
         """Correspondences, fused landmarks and alignments of two robots, iteration by iteration."""
         judged = of_pair(self._data.rows("true_pairs"), pair).set_index("iteration")
-        offered, fused = (
-            _by_iteration(of_pair(self._data.rows(name), pair))
-            for name in ("correspondences", "fused_history")
-        )
+        offered = _by_iteration(of_pair(self._data.rows("correspondences"), pair))
+        fused = _by_iteration(of_pair(self._data.rows("fused_history"), pair))
         frames = []
         for place, k in enumerate(self._shown.tolist()):
             if k not in judged.index:
@@ -177,9 +174,8 @@ class _View:
         """By aligner and iteration: the first repetition's motion, as estimated and refined."""
         estimates = of_pair(self._data.rows("estimates"), pair)
         errors = of_pair(self._data.table("errors"), pair)
-        new = [name for name in errors if name in _ANSWER or name not in estimates]
-        joined = estimates[estimates["repetition"] == 0].merge(errors[new], on=_ANSWER)
-        rows = joined.to_dict("records")
+        first = estimates[estimates["repetition"] == 0]
+        rows = first.merge(errors, on=_ANSWER, suffixes=("", "_of_error")).to_dict("records")
         found = {(row["aligner"], row["iteration"]): _alignment(row) for row in rows}
         return {
             name: [found.get((name, k)) for k in iterations]
@@ -199,13 +195,13 @@ def _pose(pose: Float | None) -> list[float | None] | None:
 def _alignment(row: Json) -> Json:
     """A row of `estimates` joined with that of `errors`."""
     reasons = (row["refined_reason"], row["reason"], row["acceptance_reason"])
-    found: Json = {
+    motion, error = (
+        {stage: rounded([row[f"{prefix}{name}"] for name in names]) for stage, prefix in _STAGES}
+        for names in (_MOTION, _ERROR)
+    )
+    return motion | {
         "accepted": bool(row["accepted"]),
         "status": str(row["refined_status"]),
         "reason": next((str(reason) for reason in reasons if reason), ""),
-        "error": {},
+        "error": error,
     }
-    for stage, prefix in _STAGES.items():
-        found[stage] = rounded([row[f"{prefix}{name}"] for name in _MOTION])
-        found["error"][stage] = rounded([row[f"{prefix}{name}"] for name in _ERROR])
-    return found
