@@ -178,10 +178,8 @@ class ResultTables:
 
     def walls_in_frame_of(self, robot: str) -> list[Float]:
         """The walls' corner points, (n, 2) each, in a robot's map frame; none where unknown."""
-        T_world_map = self.start_pose(robot)
-        if T_world_map is None:
-            return []
-        return [transform_points(inverse(T_world_map), wall) for wall in self.walls]
+        start = self.start_pose(robot)
+        return [transform_points(inverse(start), wall) for wall in self.walls if start is not None]
 
     def true_alignment(self, pair: Pair) -> Float | None:
         """The true T_a_b (3,) of two map frames, or None where it is unknown."""

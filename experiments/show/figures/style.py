@@ -59,17 +59,9 @@ _KNOWN_ALIGNERS: dict[str, tuple[Any, ...]] = {
 # All others (plug-ins, names of a scenario's own) by their place among themselves. The lengths have
 # no common factor, so 99 styles come before one repeats.
 _OTHER_COLOURS = (INDIGO, OLIVE, BLUE, WINE, TEAL, VERMILLION, SKY, ORANGE, PURPLE, GREEN, GRAY)
-_OTHER_DASHES = (
-    (0, (2, 2)),
-    (0, (9, 1, 2, 1)),
-    "-",
-    (0, (4, 1, 1, 1)),
-    (0, (1, 2)),
-    (0, (7, 3)),
-    (0, (5, 1, 1, 1, 1, 1, 1, 1)),
-    (0, (3, 3)),
-    (0, (10, 2, 4, 2)),
-)
+_DASHES_AND_GAPS = [(2, 2), (9, 1, 2, 1), (), (4, 1, 1, 1), (1, 2), (7, 3)]
+_DASHES_AND_GAPS += [(5, 1, 1, 1, 1, 1, 1, 1), (3, 3), (10, 2, 4, 2)]
+_OTHER_DASHES = [(0, lengths) if lengths else "-" for lengths in _DASHES_AND_GAPS]
 _OTHER_MARKERS = ("p", "h", "d", "8", "H", "1", "2", "3", "4")
 ROBOT_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
 FUSED_COLOUR = BLACK
