@@ -126,8 +126,8 @@ def draw(summary: pd.DataFrame) -> Figure:
         column[-1].set_xlabel("outliers (%)")
     _lay_out(panels, shares)
     absent = set(summary["method"][summary["status"] == Status.ABSENT])
-    labels = {name: f"{name} (absent)" if name in absent else name for name in methods}
-    style.aligner_legend(figure, labels, styles, columns=5)
+    looks = {f"{m} (absent)" if m in absent else m: styles[m] for m in methods}
+    style.aligner_legend(figure, looks, columns=5)
     return figure
 
 

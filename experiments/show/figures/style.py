@@ -87,14 +87,10 @@ def aligner_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
 
 
 def aligner_legend(
-    figure: Figure,
-    labels: Mapping[str, str],
-    styles: Mapping[str, dict[str, Any]],
-    columns: int,
-    others: Sequence[Artist] = (),
+    figure: Figure, looks: Mapping[str, dict[str, Any]], columns: int, others: Sequence[Artist] = ()
 ) -> None:
-    """Put a legend of aligners, by their labels, and what else it explains above a figure."""
-    lines = [Line2D([], [], label=text, **styles[name]) for name, text in labels.items()]
+    """Put a legend of aligners, styles by label, and what else it explains above a figure."""
+    lines = [Line2D([], [], label=label, **look) for label, look in looks.items()]
     handles = [*lines, *others]
     place = {"loc": "outside upper center", "ncols": min(len(handles), columns)}
     figure.legend(handles=handles, handlelength=3.2, **place)
