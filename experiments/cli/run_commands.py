@@ -9,7 +9,7 @@ import typer
 from experiments.cli import options
 
 app = typer.Typer()
-_DRAWING = "draw the figures"
+_DRAWING = _DRAWING
 _SUITE = Path("scenarios")
 
 
@@ -30,29 +30,27 @@ def run(
     from experiments.judge.expectations import load_checked
     from experiments.judge.result import run_scenario
     from experiments.scenario.suite import scenarios_of
-    from experiments.show.figures import draw_all
+    from experiments.show.figures.drawing import draw_all
     from experiments.show.terminal import layout, run_screen
 
     for loaded in [load_checked(path, overrides, seed) for path in scenarios_of(scenarios)]:
-        skipped: list[str] = []
         with layout.progress() as show:
             folder = run_scenario(loaded, results, jobs, show, fresh)
-            draw_all(folder, jobs, partial(show, _DRAWING), skipped.append)
-        run_screen.print_result(folder, skipped)
+            drawn = draw_all(folder, jobs, partial(show, _DRAWING))
+        run_screen.print_result(folder, drawn.skipped)
 
 
 @app.command()
 def figures(result: options.ResultFolder, *, jobs: options.Jobs = options.ALL_CORES) -> None:
     """Draw a result's figures again, from its tables alone: `mapfusion figures results/quick-0`."""
     from experiments.judge.result import require_result
-    from experiments.show.figures import draw_all
+    from experiments.show.figures.drawing import draw_all
     from experiments.show.terminal import layout
 
     require_result(result)
-    skipped: list[str] = []
     with layout.progress() as show:
-        paths = draw_all(result, jobs, partial(show, _DRAWING), skipped.append)
-    layout.print_paths(result / "figures", paths, skipped)
+        drawn = draw_all(result, jobs, partial(show, _DRAWING))
+    layout.print_paths(result / "figures", *drawn)
 
 
 @app.command()
@@ -64,7 +62,7 @@ def report(
     ] = None,
 ) -> None:
     """Show a result in one HTML file that works offline: `mapfusion report results/quick-0`."""
-    from experiments.show.report import write_report
+    from experiments.show.report.document import write_report
     from experiments.show.terminal.layout import print_lines
 
     path = write_report(result, output)

@@ -30,7 +30,8 @@ def refusal(
     For example, after a sweep of them: `mapfusion refusal full --seeds 0..2 -o results/refusal`.
     """
     from experiments.scenario.seeds import parse_seeds
-    from experiments.show.figures.refusal_figures import write
+    from experiments.show.figures.drawing import save_figure
+    from experiments.show.figures.refusal_figures import draw
     from experiments.show.terminal import layout, study_screen
     from experiments.study.refusal import refusal_rates, refusal_trial
     from experiments.study.refusal.stored_worlds import worlds_of
@@ -40,7 +41,8 @@ def refusal(
         false_alarms = refusal_trial.run(mapped, output, pairs, jobs, show)
     refusals, calibration = (refusal_trial.read(output, name) for name in refusal_trial.TABLES)
     study_screen.print_refusals(refusal_rates.summary(refusals), false_alarms)
-    layout.print_paths(output, write(output, refusals, calibration, false_alarms))
+    data = (refusals, calibration, false_alarms)
+    layout.print_paths(output, save_figure(output / "figures", "refusal", draw, *data))
 
 
 @app.command()
@@ -120,9 +122,15 @@ def compare(
 
     Runs are matched by scenario, seed and settings; a verdict means more than noise.
     """
-    from experiments.show.statistics_files import run_compare
+    from experiments.show.export import write_tables
+    from experiments.show.terminal.statistics_screen import print_comparison
+    from experiments.study.compare import versions
 
-    if run_compare(first, second, show_all, output) and fail_if_worse:
+    found = versions.compare(first, second)
+    if output is not None:
+        write_tables(output, {"comparison": found.table})
+    print_comparison(found, show_all, output)
+    if found.worse and fail_if_worse:
         raise typer.Exit(options.EXIT_FAILED)
 
 

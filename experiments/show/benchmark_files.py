@@ -57,8 +57,7 @@ def write_benchmark(
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
     }
     write_text(folder / "provenance.json", json.dumps(provenance, indent=1))
-    with style.house_style():
-        save_figure(draw(summary), folder, "benchmark")
+    save_figure(folder, "benchmark", draw, summary)
 
 
 def markdown(design: BenchmarkDesign, summary: pd.DataFrame) -> str:
@@ -127,8 +126,8 @@ def draw(summary: pd.DataFrame) -> Figure:
         column[-1].set_xlabel("outliers (%)")
     _lay_out(panels, shares)
     absent = set(summary["method"][summary["status"] == Status.ABSENT])
-    labels = {name: f"{name} (absent)" if name in absent else name for name in methods}
-    style.aligner_legend(figure, labels, styles, columns=5)
+    looks = {f"{m} (absent)" if m in absent else m: styles[m] for m in methods}
+    style.aligner_legend(figure, looks, columns=5)
     return figure
 
 

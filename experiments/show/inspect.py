@@ -1,9 +1,8 @@
 """`mapfusion inspect`: what a file or folder is, of which version, and what it holds."""
 
 import json
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pandas as pd
 import pyarrow as pa
@@ -19,9 +18,9 @@ from sim import trajectory
 
 _PREFIX, _KIND, _VERSION = "mapfusion.", "kind", "schema_version"
 # What people bring or take away is checked; tables of stages and studies tell what they are.
-_LOG_SCHEMAS = ("FRAMES", "OBSERVATIONS", "TRUTH_POSES", "TRUTH_POINTS")
 _SCHEMAS = [*tables.ALL.values(), landmark_map.LANDMARKS, trajectory.TRAJECTORY]
-_SCHEMAS += [getattr(robot_log, name) for name in _LOG_SCHEMAS]
+_SCHEMAS += [robot_log.FRAMES, robot_log.OBSERVATIONS]
+_SCHEMAS += [robot_log.TRUTH_POSES, robot_log.TRUTH_POINTS]
 _CHECKED = {each.metadata[f"{_PREFIX}{_KIND}".encode()].decode(): each for each in _SCHEMAS}
 _UNITS = {"m": "m", "m2": "m²", "rad": "rad", "s": "s", "ms": "ms", "px": "px"}
 # the upper triangle of an alignment's covariance names its axes instead
@@ -48,13 +47,12 @@ _FOLDER_MARKS = {
 }
 
 
-@dataclass(frozen=True)
-class Contents:
+class Contents(NamedTuple):
     """What is known of a file or folder: its kind in words, facts by name, its columns or files."""
 
     kind: str
     facts: dict[str, Any]
-    parts: pd.DataFrame = field(default_factory=pd.DataFrame)
+    parts: pd.DataFrame = pd.DataFrame()
 
 
 def inspect(path: Path) -> None:

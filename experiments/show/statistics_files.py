@@ -1,4 +1,4 @@
-"""The commands `statistics` and `compare`: load, compute, write, show."""
+"""The command `statistics`: load, compute, write, show."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -7,8 +7,7 @@ from pathlib import Path
 from experiments.show.export import write_tables
 from experiments.show.figures.drawing import draw_figure
 from experiments.show.figures.result_tables import ResultTables
-from experiments.show.terminal.statistics_screen import print_comparison, print_summary
-from experiments.study.compare.versions import compare
+from experiments.show.terminal.statistics_screen import print_summary
 from experiments.study.statistics.run_tables import find_runs
 from experiments.study.statistics.summary import ALL_SCENARIOS, Summary, configurations, summarise
 
@@ -49,17 +48,4 @@ def _draw_over_runs(summary: Summary, folder: Path) -> Iterator[str]:
         target = folder if len(drawn) == 1 else folder / re.sub(r"[^\w.=-]", "_", name)[:120]
         data = ResultTables(target, {"errors": medians, "aligner_timings": timings})
         for figure in _FIGURES:
-            if reason := draw_figure(data, figure, target).skipped:
-                yield f"{name}, {figure}: {reason}"
-
-
-def run_compare(first: Path, second: Path, show_all: bool, output: Path | None) -> bool:
-    """Show what changed; returns whether anything got worse.
-
-    Raises InputError where a path holds no runs, or the runs have nothing in common.
-    """
-    found = compare(first, second)
-    if output is not None:
-        write_tables(output, {"comparison": found.table})
-    print_comparison(found, show_all, output)
-    return found.worse
+            yield from (f"{name}, {line}" for line in draw_figure(data, figure, target).skipped)

@@ -148,10 +148,10 @@ def _inherit(slots: Slots, which: np.ndarray, ancestors: np.ndarray, generation:
             slots.count[s, m] = count[parent]
             if count[parent] > 0:
                 alive[i] = True
-                for i in range(3):
-                    slots.mean_m[s, m, i] = mean[parent, i]
-                for i in range(6):
-                    slots.covariance_m2[s, m, i] = covariance[parent, i]
+                for k in range(3):
+                    slots.mean_m[s, m, k] = mean[parent, k]
+                for k in range(6):
+                    slots.covariance_m2[s, m, k] = covariance[parent, k]
     return alive
 
 

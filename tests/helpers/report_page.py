@@ -5,7 +5,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 from experiments.judge import tables
-from experiments.show.report import write_report
+from experiments.show.report.document import write_report
 
 HOSTILE = '<img src=x onerror=alert(1)></script><script>alert("2")</script>'
 

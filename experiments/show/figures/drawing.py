@@ -5,7 +5,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 from pkgutil import iter_modules
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from matplotlib.figure import Figure
 
@@ -22,23 +22,19 @@ _DPI = {"png": 200, "svg": 150}
 
 
 class Drawn(NamedTuple):
-    """What became of one figure: its pictures, or why there are none, in one line."""
+    """The pictures written, and one line each which figures there is no data for, and why."""
 
     files: list[Path]
-    skipped: str = ""
+    skipped: list[str]
 
 
 def draw_all(
-    result: Path,
-    jobs: int = 2,
-    on_progress: Callable[[int, int], None] | None = None,
-    on_skip: Callable[[str], None] | None = None,
-) -> list[Path]:
+    result: Path, jobs: int = 2, on_progress: Callable[[int, int], None] | None = None
+) -> Drawn:
     """Draw all figures of a result folder into `RESULT/figures/`, in `jobs` processes.
 
-    `on_progress` is told (figures done, figures in all) after each, and `on_skip` in one line each
-    which figures the result holds no data for, and why. Returns the pictures written, in order;
-    raises InputError where a table is missing or damaged.
+    `on_progress` is told (figures done, figures in all) after each. Returns what was drawn in the
+    order of the figures; raises InputError where a table is missing or damaged.
     """
     outcomes: dict[str, Drawn] = {}
     with workers(jobs) as pool:
@@ -48,10 +44,9 @@ def draw_all(
             outcomes[name] = outcome
             if on_progress is not None:
                 on_progress(len(outcomes), len(FIGURES))
-    for name in FIGURES:
-        if on_skip is not None and outcomes[name].skipped:
-            on_skip(f"{name}: {outcomes[name].skipped}")
-    return [file for name in FIGURES for file in outcomes[name].files]
+    drawn = [outcomes[name] for name in FIGURES]
+    files = [file for each in drawn for file in each.files]
+    return Drawn(files, [line for each in drawn for line in each.skipped])
 
 
 def draw_figure(data: ResultTables, name: str, folder: Path | None = None) -> Drawn:
@@ -61,22 +56,22 @@ def draw_figure(data: ResultTables, name: str, folder: Path | None = None) -> Dr
     """
     module = importlib.import_module(f"experiments.show.figures.{name}")
     folder = folder or data.folder / "figures"
+    try:
+        return Drawn(save_figure(folder, name, module.draw, data), [])
+    except NothingToDraw as reason:
+        for kind in _DPI:
+            (folder / f"{name}.{kind}").unlink(missing_ok=True)
+        return Drawn([], [f"{name}: {reason}"])
+
+
+def save_figure(folder: Path, name: str, draw: Callable[..., Figure], *data: Any) -> list[Path]:
+    """Write the figure `draw(*data)`, in the house style, in all formats; returns the pictures."""
+    files = [folder / f"{name}.{kind}" for kind in _DPI]
     with house_style():
-        try:
-            return Drawn(save_figure(module.draw(data), folder, name))
-        except NothingToDraw as reason:
-            for kind in _DPI:
-                (folder / f"{name}.{kind}").unlink(missing_ok=True)
-            return Drawn([], str(reason))
-
-
-def save_figure(figure: Figure, folder: Path, name: str) -> list[Path]:
-    """Write a figure in all formats (inside `house_style`); returns the pictures."""
-    files = []
-    for kind in _DPI:
-        files.append(folder / f"{name}.{kind}")
-        write_whole(files[-1], lambda path, kind=kind: _save(figure, path, kind))
-        figure.set_layout_engine("none")  # as laid out for the first; once is enough
+        figure = draw(*data)
+        for file, kind in zip(files, _DPI, strict=True):
+            write_whole(file, lambda path, kind=kind: _save(figure, path, kind))
+            figure.set_layout_engine("none")  # as laid out for the first; once is enough
     return files
 
 

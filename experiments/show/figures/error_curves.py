@@ -52,7 +52,8 @@ def draw_error_curves(data: ResultTables, quantity: str, label: str) -> tuple[Fi
         Patch(color=BLUE, label=f"10-90 % of {over}", **_BAND_STYLE),
         Patch(label=f"< {ANSWERABLE_PAIRS} true pairs", **_SCARCE_STYLE),
     )
-    aligner_legend(figure, data.labels, data.styles, 4, explained)
+    looks = {label: data.styles[name] for name, label in data.labels.items()}
+    aligner_legend(figure, looks, 4, explained)
     return figure, drawn
 
 

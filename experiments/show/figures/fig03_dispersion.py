@@ -19,8 +19,6 @@ _RECENT_ITERATIONS = 50
 _GRID_COLUMNS = 6  # holds one, two or three panels of one width
 _LOWER_ROW_IN = 2.6
 _PLANE = ["x_m", "y_m"]
-
-
 Moments = tuple[str, int, int]  # a robot, and a wide and a tight iteration of it: A and B
 
 

@@ -35,8 +35,8 @@ def draw(data: ResultTables) -> Figure:
         axes.set(xlabel=label, yscale="log")
         axes.yaxis.set_major_formatter(plain_numbers())
     panels[0].set_ylabel("time of one alignment (s)")
-    shown = {name: text for name, text in data.labels.items() if name in timed or text != name}
-    aligner_legend(figure, shown, data.styles, columns=5)
+    shown = [(n, label) for n, label in data.labels.items() if n in timed or label != n]
+    aligner_legend(figure, {label: data.styles[name] for name, label in shown}, columns=5)
     return figure
 
 

@@ -27,11 +27,10 @@ def draw(data: ResultTables) -> Figure:
     parts = data.parents_and_fused(pairs.robots)
     for k, (name, marker, colour) in enumerate(parts):
         here, dashes = slice(k, k + 1), ("--", "-.", "-")[k]
-        plan.add_ellipses(
-            axes, position[here], covariance[here], edgecolors=colour, linestyles=dashes
-        )
+        look: dict[str, Any] = {"edgecolors": colour, "linestyles": dashes}
+        plan.add_ellipses(axes, position[here], covariance[here], **look)
         whose = "fused" if k == 2 else f"{name}'s"
-        look: dict[str, Any] = {"marker": marker, "markersize": 6, "linestyle": dashes}
+        look = {"marker": marker, "markersize": 6, "linestyle": dashes}
         axes.plot(*position[k, :2], color=colour, label=f"{whose} landmark $L_{'ijF'[k]}$", **look)
     own = pairs.own_covariance_m2[:, chosen]
     thin = {"edgecolors": [colour for *_, colour in parts[:2]], "linewidths": 0.6}

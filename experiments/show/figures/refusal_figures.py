@@ -1,6 +1,5 @@
 """Figure of the experiment `refusal`: false merges against missed merges, and the calibration."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,6 @@ from matplotlib.figure import Figure
 
 from experiments.judge.criteria import MERGEABLE_PAIRS, has_common_ground
 from experiments.show.figures import style
-from experiments.show.figures.drawing import save_figure
 from experiments.show.figures.style import BLACK, GRAY
 from experiments.study.refusal.cases import FEW, POSTER_RADII_M, POSTERS
 from experiments.study.refusal.refusal_rates import Rate, mergeable, swept, without_common_ground
@@ -19,14 +17,6 @@ _SUPPORT_OF = "ransac"  # whose plain number of inliers is swept for comparison
 _LEAST_DECADES = 0.5  # shares of zero are drawn so far below one in all pairs
 _THRESHOLDS = np.linspace(-100, 8, 500)  # on log10 of the false alarms
 _POSTER_COLOURS = (style.ORANGE, style.VERMILLION, style.PURPLE)
-
-
-def write(
-    folder: Path, refusals: pd.DataFrame, calibration: pd.DataFrame, false_alarms: float
-) -> list[Path]:
-    """Draw into `FOLDER/figures/refusal.png` and `.svg`; returns them."""
-    with style.house_style():
-        return save_figure(draw(refusals, calibration, false_alarms), folder / "figures", "refusal")
 
 
 def draw(refusals: pd.DataFrame, calibration: pd.DataFrame, false_alarms: float) -> Figure:
@@ -49,7 +39,9 @@ def draw(refusals: pd.DataFrame, calibration: pd.DataFrame, false_alarms: float)
 
 def _draw_curves(axes: Axes, refusals: pd.DataFrame) -> None:
     """ROC of each method as the threshold moves, and the point it works at."""
-    floor = np.array([_floor(of(refusals)) for of in (without_common_ground, mergeable)])
+    n_of_all = np.array([len(rows(refusals)) for rows in (without_common_ground, mergeable)])
+    n_pairs = np.maximum(n_of_all / refusals["aligner"].nunique(), 1)
+    floor = 10**-_LEAST_DECADES / n_pairs
     scored = refusals.assign(score=refusals["log10_false_alarms"])
     styles = style.aligner_styles(refusals["aligner"].unique().tolist())
     for name, own in scored.groupby("aligner", sort=False):
@@ -71,11 +63,6 @@ def _draw_sweep(axes: Axes, own: pd.DataFrame, floor: np.ndarray, **line: Any) -
     false = swept(without_common_ground(own)["score"], thresholds)
     found = swept(mergeable(own)["score"], thresholds)
     axes.plot(np.maximum(false, floor[0]), np.maximum(1 - found, floor[1]), **line)
-
-
-def _floor(rows: pd.DataFrame) -> float:
-    one_in_all = rows["aligner"].nunique() / max(len(rows), 1)
-    return one_in_all * 10**-_LEAST_DECADES
 
 
 def _draw_point(axes: Axes, own: pd.DataFrame, floor: np.ndarray, colour: str) -> None:

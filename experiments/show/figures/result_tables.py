@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping
 from functools import cached_property
+from itertools import cycle
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,8 +12,8 @@ import pandas as pd
 import pyarrow as pa
 
 from experiments.judge.judged_maps import methods_in
-from experiments.judge.tables import read, table_path
-from experiments.show.figures.style import FUSED_COLOUR, aligner_styles, robot_colours
+from experiments.judge.tables import ALL, read, table_path
+from experiments.show.figures.style import FUSED_COLOUR, ROBOT_COLOURS, aligner_styles
 from mapfusion.align.result import Status
 from mapfusion.errors import InputError
 from mapfusion.se2 import Float, between, inverse, transform_covariances, transform_points
@@ -61,6 +62,14 @@ class ResultTables:
             raise NothingToDraw(f"no run has a table {name}")
         return self._tables[name]
 
+    def has(self, name: str) -> bool:
+        """Whether there is a table of that name; older results lack some."""
+        return name in self._tables or table_path(self.folder, name).is_file()
+
+    def rows(self, name: str) -> pd.DataFrame:
+        """The table of that name; without rows where there is none."""
+        return self.table(name) if self.has(name) else ALL[name].empty_table().to_pandas()
+
     @cached_property
     def scenario(self) -> dict[str, Any]:
         """The resolved scenario."""
@@ -74,12 +83,13 @@ class ResultTables:
     @cached_property
     def colours(self) -> dict[str, str]:
         """Each robot's colour, in display order."""
-        return robot_colours(self.robots)
+        return dict(zip(self.robots, cycle(ROBOT_COLOURS), strict=False))
 
     @cached_property
     def pairs(self) -> list[Pair]:
         """Robot pairs that were aligned, in display order."""
-        return pairs_in(self.table("errors"))
+        pairs = self.table("errors")[["robot_a", "robot_b"]].drop_duplicates()
+        return list(pairs.itertuples(index=False, name=None))
 
     @cached_property
     def aligners(self) -> list[str]:
@@ -125,7 +135,7 @@ class ResultTables:
 
         Positions (N, 3), covariances (N, 3, 3), and these before the drift widened them.
         """
-        if not table_path(self.folder, "fused_motions").is_file():
+        if not self.has("fused_motions"):
             raise NothingToDraw("made before fused motions were stored: run it again")
         motions = self.table("fused_motions").set_index("robot").loc[robot]
         T_fused_robot = motions[["tx_m", "ty_m", "theta_rad"]].to_numpy(dtype=np.float64)
@@ -168,10 +178,8 @@ class ResultTables:
 
     def walls_in_frame_of(self, robot: str) -> list[Float]:
         """The walls' corner points, (n, 2) each, in a robot's map frame; none where unknown."""
-        T_world_map = self.start_pose(robot)
-        if T_world_map is None:
-            return []
-        return [transform_points(inverse(T_world_map), wall) for wall in self.walls]
+        start = self.start_pose(robot)
+        return [transform_points(inverse(start), wall) for wall in self.walls if start is not None]
 
     def true_alignment(self, pair: Pair) -> Float | None:
         """The true T_a_b (3,) of two map frames, or None where it is unknown."""
@@ -184,12 +192,6 @@ class ResultTables:
         return None if pose is None else np.array(pose, dtype=np.float64)
 
 
-def pairs_in(errors: pd.DataFrame) -> list[Pair]:
-    """Robot pairs in the order of their appearance."""
-    pairs = errors[["robot_a", "robot_b"]].drop_duplicates()
-    return list(pairs.itertuples(index=False, name=None))
-
-
 def of_pair(rows: pd.DataFrame, pair: Pair) -> pd.DataFrame:
     """The rows of one robot pair."""
     return rows[(rows["robot_a"] == pair[0]) & (rows["robot_b"] == pair[1])]
@@ -197,14 +199,18 @@ def of_pair(rows: pd.DataFrame, pair: Pair) -> pd.DataFrame:
 
 def positions_and_covariances(rows: pd.DataFrame) -> tuple[Float, Float]:
     """Positions (N, 3) and covariances (N, 3, 3) of rows with the columns of a map."""
-    columns = rows[POSITION_FIELDS + COVARIANCE_FIELDS]
-    return points_from(pa.Table.from_pandas(columns, preserve_index=False))
+    return points_from(pa.Table.from_pandas(rows[POSITION_FIELDS + COVARIANCE_FIELDS]))
 
 
 def _read_json(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        raise InputError(f"{path}: no such file (expected a result folder of `run`)")
+    return json_object(path.read_text(encoding="utf-8", errors="replace"), path)
+
+
+def json_object(text: str, where: Path) -> dict[str, Any]:
+    """What a text holds; raises InputError, which says where it stands, if that is no object."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file (expected a result folder of `run`)") from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read as JSON ({error})") from error
+        return {} | json.loads(text)
+    except (ValueError, TypeError) as error:  # of JSON, or of another value than an object
+        raise InputError(f"{where}: cannot be read as a JSON object ({error})") from error

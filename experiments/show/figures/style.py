@@ -21,7 +21,6 @@ PURPLE, ORANGE, SKY = "#CC79A7", "#E69F00", "#56B4E9"
 # Four of Tol's (2021) muted scheme, darker or duller than those, where more methods are compared.
 INDIGO, WINE, OLIVE, TEAL = "#332288", "#882255", "#999933", "#44AA99"
 BLACK, GRAY, PALE_GRAY = "#000000", "#7F7F7F", "#C8C8C8"
-SEQUENTIAL_MAP = "viridis"
 
 _RC: dict[str, Any] = {
     "font.family": "DejaVu Sans",  # comes with matplotlib: the same on every machine
@@ -60,19 +59,11 @@ _KNOWN_ALIGNERS: dict[str, tuple[Any, ...]] = {
 # All others (plug-ins, names of a scenario's own) by their place among themselves. The lengths have
 # no common factor, so 99 styles come before one repeats.
 _OTHER_COLOURS = (INDIGO, OLIVE, BLUE, WINE, TEAL, VERMILLION, SKY, ORANGE, PURPLE, GREEN, GRAY)
-_OTHER_DASHES = (
-    (0, (2, 2)),
-    (0, (9, 1, 2, 1)),
-    "-",
-    (0, (4, 1, 1, 1)),
-    (0, (1, 2)),
-    (0, (7, 3)),
-    (0, (5, 1, 1, 1, 1, 1, 1, 1)),
-    (0, (3, 3)),
-    (0, (10, 2, 4, 2)),
-)
+_DASHES_AND_GAPS = [(2, 2), (9, 1, 2, 1), (), (4, 1, 1, 1), (1, 2), (7, 3)]
+_DASHES_AND_GAPS += [(5, 1, 1, 1, 1, 1, 1, 1), (3, 3), (10, 2, 4, 2)]
+_OTHER_DASHES = [(0, lengths) if lengths else "-" for lengths in _DASHES_AND_GAPS]
 _OTHER_MARKERS = ("p", "h", "d", "8", "H", "1", "2", "3", "4")
-_ROBOT_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
+ROBOT_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
 FUSED_COLOUR = BLACK
 
 
@@ -90,29 +81,16 @@ def aligner_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Line style of each aligner: its own if it has one, else by its place among those without."""
     others = [name for name in names if name not in _KNOWN_ALIGNERS]
     looks = zip(cycle(_OTHER_COLOURS), cycle(_OTHER_DASHES), cycle(_OTHER_MARKERS), strict=False)
-    return {
-        name: {"color": colour, "linestyle": dashes, "marker": marker}
-        for name, (colour, dashes, marker) in (
-            *_KNOWN_ALIGNERS.items(),
-            *zip(others, looks, strict=False),
-        )
-    }
+    chosen = _KNOWN_ALIGNERS | dict(zip(others, looks, strict=False))
+    parts = ("color", "linestyle", "marker")
+    return {name: dict(zip(parts, look, strict=True)) for name, look in chosen.items()}
 
 
 def aligner_legend(
-    figure: Figure,
-    labels: Mapping[str, str],
-    styles: Mapping[str, dict[str, Any]],
-    columns: int,
-    others: Sequence[Artist] = (),
+    figure: Figure, looks: Mapping[str, dict[str, Any]], columns: int, others: Sequence[Artist] = ()
 ) -> None:
-    """Put a legend of aligners, by their labels, and what else it explains above a figure."""
-    lines = [Line2D([], [], label=text, **styles[name]) for name, text in labels.items()]
+    """Put a legend of aligners, styles by label, and what else it explains above a figure."""
+    lines = [Line2D([], [], label=label, **look) for label, look in looks.items()]
     handles = [*lines, *others]
     place = {"loc": "outside upper center", "ncols": min(len(handles), columns)}
     figure.legend(handles=handles, handlelength=3.2, **place)
-
-
-def robot_colours(names: Sequence[str]) -> dict[str, str]:
-    """Colour of each robot by its place in the display order."""
-    return dict(zip(names, cycle(_ROBOT_COLOURS), strict=False))

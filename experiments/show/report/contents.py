@@ -11,7 +11,7 @@ import pandas as pd
 from PIL import Image
 from ruamel.yaml import YAML
 
-from experiments.judge import metrics, tables
+from experiments.judge import metrics
 from experiments.judge.criteria import that_ever_meet
 from experiments.judge.expectations import Outcome
 from experiments.judge.judged_maps import methods_in, setting_columns
@@ -19,11 +19,10 @@ from experiments.judge.path_errors import path_rms
 from experiments.judge.result import require_result
 from experiments.scenario.settings import Bound
 from experiments.show.figures.drawing import FIGURES
-from experiments.show.figures.result_tables import ResultTables, of_pair, pairs_in
+from experiments.show.figures.result_tables import Pair, ResultTables, of_pair
 from experiments.show.figures.style import aligner_styles
 from experiments.show.report.charts import error_curves, success_curves, time_curves
-from experiments.show.report.map_view import TABLES as MAP_TABLES
-from experiments.show.report.map_view import map_view
+from experiments.show.report.map_view import MAP_TABLES, map_view
 from experiments.show.report.origin import natural, provenance_of, stage_times
 from experiments.show.report.theme import chart_style
 from experiments.study.statistics.run_tables import find_runs
@@ -37,8 +36,7 @@ _TABLES = tuple(dict.fromkeys((*MAP_TABLES, *metrics.USED_TABLES, "timings")))
 def contents_of(path: Path) -> dict[str, Any]:
     """What the report of a result folder, or of a sweep, shows.
 
-    Raises:
-        InputError: neither, or a table is damaged.
+    Raises InputError where the path is neither, or a table is damaged.
     """
     runs = find_runs(path)
     if not runs.sweeps:
@@ -49,7 +47,8 @@ def contents_of(path: Path) -> dict[str, Any]:
     if runs.sweeps:
         own, groups = _of_sweep(path, maps), _by_configuration(reduced.medians)
     else:
-        own, groups = _of_result(ResultTables(path)), _by_robots(runs.read("errors"))
+        data = ResultTables(path)
+        own, groups = _of_result(data), _by_robots(runs.read("errors"), data.pairs)
     aligners = methods_in(maps, oracle=True)
     styles = aligner_styles(aligners)
     timings = runs.read("aligner_timings") if runs.has("aligner_timings") else pd.DataFrame()
@@ -96,44 +95,36 @@ def _by_configuration(spread: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]
 
 def _of_result(data: ResultTables) -> dict[str, Any]:
     """Title and sections of a result; what builds on tables that it does not hold is empty."""
-    held = {
-        name: data.table(name) for name in _TABLES if tables.table_path(data.folder, name).is_file()
-    }
     return {
         "title": f"{data.scenario['name']}, seed {data.scenario['seed']}",
         "description": data.scenario.get("description", ""),
         "spread_text": "repetitions on the same maps",
-        "map": map_view(data, held),
+        "map": map_view(data),
         "robot_colours": data.colours,
-        "outcomes": _outcomes(data.scenario, held),
-        "robots": path_rms(held["robots"]).to_dict("records") if "robots" in held else [],
-        "fits": held["map_fits"].to_dict("records") if "map_fits" in held else [],
+        "outcomes": list(_outcomes(data)),
+        "robots": path_rms(data.table("robots")).to_dict("records"),
+        "fits": data.rows("map_fits").to_dict("records"),
         "figures": list(_pictures(data.folder)),
         "scenario_text": _as_yaml(data.scenario),
-        "missing": [name for name in _TABLES if name not in held],
+        "missing": [name for name in _TABLES if not data.has(name)],
     }
 
 
-def _by_robots(errors: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
+def _by_robots(errors: pd.DataFrame, pairs: list[Pair]) -> Iterator[tuple[str, pd.DataFrame]]:
     """Errors of each pair of robots, and of all together, with a label each."""
-    pairs = pairs_in(errors)
     for a, b in pairs:
         yield f"{a} – {b}", of_pair(errors, (a, b))
     if len(pairs) > 1:
         yield "all pairs", errors
 
 
-def _outcomes(scenario: dict[str, Any], held: dict[str, pd.DataFrame]) -> list[Outcome]:
+def _outcomes(data: ResultTables) -> Iterator[Outcome]:
     """The scenario's expectations, measured on this run alone."""
-    if not set(metrics.USED_TABLES) <= set(held):
-        return []
-    used = {name: held[name].assign(seed=0) for name in metrics.USED_TABLES}
-    outcomes = []
-    for metric, bound in scenario.get("expect", {}).items():
-        value = metrics.compute(metric, used)
-        limits = Bound.model_validate(bound)
-        outcomes.append(Outcome(scenario["name"], metric, value, limits, {0: value}))
-    return outcomes
+    if all(map(data.has, metrics.USED_TABLES)):
+        used = {name: data.table(name).assign(seed=0) for name in metrics.USED_TABLES}
+        for metric, bound in data.scenario.get("expect", {}).items():
+            value, limits = metrics.compute(metric, used), Bound.model_validate(bound)
+            yield Outcome(data.scenario["name"], metric, value, limits, {0: value})
 
 
 def _pictures(folder: Path) -> Iterator[dict[str, Any]]:

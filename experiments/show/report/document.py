@@ -3,7 +3,6 @@
 import base64
 import hashlib
 import math
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -11,33 +10,29 @@ import jinja2
 
 from experiments.judge import criteria, tables
 from experiments.show import numbers
+from experiments.show.export import write_text
 from experiments.show.report.contents import contents_of
 from experiments.show.report.theme import css_name, palette
 from experiments.study.statistics.error_bands import BAND
-from mapfusion.storage import write_whole
 
-_PACKAGE = "experiments.show.report"
+_PAGE = Path(__file__).parent / "page"
 _DRAWN_BY_SCRIPTS = ("aligners", "groups", "success", "times", "map")
 
 
 def write_report(path: Path, output: Path | None = None) -> Path:
     """Write the report of a folder of `run` or `sweep`, from it alone; returns the file.
 
-    By default that is `report.html` in the folder.
-
-    Raises:
-        InputError: the folder is neither, or a table is damaged.
+    By default that is `report.html` in the folder. Raises InputError as `contents_of` does.
     """
-    text = _render(contents_of(path))
     target = path / "report.html" if output is None else output
-    write_whole(target, lambda file: file.write_text(text, encoding="utf-8"))
+    write_text(target, _render(contents_of(path)))
     return target
 
 
 def templates() -> jinja2.Environment:
     """The page's templates; all names that they show are escaped."""
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader(_PACKAGE, "page"),
+        loader=jinja2.FileSystemLoader(_PAGE),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
@@ -56,9 +51,12 @@ def _render(contents: dict[str, Any]) -> str:
     """
     from plotly.offline import get_plotlyjs
 
-    script = "\n".join(map(_page_file, ("base.js", "map.js")))
-    plotly, charts = get_plotlyjs(), _page_file("charts.js")
-    digests = [hashlib.sha256(text.encode()).digest() for text in (script, plotly, charts)]
+    style, base, map_view, charts = (
+        (_PAGE / name).read_text(encoding="utf-8")
+        for name in ("report.css", "base.js", "map.js", "charts.js")
+    )
+    scripts = {"script": f"{base}\n{map_view}", "plotly": get_plotlyjs(), "charts": charts}
+    digests = [hashlib.sha256(text.encode()).digest() for text in scripts.values()]
     robots, aligners = contents["robot_colours"], contents["aligners"]
     data = {name: contents[name] for name in _DRAWN_BY_SCRIPTS} | {
         "min_true_pairs": criteria.ANSWERABLE_PAIRS,
@@ -66,18 +64,11 @@ def _render(contents: dict[str, Any]) -> str:
     }
     template = templates().get_template("report.html.j2")
     return template.render(
-        contents,
+        contents | scripts,
         data=data,
         style_of={style["name"]: style for style in aligners},
         palette=palette([*(style["hex"] for style in aligners), *robots.values()]),
         band=BAND,
-        style=_page_file("report.css"),
-        script=script,
-        plotly=plotly,
-        charts=charts,
+        style=style,
         script_hashes=[base64.b64encode(digest).decode() for digest in digests],
     )
-
-
-def _page_file(name: str) -> str:
-    return (resources.files(_PACKAGE) / "page" / name).read_text(encoding="utf-8")

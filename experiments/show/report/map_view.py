@@ -11,15 +11,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from experiments.judge.tables import ALL
 from experiments.run.estimates import inlier_mask
 from experiments.show.figures.floor_plan import LEVEL_TEXT, semi_axes
 from experiments.show.figures.result_tables import Pair, ResultTables, of_pair
 from experiments.show.report.charts import rounded, thinned
 from mapfusion.se2 import Float
 
-TABLES = ("map_history", "true_pairs", "clouds", "paths")
-TABLES += ("correspondences", "fused_history", "estimates")
+MAP_TABLES = ("map_history", "true_pairs", "clouds", "paths")
+MAP_TABLES += ("correspondences", "fused_history", "estimates")
 MAX_BYTES = 4_000_000  # of the block: with Plotly and the pictures the report stays under 15 MB
 _FINEST_STEP_M = 0.001  # a screen never shows a millimetre of a map
 # Semi-axes from 1 mm to 100 m: 255 steps of 4.6 % each, which no eye tells apart.
@@ -27,11 +26,10 @@ ELLIPSE_MIN_M, ELLIPSE_MAX_M = 1e-3, 100.0
 _COVARIANCE = ["cov_xx_m2", "cov_xy_m2", "cov_xy_m2", "cov_yy_m2"]
 _NO_LANDMARKS = {"at": [0, 0], "ellipses": [0, 0]}
 _ANSWER = ["aligner", "iteration", "repetition"]
-_STAGES = {"estimated": "", "refined": "refined_"}
+_STAGES = (("estimated", ""), ("refined", "refined_"))
 _MOTION = ("tx_m", "ty_m", "theta_rad")
 _ERROR = ("translation_error_m", "rotation_error_rad")
 
-Tables = dict[str, pd.DataFrame]
 Json = dict[Any, Any]
 
 
@@ -45,21 +43,17 @@ def packed_ellipses(covariance_m2: Float) -> np.ndarray:
     return np.stack(columns, -1).round().astype(np.int64).astype(np.uint8)  # 256 wraps to 0
 
 
-def map_view(data: ResultTables, tables: Tables) -> Json | None:
-    """Index and block (in base64) of the map view; None where the result keeps no maps.
-
-    `tables` are those of TABLES that the result holds.
-    """
-    if not {"map_history", "true_pairs"} <= set(tables) or not data.pairs:
+def map_view(data: ResultTables) -> Json | None:
+    """Index and block (in base64) of the map view; None where the result keeps no maps."""
+    if not (data.has("map_history") and data.has("true_pairs") and data.pairs):
         return None
-    view = _View(data, {name: ALL[name].empty_table().to_pandas() for name in TABLES} | tables)
-    starts = {robot: data.start_pose(robot) for robot in data.robots}
+    view = _View(data)
     return {
         "level": LEVEL_TEXT,
         "ellipse_m": [ELLIPSE_MIN_M, ELLIPSE_MAX_M],
         "robots": {name: view.robot(name) for name in data.robots},
         "pairs": [view.pair(pair) for pair in data.pairs],
-        "starts": {robot: _pose(start) for robot, start in starts.items()},
+        "starts": {robot: _pose(data.start_pose(robot)) for robot in data.robots},
         "walls": [[rounded(point) for point in wall] for wall in data.walls],
         "index_bytes": view.index_type.itemsize,
         "merge_aligner": data.scenario.get("merge", {}).get("aligner", ""),
@@ -71,11 +65,10 @@ def map_view(data: ResultTables, tables: Tables) -> Json | None:
 class _View:
     """Packs robots and pairs of robots into one block, one after the other."""
 
-    def __init__(self, data: ResultTables, tables: Tables) -> None:
+    def __init__(self, data: ResultTables) -> None:
         self.block = bytearray()
         self._data = data
-        self._tables = tables
-        history, true_pairs = tables["map_history"], tables["true_pairs"]
+        history, true_pairs = data.table("map_history"), data.table("true_pairs")
         iterations = np.unique(true_pairs["iteration"])
         bytes_in_all = 7 * len(history) + 5 * int(true_pairs["n_correspondences"].sum())
         n_affordable = int(len(iterations) * MAX_BYTES / max(bytes_in_all, 1))
@@ -86,7 +79,7 @@ class _View:
         self._step_m = {name: self._finest_step(name) for name in data.robots}
 
     def _of_robot(self, table: str, robot: str) -> pd.DataFrame:
-        rows = self._tables[table]
+        rows = self._data.rows(table)
         return rows[rows["robot"] == robot]
 
     def _finest_step(self, robot: str) -> float:
@@ -151,11 +144,9 @@ class _View:
 
     def pair(self, pair: Pair) -> Json:
         """Correspondences, fused landmarks and alignments of two robots, iteration by iteration."""
-        judged = of_pair(self._tables["true_pairs"], pair).set_index("iteration")
-        offered, fused = (
-            _by_iteration(of_pair(self._tables[name], pair))
-            for name in ("correspondences", "fused_history")
-        )
+        judged = of_pair(self._data.rows("true_pairs"), pair).set_index("iteration")
+        offered = _by_iteration(of_pair(self._data.rows("correspondences"), pair))
+        fused = _by_iteration(of_pair(self._data.rows("fused_history"), pair))
         frames = []
         for place, k in enumerate(self._shown.tolist()):
             if k not in judged.index:
@@ -181,11 +172,10 @@ class _View:
 
     def _alignments(self, pair: Pair, iterations: list[int]) -> dict[str, list[Json | None]]:
         """By aligner and iteration: the first repetition's motion, as estimated and refined."""
-        estimates = of_pair(self._tables["estimates"], pair)
+        estimates = of_pair(self._data.rows("estimates"), pair)
         errors = of_pair(self._data.table("errors"), pair)
-        new = [name for name in errors if name in _ANSWER or name not in estimates]
-        joined = estimates[estimates["repetition"] == 0].merge(errors[new], on=_ANSWER)
-        rows = joined.to_dict("records")
+        first = estimates[estimates["repetition"] == 0]
+        rows = first.merge(errors, on=_ANSWER, suffixes=("", "_of_error")).to_dict("records")
         found = {(row["aligner"], row["iteration"]): _alignment(row) for row in rows}
         return {
             name: [found.get((name, k)) for k in iterations]
@@ -205,13 +195,13 @@ def _pose(pose: Float | None) -> list[float | None] | None:
 def _alignment(row: Json) -> Json:
     """A row of `estimates` joined with that of `errors`."""
     reasons = (row["refined_reason"], row["reason"], row["acceptance_reason"])
-    found: Json = {
+    motion, error = (
+        {stage: rounded([row[f"{prefix}{name}"] for name in names]) for stage, prefix in _STAGES}
+        for names in (_MOTION, _ERROR)
+    )
+    return motion | {
         "accepted": bool(row["accepted"]),
         "status": str(row["refined_status"]),
         "reason": next((str(reason) for reason in reasons if reason), ""),
-        "error": {},
+        "error": error,
     }
-    for stage, prefix in _STAGES.items():
-        found[stage] = rounded([row[f"{prefix}{name}"] for name in _MOTION])
-        found["error"][stage] = rounded([row[f"{prefix}{name}"] for name in _ERROR])
-    return found

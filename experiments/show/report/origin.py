@@ -1,13 +1,12 @@
 """Where a report's numbers come from: runs, versions, stages and their times."""
 
-import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from experiments.show.figures.result_tables import json_object
 from experiments.study.statistics.run_tables import Runs, setting_columns
-from mapfusion.errors import InputError
 
 _SOURCE_DIGITS = 16
 
@@ -23,11 +22,8 @@ def natural(text: object) -> tuple[float, str]:
 def provenance_of(path: Path, runs: Runs) -> tuple[dict[str, str], list[str]]:
     """Seeds, settings, versions, renderer and sources of the finished runs; all where they differ.
 
-    Returns:
-        Texts by name, and the keys of the stages of a single run.
-
-    Raises:
-        InputError: a description is damaged.
+    Texts by name, and the keys of the stages of a single run; raises InputError where a
+    description is damaged.
     """
     found: dict[str, dict[str, None]] = {}
     stages: list[str] = []
@@ -58,17 +54,10 @@ def _descriptions(path: Path, runs: Runs) -> Iterator[dict[str, Any]]:
                 "settings": {name: row[name] for name in setting_columns(rows)},
                 "renderer": row["renderer"],
                 "source_hash": str(row["source_hash"])[:_SOURCE_DIGITS],
-                "libraries": _json_object(str(row["libraries"]), path / "runs"),
+                "libraries": json_object(str(row["libraries"]), path / "runs"),
             }
     elif not runs.sweeps and file.is_file():
-        yield _json_object(file.read_text(encoding="utf-8", errors="replace"), file)
-
-
-def _json_object(text: str, where: Path) -> dict[str, Any]:
-    try:
-        return {} | json.loads(text)
-    except (ValueError, TypeError) as error:  # of JSON, or of another value than an object
-        raise InputError(f"{where}: cannot be read as a JSON object ({error})") from error
+        yield json_object(file.read_text(encoding="utf-8", errors="replace"), file)
 
 
 def _flat(described: dict[str, Any]) -> Iterator[tuple[str, str]]:

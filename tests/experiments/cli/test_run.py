@@ -268,7 +268,7 @@ def test_run_shows_the_aligners(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("experiments.show.figures.draw_all", lambda *_: [])  # drawn in other tests
+    monkeypatch.setattr("experiments.show.figures.drawing.FIGURES", ())  # drawn in other tests
     reply = command(capsys, "run", tiny_path, "--jobs", 1, "--results", tiny_results)
     assert reply.code == 0
     assert all(name in reply.out for name in ("ransac", "svd", "icp", "oracle", "R1", "R2"))
@@ -296,7 +296,7 @@ def test_runs_with_little_to_go_on(
     overrides: list[str],
 ) -> None:
     if name == "nothing alike":  # differs from a usual run in its tables alone
-        monkeypatch.setattr("experiments.show.figures.draw_all", lambda *_: [])
+        monkeypatch.setattr("experiments.show.figures.drawing.FIGURES", ())
     path = tmp_path / "tiny.yaml"
     path.write_text(TINY, encoding="utf-8")
     changes = [part for override in overrides for part in ("--set", override)]

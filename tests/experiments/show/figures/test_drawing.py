@@ -11,8 +11,8 @@ import pandas as pd
 import pytest
 
 from experiments.judge import tables
-from experiments.show.figures import draw_all, drawing
-from experiments.show.figures.drawing import FIGURES, draw_figure
+from experiments.show.figures import drawing
+from experiments.show.figures.drawing import FIGURES, draw_all, draw_figure
 from experiments.show.figures.fig03_dispersion import choose_moments, spread_over_time
 from experiments.show.figures.result_tables import ResultTables
 from experiments.show.figures.style import aligner_styles, house_style
@@ -26,8 +26,8 @@ def change(folder: Path, name: str, rows: pd.DataFrame) -> None:
 
 
 def test_all_figures_are_drawn(trio_copy: Path) -> None:
-    done, skipped = [], []
-    files = draw_all(trio_copy, 1, lambda n, total: done.append((n, total)), skipped.append)
+    done = []
+    files, skipped = draw_all(trio_copy, 1, lambda n, total: done.append((n, total)))
     assert [file.name for file in files] == [
         f"{name}.{kind}" for name in FIGURES for kind in ("png", "svg")
     ]
@@ -66,8 +66,7 @@ def test_users_settings_come_back() -> None:
 
 
 def skipped_figures(folder: Path) -> dict[str, str]:
-    lines: list[str] = []
-    files = draw_all(folder, 1, None, lines.append)
+    files, lines = draw_all(folder, 1)
     reasons = dict(line.split(": ", 1) for line in lines)
     assert not any("\n" in line for line in lines)
     drawn = {file.stem for file in files}
@@ -130,8 +129,8 @@ def test_damaged_key_frame_is_an_error_that_names_the_file(trio_copy: Path) -> N
 
 def test_workers_draw_the_same_pictures(trio_copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(drawing, "FIGURES", ("fig08_fused_landmark", "fig10_fused_map"))
-    alone = {file: file.read_bytes() for file in draw_all(trio_copy, 1)}
-    assert {file: file.read_bytes() for file in draw_all(trio_copy, 2)} == alone
+    alone = {file: file.read_bytes() for file in draw_all(trio_copy, 1).files}
+    assert {file: file.read_bytes() for file in draw_all(trio_copy, 2).files} == alone
 
 
 KNOWN = ["ransac", "svd", "svd-solved", "icp", "impicp", "gnc", "clique", "ransac_mahalanobis"]

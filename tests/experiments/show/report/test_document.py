@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from experiments.judge import tables
-from experiments.show.report import write_report
+from experiments.show.report.document import write_report
 from tests.helpers.report_page import HOSTILE, Page, hostile, page_of
 from tests.helpers.tiny_scenario import command
 

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from experiments.judge.tables import table_path
 from experiments.show.figures.floor_plan import semi_axes
 from experiments.show.figures.result_tables import ResultTables, of_pair
 from experiments.show.report import map_view as module
 from experiments.show.report.map_view import (
     ELLIPSE_MAX_M,
     ELLIPSE_MIN_M,
-    TABLES,
     map_view,
     packed_ellipses,
 )
@@ -30,7 +30,7 @@ def view(data: ResultTables) -> dict[str, Any]:
 
 
 def view_of(data: ResultTables) -> dict[str, Any]:
-    found = map_view(data, {name: data.table(name) for name in TABLES})
+    found = map_view(data)
     assert found is not None
     return found
 
@@ -86,5 +86,6 @@ def test_too_many_iterations_are_thinned_and_the_last_stays(
     assert len(thinned["block"]) < len(whole["block"])
 
 
-def test_without_histories_there_is_no_map(data: ResultTables) -> None:
-    assert map_view(data, {"paths": data.table("paths")}) is None
+def test_without_histories_there_is_no_map(trio_copy: Path) -> None:
+    table_path(trio_copy, "map_history").unlink()
+    assert map_view(ResultTables(trio_copy)) is None

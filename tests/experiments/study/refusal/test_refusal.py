@@ -12,7 +12,8 @@ import pytest
 
 from experiments.judge.result import run_scenario
 from experiments.scenario.settings import Simulation
-from experiments.show.figures.refusal_figures import write
+from experiments.show.figures.drawing import save_figure
+from experiments.show.figures.refusal_figures import draw
 from experiments.study.refusal import cases
 from experiments.study.refusal import refusal_trial as results
 from experiments.study.refusal.calibration import (
@@ -274,7 +275,8 @@ def test_worlds_of_one_name_are_refused(
 
 def test_the_figure_is_the_same_bytes(tmp_path: Path) -> None:
     calibration = calibrate(Acceptance(), np.random.default_rng(0), n_pairs=20)
-    first = write(tmp_path / "a", TABLE, calibration, 1e-3)
-    second = write(tmp_path / "b", TABLE, calibration, 1e-3)
+    data = (TABLE, calibration, 1e-3)
+    first = save_figure(tmp_path / "a", "refusal", draw, *data)
+    second = save_figure(tmp_path / "b", "refusal", draw, *data)
     for one, other in zip(first, second, strict=True):
         assert one.read_bytes() == other.read_bytes()

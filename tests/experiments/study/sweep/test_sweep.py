@@ -86,7 +86,7 @@ def test_a_run_of_the_sweep_is_the_same_as_the_run_alone(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr("experiments.show.figures.draw_all", lambda *_: [])
+    monkeypatch.setattr("experiments.show.figures.drawing.FIGURES", ())
     arguments = ("--set", "slam.filter.n_particles=5", "--set", "align.repetitions=1")
     reply = command(
         capsys, "run", short_path, "--seed", 1, *arguments, "--jobs", 1, "--results", tmp_path
