@@ -23,7 +23,7 @@ from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import AlignerEntry
 from experiments.study.benchmark.synthetic_pairs import true_pairs_of
 from experiments.study.benchmark.trials import CELL, TRIALS, TRIALS_FILE, CellSettings, run_cell
-from experiments.study.statistics.wilson import wilson
+from experiments.study.statistics.intervals import wilson
 from mapfusion.align.result import NOT_RUN, Status
 from mapfusion.errors import InputError
 from mapfusion.storage import schema

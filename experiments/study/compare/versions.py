@@ -17,7 +17,7 @@ from experiments.study.statistics.better import (
     holm,
     mean_change,
 )
-from experiments.study.statistics.bootstrap import MAPS_OF_ONE_RUN, RUN
+from experiments.study.statistics.intervals import MAPS_OF_ONE_RUN, RUN
 from experiments.study.statistics.run_tables import RunPath, Runs, find_runs
 from mapfusion.errors import InputError
 

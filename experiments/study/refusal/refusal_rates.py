@@ -8,7 +8,7 @@ import pandas as pd
 from experiments.judge import criteria
 from experiments.judge.criteria import has_common_ground, right_refined
 from experiments.study.refusal.cases import APART, COMMON, FEW, POSTER_RADII_M, POSTERS
-from experiments.study.statistics.wilson import wilson
+from experiments.study.statistics.intervals import wilson
 from mapfusion.se2 import Float
 
 

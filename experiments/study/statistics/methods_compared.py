@@ -10,7 +10,7 @@ import pandas as pd
 from experiments.judge.criteria import ORACLE, rich
 from experiments.judge.judged_maps import MAP_PAIR, methods_in
 from experiments.study.statistics.better import change_of_each_run, holm, log_ratio, mean_change
-from experiments.study.statistics.bootstrap import (
+from experiments.study.statistics.intervals import (
     RUN,
     Interval,
     WeightedMedian,
@@ -79,11 +79,11 @@ def compare_methods(
     rows = []
     for first, second in combinations(methods_in(rich(maps)), 2):
         known = frame[[first, second]].notna().all(axis=1).to_numpy()
-        both, codes = frame[known], clusters.codes[known]
+        both, judged = frame[known], clusters._replace(codes=clusters.codes[known])
         change = log_ratio(both[first].to_numpy(), both[second].to_numpy())
-        ratio = percentile_interval(WeightedMedian(change, codes), clusters.n, rng)
+        ratio = percentile_interval(WeightedMedian(change, judged.codes), judged.n, rng)
         won = (change < 0) + 0.5 * (change == 0)
-        wins = weighted_mean_interval(won, np.ones(len(won)), codes, clusters.n, rng)
+        wins = weighted_mean_interval(won, np.ones(len(won)), judged, rng)
         row: dict[str, Any] = {"first": first, "second": second}
         row |= {"n_runs": both["run_id"].nunique(), "n_maps": len(both), "unit": clusters.unit}
         row |= Interval(*np.exp(ratio)).columns("ratio") | wins.columns("first_wins")

@@ -1,9 +1,8 @@
 """All tables of statistics over some runs, by name."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -47,8 +46,7 @@ _FURTHER: dict[str, tuple[Any, str, Callable[..., pd.DataFrame], str]] = {
 }
 
 
-@dataclass(frozen=True)
-class Summary:
+class Summary(NamedTuple):
     """Statistics over some runs.
 
     Attributes:
@@ -64,7 +62,7 @@ class Summary:
     run_medians: pd.DataFrame
     timings: pd.DataFrame
     missing: tuple[str, ...]
-    failed: pd.DataFrame = field(default_factory=pd.DataFrame)
+    failed: pd.DataFrame
 
     @property
     def n_configurations(self) -> int:
@@ -76,8 +74,8 @@ class Summary:
 def configurations(frame: pd.DataFrame) -> Iterator[tuple[dict[str, Any], pd.DataFrame]]:
     """Labels and rows by scenario and settings; also of all scenarios, if several."""
     names = ["scenario", *setting_columns(frame)]
-    several = len(frame["scenario"].unique()) > 1
-    for each in [frame, *([frame.assign(scenario=ALL_SCENARIOS)] if several else [])]:
+    pooled = frame.assign(scenario=ALL_SCENARIOS)
+    for each in [frame, pooled] if len(frame["scenario"].unique()) > 1 else [frame]:
         for keys, rows in each.groupby(names, sort=False, dropna=False):
             yield dict(zip(names, keys, strict=True)), rows
 
@@ -91,19 +89,18 @@ def summarise(runs: Runs) -> Summary:
     made["methods_compared"] = _each(maps, compare_methods, "paired")
     made["errors_by_iteration"] = _each(medians, _error_bands)
     timings = pd.DataFrame()
-    there = {name: how for name, how in _FURTHER.items() if runs.has(name)}
-    for table, (columns, name, made_of, seed) in there.items():
-        rows = runs.read(table, columns)
-        before = [made[name]] if name in made else []
-        made[name] = pd.concat([*before, _each(rows, made_of, seed)], ignore_index=True)
-        timings = rows if table == "aligner_timings" else timings
+    missing = tuple(table for table in _FURTHER if not runs.has(table))
+    for table, (columns, name, made_of, seed) in _FURTHER.items():
+        if table not in missing:
+            rows = runs.read(table, columns)
+            parts = [made.get(name), _each(rows, made_of, seed)]
+            made[name] = pd.concat(parts, ignore_index=True)
+            timings = rows if table == "aligner_timings" else timings
     made = {name: table for name, table in made.items() if len(table)}
-    missing = tuple(name for name in _FURTHER if name not in there)
     return Summary(len(runs.names), made, medians, timings, missing, runs.failed)
 
 
-@dataclass(frozen=True)
-class ReducedErrors:
+class ReducedErrors(NamedTuple):
     """The errors of some runs, read and reduced run by run to `maps_of` and `medians_of_run`.
 
     The absent aligners are those whose package is not installed, which is no failure.
@@ -116,20 +113,18 @@ class ReducedErrors:
 
 def reduced_errors(runs: Runs) -> ReducedErrors:
     """All that statistics, figures and reports say of errors starts from these rows."""
-    maps, medians = [], []
-    every: dict[str, None] = {}
+    maps, medians, every = [], [], []
     for whole in runs.each("errors", NEEDED, ("status", *OPTIONAL)):
-        every |= dict.fromkeys(whole["aligner"])
+        every += whole["aligner"].unique().tolist()
         errors = whole[whole["status"] != Status.ABSENT]
         if len(errors):
             maps.append(maps_of(errors))
             medians.append(medians_of_run(errors))
     if not maps:  # robots that were alone
         nothing = pd.DataFrame(columns=["run_id", "scenario", "aligner"])
-        return ReducedErrors(nothing, nothing, list(every))
+        return ReducedErrors(nothing, nothing, list(dict.fromkeys(every)))
     joined = with_overlap_share(pd.concat(maps, ignore_index=True), runs)
-    there = set(joined["aligner"])
-    absent = [name for name in every if name not in there]
+    absent = [name for name in dict.fromkeys(every) if name not in set(joined["aligner"])]
     return ReducedErrors(joined, pd.concat(medians, ignore_index=True), absent)
 
 

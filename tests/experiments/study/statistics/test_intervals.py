@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binomtest
 
-from experiments.study.statistics.wilson import effective_trials, wilson
+from experiments.study.statistics.intervals import effective_trials, wilson
 
 
 @given(
