@@ -4,6 +4,7 @@ Only what both have counts: the same scenario, seed and settings, robot pair, it
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -26,6 +27,7 @@ from experiments.study.statistics.better import log_ratio
 from experiments.study.statistics.error_bands import ROBOT_PAIR
 from experiments.study.statistics.run_tables import Runs, match_names
 
+_ROBOT = ("run_id", "robot")
 _KEYS = (*MAP_PAIR, "aligner", "robot", "map")
 _NEES, _REFINED = "nees_with_drift", "refined_translation_error_m"
 _EACH = "each method"
@@ -61,7 +63,9 @@ def all_values(a: Runs, b: Runs) -> Iterator[tuple[Quantity, str, pd.DataFrame]]
             of = method if method in ("", ORACLE) else _EACH
             for quantity in _QUANTITIES:
                 if (quantity.table, quantity.of) == (table, of):
-                    yield quantity, method, _changes(quantity, own)
+                    values = _changes(quantity, own)
+                    if len(values):
+                        yield quantity, method, values
 
 
 def _joined(a: Runs, b: Runs, table: str) -> pd.DataFrame:
@@ -106,10 +110,6 @@ def _maps_over_oracle(errors: pd.DataFrame) -> pd.DataFrame:
     return maps.assign(over_oracle=maps[_REFINED] / reference)
 
 
-def _path_rms(robots: pd.DataFrame) -> pd.DataFrame:
-    return path_rms(robots, ("run_id", "robot"))
-
-
 def _nees_per_dof(fusion: pd.DataFrame) -> pd.DataFrame:
     true = fusion[fusion["true_pair"]]
     per_dof = true.assign(nees=true[_NEES] / true["degrees_of_freedom"])
@@ -117,10 +117,9 @@ def _nees_per_dof(fusion: pd.DataFrame) -> pd.DataFrame:
 
 
 # What is read of each table, what older runs may lack of it, and how a run's rows are reduced.
-_Reduce = Callable[[pd.DataFrame], pd.DataFrame]
-_READ: dict[str, tuple[Sequence[str], Sequence[str], _Reduce]] = {
+_READ: dict[str, tuple[Sequence[str], Sequence[str], Callable[..., pd.DataFrame]]] = {
     "errors": (NEEDED, OPTIONAL, _maps_over_oracle),
-    "robots": (["robot", "path_error_m", "odometry_error_m"], (), _path_rms),
+    "robots": (["robot", "path_error_m", "odometry_error_m"], (), partial(path_rms, by=_ROBOT)),
     "map_fits": (["map", "rmse_m"], (), pd.DataFrame),
     "fusion": ([*ROBOT_PAIR, "true_pair", _NEES, "degrees_of_freedom"], (), _nees_per_dof),
     "aligner_timings": ([*MAP_KEYS, "aligner", "elapsed_s"], (), pd.DataFrame),

@@ -10,13 +10,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.study.compare.version_values import Quantity, all_values
-from experiments.study.statistics.better import (
-    FEW_RUNS,
-    SIGNIFICANCE,
-    change_of_each_run,
-    holm,
-    mean_change,
-)
+from experiments.study.statistics import better
 from experiments.study.statistics.intervals import MAPS_OF_ONE_RUN, RUN
 from experiments.study.statistics.run_tables import RunPath, Runs, find_runs
 from mapfusion.errors import InputError
@@ -67,30 +61,27 @@ def compare(path_a: Path, path_b: Path) -> VersionComparison:
             f"the first has {_some(runs_a)}, the second {_some(runs_b)}"
         )
     unit = RUN if len(common) > 1 else MAPS_OF_ONE_RUN
-    rows = [
-        _judged(quantity, method, values, len(common))
-        for quantity, method, values in all_values(a, b)
-        if len(values)
-    ]
+    rows = [_judged(*each, len(common)) for each in all_values(a, b)]
     if not rows:
         raise InputError(f"{path_a} and {path_b}: their common runs have no rows in common")
     table = pd.DataFrame(rows)
-    table["p_holm"] = holm(table["p"].to_numpy())
+    table["p_holm"] = better.holm(table["p"].to_numpy())
     table["verdict"] = [_verdict(row) for row in table.to_dict("records")]
-    notes = [
-        *_differing_settings(a, b),
-        *_left_out(runs_a - runs_b, "first"),
-        *_left_out(runs_b - runs_a, "second"),
-        *_notes_on(table, unit, len(common)),
-    ]
+    notes = _differing_settings(a, b)
+    for names, which in ((runs_a - runs_b, "first"), (runs_b - runs_a, "second")):
+        if names:
+            runs = f"{len(names)} run{'s' * (len(names) > 1)} of the {which}"
+            notes.append(f"left out: {runs} that the other has not ({_some(names)})")
+    notes += _notes_on(table, unit, len(common))
     return VersionComparison(table.drop(columns=_NOT_SHOWN), unit, len(common), tuple(notes))
 
 
 def _judged(quantity: Quantity, method: str, values: pd.DataFrame, n_runs: int) -> dict[str, Any]:
     """One row of the table, verdict and correction apart."""
     is_share = quantity.scale == "share"
-    changes = change_of_each_run(values["change"].to_numpy(), values["run_id"], n_runs, is_share)
-    found = mean_change(changes)
+    of_maps, run_id = values["change"].to_numpy(), values["run_id"]
+    changes = better.change_of_each_run(of_maps, run_id, n_runs, is_share)
+    found = better.mean_change(changes)
     told = np.exp(found[:3]) if quantity.scale == "ratio" else found[:3]
     a, b = values[["a", "b"]].agg("mean" if is_share else "median")
     row = {"metric": quantity.metric, "method": method} | quantity._asdict() | {"a": a, "b": b}
@@ -107,16 +98,9 @@ def _verdict(row: dict[Any, Any]) -> str:
     change, least = row["change"], LEAST_CHANGE
     if row["scale"] == "ratio":
         change, least = np.log(change), np.log1p(least)
-    if np.isnan(row["p_holm"]) or row["p_holm"] > SIGNIFICANCE or abs(change) < least:
+    if not row["p_holm"] <= better.SIGNIFICANCE or abs(change) < least:
         return NOISE
     return BETTER if (change > 0) == row["higher_is_better"] else WORSE
-
-
-def _left_out(names: set[str], which: str) -> list[str]:
-    if not names:
-        return []
-    runs = "1 run" if len(names) == 1 else f"{len(names)} runs"
-    return [f"left out: {runs} of the {which} that the other has not ({_some(names)})"]
 
 
 def _some(names: set[str]) -> str:
@@ -131,10 +115,10 @@ def _notes_on(table: pd.DataFrame, unit: str, n_runs: int) -> list[str]:
             "weak: one run each. The noise is that between the robots and maps of this run, which "
             "depend on each other; another seed may say otherwise. Compare six seeds or more"
         )
-    elif n_runs < FEW_RUNS:
+    elif n_runs < better.FEW_RUNS:
         notes.append(
             f"weak: {n_runs} runs. The test takes the changes for normally distributed, which so "
-            f"few cannot show; compare {FEW_RUNS} seeds or more"
+            f"few cannot show; compare {better.FEW_RUNS} seeds or more"
         )
     if table["timed"].any():
         notes.append(
@@ -147,12 +131,10 @@ def _notes_on(table: pd.DataFrame, unit: str, n_runs: int) -> list[str]:
 def _differing_settings(a: Runs, b: Runs) -> list[str]:
     """Settings in which the scenarios of matched results differ."""
     found: dict[str, str] = {}
-    pairs = [(_flat(x), _flat(y)) for x in a.results for y in b.results if x.run == y.run]
-    for first, second in pairs:
-        for key in sorted(first.keys() | second.keys()):
-            old, new = first.get(key, "absent"), second.get(key, "absent")
-            if old != new:
-                found[key] = f"{key} is {old} in the first and {new} in the second"
+    for x, y in ((x, y) for x in a.results for y in b.results if x.run == y.run):
+        both = pd.DataFrame([_flat(x), _flat(y)]).fillna("absent")
+        for key in sorted(both.columns[both.loc[0] != both.loc[1]]):
+            found[key] = f"{key} is {both[key][0]} in the first and {both[key][1]} in the second"
     shown = [f"the scenarios differ: {text}" for text in islice(found.values(), _SHOWN_NAMES)]
     more = len(found) - len(shown)
     return [*shown, f"the scenarios differ in {more} more settings"] if more else shown

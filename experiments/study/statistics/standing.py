@@ -13,14 +13,7 @@ from experiments.judge.criteria import ORACLE, answerable, has_common_ground, ri
 from experiments.judge.judged_maps import ERROR_COLUMNS, MAP_PAIR, error_over_oracle, maps_of
 from experiments.judge.metrics import repetition_spread_m
 from experiments.judge.tables import SHOWN
-from experiments.study.statistics.better import (
-    LARGEST_LOG_RATIO,
-    SIGNIFICANCE,
-    change_of_each_run,
-    holm,
-    log_ratio,
-    mean_change,
-)
+from experiments.study.statistics import better
 from experiments.study.statistics.methods_compared import paired_values
 from experiments.study.statistics.success_rates import success_rates
 from mapfusion.align.result import Status
@@ -192,16 +185,16 @@ def _equal_to_first(standings: list[Standing], maps: pd.DataFrame, column: str) 
     p_values, near = [], []
     for standing in standings[1:]:
         own = values[standing.aligner]
-        changes = own - first if is_share else pd.Series(log_ratio(own, first), values.index)
+        changes = own - first if is_share else pd.Series(better.log_ratio(own, first), own.index)
         changes = changes.dropna()  # maps that either has no row of
         run_id = changes.index.get_level_values("run_id")
-        of_runs = change_of_each_run(changes.to_numpy(), run_id, n_runs, is_share)
-        p_values.append(mean_change(of_runs).p)
+        of_runs = better.change_of_each_run(changes.to_numpy(), run_id, n_runs, is_share)
+        p_values.append(better.mean_change(of_runs).p)
         if is_share:
             n_apart = abs(changes.mean()) * len(changes)
             near.append(n_apart <= max(1, _EQUAL_SHARE * len(changes)) + _ROUNDING)
         else:
-            middle = changes.clip(-LARGEST_LOG_RATIO, LARGEST_LOG_RATIO).median()
+            middle = changes.clip(-better.LARGEST_LOG_RATIO, better.LARGEST_LOG_RATIO).median()
             near.append(abs(middle) <= _EQUAL_LOG_RATIO)
-    same = np.array(near, bool) & ~(holm(np.array(p_values)) <= SIGNIFICANCE)
+    same = np.array(near, bool) & ~(better.holm(np.array(p_values)) <= better.SIGNIFICANCE)
     return [standings[0], *compress(standings[1:], same)]

@@ -6,7 +6,7 @@ import tempfile
 import time
 import uuid
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence, Sized
+from collections.abc import Callable, Collection, Sized
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import cast
@@ -100,10 +100,10 @@ class SweepDriver:
         try:
             laid_out = planned(run, self._sweep.store, self._sweep.dataset)
         except InputError as error:  # no world can be made from this seed, a log is damaged, ...
-            self._fail(run, " ".join(str(error).split()))
-            return
-        if not laid_out.left:
+            reason = " ".join(str(error).split())
             self.progress.done += 1
+            self.progress.failed[run.run_id] = reason
+            self._sweep.dataset.fail(run, reason)
             return
         self._open[laid_out] = set()
         blocked: set[str] = set()
@@ -146,10 +146,8 @@ class SweepDriver:
     def _failure(self, future: Future, name: str) -> dask_worker.TaskFailedError:
         """Which task failed and why: those that needed it fail like it."""
         if future.status != "error":
-            raise InputError(
-                "the connection to the Dask scheduler was lost; what was finished is kept, the "
-                "same command goes on from there"
-            )
+            kept = "what was finished is kept, the same command goes on from there"
+            raise InputError(f"the connection to the Dask scheduler was lost; {kept}")
         error = future.exception()
         if isinstance(error, dask_worker.TaskFailedError):
             return error
@@ -166,21 +164,13 @@ class SweepDriver:
         if self._open[laid_out]:
             return
         del self._open[laid_out]
+        self.progress.done += 1
         # All tasks that could be done were done, so which comes first does not depend on chance.
         failures = (self._failures.get(task.name) for task in laid_out.left)
-        first = next(filter(None, failures), None)
-        if first is None:
-            self.progress.done += 1
-        else:
+        if first := next(filter(None, failures), None):
             reason = explained(first.reason, self._sweep.store)
-            self._fail(laid_out.run, reason, first.details, laid_out.stages)
-
-    def _fail(
-        self, run: SweepRun, reason: str, details: str = "", stages: Sequence[str] = ()
-    ) -> None:
-        self.progress.done += 1
-        self.progress.failed[run.run_id] = reason
-        self._sweep.dataset.fail(run, reason, details, stages)
+            self.progress.failed[laid_out.run.run_id] = reason
+            self._sweep.dataset.fail(laid_out.run, reason, first.details, laid_out.stages)
 
 
 def _label_and_name(key: object) -> tuple[str, str]:
@@ -205,12 +195,8 @@ def execute(
     for left_behind in folder.glob(f"{_ATTEMPTS_PREFIX}*"):  # by a sweep that was killed
         if time.time() - left_behind.stat().st_mtime > _OLD_S:  # else another one may be running
             shutil.rmtree(left_behind, ignore_errors=True)
-    with (
-        tempfile.TemporaryDirectory(
-            prefix=_ATTEMPTS_PREFIX, dir=folder, ignore_cleanup_errors=True
-        ) as attempts,
-        connected(jobs, scheduler) as client,
-    ):
+    own = tempfile.TemporaryDirectory(None, _ATTEMPTS_PREFIX, folder, ignore_cleanup_errors=True)
+    with own as attempts, connected(jobs, scheduler) as client:
         terms = dask_worker.Terms(Path(attempts), RETRIES, dask_worker.code_version())
         driver = SweepDriver(client, sweep, terms, on_progress)
         driver.execute()
