@@ -1,7 +1,7 @@
 """Intervals: Wilson's for rates, the bootstrap for medians and means.
 
-Rows of one run depend on each other: the bootstrap resamples whole runs, and Wilson's interval is
-given the number of trials that dependent rows are worth.
+Rows of one run depend on each other, and an interval over rows would be several times too narrow:
+the bootstrap resamples whole runs, and Wilson's interval is given as many trials as they are worth.
 """
 
 from collections.abc import Callable
@@ -107,6 +107,11 @@ def percentile_interval(
     return Interval(value, float(low), float(high))
 
 
+def median_interval(values: Float, clusters: Clusters, rng: np.random.Generator) -> Interval:
+    """Median of rows (N,), whole clusters resampled."""
+    return percentile_interval(WeightedMedian(values, clusters.codes), clusters.n, rng)
+
+
 def weighted_mean_interval(
     values: Float, weights: Float, clusters: Clusters, rng: np.random.Generator
 ) -> Interval:
@@ -121,23 +126,19 @@ def weighted_mean_interval(
     return percentile_interval(mean, clusters.n, rng)
 
 
-def wilson(
-    successes: ArrayLike, trials: ArrayLike, confidence: float = CONFIDENCE
-) -> tuple[Float, Float]:
-    """Lower and upper ends of the score interval of a binomial proportion (Wilson 1927).
+def wilson(successes: ArrayLike, trials: ArrayLike) -> tuple[Float, Float]:
+    """Lower and upper 95 % ends of the score interval of a binomial proportion (Wilson 1927).
 
     Unlike the textbook interval it keeps its level for few trials and for rates near 0 and 1.
     Counts need not be whole; where there are no trials, nothing is known: [0, 1].
 
     Raises:
-        ValueError: negative counts, more successes than trials, or a level not in (0, 1).
+        ValueError: negative counts, or more successes than trials.
     """
     k, n = np.broadcast_arrays(np.asarray(successes, float), np.asarray(trials, float))
-    if not 0 < confidence < 1:
-        raise ValueError("confidence: must lie between 0 and 1")
     if np.any(k < 0) or np.any(k > n + 1e-9 * (1 + n)):  # sums of fractions round
         raise ValueError("successes: must lie between 0 and trials")
-    z2 = ndtri((1 + confidence) / 2) ** 2
+    z2 = ndtri((1 + CONFIDENCE) / 2) ** 2
     known = n > 0
     rate = np.minimum(np.divide(k, n, out=np.full(n.shape, 0.5), where=known), 1.0)
     centre = (n * rate + z2 / 2) / (n + z2)

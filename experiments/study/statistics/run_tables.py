@@ -133,9 +133,8 @@ def find_runs(paths: Path | Sequence[Path]) -> Runs:
             results.append(RunPath(path, _run_of(path / "scenario.json")))
         else:
             what = "no such folder" if not path.is_dir() else "no scenario.json and no sweep.json"
-            raise InputError(
-                f"{path}: {what} (expected a result folder of `run` or a folder of `sweep`)"
-            )
+            expected = "a result folder of `run` or a folder of `sweep`"
+            raise InputError(f"{path}: {what} (expected {expected})")
     return Runs(tuple(results), tuple(sweeps))
 
 

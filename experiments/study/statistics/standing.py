@@ -181,20 +181,19 @@ def _or_last(value: float, missing: float = math.inf) -> float:
 def _equal_to_first(standings: list[Standing], maps: pd.DataFrame, column: str) -> list[Standing]:
     """The first, and those that neither the test nor the band tells from it in this column."""
     values, is_share = paired_values(maps, column), column == "refined_success"
-    n_runs, first = maps["run_id"].nunique(), values[standings[0].aligner]
     p_values, near = [], []
     for standing in standings[1:]:
-        own = values[standing.aligner]
-        changes = own - first if is_share else pd.Series(better.log_ratio(own, first), own.index)
-        changes = changes.dropna()  # maps that either has no row of
-        run_id = changes.index.get_level_values("run_id")
-        of_runs = better.change_of_each_run(changes.to_numpy(), run_id, n_runs, is_share)
+        judged = values[[standings[0].aligner, standing.aligner]].dropna()  # by both
+        n, (first, own) = len(judged), judged.to_numpy(np.float64).T
+        changes = own - first if is_share else better.log_ratio(own, first)
+        run_id = judged.index.get_level_values("run_id")
+        n_runs = maps["run_id"].nunique()
+        of_runs = better.change_of_each_run(changes, run_id, n_runs, is_share)
         p_values.append(better.mean_change(of_runs).p)
+        apart = pd.Series(changes).clip(-better.LARGEST_LOG_RATIO, better.LARGEST_LOG_RATIO)
         if is_share:
-            n_apart = abs(changes.mean()) * len(changes)
-            near.append(n_apart <= max(1, _EQUAL_SHARE * len(changes)) + _ROUNDING)
+            near.append(abs(apart.mean()) * n <= max(1, _EQUAL_SHARE * n) + _ROUNDING)
         else:
-            middle = changes.clip(-better.LARGEST_LOG_RATIO, better.LARGEST_LOG_RATIO).median()
-            near.append(abs(middle) <= _EQUAL_LOG_RATIO)
+            near.append(abs(apart.median()) <= _EQUAL_LOG_RATIO)
     same = np.array(near, bool) & ~(better.holm(np.array(p_values)) <= better.SIGNIFICANCE)
     return [standings[0], *compress(standings[1:], same)]

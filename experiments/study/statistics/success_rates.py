@@ -1,9 +1,7 @@
 """How often each method is right, against what makes it hard, with Wilson intervals.
 
 Rows of one run depend on each other: its maps grow from one another, its pairs share robots, the
-repetitions share maps. An interval over rows would be several times too narrow, so the trials that
-Wilson's interval is given are runs (`effective_trials`): right whatever the dependence, and wider
-than need be where a run's maps differ from each other.
+repetitions share maps. So the trials of Wilson's interval are runs (`effective_trials`).
 """
 
 from collections.abc import Sequence

@@ -10,6 +10,7 @@ import pandas as pd
 from experiments.judge.criteria import that_ever_meet
 from experiments.judge.judged_maps import MAP_KEYS, NEEDED, OPTIONAL, maps_of, setting_columns
 from experiments.scenario.randomness import generator
+from experiments.study.statistics import paths_and_nees
 from experiments.study.statistics.error_bands import (
     ROBOT_PAIR,
     error_bands,
@@ -17,12 +18,6 @@ from experiments.study.statistics.error_bands import (
     time_bands,
 )
 from experiments.study.statistics.methods_compared import compare_methods, oracle_ratios
-from experiments.study.statistics.paths_and_nees import (
-    FUSION_COLUMNS,
-    nees_of_maps,
-    nees_of_pairs,
-    path_summary,
-)
 from experiments.study.statistics.run_tables import Runs
 from experiments.study.statistics.success_rates import LAST, success_rates
 from mapfusion.align.result import Status
@@ -40,9 +35,9 @@ _TIMING_COLUMNS = (*MAP_KEYS, "aligner", "n_correspondences", "n_common", "elaps
 # Of tables that not every run has: what is read, under what name which statistics go, their seed.
 _FURTHER: dict[str, tuple[Any, str, Callable[..., pd.DataFrame], str]] = {
     "aligner_timings": (_TIMING_COLUMNS, "time_by_overlap", time_bands, ""),
-    "path_statistics": (None, "paths", path_summary, "paths"),
-    "landmark_nees": (None, "nees", nees_of_maps, "nees"),
-    "fusion": (FUSION_COLUMNS, "nees", nees_of_pairs, "fusion"),
+    "path_statistics": (None, "paths", paths_and_nees.path_summary, "paths"),
+    "landmark_nees": (None, "nees", paths_and_nees.nees_of_maps, "nees"),
+    "fusion": (paths_and_nees.FUSION_COLUMNS, "nees", paths_and_nees.nees_of_pairs, "fusion"),
 }
 
 

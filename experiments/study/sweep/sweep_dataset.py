@@ -36,14 +36,10 @@ _OWN_FIELDS = {
         libraries=TEXT,  # JSON object of versions
         source_hash=TEXT,
     ),
-    # Seconds of work behind the run, by stage: also of stages that it shares with other runs.
-    # Beside `aligner_timings` the only table that differs from time to time.
-    RUN_TIMES: fields(
-        stage=TEXT,
-        key=TEXT,
-        figure=TEXT,  # elapsed_s, or rendering_s as a part of it
-        seconds=FLOAT,
-    ),
+    # Seconds of work behind the run, by stage: also of stages that it shares with other runs. The
+    # figure is elapsed_s, or rendering_s as a part of it. Beside `aligner_timings` the only table
+    # that differs from time to time.
+    RUN_TIMES: fields(stage=TEXT, key=TEXT, figure=TEXT, seconds=FLOAT),
 }
 
 

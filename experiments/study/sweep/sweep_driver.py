@@ -14,6 +14,8 @@ from typing import cast
 from distributed import Client, Future, as_completed
 from distributed.scheduler import KilledWorker
 
+from experiments.judge.judged_run import JudgedRun
+from experiments.judge.result import measure_aligners
 from experiments.methods.threads import single_threaded
 from experiments.run import dask_worker
 from experiments.run.dask_cluster import connected
@@ -21,7 +23,7 @@ from experiments.run.store import explained
 from experiments.run.tasks import OnProgress, Task
 from experiments.study.sweep.combinations import SweepRun
 from experiments.study.sweep.sweep_dataset import ALIGNER_TIMINGS, open_dataset
-from experiments.study.sweep.sweep_plan import PlannedRun, Sweep, planned, write_aligner_timings
+from experiments.study.sweep.sweep_plan import PlannedRun, Sweep, planned
 from mapfusion.errors import InputError
 
 # Tasks at Dask for each worker. Enough that none waits while this process plans the next run; few
@@ -40,11 +42,8 @@ _OLD_S = 24 * 3600  # in a sweep that runs, tasks begin and end in the meantime
 class SweepProgress:
     """How far a sweep is; the driver counts on in it.
 
-    Attributes:
-        runs: in all.
-        done: runs that need nothing more.
-        failed: those of them that failed, with their reasons, by run id.
-        tasks, tasks_done: by label, of the runs looked at so far.
+    Runs in all; those `done`, which need nothing more; of these the failed ones, with their reasons
+    by run id. Tasks by label, of the runs looked at so far.
     """
 
     runs: int
@@ -54,15 +53,14 @@ class SweepProgress:
     tasks_done: Counter[str] = field(default_factory=Counter)
 
 
+OnSweepProgress = Callable[[SweepProgress], None]
+
+
 class SweepDriver:
     """Runs everything that is not finished; a run that fails does not stop the others."""
 
     def __init__(
-        self,
-        client: Client,
-        sweep: Sweep,
-        terms: dask_worker.Terms,
-        on_progress: Callable[[SweepProgress], None],
+        self, client: Client, sweep: Sweep, terms: dask_worker.Terms, on_progress: OnSweepProgress
     ) -> None:
         self._client, self._sweep, self._terms = client, sweep, terms
         self._on_progress = on_progress
@@ -180,10 +178,7 @@ def _label_and_name(key: object) -> tuple[str, str]:
 
 
 def execute(
-    sweep: Sweep,
-    jobs: int,
-    scheduler: str | None,
-    on_progress: Callable[[SweepProgress], None],
+    sweep: Sweep, jobs: int, scheduler: str | None, on_progress: OnSweepProgress
 ) -> dict[str, str]:
     """Run a sweep; returns the failed runs with their reasons.
 
@@ -210,5 +205,7 @@ def measure_times(sweep: Sweep, failed: Collection[str], on_progress: OnProgress
     for done, run in enumerate(runs):
         on_progress("time the aligners", done, len(runs))
         if not sweep.dataset.path(ALIGNER_TIMINGS, run).is_file():
-            write_aligner_timings(run, sweep.store, sweep.dataset)
+            judged = JudgedRun.of(run.load(), sweep.store)
+            measure_aligners(judged, judged.load_robots())
+            sweep.dataset.write(ALIGNER_TIMINGS, run, judged.pair_table(ALIGNER_TIMINGS))
     on_progress("time the aligners", len(runs), len(runs))

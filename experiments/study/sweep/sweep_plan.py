@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from experiments.judge.judged_run import JudgedRun
-from experiments.judge.result import all_tables, measure_aligners, renderer
+from experiments.judge.result import all_tables, renderer
 from experiments.run.store import Store
 from experiments.run.tasks import Task, task_names, unfinished
 from experiments.scenario.suite import scenarios_of
@@ -51,13 +51,10 @@ def prepare(
 
 @dataclass(frozen=True, eq=False)
 class PlannedRun:
-    """A run and its tasks.
+    """A run, the stages it is made from (STAGE/KEY), and its tasks by name.
 
-    Attributes:
-        run: which one.
-        stages: STAGE/KEY of all it is made from.
-        tasks: all of them by name; the last one writes the run's rows.
-        left: those to be done, each after those it needs; none if the dataset holds the run.
+    The last task writes the run's rows. `left` are those to be done, each after those it needs;
+    none if the dataset holds the run.
     """
 
     run: SweepRun
@@ -97,21 +94,11 @@ def write_rows(
     dataset.finish(run, renderer(judged.scenario), stages)
 
 
-def write_aligner_timings(run: SweepRun, store: Store, dataset: SweepDataset) -> None:
-    """Time a finished run's aligners, serially: nothing else may be running."""
-    judged = JudgedRun.of(run.load(), store)
-    measure_aligners(judged, judged.load_robots())
-    dataset.write(ALIGNER_TIMINGS, run, judged.pair_table(ALIGNER_TIMINGS))
-
-
 @dataclass
 class Survey:
     """What a sweep would do: runs in all, finished, and that cannot be laid out; tasks by label.
 
-    Attributes:
-        wanted: over all runs, as if nothing were shared.
-        finished: on disk.
-        left: to be computed.
+    Tasks are `wanted` over all runs, as if nothing were shared.
     """
 
     runs: int
