@@ -16,7 +16,7 @@ from experiments.show.terminal import layout
 from experiments.show.terminal.layout import columns
 from experiments.study.compare import versions
 from experiments.study.statistics.better import FEW_RUNS
-from experiments.study.statistics.bootstrap import MAPS_OF_ONE_RUN
+from experiments.study.statistics.intervals import MAPS_OF_ONE_RUN
 from experiments.study.statistics.summary import ALL_SCENARIOS, Summary
 
 _MAX_CONFIGURATIONS = 6  # more would fill screens; the files hold all

@@ -23,7 +23,7 @@ from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import AlignerEntry
 from experiments.study.benchmark.synthetic_pairs import true_pairs_of
 from experiments.study.benchmark.trials import CELL, TRIALS, TRIALS_FILE, CellSettings, run_cell
-from experiments.study.statistics.wilson import wilson
+from experiments.study.statistics.intervals import wilson
 from mapfusion.align.result import NOT_RUN, Status
 from mapfusion.errors import InputError
 from mapfusion.storage import schema
@@ -59,10 +59,8 @@ SUMMARY = schema(
 class BenchmarkDesign:
     """What is measured: methods, each on the same maps, in all cells of these counts and shares.
 
-    Attributes:
-        trials: of each cell, each on maps of its own.
-        seed: of maps and methods.
-        budget_s: a cell that has taken longer ends with the trials it has.
+    Each of a cell's trials is on maps of its own; a cell that has taken longer than its budget ends
+    with the trials it has. The seed is of maps and methods.
     """
 
     aligners: tuple[AlignerEntry, ...]
@@ -88,11 +86,11 @@ def entries_of(methods: Sequence[str], scenario: Path | None = None) -> tuple[Al
             if name not in entries:
                 raise InputError(f"{scenario}: align.aligners: none is named {name}")
         return tuple(entries[name] for name in names or entries)
-    for name in names:
-        try:
+    try:
+        for name in names:
             find_method(name)
-        except ValueError as error:
-            raise InputError(f"--method: {error}") from error
+    except ValueError as error:
+        raise InputError(f"--method: {error}") from error
     return tuple(AlignerEntry(name=name, method=name) for name in names or known_methods())
 
 
@@ -117,8 +115,7 @@ def _stage(design: BenchmarkDesign, entry: AlignerEntry, n_pairs: int, share: fl
         seed=design.seed,
         budget_s=design.budget_s,
     )
-    loads = (method.target.partition(":")[0],)
-    label = "measure the aligners"
+    loads, label = (method.target.partition(":")[0],), "measure the aligners"
     return Stage("benchmark", label, settings, run_cell, (TRIALS_FILE,), loads=loads)
 
 

@@ -62,13 +62,9 @@ def synthetic_pair(n_pairs: int, outlier_share: float, rng: np.random.Generator)
     p_b = p_b + rng.normal(0, own_m, p_b.shape)
     index_a, index_b, order = (rng.permutation(n_pairs) for _ in range(3))
     distance = rng.uniform(0, 0.3, n_pairs)  # as what matching lets through: they tell nothing
-    return SyntheticPair(
-        _map(p_a, index_a, own_m, "a"),
-        _map(p_b, index_b, own_m, "b"),
-        Correspondences(index_a[order], index_b[order], distance),
-        T_a_b,
-        is_true[order],
-    )
+    map_a, map_b = _map(p_a, index_a, own_m, "a"), _map(p_b, index_b, own_m, "b")
+    pairs = Correspondences(index_a[order], index_b[order], distance)
+    return SyntheticPair(map_a, map_b, pairs, T_a_b, is_true[order])
 
 
 def _map(points_m: Float, rows: np.ndarray, sigma_m: float, name: str) -> LandmarkMap:

@@ -1,24 +1,26 @@
-"""Two versions on the same runs: what got better or worse, and whether that is more than noise."""
+"""Two versions on the same runs: what got better or worse, and whether that is more than noise.
+
+Only what both have counts: the same scenario, seed and settings, robot pair, iteration and aligner.
+"""
 
 import json
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from experiments.study.compare.version_values import Quantity, all_values
-from experiments.study.statistics.better import (
-    FEW_RUNS,
-    SIGNIFICANCE,
-    change_of_each_run,
-    holm,
-    mean_change,
-)
-from experiments.study.statistics.bootstrap import MAPS_OF_ONE_RUN, RUN
-from experiments.study.statistics.run_tables import RunPath, Runs, find_runs
+from experiments.judge import judged_maps
+from experiments.judge.criteria import ANSWERABLE_PAIRS, COMMON_LANDMARKS, ORACLE, RICH_PAIRS
+from experiments.judge.judged_maps import MAP_KEYS, MAP_PAIR
+from experiments.judge.path_errors import path_rms
+from experiments.study.statistics import better
+from experiments.study.statistics.error_bands import ROBOT_PAIR
+from experiments.study.statistics.intervals import MAPS_OF_ONE_RUN, RUN
+from experiments.study.statistics.run_tables import RunPath, Runs, find_runs, match_names
 from mapfusion.errors import InputError
 
 # A change of less than one percent (or percentage point) matters to nobody who picks a method.
@@ -27,10 +29,32 @@ BETTER, WORSE, SAME = "better", "worse", "identical"
 NOISE, UNKNOWN = "no difference beyond noise", "cannot be judged"
 _SHOWN_NAMES = 3
 _NOT_SHOWN = ["table", "column", "of", "where", "higher_is_better"]
+_ROBOT = ("run_id", "robot")
+_KEYS = (*MAP_PAIR, "aligner", "robot", "map")
+_NEES, _REFINED = "nees_with_drift", "refined_translation_error_m"
+_EACH = "each method"
 
 
-@dataclass(frozen=True)
-class VersionComparison:
+class Quantity(NamedTuple):
+    """What two versions are compared in: a column of the rows of a table, or of those `where`.
+
+    Their counts are the lesser ones of the two versions. A change is told as a ratio b / a, as a
+    difference of shares, or as one of distances from consistency |ln(NEES per degree of freedom)|.
+    It is `of` each method, of the oracle, or of no aligner. What is timed depends on the machine
+    and its load, which runs share.
+    """
+
+    table: str
+    metric: str
+    column: str
+    scale: Literal["ratio", "share", "ln"] = "ratio"
+    of: str = ""
+    higher_is_better: bool = False
+    where: str = ""
+    timed: bool = False
+
+
+class VersionComparison(NamedTuple):
     """What two versions differ in.
 
     Attributes:
@@ -67,30 +91,27 @@ def compare(path_a: Path, path_b: Path) -> VersionComparison:
             f"the first has {_some(runs_a)}, the second {_some(runs_b)}"
         )
     unit = RUN if len(common) > 1 else MAPS_OF_ONE_RUN
-    rows = [
-        _judged(quantity, method, values, len(common))
-        for quantity, method, values in all_values(a, b)
-        if len(values)
-    ]
+    rows = [_judged(*each, len(common)) for each in _all_values(a, b)]
     if not rows:
         raise InputError(f"{path_a} and {path_b}: their common runs have no rows in common")
     table = pd.DataFrame(rows)
-    table["p_holm"] = holm(table["p"].to_numpy())
+    table["p_holm"] = better.holm(table["p"].to_numpy())
     table["verdict"] = [_verdict(row) for row in table.to_dict("records")]
-    notes = [
-        *_differing_settings(a, b),
-        *_left_out(runs_a - runs_b, "first"),
-        *_left_out(runs_b - runs_a, "second"),
-        *_notes_on(table, unit, len(common)),
-    ]
+    notes = _differing_settings(a, b)
+    for names, which in ((runs_a - runs_b, "first"), (runs_b - runs_a, "second")):
+        if names:
+            runs = f"{len(names)} run{'s' * (len(names) > 1)} of the {which}"
+            notes.append(f"left out: {runs} that the other has not ({_some(names)})")
+    notes += _notes_on(table, unit, len(common))
     return VersionComparison(table.drop(columns=_NOT_SHOWN), unit, len(common), tuple(notes))
 
 
 def _judged(quantity: Quantity, method: str, values: pd.DataFrame, n_runs: int) -> dict[str, Any]:
     """One row of the table, verdict and correction apart."""
     is_share = quantity.scale == "share"
-    changes = change_of_each_run(values["change"].to_numpy(), values["run_id"], n_runs, is_share)
-    found = mean_change(changes)
+    of_maps, run_id = values["change"].to_numpy(), values["run_id"]
+    changes = better.change_of_each_run(of_maps, run_id, n_runs, is_share)
+    found = better.mean_change(changes)
     told = np.exp(found[:3]) if quantity.scale == "ratio" else found[:3]
     a, b = values[["a", "b"]].agg("mean" if is_share else "median")
     row = {"metric": quantity.metric, "method": method} | quantity._asdict() | {"a": a, "b": b}
@@ -107,16 +128,9 @@ def _verdict(row: dict[Any, Any]) -> str:
     change, least = row["change"], LEAST_CHANGE
     if row["scale"] == "ratio":
         change, least = np.log(change), np.log1p(least)
-    if np.isnan(row["p_holm"]) or row["p_holm"] > SIGNIFICANCE or abs(change) < least:
+    if not row["p_holm"] <= better.SIGNIFICANCE or abs(change) < least:
         return NOISE
     return BETTER if (change > 0) == row["higher_is_better"] else WORSE
-
-
-def _left_out(names: set[str], which: str) -> list[str]:
-    if not names:
-        return []
-    runs = "1 run" if len(names) == 1 else f"{len(names)} runs"
-    return [f"left out: {runs} of the {which} that the other has not ({_some(names)})"]
 
 
 def _some(names: set[str]) -> str:
@@ -131,10 +145,10 @@ def _notes_on(table: pd.DataFrame, unit: str, n_runs: int) -> list[str]:
             "weak: one run each. The noise is that between the robots and maps of this run, which "
             "depend on each other; another seed may say otherwise. Compare six seeds or more"
         )
-    elif n_runs < FEW_RUNS:
+    elif n_runs < better.FEW_RUNS:
         notes.append(
             f"weak: {n_runs} runs. The test takes the changes for normally distributed, which so "
-            f"few cannot show; compare {FEW_RUNS} seeds or more"
+            f"few cannot show; compare {better.FEW_RUNS} seeds or more"
         )
     if table["timed"].any():
         notes.append(
@@ -147,12 +161,11 @@ def _notes_on(table: pd.DataFrame, unit: str, n_runs: int) -> list[str]:
 def _differing_settings(a: Runs, b: Runs) -> list[str]:
     """Settings in which the scenarios of matched results differ."""
     found: dict[str, str] = {}
-    pairs = [(_flat(x), _flat(y)) for x in a.results for y in b.results if x.run == y.run]
-    for first, second in pairs:
-        for key in sorted(first.keys() | second.keys()):
-            old, new = first.get(key, "absent"), second.get(key, "absent")
+    for x, y in ((x, y) for x in a.results for y in b.results if x.run == y.run):
+        both = pd.DataFrame([_flat(x), _flat(y)]).fillna("absent")
+        for key, (old, new) in both.sort_index(axis=1).items():
             if old != new:
-                found[key] = f"{key} is {old} in the first and {new} in the second"
+                found[str(key)] = f"{key} is {old} in the first and {new} in the second"
     shown = [f"the scenarios differ: {text}" for text in islice(found.values(), _SHOWN_NAMES)]
     more = len(found) - len(shown)
     return [*shown, f"the scenarios differ in {more} more settings"] if more else shown
@@ -163,3 +176,99 @@ def _flat(result: RunPath) -> dict[str, str]:
     scenario = json.loads((result.path / "scenario.json").read_text(encoding="utf-8"))
     settings = pd.json_normalize(scenario).to_dict("records")[0]
     return {str(name): json.dumps(value) for name, value in settings.items()}
+
+
+def _all_values(a: Runs, b: Runs) -> Iterator[tuple[Quantity, str, pd.DataFrame]]:
+    """All quantities that both have tables for, the method, and columns run_id, a, b, change."""
+    for table in _READ:
+        if not (a.has(table) and b.has(table)):
+            continue
+        rows = _joined(a, b, table)
+        for method in [
+            *(judged_maps.methods_in(rows, oracle=True) if "aligner" in rows else []),
+            "",
+        ]:
+            own = rows[rows["aligner"] == method] if method else rows
+            of = method if method in ("", ORACLE) else _EACH
+            for quantity in _QUANTITIES:
+                if (quantity.table, quantity.of) == (table, of):
+                    values = _changes(quantity, own)
+                    if len(values):
+                        yield quantity, method, values
+
+
+def _joined(a: Runs, b: Runs, table: str) -> pd.DataFrame:
+    """Rows of both by run and keys, values with the suffixes _a and _b; the lesser counts."""
+    columns, optional, reduce = _READ[table]
+    frames = []
+    for runs in (a, b):
+        parts = []
+        for rows in runs.each(table, columns, optional):
+            named = rows.drop(columns=[*judged_maps.RUN_KEYS, *judged_maps.setting_columns(rows)])
+            parts.append(reduce(named.assign(run_id=match_names(rows))))
+        # a run of one robot has no rows, and must not decide the columns' types
+        parts = [part for part in parts if len(part)] or parts[:1]
+        frames.append(pd.concat(parts, ignore_index=True))
+    keys = [name for name in _KEYS if name in frames[0]]
+    joined = frames[0].merge(frames[1], on=keys, suffixes=("_a", "_b"))
+    lesser = {
+        name: joined.filter(like=name).min(axis=1)
+        for name in judged_maps.COUNTS
+        if name in frames[0]
+    }
+    return joined.assign(**lesser)
+
+
+def _changes(quantity: Quantity, rows: pd.DataFrame) -> pd.DataFrame:
+    """Where both versions have a value and the change is finite; success tells the rest."""
+    rows = rows.query(quantity.where) if quantity.where else rows
+    a, b = (rows[f"{quantity.column}_{side}"].to_numpy(dtype=np.float64) for side in "ab")
+    if quantity.scale == "ln":  # too small a covariance is as wrong as one too large
+        change = np.abs(better.log_ratio(b, np.ones(1))) - np.abs(better.log_ratio(a, np.ones(1)))
+    else:
+        change = b - a if quantity.scale == "share" else better.log_ratio(b, a)
+    frame = pd.DataFrame({"run_id": rows["run_id"], "a": a, "b": b, "change": change})
+    return frame[np.isfinite(a) & np.isfinite(change)]
+
+
+def _maps_over_oracle(errors: pd.DataFrame) -> pd.DataFrame:
+    """Rows of `maps_of`, with each map's refined error over the oracle's there."""
+    maps = judged_maps.maps_of(errors)
+    of_oracle = maps.assign(oracle=maps[_REFINED].where(maps["aligner"] == ORACLE))
+    reference = of_oracle.groupby(MAP_PAIR)["oracle"].transform("first")
+    return maps.assign(over_oracle=maps[_REFINED] / reference)
+
+
+def _nees_per_dof(fusion: pd.DataFrame) -> pd.DataFrame:
+    true = fusion[fusion["true_pair"]]
+    per_dof = true.assign(nees=true[_NEES] / true["degrees_of_freedom"])
+    return per_dof.groupby(["run_id", *ROBOT_PAIR], sort=False)["nees"].mean().reset_index()
+
+
+# What is read of each table, what older runs may lack of it, and how a run's rows are reduced.
+_READ: dict[str, tuple[Sequence[str], Sequence[str], Callable[..., pd.DataFrame]]] = {
+    "errors": (judged_maps.NEEDED, judged_maps.OPTIONAL, _maps_over_oracle),
+    "robots": (["robot", "path_error_m", "odometry_error_m"], (), partial(path_rms, by=_ROBOT)),
+    "map_fits": (["map", "rmse_m"], (), pd.DataFrame),
+    "fusion": ([*ROBOT_PAIR, "true_pair", _NEES, "degrees_of_freedom"], (), _nees_per_dof),
+    "aligner_timings": ([*MAP_KEYS, "aligner", "elapsed_s"], (), pd.DataFrame),
+}
+_GROUND = f"n_common >= {COMMON_LANDMARKS}"
+_ENOUGH, _RICH = f"n_true >= {ANSWERABLE_PAIRS}", f"n_true >= {RICH_PAIRS}"
+_OFFERED = f"aligner == '{ORACLE}' and {_ENOUGH}"
+_QUANTITIES = (
+    Quantity("errors", "success estimated", "estimated_success", "share", _EACH, True),
+    Quantity("errors", "success refined", "refined_success", "share", _EACH, True),
+    Quantity("errors", "wrongly accepted", "false_accepted", "share", _EACH),
+    Quantity("errors", "accepted", "accepted", "share", _EACH, True, _GROUND),
+    Quantity("errors", "estimated error, m", "translation_error_m", of=_EACH, where=_ENOUGH),
+    Quantity("errors", "refined / oracle", "over_oracle", of=_EACH, where=_RICH),
+    Quantity("errors", "refined error, m", _REFINED, of=ORACLE, where=_ENOUGH),
+    Quantity("errors", "true pairs", "n_true", higher_is_better=True, where=_OFFERED),
+    Quantity("robots", "path RMSE, m", "path_m"),
+    Quantity("robots", "odometry RMSE, m", "odometry_m"),
+    Quantity("map_fits", "landmark RMSE, m", "rmse_m", where="map != 'fused'"),
+    Quantity("map_fits", "fused RMSE, m", "rmse_m", where="map == 'fused'"),
+    Quantity("fusion", "fused NEES / dof", "nees", "ln"),
+    Quantity("aligner_timings", "time, s", "elapsed_s", of=_EACH, timed=True),
+)

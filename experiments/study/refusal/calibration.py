@@ -41,14 +41,9 @@ def calibrate(
         p_a, p_b = points_on_walls(rng, N_CORRESPONDENCES), points_on_walls(rng, N_CORRESPONDENCES)
         pairs = independent_pairs(p_a, p_b, np.zeros((N_CORRESPONDENCES, 4)))
         counts[k] = accepted_motions(pairs, gates, bounds)
-    return pd.DataFrame(
-        {
-            "stated": STATED,
-            "motions_a_pair": counts.mean(axis=0),
-            "n_accepted": np.count_nonzero(counts, axis=0),
-            "n_pairs": n_pairs,
-        }
-    )
+    columns = {"stated": STATED, "motions_a_pair": counts.mean(axis=0)}
+    columns |= {"n_accepted": np.count_nonzero(counts, axis=0), "n_pairs": n_pairs}
+    return pd.DataFrame(columns)
 
 
 @njit(cache=True)

@@ -47,12 +47,10 @@ class Case:
     poster_radius_m: float = np.nan
 
 
-def apart(
-    map_a: LandmarkMap, map_b: LandmarkMap, matching: MatchParameters, ground: str = APART
-) -> Case:
+def apart(map_a: LandmarkMap, map_b: LandmarkMap, matching: MatchParameters) -> Case:
     """Maps of two worlds."""
     pairs = match(map_a, map_b, matching)
-    return Case(ground, map_a, map_b, pairs, np.zeros(len(pairs), bool), 0, np.full(3, np.nan))
+    return Case(APART, map_a, map_b, pairs, np.zeros(len(pairs), bool), 0, np.full(3, np.nan))
 
 
 def common(
@@ -104,11 +102,7 @@ def repeated(
         position_m=se2.transform_points(T_other_b, poster.position_m),
         covariance_m2=se2.transform_covariances(T_other_b, poster.covariance_m2),
     )
-    case = apart(source.map_a, _joined(other, hung), matching, REPEATED)
-    return replace(case, poster_radius_m=radius_m)
-
-
-def _joined(first: LandmarkMap, second: LandmarkMap) -> LandmarkMap:
     columns = ("position_m", "covariance_m2", "count", "source_observation", "descriptor")
-    both = {name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in columns}
-    return replace(first, **both)
+    both = {name: np.concatenate([getattr(other, name), getattr(hung, name)]) for name in columns}
+    case = apart(source.map_a, replace(other, **both), matching)
+    return replace(case, ground=REPEATED, poster_radius_m=radius_m)

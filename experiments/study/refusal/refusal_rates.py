@@ -8,7 +8,7 @@ import pandas as pd
 from experiments.judge import criteria
 from experiments.judge.criteria import has_common_ground, right_refined
 from experiments.study.refusal.cases import APART, COMMON, FEW, POSTER_RADII_M, POSTERS
-from experiments.study.statistics.wilson import wilson
+from experiments.study.statistics.intervals import wilson
 from mapfusion.se2 import Float
 
 
@@ -47,9 +47,8 @@ def mergeable(rows: pd.DataFrame) -> pd.DataFrame:
 
 def summary(refusals: pd.DataFrame) -> list[dict[str, Any]]:
     """One row an aligner, in their order: the rates that the operating point has."""
-    return [
-        {"aligner": name} | _rates(own) for name, own in refusals.groupby("aligner", sort=False)
-    ]
+    groups = refusals.groupby("aligner", sort=False)
+    return [{"aligner": name} | _rates(own) for name, own in groups]
 
 
 def _rates(own: pd.DataFrame) -> dict[str, Rate]:
@@ -57,19 +56,19 @@ def _rates(own: pd.DataFrame) -> dict[str, Rate]:
     wrong = accepted & ~right
     common, few, hung = (own["ground"] == kind for kind in (COMMON, FEW, POSTERS))
     able = own.index.isin(mergeable(own).index)
-    return {
-        "false": Rate.of(without_common_ground(own)["accepted"]),
-        "wrong": Rate.of(wrong[common & ground]),
-        "missed": Rate.of(~accepted[able]),
-        "missed_though_right": Rate.of(~accepted[able & right]),
-        "few_missed_though_right": Rate.of(~accepted[few & right]),
-        "few_wrong": Rate.of(wrong[few]),
-        "posters_false": Rate.of(accepted[hung & ~ground]),
-        "posters_wrong": Rate.of(wrong[hung & ground]),
-    } | {
-        f"poster_{radius_m:g}": Rate.of(accepted[own["poster_radius_m"] == radius_m])
-        for radius_m in POSTER_RADII_M
+    hits = {
+        "false": without_common_ground(own)["accepted"],
+        "wrong": wrong[common & ground],
+        "missed": ~accepted[able],
+        "missed_though_right": ~accepted[able & right],
+        "few_missed_though_right": ~accepted[few & right],
+        "few_wrong": wrong[few],
+        "posters_false": accepted[hung & ~ground],
+        "posters_wrong": wrong[hung & ground],
     }
+    for radius_m in POSTER_RADII_M:
+        hits[f"poster_{radius_m:g}"] = accepted[own["poster_radius_m"] == radius_m]
+    return {name: Rate.of(rows) for name, rows in hits.items()}
 
 
 def swept(score: pd.Series, thresholds: Float) -> Float:

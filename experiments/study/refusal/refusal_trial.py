@@ -170,15 +170,9 @@ def apart_rows(
 def _answers(scenario: Simulation, case: Case, worlds: tuple[str, str], iteration: int) -> Rows:
     """One row an aligner: its refined alignment, judged."""
     settings = scenario.align
-    names = {
-        "ground": case.ground,
-        "poster_radius_m": case.poster_radius_m,
-        "world_a": worlds[0],
-        "robot_a": case.map_a.name,
-        "world_b": worlds[1],
-        "robot_b": case.map_b.name,
-        "iteration": iteration,
-    }
+    names: dict[str, Any] = {"ground": case.ground, "poster_radius_m": case.poster_radius_m}
+    names |= {"world_a": worlds[0], "robot_a": case.map_a.name}
+    names |= {"world_b": worlds[1], "robot_b": case.map_b.name, "iteration": iteration}
     rows = []
     for entry in settings.aligners:
         rng = generator(scenario.seed, *map(str, names.values()), entry.name)

@@ -59,10 +59,8 @@ def worlds_of(words: Sequence[str], seeds: Sequence[int], results: Path) -> list
         if world.name == first.name:
             raise InputError(f"{world.label}: is named as {first.label} is; rename one of them")
     if len({world.scenario.seed for world in worlds}) < 2:
-        raise InputError(
-            f"refusal: all worlds have seed {worlds[0].scenario.seed}, and so some pictures in "
-            "common; give those of another seed too"
-        )
+        what = f"all worlds have seed {worlds[0].scenario.seed}, and so some pictures in common"
+        raise InputError(f"refusal: {what}; give those of another seed too")
     return worlds
 
 
@@ -85,10 +83,8 @@ def _world(label: str, name: str, scenario: AnyScenario, store: Store) -> Mapped
     judged = JudgedRun.of(scenario, store)
     for robot in judged.pipeline.simulated:
         if not all(store.folder(stage).finished for stage in (robot.log, robot.slam)):
-            raise InputError(
-                f"{label}: the maps of {robot.name} are not in {store.root} (made by "
-                "another version?); run its scenario again"
-            )
+            what = f"the maps of {robot.name} are not in {store.root} (made by another version?)"
+            raise InputError(f"{label}: {what}; run its scenario again")
     faces = judged.pipeline.simulated[0].features.before["faces"]
     folders = {robot.name: judged.robot_folders(robot) for robot in judged.pipeline.robots}
     return MappedWorld(label, name, scenario, faces.key, folders)

@@ -20,7 +20,7 @@ import numpy as np
 import pandas as pd
 import scipy.stats
 
-from experiments.study.statistics.wilson import CONFIDENCE
+from experiments.study.statistics.intervals import CONFIDENCE
 from mapfusion.se2 import Float
 
 SIGNIFICANCE = 0.05
@@ -28,7 +28,7 @@ SIGNIFICANCE = 0.05
 FEW_RUNS = 6
 # An error without an estimate is infinitely far off. In a mean it counts as a factor of a thousand,
 # a hall's length over an inch: no larger one says more.
-_LARGEST_LOG_RATIO = float(np.log(1e3))
+LARGEST_LOG_RATIO = float(np.log(1e3))
 
 
 class BetterTest(NamedTuple):
@@ -64,7 +64,7 @@ def mean_change(changes: Float) -> BetterTest:
 
     With fewer than two the interval and p are NaN; where nothing changed at all p is.
     """
-    changes = np.clip(changes, -_LARGEST_LOG_RATIO, _LARGEST_LOG_RATIO)
+    changes = np.clip(changes, -LARGEST_LOG_RATIO, LARGEST_LOG_RATIO)
     if not len(changes):
         return BetterTest(np.nan, np.nan, np.nan, np.nan)
     mean = float(np.mean(changes))

@@ -5,15 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
+from experiments.judge import judged_maps
 from experiments.judge.criteria import ANSWERABLE_PAIRS
-from experiments.judge.judged_maps import (
-    COUNTS,
-    ERROR_COLUMNS,
-    MAP_KEYS,
-    RUN_KEYS,
-    methods_in,
-    setting_columns,
-)
+from experiments.judge.judged_maps import ERROR_COLUMNS, MAP_KEYS, RUN_KEYS, setting_columns
 
 BAND = (0.1, 0.9)
 ROBOT_PAIR = ("robot_a", "robot_b")
@@ -49,7 +43,7 @@ def medians_of_run(errors: pd.DataFrame) -> pd.DataFrame:
     """
     keys = [name for name in RUN_KEYS if name in errors] + setting_columns(errors)
     groups = errors.groupby([*keys, *MAP_KEYS, "aligner"], sort=False, dropna=False)
-    parts = [groups[list(ERROR_COLUMNS)].median(), groups[list(COUNTS)].first()]
+    parts = [groups[list(ERROR_COLUMNS)].median(), groups[list(judged_maps.COUNTS)].first()]
     return pd.concat(parts, axis=1).reset_index()
 
 
@@ -90,6 +84,4 @@ def time_bands(
     found |= {"n_maps": grouped.size(), "elapsed_low_s": elapsed.quantile(BAND[0])}
     found |= {"elapsed_s": elapsed.median(), "elapsed_high_s": elapsed.quantile(BAND[1])}
     bands = pd.DataFrame(found).reset_index().drop(columns="group")
-    return bands.sort_values(
-        "aligner", key=lambda names: names.map(methods_in(timed, oracle=True).index), kind="stable"
-    ).reset_index(drop=True)
+    return bands.set_index("aligner").loc[judged_maps.methods_in(timed, oracle=True)].reset_index()

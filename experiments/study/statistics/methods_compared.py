@@ -9,15 +9,9 @@ import pandas as pd
 
 from experiments.judge.criteria import ORACLE, rich
 from experiments.judge.judged_maps import MAP_PAIR, methods_in
+from experiments.study.statistics import intervals
 from experiments.study.statistics.better import change_of_each_run, holm, log_ratio, mean_change
-from experiments.study.statistics.bootstrap import (
-    RUN,
-    Interval,
-    WeightedMedian,
-    clusters_of,
-    percentile_interval,
-    weighted_mean_interval,
-)
+from experiments.study.statistics.intervals import RUN, Interval, WeightedMedian, clusters_of
 from mapfusion.se2 import Float
 
 STAGES = {"estimated": "translation_error_m", "refined": "refined_translation_error_m"}
@@ -48,7 +42,7 @@ def oracle_ratios(maps: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
         row |= {"n_maps": len(own), "unit": clusters.unit}
         for stage, column in STAGES.items():
             ratio = partial(_ratio, median(aligner, column), below)
-            interval = percentile_interval(ratio, clusters.n, rng)
+            interval = intervals.percentile_interval(ratio, clusters.n, rng)
             row |= {f"{stage}_m": own[column].median()} | interval.columns(f"{stage}_ratio")
         rows.append(row)
     return pd.DataFrame(rows)
@@ -59,13 +53,11 @@ def _ratio(above: WeightedMedian, below: WeightedMedian, counts: Float) -> Float
     return above(counts) / np.where(divisor > 0, divisor, np.nan)
 
 
-def compare_methods(
-    maps: pd.DataFrame, rng: np.random.Generator, column: str = "translation_error_m"
-) -> pd.DataFrame:
+def compare_methods(maps: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
     """Every two methods on the same rich maps: ratio of their errors, and who is nearer how often.
 
     A method without an estimate on a map is infinitely far off there; where both have none it is a
-    draw. The error to compare is a column of `maps_of`.
+    draw. Compared are translation errors as estimated.
 
     Returns:
         One row per pair of methods: first, second, n_runs, n_maps, unit; ratio, the median over the
@@ -74,16 +66,16 @@ def compare_methods(
         p, of the runs' median log ratios (NaN for a single run), and p_holm, corrected for the
         number of pairs.
     """
-    frame = paired_values(rich(maps), column).reset_index()
+    frame = paired_values(rich(maps), "translation_error_m").reset_index()
     clusters = clusters_of(frame)
     rows = []
     for first, second in combinations(methods_in(rich(maps)), 2):
         known = frame[[first, second]].notna().all(axis=1).to_numpy()
-        both, codes = frame[known], clusters.codes[known]
+        both, judged = frame[known], clusters._replace(codes=clusters.codes[known])
         change = log_ratio(both[first].to_numpy(), both[second].to_numpy())
-        ratio = percentile_interval(WeightedMedian(change, codes), clusters.n, rng)
+        ratio = intervals.median_interval(change, judged, rng)
         won = (change < 0) + 0.5 * (change == 0)
-        wins = weighted_mean_interval(won, np.ones(len(won)), codes, clusters.n, rng)
+        wins = intervals.weighted_mean_interval(won, np.ones(len(won)), judged, rng)
         row: dict[str, Any] = {"first": first, "second": second}
         row |= {"n_runs": both["run_id"].nunique(), "n_maps": len(both), "unit": clusters.unit}
         row |= Interval(*np.exp(ratio)).columns("ratio") | wins.columns("first_wins")

@@ -5,11 +5,7 @@ import pandas as pd
 
 from experiments.judge.fused_landmarks import mean_nees_band
 from experiments.judge.path_errors import STATISTICS
-from experiments.study.statistics.bootstrap import (
-    WeightedMedian,
-    percentile_interval,
-    weighted_mean_interval,
-)
+from experiments.study.statistics import intervals
 
 FUSION_COLUMNS = ("nees_with_drift", "nees_without_drift", "degrees_of_freedom", "true_pair")
 _PATH_KEYS = ["source", "quantity", "delta", "delta_unit"]
@@ -24,11 +20,10 @@ def path_summary(path_statistics: pd.DataFrame, rng: np.random.Generator) -> pd.
     """
     rows = []
     for keys, own in path_statistics.groupby(_PATH_KEYS, sort=False, dropna=False):
-        codes, runs = pd.factorize(own["run_id"])
-        rmse = WeightedMedian(own["rmse"].to_numpy(), codes)
-        _, low, high = percentile_interval(rmse, len(runs), rng)
-        row = dict(zip(_PATH_KEYS, keys, strict=True)) | {"n_runs": len(runs), "n_paths": len(own)}
+        runs = intervals.clusters_of(own)
+        row = dict(zip(_PATH_KEYS, keys, strict=True)) | {"n_runs": runs.n, "n_paths": len(own)}
         row |= dict(own[list(STATISTICS)].median())
+        _, low, high = intervals.median_interval(own["rmse"].to_numpy(), runs, rng)
         rows.append(row | {"rmse_low": low, "rmse_high": high})
     return pd.DataFrame(rows)
 
@@ -46,15 +41,14 @@ def nees_of_maps(landmark_nees: pd.DataFrame, rng: np.random.Generator) -> pd.Da
     rows = []
     known = landmark_nees[landmark_nees["n_landmarks"] > 0]
     for kind, own in known.groupby("landmarks", sort=False):
-        codes, runs = pd.factorize(own["run_id"])
-        weight = own["n_landmarks"].to_numpy(dtype=np.float64)
+        runs, weight = intervals.clusters_of(own), own["n_landmarks"].to_numpy(dtype=np.float64)
         dof, share = own["degrees_of_freedom"].to_numpy(), own["share_in_gate"].to_numpy()
         per_dof = own["nees_mean"].to_numpy() / dof
-        nees = weighted_mean_interval(per_dof, dof * weight, codes, len(runs), rng)
-        inside = weighted_mean_interval(share, weight, codes, len(runs), rng)
+        nees = intervals.weighted_mean_interval(per_dof, dof * weight, runs, rng)
+        inside = intervals.weighted_mean_interval(share, weight, runs, rng)
         # the degrees of freedom of a sum add up
         band = dict(zip(("band_low", "band_high"), mean_nees_band(dof @ weight, 1), strict=True))
-        row = {"landmarks": kind, "n_runs": len(runs), "n_landmarks": int(weight.sum())}
+        row = {"landmarks": kind, "n_runs": runs.n, "n_landmarks": int(weight.sum())}
         row |= nees.columns("nees_per_dof") | band | inside.columns("share_in_gate")
         rows.append(row)
     return pd.DataFrame(rows)

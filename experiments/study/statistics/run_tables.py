@@ -61,13 +61,12 @@ class Runs:
         self, table: str, columns: Sequence[str] | None = None, optional: Sequence[str] = ()
     ) -> Iterator[pd.DataFrame]:
         """Each run's rows; see `read`."""
-        files = self.files(table)
-        if not files:
-            where = ", ".join(str(path) for path in [r.path for r in self.results] + [*self.sweeps])
+        if not self.has(table):
+            where = ", ".join(map(str, [*(result.path for result in self.results), *self.sweeps]))
             what = f"no table {table} (expected the results of `run` or `sweep`)"
             raise InputError(f"{where}: {what}")
         seen: dict[str, Path] = {}
-        for file in files:
+        for file in self.files(table):
             rows = _read(file, table, columns, optional)
             for run_id in rows["run_id"].unique():
                 if run_id in seen:
@@ -98,13 +97,9 @@ class Runs:
     @property
     def names(self) -> set[str]:
         """All runs that have errors or paths, by scenario, seed and settings."""
-        return {
-            name
-            for table in ("errors", "robots")
-            if self.has(table)
-            for rows in self.each(table, ["iteration"])
-            for name in match_names(rows.drop_duplicates("run_id"))
-        }
+        tables_there = filter(self.has, ("errors", "robots"))
+        every = (rows for table in tables_there for rows in self.each(table, ["iteration"]))
+        return {name for rows in every for name in match_names(rows.drop_duplicates("run_id"))}
 
     @cached_property
     def _told(self) -> pd.DataFrame:
@@ -138,9 +133,8 @@ def find_runs(paths: Path | Sequence[Path]) -> Runs:
             results.append(RunPath(path, _run_of(path / "scenario.json")))
         else:
             what = "no such folder" if not path.is_dir() else "no scenario.json and no sweep.json"
-            raise InputError(
-                f"{path}: {what} (expected a result folder of `run` or a folder of `sweep`)"
-            )
+            expected = "a result folder of `run` or a folder of `sweep`"
+            raise InputError(f"{path}: {what} (expected {expected})")
     return Runs(tuple(results), tuple(sweeps))
 
 
@@ -173,7 +167,16 @@ def _read(
     try:
         data = ds.dataset(file.path, format="parquet")
         _require_readable(file.path, table, data.schema)
-        wanted = _wanted(file, table, data.schema.names, columns, optional)
+        found, of_run = data.schema.names, () if file.run else RUN_KEYS
+        missing = [name for name in (*of_run, *(columns or ())) if name not in found]
+        if missing:
+            raise InputError(f"{file.path}: has no column {', '.join(missing)} (a table {table})")
+        wanted = found
+        if columns is not None:
+            own = set(tables.ALL[table].names) if table in tables.ALL else set(_TOLD)
+            leading = [] if file.run else takewhile(lambda name: name not in own, found)
+            there = (name for name in optional if name in found)
+            wanted = list(dict.fromkeys([*leading, *columns, *there]))
         rows = data.to_table(columns=wanted).to_pandas()
     except _DAMAGED as error:
         reason = str(error).splitlines()[0]
@@ -181,26 +184,6 @@ def _read(
     for place, (name, value) in enumerate(file.run.items()):
         rows.insert(place, name, value)
     return rows.assign(**{name: float("nan") for name in optional if name not in rows})
-
-
-def _wanted(
-    file: RunPath,
-    table: str,
-    found: list[str],
-    columns: Sequence[str] | None,
-    optional: Sequence[str],
-) -> list[str]:
-    """The columns to read of those found: the run's, then the table's."""
-    own = set(tables.ALL[table].names) if table in tables.ALL else set(_TOLD)
-    leading = [] if file.run else list(takewhile(lambda name: name not in own, found))
-    required = [*([] if file.run else RUN_KEYS), *(columns or [])]
-    missing = [name for name in required if name not in found]
-    if missing:
-        raise InputError(f"{file.path}: has no column {', '.join(missing)} (a table {table})")
-    if columns is None:
-        return found
-    chosen = [*leading, *columns, *(name for name in optional if name in found)]
-    return list(dict.fromkeys(chosen))
 
 
 def _require_readable(path: Path, table: str, schema: pa.Schema) -> None:

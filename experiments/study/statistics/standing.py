@@ -1,8 +1,9 @@
 """How each aligner stands on the maps of one or more runs, and which one to use."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -12,23 +13,20 @@ from experiments.judge.criteria import ORACLE, answerable, has_common_ground, ri
 from experiments.judge.judged_maps import ERROR_COLUMNS, MAP_PAIR, error_over_oracle, maps_of
 from experiments.judge.metrics import repetition_spread_m
 from experiments.judge.tables import SHOWN
-from experiments.study.statistics.better import (
-    SIGNIFICANCE,
-    change_of_each_run,
-    holm,
-    log_ratio,
-    mean_change,
-)
+from experiments.study.statistics import better
 from experiments.study.statistics.methods_compared import paired_values
 from experiments.study.statistics.success_rates import success_rates
 from mapfusion.align.result import Status
-from mapfusion.se2 import Float
 
 # Aligners are equal if the test does not tell them apart and what was measured lies no farther
-# apart than this: what few runs cannot prove they do not disprove either.
+# apart than this: what few runs cannot prove they do not disprove either. Shares: by one map, which
+# chance decides, or of many by one in twenty: the robots go on and meet there again, and a merge
+# that now and then comes later costs less than larger errors or more time everywhere.
 _EQUAL_SHARE = 0.05
+_ROUNDING = 1e-9  # in sums of repetitions' shares
+# Errors: by the median map, which a lost one does not move. Good estimates are a few decimetres
+# off: a tenth of that is less than the maps' own drift, and the refinement evens it out.
 _EQUAL_LOG_RATIO = math.log(1.1)
-
 
 # The names that a `Standing` has for columns of `SHOWN`, and for the rates' of `success_rates`.
 _ERRORS = dict(
@@ -166,11 +164,9 @@ def _ranked(
     )
     if not by_rate or ground.empty:
         return by_rate, ()
-    success = paired_values(ground, "refined_success")
-    contenders = _equal_to_first(by_rate, success, np.subtract, _EQUAL_SHARE)
+    contenders = _equal_to_first(by_rate, ground, "refined_success")
     contenders.sort(key=lambda s: _or_last(s.estimated_m))
-    error = paired_values(ground, "translation_error_m")
-    equal = _equal_to_first(contenders, error, log_ratio, _EQUAL_LOG_RATIO)
+    equal = _equal_to_first(contenders, ground, "translation_error_m")
     equal.sort(key=lambda s: _or_last(s.time_ms))
     rest = [s for s in contenders if s not in equal]
     others = [s for s in by_rate if s not in contenders]
@@ -182,25 +178,22 @@ def _or_last(value: float, missing: float = math.inf) -> float:
     return missing if math.isnan(value) else value
 
 
-def _equal_to_first(
-    standings: list[Standing],
-    values: pd.DataFrame,
-    change_of: Callable[[Float, Float], Float],
-    slack: float,
-) -> list[Standing]:
-    """The first, and those that the test does not tell from it."""
-    first = values[standings[0].aligner].to_numpy()
-    run_id = values.index.get_level_values("run_id")
-    tests = []
+def _equal_to_first(standings: list[Standing], maps: pd.DataFrame, column: str) -> list[Standing]:
+    """The first, and those that neither the test nor the band tells from it in this column."""
+    values, is_share = paired_values(maps, column), column == "refined_success"
+    p_values, near = [], []
     for standing in standings[1:]:
-        changes = change_of(values[standing.aligner].to_numpy(), first)
-        known = ~np.isnan(changes)
-        mean = change_of is np.subtract
-        of_runs = change_of_each_run(changes[known], run_id[known], run_id.nunique(), mean)
-        tests.append(mean_change(of_runs))
-    p_holm = holm(np.array([test.p for test in tests]))
-    return [standings[0]] + [
-        standing
-        for standing, test, p in zip(standings[1:], tests, p_holm, strict=True)
-        if not p <= SIGNIFICANCE and abs(test.change) <= slack
-    ]
+        judged = values[[standings[0].aligner, standing.aligner]].dropna()  # by both
+        n, (first, own) = len(judged), judged.to_numpy(np.float64).T
+        changes = own - first if is_share else better.log_ratio(own, first)
+        run_id = judged.index.get_level_values("run_id")
+        n_runs = maps["run_id"].nunique()
+        of_runs = better.change_of_each_run(changes, run_id, n_runs, is_share)
+        p_values.append(better.mean_change(of_runs).p)
+        apart = pd.Series(changes).clip(-better.LARGEST_LOG_RATIO, better.LARGEST_LOG_RATIO)
+        if is_share:
+            near.append(abs(apart.mean()) * n <= max(1, _EQUAL_SHARE * n) + _ROUNDING)
+        else:
+            near.append(abs(apart.median()) <= _EQUAL_LOG_RATIO)
+    same = np.array(near, bool) & ~(better.holm(np.array(p_values)) <= better.SIGNIFICANCE)
+    return [standings[0], *compress(standings[1:], same)]

@@ -1,11 +1,11 @@
 """How often each method is right, against what makes it hard, with Wilson intervals.
 
 Rows of one run depend on each other: its maps grow from one another, its pairs share robots, the
-repetitions share maps. An interval over rows would be several times too narrow, so the trials that
-Wilson's interval is given are runs (`effective_trials`): right whatever the dependence, and wider
-than need be where a run's maps differ from each other.
+repetitions share maps. So the trials of Wilson's interval are runs (`effective_trials`).
 """
 
+from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -13,8 +13,7 @@ import pandas as pd
 
 from experiments.judge.criteria import at_the_end, has_common_ground
 from experiments.judge.judged_maps import methods_in
-from experiments.study.statistics.bootstrap import clusters_of
-from experiments.study.statistics.wilson import effective_trials, wilson
+from experiments.study.statistics.intervals import clusters_of, effective_trials, wilson
 from mapfusion.se2 import Float
 
 LAST = "last"
@@ -26,15 +25,16 @@ EDGES: dict[str, tuple[float, ...]] = {
     "n_true": _COUNT_EDGES,
     "overlap_share": (0, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1),
     "outlier_share": (0, 0.2, 0.5, 0.7, 0.8, 0.9, 0.95, 0.99, 1),
+    LAST: (0, np.inf),
 }
-BY = ("iteration", *EDGES, LAST)
+BY = ("iteration", *EDGES)
 _ITERATION_BINS = 8
 _WITHOUT_TEST = ("estimated_success", "refined_success")
-_SHARES = (*_WITHOUT_TEST, "accepted", "false_accepted", "refused_apart")
+_WITH_TEST = (*_WITHOUT_TEST, "accepted", "false_accepted", "refused_apart")
 
 
 def success_rates(
-    maps: pd.DataFrame, by: str, edges: tuple[float, ...] | None = None
+    maps: pd.DataFrame, by: str, edges: Sequence[float] | None = None
 ) -> pd.DataFrame:
     """Success rates of each method over rows of `maps_of`, binned.
 
@@ -61,33 +61,31 @@ def success_rates(
         raise ValueError(f"by: these rows have no {by}")
     used = at_the_end(maps) if by == LAST else maps
     clusters = clusters_of(used)
-    if by == LAST:
-        chosen = np.array([0.0, np.inf])
-        values = np.zeros(len(used))
-    else:
-        values = used[by].to_numpy(dtype=np.float64)
-        chosen = np.array(edges if edges is not None else _edges(by, values), dtype=np.float64)
+    # of LAST a single bin holds all
+    values = used["n_common" if by == LAST else by].to_numpy(dtype=np.float64)
+    chosen = np.asarray(_edges(by, values) if edges is None else edges, dtype=np.float64)
     if len(chosen) < 2 or np.any(np.diff(chosen) <= 0):
         raise ValueError("edges: must be two or more that rise")
     place = np.searchsorted(chosen, values, side="right") - 1
     place[values == chosen[-1]] = len(chosen) - 2
     rows = []
-    for number in range(len(chosen) - 1):
+    for number, limits in enumerate(pairwise(chosen)):
         for aligner in methods_in(maps, oracle=True):
             inside = (place == number) & (used["aligner"] == aligner).to_numpy()
             if inside.any():
-                limits = {} if by == LAST else {"from": chosen[number], "to": chosen[number + 1]}
-                row = _rates(used[inside], clusters.codes[inside])
-                rows.append(limits | {"aligner": aligner} | row | {"unit": clusters.unit})
-    return pd.DataFrame(rows)
+                row = dict(zip(("from", "to"), limits, strict=True)) | {"aligner": aligner}
+                row |= _rates(used[inside], clusters.codes[inside])
+                rows.append(row | {"unit": clusters.unit})
+    rates = pd.DataFrame(rows)
+    return rates.drop(columns=["from", "to"]) if by == LAST else rates
 
 
-def _edges(by: str, values: Float) -> Float:
-    if by in EDGES:
-        return np.array(EDGES[by])
+def _edges(by: str, values: Float) -> Sequence[float]:
+    if by != "iteration":
+        return EDGES[by]
     iterations = np.unique(values)
     groups = np.array_split(iterations, min(_ITERATION_BINS, len(iterations)))
-    return np.array([group[0] for group in groups if len(group)] + [values.max() + 1])
+    return [*(group[0] for group in groups), values.max() + 1]
 
 
 def _rates(rows: pd.DataFrame, codes: np.ndarray) -> dict[str, Any]:
@@ -95,15 +93,12 @@ def _rates(rows: pd.DataFrame, codes: np.ndarray) -> dict[str, Any]:
     ground = has_common_ground(rows).to_numpy()
     found: dict[str, Any] = {"n_runs": rows["run_id"].nunique(), "n_maps": len(rows)}
     found |= {"n_apart": int(np.count_nonzero(~ground))}
-    has_test = bool(rows["accepted"].notna().any())
-    for name in _SHARES:
+    for name in _WITH_TEST if rows["accepted"].notna().any() else _WITHOUT_TEST:
         known = rows[name].notna().to_numpy() & (ground if name == "accepted" else True)
         share = low = high = np.nan
         if known.any():
             n = effective_trials(np.unique(codes[known], return_counts=True)[1])
             share = float(rows[name][known].mean())
             low, high = map(float, wilson(share * n, n))
-        elif name not in _WITHOUT_TEST and not has_test:
-            continue
         found |= {name: share, f"{name}_low": low, f"{name}_high": high}
     return found

@@ -1,9 +1,8 @@
 """All tables of statistics over some runs, by name."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -11,6 +10,7 @@ import pandas as pd
 from experiments.judge.criteria import that_ever_meet
 from experiments.judge.judged_maps import MAP_KEYS, NEEDED, OPTIONAL, maps_of, setting_columns
 from experiments.scenario.randomness import generator
+from experiments.study.statistics import paths_and_nees
 from experiments.study.statistics.error_bands import (
     ROBOT_PAIR,
     error_bands,
@@ -18,12 +18,6 @@ from experiments.study.statistics.error_bands import (
     time_bands,
 )
 from experiments.study.statistics.methods_compared import compare_methods, oracle_ratios
-from experiments.study.statistics.paths_and_nees import (
-    FUSION_COLUMNS,
-    nees_of_maps,
-    nees_of_pairs,
-    path_summary,
-)
 from experiments.study.statistics.run_tables import Runs
 from experiments.study.statistics.success_rates import LAST, success_rates
 from mapfusion.align.result import Status
@@ -41,14 +35,13 @@ _TIMING_COLUMNS = (*MAP_KEYS, "aligner", "n_correspondences", "n_common", "elaps
 # Of tables that not every run has: what is read, under what name which statistics go, their seed.
 _FURTHER: dict[str, tuple[Any, str, Callable[..., pd.DataFrame], str]] = {
     "aligner_timings": (_TIMING_COLUMNS, "time_by_overlap", time_bands, ""),
-    "path_statistics": (None, "paths", path_summary, "paths"),
-    "landmark_nees": (None, "nees", nees_of_maps, "nees"),
-    "fusion": (FUSION_COLUMNS, "nees", nees_of_pairs, "fusion"),
+    "path_statistics": (None, "paths", paths_and_nees.path_summary, "paths"),
+    "landmark_nees": (None, "nees", paths_and_nees.nees_of_maps, "nees"),
+    "fusion": (paths_and_nees.FUSION_COLUMNS, "nees", paths_and_nees.nees_of_pairs, "fusion"),
 }
 
 
-@dataclass(frozen=True)
-class Summary:
+class Summary(NamedTuple):
     """Statistics over some runs.
 
     Attributes:
@@ -64,7 +57,7 @@ class Summary:
     run_medians: pd.DataFrame
     timings: pd.DataFrame
     missing: tuple[str, ...]
-    failed: pd.DataFrame = field(default_factory=pd.DataFrame)
+    failed: pd.DataFrame
 
     @property
     def n_configurations(self) -> int:
@@ -76,8 +69,8 @@ class Summary:
 def configurations(frame: pd.DataFrame) -> Iterator[tuple[dict[str, Any], pd.DataFrame]]:
     """Labels and rows by scenario and settings; also of all scenarios, if several."""
     names = ["scenario", *setting_columns(frame)]
-    several = len(frame["scenario"].unique()) > 1
-    for each in [frame, *([frame.assign(scenario=ALL_SCENARIOS)] if several else [])]:
+    pooled = frame.assign(scenario=ALL_SCENARIOS)
+    for each in [frame, pooled] if len(frame["scenario"].unique()) > 1 else [frame]:
         for keys, rows in each.groupby(names, sort=False, dropna=False):
             yield dict(zip(names, keys, strict=True)), rows
 
@@ -91,19 +84,18 @@ def summarise(runs: Runs) -> Summary:
     made["methods_compared"] = _each(maps, compare_methods, "paired")
     made["errors_by_iteration"] = _each(medians, _error_bands)
     timings = pd.DataFrame()
-    there = {name: how for name, how in _FURTHER.items() if runs.has(name)}
-    for table, (columns, name, made_of, seed) in there.items():
-        rows = runs.read(table, columns)
-        before = [made[name]] if name in made else []
-        made[name] = pd.concat([*before, _each(rows, made_of, seed)], ignore_index=True)
-        timings = rows if table == "aligner_timings" else timings
+    missing = tuple(table for table in _FURTHER if not runs.has(table))
+    for table, (columns, name, made_of, seed) in _FURTHER.items():
+        if table not in missing:
+            rows = runs.read(table, columns)
+            parts = [made.get(name), _each(rows, made_of, seed)]
+            made[name] = pd.concat(parts, ignore_index=True)
+            timings = rows if table == "aligner_timings" else timings
     made = {name: table for name, table in made.items() if len(table)}
-    missing = tuple(name for name in _FURTHER if name not in there)
     return Summary(len(runs.names), made, medians, timings, missing, runs.failed)
 
 
-@dataclass(frozen=True)
-class ReducedErrors:
+class ReducedErrors(NamedTuple):
     """The errors of some runs, read and reduced run by run to `maps_of` and `medians_of_run`.
 
     The absent aligners are those whose package is not installed, which is no failure.
@@ -116,20 +108,18 @@ class ReducedErrors:
 
 def reduced_errors(runs: Runs) -> ReducedErrors:
     """All that statistics, figures and reports say of errors starts from these rows."""
-    maps, medians = [], []
-    every: dict[str, None] = {}
+    maps, medians, every = [], [], []
     for whole in runs.each("errors", NEEDED, ("status", *OPTIONAL)):
-        every |= dict.fromkeys(whole["aligner"])
+        every += whole["aligner"].unique().tolist()
         errors = whole[whole["status"] != Status.ABSENT]
         if len(errors):
             maps.append(maps_of(errors))
             medians.append(medians_of_run(errors))
     if not maps:  # robots that were alone
         nothing = pd.DataFrame(columns=["run_id", "scenario", "aligner"])
-        return ReducedErrors(nothing, nothing, list(every))
+        return ReducedErrors(nothing, nothing, list(dict.fromkeys(every)))
     joined = with_overlap_share(pd.concat(maps, ignore_index=True), runs)
-    there = set(joined["aligner"])
-    absent = [name for name in every if name not in there]
+    absent = [name for name in dict.fromkeys(every) if name not in set(joined["aligner"])]
     return ReducedErrors(joined, pd.concat(medians, ignore_index=True), absent)
 
 

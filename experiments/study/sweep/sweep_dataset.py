@@ -36,14 +36,10 @@ _OWN_FIELDS = {
         libraries=TEXT,  # JSON object of versions
         source_hash=TEXT,
     ),
-    # Seconds of work behind the run, by stage: also of stages that it shares with other runs.
-    # Beside `aligner_timings` the only table that differs from time to time.
-    RUN_TIMES: fields(
-        stage=TEXT,
-        key=TEXT,
-        figure=TEXT,  # elapsed_s, or rendering_s as a part of it
-        seconds=FLOAT,
-    ),
+    # Seconds of work behind the run, by stage: also of stages that it shares with other runs. The
+    # figure is elapsed_s, or rendering_s as a part of it. Beside `aligner_timings` the only table
+    # that differs from time to time.
+    RUN_TIMES: fields(stage=TEXT, key=TEXT, figure=TEXT, seconds=FLOAT),
 }
 
 
@@ -61,35 +57,36 @@ class SweepDataset:
     def write(self, table: str, run: SweepRun, rows: pd.DataFrame | list[dict[str, Any]]) -> None:
         """Write a run's rows of one table."""
         own = _OWN_FIELDS[table] if table in _OWN_FIELDS else list(tables.ALL[table])
-        settings = dict(run.settings)
-        leading = {"run_id": TEXT, "scenario": TEXT, "seed": pa.int64()}
-        leading |= dict.fromkeys(settings, TEXT)
-        frame = pd.DataFrame(rows, columns=pd.Index([field.name for field in own]))
-        frame = frame.assign(run_id=run.run_id, scenario=run.scenario, seed=run.seed, **settings)
-        table_schema = schema(f"sweep.{table}", SCHEMA_VERSION, fields(**leading) + own)
+        told: dict[str, Any] = {"run_id": run.run_id, "scenario": run.scenario, "seed": run.seed}
+        told |= dict(run.settings)
+        leading = fields(**dict.fromkeys(told, TEXT) | {"seed": pa.int64()})
+        frame = pd.DataFrame(rows, columns=pd.Index([field.name for field in own])).assign(**told)
+        table_schema = schema(f"sweep.{table}", SCHEMA_VERSION, leading + own)
         write_rows(self.path(table, run), table_schema, frame)
 
     def finish(self, run: SweepRun, renderer: str, stages: Sequence[str]) -> None:
         """Say that all rows of a run are there."""
-        self._details(run).unlink(missing_ok=True)
         row = {"status": "finished", "reason": "", "renderer": renderer}
-        self.write(RUNS, run, [row | _made_by(stages)])
+        self._end(run, row | _made_by(stages))
 
     def fail(
         self, run: SweepRun, reason: str, details: str = "", stages: Sequence[str] = ()
     ) -> None:
         """Say why a run has no rows; those of an earlier, finished one are removed."""
         row = {"status": "failed", "reason": reason, "renderer": ""}
-        self.write(RUNS, run, [row | _made_by(stages)])
-        for folder in self.folder.iterdir():
-            if folder.is_dir() and folder.name != RUNS:
-                (folder / f"{run.run_id}.parquet").unlink(missing_ok=True)
-        self._details(run).unlink(missing_ok=True)
+        path = self._end(run, row | _made_by(stages))
+        for file in self.folder.glob(f"*/{run.run_id}.parquet"):
+            if file.parent.name != RUNS:
+                file.unlink(missing_ok=True)
         if details:
-            write_whole(self._details(run), lambda file: file.write_text(details, encoding="utf-8"))
+            write_whole(path, lambda file: file.write_text(details, encoding="utf-8"))
 
-    def _details(self, run: SweepRun) -> Path:
-        return self.folder / "failures" / f"{run.run_id}.txt"
+    def _end(self, run: SweepRun, row: dict[str, str]) -> Path:
+        """Write the row of `runs`; returns where details of a failure go, none of which is left."""
+        details = self.folder / "failures" / f"{run.run_id}.txt"
+        details.unlink(missing_ok=True)
+        self.write(RUNS, run, [row])
+        return details
 
     def holds(self, run: SweepRun, stages: Sequence[str]) -> bool:
         """Whether the run is finished, made from these stages by the source as it is now."""
@@ -119,9 +116,8 @@ def open_dataset(folder: Path, keys: Iterable[str]) -> SweepDataset:
     if path.exists():
         _require_settings(path, dataset.keys)
     elif folder.exists() and any(folder.iterdir()):
-        raise InputError(
-            f"{folder}: is no folder of a sweep (no sweep.json); give another --output"
-        )
+        what = "is no folder of a sweep (no sweep.json); give another --output"
+        raise InputError(f"{folder}: {what}")
     else:
         description = {"schema_version": SCHEMA_VERSION, "kind": "sweep", "settings": dataset.keys}
         text = json.dumps(description, indent=1)
@@ -136,9 +132,8 @@ def _require_settings(path: Path, keys: tuple[str, ...]) -> None:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: damaged or no description of a sweep ({error})") from error
     if version != SCHEMA_VERSION:
-        raise InputError(
-            f"{path}: schema_version is {version}, this program reads {SCHEMA_VERSION}"
-        )
+        reads = f"this program reads {SCHEMA_VERSION}"
+        raise InputError(f"{path}: schema_version is {version}, {reads}")
     if tuple(known) != keys:
         was, now = (", ".join(listed) or "seeds alone" for listed in (known, keys))
         raise InputError(

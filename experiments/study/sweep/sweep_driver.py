@@ -6,7 +6,7 @@ import tempfile
 import time
 import uuid
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence, Sized
+from collections.abc import Callable, Collection, Sized
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import cast
@@ -14,6 +14,8 @@ from typing import cast
 from distributed import Client, Future, as_completed
 from distributed.scheduler import KilledWorker
 
+from experiments.judge.judged_run import JudgedRun
+from experiments.judge.result import measure_aligners
 from experiments.methods.threads import single_threaded
 from experiments.run import dask_worker
 from experiments.run.dask_cluster import connected
@@ -21,7 +23,7 @@ from experiments.run.store import explained
 from experiments.run.tasks import OnProgress, Task
 from experiments.study.sweep.combinations import SweepRun
 from experiments.study.sweep.sweep_dataset import ALIGNER_TIMINGS, open_dataset
-from experiments.study.sweep.sweep_plan import PlannedRun, Sweep, planned, write_aligner_timings
+from experiments.study.sweep.sweep_plan import PlannedRun, Sweep, planned
 from mapfusion.errors import InputError
 
 # Tasks at Dask for each worker. Enough that none waits while this process plans the next run; few
@@ -40,11 +42,8 @@ _OLD_S = 24 * 3600  # in a sweep that runs, tasks begin and end in the meantime
 class SweepProgress:
     """How far a sweep is; the driver counts on in it.
 
-    Attributes:
-        runs: in all.
-        done: runs that need nothing more.
-        failed: those of them that failed, with their reasons, by run id.
-        tasks, tasks_done: by label, of the runs looked at so far.
+    Runs in all; those `done`, which need nothing more; of these the failed ones, with their reasons
+    by run id. Tasks by label, of the runs looked at so far.
     """
 
     runs: int
@@ -54,15 +53,14 @@ class SweepProgress:
     tasks_done: Counter[str] = field(default_factory=Counter)
 
 
+OnSweepProgress = Callable[[SweepProgress], None]
+
+
 class SweepDriver:
     """Runs everything that is not finished; a run that fails does not stop the others."""
 
     def __init__(
-        self,
-        client: Client,
-        sweep: Sweep,
-        terms: dask_worker.Terms,
-        on_progress: Callable[[SweepProgress], None],
+        self, client: Client, sweep: Sweep, terms: dask_worker.Terms, on_progress: OnSweepProgress
     ) -> None:
         self._client, self._sweep, self._terms = client, sweep, terms
         self._on_progress = on_progress
@@ -100,10 +98,10 @@ class SweepDriver:
         try:
             laid_out = planned(run, self._sweep.store, self._sweep.dataset)
         except InputError as error:  # no world can be made from this seed, a log is damaged, ...
-            self._fail(run, " ".join(str(error).split()))
-            return
-        if not laid_out.left:
+            reason = " ".join(str(error).split())
             self.progress.done += 1
+            self.progress.failed[run.run_id] = reason
+            self._sweep.dataset.fail(run, reason)
             return
         self._open[laid_out] = set()
         blocked: set[str] = set()
@@ -146,10 +144,8 @@ class SweepDriver:
     def _failure(self, future: Future, name: str) -> dask_worker.TaskFailedError:
         """Which task failed and why: those that needed it fail like it."""
         if future.status != "error":
-            raise InputError(
-                "the connection to the Dask scheduler was lost; what was finished is kept, the "
-                "same command goes on from there"
-            )
+            kept = "what was finished is kept, the same command goes on from there"
+            raise InputError(f"the connection to the Dask scheduler was lost; {kept}")
         error = future.exception()
         if isinstance(error, dask_worker.TaskFailedError):
             return error
@@ -166,21 +162,13 @@ class SweepDriver:
         if self._open[laid_out]:
             return
         del self._open[laid_out]
+        self.progress.done += 1
         # All tasks that could be done were done, so which comes first does not depend on chance.
         failures = (self._failures.get(task.name) for task in laid_out.left)
-        first = next(filter(None, failures), None)
-        if first is None:
-            self.progress.done += 1
-        else:
+        if first := next(filter(None, failures), None):
             reason = explained(first.reason, self._sweep.store)
-            self._fail(laid_out.run, reason, first.details, laid_out.stages)
-
-    def _fail(
-        self, run: SweepRun, reason: str, details: str = "", stages: Sequence[str] = ()
-    ) -> None:
-        self.progress.done += 1
-        self.progress.failed[run.run_id] = reason
-        self._sweep.dataset.fail(run, reason, details, stages)
+            self.progress.failed[laid_out.run.run_id] = reason
+            self._sweep.dataset.fail(laid_out.run, reason, first.details, laid_out.stages)
 
 
 def _label_and_name(key: object) -> tuple[str, str]:
@@ -190,10 +178,7 @@ def _label_and_name(key: object) -> tuple[str, str]:
 
 
 def execute(
-    sweep: Sweep,
-    jobs: int,
-    scheduler: str | None,
-    on_progress: Callable[[SweepProgress], None],
+    sweep: Sweep, jobs: int, scheduler: str | None, on_progress: OnSweepProgress
 ) -> dict[str, str]:
     """Run a sweep; returns the failed runs with their reasons.
 
@@ -205,12 +190,8 @@ def execute(
     for left_behind in folder.glob(f"{_ATTEMPTS_PREFIX}*"):  # by a sweep that was killed
         if time.time() - left_behind.stat().st_mtime > _OLD_S:  # else another one may be running
             shutil.rmtree(left_behind, ignore_errors=True)
-    with (
-        tempfile.TemporaryDirectory(
-            prefix=_ATTEMPTS_PREFIX, dir=folder, ignore_cleanup_errors=True
-        ) as attempts,
-        connected(jobs, scheduler) as client,
-    ):
+    own = tempfile.TemporaryDirectory(None, _ATTEMPTS_PREFIX, folder, ignore_cleanup_errors=True)
+    with own as attempts, connected(jobs, scheduler) as client:
         terms = dask_worker.Terms(Path(attempts), RETRIES, dask_worker.code_version())
         driver = SweepDriver(client, sweep, terms, on_progress)
         driver.execute()
@@ -224,5 +205,7 @@ def measure_times(sweep: Sweep, failed: Collection[str], on_progress: OnProgress
     for done, run in enumerate(runs):
         on_progress("time the aligners", done, len(runs))
         if not sweep.dataset.path(ALIGNER_TIMINGS, run).is_file():
-            write_aligner_timings(run, sweep.store, sweep.dataset)
+            judged = JudgedRun.of(run.load(), sweep.store)
+            measure_aligners(judged, judged.load_robots())
+            sweep.dataset.write(ALIGNER_TIMINGS, run, judged.pair_table(ALIGNER_TIMINGS))
     on_progress("time the aligners", len(runs), len(runs))

@@ -4,12 +4,10 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import pandas as pd
+from typing import NamedTuple
 
 from experiments.judge.judged_run import JudgedRun
-from experiments.judge.result import all_tables, measure_aligners, renderer
+from experiments.judge.result import all_tables, renderer
 from experiments.run.store import Store
 from experiments.run.tasks import Task, task_names, unfinished
 from experiments.scenario.suite import scenarios_of
@@ -18,6 +16,7 @@ from experiments.study.sweep.sweep_dataset import ALIGNER_TIMINGS, RUN_TIMES, Sw
 from mapfusion.errors import InputError
 
 _LONGEST_NAME = 80
+_TABLES = ("errors", "fusion", "robots", "path_statistics", "map_fits", "landmark_nees")
 
 
 class Sweep(NamedTuple):
@@ -50,18 +49,12 @@ def prepare(
     return Sweep(runs, Store.of(results.resolve()), SweepDataset(folder.resolve(), tuple(axes)))
 
 
-_TABLES = ("errors", "fusion", "robots", "path_statistics", "map_fits", "landmark_nees")
-
-
 @dataclass(frozen=True, eq=False)
 class PlannedRun:
-    """A run and its tasks.
+    """A run, the stages it is made from (STAGE/KEY), and its tasks by name.
 
-    Attributes:
-        run: which one.
-        stages: STAGE/KEY of all it is made from.
-        tasks: all of them by name; the last one writes the run's rows.
-        left: those to be done, each after those it needs; none if the dataset holds the run.
+    The last task writes the run's rows. `left` are those to be done, each after those it needs;
+    none if the dataset holds the run.
     """
 
     run: SweepRun
@@ -73,55 +66,39 @@ class PlannedRun:
 def planned(run: SweepRun, store: Store, dataset: SweepDataset) -> PlannedRun:
     """Lay out a run; nothing is computed. Raises InputError for what cannot be run."""
     judged = JudgedRun.of(run.load(), store)
-    pipeline, stages = judged.pipeline, _stages_of(judged)
+    pipeline, stages = judged.pipeline, [f"{each.name}/{each.key}" for each in judged.stages()]
     read = [stage for robot in pipeline.robots for stage in (robot.log, robot.slam)]
     read += [*(pair.estimates for pair in pipeline.pairs), *judged.judgements]
     needs = tuple(name for stage in read for name in task_names(stage))
-    name, arguments = f"run/{run.run_id}", (run, judged, dataset)
-    tasks = dict(judged.tasks)
-    tasks[name] = Task(name, "write the tables", write_rows, arguments, (), needs)
+    name, arguments = f"run/{run.run_id}", (run, judged, stages, dataset)
+    last = Task(name, "write the tables", write_rows, arguments, (), needs)
+    tasks = judged.tasks | {name: last}
     left = [] if dataset.holds(run, stages) else unfinished(tasks, [name])
     return PlannedRun(run, stages, tasks, left)
 
 
-def _stages_of(judged: JudgedRun) -> list[str]:
-    return [f"{stage.name}/{stage.key}" for stage in judged.stages()]
-
-
-def write_rows(run: SweepRun, judged: JudgedRun, dataset: SweepDataset) -> None:
+def write_rows(
+    run: SweepRun, judged: JudgedRun, stages: Sequence[str], dataset: SweepDataset
+) -> None:
     """Write a run's rows of all tables, `runs` last; no maps, no images."""
     dataset.path(ALIGNER_TIMINGS, run).unlink(missing_ok=True)  # of an earlier state of the run
-    for name, rows in _run_tables(judged).items():
-        dataset.write(name, run, rows)
-    dataset.finish(run, renderer(judged.scenario), _stages_of(judged))
-
-
-def _run_tables(judged: JudgedRun) -> dict[str, pd.DataFrame | list[dict[str, Any]]]:
     made = all_tables(judged, judged.load_team())
-    return {name: made[name] for name in _TABLES} | {
-        RUN_TIMES: [
-            {"stage": folder.name, "key": folder.key, "figure": name, "seconds": seconds}
-            for folder in judged.folders()
-            for name, seconds in folder.figures().items()
-        ],
-    }
-
-
-def write_aligner_timings(run: SweepRun, store: Store, dataset: SweepDataset) -> None:
-    """Time a finished run's aligners, serially: nothing else may be running."""
-    judged = JudgedRun.of(run.load(), store)
-    measure_aligners(judged, judged.load_robots())
-    dataset.write(ALIGNER_TIMINGS, run, judged.pair_table(ALIGNER_TIMINGS))
+    for name in _TABLES:
+        dataset.write(name, run, made[name])
+    times = [
+        {"stage": folder.name, "key": folder.key, "figure": name, "seconds": seconds}
+        for folder in judged.folders()
+        for name, seconds in folder.figures().items()
+    ]
+    dataset.write(RUN_TIMES, run, times)
+    dataset.finish(run, renderer(judged.scenario), stages)
 
 
 @dataclass
 class Survey:
     """What a sweep would do: runs in all, finished, and that cannot be laid out; tasks by label.
 
-    Attributes:
-        wanted: over all runs, as if nothing were shared.
-        finished: on disk.
-        left: to be computed.
+    Tasks are `wanted` over all runs, as if nothing were shared.
     """
 
     runs: int

@@ -3,9 +3,10 @@ import pandas as pd
 import pytest
 import scipy.stats
 
-from experiments.study.statistics.bootstrap import (
+from experiments.study.statistics.intervals import (
     MAPS_OF_ONE_RUN,
     RUN,
+    Clusters,
     WeightedMedian,
     clusters_of,
     percentile_interval,
@@ -40,7 +41,7 @@ def test_weighted_medians_are_the_same_in_however_many_parts(
     median = WeightedMedian(rng.normal(size=50), rng.integers(0, 10, 50))
     counts = rng.multinomial(10, np.full(10, 0.1), size=40)
     whole = median(counts)
-    monkeypatch.setattr("experiments.study.statistics.bootstrap._MAX_CELLS", 60)
+    monkeypatch.setattr("experiments.study.statistics.intervals._MAX_CELLS", 60)
     np.testing.assert_array_equal(median(counts), whole)
 
 
@@ -78,14 +79,15 @@ def test_resampling_runs_covers_and_resampling_rows_does_not() -> None:
 
 def test_weighted_mean_is_of_rows_in_resampled_clusters() -> None:
     rng = np.random.default_rng(6)
-    values, weights, codes = rng.normal(size=60), rng.uniform(size=60), np.repeat(np.arange(6), 10)
-    found = weighted_mean_interval(values, weights, codes, 6, np.random.default_rng(8))
+    values, weights = rng.normal(size=60), rng.uniform(size=60)
+    runs = Clusters(np.repeat(np.arange(6), 10), 6, RUN)
+    found = weighted_mean_interval(values, weights, runs, np.random.default_rng(8))
     assert found.value == pytest.approx(np.average(values, weights=weights))
     assert found.low < found.value < found.high
-    again = weighted_mean_interval(values, weights, codes, 6, np.random.default_rng(8))
+    again = weighted_mean_interval(values, weights, runs, np.random.default_rng(8))
     assert again == found  # the same generator, the same interval
     assert found.columns("x") == {"x": found[0], "x_low": found[1], "x_high": found[2]}
-    alone = weighted_mean_interval(values, weights, np.zeros(60, int), 1, rng)
+    alone = weighted_mean_interval(values, weights, Clusters(np.zeros(60, int), 1, RUN), rng)
     assert np.isnan([alone.low, alone.high]).all()
 
 

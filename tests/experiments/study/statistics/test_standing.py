@@ -80,6 +80,28 @@ def test_of_equal_ones_the_fastest_wins_and_the_others_are_equals() -> None:
     assert verdict.equals == ("slow",)
 
 
+@pytest.mark.parametrize("lost_m", [9.0, np.nan])
+@pytest.mark.parametrize("n_maps", [6, 16, 20])
+def test_one_map_does_not_decide(n_maps: int, lost_m: float) -> None:
+    """Neither by its share, which is more than 5 points of 16, nor by the error that it adds."""
+    near = [0.1 + 0.005 * (-1) ** k for k in range(n_maps)]
+    errors = {"steady": near, "fast": [*near[:-1], lost_m]}
+    verdict = verdict_of(made_up(errors), timings(steady=5, fast=1))
+    assert [s.aligner for s in verdict.standings] == ["fast", "steady"]
+    assert verdict.equals == ("steady",)
+    errors["fast"] = [*near[:-2], lost_m, lost_m]
+    verdict = verdict_of(made_up(errors), timings(steady=5, fast=1))
+    assert [s.aligner for s in verdict.standings] == ["steady", "fast"]
+    assert verdict.equals == ()
+
+
+def test_methods_without_a_map_in_common_are_not_equal() -> None:
+    errors = made_up({"one": [0.1] * 6, "other": [0.1] * 6})
+    early = errors["iteration"] < 3
+    apart = errors[(errors["aligner"] == "oracle") | ((errors["aligner"] == "one") == early)]
+    assert verdict_of(apart).equals == ()
+
+
 def test_repetitions_are_no_trials() -> None:
     errors = made_up({"one": [0.1] * 5})
     repeated = pd.concat([errors.assign(repetition=r) for r in range(20)])

@@ -7,11 +7,10 @@ from scipy.stats import binomtest
 
 from experiments.judge.criteria import RIGHT_WITHIN_M, RIGHT_WITHIN_RAD, that_ever_meet
 from experiments.judge.judged_maps import maps_of
-from experiments.study.statistics.bootstrap import MAPS_OF_ONE_RUN, RUN
+from experiments.study.statistics.intervals import MAPS_OF_ONE_RUN, RUN, wilson
 from experiments.study.statistics.run_tables import find_runs
 from experiments.study.statistics.success_rates import LAST, success_rates
 from experiments.study.statistics.summary import with_overlap_share
-from experiments.study.statistics.wilson import wilson
 from mapfusion.align.refine import Refinement
 from tests.helpers.made_up_runs import (
     ITERATIONS,

@@ -1,15 +1,21 @@
-"""Bootstrap intervals that resample whole runs, since the rows of one run depend on each other."""
+"""Intervals: Wilson's for rates, the bootstrap for medians and means.
+
+Rows of one run depend on each other, and an interval over rows would be several times too narrow:
+the bootstrap resamples whole runs, and Wilson's interval is given as many trials as they are worth.
+"""
 
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+from numpy.typing import ArrayLike
+from scipy.special import ndtri
 
 from experiments.judge.judged_maps import MAP_KEYS
-from experiments.study.statistics.wilson import CONFIDENCE
 from mapfusion.se2 import Float
 
+CONFIDENCE = 0.95
 # An interval's end at 2.5 % then rests on 50 draws (Efron & Tibshirani 1993, ch. 14.3).
 RESAMPLES = 2000
 RUN, MAPS_OF_ONE_RUN = "run", "maps of one run"
@@ -58,10 +64,9 @@ class WeightedMedian:
     """
 
     def __init__(self, values: Float, codes: np.ndarray) -> None:
-        known = ~np.isnan(values)
-        order = np.argsort(values[known], kind="stable")
-        self._values = values[known][order]
-        self._codes = codes[known][order]
+        order = np.argsort(values, kind="stable")
+        order = order[~np.isnan(values[order])]
+        self._values, self._codes = values[order], codes[order]
 
     def __call__(self, counts: Float) -> Float:
         """The medians (B,) for counts (B, n_clusters); NaN where no row counts."""
@@ -102,15 +107,55 @@ def percentile_interval(
     return Interval(value, float(low), float(high))
 
 
+def median_interval(values: Float, clusters: Clusters, rng: np.random.Generator) -> Interval:
+    """Median of rows (N,), whole clusters resampled."""
+    return percentile_interval(WeightedMedian(values, clusters.codes), clusters.n, rng)
+
+
 def weighted_mean_interval(
-    values: Float, weights: Float, codes: np.ndarray, n_clusters: int, rng: np.random.Generator
+    values: Float, weights: Float, clusters: Clusters, rng: np.random.Generator
 ) -> Interval:
-    """Weighted mean of rows (N,) whose cluster codes are (N,), whole clusters resampled."""
-    sums = np.bincount(codes, values * weights, minlength=n_clusters)
-    totals = np.bincount(codes, weights, minlength=n_clusters)
+    """Weighted mean of rows (N,), whole clusters resampled."""
+    sums = np.bincount(clusters.codes, values * weights, minlength=clusters.n)
+    totals = np.bincount(clusters.codes, weights, minlength=clusters.n)
 
     def mean(counts: Float) -> Float:
         total = counts @ totals
         return counts @ sums / np.where(total > 0, total, np.nan)
 
-    return percentile_interval(mean, n_clusters, rng)
+    return percentile_interval(mean, clusters.n, rng)
+
+
+def wilson(successes: ArrayLike, trials: ArrayLike) -> tuple[Float, Float]:
+    """Lower and upper 95 % ends of the score interval of a binomial proportion (Wilson 1927).
+
+    Unlike the textbook interval it keeps its level for few trials and for rates near 0 and 1.
+    Counts need not be whole; where there are no trials, nothing is known: [0, 1].
+
+    Raises:
+        ValueError: negative counts, or more successes than trials.
+    """
+    k, n = np.broadcast_arrays(np.asarray(successes, float), np.asarray(trials, float))
+    if np.any(k < 0) or np.any(k > n + 1e-9 * (1 + n)):  # sums of fractions round
+        raise ValueError("successes: must lie between 0 and trials")
+    z2 = ndtri((1 + CONFIDENCE) / 2) ** 2
+    known = n > 0
+    rate = np.minimum(np.divide(k, n, out=np.full(n.shape, 0.5), where=known), 1.0)
+    centre = (n * rate + z2 / 2) / (n + z2)
+    half = np.sqrt(z2 * (n * rate * (1 - rate) + z2 / 4)) / (n + z2)
+    # at rates of 0 and 1 centre and half cancel to within rounding
+    low = np.where(known & (rate > 0), np.maximum(centre - half, 0.0), 0.0)
+    high = np.where(known & (rate < 1), np.minimum(centre + half, 1.0), 1.0)
+    return low, high
+
+
+def effective_trials(rows_per_cluster: ArrayLike) -> float:
+    """How many independent trials rows in clusters are worth at the least (Kish 1965).
+
+    Whatever the dependence inside a cluster, a rate p over rows has a variance of at most
+    p (1 - p) sum m_i^2 / (sum m_i)^2, reached when all rows of a cluster share one fate. So an
+    interval with n = (sum m_i)^2 / sum m_i^2 trials never claims too much.
+    """
+    rows = np.asarray(rows_per_cluster, dtype=np.float64)
+    total = rows.sum()
+    return float(total**2 / np.sum(rows**2)) if total > 0 else 0.0
