@@ -9,7 +9,7 @@ import typer
 from experiments.cli import options
 
 app = typer.Typer()
-_DRAWING = _DRAWING
+_DRAWING = "draw the figures"
 _SUITE = Path("scenarios")
 
 

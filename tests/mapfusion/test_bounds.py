@@ -1,7 +1,7 @@
 """All kernels once with Numba's bounds checks on: none reads or writes outside of an array.
 
-A kernel in the cache ignores the flag, and a process reads it once: so a process of its own, with an
-empty cache, runs the tests of the kernels.
+A kernel in the cache ignores the flag, and a process reads it once: so a process of its own, with
+an empty cache, runs the tests of the kernels.
 """
 
 import os
