@@ -10,9 +10,12 @@ from pathlib import Path
 
 _PATIENCE_S = 900  # kernels may have to be compiled, on a busy machine
 # Read by every Python process that is started, so also by a command's workers. A finished file is
-# renamed to its name, which Python tells its audit hooks before it happens.
+# renamed to its name, which Python tells its audit hooks before it happens. Tests that run in the
+# background hand down that Ctrl-C is ignored: here it counts.
 _STAND_STILL = """
-import os, pathlib, sys, time
+import os, pathlib, signal, sys, time
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 def stand_still(event, arguments):
     if event == "os.rename" and str(arguments[1]).endswith({name!r}):

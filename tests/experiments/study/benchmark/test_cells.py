@@ -141,17 +141,13 @@ def test_what_counts_as_success() -> None:
 
 
 def test_an_absent_package_is_no_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(catalogue, "PEERS", {"far": KissMatcher})
-    monkeypatch.setattr(catalogue, "_PEER_PACKAGES", {"far": ("far-package", "no_such_module_far")})
-    catalogue.declared.cache_clear()
-    try:
-        plan = BenchmarkDesign(
-            entries_of(["far", "ransac"]), 2, pair_counts=(60,), outlier_shares=(0.5,)
-        )
-        summary = summarise(run_benchmark(plan, Store(tmp_path), quiet))
-    finally:
-        monkeypatch.undo()
-        catalogue.declared.cache_clear()
+    target = f"{KissMatcher.__module__}:KissMatcher"
+    packages = ("far-package", "no_such_module_far")
+    far = catalogue.KnownMethod("far", catalogue.Kind.PEER, target, *packages)
+    monkeypatch.setitem(catalogue._OWN_METHODS, "far", far)
+    entries = entries_of(["far", "ransac"])
+    plan = BenchmarkDesign(entries, 2, pair_counts=(60,), outlier_shares=(0.5,))
+    summary = summarise(run_benchmark(plan, Store(tmp_path), quiet))
     far = summary.iloc[0]
     assert (far["status"], far["n_failed"], far["n_wrong"]) == ("absent", 0, 0)
     assert np.isnan(far["success"])
