@@ -2,9 +2,11 @@
 
 import sys
 import warnings
-from typing import Any
+from typing import Annotated, Any
 
 import typer
+
+import mapfusion
 
 from experiments.cli import run_commands, step_commands, study_commands
 from experiments.cli.options import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_INTERRUPTED
@@ -12,10 +14,9 @@ from mapfusion.recordings.registry import IMPORTERS
 
 app = typer.Typer(
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     help="Measures how well landmark maps of independent robots can be fused.\n\n"
-    "Start with:  mapfusion run scenarios/quick.yaml",
+    "Start with:  mapfusion run quick",
 )
 for commands in (run_commands, study_commands, step_commands):
     app.add_typer(commands.app)
@@ -26,6 +27,21 @@ for name, importer in IMPORTERS.items():
     usage = f"`mapfusion import {name} {importer.example} -o logs/{name}`"
     import_app.command(name, help=f"{importer.what}: {usage}.")(step_commands.import_command(name))
 app.add_typer(import_app, name="import")
+
+
+def _tell_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"mapfusion {mapfusion.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", help="Tell the version.", callback=_tell_version, is_eager=True)
+    ] = False,
+) -> None:
+    pass
 
 
 def main() -> None:
