@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: browser-test clean-kernels lock demo test endurance lint check bench paper install clean
+.PHONY: wheel-test browser-test clean-kernels lock demo test endurance lint check bench paper install clean
 
 install: $(STAMP)
 
@@ -26,6 +26,10 @@ test: $(STAMP)
 # Ten random kills of a sweep; minutes.
 endurance: $(STAMP)
 	$(BIN)/python -m pytest tests/experiments/study/sweep/ten_kills.py -s
+
+# The wheel in a fresh environment, which takes minutes to install.
+wheel-test: $(STAMP)
+	$(BIN)/python -m pytest tests/installed_wheel.py -s
 
 # Installs Debian's chromium where it is missing (needs root for that).
 browser-test: $(STAMP)

@@ -7,7 +7,6 @@ from typing import Annotated, Any
 import typer
 
 import mapfusion
-
 from experiments.cli import run_commands, step_commands, study_commands
 from experiments.cli.options import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_INTERRUPTED
 from mapfusion.recordings.registry import IMPORTERS
@@ -38,7 +37,8 @@ def _tell_version(wanted: bool) -> None:
 @app.callback()
 def _options(
     version: Annotated[
-        bool, typer.Option("--version", help="Tell the version.", callback=_tell_version, is_eager=True)
+        bool,
+        typer.Option("--version", help="Tell the version.", callback=_tell_version, is_eager=True),
     ] = False,
 ) -> None:
     pass
@@ -52,7 +52,7 @@ def main() -> None:
     _tell_name_clashes()
     try:
         use_kernel_cache()
-        code = app(standalone_mode=False) or 0
+        code = app(prog_name="mapfusion", standalone_mode=False) or 0
     except InputError as error:
         _complain(str(error))
         code = EXIT_BAD_INPUT

@@ -1,6 +1,6 @@
-"""The scenario suite, found by path, by name or by tag: what is shipped, and what is in ./scenarios.
+"""The scenario suite, found by path, by name or by tag: shipped files, and those in ./scenarios.
 
-A file in ./scenarios takes the place of the shipped one of its name: who edits a copy runs the copy.
+One in ./scenarios takes the place of the shipped one of its name: who edits a copy runs the copy.
 """
 
 from collections.abc import Sequence
@@ -90,7 +90,9 @@ def entries(folder: Path | None = None) -> list[dict[str, Any]]:
     """
     files = _files(folder)
     if not files:
-        raise InputError(f"{folder}: holds no scenario (*.yaml); without a folder the suite is listed")
+        raise InputError(
+            f"{folder}: holds no scenario (*.yaml); without a folder the suite is listed"
+        )
     return [_entry(path) for path in files]
 
 
