@@ -104,17 +104,11 @@ def test_a_bad_scenario_is_refused(installed: Installed) -> None:
         assert re.fullmatch(r"mapfusion: bad\.yaml: drive\.frames: .*\n", done.stderr)
 
 
-def test_it_runs_aligns_and_reports(installed: Installed) -> None:
-    (installed.folder / "tiny.yaml").write_text(TINY)
-    installed.answer("mapfusion", "run", "tiny.yaml")
-    result = Path("results", "tiny-3")
+def test_the_demo_runs_by_name_and_its_maps_align(installed: Installed) -> None:
+    settings = ("drive.frames=40", "slam.filter.n_particles=10", "evaluate.every=20")
+    installed.answer("mapfusion", "run", "quick", *(f"--set={each}" for each in settings))
+    result = Path("results", "quick-0")
     maps = [result / "maps" / f"{robot}.parquet" for robot in ("R1", "R2")]
     assert "ransac" in installed.answer("mapfusion", "align", *maps)
     installed.answer("mapfusion", "report", result)
     assert (installed.folder / result / "report.html").stat().st_size > 0
-
-
-def test_the_demo_runs_by_name(installed: Installed) -> None:
-    settings = ("drive.frames=40", "slam.filter.n_particles=10", "evaluate.every=20")
-    installed.answer("mapfusion", "run", "quick", *(f"--set={each}" for each in settings))
-    assert (installed.folder / "results" / "quick-0" / "tables" / "errors.parquet").is_file()
