@@ -138,7 +138,7 @@ def find_method(name: str) -> KnownMethod:
     return known[name]
 
 
-def make_method(name: str, **parameters: Any) -> Any:
+def make_method(name: str, /, **parameters: Any) -> Any:
     """Build a method by name, in this process; it has `find`, or `align` in older packages.
 
     Raises:

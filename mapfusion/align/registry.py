@@ -27,7 +27,7 @@ ALIGNERS: dict[str, type[Method]] = {
 PEERS: dict[str, type[Method]] = {"opencv": OpenCv, "kiss_matcher": KissMatcher}
 
 
-def make_aligner(name: str, **parameters: Any) -> Method:
+def make_aligner(name: str, /, **parameters: Any) -> Method:
     """Build one of our own methods by name.
 
     Raises:
@@ -46,8 +46,11 @@ def construct(name: str, constructor: Callable[..., Any], parameters: Mapping[st
         ValueError: a parameter is unknown or out of range.
     """
     try:
-        if isinstance(parameters.get("height"), dict):
-            parameters = {**parameters, "height": HeightGate(**parameters["height"])}
+        height = parameters.get("height", HeightGate())
+        if isinstance(height, dict):
+            parameters = {**parameters, "height": HeightGate(**height)}
+        elif not isinstance(height, HeightGate):
+            raise ValueError(f"parameters: {name}: height: expected probability and floor_m")
         return constructor(**parameters)
     except TypeError as error:
         raise ValueError(f"parameters: {name}: {error}") from error
