@@ -1,8 +1,12 @@
 """The one error a person is meant to read."""
 
+import difflib
+from collections.abc import Iterable
+
 MOST_CHARACTERS = 300  # of a line that a person reads at one glance
 _MOST_OF_A_WORD = 120  # a path, as a rule
 _GAP = " ... "
+_MOST_SUGGESTED = 3  # names; more are no help
 
 
 class InputError(ValueError):
@@ -28,6 +32,12 @@ class OutOfRangeError(InputError):
 
 class NameClashWarning(UserWarning):
     """Two methods claim one name; the text says in one line which of them has it."""
+
+
+def did_you_mean(wrong: str, known: Iterable[str]) -> str:
+    """The end of a line about an unknown name: those of the known ones that look like it."""
+    like = difflib.get_close_matches(wrong, list(known), _MOST_SUGGESTED)
+    return f"; did you mean {' or '.join(like)}?" if like else ""
 
 
 def one_line(text: str) -> str:

@@ -1,6 +1,5 @@
 """Scenario files in, validated scenarios out, or one line: the field, and what would be right."""
 
-import difflib
 import functools
 import reprlib
 import warnings
@@ -22,7 +21,7 @@ from experiments.scenario.settings import (
     Simulation,
 )
 from experiments.scenario.yaml_input import apply_overrides, read_mapping
-from mapfusion.errors import InputError, NameClashWarning, OutOfRangeError
+from mapfusion.errors import InputError, NameClashWarning, OutOfRangeError, did_you_mean
 
 S = TypeVar("S")
 _MOST_SUGGESTED = 3  # keys that an error message offers
@@ -149,11 +148,13 @@ def _about_unknown(location: tuple[int | str, ...], known: list[tuple[str, ...]]
     for i, part in enumerate(above):
         beside = [path for path in beside if path[i] in {"*", part}]
     here = sorted({path[-1] for path in beside})
-    like = difflib.get_close_matches(str(wrong), here, _MOST_SUGGESTED)
-    # or a key of another section, of which the wrong one is a word
-    like += [".".join(p) for p in known if wrong in p[-1].split("_") and "*" not in p]
     message = f"unknown key; known here: {', '.join(here)}"
-    return message + (f"; did you mean {' or '.join(like[:_MOST_SUGGESTED])}?" if like else "")
+    meant = did_you_mean(str(wrong), here)
+    # else a key of another section, of which the wrong one is a word
+    like = [".".join(p) for p in known if wrong in p[-1].split("_") and "*" not in p]
+    if like and not meant:
+        meant = f"; did you mean {' or '.join(like[:_MOST_SUGGESTED])}?"
+    return message + meant
 
 
 def _keys(root: dict[str, Any], node: dict[str, Any], *above: str) -> Iterator[tuple[str, ...]]:

@@ -29,6 +29,7 @@ from mapfusion.align.correspondences import MatchParameters
 from mapfusion.align.refine import Refinement
 from mapfusion.arguments import Range
 from mapfusion.camera import StereoCamera
+from mapfusion.errors import OutOfRangeError
 from mapfusion.merge import MergeParameters
 from mapfusion.vision.frontend import FrontEndParameters
 from sim.odometry import OdometryNoise
@@ -57,7 +58,10 @@ class AlignerEntry(Section):
 
     @model_validator(mode="after")
     def _known(self) -> Self:
-        require_usable(self.method, self.parameters)
+        try:
+            require_usable(self.method, self.parameters)
+        except OutOfRangeError as error:
+            raise OutOfRangeError(f"parameters.{error.name}", error.problem) from error
         return self
 
 

@@ -1,6 +1,7 @@
 """Our own methods by name; the peers among them need packages of other people (`[peers]`)."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import fields, is_dataclass
 from typing import Any
 
 from mapfusion.align.clique import Clique
@@ -14,6 +15,7 @@ from mapfusion.align.peers.opencv import OpenCv
 from mapfusion.align.ransac import Ransac
 from mapfusion.align.ransac_mahalanobis import RansacMahalanobis
 from mapfusion.align.svd import Svd
+from mapfusion.errors import did_you_mean
 
 ALIGNERS: dict[str, type[Method]] = {
     "ransac": Ransac,
@@ -35,7 +37,8 @@ def make_aligner(name: str, /, **parameters: Any) -> Method:
     """
     own = ALIGNERS | PEERS
     if name not in own:
-        raise ValueError(f"unknown aligner {name!r}, known are {', '.join(own)}")
+        known = f"known are {', '.join(own)}{did_you_mean(name, own)}"
+        raise ValueError(f"unknown aligner {name!r}, {known}")
     return construct(name, own[name], parameters)
 
 
@@ -45,6 +48,11 @@ def construct(name: str, constructor: Callable[..., Any], parameters: Mapping[st
     Raises:
         ValueError: a parameter is unknown or out of range.
     """
+    known = [own.name for own in fields(constructor)] if is_dataclass(constructor) else parameters
+    wrong = next((key for key in parameters if key not in known), None)
+    if wrong is not None:
+        there = f"known: {', '.join(known) or 'none'}{did_you_mean(wrong, known)}"
+        raise ValueError(f"parameters: {name}: {wrong}: unknown; {there}")
     try:
         height = parameters.get("height", HeightGate())
         if isinstance(height, dict):
