@@ -63,7 +63,11 @@ def test_shipped_scenarios_fit_into_4_gb() -> None:
 def test_a_run_is_refused_before_anything_is_computed(
     tiny_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    asked = ("slam.filter.n_particles=10000", "vision.harris.max_corners=5000", "drive.frames=20000")
+    asked = (
+        "slam.filter.n_particles=10000",
+        "vision.harris.max_corners=5000",
+        "drive.frames=20000",
+    )
     overrides = [word for each in asked for word in ("--set", each)]
     reply = command(capsys, "run", tiny_path, *overrides, "--results", tmp_path / "results")
     assert_refused(reply, "n_particles", "20000 frames", "this machine has")
