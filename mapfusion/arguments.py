@@ -51,7 +51,7 @@ class Range:
 
 
 # Of 1 a chi-square quantile is infinite, of 0 nothing passes.
-Probability = Annotated[float, Range(1e-6, 1 - 1e-9, "1")]
+Probability = Annotated[float, Range(1e-6, 1 - 1e-15, "1")]
 
 
 def require_in_range(settings: object) -> None:
@@ -95,7 +95,7 @@ def _require_inside(name: str, number: Any, kind: Any, bounds: Range) -> None:
         raise OutOfRangeError(name, f"is {number!r}, expected {called}")
     if not bounds.low <= number <= bounds.high:
         unit = "" if bounds.unit == "1" else f" {bounds.unit}"
-        ends = f"[{bounds.low:.10g}, {bounds.high:.10g}]"
+        ends = f"[{bounds.low:.15g}, {bounds.high:.15g}]"
         raise OutOfRangeError(name, f"is {number}, must be in {ends}{unit}")
 
 

@@ -38,15 +38,15 @@ class MotionNoise:
         floor_rad: added to the heading in every step, whatever the motion.
     """
 
-    translation_m_per_sqrt_m: Annotated[float, Range(0, 10, "m/sqrt(m)")] = 0.02
+    translation_m_per_sqrt_m: Annotated[float, Range(0, 10_000, "m/sqrt(m)")] = 0.02
     rotation_rad_per_sqrt_m: Annotated[float, Range(0, 10, "rad/sqrt(m)")] = 0.01
     rotation_rad_per_sqrt_rad: Annotated[float, Range(0, 10, "rad/sqrt(rad)")] = 0.03
     scale_error: Annotated[float, Range(0, 1, "1")] = 0.01
     track_error: Annotated[float, Range(0, 1, "1")] = 0.1
-    horizon_m: Annotated[float, Range(0, 1000, "m")] = 3.0
+    horizon_m: Annotated[float, Range(0, 10_000, "m")] = 3.0
     horizon_rad: Annotated[float, Range(0, 1000, "rad")] = 0.2
-    lateral_slip_m_per_rad: Annotated[float, Range(0, 10, "m/rad")] = 0.03
-    floor_m: Annotated[float, Range(0, 10, "m")] = 0.0
+    lateral_slip_m_per_rad: Annotated[float, Range(0, 10_000, "m/rad")] = 0.03
+    floor_m: Annotated[float, Range(0, 10_000, "m")] = 0.0
     floor_rad: Annotated[float, Range(0, 10, "rad")] = 0.0
 
     def __post_init__(self) -> None:
