@@ -90,7 +90,8 @@ def _require_as_declared(name: str, value: Any, hint: Any) -> None:
 
 
 def _require_inside(name: str, number: Any, kind: Any, bounds: Range) -> None:
-    wanted, called = (Integral, "an integer") if kind is int else (Real, "a number")
+    wanted: Any = Integral if kind is int else Real
+    called = "an integer" if kind is int else "a number"
     if isinstance(number, bool) or not isinstance(number, wanted):
         raise OutOfRangeError(name, f"is {number!r}, expected {called}")
     if not bounds.low <= number <= bounds.high:

@@ -48,7 +48,8 @@ def construct(name: str, constructor: Callable[..., Any], parameters: Mapping[st
     Raises:
         ValueError: a parameter is unknown or out of range.
     """
-    known = [own.name for own in fields(constructor)] if is_dataclass(constructor) else parameters
+    made: Any = constructor  # else is_dataclass would make an instance of it
+    known = [own.name for own in fields(made)] if is_dataclass(made) else list(parameters)
     wrong = next((key for key in parameters if key not in known), None)
     if wrong is not None:
         there = f"known: {', '.join(known) or 'none'}{did_you_mean(wrong, known)}"
