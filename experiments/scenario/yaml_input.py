@@ -8,6 +8,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from mapfusion.errors import InputError
+from mapfusion.sealed import SEAL
 
 
 def read_mapping(path: Path) -> dict[str, Any]:
@@ -23,6 +24,7 @@ def read_mapping(path: Path) -> dict[str, Any]:
     if not isinstance(data, dict):
         found = "nothing" if data is None else f"a {type(data).__name__}"
         raise InputError(f"{path}: holds {found}, expected a mapping of scenario keys")
+    data.pop(SEAL, None)  # of a result's scenario.json, which may have been edited
     return data
 
 

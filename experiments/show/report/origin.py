@@ -7,6 +7,7 @@ from typing import Any
 
 from experiments.show.figures.result_tables import json_object
 from experiments.study.statistics.run_tables import Runs, setting_columns
+from mapfusion.storage import read_json
 
 _SOURCE_DIGITS = 16
 
@@ -57,7 +58,7 @@ def _descriptions(path: Path, runs: Runs) -> Iterator[dict[str, Any]]:
                 "libraries": json_object(str(row["libraries"]), path / "runs"),
             }
     elif not runs.sweeps and file.is_file():
-        yield json_object(file.read_text(encoding="utf-8", errors="replace"), file)
+        yield read_json(file, "provenance of a result")
 
 
 def _flat(described: dict[str, Any]) -> Iterator[tuple[str, str]]:

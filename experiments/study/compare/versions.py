@@ -22,6 +22,7 @@ from experiments.study.statistics.error_bands import ROBOT_PAIR
 from experiments.study.statistics.intervals import MAPS_OF_ONE_RUN, RUN
 from experiments.study.statistics.run_tables import RunPath, Runs, find_runs, match_names
 from mapfusion.errors import InputError
+from mapfusion.storage import read_json
 
 # A change of less than one percent (or percentage point) matters to nobody who picks a method.
 LEAST_CHANGE = 0.01
@@ -173,7 +174,7 @@ def _differing_settings(a: Runs, b: Runs) -> list[str]:
 
 def _flat(result: RunPath) -> dict[str, str]:
     """Settings by dotted name, as JSON."""
-    scenario = json.loads((result.path / "scenario.json").read_text(encoding="utf-8"))
+    scenario = read_json(result.path / "scenario.json", "resolved scenario")
     settings = pd.json_normalize(scenario).to_dict("records")[0]
     return {str(name): json.dumps(value) for name, value in settings.items()}
 

@@ -91,13 +91,16 @@ def test_failed_runs_stop_no_others(scene: Scene, client: Client) -> None:
         scene.write(seed, f"judge/{seed}", [f"slam/{seed}"])
     scene.write(3, "slam/3")
     driver = scene.execute(client)
-    assert scene.rows() == {
+    rows = scene.rows()
+    assert rows.pop(2)[1].startswith("slam: a defect of mapfusion itself: ZeroDivisionError a bug")
+    assert rows == {
         0: ("failed", "scenario x: R1 drove into a wall at (1, 2)"),
         1: ("failed", "slam: MemoryError"),
-        2: ("failed", "slam: ZeroDivisionError a bug"),
         3: ("finished", ""),
     }
     assert sorted(driver.progress.failed) == ["x-0", "x-1", "x-2"]
+    assert driver.progress.defects == {"x-2"}
+    assert driver.progress.failed["x-2"].endswith("failures/x-2.txt")
     details = (scene.dataset.folder / "failures" / "x-2.txt").read_text()
     assert "in break_down" in details
     assert not list(scene.terms.attempts.iterdir())
