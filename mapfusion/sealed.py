@@ -63,12 +63,16 @@ def read_sealed(path: Path, what: str, only_ours: bool = False) -> bytes:
     if intact is False or (intact is None and only_ours):
         by_hand = f"or changed by other means: then take {SEAL} out of it"
         raise DamagedFileError(path, f"damaged, it does not fit its digest ({by_hand})")
-    if intact is None and not _told:
+    return data
+
+
+def tell_unsealed(path: Path, data: bytes) -> None:
+    """Warn, once a process, that a file which could be read is of unknown soundness."""
+    if not _told and _SEAL.search(data) is None:
         _told.append(path)
         why = "made by another program or an earlier version, so damage to it may go unseen"
         text = f"{path}: carries no digest ({why}); said of the first such file alone"
         warnings.warn(text, UnsealedWarning, stacklevel=2)
-    return data
 
 
 def parquet_with_seal(data: bytes) -> bytes:

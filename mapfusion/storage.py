@@ -12,13 +12,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from mapfusion.errors import DamagedFileError, InputError
-from mapfusion.sealed import NO_DIGEST, SEAL, parquet_with_seal, read_sealed, seal
+from mapfusion.sealed import NO_DIGEST, SEAL, parquet_with_seal, read_sealed, seal, tell_unsealed
 
 _KIND = b"mapfusion.kind"
 _VERSION = b"mapfusion.schema_version"
 _PREFIX = "mapfusion."
 # What Arrow raises on bytes that it cannot read, some of it from Python code that it calls.
-_UNREADABLE = (pa.ArrowException, OSError, ValueError, MemoryError, OverflowError)
+UNREADABLE = (pa.ArrowException, OSError, ValueError, MemoryError, OverflowError)
 
 
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
@@ -61,6 +61,7 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
         found = {} | json.loads(data.decode())
     except (ValueError, TypeError, RecursionError) as error:  # of JSON, or of no object
         raise DamagedFileError(path, f"no JSON object ({error}), expected a {what}") from error
+    tell_unsealed(path, data)
     found.pop(SEAL, None)
     return found
 
@@ -80,7 +81,8 @@ def write_table(
     metadata = dict(table_schema.metadata)
     metadata |= {f"{_PREFIX}{k}".encode(): v.encode() for k, v in (attributes or {}).items()}
     arrays = [_to_arrow(columns[field.name], field.type) for field in table_schema]
-    table = pa.Table.from_arrays(arrays, schema=table_schema.with_metadata(metadata))
+    own = pa.schema([field.remove_metadata() for field in table_schema], metadata=metadata)
+    table = pa.Table.from_arrays(arrays, schema=own)
     buffer = pa.BufferOutputStream()
     pq.write_table(table, buffer, compression="zstd", write_page_checksum=True)
     write_sealed(path, parquet_with_seal(buffer.getvalue().to_pybytes()))
@@ -101,12 +103,15 @@ def read_parquet(path: Path, what: str, columns: Sequence[str] | None = None) ->
     Raises:
         DamagedFileError: the file is missing or damaged.
     """
-    data = pa.BufferReader(read_sealed(path, what))
+    data = read_sealed(path, what)
     try:
-        return pq.read_table(data, columns=columns, page_checksum_verification=True)
-    except _UNREADABLE as error:
+        source, names = pa.BufferReader(data), None if columns is None else list(columns)
+        table = pq.read_table(source, columns=names, page_checksum_verification=True)
+    except UNREADABLE as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise DamagedFileError(path, f"damaged or not a Parquet file ({reason})") from error
+    tell_unsealed(path, data)
+    return table
 
 
 def read_table(path: Path, table_schema: pa.Schema) -> tuple[pa.Table, dict[str, str]]:
@@ -119,9 +124,18 @@ def read_table(path: Path, table_schema: pa.Schema) -> tuple[pa.Table, dict[str,
         InputError: the file is missing, damaged, of another kind or version, or lacks columns.
     """
     kind = table_schema.metadata[_KIND].decode()
-    version = table_schema.metadata[_VERSION].decode()
     table = read_parquet(path, f"{kind} table")
     attributes = text_attributes(path, table)
+    require_kind(path, table, attributes, table_schema)
+    return table, attributes
+
+
+def require_kind(
+    path: Path, table: pa.Table, attributes: Mapping[str, str], table_schema: pa.Schema
+) -> None:
+    """Raise InputError for a table of another kind, version, or with other columns."""
+    kind = table_schema.metadata[_KIND].decode()
+    version = table_schema.metadata[_VERSION].decode()
     found_kind = attributes.get("kind", "none")
     if found_kind != kind:
         raise InputError(f"{path}: kind is {found_kind}, expected {kind}")
@@ -131,7 +145,6 @@ def read_table(path: Path, table_schema: pa.Schema) -> tuple[pa.Table, dict[str,
     if not table.schema.equals(table_schema, check_metadata=False):
         expected = ", ".join(f"{f.name}: {f.type}" for f in table_schema)
         raise InputError(f"{path}: columns are not those of {kind} ({expected})")
-    return table, attributes
 
 
 def text_attributes(path: Path, table: pa.Table) -> dict[str, str]:
