@@ -162,7 +162,7 @@ class World:
             DamagedFileError: a file of the folder is missing or damaged.
         """
         p, client = self.bullet, self.client
-        corners_m = _read_corners(folder / CORNERS)
+        corners_m = read_corners(folder / CORNERS)
         with silence():
             for i in range(len(corners_m)):
                 mesh, picture = _face_files(folder, i)
@@ -224,7 +224,12 @@ def write_faces(
     write_sealed(folder / CORNERS, corners.getvalue() + LINE)
 
 
-def _read_corners(path: Path) -> Float:
+def read_corners(path: Path) -> Float:
+    """The corners (F, 4, 3) of all faces, as `write_faces` left them.
+
+    Raises:
+        DamagedFileError: they are missing or damaged.
+    """
     try:
         corners_m = np.load(io.BytesIO(read_sealed(path, "array of faces' corners")))
     except (ValueError, EOFError) as error:

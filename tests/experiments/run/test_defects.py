@@ -31,7 +31,7 @@ def test_the_place_is_where_it_was_raised(work: Callable[[], object]) -> None:
     told = saved_defect(raised(work))
     assert "\n" not in told
     assert "ZeroDivisionError a bug at " in told
-    assert "acting.py:30 in break_down;" in told
+    assert "acting.py:32 in break_down;" in told
     details = Path(told.rpartition(": ")[2])
     assert 'raise ZeroDivisionError("a bug")' in details.read_text(encoding="utf-8")
     details.unlink()
