@@ -75,6 +75,11 @@ def tell_unsealed(path: Path, data: bytes) -> None:
         warnings.warn(text, UnsealedWarning, stacklevel=2)
 
 
+def say_again() -> None:
+    """Let `tell_unsealed` warn once more: a new command begins."""
+    _told.clear()
+
+
 def parquet_with_seal(data: bytes) -> bytes:
     """A Parquet file with an empty seal in front of its footer, which points at nothing behind."""
     footer = _PARQUET_TAIL + int.from_bytes(data[-_PARQUET_TAIL:][:4], "little")

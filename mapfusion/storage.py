@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -62,6 +63,9 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
     except (ValueError, TypeError, RecursionError) as error:  # of JSON, or of no object
         raise DamagedFileError(path, f"no JSON object ({error}), expected a {what}") from error
     tell_unsealed(path, data)
+    name, value = next(iter(found.items()), ("", ""))
+    if name != SEAL and re.fullmatch("[0-9a-f]{64}", str(value)):
+        raise DamagedFileError(path, f"damaged, its first field {name!r} should be {SEAL}")
     found.pop(SEAL, None)
     return found
 

@@ -230,10 +230,12 @@ def read_corners(path: Path) -> Float:
     Raises:
         DamagedFileError: they are missing or damaged.
     """
+    data = read_sealed(path, "array of faces' corners")
     try:
-        corners_m = np.load(io.BytesIO(read_sealed(path, "array of faces' corners")))
-    except (ValueError, EOFError) as error:
-        raise DamagedFileError(path, f"is no array ({error})") from error
+        corners_m = np.asarray(np.load(io.BytesIO(data)), dtype=np.float64)
+    except Exception as error:  # numpy has Python parse the header, which may raise anything
+        reason = " ".join(str(error).split())
+        raise DamagedFileError(path, f"is no array ({reason})") from error
     if corners_m.shape[1:] != (4, 3) or not np.isfinite(corners_m).all():
         raise DamagedFileError(path, "holds no corners (F, 4, 3) of faces")
     return corners_m

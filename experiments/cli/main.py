@@ -34,7 +34,7 @@ def main() -> None:
     from experiments.run.kernel_cache import use_kernel_cache
     from mapfusion.errors import InputError
 
-    _tell_warnings()
+    unsealed = _tell_warnings()
     try:
         use_kernel_cache()
         code = app(standalone_mode=False) or 0
@@ -63,25 +63,36 @@ def main() -> None:
             if message():  # empty where the help was shown instead
                 _complain(f"{message()} (see mapfusion --help)")
             code = EXIT_BAD_INPUT
+    for text in unsealed if code in {0, EXIT_FAILED} else ():
+        _complain(f"warning: {text}")
     if code == EXIT_INTERRUPTED:
         _complain("interrupted; what was finished is kept, the same command goes on from there")
     sys.exit(code)
 
 
-def _tell_warnings() -> None:
-    """Ours in one line each; others keep Python's own form."""
-    from mapfusion.errors import TellingWarning
+def _tell_warnings() -> list[str]:
+    """Ours in one line each; others keep Python's own form.
 
-    show = warnings.showwarning
+    Returns:
+        What is to be said of files without digest, once all else has gone well.
+    """
+    from mapfusion.errors import TellingWarning, UnsealedWarning
+    from mapfusion.sealed import say_again
+
+    show, unsealed = warnings.showwarning, list[str]()
+    say_again()
 
     def tell(message: Warning | str, category: type[Warning], *rest: Any) -> None:
-        if issubclass(category, TellingWarning):
+        if issubclass(category, UnsealedWarning):
+            unsealed.append(str(message))
+        elif issubclass(category, TellingWarning):
             _complain(f"warning: {message}")
         else:
             show(message, category, *rest)
 
     warnings.showwarning = tell
     warnings.simplefilter("always", TellingWarning)  # two stages may be damaged in one way
+    return unsealed
 
 
 def _complain(text: str) -> None:

@@ -12,14 +12,15 @@ from pydantic import TypeAdapter, ValidationError
 
 from experiments.run.stage import RecordedLog, Stage
 from mapfusion.errors import DamagedFileError, MendedWarning
+from mapfusion.sealed import is_intact
 from mapfusion.storage import read_json, write_json
 
 _MARK = "done"
 _FIGURES = TypeAdapter(dict[str, float])
 _DEPTH = 3  # a stage's file is STAGE/KEY/FILE
-# A stage's readers may come across one damage at the same time; a disk that always fails is none
-# that the store can mend.
-_MENDED_AT_MOST = 3
+# A disk that damages every file is none that the store can mend.
+_MENDED_AT_MOST = 2
+_TOLD_LATE_AT_MOST = 1000  # more tasks than a sweep has at work at one time
 T = TypeVar("T")
 
 
@@ -77,17 +78,26 @@ class Store:
     def discard_damaged(self, error: DamagedFileError, mended: Counter[Path]) -> bool:
         """Forget the stage that a damaged file belongs to, and warn.
 
+        Others may have read the file before that and tell later: then there is nothing to do.
+
+        Args:
+            error: what was read.
+            mended: counts, over the calls of one command.
+
         Returns:
-            False for a file that no stage made, or one that was damaged too often (see `mended`,
-            which counts).
+            False for a file that no stage made, or one that was damaged too often.
         """
         path, root = error.path.resolve(), self.root.resolve()
-        mended[path] += 1
-        if len(path.relative_to(root).parts if path.is_relative_to(root) else ()) < _DEPTH:
+        parts = path.relative_to(root).parts if path.is_relative_to(root) else ()
+        if len(parts) < _DEPTH:
             return False
+        stage = root.joinpath(*parts[:2])
+        if mended[path] and (not path.is_file() or is_intact(path.read_bytes())):
+            mended[stage] += 1
+            return mended[stage] <= _TOLD_LATE_AT_MOST
+        mended[path] += 1
         if mended[path] > _MENDED_AT_MOST:
             return False
-        stage = root.joinpath(*path.relative_to(root).parts[:2])
         shutil.rmtree(stage, ignore_errors=True)
         again = f"the stage {stage.parent.name} is discarded and computed again"
         warnings.warn(f"{error}; {again}", MendedWarning, stacklevel=2)

@@ -10,7 +10,9 @@ import numpy as np
 import pandas as pd
 
 from experiments.judge import tables
+from experiments.judge.result_files import read_provenance
 from experiments.run.store import StageFolder
+from experiments.show.figures.result_tables import ResultTables
 from experiments.study.statistics.run_tables import find_runs
 from experiments.study.sweep.sweep_dataset import open_dataset
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map
@@ -24,7 +26,7 @@ from mapfusion.robot_log import (
     write_truth_poses,
 )
 from mapfusion.sealed import read_sealed
-from mapfusion.storage import read_json, write_json
+from mapfusion.storage import write_json
 from sim.floorplan import FloorPlan, Wall
 from sim.trajectory import Trajectory, read_trajectory, write_trajectory
 from sim.world import CORNERS, read_corners, write_faces
@@ -75,14 +77,20 @@ def _of_a_result(folder: Path, rng: np.random.Generator) -> list[Door]:
     tables.write(fits, "map_fits", pd.DataFrame(rows))
     write_json(result / "scenario.json", {"name": "x", "seed": 3, "description": "a\ud800"})
     write_json(result / "provenance.json", {"stages": {}, "libraries": {"numpy": "2"}})
+    write_json(result / "world.json", {"walls": [[[0, 0], [1, 0]]], "robots": {"R1": [0, 1, 0.5]}})
     open_dataset(sweep, ["slam.every"])
     return [
         Door(fits, partial(tables.read, fits, "map_fits")),
         Door(fits, lambda: find_runs(result).read("map_fits")),
         Door(result / "scenario.json", lambda: find_runs(result).results[0].run),
-        Door(result / "provenance.json", lambda: read_json(result / "provenance.json", "test")),
+        Door(result / "provenance.json", lambda: read_provenance(result / "provenance.json")),
+        Door(result / "world.json", lambda: (ResultTables(result).walls, _start(result))),
         Door(sweep / "sweep.json", lambda: open_dataset(sweep, ["slam.every"]).keys),
     ]
+
+
+def _start(result: Path) -> Any:
+    return ResultTables(result).start_pose("R1")
 
 
 def _of_the_store(folder: Path, rng: np.random.Generator) -> list[Door]:
@@ -110,7 +118,7 @@ def same(before: Any, after: Any) -> bool:
         return before.equals(after)
     if is_dataclass(before) and not isinstance(before, type):
         before, after = astuple(before), astuple(after)
-    if isinstance(before, tuple):
+    if isinstance(before, tuple | list):
         return len(before) == len(after) and all(map(same, before, after))
     if isinstance(before, np.ndarray):
         return before.dtype == after.dtype and before.tobytes() == after.tobytes()

@@ -12,12 +12,13 @@ import pandas as pd
 import pyarrow as pa
 
 from experiments.judge.judged_maps import methods_in
+from experiments.judge.result_files import read_scenario, read_world
 from experiments.judge.tables import ALL, read, table_path
 from experiments.show.figures.style import FUSED_COLOUR, ROBOT_COLOURS, aligner_styles
 from mapfusion.align.result import Status
 from mapfusion.errors import InputError
 from mapfusion.se2 import Float, between, inverse, transform_covariances, transform_points
-from mapfusion.storage import COVARIANCE_FIELDS, POSITION_FIELDS, points_from, read_json
+from mapfusion.storage import COVARIANCE_FIELDS, POSITION_FIELDS, points_from
 
 Pair = tuple[str, str]
 
@@ -73,7 +74,7 @@ class ResultTables:
     @cached_property
     def scenario(self) -> dict[str, Any]:
         """The resolved scenario."""
-        return read_json(self.folder / "scenario.json", "resolved scenario of a result")
+        return read_scenario(self.folder / "scenario.json")
 
     @cached_property
     def robots(self) -> list[str]:
@@ -174,7 +175,7 @@ class ResultTables:
     @cached_property
     def _world(self) -> dict[str, Any]:
         path = self.folder / "world.json"
-        return read_json(path, "world of a result") if path.is_file() else {}
+        return read_world(path) if path.is_file() else {}
 
     def walls_in_frame_of(self, robot: str) -> list[Float]:
         """The walls' corner points, (n, 2) each, in a robot's map frame; none where unknown."""

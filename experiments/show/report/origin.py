@@ -5,9 +5,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from experiments.judge.result_files import read_provenance
 from experiments.show.figures.result_tables import json_object
 from experiments.study.statistics.run_tables import Runs, setting_columns
-from mapfusion.storage import read_json
 
 _SOURCE_DIGITS = 16
 
@@ -58,7 +58,7 @@ def _descriptions(path: Path, runs: Runs) -> Iterator[dict[str, Any]]:
                 "libraries": json_object(str(row["libraries"]), path / "runs"),
             }
     elif not runs.sweeps and file.is_file():
-        yield read_json(file, "provenance of a result")
+        yield read_provenance(file)
 
 
 def _flat(described: dict[str, Any]) -> Iterator[tuple[str, str]]:

@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pandas as pd
-from pydantic import BaseModel, ValidationError
 
 from experiments.judge import tables
 from experiments.judge.judged_maps import RUN_KEYS, setting_columns
+from experiments.judge.result_files import read_scenario
 from mapfusion.errors import InputError
-from mapfusion.storage import read_json, read_parquet, text_attributes
+from mapfusion.storage import read_parquet, text_attributes
 
 _VERSION = b"mapfusion.schema_version"
 _TOLD = ("status", "reason")  # of each run of a sweep
@@ -28,11 +28,6 @@ class RunPath(NamedTuple):
 
     path: Path
     run: dict[str, Any]
-
-
-class _OfRun(BaseModel):
-    name: str
-    seed: int
 
 
 @dataclass(frozen=True)
@@ -156,11 +151,8 @@ def _whole_files(folder: Path) -> list[RunPath]:
 
 def _run_of(path: Path) -> dict[str, Any]:
     """The run's columns, by its scenario: the folder may have been renamed since."""
-    try:
-        of_run = _OfRun.model_validate(read_json(path, "resolved scenario"))
-    except ValidationError as error:
-        raise InputError(f"{path}: not a resolved scenario with name and seed") from error
-    name, seed = of_run.name, of_run.seed
+    found = read_scenario(path)
+    name, seed = found["name"], int(found["seed"])
     return {"run_id": f"{name}-{seed}", "scenario": name, "seed": seed}
 
 

@@ -126,7 +126,8 @@ class SweepDriver:
             pickle.dumps(task),
             self._terms,
             *(self._futures[need] for need in task.needs if need in self._futures),
-            key=f"{task.label}-{self._suffix}-{task.name}",
+            # new at each attempt: what failed under a key, Dask does not compute again
+            key=f"{task.label}-{self._suffix}{self.progress.tasks.total()}-{task.name}",
             pure=False,
             # in order: a run is finished before others begin
             priority=-self.progress.tasks.total(),

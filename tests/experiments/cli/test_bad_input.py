@@ -233,7 +233,7 @@ def test_wrong_tables(
     assert "Traceback" not in reply.err
     assert len(reply.complaints) == 1
     assert str(wrong) in reply.complaints[0]
-    said = {"missing": "no such file", "truncated": "damaged", "foreign": "kind is none"}
+    said = {"missing": "no such file", "truncated": "damaged", "foreign": "has no column"}
     assert said.get(damage, "kind is robot_log.frames, expected") in reply.complaints[0]
 
 
