@@ -53,8 +53,8 @@ def require_no_twins(name: str, *columns: np.ndarray) -> None:
         raise ValueError(f"{name}: row {pair[1]} repeats row {pair[0]}, remove one of them")
 
 
-def _refuse(name: str, wrong: np.ndarray, what: str) -> None:
-    if wrong.any():
+def _refuse(name: str, wrong: np.ndarray | np.bool, what: str) -> None:
+    if np.any(wrong):
         raise ValueError(f"{name}: {what} in row {np.flatnonzero(wrong)[0]}")
 
 

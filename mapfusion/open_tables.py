@@ -98,16 +98,20 @@ def _column(path: Path, table: pa.Table, field: pa.Field, planar: bool) -> pa.Ar
             raise InputError(f"{path}: column {field.name} holds {values.type}, not numbers")
         is_float = pa.types.is_floating(field.type)
         if pa.types.is_floating(values.type) and not is_float:  # as pandas makes of gaps
-            values = pc.if_else(pc.is_nan(values), None, values)
+            values = pa.array(values.to_numpy(zero_copy_only=False), from_pandas=True)
         empty = np.nan if is_float else default  # pandas stores NaN as an empty cell
         if values.null_count and empty is None:
-            row = pc.index(values.is_null(), True).as_py()
+            row = values.is_null().to_pylist().index(True)
             raise InputError(f"{path}: column {field.name} is empty in row {row}")
         values = values.cast(field.type)
         return values.fill_null(pa.scalar(empty, field.type)) if values.null_count else values
     except pa.ArrowException as error:
         reason = f"{' '.join(str(error).split())} (expected {field.type})"
         raise InputError(f"{path}: column {field.name}: {reason}") from error
+
+
+def _call(name: str, values: pa.Array) -> pa.Array:
+    return pc.call_function(name, [values])
 
 
 def _rows_of_numbers(table: pa.Table, field: pa.Field) -> pa.Array:
@@ -121,11 +125,11 @@ def _rows_of_numbers(table: pa.Table, field: pa.Field) -> pa.Array:
     elif field.name in table.column_names:
         values = table.column(field.name).combine_chunks()
         if values.null_count < n:
-            lengths = pc.unique(pc.list_value_length(values).drop_null()).to_pylist()
+            lengths = _call("list_value_length", values).drop_null().unique().to_pylist()
             if lengths != [width]:
                 raise pa.ArrowInvalid(f"lists of {sorted(lengths)} numbers")
             there = ~values.is_null().to_numpy(zero_copy_only=False)
-            flat = pc.list_flatten(values).cast(pa.float64()).fill_null(np.nan)
+            flat = _call("list_flatten", values).cast(pa.float64()).fill_null(np.nan)
             matrix[there] = flat.to_numpy(zero_copy_only=False).reshape(-1, width)
     flat = pa.array(matrix.ravel().astype(field.type.value_type.to_pandas_dtype()))
     return pa.FixedSizeListArray.from_arrays(flat, type=field.type)

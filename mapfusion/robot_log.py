@@ -61,7 +61,7 @@ FRAMES = schema(
     1,
     [
         _ITERATION,
-        told(*float_fields(["time_s"]), "when, increasing"),
+        told(pa.field("time_s", pa.float64()), "when, increasing"),
         *(
             told(field, "motion since the row before, in the robot frame of that row")
             for field in float_fields(_ODOMETRY_FIELDS)
