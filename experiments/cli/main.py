@@ -5,12 +5,34 @@ import warnings
 from typing import Any
 
 import typer
+from typer.core import TyperGroup
 
 from experiments.cli import run_commands, step_commands, study_commands
-from experiments.cli.options import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_INTERRUPTED
+from experiments.cli.options import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_INTERRUPTED, STEPS, complain
+from mapfusion.errors import InputError
 from mapfusion.recordings.registry import IMPORTERS
 
+REPLACED = {
+    "aligners": "scenarios --aligners",
+    "schema": "scenarios --schema",
+    "figures": "report RESULT --figures",
+    "refusal": "study refusal",
+    "benchmark": "study benchmark",
+}
+
+
+class Commands(TyperGroup):
+    """The commands, and for those of earlier versions what took their place."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """The command asked for."""
+        if args and args[0] in REPLACED:
+            raise InputError(f"{args[0]}: is now `mapfusion {REPLACED[args[0]]}`")
+        return super().resolve_command(ctx, args)
+
+
 app = typer.Typer(
+    cls=Commands,
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -25,26 +47,25 @@ import_app = typer.Typer(
 for name, importer in IMPORTERS.items():
     usage = f"`mapfusion import {name} {importer.example} -o logs/{name}`"
     import_app.command(name, help=f"{importer.what}: {usage}.")(step_commands.import_command(name))
-app.add_typer(import_app, name="import")
+app.add_typer(import_app, name="import", rich_help_panel=STEPS)
 
 
 def main() -> None:
     """Run the command; every failure a user can cause is one line and an exit code."""
     from experiments.run.kernel_cache import use_kernel_cache
-    from mapfusion.errors import InputError
 
     _tell_name_clashes()
     try:
         use_kernel_cache()
         code = app(standalone_mode=False) or 0
     except InputError as error:
-        _complain(str(error))
+        complain(str(error))
         code = EXIT_BAD_INPUT
     except BrokenPipeError:
         code = EXIT_FAILED
     except OSError as error:  # a full disk, a folder that is a file or not ours
         where = "" if error.filename is None else f"{error.filename}: "
-        _complain(f"{where}cannot be read or written ({error.strerror or error})")
+        complain(f"{where}cannot be read or written ({error.strerror or error})")
         code = EXIT_BAD_INPUT
     except KeyboardInterrupt:  # before or after what the command itself guards
         code = EXIT_INTERRUPTED
@@ -54,10 +75,10 @@ def main() -> None:
         if message is None:
             raise
         if message():  # empty where the help was shown instead
-            _complain(f"{message()} (see mapfusion --help)")
+            complain(f"{message()} (see mapfusion --help)")
         code = EXIT_BAD_INPUT
     if code == EXIT_INTERRUPTED:
-        _complain("interrupted; what was finished is kept, the same command goes on from there")
+        complain("interrupted; what was finished is kept, the same command goes on from there")
     sys.exit(code)
 
 
@@ -69,15 +90,11 @@ def _tell_name_clashes() -> None:
 
     def tell(message: Warning | str, category: type[Warning], *rest: Any) -> None:
         if issubclass(category, NameClashWarning):
-            _complain(f"warning: {message}")
+            complain(f"warning: {message}")
         else:
             show(message, category, *rest)
 
     warnings.showwarning = tell
-
-
-def _complain(text: str) -> None:
-    typer.echo(f"mapfusion: {' '.join(text.split())}", err=True)  # one line, whatever was quoted
 
 
 if __name__ == "__main__":

@@ -54,15 +54,23 @@ def require_result(result: Path) -> None:
 
 
 def run_scenario(
-    scenario: AnyScenario, results: Path, jobs: int, on_progress: OnProgress, fresh: bool = False
+    scenario: AnyScenario,
+    results: Path,
+    jobs: int,
+    on_progress: OnProgress,
+    fresh: bool = False,
+    output: Path | None = None,
 ) -> Path:
-    """Run a scenario and write its result folder `RESULTS/NAME-SEED`; returns the folder."""
+    """Run a scenario and write its result, to `RESULTS/NAME-SEED` by default; returns the folder.
+
+    The store is that of `results`.
+    """
     run = JudgedRun.of(scenario, Store.of(results))
     if fresh:
         for stage_folder in run.folders():
             stage_folder.discard()
     run.execute(jobs, on_progress)
-    folder = results / f"{scenario.name}-{scenario.seed}"
+    folder = output or results / f"{scenario.name}-{scenario.seed}"
     on_progress(_LABEL, 0, 1)
     write_result(run, folder)
     on_progress(_LABEL, 1, 1)
