@@ -99,11 +99,12 @@ def print_table(
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
     needed = 0
     for place, (heading, layout) in enumerate(columns):
+        shown = Text(plain(heading))
         widest = max(*map(len, heading.split("\n")), *(row[place].cell_len for row in cells))
         if layout:
-            table.add_column(Text(heading), justify="right", no_wrap=True, min_width=widest)
+            table.add_column(shown, justify="right", no_wrap=True, min_width=widest)
         else:
-            table.add_column(Text(heading), overflow="fold")
+            table.add_column(shown, overflow="fold")
         needed += (widest if layout else min(widest, _LEAST_TEXT)) + _GAP
     for row in cells:
         table.add_row(*row)

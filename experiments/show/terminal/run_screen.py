@@ -104,7 +104,8 @@ def print_checks(checks: Sequence[CheckedScenario]) -> None:
     print_table(shown.values(), rows, "Checks against the truth")
     failed = sum(not outcome.passed for outcome in outcomes)
     not_run = sum(bool(check.error) for check in checks)
-    errors = f", {not_run} scenarios could not be checked" if not_run else ""
+    of_all = f"{not_run} of {len(checks)} scenarios"
+    errors = f"; {of_all} could not be checked" if not_run else ""
     print_lines([f"{len(outcomes) - failed} passed, {failed} failed{errors}"])
 
 

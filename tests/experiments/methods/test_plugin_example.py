@@ -179,7 +179,7 @@ def test_an_absent_package_is_shown_as_absent(tmp_path: Path, maps: tuple[Path, 
     hidden = tmp_path / "hidden"
     hidden.mkdir()
     (hidden / "sitecustomize.py").write_text(HIDE, encoding="utf-8")
-    listed = apart(hidden, "aligners")
+    listed = apart(hidden, "scenarios", "--aligners")
     assert "kiss_matcher: the package kiss-matcher is not installed; pip install" in listed.out
     ended = apart(hidden, "align", *maps, "--set", entry("kiss_matcher"))
     assert (ended.code, ended.err) == (0, "")
