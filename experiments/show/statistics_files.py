@@ -48,7 +48,7 @@ def _draw_over_runs(summary: Summary, folder: Path) -> Iterator[str]:
     for name, medians in drawn.items():
         runs, timings = medians["run_id"].unique(), summary.timings
         if len(runs) < 2:
-            yield f"{name}: one run alone; `mapfusion figures` draws it"
+            yield f"{name}: one run alone; `mapfusion report --figures` draws it"
             continue
         if len(timings):
             timings = timings[timings["run_id"].isin(runs)]

@@ -28,6 +28,7 @@ from experiments.show.plain_text import plain
 
 Column = tuple[str, str]  # heading and format
 _LEAST_TEXT = 8  # characters: a name that is folded can still be read
+NO_ESTIMATE = "given: share with an estimate; without one the error is infinite"
 _GAP = 2  # characters between columns
 
 
@@ -97,7 +98,7 @@ def print_table(
         return
     # Plain rules and narrow gaps: all columns should fit into 80 characters.
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
-    needed = 0
+    needed = wanted = 0
     for place, (heading, layout) in enumerate(columns):
         shown = Text(plain(heading))
         widest = max(*map(len, heading.split("\n")), *(row[place].cell_len for row in cells))
@@ -105,15 +106,18 @@ def print_table(
             table.add_column(shown, justify="right", no_wrap=True, min_width=widest)
         else:
             table.add_column(shown, overflow="fold")
-        needed += (widest if layout else min(widest, _LEAST_TEXT)) + _GAP
+        needed += (widest if layout else min(widest, _LEAST_TEXT)) + 1
+        wanted += widest + _GAP
     for row in cells:
         table.add_row(*row)
     console = _console()
+    if wanted > console.width:
+        table.padding = 0
     console.width = max(console.width, needed)
     if title:
         console.print(Text(plain(title), "bold"))
     console.print(table)
-    console.print(Text(f"{plain(note)}\n" if note else "", "dim"))
+    console.print(Text(f"{plain(note)}\n" if note else "", "dim"), soft_wrap=False)
 
 
 def columns(layout: str, **headings: str) -> dict[str, Column]:

@@ -13,6 +13,7 @@ from experiments.judge.judged_maps import methods_in
 from experiments.judge.path_errors import path_rms
 from experiments.judge.tables import SHOWN
 from experiments.show.terminal.layout import (
+    NO_ESTIMATE,
     columns,
     print_frame,
     print_lines,
@@ -64,7 +65,8 @@ def _print_aligners(errors: pd.DataFrame, summary: pd.DataFrame) -> None:
     shown |= {name: (column.label, column.layout) for name, column in SHOWN.items()}
     shown |= columns(".3f", spread_m="spread\nm") | columns(".2f", time_ms="time\nms")
     maps = answerable(errors)
-    note = "spread: 10-90 % of the repetitions; ok: accepted as more than chance"
+    note = f"{NO_ESTIMATE}\n"
+    note += "spread: 10-90 % of the repetitions; ok: accepted as more than chance"
     if len(maps):
         n_offered = maps["n_correspondences"]
         share = (maps["n_true"] / n_offered).median()
