@@ -81,7 +81,7 @@ def test_text_gives_way_before_numbers_on_a_narrow_screen(
     for shown in ("1234.500", "480/480", "+0.5000", " – ", "Title"):
         assert shown in text
     assert "…" not in text
-    assert "".join(line[:12].strip() for line in lines[4:7]) == long
+    assert "".join(line[:15].strip() for line in lines[4:7]) == long
 
 
 HOSTILE = "mk[/b]/[bold]x[/]:smile: \x1b[2J\udcff.parquet"
