@@ -39,10 +39,12 @@ from mapfusion.landmark_map import LandmarkMap, write_map
 from mapfusion.merge import merge
 from mapfusion.robot_log import read_log
 from mapfusion.storage import point_columns, write_whole
+from sim.floorplan import Wall
 from sim.renderer import renderer_name
 
 RESULT_SCHEMA_VERSION = 1
 _LABEL = "write the tables"
+_FACE_DECIMALS = 6  # a micrometre: what is beyond is rounding
 _WARM_UP_RUNS = 1  # compilation and caches
 
 
@@ -74,6 +76,8 @@ def write_result(run: JudgedRun, folder: Path) -> None:
     team = run.load_team()
     measure_aligners(run, team.robots)
     rows = all_tables(run, team) | history_tables(team, run.settings)
+    if run.no_truth:
+        rows["true_pairs"] = pd.DataFrame()
     rows |= {"aligner_timings": run.pair_table("aligner_timings"), "tracks": _tracks(run)}
     for name, table in rows.items():
         tables.write(tables.table_path(folder, name), name, table)
@@ -112,7 +116,9 @@ def _time_pair(scenario: AnyScenario, a: EvaluatedRobot, b: EvaluatedRobot) -> l
     for iteration in iterations[np.unique(spread.round().astype(int))].tolist():
         (map_a, points_a), (map_b, points_b) = a.at(iteration), b.at(iteration)
         pairs = match(map_a, map_b, scenario.align.match)
+        known = np.isfinite(points_a).any() and np.isfinite(points_b).any()
         n_common = common_landmarks(points_a, points_b, settings.true_pair_radius_m)
+        n_common = n_common if known else tables.UNKNOWN
         maps = {"robot_a": a.name, "robot_b": b.name, "iteration": iteration}
         maps |= {"n_correspondences": len(pairs), "n_common": n_common}
         for name, aligner in aligners.items():
@@ -137,15 +143,17 @@ def all_tables(run: JudgedRun, team: FusedTeam) -> dict[str, pd.DataFrame]:
     rows: dict[str, Any] = {
         "paths": joined,
         "robots": joined,
-        "path_statistics": path_statistics_rows(joined),
+        "path_statistics": [] if run.no_truth else path_statistics_rows(joined),
         "clouds": pd.concat(clouds, ignore_index=True),
         "landmarks": pd.concat(landmarks, ignore_index=True),
         "fused": fused_landmarks.fused_rows(team),
         "fused_motions": fused_landmarks.fused_motion_rows(
             team, settings.merge.parameters.use_drift
         ),
-        "map_fits": fused_landmarks.map_fit_rows(team),
-        "landmark_nees": fused_landmarks.landmark_nees_rows(team, settings.true_pair_radius_m),
+        "map_fits": [] if run.no_truth else fused_landmarks.map_fit_rows(team),
+        "landmark_nees": []
+        if run.no_truth
+        else fused_landmarks.landmark_nees_rows(team, settings.true_pair_radius_m),
         "timings": [
             {"stage": stage.name, "name": f"{stage.key}:{name}", "elapsed_s": seconds}
             for stage in run.folders()
@@ -212,9 +220,14 @@ def _write_json(path: Path, content: object) -> None:
 
 def _world(scenario: AnyScenario, robots: Sequence[EvaluatedRobot]) -> dict[str, object]:
     """The truth that figures show as background."""
-    walls = scenario.world.walls if isinstance(scenario, Simulation) else []
-    starts = {robot.name: robot.path.T_world_map.tolist() for robot in robots}
-    return {"walls": [list(wall.points) for wall in walls], "robots": starts}
+    plan = scenario.world if isinstance(scenario, Simulation) else None
+    walls = plan.walls if plan is not None else []
+    thick = plan.wall_thickness_m if plan is not None else 0.0
+    solid = [Wall(np.array(wall.points), thickness_m=thick) for wall in walls]
+    faces = [edge.round(_FACE_DECIMALS).tolist() for wall in solid for edge in wall.outline()]
+    known = [robot for robot in robots if np.isfinite(robot.path.T_world_map).all()]
+    starts = {robot.name: robot.path.T_world_map.tolist() for robot in known}
+    return {"walls": [list(wall.points) for wall in walls], "faces": faces, "robots": starts}
 
 
 def renderer(scenario: AnyScenario) -> str:

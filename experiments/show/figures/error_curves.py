@@ -28,6 +28,8 @@ def draw_error_curves(data: ResultTables, quantity: str, label: str) -> tuple[Fi
     """
     if not data.pairs:
         raise NothingToDraw("no robot pair was aligned")
+    if data.no_truth:
+        raise NothingToDraw("no truth: errors are unknown")
     errors = data.table("errors")
     bands = error_bands(errors)
     kinds = {"as estimated": quantity, "refined": f"refined_{quantity}"}

@@ -59,7 +59,7 @@ def judge_correspondences(data: ResultTables, pair: Pair) -> tuple[np.ndarray, t
     By the truth where it is known, else by the refined inliers of the first aligner that has any.
     """
     n_offered, last = len(data.last_correspondences(pair)), data.last_iteration(pair)
-    if data.start_pose(pair[0]) is not None:
+    if not data.no_truth and data.start_pose(pair[0]) is not None:
         judged = of_pair(data.table("true_pairs"), pair).set_index("iteration")["true_pair"]
         names = ("true correspondences", "false correspondences")
         return inlier_mask(judged[last], n_offered), names
