@@ -48,7 +48,8 @@ _COLUMNS = {
         accepted log10_false_alarms oracle_distance_m oracle_distance_rad
         n_correspondences n_true n_common n_inliers precision recall alignment_nees""",
     # One row per (robot, iteration); best particle online, anchored at the start, no fit. spread_m:
-    # root of the trace of the particles' weighted position covariance.
+    # root of the trace of the particles' weighted position covariance. n_landmarks: of the best
+    # particle, however often seen; its map holds those that were seen `slam.min_count` times.
     "robots": """robot iteration path_error_m path_error_rad odometry_error_m odometry_error_rad
         effective_sample_size resampled n_landmarks spread_m""",
     # Paths in the robot's own frame: the best particle's whole path at the end, the online

@@ -145,6 +145,7 @@ class _CheckedMethod:
         require_type("fitted is", found.fitted, "Pairs", Pairs, type(None))
         n = int(inlier.sum()) if found.fitted is None else len(found.fitted)
         weight = None if found.weight is None else array("weight", found.weight, (n,))
+        require(weight is None or not (weight < 0).any(), "weight is negative")
         gain = None if found.gain is None else array("gain", found.gain, (n, 3, 2))
         return replace(found, T_a_b=T_a_b, inlier=inlier, weight=weight, gain=gain)
 

@@ -7,6 +7,7 @@ past; the exit code says whether any did.
 import importlib
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from tests.helpers.made_up_maps import landmark_map, paired
 from tests.helpers.made_up_plugin import install, look_again
 
 ALL = (*kinds.OF_ALIGN, *kinds.OF_FIND, *kinds.SLOW, *kinds.WHEN_MADE)
-_CALLS = 2  # what is done between two calls shows at the second
+_CALLS, _PAUSE_S = 2, 0.1  # what is done between two calls shows at the second
 _LIMIT_S, _SHORT_LIMIT_S = 60.0, 1.0
 _POINTS = np.random.default_rng(0).uniform(0, 10, (12, 3))
 _MAPS = (landmark_map(_POINTS, "R1"), landmark_map(_POINTS + 1.0, "R2"))
@@ -67,6 +68,7 @@ def what_got_past(name: str, folder: Path) -> str:
         done = registration.register(*_MAPS, _PAIRS, np.random.default_rng(number))
         names = {"robot_a": "R1", "robot_b": "R2", "iteration": 0, "aligner": "x"}
         rows.append(names | {"repetition": number} | estimate_row(len(_PAIRS), *done))
+        time.sleep(_PAUSE_S)
     write_rows(path, ESTIMATES, rows)
     written = read_rows(path, ESTIMATES)
     failed = written[written["status"] == Status.FAILED]

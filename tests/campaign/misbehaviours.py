@@ -1,9 +1,8 @@
 """What a plug-in may do wrong, as sources of small plug-ins: bodies of its methods."""
 
 HEAD = """
-import builtins, ctypes, faulthandler, json, os, pickle, resource, signal, socket, stat, struct
-import sys
-import threading, time
+import builtins, ctypes, faulthandler, json, os, pickle, resource, signal, socket
+import stat, struct, sys, threading, time
 from dataclasses import dataclass, replace
 import numpy as np
 from mapfusion.align.method import Fit, Undetermined
@@ -90,14 +89,10 @@ OF_ALIGN = {
         "        time.sleep(0.1)"
     ),
     "writes between two calls": "threading.Timer(0.02, send, (b'late',)).start()",
-    "reads the next request": (
-        "threading.Thread(target=lambda: [os.read(k, 9) for k in sockets()], daemon=True).start()"
-    ),
     "closes the connection": "[os.close(k) for k in sockets()]",
     "closes all that is open": "os.closerange(0, 256)",
     "shuts the connection": "socket.socket(fileno=sockets()[0]).shutdown(socket.SHUT_RDWR)",
     "dies between two calls": "threading.Timer(0.02, os._exit, (1,)).start()",
-    "answers twice from a fork": "os.fork()",
     "changes how JSON is written": "json.dumps = lambda *_, **__: 'no JSON'",
     "changes how JSON is written to another value": "json.dumps = lambda *_, **__: '[1]'",
     "changes what is finite": (
@@ -167,7 +162,7 @@ OF_FIND = {
     "finds a longdouble motion that overflows": "return Fit(T * np.longdouble('1e400'), every)",
     "finds masked weights": "return Fit(T, every, np.ma.masked_array(every * 1.0, True))",
     "finds with weights that overflow": ("return Fit(T, every, every * np.longdouble('1e400'))"),
-    "finds with negative weights": "return Fit(T, every, -1.0 * every + 2e-16)",
+    "finds with negative weights": "return Fit(T, every, -1.0 * every)",
     "finds nothing for no reason": "return Undetermined('')",
     "finds a surrogate": "raise ValueError('\\ud800')",
 }
@@ -179,6 +174,9 @@ SLOW = {
     "stops its process": "os.kill(os.getpid(), signal.SIGSTOP)",
     "stops its process between two calls": (
         "threading.Timer(0.02, os.kill, (os.getpid(), signal.SIGSTOP)).start()"
+    ),
+    "reads the next request": (
+        "threading.Thread(target=lambda: [os.read(k, 9) for k in sockets()], daemon=True).start()"
     ),
     "writes half a frame and sleeps": "send(b'12345'); time.sleep(600)",
     "turns the connection to nowhere": "[os.dup2(0, k) for k in sockets()]",

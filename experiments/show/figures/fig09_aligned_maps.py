@@ -81,7 +81,7 @@ def choose_zoom(position_m: Float, covariance_m2: Float) -> Zoom:
     middle = (low + high) / 2
     some = np.unique(np.linspace(0, len(middle) - 1, _MAX_CANDIDATES).round().astype(int))
     count = min(_ZOOM_LANDMARKS, len(middle))
-    near = KDTree(middle).query(middle[some], k=[*range(1, count + 1)])[1]
+    near = np.reshape(KDTree(middle).query(middle[some], k=count)[1], (len(some), count))
     ends = low[near].min(axis=1), high[near].max(axis=1)
     side = _ZOOM_MARGIN * (ends[1] - ends[0]).max(axis=1)
     corner = (ends[0] + ends[1] - side[:, None]) / 2

@@ -106,7 +106,7 @@ def set_view(axes: Axes, landmarks_m: Float, *others_m: Float) -> str:
 
 
 def set_one_scale(panels: Sequence[Axes]) -> None:
-    """Widen the views of panels of one size to the largest among them: a metre is as long in all."""
+    """Widen the views of panels of one size to the largest of them: one scale for all."""
     views = np.array([[axes.get_xlim(), axes.get_ylim()] for axes in panels])
     half = np.ptp(views, axis=2).max(axis=0) / 2
     for axes, middle in zip(panels, views.mean(axis=2), strict=True):

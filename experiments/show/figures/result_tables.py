@@ -139,6 +139,11 @@ class ResultTables:
         """Positions (N, 3) and covariances (N, 3, 3) of the last map, by landmark number."""
         return positions_and_covariances(self.of_robot("landmarks", robot, "landmark"))
 
+    @property
+    def sightings(self) -> str:
+        """In words, how often a landmark was seen before it counts for the maps."""
+        return f"seen {self.scenario['slam']['min_count']} times or more"
+
     def path_of(self, robot: str) -> Float:
         """Positions (T, 2) of the best particle's whole path at the end, in the robot's frame."""
         return self.of_robot("paths", robot)[["final_x_m", "final_y_m"]].to_numpy()

@@ -43,10 +43,13 @@ def print_result(result: Path, skipped_figures: Sequence[str]) -> None:
         print_lines(f"  {line}" for line in not_run_lines(estimates))
     shown = columns("", robot="robot") | columns(".3f", path_m="FastSLAM, m")
     shown |= columns(".3f", odometry_m="odometry, m") | columns(".2f", over_odometry="ratio")
-    shown |= columns("d", n_landmarks="landmarks")
+    shown |= columns("d", n_landmarks="landmarks\never seen")
     paths = path_rms(table("robots"))
     known = paths["path_m"].notna().any()
     print_frame(paths, shown, "Position errors (RMS)" if known else "Robots (no truth: no errors)")
+    print_lines(
+        ["  Maps and figures hold the landmarks that were seen often enough (slam.min_count)."]
+    )
     left_out = table("fused_motions")[["robot", "left_out"]].itertuples(index=False)
     print_lines(f"  {robot} is left out of the fused map: {why}" for robot, why in left_out if why)
     print_lines([f"Figures: {result / 'figures'}   tables: {result / 'tables'}"])
