@@ -17,10 +17,9 @@ from experiments.scenario.settings import AnyScenario, Recording
 from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.refine import Refinement
 from mapfusion.errors import InputError
-from mapfusion.robot_log import RobotLog, RobotTruth, read_log, read_truth
+from mapfusion.robot_log import TRUTH_FILES, RobotLog, RobotTruth, read_log, read_truth
 
 WRITES = ("errors.parquet", "fusion.parquet")
-_TRUTH = ("truth_poses.parquet", "truth_points.parquet")
 
 
 @dataclass(frozen=True)
@@ -40,7 +39,7 @@ def why_no_truth(scenario: AnyScenario) -> str:
     """
     logs = map(Path, scenario.logs) if isinstance(scenario, Recording) else ()
     for log in logs:
-        lacking = [name for name in _TRUTH if not (log / name).is_file()]
+        lacking = [name for name in TRUTH_FILES if not (log / name).is_file()]
         if lacking and log.is_dir():
             return f"no truth is known: {log} has no {lacking[0]}"
     return ""
@@ -48,7 +47,7 @@ def why_no_truth(scenario: AnyScenario) -> str:
 
 def _truth_of(folder: Path, log: RobotLog) -> RobotTruth:
     """The truth beside a log; NaN where there is none."""
-    if all((folder / name).is_file() for name in _TRUTH):
+    if all((folder / name).is_file() for name in TRUTH_FILES):
         return read_truth(folder)
     return RobotTruth(np.full((len(log), 3), np.nan), np.full((len(log.observations), 3), np.nan))
 

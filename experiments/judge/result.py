@@ -38,11 +38,12 @@ from mapfusion.errors import InputError
 from mapfusion.landmark_map import LandmarkMap, write_map
 from mapfusion.merge import merge
 from mapfusion.robot_log import read_log
-from mapfusion.storage import point_columns, write_whole
+from mapfusion.storage import point_columns, remove_abandoned, require_writable, write_whole
 from sim.floorplan import Wall
 from sim.renderer import renderer_name
 
 RESULT_SCHEMA_VERSION = 1
+_SUBFOLDERS = ("tables", "maps", "keyframes", "figures")
 _LABEL = "write the tables"
 _FACE_DECIMALS = 6  # a micrometre: what is beyond is rounding
 _WARM_UP_RUNS = 1  # compilation and caches
@@ -60,11 +61,15 @@ def run_scenario(
 ) -> Path:
     """Run a scenario and write its result folder `RESULTS/NAME-SEED`; returns the folder."""
     run = JudgedRun.of(scenario, Store.of(results))
+    folder = results / f"{scenario.name}-{scenario.seed}"
+    for place in (run.store.root, folder, *(folder / name for name in _SUBFOLDERS)):
+        require_writable(place)
+    for place in (folder, *(stage.path for stage in run.folders())):
+        remove_abandoned(place)
     if fresh:
         for stage_folder in run.folders():
             stage_folder.discard()
     run.execute(jobs, on_progress)
-    folder = results / f"{scenario.name}-{scenario.seed}"
     on_progress(_LABEL, 0, 1)
     write_result(run, folder)
     on_progress(_LABEL, 1, 1)
