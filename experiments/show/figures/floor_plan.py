@@ -59,15 +59,15 @@ def magnification(extent_m: float, widest_m: float) -> int:
     return max((m for m in _MAGNIFICATIONS if m * widest_m <= share), default=1)
 
 
-def semi_axes(covariance_m2: Float) -> tuple[Float, Float, Float]:
-    """Ellipses of covariances (N, 2+, 2+) that hold 95 % of a plane normal distribution.
+def semi_axes(covariance_m2: Float, level: float = _LEVEL) -> tuple[Float, Float, Float]:
+    """Ellipses of covariances (N, 2+, 2+) that hold `level` of a plane normal distribution.
 
     The squared Mahalanobis distance of a normal point is chi-square with two degrees of freedom, so
     the semi-axes are sqrt(eigenvalue * quantile), along the eigenvectors. Returns semi-major and
     semi-minor axes (N,) in metres and the major axis' direction (N,) in rad.
     """
     values, vectors = np.linalg.eigh(covariance_m2[:, :2, :2])
-    lengths = np.sqrt(np.maximum(values, 0.0) * ELLIPSE_BOUND)
+    lengths = np.sqrt(np.maximum(values, 0.0) * chi_square_bound(level, _PLANE_DIMENSIONS))
     direction = np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
     return lengths[:, 1], lengths[:, 0], direction
 
