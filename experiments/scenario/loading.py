@@ -2,10 +2,12 @@
 
 import warnings
 from collections.abc import Iterator, Sequence
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass
 from pydantic_core import to_jsonable_python
 
 from experiments.methods.catalogue import name_clashes
@@ -107,7 +109,10 @@ def _warn_of_name_clashes(align: Align) -> None:
 
 
 def _validated(where: str, kind: type[S], data: dict[str, Any]) -> S:
-    known = TypeAdapter(kind)
+    strict = kind
+    if is_dataclass(kind):  # an importer's settings; sections say themselves what they forbid
+        strict = dataclass(kind, config=ConfigDict(extra="forbid"), frozen=True)
+    known: TypeAdapter[S] = TypeAdapter(strict)
     try:
         return known.validate_python(data)
     except ValidationError as error:
