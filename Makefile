@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: browser-test clean-kernels lock demo test endurance lint check bench paper install clean
+.PHONY: browser-test clean-kernels lock demo test endurance seeded-faults lint check bench paper install clean
 
 install: $(STAMP)
 
@@ -26,6 +26,10 @@ test: $(STAMP)
 # Ten random kills of a sweep; minutes.
 endurance: $(STAMP)
 	$(BIN)/python -m pytest tests/experiments/study/sweep/ten_kills.py -s
+
+# One fault of the source at a time: does a test notice? Hours; `--only NAME` for some.
+seeded-faults: $(STAMP)
+	$(BIN)/python -m tests.seeded_faults
 
 # Installs Debian's chromium where it is missing (needs root for that).
 browser-test: $(STAMP)
