@@ -226,6 +226,14 @@ def test_drift_is_at_most_what_false_pairs_over_the_gate_would_look_like():
     assert found.drift_sigma_m == pytest.approx(0.5 / 3)
 
 
+def test_a_whole_turn_more_makes_no_difference():
+    pair, maps = offered(np.random.default_rng(11), 50, 1.0, 0.0)
+    for turns in (-1, 0, 1):
+        found = Refinement().refine(Pairs(*maps), pair.T_a_b + np.array([0, 0, turns * 2 * np.pi]))
+        assert found.T_a_b[2] == pytest.approx(pair.T_a_b[2], abs=0.01)
+        assert found.ok
+
+
 def test_stays_local():
     pair, maps = offered(np.random.default_rng(2), 100, 1.0, 0.0)
     far = Refinement(gate_m=0.5).refine(Pairs(*maps), pair.T_a_b + np.array([5.0, 0, 0]))
