@@ -4,6 +4,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
+# Where this is set, each of the many processes that tests and runs start would compile our source anew.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: browser-test clean-kernels lock demo test endurance lint check bench paper install clean
 
 install: $(STAMP)

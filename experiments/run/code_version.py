@@ -15,6 +15,7 @@ PACKAGES = ("mapfusion", "sim", "experiments")
 # These find methods by name, so their imports reach every method there is. What a name stands for
 # is in a stage's settings, and its source in `Stage.loads`.
 _FINDS_BY_NAME = frozenset({"mapfusion.align.registry"})
+_HOLD_STATEMENTS = (ast.stmt, ast.ExceptHandler, ast.match_case)
 _DATA = "*.urdf"  # files that a module reads from its own folder
 _NUMERICAL_LIBRARIES = ("numba", "numpy", "opencv-python-headless", "pyarrow", "pybullet", "scipy")
 
@@ -67,17 +68,28 @@ def imported_sources(*modules: str) -> tuple[str, ...]:
     return tuple(sorted(path.relative_to(SOURCE_ROOT).as_posix() for path in reached | data))
 
 
-def _imports(path: Path) -> Iterator[Path]:
+@functools.cache
+def _imports(path: Path) -> tuple[Path, ...]:
     """Files of ours that the file imports, those imported inside of functions too."""
     if path in {_file_of(module) for module in _FINDS_BY_NAME}:
-        return
-    for node in ast.walk(ast.parse(path.read_bytes(), str(path))):
+        return ()
+    found: list[Path | None] = []
+    for node in _statements(ast.parse(path.read_bytes(), str(path))):
         if isinstance(node, ast.Import):
-            yield from filter(None, (_file_of(alias.name) for alias in node.names))
+            found += [_file_of(alias.name) for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module:
-            for alias in node.names:  # what is imported from a package may be a module in it
-                if found := _file_of(f"{node.module}.{alias.name}") or _file_of(node.module):
-                    yield found
+            # what is imported from a package may be a module in it
+            package, names = node.module, [alias.name for alias in node.names]
+            found += [_file_of(f"{package}.{name}") or _file_of(package) for name in names]
+    return tuple(filter(None, found))
+
+
+def _statements(node: ast.AST) -> Iterator[ast.AST]:
+    """All statements below a node; imports are no expressions, which would be most of the tree."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, _HOLD_STATEMENTS):
+            yield child
+            yield from _statements(child)
 
 
 def _file_of(module: str) -> Path | None:

@@ -12,6 +12,7 @@ from experiments.run.store import Store
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import Scenario, Simulation
 from experiments.show.figures import drawing
+from tests.helpers.shared_folder import shared_folder
 from tests.helpers.tiny_scenario import TINY, TRIO
 
 
@@ -48,7 +49,8 @@ def finished(scenario: Scenario, results: Path) -> Path:
 @pytest.fixture(scope="session")
 def tiny_result(tiny: Simulation, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Its result folder; tests must not change it."""
-    return finished(tiny, tmp_path_factory.mktemp("results"))
+    folder = shared_folder(tmp_path_factory, "tiny", lambda folder: finished(tiny, folder))
+    return folder / "tiny-3"
 
 
 @pytest.fixture(scope="session")
@@ -67,9 +69,12 @@ def tiny_log(tiny: Simulation, tiny_results: Path) -> Path:
 @pytest.fixture(scope="session")
 def trio_result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The result folder of three robots; tests must not change it, see `trio_copy`."""
-    folder = tmp_path_factory.mktemp("trio")
-    (folder / "trio.yaml").write_text(TRIO, encoding="utf-8")
-    return finished(load_scenario(folder / "trio.yaml"), folder)
+
+    def make(folder: Path) -> None:
+        (folder / "trio.yaml").write_text(TRIO, encoding="utf-8")
+        finished(load_scenario(folder / "trio.yaml"), folder)
+
+    return shared_folder(tmp_path_factory, "trio", make) / "trio-3"
 
 
 @pytest.fixture

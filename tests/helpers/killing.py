@@ -105,9 +105,14 @@ def _command_line(pid: int) -> bytes:
         return b""
 
 
-def same_files(sweep: Path, other: Path) -> list[str]:
-    """Files of the tables that two sweeps hold, times apart; asserts that they are the same."""
+def same_files(sweep: Path, other: Path, seed: int | None = None) -> list[str]:
+    """Files of the tables that two sweeps hold, times apart; asserts that they are the same.
+
+    Of the other one, the files of one seed alone if it is given.
+    """
     first, second = _files(sweep), _files(other)
+    if seed is not None:
+        second = {name: data for name, data in second.items() if f"-{seed}-" in Path(name).stem}
     assert sorted(first) == sorted(second)
     assert [name for name in first if first[name] != second[name]] == []
     return sorted(first)

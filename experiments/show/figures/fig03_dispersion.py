@@ -150,5 +150,6 @@ def _draw_zooms(
         # much in new territory, little on known ground
         grown = n_landmarks[k] - n_landmarks[max(0, k - _RECENT_ITERATIONS)]
         title = f"{name}: k = {k}, spread {spread_m[k]:.3f} m\n"
+        # the panels are narrow, and the last one ends at the page's edge
         title += f"+{grown} landmarks in {_RECENT_ITERATIONS} iterations"
-        axes.set_title(title, fontsize=7.5)
+        axes.set_title(title, fontsize=6.5)

@@ -203,7 +203,7 @@ def _joined(a: Runs, b: Runs, table: str) -> pd.DataFrame:
     frames = []
     for runs in (a, b):
         parts = []
-        for rows in runs.each(table, columns, optional):
+        for rows in runs.batches(table, columns, optional):
             named = rows.drop(columns=[*judged_maps.RUN_KEYS, *judged_maps.setting_columns(rows)])
             parts.append(reduce(named.assign(run_id=match_names(rows))))
         # a run of one robot has no rows, and must not decide the columns' types

@@ -30,10 +30,8 @@ def points_on_walls(rng: np.random.Generator, n: int) -> Float:
     return corners[wall] + np.where(along_x[wall, None], [1.0, 0.0], [0.0, 1.0]) * offset[:, None]
 
 
-def calibrate(
-    acceptance: Acceptance, rng: np.random.Generator, n_pairs: int = N_PAIRS_OF_MAPS
-) -> pd.DataFrame:
-    """Rows of the table `calibration`."""
+def calibrate(acceptance: Acceptance, rng: np.random.Generator, n_pairs: int) -> pd.DataFrame:
+    """Rows of the table `calibration`, of so many pairs of maps."""
     gates = np.array(sorted(acceptance.gates_m))
     bounds = np.log10(STATED)
     counts = np.zeros((n_pairs, len(STATED)), np.int64)

@@ -19,7 +19,7 @@ from experiments.run.workers import workers
 from experiments.scenario.randomness import generator
 from experiments.scenario.settings import Simulation
 from experiments.study.refusal import cases
-from experiments.study.refusal.calibration import calibrate
+from experiments.study.refusal.calibration import N_PAIRS_OF_MAPS, calibrate
 from experiments.study.refusal.cases import Case
 from experiments.study.refusal.stored_worlds import MappedWorld
 from mapfusion import se2
@@ -89,10 +89,10 @@ def run(
         for names, rows in pool.completed():
             done[names] = rows
             on_progress("cross the worlds", len(done), len(worlds) + len(crossings))
-    acceptance = scenario.align.acceptance
+    acceptance, rng = scenario.align.acceptance, generator(scenario.seed, "calibration")
     made = {
         "refusals": [row for names in sorted(done) for row in done[names]],
-        "calibration": calibrate(acceptance, generator(scenario.seed, "calibration")),
+        "calibration": calibrate(acceptance, rng, N_PAIRS_OF_MAPS),
     }
     for name, rows in made.items():
         write_rows(table_path(output, name), TABLES[name], rows)

@@ -1,7 +1,7 @@
 """Tables of many runs as one: result folders of `run`, and folders of `sweep`.
 
-Files are read run by run and only in the columns asked for, so that whoever reduces each run before
-going on holds one run in memory, however many there are.
+Files are read some at a time and only in the columns asked for, so that whoever reduces each batch
+before going on holds that much in memory, however many runs there are.
 """
 
 import json
@@ -23,6 +23,8 @@ from mapfusion.errors import InputError
 _KIND, _VERSION = b"mapfusion.kind", b"mapfusion.schema_version"
 _DAMAGED = (pa.ArrowInvalid, pa.ArrowTypeError, pa.ArrowKeyError, OSError)
 _TOLD = ("status", "reason")  # of each run of a sweep
+# Reducing costs a call what 10 000 rows cost; so many rows of `errors` are some 20 MB.
+BATCH_ROWS = 100_000
 
 
 class RunPath(NamedTuple):
@@ -57,22 +59,28 @@ class Runs:
         """Whether any run has this table."""
         return bool(self.files(table))
 
-    def each(
+    def batches(
         self, table: str, columns: Sequence[str] | None = None, optional: Sequence[str] = ()
     ) -> Iterator[pd.DataFrame]:
-        """Each run's rows; see `read`."""
+        """Rows of a few whole runs at a time, about `BATCH_ROWS`; see `read`."""
         if not self.has(table):
             where = ", ".join(map(str, [*(result.path for result in self.results), *self.sweeps]))
             what = f"no table {table} (expected the results of `run` or `sweep`)"
             raise InputError(f"{where}: {what}")
         seen: dict[str, Path] = {}
+        batch: list[pd.DataFrame] = []
         for file in self.files(table):
             rows = _read(file, table, columns, optional)
             for run_id in rows["run_id"].unique():
                 if run_id in seen:
                     raise InputError(f"{file.path}: run {run_id} is also in {seen[run_id]}")
                 seen[run_id] = file.path
-            yield rows
+            batch.append(rows)
+            if sum(map(len, batch)) >= BATCH_ROWS:
+                yield pd.concat(batch, ignore_index=True)
+                batch = []
+        if batch:
+            yield pd.concat(batch, ignore_index=True)
 
     def read(
         self, table: str, columns: Sequence[str] | None = None, optional: Sequence[str] = ()
@@ -92,13 +100,13 @@ class Runs:
             InputError: no such table, a damaged file, one made by a newer program, a missing
                 column, or a run given twice.
         """
-        return pd.concat(list(self.each(table, columns, optional)), ignore_index=True)
+        return pd.concat(list(self.batches(table, columns, optional)), ignore_index=True)
 
     @property
     def names(self) -> set[str]:
         """All runs that have errors or paths, by scenario, seed and settings."""
         tables_there = filter(self.has, ("errors", "robots"))
-        every = (rows for table in tables_there for rows in self.each(table, ["iteration"]))
+        every = (rows for table in tables_there for rows in self.batches(table, ["iteration"]))
         return {name for rows in every for name in match_names(rows.drop_duplicates("run_id"))}
 
     @cached_property

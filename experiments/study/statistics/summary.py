@@ -96,7 +96,7 @@ def summarise(runs: Runs) -> Summary:
 
 
 class ReducedErrors(NamedTuple):
-    """The errors of some runs, read and reduced run by run to `maps_of` and `medians_of_run`.
+    """The errors of some runs, read and reduced batch by batch to `maps_of` and `medians_of_run`.
 
     The absent aligners are those whose package is not installed, which is no failure.
     """
@@ -109,7 +109,7 @@ class ReducedErrors(NamedTuple):
 def reduced_errors(runs: Runs) -> ReducedErrors:
     """All that statistics, figures and reports say of errors starts from these rows."""
     maps, medians, every = [], [], []
-    for whole in runs.each("errors", NEEDED, ("status", *OPTIONAL)):
+    for whole in runs.batches("errors", NEEDED, ("status", *OPTIONAL)):
         every += whole["aligner"].unique().tolist()
         errors = whole[whole["status"] != Status.ABSENT]
         if len(errors):
@@ -131,7 +131,7 @@ def with_overlap_share(maps: pd.DataFrame, runs: Runs) -> pd.DataFrame:
     if not runs.has("robots"):
         return maps.assign(overlap_share=np.nan)
     iterations, parts = np.unique(maps["iteration"]), []
-    for rows in runs.each("robots", ["robot", "iteration", "n_landmarks"]):
+    for rows in runs.batches("robots", ["robot", "iteration", "n_landmarks"]):
         sizes = rows.pivot_table("n_landmarks", "iteration", ["run_id", "robot"]).ffill()
         at = sizes.reindex(pd.Index(iterations, name="iteration"), method="ffill")
         parts.append(at.melt(ignore_index=False).set_index(["run_id", "robot"], append=True))

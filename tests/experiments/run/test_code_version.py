@@ -8,9 +8,26 @@ from experiments.run import code_version
 
 FILES = {
     "ours/__init__.py": "",
-    "ours/start.py": "import numpy\nfrom ours import by_package\n",
+    "ours/start.py": "import numpy\nfrom ours import by_package, nested\n",
     "ours/by_package.py": "def late():\n    import ours.by_name\n",
     "ours/by_name.py": "from ours.by_module import number as renamed\n",
+    "ours/nested.py": """
+class Late:
+    with open(__file__):
+        for _ in ():
+            pass
+        else:
+            try:
+                pass
+            except OSError:
+                if True:
+                    import ours.by_handler
+    match 1:
+        case 1:
+            import ours.by_case
+""",
+    "ours/by_handler.py": "",
+    "ours/by_case.py": "",
     "ours/by_module.py": "from ours import start  # a circle\nnumber = 1\n",
     "ours/unused.py": "",
     "ours/robot.urdf": "",

@@ -163,6 +163,13 @@ def test_stated_number_of_false_alarms_bounds_the_measured_one() -> None:
     assert rows["n_accepted"].iloc[-1] > 0  # a hundred false alarms stated: some are there
 
 
+@pytest.fixture
+def few_pairs(monkeypatch: pytest.MonkeyPatch) -> int:
+    """How many pairs of maps the command calibrates by; thousands are dear and show no more."""
+    monkeypatch.setattr(results, "N_PAIRS_OF_MAPS", 50)
+    return 50
+
+
 @pytest.fixture(scope="module")
 def other_result(tiny: Simulation, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The tiny scenario in another world: another seed's textures; one aligner is enough here."""
@@ -176,6 +183,7 @@ def other_result(tiny: Simulation, tmp_path_factory: pytest.TempPathFactory) -> 
 def test_the_command_crosses_two_worlds(
     tiny_result: Path,
     other_result: Path,
+    few_pairs: int,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -191,6 +199,7 @@ def test_the_command_crosses_two_worlds(
     assert apart["refined_translation_error_m"].isna().all()
     assert not apart["accepted"].any()
     assert (common["world_a"] == common["world_b"]).all()
+    assert (results.read(tmp_path / "one", "calibration")["n_pairs"] == few_pairs).all()
     assert (tmp_path / "one" / "figures" / "refusal.png").stat().st_size > 10_000
 
     again = command(capsys, "refusal", *both, "-o", tmp_path / "two", "--pairs", 6, "--jobs", 2)
@@ -201,6 +210,7 @@ def test_the_command_crosses_two_worlds(
         )
 
 
+@pytest.mark.usefixtures("few_pairs")
 def test_worlds_may_be_scenarios_with_seeds(
     tiny: Simulation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

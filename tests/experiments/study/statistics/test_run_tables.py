@@ -8,6 +8,7 @@ import pytest
 
 from experiments.judge import tables
 from experiments.judge.judged_maps import setting_columns
+from experiments.study.statistics import run_tables
 from experiments.study.statistics.run_tables import find_runs
 from mapfusion.errors import InputError
 from mapfusion.storage import write_table
@@ -38,11 +39,18 @@ def test_settings_come_in_front_and_only_the_wanted_columns(tmp_path: Path) -> N
     assert rows["slam.particles"].unique().tolist() == ["50", "200"]
 
 
-def test_runs_come_one_by_one(tmp_path: Path) -> None:
-    sweep = write_sweep(tmp_path / "sweep", range(3))
-    assert [rows["seed"].unique().tolist() for rows in find_runs(sweep).each("robots")] == [
-        *([0], [1], [2])
-    ]
+@pytest.mark.parametrize(
+    ("rows_of_runs", "seeds"), [(0, [[0], [1], [2]]), (1.5, [[0, 1], [2]]), (9, [[0, 1, 2]])]
+)
+def test_runs_come_whole_in_batches(
+    rows_of_runs: float, seeds: list[list[int]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs = find_runs(write_sweep(tmp_path / "sweep", range(3)))
+    whole = runs.read("robots")
+    monkeypatch.setattr(run_tables, "BATCH_ROWS", rows_of_runs * len(whole) / 3)
+    batches = list(runs.batches("robots"))
+    assert [rows["seed"].unique().tolist() for rows in batches] == seeds
+    pd.testing.assert_frame_equal(pd.concat(batches, ignore_index=True), whole)
 
 
 def test_files_still_being_written_are_left_alone(tmp_path: Path) -> None:
