@@ -172,24 +172,20 @@ class CopyingFilter:
         self, particle: Particle, observations: Observations, widening: list | None = None
     ) -> list:
         candidates = []
+        gate = self.parameters.gate
         for k in range(len(observations)):
             z, R = self.observation(observations, k)
             for number, landmark in particle.landmarks.items():
+                apart = self.unlikeness(landmark, observations, k)
+                if apart is None:
+                    continue
                 difference, Z, _ = self.expectation(particle, landmark, z, R)
                 if widening is not None:
                     Z = Z + widening[k]
                 distance = difference @ np.linalg.solve(Z, difference)
-                if distance > self.parameters.gate:
-                    continue
-                if self.parameters.association == "gate":
-                    candidates.append((distance, k, number))
-                elif self.parameters.association == "label":
-                    if landmark.label == observations.label[k]:
-                        candidates.append((0.0, k, number))
-                else:
-                    apart = np.linalg.norm(landmark.descriptor - observations.descriptor[k])
-                    if apart < self.parameters.descriptor_threshold:
-                        candidates.append((apart, k, number))
+                if distance <= gate:
+                    by_distance = self.parameters.association == "gate"
+                    candidates.append((distance if by_distance else apart, k, number))
         chosen: list = [None] * len(observations)
         for _, k, number in sorted(candidates):
             if chosen[k] is None and number not in chosen:
@@ -201,6 +197,15 @@ class CopyingFilter:
                     chosen[k] = "drop"
                 named.add(int(observations.label[k]))
         return chosen
+
+    def unlikeness(self, landmark, observations: Observations, k: int) -> float | None:
+        """How far apart their looks are; None if they cannot be the same."""
+        if self.parameters.association == "label":
+            return 0.0 if landmark.label == observations.label[k] else None
+        if self.parameters.association == "descriptor":
+            apart = np.linalg.norm(landmark.descriptor - observations.descriptor[k])
+            return apart if apart < self.parameters.descriptor_threshold else None
+        return 0.0
 
     def observation(self, observations: Observations, k: int) -> tuple[np.ndarray, np.ndarray]:
         n = self.n_dof

@@ -4,7 +4,6 @@ import json
 import random
 import shutil
 import threading
-import time
 from pathlib import Path
 
 import duckdb
@@ -168,12 +167,12 @@ def test_killed_sweeps_go_on_and_readers_always_find_whole_runs(
     stop = threading.Event()
 
     def read() -> None:
-        while not stop.is_set():
+        while not stop.wait(0.2):
             seen.append(_whole_runs(sweep))
-            time.sleep(0.2)
+        seen.append(_whole_runs(sweep))
 
     reader = threading.Thread(target=read)
-    with KilledSweep((short_path, "--seeds", "0..1", *GRID), tmp_path) as killed:
+    with KilledSweep((short_path, "--seeds", "1", *GRID), tmp_path) as killed:
         reader.start()
         try:
             victims = killed.kill_at_random(random.Random(1), ["worker", "everything", "worker"])
@@ -183,7 +182,7 @@ def test_killed_sweeps_go_on_and_readers_always_find_whole_runs(
             reader.join()
     assert (code, "Traceback" in complaints) == (0, False), complaints
     assert len(victims) >= 2
-    assert len(same_files(sweep, swept)) == 4 * 7
+    assert len(same_files(sweep, swept, seed=1)) == 2 * 7
     assert max(seen) >= 1
 
 
