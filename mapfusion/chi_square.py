@@ -1,7 +1,5 @@
 """Bounds that a chi-square variable keeps with a given probability."""
 
-from scipy.special import gammaincinv
-
 
 def chi_square_bound(probability: float, degrees_of_freedom: float) -> float:
     """The value that a chi-square variable stays below with this probability.
@@ -9,4 +7,6 @@ def chi_square_bound(probability: float, degrees_of_freedom: float) -> float:
     Its distribution function is P(k / 2, x / 2), the regularised incomplete gamma function, whose
     inverse comes without scipy.stats: that alone takes half a second to import, in every worker.
     """
+    from scipy.special import gammaincinv  # a fifth of what the import of a method takes
+
     return 2.0 * float(gammaincinv(degrees_of_freedom / 2, probability))

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from experiments.show import statistics_files
 from experiments.show.export import to_latex, to_markdown, write_tables
 from experiments.show.figures.result_tables import ResultTables
 from experiments.study.statistics.error_bands import medians_of_run, time_bands
@@ -63,7 +64,10 @@ def test_eighty_columns_hold_everything(tmp_path: Path, capsys: pytest.CaptureFi
 
 
 @pytest.mark.usefixtures("quick_save")
-def test_several_scenarios_and_settings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_several_scenarios_and_settings(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(statistics_files, "_FIGURES", ("fig05_rotation_error",))  # one will do
     settings = [{"slam.particles": "50"}, {"slam.particles": "200"}]
     sweep = write_sweep(tmp_path / "sweep", range(2), settings, ("hall", "maze"))
     reply = command(capsys, "statistics", sweep, "-o", tmp_path / "out")
