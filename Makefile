@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 # Where this is set, each of the many processes that tests and runs start would compile our source anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: browser-test clean-kernels lock demo test endurance lint check bench paper install clean
+.PHONY: wheel-test browser-test clean-kernels lock demo test endurance lint check bench paper install clean
 
 install: $(STAMP)
 
@@ -29,6 +29,10 @@ test: $(STAMP)
 # Ten random kills of a sweep; minutes.
 endurance: $(STAMP)
 	$(BIN)/python -m pytest tests/experiments/study/sweep/ten_kills.py -s
+
+# The wheel in a fresh environment, which takes minutes to install.
+wheel-test: $(STAMP)
+	$(BIN)/python -m pytest tests/installed_wheel.py -s
 
 # Installs Debian's chromium where it is missing (needs root for that).
 browser-test: $(STAMP)

@@ -2,20 +2,20 @@
 
 import sys
 import warnings
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 
+import mapfusion
 from experiments.cli import run_commands, step_commands, study_commands
 from experiments.cli.options import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_INTERRUPTED
 from mapfusion.recordings.registry import IMPORTERS
 
 app = typer.Typer(
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     help="Measures how well landmark maps of independent robots can be fused.\n\n"
-    "Start with:  mapfusion run scenarios/quick.yaml",
+    "Start with:  mapfusion run quick",
 )
 for commands in (run_commands, study_commands, step_commands):
     app.add_typer(commands.app)
@@ -28,6 +28,22 @@ for name, importer in IMPORTERS.items():
 app.add_typer(import_app, name="import")
 
 
+def _tell_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"mapfusion {mapfusion.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool,
+        typer.Option("--version", help="Tell the version.", callback=_tell_version, is_eager=True),
+    ] = False,
+) -> None:
+    pass
+
+
 def main() -> None:
     """Run the command; every failure a user can cause is one line and an exit code."""
     from experiments.run.kernel_cache import use_kernel_cache
@@ -36,7 +52,7 @@ def main() -> None:
     _tell_name_clashes()
     try:
         use_kernel_cache()
-        code = app(standalone_mode=False) or 0
+        code = app(prog_name="mapfusion", standalone_mode=False) or 0
     except InputError as error:
         _complain(str(error))
         code = EXIT_BAD_INPUT

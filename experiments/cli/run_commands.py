@@ -10,7 +10,6 @@ from experiments.cli import options
 
 app = typer.Typer()
 _DRAWING = "draw the figures"
-_SUITE = Path("scenarios")
 
 
 @app.command()
@@ -28,12 +27,15 @@ def run(
     Finished stages are reused; an interrupted run goes on where it was.
     """
     from experiments.judge.expectations import load_checked
-    from experiments.judge.result import run_scenario
     from experiments.scenario.suite import scenarios_of
+
+    checked = [load_checked(path, overrides, seed) for path in scenarios_of(scenarios)]
+    # What draws takes seconds to import: a scenario is refused before.
+    from experiments.judge.result import run_scenario
     from experiments.show.figures.drawing import draw_all
     from experiments.show.terminal import layout, run_screen
 
-    for loaded in [load_checked(path, overrides, seed) for path in scenarios_of(scenarios)]:
+    for loaded in checked:
         with layout.progress() as show:
             folder = run_scenario(loaded, results, jobs, show, fresh)
             drawn = draw_all(folder, jobs, partial(show, _DRAWING))
@@ -92,17 +94,18 @@ def check(
 ) -> None:
     """Hold runs to their `expect` blocks, exit code 1 if one fails: `mapfusion check ci`."""
     from experiments.judge import expectations
-    from experiments.judge.result import run_scenario
     from experiments.scenario.seeds import parse_seeds
     from experiments.scenario.suite import scenarios_of
-    from experiments.show.junit import write_junit
-    from experiments.show.terminal import layout, run_screen
 
     wanted = parse_seeds(seeds)
     checked = [
         [expectations.load_checked(path, overrides, seed) for seed in wanted]
         for path in scenarios_of(scenarios)
     ]
+    from experiments.judge.result import run_scenario  # as in `run`
+    from experiments.show.junit import write_junit
+    from experiments.show.terminal import layout, run_screen
+
     outcomes = []
     for runs in checked:
         with layout.progress() as show:
@@ -117,10 +120,20 @@ def check(
 
 @app.command("scenarios")
 def list_scenarios(
-    folder: Annotated[Path, typer.Argument(metavar="[FOLDER]", help="Of scenario files.")] = _SUITE,
+    folder: Annotated[
+        Path | None, typer.Argument(help="Of scenario files; the suite's by default.")
+    ] = None,
+    *,
+    copy: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Write scenarios/NAME.yaml instead, to edit.")
+    ] = None,
 ) -> None:
     """List the suite, with the tags that `run` and `check` take: `mapfusion scenarios`."""
-    from experiments.scenario.suite import entries
+    from experiments.scenario.suite import copy_to_edit, entries
+
+    if copy is not None:
+        typer.echo(copy_to_edit(copy))
+        return
     from experiments.show.terminal.study_screen import print_scenarios
 
     print_scenarios(entries(folder))

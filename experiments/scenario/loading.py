@@ -21,6 +21,8 @@ from experiments.scenario.settings import (
 from experiments.scenario.yaml_input import apply_overrides, read_mapping
 from mapfusion.errors import InputError, NameClashWarning
 
+SHIPPED = Path(__file__).with_name("shipped")  # the repository's scenarios/, also where installed
+OWN = Path("scenarios")  # what shipped files name lies beside it, as it does in the repository
 S = TypeVar("S")
 _MOST_SUGGESTED = 3  # keys that an error message offers
 _UNKNOWN = {"extra_forbidden", "unexpected_keyword_argument"}
@@ -49,7 +51,8 @@ def load_scenario(
     scenario = scenario_of(data, str(path))
     _warn_of_name_clashes(scenario.align)
     if isinstance(scenario, Recording):
-        logs = [str((path.parent / log).resolve()) for log in scenario.logs]
+        folder = OWN if path.parent == SHIPPED else path.parent
+        logs = [str((folder / log).resolve()) for log in scenario.logs]
         return scenario.model_copy(update={"logs": logs})
     return scenario
 
