@@ -142,6 +142,6 @@ def list_scenarios(
 @app.command()
 def schema() -> None:
     """Print the JSON schema of scenarios, for editors: `mapfusion schema > schema.json`."""
-    from experiments.scenario.settings import schema_text
+    from experiments.scenario.schema import schema_text
 
-    typer.echo(schema_text())
+    typer.echo(schema_text(), nl=False)

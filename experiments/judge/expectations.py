@@ -10,7 +10,7 @@ import pandas as pd
 from experiments.judge import metrics, tables
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import AnyScenario, Bound
-from mapfusion.errors import InputError
+from mapfusion.errors import InputError, did_you_mean
 
 
 def load_checked(path: Path, overrides: Sequence[str] = (), seed: int | None = None) -> AnyScenario:
@@ -19,7 +19,8 @@ def load_checked(path: Path, overrides: Sequence[str] = (), seed: int | None = N
     known = metrics.known_metrics([entry.name for entry in scenario.align.aligners])
     unknown = sorted(set(scenario.expect) - set(known))
     if unknown:
-        raise InputError(f"{path}: expect.{unknown[0]}: unknown; known: {', '.join(known)}")
+        there = f"known: {', '.join(known)}{did_you_mean(unknown[0], known)}"
+        raise InputError(f"{path}: expect.{unknown[0]}: unknown; {there}")
     return scenario
 
 

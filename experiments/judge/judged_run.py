@@ -10,6 +10,7 @@ from experiments.judge import judging, tables
 from experiments.judge.errors import EvaluatedRobot, met_maps
 from experiments.judge.fused_landmarks import FusedTeam, MergeSettings
 from experiments.judge.judging import JudgeSettings
+from experiments.run.memory import require_memory
 from experiments.run.pipeline import PairStages, Pipeline, RobotStages, lay_out
 from experiments.run.stage import Stage
 from experiments.run.stages.slam import RobotFolders
@@ -79,7 +80,13 @@ class JudgedRun:
         return pd.concat(parts, ignore_index=True) if parts else tables.framed(name, [])
 
     def execute(self, jobs: int, on_progress: OnProgress, only: Sequence[Stage] = ()) -> None:
-        """Do what is not in the store yet, in `jobs` processes; of `only` these stages, if any."""
+        """Do what is not in the store yet, in `jobs` processes; of `only` these stages, if any.
+
+        Raises:
+            InputError: something that was given cannot be used, or this machine has too little
+                memory for it.
+        """
+        require_memory(self.pipeline, jobs)
         wanted = only or self.stages()
         left = unfinished(self.tasks, [name for stage in wanted for name in task_names(stage)])
         try:

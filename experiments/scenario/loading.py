@@ -1,5 +1,7 @@
 """Scenario files in, validated scenarios out, or one line: the field, and what would be right."""
 
+import functools
+import reprlib
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -9,7 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 from pydantic_core import to_jsonable_python
 
 from experiments.methods.catalogue import name_clashes
-from experiments.scenario.generated import Generate, expanded
+from experiments.scenario.generated import expanded
 from experiments.scenario.settings import (
     Align,
     AnyScenario,
@@ -19,7 +21,7 @@ from experiments.scenario.settings import (
     Simulation,
 )
 from experiments.scenario.yaml_input import apply_overrides, read_mapping
-from mapfusion.errors import InputError, NameClashWarning
+from mapfusion.errors import InputError, NameClashWarning, OutOfRangeError, did_you_mean
 
 SHIPPED = Path(__file__).with_name("shipped")  # the repository's scenarios/, also where installed
 OWN = Path("scenarios")  # what shipped files name lies beside it, as it does in the repository
@@ -28,9 +30,9 @@ _MOST_SUGGESTED = 3  # keys that an error message offers
 _UNKNOWN = {"extra_forbidden", "unexpected_keyword_argument"}
 _WORLD = {"world", "robots", "drive"}  # what a simulation must have and a recording cannot
 _EITHER = "give either world, robots and drive, or logs; generate stands for world and robots"
-_FIELDS = Simulation.model_fields | Recording.model_fields
+_FIELDS = GeneratedScenario.model_fields | Simulation.model_fields | Recording.model_fields
 # What says nothing: resolved scenarios of earlier versions name all sections.
-_SILENT = {"generate": [None]} | {
+_SILENT = {
     name: [None, [], *([] if field.is_required() else [to_jsonable_python(field.default)])]
     for name, field in _FIELDS.items()
     if name not in Scenario.model_fields
@@ -52,9 +54,16 @@ def load_scenario(
     _warn_of_name_clashes(scenario.align)
     if isinstance(scenario, Recording):
         folder = OWN if path.parent == SHIPPED else path.parent
-        logs = [str((folder / log).resolve()) for log in scenario.logs]
+        logs = [_resolved(path, folder, log) for log in scenario.logs]
         return scenario.model_copy(update={"logs": logs})
     return scenario
+
+
+def _resolved(path: Path, folder: Path, log: str) -> str:
+    try:
+        return str((folder / log).resolve())
+    except (OSError, RuntimeError, ValueError) as error:  # a loop of links, a name too long
+        raise InputError(f"{path}: logs: {log}: no folder has this path ({error})") from error
 
 
 def scenario_of(data: dict[str, Any], where: str) -> AnyScenario:
@@ -63,32 +72,22 @@ def scenario_of(data: dict[str, Any], where: str) -> AnyScenario:
     Raises:
         InputError: one line that begins with `where`.
     """
-    data = _expanded(where, data)
     data = {key: value for key, value in data.items() if value not in _SILENT.get(key, [])}
-    if "generate" in data:  # nothing can be drawn from this seed
-        _validated(where, GeneratedScenario, data)
-    recorded = "logs" in data
-    unclear = bool(data.keys() & _WORLD) if recorded else not data.keys() >= _WORLD
+    drawn, recorded = "generate" in data, "logs" in data
+    if drawn and data.keys() & {"world", "robots", "logs"}:
+        raise InputError(f"{where}: give either generate, or world and robots, or logs")
+    needed = {"drive"} if drawn else _WORLD
+    unclear = bool(data.keys() & _WORLD) if recorded else not data.keys() >= needed
     if unclear and data.keys() <= _FIELDS.keys():  # a misspelt name is the better explanation
         raise InputError(f"{where}: {_EITHER}")
+    if drawn:
+        asked = _validated(where, GeneratedScenario, data)
+        try:
+            made = expanded(asked.generate, asked.seed)
+        except InputError as error:
+            raise InputError(f"{where}: generate.{error}") from error
+        data = {key: value for key, value in data.items() if key != "generate"} | made
     return _validated(where, Recording if recorded else Simulation, data)
-
-
-def _expanded(where: str, data: dict[str, Any]) -> dict[str, Any]:
-    """The data with the world and the robots that its `generate` section stands for."""
-    if data.get("generate") is None:
-        return data
-    if data.get("world") is not None or data.get("robots") or data.get("logs"):
-        raise InputError(f"{where}: give either generate, or world and robots, or logs")
-    # the rest is judged first: what is wrong with the seed must not show as a broken plan
-    if not isinstance(data.get("seed", 0), int):
-        return data
-    settings = _validated(f"{where}: generate", Generate, data["generate"])
-    try:
-        made = expanded(settings, data.get("seed", 0))
-    except InputError as error:
-        raise InputError(f"{where}: generate.{error}") from error
-    return {key: value for key, value in data.items() if key != "generate"} | made
 
 
 def load_section(path: Path | None, name: str, kind: type[S], overrides: Sequence[str]) -> S:
@@ -109,38 +108,56 @@ def _warn_of_name_clashes(align: Align) -> None:
             warnings.warn(name_clashes()[method], NameClashWarning, stacklevel=3)
 
 
+@functools.cache  # a sweep and a campaign validate the same few kinds again and again
+def _known(kind: type[S]) -> TypeAdapter[S]:
+    return TypeAdapter(kind)
+
+
+@functools.cache
+def _known_keys(kind: type) -> list[tuple[str, ...]]:
+    schema = _known(kind).json_schema()
+    return list(_keys(schema, schema))
+
+
 def _validated(where: str, kind: type[S], data: dict[str, Any]) -> S:
-    known = TypeAdapter(kind)
     try:
-        return known.validate_python(data)
+        return _known(kind).validate_python(data)
     except ValidationError as error:
-        raise InputError(f"{where}: {_first_problem(known.json_schema(), error)}") from error
+        raise InputError(f"{where}: {_first_problem(kind, error)}") from error
 
 
-def _first_problem(schema: dict[str, Any], error: ValidationError) -> str:
-    """The first thing wrong with a section of that JSON schema, and how many more there are."""
+def _first_problem(kind: type, error: ValidationError) -> str:
+    """The first thing wrong with a section of that kind, and how many more there are."""
     # A wrong name explains the missing one that follows from it, so it goes first.
     problems = error.errors(include_url=False)
     problem, *more = sorted(problems, key=lambda each: each["type"] not in _UNKNOWN)
     location = problem["loc"]
     message = problem["msg"].removeprefix("Value error, ")
-    if problem["type"] in _UNKNOWN:
-        message = _about_unknown(location, list(_keys(schema, schema)))
+    cause = problem.get("ctx", {}).get("error")
+    if isinstance(cause, OutOfRangeError):
+        location, message = (*location, cause.name), cause.problem
+    elif problem["type"] in _UNKNOWN:
+        message = _about_unknown(location, _known_keys(kind))
     elif problem["type"] != "value_error" and not isinstance(problem["input"], dict):
-        message = f"{message} (it is {problem['input']!r})"
+        message = f"{message} (it is {reprlib.repr(problem['input'])})"
     where = f"{'.'.join(map(str, location))}: " if location else ""
     return f"{where}{message}" + (f" (and {len(more)} more)" if more else "")
 
 
 def _about_unknown(location: tuple[int | str, ...], known: list[tuple[str, ...]]) -> str:
-    """The names that would have been right there, and keys of which the wrong one is a word."""
-    *above, name = location
+    """The names that would have been right there, and those that may have been meant."""
+    *above, wrong = location
     beside = [path for path in known if len(path) == len(location)]
     for i, part in enumerate(above):
         beside = [path for path in beside if path[i] in {"*", part}]
-    like = [".".join(path) for path in known if name in path[-1].split("_") and "*" not in path]
-    message = f"unknown key; known here: {', '.join(sorted(path[-1] for path in beside))}"
-    return message + (f"; did you mean {' or '.join(like[:_MOST_SUGGESTED])}?" if like else "")
+    here = sorted({path[-1] for path in beside})
+    message = f"unknown key; known here: {', '.join(here)}"
+    meant = did_you_mean(str(wrong), here)
+    # else a key of another section, of which the wrong one is a word
+    like = [".".join(p) for p in known if wrong in p[-1].split("_") and "*" not in p]
+    if like and not meant:
+        meant = f"; did you mean {' or '.join(like[:_MOST_SUGGESTED])}?"
+    return message + meant
 
 
 def _keys(root: dict[str, Any], node: dict[str, Any], *above: str) -> Iterator[tuple[str, ...]]:

@@ -10,7 +10,7 @@ from typing import Any
 from experiments.scenario.loading import OWN, SHIPPED, load_scenario
 from experiments.scenario.settings import Recording
 from experiments.scenario.yaml_input import read_mapping
-from mapfusion.errors import InputError
+from mapfusion.errors import InputError, did_you_mean
 from mapfusion.storage import write_whole
 
 SUFFIXES = {".yaml", ".yml", ".json"}  # a JSON file is YAML too: a result's scenario.json
@@ -45,6 +45,7 @@ def _named(wanted: str, folder: Path | None) -> list[Path]:
             f"{wanted}: neither a file, nor a scenario of {folder or 'the suite'} "
             f"({', '.join(path.stem for path in known) or 'there is none'}), nor a tag "
             f"({', '.join(tags) or 'there is none'})"
+            f"{did_you_mean(wanted, [*(path.stem for path in known), *tags])}"
         )
     return by_name or by_tag
 

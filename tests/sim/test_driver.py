@@ -187,9 +187,9 @@ def test_rates_that_do_not_divide_are_refused(interval_s: float) -> None:
 
 
 def test_settings_are_checked() -> None:
-    with pytest.raises(InputError, match=r"speed_m_s is 0\.8, the P3-AT's top speed is 0.7"):
+    with pytest.raises(InputError, match=r"speed_m_s: is 0\.8, must be in .0\.01, 0\.7. m/s"):
         DriverSettings(speed_m_s=0.8)
-    with pytest.raises(InputError, match="arrival_m is 0, must be above 0"):
+    with pytest.raises(InputError, match="arrival_m: is 0, must be in"):
         DriverSettings(arrival_m=0)
     with pytest.raises(InputError, match="robot a: needs at least one waypoint"):
         Route("a", np.zeros(3), np.zeros((0, 2)))

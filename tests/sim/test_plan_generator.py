@@ -107,11 +107,11 @@ def test_a_plan_depends_on_its_seed_alone() -> None:
     [
         ({"rooms_a_side": 0}, "rooms_a_side"),
         ({"doors_a_room": 3}, "doors_a_room"),
-        ({"door_m": 1.0}, "door_m: is 1, the robot needs 1.2"),
+        ({"door_m": 1.0}, "door_m: is 1.0, must be in .1.2"),
         ({"door_m": np.nan}, "door_m"),
         ({"room_width_m": (2.0, 4.0)}, "room_width_m: is 2 to 4"),
         ({"room_depth_m": (4.0, 3.0)}, "room_depth_m: is 4 to 3"),
-        ({"corridor_m": 1.0}, "corridor_m: is 1, the robot needs"),
+        ({"corridor_m": 1.0}, "corridor_m: is 1.0, must be in .1.64"),
     ],
 )
 def test_sizes_that_cannot_be_driven_are_refused(settings: dict, words: str) -> None:
