@@ -1,4 +1,6 @@
-"""The one error a person is meant to read."""
+"""The one error a person is meant to read, and what they are warned of."""
+
+from pathlib import Path
 
 import difflib
 from collections.abc import Iterable
@@ -30,7 +32,30 @@ class OutOfRangeError(InputError):
         return one_line(f"{self.name}: {self.problem}")
 
 
-class NameClashWarning(UserWarning):
+class DamagedFileError(InputError):
+    """A file is missing or not as it was written. `path`: which."""
+
+    def __init__(self, path: Path, reason: str) -> None:
+        super().__init__(path, reason)
+        self.path = path
+
+    def __str__(self) -> str:
+        return f"{self.path}: {self.args[1]}"
+
+
+class TellingWarning(UserWarning):
+    """Something a user should know, in one line; the command shows it as it is."""
+
+
+class UnsealedWarning(TellingWarning):
+    """A file carries no digest of itself."""
+
+
+class MendedWarning(TellingWarning):
+    """A damaged stage of the store is made again."""
+
+
+class NameClashWarning(TellingWarning):
     """Two methods claim one name; the text says in one line which of them has it."""
 
 

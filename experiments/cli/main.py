@@ -8,7 +8,7 @@ import typer
 
 import mapfusion
 from experiments.cli import run_commands, step_commands, study_commands
-from experiments.cli.options import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_INTERRUPTED
+from experiments.cli.options import EXIT_BAD_INPUT, EXIT_DEFECT, EXIT_FAILED, EXIT_INTERRUPTED
 from mapfusion.recordings.registry import IMPORTERS
 
 app = typer.Typer(
@@ -46,10 +46,11 @@ def _options(
 
 def main() -> None:
     """Run the command; every failure a user can cause is one line and an exit code."""
+    from experiments.run.defects import saved_defect
     from experiments.run.kernel_cache import use_kernel_cache
     from mapfusion.errors import InputError
 
-    _tell_name_clashes()
+    unsealed = _tell_warnings()
     try:
         use_kernel_cache()
         code = app(prog_name="mapfusion", standalone_mode=False) or 0
@@ -62,34 +63,52 @@ def main() -> None:
         where = "" if error.filename is None else f"{error.filename}: "
         _complain(f"{where}cannot be read or written ({error.strerror or error})")
         code = EXIT_BAD_INPUT
+    except MemoryError:
+        kept = "what was finished is kept; --jobs 1 needs least"
+        _complain(f"this machine has too little memory for this ({kept})")
+        code = EXIT_BAD_INPUT
     except KeyboardInterrupt:  # before or after what the command itself guards
         code = EXIT_INTERRUPTED
     except Exception as error:
         # Typer keeps its usage errors' classes private; all of them can tell their message.
         message = getattr(error, "format_message", None)
         if message is None:
-            raise
-        if message():  # empty where the help was shown instead
-            _complain(f"{message()} (see mapfusion --help)")
-        code = EXIT_BAD_INPUT
+            _complain(saved_defect(error))
+            code = EXIT_DEFECT
+        else:
+            if message():  # empty where the help was shown instead
+                _complain(f"{message()} (see mapfusion --help)")
+            code = EXIT_BAD_INPUT
+    for text in unsealed if code in {0, EXIT_FAILED} else ():
+        _complain(f"warning: {text}")
     if code == EXIT_INTERRUPTED:
         _complain("interrupted; what was finished is kept, the same command goes on from there")
     sys.exit(code)
 
 
-def _tell_name_clashes() -> None:
-    """In one line each; other warnings keep Python's own form."""
-    from mapfusion.errors import NameClashWarning
+def _tell_warnings() -> list[str]:
+    """Ours in one line each; others keep Python's own form.
 
-    show = warnings.showwarning
+    Returns:
+        What is to be said of files without digest, once all else has gone well.
+    """
+    from mapfusion.errors import TellingWarning, UnsealedWarning
+    from mapfusion.sealed import say_again
+
+    show, unsealed = warnings.showwarning, list[str]()
+    say_again()
 
     def tell(message: Warning | str, category: type[Warning], *rest: Any) -> None:
-        if issubclass(category, NameClashWarning):
+        if issubclass(category, UnsealedWarning):
+            unsealed.append(str(message))
+        elif issubclass(category, TellingWarning):
             _complain(f"warning: {message}")
         else:
             show(message, category, *rest)
 
     warnings.showwarning = tell
+    warnings.simplefilter("always", TellingWarning)  # two stages may be damaged in one way
+    return unsealed
 
 
 def _complain(text: str) -> None:

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
+EXIT_DEFECT = 70  # EX_SOFTWARE of sysexits.h: an error of ours
 RESULTS = Path("results")
 # Those that this process may use.
 ALL_CORES = (

@@ -89,12 +89,12 @@ def sweep(
         sweep_screen.print_survey(sweep_plan.survey(asked))
         return
     with layout.progress() as show:
-        failed = sweep_driver.execute(asked, jobs, scheduler, sweep_screen.shown_by(show))
+        ended = sweep_driver.execute(asked, jobs, scheduler, sweep_screen.shown_by(show))
         if timings:
-            sweep_driver.measure_times(asked, failed, show)
-    sweep_screen.print_sweep(asked.dataset, asked.runs, failed)
-    if failed:
-        raise typer.Exit(options.EXIT_FAILED)
+            sweep_driver.measure_times(asked, ended.failed, show)
+    sweep_screen.print_sweep(asked.dataset, asked.runs, ended.failed)
+    if ended.failed:
+        raise typer.Exit(options.EXIT_DEFECT if ended.defects else options.EXIT_FAILED)
 
 
 @app.command()

@@ -14,11 +14,11 @@ from experiments.run.memory import require_memory
 from experiments.run.pipeline import PairStages, Pipeline, RobotStages, lay_out
 from experiments.run.stage import Stage
 from experiments.run.stages.slam import RobotFolders
-from experiments.run.store import StageFolder, Store, explained
+from experiments.run.store import StageFolder, Store
 from experiments.run.tasks import OnProgress, Task, run_tasks, task_names, tasks_of, unfinished
 from experiments.run.workers import workers
 from experiments.scenario.settings import AnyScenario
-from mapfusion.errors import InputError
+from mapfusion.errors import DamagedFileError, InputError
 
 _JUDGED = {"errors", "fusion"}  # the other tables of pairs come from the aligners
 
@@ -92,9 +92,10 @@ class JudgedRun:
         try:
             with workers(jobs) as pool:
                 run_tasks(left, pool, on_progress)
+        except DamagedFileError:  # `mending` wants to know which
+            raise
         except InputError as error:
-            reason = explained(str(error), self.store)
-            raise InputError(f"scenario {self.scenario.name}: {reason}") from error
+            raise InputError(f"scenario {self.scenario.name}: {error}") from error
         for folder in map(self.store.folder, wanted):
             if not folder.finished:
                 raise InputError(f"{folder.path}: was removed while it was being made; run again")

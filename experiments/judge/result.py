@@ -4,7 +4,6 @@
 `scenario.json` (resolved), `world.json`, `provenance.json`.
 """
 
-import json
 import platform
 import shutil
 from collections.abc import Sequence
@@ -28,7 +27,7 @@ from experiments.methods.catalogue import find_method
 from experiments.run.code_version import library_versions
 from experiments.run.frames import read_rows
 from experiments.run.stages import slam
-from experiments.run.store import Store
+from experiments.run.store import Store, mending
 from experiments.run.store_files import link_or_copy
 from experiments.run.tasks import OnProgress
 from experiments.scenario.randomness import generator
@@ -38,7 +37,7 @@ from mapfusion.errors import InputError
 from mapfusion.landmark_map import LandmarkMap, write_map
 from mapfusion.merge import merge
 from mapfusion.robot_log import read_log
-from mapfusion.storage import point_columns, write_whole
+from mapfusion.storage import point_columns, write_json
 from sim.renderer import renderer_name
 
 RESULT_SCHEMA_VERSION = 1
@@ -61,11 +60,15 @@ def run_scenario(
     if fresh:
         for stage_folder in run.folders():
             stage_folder.discard()
-    run.execute(jobs, on_progress)
     folder = results / f"{scenario.name}-{scenario.seed}"
-    on_progress(_LABEL, 0, 1)
-    write_result(run, folder)
-    on_progress(_LABEL, 1, 1)
+
+    def make() -> None:
+        run.execute(jobs, on_progress)
+        on_progress(_LABEL, 0, 1)
+        write_result(run, folder)
+        on_progress(_LABEL, 1, 1)
+
+    mending(run.store, make)
     return folder
 
 
@@ -82,9 +85,9 @@ def write_result(run: JudgedRun, folder: Path) -> None:
     for name, landmarks, _ in team.judged():
         write_map(folder / "maps" / f"{name}.parquet", landmarks)
     _write_images(run, folder)
-    _write_json(folder / "scenario.json", run.scenario.resolved())
-    _write_json(folder / "world.json", _world(run.scenario, team.robots))
-    _write_json(folder / "provenance.json", provenance(run))
+    write_json(folder / "scenario.json", run.scenario.resolved())
+    write_json(folder / "world.json", _world(run.scenario, team.robots))
+    write_json(folder / "provenance.json", provenance(run))
 
 
 def measure_aligners(run: JudgedRun, robots: Sequence[EvaluatedRobot]) -> None:
@@ -203,11 +206,6 @@ def _joined_rows(met: MetMaps, settings: MergeSettings) -> pd.DataFrame:
         ).landmarks
     joined = {"landmark_a": pairs.index_a, "landmark_b": pairs.index_b}
     return _plan_rows(fused).assign(**met.names, **joined)
-
-
-def _write_json(path: Path, content: object) -> None:
-    text = json.dumps(content, indent=1)
-    write_whole(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
 
 
 def _world(scenario: AnyScenario, robots: Sequence[EvaluatedRobot]) -> dict[str, object]:

@@ -7,7 +7,7 @@ from typing import Any
 from experiments.judge.judged_run import JudgedRun
 from experiments.methods.aligner_calls import callable_aligner
 from experiments.run.estimates import estimate_row
-from experiments.run.store import Store
+from experiments.run.store import Store, mending
 from experiments.run.store_files import link_or_copy
 from experiments.run.tasks import OnProgress
 from experiments.scenario.loading import load_section
@@ -31,10 +31,14 @@ def record(
         reason = "uses recorded logs, there is nothing to record"
         raise InputError(f"scenario {scenario.name}: {reason}")
     run = JudgedRun.of(scenario, Store.of(results))
-    run.execute(jobs, on_progress, [robot.log for robot in run.pipeline.simulated])
-    for robot in run.pipeline.robots:
-        for path in sorted(run.store.path(robot.log).glob("*.parquet")):
-            link_or_copy(path, output / robot.name / path.name)
+
+    def make() -> None:
+        run.execute(jobs, on_progress, [robot.log for robot in run.pipeline.simulated])
+        for robot in run.pipeline.robots:
+            for path in sorted(run.store.path(robot.log).glob("*.parquet")):
+                link_or_copy(path, output / robot.name / path.name)
+
+    mending(run.store, make)
     return [output / robot.name for robot in run.pipeline.robots]
 
 

@@ -8,6 +8,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode
 
 from mapfusion.errors import InputError
+from mapfusion.sealed import SEAL
 
 _MOST_BYTES = 4_000_000  # the largest resolved scenario of ours takes 0.03 of that
 _MOST_VALUES = 200_000  # with every alias written out
@@ -32,6 +33,7 @@ def read_mapping(path: Path) -> dict[str, Any]:
     if not isinstance(value, dict):
         found = "nothing" if value is None else f"a {type(value).__name__}"
         raise InputError(f"{path}: holds {found}, expected a mapping of scenario keys")
+    value.pop(SEAL, None)  # of a result's scenario.json, which may have been edited
     return value
 
 

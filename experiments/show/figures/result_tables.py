@@ -12,6 +12,7 @@ import pandas as pd
 import pyarrow as pa
 
 from experiments.judge.judged_maps import methods_in
+from experiments.judge.result_files import read_scenario, read_world
 from experiments.judge.tables import ALL, read, table_path
 from experiments.show.figures.style import FUSED_COLOUR, ROBOT_COLOURS, aligner_styles
 from mapfusion.align.result import Status
@@ -73,7 +74,7 @@ class ResultTables:
     @cached_property
     def scenario(self) -> dict[str, Any]:
         """The resolved scenario."""
-        return _read_json(self.folder / "scenario.json")
+        return read_scenario(self.folder / "scenario.json")
 
     @cached_property
     def robots(self) -> list[str]:
@@ -174,7 +175,7 @@ class ResultTables:
     @cached_property
     def _world(self) -> dict[str, Any]:
         path = self.folder / "world.json"
-        return _read_json(path) if path.is_file() else {}
+        return read_world(path) if path.is_file() else {}
 
     def walls_in_frame_of(self, robot: str) -> list[Float]:
         """The walls' corner points, (n, 2) each, in a robot's map frame; none where unknown."""
@@ -200,12 +201,6 @@ def of_pair(rows: pd.DataFrame, pair: Pair) -> pd.DataFrame:
 def positions_and_covariances(rows: pd.DataFrame) -> tuple[Float, Float]:
     """Positions (N, 3) and covariances (N, 3, 3) of rows with the columns of a map."""
     return points_from(pa.Table.from_pandas(rows[POSITION_FIELDS + COVARIANCE_FIELDS]))
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        raise InputError(f"{path}: no such file (expected a result folder of `run`)")
-    return json_object(path.read_text(encoding="utf-8", errors="replace"), path)
 
 
 def json_object(text: str, where: Path) -> dict[str, Any]:

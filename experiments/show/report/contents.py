@@ -29,6 +29,7 @@ from experiments.study.statistics.run_tables import find_runs
 from experiments.study.statistics.standing import recommend
 from experiments.study.statistics.summary import ALL_SCENARIOS, configurations, reduced_errors
 from mapfusion.errors import InputError
+from mapfusion.sealed import read_sealed
 
 _TABLES = tuple(dict.fromkeys((*MAP_TABLES, *metrics.USED_TABLES, "timings")))
 
@@ -133,9 +134,13 @@ def _pictures(folder: Path) -> Iterator[dict[str, Any]]:
         files = (folder / "figures" / f"{name}.png", folder / f"{name}.png")
         if file := next(filter(Path.is_file, files), None):
             about = importlib.import_module(f"experiments.show.figures.{name}").__doc__ or name
-            with Image.open(file) as picture:  # so that the page does not jump as pictures load
-                size = dict(zip(("width", "height"), picture.size, strict=True))
-            png = base64.b64encode(file.read_bytes()).decode()
+            data = read_sealed(file, "figure")
+            try:
+                with Image.open(io.BytesIO(data)) as picture:  # so that the page does not jump
+                    size = dict(zip(("width", "height"), picture.size, strict=True))
+            except (OSError, SyntaxError, ValueError) as error:  # how Pillow reports damaged files
+                raise InputError(f"{file}: not a readable PNG image ({error})") from error
+            png = base64.b64encode(data).decode()
             yield {"about": about.splitlines()[0], "png": png, **size}
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from experiments.judge import tables
 from experiments.show.inspect import contents_of, unit_of
-from mapfusion.storage import schema, write_table
+from mapfusion.storage import read_json, schema, write_json, write_table
 from tests.helpers.tiny_scenario import command
 
 
@@ -133,8 +133,7 @@ def other_json(result: Path, folder: Path) -> Path:
 
 def resolved_but_wrong(result: Path, folder: Path) -> Path:
     path = folder / "scenario.json"
-    text = (result / "scenario.json").read_text()
-    path.write_text(text.replace('"seed": 3', '"seed": -3'))
+    write_json(path, read_json(result / "scenario.json", "scenario") | {"seed": -3})
     return path
 
 
@@ -163,7 +162,7 @@ def picture(result: Path, folder: Path) -> Path:
         (foreign, "none of mapfusion's"),
         (of_another_version, "schema_version is 99"),
         (with_a_column_less, "columns are not those of result.errors"),
-        (no_json, "damaged or no JSON"),
+        (no_json, "no JSON object"),
         (other_json, "no file of mapfusion's"),
         (resolved_but_wrong, "seed"),
         (damaged_result, "clouds.parquet: damaged"),

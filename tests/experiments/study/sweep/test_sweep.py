@@ -40,7 +40,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def swept(short_path: Path, results: Path) -> Path:
     """A sweep of four runs on one worker, uninterrupted."""
     asked = prepare([short_path], [0, 1], [GRID[1], GRID[3]], results)
-    assert execute(asked, 1, None, lambda _: None) == {}
+    assert not execute(asked, 1, None, lambda _: None).failed
     return asked.dataset.folder
 
 
