@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 
 DESCRIPTOR_LENGTH = 64
 NO_LABEL = -1
+TRUTH_FILES = ("truth_poses.parquet", "truth_points.parquet")
 Arrays = TypeVar("Arrays", bound="DataclassInstance")
 LOOK_FIELDS = [
     told(pa.field("label", pa.int32()), "known identity of the landmark, -1 for none", NO_LABEL),

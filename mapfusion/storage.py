@@ -1,7 +1,9 @@
 """Files on disk, written whole and sealed: tables with an explicit schema, a kind and a version."""
 
+import errno
 import json
 import os
+import platform
 import re
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
@@ -20,22 +22,29 @@ _VERSION = b"mapfusion.schema_version"
 _PREFIX = "mapfusion."
 # What Arrow raises on bytes that it cannot read, some of it from Python code that it calls.
 UNREADABLE = (pa.ArrowException, OSError, ValueError, MemoryError, OverflowError)
+_WRITER = re.compile(rf"\.{re.escape(platform.node())}-(?P<pid>\d+)\.[^.]+\.part$")
 
 
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write` fill a temporary file beside `path`, then rename it: nobody sees half a file.
 
     The temporary name ends in `.part`, so that no pattern like `*.parquet` finds it, also where a
-    killed process left it behind.
+    killed process left it behind; see `remove_abandoned`. An OSError names `path`.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+    prefix = f".{path.name}.{platform.node()}-{os.getpid()}."
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=prefix, suffix=".part")
     os.close(handle)
     temporary = Path(name)
     try:
         write(temporary)
         temporary.chmod(0o644)
         temporary.replace(path)
+    except OSError as error:  # a full disk is told without a name, or with one that nobody knows
+        if error.filename not in (None, name):
+            raise
+        reason = error.strerror or str(error)
+        raise OSError(error.errno or errno.EIO, reason, str(path)) from error
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -68,6 +77,38 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
         raise DamagedFileError(path, f"damaged, its first field {name!r} should be {SEAL}")
     found.pop(SEAL, None)
     return found
+
+
+def remove_abandoned(folder: Path) -> None:
+    """Remove what `write_whole` left anywhere below a folder when its process was killed.
+
+    Files of other machines, and of processes that live, stay.
+    """
+    for path in folder.rglob(".*.part"):
+        writer = _WRITER.search(path.name)
+        if writer and not _lives(int(writer["pid"])):
+            path.unlink(missing_ok=True)
+
+
+def _lives(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:  # somebody else's
+        return True
+    return True
+
+
+def require_writable(folder: Path) -> None:
+    """Raise InputError, which says why, unless files can be put into a folder, there yet or not."""
+    there = folder
+    while not there.exists() and there != there.parent:
+        there = there.parent
+    if not there.is_dir():
+        raise InputError(f"{folder}: cannot be written ({there} is no folder)")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise InputError(f"{folder}: cannot be written (no right to write into {there})")
 
 
 def schema(kind: str, version: int, fields: list[pa.Field]) -> pa.Schema:

@@ -34,6 +34,16 @@ Overrides = Annotated[
         help="Replaces a value, e.g. evaluate.every=1.",
     ),
 ]
+ImportOverrides = Annotated[
+    list[str],
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        default_factory=list,
+        show_default=False,
+        help="Replaces a setting of the importer, e.g. its noise: range_sigma_m=0.2.",
+    ),
+]
 Seed = Annotated[int | None, typer.Option(help="Replaces the scenario's seed.", min=0)]
 OwnSeed = Annotated[int, typer.Option("--seed", help="Of all that is random.", min=0)]
 Seeds = Annotated[str, typer.Option(help="A seed, a range 0..4 or a list 0,2,5.")]

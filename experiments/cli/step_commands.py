@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from experiments.cli import options
-from mapfusion.recordings.registry import import_recording
+from mapfusion.recordings.registry import import_recording, settings_class
 
 app = typer.Typer()
 
@@ -86,15 +86,18 @@ def merge(
     print_fused(output, fused, maps)
 
 
-def import_command(format_name: str) -> Callable[[Path, Path], None]:
-    """The command that reads recordings of one format."""
+def import_command(format_name: str) -> Callable[..., None]:
+    """The command that reads recordings of one format; `--set` takes what its settings have."""
 
     def command(
         folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="The recording.")],
         output: options.Output,
+        overrides: options.ImportOverrides,
     ) -> None:
+        from experiments.scenario.loading import load_section
         from experiments.show.terminal.layout import print_paths
 
-        print_paths(output, import_recording(format_name, folder, output))
+        settings = load_section(None, format_name, settings_class(format_name), overrides)
+        print_paths(output, import_recording(format_name, folder, output, settings))
 
     return command

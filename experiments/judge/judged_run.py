@@ -29,8 +29,9 @@ class JudgedRun:
 
     pipeline: Pipeline
     settings: JudgeSettings
-    judgements: tuple[Stage, ...]  # in the order of the pipeline's pairs
+    judgements: tuple[Stage, ...]  # in the order of the pipeline's pairs; none without truth
     store: Store
+    no_truth: str  # why nothing can be judged; empty where the truth is known
 
     @classmethod
     def of(cls, scenario: AnyScenario, store: Store) -> "JudgedRun":
@@ -38,8 +39,10 @@ class JudgedRun:
         pipeline, merge = lay_out(scenario), MergeSettings(**dict(scenario.merge))
         align, radius_m = scenario.align, scenario.evaluate.true_pair_radius_m
         settings = JudgeSettings(align.refinement, align.acceptance, merge, radius_m)
-        judgements = tuple(_judgement(settings, pair) for pair in pipeline.pairs)
-        return cls(pipeline, settings, judgements, store)
+        no_truth = judging.why_no_truth(scenario)
+        judged = () if no_truth else pipeline.pairs
+        judgements = tuple(_judgement(settings, pair) for pair in judged)
+        return cls(pipeline, settings, judgements, store, no_truth)
 
     @property
     def scenario(self) -> AnyScenario:

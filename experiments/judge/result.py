@@ -37,11 +37,19 @@ from mapfusion.errors import InputError
 from mapfusion.landmark_map import LandmarkMap, write_map
 from mapfusion.merge import merge
 from mapfusion.robot_log import read_log
-from mapfusion.storage import point_columns, write_json
+from mapfusion.storage import (
+    point_columns,
+    remove_abandoned,
+    require_writable,
+    write_json,
+)
+from sim.floorplan import Wall
 from sim.renderer import renderer_name
 
 RESULT_SCHEMA_VERSION = 1
+_SUBFOLDERS = ("tables", "maps", "keyframes", "figures")
 _LABEL = "write the tables"
+_FACE_DECIMALS = 6  # a micrometre: what is beyond is rounding
 _WARM_UP_RUNS = 1  # compilation and caches
 
 
@@ -57,10 +65,14 @@ def run_scenario(
 ) -> Path:
     """Run a scenario and write its result folder `RESULTS/NAME-SEED`; returns the folder."""
     run = JudgedRun.of(scenario, Store.of(results))
+    folder = results / f"{scenario.name}-{scenario.seed}"
+    for place in (run.store.root, folder, *(folder / name for name in _SUBFOLDERS)):
+        require_writable(place)
+    for place in (folder, *(stage.path for stage in run.folders())):
+        remove_abandoned(place)
     if fresh:
         for stage_folder in run.folders():
             stage_folder.discard()
-    folder = results / f"{scenario.name}-{scenario.seed}"
 
     def make() -> None:
         run.execute(jobs, on_progress)
@@ -77,6 +89,8 @@ def write_result(run: JudgedRun, folder: Path) -> None:
     team = run.load_team()
     measure_aligners(run, team.robots)
     rows = all_tables(run, team) | history_tables(team, run.settings)
+    if run.no_truth:
+        rows["true_pairs"] = pd.DataFrame()
     rows |= {"aligner_timings": run.pair_table("aligner_timings"), "tracks": _tracks(run)}
     for name, table in rows.items():
         tables.write(tables.table_path(folder, name), name, table)
@@ -115,7 +129,9 @@ def _time_pair(scenario: AnyScenario, a: EvaluatedRobot, b: EvaluatedRobot) -> l
     for iteration in iterations[np.unique(spread.round().astype(int))].tolist():
         (map_a, points_a), (map_b, points_b) = a.at(iteration), b.at(iteration)
         pairs = match(map_a, map_b, scenario.align.match)
+        known = np.isfinite(points_a).any() and np.isfinite(points_b).any()
         n_common = common_landmarks(points_a, points_b, settings.true_pair_radius_m)
+        n_common = n_common if known else tables.UNKNOWN
         maps = {"robot_a": a.name, "robot_b": b.name, "iteration": iteration}
         maps |= {"n_correspondences": len(pairs), "n_common": n_common}
         for name, aligner in aligners.items():
@@ -140,15 +156,17 @@ def all_tables(run: JudgedRun, team: FusedTeam) -> dict[str, pd.DataFrame]:
     rows: dict[str, Any] = {
         "paths": joined,
         "robots": joined,
-        "path_statistics": path_statistics_rows(joined),
+        "path_statistics": [] if run.no_truth else path_statistics_rows(joined),
         "clouds": pd.concat(clouds, ignore_index=True),
         "landmarks": pd.concat(landmarks, ignore_index=True),
         "fused": fused_landmarks.fused_rows(team),
         "fused_motions": fused_landmarks.fused_motion_rows(
             team, settings.merge.parameters.use_drift
         ),
-        "map_fits": fused_landmarks.map_fit_rows(team),
-        "landmark_nees": fused_landmarks.landmark_nees_rows(team, settings.true_pair_radius_m),
+        "map_fits": [] if run.no_truth else fused_landmarks.map_fit_rows(team),
+        "landmark_nees": []
+        if run.no_truth
+        else fused_landmarks.landmark_nees_rows(team, settings.true_pair_radius_m),
         "timings": [
             {"stage": stage.name, "name": f"{stage.key}:{name}", "elapsed_s": seconds}
             for stage in run.folders()
@@ -210,9 +228,14 @@ def _joined_rows(met: MetMaps, settings: MergeSettings) -> pd.DataFrame:
 
 def _world(scenario: AnyScenario, robots: Sequence[EvaluatedRobot]) -> dict[str, object]:
     """The truth that figures show as background."""
-    walls = scenario.world.walls if isinstance(scenario, Simulation) else []
-    starts = {robot.name: robot.path.T_world_map.tolist() for robot in robots}
-    return {"walls": [list(wall.points) for wall in walls], "robots": starts}
+    plan = scenario.world if isinstance(scenario, Simulation) else None
+    walls = plan.walls if plan is not None else []
+    thick = plan.wall_thickness_m if plan is not None else 0.0
+    solid = [Wall(np.array(wall.points), thickness_m=thick) for wall in walls]
+    faces = [edge.round(_FACE_DECIMALS).tolist() for wall in solid for edge in wall.outline()]
+    known = [robot for robot in robots if np.isfinite(robot.path.T_world_map).all()]
+    starts = {robot.name: robot.path.T_world_map.tolist() for robot in known}
+    return {"walls": [list(wall.points) for wall in walls], "faces": faces, "robots": starts}
 
 
 def renderer(scenario: AnyScenario) -> str:

@@ -4,10 +4,12 @@ import functools
 import reprlib
 import warnings
 from collections.abc import Iterator, Sequence
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass
 from pydantic_core import to_jsonable_python
 
 from experiments.methods.catalogue import name_clashes
@@ -110,7 +112,10 @@ def _warn_of_name_clashes(align: Align) -> None:
 
 @functools.cache  # a sweep and a campaign validate the same few kinds again and again
 def _known(kind: type[S]) -> TypeAdapter[S]:
-    return TypeAdapter(kind)
+    strict = kind
+    if is_dataclass(kind):  # an importer's settings; sections say themselves what they forbid
+        strict = dataclass(kind, config=ConfigDict(extra="forbid"), frozen=True)
+    return TypeAdapter(strict)
 
 
 @functools.cache

@@ -10,6 +10,7 @@ from experiments.show.figures.result_tables import ResultTables
 from experiments.show.terminal.statistics_screen import print_summary
 from experiments.study.statistics.run_tables import find_runs
 from experiments.study.statistics.summary import ALL_SCENARIOS, Summary, configurations, summarise
+from mapfusion.errors import InputError
 
 _FIGURES = ("fig04_translation_error", "fig05_rotation_error", "fig06_aligner_time")
 
@@ -17,9 +18,12 @@ _FIGURES = ("fig04_translation_error", "fig05_rotation_error", "fig06_aligner_ti
 def run_statistics(paths: Sequence[Path], output: Path | None) -> None:
     """Show the main tables; write all, and figures 4 to 6, where an output folder is given.
 
-    Raises InputError where a path holds no runs, or a table is damaged.
+    Raises InputError where a path holds no runs, no run knows the truth, or a table is damaged.
     """
     summary = summarise(find_runs(paths))
+    if not {"success_at_the_end", "paths"} & summary.tables.keys():
+        where = ", ".join(map(str, paths))
+        raise InputError(f"{where}: no truth is known, so there are no errors to count")
     skipped: list[str] = []
     if output is not None:
         write_tables(output, summary.tables)

@@ -31,7 +31,7 @@ class Method:
         self.calls += 1
         n = len(correspondences)
         T_a_b = GOOD_T + rng.normal(0, 1e-3, 3)
-        good = Alignment(T_a_b, GOOD_COVARIANCE, np.ones(n, bool), 99.0, Status.ACCEPTED)
+        good = Alignment(T_a_b, GOOD_COVARIANCE, np.ones(n, bool), 99.0, Status.ACCEPTED, "", 0.1)
         good.T_a_b[0] += self.calls
         what = self.what
         print("noise on stdout", flush=True)

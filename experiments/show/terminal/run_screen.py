@@ -38,14 +38,36 @@ def print_result(result: Path, skipped_figures: Sequence[str]) -> None:
         _print_aligners(errors, aligner_summary(errors, table("aligner_timings"), aligners))
         print_lines(f"  {line}" for line in not_run_lines(errors))
         _print_pairs(errors, aligners[0])
+    elif len(estimates := table("estimates")):
+        _print_answers(estimates)
+        print_lines(f"  {line}" for line in not_run_lines(estimates))
     shown = columns("", robot="robot") | columns(".3f", path_m="FastSLAM, m")
     shown |= columns(".3f", odometry_m="odometry, m") | columns(".2f", over_odometry="ratio")
-    shown |= columns("d", n_landmarks="landmarks")
-    print_frame(path_rms(table("robots")), shown, "Position errors (RMS)")
+    shown |= columns("d", n_landmarks="landmarks\never seen")
+    paths = path_rms(table("robots"))
+    known = paths["path_m"].notna().any()
+    print_frame(paths, shown, "Position errors (RMS)" if known else "Robots (no truth: no errors)")
+    print_lines(
+        ["  Maps and figures hold the landmarks that were seen often enough (slam.min_count)."]
+    )
     left_out = table("fused_motions")[["robot", "left_out"]].itertuples(index=False)
     print_lines(f"  {robot} is left out of the fused map: {why}" for robot, why in left_out if why)
     print_lines([f"Figures: {result / 'figures'}   tables: {result / 'tables'}"])
     print_skipped(skipped_figures)
+
+
+def _print_answers(estimates: pd.DataFrame) -> None:
+    """Without truth: how often each aligner answered, was refined and was accepted."""
+    by_aligner = estimates.groupby("aligner", sort=False)
+    shares = {
+        name: by_aligner[column].agg(lambda told: (told == Status.ACCEPTED).mean())
+        for name, column in (("estimated", "status"), ("refined", "refined_status"))
+    }
+    rows = pd.DataFrame(shares | {"accepted": by_aligner["accepted"].mean()}).reset_index()
+    shown = columns("", aligner="aligner")
+    shown |= columns(".0%", estimated="estimated", refined="refined", accepted="accepted")
+    note = "share of all maps and repetitions; accepted: as more than chance"
+    print_frame(rows, shown, "Answers (no truth: errors are unknown)", note)
 
 
 def not_run_lines(errors: pd.DataFrame) -> list[str]:

@@ -129,7 +129,8 @@ def test_a_result_without_alignments_says_so(
     trio_copy: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     empty: list[pd.DataFrame] = []
-    tables.write(tables.table_path(trio_copy, "errors"), "errors", empty)
+    for name in ("errors", "estimates"):
+        tables.write(tables.table_path(trio_copy, name), name, empty)
     reply = command(capsys, "report", trio_copy)
     assert reply.code == 2
     assert "no pair of maps was aligned" in reply.complaints[0]
