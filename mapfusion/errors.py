@@ -1,9 +1,8 @@
 """The one error a person is meant to read, and what they are warned of."""
 
-from pathlib import Path
-
 import difflib
 from collections.abc import Iterable
+from pathlib import Path
 
 MOST_CHARACTERS = 300  # of a line that a person reads at one glance
 _MOST_OF_A_WORD = 120  # a path, as a rule
