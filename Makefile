@@ -45,7 +45,7 @@ lint: $(STAMP)
 	$(BIN)/lint-imports
 
 check: $(STAMP)
-	$(BIN)/mapfusion check scenarios/quick.yaml --seeds 0
+	$(BIN)/mapfusion check scenarios/quick.yaml --seeds 0 --junit results/junit.xml
 
 bench: $(STAMP)
 	$(BIN)/python -m pytest tests/benchmarks --benchmark-only --benchmark-columns=min,median,max,rounds

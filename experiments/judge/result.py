@@ -61,11 +61,19 @@ def require_result(result: Path) -> None:
 
 
 def run_scenario(
-    scenario: AnyScenario, results: Path, jobs: int, on_progress: OnProgress, fresh: bool = False
+    scenario: AnyScenario,
+    results: Path,
+    jobs: int,
+    on_progress: OnProgress,
+    fresh: bool = False,
+    output: Path | None = None,
 ) -> Path:
-    """Run a scenario and write its result folder `RESULTS/NAME-SEED`; returns the folder."""
+    """Run a scenario and write its result, to `RESULTS/NAME-SEED` by default; returns the folder.
+
+    The store is that of `results`.
+    """
     run = JudgedRun.of(scenario, Store.of(results))
-    folder = results / f"{scenario.name}-{scenario.seed}"
+    folder = output or results / f"{scenario.name}-{scenario.seed}"
     for place in (run.store.root, folder, *(folder / name for name in _SUBFOLDERS)):
         require_writable(place)
     for place in (folder, *(stage.path for stage in run.folders())):

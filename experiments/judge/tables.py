@@ -119,20 +119,22 @@ class Shown(NamedTuple):
     """How screens and reports show a column of `errors`, one figure a method.
 
     What follows a line break in the label goes to its second line. An `error` is shown as the
-    median of its absolute value over answerable maps, where no estimate is infinitely far off; a
-    `share` as the mean over maps with common ground.
+    median of its absolute value over answerable maps, where no estimate is infinitely far off, and
+    beside it the share of `given` estimates; a `share` as the mean over maps with common ground.
     """
 
     label: str
     layout: str
-    kind: Literal["error", "share"]
+    kind: Literal["error", "given", "share"]
 
 
 SHOWN = {
     "translation_error_m": Shown("estim.\nm", ".3f", "error"),
     "rotation_error_rad": Shown("estim.\nrad", ".4f", "error"),
+    "estimated_share": Shown("estim.\ngiven", ".0%", "given"),
     "refined_translation_error_m": Shown("refined\nm", ".3f", "error"),
     "refined_rotation_error_rad": Shown("refined\nrad", ".4f", "error"),
+    "refined_share": Shown("refined\ngiven", ".0%", "given"),
     "accepted": Shown("ok\n", ".0%", "share"),
 }
 

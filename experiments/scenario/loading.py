@@ -6,9 +6,9 @@ import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import is_dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import ConfigDict, TypeAdapter, ValidationError, model_validator
 from pydantic.dataclasses import dataclass
 from pydantic_core import to_jsonable_python
 
@@ -49,6 +49,7 @@ def load_scenario(
     Raises:
         InputError: one line that names the file, the field and what would be right.
     """
+    _require_whole_paths(overrides)
     data = apply_overrides(read_mapping(path), overrides)
     if seed is not None:
         data["seed"] = seed
@@ -92,16 +93,44 @@ def scenario_of(data: dict[str, Any], where: str) -> AnyScenario:
     return _validated(where, Recording if recorded else Simulation, data)
 
 
-def load_section(path: Path | None, name: str, kind: type[S], overrides: Sequence[str]) -> S:
-    """One section of a scenario, or its defaults, with overrides inside it; raises InputError."""
-    where, data = name, {}
-    if path is not None:
-        load_scenario(path)
-        where, data = f"{path}: {name}", read_mapping(path).get(name) or {}
-    section = _validated(where, kind, apply_overrides(data, overrides))
-    if path is None and isinstance(section, Align):
-        _warn_of_name_clashes(section)
-    return section
+def made_settings(where: str, kind: type[S], overrides: Sequence[str]) -> S:
+    """Settings of that kind alone: defaults, with overrides; raises InputError."""
+    return _validated(where, kind, apply_overrides({}, overrides))
+
+
+class _StepSettings(Scenario):
+    """Settings of one step on files: aligning alone need not be able to merge."""
+
+    @model_validator(mode="after")
+    def _merges_what_it_aligns(self) -> Self:
+        return self
+
+
+def default_settings(overrides: Sequence[str] = (), seed: int | None = None) -> Scenario:
+    """What a scenario sets beside its world, for work on files: defaults, with overrides.
+
+    Raises:
+        InputError: one line that names the key and what would be right.
+    """
+    _require_whole_paths(overrides)
+    data = apply_overrides({"schema_version": 1, "name": "defaults"}, overrides)
+    settings = _validated("--set", _StepSettings, data if seed is None else data | {"seed": seed})
+    _warn_of_name_clashes(settings.align)
+    return settings
+
+
+def _require_whole_paths(overrides: Sequence[str]) -> None:
+    """Refuse a key that lacks its beginning, as `filter.n_particles` does."""
+    roots = _FIELDS.keys() | GeneratedScenario.model_fields.keys()
+    for key in (override.partition("=")[0] for override in overrides):
+        first, *rest = key.split(".")
+        if first and first not in roots:
+            known = _known_keys(Simulation)
+            ends = [path for path in known if path[-1] == first and "*" not in path]
+            meant = sorted(((*path, *rest) for path in ends), key=lambda path: path not in known)
+            if meant:
+                whole = f"keys begin at the scenario's root: {'.'.join(meant[0])}"
+                raise InputError(f"--set {key}: {whole}")
 
 
 def _warn_of_name_clashes(align: Align) -> None:

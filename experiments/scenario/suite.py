@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.scenario.loading import OWN, SHIPPED, load_scenario
-from experiments.scenario.settings import Recording
+from experiments.scenario.loading import OWN, SHIPPED, default_settings, load_scenario
+from experiments.scenario.settings import Recording, Scenario
 from experiments.scenario.yaml_input import read_mapping
 from mapfusion.errors import InputError, did_you_mean
 from mapfusion.storage import write_whole
@@ -33,6 +33,24 @@ def scenarios_of(names_or_tags: Sequence[str | Path], folder: Path | None = None
         else:
             found += _named(str(wanted), folder)
     return list(dict.fromkeys(found))
+
+
+def one_scenario(word: str | Path, folder: Path | None = None) -> Path:
+    """The file of a scenario asked for by path or name; raises InputError for a tag of several."""
+    found = scenarios_of([word], folder)
+    if len(found) != 1:
+        names = ", ".join(path.stem for path in found)
+        raise InputError(f"{word}: stands for {len(found)} scenarios ({names}); name one of them")
+    return found[0]
+
+
+def settings_of(
+    word: str | Path | None, overrides: Sequence[str] = (), seed: int | None = None
+) -> Scenario:
+    """What a scenario sets, or the defaults without one; raises InputError."""
+    if word is None:
+        return default_settings(overrides, seed)
+    return load_scenario(one_scenario(word), overrides, seed)
 
 
 def _named(wanted: str, folder: Path | None) -> list[Path]:

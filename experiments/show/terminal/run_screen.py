@@ -7,12 +7,13 @@ import pandas as pd
 from rich.text import Text
 
 from experiments.judge import tables
+from experiments.judge.checking import CheckedScenario
 from experiments.judge.criteria import ANSWERABLE_PAIRS, ORACLE, answerable, at_the_end
-from experiments.judge.expectations import Outcome
 from experiments.judge.judged_maps import methods_in
 from experiments.judge.path_errors import path_rms
 from experiments.judge.tables import SHOWN
 from experiments.show.terminal.layout import (
+    NO_ESTIMATE,
     columns,
     print_frame,
     print_lines,
@@ -86,7 +87,8 @@ def _print_aligners(errors: pd.DataFrame, summary: pd.DataFrame) -> None:
     shown |= {name: (column.label, column.layout) for name, column in SHOWN.items()}
     shown |= columns(".3f", spread_m="spread\nm") | columns(".2f", time_ms="time\nms")
     maps = answerable(errors)
-    note = "spread: 10-90 % of the repetitions; ok: accepted as more than chance"
+    note = f"{NO_ESTIMATE}\n"
+    note += "spread: 10-90 % of the repetitions; ok: accepted as more than chance"
     if len(maps):
         n_offered = maps["n_correspondences"]
         share = (maps["n_true"] / n_offered).median()
@@ -112,8 +114,9 @@ def _print_pairs(errors: pd.DataFrame, aligner: str) -> None:
     print_table([*shown, ("true pairs", ">")], rows, title)
 
 
-def print_outcomes(outcomes: Sequence[Outcome]) -> None:
+def print_checks(checks: Sequence[CheckedScenario]) -> None:
     """The table of a check."""
+    outcomes = [outcome for check in checks for outcome in check.outcomes]
     shown = columns("", scenario="scenario", metric="metric") | columns(".4g", value="measured")
     shown |= columns("", bound_text="expected", seeds="by seed", verdict="")
     rows = []
@@ -124,7 +127,10 @@ def print_outcomes(outcomes: Sequence[Outcome]) -> None:
         rows.append((*what, seeds, verdict))
     print_table(shown.values(), rows, "Checks against the truth")
     failed = sum(not outcome.passed for outcome in outcomes)
-    print_lines([f"{len(outcomes) - failed} passed, {failed} failed"])
+    not_run = sum(bool(check.error) for check in checks)
+    of_all = f"{not_run} of {len(checks)} scenarios"
+    errors = f"; {of_all} could not be checked" if not_run else ""
+    print_lines([f"{len(outcomes) - failed} passed, {failed} failed{errors}"])
 
 
 def _by_seed(values: Sequence[float]) -> str:

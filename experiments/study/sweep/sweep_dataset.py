@@ -17,7 +17,7 @@ import pyarrow as pa
 from pydantic import BaseModel, ValidationError
 
 from experiments.judge import tables
-from experiments.judge.criteria import answerable
+from experiments.judge.criteria import answerable, how_far_off
 from experiments.run.code_version import library_versions, source_hash
 from experiments.run.frames import FLOAT, TEXT, fields, write_rows
 from experiments.study.sweep.combinations import SweepRun
@@ -28,6 +28,7 @@ from mapfusion.storage import read_json, read_parquet, schema, write_json, write
 SCHEMA_VERSION = 1
 RUNS, RUN_TIMES, ALIGNER_TIMINGS = "runs", "run_times", "aligner_timings"
 ERRORS = ["translation_error_m", "refined_translation_error_m"]
+GIVEN = ["estimated_share", "refined_share"]
 
 _OWN_FIELDS = {
     RUNS: fields(
@@ -170,15 +171,21 @@ def _require_settings(path: Path, keys: tuple[str, ...]) -> None:
 def medians_over_runs(dataset: SweepDataset, runs: Sequence[SweepRun]) -> pd.DataFrame:
     """A sweep's errors in short: medians over runs of each run's own medians.
 
-    One row for each scenario with its values (`setting`) and aligner: ERRORS, number of runs. Read
-    run by run, so that memory does not grow with the sweep.
+    One row for each scenario with its values (`setting`) and aligner: ERRORS, infinite without an
+    estimate, GIVEN, the shares of answers with one, and the number of runs. Read run by run, so
+    that memory does not grow with the sweep.
     """
     parts = []
     for run in runs:
         columns = ["aligner", "n_true", *ERRORS]
         errors = read_parquet(dataset.path("errors", run), "table errors", columns).to_pandas()
         setting = " ".join((run.scenario, *(value for _, value in run.settings)))
-        medians = answerable(errors).groupby("aligner", sort=False)[ERRORS].median()
+        errors = answerable(errors)
+        given = {name: errors[of].notna() for name, of in zip(GIVEN, ERRORS, strict=True)}
+        judged = errors.assign(**given, **how_far_off(errors, ERRORS))
+        groups = judged.groupby("aligner", sort=False)
+        medians = groups[ERRORS].median().join(groups[GIVEN].mean())
         parts.append(medians.reset_index().assign(setting=setting))
     grouped = pd.concat(parts).groupby(["setting", "aligner"], sort=False)
-    return grouped[ERRORS].median().assign(runs=grouped.size()).reset_index()
+    found = grouped[ERRORS].median().join(grouped[GIVEN].mean())
+    return found.assign(runs=grouped.size()).reset_index()

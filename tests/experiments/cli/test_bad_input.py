@@ -169,7 +169,7 @@ def test_error_in_a_worker_process_is_one_line(
         (["merge", "one.parquet", "-o", "f.parquet"], ["two maps"]),
         (["slam", "nowhere", "-o", "m.parquet"], ["nowhere", "frames.parquet"]),
         (["align", "a.parquet", "b.parquet"], ["a.parquet", "landmark_map"]),
-        (["figures", "nowhere"], ["nowhere", "not a result folder"]),
+        (["report", "nowhere", "--figures"], ["nowhere", "not a result folder"]),
     ],
 )
 def test_wrong_command(
@@ -192,14 +192,14 @@ def test_wrong_section_of_a_single_stage(
     tiny_result: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     maps = [tiny_result / "maps" / f"{name}.parquet" for name in ("R1", "R2")]
-    reply = command(capsys, "align", *maps, "--set", "repetitions=x")
-    assert_refused(reply, "align: repetitions", "integer")
-    reply = command(capsys, "merge", *maps, "-o", "f.parquet", "--set", "aligner=zz")
+    reply = command(capsys, "align", *maps, "--set", "align.repetitions=x")
+    assert_refused(reply, "align.repetitions", "integer")
+    reply = command(capsys, "merge", *maps, "-o", "f.parquet", "--set", "merge.aligner=zz")
     assert_refused(reply, "merge.aligner", "zz", "ransac")
 
 
 @pytest.mark.parametrize("damage", ["missing", "truncated", "foreign", "other table"])
-@pytest.mark.parametrize("name", ["align", "merge", "slam", "figures"])
+@pytest.mark.parametrize("name", ["align", "merge", "slam", "report"])
 def test_wrong_tables(
     tiny_result: Path,
     tiny_log: Path,
@@ -213,7 +213,7 @@ def test_wrong_tables(
         "align": (tmp_path / "map.parquet", (whole, tmp_path / "map.parquet")),
         "merge": (tmp_path / "map.parquet", (whole, tmp_path / "map.parquet", "-o", "f.parquet")),
         "slam": (tmp_path / "observations.parquet", (tmp_path, "-o", tmp_path / "m.parquet")),
-        "figures": (tmp_path / "tables" / "landmarks.parquet", (tmp_path, "--jobs", 1)),
+        "report": (tmp_path / "tables" / "landmarks.parquet", (tmp_path, "--figures", "--jobs", 1)),
     }[name]
     (tmp_path / "tables").mkdir()
     for table in sorted((tiny_result / "tables").glob("*.parquet")):
@@ -241,7 +241,7 @@ def test_wrong_tables(
 def test_figures_of_a_folder_that_is_no_result(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert_refused(command(capsys, "figures", tmp_path), "not a result folder", "run")
+    assert_refused(command(capsys, "report", tmp_path, "--figures"), "not a result folder", "run")
 
 
 def test_output_that_cannot_be_written(
@@ -258,7 +258,7 @@ def test_output_that_cannot_be_written(
     for arguments in (
         ("run", tiny_path, "--jobs", 1, "--results", blocked),
         ("record", tiny_path, "--jobs", 1, "--results", tiny_results, "-o", blocked),
-        ("slam", tiny_log, "-o", blocked / "m.parquet", "--set", "filter.n_particles=2"),
+        ("slam", tiny_log, "-o", blocked / "m.parquet", "--set", "slam.filter.n_particles=2"),
         ("merge", *maps, "-o", blocked / "m.parquet"),
         ("merge", *maps, "-o", tmp_path),
         (*check, "--junit", blocked / "junit.xml"),
@@ -271,7 +271,7 @@ def test_output_that_cannot_be_written(
 
 
 def test_schema(capsys: pytest.CaptureFixture[str]) -> None:
-    reply = command(capsys, "schema")
+    reply = command(capsys, "scenarios", "--schema")
     assert reply.code == 0
     schema = json.loads(reply.out)
     kinds = {option["$ref"].rpartition("/")[2]: option for option in schema["anyOf"]}

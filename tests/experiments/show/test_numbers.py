@@ -24,7 +24,8 @@ def test_figures_have_two_significant_digits(value: float, text: str) -> None:
 
 
 def test_what_is_not_known_is_a_dash_without_a_unit() -> None:
-    assert {percent(math.nan), metres(math.inf), ratio(math.nan)} == {"–"}
+    assert {percent(math.nan), metres(math.nan), ratio(math.nan)} == {"–"}
+    assert {metres(math.inf), ratio(math.inf), two_digits(math.inf)} == {"inf"}
 
 
 def test_names_are_listed_as_in_a_sentence() -> None:
