@@ -7,7 +7,8 @@ STAMP := $(VENV)/.installed
 # Where this is set, each of the many processes that tests and runs start would compile our source anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: wheel-test browser-test clean-kernels lock demo test endurance lint check bench paper install clean
+.PHONY: wheel-test browser-test clean-kernels lock demo test endurance seeded-faults lint check bench paper \
+    install clean
 
 install: $(STAMP)
 
@@ -33,6 +34,10 @@ endurance: $(STAMP)
 # The wheel in a fresh environment, which takes minutes to install.
 wheel-test: $(STAMP)
 	$(BIN)/python -m pytest tests/installed_wheel.py -s
+
+# One fault of the source at a time: does a test notice? Hours; `--only NAME` for some.
+seeded-faults: $(STAMP)
+	$(BIN)/python -m tests.seeded_faults
 
 # Installs Debian's chromium where it is missing (needs root for that).
 browser-test: $(STAMP)

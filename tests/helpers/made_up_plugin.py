@@ -59,12 +59,12 @@ class Method:
         if what == "kills itself":
             os.kill(os.getpid(), signal.SIGKILL)
         if what == "hangs":
-            time.sleep(1000)
+            time.sleep(100_000)
         if what == "hangs with the lock held":
-            ctypes.PyDLL(None).sleep(1000)
+            ctypes.PyDLL(None).sleep(100_000)
         if what == "closes everything":
             os.closerange(0, 64)
-            time.sleep(1000)
+            time.sleep(100_000)
         if what == "wrong type":
             return (1.0, 2.0, 0.5)
         if what == "none":

@@ -47,7 +47,7 @@ def rooms(plan: GeneratedPlan) -> list[tuple[float, float]]:
     ]
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(seeds, st.integers(1, 4), st.integers(1, 2))
 def test_every_room_of_a_wing_can_be_reached_from_every_other(
     seed: int, rooms_a_side: int, doors_a_room: int
@@ -60,7 +60,7 @@ def test_every_room_of_a_wing_can_be_reached_from_every_other(
         assert reached[int(x / CELL_M), int(y / CELL_M)]
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(seeds)
 def test_no_way_leads_from_wing_to_wing(seed: int) -> None:
     plan = generate_plan(PlanParameters(2), 2, np.random.default_rng(seed))
@@ -72,7 +72,7 @@ def test_no_way_leads_from_wing_to_wing(seed: int) -> None:
     assert second.rows[SOUTH].edges_m[0] == first.rows[NORTH].edges_m[-1]
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seeds, st.floats(1.2, 1.7))
 def test_doors_are_as_wide_as_asked_and_rooms_as_large(seed: int, door_m: float) -> None:
     parameters = PlanParameters(door_m=door_m, room_width_m=(4.4, 5))

@@ -129,6 +129,8 @@ def print_frame(
     frame: pd.DataFrame, shown: Mapping[str, Column], title: str = "", note: str = ""
 ) -> None:
     """Print columns of a frame by name, with the intervals in their NAME_low and NAME_high."""
+    if frame.empty:  # a table that could not be made has no columns either
+        return
     cells = [
         frame[[name, f"{name}_low", f"{name}_high"]].itertuples(index=False, name=None)
         if f"{name}_low" in frame

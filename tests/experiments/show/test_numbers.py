@@ -9,7 +9,14 @@ from experiments.show.numbers import listed, metres, percent, ratio, two_digits
 
 @pytest.mark.parametrize(
     ("share", "text"),
-    [(1, "100 %"), (0.9999, "> 99 %"), (0.001, "< 1 %"), (0, "0 %"), (0.5, "50 %")],
+    [
+        (1, "100 %"),
+        (0.9999, "> 99 %"),
+        (0.995, "> 99 %"),
+        (0.001, "< 1 %"),
+        (0, "0 %"),
+        (0.5, "50 %"),
+    ],
 )
 def test_percentages_claim_nothing_that_is_not_so(share: float, text: str) -> None:
     assert percent(share).replace("\u00a0", " ") == text
