@@ -8,7 +8,7 @@ import typer
 from typer.main import get_command
 
 from experiments.cli.main import REPLACED, app
-from experiments.scenario.suite import FOLDER
+from experiments.scenario.loading import OWN
 from tests.helpers.tiny_scenario import assert_refused, command
 
 MAPS = ("a.parquet", "b.parquet")
@@ -81,7 +81,7 @@ def test_keys_begin_at_the_root(
 def test_a_suite_name_is_taken_wherever_a_scenario_is(
     arguments: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert FOLDER.is_dir()
+    assert OWN.is_dir()
     wrong = ("--set", "slam.bogus=1", *(("-o", tmp_path / "x") if arguments == ("record",) else ()))
     assert_refused(command(capsys, *arguments, "quick", *wrong), "quick.yaml", "slam.bogus")
     assert_refused(command(capsys, *arguments, "full", *wrong), "full", "stands for 5 scenarios")

@@ -42,7 +42,7 @@ def test_every_field_has_a_description_and_every_number_a_range_and_a_unit() -> 
 
 
 def test_the_file_that_editors_read_is_current() -> None:
-    remedy = "mapfusion schema > scenarios/schema.json"
+    remedy = "mapfusion scenarios --schema > scenarios/schema.json"
     assert (SCENARIOS / "schema.json").read_text() == schema_text(), remedy
 
 
