@@ -19,6 +19,7 @@ from tests.helpers.made_up_runs import (
     two_sweeps,
     write_result,
     write_sweep,
+    write_together,
 )
 
 
@@ -54,10 +55,10 @@ def test_a_method_that_changed_is_found_and_no_other(
 def test_chance_alone_is_rarely_taken_for_a_change(tmp_path: Path) -> None:
     """Other random numbers in everything: of 20 comparisons at 5 %, corrected, some 1 may err."""
     wrong = 0
-    a = write_sweep(tmp_path / "a", range(8))
+    a = write_together(tmp_path / "a", {seed: tables_of(seed) for seed in range(8)})
     for trial in range(20):
         redrawn = {seed: tables_of(1000 * (trial + 1) + seed) for seed in range(8)}
-        found = compare(a, write_sweep(tmp_path / str(trial), range(8), made=redrawn))
+        found = compare(a, write_together(tmp_path / str(trial), redrawn))
         wrong += found.table["verdict"].isin([BETTER, WORSE]).any()
         assert (found.table["verdict"] == NOISE).any()
         p = found.table["p"].to_numpy()
@@ -174,7 +175,7 @@ def test_nees_is_better_the_nearer_to_one(tmp_path: Path) -> None:
         {seed: fused(nees)(seed, tables_of(seed)) for seed in range(8)} for nees in (0.2, 2.0, 4.0)
     ]
     small, near, large = (
-        write_sweep(tmp_path / str(i), range(8), made=tables) for i, tables in enumerate(made)
+        write_together(tmp_path / str(i), tables) for i, tables in enumerate(made)
     )
     metric = ("fused NEES / dof", "")
     assert verdicts(compare(small, near).table)[metric] == BETTER

@@ -27,7 +27,7 @@ GRID = ("--set", "slam.filter.n_particles=5,10", "--set", "align.repetitions=1")
 def short_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The tiny scenario with fewer frames, and of two aligners one that draws nothing."""
     path = tmp_path_factory.mktemp("short") / "short.yaml"
-    text = TINY.replace("frames: 44", "frames: 24").replace("name: tiny", "name: short")
+    text = TINY.replace("frames: 44", "frames: 12").replace("name: tiny", "name: short")
     path.write_text(text.replace("    - {name: icp, method: icp}\n", ""), encoding="utf-8")
     return path
 
