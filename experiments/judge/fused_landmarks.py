@@ -174,7 +174,7 @@ def map_fit_rows(team: FusedTeam) -> pd.DataFrame:
 
 
 def landmark_nees(landmarks: LandmarkMap, point_m: Float) -> Float:
-    """NEES (N,), see above, by true points (N, 3) in the map's frame; NaN where unknown."""
+    """NEES (N,; source above) by true points (N, 3) in the map's frame; NaN where unknown."""
     used = degrees_of_freedom(landmarks)
     error = (landmarks.position_m - point_m)[:, :used]
     covariance = landmarks.covariance_m2[:, :used, :used]

@@ -182,9 +182,9 @@ def two_sweeps(
 
 
 def write_together(folder: Path, made: Mapping[int, Tables]) -> Path:
-    """A sweep whose tables hold all runs in one file, as sweeps may be joined; returns it.
+    """A folder that is read as a sweep, with one file a table for all runs; returns it.
 
-    Quicker than a file a run, where it is not reading sweeps that is tested.
+    Quicker than the file a run that `sweep` writes, where reading is not what is tested.
     """
     folder.mkdir(parents=True)
     (folder / "sweep.json").write_text("{}", encoding="utf-8")

@@ -23,7 +23,7 @@ from mapfusion.errors import InputError
 _KIND, _VERSION = b"mapfusion.kind", b"mapfusion.schema_version"
 _DAMAGED = (pa.ArrowInvalid, pa.ArrowTypeError, pa.ArrowKeyError, OSError)
 _TOLD = ("status", "reason")  # of each run of a sweep
-# Reducing costs a call what 10 000 rows cost; so many rows of `errors` are some 20 MB.
+# Reducing costs a call what 10 000 rows cost; so many rows of `errors` are some 15 MB.
 BATCH_ROWS = 100_000
 
 

@@ -18,7 +18,6 @@ import pytest
 
 from experiments.judge import tables
 from experiments.methods.aligner_calls import end_children
-from experiments.show.figures import drawing
 from mapfusion import se2
 from mapfusion.landmark_map import write_map
 from tests.helpers.made_up_maps import landmark_map
@@ -141,17 +140,12 @@ def test_errors_name_it(maps: tuple[Path, Path], capsys: pytest.CaptureFixture[s
 
 
 def test_a_scenario_with_the_example_and_peers(
-    site: Path,
-    tiny_results: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    site: Path, tiny_results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scenario = tmp_path / "plugged.yaml"
     scenario.write_text(PLUGGED, encoding="utf-8")
     results = tmp_path / "results"
     shutil.copytree(tiny_results / "store", results / "store")
-    monkeypatch.setattr(drawing, "FIGURES", ("fig04_translation_error",))
     with found_in(site):
         ended = command(capsys, "run", scenario, "--results", results, "--jobs", 1)
     assert ended.code == 0, ended.err

@@ -10,10 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.judge.judged_run import JudgedRun
 from experiments.judge.result import run_scenario
-from experiments.run.store import Store
-from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import Simulation
 from experiments.show.figures.drawing import save_figure
 from experiments.show.figures.refusal_figures import draw
@@ -218,7 +215,6 @@ def test_worlds_may_be_scenarios_with_seeds(
     tiny: Simulation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """As a sweep leaves them: maps in the store, no result folder. Posters are told apart."""
-    seeds = (5, 6)
     short = tiny.model_copy(
         update={
             "drive": tiny.drive.model_copy(update={"frames": 16}),
@@ -232,12 +228,10 @@ def test_worlds_may_be_scenarios_with_seeds(
     for name, world in zip(("plain", "hung"), worlds, strict=True):
         paths.append(tmp_path / f"{name}.yaml")
         paths[-1].write_text(world.model_copy(update={"name": name}).model_dump_json())
-    common = ("--seeds", ",".join(map(str, seeds)), "--results", tmp_path, "--jobs", 1)
+    common = ("--seeds", "5,6", "--results", tmp_path, "--jobs", 1)
     missing = command(capsys, "refusal", *paths, "-o", tmp_path / "out", *common)
     assert missing.complaints[0].startswith("mapfusion: plain-5: the maps of R1 are not in ")
-    for path, seed in itertools.product(paths, seeds):
-        run = JudgedRun.of(load_scenario(path, (), seed), Store.of(tmp_path))
-        run.execute(1, lambda stage, done, total: None)
+    assert command(capsys, "sweep", *paths, "-o", tmp_path / "s", *common).code == 0
     reply = command(capsys, "refusal", *paths, "-o", tmp_path / "out", *common, "--pairs", 2)
     assert reply.code == 0, reply.err
     rows = results.read(tmp_path / "out", "refusals")

@@ -183,7 +183,7 @@ def test_killed_sweeps_go_on_and_readers_always_find_whole_runs(
     assert (code, "Traceback" in complaints) == (0, False), complaints
     assert len(victims) >= 2
     assert len(same_files(sweep, swept, seed=1)) == 2 * 7
-    assert max(seen) >= 1
+    assert seen[-1] == 2  # the reader's last; none if one of its readings failed before
 
 
 def _whole_runs(sweep: Path) -> int:
