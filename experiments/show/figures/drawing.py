@@ -7,6 +7,7 @@ from pathlib import Path
 from pkgutil import iter_modules
 from typing import Any, NamedTuple
 
+import matplotlib
 from matplotlib.figure import Figure
 
 from experiments.run.workers import workers
@@ -71,7 +72,9 @@ def save_figure(folder: Path, name: str, draw: Callable[..., Figure], *data: Any
         figure = draw(*data)
         for file, kind in zip(files, _DPI, strict=True):
             write_whole(file, lambda path, kind=kind: _save(figure, path, kind))
-            figure.set_layout_engine("none")  # as laid out for the first; once is enough
+            # As laid out for the first: "none" would draw the next twice, to lay nothing out.
+            with matplotlib.rc_context({"figure.constrained_layout.use": False}):
+                figure.set_layout_engine(None)
     return files
 
 
