@@ -7,7 +7,8 @@ STAMP := $(VENV)/.installed
 # Where this is set, each of the many processes that tests and runs start would compile our source anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: browser-test clean-kernels lock demo test endurance lint check bench paper install clean
+.PHONY: wheel-test browser-test clean-kernels lock demo test endurance seeded-faults lint check bench paper \
+    install clean
 
 install: $(STAMP)
 
@@ -30,6 +31,14 @@ test: $(STAMP)
 endurance: $(STAMP)
 	$(BIN)/python -m pytest tests/experiments/study/sweep/ten_kills.py -s
 
+# The wheel in a fresh environment, which takes minutes to install.
+wheel-test: $(STAMP)
+	$(BIN)/python -m pytest tests/installed_wheel.py -s
+
+# One fault of the source at a time: does a test notice? Hours; `--only NAME` for some.
+seeded-faults: $(STAMP)
+	$(BIN)/python -m tests.seeded_faults
+
 # Installs Debian's chromium where it is missing (needs root for that).
 browser-test: $(STAMP)
 	PYTHON=$(BIN)/python tests/experiments/show/report/report_in_browser.sh $(RESULT)
@@ -41,7 +50,7 @@ lint: $(STAMP)
 	$(BIN)/lint-imports
 
 check: $(STAMP)
-	$(BIN)/mapfusion check scenarios/quick.yaml --seeds 0
+	$(BIN)/mapfusion check scenarios/quick.yaml --seeds 0 --junit results/junit.xml
 
 bench: $(STAMP)
 	$(BIN)/python -m pytest tests/benchmarks --benchmark-only --benchmark-columns=min,median,max,rounds

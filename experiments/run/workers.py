@@ -5,6 +5,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -13,7 +14,7 @@ from multiprocessing import connection
 from typing import Any
 
 from experiments.methods.threads import single_threaded
-from mapfusion.errors import InputError
+from mapfusion.errors import InputError, UnsealedWarning
 
 # While a process works on one task, the next is there already. More of them would be begun in the
 # order they were submitted, though a later one may be what others wait for.
@@ -24,6 +25,7 @@ def _start_worker() -> None:
     # Ctrl-C reaches the whole process group; the parent alone decides what then happens.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    warnings.simplefilter("ignore", UnsealedWarning)  # the parent says it
     single_threaded()
 
 

@@ -5,12 +5,13 @@ dataset": robots that know each landmark by a barcode and measure its range and 
 a table each, lines that start with # are comments:
 
 - `Barcodes.dat`: subject, barcode.
-- `Landmark_Groundtruth.dat`: subject, x_m, y_m, two standard deviations.
+- `Landmark_Groundtruth.dat`: subject, x_m, y_m, two standard deviations; optional.
 - `RobotN_Odometry.dat`: time_s, forward velocity (m/s), angular velocity (rad/s).
 - `RobotN_Measurement.dat`: time_s, barcode, range_m, bearing_rad.
-- `RobotN_Groundtruth.dat`: time_s, x_m, y_m, theta_rad; it has gaps.
+- `RobotN_Groundtruth.dat`: time_s, x_m, y_m, theta_rad; optional; it has gaps.
 
-Subjects 1 to 5 are the robots themselves; the others are landmarks.
+A log has the truth that the recording has: true poses, true points, both or none. Subjects 1 to 5
+are the robots themselves; the others are landmarks.
 """
 
 import re
@@ -22,6 +23,7 @@ import numpy as np
 
 from mapfusion.errors import InputError
 from mapfusion.robot_log import (
+    TRUTH_FILES,
     Observations,
     RobotLog,
     write_log,
@@ -71,7 +73,7 @@ class MrclamSettings:
 def import_mrclam(
     folder: Path, destination: Path, settings: MrclamSettings | None = None
 ) -> list[Path]:
-    """Write one log, with its truth, for each robot of a recording.
+    """Write one log, with its truth where that is recorded, for each robot of a recording.
 
     Logs go to folders `robotN` of `destination`; they are returned by robot.
 
@@ -84,13 +86,14 @@ def import_mrclam(
         raise InputError(f"{folder}: no such folder (expected an MRCLAM recording)")
     numbers = _robots(folder)
     subject_of_barcode = _barcodes(folder / "Barcodes.dat")
-    landmarks = _landmarks(folder / "Landmark_Groundtruth.dat")
+    surveyed = folder / "Landmark_Groundtruth.dat"
+    landmarks = _landmarks(surveyed) if surveyed.exists() else None
     recordings = [
         (
             f"robot{n}",
             _timed(folder / f"Robot{n}_Odometry.dat", 3),
             _sightings(folder / f"Robot{n}_Measurement.dat", subject_of_barcode, landmarks),
-            _timed(folder / f"Robot{n}_Groundtruth.dat", 4),
+            _timed(path, 4) if (path := folder / f"Robot{n}_Groundtruth.dat").exists() else None,
         )
         for n in numbers
     ]
@@ -103,10 +106,14 @@ def import_mrclam(
         path = destination / robot
         log = _log(robot, odometry, sighted, clock_s, settings)
         write_log(path, log)
-        write_truth_poses(path, _truth_at(clock_s, truth, settings.longest_truth_gap_s))
-        assert log.observations.label is not None
-        points = np.array([landmarks[int(subject)] for subject in log.observations.label])
-        write_truth_points(path, points.reshape(-1, 3))
+        for outdated in TRUTH_FILES:  # of an import into the same folder
+            (path / outdated).unlink(missing_ok=True)
+        if truth is not None:
+            write_truth_poses(path, _truth_at(clock_s, truth, settings.longest_truth_gap_s))
+        if landmarks is not None:
+            assert log.observations.label is not None
+            points = np.array([landmarks[int(subject)] for subject in log.observations.label])
+            write_truth_points(path, points.reshape(-1, 3))
         written.append(path)
     return written
 
@@ -224,11 +231,12 @@ def _landmarks(path: Path) -> dict[int, Float]:
 
 
 def _sightings(
-    path: Path, subject_of_barcode: dict[int, int], landmarks: dict[int, Float]
+    path: Path, subject_of_barcode: dict[int, int], landmarks: dict[int, Float] | None
 ) -> Float:
     """Rows (N, 4) time_s, subject, range_m, bearing_rad of landmarks.
 
-    Robots are left out, and barcodes that the recording does not know (misread ones).
+    Robots are left out, and barcodes that the recording does not know (misread ones); where
+    landmarks were surveyed, those that were not, too.
     """
     table, lines = _table(path, 4)
     wrong = np.flatnonzero(table[:, 2] <= 0)
@@ -238,7 +246,9 @@ def _sightings(
             f"{path}, line {lines[row]}: range is {table[row, 2]:g} m, must be positive"
         )
     table[:, 1] = [subject_of_barcode.get(int(barcode), -1) for barcode in table[:, 1]]
-    kept = (table[:, 1] > _LAST_ROBOT_SUBJECT) & np.isin(table[:, 1], list(landmarks))
+    kept = table[:, 1] > _LAST_ROBOT_SUBJECT
+    if landmarks is not None:
+        kept &= np.isin(table[:, 1], list(landmarks))
     return _by_time(table[kept])
 
 

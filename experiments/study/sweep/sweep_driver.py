@@ -8,6 +8,7 @@ import uuid
 from collections import Counter
 from collections.abc import Callable, Collection, Sized
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import cast
 
@@ -19,7 +20,7 @@ from experiments.judge.result import measure_aligners
 from experiments.methods.threads import single_threaded
 from experiments.run import dask_worker
 from experiments.run.dask_cluster import connected
-from experiments.run.store import explained
+from experiments.run.store import mending
 from experiments.run.tasks import OnProgress, Task
 from experiments.study.sweep.combinations import SweepRun
 from experiments.study.sweep.sweep_dataset import ALIGNER_TIMINGS, open_dataset
@@ -43,12 +44,13 @@ class SweepProgress:
     """How far a sweep is; the driver counts on in it.
 
     Runs in all; those `done`, which need nothing more; of these the failed ones, with their reasons
-    by run id. Tasks by label, of the runs looked at so far.
+    by run id, and which of them are defects of ours. Tasks by label, of the runs looked at so far.
     """
 
     runs: int
     done: int = 0
     failed: dict[str, str] = field(default_factory=dict)
+    defects: set[str] = field(default_factory=set)
     tasks: Counter[str] = field(default_factory=Counter)
     tasks_done: Counter[str] = field(default_factory=Counter)
 
@@ -70,6 +72,8 @@ class SweepDriver:
         self._futures: dict[str, Future] = {}  # by name of the task
         self._open: dict[PlannedRun, set[str]] = {}  # with the tasks at Dask that each waits for
         self._failures: dict[str, dask_worker.TaskFailedError] = {}  # by task
+        self._mended = Counter[Path]()  # damaged files of the store
+        self._again: set[PlannedRun] = set()  # to be planned anew, since a stage was damaged
         self._n_workers, self._counted_at = 0, -_COUNT_WORKERS_EVERY_S
         self.progress = SweepProgress(len(sweep.runs))
 
@@ -122,7 +126,8 @@ class SweepDriver:
             pickle.dumps(task),
             self._terms,
             *(self._futures[need] for need in task.needs if need in self._futures),
-            key=f"{task.label}-{self._suffix}-{task.name}",
+            # new at each attempt: what failed under a key, Dask does not compute again
+            key=f"{task.label}-{self._suffix}{self.progress.tasks.total()}-{task.name}",
             pure=False,
             # in order: a run is finished before others begin
             priority=-self.progress.tasks.total(),
@@ -133,8 +138,11 @@ class SweepDriver:
     def _task_ended(self, future: Future) -> None:
         label, name = _label_and_name(future.key)
         if future.status != "finished":
-            failure = self._failure(future, name)
-            self._failures[failure.task] = failure
+            failure, store = self._failure(future, name), self._sweep.store
+            if failure.damage and store.discard_damaged(failure.damage, self._mended):
+                self._again |= {each for each in self._open if failure.task in each.tasks}
+            else:
+                self._failures[failure.task] = failure
         del self._futures[name]
         self.progress.tasks_done[label] += 1
         for laid_out in [each for each, waits_for in self._open.items() if name in waits_for]:
@@ -162,13 +170,20 @@ class SweepDriver:
         if self._open[laid_out]:
             return
         del self._open[laid_out]
+        if laid_out in self._again:
+            self._again.remove(laid_out)
+            self._begin(laid_out.run)
+            return
         self.progress.done += 1
         # All tasks that could be done were done, so which comes first does not depend on chance.
         failures = (self._failures.get(task.name) for task in laid_out.left)
         if first := next(filter(None, failures), None):
-            reason = explained(first.reason, self._sweep.store)
-            self.progress.failed[laid_out.run.run_id] = reason
-            self._sweep.dataset.fail(laid_out.run, reason, first.details, laid_out.stages)
+            run, reason = laid_out.run, first.reason
+            details = self._sweep.dataset.fail(run, reason, first.details, laid_out.stages)
+            if first.details:
+                reason += f"; its traceback: {details}"
+                self.progress.defects.add(run.run_id)
+            self.progress.failed[run.run_id] = reason
 
 
 def _label_and_name(key: object) -> tuple[str, str]:
@@ -179,8 +194,8 @@ def _label_and_name(key: object) -> tuple[str, str]:
 
 def execute(
     sweep: Sweep, jobs: int, scheduler: str | None, on_progress: OnSweepProgress
-) -> dict[str, str]:
-    """Run a sweep; returns the failed runs with their reasons.
+) -> SweepProgress:
+    """Run a sweep; returns how it ended.
 
     Raises:
         InputError: the output folder is of another sweep, no scheduler or no worker is of use.
@@ -195,7 +210,7 @@ def execute(
         terms = dask_worker.Terms(Path(attempts), RETRIES, dask_worker.code_version())
         driver = SweepDriver(client, sweep, terms, on_progress)
         driver.execute()
-    return driver.progress.failed
+    return driver.progress
 
 
 def measure_times(sweep: Sweep, failed: Collection[str], on_progress: OnProgress) -> None:
@@ -205,7 +220,12 @@ def measure_times(sweep: Sweep, failed: Collection[str], on_progress: OnProgress
     for done, run in enumerate(runs):
         on_progress("time the aligners", done, len(runs))
         if not sweep.dataset.path(ALIGNER_TIMINGS, run).is_file():
-            judged = JudgedRun.of(run.load(), sweep.store)
-            measure_aligners(judged, judged.load_robots())
-            sweep.dataset.write(ALIGNER_TIMINGS, run, judged.pair_table(ALIGNER_TIMINGS))
+            mending(sweep.store, partial(_measure, sweep, run))
     on_progress("time the aligners", len(runs), len(runs))
+
+
+def _measure(sweep: Sweep, run: SweepRun) -> None:
+    judged = JudgedRun.of(run.load(), sweep.store)
+    judged.execute(1, lambda *_: None)  # what is there already, but for a damaged stage
+    measure_aligners(judged, judged.load_robots())
+    sweep.dataset.write(ALIGNER_TIMINGS, run, judged.pair_table(ALIGNER_TIMINGS))

@@ -12,7 +12,11 @@ from experiments.run.store import Store
 from experiments.run.tasks import Task, task_names, unfinished
 from experiments.scenario.suite import scenarios_of
 from experiments.study.sweep.combinations import SweepRun, parse_axes, runs_of
-from experiments.study.sweep.sweep_dataset import ALIGNER_TIMINGS, RUN_TIMES, SweepDataset
+from experiments.study.sweep.sweep_dataset import (
+    ALIGNER_TIMINGS,
+    RUN_TIMES,
+    SweepDataset,
+)
 from mapfusion.errors import InputError
 
 _LONGEST_NAME = 80

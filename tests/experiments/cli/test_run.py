@@ -114,7 +114,7 @@ def test_ctrl_c_before_the_command_starts(
         raise KeyboardInterrupt
 
     monkeypatch.setattr("experiments.run.kernel_cache.use_kernel_cache", press)
-    reply = command(capsys, "schema")
+    reply = command(capsys, "scenarios", "--schema")
     assert reply.code == 130
     assert len(reply.err.splitlines()) == 1
 
@@ -234,7 +234,7 @@ def test_commands_one_by_one(
 @pytest.mark.usefixtures("quick_save")
 def test_figures(tiny_result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     copy = shutil.copytree(tiny_result, tmp_path / "result")
-    reply = command(capsys, "figures", copy, "--jobs", 1)
+    reply = command(capsys, "report", copy, "--figures", "--jobs", 1)
     assert reply.code == 0
     drawn = {path.name[:5] for path in (copy / "figures").iterdir()}
     skipped = {line.split()[2][:5] for line in reply.out.splitlines() if "not drawn" in line}

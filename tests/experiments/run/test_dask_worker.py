@@ -42,8 +42,8 @@ def test_it_runs_and_leaves_no_mark(terms: Terms, tmp_path: Path) -> None:
     ("function", "reason", "with_details"),
     [
         (acting.collide, "scenario x: R1 drove into a wall at (1, 2)", False),
-        (acting.run_out_of_memory, "drive: MemoryError", True),
-        (acting.break_down, "drive: ZeroDivisionError a bug", True),
+        (acting.run_out_of_memory, "drive: MemoryError", False),
+        (acting.break_down, "drive: a defect of mapfusion itself: ZeroDivisionError a bug", True),
     ],
 )
 def test_what_it_raises_is_a_reason(
@@ -52,7 +52,8 @@ def test_what_it_raises_is_a_reason(
     with pytest.raises(TaskFailedError) as raised:
         perform("drive/k", packed(function), terms)
     error = pickle.loads(pickle.dumps(raised.value))  # as it travels
-    assert (error.task, error.reason) == ("drive/k", reason)
+    assert error.task == "drive/k"
+    assert error.reason.startswith(reason)
     assert ("Traceback" in error.details) == with_details
     assert not list(terms.attempts.iterdir())
 

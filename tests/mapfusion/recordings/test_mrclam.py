@@ -11,7 +11,7 @@ from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.fastslam.proposal import Proposal
 from mapfusion.fastslam.run import run_log
 from mapfusion.recordings.mrclam import MrclamSettings, import_mrclam
-from mapfusion.recordings.registry import import_recording
+from mapfusion.recordings.registry import import_recording, settings_class
 from mapfusion.robot_log import read_log, read_truth
 from mapfusion.se2 import between, compose, inverse, transform_points, wrap
 
@@ -196,11 +196,32 @@ def test_damage_is_one_clear_line(recording: Path, tmp_path: Path, name, change,
     assert not (tmp_path / "logs").exists()
 
 
+def test_truth_is_optional(recording: Path, tmp_path: Path):
+    whole = [read_log(path) for path in import_mrclam(recording, tmp_path / "logs")]
+    (recording / "Robot1_Groundtruth.dat").unlink()
+    first, second = import_mrclam(recording, tmp_path / "logs")  # over logs that had it
+    assert not (first / "truth_poses.parquet").exists()
+    assert (first / "truth_points.parquet").exists()
+    assert (second / "truth_poses.parquet").exists()
+    (recording / "Landmark_Groundtruth.dat").unlink()
+    first, second = import_mrclam(recording, tmp_path / "logs")
+    assert [path.name for path in sorted(second.iterdir())] == [
+        "frames.parquet",
+        "observations.parquet",
+        "truth_poses.parquet",
+    ]
+    for path, log in zip((first, second), whole, strict=True):
+        read = read_log(path)
+        np.testing.assert_array_equal(read.observations.position_m, log.observations.position_m)
+        np.testing.assert_array_equal(read.observations.label, log.observations.label)
+
+
 def test_the_importer_is_found_by_its_name(recording: Path, tmp_path: Path):
     assert import_recording("mrclam", recording, tmp_path) == [
         tmp_path / "robot1",
         tmp_path / "robot2",
     ]
+    assert settings_class("mrclam") is MrclamSettings
     with pytest.raises(InputError, match="'nobody': unknown; known: mrclam"):
         import_recording("nobody", recording, tmp_path)
 
