@@ -47,7 +47,9 @@ class RouteParameters:
     def __post_init__(self) -> None:
         require_in_range(self)
         if not self.loop_m[0] <= self.loop_m[1]:
-            raise OutOfRangeError("loop_m", "the shortest is above the longest")
+            shortest_m, longest_m = self.loop_m
+            said = f"is {shortest_m:g} to {longest_m:g}, the shortest is above the longest"
+            raise OutOfRangeError("loop_m", said)
 
 
 @dataclass(frozen=True)

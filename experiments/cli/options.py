@@ -44,7 +44,7 @@ Overrides = Annotated[
 ImportOverrides = Annotated[
     list[str],
     typer.Option(
-        "--set",
+        "--param",
         metavar="KEY=VALUE",
         default_factory=list,
         show_default=False,

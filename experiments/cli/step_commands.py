@@ -111,7 +111,7 @@ def merge(
 
 
 def import_command(format_name: str) -> Callable[..., None]:
-    """The command that reads recordings of one format; `--set` takes what its settings have."""
+    """The command that reads recordings of one format; `--param` takes what its settings have."""
 
     def command(
         folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="The recording.")],

@@ -8,7 +8,7 @@ from pathlib import Path
 import pandas as pd
 
 from experiments.judge import metrics, tables
-from experiments.judge.judging import why_no_truth
+from experiments.judge.known_truth import why_no_truth
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import AnyScenario, Bound
 from mapfusion.errors import InputError, did_you_mean

@@ -10,6 +10,7 @@ from experiments.judge import judging, tables
 from experiments.judge.errors import EvaluatedRobot, met_maps
 from experiments.judge.fused_landmarks import FusedTeam, MergeSettings
 from experiments.judge.judging import JudgeSettings
+from experiments.judge.known_truth import why_no_truth
 from experiments.run.memory import require_memory
 from experiments.run.pipeline import PairStages, Pipeline, RobotStages, lay_out
 from experiments.run.stage import Stage
@@ -39,7 +40,7 @@ class JudgedRun:
         pipeline, merge = lay_out(scenario), MergeSettings(**dict(scenario.merge))
         align, radius_m = scenario.align, scenario.evaluate.true_pair_radius_m
         settings = JudgeSettings(align.refinement, align.acceptance, merge, radius_m)
-        no_truth = judging.why_no_truth(scenario)
+        no_truth = why_no_truth(scenario)
         judged = () if no_truth else pipeline.pairs
         judgements = tuple(_judgement(settings, pair) for pair in judged)
         return cls(pipeline, settings, judgements, store, no_truth)

@@ -13,7 +13,6 @@ from experiments.judge.truth import PathTruth, landmark_truth
 from experiments.run.frames import read_rows
 from experiments.run.job import Job
 from experiments.run.stages.slam import ASSOCIATIONS, RobotFolders, read_snapshots
-from experiments.scenario.settings import AnyScenario, Recording
 from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.refine import Refinement
 from mapfusion.errors import InputError
@@ -30,19 +29,6 @@ class JudgeSettings:
     acceptance: Acceptance
     merge: MergeSettings
     true_pair_radius_m: float
-
-
-def why_no_truth(scenario: AnyScenario) -> str:
-    """Which log of a scenario has no truth beside it; empty where all have.
-
-    Errors are told of all robots or of none: a map is judged against another's, too.
-    """
-    logs = map(Path, scenario.logs) if isinstance(scenario, Recording) else ()
-    for log in logs:
-        lacking = [name for name in TRUTH_FILES if not (log / name).is_file()]
-        if lacking and log.is_dir():
-            return f"no truth is known: {log} has no {lacking[0]}"
-    return ""
 
 
 def _truth_of(folder: Path, log: RobotLog) -> RobotTruth:

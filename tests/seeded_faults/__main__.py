@@ -41,8 +41,11 @@ def copy_source(folder: Path) -> None:
 def forget_kernels(folder: Path, file: str) -> None:
     """Delete compiled kernels of the file and of all modules that import it, directly or not.
 
-    Numba keeps a kernel as long as its own file is unchanged, whatever it calls.
+    Numba keeps a kernel as long as its own file is unchanged, whatever it calls. Of a file without
+    a kernel no other can have taken anything but constants.
     """
+    if "njit" not in (folder / file).read_text(encoding="utf-8"):
+        return
     module = ".".join(Path(file).with_suffix("").parts).removesuffix(".__init__")
     reached = {module, *_imports().find_downstream_modules(module)}
     stems = {name.rpartition(".")[2] for name in reached}

@@ -233,7 +233,7 @@ def test_wrong_tables(
     assert "Traceback" not in reply.err
     assert len(reply.complaints) == 1
     assert str(wrong) in reply.complaints[0]
-    foreign = "kind is none" if name == "figures" else "has no column"
+    foreign = "kind is none" if name == "report" else "has no column"
     said = {"missing": "no such file", "truncated": "damaged", "foreign": foreign}
     assert said.get(damage, "kind is robot_log.frames, expected") in reply.complaints[0]
 

@@ -19,7 +19,9 @@ from tests.helpers.tiny_scenario import assert_refused, command
 def test_wrong_settings_are_one_line(
     setting: str, words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    reply = command(capsys, "import", "mrclam", tmp_path, "-o", tmp_path / "logs", "--set", setting)
+    reply = command(
+        capsys, "import", "mrclam", tmp_path, "-o", tmp_path / "logs", "--param", setting
+    )
     assert_refused(reply, *words)
 
 
@@ -30,7 +32,7 @@ def test_settings_reach_the_importer(tmp_path: Path, capsys: pytest.CaptureFixtu
     (folder / "Robot1_Odometry.dat").write_text("0 0.1 0\n4 0.1 0\n")
     (folder / "Robot1_Measurement.dat").write_text("1 72 2.0 0.0\n")
     logs = tmp_path / "logs"
-    given = ("--set", "range_sigma_m=0.3", "--set", "range_sigma_ratio=0")
+    given = ("--param", "range_sigma_m=0.3", "--param", "range_sigma_ratio=0")
     assert command(capsys, "import", "mrclam", folder, "-o", logs, *given).code == 0
     log = read_log(logs / "robot1")
     assert log.observations.covariance_m2[0, 0, 0] == pytest.approx(0.3**2)

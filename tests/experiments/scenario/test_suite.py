@@ -80,8 +80,14 @@ def test_commands_take_tags(
     monkeypatch.chdir(folder.parent)
     for name in ("run", "check"):
         assert_refused(command(capsys, name, "soft"), "soft", "a, apart, b, c", "ci, full, hard")
-        # found, and then refused for its own reason
-        assert_refused(command(capsys, name, "ci", "--set", "drive.frames=1"), "a.yaml", "frames")
+    wrong = ("ci", "--set", "drive.frames=1")  # found, and then refused for their own reasons
+    assert_refused(command(capsys, "run", *wrong), "a.yaml", "frames")
+    checked = command(capsys, "check", *wrong)
+    assert checked.code == 2
+    assert [Path(line.split(": ")[1]).name for line in checked.complaints] == [
+        "a.yaml",
+        "quick.yaml",
+    ]
     assert_refused(command(capsys, "scenarios", "nowhere"), "nowhere", "holds no scenario")
 
 

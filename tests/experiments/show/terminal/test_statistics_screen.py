@@ -22,6 +22,7 @@ def with_interval(name: str, values: list[float], share: float) -> dict[str, lis
 def over_oracle() -> pd.DataFrame:
     aligners = ["icp", "ransac", "oracle"]
     rows = {"scenario": "hall", "aligner": aligners, "estimated_m": [0.4, 0.1, 0.05]}
+    rows |= {"estimated_share": [0.75, 1, 1], "refined_share": [0.5, 1, 1]}
     rows |= {"refined_m": [0.06, 0.05, 0.05]} | with_interval("refined_ratio", [1.2, 1, 1], 0.1)
     return pd.DataFrame(rows | with_interval("estimated_ratio", [8.0, 2.0, 1.0], 0.25))
 
@@ -45,7 +46,8 @@ def test_the_best_method_is_held_against_the_others(capsys: pytest.CaptureFixtur
     made = summary(9, error_over_oracle=over_oracle(), methods_compared=compared())
     print_summary(made, None, [])
     lines = said(capsys)
-    assert "icp 0.400 8.00 (6.00–10.00) 0.060 1.20 (1.08–1.32)" in lines
+    assert "icp 75% 0.400 8.00 (6.00–10.00)" in lines
+    assert "icp 50% 0.060 1.20 (1.08–1.32)" in lines
     assert "ransac against each other method on the same maps, as estimated" in lines
     # icp's four times larger error, from the other side
     assert "icp 0.25 (0.20–0.33) 80% (70–90) 0.012" in lines

@@ -164,7 +164,7 @@ def test_curves_over_runs_are_medians_of_run_medians(tmp_path: Path) -> None:
         at = own[own["iteration"] == iteration].groupby("run_id")["translation_error_m"].median()
         assert drawn == pytest.approx(at.median())
     legend = fig04_translation_error.draw(data).legends[0]
-    assert "10-90 % of 5 runs" in [text.get_text() for text in legend.get_texts()]
+    assert "10-90 % of 5 runs, as here ransac's" in [text.get_text() for text in legend.get_texts()]
     assert len(fig06_aligner_time.draw(data).axes) == 2
 
 
