@@ -62,9 +62,15 @@ class SweepDriver:
     """Runs everything that is not finished; a run that fails does not stop the others."""
 
     def __init__(
-        self, client: Client, sweep: Sweep, terms: dask_worker.Terms, on_progress: OnSweepProgress
+        self,
+        client: Client,
+        sweep: Sweep,
+        terms: dask_worker.Terms,
+        on_progress: OnSweepProgress,
+        jobs: int | None = None,
     ) -> None:
-        self._client, self._sweep, self._terms = client, sweep, terms
+        """`jobs` are the workers on this machine; None if they are a cluster's."""
+        self._client, self._sweep, self._terms, self._jobs = client, sweep, terms, jobs
         self._on_progress = on_progress
         # Of this sweep alone: another client's tasks of the same key might write elsewhere.
         self._suffix = uuid.uuid4().hex[:8]
@@ -100,7 +106,7 @@ class SweepDriver:
 
     def _begin(self, run: SweepRun) -> None:
         try:
-            laid_out = planned(run, self._sweep.store, self._sweep.dataset)
+            laid_out = planned(run, self._sweep.store, self._sweep.dataset, self._jobs)
         except InputError as error:  # no world can be made from this seed, a log is damaged, ...
             reason = " ".join(str(error).split())
             self.progress.done += 1
@@ -208,7 +214,7 @@ def execute(
     own = tempfile.TemporaryDirectory(None, _ATTEMPTS_PREFIX, folder, ignore_cleanup_errors=True)
     with own as attempts, connected(jobs, scheduler) as client:
         terms = dask_worker.Terms(Path(attempts), RETRIES, dask_worker.code_version())
-        driver = SweepDriver(client, sweep, terms, on_progress)
+        driver = SweepDriver(client, sweep, terms, on_progress, None if scheduler else jobs)
         driver.execute()
     return driver.progress
 

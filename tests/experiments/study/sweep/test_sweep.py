@@ -16,7 +16,7 @@ import pytest
 from experiments.judge import tables
 from experiments.study.sweep.sweep_dataset import RUN_TIMES
 from experiments.study.sweep.sweep_driver import execute
-from experiments.study.sweep.sweep_plan import prepare
+from experiments.study.sweep.sweep_plan import planned, prepare
 from tests.helpers.killing import KilledSweep, same_files
 from tests.helpers.tiny_scenario import TINY, command
 
@@ -158,6 +158,19 @@ def test_a_run_that_collides_is_a_row(
     timings = pd.read_parquet(sweep / "aligner_timings")
     assert set(timings["aligner"]) == {"ransac", "svd"}
     assert set(timings["seed"]) == {0}
+
+
+def test_a_run_that_needs_more_memory_than_there_is_is_a_row(
+    short_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two workers need 0.3 GB each before they begin; other machines have what they have."""
+    monkeypatch.setattr("experiments.run.memory.memory_bytes", lambda: 0.6e9)
+    asked = prepare([short_path], [0], [], tmp_path)
+    (reason,) = execute(asked, 2, None, lambda _: None).failed.values()
+    assert "in each of 2 processes (--jobs 1 needs least), this machine has 0.6 GB" in reason
+    rows = pd.read_parquet(asked.dataset.folder / "runs")
+    assert rows[["status", "reason"]].to_numpy().tolist() == [["failed", reason]]
+    assert planned(asked.runs[0], asked.store, asked.dataset).left
 
 
 def test_killed_sweeps_go_on_and_readers_always_find_whole_runs(

@@ -57,7 +57,9 @@ class Scene:
         output = self.folder / name.replace("/", "_")
         self.add(seed, name, acting.write, output, name, needs=tuple(needs))
 
-    def _planned(self, run: SweepRun, store: Store, dataset: SweepDataset) -> PlannedRun:
+    def _planned(
+        self, run: SweepRun, store: Store, dataset: SweepDataset, jobs: int | None = None
+    ) -> PlannedRun:
         tasks = {task.name: task for task in self.tasks[run.seed]}
         name = f"run/{run.run_id}"
         tasks[name] = Task(name, "tables", dataset.finish, (run, "", []), (), tuple(tasks))
