@@ -1,22 +1,45 @@
-"""What holds for all tests, and in which order files are tested."""
+"""What holds for all tests, in which order files are tested, and by which worker."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
+from xdist.scheduler import LoadFileScheduling
 
 # No test may depend on how fast the machine is; by default an example may take 0.2 s.
 settings.register_profile("any_speed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any_speed")
 
-_ALIGN = Path(__file__).parent / "mapfusion" / "align"
+_MAPFUSION = Path(__file__).parent / "mapfusion"
+# Who comes first compiles: of two workers one the aligners' kernels, one all others. Whole runs,
+# which take both, find them there.
+_COMPILE = (("align",), ("fastslam", "vision"))
+
+
+def _place(path: Path) -> int:
+    """Which of these packages a file tests; those of none come last."""
+    for place, packages in enumerate(_COMPILE):
+        if any(path.is_relative_to(_MAPFUSION / package) for package in packages):
+            return place
+    return len(_COMPILE)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Second in line come the tests of the aligners, all others stay as they stand.
+    """Tests of kernels first, all others as they stand."""
+    items.sort(key=lambda item: _place(item.path))
 
-    The first of two workers begins with a whole run, which compiles the kernels of the front end
-    and the filter. Meanwhile the second compiles the aligners', which that run then finds.
-    """
-    first = items[0].path if items else None
-    items.sort(key=lambda item: (item.path != first, not item.path.is_relative_to(_ALIGN)))
+
+class _Scheduling(LoadFileScheduling):
+    """A file's tests go to one worker, and so do all tests of the same packages of kernels."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        file = super()._split_scope(nodeid)
+        place = _place(Path(__file__).parents[1] / file)
+        return file if place == len(_COMPILE) else f"kernels {place}"
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> _Scheduling:
+    """What `-n 2` hands out tests by."""
+    return _Scheduling(config, log)

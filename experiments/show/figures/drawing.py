@@ -8,6 +8,7 @@ from pathlib import Path
 from pkgutil import iter_modules
 from typing import Any, NamedTuple
 
+import matplotlib
 from matplotlib.figure import Figure
 
 from experiments.run.workers import workers
@@ -77,7 +78,9 @@ def save_figure(folder: Path, name: str, draw: Callable[..., Figure], *data: Any
                 write_sealed(file, picture + LINE)
             else:
                 write_whole(file, lambda path, picture=picture: path.write_bytes(picture))
-            figure.set_layout_engine("none")  # as laid out for the first; once is enough
+            # As laid out for the first: "none" would draw the next twice, to lay nothing out.
+            with matplotlib.rc_context({"figure.constrained_layout.use": False}):
+                figure.set_layout_engine(None)
     return files
 
 
