@@ -9,7 +9,7 @@ from mapfusion import se2
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.oracle import Oracle
 from mapfusion.align.pairs import Pairs
-from mapfusion.align.ransac import Ransac, draw_pair, most_supported
+from mapfusion.align.ransac import Ransac, draw_pair, list_supporters, most_supported
 from mapfusion.align.refine import Refinement
 from mapfusion.align.registration import as_aligner
 from mapfusion.align.result import Status
@@ -163,6 +163,17 @@ def test_heights_count_unless_planar():
     assert "height" in alignment.reason
     flat = [landmarks(x, planar=True) for x in (p, lifted)]
     assert as_aligner(Ransac()).align(*flat, pairs, rng).ok
+
+
+def test_support_is_within_the_gate_in_all_dimensions_there_are():
+    """0.3 m off in the plane and 0.4 m in height: 0.5 m off."""
+    p_a, p_b = np.array([[1.0, 2.0, 3.0]]), np.array([[1.3, 2.0, 3.4]])
+    for gate_m, counted, counted_flat in ((0.29, 0, 0), (0.49, 0, 1), (0.51, 1, 1)):
+        for points, n in (((p_a, p_b), counted), ((p_a[:, :2], p_b[:, :2]), counted_flat)):
+            flat = [np.ascontiguousarray(each) for each in points]
+            found, cost = list_supporters(np.zeros(3), *flat, gate_m, 0, np.empty(1, np.int64))
+            assert found == n
+            assert cost == pytest.approx(n * (0.09 + 0.16 * (len(points[0][0]) == 3)))
 
 
 def test_one_draw_from_the_generator_decides():
