@@ -1,15 +1,13 @@
-"""Files damaged in every way, and of every kind: `python -m tests.campaign.damaged_files`.
+"""Files damaged in every way, and of every kind.
 
 Half of them are sealed again after the damage, as if they had been written so, and meet the doors'
 own checks. Each must be read, or give one line that names its file or its folder.
 """
 
-import argparse
 import json
 import random
-import sys
-import tempfile
 import warnings
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,6 +19,7 @@ import pyarrow.parquet as pq
 from mapfusion.errors import InputError, UnsealedWarning
 from mapfusion.sealed import LINE, NO_DIGEST, SEAL, parquet_with_seal, seal
 from tests.campaign.doors import Door, doors
+from tests.campaign.parts import Found
 
 Random = random.Random
 
@@ -122,18 +121,20 @@ def _array(data: bytes, rng: Random) -> bytes:
 SEALED = {".json": _json, ".parquet": _table, ".npy": _array}
 
 
-def damage(folder: Path, seed: int, each: int) -> list[str]:
-    """What went wrong in `each` damages of every file, one line each."""
-    rng, found = Random(seed), list[str]()
+def explore(seed: str, each: int, folder: Path) -> Found:
+    """Damage every file so many times."""
+    rng, counts, faults = Random(seed), Counter[str](), list[str]()
     for door in doors(folder):
         whole = door.path.read_bytes()
+        counts["kinds"] += 1
         for number in range(each):
             way = rng.choice(BYTES) if number % 2 else SEALED.get(door.path.suffix, _cut)
             door.path.write_bytes(way(whole, rng))
+            counts["damaged"] += 1
             if wrong := _wrong(door):
-                found.append(f"{door.path.name}, {way.__name__}, number {number}: {wrong}")
+                faults.append(f"{door.path.name}, {way.__name__}, number {number}: {wrong}")
         door.path.write_bytes(whole)
-    return found
+    return Found(counts, faults)
 
 
 def _wrong(door: Door) -> str:
@@ -147,19 +148,3 @@ def _wrong(door: Door) -> str:
     except Exception as error:
         return f"a traceback: {type(error).__name__} {error}"
     return ""
-
-
-def main() -> None:
-    """The command."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--each", type=int, default=67, help="damages of each kind of file")
-    asked = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        found = damage(Path(folder), asked.seed, asked.each)
-    sys.stdout.writelines(f"{line}\n" for line in [*found, f"{len(found)} wrong"])
-    sys.exit(1 if found else 0)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,13 +1,9 @@
-"""Plug-ins that misbehave: each ends as a recorded failure of that method, none ends a run.
-
-`python -m tests.campaign.misbehaving_plugins` tries all of them (minutes) and names those that got
-past; the exit code says whether any did.
-"""
+"""Plug-ins that misbehave: each ends as a recorded failure of that method, none ends a run."""
 
 import importlib
 import sys
-import tempfile
 import time
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +15,7 @@ from experiments.run.stage_tables import ESTIMATES
 from mapfusion.align.registration import Registration
 from mapfusion.align.result import Status
 from tests.campaign import misbehaviours as kinds
+from tests.campaign.parts import Found
 from tests.helpers.made_up_maps import landmark_map, paired
 from tests.helpers.made_up_plugin import install, look_again
 
@@ -79,25 +76,16 @@ def what_got_past(name: str, folder: Path) -> str:
     return f"reasons {wordless}" if wordless else "failed and accepted" if accepted else ""
 
 
-def main() -> int:
-    """Try all; returns how many got past."""
-    past = 0
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        sys.path.insert(0, name)
-        install_all(folder)
-        for number, each in enumerate(ALL, start=1):
-            try:
-                wrong = what_got_past(each, folder)
-            except Exception as error:  # this is what the campaign looks for
-                wrong = f"ended the run: {error!r}"
-            past += bool(wrong)
-            sys.stdout.write(f"{number}/{len(ALL)} {each}: {wrong or 'a recorded failure'}\n")
-            sys.stdout.flush()
-        end_children()
-    sys.stdout.write(f"{len(ALL)} misbehaviours, {past} got past\n")
-    return past
-
-
-if __name__ == "__main__":
-    sys.exit(bool(main()))
+def explore(folder: Path) -> Found:
+    """Try all, once each."""
+    faults = []
+    sys.path.insert(0, str(folder))
+    install_all(folder)
+    for each in ALL:
+        try:
+            wrong = what_got_past(each, folder)
+        except Exception as error:  # this is what the campaign looks for
+            wrong = f"ended the run: {error!r}"
+        faults += [f"{each}: {wrong}"] if wrong else []
+    end_children()
+    return Found(Counter(misbehaviours=len(ALL)), faults)
