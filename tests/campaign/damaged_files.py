@@ -6,6 +6,7 @@ own checks. Each must be read, or give one line that names its file or its folde
 
 import json
 import random
+import re
 import warnings
 from collections import Counter
 from collections.abc import Callable
@@ -18,7 +19,7 @@ import pyarrow.parquet as pq
 
 from mapfusion.errors import InputError, UnsealedWarning
 from mapfusion.sealed import LINE, NO_DIGEST, SEAL, parquet_with_seal, seal
-from tests.campaign.doors import Door, doors
+from tests.campaign.doors import Door, doors, doors_of_others
 from tests.campaign.parts import Found
 
 Random = random.Random
@@ -118,13 +119,23 @@ def _array(data: bytes, rng: Random) -> bytes:
     return seal(bytes(body) + LINE)
 
 
-SEALED = {".json": _json, ".parquet": _table, ".npy": _array}
+def _text(data: bytes, rng: Random) -> bytes:
+    """A file of text in which some words are others."""
+    words = re.split(rb"([ ,\n]+)", data)
+    for _ in range(rng.randint(1, 3)):
+        words[2 * rng.randrange(len(words) // 2)] = rng.choice(_WORDS)
+    return b"".join(words)
+
+
+_WORDS = [*(b"", b"x", b"nan", b"inf", b"-1", b"0", b"1e300", b"-1e18", b"1e-320", b"\xff", b'"')]
+# Half of all damages: what was written so, seal and all.
+SEALED = {".json": _json, ".parquet": _table, ".npy": _array, ".csv": _text, ".dat": _text}
 
 
 def explore(seed: str, each: int, folder: Path) -> Found:
     """Damage every file so many times."""
     rng, counts, faults = Random(seed), Counter[str](), list[str]()
-    for door in doors(folder):
+    for door in doors(folder) + doors_of_others(folder):
         whole = door.path.read_bytes()
         counts["kinds"] += 1
         for number in range(each):
