@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 # Where this is set, each of the many processes that tests and runs start would compile our source anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: wheel-test browser-test clean-kernels lock demo test endurance seeded-faults lint check bench paper \
+.PHONY: wheel-test browser-test clean-kernels lock demo test campaign seeded-faults lint check bench paper \
     install clean
 
 install: $(STAMP)
@@ -27,9 +27,10 @@ demo: $(STAMP)
 test: $(STAMP)
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
-# Ten random kills of a sweep; minutes.
-endurance: $(STAMP)
-	$(BIN)/python -m pytest tests/experiments/study/sweep/ten_kills.py -s
+# Thousands of broken inputs, and kills; up to an hour. ONLY=PART for one part.
+SEED ?= 0
+campaign: $(STAMP)
+	$(BIN)/python -m tests.campaign --seed $(SEED) $(if $(ONLY),--only $(ONLY))
 
 # The wheel in a fresh environment, which takes minutes to install.
 wheel-test: $(STAMP)

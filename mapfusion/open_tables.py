@@ -78,7 +78,9 @@ def _read_csv(path: Path, kind: str) -> pa.Table:
     if not path.is_file():
         raise InputError(f"{path}: no such file (expected a {kind} table)")
     try:
-        return pyarrow.csv.read_csv(pa.BufferReader(path.read_bytes()))
+        table = pyarrow.csv.read_csv(pa.BufferReader(path.read_bytes()))
+        _ = table.column_names  # decoded here first: they may be no UTF-8
+        return table
     except UNREADABLE as error:
         raise InputError(f"{path}: not readable as CSV ({error})") from error
 

@@ -5,6 +5,7 @@ import json
 import os
 import platform
 import re
+import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -22,6 +23,7 @@ _VERSION = b"mapfusion.schema_version"
 _PREFIX = "mapfusion."
 # What Arrow raises on bytes that it cannot read, some of it from Python code that it calls.
 UNREADABLE = (pa.ArrowException, OSError, ValueError, MemoryError, OverflowError)
+PART = ".part"
 _WRITER = re.compile(rf"\.{re.escape(platform.node())}-(?P<pid>\d+)\.[^.]+\.part$")
 
 
@@ -32,8 +34,7 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     killed process left it behind; see `remove_abandoned`. An OSError names `path`.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    prefix = f".{path.name}.{platform.node()}-{os.getpid()}."
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=prefix, suffix=".part")
+    handle, name = tempfile.mkstemp(PART, temporary_prefix(path.name), path.parent)
     os.close(handle)
     temporary = Path(name)
     try:
@@ -47,6 +48,11 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
         raise OSError(error.errno or errno.EIO, reason, str(path)) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def temporary_prefix(name: str) -> str:
+    """How temporary files, or folders, of this process begin; they end in `.part`."""
+    return f".{name}.{platform.node()}-{os.getpid()}."
 
 
 def write_sealed(path: Path, data: bytes) -> None:
@@ -80,13 +86,17 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
 
 
 def remove_abandoned(folder: Path) -> None:
-    """Remove what `write_whole` left anywhere below a folder when its process was killed.
+    """Remove what processes that were killed left below a folder, named by `temporary_prefix`.
 
-    Files of other machines, and of processes that live, stay.
+    What is of other machines, and of processes that live, stays.
     """
-    for path in folder.rglob(".*.part"):
+    for path in list(folder.rglob(f".*{PART}")):
         writer = _WRITER.search(path.name)
-        if writer and not _lives(int(writer["pid"])):
+        if not writer or _lives(int(writer["pid"])):
+            continue
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
             path.unlink(missing_ok=True)
 
 

@@ -76,8 +76,7 @@ def run_scenario(
     folder = output or results / f"{scenario.name}-{scenario.seed}"
     for place in (run.store.root, folder, *(folder / name for name in _SUBFOLDERS)):
         require_writable(place)
-    for place in (folder, *(stage.path for stage in run.folders())):
-        remove_abandoned(place)
+    remove_abandoned(folder)
     if fresh:
         for stage_folder in run.folders():
             stage_folder.discard()
@@ -121,6 +120,7 @@ def measure_aligners(run: JudgedRun, robots: Sequence[EvaluatedRobot]) -> None:
     for pair in run.pipeline.pairs:
         path = run.store.path(pair.estimates) / "aligner_timings.parquet"
         if not path.is_file():
+            remove_abandoned(path.parent)
             rows = _time_pair(run.scenario, by_name[pair.a.name], by_name[pair.b.name])
             tables.write(path, "aligner_timings", rows)
 

@@ -33,6 +33,8 @@ from mapfusion.robot_log import (
 from mapfusion.se2 import Float, between, compose, rotation, wrap
 
 _LAST_ROBOT_SUBJECT = 5
+_LARGEST = 1e12  # any number: times since 1970 are 1e9 s
+_MOST_FRAMES = 1_000_000  # eleven days of one a second
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,7 @@ def import_mrclam(
     ]
     first_s = min(odometry[0, 0] for _, odometry, _, _ in recordings)
     last_s = max(odometry[-1, 0] for _, odometry, _, _ in recordings)
-    n_frames = int(np.ceil((last_s - first_s) / settings.frame_s)) + 1
+    n_frames = _n_frames(folder, last_s - first_s, settings.frame_s)
     clock_s = first_s + settings.frame_s * np.arange(n_frames)
     written = []
     for robot, odometry, sighted, truth in recordings:
@@ -203,6 +205,16 @@ def _truth_at(clock_s: Float, truth: Float, longest_gap_s: float) -> Float:
     return np.where(known[:, None], pose, np.nan)
 
 
+def _n_frames(folder: Path, duration_s: float, frame_s: float) -> int:
+    """How many frames the clock of all robots has."""
+    if not duration_s / frame_s < _MOST_FRAMES:
+        wrong = (
+            f"odometry over {duration_s:g} s is more than {_MOST_FRAMES} frames of {frame_s:g} s"
+        )
+        raise InputError(f"{folder}: {wrong}; are its times seconds?")
+    return int(np.ceil(duration_s / frame_s)) + 1
+
+
 def _robots(folder: Path) -> list[int]:
     found = [re.fullmatch(r"Robot(\d+)_Odometry\.dat", path.name) for path in folder.iterdir()]
     numbers = sorted(int(match[1]) for match in found if match)
@@ -287,6 +299,8 @@ def _table(path: Path, n_columns: int) -> tuple[Float, list[int]]:
             raise InputError(f"{path}, line {number}: not a number in {line.strip()!r}") from error
         if not all(map(isfinite, row)):
             raise InputError(f"{path}, line {number}: not a finite number in {line.strip()!r}")
+        if max(map(abs, row)) > _LARGEST:
+            raise InputError(f"{path}, line {number}: larger than {_LARGEST:g}: {line.strip()!r}")
         rows.append(row)
         lines.append(number)
     return np.array(rows).reshape(-1, n_columns), lines

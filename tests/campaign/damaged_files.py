@@ -1,15 +1,14 @@
-"""Files damaged in every way, and of every kind: `python -m tests.campaign.damaged_files`.
+"""Files damaged in every way, and of every kind.
 
 Half of them are sealed again after the damage, as if they had been written so, and meet the doors'
 own checks. Each must be read, or give one line that names its file or its folder.
 """
 
-import argparse
 import json
 import random
-import sys
-import tempfile
+import re
 import warnings
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,8 @@ import pyarrow.parquet as pq
 
 from mapfusion.errors import InputError, UnsealedWarning
 from mapfusion.sealed import LINE, NO_DIGEST, SEAL, parquet_with_seal, seal
-from tests.campaign.doors import Door, doors
+from tests.campaign.doors import Door, doors, doors_of_others
+from tests.campaign.parts import Found
 
 Random = random.Random
 
@@ -119,21 +119,33 @@ def _array(data: bytes, rng: Random) -> bytes:
     return seal(bytes(body) + LINE)
 
 
-SEALED = {".json": _json, ".parquet": _table, ".npy": _array}
+def _text(data: bytes, rng: Random) -> bytes:
+    """A file of text in which some words are others."""
+    words = re.split(rb"([ ,\n]+)", data)
+    for _ in range(rng.randint(1, 3)):
+        words[2 * rng.randrange(len(words) // 2)] = rng.choice(_WORDS)
+    return b"".join(words)
 
 
-def damage(folder: Path, seed: int, each: int) -> list[str]:
-    """What went wrong in `each` damages of every file, one line each."""
-    rng, found = Random(seed), list[str]()
-    for door in doors(folder):
+_WORDS = [*(b"", b"x", b"nan", b"inf", b"-1", b"0", b"1e300", b"-1e18", b"1e-320", b"\xff", b'"')]
+# Half of all damages: what was written so, seal and all.
+SEALED = {".json": _json, ".parquet": _table, ".npy": _array, ".csv": _text, ".dat": _text}
+
+
+def explore(seed: str, each: int, folder: Path) -> Found:
+    """Damage every file so many times."""
+    rng, counts, faults = Random(seed), Counter[str](), list[str]()
+    for door in doors(folder) + doors_of_others(folder):
         whole = door.path.read_bytes()
+        counts["kinds"] += 1
         for number in range(each):
             way = rng.choice(BYTES) if number % 2 else SEALED.get(door.path.suffix, _cut)
             door.path.write_bytes(way(whole, rng))
+            counts["damaged"] += 1
             if wrong := _wrong(door):
-                found.append(f"{door.path.name}, {way.__name__}, number {number}: {wrong}")
+                faults.append(f"{door.path.name}, {way.__name__}, number {number}: {wrong}")
         door.path.write_bytes(whole)
-    return found
+    return Found(counts, faults)
 
 
 def _wrong(door: Door) -> str:
@@ -147,19 +159,3 @@ def _wrong(door: Door) -> str:
     except Exception as error:
         return f"a traceback: {type(error).__name__} {error}"
     return ""
-
-
-def main() -> None:
-    """The command."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--each", type=int, default=67, help="damages of each kind of file")
-    asked = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        found = damage(Path(folder), asked.seed, asked.each)
-    sys.stdout.writelines(f"{line}\n" for line in [*found, f"{len(found)} wrong"])
-    sys.exit(1 if found else 0)
-
-
-if __name__ == "__main__":
-    main()

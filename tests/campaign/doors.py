@@ -16,6 +16,7 @@ from experiments.show.figures.result_tables import ResultTables
 from experiments.study.statistics.run_tables import find_runs
 from experiments.study.sweep.sweep_dataset import open_dataset
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map
+from mapfusion.recordings.mrclam import MrclamSettings, import_mrclam
 from mapfusion.robot_log import (
     Observations,
     RobotLog,
@@ -43,6 +44,39 @@ def doors(folder: Path) -> list[Door]:
     """Write all kinds of files into an empty folder."""
     rng = np.random.default_rng(0)
     return [*_logs(folder, rng), *_of_a_result(folder, rng), *_of_the_store(folder, rng)]
+
+
+def doors_of_others(folder: Path) -> list[Door]:
+    """Files as other programs write them, which carry no digest: a changed number goes unseen."""
+    plain, log, recording = folder / "plain.csv", folder / "csv", folder / "MRCLAM"
+    rng, n = np.random.default_rng(1), 12
+    place = pd.DataFrame(rng.normal(size=(n, 3)), columns=pd.Index(["x_m", "y_m", "z_m"]))
+    spread = place.assign(cov_xx_m2=0.1, cov_xy_m2=0.0, cov_xz_m2=0.0)
+    spread = spread.assign(cov_yy_m2=0.1, cov_yz_m2=0.0, cov_zz_m2=0.1)
+    spread.to_csv(plain, index=False)
+    log.mkdir()
+    frames = pd.DataFrame({"iteration": range(4), "time_s": np.arange(4.0)})
+    motion = {"odometry_x_m": 0.1, "odometry_y_m": 0.0, "odometry_theta_rad": 0.1}
+    frames.assign(**motion).to_csv(log / "frames.csv", index=False)
+    spread.assign(iteration=np.arange(n) // 3).to_csv(log / "observations.csv", index=False)
+    tables = {
+        "Barcodes": [(1, 5), (6, 72), (7, 27)],
+        "Landmark_Groundtruth": [(6, 1.5, 1.0, 1e-4, 1e-4), (7, 2.0, -0.8, 1e-4, 1e-4)],
+        "Robot1_Odometry": [(1000.0 + t, 0.2, 0.1) for t in range(6)],
+        "Robot1_Measurement": [(1001.0 + t, 72, 1.0 + t, 0.1) for t in range(4)],
+        "Robot1_Groundtruth": [(999.0 + t, 0.2 * t, 0.0, 0.1) for t in range(8)],
+    }
+    recording.mkdir()
+    for name, rows in tables.items():
+        text = "".join(" ".join(map(str, row)) + "\n" for row in rows)
+        (recording / f"{name}.dat").write_text(text)
+    settings = MrclamSettings()
+    imported = partial(import_mrclam, recording, folder / "imported", settings)
+    return [
+        Door(plain, partial(read_map, plain)),
+        *(Door(log / f"{name}.csv", partial(read_log, log)) for name in ("frames", "observations")),
+        *(Door(recording / f"{name}.dat", imported) for name in tables),
+    ]
 
 
 def _points(rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -114,6 +148,8 @@ def _of_the_store(folder: Path, rng: np.random.Generator) -> list[Door]:
 
 def same(before: Any, after: Any) -> bool:
     """Whether two answers of a door hold the same values, NaN equal to NaN."""
+    if type(before) is not type(after):
+        return False
     if isinstance(before, pd.DataFrame):
         return before.equals(after)
     if is_dataclass(before) and not isinstance(before, type):

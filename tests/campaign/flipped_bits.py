@@ -1,38 +1,45 @@
-"""Bits flipped in every kind of file: `python -m tests.campaign.flipped_bits --seed 0`.
+"""Bits flipped in every kind of file.
 
 Each flip must give the same values, or one line that names the file.
 """
 
-import argparse
 import random
-import sys
-import tempfile
 import warnings
+from collections import Counter
 from pathlib import Path
 
 from mapfusion.errors import InputError, UnsealedWarning
 from tests.campaign.doors import Door, doors, same
+from tests.campaign.parts import Found
 
-SHARE_IN_FOOTERS = 1 / 3
-FOOTER = 0.3  # of a file, at its end: where Parquet keeps names, types, places
+IN_FOOTERS = 3  # every third flip
+_TAIL = 8  # bytes at a Parquet file's end: the length of the footer, and the magic number
 
 
-def flips(folder: Path, seed: int, count: int) -> list[str]:
-    """What went wrong in `count` flips, one line each."""
-    rng, found = random.Random(seed), list[str]()
+def explore(seed: str, count: int, folder: Path) -> Found:
+    """Flip so many bits, one at a time."""
+    rng, counts, faults = random.Random(seed), Counter[str](), list[str]()
     known = [(door, door.read()) for door in doors(folder)]
-    for _ in range(count):
-        door, before = rng.choice(known)
+    tables = [each for each in known if each[0].path.suffix == ".parquet"]
+    for number in range(count):
+        footer = number % IN_FOOTERS == 0
+        door, before = rng.choice(tables if footer else known)
         data = door.path.read_bytes()
-        first = (1 - FOOTER) if rng.random() < SHARE_IN_FOOTERS else 0
-        at, bit = rng.randrange(int(first * len(data)), len(data)), rng.randrange(8)
+        first = _start_of_footer(data) if footer else 0
+        at, bit = rng.randrange(first, len(data)), rng.randrange(8)
         flipped = bytearray(data)
         flipped[at] ^= 1 << bit
         door.path.write_bytes(flipped)
+        counts.update(["flips", "in footers"] if footer else ["flips"])
         if wrong := _wrong(door, before):
-            found.append(f"{door.path.name}, bit {bit} of byte {at} of {len(data)}: {wrong}")
+            faults.append(f"{door.path.name}, bit {bit} of byte {at} of {len(data)}: {wrong}")
         door.path.write_bytes(data)
-    return found
+    return Found(counts, faults)
+
+
+def _start_of_footer(data: bytes) -> int:
+    """Where Parquet begins to tell names, types and places."""
+    return len(data) - _TAIL - int.from_bytes(data[-_TAIL:][:4], "little")
 
 
 def _wrong(door: Door, before: object) -> str:
@@ -46,19 +53,3 @@ def _wrong(door: Door, before: object) -> str:
     except Exception as error:
         return f"a traceback: {type(error).__name__} {error}"
     return "" if same(before, after) else "other values, without a word"
-
-
-def main() -> None:
-    """The command."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--count", type=int, default=2000)
-    asked = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        found = flips(Path(folder), asked.seed, asked.count)
-    sys.stdout.writelines(f"{line}\n" for line in [*found, f"{len(found)} of {asked.count} wrong"])
-    sys.exit(1 if found else 0)
-
-
-if __name__ == "__main__":
-    main()

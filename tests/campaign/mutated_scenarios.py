@@ -1,33 +1,30 @@
-"""A campaign of broken scenarios: each is refused in one short line, or is a scenario.
-
-    python -m tests.campaign.mutated_scenarios --seed 0 --count 10000 --runs 500
+"""Broken scenarios: each is refused in one short line, or is a scenario.
 
 Scenarios of the suite are mutated, as values and as text; what validates is run where it costs
-little (`small_enough`), and ends with a result or with one line as well. Prints what held and ends
-with 1 where something did not.
+little (`small_enough`), and ends with a result or with one line as well.
 """
 
-import argparse
 import copy
 import json
 import math
+import multiprocessing
 import os
 import random
 import resource
 import signal
-import subprocess
 import sys
-import tempfile
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from experiments.judge.expectations import load_checked
 from experiments.scenario.settings import AnyScenario, Simulation
 from experiments.scenario.yaml_input import read_mapping
+from experiments.show.figures import drawing
 from mapfusion.errors import MOST_CHARACTERS, InputError
-from tests.helpers.tiny_scenario import TINY
+from tests.campaign.parts import Found
+from tests.helpers.tiny_scenario import SHORT
 
 SUITE = Path(__file__).parents[2] / "scenarios"
 DRAWN = """
@@ -52,7 +49,7 @@ LINES = [
     *("!!set {a, b}", "!!binary x", "2001-01-01", "9" * 5000, "!!bool x", "!!null x", "| \n"),
     '"\\ud800"',
 ]
-CPU_SECONDS_A_RUN = 300  # a tiny run takes ten, the first of all a minute more for its kernels
+CPU_SECONDS_A_RUN = 300  # a tiny run takes three, the first of all a minute more for kernels
 
 
 def mutated(rng: random.Random, data: Any) -> Any:
@@ -157,65 +154,62 @@ def small_enough(scenario: AnyScenario) -> bool:
     )
 
 
-def run_fault(path: Path, results: Path) -> str:
-    """What is wrong with how a run ended, empty where nothing is."""
-    command = [sys.executable, "-m", "experiments.cli.main", "run", str(path), "--jobs", "1"]
-    ended = subprocess.run(
-        [*command, "--results", str(results)],
-        capture_output=True,
-        text=True,
-        env=os.environ | {"NUMBA_CACHE_DIR": ""},  # kernels are shared with the tests
-        preexec_fn=_cap,
-    )
-    if ended.returncode == -signal.SIGXCPU:
+def run_fault(path: Path, results: Path, figures: Sequence[str]) -> str:
+    """What is wrong with how a run ended that draws these figures, empty where nothing is."""
+    screen = results.with_suffix(".txt")
+    process = _FRESH.Process(target=_run, args=(path, results, figures, screen))
+    process.start()
+    process.join()
+    code, text = process.exitcode, screen.read_text(encoding="utf-8", errors="replace")
+    if code == -signal.SIGXCPU:
         return f"took more than {CPU_SECONDS_A_RUN} s"
-    said = [line for line in ended.stderr.splitlines() if line.startswith("mapfusion: ")]
-    if ended.returncode not in {0, 2} or "Traceback" in ended.stderr:
-        return f"ended with {ended.returncode}: {ended.stderr[-600:]}"
-    if ended.returncode == 2 and (len(said) != 1 or len(said[0]) > MOST_CHARACTERS + 20):
+    said = [line for line in text.splitlines() if line.startswith("mapfusion: ")]
+    if code not in {0, 2} or "Traceback" in text:
+        return f"ended with {code}: {text[-600:]}"
+    if code == 2 and (len(said) != 1 or len(said[0]) > MOST_CHARACTERS + 20):
         return f"complained in other than one line: {said}"
     return ""
 
 
-def _cap() -> None:
+# What takes longest in a tiny run is to import all and to draw all. So each run is in a process
+# of its own that has all imported, as nothing else has used it yet; and draws some figures, by lot.
+_FRESH = multiprocessing.get_context("forkserver")
+_FRESH.set_forkserver_preload(["tests.campaign.mutated_scenarios", "experiments.judge.result"])
+_FIGURES_A_RUN = 2
+
+
+def _run(path: Path, results: Path, figures: Sequence[str], screen: Path) -> None:
+    """The command, in a process of its own; what it says goes to a file."""
+    from experiments.cli import main
+
+    with screen.open("wb") as file:
+        for stream in (sys.stdout, sys.stderr):
+            os.dup2(file.fileno(), stream.fileno())
     resource.setrlimit(resource.RLIMIT_CPU, (CPU_SECONDS_A_RUN, CPU_SECONDS_A_RUN + 10))
+    drawing.FIGURES = tuple(figures)
+    sys.argv = ["mapfusion", "run", str(path), "--jobs", "1", "--results", str(results)]
+    main.main()
 
 
-def campaign(seed: int, count: int, runs: int, folder: Path) -> tuple[Counter[str], list[str]]:
-    """Counts of what became of the mutants, and the faults found; `folder` keeps their files."""
+def explore(seed: str, count: int, runs: int, folder: Path) -> Found:
+    """Mutate so often and run so many of those that pass; `folder` keeps the files at fault."""
     rng, seen, faults = random.Random(seed), Counter[str](), []
-    (folder / "tiny.yaml").write_text(TINY)
+    (folder / "short.yaml").write_text(SHORT)
     (folder / "drawn.yaml").write_text(DRAWN)
-    small = [read_mapping(folder / name) for name in ("tiny.yaml", "drawn.yaml")]
+    small = [read_mapping(folder / name) for name in ("short.yaml", "drawn.yaml")]
     whole = [read_mapping(path) for path in sorted(SUITE.glob("*.yaml"))]
     for i in range(count):
         path = folder / f"{seed}-{i}.yaml"
         original = rng.choice(whole if rng.random() < 0.3 else small)
         path.write_bytes(as_text(rng, mutated(rng, original)))
         fault, scenario = complaint(lambda path=path: load_checked(path))
-        seen["valid" if scenario else "refused"] += 1
+        seen.update(["mutants", "valid" if scenario else "refused"])
         if not fault and scenario and seen["run"] < runs and small_enough(scenario):
             seen["run"] += 1
-            fault = run_fault(path, folder / "results")
+            figures = rng.sample(drawing.FIGURES, _FIGURES_A_RUN)
+            fault = run_fault(path, folder / "results", figures)
         if fault:
             faults.append(f"{path}: {fault}")
         else:
             path.unlink()
-    return seen, faults
-
-
-def main() -> None:
-    """Run the campaign as asked on the command line."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    for name, default in (("seed", 0), ("count", 10_000), ("runs", 500)):
-        parser.add_argument(f"--{name}", type=int, default=default)
-    asked = parser.parse_args()
-    folder = Path(tempfile.mkdtemp(prefix="mutants-"))
-    seen, faults = campaign(asked.seed, asked.count, asked.runs, folder)
-    lines = [str(dict(seen)), f"{len(faults)} faults in {folder}", *faults]
-    sys.stdout.write("\n".join(lines) + "\n")
-    sys.exit(bool(faults))
-
-
-if __name__ == "__main__":
-    main()
+    return Found(seen, faults)

@@ -1,4 +1,4 @@
-"""A sample of the campaign of broken scenarios; `mutated_scenarios.py` has all of it."""
+"""A sample of the broken scenarios; `python -m tests.campaign` tries all."""
 
 import random
 from pathlib import Path
@@ -8,12 +8,12 @@ import pytest
 from experiments.judge.expectations import load_checked
 from experiments.scenario.settings import AnyScenario
 from mapfusion.errors import MOST_CHARACTERS, InputError
-from tests.campaign.mutated_scenarios import DRAWN, bomb, campaign, complaint
+from tests.campaign.mutated_scenarios import DRAWN, bomb, complaint, explore
 from tests.helpers.tiny_scenario import TINY
 
 
 def test_each_of_300_mutants_is_a_scenario_or_one_line(tmp_path: Path) -> None:
-    seen, faults = campaign(seed=7, count=300, runs=0, folder=tmp_path)
+    seen, faults = explore(seed="7", count=300, runs=0, folder=tmp_path)
     assert not faults
     assert min(seen["valid"], seen["refused"]) > 30  # both were tried
 

@@ -2,13 +2,12 @@
 
 from pathlib import Path
 
-from tests.campaign.damaged_files import damage
-from tests.campaign.flipped_bits import flips
+from tests.campaign import damaged_files, flipped_bits
 
 
 def test_flipped_bits(tmp_path: Path) -> None:
-    assert flips(tmp_path, 1, 300) == []
+    assert flipped_bits.explore("1", 300, tmp_path).faults == []
 
 
 def test_damaged_files(tmp_path: Path) -> None:
-    assert damage(tmp_path, 1, 20) == []
+    assert damaged_files.explore("1", 20, tmp_path).faults == []

@@ -130,9 +130,10 @@ def test_tables_that_are_wrong_as_a_whole(tmp_path, rng):
     pq.write_table(table, path)
     with pytest.raises(InputError, match="no UTF-8"):
         read_map(path)
-    (tmp_path / "m.csv").write_bytes(b"a,b\n1,2,3\n")
-    with pytest.raises(InputError, match="not readable as CSV"):
-        read_map(tmp_path / "m.csv")
+    for data in (b"a,b\n1,2,3\n", b"a,\xff\n1,2\n"):
+        (tmp_path / "m.csv").write_bytes(data)
+        with pytest.raises(InputError, match="not readable as CSV"):
+            read_map(tmp_path / "m.csv")
 
 
 def plain_log(folder: Path, rng, kind):

@@ -26,6 +26,7 @@ from experiments.study.sweep.combinations import SweepRun
 from experiments.study.sweep.sweep_dataset import ALIGNER_TIMINGS, open_dataset
 from experiments.study.sweep.sweep_plan import PlannedRun, Sweep, planned
 from mapfusion.errors import InputError
+from mapfusion.storage import PART, remove_abandoned, temporary_prefix
 
 # Tasks at Dask for each worker. Enough that none waits while this process plans the next run; few
 # enough that memory does not grow with the number of runs.
@@ -35,7 +36,7 @@ _COUNT_WORKERS_EVERY_S = 10.0
 # A worker may be killed for no fault of its task (a machine that goes away); four times in a row
 # while at the same task it is the task.
 RETRIES = 3
-_ATTEMPTS_PREFIX = ".attempts-"
+_ATTEMPTS = "attempts"
 _OLD_S = 24 * 3600  # in a sweep that runs, tasks begin and end in the meantime
 
 
@@ -208,14 +209,16 @@ def execute(
     """
     folder = sweep.dataset.folder
     open_dataset(folder, sweep.dataset.keys)
-    for left_behind in folder.glob(f"{_ATTEMPTS_PREFIX}*"):  # by a sweep that was killed
+    for left_behind in folder.glob(f".{_ATTEMPTS}.*"):  # by a sweep killed on any machine
         if time.time() - left_behind.stat().st_mtime > _OLD_S:  # else another one may be running
             shutil.rmtree(left_behind, ignore_errors=True)
-    own = tempfile.TemporaryDirectory(None, _ATTEMPTS_PREFIX, folder, ignore_cleanup_errors=True)
+    named = PART, temporary_prefix(_ATTEMPTS)
+    own = tempfile.TemporaryDirectory(*named, folder, ignore_cleanup_errors=True)
     with own as attempts, connected(jobs, scheduler) as client:
         terms = dask_worker.Terms(Path(attempts), RETRIES, dask_worker.code_version())
         driver = SweepDriver(client, sweep, terms, on_progress, None if scheduler else jobs)
         driver.execute()
+    remove_abandoned(folder)  # by earlier sweeps, and by workers of this one, that were killed
     return driver.progress
 
 

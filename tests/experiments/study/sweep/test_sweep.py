@@ -17,8 +17,8 @@ from experiments.judge import tables
 from experiments.study.sweep.sweep_dataset import RUN_TIMES
 from experiments.study.sweep.sweep_driver import execute
 from experiments.study.sweep.sweep_plan import planned, prepare
-from tests.helpers.killing import KilledSweep, same_files
-from tests.helpers.tiny_scenario import TINY, command
+from tests.helpers.killing import KilledCommand, same_files
+from tests.helpers.tiny_scenario import SHORT, command
 
 GRID = ("--set", "slam.filter.n_particles=5,10", "--set", "align.repetitions=1")
 
@@ -27,8 +27,7 @@ GRID = ("--set", "slam.filter.n_particles=5,10", "--set", "align.repetitions=1")
 def short_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The tiny scenario with fewer frames, and of two aligners one that draws nothing."""
     path = tmp_path_factory.mktemp("short") / "short.yaml"
-    text = TINY.replace("frames: 44", "frames: 12").replace("name: tiny", "name: short")
-    path.write_text(text.replace("    - {name: icp, method: icp}\n", ""), encoding="utf-8")
+    path.write_text(SHORT.replace("    - {name: icp, method: icp}\n", ""), encoding="utf-8")
     return path
 
 
@@ -184,8 +183,8 @@ def test_killed_sweeps_go_on_and_readers_always_find_whole_runs(
             _whole_runs(sweep)
         return _whole_runs(sweep)
 
-    arguments = (short_path, "--seeds", "1", *GRID)
-    with ThreadPoolExecutor(1) as pool, KilledSweep(arguments, tmp_path) as killed:
+    arguments = ("sweep", short_path, "--seeds", "1", *GRID)
+    with ThreadPoolExecutor(1) as pool, KilledCommand(arguments, tmp_path) as killed:
         reader = pool.submit(read)
         try:
             victims = killed.kill_at_random(random.Random(1), ["worker", "everything", "worker"])
@@ -195,6 +194,7 @@ def test_killed_sweeps_go_on_and_readers_always_find_whole_runs(
     assert (code, "Traceback" in complaints) == (0, False), complaints
     assert victims == ["worker", "everything", "worker"]
     assert len(same_files(sweep, swept, seed=1)) == 2 * 7
+    assert not list(tmp_path.rglob(".*"))  # what the killed ones had begun to write
     assert reader.result() == 2  # raises what any of its readings did
 
 
@@ -212,10 +212,10 @@ def _whole_runs(sweep: Path) -> int:
 
 def test_two_sweeps_at_once_on_one_store(swept: Path, short_path: Path, tmp_path: Path) -> None:
     """They do some work twice, and nothing wrong."""
-    arguments = (short_path, "--seeds", "1", *GRID)
+    arguments = ("sweep", short_path, "--seeds", "1", *GRID)
     with (
-        KilledSweep((*arguments, "-o", tmp_path / "one"), tmp_path, jobs=1) as one,
-        KilledSweep((*arguments, "-o", tmp_path / "two"), tmp_path, jobs=1) as two,
+        KilledCommand((*arguments, "-o", tmp_path / "one"), tmp_path, jobs=1) as one,
+        KilledCommand((*arguments, "-o", tmp_path / "two"), tmp_path, jobs=1) as two,
     ):
         for sweep in (one, two):
             sweep.let_go()
