@@ -3,7 +3,6 @@
 import functools
 import pickle
 import platform
-import signal
 import threading
 import traceback
 import warnings
@@ -66,11 +65,6 @@ def _prepare() -> None:
     from experiments.methods.threads import single_threaded
 
     single_threaded()
-
-
-def dask_setup(worker: object) -> None:
-    """Local workers preload this module: Ctrl-C is for the command alone, which then ends them."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def perform(name: str, task: bytes, terms: Terms, *needs: None) -> None:

@@ -13,7 +13,6 @@ from experiments.run.dask_worker import (
     Terms,
     UnfitWorkerError,
     code_version,
-    dask_setup,
     perform,
 )
 from experiments.run.tasks import Task
@@ -85,12 +84,3 @@ def test_machines_that_cannot_take_part_say_so(terms: Terms, tmp_path: Path) -> 
     outdated = Terms(terms.attempts, 2, "another version")
     with pytest.raises(UnfitWorkerError, match="other source or libraries"):
         perform("drive/k", packed(acting.break_down), outdated)
-
-
-def test_ctrl_c_is_for_the_command_alone() -> None:
-    before = signal.getsignal(signal.SIGINT)
-    try:
-        dask_setup(None)
-        assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
-    finally:
-        signal.signal(signal.SIGINT, before)
