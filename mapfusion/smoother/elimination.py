@@ -1,219 +1,162 @@
-"""The normal equations of all observations, with the landmarks eliminated exactly.
+"""The normal equations solved: either all landmarks are eliminated first, or all poses.
 
-An observation z of landmark l from pose x = (p, theta) has the residual e = R (R^T (l - p) - z),
-turned into the map frame, so that de/dl = I and de/dx = [-I, lever]. The lever arm of the rotation is
-the landmark's own position: with the observed point instead, whose error is also in z, rotations are
-biased. Setting de/dl's normal equations to zero leaves the Schur complement on the poses:
-
-    S = sum J' W J - H' A^-1 H,   A = sum W,   H = W J   (of one landmark, over its observations)
+Both are exact. With the landmarks gone a dense system of the poses is left, with the poses gone,
+which are a chain, one of the landmarks: the smaller of the two is taken. The first pose is the
+frame and no unknown.
 """
 
 from typing import NamedTuple
 
 import numpy as np
+import scipy.linalg
 from numba import njit
 
-from mapfusion.se2 import Float, rotation
+from mapfusion.se2 import Float
+from mapfusion.smoother.normal_equations import Estimate, NormalEquations
 from mapfusion.smoother.sightings import Sightings
-from mapfusion.symmetric import cofactors
+
+_BAND = 5  # below the diagonal of a chain of poses of three coordinates
 
 
-class Eliminated(NamedTuple):
-    """What brings the landmarks back once the poses are known.
+class Solution(NamedTuple):
+    """A step, and what the landmarks' joint covariance is: block diagonal plus common' common.
 
     Attributes:
-        covariance_m2: (L, 3, 3) A^-1, of each landmark if the poses were known.
-        towards_m: (L, 3) the landmarks' best step while the poses stay.
-        coupling: (N, 3, 3) J' W, pose against landmark, by observation.
+        step: of the poses, the first one's zero, and of the landmarks.
+        decrease: of the squared sigmas, twice what the step would gain if all were linear.
+        own_m2: (L, 3, 3) covariance of each landmark if all that is eliminated later were known.
+        factor: lower Cholesky factor of the information of what was eliminated last.
+        landmarks_first: whether these are the poses (else the landmarks).
     """
 
-    covariance_m2: Float
-    towards_m: Float
-    coupling: Float
+    step: Estimate
+    decrease: float
+    own_m2: Float
+    factor: Float
+    landmarks_first: bool
 
 
-def eliminate(
-    seen: Sightings, path: Float, point_m: Float, weight: Float, S: Float, g: Float
-) -> Eliminated:
-    """Add what the observations say of the poses to S (3T, 3T), lower half, and g (3T,).
+def solve(seen: Sightings, equations: NormalEquations) -> Solution:
+    """The step that solves the equations."""
+    landmarks_first = len(equations.pose_block) - 1 < len(equations.point_block)
+    return (_landmarks_first if landmarks_first else _poses_first)(seen, equations)
 
-    The step of the poses then solves S dx = -g.
 
-    Args:
-        seen: the observations.
-        path: (T, 3) poses at which is linearised.
-        point_m: (L, 3) landmarks likewise.
-        weight: (N,) factor on the information of each observation.
-        S: is added to.
-        g: is added to.
-    """
-    n_landmarks = len(seen.starts) - 1
-    made = Eliminated(
-        np.zeros((n_landmarks, 3, 3)), np.zeros((n_landmarks, 3)), np.empty((len(seen), 3, 3))
+def common_part(seen: Sightings, equations: NormalEquations, solution: Solution) -> Float:
+    """(R, 3L) Y: the landmarks' joint covariance is block diagonal of `own_m2` plus Y' Y."""
+    if not solution.landmarks_first:
+        n = len(solution.factor)
+        return scipy.linalg.solve_triangular(solution.factor, np.eye(n), lower=True)
+    n_poses, n_points = len(equations.pose_block), len(equations.point_block)
+    wide = np.zeros((n_poses, n_points, 3, 3))
+    np.add.at(
+        wide, (seen.frame, seen.landmark), equations.coupling @ solution.own_m2[seen.landmark]
     )
-    _eliminate(
-        (seen.starts, seen.frame, seen.position_m, seen.information),
-        path,
-        point_m,
-        weight,
-        S,
-        g,
-        made,
+    right = wide.transpose(0, 2, 1, 3).reshape(3 * n_poses, 3 * n_points)[3:]
+    return scipy.linalg.solve_triangular(solution.factor, right, lower=True, check_finite=False)
+
+
+def _landmarks_first(seen: Sightings, equations: NormalEquations) -> Solution:
+    n = len(equations.pose_block)
+    S = np.zeros((3 * n, 3 * n))
+    blocks, each = S.reshape(n, 3, n, 3), np.arange(n)
+    blocks[each, :, each, :] = equations.pose_block
+    blocks[each[1:], :, each[:-1], :] = equations.link
+    own = np.linalg.inv(_regular(seen, equations.point_block))
+    gradient = equations.pose_gradient.copy()
+    _subtract_landmarks(
+        seen.arrays[:2], equations.coupling, own, equations.point_gradient, S, gradient
     )
-    return made
+    factor = scipy.linalg.cholesky(S[3:, 3:], lower=True, check_finite=False)
+    way = np.zeros((n, 3))
+    way[1:] = -scipy.linalg.cho_solve((factor, True), gradient[1:].ravel()).reshape(-1, 3)
+    moved = seen.sum_by_landmark(np.einsum("nij,ni->nj", equations.coupling, way[seen.frame]))
+    points = -np.einsum("lij,lj->li", own, equations.point_gradient + moved)
+    return _solution(seen, equations, Estimate(way, points), own, factor, True)
 
 
 @njit(cache=True)
-def _eliminate(  # noqa: PLR0913
-    seen: tuple[np.ndarray, np.ndarray, Float, Float],
-    path: Float,
-    point_m: Float,
-    weight: Float,
+def _subtract_landmarks(
+    seen: tuple[np.ndarray, np.ndarray],
+    coupling: Float,
+    own: Float,
+    point_gradient: Float,
     S: Float,
-    g: Float,
-    made: Eliminated,
+    gradient: Float,
 ) -> None:
-    starts, frame, position, information = seen
+    """Coupling A^-1 coupling' of each landmark, between all frames that saw it; the lower half."""
+    starts, frame = seen
+    gain = np.empty((3, 3))
     for j in range(len(starts) - 1):
-        first, last = starts[j], starts[j + 1]
-        A, b = np.zeros((3, 3)), np.zeros(3)
-        for i in range(first, last):
-            k = 3 * frame[i]
-            pose = path[frame[i]]
-            W, e, J = _linearised(pose, point_m[j], position[i], information[i], weight[i])
-            H = made.coupling[i]
+        b = point_gradient[j]
+        for i in range(starts[j], starts[j + 1]):
+            row, H = 3 * frame[i], coupling[i]
             for r in range(3):
                 for q in range(3):
-                    A[r, q] += W[r, q]
-                    H[r, q] = J[0, r] * W[0, q] + J[1, r] * W[1, q] + J[2, r] * W[2, q]
-            for r in range(3):
-                b[r] += W[r, 0] * e[0] + W[r, 1] * e[1] + W[r, 2] * e[2]
-                g[k + r] += H[r, 0] * e[0] + H[r, 1] * e[1] + H[r, 2] * e[2]
-                for q in range(r + 1):
-                    S[k + r, k + q] += H[r, 0] * J[0, q] + H[r, 1] * J[1, q] + H[r, 2] * J[2, q]
-        inverse = made.covariance_m2[j]
-        _invert(A, inverse)
-        for r in range(3):
-            made.towards_m[j, r] = -(
-                inverse[r, 0] * b[0] + inverse[r, 1] * b[1] + inverse[r, 2] * b[2]
-            )
-        _subtract(frame[first:last], made.coupling[first:last], inverse, b, S, g)
+                    gain[r, q] = (
+                        H[r, 0] * own[j, 0, q] + H[r, 1] * own[j, 1, q] + H[r, 2] * own[j, 2, q]
+                    )
+                gradient[frame[i], r] -= gain[r, 0] * b[0] + gain[r, 1] * b[1] + gain[r, 2] * b[2]
+            for k in range(starts[j], i + 1):
+                column, G = 3 * frame[k], coupling[k]
+                for r in range(3):
+                    for q in range(3):
+                        S[row + r, column + q] -= (
+                            gain[r, 0] * G[q, 0] + gain[r, 1] * G[q, 1] + gain[r, 2] * G[q, 2]
+                        )
 
 
-@njit(cache=True)
-def _linearised(
-    pose: Float, point: Float, seen_at: Float, information: Float, weight: float
-) -> tuple[Float, Float, Float]:
-    """W, e and de/dx of one observation, in the map frame."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    W, e, J = np.empty((3, 3)), np.empty(3), np.zeros((3, 3))
+def _poses_first(seen: Sightings, equations: NormalEquations) -> Solution:
+    n_poses, n_points = len(equations.pose_block), len(equations.point_block)
+    wide = np.zeros((n_poses, n_points, 3, 3))
+    np.add.at(wide, (seen.frame, seen.landmark), equations.coupling)
+    B = wide.transpose(0, 2, 1, 3).reshape(3 * n_poses, 3 * n_points)[3:]
+    chain = scipy.linalg.cholesky_banded(_banded(equations)[:, 3:], lower=True, check_finite=False)
+    right = np.column_stack([B, equations.pose_gradient[1:].ravel()])
+    solved = scipy.linalg.cho_solve_banded((chain, True), right, check_finite=False)
+    K = -B.T @ solved[:, :-1]
+    each = np.arange(n_points)
+    blocks = K.reshape(n_points, 3, n_points, 3)
+    blocks[each, :, each, :] += _regular(seen, equations.point_block)
+    factor = scipy.linalg.cholesky(K, lower=True, check_finite=False)
+    right = equations.point_gradient.ravel() - B.T @ solved[:, -1]
+    points = -scipy.linalg.cho_solve((factor, True), right)
+    way = np.zeros((n_poses, 3))
+    way[1:] = -(solved[:, -1] + solved[:, :-1] @ points).reshape(-1, 3)
+    step = Estimate(way, points.reshape(-1, 3))
+    return _solution(seen, equations, step, np.zeros((n_points, 3, 3)), factor, False)
+
+
+def _banded(equations: NormalEquations) -> Float:
+    """The chain of the poses as LAPACK takes a band: row d holds the d-th diagonal below the main one."""
+    n = 3 * len(equations.pose_block)
+    band = np.zeros((_BAND + 1, n))
     for r in range(3):
         for q in range(3):
-            total = 0.0
-            for u in range(3):
-                for v in range(3):
-                    total += R[r, u] * information[u, v] * R[q, v]
-            W[r, q] = weight * total
-        e[r] = point[r] - R[r, 0] * seen_at[0] - R[r, 1] * seen_at[1] - R[r, 2] * seen_at[2]
-    e[0] -= pose[0]
-    e[1] -= pose[1]
-    J[0, 0] = J[1, 1] = -1.0
-    J[0, 2], J[1, 2] = point[1] - pose[1], pose[0] - point[0]
-    return W, e, J
+            if r >= q:
+                band[r - q, q::3] = equations.pose_block[:, r, q]
+            band[3 + r - q, q : n - 3 : 3] = equations.link[:, r, q]
+    return band
 
 
-@njit(cache=True)
-def _invert(A: Float, inverse: Float) -> None:
-    """The inverse of a symmetric A; of planar data, without information in z, that of its xy part."""
-    if A[2, 2] == 0.0:
-        determinant = A[0, 0] * A[1, 1] - A[0, 1] ** 2
-        inverse[0, 0], inverse[1, 1] = A[1, 1] / determinant, A[0, 0] / determinant
-        inverse[0, 1] = inverse[1, 0] = -A[0, 1] / determinant
-        return
-    xx, xy, xz, yy, yz, zz, determinant = cofactors(
-        A[0, 0], A[0, 1], A[0, 2], A[1, 1], A[1, 2], A[2, 2]
+def _regular(seen: Sightings, point_block: Float) -> Float:
+    """The landmarks' blocks; in planar data, which say nothing of z, it has a block of its own."""
+    if seen.n_dimensions == 3:
+        return point_block
+    regular = point_block.copy()
+    regular[:, 2, 2] = 1.0
+    return regular
+
+
+def _solution(
+    seen: Sightings,
+    equations: NormalEquations,
+    step: Estimate,
+    own_m2: Float,
+    factor: Float,
+    landmarks_first: bool,
+) -> Solution:
+    gained = np.sum(equations.pose_gradient * step.path) + np.sum(
+        equations.point_gradient * step.point_m
     )
-    inverse[0, 0], inverse[1, 1], inverse[2, 2] = (
-        xx / determinant,
-        yy / determinant,
-        zz / determinant,
-    )
-    inverse[0, 1] = inverse[1, 0] = xy / determinant
-    inverse[0, 2] = inverse[2, 0] = xz / determinant
-    inverse[1, 2] = inverse[2, 1] = yz / determinant
-
-
-@njit(cache=True)
-def _subtract(frame: np.ndarray, H: Float, inverse: Float, b: Float, S: Float, g: Float) -> None:
-    """H' A^-1 H between all frames of one landmark; they ascend, so the lower half is met."""
-    gain = np.empty((3, 3))
-    for i in range(len(frame)):
-        row = 3 * frame[i]
-        for r in range(3):
-            for q in range(3):
-                gain[r, q] = (
-                    H[i, r, 0] * inverse[0, q]
-                    + H[i, r, 1] * inverse[1, q]
-                    + H[i, r, 2] * inverse[2, q]
-                )
-            g[row + r] -= gain[r, 0] * b[0] + gain[r, 1] * b[1] + gain[r, 2] * b[2]
-        for k in range(i + 1):
-            column = 3 * frame[k]
-            for r in range(3):
-                for q in range(3):
-                    S[row + r, column + q] -= (
-                        gain[r, 0] * H[k, q, 0] + gain[r, 1] * H[k, q, 1] + gain[r, 2] * H[k, q, 2]
-                    )
-
-
-def landmark_steps(seen: Sightings, made: Eliminated, way: Float) -> Float:
-    """(L, 3) what a step of the poses (3T,) moves the landmarks by, their own step included."""
-    moved = np.einsum("nij,ni->nj", made.coupling, way.reshape(-1, 3)[seen.frame])
-    of_each = np.add.reduceat(moved, seen.starts[:-1]) if len(seen) else np.zeros((0, 3))
-    return made.towards_m - np.einsum("lij,lj->li", made.covariance_m2, of_each)
-
-
-def first_points(seen: Sightings, path: Float) -> Float:
-    """(L, 3) where the observations of each landmark lie in the mean, on this path."""
-    pose = path[seen.frame]
-    position = seen.position_m.copy()
-    turned = np.einsum("nij,nj->ni", rotation(pose[:, 2]), position[:, :2])
-    position[:, :2] = pose[:, :2] + turned
-    count = np.diff(seen.starts)[:, None]
-    return np.add.reduceat(position, seen.starts[:-1]) / count if len(seen) else np.zeros((0, 3))
-
-
-def squared_distances(
-    seen: Sightings, path: Float, point_m: Float, covariance_m2: Float | None = None
-) -> Float:
-    """(N,) squared Mahalanobis distances of the observations from where they should be.
-
-    With the landmarks' covariances (L, 3, 3) these are expected ones, as they are about the true
-    landmarks: those about landmarks that were fitted to the same observations are smaller.
-    """
-    if covariance_m2 is None:
-        covariance_m2 = np.zeros((len(point_m), 3, 3))
-    squares = np.empty(len(seen))
-    arrays = seen.starts, seen.frame, seen.position_m, seen.information
-    _squared_distances(arrays, path, point_m, covariance_m2, squares)
-    return squares
-
-
-@njit(cache=True)
-def _squared_distances(
-    seen: tuple[np.ndarray, np.ndarray, Float, Float],
-    path: Float,
-    point_m: Float,
-    covariance_m2: Float,
-    squares: Float,
-) -> None:
-    starts, frame, position, information = seen
-    for j in range(len(starts) - 1):
-        for i in range(starts[j], starts[j + 1]):
-            W, e, _ = _linearised(path[frame[i]], point_m[j], position[i], information[i], 1.0)
-            total = 0.0
-            for r in range(3):
-                for q in range(3):
-                    total += W[r, q] * (e[r] * e[q] + covariance_m2[j, r, q])
-            squares[i] = total
+    return Solution(step, -float(gained), own_m2, factor, landmarks_first)

@@ -32,6 +32,22 @@ class Sightings:
     def __len__(self) -> int:
         return len(self.frame)
 
+    @property
+    def arrays(self) -> tuple[np.ndarray, np.ndarray, Float, Float]:
+        """What kernels take."""
+        return self.starts, self.frame, self.position_m, self.information
+
+    @property
+    def landmark(self) -> np.ndarray:
+        """(N,) the landmark of each observation: 0, 1, ..."""
+        return np.repeat(np.arange(len(self.starts) - 1), np.diff(self.starts))
+
+    def sum_by_landmark(self, values: Float) -> Float:
+        """(L, ...) sums of values (N, ...) over the observations of each landmark."""
+        if not len(self):
+            return np.zeros((0, *values.shape[1:]))
+        return np.add.reduceat(values, self.starts[:-1])
+
 
 def sightings_of(log: RobotLog, landmark: np.ndarray, min_count: int) -> Sightings:
     """The observations of landmarks that were seen at least `min_count` times.

@@ -1,23 +1,22 @@
 """The most probable path and landmarks of a whole log: Gauss-Newton on the poses."""
 
 from dataclasses import dataclass, field
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import numpy as np
-import scipy.linalg
 
 from mapfusion.arguments import Range, require_in_range, require_shape
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.robot_log import RobotLog
 from mapfusion.se2 import Float, between, wrap
-from mapfusion.smoother.elimination import (
-    Eliminated,
-    eliminate,
-    first_points,
-    landmark_steps,
-    squared_distances,
+from mapfusion.smoother.elimination import common_part, solve
+from mapfusion.smoother.normal_equations import (
+    Estimate,
+    disturbances,
+    normal_equations,
+    odometry_information,
 )
-from mapfusion.smoother.odometry import add_odometry, disturbances, odometry_information
+from mapfusion.smoother.residuals import first_points, squared_distances
 from mapfusion.smoother.sightings import Sightings, sightings_of
 from mapfusion.smoother.student import MOST_DOF, fitted_dof, student_cost, student_weights
 
@@ -43,13 +42,6 @@ class SmootherParameters:
         require_in_range(self)
 
 
-class Estimate(NamedTuple):
-    """Path (T, 3) and landmarks (L, 3), in the frame of the first pose."""
-
-    path: Float
-    point_m: Float
-
-
 @dataclass(frozen=True)
 class Smoothed:
     """What a log says, all at once.
@@ -57,21 +49,28 @@ class Smoothed:
     Attributes:
         estimate: path and landmarks.
         seen: the observations that went into them.
-        factor: (3T - 3, 3T - 3) lower Cholesky factor of the poses' information; the first pose is
-            the frame, and known.
-        eliminated: the landmarks' part of the normal equations.
         weight: (N,) of each observation.
         dof: degrees of freedom of the observations' Student-t.
         n_steps: Gauss-Newton steps that were taken.
+        own_m2: (L, 3, 3), see `common`.
+        common: (R, 3L) the landmarks' joint covariance is block diagonal of `own_m2` plus
+            common' common.
     """
 
     estimate: Estimate
     seen: Sightings
-    factor: Float
-    eliminated: Eliminated
     weight: Float
     dof: float
     n_steps: int
+    own_m2: Float
+    common: Float
+
+    def joint_covariance(self) -> Float:
+        """(3L, 3L), dense: for small maps."""
+        joint, n = self.common.T @ self.common, len(self.own_m2)
+        each = np.arange(n)
+        joint.reshape(n, 3, n, 3)[each, :, each, :] += self.own_m2
+        return joint
 
 
 def smooth(
@@ -93,22 +92,18 @@ def smooth(
     information = odometry_information(log.odometry, parameters.motion)
     path = between(path[0], path)
     at = Estimate(path, first_points(seen, path))
-    weight, dof = np.ones(len(seen)), MOST_DOF
-    for n_steps in range(_MOST_STEPS + 1):
-        S, g = np.zeros((3 * len(path), 3 * len(path))), np.zeros(3 * len(path))
-        add_odometry(at.path, log.odometry, information, S, g)
-        eliminated = eliminate(seen, *at, weight, S, g)
-        factor = scipy.linalg.cholesky(S[3:, 3:], lower=True, check_finite=False)
-        way = np.zeros(len(g))
-        way[3:] = -scipy.linalg.cho_solve((factor, True), g[3:], check_finite=False)
-        step = Estimate(way.reshape(-1, 3), landmark_steps(seen, eliminated, way))
-        if n_steps == _MOST_STEPS or -float(way @ g) < _CONVERGED:
-            break
-        at = _stepped(seen, log.odometry, information, dof, at, step)
-        squares = squared_distances(seen, *at, eliminated.covariance_m2)
+    weight, dof, n_steps = np.ones(len(seen)), MOST_DOF, 0
+    while True:
+        equations = normal_equations(seen, at, weight, log.odometry, information)
+        solution = solve(seen, equations)
+        if n_steps == _MOST_STEPS or solution.decrease < _CONVERGED:
+            common = common_part(seen, equations, solution)
+            return Smoothed(at, seen, weight, dof, n_steps, solution.own_m2, common)
+        at = _stepped(seen, log.odometry, information, dof, at, solution.step)
+        squares = squared_distances(seen, at, solution.own_m2)
         dof = fitted_dof(squares, seen.n_dimensions)
         weight = student_weights(squares, dof, seen.n_dimensions)
-    return Smoothed(at, seen, factor, eliminated, weight, dof, n_steps)
+        n_steps += 1
 
 
 def _stepped(
@@ -122,9 +117,8 @@ def _stepped(
     """The step, or as much of it as lowers the cost: half, a quarter, ..."""
 
     def cost(of: Estimate) -> float:
-        squares = squared_distances(seen, *of)
         walked = float(np.sum(information * disturbances(of.path, odometry) ** 2))
-        return walked + student_cost(squares, dof, seen.n_dimensions)
+        return walked + student_cost(squared_distances(seen, of), dof, seen.n_dimensions)
 
     before, share = cost(at), 1.0
     for _ in range(_MOST_HALVINGS):
