@@ -128,7 +128,7 @@ def _poses_first(seen: Sightings, equations: NormalEquations) -> Solution:
 
 
 def _banded(equations: NormalEquations) -> Float:
-    """The chain of the poses as LAPACK takes a band: row d holds the d-th diagonal below the main one."""
+    """The chain of the poses as LAPACK takes a band: row d is the d-th diagonal below the main."""
     n = 3 * len(equations.pose_block)
     band = np.zeros((_BAND + 1, n))
     for r in range(3):

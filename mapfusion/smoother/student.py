@@ -13,7 +13,7 @@ from scipy.special import gammaln
 from mapfusion.se2 import Float
 
 # Below, the variance of a Student-t is infinite; above, nobody can tell it from a Gaussian.
-LEAST_DOF, MOST_DOF = 2.1, 1e4
+LEAST_DOF, MOST_DOF = 0.5, 1e4
 
 
 def student_weights(squares: Float, dof: float, n_dimensions: int) -> Float:
