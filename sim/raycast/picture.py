@@ -3,6 +3,7 @@
 import numpy as np
 from numba import njit
 
+from mapfusion.se2 import Float
 from sim.raycast.levels import (
     BACKGROUND,
     fill,
@@ -12,13 +13,28 @@ from sim.raycast.levels import (
     texel,
 )
 from sim.raycast.plan import NONE, Pinhole, nearest, project, strips
+from sim.raycast.robots import cast, draw
 from sim.raycast.scene import Level, Walls
+from sim.raycast.solids import Solids
 from sim.raycast.wall_columns import add_strip, cuts
 
 
 @njit(cache=True)
-def filtered(camera: Pinhole, walls: Walls, floor: Level, ceiling: Level) -> np.ndarray:
-    """Grey levels (H, W) float32, each the mean over the pixel's footprint."""
+def filtered(
+    camera: Pinhole, walls: Walls, floor: Level, ceiling: Level, solids: Solids, poses: Float,
+    grey: Float,
+) -> np.ndarray:  # fmt: skip
+    """Grey levels (H, W) uint8, each the mean over the pixel's footprint.
+
+    Args:
+        camera: level.
+        walls: as they stand.
+        floor: below.
+        ceiling: above.
+        solids: of one robot.
+        poses: (R, 3) of the robots in the world.
+        grey: (S,) the solids' grey levels.
+    """
     seen = project(camera, walls)
     face, until, count = strips(camera, seen)
     below, above = footprints(camera, floor), footprints(camera, ceiling)
@@ -40,12 +56,33 @@ def filtered(camera: Pinhole, walls: Walls, floor: Level, ceiling: Level) -> np.
         fill(camera, floor, below, j, total, covered)
         for v in range(camera.height_px):
             picture[v, j] = total[v] + (1 - covered[v]) * BACKGROUND
-    return picture
+    draw(camera, seen, face, until, count, solids, poses, grey, picture)
+    return _rounded(picture)
 
 
 @njit(cache=True)
-def depths(camera: Pinhole, walls: Walls, floor: Level, ceiling: Level) -> np.ndarray:
+def _rounded(picture: np.ndarray) -> np.ndarray:
+    whole = np.empty(picture.shape, dtype=np.uint8)
+    for v in range(picture.shape[0]):
+        for j in range(picture.shape[1]):
+            whole[v, j] = np.uint8(min(max(picture[v, j], 0.0), 255.0) + 0.5)
+    return whole
+
+
+@njit(cache=True)
+def depths(
+    camera: Pinhole, walls: Walls, floor: Level, ceiling: Level, solids: Solids, poses: Float
+) -> np.ndarray:
     """Depth (H, W) float32 along the optical axis behind the pixels' middles; NaN for nothing."""
+    depth_m = _still_depths(camera, walls, floor, ceiling)
+    nothing = np.zeros((0, 0), dtype=np.float32)
+    cast(camera, solids, poses, np.zeros(0), depth_m, nothing)
+    return depth_m
+
+
+@njit(cache=True)
+def _still_depths(camera: Pinhole, walls: Walls, floor: Level, ceiling: Level) -> np.ndarray:
+    """Depth (H, W) of what stands still."""
     seen = project(camera, walls)
     face = nearest(seen, np.arange(camera.width_px) + 0.0)
     wall_m = np.full(camera.width_px, np.inf, dtype=np.float32)
@@ -70,8 +107,19 @@ def depths(camera: Pinhole, walls: Walls, floor: Level, ceiling: Level) -> np.nd
 
 
 @njit(cache=True)
-def sampled(camera: Pinhole, walls: Walls, floor: Level, ceiling: Level) -> np.ndarray:
-    """Grey levels (H, W) float32 of the texels that the pixels' middles hit."""
+def sampled(
+    camera: Pinhole, walls: Walls, floor: Level, ceiling: Level, solids: Solids, poses: Float,
+    grey: Float,
+) -> np.ndarray:  # fmt: skip
+    """Grey levels (H, W) uint8 of what the pixels' middles hit; arguments as of `filtered`."""
+    picture = _still_texels(camera, walls, floor, ceiling)
+    cast(camera, solids, poses, grey, _still_depths(camera, walls, floor, ceiling), picture)
+    return _rounded(picture)
+
+
+@njit(cache=True)
+def _still_texels(camera: Pinhole, walls: Walls, floor: Level, ceiling: Level) -> np.ndarray:
+    """Texels (H, W) float32 of what stands still."""
     seen = project(camera, walls)
     face = nearest(seen, np.arange(camera.width_px) + 0.0)
     picture = np.empty((camera.height_px, camera.width_px), dtype=np.float32)
