@@ -2,7 +2,7 @@
 
 A row of a level camera's picture shows a level plane at one depth, Z = h f / |v - c|. A footprint
 is Z / f wide and Z^2 / (h f) deep, so far off it is long and narrow and turned against the picture's
-texels: it is filled with as many bilinear samples as it is long, from the copy whose texels are as
+texels: it is filled with bilinear samples all along it, from the copy whose texels are as
 large as it is wide (Heckbert 1989, section 3; McCormack et al. 1999, Feline).
 """
 
@@ -15,6 +15,7 @@ from sim.raycast.scene import Level
 
 BACKGROUND = 255.0  # grey level of what is nowhere, as PyBullet has it
 MOST_SAMPLES = 64  # along a footprint
+STEP_TEXELS = 2.0  # between samples; floors are painted with a low pass of one texel
 COVERED = 1 - 1e-9
 
 
@@ -40,7 +41,7 @@ def footprints(camera: Pinhole, level: Level) -> np.ndarray:
         across, along, k = z / camera.focal_px * per_m, abs(outer - inner) * per_m, 0
         while across > 2 and k < len(level.first) - 1:
             across, along, k = across / 2, along / 2, k + 1
-        plan[i, 0] = min(max(np.ceil(along), 1), MOST_SAMPLES)
+        plan[i, 0] = min(max(np.ceil(along / STEP_TEXELS), 1), MOST_SAMPLES)
         plan[i, 1] = 1 if across <= 1 else 2
         plan[i, 2] = k
     return plan
@@ -89,26 +90,40 @@ def fill(
         grey, sign = 0.0, 0.0 if across == 1 else -1.0
         for _ in range(across):
             r, u = right_z + sign * right_aside, up_z + sign * up_aside
+            x_0, x_z = right_0 * width - 0.5, r * width
+            y_0, y_z = up_0 * height - 0.5, u * height
             for s in range(n):
                 z = rise / (v - 0.5 + (s + 0.5) / n - camera.center_v)
-                right, up = right_0 + r * z, up_0 + u * z
-                if not (0 <= right < 1 and 0 <= up < 1):
-                    grey += BACKGROUND
-                    continue
-                # bilinear; a half texel beyond the outermost middles the outermost texel stays
-                x = min(max(right * width - 0.5, 0.0), width - 1.0)
-                y = min(max(up * height - 0.5, 0.0), height - 1.0)
-                column, row = int(x), int(y)
-                a, b = x - column, y - row
-                here = first + row * width + column
-                aside = 1 if column + 1 < width else 0
-                above = here + width if row + 1 < height else here
-                low = texels[here] + a * (texels[here + aside] - texels[here])
-                high = texels[above] + a * (texels[above + aside] - texels[above])
-                grey += low + b * (high - low)
+                x, y = x_0 + x_z * z, y_0 + y_z * z
+                if 0 <= x < width - 1 and 0 <= y < height - 1:
+                    column, row = int(x), int(y)
+                    a, b = x - column, y - row
+                    here = first + row * width + column
+                    low = texels[here] + a * (texels[here + 1] - texels[here])
+                    here += width
+                    high = texels[here] + a * (texels[here + 1] - texels[here])
+                    grey += low + b * (high - low)
+                else:
+                    grey += _at_the_edge(level, k, x, y)
             sign = 1.0
         total[v] += (1 - covered[v]) * grey / (n * across)
         covered[v] = 1.0
+
+
+@njit(cache=True)
+def _at_the_edge(level: Level, k: int, x: float, y: float) -> float:
+    """A sample within half a texel of the picture's edge, or beside it, where there is nothing."""
+    height, width = level.shape[k]
+    if not (-0.5 <= x < width - 0.5 and -0.5 <= y < height - 0.5):
+        return BACKGROUND
+    x, y = min(max(x, 0.0), width - 1.0), min(max(y, 0.0), height - 1.0)
+    column, row = int(x), int(y)
+    here = level.first[k] + row * width + column
+    aside = 1 if column + 1 < width else 0
+    above = here + width if row + 1 < height else here
+    low = level.texels[here] + (x - column) * (level.texels[here + aside] - level.texels[here])
+    high = level.texels[above] + (x - column) * (level.texels[above + aside] - level.texels[above])
+    return low + (y - row) * (high - low)
 
 
 @njit(cache=True)

@@ -151,4 +151,4 @@ def _wall_texel(walls: Walls, i: int, right: int, up: int) -> float:
     here = walls.first[i] + right * n + up
     there = here + n
     sums = walls.sums
-    return np.uint32(sums[there + 1] - sums[there] - sums[here + 1] + sums[here])
+    return np.int32(sums[there + 1] - sums[there] - sums[here + 1] + sums[here])

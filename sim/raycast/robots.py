@@ -88,25 +88,72 @@ def cast(
 
     Both `depth_m` and `picture` (H, W) are changed; a picture of no size is left alone.
     """
-    f = camera.focal_px
     for r in range(len(poses)):
         eye, axes = in_robot(camera, poses[r])
         for i in range(len(solids.n_corners)):
             corners = project_corners(camera, solids, i, poses[r])
             top, bottom, left, right = window(camera, corners)
-            nearest_m = corners[:, 2].min()
+            if top > bottom or left > right:
+                continue
+            outline = hull(corners[:, :2]) if corners[:, 2].min() > camera.near_m else corners[:0]
+            nearness = np.empty(right - left + 1)
             for v in range(top, bottom + 1):
+                _nearness(camera, solids, i, eye, axes, outline, v, left, nearness)
                 for u in range(left, right + 1):
-                    if depth_m[v, u] <= nearest_m:
-                        continue
-                    y, z = (camera.center_u - u) / f, (camera.center_v - v) / f
-                    ray = axes[0] + y * axes[1] + z * axes[2]
-                    hit_m = depth_of(solids, i, eye, ray, camera.near_m)
+                    w = nearness[u - left]
                     # nothing at all is NaN, which nothing compares with
-                    if hit_m < np.inf and not hit_m >= depth_m[v, u]:
-                        depth_m[v, u] = hit_m
+                    if w > 0 and not w * depth_m[v, u] <= 1:
+                        depth_m[v, u] = 1 / w
                         if picture.size:
                             picture[v, u] = grey[i]
+
+
+@njit(cache=True)
+def _nearness(
+    camera: Pinhole, solids: Solids, i: int, eye: Float, axes: Float, outline: Float,
+    v: int, left: int, nearness: Float,
+) -> None:  # fmt: skip
+    """Inverse depth of a solid behind the pixels of a row from `left` on; 0 where it is not.
+
+    `outline` is that of its picture; none where it reaches the lens. Inverse depth is linear in the
+    picture on each of its planes, and its surface is the farthest of those that face the eye.
+    """
+    f, up = camera.focal_px, (camera.center_v - v) / camera.focal_px
+    nearness[:] = 0.0
+    if len(outline) == 0:
+        for u in range(len(nearness)):
+            ray = axes[0] + (camera.center_u - u - left) / f * axes[1] + up * axes[2]
+            nearness[u] = 1 / depth_of(solids, i, eye, ray, camera.near_m)
+        return
+    begin, end = _between(outline, float(v))
+    begin = max(np.ceil(begin) - left, 0.0)
+    end = min(np.floor(end) - left, len(nearness) - 1.0)
+    if begin > end:
+        return
+    inside = nearness[int(begin) : int(end) + 1]
+    inside[:] = np.inf
+    for k in range(solids.n_planes[i]):
+        n = solids.planes[i, k]
+        outside = n[0] * eye[0] + n[1] * eye[1] + n[2] * eye[2] - n[3]
+        if outside <= 0:
+            continue
+        ahead = -(n[0] * axes[0, 0] + n[1] * axes[0, 1] + n[2] * up) / outside
+        aside = -(n[0] * axes[1, 0] + n[1] * axes[1, 1]) / outside
+        at_left = ahead + aside * (camera.center_u - left - begin) / f
+        for u in range(len(inside)):
+            inside[u] = min(inside[u], at_left - aside / f * u)
+
+
+@njit(cache=True)
+def _between(outline: Float, v: float) -> tuple[float, float]:
+    """Where a convex outline (K, 2) begins and ends in row v; infinities where it does not."""
+    begin, end = np.inf, -np.inf
+    for k in range(len(outline)):
+        p, q = outline[k], outline[(k + 1) % len(outline)]
+        if min(p[1], q[1]) <= v <= max(p[1], q[1]) and p[1] != q[1]:
+            u = p[0] + (v - p[1]) / (q[1] - p[1]) * (q[0] - p[0])
+            begin, end = min(begin, u), max(end, u)
+    return begin, end
 
 
 @njit(cache=True)

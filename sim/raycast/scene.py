@@ -26,7 +26,7 @@ class Walls(NamedTuple):
         height_m: of all of them.
         size: (F, 2) int64 texels along and up.
         first: (F,) int64, where a face's table begins in `sums`.
-        sums: uint32, one after the other the faces' tables (texels along + 1, texels up + 1): sums
+        sums: int32, one after the other the faces' tables (texels along + 1, texels up + 1): sums
             of all texels left of and below a texel's corner, modulo 2^32.
     """
 
@@ -145,11 +145,11 @@ def _walls(
 
 
 def _sums(grey: np.ndarray) -> np.ndarray:
-    """Summed-area table (W + 1, H + 1) uint32 of a picture (Crow 1984), columns contiguous."""
+    """Summed-area table (W + 1, H + 1) int32 of a picture (Crow 1984), columns contiguous."""
     table = np.zeros((grey.shape[1] + 1, grey.shape[0] + 1), dtype=np.uint32)
     np.cumsum(grey.T, axis=0, dtype=np.uint32, out=table[1:, 1:])
     np.cumsum(table[1:, 1:], axis=1, dtype=np.uint32, out=table[1:, 1:])
-    return table
+    return table.view(np.int32)
 
 
 def _nowhere(height_m: float) -> Level:

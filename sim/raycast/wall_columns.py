@@ -66,19 +66,59 @@ def add_strip(
     last = min(int(np.floor(bottom + 0.5)), camera.height_px - 1)
     a_row = texels_up / (walls.height_m * camera.focal_px * w)  # texels
     at_center = camera.eye_z_m / walls.height_m * texels_up
-    lowest = max(int(at_center - (last + 0.5 - camera.center_v) * a_row) - 1, 0)
-    highest = min(int(at_center - (first - 0.5 - camera.center_v) * a_row) + 2, texels_up)
+    highest_q = at_center - (first - 0.5 - camera.center_v) * a_row
+    lowest_q = at_center - (last + 0.5 - camera.center_v) * a_row
+    lowest, highest = max(int(lowest_q) - 1, 0), min(int(highest_q) + 2, texels_up)
     _column_of_sums(walls, i, begin, end, lowest, highest, column)
-    width, pixel = high - low, end - begin
+    scale = (high - low) / (end - begin)
+    if a_row >= 1:
+        _add_means(column, texels_up, highest_q, a_row, scale, total[first : last + 1])
+    else:
+        share = total[first : last + 1]
+        _add_between(column, texels_up, highest_q, a_row, scale, top, bottom, first, share)
     for v in range(first, last + 1):
-        share = width * (min(v + 0.5, bottom) - max(v - 0.5, top))
-        middle = at_center - (v - camera.center_v) * a_row
-        below, above = _at_least_a_texel(middle - a_row / 2, middle + a_row / 2, texels_up)
-        k, m = int(below), int(above)
-        sum_below = column[k] + (below - k) * (column[min(k + 1, texels_up)] - column[k])
-        sum_above = column[m] + (above - m) * (column[min(m + 1, texels_up)] - column[m])
-        total[v] += share * (sum_above - sum_below) / ((above - below) * pixel)
-        covered[v] += share
+        covered[v] += high - low
+    covered[first] -= (high - low) * max(top - (first - 0.5), 0.0)
+    covered[last] -= (high - low) * max(last + 0.5 - bottom, 0.0)
+
+
+@njit(cache=True)
+def _add_means(sums: Float, n: int, q: float, a_row: float, scale: float, total: Float) -> None:
+    """Add means over footprints of `a_row` >= 1 texels each, the first one's upper end at `q`.
+
+    What sticks out over the wall's n texels adds nothing: it is the share that is not covered.
+    """
+    above = _until(sums, n, q)
+    scale /= a_row
+    for v in range(len(total)):
+        q -= a_row
+        below = _until(sums, n, q)
+        total[v] += scale * (above - below)
+        above = below
+
+
+@njit(cache=True)
+def _add_between(
+    sums: Float, n: int, q: float, a_row: float, scale: float, top: float, bottom: float,
+    first: int, total: Float,
+) -> None:  # fmt: skip
+    """Add linear interpolations between texels at footprints' middles, times their shares."""
+    for v in range(len(total)):
+        share = min(first + v + 0.5, bottom) - max(first + v - 0.5, top)
+        x = min(max(q - a_row * (v + 0.5) - 0.5, 0.0), n - 1.0)
+        k = int(x)
+        lower, upper = k + 1, min(k + 2, n)
+        texel = sums[lower] - sums[k]
+        next_texel = sums[upper] - sums[lower] if upper > lower else texel
+        total[v] += scale * share * (texel + (x - k) * (next_texel - texel))
+
+
+@njit(cache=True)
+def _until(sums: Float, n: int, q: float) -> float:
+    """The sum of all texels below a place between 0 and n."""
+    q = min(max(q, 0.0), n - 1e-9)
+    k = int(q)
+    return sums[k] + (q - k) * (sums[k + 1] - sums[k])
 
 
 @njit(cache=True)
@@ -95,15 +135,16 @@ def _column_of_sums(
     walls: Walls, i: int, begin: float, end: float, lowest: int, highest: int, column: Float
 ) -> None:
     """Sums of all texels between two places along face i, below each row of texels."""
-    texels_along, texels_up = walls.size[i]
-    n = texels_up + 1
+    texels_along, n = walls.size[i, 0], walls.size[i, 1] + 1
     k, m = min(int(begin), texels_along - 1), min(int(end), texels_along - 1)
     a, b = begin - k, end - m
-    sums = walls.sums
-    left, right = walls.first[i] + k * n, walls.first[i] + m * n
-    for r in range(lowest, highest + 1):
+    left, right = walls.first[i] + k * n + lowest, walls.first[i] + m * n + lowest
+    count = highest + 1 - lowest
+    low, after_low = walls.sums[left:][:count], walls.sums[left + n :][:count]
+    high, after_high = walls.sums[right:][:count], walls.sums[right + n :][:count]
+    sums = column[lowest : highest + 1]
+    for r in range(count):
         # differences are exact, though the sums may have run over
-        between = np.uint32(sums[right + r] - sums[left + r])
-        more = np.uint32(sums[right + n + r] - sums[right + r])
-        less = np.uint32(sums[left + n + r] - sums[left + r])
-        column[r] = between + b * more - a * less
+        between = np.int32(high[r] - low[r])
+        more, less = np.int32(after_high[r] - high[r]), np.int32(after_low[r] - low[r])
+        sums[r] = between + b * more - a * less
