@@ -19,7 +19,7 @@ from mapfusion.se2 import Float
 from mapfusion.sealed import LINE, read_sealed
 from mapfusion.storage import write_sealed
 from sim.floorplan import Face, FloorPlan
-from sim.renderer import Renderer, egl_driver, load_egl
+from sim.renderer import BulletRenderer, egl_driver, load_egl
 from sim.textures import AS_PAINTED, Texture, paint, paint_posters
 
 GRAVITY_M_S2 = 9.81
@@ -77,7 +77,7 @@ class World:
         client: id to pass as `physicsClientId`.
     """
 
-    def __init__(self, renderer: Renderer = "tiny") -> None:
+    def __init__(self, renderer: BulletRenderer = "tiny") -> None:
         if renderer == "egl":
             egl_driver()  # raises where there is none
         self.renderer = renderer

@@ -15,7 +15,7 @@ from sim.raycast.picture import depths, filtered, sampled
 from sim.raycast.plan import Pinhole
 from sim.raycast.scene import REFUSED, Scene, read_scene
 from sim.raycast.solids import read_solids
-from sim.stereo_head import NEAR_M
+from sim.stereo_head import NEAR_M, RadiometricNoise, StereoFrame
 
 Sampling = Literal["footprint", "middle"]
 
@@ -45,6 +45,21 @@ class RayCaster:
         self._solids = read_solids(URDF)
         rgb = self._solids.rgb.astype(np.uint8)[None]
         self._grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)[0].astype(np.float64)
+
+    def stereo(
+        self,
+        T_world_robot: ArrayLike,
+        others: ArrayLike,
+        noise: RadiometricNoise,
+        rng: np.random.Generator,
+        colour: bool = False,
+    ) -> StereoFrame:
+        """Both images and the left one's depth for a robot at a pose (3,), others at (R, 3)."""
+        half_m = self._camera.baseline_m / 2
+        left, right = (self.grey(T_world_robot, y_m, others) for y_m in (half_m, -half_m))
+        depth_m = self.depth_m(T_world_robot, half_m, others)
+        rgb = self.rgb(T_world_robot, half_m, others) if colour else None
+        return StereoFrame(noise.apply(left, rng), noise.apply(right, rng), depth_m, rgb)
 
     def grey(self, T_world_robot: ArrayLike, y_m: float, others: ArrayLike) -> np.ndarray:
         """The grey picture (H, W) uint8 of a camera beside a robot's middle.

@@ -70,7 +70,7 @@ class Scene:
     Attributes:
         walls: all faces of walls.
         floor: below.
-        ceiling: above; under the open sky one that is nowhere.
+        ceiling: above; where there is none, one that is nowhere.
     """
 
     walls: Walls
@@ -89,22 +89,33 @@ def read_scene(folder: Path, channel: int | None = None) -> Scene:
         InputError: it holds what the ray caster cannot draw.
         DamagedFileError: a file is missing or damaged.
     """
-    corners_m = read_corners(folder / CORNERS)
+
+    def picture(i: int) -> np.ndarray:
+        return _read_picture(face_files(folder, i)[1], channel)
+
+    return make_scene(read_corners(folder / CORNERS), picture)
+
+
+def make_scene(corners_m: Float, picture: Callable[[int], np.ndarray]) -> Scene:
+    """The world of faces with corners (F, 4, 3), see `sim.floorplan.Face`.
+
+    Args:
+        corners_m: of all faces.
+        picture: of a face: (H, W) uint8, its first row along the lower edge.
+
+    Raises:
+        InputError: it holds what the ray caster cannot draw.
+    """
     heights = corners_m[:, :, 2]
     is_wall = np.ptp(heights, axis=1) > 0
     if not is_wall.any():
         raise InputError(REFUSED.format(what="a world without walls"))
     top_m = float(heights[is_wall].max())
     _require_drawable(corners_m, is_wall, top_m)
-
-    def picture(i: int) -> np.ndarray:
-        return _read_picture(face_files(folder, i)[1], channel)
-
     walls = _walls(corners_m, np.flatnonzero(is_wall), top_m, picture)
     levels = {float(heights[i, 0]): _level(corners_m[i], picture(i)) for i in _others(is_wall)}
-    if 0.0 not in levels:
-        raise DamagedFileError(folder / CORNERS, "holds no floor")
-    return Scene(walls, levels[0.0], levels.get(top_m, _nowhere(top_m)))
+    floor = levels.get(0.0, _nowhere(0.0))
+    return Scene(walls, floor, levels.get(top_m, _nowhere(top_m)))
 
 
 def _others(is_wall: np.ndarray) -> list[int]:
@@ -136,20 +147,22 @@ def _walls(
 ) -> Walls:
     start, end = corners_m[faces, 0, :2], corners_m[faces, 1, :2]
     width_m = np.linalg.norm(end - start, axis=1)
-    tables = [_sums(picture(int(i))) for i in faces]
-    size = np.array([table.shape for table in tables]) - 1
-    first = np.concatenate([[0], np.cumsum([table.size for table in tables])[:-1]])
-    sums = np.concatenate([table.ravel() for table in tables])
+    pictures = [picture(int(i)) for i in faces]
+    size = np.array([grey.shape[::-1] for grey in pictures])
+    ends = np.cumsum(np.prod(size + 1, axis=1))
+    first = np.concatenate([[0], ends[:-1]])
+    sums = np.zeros(ends[-1], dtype=np.int32)
+    for grey, begin, end in zip(pictures, first, ends, strict=True):
+        table = sums[begin:end].reshape(grey.shape[1] + 1, grey.shape[0] + 1)
+        table[1:, 1:] = _sums(grey)
     along = (end - start) / width_m[:, None]
     return Walls(start.copy(), along, width_m, top_m, size, first, sums)
 
 
 def _sums(grey: np.ndarray) -> np.ndarray:
-    """Summed-area table (W + 1, H + 1) int32 of a picture (Crow 1984), columns contiguous."""
-    table = np.zeros((grey.shape[1] + 1, grey.shape[0] + 1), dtype=np.uint32)
-    np.cumsum(grey.T, axis=0, dtype=np.uint32, out=table[1:, 1:])
-    np.cumsum(table[1:, 1:], axis=1, dtype=np.uint32, out=table[1:, 1:])
-    return table.view(np.int32)
+    """Summed-area table (W, H) int32 of a picture (H, W), by columns (Crow 1984)."""
+    along = np.cumsum(grey.T, axis=0, dtype=np.int32)
+    return np.cumsum(along, axis=1, dtype=np.int32, out=along)
 
 
 def _nowhere(height_m: float) -> Level:
@@ -161,7 +174,7 @@ def _nowhere(height_m: float) -> Level:
 def _level(corners_m: Float, grey: np.ndarray) -> Level:
     corner, right, _, up = corners_m[:, :2]
     right, up = right - corner, up - corner
-    copies = [grey.astype(np.float32)]
+    copies: list[np.ndarray] = [grey.astype(np.float32)]
     while min(copies[-1].shape) > 1:
         height, width = copies[-1].shape
         # of odd sizes too each texel is the mean of what it covers
@@ -173,7 +186,7 @@ def _level(corners_m: Float, grey: np.ndarray) -> Level:
         corner.copy(),
         right / (right @ right),
         up / (up @ up),
-        np.array([np.linalg.norm(right), np.linalg.norm(up)]),
+        np.array([np.linalg.norm(right), np.linalg.norm(up)], dtype=np.float64),
         np.array([copy.shape for copy in copies]),
         first,
         np.concatenate([copy.ravel() for copy in copies]),

@@ -51,4 +51,4 @@ def test_an_unknown_renderer_lists_the_known(
     tiny_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     reply = command(capsys, "run", tiny_path, "--set", "render.renderer=vulkan")
-    assert_refused(reply, "render.renderer", "'tiny' or 'egl'", "'vulkan'")
+    assert_refused(reply, "render.renderer", "'tiny', 'egl' or 'raycast'", "'vulkan'")
