@@ -1,7 +1,7 @@
 """Floor and ceiling: what a pixel's footprint on them shows on average.
 
 A row of a level camera's picture shows a level plane at one depth, Z = h f / |v - c|. A footprint
-is Z / f wide and Z^2 / (h f) deep, so far off it is long and narrow and turned against the picture's
+is Z / f wide and Z^2 / (h f) deep: far off it is long and narrow, turned against the picture's
 texels: it is filled with bilinear samples all along it, from the copy whose texels are as
 large as it is wide (Heckbert 1989, section 3; McCormack et al. 1999, Feline).
 """
@@ -123,7 +123,7 @@ def _at_the_edge(level: Level, k: int, x: float, y: float) -> float:
     above = here + width if row + 1 < height else here
     low = level.texels[here] + (x - column) * (level.texels[here + aside] - level.texels[here])
     high = level.texels[above] + (x - column) * (level.texels[above + aside] - level.texels[above])
-    return low + (y - row) * (high - low)
+    return float(low + (y - row) * (high - low))
 
 
 @njit(cache=True)
@@ -132,4 +132,4 @@ def texel(level: Level, right: float, up: float) -> float:
     if not (0 <= right < 1 and 0 <= up < 1):
         return BACKGROUND
     height, width = level.shape[0]
-    return level.texels[int(up * height) * width + int(right * width)]
+    return float(level.texels[int(up * height) * width + int(right * width)])

@@ -84,7 +84,7 @@ def depths(
 def _still_depths(camera: Pinhole, walls: Walls, floor: Level, ceiling: Level) -> np.ndarray:
     """Depth (H, W) of what stands still."""
     seen = project(camera, walls)
-    face = nearest(seen, np.arange(camera.width_px) + 0.0)
+    face = nearest(seen, np.arange(camera.width_px).astype(np.float64))
     wall_m = np.full(camera.width_px, np.inf, dtype=np.float32)
     for j in range(camera.width_px):
         if face[j] != NONE:
@@ -121,7 +121,7 @@ def sampled(
 def _still_texels(camera: Pinhole, walls: Walls, floor: Level, ceiling: Level) -> np.ndarray:
     """Texels (H, W) float32 of what stands still."""
     seen = project(camera, walls)
-    face = nearest(seen, np.arange(camera.width_px) + 0.0)
+    face = nearest(seen, np.arange(camera.width_px).astype(np.float64))
     picture = np.empty((camera.height_px, camera.width_px), dtype=np.float32)
     for j in range(camera.width_px):
         i, wall_m, right = face[j], np.inf, 0
@@ -151,4 +151,4 @@ def _wall_texel(walls: Walls, i: int, right: int, up: int) -> float:
     here = walls.first[i] + right * n + up
     there = here + n
     sums = walls.sums
-    return np.int32(sums[there + 1] - sums[there] - sums[here + 1] + sums[here])
+    return float(np.int32(sums[there + 1] - sums[there] - sums[here + 1] + sums[here]))

@@ -49,10 +49,10 @@ class Pinhole(NamedTuple):
 
 @njit(cache=True)
 def project(camera: Pinhole, walls: Walls) -> Float:
-    """Faces (F, 7) in the picture: from and to u, w = w0 + w1 u, t Z^-1 w^-1 = t0 + t1 u - t2 w.
+    """Faces (F, 7) in the picture: from u, to u, w0, w1, t0, t1, t2: w = w0 + w1 u.
 
-    t is the place along the face in metres: t = (t0 + t1 u) / w - t2. A face that is not seen, being
-    behind or turned away, has from > to.
+    t is the place along the face in metres: t = (t0 + t1 u) / w - t2. A face that is not seen,
+    being behind or turned away, has from > to.
     """
     cos, sin = np.cos(camera.theta), np.sin(camera.theta)
     seen = np.empty((len(walls.width_m), 7))
@@ -113,7 +113,7 @@ def strips(camera: Pinhole, seen: Float) -> tuple[np.ndarray, Float, np.ndarray]
         there are (W,); column j begins at u = j - 1/2. Where no wall is the face is NONE.
     """
     width = camera.width_px
-    edges = np.arange(width + 1) - 0.5
+    edges = np.arange(width + 1).astype(np.float64) - 0.5
     at_edge = nearest(seen, edges)
     face = np.empty((width, MOST_STRIPS), dtype=np.int64)
     until = np.empty((width, MOST_STRIPS))

@@ -135,7 +135,7 @@ def _rotation(rpy: ArrayLike) -> Float:
 def front_to_back(solids: Solids, eye_m: Float) -> np.ndarray:
     """An order (S,) in which none hides one before it, seen from a point (3,) of their frame.
 
-    The boxes around them do not overlap, so between any two lies a plane along two of the axes; what
+    The boxes around them do not overlap, so between any two lies a plane along two axes; what
     is on the eye's side of it cannot be hidden by the other.
     """
     n = len(solids.n_corners)
