@@ -13,6 +13,8 @@ from mapfusion.se2 import Float
 @njit(cache=True)
 def hull(points: Float) -> Float:
     """Corners (K, 2) of the convex hull of points (N, 2), in one sense (Andrew 1979)."""
+    # upright edges share u: those are in order of v
+    points = points[np.argsort(points[:, 1], kind="mergesort")]
     points = points[np.argsort(points[:, 0], kind="mergesort")]
     n = len(points)
     chain, k = np.empty((2 * n + 1, 2)), 0

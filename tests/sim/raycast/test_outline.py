@@ -28,3 +28,9 @@ def test_an_outline_beside_the_picture_covers_nothing() -> None:
     polygon = clip(np.array([[20.0, 1], [24, 1], [22, 5]]), np.zeros(2), np.array([8.0, 8.0]))
     assert coverage(polygon, 8, 8).sum() == 0
     assert len(polygon) == 0
+
+
+def test_corners_above_each_other_stay() -> None:
+    """A box seen face on: three and more corners share a column."""
+    box = np.array([[0, 1], [0, 0], [0, 3], [0, 2], [4, 2], [4, 3], [4, 0], [4, 1.0]])
+    assert coverage(hull(box), 4, 5).sum() == pytest.approx(12)
