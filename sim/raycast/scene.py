@@ -152,8 +152,8 @@ def _walls(
     ends = np.cumsum(np.prod(size + 1, axis=1))
     first = np.concatenate([[0], ends[:-1]])
     sums = np.zeros(ends[-1], dtype=np.int32)
-    for grey, begin, end in zip(pictures, first, ends, strict=True):
-        table = sums[begin:end].reshape(grey.shape[1] + 1, grey.shape[0] + 1)
+    for grey, begin, stop in zip(pictures, first, ends, strict=True):
+        table = sums[begin:stop].reshape(grey.shape[1] + 1, grey.shape[0] + 1)
         table[1:, 1:] = _sums(grey)
     along = (end - start) / width_m[:, None]
     return Walls(start.copy(), along, width_m, top_m, size, first, sums)
