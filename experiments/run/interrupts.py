@@ -8,11 +8,12 @@ from contextlib import contextmanager
 
 @contextmanager
 def held_back_interrupts() -> Iterator[Callable[[], None]]:
-    """Until the end of a `with` block, or until what it gives is called, Ctrl-C waits.
+    """Until the end of a `with` block, or until what it gives is called, this thread blocks Ctrl-C.
 
     A terminal sends it to the command and to all its processes. Those that are started meanwhile,
-    and by threads that are started meanwhile, never see it: not even while they still import, too
-    early to say so themselves.
+    and by threads that are started meanwhile, inherit the block and never see it: not even while
+    they still import, too early to say so themselves. The command itself may be interrupted all the
+    same, through another of its threads.
     """
     if threading.current_thread() is not threading.main_thread():
         yield lambda: None  # only the main thread is interrupted
