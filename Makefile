@@ -21,8 +21,8 @@ $(STAMP): requirements.lock pyproject.toml
 demo: $(STAMP)
 	$(BIN)/mapfusion run scenarios/quick.yaml
 
-# Two tests at a time, a file's tests one after another: they share what they need. Files that take
-# long come first, as they stand.
+# Two tests at a time, a file's tests one after another: they share what they need. Kernels come first
+# (`tests/conftest.py`), all others as they stand.
 test: $(STAMP)
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 

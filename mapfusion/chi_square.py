@@ -7,8 +7,7 @@ def chi_square_bound(probability: float, degrees_of_freedom: float) -> float:
     Its distribution function is P(k / 2, x / 2), the regularised incomplete gamma function, whose
     inverse comes without scipy.stats: that alone takes half a second to import, in every worker.
     """
-    from scipy.special import (
-        gammaincinv,
-    )  # here, so that a process without gates does not pay for it
+    # Here, so that a process without gates does not pay for it.
+    from scipy.special import gammaincinv
 
     return 2.0 * float(gammaincinv(degrees_of_freedom / 2, probability))
