@@ -23,14 +23,14 @@ def percent(share: float) -> str:
 def two_digits(value: float) -> str:
     """A figure with about two significant digits; its unit stands in the heading."""
     if not math.isfinite(value):
-        return UNKNOWN
+        return UNKNOWN if math.isnan(value) else str(value)
     digits = 0 if value >= 100 else max(0, min(5, 1 - math.floor(math.log10(abs(value) or 1))))
     return f"{value:.{digits}f}"
 
 
 def with_unit(unit: str, value: float) -> str:
-    """Two digits and the unit; what is not known has none."""
-    return f"{two_digits(value)}{_SPACE}{unit}" if math.isfinite(value) else UNKNOWN
+    """Two digits and the unit; what is not known or infinite has none."""
+    return f"{two_digits(value)}{_SPACE}{unit}" if math.isfinite(value) else two_digits(value)
 
 
 metres, radians, milliseconds = (partial(with_unit, unit) for unit in ("m", "rad", "ms"))
@@ -38,7 +38,9 @@ metres, radians, milliseconds = (partial(with_unit, unit) for unit in ("m", "rad
 
 def ratio(value: float) -> str:
     """How many times larger."""
-    return UNKNOWN if not math.isfinite(value) else f"{value:.2f}" if value < 10 else f"{value:.0f}"
+    if math.isnan(value):
+        return UNKNOWN
+    return f"{value:.2f}" if value < 10 else f"{value:.0f}"
 
 
 def number(value: float, layout: str) -> str:

@@ -9,7 +9,14 @@ from experiments.show.numbers import listed, metres, percent, ratio, two_digits
 
 @pytest.mark.parametrize(
     ("share", "text"),
-    [(1, "100 %"), (0.9999, "> 99 %"), (0.001, "< 1 %"), (0, "0 %"), (0.5, "50 %")],
+    [
+        (1, "100 %"),
+        (0.9999, "> 99 %"),
+        (0.995, "> 99 %"),
+        (0.001, "< 1 %"),
+        (0, "0 %"),
+        (0.5, "50 %"),
+    ],
 )
 def test_percentages_claim_nothing_that_is_not_so(share: float, text: str) -> None:
     assert percent(share).replace("\u00a0", " ") == text
@@ -24,7 +31,8 @@ def test_figures_have_two_significant_digits(value: float, text: str) -> None:
 
 
 def test_what_is_not_known_is_a_dash_without_a_unit() -> None:
-    assert {percent(math.nan), metres(math.inf), ratio(math.nan)} == {"–"}
+    assert {percent(math.nan), metres(math.nan), ratio(math.nan)} == {"–"}
+    assert {metres(math.inf), ratio(math.inf), two_digits(math.inf)} == {"inf"}
 
 
 def test_names_are_listed_as_in_a_sentence() -> None:
