@@ -7,7 +7,8 @@ STAMP := $(VENV)/.installed
 # Where this is set, each of the many processes that tests and runs start would compile our source anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: browser-test clean-kernels lock demo test endurance lint check bench paper install clean
+.PHONY: wheel-test browser-test clean-kernels lock demo test campaign seeded-faults lint check bench paper \
+    install clean
 
 install: $(STAMP)
 
@@ -26,9 +27,18 @@ demo: $(STAMP)
 test: $(STAMP)
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
-# Ten random kills of a sweep; minutes.
-endurance: $(STAMP)
-	$(BIN)/python -m pytest tests/experiments/study/sweep/ten_kills.py -s
+# Thousands of broken inputs, and kills; up to an hour. ONLY=PART for one part.
+SEED ?= 0
+campaign: $(STAMP)
+	$(BIN)/python -m tests.campaign --seed $(SEED) $(if $(ONLY),--only $(ONLY))
+
+# The wheel in a fresh environment, which takes minutes to install.
+wheel-test: $(STAMP)
+	$(BIN)/python -m pytest tests/installed_wheel.py -s
+
+# One fault of the source at a time: does a test notice? Hours; `--only NAME` for some.
+seeded-faults: $(STAMP)
+	$(BIN)/python -m tests.seeded_faults
 
 # Installs Debian's chromium where it is missing (needs root for that).
 browser-test: $(STAMP)
@@ -41,7 +51,7 @@ lint: $(STAMP)
 	$(BIN)/lint-imports
 
 check: $(STAMP)
-	$(BIN)/mapfusion check scenarios/quick.yaml --seeds 0
+	$(BIN)/mapfusion check scenarios/quick.yaml --seeds 0 --junit results/junit.xml
 
 bench: $(STAMP)
 	$(BIN)/python -m pytest tests/benchmarks --benchmark-only --benchmark-columns=min,median,max,rounds

@@ -5,27 +5,39 @@ left pixel is (0, 0). A point at depth Z has disparity d = u_left - u_right = f 
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mapfusion.arguments import Range, require_in_range
 from mapfusion.se2 import Float
+
+MAX_IMAGE_SIDE_PX = 4096  # the software renderer takes seconds and 100 MB a frame at this size
 
 
 @dataclass(frozen=True)
 class StereoCamera:
     """Intrinsics and mount; the defaults are the STH-MDCS2 head (640x480, 1/2" sensor, 6 mm lens).
 
-    `mount_x_m` and `mount_z_m` give the middle between the two optical centres in the robot frame
-    (on the floor below the middle of the axles); the left camera is half a baseline to the left.
+    Attributes:
+        width_px: of either image.
+        height_px: of either image.
+        focal_px: focal length.
+        baseline_m: between the two optical centres; the left one is half of it to the left.
+        mount_x_m: of the middle between the optical centres, ahead of the middle of the axles.
+        mount_z_m: of the same, above the floor.
     """
 
-    width_px: int = 640
-    height_px: int = 480
-    focal_px: float = 577.0
-    baseline_m: float = 0.09
-    mount_x_m: float = 0.15
-    mount_z_m: float = 0.45
+    width_px: Annotated[int, Range(1, MAX_IMAGE_SIDE_PX, "px")] = 640
+    height_px: Annotated[int, Range(1, MAX_IMAGE_SIDE_PX, "px")] = 480
+    focal_px: Annotated[float, Range(1, 100_000, "px")] = 577.0
+    baseline_m: Annotated[float, Range(1e-3, 10, "m")] = 0.09
+    mount_x_m: Annotated[float, Range(-10, 10, "m")] = 0.15
+    mount_z_m: Annotated[float, Range(0.01, 10, "m")] = 0.45
+
+    def __post_init__(self) -> None:
+        require_in_range(self)
 
     @property
     def center_px(self) -> tuple[float, float]:

@@ -10,8 +10,14 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from mapfusion.arguments import require_finite, require_shape
+from mapfusion.arguments import (
+    require_finite,
+    require_no_twins,
+    require_points,
+    require_shape,
+)
 from mapfusion.errors import InputError
+from mapfusion.open_tables import read_open_table, told
 from mapfusion.robot_log import (
     DESCRIPTOR_LENGTH,
     LOOK_FIELDS,
@@ -25,7 +31,6 @@ from mapfusion.storage import (
     point_columns,
     point_fields,
     points_from,
-    read_table,
     schema,
     write_table,
 )
@@ -34,9 +39,13 @@ LANDMARKS = schema(
     "landmark_map",
     1,
     [
-        *point_fields(),  # in the map's frame
-        pa.field("count", pa.int32()),  # observations that went into the landmark
-        pa.field("source_observation", pa.int64()),  # row of the log; -1 in a fused map
+        *(told(field, "in the map's frame") for field in point_fields()),
+        told(pa.field("count", pa.int32()), "observations that went into the landmark", 1),
+        told(
+            pa.field("source_observation", pa.int64()),
+            "row of the log that it came from, -1 for none",
+            -1,
+        ),
         *LOOK_FIELDS,
     ],
 )
@@ -103,17 +112,21 @@ def write_map(path: Path, landmarks: LandmarkMap) -> None:
 
 def read_map(path: Path) -> LandmarkMap:
     """Read a map; raises InputError that names the file."""
-    table, attributes = read_table(path, LANDMARKS)
+    table, attributes = read_open_table(path, LANDMARKS)
     position, covariance = points_from(table)
+    planar = attributes.get("planar") == "true"
     try:
-        return LandmarkMap(
+        found = LandmarkMap(
             position,
             covariance,
             column(table, "count"),
             column(table, "source_observation"),
             *looks_from(table),
-            attributes.get("planar") == "true",
+            planar,
             attributes.get("name", path.stem),
         )
+        require_points(position, covariance, planar)
+        require_no_twins("landmarks", position, covariance.reshape(-1, 9))
+        return found
     except ValueError as error:
         raise InputError(f"{path}: {error}") from error

@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 
 from mapfusion.align.correspondences import Correspondences, HeightGate
 from mapfusion.align.result import Alignment
 from mapfusion.aligned_landmarks import AlignedLandmarks
-from mapfusion.arguments import require_above, require_between, require_shape
+from mapfusion.arguments import Probability, Range, require_in_range, require_shape
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.same_point import SamePoint, one_to_one
 from mapfusion.se2 import IDENTITY, Float
@@ -32,15 +33,14 @@ class MergeParameters:
             per-landmark covariances cannot say.
     """
 
-    max_descriptor_distance: float = 0.3
-    gate_probability: float = 0.99
+    max_descriptor_distance: Annotated[float, Range(1e-3, 2, "1")] = 0.3
+    gate_probability: Probability = 0.99
     height: HeightGate = field(default_factory=HeightGate)
     use_drift: bool = True
     use_alignment_uncertainty: bool = False
 
     def __post_init__(self) -> None:
-        require_above(0, self, "max_descriptor_distance")
-        require_between(0, 1, self, "gate_probability")
+        require_in_range(self)
 
 
 @dataclass(frozen=True)

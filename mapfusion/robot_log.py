@@ -14,8 +14,15 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 import pyarrow as pa
 
-from mapfusion.arguments import require_finite, require_shape
+from mapfusion.arguments import (
+    LARGEST_POSITION_M,
+    require_finite,
+    require_no_twins,
+    require_points,
+    require_shape,
+)
 from mapfusion.errors import InputError
+from mapfusion.open_tables import read_open_table, table_path, told
 from mapfusion.se2 import Float
 from mapfusion.storage import (
     POSE_FIELDS,
@@ -27,7 +34,6 @@ from mapfusion.storage import (
     point_columns,
     point_fields,
     points_from,
-    read_table,
     schema,
     write_table,
 )
@@ -37,12 +43,17 @@ if TYPE_CHECKING:
 
 DESCRIPTOR_LENGTH = 64
 NO_LABEL = -1
+TRUTH_FILES = ("truth_poses.parquet", "truth_points.parquet")
 Arrays = TypeVar("Arrays", bound="DataclassInstance")
 LOOK_FIELDS = [
-    pa.field("label", pa.int32()),  # known identity, -1 for none
-    pa.field("descriptor", pa.list_(pa.float32(), DESCRIPTOR_LENGTH)),  # NaN for none
+    told(pa.field("label", pa.int32()), "known identity of the landmark, -1 for none", NO_LABEL),
+    told(
+        pa.field("descriptor", pa.list_(pa.float32(), DESCRIPTOR_LENGTH)),
+        "what it looks like (U-SURF or another), NaN for none",
+        np.nan,
+    ),
 ]
-# motion since the row before, in the robot frame of the row before
+_ITERATION = told(pa.field("iteration", pa.int32()), "number of the frame: 0, 1, 2, ...")
 _ODOMETRY_FIELDS = ["odometry_x_m", "odometry_y_m", "odometry_theta_rad"]
 _PIXEL_FIELDS = ["u_px", "v_px", "disparity_px"]  # left image; NaN where there are no images
 
@@ -50,17 +61,24 @@ FRAMES = schema(
     "robot_log.frames",
     1,
     [
-        pa.field("iteration", pa.int32()),
-        *float_fields(["time_s", *_ODOMETRY_FIELDS]),
+        _ITERATION,
+        told(pa.field("time_s", pa.float64()), "when, increasing"),
+        *(
+            told(field, "motion since the row before, in the robot frame of that row")
+            for field in float_fields(_ODOMETRY_FIELDS)
+        ),
     ],
 )
 OBSERVATIONS = schema(
     "robot_log.observations",
     1,
     [
-        pa.field("iteration", pa.int32()),
-        *point_fields(),  # in the robot frame
-        *(pa.field(name, pa.float32()) for name in _PIXEL_FIELDS),
+        told(_ITERATION, "frame of the sighting; rows are ordered by it"),
+        *(told(field, "of the sighting, in the robot frame") for field in point_fields()),
+        *(
+            told(pa.field(name, pa.float32()), "in the left image, NaN without images", np.nan)
+            for name in _PIXEL_FIELDS
+        ),
         *LOOK_FIELDS,
     ],
 )
@@ -68,12 +86,18 @@ TRUTH_POSES = schema(
     "robot_log.truth_poses",
     1,
     [
-        pa.field("iteration", pa.int32()),
-        *float_fields(POSE_FIELDS),  # T_world_robot; NaN where unknown
+        _ITERATION,
+        *(told(field, "T_world_robot, NaN where unknown") for field in float_fields(POSE_FIELDS)),
     ],
 )
-# row i is the point of the world that observation i shows; NaN where unknown
-TRUTH_POINTS = schema("robot_log.truth_points", 1, float_fields(POSITION_FIELDS))
+TRUTH_POINTS = schema(
+    "robot_log.truth_points",
+    1,
+    [
+        told(field, "point of the world that the observation of this row shows, NaN where unknown")
+        for field in float_fields(POSITION_FIELDS)
+    ],
+)
 
 
 def with_rows(value: Arrays, rows: slice | np.ndarray) -> Arrays:
@@ -204,8 +228,13 @@ def write_observations(folder: Path, iteration: np.ndarray, observations: Observ
 
 def read_observations(folder: Path) -> tuple[np.ndarray, Observations]:
     """Iterations (N,) and observations of a log's folder; raises InputError."""
-    path = folder / "observations.parquet"
-    table, _ = read_table(path, OBSERVATIONS)
+    return _observations(folder)[:2]
+
+
+def _observations(folder: Path) -> tuple[np.ndarray, Observations, bool]:
+    """The same, and whether the file itself says that they are planar."""
+    path = table_path(folder, "observations")
+    table, attributes = read_open_table(path, OBSERVATIONS)
     position, covariance = points_from(table)
     uvd = columns(table, _PIXEL_FIELDS)
     try:
@@ -214,7 +243,7 @@ def read_observations(folder: Path) -> tuple[np.ndarray, Observations]:
         )
     except ValueError as error:
         raise InputError(f"{path}: {error}") from error
-    return column(table, "iteration"), observations
+    return column(table, "iteration"), observations, attributes.get("planar") == "true"
 
 
 def write_frames(folder: Path, robot: str, planar: bool, time_s: Float, odometry: Float) -> None:
@@ -239,22 +268,39 @@ def write_log(folder: Path, log: RobotLog) -> None:
 
 def read_log(folder: Path) -> RobotLog:
     """Read a log; raises InputError that names the file."""
-    path = folder / "frames.parquet"
+    path = table_path(folder, "frames")
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder (expected a robot log with frames.parquet)")
-    frames, attributes = read_table(path, FRAMES)
-    iteration, observations = read_observations(folder)
+    frames, attributes = read_open_table(path, FRAMES)
+    _require_numbered(path, frames)
+    iteration, observations, planar = _observations(folder)
+    seen = table_path(folder, "observations")
+    if "robot" in attributes:
+        planar = attributes.get("planar") == "true"
+    name, looks = attributes.get("robot", folder.resolve().name), observations.label
+    odometry, time_s = columns(frames, _ODOMETRY_FIELDS), column(frames, "time_s")
     try:
-        return RobotLog(
-            robot=attributes.get("robot", folder.name),
-            planar=attributes.get("planar") == "true",
-            time_s=column(frames, "time_s"),
-            odometry=columns(frames, _ODOMETRY_FIELDS),
-            iteration=iteration,
-            observations=observations,
-        )
+        log = RobotLog(name, planar, time_s, odometry, iteration, observations)
+        require_finite("time_s", time_s)
     except ValueError as error:
         raise InputError(f"{folder}: {error}") from error
+    try:
+        require_points(observations.position_m, observations.covariance_m2, planar)
+        label = np.zeros(len(iteration)) if looks is None else looks
+        points = (observations.position_m, observations.covariance_m2.reshape(-1, 9))
+        require_no_twins("observations", iteration, label, *points)
+    except ValueError as error:
+        raise InputError(f"{seen}: {error}") from error
+    return log
+
+
+def _require_numbered(path: Path, table: pa.Table) -> None:
+    """Raise InputError where frames are not there once each, in order."""
+    wrong = np.flatnonzero(column(table, "iteration") != np.arange(table.num_rows))
+    if len(wrong):
+        row = wrong[0]
+        found = f"is {column(table, 'iteration')[row]} in row {row}"
+        raise InputError(f"{path}: iteration {found}; there must be 0, 1, 2, ..., one row each")
 
 
 def write_truth_points(folder: Path, point_world_m: Float) -> None:
@@ -280,6 +326,16 @@ def write_truth_poses(folder: Path, T_world_robot: Float) -> None:
 
 def read_truth(folder: Path) -> RobotTruth:
     """Read the truth beside a log; raises InputError. For evaluation only."""
-    poses, _ = read_table(folder / "truth_poses.parquet", TRUTH_POSES)
-    points, _ = read_table(folder / "truth_points.parquet", TRUTH_POINTS)
-    return RobotTruth(columns(poses, POSE_FIELDS), columns(points, POSITION_FIELDS))
+    paths = [table_path(folder, name) for name in ("truth_poses", "truth_points")]
+    poses, _ = read_open_table(paths[0], TRUTH_POSES)
+    points, _ = read_open_table(paths[1], TRUTH_POINTS)
+    _require_numbered(paths[0], poses)
+    truth = RobotTruth(columns(poses, POSE_FIELDS), columns(points, POSITION_FIELDS))
+    for path, values in zip(paths, (truth.T_world_robot, truth.point_world_m), strict=True):
+        known = ~np.isnan(values)
+        half = known.any(1) & ~known.all(1)
+        large = (np.abs(values) > LARGEST_POSITION_M).any(1)  # infinity is
+        for wrong, what in ((half, "known in part"), (large, "infinite or above 1e7 m")):
+            if wrong.any():
+                raise InputError(f"{path}: the truth is {what} in row {np.flatnonzero(wrong)[0]}")
+    return truth

@@ -1,6 +1,11 @@
-"""Tables on disk: Parquet with an explicit schema, a kind and a version, written whole."""
+"""Files on disk, written whole and sealed: tables with an explicit schema, a kind and a version."""
 
+import errno
+import json
 import os
+import platform
+import re
+import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -10,29 +15,110 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from mapfusion.errors import InputError
+from mapfusion.errors import DamagedFileError, InputError
+from mapfusion.sealed import NO_DIGEST, SEAL, parquet_with_seal, read_sealed, seal, tell_unsealed
 
 _KIND = b"mapfusion.kind"
 _VERSION = b"mapfusion.schema_version"
 _PREFIX = "mapfusion."
+# What Arrow raises on bytes that it cannot read, some of it from Python code that it calls.
+UNREADABLE = (pa.ArrowException, OSError, ValueError, MemoryError, OverflowError)
+PART = ".part"
+_WRITER = re.compile(rf"\.{re.escape(platform.node())}-(?P<pid>\d+)\.[^.]+\.part$")
 
 
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write` fill a temporary file beside `path`, then rename it: nobody sees half a file.
 
     The temporary name ends in `.part`, so that no pattern like `*.parquet` finds it, also where a
-    killed process left it behind.
+    killed process left it behind; see `remove_abandoned`. An OSError names `path`.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+    handle, name = tempfile.mkstemp(PART, temporary_prefix(path.name), path.parent)
     os.close(handle)
     temporary = Path(name)
     try:
         write(temporary)
         temporary.chmod(0o644)
         temporary.replace(path)
+    except OSError as error:  # a full disk is told without a name, or with one that nobody knows
+        if error.filename not in (None, name):
+            raise
+        reason = error.strerror or str(error)
+        raise OSError(error.errno or errno.EIO, reason, str(path)) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def temporary_prefix(name: str) -> str:
+    """How temporary files, or folders, of this process begin; they end in `.part`."""
+    return f".{name}.{platform.node()}-{os.getpid()}."
+
+
+def write_sealed(path: Path, data: bytes) -> None:
+    """Fill in the empty seal that a file's bytes hold, and write them whole."""
+    sealed = seal(data)
+    write_whole(path, lambda temporary: temporary.write_bytes(sealed))
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a JSON object, its digest as first field."""
+    write_sealed(path, json.dumps({SEAL: NO_DIGEST, **content}, indent=1).encode())
+
+
+def read_json(path: Path, what: str) -> dict[str, Any]:
+    """A JSON object without its digest; `what` it is, for messages.
+
+    Raises:
+        DamagedFileError: the file is missing or damaged, or holds something else.
+    """
+    data = read_sealed(path, what)
+    try:
+        found = {} | json.loads(data.decode())
+    except (ValueError, TypeError, RecursionError) as error:  # of JSON, or of no object
+        raise DamagedFileError(path, f"no JSON object ({error}), expected a {what}") from error
+    tell_unsealed(path, data)
+    name, value = next(iter(found.items()), ("", ""))
+    if name != SEAL and re.fullmatch("[0-9a-f]{64}", str(value)):
+        raise DamagedFileError(path, f"damaged, its first field {name!r} should be {SEAL}")
+    found.pop(SEAL, None)
+    return found
+
+
+def remove_abandoned(folder: Path) -> None:
+    """Remove what processes that were killed left below a folder, named by `temporary_prefix`.
+
+    What is of other machines, and of processes that live, stays.
+    """
+    for path in list(folder.rglob(f".*{PART}")):
+        writer = _WRITER.search(path.name)
+        if not writer or _lives(int(writer["pid"])):
+            continue
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def _lives(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:  # somebody else's
+        return True
+    return True
+
+
+def require_writable(folder: Path) -> None:
+    """Raise InputError, which says why, unless files can be put into a folder, there yet or not."""
+    there = folder
+    while not there.exists() and there != there.parent:
+        there = there.parent
+    if not there.is_dir():
+        raise InputError(f"{folder}: cannot be written ({there} is no folder)")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise InputError(f"{folder}: cannot be written (no right to write into {there})")
 
 
 def schema(kind: str, version: int, fields: list[pa.Field]) -> pa.Schema:
@@ -50,8 +136,11 @@ def write_table(
     metadata = dict(table_schema.metadata)
     metadata |= {f"{_PREFIX}{k}".encode(): v.encode() for k, v in (attributes or {}).items()}
     arrays = [_to_arrow(columns[field.name], field.type) for field in table_schema]
-    table = pa.Table.from_arrays(arrays, schema=table_schema.with_metadata(metadata))
-    write_whole(path, lambda temporary: pq.write_table(table, temporary, compression="zstd"))
+    own = pa.schema([field.remove_metadata() for field in table_schema], metadata=metadata)
+    table = pa.Table.from_arrays(arrays, schema=own)
+    buffer = pa.BufferOutputStream()
+    pq.write_table(table, buffer, compression="zstd", write_page_checksum=True)
+    write_sealed(path, parquet_with_seal(buffer.getvalue().to_pybytes()))
 
 
 def _to_arrow(values: Any, kind: pa.DataType) -> pa.Array:
@@ -61,6 +150,23 @@ def _to_arrow(values: Any, kind: pa.DataType) -> pa.Array:
             pa.array(matrix.ravel(), kind.value_type), kind.list_size
         )
     return pa.array(values, kind)
+
+
+def read_parquet(path: Path, what: str, columns: Sequence[str] | None = None) -> pa.Table:
+    """Any Parquet table, all its columns or some, its bytes checked; `what` it is, for messages.
+
+    Raises:
+        DamagedFileError: the file is missing or damaged.
+    """
+    data = read_sealed(path, what)
+    try:
+        source, names = pa.BufferReader(data), None if columns is None else list(columns)
+        table = pq.read_table(source, columns=names, page_checksum_verification=True)
+    except UNREADABLE as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise DamagedFileError(path, f"damaged or not a Parquet file ({reason})") from error
+    tell_unsealed(path, data)
+    return table
 
 
 def read_table(path: Path, table_schema: pa.Schema) -> tuple[pa.Table, dict[str, str]]:
@@ -73,30 +179,36 @@ def read_table(path: Path, table_schema: pa.Schema) -> tuple[pa.Table, dict[str,
         InputError: the file is missing, damaged, of another kind or version, or lacks columns.
     """
     kind = table_schema.metadata[_KIND].decode()
+    table = read_parquet(path, f"{kind} table")
+    attributes = text_attributes(path, table)
+    require_kind(path, table, attributes, table_schema)
+    return table, attributes
+
+
+def require_kind(
+    path: Path, table: pa.Table, attributes: Mapping[str, str], table_schema: pa.Schema
+) -> None:
+    """Raise InputError for a table of another kind, version, or with other columns."""
+    kind = table_schema.metadata[_KIND].decode()
     version = table_schema.metadata[_VERSION].decode()
-    if not path.is_file():
-        raise InputError(f"{path}: no such file (expected a {kind} table)")
-    try:
-        table = pq.read_table(path)
-    except (pa.ArrowInvalid, pa.ArrowTypeError, OSError) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(f"{path}: damaged or not a Parquet file ({reason})") from error
-    metadata = table.schema.metadata or {}
-    found_kind = metadata.get(_KIND, b"none").decode()
+    found_kind = attributes.get("kind", "none")
     if found_kind != kind:
         raise InputError(f"{path}: kind is {found_kind}, expected {kind}")
-    found_version = metadata.get(_VERSION, b"none").decode()
+    found_version = attributes.get("schema_version", "none")
     if found_version != version:
         raise InputError(f"{path}: schema_version is {found_version}, this program reads {version}")
     if not table.schema.equals(table_schema, check_metadata=False):
         expected = ", ".join(f"{f.name}: {f.type}" for f in table_schema)
         raise InputError(f"{path}: columns are not those of {kind} ({expected})")
-    attributes = {
-        k.decode().removeprefix(_PREFIX): v.decode()
-        for k, v in metadata.items()
-        if k.decode().startswith(_PREFIX)
-    }
-    return table, attributes
+
+
+def text_attributes(path: Path, table: pa.Table) -> dict[str, str]:
+    """What `write_table` stored beside the columns, kind and version among it."""
+    try:
+        texts = {k.decode(): v.decode() for k, v in (table.schema.metadata or {}).items()}
+    except UnicodeDecodeError as error:
+        raise DamagedFileError(path, f"its metadata is no UTF-8 text ({error})") from error
+    return {k.removeprefix(_PREFIX): v for k, v in texts.items() if k.startswith(_PREFIX)}
 
 
 def column(table: pa.Table, name: str) -> np.ndarray:

@@ -3,9 +3,11 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from mapfusion.arguments import Range, require_in_range
 from mapfusion.errors import InputError
 from mapfusion.se2 import Float, between, wrap
 from sim.floorplan import FloorPlan
@@ -43,26 +45,18 @@ class DriverSettings:
             stop short of its way where both come to a crossing at once.
     """
 
-    speed_m_s: float = 0.5
-    turn_rate_rad_s: float = 0.4
-    acceleration_m_s2: float = 0.5
-    turn_acceleration_rad_s2: float = 2.0
-    turn_in_place_rad: float = 0.2
-    stand_s: float = 1.0
-    arrival_m: float = 0.2
-    patience_s: float = 30.0
-    give_way_m: float = 1.6
+    speed_m_s: Annotated[float, Range(0.01, TOP_SPEED_M_S, "m/s")] = 0.5
+    turn_rate_rad_s: Annotated[float, Range(0.01, 10, "rad/s")] = 0.4
+    acceleration_m_s2: Annotated[float, Range(0.01, 10, "m/s^2")] = 0.5
+    turn_acceleration_rad_s2: Annotated[float, Range(0.01, 100, "rad/s^2")] = 2.0
+    turn_in_place_rad: Annotated[float, Range(0.01, 3.2, "rad")] = 0.2
+    stand_s: Annotated[float, Range(0, 3600, "s")] = 1.0
+    arrival_m: Annotated[float, Range(0.01, 10, "m")] = 0.2
+    patience_s: Annotated[float, Range(0.1, 3600, "s")] = 30.0
+    give_way_m: Annotated[float, Range(0.01, 100, "m")] = 1.6
 
     def __post_init__(self) -> None:
-        if self.stand_s < 0:
-            raise InputError(f"driver: stand_s is {self.stand_s}, must not be negative")
-        for name in sorted(set(self.__dataclass_fields__) - {"stand_s"}):
-            if not getattr(self, name) > 0:
-                raise InputError(f"driver: {name} is {getattr(self, name)}, must be above 0")
-        if self.speed_m_s > TOP_SPEED_M_S:
-            raise InputError(
-                f"driver: speed_m_s is {self.speed_m_s}, the P3-AT's top speed is {TOP_SPEED_M_S}"
-            )
+        require_in_range(self)
 
 
 def drive(

@@ -67,6 +67,13 @@ class Wall:
         normals *= 2 / np.sum(normals**2, axis=1, keepdims=True)
         return points + (0.5 if left else -0.5) * self.thickness_m * normals
 
+    def outline(self) -> list[Float]:
+        """Where its faces stand, in plan: closed lines (n, 2), two of a wall that is closed."""
+        left, right = self.side(left=True), self.side(left=False)
+        if self.closed:
+            return [left, right]
+        return [np.concatenate([left, right[::-1], left[:1]])]
+
 
 @dataclass(frozen=True)
 class Face:

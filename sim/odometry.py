@@ -2,12 +2,12 @@
 
 from dataclasses import dataclass
 from functools import cache
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mapfusion.arguments import require_finite, require_shape
-from mapfusion.errors import InputError
+from mapfusion.arguments import Range, require_finite, require_in_range, require_shape
 from mapfusion.se2 import Float, wrap
 from sim.p3at import WHEEL_RADIUS_M, P3at
 from sim.world import World
@@ -30,16 +30,14 @@ class OdometryNoise:
         track_sigma: relative error of the effective track, drawn once a robot.
     """
 
-    translation_m_per_sqrt_m: float = 0.02
-    yaw_rad_per_sqrt_m: float = 0.01
-    yaw_rad_per_sqrt_rad: float = 0.03
-    scale_sigma: float = 0.01
-    track_sigma: float = 0.02
+    translation_m_per_sqrt_m: Annotated[float, Range(0, 10, "m/sqrt(m)")] = 0.02
+    yaw_rad_per_sqrt_m: Annotated[float, Range(0, 10, "rad/sqrt(m)")] = 0.01
+    yaw_rad_per_sqrt_rad: Annotated[float, Range(0, 10, "rad/sqrt(rad)")] = 0.03
+    scale_sigma: Annotated[float, Range(0, 1, "1")] = 0.01
+    track_sigma: Annotated[float, Range(0, 1, "1")] = 0.02
 
     def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            if not 0 <= getattr(self, name) < np.inf:
-                raise InputError(f"odometry: {name} is {getattr(self, name)}, must be 0 or more")
+        require_in_range(self)
 
 
 @cache

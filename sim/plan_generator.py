@@ -8,9 +8,11 @@ to each other and are closed all around: from one, nothing of another is ever se
 
 import itertools
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from mapfusion.arguments import Range, require_in_range
 from mapfusion.errors import InputError
 from mapfusion.se2 import Float
 from sim.p3at import OUTER_RADIUS_M
@@ -22,6 +24,9 @@ CLEARANCE_M = OUTER_RADIUS_M + 0.2 + 0.1
 PIER_M = 0.3  # least wall between two doors, or between a door and a corner
 NARROWEST_DOOR_M = 1.2  # 0.25 m for half the body, 0.2 m beside the leg, 0.15 m to spare: twice
 
+_ROOM_TO_TURN_M = round(2.5 * CLEARANCE_M, 2)
+_RoomSide = Annotated[float, Range(0.1, 50, "m")]
+
 
 @dataclass(frozen=True)
 class PlanParameters:
@@ -32,40 +37,28 @@ class PlanParameters:
         doors_a_room: doors from each room to the corridor, 1 or 2; more doors, more ways to go.
         room_width_m: along the corridor, smallest and largest.
         room_depth_m: across it, smallest and largest.
-        corridor_m: its width.
+        corridor_m: its width; the robot turns in it.
         door_m: width of every door.
     """
 
-    rooms_a_side: int = 3
-    doors_a_room: int = 2
-    room_width_m: tuple[float, float] = (3.8, 4.8)
-    room_depth_m: tuple[float, float] = (3.0, 4.0)
-    corridor_m: float = 2.4
-    door_m: float = 1.4
+    rooms_a_side: Annotated[int, Range(1, 12, "rooms")] = 3
+    doors_a_room: Annotated[int, Range(1, 2, "doors")] = 2
+    room_width_m: tuple[_RoomSide, _RoomSide] = (3.8, 4.8)
+    room_depth_m: tuple[_RoomSide, _RoomSide] = (3.0, 4.0)
+    corridor_m: Annotated[float, Range(_ROOM_TO_TURN_M, 50, "m")] = 2.4
+    door_m: Annotated[float, Range(NARROWEST_DOOR_M, 20, "m")] = 1.4
 
     def __post_init__(self) -> None:
-        if not 1 <= self.rooms_a_side <= 12:
-            raise InputError(f"rooms_a_side: is {self.rooms_a_side}, must be in [1, 12]")
-        if not NARROWEST_DOOR_M <= self.door_m < np.inf:
-            raise InputError(
-                f"door_m: is {self.door_m:g}, the robot needs {NARROWEST_DOOR_M:g} or more"
-            )
-        if self.doors_a_room not in (1, 2):
-            raise InputError(f"doors_a_room: is {self.doors_a_room}, must be 1 or 2")
+        require_in_range(self)
         least_depth_m = 2 * self.beside_door_m
         least_width_m = least_depth_m + (self.doors_a_room - 1) * (self.door_m + PIER_M)
         for name, least_m in (("room_width_m", least_width_m), ("room_depth_m", least_depth_m)):
             low, high = getattr(self, name)
-            if not least_m <= low <= high < np.inf:
+            if not least_m <= low <= high:
                 raise InputError(
                     f"{name}: is {low:g} to {high:g}, must be a range from {least_m:.2f} on "
                     "(for the doors, and to turn before them)"
                 )
-        if not 2.5 * CLEARANCE_M <= self.corridor_m < np.inf:
-            raise InputError(
-                f"corridor_m: is {self.corridor_m:g}, the robot needs {2.5 * CLEARANCE_M:.2f} "
-                "or more to turn in it"
-            )
 
     @property
     def beside_door_m(self) -> float:

@@ -8,10 +8,12 @@ the corridor in the same direction, as a camera that looks ahead sees a wall fro
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
-from mapfusion.errors import InputError
+from mapfusion.arguments import Range, require_in_range
+from mapfusion.errors import InputError, OutOfRangeError
 from mapfusion.se2 import Float
 from sim.floorplan import segment_distance_m
 from sim.plan_generator import GeneratedPlan, PlanParameters, Wing, generate_plan
@@ -25,6 +27,8 @@ NEAR_ENOUGH = 0.03  # of the overlap asked for: drawing stops
 TOLERANCE = 0.13  # of the overlap asked for: farther off is refused (half the gap below 1)
 MOST_CHOICES = 3000  # sets of loops compared in one plan
 
+_LoopLength = Annotated[float, Range(0.1, 1000, "m")]
+
 
 @dataclass(frozen=True)
 class RouteParameters:
@@ -36,18 +40,16 @@ class RouteParameters:
         loop_m: shortest and longest loop.
     """
 
-    robots: int = 2
-    overlap: float = 0.5
-    loop_m: tuple[float, float] = (12.0, 22.0)
+    robots: Annotated[int, Range(1, 4, "robots")] = 2
+    overlap: Annotated[float, Range(0, 1, "1")] = 0.5
+    loop_m: tuple[_LoopLength, _LoopLength] = (12.0, 22.0)
 
     def __post_init__(self) -> None:
-        if not 1 <= self.robots <= 4:
-            raise InputError(f"robots: is {self.robots}, must be in [1, 4]")
-        if not 0 <= self.overlap <= 1:
-            raise InputError(f"overlap: is {self.overlap}, must be in [0, 1]")
-        low, high = self.loop_m
-        if not 0 < low <= high < np.inf:
-            raise InputError(f"loop_m: is {low:g} to {high:g}, must be a positive range")
+        require_in_range(self)
+        if not self.loop_m[0] <= self.loop_m[1]:
+            shortest_m, longest_m = self.loop_m
+            said = f"is {shortest_m:g} to {longest_m:g}, the shortest is above the longest"
+            raise OutOfRangeError("loop_m", said)
 
 
 @dataclass(frozen=True)

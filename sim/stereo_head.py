@@ -1,13 +1,14 @@
 """The stereo head: what a rectified pair of pinhole cameras on a robot sees of a world."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mapfusion.arguments import Range, require_in_range
 from mapfusion.camera import StereoCamera
-from mapfusion.errors import InputError
 from mapfusion.se2 import Float, compose
 from sim.world import World
 
@@ -28,15 +29,13 @@ class RadiometricNoise:
         sigma_offset_gray: standard deviation of an image's offset, in gray levels.
     """
 
-    sigma_gray: float = 2.0
-    sigma_gain: float = 0.01
-    sigma_offset_gray: float = 1.0
-    gain: float = 1.0
+    sigma_gray: Annotated[float, Range(0, 255, "grey levels")] = 2.0
+    sigma_gain: Annotated[float, Range(0, 10, "1")] = 0.01
+    sigma_offset_gray: Annotated[float, Range(0, 255, "grey levels")] = 1.0
+    gain: Annotated[float, Range(0, 10, "1")] = 1.0
 
     def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            if not 0 <= getattr(self, name) < np.inf:
-                raise InputError(f"radiometry: {name} is {getattr(self, name)}, must be 0 or more")
+        require_in_range(self)
 
     def apply(self, gray: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """A noisy copy of a gray image (H, W) uint8."""

@@ -8,12 +8,15 @@ metre), and the picture is low-passed to what a pixel resolves at 5 m and beyond
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
 
-from mapfusion.errors import InputError
+from mapfusion.arguments import Range, require_in_range
 from sim.floorplan import Face
+
+_PosterSide = Annotated[float, Range(0.05, 10, "m")]
 
 
 @dataclass(frozen=True)
@@ -49,21 +52,15 @@ class Texture:
         poster_gap_m: between two posters.
     """
 
-    contrast: float = 1.0
-    coverage: float = 1.0
-    bare: float = 0.0
-    posters: int = 0
-    poster_m: tuple[float, float] = (1.2, 1.6)
-    poster_gap_m: float = 0.4
+    contrast: Annotated[float, Range(0, 1, "1")] = 1.0
+    coverage: Annotated[float, Range(0, 2, "1")] = 1.0
+    bare: Annotated[float, Range(0, 1, "1")] = 0.0
+    posters: Annotated[int, Range(0, 100, "posters")] = 0
+    poster_m: tuple[_PosterSide, _PosterSide] = (1.2, 1.6)
+    poster_gap_m: Annotated[float, Range(0, 100, "m")] = 0.4
 
     def __post_init__(self) -> None:
-        for name, most in (("contrast", 1), ("coverage", 2), ("bare", 1), ("posters", 100)):
-            if not 0 <= getattr(self, name) <= most:
-                raise InputError(
-                    f"texture: {name} is {getattr(self, name)}, must be in [0, {most}]"
-                )
-        if not min(self.poster_m) > 0 or not self.poster_gap_m >= 0:
-            raise InputError("texture: poster_m must be positive, poster_gap_m 0 or more")
+        require_in_range(self)
 
 
 AS_PAINTED = Texture()

@@ -3,6 +3,7 @@
 import atexit
 import contextlib
 import ctypes
+import io
 import os
 import sys
 import tempfile
@@ -13,8 +14,10 @@ from types import TracebackType
 import cv2
 import numpy as np
 
+from mapfusion.errors import DamagedFileError
 from mapfusion.se2 import Float
-from mapfusion.storage import write_whole
+from mapfusion.sealed import LINE, read_sealed
+from mapfusion.storage import write_sealed
 from sim.floorplan import Face, FloorPlan
 from sim.renderer import Renderer, egl_driver, load_egl
 from sim.textures import AS_PAINTED, Texture, paint, paint_posters
@@ -154,12 +157,16 @@ class World:
 
         Returns:
             Their corners (F, 4, 3).
+
+        Raises:
+            DamagedFileError: a file of the folder is missing or damaged.
         """
         p, client = self.bullet, self.client
-        corners_m = np.load(folder / CORNERS)
+        corners_m = read_corners(folder / CORNERS)
         with silence():
             for i in range(len(corners_m)):
                 mesh, picture = _face_files(folder, i)
+                read_sealed(mesh, "mesh", only_ours=True)  # Bullet reads the file by itself
                 shape = p.createVisualShape(p.GEOM_MESH, fileName=str(mesh), physicsClientId=client)
                 body = p.createMultiBody(0, baseVisualShapeIndex=shape, physicsClientId=client)
                 texture = self._load_texture(picture)
@@ -175,11 +182,12 @@ class World:
         bytes: of any other width a picture comes out sheared.
         """
         p, client = self.bullet, self.client
+        data = read_sealed(picture, "picture", only_ours=True)
         if self.renderer == "tiny":
             return p.loadTexture(str(picture), physicsClientId=client)
-        image = cv2.imread(str(picture))
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         if image is None:
-            raise OSError(f"{picture}: could not be read")
+            raise DamagedFileError(picture, "is no picture")
         size = (-(-image.shape[1] // GL_ROW_TEXELS) * GL_ROW_TEXELS, image.shape[0])
         with tempfile.TemporaryDirectory() as folder:
             fitting = str(Path(folder) / "texture.bmp")
@@ -208,17 +216,29 @@ def write_faces(
         mesh, path = _face_files(folder, i)
         picture = cv2.cvtColor(paint(face, child, texture, posters), cv2.COLOR_RGB2BGR)
         encoded = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
-        text = _mesh(face).encode("ascii")
         # whole: another run may be painting, or looking at, the same walls
-        write_whole(path, lambda temporary, data=encoded: temporary.write_bytes(data))
-        write_whole(mesh, lambda temporary, data=text: temporary.write_bytes(data))
-    corners = np.stack([face.corners_m for face in faces])
-    write_whole(folder / CORNERS, lambda temporary: _save_array(temporary, corners))
+        write_sealed(path, encoded + LINE)
+        write_sealed(mesh, b"# " + LINE + _mesh(face).encode("ascii"))
+    corners = io.BytesIO()
+    np.save(corners, np.stack([face.corners_m for face in faces]))
+    write_sealed(folder / CORNERS, corners.getvalue() + LINE)
 
 
-def _save_array(path: Path, array: np.ndarray) -> None:
-    with path.open("wb") as file:
-        np.save(file, array)
+def read_corners(path: Path) -> Float:
+    """The corners (F, 4, 3) of all faces, as `write_faces` left them.
+
+    Raises:
+        DamagedFileError: they are missing or damaged.
+    """
+    data = read_sealed(path, "array of faces' corners")
+    try:
+        corners_m = np.asarray(np.load(io.BytesIO(data)), dtype=np.float64)
+    except Exception as error:  # numpy has Python parse the header, which may raise anything
+        reason = " ".join(str(error).split())
+        raise DamagedFileError(path, f"is no array ({reason})") from error
+    if corners_m.shape[1:] != (4, 3) or not np.isfinite(corners_m).all():
+        raise DamagedFileError(path, "holds no corners (F, 4, 3) of faces")
+    return corners_m
 
 
 def _face_files(folder: Path, i: int) -> tuple[Path, Path]:

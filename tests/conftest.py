@@ -1,10 +1,15 @@
-"""In which order files are tested, and by which worker."""
+"""What holds for all tests, in which order files are tested, and by which worker."""
 
 from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import HealthCheck, settings
 from xdist.scheduler import LoadFileScheduling
+
+# No test may depend on how fast the machine is; by default an example may take 0.2 s.
+settings.register_profile("any_speed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("any_speed")
 
 _MAPFUSION = Path(__file__).parent / "mapfusion"
 # Who comes first compiles: of two workers one the aligners' kernels, one all others. Whole runs,

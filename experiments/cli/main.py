@@ -2,20 +2,49 @@
 
 import sys
 import warnings
-from typing import Any
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
+import mapfusion
 from experiments.cli import run_commands, step_commands, study_commands
-from experiments.cli.options import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_INTERRUPTED
+from experiments.cli.options import (
+    EXIT_BAD_INPUT,
+    EXIT_DEFECT,
+    EXIT_FAILED,
+    EXIT_INTERRUPTED,
+    STEPS,
+    complain,
+)
+from mapfusion.errors import InputError
 from mapfusion.recordings.registry import IMPORTERS
 
+REPLACED = {
+    "aligners": "scenarios --aligners",
+    "schema": "scenarios --schema",
+    "figures": "report RESULT --figures",
+    "refusal": "study refusal",
+    "benchmark": "study benchmark",
+}
+
+
+class Commands(TyperGroup):
+    """The commands, and for those of earlier versions what took their place."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """The command asked for."""
+        if args and args[0] in REPLACED:
+            raise InputError(f"{args[0]}: is now `mapfusion {REPLACED[args[0]]}`")
+        return super().resolve_command(ctx, args)
+
+
 app = typer.Typer(
+    cls=Commands,
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     help="Measures how well landmark maps of independent robots can be fused.\n\n"
-    "Start with:  mapfusion run scenarios/quick.yaml",
+    "Start with:  mapfusion run quick",
 )
 for commands in (run_commands, study_commands, step_commands):
     app.add_typer(commands.app)
@@ -25,26 +54,46 @@ import_app = typer.Typer(
 for name, importer in IMPORTERS.items():
     usage = f"`mapfusion import {name} {importer.example} -o logs/{name}`"
     import_app.command(name, help=f"{importer.what}: {usage}.")(step_commands.import_command(name))
-app.add_typer(import_app, name="import")
+app.add_typer(import_app, name="import", rich_help_panel=STEPS)
+
+
+def _tell_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"mapfusion {mapfusion.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool,
+        typer.Option("--version", help="Tell the version.", callback=_tell_version, is_eager=True),
+    ] = False,
+) -> None:
+    pass
 
 
 def main() -> None:
     """Run the command; every failure a user can cause is one line and an exit code."""
+    from experiments.run.defects import saved_defect
     from experiments.run.kernel_cache import use_kernel_cache
-    from mapfusion.errors import InputError
 
-    _tell_name_clashes()
+    unsealed = _tell_warnings()
     try:
         use_kernel_cache()
-        code = app(standalone_mode=False) or 0
+        code = app(prog_name="mapfusion", standalone_mode=False) or 0
     except InputError as error:
-        _complain(str(error))
+        complain(str(error))
         code = EXIT_BAD_INPUT
     except BrokenPipeError:
         code = EXIT_FAILED
     except OSError as error:  # a full disk, a folder that is a file or not ours
         where = "" if error.filename is None else f"{error.filename}: "
-        _complain(f"{where}cannot be read or written ({error.strerror or error})")
+        complain(f"{where}cannot be read or written ({error.strerror or error})")
+        code = EXIT_BAD_INPUT
+    except MemoryError:
+        kept = "what was finished is kept; --jobs 1 needs least"
+        complain(f"this machine has too little memory for this ({kept})")
         code = EXIT_BAD_INPUT
     except KeyboardInterrupt:  # before or after what the command itself guards
         code = EXIT_INTERRUPTED
@@ -52,32 +101,42 @@ def main() -> None:
         # Typer keeps its usage errors' classes private; all of them can tell their message.
         message = getattr(error, "format_message", None)
         if message is None:
-            raise
-        if message():  # empty where the help was shown instead
-            _complain(f"{message()} (see mapfusion --help)")
-        code = EXIT_BAD_INPUT
+            complain(saved_defect(error))
+            code = EXIT_DEFECT
+        else:
+            if message():  # empty where the help was shown instead
+                complain(f"{message()} (see mapfusion --help)")
+            code = EXIT_BAD_INPUT
+    for text in unsealed if code in {0, EXIT_FAILED} else ():
+        complain(f"warning: {text}")
     if code == EXIT_INTERRUPTED:
-        _complain("interrupted; what was finished is kept, the same command goes on from there")
+        complain("interrupted; what was finished is kept, the same command goes on from there")
     sys.exit(code)
 
 
-def _tell_name_clashes() -> None:
-    """In one line each; other warnings keep Python's own form."""
-    from mapfusion.errors import NameClashWarning
+def _tell_warnings() -> list[str]:
+    """Ours in one line each; others keep Python's own form.
 
-    show = warnings.showwarning
+    Returns:
+        What is to be said of files without digest, once all else has gone well.
+    """
+    from mapfusion.errors import TellingWarning, UnsealedWarning
+    from mapfusion.sealed import say_again
+
+    show, unsealed = warnings.showwarning, list[str]()
+    say_again()
 
     def tell(message: Warning | str, category: type[Warning], *rest: Any) -> None:
-        if issubclass(category, NameClashWarning):
-            _complain(f"warning: {message}")
+        if issubclass(category, UnsealedWarning):
+            unsealed.append(str(message))
+        elif issubclass(category, TellingWarning):
+            complain(f"warning: {message}")
         else:
             show(message, category, *rest)
 
     warnings.showwarning = tell
-
-
-def _complain(text: str) -> None:
-    typer.echo(f"mapfusion: {' '.join(text.split())}", err=True)  # one line, whatever was quoted
+    warnings.simplefilter("always", TellingWarning)  # two stages may be damaged in one way
+    return unsealed
 
 
 if __name__ == "__main__":

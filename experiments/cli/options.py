@@ -6,8 +6,13 @@ from typing import Annotated
 
 import typer
 
+from experiments.show.plain_text import plain
+
 EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
+EXIT_DEFECT = 70  # EX_SOFTWARE of sysexits.h: an error of ours
 RESULTS = Path("results")
+# Panels of the help, in the order of a user's day.
+RUN, LOOK, STEPS = "Run", "Look and compare", "Your own maps, logs and recordings"
 # Those that this process may use.
 ALL_CORES = (
     len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -18,9 +23,12 @@ ScenarioNames = Annotated[
     list[str],
     typer.Argument(metavar="SCENARIO...", help="Scenario files, or names or tags of the suite."),
 ]
-ScenarioPath = Annotated[Path, typer.Argument(metavar="SCENARIO", help="Scenario file (YAML).")]
-SectionsOf = Annotated[
-    Path | None, typer.Option("--scenario", help="Scenario whose sections to use.")
+OneScenario = Annotated[
+    str, typer.Argument(metavar="SCENARIO", help="Scenario file, or a name of the suite.")
+]
+SettingsOf = Annotated[
+    str | None,
+    typer.Option("--scenario", metavar="SCENARIO", help="File or name whose settings to use."),
 ]
 ResultFolder = Annotated[Path, typer.Argument(metavar="RESULT", help="A run's result folder.")]
 Overrides = Annotated[
@@ -30,14 +38,32 @@ Overrides = Annotated[
         metavar="KEY=VALUE",
         default_factory=list,
         show_default=False,
-        help="Replaces a value, e.g. evaluate.every=1.",
+        help="Replaces a value of the scenario, e.g. slam.filter.n_particles=50.",
     ),
 ]
-Seed = Annotated[int | None, typer.Option(help="Replaces the scenario's seed.", min=0)]
-OwnSeed = Annotated[int, typer.Option("--seed", help="Of all that is random.", min=0)]
+ImportOverrides = Annotated[
+    list[str],
+    typer.Option(
+        "--param",
+        metavar="KEY=VALUE",
+        default_factory=list,
+        show_default=False,
+        help="Replaces a setting of the importer, e.g. its noise: range_sigma_m=0.2.",
+    ),
+]
+Seed = Annotated[int | None, typer.Option(help="Replaces the scenario's seed (0).", min=0)]
 Seeds = Annotated[str, typer.Option(help="A seed, a range 0..4 or a list 0,2,5.")]
 Jobs = Annotated[int, typer.Option(help="Processes.", min=1, show_default="all cores")]
 Fresh = Annotated[bool, typer.Option("--fresh", help="Compute again what is stored already.")]
 Results = Annotated[Path, typer.Option(help="Folder that results go to.", show_default="results")]
 Output = Annotated[Path, typer.Option("--output", "-o", help="File or folder to write.")]
 OutputFolder = Annotated[Path | None, typer.Option("--output", "-o", help="Folder to write.")]
+DocumentFile = Annotated[
+    Path | None, typer.Option("--output", "-o", help="File for what --json prints.")
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document instead.")]
+
+
+def complain(text: str) -> None:
+    """Tell what is wrong, in one line whatever was quoted."""
+    typer.echo(f"mapfusion: {plain(' '.join(text.split()))}", err=True)

@@ -7,13 +7,13 @@ from typing import Annotated
 import typer
 
 from experiments.cli import options
+from mapfusion.errors import InputError
 
 app = typer.Typer()
 _DRAWING = "draw the figures"
-_SUITE = Path("scenarios")
 
 
-@app.command()
+@app.command(rich_help_panel=options.RUN)
 def run(
     scenarios: options.ScenarioNames,
     *,
@@ -22,54 +22,63 @@ def run(
     jobs: options.Jobs = options.ALL_CORES,
     fresh: options.Fresh = False,
     results: options.Results = options.RESULTS,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="Folder; RESULTS/NAME-SEED by default."),
+    ] = None,
 ) -> None:
     """Simulate, map, align, merge, evaluate and draw: `mapfusion run scenarios/quick.yaml`.
 
     Finished stages are reused; an interrupted run goes on where it was.
     """
     from experiments.judge.expectations import load_checked
-    from experiments.judge.result import run_scenario
     from experiments.scenario.suite import scenarios_of
+
+    checked = [load_checked(path, overrides, seed) for path in scenarios_of(scenarios)]
+    if output is not None and len(checked) > 1:
+        several = f"is one folder for {len(checked)} runs; give --results"
+        raise InputError(f"--output {output}: {several}")
+    # What draws takes seconds to import: a scenario is refused before.
+    from experiments.judge.result import run_scenario
     from experiments.show.figures.drawing import draw_all
     from experiments.show.terminal import layout, run_screen
 
-    for loaded in [load_checked(path, overrides, seed) for path in scenarios_of(scenarios)]:
+    for loaded in checked:
         with layout.progress() as show:
-            folder = run_scenario(loaded, results, jobs, show, fresh)
+            folder = run_scenario(loaded, results, jobs, show, fresh, output)
             drawn = draw_all(folder, jobs, partial(show, _DRAWING))
         run_screen.print_result(folder, drawn.skipped)
 
 
-@app.command()
-def figures(result: options.ResultFolder, *, jobs: options.Jobs = options.ALL_CORES) -> None:
-    """Draw a result's figures again, from its tables alone: `mapfusion figures results/quick-0`."""
-    from experiments.judge.result import require_result
-    from experiments.show.figures.drawing import draw_all
-    from experiments.show.terminal import layout
-
-    require_result(result)
-    with layout.progress() as show:
-        drawn = draw_all(result, jobs, partial(show, _DRAWING))
-    layout.print_paths(result / "figures", *drawn)
-
-
-@app.command()
+@app.command(rich_help_panel=options.LOOK)
 def report(
     result: options.ResultFolder,
+    *,
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", help="HTML file; RESULT/report.html by default."),
     ] = None,
+    figures: Annotated[
+        bool, typer.Option("--figures", help="Draw RESULT/figures again first, from its tables.")
+    ] = False,
+    jobs: options.Jobs = options.ALL_CORES,
 ) -> None:
     """Show a result in one HTML file that works offline: `mapfusion report results/quick-0`."""
+    from experiments.judge.result import require_result
+    from experiments.show.figures.drawing import draw_all
     from experiments.show.report.document import write_report
-    from experiments.show.terminal.layout import print_lines
+    from experiments.show.terminal import layout
 
+    if figures:
+        require_result(result)
+        with layout.progress() as show:
+            drawn = draw_all(result, jobs, partial(show, _DRAWING))
+        layout.print_paths(result / "figures", *drawn)
     path = write_report(result, output)
-    print_lines([f"{path} ({path.stat().st_size / 1e6:.1f} MB)"])
+    layout.print_lines([f"{path} ({path.stat().st_size / 1e6:.1f} MB)"])
 
 
-@app.command("inspect")
+@app.command("inspect", rich_help_panel=options.LOOK)
 def inspect_command(
     path: Annotated[Path, typer.Argument(metavar="FILE", help="A file or folder of mapfusion's.")],
 ) -> None:
@@ -79,7 +88,7 @@ def inspect_command(
     inspect(path)
 
 
-@app.command()
+@app.command(rich_help_panel=options.RUN)
 def check(
     scenarios: options.ScenarioNames,
     *,
@@ -89,46 +98,73 @@ def check(
     fresh: options.Fresh = False,
     junit: Annotated[Path | None, typer.Option(help="Write a JUnit report to this file.")] = None,
     results: options.Results = options.RESULTS,
+    output: options.DocumentFile = None,
+    as_json: options.AsJson = False,
 ) -> None:
-    """Hold runs to their `expect` blocks, exit code 1 if one fails: `mapfusion check ci`."""
-    from experiments.judge import expectations
-    from experiments.judge.result import run_scenario
+    """Hold runs to their `expect` blocks, exit code 1 if one fails: `mapfusion check ci`.
+
+    Exit code 2 if a scenario cannot be read, and then none is run, or if it cannot be run.
+    """
+    from experiments.judge.checking import CheckedScenario, check_all
     from experiments.scenario.seeds import parse_seeds
-    from experiments.scenario.suite import scenarios_of
+    from experiments.scenario.settings import AnyScenario
+    from experiments.show import json_document
     from experiments.show.junit import write_junit
     from experiments.show.terminal import layout, run_screen
 
-    wanted = parse_seeds(seeds)
-    checked = [
-        [expectations.load_checked(path, overrides, seed) for seed in wanted]
-        for path in scenarios_of(scenarios)
-    ]
-    outcomes = []
-    for runs in checked:
+    def run_one(scenario: AnyScenario) -> Path:
+        from experiments.judge.result import run_scenario  # as in `run`
+
         with layout.progress() as show:
-            folders = {run.seed: run_scenario(run, results, jobs, show, fresh) for run in runs}
-        outcomes += expectations.check(runs[0], folders)
-    run_screen.print_outcomes(outcomes)
-    if junit is not None:
-        write_junit(junit, outcomes)
-    if not all(outcome.passed for outcome in outcomes):
-        raise typer.Exit(options.EXIT_FAILED)
+            return run_scenario(scenario, results, jobs, show, fresh)
+
+    checks: list[CheckedScenario] = []
+    try:
+        for checked in check_all(scenarios, parse_seeds(seeds), overrides, run_one):
+            checks.append(checked)
+            if checked.error:
+                options.complain(checked.error)
+        if not as_json:
+            run_screen.print_checks(checks)
+        json_document.publish("check", json_document.of_checks(checks), as_json, output)
+    finally:
+        if junit is not None:
+            write_junit(junit, checks)
+    if not all(check.passed for check in checks):
+        is_bad = any(check.error for check in checks)
+        raise typer.Exit(options.EXIT_BAD_INPUT if is_bad else options.EXIT_FAILED)
 
 
-@app.command("scenarios")
+@app.command("scenarios", rich_help_panel=options.RUN)
 def list_scenarios(
-    folder: Annotated[Path, typer.Argument(metavar="[FOLDER]", help="Of scenario files.")] = _SUITE,
+    folder: Annotated[
+        Path | None,
+        typer.Argument(metavar="[FOLDER]", help="Of scenario files; the suite's by default."),
+    ] = None,
+    *,
+    copy: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Write scenarios/NAME.yaml instead, to edit.")
+    ] = None,
+    aligners: Annotated[
+        bool, typer.Option("--aligners", help="List the methods they can name instead.")
+    ] = False,
+    schema: Annotated[
+        bool, typer.Option("--schema", help="Print their JSON schema instead, for editors.")
+    ] = False,
 ) -> None:
     """List the suite, with the tags that `run` and `check` take: `mapfusion scenarios`."""
-    from experiments.scenario.suite import entries
-    from experiments.show.terminal.study_screen import print_scenarios
+    from experiments.scenario.schema import schema_text
+    from experiments.scenario.suite import copy_to_edit, entries
 
-    print_scenarios(entries(folder))
+    if copy is not None:
+        typer.echo(copy_to_edit(copy))
+        return
+    if schema:
+        typer.echo(schema_text(), nl=False)
+        return
+    from experiments.show.terminal import study_screen
 
-
-@app.command()
-def schema() -> None:
-    """Print the JSON schema of scenarios, for editors: `mapfusion schema > schema.json`."""
-    from experiments.scenario.settings import schema_text
-
-    typer.echo(schema_text())
+    if aligners:
+        study_screen.print_methods()
+    else:
+        study_screen.print_scenarios(entries(folder))

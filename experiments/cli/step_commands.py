@@ -7,14 +7,14 @@ from typing import Annotated
 import typer
 
 from experiments.cli import options
-from mapfusion.recordings.registry import import_recording
+from mapfusion.recordings.registry import import_recording, settings_class
 
 app = typer.Typer()
 
 
-@app.command()
+@app.command(rich_help_panel=options.STEPS)
 def record(
-    scenario: options.ScenarioPath,
+    scenario: options.OneScenario,
     *,
     output: options.Output,
     seed: options.Seed = None,
@@ -25,76 +25,103 @@ def record(
     """Simulate only: one robot log (with its truth) per robot: `mapfusion record S -o logs`."""
     from experiments.judge import user_files as single
     from experiments.judge.expectations import load_checked
+    from experiments.scenario.suite import one_scenario
     from experiments.show.terminal.layout import print_paths, progress
 
-    loaded = load_checked(scenario, overrides, seed)
+    loaded = load_checked(one_scenario(scenario), overrides, seed)
     with progress() as show:
         paths = single.record(loaded, output, results, jobs, show)
     print_paths(output, paths)
 
 
-@app.command()
+@app.command(rich_help_panel=options.STEPS)
 def slam(
     log: Annotated[Path, typer.Argument(metavar="LOG", help="A robot log (folder).")],
     *,
     output: options.Output,
-    settings: options.SectionsOf = None,
+    scenario: options.SettingsOf = None,
     overrides: options.Overrides,
-    seed: options.OwnSeed = 0,
+    seed: options.Seed = None,
+    as_json: options.AsJson = False,
 ) -> None:
     """Build one robot's map from its log: `mapfusion slam logs/R1 -o R1.parquet`."""
     from experiments.judge import user_files as single
+    from experiments.scenario.suite import settings_of
+    from experiments.show import json_document
     from experiments.show.terminal import layout
 
+    settings = settings_of(scenario, overrides, seed)
     with layout.progress() as show:
-        landmarks = single.slam(log, settings, overrides, seed, show)
+        landmarks = single.slam(log, settings, show)
     single.save_map(output, landmarks)
-    layout.print_lines([f"{len(landmarks)} landmarks of {landmarks.name} in {output}"])
+    made = json_document.of_map(output, log, settings.seed, landmarks)
+    json_document.publish("slam", made, as_json)
+    if not as_json:
+        layout.print_lines([f"{len(landmarks)} landmarks of {landmarks.name} in {output}"])
 
 
-@app.command()
+@app.command(rich_help_panel=options.STEPS)
 def align(
     map_a: Annotated[Path, typer.Argument(metavar="MAP_A")],
     map_b: Annotated[Path, typer.Argument(metavar="MAP_B")],
     *,
-    settings: options.SectionsOf = None,
+    output: options.DocumentFile = None,
+    scenario: options.SettingsOf = None,
     overrides: options.Overrides,
-    seed: options.OwnSeed = 0,
+    seed: options.Seed = None,
+    as_json: options.AsJson = False,
 ) -> None:
     """Estimate T_a_b with every aligner: `mapfusion align R1.parquet R2.parquet`."""
     from experiments.judge import user_files as single
+    from experiments.scenario.suite import settings_of
+    from experiments.show import json_document
     from experiments.show.terminal.step_screen import print_estimates
 
-    print_estimates(single.align((map_a, map_b), settings, overrides, seed))
+    settings = settings_of(scenario, overrides, seed)
+    rows = single.align(map_a, map_b, settings)
+    found = json_document.of_alignment((map_a, map_b), settings.seed, rows)
+    json_document.publish("align", found, as_json, output)
+    if not as_json:
+        print_estimates(rows)
 
 
-@app.command()
+@app.command(rich_help_panel=options.STEPS)
 def merge(
     maps: Annotated[list[Path], typer.Argument(metavar="MAP MAP...", help="Two maps or more.")],
     *,
     output: options.Output,
-    settings: options.SectionsOf = None,
+    scenario: options.SettingsOf = None,
     overrides: options.Overrides,
-    seed: options.OwnSeed = 0,
+    seed: options.Seed = None,
+    as_json: options.AsJson = False,
 ) -> None:
     """Fuse maps in the frame of the first: `mapfusion merge A.parquet B.parquet -o F.parquet`."""
     from experiments.judge import user_files as single
+    from experiments.scenario.suite import settings_of
+    from experiments.show import json_document
     from experiments.show.terminal.step_screen import print_fused
 
-    fused = single.merge(maps, settings, overrides, seed)
+    settings = settings_of(scenario, overrides, seed)
+    fused = single.merge(maps, settings)
     single.save_map(output, fused.landmarks)
-    print_fused(output, fused, maps)
+    found = json_document.of_fused(output, settings.seed, fused, maps)
+    json_document.publish("merge", found, as_json)
+    if not as_json:
+        print_fused(output, fused, maps)
 
 
-def import_command(format_name: str) -> Callable[[Path, Path], None]:
-    """The command that reads recordings of one format."""
+def import_command(format_name: str) -> Callable[..., None]:
+    """The command that reads recordings of one format; `--param` takes what its settings have."""
 
     def command(
         folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="The recording.")],
         output: options.Output,
+        overrides: options.ImportOverrides,
     ) -> None:
+        from experiments.scenario.loading import made_settings
         from experiments.show.terminal.layout import print_paths
 
-        print_paths(output, import_recording(format_name, folder, output))
+        settings = made_settings(format_name, settings_class(format_name), overrides)
+        print_paths(output, import_recording(format_name, folder, output, settings))
 
     return command

@@ -8,9 +8,11 @@ import typer
 from experiments.cli import options
 
 app = typer.Typer()
+studies = typer.Typer(no_args_is_help=True, help="Measure the methods themselves: refusal, times.")
+app.add_typer(studies, name="study", rich_help_panel=options.LOOK)
 
 
-@app.command()
+@studies.command()
 def refusal(
     worlds: Annotated[
         list[str],
@@ -27,7 +29,7 @@ def refusal(
 ) -> None:
     """Cross the maps of several worlds: are those without common ground refused, and only those?
 
-    For example, after a sweep of them: `mapfusion refusal full --seeds 0..2 -o results/refusal`.
+    For example, after a sweep of them: `mapfusion study refusal full --seeds 0..2 -o refusal`.
     """
     from experiments.scenario.seeds import parse_seeds
     from experiments.show.figures.drawing import save_figure
@@ -45,11 +47,9 @@ def refusal(
     layout.print_paths(output, save_figure(output / "figures", "refusal", draw, *data))
 
 
-@app.command()
+@app.command(rich_help_panel=options.RUN)
 def sweep(
-    scenarios: Annotated[
-        list[str], typer.Argument(metavar="SCENARIO|TAG...", help="Scenario files, or tags.")
-    ],
+    scenarios: options.ScenarioNames,
     *,
     seeds: options.Seeds = "0",
     settings: Annotated[
@@ -89,26 +89,28 @@ def sweep(
         sweep_screen.print_survey(sweep_plan.survey(asked))
         return
     with layout.progress() as show:
-        failed = sweep_driver.execute(asked, jobs, scheduler, sweep_screen.shown_by(show))
+        ended = sweep_driver.execute(asked, jobs, scheduler, sweep_screen.shown_by(show))
         if timings:
-            sweep_driver.measure_times(asked, failed, show)
-    sweep_screen.print_sweep(asked.dataset, asked.runs, failed)
-    if failed:
-        raise typer.Exit(options.EXIT_FAILED)
+            sweep_driver.measure_times(asked, ended.failed, show)
+    sweep_screen.print_sweep(asked.dataset, asked.runs, ended.failed)
+    if ended.failed:
+        raise typer.Exit(options.EXIT_DEFECT if ended.defects else options.EXIT_FAILED)
 
 
-@app.command()
+@app.command(rich_help_panel=options.LOOK)
 def statistics(
     paths: Annotated[list[Path], typer.Argument(metavar="PATH...", help="Results or sweeps.")],
+    *,
     output: options.OutputFolder = None,
+    as_json: options.AsJson = False,
 ) -> None:
     """Success, errors and consistency over many runs: `mapfusion statistics results/quick-*`."""
     from experiments.show.statistics_files import run_statistics
 
-    run_statistics(paths, output)
+    run_statistics(paths, output, as_json)
 
 
-@app.command()
+@app.command(rich_help_panel=options.LOOK)
 def compare(
     first: Annotated[Path, typer.Argument(metavar="FIRST", help="Result or sweep of the one.")],
     second: Annotated[Path, typer.Argument(metavar="SECOND", help="And of the other version.")],
@@ -134,7 +136,7 @@ def compare(
         raise typer.Exit(options.EXIT_FAILED)
 
 
-@app.command()
+@studies.command()
 def benchmark(
     *,
     methods: Annotated[
@@ -149,39 +151,31 @@ def benchmark(
         list[float] | None,
         typer.Option(help="Shares of false pairs; may be repeated.", min=0, max=1),
     ] = None,
-    seed: options.OwnSeed = 0,
-    settings: Annotated[
-        Path | None, typer.Option("--scenario", help="Scenario whose `align.aligners` to measure.")
-    ] = None,
+    seed: options.Seed = None,
+    scenario: options.SettingsOf = None,
     budget_s: Annotated[
         float, typer.Option(help="A cell that took longer ends with the trials it has.", min=0)
     ] = 600.0,
     output: options.OutputFolder = None,
     results: options.Results = options.RESULTS,
 ) -> None:
-    """Success, error and time of all methods on made-up maps: `mapfusion benchmark`.
+    """Success, error and time of all methods on made-up maps: `mapfusion study benchmark`.
 
     Serial, so that times can be compared; finished cells are reused.
     """
     from experiments.run.store import Store
+    from experiments.scenario.suite import settings_of
     from experiments.show.benchmark_files import write_benchmark
     from experiments.show.terminal import layout, study_screen
     from experiments.study.benchmark import cells
 
-    entries = cells.entries_of(methods or (), settings)
+    entries = cells.entries_of(methods or (), scenario)
     counts, shares = tuple(pairs or cells.PAIR_COUNTS), tuple(outliers or cells.OUTLIER_SHARES)
-    design = cells.BenchmarkDesign(entries, trials, seed, budget_s, counts, shares)
+    chosen_seed = settings_of(scenario, (), seed).seed
+    design = cells.BenchmarkDesign(entries, trials, chosen_seed, budget_s, counts, shares)
     folder = output or results / "benchmark"
     with layout.progress() as show:
         rows = cells.run_benchmark(design, Store(results / "store"), show)
     summary = cells.summarise(rows)
     write_benchmark(folder, design, rows, summary)
     study_screen.print_benchmark(folder, summary)
-
-
-@app.command()
-def aligners() -> None:
-    """List the alignment methods that scenarios can name, and whose they are."""
-    from experiments.show.terminal.study_screen import print_methods
-
-    print_methods()

@@ -5,6 +5,9 @@ shares (right, accepted) are of maps with common ground, median errors are over 
 ratios to the oracle over rich ones.
 """
 
+import math
+from collections.abc import Sequence
+
 import pandas as pd
 
 ORACLE = "oracle"  # the aligner that is given the true pairs
@@ -42,6 +45,15 @@ def right_as_estimated(rows: pd.DataFrame) -> pd.Series:
 def right_refined(rows: pd.DataFrame) -> pd.Series:
     """Bool per row of `errors`: what the least squares made of the estimate is right."""
     return is_right(rows["refined_translation_error_m"], rows["refined_rotation_error_rad"])
+
+
+def how_far_off(rows: pd.DataFrame, columns: Sequence[str]) -> dict[str, pd.Series]:
+    """Columns of errors, without their sign; what has no estimate is infinitely far off.
+
+    Whatever sums up errors starts here: over the estimates that happen to exist a median flatters
+    the methods that fail.
+    """
+    return {name: rows[name].abs().fillna(math.inf) for name in columns}
 
 
 def has_common_ground(rows: pd.DataFrame) -> pd.Series:

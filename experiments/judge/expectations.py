@@ -8,18 +8,26 @@ from pathlib import Path
 import pandas as pd
 
 from experiments.judge import metrics, tables
+from experiments.judge.known_truth import why_no_truth
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import AnyScenario, Bound
-from mapfusion.errors import InputError
+from mapfusion.errors import InputError, did_you_mean
 
 
 def load_checked(path: Path, overrides: Sequence[str] = (), seed: int | None = None) -> AnyScenario:
-    """A scenario as `load_scenario` gives it; raises InputError also for unknown metrics."""
+    """A scenario as `load_scenario` gives it.
+
+    Raises InputError also for unknown metrics, and where the truth that they need is.
+    """
     scenario = load_scenario(path, overrides, seed)
     known = metrics.known_metrics([entry.name for entry in scenario.align.aligners])
     unknown = sorted(set(scenario.expect) - set(known))
     if unknown:
-        raise InputError(f"{path}: expect.{unknown[0]}: unknown; known: {', '.join(known)}")
+        there = f"known: {', '.join(known)}{did_you_mean(unknown[0], known)}"
+        raise InputError(f"{path}: expect.{unknown[0]}: unknown; {there}")
+    if scenario.expect and (reason := why_no_truth(scenario)):
+        name = next(iter(scenario.expect))
+        raise InputError(f"{path}: expect.{name}: {reason}; leave `expect` out, or add the file")
     return scenario
 
 

@@ -18,7 +18,10 @@ _ERRORS = ("translation_error_m", "rotation_error_rad")
 ERROR_COLUMNS = (*_ERRORS, *(f"refined_{name}" for name in _ERRORS))
 COUNTS = ("n_correspondences", "n_true", "n_common")
 NEEDED = (*MAP_KEYS, "aligner", "repetition", *ERROR_COLUMNS, *COUNTS)
-OPTIONAL = tuple(name for name in SHOWN if name not in NEEDED)  # older runs may lack them
+_MADE_HERE = ("estimated_share", "refined_share")
+OPTIONAL = tuple(
+    name for name in SHOWN if name not in (*NEEDED, *_MADE_HERE)
+)  # older runs may lack them
 
 
 def maps_of(errors: pd.DataFrame) -> pd.DataFrame:
@@ -26,7 +29,8 @@ def maps_of(errors: pd.DataFrame) -> pd.DataFrame:
 
     Columns: the run's, robot_a, robot_b, iteration, aligner; n_repetitions; as shares of the
     repetitions estimated_success and refined_success (NaN for maps without common ground, where
-    there is nothing to be right about), accepted, false_accepted (see `is_false_merge`) and
+    there is nothing to be right about), estimated_share and refined_share (an estimate is there),
+    accepted, false_accepted (see `is_false_merge`) and
     refused_apart (NaN for maps with common ground), the last three NaN for runs without an
     acceptance test; the median absolute errors, infinite where most repetitions gave no estimate;
     further columns that are shown; n_correspondences, n_true, n_common, outlier_share.
@@ -37,13 +41,15 @@ def maps_of(errors: pd.DataFrame) -> pd.DataFrame:
     shares = {
         "estimated_success": criteria.right_as_estimated(errors).astype(float).where(ground),
         "refined_success": criteria.right_refined(errors).astype(float).where(ground),
+        "estimated_share": errors["translation_error_m"].notna().astype(float),
+        "refined_share": errors["refined_translation_error_m"].notna().astype(float),
         "accepted": accepted,
         "false_accepted": false.astype(float).where(accepted.notna()),
         "refused_apart": (1.0 - accepted).where(~ground),
     }
     off = [name for name in SHOWN if name in errors and SHOWN[name].kind == "error"]
     off = list(dict.fromkeys([*ERROR_COLUMNS, *off]))
-    judged = errors.assign(**shares, **{name: errors[name].abs().fillna(np.inf) for name in off})
+    judged = errors.assign(**shares, **criteria.how_far_off(errors, off))
     further = [name for name in SHOWN if name in errors and name not in (*shares, *off)]
     keys = [name for name in RUN_KEYS if name in errors]
     keys += [*setting_columns(errors), *MAP_KEYS, "aligner"]

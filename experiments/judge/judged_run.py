@@ -10,14 +10,16 @@ from experiments.judge import judging, tables
 from experiments.judge.errors import EvaluatedRobot, met_maps
 from experiments.judge.fused_landmarks import FusedTeam, MergeSettings
 from experiments.judge.judging import JudgeSettings
+from experiments.judge.known_truth import why_no_truth
+from experiments.run.memory import require_memory
 from experiments.run.pipeline import PairStages, Pipeline, RobotStages, lay_out
 from experiments.run.stage import Stage
 from experiments.run.stages.slam import RobotFolders
-from experiments.run.store import StageFolder, Store, explained
+from experiments.run.store import StageFolder, Store
 from experiments.run.tasks import OnProgress, Task, run_tasks, task_names, tasks_of, unfinished
 from experiments.run.workers import workers
 from experiments.scenario.settings import AnyScenario
-from mapfusion.errors import InputError
+from mapfusion.errors import DamagedFileError, InputError
 
 _JUDGED = {"errors", "fusion"}  # the other tables of pairs come from the aligners
 
@@ -28,8 +30,9 @@ class JudgedRun:
 
     pipeline: Pipeline
     settings: JudgeSettings
-    judgements: tuple[Stage, ...]  # in the order of the pipeline's pairs
+    judgements: tuple[Stage, ...]  # in the order of the pipeline's pairs; none without truth
     store: Store
+    no_truth: str  # why nothing can be judged; empty where the truth is known
 
     @classmethod
     def of(cls, scenario: AnyScenario, store: Store) -> "JudgedRun":
@@ -37,8 +40,10 @@ class JudgedRun:
         pipeline, merge = lay_out(scenario), MergeSettings(**dict(scenario.merge))
         align, radius_m = scenario.align, scenario.evaluate.true_pair_radius_m
         settings = JudgeSettings(align.refinement, align.acceptance, merge, radius_m)
-        judgements = tuple(_judgement(settings, pair) for pair in pipeline.pairs)
-        return cls(pipeline, settings, judgements, store)
+        no_truth = why_no_truth(scenario)
+        judged = () if no_truth else pipeline.pairs
+        judgements = tuple(_judgement(settings, pair) for pair in judged)
+        return cls(pipeline, settings, judgements, store, no_truth)
 
     @property
     def scenario(self) -> AnyScenario:
@@ -79,15 +84,22 @@ class JudgedRun:
         return pd.concat(parts, ignore_index=True) if parts else tables.framed(name, [])
 
     def execute(self, jobs: int, on_progress: OnProgress, only: Sequence[Stage] = ()) -> None:
-        """Do what is not in the store yet, in `jobs` processes; of `only` these stages, if any."""
+        """Do what is not in the store yet, in `jobs` processes; of `only` these stages, if any.
+
+        Raises:
+            InputError: something that was given cannot be used, or this machine has too little
+                memory for it.
+        """
+        require_memory(self.pipeline, jobs)
         wanted = only or self.stages()
         left = unfinished(self.tasks, [name for stage in wanted for name in task_names(stage)])
         try:
             with workers(jobs) as pool:
                 run_tasks(left, pool, on_progress)
+        except DamagedFileError:  # `mending` wants to know which
+            raise
         except InputError as error:
-            reason = explained(str(error), self.store)
-            raise InputError(f"scenario {self.scenario.name}: {reason}") from error
+            raise InputError(f"scenario {self.scenario.name}: {error}") from error
         for folder in map(self.store.folder, wanted):
             if not folder.finished:
                 raise InputError(f"{folder.path}: was removed while it was being made; run again")

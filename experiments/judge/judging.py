@@ -1,7 +1,9 @@
 """Stage: one robot pair's estimates against the truth, and whether fusing the pair was worth it."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
+import numpy as np
 import pandas as pd
 
 from experiments.judge import tables
@@ -14,7 +16,7 @@ from experiments.run.stages.slam import ASSOCIATIONS, RobotFolders, read_snapsho
 from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.refine import Refinement
 from mapfusion.errors import InputError
-from mapfusion.robot_log import read_log, read_truth
+from mapfusion.robot_log import TRUTH_FILES, RobotLog, RobotTruth, read_log, read_truth
 
 WRITES = ("errors.parquet", "fusion.parquet")
 
@@ -29,9 +31,17 @@ class JudgeSettings:
     true_pair_radius_m: float
 
 
+def _truth_of(folder: Path, log: RobotLog) -> RobotTruth:
+    """The truth beside a log; NaN where there is none."""
+    if all((folder / name).is_file() for name in TRUTH_FILES):
+        return read_truth(folder)
+    return RobotTruth(np.full((len(log), 3), np.nan), np.full((len(log.observations), 3), np.nan))
+
+
 def load_robot(folders: RobotFolders) -> EvaluatedRobot:
-    """A robot's maps joined with the truth."""
-    log, truth = read_log(folders.log), read_truth(folders.log)
+    """A robot's maps joined with the truth, which is NaN where it is unknown."""
+    log = read_log(folders.log)
+    truth = _truth_of(folders.log, log)
     poses, points = (truth.T_world_robot, log), (truth.point_world_m, log.observations)
     for file, (true, logged) in (("truth_poses", poses), ("truth_points", points)):
         if len(true) != len(logged):

@@ -66,7 +66,8 @@ def path_over_odometry(tables: Tables) -> float:
 )
 def _oracle_at_the_end(tables: Tables, which: str) -> float:
     """The oracle's errors and true pairs at the last iteration, median over seeds and pairs."""
-    return criteria.at_the_end(_of(tables["errors"], ORACLE))[which].abs().median()
+    rows = criteria.at_the_end(_of(tables["errors"], ORACLE))
+    return criteria.how_far_off(rows, [which])[which].median()
 
 
 def _truly_fused(tables: Tables) -> pd.DataFrame:
@@ -106,7 +107,8 @@ def fused_landmark_rmse_m(tables: Tables) -> float:
 @metric()
 def refined_oracle_distance_m(tables: Tables, aligner: str) -> float:
     """Refined translation against the oracle's, where there are 30 or more true pairs."""
-    return rich(_of(tables["errors"], aligner))["oracle_distance_m"].median()
+    rows = rich(_of(tables["errors"], aligner))
+    return criteria.how_far_off(rows, ["oracle_distance_m"])["oracle_distance_m"].median()
 
 
 @metric(
@@ -146,7 +148,7 @@ def scatter_m(tables: Tables, aligner: str) -> float:
 def repetition_spread_m(rows: pd.DataFrame) -> float:
     """10-90 % range of one aligner's translation error over the repetitions on the same maps.
 
-    As estimated; median over seeds, pairs, iterations.
+    As estimated, of those repetitions that gave an estimate; median over seeds, pairs, iterations.
     """
     keys = [name for name in ("run_id", *_PAIR, "iteration") if name in rows]
     groups = rows.groupby(keys)["translation_error_m"]

@@ -4,7 +4,6 @@
 `scenario.json` (resolved), `world.json`, `provenance.json`.
 """
 
-import json
 import platform
 import shutil
 from collections.abc import Sequence
@@ -28,7 +27,7 @@ from experiments.methods.catalogue import find_method
 from experiments.run.code_version import library_versions
 from experiments.run.frames import read_rows
 from experiments.run.stages import slam
-from experiments.run.store import Store
+from experiments.run.store import Store, mending
 from experiments.run.store_files import link_or_copy
 from experiments.run.tasks import OnProgress
 from experiments.scenario.randomness import generator
@@ -38,11 +37,19 @@ from mapfusion.errors import InputError
 from mapfusion.landmark_map import LandmarkMap, write_map
 from mapfusion.merge import merge
 from mapfusion.robot_log import read_log
-from mapfusion.storage import point_columns, write_whole
+from mapfusion.storage import (
+    point_columns,
+    remove_abandoned,
+    require_writable,
+    write_json,
+)
+from sim.floorplan import Wall
 from sim.renderer import renderer_name
 
 RESULT_SCHEMA_VERSION = 1
+_SUBFOLDERS = ("tables", "maps", "keyframes", "figures")
 _LABEL = "write the tables"
+_FACE_DECIMALS = 6  # a micrometre: what is beyond is rounding
 _WARM_UP_RUNS = 1  # compilation and caches
 
 
@@ -54,18 +61,33 @@ def require_result(result: Path) -> None:
 
 
 def run_scenario(
-    scenario: AnyScenario, results: Path, jobs: int, on_progress: OnProgress, fresh: bool = False
+    scenario: AnyScenario,
+    results: Path,
+    jobs: int,
+    on_progress: OnProgress,
+    fresh: bool = False,
+    output: Path | None = None,
 ) -> Path:
-    """Run a scenario and write its result folder `RESULTS/NAME-SEED`; returns the folder."""
+    """Run a scenario and write its result, to `RESULTS/NAME-SEED` by default; returns the folder.
+
+    The store is that of `results`.
+    """
     run = JudgedRun.of(scenario, Store.of(results))
+    folder = output or results / f"{scenario.name}-{scenario.seed}"
+    for place in (run.store.root, folder, *(folder / name for name in _SUBFOLDERS)):
+        require_writable(place)
+    remove_abandoned(folder)
     if fresh:
         for stage_folder in run.folders():
             stage_folder.discard()
-    run.execute(jobs, on_progress)
-    folder = results / f"{scenario.name}-{scenario.seed}"
-    on_progress(_LABEL, 0, 1)
-    write_result(run, folder)
-    on_progress(_LABEL, 1, 1)
+
+    def make() -> None:
+        run.execute(jobs, on_progress)
+        on_progress(_LABEL, 0, 1)
+        write_result(run, folder)
+        on_progress(_LABEL, 1, 1)
+
+    mending(run.store, make)
     return folder
 
 
@@ -74,6 +96,8 @@ def write_result(run: JudgedRun, folder: Path) -> None:
     team = run.load_team()
     measure_aligners(run, team.robots)
     rows = all_tables(run, team) | history_tables(team, run.settings)
+    if run.no_truth:
+        rows["true_pairs"] = pd.DataFrame()
     rows |= {"aligner_timings": run.pair_table("aligner_timings"), "tracks": _tracks(run)}
     for name, table in rows.items():
         tables.write(tables.table_path(folder, name), name, table)
@@ -82,9 +106,9 @@ def write_result(run: JudgedRun, folder: Path) -> None:
     for name, landmarks, _ in team.judged():
         write_map(folder / "maps" / f"{name}.parquet", landmarks)
     _write_images(run, folder)
-    _write_json(folder / "scenario.json", run.scenario.resolved())
-    _write_json(folder / "world.json", _world(run.scenario, team.robots))
-    _write_json(folder / "provenance.json", provenance(run))
+    write_json(folder / "scenario.json", run.scenario.resolved())
+    write_json(folder / "world.json", _world(run.scenario, team.robots))
+    write_json(folder / "provenance.json", provenance(run))
 
 
 def measure_aligners(run: JudgedRun, robots: Sequence[EvaluatedRobot]) -> None:
@@ -96,6 +120,7 @@ def measure_aligners(run: JudgedRun, robots: Sequence[EvaluatedRobot]) -> None:
     for pair in run.pipeline.pairs:
         path = run.store.path(pair.estimates) / "aligner_timings.parquet"
         if not path.is_file():
+            remove_abandoned(path.parent)
             rows = _time_pair(run.scenario, by_name[pair.a.name], by_name[pair.b.name])
             tables.write(path, "aligner_timings", rows)
 
@@ -112,7 +137,9 @@ def _time_pair(scenario: AnyScenario, a: EvaluatedRobot, b: EvaluatedRobot) -> l
     for iteration in iterations[np.unique(spread.round().astype(int))].tolist():
         (map_a, points_a), (map_b, points_b) = a.at(iteration), b.at(iteration)
         pairs = match(map_a, map_b, scenario.align.match)
+        known = np.isfinite(points_a).any() and np.isfinite(points_b).any()
         n_common = common_landmarks(points_a, points_b, settings.true_pair_radius_m)
+        n_common = n_common if known else tables.UNKNOWN
         maps = {"robot_a": a.name, "robot_b": b.name, "iteration": iteration}
         maps |= {"n_correspondences": len(pairs), "n_common": n_common}
         for name, aligner in aligners.items():
@@ -137,15 +164,17 @@ def all_tables(run: JudgedRun, team: FusedTeam) -> dict[str, pd.DataFrame]:
     rows: dict[str, Any] = {
         "paths": joined,
         "robots": joined,
-        "path_statistics": path_statistics_rows(joined),
+        "path_statistics": [] if run.no_truth else path_statistics_rows(joined),
         "clouds": pd.concat(clouds, ignore_index=True),
         "landmarks": pd.concat(landmarks, ignore_index=True),
         "fused": fused_landmarks.fused_rows(team),
         "fused_motions": fused_landmarks.fused_motion_rows(
             team, settings.merge.parameters.use_drift
         ),
-        "map_fits": fused_landmarks.map_fit_rows(team),
-        "landmark_nees": fused_landmarks.landmark_nees_rows(team, settings.true_pair_radius_m),
+        "map_fits": [] if run.no_truth else fused_landmarks.map_fit_rows(team),
+        "landmark_nees": []
+        if run.no_truth
+        else fused_landmarks.landmark_nees_rows(team, settings.true_pair_radius_m),
         "timings": [
             {"stage": stage.name, "name": f"{stage.key}:{name}", "elapsed_s": seconds}
             for stage in run.folders()
@@ -205,16 +234,16 @@ def _joined_rows(met: MetMaps, settings: MergeSettings) -> pd.DataFrame:
     return _plan_rows(fused).assign(**met.names, **joined)
 
 
-def _write_json(path: Path, content: object) -> None:
-    text = json.dumps(content, indent=1)
-    write_whole(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
-
-
 def _world(scenario: AnyScenario, robots: Sequence[EvaluatedRobot]) -> dict[str, object]:
     """The truth that figures show as background."""
-    walls = scenario.world.walls if isinstance(scenario, Simulation) else []
-    starts = {robot.name: robot.path.T_world_map.tolist() for robot in robots}
-    return {"walls": [list(wall.points) for wall in walls], "robots": starts}
+    plan = scenario.world if isinstance(scenario, Simulation) else None
+    walls = plan.walls if plan is not None else []
+    thick = plan.wall_thickness_m if plan is not None else 0.0
+    solid = [Wall(np.array(wall.points), thickness_m=thick) for wall in walls]
+    faces = [edge.round(_FACE_DECIMALS).tolist() for wall in solid for edge in wall.outline()]
+    known = [robot for robot in robots if np.isfinite(robot.path.T_world_map).all()]
+    starts = {robot.name: robot.path.T_world_map.tolist() for robot in known}
+    return {"walls": [list(wall.points) for wall in walls], "faces": faces, "robots": starts}
 
 
 def renderer(scenario: AnyScenario) -> str:

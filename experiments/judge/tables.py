@@ -18,8 +18,8 @@ from mapfusion.storage import COVARIANCE_FIELDS, POSITION_FIELDS, schema
 
 # Names that are no floats.
 _NAMES = {
-    frames.TEXT: """aligner delta_unit landmarks left_out map name quantity reason refined_status
-        robot robot_a robot_b source stage status""",
+    frames.TEXT: """aligner delta_unit landmarks left_out map name quantity reason refined_reason
+        refined_status robot robot_a robot_b source stage status""",
     frames.INT: """count degrees_of_freedom iteration landmark landmark_a landmark_b n n_common
         n_correspondences n_inliers n_landmarks n_parents n_true particle repetition""",
     frames.BOOL: "accepted resampled true_pair",
@@ -31,7 +31,8 @@ _OTHER_TYPES = {
     "fused_history": dict.fromkeys(_PLAN, pa.float32()),
     "true_pairs": {"true_pair": pa.binary()},
 }
-_VERSIONS = {"errors": 2}  # of the others: 1
+_VERSIONS = {"errors": 3}  # of the others: 1
+UNKNOWN = -1  # a count that only the truth could tell
 _POINT = " ".join(POSITION_FIELDS + COVARIANCE_FIELDS)
 _COLUMNS = {
     # One row per (robot pair, iteration, aligner, repetition), the estimates joined with the truth.
@@ -43,11 +44,12 @@ _COLUMNS = {
     # of freedom.
     "errors": """robot_a robot_b iteration aligner repetition status reason
         translation_error_m rotation_error_rad
-        refined_status refined_translation_error_m refined_rotation_error_rad
+        refined_status refined_reason refined_translation_error_m refined_rotation_error_rad
         accepted log10_false_alarms oracle_distance_m oracle_distance_rad
         n_correspondences n_true n_common n_inliers precision recall alignment_nees""",
     # One row per (robot, iteration); best particle online, anchored at the start, no fit. spread_m:
-    # root of the trace of the particles' weighted position covariance.
+    # root of the trace of the particles' weighted position covariance. n_landmarks: of the best
+    # particle, however often seen; its map holds those that were seen `slam.min_count` times.
     "robots": """robot iteration path_error_m path_error_rad odometry_error_m odometry_error_rad
         effective_sample_size resampled n_landmarks spread_m""",
     # Paths in the robot's own frame: the best particle's whole path at the end, the online
@@ -95,7 +97,8 @@ _COLUMNS = {
         nees_mean nees_median share_in_gate""",
     # Seconds of work by stage.
     "timings": "stage name elapsed_s",
-    # Serial, warmed, repeated: figure 6. Median of the repeats, 10th and 90th percentile.
+    # Serial, warmed, repeated: figure 6. Median of the repeats, 10th and 90th percentile; n_common
+    # is -1 where the truth is unknown.
     "aligner_timings": """robot_a robot_b iteration aligner n_correspondences n_common
         elapsed_s elapsed_low_s elapsed_high_s""",
 }
@@ -116,20 +119,22 @@ class Shown(NamedTuple):
     """How screens and reports show a column of `errors`, one figure a method.
 
     What follows a line break in the label goes to its second line. An `error` is shown as the
-    median of its absolute value over answerable maps, where no estimate is infinitely far off; a
-    `share` as the mean over maps with common ground.
+    median of its absolute value over answerable maps, where no estimate is infinitely far off, and
+    beside it the share of `given` estimates; a `share` as the mean over maps with common ground.
     """
 
     label: str
     layout: str
-    kind: Literal["error", "share"]
+    kind: Literal["error", "given", "share"]
 
 
 SHOWN = {
     "translation_error_m": Shown("estim.\nm", ".3f", "error"),
     "rotation_error_rad": Shown("estim.\nrad", ".4f", "error"),
+    "estimated_share": Shown("estim.\ngiven", ".0%", "given"),
     "refined_translation_error_m": Shown("refined\nm", ".3f", "error"),
     "refined_rotation_error_rad": Shown("refined\nrad", ".4f", "error"),
+    "refined_share": Shown("refined\ngiven", ".0%", "given"),
     "accepted": Shown("ok\n", ".0%", "share"),
 }
 

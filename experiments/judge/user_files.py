@@ -1,20 +1,20 @@
 """The stages one by one, on files of the user's own."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from experiments.judge.judged_run import JudgedRun
 from experiments.methods.aligner_calls import callable_aligner
 from experiments.run.estimates import estimate_row
-from experiments.run.store import Store
+from experiments.run.store import Store, mending
 from experiments.run.store_files import link_or_copy
 from experiments.run.tasks import OnProgress
-from experiments.scenario.loading import load_section
 from experiments.scenario.randomness import generator
-from experiments.scenario.settings import Align, AlignerEntry, AnyScenario, Merge, Recording, Slam
+from experiments.scenario.settings import Align, AlignerEntry, AnyScenario, Recording, Scenario
 from mapfusion.align.correspondences import match
 from mapfusion.align.registration import Registration
+from mapfusion.align.result import NOT_RUN, Status
 from mapfusion.errors import InputError
 from mapfusion.fastslam.run import run_log
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map
@@ -31,24 +31,25 @@ def record(
         reason = "uses recorded logs, there is nothing to record"
         raise InputError(f"scenario {scenario.name}: {reason}")
     run = JudgedRun.of(scenario, Store.of(results))
-    run.execute(jobs, on_progress, [robot.log for robot in run.pipeline.simulated])
-    for robot in run.pipeline.robots:
-        for path in sorted(run.store.path(robot.log).glob("*.parquet")):
-            link_or_copy(path, output / robot.name / path.name)
+
+    def make() -> None:
+        run.execute(jobs, on_progress, [robot.log for robot in run.pipeline.simulated])
+        for robot in run.pipeline.robots:
+            for path in sorted(run.store.path(robot.log).glob("*.parquet")):
+                link_or_copy(path, output / robot.name / path.name)
+
+    mending(run.store, make)
     return [output / robot.name for robot in run.pipeline.robots]
 
 
-def slam(
-    log: Path, scenario: Path | None, overrides: Sequence[str], seed: int, on_progress: OnProgress
-) -> LandmarkMap:
-    """The most probable map at the end of a log, by the `slam` section of a scenario if given."""
-    settings = load_section(scenario, "slam", Slam, overrides)
+def slam(log: Path, settings: Scenario, on_progress: OnProgress) -> LandmarkMap:
+    """The most probable map at the end of a log, by a scenario's `slam` section and seed."""
     robot_log = read_log(log)
     if not len(robot_log):
         raise InputError(f"{log}: frames.parquet holds no frame")
-    n_frames, rng = len(robot_log), generator(seed, "slam", robot_log.robot)
-    landmarks = None
-    for frame in run_log(robot_log, settings.filter, rng, [n_frames - 1], settings.min_count):
+    n_frames, rng = len(robot_log), generator(settings.seed, "slam", robot_log.robot)
+    wanted, least, landmarks = [n_frames - 1], settings.slam.min_count, None
+    for frame in run_log(robot_log, settings.slam.filter, rng, wanted, least):
         on_progress("FastSLAM", frame.iteration + 1, n_frames)
         landmarks = frame.landmarks
     assert landmarks is not None
@@ -68,39 +69,46 @@ def _registration(entry: AlignerEntry, settings: Align) -> Registration:
     return Registration(aligner, settings.refinement, settings.acceptance)
 
 
-def align(
-    paths: tuple[Path, Path], scenario: Path | None, overrides: Sequence[str], seed: int
-) -> list[dict[str, Any]]:
-    """Every aligner's estimate, its refinement and the verdict on it, as rows."""
-    settings = load_section(scenario, "align", Align, overrides)
-    map_a, map_b = map(read_map, paths)
-    pairs = match(map_a, map_b, settings.match)
+def align(path_a: Path, path_b: Path, settings: Scenario) -> list[dict[str, Any]]:
+    """Every aligner's estimate, its refinement and the verdict on it, as rows.
+
+    Each is called twice, with the same random numbers, and the second call is timed: the first
+    compiles kernels and starts processes.
+    """
+    map_a, map_b = read_map(path_a), read_map(path_b)
+    pairs = match(map_a, map_b, settings.align.match)
     rows = []
-    for entry in settings.aligners:
-        rng = generator(seed, "align", entry.name)
-        done = _registration(entry, settings).register(map_a, map_b, pairs, rng)
+    for entry in settings.align.aligners:
+        registration = _registration(entry, settings.align).on(map_a, map_b, pairs)
+        done = registration.register(generator(settings.seed, "align", entry.name))
+        if done.estimated.status not in NOT_RUN:
+            done = registration.register(generator(settings.seed, "align", entry.name))
         row = {"aligner": entry.name, "elapsed_s": done.estimated.elapsed_s}
         row |= {"n_inliers": int(done.refined.inlier.sum())} | estimate_row(len(pairs), *done)
         rows.append(row)
     return rows
 
 
-def merge(
-    paths: Sequence[Path], scenario: Path | None, overrides: Sequence[str], seed: int
-) -> FusedMap:
+def verdict_on(row: Mapping[str, Any]) -> tuple[Status, str]:
+    """What became of an estimate (a row of `align`) in the end, and why it was not accepted."""
+    if row["accepted"]:
+        return Status.ACCEPTED, ""
+    status = Status(row["status"]) if row["status"] in NOT_RUN else Status.REFUSED
+    return status, row["reason"] or row["refined_reason"] or row["acceptance_reason"]
+
+
+def merge(paths: Sequence[Path], settings: Scenario) -> FusedMap:
     """Fuse maps in the frame of the first."""
     if len(paths) < 2:
         raise InputError("merge: give two maps or more")
-    settings = load_section(scenario, "merge", Merge, overrides)
-    align_section = load_section(scenario, "align", Align, ())
-    entries = {entry.name: entry for entry in align_section.aligners}
-    if settings.aligner not in entries:
-        raise InputError(f"merge.aligner: {settings.aligner} is not among {', '.join(entries)}")
+    name, entries = settings.merge.aligner, {each.name: each for each in settings.align.aligners}
+    if name not in entries:
+        raise InputError(f"merge.aligner: {name} is not among {', '.join(entries)}")
     first, *others = maps = [read_map(path) for path in paths]
-    registration = _registration(entries[settings.aligner], align_section)
+    registration = _registration(entries[name], settings.align)
     offered, alignments = [], []
     for number, other in enumerate(others, start=1):
-        rng = generator(seed, "align", settings.aligner, number)
-        offered.append(match(first, other, align_section.match))
+        rng = generator(settings.seed, "align", name, number)
+        offered.append(match(first, other, settings.align.match))
         alignments.append(registration.register(first, other, offered[-1], rng).applied)
-    return merge_maps(maps, alignments, offered, settings.parameters)
+    return merge_maps(maps, alignments, offered, settings.merge.parameters)

@@ -13,19 +13,22 @@ import operator
 import os
 import pickle
 import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass
-from multiprocessing import Pipe
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from experiments.methods.answers import one_line, read
 from experiments.methods.catalogue import Kind, KnownMethod, find_method, make_method
+from experiments.methods.channel import Channel, GarbledError
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.registration import Aligner, as_aligner
 from mapfusion.align.result import Alignment, Status, without_answer
@@ -76,7 +79,8 @@ class Child:
     def __init__(self, spec: Spec) -> None:
         """Start it; raises ChildFailedError where the aligner could not be made."""
         self._maps: Maps | None = None
-        self._connection, theirs = Pipe()
+        ours, theirs = socket.socketpair()
+        self._channel = Channel(ours)
         lifeline, self._lifeline = os.pipe()
         descriptors = (theirs.fileno(), lifeline)
         path = os.pathsep.join(filter(None, sys.path))
@@ -91,11 +95,12 @@ class Child:
         )
         theirs.close()
         os.close(lifeline)
-        made = self._ask("make", spec.method, json.loads(spec.parameters), _START_LIMIT_S)
-        if isinstance(made, str):
+        request = ("make", spec.method, json.loads(spec.parameters), _START_LIMIT_S)
+        made = self._understood(json.loads, self._ask(*request))
+        if not isinstance(made, bool):
             self.kill()
-            raise ChildFailedError(made)
-        self.randomised: bool = made
+            raise ChildFailedError(one_line(made))
+        self.randomised = made
         self._memory_at_start = self._memory_bytes()
 
     def align(self, maps: Maps, rng: np.random.Generator, limit_s: float) -> Alignment:
@@ -109,16 +114,26 @@ class Child:
         answer = self._ask("align", sent, rng, limit_s)
         if self._memory_bytes() > self._memory_at_start + _MOST_GROWTH_BYTES:
             self.kill()
-        return answer
+        return self._understood(read, answer, len(maps[2]))
 
-    def _ask(self, *request: Any) -> Any:
+    def _understood(self, reader: Callable[..., Any], *answer: Any) -> Any:
+        try:
+            return reader(*answer)
+        except Exception as error:  # its libraries are no longer as they were
+            self.kill()
+            raise ChildFailedError(f"answered nonsense: {one_line(str(error))}") from None
+
+    def _ask(self, *request: Any) -> bytes:
         """The answer to a request, whose last entry is its time limit in seconds."""
         limit_s: float = request[-1]
         try:
-            self._connection.send(request)
-            if not self._connection.poll(limit_s):
-                raise TimedOutError(f"gave no answer within {limit_s:g} s")
-            return self._connection.recv()
+            return self._channel.ask(pickle.dumps(request, pickle.HIGHEST_PROTOCOL), limit_s)
+        except TimeoutError:
+            self.kill()
+            raise TimedOutError(f"gave no answer within {limit_s:g} s") from None
+        except GarbledError:
+            self.kill()
+            raise ChildFailedError("wrote into the connection to its process") from None
         except (EOFError, OSError):
             raise ChildFailedError(self._why_ended()) from None
         except BaseException:  # Ctrl-C too: an answer to this call must not be taken for the next's
@@ -142,8 +157,7 @@ class Child:
         code = self._process.returncode
         if not ended:
             return "closed the connection to its process"
-        how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
-        return f"ended its process with {how}"
+        return f"ended its process with {_signal_name(-code) if code < 0 else f'exit code {code}'}"
 
     def _has_ended(self) -> bool:
         """Without collecting its exit code: until then its number is nobody else's."""
@@ -155,15 +169,21 @@ class Child:
     @property
     def alive(self) -> bool:
         """Whether it can be asked."""
-        return not self._connection.closed and not self._has_ended()
+        return not self._channel.closed and not self._has_ended()
 
     def kill(self) -> None:
         """End the process, and those it started, at once."""
         if self._process.returncode is None:
             os.killpg(self._process.pid, signal.SIGKILL)
             self._process.wait()
-            self._connection.close()
+            self._channel.close()
             os.close(self._lifeline)
+
+
+def _signal_name(number: int) -> str:
+    """Also of those between SIGRTMIN and SIGRTMAX, which have numbers alone."""
+    names = {each.value: each.name for each in signal.Signals}
+    return names.get(number, f"signal {number}")
 
 
 _children: OrderedDict[Spec, Child] = OrderedDict()

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from mapfusion.align.registry import ALIGNERS, PEERS, construct
+from mapfusion.errors import did_you_mean
 
 ENTRY_POINTS = "mapfusion.aligners"  # the group by which an installed package declares aligners
 _CODE_SUFFIXES = (".py", ".so", ".pyd")
@@ -133,12 +134,14 @@ def find_method(name: str) -> KnownMethod:
     # ours need no look at installed packages
     known = _OWN_METHODS if name in _OWN_METHODS else known_methods()
     if name not in known:
-        unknown = f"unknown aligner {name!r}, known are {', '.join(known)}"
+        unknown = (
+            f"unknown aligner {name!r}, known are {', '.join(known)}{did_you_mean(name, known)}"
+        )
         raise ValueError(name_clashes().get(name, unknown))
     return known[name]
 
 
-def make_method(name: str, **parameters: Any) -> Any:
+def make_method(name: str, /, **parameters: Any) -> Any:
     """Build a method by name, in this process; it has `find`, or `align` in older packages.
 
     Raises:

@@ -7,9 +7,11 @@ from contextlib import AbstractContextManager, contextmanager
 import dask.config
 from distributed import Client, LocalCluster
 
+from experiments.run.interrupts import held_back_interrupts
 from mapfusion.errors import InputError
 
 CONNECT_TIMEOUT_S = 30
+_STARTS = 3  # of a cluster: a worker may be killed for no fault of ours, thrice in a row it is not
 
 _LOCAL_SETTINGS = {
     # Dask blames every task that was assigned to a killed worker, not only the one at work; the
@@ -48,16 +50,10 @@ def connected(jobs: int, scheduler: str | None) -> AbstractContextManager[Client
 @contextmanager
 def _local(jobs: int) -> Iterator[Client]:
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # the sweep tells what matters
-    with dask.config.set(_LOCAL_SETTINGS):
-        cluster = LocalCluster(
-            n_workers=jobs,
-            threads_per_worker=1,
-            processes=True,
-            dashboard_address="localhost:0",  # any port that is free
-            silence_logs=logging.CRITICAL,
-            preload=["experiments.run.dask_worker"],
-        )
+    with dask.config.set(_LOCAL_SETTINGS), held_back_interrupts() as let_them_come:
+        cluster = _started(jobs)
         try:
+            let_them_come()
             with Client(cluster, set_as_default=False) as client:
                 yield client
         except BaseException:  # end workers at once: the next sweep begins their tasks again
@@ -68,3 +64,21 @@ def _local(jobs: int) -> Iterator[Client]:
             raise
         finally:
             cluster.close()
+
+
+def _started(jobs: int) -> LocalCluster:
+    """A cluster with all its workers; where one was killed before it answered, once more."""
+    for attempt in range(_STARTS):
+        try:
+            return LocalCluster(
+                n_workers=jobs,
+                threads_per_worker=1,
+                processes=True,
+                dashboard_address="localhost:0",  # any port that is free
+                silence_logs=logging.CRITICAL,
+            )
+        except RuntimeError as error:  # "Nanny failed to start."
+            if attempt == _STARTS - 1:
+                reason = f"{jobs} workers could not be started, {_STARTS} times ({error})"
+                raise InputError(f"--jobs {jobs}: {reason}") from error
+    raise AssertionError

@@ -3,15 +3,16 @@
 import functools
 import pickle
 import platform
-import signal
 import threading
 import traceback
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
 from experiments.run.code_version import library_versions, source_hash
+from experiments.run.defects import described
 from experiments.run.kernel_cache import use_kernel_cache
-from mapfusion.errors import InputError
+from mapfusion.errors import DamagedFileError, InputError, UnsealedWarning
 
 # Tasks keep state of their process (the open PyBullet world, OpenCV's threads), so a worker that
 # was started with several threads works with one at a time.
@@ -19,11 +20,16 @@ _one_at_a_time = threading.Lock()
 
 
 class TaskFailedError(Exception):
-    """A task raised: its name, the reason in one line, and the traceback where it is no input's."""
+    """A task raised: its name and the reason in one line.
 
-    def __init__(self, task: str, reason: str, details: str = "") -> None:
-        super().__init__(task, reason, details)
-        self.task, self.reason, self.details = task, reason, details
+    And the traceback where it is a defect, or the error where it read a damaged file.
+    """
+
+    def __init__(
+        self, task: str, reason: str, details: str = "", damage: DamagedFileError | None = None
+    ) -> None:
+        super().__init__(task, reason, details, damage)
+        self.task, self.reason, self.details, self.damage = task, reason, details, damage
 
 
 class UnfitWorkerError(Exception):
@@ -55,14 +61,10 @@ def code_version() -> str:
 def _prepare() -> None:
     """Once a process, before anything is imported that computes."""
     use_kernel_cache()
+    warnings.simplefilter("ignore", UnsealedWarning)  # the command says it
     from experiments.methods.threads import single_threaded
 
     single_threaded()
-
-
-def dask_setup(worker: object) -> None:
-    """Local workers preload this module: Ctrl-C is for the command alone, which then ends them."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def perform(name: str, task: bytes, terms: Terms, *needs: None) -> None:
@@ -101,9 +103,13 @@ def _attempt(name: str, task: bytes, terms: Terms) -> None:
     try:
         pickle.loads(task).run()  # noqa: S301 (our own client's)
     except InputError as error:
-        raise TaskFailedError(name, " ".join(str(error).split())) from None
-    except Exception as error:
+        damage = error if isinstance(error, DamagedFileError) else None
+        raise TaskFailedError(name, " ".join(str(error).split()), damage=damage) from None
+    except (OSError, MemoryError) as error:  # of this machine: full, or not ours to write to
         reason = " ".join(f"{stage}: {type(error).__name__} {error}".split())
-        raise TaskFailedError(name, reason, traceback.format_exc()) from None
+        raise TaskFailedError(name, reason) from None
+    except Exception as error:
+        details = traceback.format_exc()
+        raise TaskFailedError(name, f"{stage}: {described(error, details)}", details) from None
     finally:
         mark.unlink(missing_ok=True)

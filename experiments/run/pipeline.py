@@ -25,14 +25,8 @@ from experiments.run.stages import (
     slam,
 )
 from experiments.run.stages.walls import Walls
-from experiments.scenario.settings import (
-    NAME_PATTERN,
-    AnyScenario,
-    Recording,
-    Scenario,
-    Section,
-    Simulation,
-)
+from experiments.scenario.sections import NAME_PATTERN, TAKEN_NAMES, Section
+from experiments.scenario.settings import AnyScenario, Recording, Scenario, Simulation
 from mapfusion.errors import InputError
 from mapfusion.robot_log import read_log
 from mapfusion.vision.frontend import FrontEndParameters
@@ -147,6 +141,8 @@ def _recorded(scenario: Recording) -> Iterable[RobotStages]:
             raise InputError(f"{folder}: frames.parquet holds no frame")
         if not re.fullmatch(NAME_PATTERN, name):
             raise InputError(f"{frames}: robot is named {name!r}, expected {NAME_PATTERN}")
+        if name in TAKEN_NAMES:
+            raise InputError(f"{frames}: robot is named {name}, a name of the evaluation's own")
         if name in robots:
             raise InputError(f"{frames}: robot {name} is in another log already")
         recorded = RecordedLog(folder)

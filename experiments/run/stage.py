@@ -80,7 +80,8 @@ class RecordedLog:
     def key(self) -> str:
         """Hash of its tables."""
         digest = hashlib.sha256()
-        for file in sorted(self.path.glob("*.parquet")):
+        tables = [*self.path.glob("[!.]*.parquet"), *self.path.glob("[!.]*.csv")]
+        for file in sorted(tables):
             digest.update(file.name.encode() + b"\0")
             digest.update(file.read_bytes())
         return digest.hexdigest()[:_KEY_LENGTH]

@@ -1,17 +1,27 @@
 """Where finished stages are kept, so that nothing is computed twice."""
 
-import json
 import shutil
+import warnings
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+from pydantic import TypeAdapter, ValidationError
 
 from experiments.run.stage import RecordedLog, Stage
-from mapfusion.storage import write_whole
+from mapfusion.errors import DamagedFileError, MendedWarning
+from mapfusion.sealed import is_intact
+from mapfusion.storage import read_json, write_json
 
 _MARK = "done"
+_FIGURES = TypeAdapter(dict[str, float])
+_DEPTH = 3  # a stage's file is STAGE/KEY/FILE
+# A disk that damages every file is none that the store can mend.
+_MENDED_AT_MOST = 2
+_TOLD_LATE_AT_MOST = 1000  # more tasks than a sweep has at work at one time
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -30,15 +40,19 @@ class StageFolder:
 
     def finish(self, part: str, figures: Mapping[str, float]) -> None:
         """Mark a part as finished, with figures about the work (times; never results)."""
-        text = json.dumps({"stage": self.name, "key": self.key, "figures": dict(figures)}, indent=1)
-        write_whole(self.outputs[part][-1], lambda file: file.write_text(text))
+        told = {"stage": self.name, "key": self.key, "figures": dict(figures)}
+        write_json(self.outputs[part][-1], told)
 
     def figures(self) -> dict[str, Any]:
-        """What `finish` was given, summed over the parts that are finished."""
+        """What `finish` was given, summed over the parts that are finished.
+
+        Raises:
+            DamagedFileError: a mark is no such file.
+        """
         total = Counter[str]()
         for *_, mark in self.outputs.values():
             if mark.is_file():
-                total.update(json.loads(mark.read_text())["figures"])
+                total.update(_figures(mark))
         return dict(total)
 
     def discard(self) -> None:
@@ -61,6 +75,34 @@ class Store:
         """Where what a stage made is or will be."""
         return stage.path if isinstance(stage, RecordedLog) else self.root / stage.name / stage.key
 
+    def discard_damaged(self, error: DamagedFileError, mended: Counter[Path]) -> bool:
+        """Forget the stage that a damaged file belongs to, and warn.
+
+        Others may have read the file before that and tell later: then there is nothing to do.
+
+        Args:
+            error: what was read.
+            mended: counts, over the calls of one command.
+
+        Returns:
+            False for a file that no stage made, or one that was damaged too often.
+        """
+        path, root = error.path.resolve(), self.root.resolve()
+        parts = path.relative_to(root).parts if path.is_relative_to(root) else ()
+        if len(parts) < _DEPTH:
+            return False
+        stage = root.joinpath(*parts[:2])
+        if mended[path] and (not path.is_file() or is_intact(path.read_bytes())):
+            mended[stage] += 1
+            return mended[stage] <= _TOLD_LATE_AT_MOST
+        mended[path] += 1
+        if mended[path] > _MENDED_AT_MOST:
+            return False
+        shutil.rmtree(stage, ignore_errors=True)
+        again = f"the stage {stage.parent.name} is discarded and computed again"
+        warnings.warn(f"{error}; {again}", MendedWarning, stacklevel=2)
+        return True
+
     def folder(self, stage: Stage) -> StageFolder:
         """The same with all that is known of it."""
         path = self.path(stage)
@@ -72,8 +114,25 @@ class Store:
         return StageFolder(path, stage.name, stage.key, outputs)
 
 
-def explained(reason: str, store: Store) -> str:
-    """What to do about a reason that names a file of the store: it is no file of the user's."""
-    if str(store.root) not in reason:
-        return reason
-    return f"{reason}; delete its folder, then it is computed again"
+def _figures(mark: Path) -> dict[str, float]:
+    try:
+        return _FIGURES.validate_python(read_json(mark, "mark of a finished stage").get("figures"))
+    except ValidationError as error:
+        raise DamagedFileError(mark, "holds no figures about a finished stage") from error
+
+
+def mending(store: Store, work: Callable[[], T]) -> T:
+    """What `work` gives, called again after each damaged stage of the store that it comes across.
+
+    `work` makes again what is no longer there. What it finds is told as a warning.
+
+    Raises:
+        DamagedFileError: a file outside the store, or one that is damaged again and again.
+    """
+    mended = Counter[Path]()
+    while True:
+        try:
+            return work()
+        except DamagedFileError as error:
+            if not store.discard_damaged(error, mended):
+                raise

@@ -15,6 +15,7 @@ from experiments.run.job import Job
 from experiments.run.stage import RecordedLog, Stage
 from experiments.run.store import StageFolder, Store
 from experiments.run.workers import Workers
+from mapfusion.storage import remove_abandoned
 
 OnProgress = Callable[[str, int, int], None]
 
@@ -89,6 +90,7 @@ def _task(stage: Stage, part: str, store: Store) -> Task:
 
 def _perform(work: Callable[..., Any], settings: Any, job: Job, folder: StageFolder) -> None:
     """Have a part made and mark it as finished, with how long it took."""
+    remove_abandoned(folder.path)  # by a process that was killed while it made the same
     started = time.perf_counter()
     figures = dict(work(settings, job) or {})
     folder.finish(job.part, {"elapsed_s": time.perf_counter() - started} | figures)

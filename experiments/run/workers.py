@@ -3,8 +3,8 @@
 import functools
 import multiprocessing
 import os
-import signal
 import threading
+import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -13,7 +13,8 @@ from multiprocessing import connection
 from typing import Any
 
 from experiments.methods.threads import single_threaded
-from mapfusion.errors import InputError
+from experiments.run.interrupts import held_back_interrupts
+from mapfusion.errors import InputError, UnsealedWarning
 
 # While a process works on one task, the next is there already. More of them would be begun in the
 # order they were submitted, though a later one may be what others wait for.
@@ -21,9 +22,8 @@ TASKS_PER_PROCESS = 2
 
 
 def _start_worker() -> None:
-    # Ctrl-C reaches the whole process group; the parent alone decides what then happens.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    warnings.simplefilter("ignore", UnsealedWarning)  # the parent says it
     single_threaded()
 
 
@@ -50,7 +50,8 @@ class Workers:
     def submit(self, tag: Any, function: Callable[..., Any], *arguments: Any) -> None:
         """Have `function(*arguments)` called, after what was submitted before."""
         submit = functools.partial if self._pool is None else self._pool.submit
-        self._pending[submit(function, *arguments)] = tag
+        with held_back_interrupts():  # the first task starts the processes
+            self._pending[submit(function, *arguments)] = tag
 
     @property
     def room(self) -> int:

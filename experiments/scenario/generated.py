@@ -3,10 +3,11 @@
 from dataclasses import field
 from typing import Annotated, Any
 
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
 from experiments.scenario.randomness import generator
+from mapfusion.arguments import Range
 from sim.plan_generator import PlanParameters
 from sim.route_planner import RouteParameters, generate_world
 
@@ -15,11 +16,12 @@ from sim.route_planner import RouteParameters, generate_world
 class Generate(RouteParameters, PlanParameters):
     """A floor plan and routes drawn from a seed.
 
-    The scenario's seed also draws the plan, unless `plan_seed` is given. `world` holds whatever of
-    the world is not drawn (heights, textures).
+    Attributes:
+        plan_seed: draws the plan; None: the scenario's seed does.
+        world: whatever of the world is not drawn (heights, textures).
     """
 
-    plan_seed: Annotated[int, Field(ge=0, lt=2**32)] | None = None
+    plan_seed: Annotated[int, Range(0, 2**32 - 1, "1")] | None = None
     world: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -1,15 +1,19 @@
 """Scenario files in, validated scenarios out, or one line: the field, and what would be right."""
 
+import functools
+import reprlib
 import warnings
 from collections.abc import Iterator, Sequence
+from dataclasses import is_dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ConfigDict, TypeAdapter, ValidationError, model_validator
+from pydantic.dataclasses import dataclass
 from pydantic_core import to_jsonable_python
 
 from experiments.methods.catalogue import name_clashes
-from experiments.scenario.generated import Generate, expanded
+from experiments.scenario.generated import expanded
 from experiments.scenario.settings import (
     Align,
     AnyScenario,
@@ -19,16 +23,18 @@ from experiments.scenario.settings import (
     Simulation,
 )
 from experiments.scenario.yaml_input import apply_overrides, read_mapping
-from mapfusion.errors import InputError, NameClashWarning
+from mapfusion.errors import InputError, NameClashWarning, OutOfRangeError, did_you_mean
 
+SHIPPED = Path(__file__).with_name("shipped")  # the repository's scenarios/, also where installed
+OWN = Path("scenarios")  # what shipped files name lies beside it, as it does in the repository
 S = TypeVar("S")
 _MOST_SUGGESTED = 3  # keys that an error message offers
 _UNKNOWN = {"extra_forbidden", "unexpected_keyword_argument"}
 _WORLD = {"world", "robots", "drive"}  # what a simulation must have and a recording cannot
 _EITHER = "give either world, robots and drive, or logs; generate stands for world and robots"
-_FIELDS = Simulation.model_fields | Recording.model_fields
+_FIELDS = GeneratedScenario.model_fields | Simulation.model_fields | Recording.model_fields
 # What says nothing: resolved scenarios of earlier versions name all sections.
-_SILENT = {"generate": [None]} | {
+_SILENT = {
     name: [None, [], *([] if field.is_required() else [to_jsonable_python(field.default)])]
     for name, field in _FIELDS.items()
     if name not in Scenario.model_fields
@@ -43,15 +49,24 @@ def load_scenario(
     Raises:
         InputError: one line that names the file, the field and what would be right.
     """
+    _require_whole_paths(overrides)
     data = apply_overrides(read_mapping(path), overrides)
     if seed is not None:
         data["seed"] = seed
     scenario = scenario_of(data, str(path))
     _warn_of_name_clashes(scenario.align)
     if isinstance(scenario, Recording):
-        logs = [str((path.parent / log).resolve()) for log in scenario.logs]
+        folder = OWN if path.parent == SHIPPED else path.parent
+        logs = [_resolved(path, folder, log) for log in scenario.logs]
         return scenario.model_copy(update={"logs": logs})
     return scenario
+
+
+def _resolved(path: Path, folder: Path, log: str) -> str:
+    try:
+        return str((folder / log).resolve())
+    except (OSError, RuntimeError, ValueError) as error:  # a loop of links, a name too long
+        raise InputError(f"{path}: logs: {log}: no folder has this path ({error})") from error
 
 
 def scenario_of(data: dict[str, Any], where: str) -> AnyScenario:
@@ -60,44 +75,62 @@ def scenario_of(data: dict[str, Any], where: str) -> AnyScenario:
     Raises:
         InputError: one line that begins with `where`.
     """
-    data = _expanded(where, data)
     data = {key: value for key, value in data.items() if value not in _SILENT.get(key, [])}
-    if "generate" in data:  # nothing can be drawn from this seed
-        _validated(where, GeneratedScenario, data)
-    recorded = "logs" in data
-    unclear = bool(data.keys() & _WORLD) if recorded else not data.keys() >= _WORLD
+    drawn, recorded = "generate" in data, "logs" in data
+    if drawn and data.keys() & {"world", "robots", "logs"}:
+        raise InputError(f"{where}: give either generate, or world and robots, or logs")
+    needed = {"drive"} if drawn else _WORLD
+    unclear = bool(data.keys() & _WORLD) if recorded else not data.keys() >= needed
     if unclear and data.keys() <= _FIELDS.keys():  # a misspelt name is the better explanation
         raise InputError(f"{where}: {_EITHER}")
+    if drawn:
+        asked = _validated(where, GeneratedScenario, data)
+        try:
+            made = expanded(asked.generate, asked.seed)
+        except InputError as error:
+            raise InputError(f"{where}: generate.{error}") from error
+        data = {key: value for key, value in data.items() if key != "generate"} | made
     return _validated(where, Recording if recorded else Simulation, data)
 
 
-def _expanded(where: str, data: dict[str, Any]) -> dict[str, Any]:
-    """The data with the world and the robots that its `generate` section stands for."""
-    if data.get("generate") is None:
-        return data
-    if data.get("world") is not None or data.get("robots") or data.get("logs"):
-        raise InputError(f"{where}: give either generate, or world and robots, or logs")
-    # the rest is judged first: what is wrong with the seed must not show as a broken plan
-    if not isinstance(data.get("seed", 0), int):
-        return data
-    settings = _validated(f"{where}: generate", Generate, data["generate"])
-    try:
-        made = expanded(settings, data.get("seed", 0))
-    except InputError as error:
-        raise InputError(f"{where}: generate.{error}") from error
-    return {key: value for key, value in data.items() if key != "generate"} | made
+def made_settings(where: str, kind: type[S], overrides: Sequence[str]) -> S:
+    """Settings of that kind alone: defaults, with overrides; raises InputError."""
+    return _validated(where, kind, apply_overrides({}, overrides))
 
 
-def load_section(path: Path | None, name: str, kind: type[S], overrides: Sequence[str]) -> S:
-    """One section of a scenario, or its defaults, with overrides inside it; raises InputError."""
-    where, data = name, {}
-    if path is not None:
-        load_scenario(path)
-        where, data = f"{path}: {name}", read_mapping(path).get(name) or {}
-    section = _validated(where, kind, apply_overrides(data, overrides))
-    if path is None and isinstance(section, Align):
-        _warn_of_name_clashes(section)
-    return section
+class _StepSettings(Scenario):
+    """Settings of one step on files: aligning alone need not be able to merge."""
+
+    @model_validator(mode="after")
+    def _merges_what_it_aligns(self) -> Self:
+        return self
+
+
+def default_settings(overrides: Sequence[str] = (), seed: int | None = None) -> Scenario:
+    """What a scenario sets beside its world, for work on files: defaults, with overrides.
+
+    Raises:
+        InputError: one line that names the key and what would be right.
+    """
+    _require_whole_paths(overrides)
+    data = apply_overrides({"schema_version": 1, "name": "defaults"}, overrides)
+    settings = _validated("--set", _StepSettings, data if seed is None else data | {"seed": seed})
+    _warn_of_name_clashes(settings.align)
+    return settings
+
+
+def _require_whole_paths(overrides: Sequence[str]) -> None:
+    """Refuse a key that lacks its beginning, as `filter.n_particles` does."""
+    roots = _FIELDS.keys() | GeneratedScenario.model_fields.keys()
+    for key in (override.partition("=")[0] for override in overrides):
+        first, *rest = key.split(".")
+        if first and first not in roots:
+            known = _known_keys(Simulation)
+            ends = [path for path in known if path[-1] == first and "*" not in path]
+            meant = sorted(((*path, *rest) for path in ends), key=lambda path: path not in known)
+            if meant:
+                whole = f"keys begin at the scenario's root: {'.'.join(meant[0])}"
+                raise InputError(f"--set {key}: {whole}")
 
 
 def _warn_of_name_clashes(align: Align) -> None:
@@ -106,38 +139,59 @@ def _warn_of_name_clashes(align: Align) -> None:
             warnings.warn(name_clashes()[method], NameClashWarning, stacklevel=3)
 
 
+@functools.cache  # a sweep and a campaign validate the same few kinds again and again
+def _known(kind: type[S]) -> TypeAdapter[S]:
+    strict = kind
+    if is_dataclass(kind):  # an importer's settings; sections say themselves what they forbid
+        strict = dataclass(kind, config=ConfigDict(extra="forbid"), frozen=True)
+    return TypeAdapter(strict)
+
+
+@functools.cache
+def _known_keys(kind: type) -> list[tuple[str, ...]]:
+    schema = _known(kind).json_schema()
+    return list(_keys(schema, schema))
+
+
 def _validated(where: str, kind: type[S], data: dict[str, Any]) -> S:
-    known = TypeAdapter(kind)
     try:
-        return known.validate_python(data)
+        return _known(kind).validate_python(data)
     except ValidationError as error:
-        raise InputError(f"{where}: {_first_problem(known.json_schema(), error)}") from error
+        raise InputError(f"{where}: {_first_problem(kind, error)}") from error
 
 
-def _first_problem(schema: dict[str, Any], error: ValidationError) -> str:
-    """The first thing wrong with a section of that JSON schema, and how many more there are."""
+def _first_problem(kind: type, error: ValidationError) -> str:
+    """The first thing wrong with a section of that kind, and how many more there are."""
     # A wrong name explains the missing one that follows from it, so it goes first.
     problems = error.errors(include_url=False)
     problem, *more = sorted(problems, key=lambda each: each["type"] not in _UNKNOWN)
     location = problem["loc"]
     message = problem["msg"].removeprefix("Value error, ")
-    if problem["type"] in _UNKNOWN:
-        message = _about_unknown(location, list(_keys(schema, schema)))
+    cause = problem.get("ctx", {}).get("error")
+    if isinstance(cause, OutOfRangeError):
+        location, message = (*location, cause.name), cause.problem
+    elif problem["type"] in _UNKNOWN:
+        message = _about_unknown(location, _known_keys(kind))
     elif problem["type"] != "value_error" and not isinstance(problem["input"], dict):
-        message = f"{message} (it is {problem['input']!r})"
+        message = f"{message} (it is {reprlib.repr(problem['input'])})"
     where = f"{'.'.join(map(str, location))}: " if location else ""
     return f"{where}{message}" + (f" (and {len(more)} more)" if more else "")
 
 
 def _about_unknown(location: tuple[int | str, ...], known: list[tuple[str, ...]]) -> str:
-    """The names that would have been right there, and keys of which the wrong one is a word."""
-    *above, name = location
+    """The names that would have been right there, and those that may have been meant."""
+    *above, wrong = location
     beside = [path for path in known if len(path) == len(location)]
     for i, part in enumerate(above):
         beside = [path for path in beside if path[i] in {"*", part}]
-    like = [".".join(path) for path in known if name in path[-1].split("_") and "*" not in path]
-    message = f"unknown key; known here: {', '.join(sorted(path[-1] for path in beside))}"
-    return message + (f"; did you mean {' or '.join(like[:_MOST_SUGGESTED])}?" if like else "")
+    here = sorted({path[-1] for path in beside})
+    message = f"unknown key; known here: {', '.join(here)}"
+    meant = did_you_mean(str(wrong), here)
+    # else a key of another section, of which the wrong one is a word
+    like = [".".join(p) for p in known if wrong in p[-1].split("_") and "*" not in p]
+    if like and not meant:
+        meant = f"; did you mean {' or '.join(like[:_MOST_SUGGESTED])}?"
+    return message + meant
 
 
 def _keys(root: dict[str, Any], node: dict[str, Any], *above: str) -> Iterator[tuple[str, ...]]:

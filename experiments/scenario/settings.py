@@ -4,136 +4,64 @@ The stages' own parameter classes (`FrontEndParameters`, `FastSlamParameters`, .
 are: pydantic validates them in place, so a parameter is named and explained once, where it is used.
 """
 
-import json
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from experiments.methods.aligner_calls import require_usable
 from experiments.scenario.generated import Generate
+from experiments.scenario.sections import (
+    MAX_COUNT,
+    MAX_NAMED,
+    Drive,
+    Keep,
+    Name,
+    Render,
+    Robot,
+    Section,
+    Slam,
+    World,
+    different,
+    free,
+)
 from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.correspondences import MatchParameters
 from mapfusion.align.refine import Refinement
+from mapfusion.arguments import Range
 from mapfusion.camera import StereoCamera
-from mapfusion.fastslam.parameters import FastSlamParameters
+from mapfusion.errors import OutOfRangeError
 from mapfusion.merge import MergeParameters
 from mapfusion.vision.frontend import FrontEndParameters
-from sim.driver import DriverSettings
 from sim.odometry import OdometryNoise
-from sim.p3at import TIRE_FRICTION
 from sim.stereo_head import RadiometricNoise
-from sim.textures import Texture
 
-NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,40}$"  # names become parts of file names
-T = TypeVar("T")
-Name = Annotated[str, Field(pattern=NAME_PATTERN)]
-Point = tuple[float, float]
-MAX_IMAGE_SIDE_PX = 4096  # the software renderer takes seconds and 100 MB a frame at this size
-
-
-def _different(items: list[T], prefix: str = "") -> list[T]:
-    """Refuse two of one name; the items are names or have one."""
-    names = [getattr(item, "name", item) for item in items]
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f"{prefix}two are named {name}; names must differ")
-    return items
-
-
-def _renderable(camera: StereoCamera) -> StereoCamera:
-    for name, value in vars(camera).items():
-        if name in {"width_px", "height_px"} and not 1 <= value <= MAX_IMAGE_SIDE_PX:
-            raise ValueError(f"{name}: is {value}, must be in [1, {MAX_IMAGE_SIDE_PX}]")
-        if name in {"focal_px", "baseline_m", "mount_z_m"} and not value > 0:
-            raise ValueError(f"{name}: is {value}, must be positive")
-    return camera
-
-
-class Section(BaseModel):
-    """Frozen; unknown keys, NaN and infinity are refused."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class Wall(Section):
-    """A wall along a polyline, in world metres."""
-
-    points: Annotated[list[Point], Field(min_length=2)]
-
-
-class World(Section):
-    """Walls, all of one height and thickness, under one ceiling."""
-
-    walls: Annotated[list[Wall], Field(min_length=1)]
-    wall_height_m: Annotated[float, Field(gt=0.5, le=6)] = 2.5
-    wall_thickness_m: Annotated[float, Field(gt=0.01, le=1)] = 0.12
-    texture: Texture = Texture()
-
-
-class Robot(Section):
-    """One robot: where it starts (x_m, y_m, theta_rad in the world) and the points it visits.
-
-    `odometry` and `radiometry` replace the scenario's for this robot. `tire_friction` is that of
-    its wheels against the ground; on a slippery floor they spin as it speeds up.
-    """
-
-    name: Name
-    start: tuple[float, float, float]
-    route: Annotated[list[Point], Field(min_length=1)]
-    loop: bool = True
-    odometry: OdometryNoise | None = None
-    radiometry: RadiometricNoise | None = None
-    tire_friction: Annotated[float, Field(gt=0, le=2)] = TIRE_FRICTION
-
-
-class Drive(Section):
-    """How long and how the robots drive. The seed moves each start within the jitter."""
-
-    frames: Annotated[int, Field(ge=2, le=20_000)]
-    frame_interval_s: Annotated[float, Field(gt=0, le=2)] = 0.2
-    start_jitter_m: Annotated[float, Field(ge=0, le=1)] = 0.1
-    start_jitter_rad: Annotated[float, Field(ge=0, le=3.2)] = 0.1
-    control: DriverSettings = DriverSettings()
-
-
-class Render(Section):
-    """What draws the images: PyBullet's own software renderer, or the system's OpenGL by EGL."""
-
-    renderer: Literal["tiny", "egl"] = "tiny"
-
-
-class Keep(Section):
-    """What is kept for the figures beyond the tables."""
-
-    images_at: Annotated[int, Field(ge=0)] = 60
-    images: Annotated[int, Field(ge=0, le=50)] = 6
-    clouds_every: Annotated[int, Field(ge=1)] = 10
-
-
-class Slam(Section):
-    """The filter, and how often a landmark must have been seen to enter the map."""
-
-    filter: FastSlamParameters = FastSlamParameters()
-    min_count: Annotated[int, Field(ge=1)] = 3
+# Of whatever metrics measure; beyond, the screens' numbers say nothing.
+MetricValue = Annotated[float, Range(-1e9, 1e9, "the metric's")]
 
 
 class AlignerEntry(Section):
     """An aligner under the name that tables and figures use.
 
-    The time limit holds for one call of an aligner that is not our own. TEASER++ takes 0.6 s for
-    5000 pairs: a hundred times that, so that a busy machine is not taken for a method that hangs.
+    Attributes:
+        name: what tables and figures call it.
+        method: an alignment method, built in or of an installed package.
+        parameters: the method's own.
+        time_limit_s: of one call of an aligner that is not our own. TEASER++ takes 0.6 s for 5000
+            pairs: a hundred times that, so that a busy machine is not taken for a method that
+            hangs.
     """
 
-    name: Name
-    method: str
-    parameters: dict[str, Any] = {}
-    time_limit_s: Annotated[float, Field(gt=0, le=86_400)] = 60.0
+    name: Annotated[Name, AfterValidator(free)]
+    method: Annotated[str, Field(max_length=100)]
+    parameters: dict[str, Any] = Field(default_factory=dict)
+    time_limit_s: Annotated[float, Range(0.01, 86_400, "s")] = 60.0
 
     @model_validator(mode="after")
     def _known(self) -> Self:
-        require_usable(self.method, self.parameters)
-        if self.name == "oracle":
-            raise ValueError("the name oracle is taken by the evaluation")
+        try:
+            require_usable(self.method, self.parameters)
+        except OutOfRangeError as error:
+            raise OutOfRangeError(f"parameters.{error.name}", error.problem) from error
         return self
 
 
@@ -152,47 +80,71 @@ DEFAULT_ALIGNERS = [
 class Align(Section):
     """Correspondences, the aligners on them, the least squares after each, the test against chance.
 
-    Randomised aligners are repeated on each pair of maps, so that their own spread can be seen.
-    `also` names aligners beside those of `aligners`, which need not be repeated then.
+    Attributes:
+        match: how landmarks are paired.
+        aligners: the aligners that are compared.
+        also: aligners beside those of `aligners`, which need not be repeated then.
+        refinement: least squares after each aligner.
+        acceptance: the test of each alignment against chance.
+        repetitions: of randomised aligners on each pair of maps, so that their own spread is seen.
     """
 
     match: MatchParameters = MatchParameters()
-    aligners: Annotated[list[AlignerEntry], Field(min_length=1)] = DEFAULT_ALIGNERS
-    also: list[AlignerEntry] = []
+    aligners: Annotated[list[AlignerEntry], Field(min_length=1, max_length=MAX_NAMED)] = (
+        DEFAULT_ALIGNERS
+    )
+    also: list[AlignerEntry] = Field(default_factory=list, max_length=MAX_NAMED)
     refinement: Refinement = Refinement()
     acceptance: Acceptance = Acceptance()
-    repetitions: Annotated[int, Field(ge=1, le=1000)] = 20
+    repetitions: Annotated[int, Range(1, 1000, "repetitions")] = 20
 
     @model_validator(mode="after")
     def _unique(self) -> Self:
         # One list from here on; pydantic freezes models for their users, not for their validators.
-        aligners = _different([*self.aligners, *self.also], "aligners: ")
+        aligners = different([*self.aligners, *self.also], "aligners: ")
         object.__setattr__(self, "aligners", aligners)
         object.__setattr__(self, "also", [])
         return self
 
 
 class Merge(Section):
-    """Which aligner's refined result the maps are merged with, and how."""
+    """The fused map.
+
+    Attributes:
+        aligner: whose refined result the maps are merged with; a name of `align.aligners`.
+        parameters: how they are merged.
+    """
 
     aligner: Name = "ransac"
     parameters: MergeParameters = MergeParameters()
 
 
 class Evaluate(Section):
-    """When aligners are compared, and what counts as truly the same landmark."""
+    """When aligners are compared, and what counts as truly the same landmark.
 
-    every: Annotated[int, Field(ge=1)] = 25
-    true_pair_radius_m: Annotated[float, Field(gt=0)] = 0.10
-    timing_points: Annotated[int, Field(ge=1)] = 8
-    timing_repeats: Annotated[int, Field(ge=1)] = 5
+    Attributes:
+        every: maps are aligned and judged at every so-manieth frame, and at the last.
+        true_pair_radius_m: landmarks whose true points lie this near are one.
+        timing_points: pairs of maps, evenly spread over the run, on which aligners are timed.
+        timing_repeats: timings on each.
+    """
+
+    every: Annotated[int, Range(1, MAX_COUNT, "frames")] = 25
+    true_pair_radius_m: Annotated[float, Range(1e-3, 10, "m")] = 0.10
+    timing_points: Annotated[int, Range(1, 1000, "pairs of maps")] = 8
+    timing_repeats: Annotated[int, Range(1, 1000, "repetitions")] = 5
 
 
 class Bound(Section):
-    """The range a metric must lie in; both ends included."""
+    """The range a metric must lie in; both ends included.
 
-    min: float | None = None
-    max: float | None = None
+    Attributes:
+        min: the least value that passes.
+        max: the largest value that passes.
+    """
+
+    min: MetricValue | None = None
+    max: MetricValue | None = None
 
     @model_validator(mode="after")
     def _one_end(self) -> Self:
@@ -204,19 +156,33 @@ class Bound(Section):
 
 
 class Scenario(Section):
-    """What a simulation and a recording have in common."""
+    """What a simulation and a recording have in common.
+
+    Attributes:
+        schema_version: of this file's format.
+        name: of the result's folder.
+        description: one line for people.
+        tags: words that commands take in place of this scenario's name.
+        seed: of all that is random.
+        slam: how maps are made.
+        align: alignment of two maps.
+        merge: the fused map.
+        evaluate: when and how it is judged.
+        keep: what is kept for the figures.
+        expect: bounds by metric, which `mapfusion check` holds runs to.
+    """
 
     schema_version: Literal[1]
     name: Name
-    description: str = ""
-    tags: list[Name] = []
-    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    description: Annotated[str, Field(max_length=2000)] = ""
+    tags: list[Name] = Field(default_factory=list, max_length=MAX_NAMED)
+    seed: Annotated[int, Range(0, 2**32 - 1, "1")] = 0
     slam: Slam = Slam()
     align: Align = Align()
     merge: Merge = Merge()
     evaluate: Evaluate = Evaluate()
     keep: Keep = Keep()
-    expect: dict[str, Bound] = {}
+    expect: dict[str, Bound] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _merges_what_it_aligns(self) -> Self:
@@ -232,24 +198,41 @@ class Scenario(Section):
 
 
 class Recording(Scenario):
-    """An experiment on recorded logs: folders, relative to the scenario's file."""
+    """An experiment on recorded logs.
 
-    logs: Annotated[list[str], Field(min_length=1), AfterValidator(_different)]
+    Attributes:
+        logs: folders of robots' logs, relative to the scenario's file.
+    """
+
+    logs: Annotated[list[str], Field(min_length=1, max_length=MAX_NAMED), AfterValidator(different)]
 
 
 class SimulatedScenario(Scenario):
-    """What simulations have in common, whoever draws their world."""
+    """What simulations have in common, whoever draws their world.
+
+    Attributes:
+        drive: how the robots drive.
+        render: what draws the images.
+        camera: the stereo head of all robots.
+        radiometry: noise of the images.
+        odometry: noise of the wheels' counts.
+        vision: from images to observations.
+    """
 
     drive: Drive
     render: Render = Render()
-    camera: Annotated[StereoCamera, AfterValidator(_renderable)] = StereoCamera()
+    camera: StereoCamera = StereoCamera()
     radiometry: RadiometricNoise = RadiometricNoise()
     odometry: OdometryNoise = OdometryNoise()
     vision: FrontEndParameters = FrontEndParameters()
 
 
 class GeneratedScenario(SimulatedScenario):
-    """A simulation as its file has it, whose world and robots the seed draws."""
+    """A simulation as its file has it, whose world and robots the seed draws.
+
+    Attributes:
+        generate: what is drawn.
+    """
 
     generate: Generate
 
@@ -257,27 +240,30 @@ class GeneratedScenario(SimulatedScenario):
 class Generated(Section):
     """Where a generated world came from; written by the program, read by nobody but people.
 
-    `overlap` is the one achieved: ground that two robots both visit over the ground that either
-    visits, mean over pairs.
+    Attributes:
+        plan_seed: what the plan was drawn from.
+        overlap_asked: of the `generate` section.
+        overlap: the one achieved: ground that two robots both visit over the ground that either
+            visits, mean over pairs.
     """
 
-    plan_seed: int
-    overlap_asked: float
-    overlap: float
+    plan_seed: Annotated[int, Range(0, 2**32 - 1, "1")]
+    overlap_asked: Annotated[float, Range(0, 1, "1")]
+    overlap: Annotated[float, Range(0, 1, "1")]
 
 
 class Simulation(SimulatedScenario):
-    """An experiment in a simulated world; `generated` tells where a drawn one came from."""
+    """An experiment in a simulated world.
+
+    Attributes:
+        world: walls and how they are painted.
+        robots: the robots.
+        generated: where a drawn world came from.
+    """
 
     world: World
-    robots: Annotated[list[Robot], Field(min_length=1), AfterValidator(_different)]
+    robots: Annotated[list[Robot], Field(min_length=1, max_length=32), AfterValidator(different)]
     generated: Generated | None = None
 
 
 AnyScenario = Simulation | Recording
-
-
-def schema_text() -> str:
-    """The JSON schema of scenarios, for editors."""
-    kinds = TypeAdapter[object](Simulation | GeneratedScenario | Recording)
-    return json.dumps(kinds.json_schema(), indent=2)

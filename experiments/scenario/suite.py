@@ -1,23 +1,26 @@
-"""The scenario suite: the files of one folder, found by path, by name or by tag."""
+"""The scenario suite, found by path, by name or by tag: shipped files, and those in ./scenarios.
+
+One in ./scenarios takes the place of the shipped one of its name: who edits a copy runs the copy.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.scenario.loading import load_scenario
-from experiments.scenario.settings import Recording
+from experiments.scenario.loading import OWN, SHIPPED, default_settings, load_scenario
+from experiments.scenario.settings import Recording, Scenario
 from experiments.scenario.yaml_input import read_mapping
-from mapfusion.errors import InputError
+from mapfusion.errors import InputError, did_you_mean
+from mapfusion.storage import write_whole
 
-FOLDER = Path("scenarios")
 SUFFIXES = {".yaml", ".yml", ".json"}  # a JSON file is YAML too: a result's scenario.json
 
 
-def scenarios_of(names_or_tags: Sequence[str | Path], folder: Path = FOLDER) -> list[Path]:
+def scenarios_of(names_or_tags: Sequence[str | Path], folder: Path | None = None) -> list[Path]:
     """Scenario files, in the order asked for and each once.
 
-    Each is asked for by its path, by the name of a scenario in `folder`, or by a tag, which stands
-    for all scenarios that carry it (in the order of their files' names).
+    Each is asked for by its path, by the name of a scenario in `folder` (of the suite by default),
+    or by a tag, which stands for all scenarios that carry it (in the order of their files' names).
 
     Raises:
         InputError: nothing of that name; lists the names and tags there are.
@@ -32,21 +35,61 @@ def scenarios_of(names_or_tags: Sequence[str | Path], folder: Path = FOLDER) -> 
     return list(dict.fromkeys(found))
 
 
-def _named(wanted: str, folder: Path) -> list[Path]:
+def one_scenario(word: str | Path, folder: Path | None = None) -> Path:
+    """The file of a scenario asked for by path or name; raises InputError for a tag of several."""
+    found = scenarios_of([word], folder)
+    if len(found) != 1:
+        names = ", ".join(path.stem for path in found)
+        raise InputError(f"{word}: stands for {len(found)} scenarios ({names}); name one of them")
+    return found[0]
+
+
+def settings_of(
+    word: str | Path | None, overrides: Sequence[str] = (), seed: int | None = None
+) -> Scenario:
+    """What a scenario sets, or the defaults without one; raises InputError."""
+    if word is None:
+        return default_settings(overrides, seed)
+    return load_scenario(one_scenario(word), overrides, seed)
+
+
+def _named(wanted: str, folder: Path | None) -> list[Path]:
     known = {path: read_mapping(path) for path in _files(folder)}
     by_name = [path for path, data in known.items() if wanted in (data.get("name"), path.stem)]
     by_tag = [path for path, data in known.items() if wanted in _tags(data)]
     if not by_name and not by_tag:
         tags = sorted({tag for data in known.values() for tag in _tags(data)})
         raise InputError(
-            f"{wanted}: neither a file, nor a scenario in {folder} "
+            f"{wanted}: neither a file, nor a scenario of {folder or 'the suite'} "
             f"({', '.join(path.stem for path in known) or 'there is none'}), nor a tag "
             f"({', '.join(tags) or 'there is none'})"
+            f"{did_you_mean(wanted, [*(path.stem for path in known), *tags])}"
         )
     return by_name or by_tag
 
 
-def _files(folder: Path) -> list[Path]:
+def copy_to_edit(name: str) -> Path:
+    """Copy a shipped scenario to ./scenarios and give the copy's path.
+
+    Raises:
+        InputError: there is none of that name, or a file is in the way.
+    """
+    shipped = {path.stem: path for path in _files(SHIPPED)}
+    if name not in shipped:
+        raise InputError(f"--copy {name}: no scenario of the suite; known: {', '.join(shipped)}")
+    source = shipped[name]
+    copy = OWN / source.name
+    if copy.exists():
+        raise InputError(f"{copy}: exists; edit it, or rename it to get the shipped one again")
+    write_whole(copy, lambda temporary: temporary.write_bytes(source.read_bytes()))
+    return copy
+
+
+def _files(folder: Path | None) -> list[Path]:
+    """Scenario files in the order of their names; of the suite where there is no folder."""
+    if folder is None:
+        by_name = {path.stem: path for each in (SHIPPED, OWN) for path in _files(each)}
+        return [by_name[name] for name in sorted(by_name)]
     return sorted(path for path in folder.glob("*") if path.suffix in {".yaml", ".yml"})
 
 
@@ -55,8 +98,8 @@ def _tags(data: dict) -> list[str]:
     return [str(tag) for tag in tags] if isinstance(tags, list) else []
 
 
-def entries(folder: Path = FOLDER) -> list[dict[str, Any]]:
-    """What a listing tells of all scenarios of a folder, in the order of their files' names.
+def entries(folder: Path | None = None) -> list[dict[str, Any]]:
+    """What a listing tells of a folder's scenarios, or the suite's, in the order of their names.
 
     `iterations` are frames a robot, None for recorded logs; `overlap` is that of the robots'
     ground, None where the world was not generated.
@@ -66,7 +109,9 @@ def entries(folder: Path = FOLDER) -> list[dict[str, Any]]:
     """
     files = _files(folder)
     if not files:
-        raise InputError(f"{folder}: holds no scenario (*.yaml); run from the project's folder")
+        raise InputError(
+            f"{folder}: holds no scenario (*.yaml); without a folder the suite is listed"
+        )
     return [_entry(path) for path in files]
 
 

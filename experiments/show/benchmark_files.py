@@ -1,6 +1,5 @@
 """What a benchmark leaves behind: tables for machines and people, and its figure."""
 
-import json
 import math
 import platform
 from datetime import UTC, datetime
@@ -23,6 +22,7 @@ from experiments.study.benchmark.cells import SUMMARY, BenchmarkDesign
 from experiments.study.benchmark.synthetic_pairs import SIGMA_M, SIZE_M
 from experiments.study.benchmark.trials import TRIALS
 from mapfusion.align.result import Status
+from mapfusion.storage import write_json
 
 SCHEMA_VERSION = 1
 _BAND_ALPHA = 0.14
@@ -56,7 +56,7 @@ def write_benchmark(
         "libraries": library_versions(),
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
     }
-    write_text(folder / "provenance.json", json.dumps(provenance, indent=1))
+    write_json(folder / "provenance.json", provenance)
     save_figure(folder, "benchmark", draw, summary)
 
 

@@ -20,7 +20,8 @@ def write_tables(folder: Path, tables: dict[str, pd.DataFrame]) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file as a whole."""
-    write_whole(path, lambda file: file.write_text(text, encoding="utf-8"))
+    data = text.encode("utf-8", "backslashreplace")  # what a user gave may hold half characters
+    write_whole(path, lambda file: file.write_bytes(data))
 
 
 def to_markdown(table: pd.DataFrame) -> str:

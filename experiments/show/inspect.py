@@ -1,19 +1,16 @@
 """`mapfusion inspect`: what a file or folder is, of which version, and what it holds."""
 
-import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pandas as pd
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from experiments.judge import tables
 from experiments.scenario.loading import load_scenario
 from experiments.show.terminal.layout import print_lines, print_table
 from mapfusion import landmark_map, robot_log
 from mapfusion.errors import InputError
-from mapfusion.storage import read_table
+from mapfusion.storage import read_json, read_parquet, read_table, text_attributes
 from sim import trajectory
 
 _PREFIX, _KIND, _VERSION = "mapfusion.", "kind", "schema_version"
@@ -92,35 +89,22 @@ def unit_of(name: str) -> str:
 
 
 def _table(path: Path) -> Contents:
-    file = _metadata(path)
-    texts = {name.decode(): value.decode() for name, value in (file.metadata or {}).items()}
-    facts = {k.removeprefix(_PREFIX): text for k, text in texts.items() if k.startswith(_PREFIX)}
+    table = read_parquet(path, "table")
+    facts: dict[str, Any] = dict(text_attributes(path, table))
     kind = facts.pop(_KIND, None)
     if kind is None:
         raise InputError(f"{path}: none of mapfusion's (no mapfusion.kind in its metadata)")
     if kind in _CHECKED:
         read_table(path, _CHECKED[kind])  # raises where version or columns are others
-    facts |= {"rows": file.num_rows, "MB": f"{path.stat().st_size / 1e6:.2f}"}
-    schema = file.schema.to_arrow_schema()
-    columns = {"column": schema.names, "type": map(str, schema.types)}
-    return Contents(kind, facts, pd.DataFrame(columns | {"unit": map(unit_of, schema.names)}))
-
-
-def _metadata(path: Path) -> pq.FileMetaData:
-    try:
-        return pq.read_metadata(path)
-    except (pa.ArrowException, OSError) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(f"{path}: damaged or not a Parquet file ({reason})") from error
+    facts |= {"rows": table.num_rows, "MB": f"{path.stat().st_size / 1e6:.2f}"}
+    columns = {"column": table.column_names, "type": map(str, table.schema.types)}
+    return Contents(kind, facts, pd.DataFrame(columns | {"unit": map(unit_of, table.column_names)}))
 
 
 def _json(path: Path) -> Contents:
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: damaged or no JSON ({error})") from error
+    found = read_json(path, "file of mapfusion's")
     for kind, keys in _JSON_KEYS.items():
-        if isinstance(found, dict) and keys <= set(found):
+        if keys <= set(found):
             return Contents(kind, _brief(found))
     raise InputError(f"{path}: no file of mapfusion's (known: {'; '.join(_JSON_KEYS)})")
 
@@ -150,6 +134,6 @@ def _folder(path: Path) -> Contents:
     n_levels = 2 if kind == _RESULT else 1
     files = sorted(path.rglob("[!.]*.parquet"))
     inside = [file.relative_to(path).with_suffix("").parts[:n_levels] for file in files]
-    n_rows = [_metadata(file).num_rows for file in files]
+    n_rows = [read_parquet(file, "table").num_rows for file in files]
     parts = pd.DataFrame({"holds": map("/".join, inside), "files": 1, "rows": n_rows})
     return Contents(kind, facts, parts.groupby("holds", sort=False, as_index=False).sum())

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 
@@ -14,7 +15,10 @@ from mapfusion.align.false_alarms import (
 )
 from mapfusion.align.pairs import MIN_PAIRS, Pairs
 from mapfusion.align.result import Alignment, Status
+from mapfusion.arguments import Range, require_in_range
 from mapfusion.se2 import Float
+
+_MAX_GATES = 20  # each is another pass over all pairs
 
 
 @dataclass(frozen=True)
@@ -75,18 +79,15 @@ class Acceptance:
         height: which landmarks can have one height (not for planar maps).
     """
 
-    false_alarms: float = 1e-3
-    gates_m: tuple[float, ...] = (0.05, 0.1, 0.2, 0.4)
-    patch_m: float = 0.2
+    false_alarms: Annotated[float, Range(1e-100, 1, "1")] = 1e-3
+    gates_m: tuple[Annotated[float, Range(1e-3, 100, "m")], ...] = (0.05, 0.1, 0.2, 0.4)
+    patch_m: Annotated[float, Range(0, 100, "m")] = 0.2
     height: HeightGate = field(default_factory=HeightGate)
 
     def __post_init__(self) -> None:
-        if not 0 < self.false_alarms <= 1:
-            raise ValueError(f"false_alarms: is {self.false_alarms}, expected above 0, at most 1")
-        if not self.gates_m or not all(0 < gate < math.inf for gate in self.gates_m):
-            raise ValueError("gates_m: expected one or more positive distances")
-        if not 0 <= self.patch_m < math.inf:
-            raise ValueError("patch_m: must not be negative")
+        require_in_range(self)
+        if not 1 <= len(self.gates_m) <= _MAX_GATES:
+            raise ValueError(f"gates_m: expected 1 to {_MAX_GATES} distances")
 
     def judge(self, pairs: Pairs, alignment: Alignment) -> Verdict:
         """Hold an alignment of these correspondences against chance."""

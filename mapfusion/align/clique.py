@@ -1,7 +1,7 @@
 """Maximum clique of pairwise consistent correspondences."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from mapfusion.align.max_clique import greedy_clique, larger_clique
 from mapfusion.align.method import Fit, Undetermined
 from mapfusion.align.pairs import Pairs
 from mapfusion.align.rigid import fit_rigid
-from mapfusion.arguments import require_above, require_between
+from mapfusion.arguments import Probability, Range
 from mapfusion.chi_square import chi_square_bound
 from mapfusion.se2 import Float
 
@@ -36,13 +36,8 @@ class Clique(Consensus):
     """
 
     randomised: ClassVar[bool] = False
-    agreement_probability: float = 0.999
-    max_nodes: int = 1000
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_between(0, 1, self, "agreement_probability")
-        require_above(0, self, "max_nodes")
+    agreement_probability: Probability = 0.999
+    max_nodes: Annotated[int, Range(1, 10_000_000, "nodes")] = 1000
 
     def find(self, pairs: Pairs, rng: np.random.Generator) -> Fit | Undetermined:
         """T_a_b under which the residuals are likeliest; nothing is drawn from `rng`."""

@@ -1,6 +1,7 @@
 """What the methods that judge by covariances share: parameters, and settling on the support."""
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from mapfusion.align.drift import DRIFT_FLOOR_M
 from mapfusion.align.mahalanobis_gate import PlanarPairs, mean_variances, settle_at_best_scale
 from mapfusion.align.method import Fit, Undetermined
 from mapfusion.align.pairs import Pairs
-from mapfusion.arguments import require_at_least, require_between
+from mapfusion.arguments import Probability, Range, require_in_range
 from mapfusion.chi_square import chi_square_bound
 from mapfusion.se2 import Float
 
@@ -30,13 +31,12 @@ class Consensus:
         height: which pairs can be true by their heights (not for planar maps).
     """
 
-    drift_sigma_m: float = 0.1
-    probability: float = 0.99
+    drift_sigma_m: Annotated[float, Range(0, 100, "m")] = 0.1
+    probability: Probability = 0.99
     height: HeightGate = field(default_factory=HeightGate)
 
     def __post_init__(self) -> None:
-        require_at_least(0, self, "drift_sigma_m")
-        require_between(0, 1, self, "probability")
+        require_in_range(self)
 
     @property
     def bound(self) -> float:

@@ -1,18 +1,12 @@
 """Pairs of landmarks, one of each map, that may be the same point of the world."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numba import njit
 
-from mapfusion.arguments import (
-    require_above,
-    require_at_least,
-    require_between,
-    require_finite,
-    require_shape,
-)
+from mapfusion.arguments import Probability, Range, require_finite, require_in_range, require_shape
 from mapfusion.chi_square import chi_square_bound
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import NO_LABEL
@@ -69,12 +63,11 @@ class HeightGate:
             pitches by a quarter of a degree lifts such a point by 0.035 m.
     """
 
-    probability: float = 0.999
-    floor_m: float = 0.035
+    probability: Probability = 0.999
+    floor_m: Annotated[float, Range(0, 10, "m")] = 0.035
 
     def __post_init__(self) -> None:
-        require_between(0, 1, self, "probability")
-        require_at_least(0, self, "floor_m")
+        require_in_range(self)
 
     @property
     def bound(self) -> float:
@@ -100,11 +93,11 @@ class MatchParameters:
         height: which heights can be the same.
     """
 
-    max_descriptor_distance: float = 0.6
+    max_descriptor_distance: Annotated[float, Range(1e-3, 2, "1")] = 0.6
     height: HeightGate = HeightGate()
 
     def __post_init__(self) -> None:
-        require_above(0, self, "max_descriptor_distance")
+        require_in_range(self)
 
 
 def match(

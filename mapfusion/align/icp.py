@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numba import njit
@@ -12,7 +12,7 @@ from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.method import Fit, Needs
 from mapfusion.align.pairs import Pairs
 from mapfusion.align.rigid import fit_rigid
-from mapfusion.arguments import require_above
+from mapfusion.arguments import Range, require_in_range
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.planar import moved_point
 from mapfusion.se2 import Float
@@ -34,10 +34,10 @@ class Icp:
 
     randomised: ClassVar[bool] = True
     needs: ClassVar[Needs] = Needs(dimensions=1)
-    max_rounds: int = MAX_ROUNDS
+    max_rounds: Annotated[int, Range(1, 100_000, "rounds")] = MAX_ROUNDS
 
     def __post_init__(self) -> None:
-        require_above(0, self, "max_rounds")
+        require_in_range(self)
 
     def find(self, pairs: Pairs, rng: np.random.Generator) -> Fit:
         """T_a_b of the last pairing."""

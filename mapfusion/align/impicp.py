@@ -1,14 +1,14 @@
 """ImpICP: ICP from the best of a few minimal sets (section 5)."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from mapfusion.align.icp import MAX_ROUNDS, ClosestPoints, draw_motion
 from mapfusion.align.method import Fit, Needs
 from mapfusion.align.pairs import Pairs
-from mapfusion.arguments import require_above
+from mapfusion.arguments import Range, require_in_range
 
 
 @dataclass(frozen=True)
@@ -28,15 +28,12 @@ class ImpIcp:
 
     randomised: ClassVar[bool] = True
     needs: ClassVar[Needs] = Needs(dimensions=1)
-    sets: int = 3
-    best_share: float = 0.25
-    max_rounds: int = MAX_ROUNDS
+    sets: Annotated[int, Range(1, 100_000, "sets")] = 3
+    best_share: Annotated[float, Range(1e-3, 1, "1")] = 0.25
+    max_rounds: Annotated[int, Range(1, 100_000, "rounds")] = MAX_ROUNDS
 
     def __post_init__(self) -> None:
-        require_above(0, self, "sets")
-        if not 0 < self.best_share <= 1:
-            raise ValueError("best_share: must lie between 0 and 1")
-        require_above(0, self, "max_rounds")
+        require_in_range(self)
 
     def find(self, pairs: Pairs, rng: np.random.Generator) -> Fit:
         """T_a_b of the last pairing."""

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numba import njit
@@ -11,7 +11,7 @@ from mapfusion.align.correspondences import HeightGate
 from mapfusion.align.method import Fit, Undetermined
 from mapfusion.align.pairs import Pairs
 from mapfusion.align.rigid import fit_rigid, fit_two
-from mapfusion.arguments import require_above, require_between
+from mapfusion.arguments import Probability, Range, require_in_range
 from mapfusion.planar import residual
 from mapfusion.se2 import Float
 
@@ -36,16 +36,14 @@ class Ransac:
     """
 
     randomised: ClassVar[bool] = True
-    gate_m: float = 0.3
-    min_baseline_m: float = 1.0
-    confidence: float = 0.9999
-    max_draws: int = 100_000
+    gate_m: Annotated[float, Range(1e-3, 1000, "m")] = 0.3
+    min_baseline_m: Annotated[float, Range(1e-3, 1000, "m")] = 1.0
+    confidence: Probability = 0.9999
+    max_draws: Annotated[int, Range(1, 100_000_000, "draws")] = 100_000
     height: HeightGate = field(default_factory=HeightGate)
 
     def __post_init__(self) -> None:
-        require_above(0, self, "gate_m", "min_baseline_m")
-        require_between(0, 1, self, "confidence")
-        require_above(0, self, "max_draws")
+        require_in_range(self)
 
     def find(self, pairs: Pairs, rng: np.random.Generator) -> Fit | Undetermined:
         """T_a_b of the minimal set with the most support, fitted to it."""

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numba import njit
@@ -14,7 +14,7 @@ from mapfusion.align.method import Fit, Undetermined
 from mapfusion.align.pairs import Pairs
 from mapfusion.align.ransac import draw_pair
 from mapfusion.align.rigid import fit_two
-from mapfusion.arguments import require_above, require_between
+from mapfusion.arguments import Probability, Range
 from mapfusion.chi_square import chi_square_bound
 from mapfusion.se2 import Float
 
@@ -36,15 +36,9 @@ class RansacMahalanobis(Consensus):
     """
 
     randomised: ClassVar[bool] = True
-    min_baseline_m: float = 1.0
-    confidence: float = 0.9999
-    max_draws: int = 100_000
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_above(0, self, "min_baseline_m")
-        require_between(0, 1, self, "confidence")
-        require_above(0, self, "max_draws")
+    min_baseline_m: Annotated[float, Range(1e-3, 1000, "m")] = 1.0
+    confidence: Probability = 0.9999
+    max_draws: Annotated[int, Range(1, 100_000_000, "draws")] = 100_000
 
     def find(self, pairs: Pairs, rng: np.random.Generator) -> Fit | Undetermined:
         """T_a_b of the best minimal set at the largest s_drift, settled on its support."""

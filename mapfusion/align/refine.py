@@ -3,6 +3,7 @@
 import math
 import time
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from numba import njit
@@ -14,7 +15,7 @@ from mapfusion.align.leverage import most_leverage, why_one_pair
 from mapfusion.align.mahalanobis_gate import PlanarPairs
 from mapfusion.align.pairs import MIN_PAIRS, Pairs, undetermined
 from mapfusion.align.result import Alignment, Status
-from mapfusion.arguments import require_above, require_at_least, require_shape
+from mapfusion.arguments import Range, require_in_range, require_shape
 from mapfusion.planar import add_turned, lever, residual
 from mapfusion.se2 import Float, wrap
 from mapfusion.symmetric import cofactors
@@ -56,15 +57,13 @@ class Refinement:
         height: which pairs can be true by their heights (not for planar maps).
     """
 
-    gate_m: float = 0.5
-    least_drift_m: float = 0.1
-    max_rounds: int = 500
+    gate_m: Annotated[float, Range(1e-3, 1000, "m")] = 0.5
+    least_drift_m: Annotated[float, Range(0, 100, "m")] = 0.1
+    max_rounds: Annotated[int, Range(1, 100_000, "rounds")] = 500
     height: HeightGate = field(default_factory=HeightGate)
 
     def __post_init__(self) -> None:
-        require_above(0, self, "gate_m")
-        require_at_least(0, self, "least_drift_m")
-        require_above(0, self, "max_rounds")
+        require_in_range(self)
 
     def refine(self, pairs: Pairs, T_a_b: Float) -> Alignment:
         """Improve T_a_b (3,); an estimate of NaN stays degenerate.

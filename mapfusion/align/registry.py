@@ -1,6 +1,7 @@
 """Our own methods by name; the peers among them need packages of other people (`[peers]`)."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import fields, is_dataclass
 from typing import Any
 
 from mapfusion.align.clique import Clique
@@ -14,6 +15,7 @@ from mapfusion.align.peers.opencv import OpenCv
 from mapfusion.align.ransac import Ransac
 from mapfusion.align.ransac_mahalanobis import RansacMahalanobis
 from mapfusion.align.svd import Svd
+from mapfusion.errors import did_you_mean
 
 ALIGNERS: dict[str, type[Method]] = {
     "ransac": Ransac,
@@ -27,7 +29,7 @@ ALIGNERS: dict[str, type[Method]] = {
 PEERS: dict[str, type[Method]] = {"opencv": OpenCv, "kiss_matcher": KissMatcher}
 
 
-def make_aligner(name: str, **parameters: Any) -> Method:
+def make_aligner(name: str, /, **parameters: Any) -> Method:
     """Build one of our own methods by name.
 
     Raises:
@@ -35,7 +37,8 @@ def make_aligner(name: str, **parameters: Any) -> Method:
     """
     own = ALIGNERS | PEERS
     if name not in own:
-        raise ValueError(f"unknown aligner {name!r}, known are {', '.join(own)}")
+        known = f"known are {', '.join(own)}{did_you_mean(name, own)}"
+        raise ValueError(f"unknown aligner {name!r}, {known}")
     return construct(name, own[name], parameters)
 
 
@@ -45,9 +48,18 @@ def construct(name: str, constructor: Callable[..., Any], parameters: Mapping[st
     Raises:
         ValueError: a parameter is unknown or out of range.
     """
+    made: Any = constructor  # else is_dataclass would make an instance of it
+    known = [own.name for own in fields(made)] if is_dataclass(made) else list(parameters)
+    wrong = next((key for key in parameters if key not in known), None)
+    if wrong is not None:
+        there = f"known: {', '.join(known) or 'none'}{did_you_mean(wrong, known)}"
+        raise ValueError(f"parameters: {name}: {wrong}: unknown; {there}")
     try:
-        if isinstance(parameters.get("height"), dict):
-            parameters = {**parameters, "height": HeightGate(**parameters["height"])}
+        height = parameters.get("height", HeightGate())
+        if isinstance(height, dict):
+            parameters = {**parameters, "height": HeightGate(**height)}
+        elif not isinstance(height, HeightGate):
+            raise ValueError(f"parameters: {name}: height: expected probability and floor_m")
         return constructor(**parameters)
     except TypeError as error:
         raise ValueError(f"parameters: {name}: {error}") from error

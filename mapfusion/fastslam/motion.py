@@ -1,9 +1,11 @@
 """Where a particle may have gone, given what the wheels counted (eq. 3)."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from mapfusion.arguments import Range, require_in_range
 from mapfusion.se2 import Float, compose
 
 
@@ -36,21 +38,19 @@ class MotionNoise:
         floor_rad: added to the heading in every step, whatever the motion.
     """
 
-    translation_m_per_sqrt_m: float = 0.02
-    rotation_rad_per_sqrt_m: float = 0.01
-    rotation_rad_per_sqrt_rad: float = 0.03
-    scale_error: float = 0.01
-    track_error: float = 0.1
-    horizon_m: float = 3.0
-    horizon_rad: float = 0.2
-    lateral_slip_m_per_rad: float = 0.03
-    floor_m: float = 0.0
-    floor_rad: float = 0.0
+    translation_m_per_sqrt_m: Annotated[float, Range(0, 10_000, "m/sqrt(m)")] = 0.02
+    rotation_rad_per_sqrt_m: Annotated[float, Range(0, 10, "rad/sqrt(m)")] = 0.01
+    rotation_rad_per_sqrt_rad: Annotated[float, Range(0, 10, "rad/sqrt(rad)")] = 0.03
+    scale_error: Annotated[float, Range(0, 1, "1")] = 0.01
+    track_error: Annotated[float, Range(0, 1, "1")] = 0.1
+    horizon_m: Annotated[float, Range(0, 10_000, "m")] = 3.0
+    horizon_rad: Annotated[float, Range(0, 1000, "rad")] = 0.2
+    lateral_slip_m_per_rad: Annotated[float, Range(0, 10_000, "m/rad")] = 0.03
+    floor_m: Annotated[float, Range(0, 10_000, "m")] = 0.0
+    floor_rad: Annotated[float, Range(0, 10, "rad")] = 0.0
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not (np.isfinite(value) and value >= 0):
-                raise ValueError(f"{name}: is {value}, must be finite and not negative")
+        require_in_range(self)
 
     def standard_deviations(self, odometry: Float) -> Float:
         """(3,) of x_m, y_m, theta_rad for one odometry increment (3,)."""

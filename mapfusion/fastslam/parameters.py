@@ -1,8 +1,9 @@
 """Settings of the filter."""
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
-from mapfusion.arguments import require_above, require_at_least, require_between
+from mapfusion.arguments import Probability, Range, require_in_range
 from mapfusion.chi_square import chi_square_bound
 from mapfusion.fastslam.association import Association
 from mapfusion.fastslam.motion import MotionNoise
@@ -37,27 +38,22 @@ class FastSlamParameters:
             log says; of a filter without a log, no.
     """
 
-    n_particles: int = 200
+    n_particles: Annotated[int, Range(1, 10_000, "particles")] = 200
     motion: MotionNoise = field(default_factory=MotionNoise)
     proposal: Proposal = Proposal.INFORMED
     association: Association = Association.DESCRIPTOR
-    gate_probability: float = 0.9999
-    descriptor_threshold: float = 0.5
-    resample_fraction: float = 0.5
-    noise_scale: float = 4.0
-    noise_floor_m: float = 0.0
-    log_new_landmark_density: float | None = None
+    gate_probability: Probability = 0.9999
+    descriptor_threshold: Annotated[float, Range(1e-3, 2, "1")] = 0.5
+    resample_fraction: Annotated[float, Range(0, 1, "1")] = 0.5
+    noise_scale: Annotated[float, Range(0.01, 100, "1")] = 4.0
+    noise_floor_m: Annotated[float, Range(0, 10, "m")] = 0.0
+    log_new_landmark_density: Annotated[float, Range(-100, 100, "ln 1/m^3")] | None = None
     planar: bool | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "proposal", Proposal(self.proposal))
         object.__setattr__(self, "association", Association(self.association))
-        require_at_least(1, self, "n_particles")
-        require_between(0, 1, self, "gate_probability")
-        require_at_least(0, self, "resample_fraction", "noise_floor_m")
-        require_above(0, self, "descriptor_threshold", "noise_scale")
-        if self.resample_fraction > 1:
-            raise ValueError(f"resample_fraction: is {self.resample_fraction}, must be at most 1")
+        require_in_range(self)
 
     @property
     def gate(self) -> float:

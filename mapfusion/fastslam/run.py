@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mapfusion.errors import InputError
+from mapfusion.fastslam.association import Association
 from mapfusion.fastslam.filter import FastSlam, StepResult
 from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.robot_log import RobotLog
+from mapfusion.robot_log import NO_LABEL, RobotLog
 
 
 @dataclass(frozen=True)
@@ -49,8 +50,10 @@ def run_log(
         One `Frame` for each row of the log's frames.
 
     Raises:
-        InputError: `parameters.planar` contradicts the log.
+        InputError: `parameters.planar` contradicts the log, or observations have no labels or
+            descriptors where `parameters.association` needs them.
     """
+    _require_looks(log, parameters.association)
     wanted = frozenset(snapshots)
     slam = FastSlam(_as_the_log_says(log, parameters), rng)
     starts = log.frame_starts()
@@ -79,6 +82,23 @@ def build_map(
         if frame.landmarks is not None:
             return frame.landmarks
     raise InputError(f"log {log.robot}: holds no frame")
+
+
+def _require_looks(log: RobotLog, association: Association) -> None:
+    """Refuse a log as a whole, before hours of work on its first frames."""
+    seen = log.observations
+    if association is Association.LABEL:
+        what, lacking = "label", seen.label is None or seen.label == NO_LABEL
+    elif association is Association.DESCRIPTOR:
+        what, lacking = "descriptor", seen.descriptor is None or np.isnan(seen.descriptor).any(1)
+    else:
+        return
+    n = len(seen) if lacking is True else int(np.sum(lacking))
+    if n:
+        raise InputError(
+            f"log {log.robot}: {n} of {len(seen)} observations have no {what}, which the setting "
+            f"association={association.value} needs; choose another association"
+        )
 
 
 def _as_the_log_says(log: RobotLog, parameters: FastSlamParameters) -> FastSlamParameters:

@@ -5,12 +5,13 @@ dataset": robots that know each landmark by a barcode and measure its range and 
 a table each, lines that start with # are comments:
 
 - `Barcodes.dat`: subject, barcode.
-- `Landmark_Groundtruth.dat`: subject, x_m, y_m, two standard deviations.
+- `Landmark_Groundtruth.dat`: subject, x_m, y_m, two standard deviations; optional.
 - `RobotN_Odometry.dat`: time_s, forward velocity (m/s), angular velocity (rad/s).
 - `RobotN_Measurement.dat`: time_s, barcode, range_m, bearing_rad.
-- `RobotN_Groundtruth.dat`: time_s, x_m, y_m, theta_rad; it has gaps.
+- `RobotN_Groundtruth.dat`: time_s, x_m, y_m, theta_rad; optional; it has gaps.
 
-Subjects 1 to 5 are the robots themselves; the others are landmarks.
+A log has the truth that the recording has: true poses, true points, both or none. Subjects 1 to 5
+are the robots themselves; the others are landmarks.
 """
 
 import re
@@ -22,6 +23,7 @@ import numpy as np
 
 from mapfusion.errors import InputError
 from mapfusion.robot_log import (
+    TRUTH_FILES,
     Observations,
     RobotLog,
     write_log,
@@ -31,6 +33,8 @@ from mapfusion.robot_log import (
 from mapfusion.se2 import Float, between, compose, rotation, wrap
 
 _LAST_ROBOT_SUBJECT = 5
+_LARGEST = 1e12  # any number: times since 1970 are 1e9 s
+_MOST_FRAMES = 1_000_000  # eleven days of one a second
 
 
 @dataclass(frozen=True)
@@ -71,7 +75,7 @@ class MrclamSettings:
 def import_mrclam(
     folder: Path, destination: Path, settings: MrclamSettings | None = None
 ) -> list[Path]:
-    """Write one log, with its truth, for each robot of a recording.
+    """Write one log, with its truth where that is recorded, for each robot of a recording.
 
     Logs go to folders `robotN` of `destination`; they are returned by robot.
 
@@ -84,29 +88,34 @@ def import_mrclam(
         raise InputError(f"{folder}: no such folder (expected an MRCLAM recording)")
     numbers = _robots(folder)
     subject_of_barcode = _barcodes(folder / "Barcodes.dat")
-    landmarks = _landmarks(folder / "Landmark_Groundtruth.dat")
+    surveyed = folder / "Landmark_Groundtruth.dat"
+    landmarks = _landmarks(surveyed) if surveyed.exists() else None
     recordings = [
         (
             f"robot{n}",
             _timed(folder / f"Robot{n}_Odometry.dat", 3),
             _sightings(folder / f"Robot{n}_Measurement.dat", subject_of_barcode, landmarks),
-            _timed(folder / f"Robot{n}_Groundtruth.dat", 4),
+            _timed(path, 4) if (path := folder / f"Robot{n}_Groundtruth.dat").exists() else None,
         )
         for n in numbers
     ]
     first_s = min(odometry[0, 0] for _, odometry, _, _ in recordings)
     last_s = max(odometry[-1, 0] for _, odometry, _, _ in recordings)
-    n_frames = int(np.ceil((last_s - first_s) / settings.frame_s)) + 1
+    n_frames = _n_frames(folder, last_s - first_s, settings.frame_s)
     clock_s = first_s + settings.frame_s * np.arange(n_frames)
     written = []
     for robot, odometry, sighted, truth in recordings:
         path = destination / robot
         log = _log(robot, odometry, sighted, clock_s, settings)
         write_log(path, log)
-        write_truth_poses(path, _truth_at(clock_s, truth, settings.longest_truth_gap_s))
-        assert log.observations.label is not None
-        points = np.array([landmarks[int(subject)] for subject in log.observations.label])
-        write_truth_points(path, points.reshape(-1, 3))
+        for outdated in TRUTH_FILES:  # of an import into the same folder
+            (path / outdated).unlink(missing_ok=True)
+        if truth is not None:
+            write_truth_poses(path, _truth_at(clock_s, truth, settings.longest_truth_gap_s))
+        if landmarks is not None:
+            assert log.observations.label is not None
+            points = np.array([landmarks[int(subject)] for subject in log.observations.label])
+            write_truth_points(path, points.reshape(-1, 3))
         written.append(path)
     return written
 
@@ -196,6 +205,16 @@ def _truth_at(clock_s: Float, truth: Float, longest_gap_s: float) -> Float:
     return np.where(known[:, None], pose, np.nan)
 
 
+def _n_frames(folder: Path, duration_s: float, frame_s: float) -> int:
+    """How many frames the clock of all robots has."""
+    if not duration_s / frame_s < _MOST_FRAMES:
+        wrong = (
+            f"odometry over {duration_s:g} s is more than {_MOST_FRAMES} frames of {frame_s:g} s"
+        )
+        raise InputError(f"{folder}: {wrong}; are its times seconds?")
+    return int(np.ceil(duration_s / frame_s)) + 1
+
+
 def _robots(folder: Path) -> list[int]:
     found = [re.fullmatch(r"Robot(\d+)_Odometry\.dat", path.name) for path in folder.iterdir()]
     numbers = sorted(int(match[1]) for match in found if match)
@@ -224,11 +243,12 @@ def _landmarks(path: Path) -> dict[int, Float]:
 
 
 def _sightings(
-    path: Path, subject_of_barcode: dict[int, int], landmarks: dict[int, Float]
+    path: Path, subject_of_barcode: dict[int, int], landmarks: dict[int, Float] | None
 ) -> Float:
     """Rows (N, 4) time_s, subject, range_m, bearing_rad of landmarks.
 
-    Robots are left out, and barcodes that the recording does not know (misread ones).
+    Robots are left out, and barcodes that the recording does not know (misread ones); where
+    landmarks were surveyed, those that were not, too.
     """
     table, lines = _table(path, 4)
     wrong = np.flatnonzero(table[:, 2] <= 0)
@@ -238,7 +258,9 @@ def _sightings(
             f"{path}, line {lines[row]}: range is {table[row, 2]:g} m, must be positive"
         )
     table[:, 1] = [subject_of_barcode.get(int(barcode), -1) for barcode in table[:, 1]]
-    kept = (table[:, 1] > _LAST_ROBOT_SUBJECT) & np.isin(table[:, 1], list(landmarks))
+    kept = table[:, 1] > _LAST_ROBOT_SUBJECT
+    if landmarks is not None:
+        kept &= np.isin(table[:, 1], list(landmarks))
     return _by_time(table[kept])
 
 
@@ -277,6 +299,8 @@ def _table(path: Path, n_columns: int) -> tuple[Float, list[int]]:
             raise InputError(f"{path}, line {number}: not a number in {line.strip()!r}") from error
         if not all(map(isfinite, row)):
             raise InputError(f"{path}, line {number}: not a finite number in {line.strip()!r}")
+        if max(map(abs, row)) > _LARGEST:
+            raise InputError(f"{path}, line {number}: larger than {_LARGEST:g}: {line.strip()!r}")
         rows.append(row)
         lines.append(number)
     return np.array(rows).reshape(-1, n_columns), lines

@@ -1,10 +1,11 @@
 """The visual front end: a stereo pair in, landmark observations out."""
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 
-from mapfusion.arguments import require_above
+from mapfusion.arguments import Range, require_in_range
 from mapfusion.camera import StereoCamera
 from mapfusion.robot_log import Observations
 from mapfusion.vision.features import Features
@@ -30,12 +31,12 @@ class FrontEndParameters:
     stereo: StereoParameters = field(default_factory=StereoParameters)
     usurf: USurfParameters = field(default_factory=USurfParameters)
     tracks: TrackParameters = field(default_factory=TrackParameters)
-    sigma_uv_px: float = 0.3
-    max_depth_m: float = 8.0
-    max_sigma_depth_m: float = 0.4
+    sigma_uv_px: Annotated[float, Range(1e-3, 100, "px")] = 0.3
+    max_depth_m: Annotated[float, Range(0.1, 1000, "m")] = 8.0
+    max_sigma_depth_m: Annotated[float, Range(1e-4, 1000, "m")] = 0.4
 
     def __post_init__(self) -> None:
-        require_above(0, self, "sigma_uv_px", "max_depth_m", "max_sigma_depth_m")
+        require_in_range(self)
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,13 @@
 """Harris corners (Harris and Stephens 1988), the strongest of each part of the image."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
 from numba import njit
 
-from mapfusion.arguments import require_above, require_at_least, require_between
+from mapfusion.arguments import Range, require_in_range
 from mapfusion.se2 import Float
 
 _SOBEL_APERTURE_PX = 3
@@ -34,20 +35,17 @@ class HarrisParameters:
         border_px: margin in which no corners are taken; the stereo windows must fit.
     """
 
-    max_corners: int = 110
-    smoothing_px: float = 1.5
-    min_distance_px: int = 10
-    cell_px: int = 160
-    block_px: int = 3
-    k: float = 0.04
-    min_slope: float = 2.5
-    border_px: int = 12
+    max_corners: Annotated[int, Range(1, 5000, "corners")] = 110
+    smoothing_px: Annotated[float, Range(0.1, 50, "px")] = 1.5
+    min_distance_px: Annotated[int, Range(1, 1000, "px")] = 10
+    cell_px: Annotated[int, Range(8, 4096, "px")] = 160
+    block_px: Annotated[int, Range(1, 99, "px")] = 3
+    k: Annotated[float, Range(1e-4, 0.2499, "1")] = 0.04
+    min_slope: Annotated[float, Range(1e-3, 1000, "grey levels/px")] = 2.5
+    border_px: Annotated[int, Range(1, 2048, "px")] = 12
 
     def __post_init__(self) -> None:
-        require_at_least(1, self, "max_corners", "min_distance_px", "cell_px", "block_px")
-        require_at_least(1, self, "border_px")
-        require_between(0, 0.25, self, "k")  # beyond, no corner can pass
-        require_above(0, self, "smoothing_px", "min_slope")
+        require_in_range(self)
 
     @property
     def min_response(self) -> float:

@@ -11,13 +11,15 @@
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from mapfusion.arguments import (
-    require_above,
+    Range,
     require_at_least,
     require_finite,
+    require_in_range,
     require_shape,
 )
 from mapfusion.camera import StereoCamera
@@ -54,30 +56,23 @@ class StereoParameters:
             fall on whole pixels; a lens and a sensor do better.
     """
 
-    min_depth_m: float = 0.5
-    max_depth_m: float = 20.0
-    half_px: int = 8
-    min_correlation: float = 0.8
-    max_ambiguity: float = 0.7
-    max_round_trip_px: int = 1
-    max_jump_px: float = 1.5
-    nearest_plane_m: float = 1.0
-    noise_grey: float = 2.0
-    silhouette_half_px: int = 12
-    max_misfit_px: float = 1.0
-    residual_correlation_px: float = 3.0
-    sigma_floor_px: float = 0.1
+    min_depth_m: Annotated[float, Range(0.01, 100, "m")] = 0.5
+    max_depth_m: Annotated[float, Range(0.02, 1000, "m")] = 20.0
+    half_px: Annotated[int, Range(2, _MAX_HALF_PX, "px")] = 8
+    min_correlation: Annotated[float, Range(1e-3, 1, "1")] = 0.8
+    max_ambiguity: Annotated[float, Range(1e-3, 1, "1")] = 0.7
+    max_round_trip_px: Annotated[int, Range(0, 100, "px")] = 1
+    max_jump_px: Annotated[float, Range(0.01, 100, "px")] = 1.5
+    nearest_plane_m: Annotated[float, Range(0.01, 1000, "m")] = 1.0
+    noise_grey: Annotated[float, Range(0, 255, "grey levels")] = 2.0
+    silhouette_half_px: Annotated[int, Range(2, 100, "px")] = 12
+    max_misfit_px: Annotated[float, Range(1e-3, 100, "px")] = 1.0
+    residual_correlation_px: Annotated[float, Range(0, 100, "px")] = 3.0
+    sigma_floor_px: Annotated[float, Range(0, 100, "px")] = 0.1
 
     def __post_init__(self) -> None:
-        require_above(0, self, "min_depth_m", "nearest_plane_m", "max_jump_px", "max_misfit_px")
-        require_at_least(0, self, "noise_grey", "residual_correlation_px", "sigma_floor_px")
-        require_at_least(0, self, "max_round_trip_px")
-        for name in ("min_correlation", "max_ambiguity"):
-            if not 0 < getattr(self, name) <= 1:
-                raise ValueError(f"{name}: must lie in (0, 1]")
-        require_above(self.min_depth_m, self, "max_depth_m")
-        if not 2 <= self.half_px <= _MAX_HALF_PX:
-            raise ValueError(f"half_px: must lie in 2..{_MAX_HALF_PX}")
+        require_in_range(self)
+        require_at_least(self.min_depth_m, self, "max_depth_m")
         require_at_least(self.half_px, self, "silhouette_half_px")
 
 

@@ -1,11 +1,12 @@
 """Features followed over consecutive frames; a landmark counts only after some frames in a row."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numba import njit
 
-from mapfusion.arguments import require_above, require_at_least, require_between
+from mapfusion.arguments import Probability, Range, require_in_range
 from mapfusion.camera import StereoCamera
 from mapfusion.se2 import Float
 from mapfusion.vision.features import Features
@@ -31,18 +32,15 @@ class TrackParameters:
             lets them (chi-square); what agrees less is cut.
     """
 
-    min_length: int = 3
-    max_shift_u_px: float = 120.0
-    max_shift_v_px: float = 25.0
-    max_disparity_ratio: float = 1.3
-    max_descriptor_distance: float = 0.3
-    rigid_probability: float = 0.999
+    min_length: Annotated[int, Range(1, 1000, "frames")] = 3
+    max_shift_u_px: Annotated[float, Range(0.1, 8192, "px")] = 120.0
+    max_shift_v_px: Annotated[float, Range(0.1, 8192, "px")] = 25.0
+    max_disparity_ratio: Annotated[float, Range(1.001, 100, "1")] = 1.3
+    max_descriptor_distance: Annotated[float, Range(1e-3, 2, "1")] = 0.3
+    rigid_probability: Probability = 0.999
 
     def __post_init__(self) -> None:
-        require_at_least(1, self, "min_length")
-        require_above(0, self, "max_shift_u_px", "max_shift_v_px", "max_descriptor_distance")
-        require_above(1, self, "max_disparity_ratio")
-        require_between(0, 1, self, "rigid_probability")
+        require_in_range(self)
 
 
 @dataclass(frozen=True)

@@ -12,16 +12,17 @@ on as extrapolation, which is the exact integral of an image whose border pixels
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
 from numba import njit
 
 from mapfusion.arguments import (
-    require_above,
+    Range,
     require_at_least,
     require_finite,
+    require_in_range,
     require_shape,
 )
 from mapfusion.se2 import Float
@@ -52,15 +53,15 @@ class USurfParameters:
     """
 
     window: Literal["pixels", "metric"] = "metric"
-    scale_px: float = 2.0
-    side_m: float = 0.6
-    min_scale_px: float = 1.0
-    max_scale_px: float = 30.0
+    scale_px: Annotated[float, Range(0.1, 200, "px")] = 2.0
+    side_m: Annotated[float, Range(0.01, 10, "m")] = 0.6
+    min_scale_px: Annotated[float, Range(0.1, 200, "px")] = 1.0
+    max_scale_px: Annotated[float, Range(0.1, 200, "px")] = 30.0
 
     def __post_init__(self) -> None:
         if self.window not in ("pixels", "metric"):
             raise ValueError(f'window: is "{self.window}", expected "pixels" or "metric"')
-        require_above(0, self, "scale_px", "side_m", "min_scale_px")
+        require_in_range(self)
         require_at_least(self.min_scale_px, self, "max_scale_px")
 
     def scales_px(self, depth_m: Float, focal_px: float) -> Float:

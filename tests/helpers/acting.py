@@ -5,7 +5,9 @@ import signal
 import time
 from pathlib import Path
 
+from mapfusion import sealed
 from mapfusion.errors import InputError
+from mapfusion.storage import write_sealed
 
 
 def write(path: Path, text: str) -> None:
@@ -46,3 +48,11 @@ def wait_for(path: Path, output: Path) -> None:
     while not path.exists():
         time.sleep(0.01)
     write(output, "done")
+
+
+def write_with_seal(path: Path) -> None:
+    write_sealed(path, sealed.LINE + b"made")
+
+
+def read_with_seal(path: Path, output: Path) -> None:
+    write(output, sealed.read_sealed(path, "test").decode())

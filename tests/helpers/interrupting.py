@@ -4,11 +4,11 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
-_PATIENCE_S = 900  # kernels may have to be compiled, on a busy machine
+from tests.helpers.waiting import PATIENCE_S, wait_until
+
 # Read by every Python process that is started, so also by a command's workers. A finished file is
 # renamed to its name, which Python tells its audit hooks before it happens. Tests that run in the
 # background hand down that Ctrl-C is ignored: here it counts.
@@ -49,11 +49,9 @@ def interrupted(
         env=os.environ | {"PYTHONPATH": path},
         start_new_session=True,  # a process group of its own, as a shell gives each command
     )
-    deadline = time.monotonic() + _PATIENCE_S
-    while not (mark.exists() and ready()):
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    there = wait_until(lambda: (mark.exists() and ready()) or process.poll() is not None)
+    assert there, "it never came to stand still"
+    assert process.poll() is None, process.communicate()
     os.killpg(process.pid, signal.SIGINT)
-    out, err = process.communicate(timeout=_PATIENCE_S)
+    out, err = process.communicate(timeout=PATIENCE_S)
     return subprocess.CompletedProcess(process.args, process.returncode, out, err)

@@ -1,4 +1,4 @@
-"""A sweep in a process group of its own, to be killed at random moments."""
+"""A command in a process group of its own, to be killed after any number of its files."""
 
 import contextlib
 import os
@@ -6,27 +6,65 @@ import random
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, Self
+from typing import Literal, NamedTuple, Self
 
-Victim = Literal["worker", "everything"]
-_PATIENCE_S = 900  # kernels may have to be compiled, on a busy machine
+from tests.helpers.waiting import PATIENCE_S, wait_until
+
+Victim = Literal["worker", "everything", "interrupted", "terminated"]
+_SIGNALS = {
+    "everything": signal.SIGKILL,
+    "interrupted": signal.SIGINT,  # as Ctrl-C: all of the process group
+    "terminated": signal.SIGTERM,  # as `kill`: the command's own process
+}
+# Read by every Python process that is started, so also by workers. A finished file is renamed to
+# its name, which Python tells its audit hooks before it happens: none without a permit. What is
+# started in the background hands down that Ctrl-C is ignored: here it counts.
+_GATE = """
+import pathlib, signal, sys, time
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+permits = pathlib.Path({permits!r})
+
+def ask(event, arguments):
+    if event != "os.rename" or not str(arguments[0]).endswith(".part"):
+        return
+    while not (permits / "unlimited").exists():
+        for permit in permits.glob("permit_*"):
+            try:
+                permit.unlink()
+                return
+            except FileNotFoundError:  # somebody else has taken it
+                pass
+        time.sleep(0.01)
+
+sys.addaudithook(ask)
+"""
 
 
-class KilledSweep:
-    """Runs one and the same sweep again and again until nothing is left; use in a `with` block."""
+class Ended(NamedTuple):
+    """How the command ended, and what it wrote on stdout and stderr."""
+
+    code: int
+    out: str
+    err: str
+
+
+class KilledCommand:
+    """Runs one and the same command again and again until nothing is left; use in a `with` block.
+
+    It makes as many files as it is let, however fast the machine is, until `finish` is called.
+    """
 
     def __init__(self, arguments: Sequence[object], results: Path, jobs: int = 2) -> None:
-        self._results = results
-        self._command = [
-            sys.executable,
-            "-m",
-            "experiments.cli.main",
-            "sweep",
-            *map(str, arguments),
-        ]
+        self._gate = tempfile.TemporaryDirectory()
+        self._permits = Path(self._gate.name)
+        text = _GATE.format(permits=self._gate.name)
+        (self._permits / "sitecustomize.py").write_text(text, encoding="utf-8")
+        self._command = [sys.executable, "-m", "experiments.cli.main", *map(str, arguments)]
         self._command += ["--jobs", str(jobs), "--results", str(results)]
         self.process = self._start()
 
@@ -37,71 +75,96 @@ class KilledSweep:
         if self.process.poll() is None:  # a test that failed leaves nothing running
             os.killpg(self.process.pid, signal.SIGKILL)
             self.process.communicate()
+        self._gate.cleanup()
 
-    def _start(self) -> subprocess.Popen[bytes]:
+    def _start(self) -> subprocess.Popen[str]:
+        path = os.pathsep.join([self._gate.name, *filter(None, sys.path)])
         return subprocess.Popen(
             self._command,
-            stdout=subprocess.DEVNULL,
+            env=os.environ | {"PYTHONPATH": path},
+            stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
+            text=True,
             start_new_session=True,
         )
 
+    def go_on(self) -> None:
+        """Start the same command again, once it has ended."""
+        self.process = self._start()
+
     def kill_at_random(self, rng: random.Random, victims: Sequence[Victim]) -> list[Victim]:
-        """Kill each in turn, after a few more files were made; starts the sweep again if needed.
+        """Kill each in turn, after a few more files were made; starts the command again if needed.
 
         Returns:
-            Those that were killed before the sweep came to its end.
+            Those that were killed before the command came to its end.
         """
         killed: list[Victim] = []
         for victim in victims:
-            if not self._wait_for_files(rng.randint(1, 6)):
+            if not self.makes(rng.randint(1, 6)):
                 break
-            if victim == "worker":
-                workers = self.workers()
-                if not workers:
-                    continue
-                _kill(rng.choice(workers))
-            else:
-                os.killpg(self.process.pid, signal.SIGKILL)
-                self.process.communicate()
-                self.process = self._start()
+            self.kill(victim, rng)
+            if victim != "worker":
+                self.ended()
+                self.go_on()
             killed.append(victim)
         return killed
 
-    def _wait_for_files(self, more: int) -> bool:
-        wanted = self._n_files() + more
-        deadline = time.monotonic() + _PATIENCE_S
-        while self._n_files() < wanted:
-            if self.process.poll() is not None:
-                return False
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
-        return True
+    def makes(self, more: int, moment_s: float = 0.0) -> bool:
+        """Let so many files be made, and time pass; whether the command has not ended by then."""
+        for number in range(more):
+            (self._permits / f"permit_{number}").touch()
+        taken = wait_until(lambda: not any(self._permits.glob("permit_*")) or self._has_ended)
+        assert taken, "it makes nothing any more"
+        time.sleep(moment_s)
+        return not self._has_ended
 
-    def _n_files(self) -> int:
-        return sum(1 for _ in self._results.rglob("*.parquet"))
+    def kill(self, victim: Victim, rng: random.Random) -> None:
+        """Send the signal; a worker is waited for."""
+        if victim == "worker":
+            assert wait_until(lambda: len(self.workers()) > 0 or self._has_ended)
+            for pid in rng.sample(self.workers(), 1) if self.workers() else ():
+                _send(pid, signal.SIGKILL)
+        elif victim == "terminated":
+            _send(self.process.pid, _SIGNALS[victim])
+        else:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self.process.pid, _SIGNALS[victim])
+
+    @property
+    def _has_ended(self) -> bool:
+        return self.process.poll() is not None
 
     def workers(self) -> list[int]:
-        """Process ids of the Dask workers."""
+        """Process ids of the workers."""
         children = Path(f"/proc/{self.process.pid}/task").glob("*/children")
-        pids = [int(pid) for path in children for pid in path.read_text().split()]
-        return [pid for pid in pids if b"spawn_main" in _command_line(pid)]
+        pids = [int(pid) for path in children for pid in _read(path).split()]
+        return [pid for pid in pids if b"spawn_main" in _read(Path(f"/proc/{pid}/cmdline"))]
+
+    def let_go(self) -> None:
+        """Let it make all that is left."""
+        (self._permits / "unlimited").touch()
+
+    def ended(self) -> Ended:
+        """Wait until the command and all that it started have ended."""
+        out, err = self.process.communicate(timeout=PATIENCE_S)
+        return Ended(self.process.returncode, out, err)
 
     def finish(self) -> tuple[int, str]:
         """Wait for the end; returns the exit code and what was complained about."""
-        _, err = self.process.communicate(timeout=_PATIENCE_S)
-        return self.process.returncode, err.decode()
+        self.let_go()
+        ended = self.ended()
+        return ended.code, ended.err
 
 
-def _kill(pid: int) -> None:
+def _send(pid: int, number: int) -> None:
     with contextlib.suppress(ProcessLookupError):  # it ended by itself meanwhile
-        os.kill(pid, signal.SIGKILL)
+        os.kill(pid, number)
 
 
-def _command_line(pid: int) -> bytes:
+def _read(path: Path) -> bytes:
     try:
-        return Path(f"/proc/{pid}/cmdline").read_bytes()
-    except OSError:
+        return path.read_bytes()
+    except OSError:  # it ended by itself meanwhile
         return b""
 
 

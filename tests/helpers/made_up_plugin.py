@@ -31,7 +31,7 @@ class Method:
         self.calls += 1
         n = len(correspondences)
         T_a_b = GOOD_T + rng.normal(0, 1e-3, 3)
-        good = Alignment(T_a_b, GOOD_COVARIANCE, np.ones(n, bool), 99.0, Status.ACCEPTED)
+        good = Alignment(T_a_b, GOOD_COVARIANCE, np.ones(n, bool), 99.0, Status.ACCEPTED, "", 0.1)
         good.T_a_b[0] += self.calls
         what = self.what
         print("noise on stdout", flush=True)
@@ -59,12 +59,12 @@ class Method:
         if what == "kills itself":
             os.kill(os.getpid(), signal.SIGKILL)
         if what == "hangs":
-            time.sleep(1000)
+            time.sleep(100_000)
         if what == "hangs with the lock held":
-            ctypes.PyDLL(None).sleep(1000)
+            ctypes.PyDLL(None).sleep(100_000)
         if what == "closes everything":
             os.closerange(0, 64)
-            time.sleep(1000)
+            time.sleep(100_000)
         if what == "wrong type":
             return (1.0, 2.0, 0.5)
         if what == "none":

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from experiments.judge import tables
 from experiments.show.report.document import write_report
+from mapfusion.storage import read_json, write_json
 
 HOSTILE = '<img src=x onerror=alert(1)></script><script>alert("2")</script>'
 
@@ -47,9 +48,9 @@ def hostile(result: Path) -> Path:
         file = tables.table_path(result, name)
         if file.is_file():
             tables.write(file, name, tables.read(file, name).replace(renamed))
-    text = (result / "scenario.json").read_text().replace('"ransac"', json.dumps(HOSTILE))
-    scenario = json.loads(text) | {"description": HOSTILE, "name": HOSTILE}
-    (result / "scenario.json").write_text(json.dumps(scenario))
-    world = (result / "world.json").read_text().replace('"R2"', json.dumps(f"R2{HOSTILE}"))
-    (result / "world.json").write_text(world)
+    for name, old, new in (("scenario", "ransac", HOSTILE), ("world", "R2", f"R2{HOSTILE}")):
+        path = result / f"{name}.json"
+        text = json.dumps(read_json(path, name)).replace(json.dumps(old), json.dumps(new))
+        named = {"description": HOSTILE, "name": HOSTILE} if name == "scenario" else {}
+        write_json(path, json.loads(text) | named)
     return result

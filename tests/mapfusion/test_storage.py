@@ -1,3 +1,8 @@
+import errno
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pandas as pd
 import pyarrow as pa
@@ -10,6 +15,8 @@ from mapfusion.storage import (
     point_fields,
     points_from,
     read_table,
+    remove_abandoned,
+    require_writable,
     schema,
     write_table,
     write_whole,
@@ -73,6 +80,60 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):
         write_whole(path, fail)
     assert [p.name for p in tmp_path.iterdir()] == ["things.parquet"]
     assert path.read_text() == "old"
+
+
+def test_a_full_disk_is_told_with_the_name_of_the_file(tmp_path):
+    def full(temporary):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(OSError, match="No space left") as told:
+        write_whole(tmp_path / "things.parquet", full)
+    assert told.value.filename == str(tmp_path / "things.parquet")
+
+    def elsewhere(temporary):
+        (tmp_path / "not there").read_bytes()
+
+    with pytest.raises(FileNotFoundError) as told:
+        write_whole(tmp_path / "things.parquet", elsewhere)
+    assert told.value.filename == str(tmp_path / "not there")
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from mapfusion.storage import write_whole
+write_whole(Path(sys.argv[1]), lambda temporary: os.kill(os.getpid(), signal.SIGKILL))
+"""
+
+
+def test_what_a_killed_process_left_is_removed_and_nothing_else(tmp_path):
+    path = tmp_path / "figures" / "fig.01.png"
+    subprocess.run([sys.executable, "-c", KILLED, str(path)], check=False)
+    (left,) = path.parent.iterdir()
+    assert left.suffix == ".part"
+    kept = [path, path.with_name("other.part"), path.with_name(".fig.elsewhere-1.ab12.part")]
+    for file in kept:
+        file.write_text("kept")
+
+    def meanwhile(temporary):
+        remove_abandoned(tmp_path)
+        assert temporary.exists()
+        temporary.write_text("kept")
+
+    write_whole(path, meanwhile)
+    assert sorted(path.parent.iterdir()) == sorted(kept)
+    remove_abandoned(tmp_path / "not there")
+
+
+def test_a_folder_that_cannot_be_written_is_told_before(tmp_path, monkeypatch):
+    require_writable(tmp_path / "new" / "newer")
+    assert not (tmp_path / "new").exists()
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match=r"file/new: cannot be written \(.*file is no folder\)"):
+        require_writable(tmp_path / "file" / "new")
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    with pytest.raises(InputError, match="no right to write"):
+        require_writable(tmp_path / "new")
 
 
 def damaged(path):

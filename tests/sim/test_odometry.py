@@ -127,5 +127,5 @@ def test_bad_arguments_are_named() -> None:
         encoder_increments(np.zeros((4, 3)), 0.5)
     with pytest.raises(ValueError, match="increments: contains NaN"):
         add_noise(np.full((4, 3), np.nan), OdometryNoise(), np.random.default_rng(0))
-    with pytest.raises(InputError, match=r"scale_sigma is -0\.1"):
+    with pytest.raises(InputError, match=r"scale_sigma: is -0\.1"):
         OdometryNoise(scale_sigma=-0.1)

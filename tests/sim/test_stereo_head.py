@@ -114,5 +114,5 @@ def test_a_dark_camera_scales_the_light_and_not_the_noise() -> None:
 
 
 def test_negative_noise_is_refused() -> None:
-    with pytest.raises(InputError, match="radiometry: gain is -1"):
+    with pytest.raises(InputError, match="gain: is -1"):
         RadiometricNoise(gain=-1)

@@ -19,6 +19,7 @@ from experiments.scenario.randomness import generator
 from mapfusion.camera import StereoCamera
 from mapfusion.robot_log import DESCRIPTOR_LENGTH, with_rows
 from mapfusion.se2 import Float
+from mapfusion.sealed import LINE
 from mapfusion.storage import (
     POSITION_FIELDS,
     column,
@@ -27,8 +28,8 @@ from mapfusion.storage import (
     named_columns,
     read_table,
     schema,
+    write_sealed,
     write_table,
-    write_whole,
 )
 from mapfusion.vision.features import Features
 from mapfusion.vision.frontend import FrontEnd, FrontEndParameters
@@ -114,8 +115,7 @@ def run(settings: FeatureSettings, job: Job) -> dict[str, float]:
         truth.append(truth_points(settings.camera, frame.depth_m, found.uv_px, own_pose))
         if 0 <= iteration - settings.images_at < settings.images:
             encoded = cv2.imencode(".png", frame.left)[1].tobytes()
-            image = job.output / f"image_{iteration:06d}.png"
-            write_whole(image, lambda temporary, encoded=encoded: temporary.write_bytes(encoded))
+            write_sealed(job.output / f"image_{iteration:06d}.png", encoded + LINE)
     truth_path, features_path = (job.output / name.format(part=job.part) for name in WRITES)
     joined = {
         name: np.concatenate([getattr(found, name) for found in features])

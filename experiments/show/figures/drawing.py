@@ -1,6 +1,7 @@
 """All figures of a result, each from stored tables and key frames alone."""
 
 import importlib
+import io
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +14,8 @@ from matplotlib.figure import Figure
 from experiments.run.workers import workers
 from experiments.show.figures.result_tables import NothingToDraw, ResultTables
 from experiments.show.figures.style import house_style
-from mapfusion.storage import write_whole
+from mapfusion.sealed import LINE
+from mapfusion.storage import write_sealed, write_whole
 
 # Each is a module `figNN_NAME` with a function `draw`; its docstring is the caption.
 _MODULES = iter_modules([str(Path(__file__).parent)])
@@ -71,14 +73,20 @@ def save_figure(folder: Path, name: str, draw: Callable[..., Figure], *data: Any
     with house_style():
         figure = draw(*data)
         for file, kind in zip(files, _DPI, strict=True):
-            write_whole(file, lambda path, kind=kind: _save(figure, path, kind))
+            picture = _picture(figure, kind)
+            if kind == "png":
+                write_sealed(file, picture + LINE)
+            else:
+                write_whole(file, lambda path, picture=picture: path.write_bytes(picture))
             # As laid out for the first: "none" would draw the next twice, to lay nothing out.
             with matplotlib.rc_context({"figure.constrained_layout.use": False}):
                 figure.set_layout_engine(None)
     return files
 
 
-def _save(figure: Figure, path: Path, kind: str) -> None:
+def _picture(figure: Figure, kind: str) -> bytes:
     # No date: the same tables give the same bytes.
     metadata = {"Date": None} if kind == "svg" else None
-    figure.savefig(path, format=kind, dpi=_DPI[kind], metadata=metadata)
+    stream = io.BytesIO()
+    figure.savefig(stream, format=kind, dpi=_DPI[kind], metadata=metadata)
+    return stream.getvalue()

@@ -1,5 +1,7 @@
 """Errors against the iteration, for all aligners and robot pairs: figures 4 and 5."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
@@ -8,7 +10,7 @@ from matplotlib.patches import Patch
 
 from experiments.judge.criteria import ANSWERABLE_PAIRS, ORACLE
 from experiments.show.figures.result_tables import NothingToDraw, ResultTables, of_pair
-from experiments.show.figures.style import BLUE, PAGE_WIDTH_IN, PALE_GRAY, aligner_legend
+from experiments.show.figures.style import PAGE_WIDTH_IN, PALE_GRAY, aligner_legend
 from experiments.study.statistics.error_bands import error_bands, scarce_spans
 
 _PANEL_HEIGHT_IN, _EXTRA_HEIGHT_IN = 1.9, 0.9  # the latter of legend and common x label
@@ -28,6 +30,8 @@ def draw_error_curves(data: ResultTables, quantity: str, label: str) -> tuple[Fi
     """
     if not data.pairs:
         raise NothingToDraw("no robot pair was aligned")
+    if data.no_truth:
+        raise NothingToDraw("no truth: errors are unknown")
     errors = data.table("errors")
     bands = error_bands(errors)
     kinds = {"as estimated": quantity, "refined": f"refined_{quantity}"}
@@ -48,13 +52,23 @@ def draw_error_curves(data: ResultTables, quantity: str, label: str) -> tuple[Fi
         row[0].set_ylabel(label)
     figure.supxlabel("FastSLAM iteration k", fontsize=8)
     over = f"{errors['run_id'].nunique()} runs" if data.several_runs else "repetitions"
-    explained = (
-        Patch(color=BLUE, label=f"10-90 % of {over}", **_BAND_STYLE),
-        Patch(label=f"< {ANSWERABLE_PAIRS} true pairs", **_SCARCE_STYLE),
-    )
+    explained = []
+    if any(len(list(scarce_spans(of_pair(errors, pair)))) for pair in data.pairs):
+        explained.append(Patch(label=f"< {ANSWERABLE_PAIRS} true pairs", **_SCARCE_STYLE))
+    if banded := _with_band(bands, list(kinds.values())):
+        shown = next(name for name in data.aligners if name in banded)
+        colour = data.styles[shown]["color"]
+        label = f"10-90 % of {over}, as here {shown}'s"
+        explained.insert(0, Patch(color=colour, label=label, **_BAND_STYLE))
     looks = {label: data.styles[name] for name, label in data.labels.items()}
     aligner_legend(figure, looks, 4, explained)
     return figure, drawn
+
+
+def _with_band(bands: pd.DataFrame, columns: Sequence[str]) -> set[str]:
+    """Aligners whose repetitions, or runs, differ anywhere: the others' bands cannot be seen."""
+    wide = [bands[f"{column}_high"] > bands[f"{column}_low"] for column in columns]
+    return set(bands["aligner"][np.any(wide, axis=0)])
 
 
 def _draw_panel(axes: Axes, data: ResultTables, bands: pd.DataFrame, column: str) -> None:

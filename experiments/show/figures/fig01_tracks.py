@@ -1,5 +1,6 @@
 """Figure 1: Harris points, described by U-SURF, tracked over consecutive key frames."""
 
+import io
 import re
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from matplotlib.ticker import MaxNLocator
 from experiments.show.figures.result_tables import NothingToDraw, ResultTables
 from experiments.show.figures.style import PAGE_WIDTH_IN
 from mapfusion.errors import InputError
+from mapfusion.sealed import read_sealed
 
 _MAX_FRAMES, _TRAIL_FRAMES = 4, 5
 _KEY_FRAME = re.compile(r"(?P<robot>.+)_(?P<iteration>\d+)\.png")
@@ -64,8 +66,9 @@ def _consecutive_frames(data: ResultTables) -> tuple[str, dict[int, Path]]:
 
 
 def _show_image(axes: Axes, path: Path) -> None:
+    data = read_sealed(path, "key frame")
     try:
-        image = matplotlib.image.imread(path)
+        image = matplotlib.image.imread(io.BytesIO(data))
     except (OSError, SyntaxError, ValueError) as error:  # how Pillow reports damaged files
         raise InputError(f"{path}: not a readable PNG image ({error})") from error
     axes.imshow(image, cmap="gray", vmin=0, vmax=1)

@@ -1,11 +1,13 @@
 """Figure 2: the maps of two robots that know nothing of each other, each in its own frame."""
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.show.figures import floor_plan as plan
 from experiments.show.figures.result_tables import NothingToDraw, ResultTables
-from experiments.show.figures.style import BLACK, GRAY, PAGE_WIDTH_IN, PURPLE
+from experiments.show.figures.style import BLACK, GRAY, PAGE_WIDTH_IN
+from mapfusion.se2 import Float
 
 
 def draw(data: ResultTables) -> Figure:
@@ -15,15 +17,33 @@ def draw(data: ResultTables) -> Figure:
         raise NothingToDraw("no robot has a landmark in its map")
     figure = Figure(figsize=(PAGE_WIDTH_IN, PAGE_WIDTH_IN))
     panels = figure.subplots(1, len(robots), squeeze=False)[0]
+    enlarged = _magnification(data, robots)
     for axes, robot in zip(panels, robots, strict=True):
-        _draw_map(axes, data, robot)
+        _draw_map(axes, data, robot, enlarged)
+    plan.set_one_scale(panels)
     handles, _ = panels[0].get_legend_handles_labels()
     handles.insert(1, plan.ellipse_handle(data.colours[robots[0]]))
     plan.finish_plans(figure, panels, handles, 3)
     return figure
 
 
-def _draw_map(axes: Axes, data: ResultTables, robot: str) -> None:
+def _last_particles(data: ResultTables, robot: str) -> Float:
+    clouds = data.of_robot("clouds", robot)
+    last = clouds["iteration"] == clouds["iteration"].max()
+    return clouds.loc[last, ["x_m", "y_m"]].to_numpy()
+
+
+def _magnification(data: ResultTables, robots: list[str]) -> int:
+    extent = min(
+        float(np.ptp(data.landmarks_of(robot)[0][:, :2], axis=0).max()) for robot in robots
+    )
+    sets = [points for robot in robots if len(points := _last_particles(data, robot))]
+    return plan.magnification(
+        extent, max((float(np.ptp(p, axis=0).max()) for p in sets), default=0)
+    )
+
+
+def _draw_map(axes: Axes, data: ResultTables, robot: str, enlarged: int) -> None:
     position, covariance = data.landmarks_of(robot)
     path, colour = data.path_of(robot), data.colours[robot]
     walls = plan.start_plan(axes, data, robot)
@@ -33,9 +53,11 @@ def _draw_map(axes: Axes, data: ResultTables, robot: str) -> None:
     plan.add_ellipses(axes, position, covariance, rasterized=True, **ellipses)
     axes.plot(*path.T, color=GRAY, label="path of the best particle", zorder=3)
     axes.plot(0, 0, linestyle="none", marker="o", color=BLACK, label="start pose, the map's frame")
-    clouds = data.of_robot("clouds", robot)
-    last = clouds[clouds["iteration"] == clouds["iteration"].max()][["x_m", "y_m"]].to_numpy()
-    points = {"marker": ".", "markersize": 2.0, "color": PURPLE, "zorder": 5}
-    plan.add_points(axes, last, label="particles at the end", **points)
+    last = _last_particles(data, robot)
+    middle = last.mean(axis=0) if len(last) else 0.0
+    points = {"marker": ".", "markersize": 2.5, "markeredgewidth": 0, "color": BLACK, "zorder": 5}
+    label = "particles at the end" + (f", spread x{enlarged}" if enlarged > 1 else "")
+    plan.add_points(axes, middle + enlarged * (last - middle), label=label, **points)
     plan.add_frame(axes)
-    axes.set_title(f"{robot}: {plan.set_view(axes, position, path, *walls)}")
+    counted = plan.set_view(axes, position, path, *walls)
+    axes.set_title(f"{robot}: {counted}\n({data.sightings})")

@@ -12,8 +12,6 @@ from experiments.show.figures.result_tables import NothingToDraw, ResultTables
 from experiments.show.figures.style import BLACK, GRAY, PAGE_WIDTH_IN
 
 _MAX_ROBOTS = 3
-_MAGNIFICATIONS = (1, 2, 5, 10, 20, 50, 100)
-_WIDEST_SHARE = 1 / 10  # of the map's extent that the widest drawn particle set may take
 _ZOOM_MARGIN = 1.25
 _RECENT_ITERATIONS = 50
 _GRID_COLUMNS = 6  # holds one, two or three panels of one width
@@ -84,12 +82,12 @@ def choose_moments(spread: pd.DataFrame) -> Moments | None:
 
 
 def _magnification(data: ResultTables, robots: list[str]) -> int:
-    """The largest round factor at which the particle sets still look like spots on the paths."""
+    """By how much all particle sets are drawn larger, so that they can be seen on the paths."""
     extent = min(np.ptp(data.path_of(robot), axis=0).max() for robot in robots)
     clouds = data.table("clouds")
     sets = clouds[clouds["robot"].isin(robots)].groupby(["robot", "iteration"])[_PLANE]
     widest = (sets.max() - sets.min()).to_numpy().max()
-    return max((m for m in _MAGNIFICATIONS if m * widest <= _WIDEST_SHARE * extent), default=1)
+    return plan.magnification(float(extent), float(widest))
 
 
 def _draw_path(axes: Axes, data: ResultTables, robot: str, magnification: int) -> None:

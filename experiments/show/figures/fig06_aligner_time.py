@@ -5,6 +5,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.judge.criteria import ORACLE
+from experiments.judge.tables import UNKNOWN
 from experiments.show.figures.result_tables import NothingToDraw, ResultTables
 from experiments.show.figures.style import PAGE_WIDTH_IN, aligner_legend, plain_numbers
 from experiments.study.statistics.error_bands import TIME_GROUPS, time_bands
@@ -31,7 +32,11 @@ def draw(data: ResultTables) -> Figure:
     timed = dict(list(timings.groupby("aligner")))
     for axes, (column, label) in zip(panels, _AXES.items(), strict=True):
         for name in filter(timed.__contains__, data.aligners):
-            _add_aligner(axes, data, name, timed[name], column)
+            known = timed[name][timed[name][column] != UNKNOWN]
+            if len(known):
+                _add_aligner(axes, data, name, known, column)
+        if not axes.lines:
+            axes.text(0.5, 0.5, "no truth: unknown", ha="center", transform=axes.transAxes)
         axes.set(xlabel=label, yscale="log")
         axes.yaxis.set_major_formatter(plain_numbers())
     panels[0].set_ylabel("time of one alignment (s)")

@@ -1,12 +1,17 @@
 """Figure 7: two maps in their own frames, in space, and the correspondences between them."""
 
+from itertools import product
 from typing import Any
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.legend import Legend
 from matplotlib.ticker import MaxNLocator
+from matplotlib.transforms import Bbox
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
+from mpl_toolkits.mplot3d.proj3d import proj_transform
 
 from experiments.run.estimates import inlier_mask
 from experiments.show.figures.result_tables import NothingToDraw, Pair, ResultTables, of_pair
@@ -18,7 +23,8 @@ _STRAY_SHARE, _STRAY_MARGIN = 0.005, 0.05
 _GAP = 0.15  # between the two maps, as a share of the first one's width
 _MIN_HEIGHT = 0.2  # of the box, as a share of its length: rooms are low; the axis is true anyway
 _MAX_LINES = 80  # of each kind: more would hide the maps
-_ZOOM = 1.3  # fills the page: the default leaves room for any view
+_PADDING_IN = 0.08  # around the box with its labels
+_FITTING_STEPS = 4  # labels do not grow with the box: its size on the page is found step by step
 # All that is drawn as pixels, and the enlarged box reaches beyond the axes' own rectangle.
 _IN_SPACE: dict[str, Any] = {"rasterized": True, "clip_on": False, "in_layout": False}
 
@@ -32,7 +38,8 @@ def draw(data: ResultTables) -> Figure:
     left, right = np.nanmin(position_a[:, 0]), np.nanmax(position_a[:, 0])
     shift_m = right - np.nanmin(position_b[:, 0]) + _GAP * (right - left)
     position_b += [shift_m, 0.0, 0.0]
-    figure = Figure(figsize=(PAGE_WIDTH_IN, 3.9))
+    figure = Figure(figsize=(PAGE_WIDTH_IN, PAGE_WIDTH_IN))
+    figure.set_layout_engine("none")
     axes: Axes3D = figure.add_subplot(projection="3d")
     for robot, points, marker in zip(pair, (position_a, position_b), "*^", strict=True):
         look = {"marker": marker, "markersize": 2.0, "markeredgewidth": 0.2, "linestyle": "none"}
@@ -41,7 +48,8 @@ def draw(data: ResultTables) -> Figure:
     _add_correspondences(axes, data, pair, position_a, position_b)
     _set_space(axes, np.concatenate([position_a, position_b]))
     title = f"each map in its own frame; {pair[1]}'s is drawn {shift_m:.1f} m along x"
-    figure.legend(loc="outside upper center", ncols=2, title=title, title_fontsize=7.5)
+    legend = figure.legend(loc="upper center", ncols=2, title=title, title_fontsize=7.5)
+    _fill_page(figure, axes, legend)
     return figure
 
 
@@ -59,7 +67,7 @@ def judge_correspondences(data: ResultTables, pair: Pair) -> tuple[np.ndarray, t
     By the truth where it is known, else by the refined inliers of the first aligner that has any.
     """
     n_offered, last = len(data.last_correspondences(pair)), data.last_iteration(pair)
-    if data.start_pose(pair[0]) is not None:
+    if not data.no_truth and data.start_pose(pair[0]) is not None:
         judged = of_pair(data.table("true_pairs"), pair).set_index("iteration")["true_pair"]
         names = ("true correspondences", "false correspondences")
         return inlier_mask(judged[last], n_offered), names
@@ -103,7 +111,38 @@ def _set_space(axes: Axes3D, points: Float) -> None:
     axes.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)", **limits)
     box = high - low
     box[2] = max(box[2], _MIN_HEIGHT * max(box[:2]))
-    axes.set_box_aspect(tuple(box), zoom=_ZOOM)  # pyright: ignore[reportArgumentType]  # takes floats
+    axes.set_box_aspect(tuple(box))  # pyright: ignore[reportArgumentType]  # takes floats
     for axis in (axes.yaxis, axes.zaxis):
         axis.set_major_locator(MaxNLocator(4))
     axes.view_init(elev=32.0, azim=-72.0)
+
+
+def _fill_page(figure: Figure, axes: Axes3D, legend: Legend) -> None:
+    """Make the box as wide as the page, and the page as high as box and legend.
+
+    Axes in space leave room for any view: of a low box seen from aside, half of it stays empty.
+    """
+    canvas, dpi, width_in = FigureCanvasAgg(figure), figure.dpi, PAGE_WIDTH_IN
+    left_in = bottom_in = 0.0
+    legend_in = legend.get_window_extent().height / dpi
+    for _ in range(_FITTING_STEPS):
+        page_in = np.array([PAGE_WIDTH_IN, figure.get_figheight()])
+        axes.set_position((*([left_in, bottom_in] / page_in), *(width_in / page_in)))
+        drawn = _extent_px(axes, canvas)
+        left_in += _PADDING_IN - drawn.x0 / dpi
+        bottom_in += _PADDING_IN - drawn.y0 / dpi
+        width_in *= (PAGE_WIDTH_IN - 2 * _PADDING_IN) / (drawn.width / dpi)
+        figure.set_figheight(drawn.height / dpi + legend_in + 4 * _PADDING_IN)
+
+
+def _extent_px(axes: Axes3D, canvas: FigureCanvasAgg) -> Bbox:
+    """Where the box and its labels are drawn."""
+    canvas.draw()  # only then is it known how it is projected
+    corners = np.array(list(product(axes.get_xlim(), axes.get_ylim(), axes.get_zlim())))
+    x, y, _ = proj_transform(corners[:, 0], corners[:, 1], corners[:, 2], axes.get_proj())
+    box = Bbox.null()
+    box.update_from_data_xy(axes.transData.transform(np.stack([x, y], -1)))
+    labels = [
+        axis.get_tightbbox(canvas.get_renderer()) for axis in (axes.xaxis, axes.yaxis, axes.zaxis)
+    ]
+    return Bbox.union([box, *filter(None, labels)])

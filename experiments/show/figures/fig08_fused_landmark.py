@@ -41,14 +41,16 @@ def draw(data: ResultTables) -> Figure:
     reach = (np.abs(position[:, :2] - centre).max(axis=1) + plan.semi_axes(covariance)[0]).max()
     plan.set_square(axes, centre, _MARGIN * reach)
     plan.label_plan(axes, data.robots[0])
-    thin_ones = "thin: the maps' own covariances, before drift is added"
-    axes.set_title(f"{plan.LEVEL_TEXT} ellipses, to scale\n({thin_ones})")
+    note = "thin: the maps' own covariances, before drift is added"
+    if (n_more := pairs.n_parents[chosen] - 2) > 0:
+        note += f"; {n_more} more robot{'s' if n_more > 1 else ''} knew it"
+    axes.set_title(f"{plan.LEVEL_TEXT} ellipses, to scale\n({note})")
     figure.legend(loc="outside lower center", ncols=3)
     return figure
 
 
 def choose_landmark(pairs: FusedPairs) -> int | None:
-    """The fused landmark easiest to read: round enough, parents apart but overlapping.
+    """The fused landmark easiest to read: of two parents, round enough, apart but overlapping.
 
     Among those the one whose parents' ellipses cross the most, which is where fusing gains the
     most over the better parent. When none is that clear, the best of all regular ones.
@@ -65,9 +67,11 @@ def choose_landmark(pairs: FusedPairs) -> int | None:
     area = major * minor
     with np.errstate(divide="ignore", invalid="ignore"):
         gain = np.where(regular, area[:2].min(axis=0) / area[2], -np.inf)
-    for candidates in (regular & round_enough & apart, regular & apart, regular):
-        if candidates.any():
-            return int(np.argmax(np.where(candidates, gain, -np.inf)))
+    legible = (regular & round_enough & apart, regular & apart, regular)
+    for parents in (pairs.n_parents == 2, pairs.n_parents > 2):
+        for candidates in legible:
+            if (candidates & parents).any():
+                return int(np.argmax(np.where(candidates & parents, gain, -np.inf)))
     return None
 
 

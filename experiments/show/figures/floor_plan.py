@@ -11,12 +11,15 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from experiments.show.figures.result_tables import ResultTables
-from experiments.show.figures.style import BLACK, PAGE_WIDTH_IN, PALE_GRAY
+from experiments.show.figures.style import BLACK, PAGE_WIDTH_IN, WALL_GRAY
 from mapfusion.chi_square import chi_square_bound
 from mapfusion.se2 import Float
 
 LEVEL_TEXT = "95 %"
 _LEVEL, _PLANE_DIMENSIONS = 0.95, 2
+ELLIPSE_BOUND = chi_square_bound(_LEVEL, _PLANE_DIMENSIONS)  # squared Mahalanobis distance
+_MAGNIFICATIONS = (1, 2, 5, 10, 20, 50, 100)
+_WIDEST_SHARE = 1 / 10  # of the map's extent that the widest drawn particle set may take
 _STRAY_SHARE = 0.005  # a stray landmark tens of metres off, on each side, must not shrink the map
 _MARGIN, _MIN_MARGIN_M = 0.05, 0.3  # of the view's extent
 _LABELS_WIDTH_IN, _LABELS_HEIGHT_IN = 0.55, 0.65  # what labels and titles take beside each panel
@@ -24,11 +27,11 @@ _LEGEND_ROW_IN, _LEGEND_FRAME_IN = 0.16, 0.2
 
 
 def start_plan(axes: Axes, data: ResultTables, robot: str) -> list[Float]:
-    """Label a plan in a robot's map frame and draw the true walls faintly; returns the walls."""
+    """Label a plan in a robot's map frame and draw the walls' faces faintly; returns the lines."""
     label_plan(axes, robot)
     walls = data.walls_in_frame_of(robot)
     for wall in walls:
-        axes.plot(*wall.T, color=PALE_GRAY, linewidth=2.0, zorder=0.8)
+        axes.plot(*wall.T, color=WALL_GRAY, linewidth=0.7, zorder=0.8)
     return walls
 
 
@@ -48,6 +51,12 @@ def add_frame(axes: Axes, length_m: float = 1.0) -> None:
     for tip, name in (((length_m, 0.0), "x"), ((0.0, length_m), "y")):
         axes.annotate("", xy=tip, xytext=(0.0, 0.0), arrowprops=arrow, zorder=6)
         axes.annotate(name, xy=tip, xytext=(3, -4), textcoords="offset points", zorder=6)
+
+
+def magnification(extent_m: float, widest_m: float) -> int:
+    """The largest round factor at which particle sets still look like spots in a map."""
+    share = _WIDEST_SHARE * extent_m
+    return max((m for m in _MAGNIFICATIONS if m * widest_m <= share), default=1)
 
 
 def semi_axes(covariance_m2: Float, level: float = _LEVEL) -> tuple[Float, Float, Float]:
@@ -94,6 +103,15 @@ def set_view(axes: Axes, landmarks_m: Float, *others_m: Float) -> str:
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     outside = np.any((plan < low) | (plan > high), axis=1).sum()
     return f"{len(plan)} landmarks" + (f", {outside} out of view" if outside else "")
+
+
+def set_one_scale(panels: Sequence[Axes]) -> None:
+    """Widen the views of panels of one size to the largest of them: one scale for all."""
+    views = np.array([[axes.get_xlim(), axes.get_ylim()] for axes in panels])
+    half = np.ptp(views, axis=2).max(axis=0) / 2
+    for axes, middle in zip(panels, views.mean(axis=2), strict=True):
+        (x0, y0), (x1, y1) = middle - half, middle + half
+        axes.set(xlim=(x0, x1), ylim=(y0, y1))
 
 
 def set_square(axes: Axes, centre: Float, reach_m: float) -> None:

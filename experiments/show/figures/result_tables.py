@@ -12,6 +12,7 @@ import pandas as pd
 import pyarrow as pa
 
 from experiments.judge.judged_maps import methods_in
+from experiments.judge.result_files import read_scenario, read_world
 from experiments.judge.tables import ALL, read, table_path
 from experiments.show.figures.style import FUSED_COLOUR, ROBOT_COLOURS, aligner_styles
 from mapfusion.align.result import Status
@@ -27,15 +28,17 @@ class NothingToDraw(Exception):  # noqa: N818  # no error: the result simply hol
 
 
 class FusedPairs(NamedTuple):
-    """N landmarks fused from one of each of two robots: both parents', then the fused one's values.
+    """N landmarks that two robots know: both parents', then the fused one's values.
 
-    The parents' covariances are as the merge weighed them, so with what it added for drift.
+    The parents' covariances are as the merge weighed them, so with what it added for drift. Further
+    robots may have known a landmark, too; the fused one is then of all its parents.
     """
 
     robots: Pair
     position_m: Float  # (3, N, 3)
     covariance_m2: Float  # (3, N, 3, 3)
     own_covariance_m2: Float  # (2, N, 3, 3) of the parents, without the drift
+    n_parents: np.ndarray  # (N,) 2 or more
 
 
 class ResultTables:
@@ -73,7 +76,7 @@ class ResultTables:
     @cached_property
     def scenario(self) -> dict[str, Any]:
         """The resolved scenario."""
-        return _read_json(self.folder / "scenario.json")
+        return read_scenario(self.folder / "scenario.json")
 
     @cached_property
     def robots(self) -> list[str]:
@@ -86,15 +89,26 @@ class ResultTables:
         return dict(zip(self.robots, cycle(ROBOT_COLOURS), strict=False))
 
     @cached_property
+    def answers(self) -> pd.DataFrame:
+        """What the aligners answered: `errors`, or `estimates` where no truth is known."""
+        errors = self.table("errors")
+        return errors if len(errors) or self.several_runs else self.rows("estimates")
+
+    @property
+    def no_truth(self) -> bool:
+        """Whether there are answers and nothing to judge them by."""
+        return self.table("errors").empty and not self.answers.empty
+
+    @cached_property
     def pairs(self) -> list[Pair]:
         """Robot pairs that were aligned, in display order."""
-        pairs = self.table("errors")[["robot_a", "robot_b"]].drop_duplicates()
+        pairs = self.answers[["robot_a", "robot_b"]].drop_duplicates()
         return list(pairs.itertuples(index=False, name=None))
 
     @cached_property
     def aligners(self) -> list[str]:
         """Aligners that were run, in the scenario's order as the table has it, the oracle last."""
-        return methods_in(self.table("errors"), oracle=True)
+        return methods_in(self.answers, oracle=True)
 
     @cached_property
     def styles(self) -> dict[str, dict[str, Any]]:
@@ -104,13 +118,13 @@ class ResultTables:
     @cached_property
     def labels(self) -> dict[str, str]:
         """Each aligner's name in legends, with a word where its package is not installed."""
-        errors = self.table("errors")
-        absent = errors["aligner"][errors["status"] == Status.ABSENT] if "status" in errors else ()
+        rows = self.answers
+        absent = rows["aligner"][rows["status"] == Status.ABSENT] if "status" in rows else ()
         return {name: f"{name} (absent)" if name in set(absent) else name for name in self.aligners}
 
     def last_iteration(self, pair: Pair) -> int:
         """The last iteration at which the pair's maps were aligned: that of the stored maps."""
-        return int(of_pair(self.table("errors"), pair)["iteration"].max())
+        return int(of_pair(self.answers, pair)["iteration"].max())
 
     def last_correspondences(self, pair: Pair) -> pd.DataFrame:
         """The pairs offered to the aligners at the end: rows of the two stored maps."""
@@ -125,6 +139,11 @@ class ResultTables:
     def landmarks_of(self, robot: str) -> tuple[Float, Float]:
         """Positions (N, 3) and covariances (N, 3, 3) of the last map, by landmark number."""
         return positions_and_covariances(self.of_robot("landmarks", robot, "landmark"))
+
+    @property
+    def sightings(self) -> str:
+        """In words, how often a landmark was seen before it counts for the maps."""
+        return f"seen {self.scenario['slam']['min_count']} times or more"
 
     def path_of(self, robot: str) -> Float:
         """Positions (T, 2) of the best particle's whole path at the end, in the robot's frame."""
@@ -147,7 +166,7 @@ class ResultTables:
     def fused_pairs(self) -> FusedPairs:
         """The fused landmarks of the robot pair that shares most; NothingToDraw where none."""
         fused = self.table("fused")
-        rows = fused[(fused["n_parents"] == 2) & (fused["robot_b"] != "")]
+        rows = fused[fused["n_parents"] >= 2]
         if rows.empty:
             raise NothingToDraw("no two landmarks were fused")
         robots: Any = rows.groupby(["robot_a", "robot_b"], sort=False).size().idxmax()
@@ -159,7 +178,8 @@ class ResultTables:
         moved, widened, own = (np.stack(values) for values in zip(*parents, strict=True))
         position, covariance = positions_and_covariances(rows)
         three = np.concatenate([moved, position[None]])
-        return FusedPairs(robots, three, np.concatenate([widened, covariance[None]]), own)
+        covariances = np.concatenate([widened, covariance[None]])
+        return FusedPairs(robots, three, covariances, own, rows["n_parents"].to_numpy())
 
     def parents_and_fused(self, robots: Pair) -> list[tuple[str, str, str]]:
         """Robot name or "fused", marker and colour of two parents and the fused landmark."""
@@ -168,16 +188,20 @@ class ResultTables:
 
     @cached_property
     def walls(self) -> list[Float]:
-        """The walls' corner points, (n, 2) each, in the world; none where unknown."""
-        return [np.array(wall) for wall in self._world.get("walls", [])]
+        """Lines (n, 2) in the world along which the walls' faces stand; none where unknown.
+
+        Of results made before faces were stored, the walls' middle lines.
+        """
+        known = self._world.get("faces", self._world.get("walls", []))
+        return [np.array(line) for line in known]
 
     @cached_property
     def _world(self) -> dict[str, Any]:
         path = self.folder / "world.json"
-        return _read_json(path) if path.is_file() else {}
+        return read_world(path) if path.is_file() else {}
 
     def walls_in_frame_of(self, robot: str) -> list[Float]:
-        """The walls' corner points, (n, 2) each, in a robot's map frame; none where unknown."""
+        """The same lines in a robot's map frame."""
         start = self.start_pose(robot)
         return [transform_points(inverse(start), wall) for wall in self.walls if start is not None]
 
@@ -200,12 +224,6 @@ def of_pair(rows: pd.DataFrame, pair: Pair) -> pd.DataFrame:
 def positions_and_covariances(rows: pd.DataFrame) -> tuple[Float, Float]:
     """Positions (N, 3) and covariances (N, 3, 3) of rows with the columns of a map."""
     return points_from(pa.Table.from_pandas(rows[POSITION_FIELDS + COVARIANCE_FIELDS]))
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        raise InputError(f"{path}: no such file (expected a result folder of `run`)")
-    return json_object(path.read_text(encoding="utf-8", errors="replace"), path)
 
 
 def json_object(text: str, where: Path) -> dict[str, Any]:

@@ -20,7 +20,7 @@ BLUE, VERMILLION, GREEN = "#0072B2", "#D55E00", "#009E73"
 PURPLE, ORANGE, SKY = "#CC79A7", "#E69F00", "#56B4E9"
 # Four of Tol's (2021) muted scheme, darker or duller than those, where more methods are compared.
 INDIGO, WINE, OLIVE, TEAL = "#332288", "#882255", "#999933", "#44AA99"
-BLACK, GRAY, PALE_GRAY = "#000000", "#7F7F7F", "#C8C8C8"
+BLACK, GRAY, WALL_GRAY, PALE_GRAY = "#000000", "#7F7F7F", "#A8A8A8", "#C8C8C8"
 
 _RC: dict[str, Any] = {
     "font.family": "DejaVu Sans",  # comes with matplotlib: the same on every machine

@@ -25,10 +25,11 @@ from experiments.show.report.charts import error_curves, success_curves, time_cu
 from experiments.show.report.map_view import MAP_TABLES, map_view
 from experiments.show.report.origin import natural, provenance_of, stage_times
 from experiments.show.report.theme import chart_style
-from experiments.study.statistics.run_tables import find_runs
+from experiments.study.statistics.run_tables import Runs, find_runs
 from experiments.study.statistics.standing import recommend
 from experiments.study.statistics.summary import ALL_SCENARIOS, configurations, reduced_errors
 from mapfusion.errors import InputError
+from mapfusion.sealed import read_sealed
 
 _TABLES = tuple(dict.fromkeys((*MAP_TABLES, *metrics.USED_TABLES, "timings")))
 
@@ -42,7 +43,9 @@ def contents_of(path: Path) -> dict[str, Any]:
     if not runs.sweeps:
         require_result(path)
     if not runs.has("errors") or (reduced := reduced_errors(runs)).maps.empty:
-        raise InputError(f"{path}: no pair of maps was aligned, there is nothing to report on")
+        if runs.sweeps or not (data := ResultTables(path)).no_truth:
+            raise InputError(f"{path}: no pair of maps was aligned, there is nothing to report on")
+        return _without_truth(path, runs, data)
     maps = reduced.maps
     if runs.sweeps:
         own, groups = _of_sweep(path, maps), _by_configuration(reduced.medians)
@@ -54,6 +57,7 @@ def contents_of(path: Path) -> dict[str, Any]:
     timings = runs.read("aligner_timings") if runs.has("aligner_timings") else pd.DataFrame()
     provenance, stages = provenance_of(path, runs)
     return own | {
+        "no_truth": False,
         "ranking": recommend(maps, timings, aligners),
         "n_robot_pairs": len(maps[["scenario", "robot_a", "robot_b"]].drop_duplicates()),
         "settings": setting_columns(maps),
@@ -66,6 +70,26 @@ def contents_of(path: Path) -> dict[str, Any]:
         "stages": stages,
         "stage_times": stage_times(runs),
         "failed": runs.failed.to_dict("records"),
+    }
+
+
+def _without_truth(path: Path, runs: Runs, data: ResultTables) -> dict[str, Any]:
+    """What a result shows whose answers cannot be judged: all but errors and success."""
+    styles, timings = data.styles, runs.read("aligner_timings")
+    provenance, stages = provenance_of(path, runs)
+    return _of_result(data) | {
+        "no_truth": True,
+        "outcomes": (),
+        "ranking": None,
+        "aligners": [{"name": name, **chart_style(styles[name])} for name in data.aligners],
+        "groups": [],
+        "success": [],
+        "times": time_curves(timings, data.aligners),
+        "absent": [name for name, label in data.labels.items() if label != name],
+        "provenance": provenance,
+        "stages": stages,
+        "stage_times": stage_times(runs),
+        "failed": [],
     }
 
 
@@ -133,9 +157,13 @@ def _pictures(folder: Path) -> Iterator[dict[str, Any]]:
         files = (folder / "figures" / f"{name}.png", folder / f"{name}.png")
         if file := next(filter(Path.is_file, files), None):
             about = importlib.import_module(f"experiments.show.figures.{name}").__doc__ or name
-            with Image.open(file) as picture:  # so that the page does not jump as pictures load
-                size = dict(zip(("width", "height"), picture.size, strict=True))
-            png = base64.b64encode(file.read_bytes()).decode()
+            data = read_sealed(file, "figure")
+            try:
+                with Image.open(io.BytesIO(data)) as picture:  # so that the page does not jump
+                    size = dict(zip(("width", "height"), picture.size, strict=True))
+            except (OSError, SyntaxError, ValueError) as error:  # how Pillow reports damaged files
+                raise InputError(f"{file}: not a readable PNG image ({error})") from error
+            png = base64.b64encode(data).decode()
             yield {"about": about.splitlines()[0], "png": png, **size}
 
 

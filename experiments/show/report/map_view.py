@@ -50,6 +50,7 @@ def map_view(data: ResultTables) -> Json | None:
     view = _View(data)
     return {
         "level": LEVEL_TEXT,
+        "no_truth": data.no_truth,
         "ellipse_m": [ELLIPSE_MIN_M, ELLIPSE_MAX_M],
         "robots": {name: view.robot(name) for name in data.robots},
         "pairs": [view.pair(pair) for pair in data.pairs],
@@ -69,7 +70,7 @@ class _View:
         self.block = bytearray()
         self._data = data
         history, true_pairs = data.table("map_history"), data.table("true_pairs")
-        iterations = np.unique(true_pairs["iteration"])
+        iterations = np.unique(data.answers["iteration"])
         bytes_in_all = 7 * len(history) + 5 * int(true_pairs["n_correspondences"].sum())
         n_affordable = int(len(iterations) * MAX_BYTES / max(bytes_in_all, 1))
         self._shown = thinned(iterations, max(n_affordable, 1))
@@ -147,12 +148,12 @@ class _View:
         judged = of_pair(self._data.rows("true_pairs"), pair).set_index("iteration")
         offered = _by_iteration(of_pair(self._data.rows("correspondences"), pair))
         fused = _by_iteration(of_pair(self._data.rows("fused_history"), pair))
-        frames = []
+        met, frames = set(of_pair(self._data.answers, pair)["iteration"]), []
         for place, k in enumerate(self._shown.tolist()):
-            if k not in judged.index:
+            if k not in met:
                 continue
             frame: Json = {"iteration": k, "map": place}
-            if k in offered:
+            if k in offered and k in judged.index:
                 is_true = inlier_mask(judged["true_pair"][k], judged["n_correspondences"][k])
                 index = offered[k][["index_a", "index_b"]].to_numpy()
                 frame["pairs"] = self._pack(index.astype(self.index_type))
@@ -175,7 +176,7 @@ class _View:
         estimates = of_pair(self._data.rows("estimates"), pair)
         errors = of_pair(self._data.table("errors"), pair)
         first = estimates[estimates["repetition"] == 0]
-        rows = first.merge(errors, on=_ANSWER, suffixes=("", "_of_error")).to_dict("records")
+        rows = first.merge(errors, "left", _ANSWER, suffixes=("", "_of_error")).to_dict("records")
         found = {(row["aligner"], row["iteration"]): _alignment(row) for row in rows}
         return {
             name: [found.get((name, k)) for k in iterations]

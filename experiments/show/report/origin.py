@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from experiments.judge.result_files import read_provenance
 from experiments.show.figures.result_tables import json_object
 from experiments.study.statistics.run_tables import Runs, setting_columns
 
@@ -57,7 +58,7 @@ def _descriptions(path: Path, runs: Runs) -> Iterator[dict[str, Any]]:
                 "libraries": json_object(str(row["libraries"]), path / "runs"),
             }
     elif not runs.sweeps and file.is_file():
-        yield json_object(file.read_text(encoding="utf-8", errors="replace"), file)
+        yield read_provenance(file)
 
 
 def _flat(described: dict[str, Any]) -> Iterator[tuple[str, str]]:

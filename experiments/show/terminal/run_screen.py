@@ -7,12 +7,13 @@ import pandas as pd
 from rich.text import Text
 
 from experiments.judge import tables
+from experiments.judge.checking import CheckedScenario
 from experiments.judge.criteria import ANSWERABLE_PAIRS, ORACLE, answerable, at_the_end
-from experiments.judge.expectations import Outcome
 from experiments.judge.judged_maps import methods_in
 from experiments.judge.path_errors import path_rms
 from experiments.judge.tables import SHOWN
 from experiments.show.terminal.layout import (
+    NO_ESTIMATE,
     columns,
     print_frame,
     print_lines,
@@ -38,14 +39,36 @@ def print_result(result: Path, skipped_figures: Sequence[str]) -> None:
         _print_aligners(errors, aligner_summary(errors, table("aligner_timings"), aligners))
         print_lines(f"  {line}" for line in not_run_lines(errors))
         _print_pairs(errors, aligners[0])
+    elif len(estimates := table("estimates")):
+        _print_answers(estimates)
+        print_lines(f"  {line}" for line in not_run_lines(estimates))
     shown = columns("", robot="robot") | columns(".3f", path_m="FastSLAM, m")
     shown |= columns(".3f", odometry_m="odometry, m") | columns(".2f", over_odometry="ratio")
-    shown |= columns("d", n_landmarks="landmarks")
-    print_frame(path_rms(table("robots")), shown, "Position errors (RMS)")
+    shown |= columns("d", n_landmarks="landmarks\never seen")
+    paths = path_rms(table("robots"))
+    known = paths["path_m"].notna().any()
+    print_frame(paths, shown, "Position errors (RMS)" if known else "Robots (no truth: no errors)")
+    print_lines(
+        ["  Maps and figures hold the landmarks that were seen often enough (slam.min_count)."]
+    )
     left_out = table("fused_motions")[["robot", "left_out"]].itertuples(index=False)
     print_lines(f"  {robot} is left out of the fused map: {why}" for robot, why in left_out if why)
     print_lines([f"Figures: {result / 'figures'}   tables: {result / 'tables'}"])
     print_skipped(skipped_figures)
+
+
+def _print_answers(estimates: pd.DataFrame) -> None:
+    """Without truth: how often each aligner answered, was refined and was accepted."""
+    by_aligner = estimates.groupby("aligner", sort=False)
+    shares = {
+        name: by_aligner[column].agg(lambda told: (told == Status.ACCEPTED).mean())
+        for name, column in (("estimated", "status"), ("refined", "refined_status"))
+    }
+    rows = pd.DataFrame(shares | {"accepted": by_aligner["accepted"].mean()}).reset_index()
+    shown = columns("", aligner="aligner")
+    shown |= columns(".0%", estimated="estimated", refined="refined", accepted="accepted")
+    note = "share of all maps and repetitions; accepted: as more than chance"
+    print_frame(rows, shown, "Answers (no truth: errors are unknown)", note)
 
 
 def not_run_lines(errors: pd.DataFrame) -> list[str]:
@@ -64,7 +87,8 @@ def _print_aligners(errors: pd.DataFrame, summary: pd.DataFrame) -> None:
     shown |= {name: (column.label, column.layout) for name, column in SHOWN.items()}
     shown |= columns(".3f", spread_m="spread\nm") | columns(".2f", time_ms="time\nms")
     maps = answerable(errors)
-    note = "spread: 10-90 % of the repetitions; ok: accepted as more than chance"
+    note = f"{NO_ESTIMATE}\n"
+    note += "spread: 10-90 % of the repetitions; ok: accepted as more than chance"
     if len(maps):
         n_offered = maps["n_correspondences"]
         share = (maps["n_true"] / n_offered).median()
@@ -90,8 +114,9 @@ def _print_pairs(errors: pd.DataFrame, aligner: str) -> None:
     print_table([*shown, ("true pairs", ">")], rows, title)
 
 
-def print_outcomes(outcomes: Sequence[Outcome]) -> None:
+def print_checks(checks: Sequence[CheckedScenario]) -> None:
     """The table of a check."""
+    outcomes = [outcome for check in checks for outcome in check.outcomes]
     shown = columns("", scenario="scenario", metric="metric") | columns(".4g", value="measured")
     shown |= columns("", bound_text="expected", seeds="by seed", verdict="")
     rows = []
@@ -102,7 +127,10 @@ def print_outcomes(outcomes: Sequence[Outcome]) -> None:
         rows.append((*what, seeds, verdict))
     print_table(shown.values(), rows, "Checks against the truth")
     failed = sum(not outcome.passed for outcome in outcomes)
-    print_lines([f"{len(outcomes) - failed} passed, {failed} failed"])
+    not_run = sum(bool(check.error) for check in checks)
+    of_all = f"{not_run} of {len(checks)} scenarios"
+    errors = f"; {of_all} could not be checked" if not_run else ""
+    print_lines([f"{len(outcomes) - failed} passed, {failed} failed{errors}"])
 
 
 def _by_seed(values: Sequence[float]) -> str:

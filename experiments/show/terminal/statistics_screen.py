@@ -33,12 +33,7 @@ _PATH_NAMES = {"ate_m": "ATE, m", "rpe_m": "RPE, m", "rpe_rad": "RPE, rad"}
 # Columns of tables; intervals, where there are any, stand beside the numbers.
 _METHOD = columns("", aligner="method")
 _SUCCESS = _METHOD | columns(".0%", estimated_success="as estimated", refined_success="refined")
-_OVER_ORACLE = _METHOD | {
-    "estimated_m": ("estim.\nm", ".3f"),
-    "estimated_ratio": ("over the oracle", ".2f"),
-    "refined_m": ("refined\nm", ".3f"),
-    "refined_ratio": ("over the oracle", ".2f"),
-}
+_STAGES = {"estimated": "as estimated", "refined": "refined"}
 _AGAINST = {
     "second": ("other", ""),
     "ratio": ("its error over other's", ".2f"),
@@ -57,9 +52,14 @@ def print_summary(summary: Summary, written: Path | None, skipped: Sequence[str]
     _print_success(_rows(summary, "success_at_the_end"), summary.n_runs)
     _print_by_true_pairs(_rows(summary, "success_by_true_pairs"))
     ratios = _rows(summary, "error_over_oracle")
-    title = "Median translation error, and its ratio to the oracle's"
-    note = f"maps with {RICH_PAIRS}+ true pairs; inf: no estimate on most; (95 %, bootstrap)"
-    _print(ratios, _OVER_ORACLE, title, note)
+    for stage, kind in _STAGES.items():
+        shown = _METHOD | columns(".0%", **{f"{stage}_share": "given"})
+        shown |= columns(".3f", **{f"{stage}_m": "error, m"})
+        shown |= columns(".2f", **{f"{stage}_ratio": "over the oracle"})
+        note = f"maps with {RICH_PAIRS}+ true pairs; (95 %, bootstrap); {layout.NO_ESTIMATE}"
+        _print(
+            ratios, shown, f"Median translation error {kind}, and its ratio to the oracle's", note
+        )
     _print_best_against_others(_rows(summary, "methods_compared"), ratios)
     _print_paths(_rows(summary, "paths"))
     _print_nees(_rows(summary, "nees"))

@@ -7,32 +7,36 @@ from typing import Any
 
 import pandas as pd
 
+from experiments.judge.user_files import verdict_on
 from experiments.show.numbers import two_digits
 from experiments.show.terminal.layout import columns, print_frame, print_lines
-from mapfusion.align.result import NOT_RUN, Status
 from mapfusion.merge import FusedMap
 
-_ESTIMATES = columns("", aligner="aligner")
-_ESTIMATES |= columns(".2f", tx_m="tx\nm", ty_m="ty\nm", theta_rad="theta\nrad")
-_ESTIMATES |= columns(".2f", refined_tx_m="refined\nm", refined_ty_m="ty\nm")
-_ESTIMATES |= columns(".3f", refined_theta_rad="theta\nrad") | columns(">", inliers="inliers")
-_ESTIMATES |= columns(".0f", log10_false_alarms="NFA\nlog10") | columns(">", time="time\nms")
+_MOTIONS = columns("", aligner="aligner")
+_MOTIONS |= columns(".3f", tx_m="estim.\ntx, m", ty_m="\nty, m")
+_MOTIONS |= columns(".4f", theta_rad="\ntheta, rad")
+_MOTIONS |= columns(".3f", refined_tx_m="refined\ntx, m", refined_ty_m="\nty, m")
+_MOTIONS |= columns(".4f", refined_theta_rad="\ntheta, rad")
+_VERDICTS = columns("", aligner="aligner", verdict="verdict") | columns(">", inliers="inliers")
+_VERDICTS |= columns(".0f", log10_false_alarms="NFA\nlog10") | columns(">", time="time\nms")
 
 
 def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
     """Estimates of all aligners on two maps, and why those were not accepted that were not."""
     found = pd.DataFrame(rows)
+    print_frame(found, _MOTIONS, "T_a_b, as estimated and refined")
     inliers = found["n_inliers"].map(str) + "/" + found["n_correspondences"].map(str)
+    verdicts = [verdict_on(row) for row in rows]
+    times = (1e3 * found["elapsed_s"]).map(two_digits)
     print_frame(
-        found.assign(inliers=inliers, time=(1e3 * found["elapsed_s"]).map(two_digits)),
-        _ESTIMATES,
-        "T_a_b, as estimated and refined",
-        "NFA: expected number of alignments that chance alone supports as well",
+        found.assign(inliers=inliers, time=times, verdict=[str(status) for status, _ in verdicts]),
+        _VERDICTS,
+        "Verdicts on the refined ones",
+        "NFA: expected number of alignments that chance alone supports as well; time: of the\n"
+        "estimate alone, kernels compiled",
     )
-    for row in rows:
-        if reason := row["reason"] or row["acceptance_reason"]:
-            refused = row["status"] if row["status"] in NOT_RUN else Status.REFUSED
-            status = Status.ACCEPTED if row["accepted"] else refused
+    for row, (status, why) in zip(rows, verdicts, strict=True):
+        if reason := why or row["reason"]:
             print_lines([f"  {row['aligner']}: {status}: {reason}"])
 
 

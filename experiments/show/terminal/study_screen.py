@@ -1,4 +1,4 @@
-"""What `refusal`, `benchmark`, `aligners` and `scenarios` show."""
+"""What `study refusal`, `study benchmark` and `scenarios` show."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -3,9 +3,15 @@
 from collections.abc import Callable, Mapping, Sequence
 
 from experiments.judge.criteria import ANSWERABLE_PAIRS
-from experiments.show.terminal.layout import columns, print_frame, print_lines, print_table
+from experiments.show.terminal.layout import (
+    NO_ESTIMATE,
+    columns,
+    print_frame,
+    print_lines,
+    print_table,
+)
 from experiments.study.sweep.combinations import SweepRun
-from experiments.study.sweep.sweep_dataset import ERRORS, SweepDataset, medians_over_runs
+from experiments.study.sweep.sweep_dataset import ERRORS, GIVEN, SweepDataset, medians_over_runs
 from experiments.study.sweep.sweep_driver import SweepProgress
 from experiments.study.sweep.sweep_plan import Survey
 
@@ -46,10 +52,12 @@ def print_sweep(dataset: SweepDataset, runs: Sequence[SweepRun], failed: Mapping
         summary = medians_over_runs(dataset, finished)
         keys = (key.rpartition(".")[2] for key in dataset.keys)
         shown = columns("", setting=" ".join(("scenario", *keys)), aligner="aligner")
-        errors = dict(zip(ERRORS, ("estim., m", "refined, m"), strict=True))
-        shown |= columns(".3f", **errors) | columns("d", runs="runs")
+        for error, given, stage in zip(ERRORS, GIVEN, ("estim.", "refined"), strict=True):
+            shown |= columns(".3f", **{error: f"{stage}\nm"})
+            shown |= columns(".0%", **{given: "\ngiven"})
+        shown |= columns("d", runs="runs")
         title = f"Median translation errors over runs, {ANSWERABLE_PAIRS}+ true pairs"
-        print_frame(summary.head(MAX_ROWS_SHOWN), shown, title)
+        print_frame(summary.head(MAX_ROWS_SHOWN), shown, title, NO_ESTIMATE)
         if len(summary) > MAX_ROWS_SHOWN:
             lines.append(f"... and {len(summary) - MAX_ROWS_SHOWN} more rows")
     shown = sorted(failed)[:MAX_FAILURES_SHOWN]

@@ -19,8 +19,8 @@ from experiments.run.stage import Stage
 from experiments.run.store import Store
 from experiments.run.tasks import OnProgress, run_tasks, tasks_of
 from experiments.run.workers import workers
-from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import AlignerEntry
+from experiments.scenario.suite import settings_of
 from experiments.study.benchmark.synthetic_pairs import true_pairs_of
 from experiments.study.benchmark.trials import CELL, TRIALS, TRIALS_FILE, CellSettings, run_cell
 from experiments.study.statistics.intervals import wilson
@@ -71,7 +71,9 @@ class BenchmarkDesign:
     outlier_shares: tuple[float, ...] = OUTLIER_SHARES
 
 
-def entries_of(methods: Sequence[str], scenario: Path | None = None) -> tuple[AlignerEntry, ...]:
+def entries_of(
+    methods: Sequence[str], scenario: str | Path | None = None
+) -> tuple[AlignerEntry, ...]:
     """The methods of these names, with their default parameters, or a scenario's aligners.
 
     With both, the scenario's aligners of these names; with neither, all known methods.
@@ -81,7 +83,7 @@ def entries_of(methods: Sequence[str], scenario: Path | None = None) -> tuple[Al
     """
     names = list(dict.fromkeys(methods))
     if scenario is not None:
-        entries = {entry.name: entry for entry in load_scenario(scenario).align.aligners}
+        entries = {entry.name: entry for entry in settings_of(scenario).align.aligners}
         for name in names:
             if name not in entries:
                 raise InputError(f"{scenario}: align.aligners: none is named {name}")

@@ -17,6 +17,7 @@ from experiments.judge import judged_maps
 from experiments.judge.criteria import ANSWERABLE_PAIRS, COMMON_LANDMARKS, ORACLE, RICH_PAIRS
 from experiments.judge.judged_maps import MAP_KEYS, MAP_PAIR
 from experiments.judge.path_errors import path_rms
+from experiments.judge.result_files import read_scenario
 from experiments.study.statistics import better
 from experiments.study.statistics.error_bands import ROBOT_PAIR
 from experiments.study.statistics.intervals import MAPS_OF_ONE_RUN, RUN
@@ -173,7 +174,7 @@ def _differing_settings(a: Runs, b: Runs) -> list[str]:
 
 def _flat(result: RunPath) -> dict[str, str]:
     """Settings by dotted name, as JSON."""
-    scenario = json.loads((result.path / "scenario.json").read_text(encoding="utf-8"))
+    scenario = read_scenario(result.path / "scenario.json")
     settings = pd.json_normalize(scenario).to_dict("records")[0]
     return {str(name): json.dumps(value) for name, value in settings.items()}
 

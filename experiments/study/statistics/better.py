@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-import scipy.stats
 
 from experiments.study.statistics.intervals import CONFIDENCE
 from mapfusion.se2 import Float
@@ -75,7 +74,9 @@ def mean_change(changes: Float) -> BetterTest:
         return BetterTest(mean, mean, mean, p)
     with warnings.catch_warnings():  # changes alike but for rounding
         warnings.simplefilter("ignore", RuntimeWarning)
-        tested: Any = scipy.stats.ttest_1samp(changes, 0.0)
+        from scipy.stats import ttest_1samp  # the dearest import there is: where it is asked for
+
+        tested: Any = ttest_1samp(changes, 0.0)
     low, high = tested.confidence_interval(CONFIDENCE)
     return BetterTest(mean, float(low), float(high), float(tested.pvalue))
 

@@ -1,15 +1,17 @@
 """Medians with the 10-90 % around them: the numbers of figures 4, 5 and 6, and of the charts."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from experiments.judge import judged_maps
-from experiments.judge.criteria import ANSWERABLE_PAIRS
+from experiments.judge.criteria import ANSWERABLE_PAIRS, how_far_off
 from experiments.judge.judged_maps import ERROR_COLUMNS, MAP_KEYS, RUN_KEYS, setting_columns
 
 BAND = (0.1, 0.9)
+_SIGNED = tuple(name for name in ERROR_COLUMNS if name.endswith("_rad"))
 ROBOT_PAIR = ("robot_a", "robot_b")
 TIME_GROUPS = 8
 
@@ -17,7 +19,10 @@ TIME_GROUPS = 8
 def error_bands(
     rows: pd.DataFrame, by: Sequence[str] = ROBOT_PAIR, absolute: bool = False
 ) -> pd.DataFrame:
-    """Errors against the iteration: median and 10-90 % of the rows that have an estimate.
+    """Errors against the iteration: median and 10-90 % of the rows.
+
+    A row without an estimate is infinitely far off. A signed rotation has no such value: it is NaN
+    where not more than half of the rows have an estimate, and else of those that have one.
 
     Over the repetitions for rows of `errors`, over the runs for rows of `medians_of_run`; apart for
     each robot pair, or whatever `by` names; `absolute` drops the sign of rotations first.
@@ -26,25 +31,45 @@ def error_bands(
         The columns of `by`, aligner, iteration, n_runs where runs are named, and for each error
         NAME_low, NAME (the median) and NAME_high.
     """
-    rows = rows.assign(**{c: rows[c].abs() for c in ERROR_COLUMNS}) if absolute else rows
+    rows, signed = _far_where_missing(rows, () if absolute else _SIGNED)
     groups = rows.groupby([*by, "aligner", "iteration"], sort=False)
     parts = [groups["run_id"].nunique().rename("n_runs")] if "run_id" in rows else []
     for column in ERROR_COLUMNS:
         low, high = (groups[column].quantile(q) for q in BAND)
-        parts += [low.rename(f"{column}_low"), groups[column].median()]
-        parts += [high.rename(f"{column}_high")]
+        found = [low.rename(f"{column}_low"), groups[column].median()]
+        found += [high.rename(f"{column}_high")]
+        if column in signed:
+            parts += [each.where(_mostly_known(groups, column)) for each in found]
+        else:  # between two infinities pandas finds no quantile
+            parts += [each.fillna(np.inf) for each in found]
     return pd.concat(parts, axis=1).reset_index()
 
 
 def medians_of_run(errors: pd.DataFrame) -> pd.DataFrame:
-    """A run's repetitions reduced to their median: signed rotation errors, NaN where all failed.
+    """A run's repetitions reduced to their median, as `error_bands` does it, rotations signed.
 
     The band of several runs is then over the runs, each of which counts once.
     """
     keys = [name for name in RUN_KEYS if name in errors] + setting_columns(errors)
+    errors, signed = _far_where_missing(errors, _SIGNED)
     groups = errors.groupby([*keys, *MAP_KEYS, "aligner"], sort=False, dropna=False)
-    parts = [groups[list(ERROR_COLUMNS)].median(), groups[list(judged_maps.COUNTS)].first()]
+    medians = groups[list(ERROR_COLUMNS)].median()
+    known = {name: medians[name].where(_mostly_known(groups, name)) for name in signed}
+    parts = [medians.assign(**known), groups[list(judged_maps.COUNTS)].first()]
     return pd.concat(parts, axis=1).reset_index()
+
+
+def _far_where_missing(
+    rows: pd.DataFrame, signed: Sequence[str]
+) -> tuple[pd.DataFrame, Sequence[str]]:
+    """The rows, infinitely far off where they have no estimate, but for the signed columns."""
+    unsigned = [name for name in ERROR_COLUMNS if name not in signed]
+    return rows.assign(**how_far_off(rows, unsigned)), signed
+
+
+def _mostly_known(groups: Any, column: str) -> pd.Series:
+    """Bool by group: whether more than half of its rows have a value."""
+    return groups[column].count() > groups.size() / 2
 
 
 def scarce_spans(rows: pd.DataFrame) -> list[tuple[float, float]]:

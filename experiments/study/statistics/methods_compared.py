@@ -24,8 +24,9 @@ def oracle_ratios(maps: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
     runs, robot pairs and iterations; whole runs are resampled, the same for method and oracle.
 
     Returns:
-        One row a method: aligner, n_runs, n_maps, unit, and for estimated and refined the median
-        error in metres (_m), the ratio (_ratio) and its interval (_ratio_low, _ratio_high).
+        One row a method: aligner, n_runs, n_maps, unit, and for estimated and refined the share of
+        answers with an estimate (_share; without one the error is infinite), the median error in
+        metres (_m), the ratio (_ratio) and its interval (_ratio_low, _ratio_high).
     """
     maps = rich(maps)
     clusters = clusters_of(maps)
@@ -43,6 +44,7 @@ def oracle_ratios(maps: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
         for stage, column in STAGES.items():
             ratio = partial(_ratio, median(aligner, column), below)
             interval = intervals.percentile_interval(ratio, clusters.n, rng)
+            row |= {f"{stage}_share": own[f"{stage}_share"].mean()}
             row |= {f"{stage}_m": own[column].median()} | interval.columns(f"{stage}_ratio")
         rows.append(row)
     return pd.DataFrame(rows)

@@ -4,8 +4,7 @@ Files are read some at a time and only in the columns asked for, so that whoever
 before going on holds that much in memory, however many runs there are.
 """
 
-import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import takewhile
@@ -13,15 +12,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pandas as pd
-import pyarrow as pa
-import pyarrow.dataset as ds
 
 from experiments.judge import tables
 from experiments.judge.judged_maps import RUN_KEYS, setting_columns
+from experiments.judge.result_files import read_scenario
 from mapfusion.errors import InputError
+from mapfusion.storage import read_parquet, text_attributes
 
-_KIND, _VERSION = b"mapfusion.kind", b"mapfusion.schema_version"
-_DAMAGED = (pa.ArrowInvalid, pa.ArrowTypeError, pa.ArrowKeyError, OSError)
+_VERSION = b"mapfusion.schema_version"
 _TOLD = ("status", "reason")  # of each run of a sweep
 # Reducing costs a call what 10 000 rows cost; so many rows of `errors` are some 15 MB.
 BATCH_ROWS = 100_000
@@ -161,48 +159,40 @@ def _whole_files(folder: Path) -> list[RunPath]:
 
 def _run_of(path: Path) -> dict[str, Any]:
     """The run's columns, by its scenario: the folder may have been renamed since."""
-    try:
-        scenario = json.loads(path.read_text(encoding="utf-8"))
-        name, seed = str(scenario["name"]), int(scenario["seed"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: not a resolved scenario with name and seed ({error})") from error
+    found = read_scenario(path)
+    name, seed = found["name"], int(found["seed"])
     return {"run_id": f"{name}-{seed}", "scenario": name, "seed": seed}
 
 
 def _read(
     file: RunPath, table: str, columns: Sequence[str] | None, optional: Sequence[str]
 ) -> pd.DataFrame:
-    try:
-        data = ds.dataset(file.path, format="parquet")
-        _require_readable(file.path, table, data.schema)
-        found, of_run = data.schema.names, () if file.run else RUN_KEYS
-        missing = [name for name in (*of_run, *(columns or ())) if name not in found]
-        if missing:
-            raise InputError(f"{file.path}: has no column {', '.join(missing)} (a table {table})")
-        wanted = found
-        if columns is not None:
-            own = set(tables.ALL[table].names) if table in tables.ALL else set(_TOLD)
-            leading = [] if file.run else takewhile(lambda name: name not in own, found)
-            there = (name for name in optional if name in found)
-            wanted = list(dict.fromkeys([*leading, *columns, *there]))
-        rows = data.to_table(columns=wanted).to_pandas()
-    except _DAMAGED as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(f"{file.path}: damaged or not a Parquet file ({reason})") from error
+    data = read_parquet(file.path, f"table {table}")
+    _require_readable(file.path, table, text_attributes(file.path, data))
+    found, of_run = data.column_names, () if file.run else RUN_KEYS
+    missing = [name for name in (*of_run, *(columns or ())) if name not in found]
+    if missing:
+        raise InputError(f"{file.path}: has no column {', '.join(missing)} (a table {table})")
+    wanted = found
+    if columns is not None:
+        own = set(tables.ALL[table].names) if table in tables.ALL else set(_TOLD)
+        leading = [] if file.run else takewhile(lambda name: name not in own, found)
+        there = (name for name in optional if name in found)
+        wanted = list(dict.fromkeys([*leading, *columns, *there]))
+    rows = data.select(wanted).to_pandas()
     for place, (name, value) in enumerate(file.run.items()):
         rows.insert(place, name, value)
     return rows.assign(**{name: float("nan") for name in optional if name not in rows})
 
 
-def _require_readable(path: Path, table: str, schema: pa.Schema) -> None:
+def _require_readable(path: Path, table: str, attributes: Mapping[str, str]) -> None:
     """The right table, and none of a newer program; older ones may lack columns, no more."""
-    metadata = schema.metadata or {}
-    kind = metadata.get(_KIND, table.encode()).decode()
+    kind = attributes.get("kind", table)
     if kind.rpartition(".")[2] != table:
         raise InputError(f"{path}: kind is {kind}, expected {table}")
     if kind != f"result.{table}":  # a sweep has a version of its own
         return
     known = int(tables.ALL[table].metadata[_VERSION])
-    version = metadata.get(_VERSION, b"0").decode()
-    if not version.isdigit() or int(version) > known:
+    version = attributes.get("schema_version", "0")
+    if not version.isdecimal() or int(version) > known:
         raise InputError(f"{path}: schema_version is {version}, this program reads up to {known}")

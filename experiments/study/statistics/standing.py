@@ -97,11 +97,14 @@ def aligner_summary(
 
 def _shown_columns(maps: pd.DataFrame) -> pd.DataFrame:
     """By aligner, the columns of `SHOWN` from rows of `maps_of`; NaN where these have none."""
-    off = [name for name, how in SHOWN.items() if how.kind == "error" and name in maps]
-    shares = [name for name, how in SHOWN.items() if how.kind == "share" and name in maps]
-    errors = answerable(maps).groupby("aligner", sort=False)[off].median()
-    means = maps[has_common_ground(maps)].groupby("aligner", sort=False)[shares].mean()
-    return pd.concat([errors, means], axis=1).reindex(columns=list(SHOWN))
+    names = {
+        kind: [name for name, how in SHOWN.items() if how.kind == kind and name in maps]
+        for kind in ("error", "given", "share")
+    }
+    answers = answerable(maps).groupby("aligner", sort=False)
+    ground = maps[has_common_ground(maps)].groupby("aligner", sort=False)
+    parts = [answers[names["error"]].median(), answers[names["given"]].mean()]
+    return pd.concat([*parts, ground[names["share"]].mean()], axis=1).reindex(columns=list(SHOWN))
 
 
 def _median_times_ms(timings: pd.DataFrame) -> pd.Series:

@@ -6,6 +6,7 @@ key. `runs` has one row a run and is written after all others: what it calls fin
 """
 
 import json
+import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,19 +14,21 @@ from typing import Any
 
 import pandas as pd
 import pyarrow as pa
-import pyarrow.parquet as pq
+from pydantic import BaseModel, ValidationError
 
 from experiments.judge import tables
-from experiments.judge.criteria import answerable
+from experiments.judge.criteria import answerable, how_far_off
 from experiments.run.code_version import library_versions, source_hash
 from experiments.run.frames import FLOAT, TEXT, fields, write_rows
 from experiments.study.sweep.combinations import SweepRun
-from mapfusion.errors import InputError
-from mapfusion.storage import schema, write_whole
+from mapfusion.errors import DamagedFileError, InputError, MendedWarning
+from mapfusion.sealed import read_sealed
+from mapfusion.storage import read_json, read_parquet, schema, write_json, write_whole
 
 SCHEMA_VERSION = 1
 RUNS, RUN_TIMES, ALIGNER_TIMINGS = "runs", "run_times", "aligner_timings"
 ERRORS = ["translation_error_m", "refined_translation_error_m"]
+GIVEN = ["estimated_share", "refined_share"]
 
 _OWN_FIELDS = {
     RUNS: fields(
@@ -41,6 +44,13 @@ _OWN_FIELDS = {
     # that differs from time to time.
     RUN_TIMES: fields(stage=TEXT, key=TEXT, figure=TEXT, seconds=FLOAT),
 }
+
+
+class _Description(BaseModel):
+    """What `sweep.json` holds."""
+
+    schema_version: int
+    settings: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -71,15 +81,21 @@ class SweepDataset:
 
     def fail(
         self, run: SweepRun, reason: str, details: str = "", stages: Sequence[str] = ()
-    ) -> None:
-        """Say why a run has no rows; those of an earlier, finished one are removed."""
+    ) -> Path:
+        """Say why a run has no rows; those of an earlier, finished one are removed.
+
+        Returns:
+            Where the details are, if there are any.
+        """
         row = {"status": "failed", "reason": reason, "renderer": ""}
         path = self._end(run, row | _made_by(stages))
         for file in self.folder.glob(f"*/{run.run_id}.parquet"):
             if file.parent.name != RUNS:
                 file.unlink(missing_ok=True)
         if details:
-            write_whole(path, lambda file: file.write_text(details, encoding="utf-8"))
+            text = details.encode("utf-8", "backslashreplace")  # an exception's text may be any
+            write_whole(path, lambda file: file.write_bytes(text))
+        return path
 
     def _end(self, run: SweepRun, row: dict[str, str]) -> Path:
         """Write the row of `runs`; returns where details of a failure go, none of which is left."""
@@ -89,12 +105,23 @@ class SweepDataset:
         return details
 
     def holds(self, run: SweepRun, stages: Sequence[str]) -> bool:
-        """Whether the run is finished, made from these stages by the source as it is now."""
-        wanted = {"status": "finished"} | _made_by(stages)
-        try:
-            return pq.read_table(self.path(RUNS, run), columns=list(wanted)).to_pylist() == [wanted]
-        except (OSError, pa.ArrowInvalid):
+        """Whether the run is finished, made from these stages by the source as it is now.
+
+        And whether its tables are as they were written: a damaged one is told, and made again.
+        """
+        path, wanted = self.path(RUNS, run), {"status": "finished"} | _made_by(stages)
+        if not path.is_file():
             return False
+        try:
+            if read_parquet(path, RUNS, list(wanted)).to_pylist() != [wanted]:
+                return False
+            for file in self.folder.glob(f"*/{run.run_id}.parquet"):
+                read_sealed(file, "table of a sweep")
+        except DamagedFileError as error:
+            told = f"{error}; the run's tables are written again"
+            warnings.warn(told, MendedWarning, stacklevel=2)
+            return False
+        return True
 
 
 def _made_by(stages: Sequence[str]) -> dict[str, str]:
@@ -119,18 +146,17 @@ def open_dataset(folder: Path, keys: Iterable[str]) -> SweepDataset:
         what = "is no folder of a sweep (no sweep.json); give another --output"
         raise InputError(f"{folder}: {what}")
     else:
-        description = {"schema_version": SCHEMA_VERSION, "kind": "sweep", "settings": dataset.keys}
-        text = json.dumps(description, indent=1)
-        write_whole(path, lambda file: file.write_text(text, encoding="utf-8"))
+        own = {"schema_version": SCHEMA_VERSION, "kind": "sweep", "settings": dataset.keys}
+        write_json(path, own)
     return dataset
 
 
 def _require_settings(path: Path, keys: tuple[str, ...]) -> None:
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        version, known = found["schema_version"], found["settings"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: damaged or no description of a sweep ({error})") from error
+        found = _Description.model_validate(read_json(path, "description of a sweep"))
+    except ValidationError as error:
+        raise InputError(f"{path}: damaged or no description of a sweep") from error
+    version, known = found.schema_version, found.settings
     if version != SCHEMA_VERSION:
         reads = f"this program reads {SCHEMA_VERSION}"
         raise InputError(f"{path}: schema_version is {version}, {reads}")
@@ -145,15 +171,21 @@ def _require_settings(path: Path, keys: tuple[str, ...]) -> None:
 def medians_over_runs(dataset: SweepDataset, runs: Sequence[SweepRun]) -> pd.DataFrame:
     """A sweep's errors in short: medians over runs of each run's own medians.
 
-    One row for each scenario with its values (`setting`) and aligner: ERRORS, number of runs. Read
-    run by run, so that memory does not grow with the sweep.
+    One row for each scenario with its values (`setting`) and aligner: ERRORS, infinite without an
+    estimate, GIVEN, the shares of answers with one, and the number of runs. Read run by run, so
+    that memory does not grow with the sweep.
     """
     parts = []
     for run in runs:
         columns = ["aligner", "n_true", *ERRORS]
-        errors = pq.read_table(dataset.path("errors", run), columns=columns).to_pandas()
+        errors = read_parquet(dataset.path("errors", run), "table errors", columns).to_pandas()
         setting = " ".join((run.scenario, *(value for _, value in run.settings)))
-        medians = answerable(errors).groupby("aligner", sort=False)[ERRORS].median()
+        errors = answerable(errors)
+        given = {name: errors[of].notna() for name, of in zip(GIVEN, ERRORS, strict=True)}
+        judged = errors.assign(**given, **how_far_off(errors, ERRORS))
+        groups = judged.groupby("aligner", sort=False)
+        medians = groups[ERRORS].median().join(groups[GIVEN].mean())
         parts.append(medians.reset_index().assign(setting=setting))
     grouped = pd.concat(parts).groupby(["setting", "aligner"], sort=False)
-    return grouped[ERRORS].median().assign(runs=grouped.size()).reset_index()
+    found = grouped[ERRORS].median().join(grouped[GIVEN].mean())
+    return found.assign(runs=grouped.size()).reset_index()

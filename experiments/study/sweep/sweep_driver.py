@@ -8,6 +8,7 @@ import uuid
 from collections import Counter
 from collections.abc import Callable, Collection, Sized
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import cast
 
@@ -19,12 +20,13 @@ from experiments.judge.result import measure_aligners
 from experiments.methods.threads import single_threaded
 from experiments.run import dask_worker
 from experiments.run.dask_cluster import connected
-from experiments.run.store import explained
+from experiments.run.store import mending
 from experiments.run.tasks import OnProgress, Task
 from experiments.study.sweep.combinations import SweepRun
 from experiments.study.sweep.sweep_dataset import ALIGNER_TIMINGS, open_dataset
 from experiments.study.sweep.sweep_plan import PlannedRun, Sweep, planned
 from mapfusion.errors import InputError
+from mapfusion.storage import PART, remove_abandoned, temporary_prefix
 
 # Tasks at Dask for each worker. Enough that none waits while this process plans the next run; few
 # enough that memory does not grow with the number of runs.
@@ -34,7 +36,7 @@ _COUNT_WORKERS_EVERY_S = 10.0
 # A worker may be killed for no fault of its task (a machine that goes away); four times in a row
 # while at the same task it is the task.
 RETRIES = 3
-_ATTEMPTS_PREFIX = ".attempts-"
+_ATTEMPTS = "attempts"
 _OLD_S = 24 * 3600  # in a sweep that runs, tasks begin and end in the meantime
 
 
@@ -43,12 +45,13 @@ class SweepProgress:
     """How far a sweep is; the driver counts on in it.
 
     Runs in all; those `done`, which need nothing more; of these the failed ones, with their reasons
-    by run id. Tasks by label, of the runs looked at so far.
+    by run id, and which of them are defects of ours. Tasks by label, of the runs looked at so far.
     """
 
     runs: int
     done: int = 0
     failed: dict[str, str] = field(default_factory=dict)
+    defects: set[str] = field(default_factory=set)
     tasks: Counter[str] = field(default_factory=Counter)
     tasks_done: Counter[str] = field(default_factory=Counter)
 
@@ -60,9 +63,15 @@ class SweepDriver:
     """Runs everything that is not finished; a run that fails does not stop the others."""
 
     def __init__(
-        self, client: Client, sweep: Sweep, terms: dask_worker.Terms, on_progress: OnSweepProgress
+        self,
+        client: Client,
+        sweep: Sweep,
+        terms: dask_worker.Terms,
+        on_progress: OnSweepProgress,
+        jobs: int | None = None,
     ) -> None:
-        self._client, self._sweep, self._terms = client, sweep, terms
+        """`jobs` are the workers on this machine; None if they are a cluster's."""
+        self._client, self._sweep, self._terms, self._jobs = client, sweep, terms, jobs
         self._on_progress = on_progress
         # Of this sweep alone: another client's tasks of the same key might write elsewhere.
         self._suffix = uuid.uuid4().hex[:8]
@@ -70,6 +79,8 @@ class SweepDriver:
         self._futures: dict[str, Future] = {}  # by name of the task
         self._open: dict[PlannedRun, set[str]] = {}  # with the tasks at Dask that each waits for
         self._failures: dict[str, dask_worker.TaskFailedError] = {}  # by task
+        self._mended = Counter[Path]()  # damaged files of the store
+        self._again: set[PlannedRun] = set()  # to be planned anew, since a stage was damaged
         self._n_workers, self._counted_at = 0, -_COUNT_WORKERS_EVERY_S
         self.progress = SweepProgress(len(sweep.runs))
 
@@ -96,7 +107,7 @@ class SweepDriver:
 
     def _begin(self, run: SweepRun) -> None:
         try:
-            laid_out = planned(run, self._sweep.store, self._sweep.dataset)
+            laid_out = planned(run, self._sweep.store, self._sweep.dataset, self._jobs)
         except InputError as error:  # no world can be made from this seed, a log is damaged, ...
             reason = " ".join(str(error).split())
             self.progress.done += 1
@@ -122,7 +133,8 @@ class SweepDriver:
             pickle.dumps(task),
             self._terms,
             *(self._futures[need] for need in task.needs if need in self._futures),
-            key=f"{task.label}-{self._suffix}-{task.name}",
+            # new at each attempt: what failed under a key, Dask does not compute again
+            key=f"{task.label}-{self._suffix}{self.progress.tasks.total()}-{task.name}",
             pure=False,
             # in order: a run is finished before others begin
             priority=-self.progress.tasks.total(),
@@ -133,8 +145,11 @@ class SweepDriver:
     def _task_ended(self, future: Future) -> None:
         label, name = _label_and_name(future.key)
         if future.status != "finished":
-            failure = self._failure(future, name)
-            self._failures[failure.task] = failure
+            failure, store = self._failure(future, name), self._sweep.store
+            if failure.damage and store.discard_damaged(failure.damage, self._mended):
+                self._again |= {each for each in self._open if failure.task in each.tasks}
+            else:
+                self._failures[failure.task] = failure
         del self._futures[name]
         self.progress.tasks_done[label] += 1
         for laid_out in [each for each, waits_for in self._open.items() if name in waits_for]:
@@ -162,13 +177,20 @@ class SweepDriver:
         if self._open[laid_out]:
             return
         del self._open[laid_out]
+        if laid_out in self._again:
+            self._again.remove(laid_out)
+            self._begin(laid_out.run)
+            return
         self.progress.done += 1
         # All tasks that could be done were done, so which comes first does not depend on chance.
         failures = (self._failures.get(task.name) for task in laid_out.left)
         if first := next(filter(None, failures), None):
-            reason = explained(first.reason, self._sweep.store)
-            self.progress.failed[laid_out.run.run_id] = reason
-            self._sweep.dataset.fail(laid_out.run, reason, first.details, laid_out.stages)
+            run, reason = laid_out.run, first.reason
+            details = self._sweep.dataset.fail(run, reason, first.details, laid_out.stages)
+            if first.details:
+                reason += f"; its traceback: {details}"
+                self.progress.defects.add(run.run_id)
+            self.progress.failed[run.run_id] = reason
 
 
 def _label_and_name(key: object) -> tuple[str, str]:
@@ -179,23 +201,25 @@ def _label_and_name(key: object) -> tuple[str, str]:
 
 def execute(
     sweep: Sweep, jobs: int, scheduler: str | None, on_progress: OnSweepProgress
-) -> dict[str, str]:
-    """Run a sweep; returns the failed runs with their reasons.
+) -> SweepProgress:
+    """Run a sweep; returns how it ended.
 
     Raises:
         InputError: the output folder is of another sweep, no scheduler or no worker is of use.
     """
     folder = sweep.dataset.folder
     open_dataset(folder, sweep.dataset.keys)
-    for left_behind in folder.glob(f"{_ATTEMPTS_PREFIX}*"):  # by a sweep that was killed
+    for left_behind in folder.glob(f".{_ATTEMPTS}.*"):  # by a sweep killed on any machine
         if time.time() - left_behind.stat().st_mtime > _OLD_S:  # else another one may be running
             shutil.rmtree(left_behind, ignore_errors=True)
-    own = tempfile.TemporaryDirectory(None, _ATTEMPTS_PREFIX, folder, ignore_cleanup_errors=True)
+    named = PART, temporary_prefix(_ATTEMPTS)
+    own = tempfile.TemporaryDirectory(*named, folder, ignore_cleanup_errors=True)
     with own as attempts, connected(jobs, scheduler) as client:
         terms = dask_worker.Terms(Path(attempts), RETRIES, dask_worker.code_version())
-        driver = SweepDriver(client, sweep, terms, on_progress)
+        driver = SweepDriver(client, sweep, terms, on_progress, None if scheduler else jobs)
         driver.execute()
-    return driver.progress.failed
+    remove_abandoned(folder)  # by earlier sweeps, and by workers of this one, that were killed
+    return driver.progress
 
 
 def measure_times(sweep: Sweep, failed: Collection[str], on_progress: OnProgress) -> None:
@@ -205,7 +229,12 @@ def measure_times(sweep: Sweep, failed: Collection[str], on_progress: OnProgress
     for done, run in enumerate(runs):
         on_progress("time the aligners", done, len(runs))
         if not sweep.dataset.path(ALIGNER_TIMINGS, run).is_file():
-            judged = JudgedRun.of(run.load(), sweep.store)
-            measure_aligners(judged, judged.load_robots())
-            sweep.dataset.write(ALIGNER_TIMINGS, run, judged.pair_table(ALIGNER_TIMINGS))
+            mending(sweep.store, partial(_measure, sweep, run))
     on_progress("time the aligners", len(runs), len(runs))
+
+
+def _measure(sweep: Sweep, run: SweepRun) -> None:
+    judged = JudgedRun.of(run.load(), sweep.store)
+    judged.execute(1, lambda *_: None)  # what is there already, but for a damaged stage
+    measure_aligners(judged, judged.load_robots())
+    sweep.dataset.write(ALIGNER_TIMINGS, run, judged.pair_table(ALIGNER_TIMINGS))

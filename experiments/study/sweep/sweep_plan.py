@@ -8,11 +8,16 @@ from typing import NamedTuple
 
 from experiments.judge.judged_run import JudgedRun
 from experiments.judge.result import all_tables, renderer
+from experiments.run.memory import require_memory
 from experiments.run.store import Store
 from experiments.run.tasks import Task, task_names, unfinished
 from experiments.scenario.suite import scenarios_of
 from experiments.study.sweep.combinations import SweepRun, parse_axes, runs_of
-from experiments.study.sweep.sweep_dataset import ALIGNER_TIMINGS, RUN_TIMES, SweepDataset
+from experiments.study.sweep.sweep_dataset import (
+    ALIGNER_TIMINGS,
+    RUN_TIMES,
+    SweepDataset,
+)
 from mapfusion.errors import InputError
 
 _LONGEST_NAME = 80
@@ -63,9 +68,16 @@ class PlannedRun:
     left: list[Task]
 
 
-def planned(run: SweepRun, store: Store, dataset: SweepDataset) -> PlannedRun:
-    """Lay out a run; nothing is computed. Raises InputError for what cannot be run."""
+def planned(
+    run: SweepRun, store: Store, dataset: SweepDataset, jobs: int | None = None
+) -> PlannedRun:
+    """Lay out a run; nothing is computed. Raises InputError for what cannot be run.
+
+    `jobs` are the processes that share this machine's memory; None if other machines run it.
+    """
     judged = JudgedRun.of(run.load(), store)
+    if jobs is not None:
+        require_memory(judged.pipeline, jobs)
     pipeline, stages = judged.pipeline, [f"{each.name}/{each.key}" for each in judged.stages()]
     read = [stage for robot in pipeline.robots for stage in (robot.log, robot.slam)]
     read += [*(pair.estimates for pair in pipeline.pairs), *judged.judgements]

@@ -3,12 +3,13 @@
 import importlib
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
 from mapfusion.align.method import Fit, Undetermined, supported
 from mapfusion.align.pairs import Pairs
+from mapfusion.arguments import Range, require_in_range
 from mapfusion.se2 import transform_points
 
 _SMALLEST_BOUND_M = 5e-3  # the package raises below
@@ -34,14 +35,11 @@ class KissMatcher:
     """
 
     randomised: ClassVar[bool] = False
-    noise_bound_m: float = 0.3
-    solver_share: float = 0.75
+    noise_bound_m: Annotated[float, Range(_SMALLEST_BOUND_M, 1000, "m")] = 0.3
+    solver_share: Annotated[float, Range(1e-3, 1, "1")] = 0.75
 
     def __post_init__(self) -> None:
-        if not self.noise_bound_m >= _SMALLEST_BOUND_M:
-            raise ValueError(f"noise_bound_m: must be {_SMALLEST_BOUND_M:g} or more")
-        if not 0 < self.solver_share <= 1:
-            raise ValueError("solver_share: must lie in (0, 1]")
+        require_in_range(self)
 
     def find(self, pairs: Pairs, rng: np.random.Generator) -> Fit | Undetermined:
         """T_a_b of the pairs it keeps; nothing is drawn from `rng`."""

@@ -2,13 +2,13 @@
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from mapfusion.align.method import Fit, Undetermined, supported
 from mapfusion.align.pairs import Pairs
-from mapfusion.arguments import require_above, require_at_least, require_between
+from mapfusion.arguments import Probability, Range, require_in_range
 from mapfusion.se2 import rotation, transform_points
 
 
@@ -29,16 +29,13 @@ class OpenCv:
     """
 
     randomised: ClassVar[bool] = True
-    gate_m: float = 0.3
-    confidence: float = 0.9999
-    max_draws: int = 20_000
-    local_rounds: int = 10
+    gate_m: Annotated[float, Range(1e-3, 1000, "m")] = 0.3
+    confidence: Probability = 0.9999
+    max_draws: Annotated[int, Range(1, 100_000_000, "draws")] = 20_000
+    local_rounds: Annotated[int, Range(0, 100_000, "rounds")] = 10
 
     def __post_init__(self) -> None:
-        require_above(0, self, "gate_m")
-        require_between(0, 1, self, "confidence")
-        require_above(0, self, "max_draws")
-        require_at_least(0, self, "local_rounds")
+        require_in_range(self)
 
     def find(self, pairs: Pairs, rng: np.random.Generator) -> Fit | Undetermined:
         """T_a_b of the similarity, without its scale.

@@ -6,10 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from experiments.judge.result import run_scenario
-from experiments.scenario.loading import load_scenario
 from mapfusion.robot_log import read_log, write_log
-from tests.helpers.tiny_scenario import assert_refused, command
+from tests.helpers.tiny_scenario import assert_refused, assert_same_tables, command
 
 
 def recorded(tmp_path: Path, *names: str) -> Path:
@@ -77,18 +75,42 @@ def test_empty_log(tiny_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture
     assert_refused(reply, "frames.parquet", "no frame")
 
 
-def test_damaged_store_is_named(
-    tiny_path: Path, tiny_results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("jobs", "left_out", "where"),
+    [
+        (2, ("observed", "log", "slam", "align", "judge"), "features/*/features_000020.parquet"),
+        (1, ("features", "observed", "log", "slam", "align", "judge"), "faces/*/*_0001.png"),
+        (1, (), "judge/*/errors.parquet"),
+        (1, (), "slam/*/done.json"),
+        (1, (), "log/*/observations.parquet"),
+    ],
+)
+def test_a_damaged_stage_is_named_and_made_again(
+    jobs: int,
+    left_out: tuple[str, ...],
+    where: str,
+    tiny_path: Path,
+    tiny_result: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    shutil.copytree(tiny_results / "store", tmp_path / "store")
-    for stage in ("observed", "log", "slam", "align", "judge"):
+    shutil.copytree(tiny_result.parent / "store", tmp_path / "store")
+    for stage in left_out:
         shutil.rmtree(tmp_path / "store" / stage)
-    chunk = next((tmp_path / "store" / "features").rglob("features_000020.parquet"))
-    chunk.write_bytes(chunk.read_bytes()[:100])
-    reply = command(capsys, "run", tiny_path, "--jobs", 1, "--results", tmp_path)
-    assert reply.code == 2
-    assert len(reply.complaints) == 1
-    assert str(chunk) in reply.complaints[0]
-    assert "delete its folder" in reply.complaints[0]
-    shutil.rmtree(chunk.parent)
-    run_scenario(load_scenario(tiny_path), tmp_path, 1, lambda stage, done, total: None)
+    damaged, *_ = (tmp_path / "store").glob(where)
+    flip(damaged, damaged.stat().st_size // 2)
+    reply = command(capsys, "run", tiny_path, "--jobs", jobs, "--results", tmp_path)
+    assert reply.code == 0, reply.err
+    complaint, *more = reply.complaints
+    assert str(damaged) in complaint
+    assert f"the stage {where.partition('/')[0]} is discarded and computed again" in complaint
+    assert not more
+    assert_same_tables(tmp_path / tiny_result.name, tiny_result)
+
+
+def flip(path: Path, byte: int) -> None:
+    """Change one bit of a file, its other names apart."""
+    data = bytearray(path.read_bytes())
+    data[byte] ^= 4
+    path.unlink()
+    path.write_bytes(data)

@@ -114,7 +114,7 @@ def test_ctrl_c_before_the_command_starts(
         raise KeyboardInterrupt
 
     monkeypatch.setattr("experiments.run.kernel_cache.use_kernel_cache", press)
-    reply = command(capsys, "schema")
+    reply = command(capsys, "scenarios", "--schema")
     assert reply.code == 130
     assert len(reply.err.splitlines()) == 1
 
@@ -234,7 +234,7 @@ def test_commands_one_by_one(
 @pytest.mark.usefixtures("quick_save")
 def test_figures(tiny_result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     copy = shutil.copytree(tiny_result, tmp_path / "result")
-    reply = command(capsys, "figures", copy, "--jobs", 1)
+    reply = command(capsys, "report", copy, "--figures", "--jobs", 1)
     assert reply.code == 0
     drawn = {path.name[:5] for path in (copy / "figures").iterdir()}
     skipped = {line.split()[2][:5] for line in reply.out.splitlines() if "not drawn" in line}
@@ -282,8 +282,8 @@ def test_run_shows_the_aligners(
     [
         ("one robot", ["robots=[{name: R1, start: [1.2, 1.2, 0.6], route: [[4.8, 1.2]]}]"]),
         # no wall is this near: nothing is seen, all maps are empty
-        ("blind", ["vision.max_depth_m=0.01"]),
-        ("nothing alike", ["align.match.max_descriptor_distance=1e-9"]),
+        ("blind", ["vision.max_depth_m=0.1"]),
+        ("nothing alike", ["align.match.max_descriptor_distance=0.001"]),
         ("empty at first", ["evaluate.every=1", "drive.frames=6", "slam.min_count=4"]),
     ],
 )

@@ -44,6 +44,12 @@ def test_every_import_of_ours_is_followed(tmp_path: Path, monkeypatch: pytest.Mo
     code_version.imported_sources.cache_clear()
     found = code_version.imported_sources("ours.start")
     assert set(found) == set(FILES) - {"ours/unused.py", "ours/__init__.py"}
+    deep = tmp_path / "ours" / "kit" / "within" / "deep.py"
+    deep.parent.mkdir(parents=True)
+    deep.write_text("from ours import unused\n")
+    (tmp_path / "ours" / "kit" / "__init__.py").touch()
+    whole = {"ours/kit/__init__.py", "ours/kit/within/deep.py", "ours/unused.py", "ours/robot.urdf"}
+    assert set(code_version.imported_sources("ours.kit")) == whole
 
 
 @pytest.mark.parametrize(
@@ -51,6 +57,7 @@ def test_every_import_of_ours_is_followed(tmp_path: Path, monkeypatch: pytest.Mo
     [
         ("ours/a.py", True),
         ("ours/new.py", True),
+        ("ours/within/deep/er.py", True),
         ("ours/robot.urdf", True),
         ("single.py", True),
         ("ours/notes.txt", False),
@@ -71,10 +78,11 @@ def test_the_hash_is_of_all_source_and_of_nothing_else(
 
     before = found()
     assert found() == before
+    (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / file).write_text("2")
-    assert (found() != before) == matters
-    if matters:
+    changed = found()
+    assert (changed != before) == matters
+    if matters and file != "single.py":
         (tmp_path / file).rename(tmp_path / "ours" / f"moved{Path(file).suffix}")
-        moved = found() if file != "single.py" else ""
-        assert moved != before
+        assert found() not in (before, changed)
     code_version.source_hash.cache_clear()

@@ -13,7 +13,6 @@ from experiments.run.dask_worker import (
     Terms,
     UnfitWorkerError,
     code_version,
-    dask_setup,
     perform,
 )
 from experiments.run.tasks import Task
@@ -42,8 +41,8 @@ def test_it_runs_and_leaves_no_mark(terms: Terms, tmp_path: Path) -> None:
     ("function", "reason", "with_details"),
     [
         (acting.collide, "scenario x: R1 drove into a wall at (1, 2)", False),
-        (acting.run_out_of_memory, "drive: MemoryError", True),
-        (acting.break_down, "drive: ZeroDivisionError a bug", True),
+        (acting.run_out_of_memory, "drive: MemoryError", False),
+        (acting.break_down, "drive: a defect of mapfusion itself: ZeroDivisionError a bug", True),
     ],
 )
 def test_what_it_raises_is_a_reason(
@@ -52,7 +51,8 @@ def test_what_it_raises_is_a_reason(
     with pytest.raises(TaskFailedError) as raised:
         perform("drive/k", packed(function), terms)
     error = pickle.loads(pickle.dumps(raised.value))  # as it travels
-    assert (error.task, error.reason) == ("drive/k", reason)
+    assert error.task == "drive/k"
+    assert error.reason.startswith(reason)
     assert ("Traceback" in error.details) == with_details
     assert not list(terms.attempts.iterdir())
 
@@ -84,12 +84,3 @@ def test_machines_that_cannot_take_part_say_so(terms: Terms, tmp_path: Path) -> 
     outdated = Terms(terms.attempts, 2, "another version")
     with pytest.raises(UnfitWorkerError, match="other source or libraries"):
         perform("drive/k", packed(acting.break_down), outdated)
-
-
-def test_ctrl_c_is_for_the_command_alone() -> None:
-    before = signal.getsignal(signal.SIGINT)
-    try:
-        dask_setup(None)
-        assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
-    finally:
-        signal.signal(signal.SIGINT, before)

@@ -7,6 +7,7 @@ from experiments.run.stage import Stage
 from experiments.run.store import Store
 from experiments.run.store_files import link_or_copy
 from experiments.run.tasks import tasks_of
+from mapfusion.errors import DamagedFileError
 
 
 def work(settings: int, job: Job) -> dict[str, float]:
@@ -68,7 +69,7 @@ def test_copies_where_no_link_can_be(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_a_failed_copy_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
     target = tmp_path / "target"
     target.write_text("old")
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(DamagedFileError):
         link_or_copy(tmp_path / "nowhere", target)
     assert target.read_text() == "old"
     assert [path.name for path in tmp_path.iterdir()] == ["target"]

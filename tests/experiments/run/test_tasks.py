@@ -59,6 +59,16 @@ def test_a_task_without_outputs_is_never_finished(tmp_path: Path) -> None:
     assert not Task("x", "x", made.function, made.arguments, ()).finished
 
 
+def test_a_task_is_finished_with_the_last_of_its_outputs(tmp_path: Path) -> None:
+    made, outputs = tasks(tmp_path, {"a": ()})["a"], (tmp_path / "a", tmp_path / "b")
+    two = Task("x", "x", made.function, made.arguments, outputs)
+    for output in reversed(outputs):
+        assert not two.finished
+        assert unfinished({"x": two}, ["x"]) == [two]
+        output.touch()
+    assert two.finished
+
+
 def test_a_task_done_by_somebody_else_is_not_done_again(tmp_path: Path) -> None:
     made = tasks(tmp_path, {"a": ()})["a"]
     made.run()

@@ -2,13 +2,13 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 
 from experiments.run.workers import workers
 from mapfusion.errors import InputError
+from tests.helpers.waiting import has_ended, wait_until
 
 
 def _die() -> None:
@@ -28,7 +28,7 @@ from experiments.run.workers import workers
 if __name__ == "__main__":
     with workers(2) as pool:
         pool.submit("task", os.getpid)
-        pool.submit("task", time.sleep, 60)
+        pool.submit("task", time.sleep, 100_000)
         for _, pid in pool.completed():
             print(pid, flush=True)
 """
@@ -41,7 +41,4 @@ def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
         assert run.stdout is not None
         worker = int(run.stdout.readline())
         run.kill()
-    deadline = time.monotonic() + 20
-    while Path(f"/proc/{worker}").exists() and time.monotonic() < deadline:
-        time.sleep(0.1)
-    assert not Path(f"/proc/{worker}").exists()
+    assert wait_until(lambda: has_ended(worker))

@@ -2,7 +2,7 @@
 
 import pytest
 
-from experiments.scenario.loading import load_section
+from experiments.scenario.loading import default_settings
 from experiments.scenario.settings import DEFAULT_ALIGNERS, Align
 from mapfusion.errors import InputError
 
@@ -29,4 +29,4 @@ def test_also_goes_behind_the_default_list() -> None:
 )
 def test_wrong_entries_are_named(also: list[dict], said: str) -> None:
     with pytest.raises(InputError, match=said):
-        load_section(None, "align", Align, [f"also={also}".replace("'", "")])
+        default_settings([f"align.also={also}".replace("'", "")])

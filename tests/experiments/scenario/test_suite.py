@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 
 from experiments.scenario.loading import load_scenario
-from experiments.scenario.suite import entries, scenarios_of
+from experiments.scenario.suite import SHIPPED as SUITE
+from experiments.scenario.suite import copy_to_edit, entries, scenarios_of
 from mapfusion.errors import InputError
 from tests.helpers.tiny_scenario import assert_refused, command
 
@@ -78,10 +79,54 @@ def test_commands_take_tags(
 ) -> None:
     monkeypatch.chdir(folder.parent)
     for name in ("run", "check"):
-        assert_refused(command(capsys, name, "soft"), "soft", "ci, hard")
-        # found, and then refused for its own reason
-        assert_refused(command(capsys, name, "ci", "--set", "drive.frames=1"), "a.yaml", "frames")
+        assert_refused(command(capsys, name, "soft"), "soft", "a, apart, b, c", "ci, full, hard")
+    wrong = ("ci", "--set", "drive.frames=1")  # found, and then refused for their own reasons
+    assert_refused(command(capsys, "run", *wrong), "a.yaml", "frames")
+    checked = command(capsys, "check", *wrong)
+    assert checked.code == 2
+    assert [Path(line.split(": ")[1]).name for line in checked.complaints] == [
+        "a.yaml",
+        "quick.yaml",
+    ]
     assert_refused(command(capsys, "scenarios", "nowhere"), "nowhere", "holds no scenario")
+
+
+def test_the_suite_is_found_from_any_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert scenarios_of(["quick"]) == scenarios_of(["ci"]) == [SUITE / "quick.yaml"]
+    assert [entry["name"] for entry in entries()] == SHIPPED
+    assert "quick" in command(capsys, "scenarios").out
+    log = load_scenario(SUITE / "mrclam7.yaml").logs[0]  # beside the folder that one works in
+    assert log == str(tmp_path / "results" / "mrclam7" / "robot1")
+
+
+def test_own_files_go_before_shipped_ones_of_their_name(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder.parent)
+    (folder / "quick.yaml").write_text(WORLD.format(name="quick", tags="ci"))
+    own = Path("scenarios")
+    assert scenarios_of(["quick", "a"]) == [own / "quick.yaml", own / "a.yaml"]
+    assert scenarios_of(["ci"]) == [own / "a.yaml", own / "quick.yaml"]
+    assert scenarios_of(["dark"]) == [SUITE / "dark.yaml"]
+
+
+def test_a_copy_to_edit_is_written_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    reply = command(capsys, "scenarios", "--copy", "quick")
+    assert (reply.code, reply.out.strip()) == (0, "scenarios/quick.yaml")
+    copy = Path("scenarios/quick.yaml")
+    assert copy.read_bytes() == (SCENARIOS / "quick.yaml").read_bytes()
+    copy.write_text("mine")
+    with pytest.raises(InputError, match=r"scenarios/quick\.yaml: exists"):
+        copy_to_edit("quick")
+    assert copy.read_text() == "mine"
+    for name in ("none", "../../quick", ""):
+        assert_refused(command(capsys, "scenarios", "--copy", name), "no scenario of the suite")
 
 
 @pytest.mark.parametrize("name", SHIPPED)

@@ -10,7 +10,7 @@ import pytest
 
 from experiments.judge import tables
 from experiments.show.inspect import contents_of, unit_of
-from mapfusion.storage import schema, write_table
+from mapfusion.storage import read_json, schema, write_json, write_table
 from tests.helpers.tiny_scenario import command
 
 
@@ -30,7 +30,7 @@ def test_every_file_of_a_run_is_told(
 def test_kind_version_rows_and_columns_are_those_of_the_table(tiny_result: Path) -> None:
     path = tables.table_path(tiny_result, "errors")
     rows, found = tables.read(path, "errors"), contents_of(path)
-    assert (found.kind, found.facts["schema_version"]) == ("result.errors", "2")
+    assert (found.kind, found.facts["schema_version"]) == ("result.errors", "3")
     assert found.facts["rows"] == len(rows)
     assert found.parts["column"].tolist() == list(rows)
     told = {name: (kind, unit) for name, kind, unit in found.parts.to_numpy()}
@@ -133,8 +133,7 @@ def other_json(result: Path, folder: Path) -> Path:
 
 def resolved_but_wrong(result: Path, folder: Path) -> Path:
     path = folder / "scenario.json"
-    text = (result / "scenario.json").read_text()
-    path.write_text(text.replace('"seed": 3', '"seed": -3'))
+    write_json(path, read_json(result / "scenario.json", "scenario") | {"seed": -3})
     return path
 
 
@@ -159,11 +158,11 @@ def picture(result: Path, folder: Path) -> Path:
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (truncated, "damaged or not a Parquet file"),
+        (truncated, "damaged, it does not fit its digest"),
         (foreign, "none of mapfusion's"),
         (of_another_version, "schema_version is 99"),
         (with_a_column_less, "columns are not those of result.errors"),
-        (no_json, "damaged or no JSON"),
+        (no_json, "no JSON object"),
         (other_json, "no file of mapfusion's"),
         (resolved_but_wrong, "seed"),
         (damaged_result, "clouds.parquet: damaged"),

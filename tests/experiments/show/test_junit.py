@@ -2,6 +2,7 @@ import math
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
+from experiments.judge.checking import CheckedScenario
 from experiments.judge.expectations import Outcome
 from experiments.scenario.settings import Bound
 from experiments.show.junit import write_junit
@@ -14,10 +15,16 @@ def test_junit_is_read_back(tmp_path: Path) -> None:
         Outcome("quick", "bad <&>", 2, Bound(max=1), {0: 2}),
         Outcome("paper", "unknown", math.nan, Bound(min=1), {0: math.nan}),
     ]
-    write_junit(path, outcomes)
-    suite = ET.parse(path).getroot()
-    assert (suite.get("tests"), suite.get("failures")) == ("3", "2")
-    cases = {case.get("name"): case for case in suite.iter("testcase")}
+    checks = [
+        CheckedScenario("quick", outcomes[:2], elapsed_s={0: 1.5, 1: 2.25}),
+        CheckedScenario("paper", outcomes[2:], elapsed_s={0: 4.0}),
+    ]
+    write_junit(path, checks)
+    root = ET.parse(path).getroot()
+    assert (root.get("tests"), root.get("failures"), root.get("time")) == ("6", "2", "7.750")
+    assert root[0].get("time") == "3.750"
+    cases = {case.get("name"): case for case in root.iter("testcase")}
+    assert cases["run, seed 1"].get("time") == "2.250"
     assert cases["fine"].find("failure") is None
     failure = cases["bad <&>"].find("failure")
     assert failure is not None

@@ -186,6 +186,17 @@ def test_oracle_ignores_false_pairs():
     assert error(found.T_a_b, pair.T_a_b)[0] < 0.05
 
 
+def test_oracle_starts_from_the_true_pairs_alone():
+    """False ones that agree on a motion 10 m away would pull a start over all out of the gate."""
+    pair = given_pairs(np.random.default_rng(6), 100)
+    position, is_true = pair.map_b.position_m.copy(), np.arange(100) < 40
+    position[~is_true, :2] += [8.0, -6.0]
+    shifted = replace(pair, map_b=replace(pair.map_b, position_m=position), is_true=is_true)
+    found = estimate("oracle", shifted)
+    assert found.status is Status.ACCEPTED
+    assert error(found.T_a_b, pair.T_a_b) == pytest.approx((0, 0), abs=1e-9)
+
+
 def test_unknown_names_and_parameters():
     with pytest.raises(ValueError, match="unknown aligner 'ransack', known are ransac, svd, icp"):
         make_aligner("ransack")

@@ -49,7 +49,7 @@ def with_noise_in_both(seed, n, true_share, sigma_m=0.05, drift_m=0.0):
     return replace(pair, map_a=landmarks(p_a, share, planar=True, name="a"))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.sampled_from(NAMES), st.integers(0, 1000), motions, motions)
 def test_follows_the_frames_of_the_maps(name, seed, T_u_a, T_v_b):
     maps, pair = blurred(np.random.default_rng(seed), 60, 0.6)

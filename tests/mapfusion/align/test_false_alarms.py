@@ -11,6 +11,7 @@ from scipy.stats import binom
 from mapfusion import se2
 from mapfusion.align.false_alarms import (
     agreeing_repairings,
+    chance_of_agreeing,
     fewest_false_alarms,
     independent_pairs,
     log10_tail,
@@ -84,6 +85,12 @@ def test_repairings_are_counted_right():
             assert pairs.possible[size - 1] == possible
 
 
+def test_chance_is_the_larger_of_the_selections_and_of_all():
+    """Counted by hand, one more than was counted: 1/5 and 3/101, 5/5 and 4/101, 1/5 and 101/101."""
+    agreeing, possible = np.array([[0, 4, 0], [2, 3, 100]]), np.array([4, 100])
+    np.testing.assert_allclose(chance_of_agreeing(agreeing, possible), [0.2, 1.0, 1.0], rtol=1e-12)
+
+
 def test_minimal_motion_is_the_nearest_of_all():
     rng = np.random.default_rng(2)
     pair = given_pairs(rng, 12, sigma_m=0.1, planar=True)
@@ -129,11 +136,12 @@ def twin_nfa(p_a, p_b, heights, T_a_b):
     return best
 
 
-@pytest.mark.parametrize("true_share", [0.0, 0.2])
-def test_the_whole_is_the_documented_formula(true_share):
+@pytest.mark.parametrize(("true_share", "sigma_m"), [(0.0, 0.03), (0.2, 0.03), (0.6, 0.2)])
+def test_the_whole_is_the_documented_formula(true_share, sigma_m):
+    """With noise of half a gate, support under the motion judged is not that under two pairs'."""
     rng = np.random.default_rng(3)
     for n in (20, 70):
-        pair = given_pairs(rng, n, true_share, sigma_m=0.03, planar=True)
+        pair = given_pairs(rng, n, true_share, sigma_m, planar=True)
         p_a, p_b = pair.map_a.position_m[:, :2].copy(), pair.map_b.position_m[:, :2].copy()
         heights = heights_of(rng, n)
         wrong = np.array([*(p_a[0] - p_b[0]), 0.3])

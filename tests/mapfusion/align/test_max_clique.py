@@ -62,7 +62,7 @@ dense_graphs = st.builds(
 )
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(st.one_of(graphs, dense_graphs), st.integers(0, 4))
 def test_as_large_as_the_slow_way_finds(adjacent, short_of):
     size = bron_kerbosch(adjacent)
@@ -73,7 +73,7 @@ def test_as_large_as_the_slow_way_finds(adjacent, short_of):
     assert is_clique(adjacent, clique)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.one_of(graphs, dense_graphs))
 def test_greedy_gives_a_clique_that_nothing_can_join(adjacent):
     clique = greedy_clique(on_bits(adjacent), 10)
@@ -83,7 +83,7 @@ def test_greedy_gives_a_clique_that_nothing_can_join(adjacent):
     assert not joined_to_all.any()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.one_of(graphs, dense_graphs))
 def test_core_numbers_are_what_taking_away_leaves(adjacent):
     order, core = degeneracy_order(on_bits(adjacent))

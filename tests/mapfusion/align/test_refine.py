@@ -211,6 +211,29 @@ def test_a_part_that_moved_as_one_is_not_taken_for_false():
     assert not all(np.all(answer.inlier) for answer in answers)
 
 
+def test_drift_is_at_most_what_false_pairs_over_the_gate_would_look_like():
+    """Residuals spread evenly over the gate of 0.5 m fit any s_drift: a third of it is the most."""
+    rng = np.random.default_rng(10)
+    pair = given_pairs(rng, 400, planar=True)
+    angle, radius = rng.uniform(0, 2 * np.pi, 400), 0.5 * np.sqrt(rng.uniform(0, 1, 400))
+    aside = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(400)], -1)
+    pairs = Pairs(
+        pair.map_a,
+        replace(pair.map_b, position_m=pair.map_b.position_m + aside),
+        pair.correspondences,
+    )
+    found = Refinement(gate_m=0.5).refine(pairs, pair.T_a_b)
+    assert found.drift_sigma_m == pytest.approx(0.5 / 3)
+
+
+def test_a_whole_turn_more_makes_no_difference():
+    pair, maps = offered(np.random.default_rng(11), 50, 1.0, 0.0)
+    for turns in (-1, 0, 1):
+        found = Refinement().refine(Pairs(*maps), pair.T_a_b + np.array([0, 0, turns * 2 * np.pi]))
+        assert found.T_a_b[2] == pytest.approx(pair.T_a_b[2], abs=0.01)
+        assert found.ok
+
+
 def test_stays_local():
     pair, maps = offered(np.random.default_rng(2), 100, 1.0, 0.0)
     far = Refinement(gate_m=0.5).refine(Pairs(*maps), pair.T_a_b + np.array([5.0, 0, 0]))

@@ -11,7 +11,7 @@ from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.fastslam.proposal import Proposal
 from mapfusion.fastslam.run import run_log
 from mapfusion.recordings.mrclam import MrclamSettings, import_mrclam
-from mapfusion.recordings.registry import import_recording
+from mapfusion.recordings.registry import import_recording, settings_class
 from mapfusion.robot_log import read_log, read_truth
 from mapfusion.se2 import between, compose, inverse, transform_points, wrap
 
@@ -173,6 +173,8 @@ def test_the_filter_finds_the_landmarks(recording: Path, tmp_path: Path):
         ("Robot1_Odometry.dat", "1.0 2.0 3.0\n4.0 5.0", "line 2: has 2 columns, expected 3"),
         ("Robot1_Odometry.dat", "1.0 2.0 3.0\n4.0 fast 0", "line 2: not a number in '4.0 fast 0'"),
         ("Robot1_Odometry.dat", "1.0 2.0 3.0\n4.0 nan 0", "line 2: not a finite number"),
+        ("Robot1_Odometry.dat", "1.0 2.0 3.0\n4.0 1e300 0", "line 2: larger than 1e+12"),
+        ("Robot1_Measurement.dat", "1 72 1e200 0", "line 1: larger than 1e+12"),
         ("Robot1_Odometry.dat", "# nothing", "has 0 rows, expected at least 2"),
         ("Robot1_Groundtruth.dat", b"PAR1\xff\xfe\x00", "not a readable text file"),
         ("Barcodes.dat", "1 5\n6 72\n7 72", "line 3: barcode 72 is subject 6's"),
@@ -196,13 +198,42 @@ def test_damage_is_one_clear_line(recording: Path, tmp_path: Path, name, change,
     assert not (tmp_path / "logs").exists()
 
 
+def test_truth_is_optional(recording: Path, tmp_path: Path):
+    whole = [read_log(path) for path in import_mrclam(recording, tmp_path / "logs")]
+    (recording / "Robot1_Groundtruth.dat").unlink()
+    first, second = import_mrclam(recording, tmp_path / "logs")  # over logs that had it
+    assert not (first / "truth_poses.parquet").exists()
+    assert (first / "truth_points.parquet").exists()
+    assert (second / "truth_poses.parquet").exists()
+    (recording / "Landmark_Groundtruth.dat").unlink()
+    first, second = import_mrclam(recording, tmp_path / "logs")
+    assert [path.name for path in sorted(second.iterdir())] == [
+        "frames.parquet",
+        "observations.parquet",
+        "truth_poses.parquet",
+    ]
+    for path, log in zip((first, second), whole, strict=True):
+        read = read_log(path)
+        np.testing.assert_array_equal(read.observations.position_m, log.observations.position_m)
+        np.testing.assert_array_equal(read.observations.label, log.observations.label)
+
+
 def test_the_importer_is_found_by_its_name(recording: Path, tmp_path: Path):
     assert import_recording("mrclam", recording, tmp_path) == [
         tmp_path / "robot1",
         tmp_path / "robot2",
     ]
+    assert settings_class("mrclam") is MrclamSettings
     with pytest.raises(InputError, match="'nobody': unknown; known: mrclam"):
         import_recording("nobody", recording, tmp_path)
+
+
+@pytest.mark.parametrize("time_s", ["1e9", "1e12"])
+def test_times_that_are_none_do_not_fill_the_memory(recording: Path, tmp_path: Path, time_s: str):
+    with (recording / "Robot1_Odometry.dat").open("a") as file:
+        file.write(f"-{time_s} 0 0\n{time_s} 0 0\n")
+    with pytest.raises(InputError, match=r"MRCLAM: odometry over .* is more than 1000000 frames"):
+        import_mrclam(recording, tmp_path / "logs")
 
 
 def test_another_folder_is_refused(tmp_path: Path):

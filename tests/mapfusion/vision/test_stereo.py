@@ -4,53 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.ndimage import map_coordinates
-from scipy.optimize import least_squares
 from scipy.stats import chi2
 
-from mapfusion.camera import StereoCamera
 from mapfusion.vision.harris import HarrisParameters, detect
-from mapfusion.vision.plane_fit import fit_planes
 from mapfusion.vision.row_search import search_rows
 from mapfusion.vision.stereo import StereoParameters, match
 from mapfusion.vision.verdict import Verdict
 from tests.mapfusion.vision.rendered_scene import Plane, render, wall
+from tests.mapfusion.vision.shifted_pictures import CAMERA, grid, pair
 
-CAMERA = StereoCamera(width_px=320, height_px=240, focal_px=300.0)
 PARAMETERS = StereoParameters(min_depth_m=0.9, max_depth_m=12.0)
-
-
-class Picture:
-    """Brightness as a smooth function of the plane, so that it can be shifted exactly."""
-
-    def __init__(self, seed: int, waves: int = 60) -> None:
-        rng = np.random.default_rng(seed)
-        self.frequency = rng.normal(0, 0.25, (waves, 2))
-        self.phase = rng.uniform(0, 2 * np.pi, waves)
-
-    def __call__(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        total = np.zeros(np.broadcast(u, v).shape)
-        for (fu, fv), phase in zip(self.frequency, self.phase, strict=True):
-            total += np.sin(fu * u + fv * v + phase)
-        return 128 + 40 * total / np.sqrt(len(self.phase) / 2)
-
-
-def pair(
-    d: float, a: float = 0.0, b: float = 0.0, noise: float = 0.0, seed: int = 0
-) -> tuple[np.ndarray, np.ndarray]:
-    """Left and right uint8 images with disparity d + a u + b v at each left pixel."""
-    u, v = np.meshgrid(np.arange(CAMERA.width_px), np.arange(CAMERA.height_px))
-    picture, rng = Picture(seed), np.random.default_rng(seed)
-    u_left = (u + d + b * v) / (1 - a)  # of what the right image shows at u
-    images = (picture(x, v) + noise * rng.standard_normal(u.shape) for x in (u, u_left))
-    left, right = (np.clip(np.rint(i), 0, 255).astype(np.uint8) for i in images)
-    return left, right
-
-
-def grid(step: int = 12) -> np.ndarray:
-    """Points with fractions, clear of the borders and of the largest disparity."""
-    u, v = np.meshgrid(np.arange(70.3, 290, step), np.arange(25.6, 215, step))
-    return np.stack([u.ravel(), v.ravel()], -1)
 
 
 @pytest.mark.parametrize(
@@ -100,24 +63,12 @@ def test_correlation_length_and_floor_enter_the_sigma() -> None:
     )
 
 
-def test_fit_equals_a_general_least_squares_solver() -> None:
-    left, right = pair(9.3, 0.02, -0.01, noise=0.0)
-    half, slope_sigma = 6, 0.05
-    pixel = np.rint(grid(step=40)).astype(np.int64)
-    start = np.rint(9.3 + pixel @ [0.02, -0.01])
-    plane, _ = fit_planes(left, right, pixel, np.zeros(pixel.shape), start, half, slope_sigma, 1.0)
-    y, x = (k.ravel() for k in np.mgrid[-half : half + 1, -half : half + 1])
-    for n, (u, v) in enumerate(pixel):
-        grey = left[v + y, u + x].astype(float)
-
-        def residuals(p: np.ndarray, u: int = u, v: int = v, grey: np.ndarray = grey) -> np.ndarray:
-            at = u + x - p[1] - p[2] * x - p[3] * y
-            seen = map_coordinates(right.astype(float), [v + y, at], order=3)
-            return np.append(seen - grey - p[0], np.sqrt(2) * p[2:] / slope_sigma)
-
-        best = least_squares(residuals, [0, start[n], 0, 0]).x
-        assert abs(plane[n, 0] - best[1]) < 0.01
-        np.testing.assert_allclose(plane[n, 1:], best[2:], atol=0.002)
+def test_a_refinement_that_leaves_the_search_is_refused() -> None:
+    """The search finds whole pixels: of 8.4 it is 8, and the least squares moves by 0.4."""
+    left, right = pair(8.4)
+    for most, verdict in ((0.35, Verdict.DIVERGED), (0.45, Verdict.MATCHED)):
+        matches = match(left, right, grid(), CAMERA, replace(PARAMETERS, max_jump_px=most))
+        assert np.mean(matches.verdict == verdict) > 0.95
 
 
 def search_twin(
@@ -170,7 +121,7 @@ def test_what_only_the_left_camera_sees_is_one_sided() -> None:
     uv = np.array([[140.0, 110.0]])
     parameters = replace(PARAMETERS, min_depth_m=0.25)  # disparities of both patches, 10 and 70
     assert match(left, right, uv, CAMERA, parameters).verdict == Verdict.ONE_SIDED
-    unchecked = replace(parameters, max_round_trip_px=1000)
+    unchecked = replace(parameters, max_round_trip_px=100)
     assert match(left, right, uv, CAMERA, unchecked).verdict == Verdict.MATCHED
 
 

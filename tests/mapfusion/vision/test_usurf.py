@@ -119,6 +119,15 @@ def test_unit_length_or_zero_where_nothing_is(image: np.ndarray) -> None:
     assert describe(image, np.zeros((0, 2)), np.zeros(0)).shape == (0, 64)
 
 
+def test_flat_is_what_is_faint_over_the_whole_window() -> None:
+    """One grey level at one of 600 x 600 pixels, well off the middle: a mean of 1e-5 of a level."""
+    image = np.full((900, 900), 100, np.uint8)
+    image[450 + 6 * 30, 450 + 8 * 30] = 101
+    uv = np.array([[450.0, 450.0], [450.0 + 8 * 30, 450.0 + 6 * 30]])
+    assert not describe(image, uv[:1], np.array([30.0])).any()
+    assert describe(image, uv[1:], np.array([2.0])).any()  # in the middle of a small window
+
+
 def test_scales() -> None:
     depth = np.array([1.0, 4.0, 1000.0, 0.01])
     metric = USurfParameters("metric", side_m=0.8, min_scale_px=1.5, max_scale_px=30.0)

@@ -232,4 +232,4 @@ BUS.addEventListener("iteration", (event) => {
     if (errors.drawn) Plotly.relayout(errors.node, { shapes: [...DATA.groups[group].curves.scarce.map(shade), ...mark()] });
   });
 });
-addEventListener("beforeprint", () => charts.forEach(draw));
+addEventListener("beforeprint", () => charts.filter(({ node }) => !node.closest("[hidden]")).forEach(draw));

@@ -105,7 +105,7 @@
   }
 
   function drawWalls(px) {
-    pen.lineWidth = Math.max(0.1, 2.5 * px);
+    pen.lineWidth = 1.2 * px;
     pen.lineCap = pen.lineJoin = "round";
     pen.strokeStyle = colour("wall");
     pen.beginPath();
@@ -259,10 +259,10 @@
     const facts = [];
     const { alignment } = now;
     const n = now.frame.true ? now.frame.true[1] : 0;
-    facts.push(["true pairs", `${counts.true ?? 0} of ${n}`]);
+    facts.push(["true pairs", MAP.no_truth ? "no truth" : `${counts.true ?? 0} of ${n}`]);
     if (placed !== "") {
       const error = alignment && alignment.error[stage];
-      facts.push(["error", error && error[0] !== null ? `${short(error[0])} m, ${short(error[1])} rad` : "no estimate"]);
+      facts.push(["error", error && error[0] !== null ? `${short(error[0])} m, ${short(error[1])} rad` : MAP.no_truth ? "no truth" : "no estimate"]);
       facts.push(["status", alignment ? (alignment.accepted ? "accepted" : alignment.status === "accepted" ? "refused" : alignment.status) : "–"]);
       if (alignment && alignment.reason) facts.push(["reason", alignment.reason]);
     }

@@ -1,6 +1,7 @@
 """Each figure on ordinary and on degenerate results."""
 
 import hashlib
+import re
 import shutil
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pandas as pd
 import pytest
 
 from experiments.judge import tables
-from experiments.show.figures import drawing
+from experiments.show.figures import drawing, fig02_two_maps
 from experiments.show.figures.drawing import FIGURES, draw_all, draw_figure
 from experiments.show.figures.fig03_dispersion import choose_moments, spread_over_time
 from experiments.show.figures.result_tables import ResultTables
@@ -113,6 +114,25 @@ def test_nothing_is_drawn_of_what_failed(trio_copy: Path) -> None:
     assert list(skipped_figures(trio_copy)) == [
         name for name in FIGURES if "04" <= name[3:5] <= "10"
     ]
+
+
+def test_the_two_maps_are_drawn_in_one_scale(trio_result: Path) -> None:
+    figure = fig02_two_maps.draw(ResultTables(trio_result))
+    spans = [[np.ptp(a.get_xlim()), np.ptp(a.get_ylim())] for a in figure.axes]
+    np.testing.assert_allclose(spans[0], spans[1])
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert [label for label in labels if re.search(r"particles at the end, spread x\d+", label)]
+    assert all("(seen 3 times or more)" in axes.get_title() for axes in figure.axes)
+
+
+def test_the_maps_in_space_fill_their_page(trio_copy: Path) -> None:
+    png, _ = draw_figure(ResultTables(trio_copy), "fig07_correspondences").files
+    ink = matplotlib.image.imread(png)[..., :3].min(axis=2) < 0.99
+    height, width = ink.shape
+    assert np.ptp(np.flatnonzero(ink.any(axis=0))) > 0.95 * width
+    assert np.ptp(np.flatnonzero(ink.any(axis=1))) > 0.95 * height
+    gaps = np.diff(np.flatnonzero(ink.any(axis=1)))
+    assert gaps.max() < 0.1 * height
 
 
 def test_missing_table_is_an_error_that_names_the_file(trio_copy: Path) -> None:

@@ -4,7 +4,9 @@ import statistics
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
@@ -12,6 +14,7 @@ from experiments.judge import tables
 from experiments.judge.criteria import ANSWERABLE_PAIRS
 from experiments.show.figures import fig04_translation_error, fig05_rotation_error
 from experiments.show.figures.result_tables import ResultTables
+from experiments.show.figures.style import aligner_styles
 from experiments.study.statistics.error_bands import error_bands
 
 COLUMNS = {
@@ -25,8 +28,12 @@ def slow_medians(rows: list[dict], aligner: str, column: str) -> dict[int, float
     for row in rows:
         if row["aligner"] == aligner:
             values.setdefault(row["iteration"], []).append(row[column])
+    if not column.endswith("_rad"):  # no estimate is infinitely far off
+        far = {k: [np.inf if np.isnan(v) else v for v in group] for k, group in values.items()}
+        return {k: statistics.median(group) for k, group in far.items()}
     known = {k: [v for v in group if not np.isnan(v)] for k, group in values.items()}
-    return {k: statistics.median(group) if group else np.nan for k, group in known.items()}
+    mostly = {k: 2 * len(known[k]) > len(group) for k, group in values.items()}
+    return {k: statistics.median(known[k]) if mostly[k] else np.nan for k in values}
 
 
 @pytest.mark.parametrize("module", COLUMNS)
@@ -58,6 +65,26 @@ def test_band_holds_the_middle_four_fifths(trio_result: Path) -> None:
         expected = np.quantile(values["translation_error_m"], [0.1, 0.9])
         found = [row["translation_error_m_low"], row["translation_error_m_high"]]
         np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_the_legend_shows_bands_and_shades_that_occur(trio_result: Path, tmp_path: Path) -> None:
+    errors = ResultTables(trio_result).table("errors")
+    path = tables.table_path(tmp_path, "errors")
+
+    def explained(rows: pd.DataFrame) -> dict[str, str]:
+        tables.write(path, "errors", rows)
+        (legend,) = fig04_translation_error.draw(ResultTables(tmp_path)).legends
+        patches = list(legend.get_patches())
+        texts = [each.get_text() for each in legend.get_texts()][-len(patches) :]
+        return {t: to_hex(p.get_facecolor()) for t, p in zip(texts, patches, strict=True)}
+
+    assert explained(errors.assign(n_true=9)) == {
+        "10-90 % of repetitions, as here icp's": aligner_styles(["icp"])["icp"]["color"].lower()
+    }
+    alike = errors.assign(n_true=9)[errors["aligner"].isin(["ransac", "oracle"])]
+    tables.write(path, "errors", alike[alike["repetition"] == 0].assign(n_true=0))
+    (legend,) = fig04_translation_error.draw(ResultTables(tmp_path)).legends
+    assert [each.get_text() for each in legend.get_texts()][2:] == ["< 3 true pairs"]
 
 
 def shaded(figure: Figure, panel: int) -> list[tuple[float, float]]:

@@ -7,7 +7,9 @@ import pytest
 from scipy.spatial.distance import pdist
 
 from experiments.judge import tables
+from experiments.show.figures.drawing import draw_figure
 from experiments.show.figures.fig08_fused_landmark import choose_landmark
+from experiments.show.figures.fig09_aligned_maps import choose_zoom
 from experiments.show.figures.result_tables import (
     FusedPairs,
     NothingToDraw,
@@ -42,6 +44,11 @@ def test_maps_lie_where_the_merge_put_them(robot: str, trio_result: Path) -> Non
 
 def test_parents_fuse_into_the_stored_landmark(trio_result: Path) -> None:
     pairs = ResultTables(trio_result).fused_pairs()
+    assert {2, 3} == set(pairs.n_parents)
+    two = pairs.n_parents == 2
+    pairs = pairs._replace(
+        position_m=pairs.position_m[:, two], covariance_m2=pairs.covariance_m2[:, two]
+    )
     information = np.linalg.inv(pairs.covariance_m2)
     total = information[0] + information[1]
     np.testing.assert_allclose(total, information[2], rtol=1e-6)
@@ -54,6 +61,37 @@ def test_a_result_made_before_motions_were_stored_says_so(trio_copy: Path) -> No
     tables.table_path(trio_copy, "fused_motions").unlink()
     with pytest.raises(NothingToDraw, match="made before fused motions were stored"):
         ResultTables(trio_copy).fused_pairs()
+
+
+@pytest.mark.usefixtures("quick_save")
+@pytest.mark.parametrize("name", ["fig08_fused_landmark", "fig09_aligned_maps"])
+def test_landmarks_that_all_three_robots_knew_are_drawn_too(name: str, trio_copy: Path) -> None:
+    path = tables.table_path(trio_copy, "fused")
+    rows = tables.read(path, "fused")
+    tables.write(path, "fused", rows[rows["n_parents"] != 2])
+    drawn = draw_figure(ResultTables(trio_copy), name)
+    assert drawn.skipped == []
+    assert len(drawn.files) == 2
+
+
+def test_ellipses_in_the_zoom_are_whole() -> None:
+    """Around neighbours none of whose ellipses its rim cuts, and nobody else's where it can."""
+    rng = np.random.default_rng(0)
+    places = np.repeat([[0.0, 0.0, 1.0], [9.0, 3.0, 1.0], [9.0, -3.0, 1.0]], 6, axis=0)
+    position = places + rng.normal(0, 0.2, (3, 18, 3))
+    covariance = np.broadcast_to(np.diag([4e-2, 1e-3, 1e-3]), (3, 18, 3, 3)).copy()
+    covariance[:, :6] *= 100  # the first six overlap with everything near them
+    zoom = choose_zoom(position, covariance)
+    assert zoom.n_cut == 0
+    assert zoom.whole.sum() >= 5
+    reach = np.sqrt(5.991464547107979 * covariance[:, :, [0, 1], [0, 1]])
+    low, high = (
+        (position[..., :2] - reach)[:, zoom.whole],
+        (position[..., :2] + reach)[:, zoom.whole],
+    )
+    assert (low >= zoom.corner_m).all()
+    assert (high <= zoom.corner_m + zoom.side_m).all()
+    assert choose_zoom(position[:, :1], covariance[:, :1]).whole.tolist() == [True]
 
 
 def one_pair(separation_m: float, sigma_a: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
@@ -74,12 +112,20 @@ def test_legible_landmark_is_chosen() -> None:
         np.stack([position for position, _ in cases], axis=1),
         np.stack([covariance for _, covariance in cases], axis=1),
         np.zeros((2, len(cases), 3, 3)),
+        np.full(len(cases), 2),
     )
     assert choose_landmark(pairs) == 2
+    # one of two parents comes before any of three, however clear
+    assert choose_landmark(pairs._replace(n_parents=np.array([2, 2, 3, 2]))) != 2
+    assert choose_landmark(pairs._replace(n_parents=np.full(4, 3))) == 2
 
 
 def test_singular_covariances_are_not_chosen() -> None:
     flat = FusedPairs(
-        ("R1", "R2"), np.zeros((3, 2, 3)), np.zeros((3, 2, 3, 3)), np.zeros((2, 2, 3, 3))
+        ("R1", "R2"),
+        np.zeros((3, 2, 3)),
+        np.zeros((3, 2, 3, 3)),
+        np.zeros((2, 2, 3, 3)),
+        np.full(2, 2),
     )
     assert choose_landmark(flat) is None

@@ -8,6 +8,7 @@ from experiments.judge import tables
 from experiments.show.figures.fig07_correspondences import judge_correspondences
 from experiments.show.figures.result_tables import ResultTables
 from mapfusion.errors import InputError
+from mapfusion.sealed import SEAL
 
 PAIR = ("R1", "R2")
 ALIGNERS = ["ransac", "svd", "icp", "impicp"]
@@ -46,8 +47,21 @@ def test_walls_are_moved_into_the_robots_frame(trio_result: Path) -> None:
     world = json.loads((trio_result / "world.json").read_text())
     x, y, theta = world["robots"]["R3"]
     back = np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]])
-    for wall, moved in zip(world["walls"], data.walls_in_frame_of("R3"), strict=True):
+    for wall, moved in zip(world["faces"], data.walls_in_frame_of("R3"), strict=True):
         np.testing.assert_allclose(moved @ back.T + [x, y], wall, atol=1e-12)
+
+
+def test_walls_are_drawn_where_their_faces_stand(trio_copy: Path) -> None:
+    """Half of the wall's thickness off its middle line: there is where the landmarks are."""
+    inner, outer = sorted(ResultTables(trio_copy).walls, key=np.ptp)
+    room = np.array([[0, 0], [6, 0], [6, 4], [0, 4], [0, 0]])
+    outward = np.sign(room - [3, 2])
+    np.testing.assert_allclose(inner, room - 0.06 * outward, atol=1e-9)
+    np.testing.assert_allclose(outer, room + 0.06 * outward, atol=1e-9)
+    world = json.loads((trio_copy / "world.json").read_text())
+    del world["faces"], world[SEAL]  # as results were before
+    (trio_copy / "world.json").write_text(json.dumps(world))
+    np.testing.assert_array_equal(ResultTables(trio_copy).walls, [room])
 
 
 def test_without_a_world_there_are_no_walls_and_no_truth(trio_copy: Path) -> None:

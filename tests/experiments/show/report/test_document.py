@@ -12,6 +12,7 @@ import pytest
 
 from experiments.judge import tables
 from experiments.show.report.document import write_report
+from mapfusion.storage import read_json, write_json
 from tests.helpers.report_page import HOSTILE, Page, hostile, page_of
 from tests.helpers.tiny_scenario import command
 
@@ -97,9 +98,9 @@ def test_real_results_fit(tiny_result: Path, tmp_path: Path) -> None:
 
 
 def test_an_expectation_that_is_not_met_is_said(trio_copy: Path) -> None:
-    scenario = json.loads((trio_copy / "scenario.json").read_text())
+    scenario = read_json(trio_copy / "scenario.json", "scenario")
     scenario["expect"] = {"path_rmse_m": {"max": 0}, "odometry_rmse_m": {"min": 0}}
-    (trio_copy / "scenario.json").write_text(json.dumps(scenario))
+    write_json(trio_copy / "scenario.json", scenario)
     words = page_of(trio_copy, trio_copy / "r.html").words
     assert "1 of 2 expectations of the scenario are not met" in words
     assert "Runs that failed" not in words
@@ -128,7 +129,8 @@ def test_a_result_without_alignments_says_so(
     trio_copy: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     empty: list[pd.DataFrame] = []
-    tables.write(tables.table_path(trio_copy, "errors"), "errors", empty)
+    for name in ("errors", "estimates"):
+        tables.write(tables.table_path(trio_copy, name), name, empty)
     reply = command(capsys, "report", trio_copy)
     assert reply.code == 2
     assert "no pair of maps was aligned" in reply.complaints[0]

@@ -1,11 +1,16 @@
 """How tables look on the screen, and what it says about aligners that did not run."""
 
 import math
+import os
+import pty
+from pathlib import Path
 
 import pandas as pd
 import pytest
 
-from experiments.show.terminal.layout import print_table
+from experiments.show.plain_text import plain
+from experiments.show.terminal import layout
+from experiments.show.terminal.layout import print_lines, print_table
 from experiments.show.terminal.run_screen import not_run_lines
 from experiments.study.statistics.standing import aligner_summary
 
@@ -76,4 +81,62 @@ def test_text_gives_way_before_numbers_on_a_narrow_screen(
     for shown in ("1234.500", "480/480", "+0.5000", " – ", "Title"):
         assert shown in text
     assert "…" not in text
-    assert "".join(line[1:11].strip() for line in lines[5:9]) == long
+    assert "".join(line[:15].strip() for line in lines[4:7]) == long
+
+
+HOSTILE = "mk[/b]/[bold]x[/]:smile: \x1b[2J\udcff.parquet"
+SHOWN = "mk[/b]/[bold]x[/]:smile: \\x1b[2J\\udcff.parquet"
+
+
+def test_a_number_is_never_cut(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Not even where the numbers alone are wider than the screen."""
+    monkeypatch.setenv("COLUMNS", "20")
+    print_table([("method", ""), *[("x", ".3f")] * 4], [("a_long_name", *[-1234.5] * 4)])
+    out = capsys.readouterr().out
+    assert out.count("-1234.500") == 4
+    assert "a_long_n" in out
+
+
+def test_what_comes_from_users_is_shown_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:
+    print_lines([HOSTILE])
+    assert capsys.readouterr().out == SHOWN + "\n"
+    print_table([(HOSTILE, "")], [(HOSTILE,)], HOSTILE, HOSTILE)
+    shown = capsys.readouterr().out.replace(" ", "")
+    assert shown.count("mk[/b]/[bold]x[/]:smile:") == 4
+    assert "\x1b" not in shown
+    assert plain("two\nlines") == "two\nlines"
+
+
+def test_one_place_prints() -> None:
+    """So that no other can take text for markup."""
+    for path in Path("experiments").rglob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        has_console = "Console(" in text or "rich.print" in text or "from rich import print" in text
+        assert has_console == (path.name == "layout.py"), path
+
+
+def test_progress_without_a_terminal_is_plain_lines(capfd: pytest.CaptureFixture[str]) -> None:
+    with layout.progress() as show:
+        for done in range(1001):
+            show("render [R1[/b]]", done, 1000)
+        show("merge", 1, 1)
+    err = capfd.readouterr().err
+    assert err.splitlines() == [
+        "render [R1[/b]]: 0/1000",
+        "render [R1[/b]]: 1000/1000",
+        "merge: 1/1",
+    ]
+    assert all(character.isprintable() or character == "\n" for character in err)
+
+
+def test_progress_on_a_terminal_takes_no_label_for_markup(monkeypatch: pytest.MonkeyPatch) -> None:
+    ours, theirs = pty.openpty()
+    with os.fdopen(theirs, "w") as terminal, monkeypatch.context() as patch:
+        patch.setattr("sys.stderr", terminal)
+        patch.setenv("TERM", "xterm")
+        with layout.progress() as show:
+            show("R1[/b]", 1, 1)
+    assert b"R1[/b]" in os.read(ours, 100_000)
+    os.close(ours)

@@ -163,7 +163,7 @@ def test_command_writes_tables_and_figure(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     options = ["--trials", 2, "--pairs", 60, "--outliers", 0.5, "--results", tmp_path]
-    reply = command(capsys, "benchmark", "--method", "ransac", *options)
+    reply = command(capsys, "study", "benchmark", "--method", "ransac", *options)
     assert reply.code == 0
     assert "60 pairs" in reply.out
     folder = tmp_path / "benchmark"
@@ -194,7 +194,7 @@ def test_command_writes_tables_and_figure(
 def test_bad_input_is_one_line(
     arguments: list[str], complaint: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    reply = command(capsys, "benchmark", *arguments)
+    reply = command(capsys, "study", "benchmark", *arguments)
     assert reply.code == 2
     assert len(reply.complaints) == 1
     assert complaint in reply.complaints[0]

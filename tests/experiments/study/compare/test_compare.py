@@ -1,4 +1,3 @@
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,6 +9,7 @@ from experiments.judge.judged_maps import ERROR_COLUMNS
 from experiments.study.compare.versions import BETTER, NOISE, SAME, WORSE, compare
 from experiments.study.statistics.better import holm
 from mapfusion.errors import InputError
+from mapfusion.storage import read_json, write_json
 from tests.helpers.made_up_runs import (
     Tables,
     errors_of,
@@ -146,9 +146,9 @@ def test_nothing_in_common_is_one_clear_line(tmp_path: Path) -> None:
 def test_other_settings_under_the_same_name_are_told(tmp_path: Path) -> None:
     a = write_result(tmp_path / "a", 0, tables_of(0))
     b = write_result(tmp_path / "b", 0, tables_of(0))
-    scenario = json.loads((b / "scenario.json").read_text())
+    scenario = read_json(b / "scenario.json", "scenario")
     scenario["slam"] = {"filter": {"n_particles": 50}}
-    (b / "scenario.json").write_text(json.dumps(scenario))
+    write_json(b / "scenario.json", scenario)
     assert (
         "the scenarios differ: slam.filter.n_particles is absent in the first and 50 in the second"
         in compare(a, b).notes

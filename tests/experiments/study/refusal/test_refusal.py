@@ -188,7 +188,9 @@ def test_the_command_crosses_two_worlds(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     both = [tiny_result, other_result]
-    reply = command(capsys, "refusal", *both, "-o", tmp_path / "one", "--pairs", 6, "--jobs", 1)
+    reply = command(
+        capsys, "study", "refusal", *both, "-o", tmp_path / "one", "--pairs", 6, "--jobs", 1
+    )
     assert reply.code == 0, reply.err
     assert "false" in reply.out
     rows = results.read(tmp_path / "one", "refusals")
@@ -202,7 +204,9 @@ def test_the_command_crosses_two_worlds(
     assert (results.read(tmp_path / "one", "calibration")["n_pairs"] == few_pairs).all()
     assert (tmp_path / "one" / "figures" / "refusal.png").stat().st_size > 10_000
 
-    again = command(capsys, "refusal", *both, "-o", tmp_path / "two", "--pairs", 6, "--jobs", 2)
+    again = command(
+        capsys, "study", "refusal", *both, "-o", tmp_path / "two", "--pairs", 6, "--jobs", 2
+    )
     assert again.code == 0, again.err
     for name in results.TABLES:
         pd.testing.assert_frame_equal(
@@ -229,10 +233,11 @@ def test_worlds_may_be_scenarios_with_seeds(
         paths.append(tmp_path / f"{name}.yaml")
         paths[-1].write_text(world.model_copy(update={"name": name}).model_dump_json())
     common = ("--seeds", "5,6", "--results", tmp_path, "--jobs", 1)
-    missing = command(capsys, "refusal", *paths, "-o", tmp_path / "out", *common)
+    missing = command(capsys, "study", "refusal", *paths, "-o", tmp_path / "out", *common)
     assert missing.complaints[0].startswith("mapfusion: plain-5: the maps of R1 are not in ")
     assert command(capsys, "sweep", *paths, "-o", tmp_path / "s", *common).code == 0
-    reply = command(capsys, "refusal", *paths, "-o", tmp_path / "out", *common, "--pairs", 2)
+    asked = (*common, "--pairs", 2)
+    reply = command(capsys, "study", "refusal", *paths, "-o", tmp_path / "out", *asked)
     assert reply.code == 0, reply.err
     rows = results.read(tmp_path / "out", "refusals")
     by_ground = rows.groupby("ground")["world_a"].unique()
@@ -241,7 +246,9 @@ def test_worlds_may_be_scenarios_with_seeds(
     assert not set(by_ground.get("few", ())) & {"hung-5", "hung-6"}
     crossed = rows[rows["world_a"] != rows["world_b"]]
     assert (crossed["world_a"].str[-1] != crossed["world_b"].str[-1]).all()
-    alone = command(capsys, "refusal", *paths, "-o", tmp_path / "x", *common[2:], "--seeds", 5)
+    alone = command(
+        capsys, "study", "refusal", *paths, "-o", tmp_path / "x", *common[2:], "--seeds", 5
+    )
     assert "all worlds have seed 5" in alone.complaints[0]
     assert ("posters" in reply.out) == bool((rows["ground"] == "posters").any())
 
@@ -254,7 +261,7 @@ def test_wrong_results_are_named(
         ([tiny_result, tiny_result], "the same world"),
         ([tiny_result, tmp_path], "not a result folder"),
     ):
-        reply = command(capsys, "refusal", *folders, "-o", tmp_path / "out")
+        reply = command(capsys, "study", "refusal", *folders, "-o", tmp_path / "out")
         assert reply.code == 2
         assert len(reply.complaints) == 1
         assert problem in reply.complaints[0]
@@ -267,7 +274,7 @@ def test_maps_no_longer_there_are_named(
     alone.mkdir()
     (alone / "tables").mkdir()
     (alone / "scenario.json").write_bytes((other_result / "scenario.json").read_bytes())
-    reply = command(capsys, "refusal", tiny_result, alone, "-o", tmp_path / "out")
+    reply = command(capsys, "study", "refusal", tiny_result, alone, "-o", tmp_path / "out")
     assert reply.code == 2
     assert "run its scenario again" in reply.complaints[0]
 
@@ -278,7 +285,7 @@ def test_worlds_of_one_name_are_refused(
     """Rows are told apart by their worlds' names."""
     copied = shutil.copytree(other_result.parent, tmp_path / "copy")
     renamed = (copied / other_result.name).rename(copied / tiny_result.name)
-    reply = command(capsys, "refusal", tiny_result, renamed, "-o", tmp_path / "out")
+    reply = command(capsys, "study", "refusal", tiny_result, renamed, "-o", tmp_path / "out")
     assert reply.code == 2
     assert f"is named as {tiny_result} is" in reply.complaints[0]
 

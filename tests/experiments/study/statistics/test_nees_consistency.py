@@ -83,3 +83,12 @@ def test_path_statistics_are_medians_over_paths() -> None:
     for name in names:
         assert row[name] == np.median(rows[name])
     assert row["rmse_low"] < row["rmse"] < row["rmse_high"]
+
+
+def test_every_landmark_counts_once_however_they_are_spread_over_maps() -> None:
+    """One of NEES 3 per degree of freedom and nine of 1 are 1.2; in the gate are none and all."""
+    runs = {"run_id": ["x", "y"], "landmarks": "own", "degrees_of_freedom": 3}
+    maps = {"n_landmarks": [1, 9], "nees_mean": [9.0, 3.0], "share_in_gate": [0.0, 1.0]}
+    (row,) = nees_of_maps(pd.DataFrame(runs | maps), np.random.default_rng(0)).to_dict("records")
+    assert (row["n_runs"], row["n_landmarks"]) == (2, 10)
+    assert (row["nees_per_dof"], row["share_in_gate"]) == pytest.approx((1.2, 0.9))

@@ -89,7 +89,7 @@ def test_a_single_run_is_weak_and_its_figures_are_elsewhere(
     folder = write_result(tmp_path, 0, tables_of(0))
     reply = command(capsys, "statistics", folder, "-o", tmp_path / "out")
     assert "One run: the brackets tell of the maps of one run" in reply.out
-    assert "`mapfusion figures` draws it" in reply.out
+    assert "`mapfusion report --figures` draws it" in reply.out
     assert not (tmp_path / "out/figures").exists()
 
 
@@ -164,7 +164,7 @@ def test_curves_over_runs_are_medians_of_run_medians(tmp_path: Path) -> None:
         at = own[own["iteration"] == iteration].groupby("run_id")["translation_error_m"].median()
         assert drawn == pytest.approx(at.median())
     legend = fig04_translation_error.draw(data).legends[0]
-    assert "10-90 % of 5 runs" in [text.get_text() for text in legend.get_texts()]
+    assert "10-90 % of 5 runs, as here ransac's" in [text.get_text() for text in legend.get_texts()]
     assert len(fig06_aligner_time.draw(data).axes) == 2
 
 

@@ -57,7 +57,11 @@ def test_wrong_entries_are_told(entries: list[str], words: list[str]) -> None:
         assert word in str(error.value)
 
 
-@given(st.lists(st.lists(st.integers(), min_size=1, max_size=3), min_size=1, max_size=4))
+@given(
+    st.lists(
+        st.lists(st.integers(1 - 2**63, 2**63 - 1), min_size=1, max_size=3), min_size=1, max_size=4
+    )
+)
 def test_lists_go_through_whole(lists: list[list[int]]) -> None:
     distinct = [list(values) for values in dict.fromkeys(map(tuple, lists))]
     axes = parse_axes([f"a={','.join(map(str, distinct))}"])

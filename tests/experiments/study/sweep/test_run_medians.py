@@ -1,12 +1,18 @@
 """A sweep's errors in short."""
 
+from math import inf, nan
 from pathlib import Path
 
 import pyarrow as pa
 
 from experiments.judge import tables
 from experiments.study.sweep.combinations import SweepRun, parse_axes
-from experiments.study.sweep.sweep_dataset import medians_over_runs, open_dataset
+from experiments.study.sweep.sweep_dataset import (
+    ERRORS,
+    GIVEN,
+    medians_over_runs,
+    open_dataset,
+)
 
 EMPTY = {pa.string(): "", pa.bool_(): False}
 
@@ -30,4 +36,16 @@ def test_medians_over_runs_of_the_runs_own_medians(tmp_path: Path) -> None:
         runs.append(SweepRun(Path("x.yaml"), "x", seed, (("slam.min_count", count),)))
         dataset.write("errors", runs[-1], rows)
     found = medians_over_runs(dataset, runs)
-    assert found.values.tolist() == [["x 2", "svd", 3.0, 0.375, 2], ["x 3", "svd", 5.0, 0.625, 1]]
+    assert found.drop(columns=GIVEN).values.tolist() == [
+        ["x 2", "svd", 3.0, 0.375, 2],
+        ["x 3", "svd", 5.0, 0.625, 1],
+    ]
+    assert (found[GIVEN] == 1).all(axis=None)
+
+
+def test_what_has_no_estimate_is_infinitely_far_off(tmp_path: Path) -> None:
+    dataset = open_dataset(tmp_path / "sweep", ())
+    run = SweepRun(Path("x.yaml"), "x", 0)
+    dataset.write("errors", run, [row("svd", 9, error) for error in (1.0, nan, 2.0, nan, nan)])
+    (found,) = medians_over_runs(dataset, [run]).to_dict("records")
+    assert [found[name] for name in (*ERRORS, *GIVEN)] == [inf, inf, 0.4, 0.4]

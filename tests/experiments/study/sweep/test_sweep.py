@@ -4,6 +4,7 @@ import json
 import random
 import shutil
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import duckdb
@@ -15,9 +16,9 @@ import pytest
 from experiments.judge import tables
 from experiments.study.sweep.sweep_dataset import RUN_TIMES
 from experiments.study.sweep.sweep_driver import execute
-from experiments.study.sweep.sweep_plan import prepare
-from tests.helpers.killing import KilledSweep, same_files
-from tests.helpers.tiny_scenario import TINY, command
+from experiments.study.sweep.sweep_plan import planned, prepare
+from tests.helpers.killing import KilledCommand, same_files
+from tests.helpers.tiny_scenario import SHORT, command
 
 GRID = ("--set", "slam.filter.n_particles=5,10", "--set", "align.repetitions=1")
 
@@ -26,8 +27,7 @@ GRID = ("--set", "slam.filter.n_particles=5,10", "--set", "align.repetitions=1")
 def short_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The tiny scenario with fewer frames, and of two aligners one that draws nothing."""
     path = tmp_path_factory.mktemp("short") / "short.yaml"
-    text = TINY.replace("frames: 44", "frames: 12").replace("name: tiny", "name: short")
-    path.write_text(text.replace("    - {name: icp, method: icp}\n", ""), encoding="utf-8")
+    path.write_text(SHORT.replace("    - {name: icp, method: icp}\n", ""), encoding="utf-8")
     return path
 
 
@@ -40,7 +40,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def swept(short_path: Path, results: Path) -> Path:
     """A sweep of four runs on one worker, uninterrupted."""
     asked = prepare([short_path], [0, 1], [GRID[1], GRID[3]], results)
-    assert execute(asked, 1, None, lambda _: None) == {}
+    assert not execute(asked, 1, None, lambda _: None).failed
     return asked.dataset.folder
 
 
@@ -159,31 +159,43 @@ def test_a_run_that_collides_is_a_row(
     assert set(timings["seed"]) == {0}
 
 
+def test_a_run_that_needs_more_memory_than_there_is_is_a_row(
+    short_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two workers need 0.3 GB each before they begin; other machines have what they have."""
+    monkeypatch.setattr("experiments.run.memory.memory_bytes", lambda: 0.6e9)
+    asked = prepare([short_path], [0], [], tmp_path)
+    (reason,) = execute(asked, 2, None, lambda _: None).failed.values()
+    assert "in each of 2 processes (--jobs 1 needs least), this machine has 0.6 GB" in reason
+    rows = pd.read_parquet(asked.dataset.folder / "runs")
+    assert rows[["status", "reason"]].to_numpy().tolist() == [["failed", reason]]
+    assert planned(asked.runs[0], asked.store, asked.dataset).left
+
+
 def test_killed_sweeps_go_on_and_readers_always_find_whole_runs(
     swept: Path, short_path: Path, tmp_path: Path
 ) -> None:
     sweep = tmp_path / "sweeps" / "short"
-    seen: list[int] = []
     stop = threading.Event()
 
-    def read() -> None:
+    def read() -> int:
         while not stop.wait(0.2):
-            seen.append(_whole_runs(sweep))
-        seen.append(_whole_runs(sweep))
+            _whole_runs(sweep)
+        return _whole_runs(sweep)
 
-    reader = threading.Thread(target=read)
-    with KilledSweep((short_path, "--seeds", "1", *GRID), tmp_path) as killed:
-        reader.start()
+    arguments = ("sweep", short_path, "--seeds", "1", *GRID)
+    with ThreadPoolExecutor(1) as pool, KilledCommand(arguments, tmp_path) as killed:
+        reader = pool.submit(read)
         try:
             victims = killed.kill_at_random(random.Random(1), ["worker", "everything", "worker"])
             code, complaints = killed.finish()
         finally:
             stop.set()
-            reader.join()
     assert (code, "Traceback" in complaints) == (0, False), complaints
-    assert len(victims) >= 2
+    assert victims == ["worker", "everything", "worker"]
     assert len(same_files(sweep, swept, seed=1)) == 2 * 7
-    assert seen[-1] == 2  # the reader's last; none if one of its readings failed before
+    assert not list(tmp_path.rglob(".*"))  # what the killed ones had begun to write
+    assert reader.result() == 2  # raises what any of its readings did
 
 
 def _whole_runs(sweep: Path) -> int:
@@ -200,11 +212,13 @@ def _whole_runs(sweep: Path) -> int:
 
 def test_two_sweeps_at_once_on_one_store(swept: Path, short_path: Path, tmp_path: Path) -> None:
     """They do some work twice, and nothing wrong."""
-    arguments = (short_path, "--seeds", "1", *GRID)
+    arguments = ("sweep", short_path, "--seeds", "1", *GRID)
     with (
-        KilledSweep((*arguments, "-o", tmp_path / "one"), tmp_path, jobs=1) as one,
-        KilledSweep((*arguments, "-o", tmp_path / "two"), tmp_path, jobs=1) as two,
+        KilledCommand((*arguments, "-o", tmp_path / "one"), tmp_path, jobs=1) as one,
+        KilledCommand((*arguments, "-o", tmp_path / "two"), tmp_path, jobs=1) as two,
     ):
+        for sweep in (one, two):
+            sweep.let_go()
         for sweep in (one, two):
             code, complaints = sweep.finish()
             assert code == 0, complaints

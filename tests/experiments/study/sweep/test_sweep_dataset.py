@@ -4,7 +4,6 @@ from pathlib import Path
 
 import duckdb
 import pandas as pd
-import pyarrow.parquet as pq
 import pytest
 
 from experiments.judge import tables
@@ -53,16 +52,16 @@ def test_files_that_are_being_written_disturb_no_reader(
 ) -> None:
     """DuckDB's *.parquet finds files whose names begin with a dot."""
     seen = []
-    write_table = pq.write_table
+    write_bytes = Path.write_bytes
     dataset.write("map_fits", run(0), FITS)
 
-    def reading_meanwhile(table: object, path: Path, **options: object) -> None:
-        Path(path).write_bytes(b"half a file")
+    def reading_meanwhile(path: Path, data: bytes) -> int:
+        path.write_text("half a file")
         for read in (_by_pandas, _by_duckdb):
             seen.append(read(dataset.folder / "map_fits"))
-        write_table(table, path, **options)
+        return write_bytes(path, data)
 
-    monkeypatch.setattr("mapfusion.storage.pq.write_table", reading_meanwhile)
+    monkeypatch.setattr(Path, "write_bytes", reading_meanwhile)
     dataset.write("map_fits", run(1), FITS)
     assert seen == [2, 2]
     assert _by_pandas(dataset.folder / "map_fits") == 4

@@ -21,7 +21,8 @@ from experiments.study.sweep.combinations import SweepRun
 from experiments.study.sweep.sweep_dataset import SweepDataset, open_dataset
 from experiments.study.sweep.sweep_driver import SweepDriver, SweepProgress
 from experiments.study.sweep.sweep_plan import PlannedRun, Sweep
-from mapfusion.errors import InputError
+from mapfusion import sealed
+from mapfusion.errors import InputError, MendedWarning
 from tests.helpers import acting
 
 
@@ -56,7 +57,9 @@ class Scene:
         output = self.folder / name.replace("/", "_")
         self.add(seed, name, acting.write, output, name, needs=tuple(needs))
 
-    def _planned(self, run: SweepRun, store: Store, dataset: SweepDataset) -> PlannedRun:
+    def _planned(
+        self, run: SweepRun, store: Store, dataset: SweepDataset, jobs: int | None = None
+    ) -> PlannedRun:
         tasks = {task.name: task for task in self.tasks[run.seed]}
         name = f"run/{run.run_id}"
         tasks[name] = Task(name, "tables", dataset.finish, (run, "", []), (), tuple(tasks))
@@ -91,13 +94,16 @@ def test_failed_runs_stop_no_others(scene: Scene, client: Client) -> None:
         scene.write(seed, f"judge/{seed}", [f"slam/{seed}"])
     scene.write(3, "slam/3")
     driver = scene.execute(client)
-    assert scene.rows() == {
+    rows = scene.rows()
+    assert rows.pop(2)[1].startswith("slam: a defect of mapfusion itself: ZeroDivisionError a bug")
+    assert rows == {
         0: ("failed", "scenario x: R1 drove into a wall at (1, 2)"),
         1: ("failed", "slam: MemoryError"),
-        2: ("failed", "slam: ZeroDivisionError a bug"),
         3: ("finished", ""),
     }
     assert sorted(driver.progress.failed) == ["x-0", "x-1", "x-2"]
+    assert driver.progress.defects == {"x-2"}
+    assert driver.progress.failed["x-2"].endswith("failures/x-2.txt")
     details = (scene.dataset.folder / "failures" / "x-2.txt").read_text()
     assert "in break_down" in details
     assert not list(scene.terms.attempts.iterdir())
@@ -110,6 +116,44 @@ def test_failed_runs_stop_no_others(scene: Scene, client: Client) -> None:
     assert set(scene.rows().values()) == {("finished", "")}
     assert scene.told[-1].tasks == Counter(slam=3, judge=3, tables=3)
     assert not list((scene.dataset.folder / "failures").iterdir())
+
+
+def test_a_damaged_stage_is_made_again_for_all_that_read_it(scene: Scene, client: Client) -> None:
+    made = scene.folder / "drive" / "k" / "data"
+    acting.write_with_seal(made)
+    made.write_bytes(made.read_bytes()[:-1] + b"!")
+    for seed in range(4):
+        output = scene.folder / f"slam_{seed}"
+        work = (acting.read_with_seal, (made, output), (output,), ("drive/k",))
+        scene.tasks[seed] = [
+            Task("drive/k", "drive", acting.write_with_seal, (made,), (made,)),
+            Task(f"slam/{seed}", "slam", *work),
+        ]
+    with pytest.warns(MendedWarning, match=r"data: damaged.*the stage drive is discarded"):
+        driver = scene.execute(client)
+    assert not driver.progress.failed
+    assert driver.progress.done == 4
+    assert set(scene.rows().values()) == {("finished", "")}
+    assert all((scene.folder / f"slam_{seed}").read_text().endswith("made") for seed in range(4))
+
+
+def test_a_file_that_is_always_damaged_fails_its_runs(scene: Scene, client: Client) -> None:
+    made = scene.folder / "drive" / "k" / "data"
+    scene.tasks[0] = [
+        Task("drive/k", "drive", acting.write, (made, sealed.LINE.decode()), (made,)),
+        Task(
+            "slam/0",
+            "slam",
+            acting.read_with_seal,
+            (made, made),
+            (scene.folder / "s",),
+            ("drive/k",),
+        ),
+    ]
+    with pytest.warns(MendedWarning):
+        driver = scene.execute(client)
+    assert "data: damaged" in driver.progress.failed["x-0"]
+    assert not driver.progress.defects
 
 
 def test_what_runs_share_is_done_once_and_fails_once(scene: Scene, client: Client) -> None:

@@ -1,0 +1,91 @@
+"""Several scenarios held to what they expect, whatever becomes of single ones."""
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from experiments.judge.expectations import Outcome, check, load_checked
+from experiments.scenario.settings import AnyScenario
+from experiments.scenario.suite import scenarios_of
+from mapfusion.errors import InputError
+
+
+@dataclass(frozen=True)
+class CheckedScenario:
+    """A scenario's outcomes, or the error that kept it from having any.
+
+    `elapsed_s` are seconds on the clock by seed, of all that were begun: an error is of the last.
+    Without any of the three it was not begun, since another scenario cannot be read.
+    """
+
+    scenario: str
+    outcomes: Sequence[Outcome] = ()
+    error: str = ""
+    elapsed_s: Mapping[int, float] = field(default_factory=dict)
+
+    @property
+    def passed(self) -> bool:
+        """Whether it ran and all that it expects holds."""
+        ran = bool(self.elapsed_s) and not self.error
+        return ran and all(outcome.passed for outcome in self.outcomes)
+
+
+def check_all(
+    words: Sequence[str],
+    seeds: Sequence[int],
+    overrides: Sequence[str],
+    run: Callable[[AnyScenario], Path],
+) -> Iterator[CheckedScenario]:
+    """Check scenarios asked for by file, name or tag; `run` gives the result folder of one.
+
+    Where one cannot be read none is run. What else goes wrong ends its own scenario alone; if it
+    is no `InputError`, it is raised again once it is told.
+    """
+    read = [each for word in words for each in _read(word, seeds, overrides)]
+    if any(isinstance(each, CheckedScenario) for each in read):
+        for each in read:
+            untold = isinstance(each, CheckedScenario)
+            yield each if untold else CheckedScenario(each[0].name)
+        return
+    for runs in read:
+        assert not isinstance(runs, CheckedScenario)
+        yield from _checked(runs, run)
+
+
+def _read(
+    word: str, seeds: Sequence[int], overrides: Sequence[str]
+) -> Iterator[CheckedScenario | list[AnyScenario]]:
+    """For each scenario that a word stands for its runs by seed, or why it cannot be read."""
+    try:
+        paths = scenarios_of([word])
+    except InputError as error:
+        yield CheckedScenario(word, error=str(error))
+        return
+    for path in paths:
+        try:
+            yield [load_checked(path, overrides, seed) for seed in seeds]
+        except InputError as error:
+            yield CheckedScenario(path.stem, error=str(error))
+
+
+def _checked(
+    runs: Sequence[AnyScenario], run: Callable[[AnyScenario], Path]
+) -> Iterator[CheckedScenario]:
+    """One scenario over its seeds."""
+    name, folders, elapsed_s = runs[0].name, dict[int, Path](), dict[int, float]()
+    try:
+        for scenario in runs:
+            started_s = time.perf_counter()
+            try:
+                folders[scenario.seed] = run(scenario)
+            finally:
+                elapsed_s[scenario.seed] = time.perf_counter() - started_s
+        outcomes = check(runs[0], folders)
+    except InputError as error:
+        yield CheckedScenario(name, error=str(error), elapsed_s=elapsed_s)
+    except Exception as error:
+        yield CheckedScenario(name, error=f"{type(error).__name__}: {error}", elapsed_s=elapsed_s)
+        raise
+    else:
+        yield CheckedScenario(name, outcomes, elapsed_s=elapsed_s)

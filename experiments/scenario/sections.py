@@ -1,0 +1,154 @@
+"""What all parts of a scenario are made of, and the parts that say what is driven and kept."""
+
+from typing import Annotated, Literal, Self, TypeVar
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+
+from mapfusion.arguments import Range, require_in_range
+from mapfusion.fastslam.parameters import FastSlamParameters
+from sim.driver import DriverSettings
+from sim.odometry import OdometryNoise
+from sim.p3at import TIRE_FRICTION
+from sim.stereo_head import RadiometricNoise
+from sim.textures import Texture
+
+NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,40}$"  # names become parts of file names
+TAKEN_NAMES = {"fused", "oracle"}  # of a map and of an estimate beside the robots' and aligners'
+MAX_FRAMES = 20_000  # an hour at five frames a second
+MAX_COUNT = 1_000_000  # of frames or sightings in a log: a day at ten a second
+MAX_POINTS = 1000  # of one wall or route
+MAX_NAMED = 100  # things with names of their own: more do not fit into any table or figure
+T = TypeVar("T")
+Name = Annotated[str, Field(pattern=NAME_PATTERN)]
+Coordinate = Annotated[float, Range(-500, 500, "m")]  # beyond any building
+Point = tuple[Coordinate, Coordinate]
+
+
+def different(items: list[T], prefix: str = "") -> list[T]:
+    """Refuse two of one name; the items are names or have one."""
+    names = [getattr(item, "name", item) for item in items]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"{prefix}two are named {name}; names must differ")
+    return items
+
+
+def free(name: str) -> str:
+    """Refuse a name that the evaluation uses itself."""
+    if name in TAKEN_NAMES:
+        raise ValueError(f"the name {name} is taken by the evaluation")
+    return name
+
+
+class Section(BaseModel):
+    """Frozen; unknown keys, NaN, infinity and what lies outside a declared range are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @model_validator(mode="after")
+    def _in_range(self) -> Self:
+        require_in_range(self)
+        return self
+
+
+class Wall(Section):
+    """A wall.
+
+    Attributes:
+        points: corners x, y of the polyline it stands on, in the world's frame.
+    """
+
+    points: Annotated[list[Point], Field(min_length=2, max_length=MAX_POINTS)]
+
+
+class World(Section):
+    """Walls, all of one height and thickness, under one ceiling.
+
+    Attributes:
+        walls: the walls.
+        wall_height_m: of all of them, and of the ceiling; the cameras look from 0.45 m.
+        wall_thickness_m: of all of them.
+        texture: how the world is painted.
+    """
+
+    walls: Annotated[list[Wall], Field(min_length=1, max_length=1000)]
+    wall_height_m: Annotated[float, Range(0.5, 6, "m")] = 2.5
+    wall_thickness_m: Annotated[float, Range(0.01, 1, "m")] = 0.12
+    texture: Texture = Texture()
+
+
+class Robot(Section):
+    """One robot.
+
+    Attributes:
+        name: of its map and tables.
+        start: x, y and heading in the world's frame.
+        route: points x, y that it visits, in the world's frame.
+        loop: whether it goes on from the last point to the first, or parks.
+        odometry: in place of the scenario's.
+        radiometry: in place of the scenario's.
+        tire_friction: of its wheels against the ground, the coefficient; on a slippery floor they
+            spin as it speeds up.
+    """
+
+    name: Annotated[Name, AfterValidator(free)]
+    start: tuple[Coordinate, Coordinate, Annotated[float, Range(-100, 100, "rad")]]
+    route: Annotated[list[Point], Field(min_length=1, max_length=MAX_POINTS)]
+    loop: bool = True
+    odometry: OdometryNoise | None = None
+    radiometry: RadiometricNoise | None = None
+    tire_friction: Annotated[float, Range(1e-3, 2, "1")] = TIRE_FRICTION
+
+
+class Drive(Section):
+    """How long and how the robots drive.
+
+    Attributes:
+        frames: pairs of images that each robot takes.
+        frame_interval_s: between two of them.
+        start_jitter_m: by which the seed moves each start at most, along x and along y.
+        start_jitter_rad: by which the seed turns each start at most.
+        control: how the robots are driven.
+    """
+
+    frames: Annotated[int, Range(2, MAX_FRAMES, "frames")]
+    frame_interval_s: Annotated[float, Range(0.016, 2, "s")] = 0.2  # from one step of the physics
+    start_jitter_m: Annotated[float, Range(0, 1, "m")] = 0.1
+    start_jitter_rad: Annotated[float, Range(0, 3.2, "rad")] = 0.1
+    control: DriverSettings = DriverSettings()
+
+
+class Render(Section):
+    """What draws the images.
+
+    Attributes:
+        renderer: tiny is PyBullet's own in software, egl the system's OpenGL.
+    """
+
+    renderer: Literal["tiny", "egl"] = "tiny"
+
+
+class Keep(Section):
+    """What is kept for the figures beyond the tables.
+
+    Attributes:
+        images_at: first frame of each robot whose images are kept.
+        images: how many frames from there on.
+        clouds_every: the particles are kept at every so-manieth frame.
+    """
+
+    images_at: Annotated[int, Range(0, MAX_FRAMES, "frames")] = 60
+    images: Annotated[int, Range(0, 50, "frames")] = 6
+    clouds_every: Annotated[int, Range(1, MAX_COUNT, "frames")] = 10
+
+
+class Slam(Section):
+    """Mapping.
+
+    Attributes:
+        filter: the filter's settings.
+        min_count: sightings that a landmark needs to enter the map.
+    """
+
+    filter: FastSlamParameters = FastSlamParameters()
+    min_count: Annotated[int, Range(1, MAX_COUNT, "sightings")] = 3

@@ -1,0 +1,111 @@
+"""What `--json` prints: one document a command, with the same names whatever was found.
+
+Units are in the names. Null is what is not known; an estimate that was refused is null, and a
+`reason` stands beside it. So is a median error where most have no estimate: it is infinite.
+"""
+
+import json
+import math
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from experiments.judge.checking import CheckedScenario
+from experiments.judge.user_files import verdict_on
+from experiments.run.stage_tables import COVARIANCE, MOTION
+from experiments.show.export import write_text
+from mapfusion.align.result import Status
+from mapfusion.landmark_map import LandmarkMap
+from mapfusion.merge import FusedMap
+
+SCHEMA_VERSION = 1
+_AXES = ("xx_m2", "xy_m2", "xt_m_rad", "yy_m2", "yt_m_rad", "tt_rad2")  # those of COVARIANCE
+
+
+def publish(kind: str, content: Mapping[str, Any], shown: bool, path: Path | None = None) -> None:
+    """Print the document of a command where it is to be shown, write it where there is a path."""
+    document = {"schema_version": SCHEMA_VERSION, "kind": kind} | _json_able(content)
+    text = json.dumps(document, indent=1, allow_nan=False) + "\n"
+    if path is not None:
+        write_text(path, text)
+    if shown:
+        sys.stdout.write(text)
+
+
+def _json_able(value: Any) -> Any:
+    if isinstance(value, pd.DataFrame):
+        return _json_able(value.to_dict("records"))
+    if isinstance(value, Mapping):
+        return {str(name): _json_able(held) for name, held in value.items()}
+    if isinstance(value, list | tuple):
+        return [_json_able(held) for held in value]
+    if isinstance(value, np.generic):
+        return _json_able(value.item())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if value is None or isinstance(value, bool | int | str) else str(value)
+
+
+def _motion(values: Iterable[float]) -> dict[str, float] | None:
+    found = {str(name): float(x) for name, x in zip(MOTION, values, strict=True)}
+    return None if any(map(math.isnan, found.values())) else found
+
+
+def of_alignment(
+    maps: Sequence[Path], seed: int, rows: Sequence[Mapping[str, Any]]
+) -> dict[str, Any]:
+    """Every aligner's T_a_b, from the rows of `user_files.align`."""
+    return {"map_a": maps[0], "map_b": maps[1], "seed": seed, "aligners": list(map(_aligner, rows))}
+
+
+def _aligner(row: Mapping[str, Any]) -> dict[str, Any]:
+    status, reason = verdict_on(row)
+    accepted, estimated = status is Status.ACCEPTED, row["status"] == Status.ACCEPTED
+    refined = {name: row[f"refined_{name}"] for name in MOTION}
+    refined |= {f"cov_{axes}": row[name] for axes, name in zip(_AXES, COVARIANCE, strict=True)}
+    refined |= {"drift_sigma_m": row["drift_sigma_m"]}
+    told = {"aligner": row["aligner"], "status": status, "reason": reason or None}
+    told |= {"estimated": _motion([row[name] for name in MOTION]) if estimated else None}
+    told |= {"estimated_status": row["status"], "estimated_reason": row["reason"] or None}
+    told |= {"refined": refined if accepted else None}
+    numbers = ("n_inliers", "n_correspondences", "log10_false_alarms", "elapsed_s")
+    return told | {name: row[name] for name in numbers}
+
+
+def of_map(path: Path, log: Path, seed: int, landmarks: LandmarkMap) -> dict[str, Any]:
+    """What `slam` made of a log."""
+    made = {"robot": landmarks.name, "n_landmarks": len(landmarks)}
+    return {"log": log, "seed": seed, "map": path} | made
+
+
+def of_fused(path: Path, seed: int, fused: FusedMap, maps: Sequence[Path]) -> dict[str, Any]:
+    """What a fused map was made of; `T_first_map` is null for a map that was left out."""
+    reasons = (reason for _, reason in fused.left_out)
+    motions = zip(maps, map(_motion, fused.T_first_map), strict=True)
+    sources = [
+        {"map": name, "T_first_map": T, "reason": None if T else next(reasons)}
+        for name, T in motions
+    ]
+    several = int(((fused.parents >= 0).sum(axis=1) > 1).sum())
+    found = {"n_landmarks": len(fused.landmarks), "n_fused_of_several": several}
+    found |= {"duplicate_share": fused.duplicate_share}
+    return {"seed": seed, "map": path, "maps": sources} | found
+
+
+def of_checks(checks: Sequence[CheckedScenario]) -> dict[str, Any]:
+    """What was expected of scenarios, what was measured, and which could not be run."""
+    return {"passed": all(each.passed for each in checks), "scenarios": list(map(_check, checks))}
+
+
+def _check(check: CheckedScenario) -> dict[str, Any]:
+    outcomes = [
+        {"metric": each.metric, "value": each.value, "min": each.bound.min, "max": each.bound.max}
+        | {"passed": each.passed, "by_seed": each.per_seed}
+        for each in check.outcomes
+    ]
+    told = {"scenario": check.scenario, "passed": check.passed, "error": check.error or None}
+    return told | {"elapsed_s_by_seed": check.elapsed_s, "outcomes": outcomes}

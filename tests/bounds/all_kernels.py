@@ -1,0 +1,91 @@
+"""All kernels, called in this process on small arrays; says which were not.
+
+`test_bounds.py` starts it with Numba's bounds checks on. To compile is what takes the time, so it
+calls what reaches many kernels at once, and each with one kind of arguments where that is enough.
+"""
+
+import importlib
+import pkgutil
+import sys
+import tempfile
+from itertools import product
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+from numba import njit
+from numba.core.registry import CPUDispatcher
+
+import experiments
+import mapfusion
+from experiments.judge.result import run_scenario
+from experiments.run.code_version import SOURCE_ROOT
+from experiments.scenario.settings import Simulation
+from experiments.scenario.yaml_input import read_mapping
+from mapfusion.align.registry import ALIGNERS
+from tests.experiments.study.refusal.test_refusal import (
+    test_calibration_counts_every_motion_of_two_pairs,
+)
+from tests.helpers.tiny_scenario import SHORT
+from tests.mapfusion.fastslam.test_filter_twin import test_equals_the_filter_that_copies
+from tests.mapfusion.fastslam.test_particles import (
+    test_near_finds_the_gates_that_touch_a_box_and_no_freed_slot,
+    test_without_landmarks_nothing_is_near,
+)
+from tests.mapfusion.smoother.test_smooth import test_equals_the_dense_twin
+
+
+@njit
+def _beyond(values: np.ndarray) -> float:
+    return values[len(values)]
+
+
+def kernels() -> dict[str, CPUDispatcher]:
+    """All kernels of ours by name."""
+    found = {}
+    for package in (mapfusion, experiments):
+        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            path = SOURCE_ROOT.joinpath(*module.name.split(".")).with_suffix(".py")
+            if not path.is_file() or "njit" not in path.read_text(encoding="utf-8"):
+                continue
+            for name, value in vars(importlib.import_module(module.name)).items():
+                if isinstance(value, CPUDispatcher):
+                    found[f"{value.py_func.__module__}.{name}"] = value
+    return found
+
+
+def run_all_aligners(folder: Path) -> None:
+    """A run from the cameras to the tables, with all of our methods."""
+    path = folder / "short.yaml"
+    path.write_text(SHORT, encoding="utf-8")
+    asked = read_mapping(path)
+    asked["align"]["aligners"] = [{"name": name, "method": name} for name in ALIGNERS]
+    run_scenario(Simulation.model_validate(asked), folder, 1, lambda *_: None)
+
+
+def main() -> int:
+    """Exit code 1 where a kernel was not reached."""
+    assert numba.config.BOUNDSCHECK
+    with pytest.raises(IndexError):  # the checks are on
+        _beyond(np.zeros(3))
+    # particles that have less than a handful of landmarks, and so of slots for them
+    for ways in product(["gate", "descriptor", "label"], [True, False], ["informed", "motion"]):
+        association, planar, proposal = ways
+        test_equals_the_filter_that_copies(association, planar, 0.5, proposal)
+    test_near_finds_the_gates_that_touch_a_box_and_no_freed_slot()
+    test_without_landmarks_nothing_is_near()
+    test_equals_the_dense_twin(8, 90, planar=False)
+    test_calibration_counts_every_motion_of_two_pairs()
+    with tempfile.TemporaryDirectory() as folder:
+        run_all_aligners(Path(folder))
+    found = kernels()
+    cached = [name for name, kernel in found.items() if kernel.stats.cache_hits]
+    assert not cached, f"not compiled with checks: {cached}"
+    unreached = sorted(name for name, kernel in found.items() if not kernel.signatures)
+    sys.stdout.write(f"{len(found)} kernels, not reached: {' '.join(unreached) or 'none'}\n")
+    return bool(unreached)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,161 @@
+"""One small file of each kind that we read, with the door that it is read through."""
+
+from collections.abc import Callable
+from dataclasses import astuple, is_dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from experiments.judge import tables
+from experiments.judge.result_files import read_provenance
+from experiments.run.store import StageFolder
+from experiments.show.figures.result_tables import ResultTables
+from experiments.study.statistics.run_tables import find_runs
+from experiments.study.sweep.sweep_dataset import open_dataset
+from mapfusion.landmark_map import LandmarkMap, read_map, write_map
+from mapfusion.recordings.mrclam import MrclamSettings, import_mrclam
+from mapfusion.robot_log import (
+    Observations,
+    RobotLog,
+    read_log,
+    read_truth,
+    write_log,
+    write_truth_points,
+    write_truth_poses,
+)
+from mapfusion.sealed import read_sealed
+from mapfusion.storage import write_json
+from sim.floorplan import FloorPlan, Wall
+from sim.trajectory import Trajectory, read_trajectory, write_trajectory
+from sim.world import CORNERS, read_corners, write_faces
+
+
+class Door(NamedTuple):
+    """A file, and what reads it into values that can be compared."""
+
+    path: Path
+    read: Callable[[], Any]
+
+
+def doors(folder: Path) -> list[Door]:
+    """Write all kinds of files into an empty folder."""
+    rng = np.random.default_rng(0)
+    return [*_logs(folder, rng), *_of_a_result(folder, rng), *_of_the_store(folder, rng)]
+
+
+def doors_of_others(folder: Path) -> list[Door]:
+    """Files as other programs write them, which carry no digest: a changed number goes unseen."""
+    plain, log, recording = folder / "plain.csv", folder / "csv", folder / "MRCLAM"
+    rng, n = np.random.default_rng(1), 12
+    place = pd.DataFrame(rng.normal(size=(n, 3)), columns=pd.Index(["x_m", "y_m", "z_m"]))
+    spread = place.assign(cov_xx_m2=0.1, cov_xy_m2=0.0, cov_xz_m2=0.0)
+    spread = spread.assign(cov_yy_m2=0.1, cov_yz_m2=0.0, cov_zz_m2=0.1)
+    spread.to_csv(plain, index=False)
+    log.mkdir()
+    frames = pd.DataFrame({"iteration": range(4), "time_s": np.arange(4.0)})
+    motion = {"odometry_x_m": 0.1, "odometry_y_m": 0.0, "odometry_theta_rad": 0.1}
+    frames.assign(**motion).to_csv(log / "frames.csv", index=False)
+    spread.assign(iteration=np.arange(n) // 3).to_csv(log / "observations.csv", index=False)
+    tables = {
+        "Barcodes": [(1, 5), (6, 72), (7, 27)],
+        "Landmark_Groundtruth": [(6, 1.5, 1.0, 1e-4, 1e-4), (7, 2.0, -0.8, 1e-4, 1e-4)],
+        "Robot1_Odometry": [(1000.0 + t, 0.2, 0.1) for t in range(6)],
+        "Robot1_Measurement": [(1001.0 + t, 72, 1.0 + t, 0.1) for t in range(4)],
+        "Robot1_Groundtruth": [(999.0 + t, 0.2 * t, 0.0, 0.1) for t in range(8)],
+    }
+    recording.mkdir()
+    for name, rows in tables.items():
+        text = "".join(" ".join(map(str, row)) + "\n" for row in rows)
+        (recording / f"{name}.dat").write_text(text)
+    settings = MrclamSettings()
+    imported = partial(import_mrclam, recording, folder / "imported", settings)
+    return [
+        Door(plain, partial(read_map, plain)),
+        *(Door(log / f"{name}.csv", partial(read_log, log)) for name in ("frames", "observations")),
+        *(Door(recording / f"{name}.dat", imported) for name in tables),
+    ]
+
+
+def _points(rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray]:
+    root = rng.normal(size=(n, 3, 3))
+    return rng.normal(size=(n, 3)), root @ np.swapaxes(root, 1, 2) + np.eye(3)
+
+
+def _logs(folder: Path, rng: np.random.Generator) -> list[Door]:
+    log, n = folder / "log", 12
+    look = rng.normal(size=(n, 64)).astype(np.float32)
+    seen = Observations(*_points(rng, n), look, np.arange(n, dtype=np.int32))
+    iteration, odometry = np.repeat(np.arange(4), 3), rng.normal(size=(4, 3))
+    write_log(log, RobotLog("R1", False, np.arange(4.0), odometry, iteration, seen))
+    write_truth_poses(log, rng.normal(size=(4, 3)))
+    write_truth_points(log, rng.normal(size=(n, 3)))
+    measured = (log / f"{name}.parquet" for name in ("frames", "observations"))
+    true = (log / f"truth_{name}.parquet" for name in ("poses", "points"))
+    path = folder / "map.parquet"
+    counts = np.arange(n, dtype=np.int32) + 1
+    write_map(path, LandmarkMap(*_points(rng, n), counts, counts.astype(np.int64), look))
+    return [
+        *(Door(each, partial(read_log, log)) for each in measured),
+        *(Door(each, partial(read_truth, log)) for each in true),
+        Door(path, partial(read_map, path)),
+    ]
+
+
+def _of_a_result(folder: Path, rng: np.random.Generator) -> list[Door]:
+    result, sweep = folder / "result", folder / "sweep"
+    fits = tables.table_path(result, "map_fits")
+    rows = {"map": ["R1", "fused"], "n_landmarks": [3, 4], "rmse_m": rng.normal(size=2)}
+    tables.write(fits, "map_fits", pd.DataFrame(rows))
+    write_json(result / "scenario.json", {"name": "x", "seed": 3, "description": "a\ud800"})
+    write_json(result / "provenance.json", {"stages": {}, "libraries": {"numpy": "2"}})
+    write_json(result / "world.json", {"walls": [[[0, 0], [1, 0]]], "robots": {"R1": [0, 1, 0.5]}})
+    open_dataset(sweep, ["slam.every"])
+    return [
+        Door(fits, partial(tables.read, fits, "map_fits")),
+        Door(fits, lambda: find_runs(result).read("map_fits")),
+        Door(result / "scenario.json", lambda: find_runs(result).results[0].run),
+        Door(result / "provenance.json", lambda: read_provenance(result / "provenance.json")),
+        Door(result / "world.json", lambda: (ResultTables(result).walls, _start(result))),
+        Door(sweep / "sweep.json", lambda: open_dataset(sweep, ["slam.every"]).keys),
+    ]
+
+
+def _start(result: Path) -> Any:
+    return ResultTables(result).start_pose("R1")
+
+
+def _of_the_store(folder: Path, rng: np.random.Generator) -> list[Door]:
+    stage, faces = folder / "store" / "slam" / "k", folder / "faces"
+    mark, drive = stage / "done.json", folder / "trajectory.parquet"
+    made = StageFolder(stage, "slam", "k", {"": (mark,)})
+    made.finish("", {"elapsed_s": 1.5})
+    driven = Trajectory(("R1",), np.arange(5.0), rng.normal(size=(1, 5, 3)), np.zeros((1, 5, 2)))
+    write_trajectory(drive, driven)
+    corner = np.array([[0.0, 0.0], [0.4, 0.0], [0.4, 0.4]])
+    write_faces(faces, FloorPlan((Wall(corner, 0.3),)), rng)
+    mesh, picture = (next(faces.glob(kind)) for kind in ("*.obj", "*.png"))
+    return [
+        Door(mark, made.figures),
+        Door(drive, partial(read_trajectory, drive)),
+        Door(faces / CORNERS, partial(read_corners, faces / CORNERS)),
+        Door(mesh, partial(read_sealed, mesh, "mesh", only_ours=True)),
+        Door(picture, partial(read_sealed, picture, "picture", only_ours=True)),
+    ]
+
+
+def same(before: Any, after: Any) -> bool:
+    """Whether two answers of a door hold the same values, NaN equal to NaN."""
+    if type(before) is not type(after):
+        return False
+    if isinstance(before, pd.DataFrame):
+        return before.equals(after)
+    if is_dataclass(before) and not isinstance(before, type):
+        before, after = astuple(before), astuple(after)
+    if isinstance(before, tuple | list):
+        return len(before) == len(after) and all(map(same, before, after))
+    if isinstance(before, np.ndarray):
+        return before.dtype == after.dtype and before.tobytes() == after.tobytes()
+    return before == after

@@ -1,0 +1,96 @@
+"""Recorded logs without truth: all that can be had without it, and a word where it is needed."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.judge.judged_run import JudgedRun
+from experiments.judge.tables import UNKNOWN
+from experiments.run.store import Store
+from experiments.scenario.settings import Simulation
+from experiments.show.figures.result_tables import ResultTables
+from tests.helpers.report_page import page_of
+from tests.helpers.tiny_scenario import assert_refused, command, estimated_tables
+
+SCENARIO = """
+schema_version: 1
+name: recorded
+seed: 3
+logs: [R1, R2]
+slam: {filter: {n_particles: 30, proposal: motion, noise_scale: 1}}
+align:
+  repetitions: 2
+  aligners:
+    - {name: ransac, method: ransac}
+    - {name: svd, method: svd}
+    - {name: icp, method: icp}
+evaluate: {every: 10, timing_points: 2, timing_repeats: 1}
+"""
+NEED_THE_TRUTH = {"errors", "fusion", "true_pairs", "path_statistics", "map_fits", "landmark_nees"}
+
+
+@pytest.fixture(scope="module")
+def scenario(
+    tiny: Simulation, tiny_results: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    folder = tmp_path_factory.mktemp("recorded")
+    run = JudgedRun.of(tiny, Store.of(tiny_results))
+    for robot in run.pipeline.robots:
+        (folder / robot.name).mkdir()
+        for name in ("frames.parquet", "observations.parquet"):
+            shutil.copy(run.store.path(robot.log) / name, folder / robot.name / name)
+    (folder / "recorded.yaml").write_text(SCENARIO, encoding="utf-8")
+    return folder / "recorded.yaml"
+
+
+def test_there_is_a_result_without_errors(
+    scenario: Path, tiny_results: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    results = scenario.parent / "results"
+    reply = command(capsys, "run", scenario, "--jobs", 1, "--results", results)
+    assert (reply.code, reply.complaints) == (0, [])
+    for text in ("Answers (no truth: errors are unknown)", "Robots (no truth: no errors)"):
+        assert text in reply.out
+    assert "not drawn: fig04_translation_error: no truth" in reply.out
+    result = results / "recorded-3"
+    found, simulated = estimated_tables(result), estimated_tables(tiny_results / "tiny-3")
+    assert {name for name in found if name != "tracks" and found[name].empty} == NEED_THE_TRUTH
+    assert found["estimates"].equals(simulated["estimates"])
+    assert found["fused"]["x_m"].equals(simulated["fused"]["x_m"])
+    assert found["robots"][["path_error_m", "odometry_error_m"]].isna().all(axis=None)
+    data = ResultTables(result)
+    assert (data.table("aligner_timings")["n_common"] == UNKNOWN).all()
+    assert data.no_truth
+    assert data.start_pose("R1") is None
+    assert (data.pairs, data.aligners) == ([("R1", "R2")], ["ransac", "svd", "icp"])
+    page = page_of(result, result / "report.html")
+    assert "No truth is known" in page.words
+    assert_refused(command(capsys, "statistics", result), "recorded-3", "no truth is known")
+
+
+def test_what_needs_the_truth_is_refused_before_any_work(
+    scenario: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    expected = ("--set", "expect={path_rmse_m: {max: 1}}")
+    reply = command(capsys, "run", scenario, *expected, "--results", tmp_path / "new")
+    assert_refused(reply, "recorded.yaml", "expect.path_rmse_m", "R1 has no truth_poses.parquet")
+    assert not (tmp_path / "new").exists()
+
+
+def test_results_that_cannot_be_written_are_told_before_any_work(
+    scenario: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "recorded-3").mkdir()
+    (tmp_path / "recorded-3" / "figures").write_text("no folder")
+    reply = command(capsys, "run", scenario, "--results", tmp_path)
+    assert_refused(reply, "recorded-3/figures", "cannot be written")
+    assert not (tmp_path / "store").exists()
+
+
+def test_errors_tell_why_a_refinement_was_refused(tiny_results: Path) -> None:
+    errors = estimated_tables(tiny_results / "tiny-3")["errors"]
+    refined = errors["refined_status"] == "accepted"
+    assert np.array_equal(errors["refined_reason"] == "", refined)
+    assert not refined.all()

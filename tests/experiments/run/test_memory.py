@@ -1,0 +1,78 @@
+"""What a run will need is estimated, and refused where the machine has less."""
+
+from pathlib import Path
+
+import pytest
+
+from experiments.run.memory import memory_bytes, needs, require_memory
+from experiments.run.pipeline import lay_out
+from experiments.scenario.loading import load_scenario
+from mapfusion.errors import InputError
+from mapfusion.fastslam.slots import allocate
+from tests.helpers.tiny_scenario import assert_refused, command
+
+GB = 1e9
+
+
+def need(path: Path, *overrides: str) -> dict[str, float]:
+    asked = needs(lay_out(load_scenario(path, overrides)))
+    return {each.setting: each.n_bytes for each in asked}
+
+
+@pytest.mark.parametrize(
+    ("overrides", "named"),
+    [
+        (["slam.filter.n_particles=10000", "drive.frames=20000"], "slam.filter.n_particles"),
+        (["camera.width_px=4096", "camera.height_px=4096"], "camera.width_px"),
+        (["world.walls.0.points=[[0, 0], [500, 0], [500, 400], [0, 400]]"], "world.walls"),
+    ],
+)
+def test_what_does_not_fit_is_refused_by_its_setting(
+    tiny_path: Path, overrides: list[str], named: str
+) -> None:
+    pipeline = lay_out(load_scenario(tiny_path, overrides))
+    with pytest.raises(InputError, match=f"^{named}: .* GB, this machine has 1.0 GB"):
+        require_memory(pipeline, 1, GB)
+    require_memory(pipeline, 1, 1e15)
+
+
+def test_each_process_needs_its_own(tiny_path: Path) -> None:
+    pipeline = lay_out(load_scenario(tiny_path))
+    require_memory(pipeline, 1, GB)
+    with pytest.raises(InputError, match="in each of 8 processes"):
+        require_memory(pipeline, 8, GB)
+
+
+def test_the_filter_needs_what_its_slots_take(tiny_path: Path) -> None:
+    """Twice the particles take twice as much; a landmark no less than its slot holds."""
+    one, two = (need(tiny_path, f"slam.filter.n_particles={n}") for n in (100, 200))
+    name = "slam.filter.n_particles"
+    assert two[name] == pytest.approx(2 * one[name])
+    slots = allocate(256, 100)
+    per_landmark = sum(part.nbytes for part in slots[:3]) / 256
+    n_observations = 44 * 110
+    assert one[name] > 0.02 * n_observations * per_landmark
+
+
+def test_shipped_scenarios_fit_into_4_gb() -> None:
+    for path in (Path(__file__).parents[3] / "scenarios").glob("*.yaml"):
+        if path.stem != "mrclam7":  # its logs are not there
+            require_memory(lay_out(load_scenario(path)), 2, 4 * GB)
+
+
+def test_a_run_is_refused_before_anything_is_computed(
+    tiny_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = (
+        "slam.filter.n_particles=10000",
+        "vision.harris.max_corners=5000",
+        "drive.frames=20000",
+    )
+    overrides = [word for each in asked for word in ("--set", each)]
+    reply = command(capsys, "run", tiny_path, *overrides, "--results", tmp_path / "results")
+    assert_refused(reply, "n_particles", "20000 frames", "this machine has")
+    assert not (tmp_path / "results").exists()
+
+
+def test_the_machine_is_not_taken_for_a_giant() -> None:
+    assert 1e8 < memory_bytes() < 1e14

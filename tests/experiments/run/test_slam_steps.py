@@ -1,0 +1,19 @@
+"""What the SLAM stage tells of a step of the filter."""
+
+import numpy as np
+import pytest
+
+from experiments.run.stages.slam import _step
+from mapfusion.fastslam.filter import StepResult
+
+
+def test_spread_is_that_of_the_weighted_particles() -> None:
+    """Three of four parts lie at x = 1, one at x = 5: variance 3, whatever the weights' scale."""
+    cloud = np.array([[1.0, 2.0, 0.3], [5.0, 2.0, 0.1], [40.0, -9.0, 0.0]])
+    weights = np.array([0.75, 0.25, 0.0])
+    with np.errstate(divide="ignore"):
+        log_weights = np.log(weights) - 700.0
+    told = _step(StepResult(cloud[0], 1.6, True, 9, cloud, log_weights, -3.0))
+    assert told["spread_m"] == pytest.approx(np.sqrt(3.0))
+    assert [told[f"online_{name}"] for name in ("x_m", "y_m", "theta_rad")] == [1.0, 2.0, 0.3]
+    assert (told["effective_sample_size"], told["resampled"], told["n_landmarks"]) == (1.6, True, 9)

@@ -1,0 +1,83 @@
+"""The values behind the report's charts, worked out by hand."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from experiments.judge.judged_maps import maps_of
+from experiments.show.report.charts import (
+    error_curves,
+    rounded,
+    success_curves,
+    thinned,
+    time_curves,
+)
+from tests.helpers.made_up_runs import many_errors
+
+
+def test_five_digits_and_none_for_what_is_not_finite() -> None:
+    assert rounded([1 / 3, 123456.0, np.nan, np.inf]) == [0.33333, 123460.0, None, None]
+
+
+def test_the_last_of_thinned_values_stays() -> None:
+    assert thinned(np.arange(11), 3).tolist() == [0, 5, 10]
+    assert thinned(np.arange(11), 1).tolist() == [10]
+    assert thinned(np.arange(3), 400).tolist() == [0, 1, 2]
+
+
+def errors(iteration: int, n_true: int, lengths_m: list[float]) -> pd.DataFrame:
+    rows = pd.DataFrame({"translation_error_m": lengths_m, "repetition": range(len(lengths_m))})
+    rows["rotation_error_rad"] = -rows["translation_error_m"]
+    for name in ("translation_error_m", "rotation_error_rad"):
+        rows[f"refined_{name}"] = rows[name] / 10
+    names = {"run_id": "x-0", "robot_a": "R1", "robot_b": "R2", "iteration": iteration}
+    return rows.assign(**names, aligner="icp", n_true=n_true, n_correspondences=90)
+
+
+def test_errors_are_medians_and_what_four_fifths_lie_between() -> None:
+    rows = pd.concat([errors(10, 2, [np.nan] * 3), errors(20, 7, [0.1, 0.2, 0.4])])
+    found = error_curves(rows, ["icp", "absent"])
+    assert (found["iteration"], found["n_true"]) == ([10, 20], [2.0, 7.0])
+    assert found["n_correspondences"] == [90.0, 90.0]
+    assert found["scarce"] == [(5.0, 15.0)]
+    curves = found["aligners"]["icp"]
+    expected = {"low": [None, 0.12], "median": [None, 0.2], "high": [None, 0.36]}
+    assert curves["translation_estimated"] == expected
+    assert curves["rotation_estimated"] == expected  # without the sign
+    assert curves["rotation_refined"]["high"] == [None, 0.036]
+    assert set(found["aligners"]["absent"]["translation_refined"]["median"]) == {None}
+
+
+def test_success_is_by_bin_and_of_maps_with_common_ground() -> None:
+    rows = many_errors(6, methods={"ransac": (1.0, 0.0, 0.0)}, repetitions=1)
+    rows = rows.assign(n_true=np.where(rows["iteration"] <= 50, 5, 40), n_correspondences=100)
+    lost = (rows["iteration"] == 75) & (rows["aligner"] == "ransac")
+    rows.loc[lost, "refined_translation_error_m"] = 9.0
+    maps = maps_of(rows.assign(n_common=9)).assign(overlap_share=np.nan)
+    by_name = {curve["label"]: curve for curve in success_curves(maps, ["ransac"])}
+    pairs = by_name["true pairs among the correspondences"]
+    assert pairs["bins"] == ["3–9", "30–99"]
+    assert pairs["aligners"]["ransac"]["rate"] == [1.0, 0.5]
+    assert pairs["aligners"]["ransac"]["n"] == [6 * 2 * 2] * 2
+    low, high = (pairs["aligners"]["ransac"][end][1] for end in ("low", "high"))
+    assert low < 0.5 < high
+    assert by_name["share of false correspondences"]["bins"] == ["50–70 %", "95–99 %"]
+    assert "common landmarks, share of the smaller map" not in by_name
+    apart = rows.assign(n_common=np.where(rows["n_true"] == 5, 2, 9))
+    curves = success_curves(maps_of(apart).assign(overlap_share=0.5), ["ransac"])
+    assert curves[0]["bins"] == ["30–99"]  # elsewhere there is nothing to be right about
+
+
+def test_times_are_milliseconds_by_number_of_correspondences() -> None:
+    few = pd.DataFrame({"aligner": "icp", "n_correspondences": [30, 10, 20]})
+    few = few.assign(elapsed_s=[0.003, 0.001, np.nan], elapsed_low_s=0.0005, elapsed_high_s=0.004)
+    found = time_curves(few, ["icp", "ransac"])
+    assert found == {
+        "icp": {"n": [10, 30], "median": [1.0, 3.0], "low": [0.5] * 2, "high": [4.0] * 2}
+    }
+    many = pd.DataFrame({"aligner": "icp", "n_correspondences": np.arange(1, 401)})
+    many = many.assign(elapsed_s=many["n_correspondences"] / 1e3, elapsed_low_s=0, elapsed_high_s=0)
+    grouped = time_curves(many, ["icp"])["icp"]
+    assert grouped["n"] == grouped["median"]  # 1 ms a correspondence
+    assert len(grouped["n"]) == 40
+    assert grouped["n"][0] == pytest.approx(5.5)  # of 1 to 10
