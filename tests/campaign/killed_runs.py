@@ -60,21 +60,24 @@ def explore(seed: str, kills: int, folder: Path) -> Found:
         with _started(Kind(command, 1), scenario, folder / command) as undisturbed:
             if (ended := undisturbed.finish())[0]:
                 return Found(counts, [f"{command}, which nobody disturbed: {ended}"])
-    story = 0
-    while counts["kills"] < kills:
+    for story in range(kills):
+        if counts["kills"] >= kills:
+            break
         kind = KINDS[story % len(KINDS)]
         results = folder / f"{story}-{kind.command}"
         left = min(kills - counts["kills"], MOST_KILLS)
         with _started(kind, scenario, results) as killed:
             told = Story(kind, killed, results)
-            done = told.kill_and_go_on(rng, left)
-            told.end(folder / kind.command)
-        counts.update(done, kills=len(done))
-        name = f"{kind.command} --jobs {kind.jobs}, number {story} of seed {seed}, {done}"
+            try:
+                told.kill_and_go_on(rng, left)
+                told.end(folder / kind.command)
+            except AssertionError as error:
+                told.faults.append(str(error))
+        counts.update(told.kills, kills=len(told.kills))
+        name = f"{kind.command} --jobs {kind.jobs}, number {story} of seed {seed}, {told.kills}"
         faults += [f"{name}: {fault}" for fault in told.faults]
         if not told.faults:
             shutil.rmtree(results)
-        story += 1
     return Found(counts, faults)
 
 
@@ -84,17 +87,16 @@ def _started(kind: Kind, scenario: Path, results: Path) -> KilledCommand:
 
 
 class Story:
-    """One command from its first start to its end, and what was wrong on the way."""
+    """One command from its first start to its end, how it was killed, and what was wrong."""
 
     def __init__(self, kind: Kind, killed: KilledCommand, results: Path) -> None:
         self._kind, self._killed, self._results = kind, killed, results
         self._finished: dict[Path, int] = {}
-        self.faults = list[str]()
+        self.kills, self.faults = list[str](), list[str]()
 
-    def kill_and_go_on(self, rng: random.Random, most: int) -> list[str]:
+    def kill_and_go_on(self, rng: random.Random, most: int) -> None:
         """Kill at random until the command has come to its end or was killed so often."""
-        done = list[str]()
-        while len(done) < most:
+        while len(self.kills) < most:
             victim = rng.choice(self._kind.victims)
             if victim != "interrupted" and rng.random() < _SHARE_AT_START:
                 alive = self._killed.makes(0, rng.uniform(0, _LONGEST_START_S))
@@ -104,12 +106,11 @@ class Story:
             if not alive:
                 break
             self._killed.kill(victim, rng)
-            done.append(victim)
+            self.kills.append(victim)
             if victim != "worker" or self._kind.command == "run":
                 self._look_at(self._killed.ended(), _CODES[victim])
                 self._killed.go_on()
             self._nothing_is_lost()
-        return done
 
     def end(self, undisturbed: Path) -> None:
         """Let the command come to its end, and hold what it made to what nobody disturbed."""
@@ -126,7 +127,9 @@ class Story:
 
     def _look_at(self, ended: Ended, codes: set[int]) -> None:
         said = ended.out + ended.err
-        if ended.code not in codes or "Traceback" in said:
+        if "Traceback" in said:
+            self.faults.append(f"ended with {ended.code} and told a traceback: {said[-2000:]!r}")
+        elif ended.code not in codes:
             self.faults.append(f"ended with {ended.code}, expected {codes}: {said[-2000:]!r}")
 
     def _nothing_is_lost(self) -> None:

@@ -81,7 +81,8 @@ class KilledCommand:
         path = os.pathsep.join([self._gate.name, *filter(None, sys.path)])
         return subprocess.Popen(
             self._command,
-            env=os.environ | {"PYTHONPATH": path},
+            # the second: a process that is aborted says where its threads are
+            env=os.environ | {"PYTHONPATH": path, "PYTHONFAULTHANDLER": "1"},
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -145,8 +146,17 @@ class KilledCommand:
         (self._permits / "unlimited").touch()
 
     def ended(self) -> Ended:
-        """Wait until the command and all that it started have ended."""
-        out, err = self.process.communicate(timeout=PATIENCE_S)
+        """Wait until the command and all that it started have ended.
+
+        Raises:
+            AssertionError: they do not; says where their threads are.
+        """
+        try:
+            out, err = self.process.communicate(timeout=PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            os.killpg(self.process.pid, signal.SIGABRT)
+            err = self.process.communicate()[1]
+            raise AssertionError(f"it does not end:\n{err}") from None
         return Ended(self.process.returncode, out, err)
 
     def finish(self) -> tuple[int, str]:
