@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from ruamel.yaml import YAML
+from ruamel.yaml.composer import MaxDepthExceededError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode
 
 from mapfusion.errors import InputError
@@ -13,6 +14,7 @@ from mapfusion.sealed import SEAL
 _MOST_BYTES = 4_000_000  # the largest resolved scenario of ours takes 0.03 of that
 _MOST_VALUES = 200_000  # with every alias written out
 _MOST_DEPTH = 50  # a scenario needs 8
+_TOO_DEEP = "nested too deeply, or holds itself"
 _LARGEST_INTEGER = 2**63  # what tables and other people's readers of JSON can hold
 
 
@@ -44,6 +46,7 @@ def parse_value(text: str, where: str) -> Any:
         InputError: one line that begins with `where`.
     """
     reader = YAML(typ="safe", pure=True)
+    reader.max_depth = _MOST_DEPTH  # given up there: to read all of a deep text takes seconds
     try:
         node = reader.compose(text)
         if node is None:
@@ -52,8 +55,8 @@ def parse_value(text: str, where: str) -> Any:
         value = reader.constructor.construct_document(node)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
-    except RecursionError as error:
-        raise InputError(f"{where}: nested too deeply, or holds itself") from error
+    except MaxDepthExceededError as error:
+        raise InputError(f"{where}: {_TOO_DEEP}") from error
     except Exception as error:  # the reader leaves by any door where a tag does not fit its value
         mark = getattr(error, "problem_mark", None)
         line = f", line {mark.line + 1}" if mark is not None else ""
@@ -76,7 +79,7 @@ def _measured(node: Node, known: dict[int, tuple[int, int]], depth: int = 0) -> 
         known[id(node)] = size, height
     size, height = known.get(id(node), (0, _MOST_DEPTH + 1))
     if height > _MOST_DEPTH:
-        raise InputError("nested too deeply, or holds itself")
+        raise InputError(_TOO_DEEP)
     if size > _MOST_VALUES:
         raise InputError(f"holds more than {_MOST_VALUES} values, aliases written out")
     return size, height

@@ -93,7 +93,9 @@ def test_a_damaged_stage_is_named_and_made_again(
     tiny_result: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr("experiments.show.figures.drawing.FIGURES", ())  # drawn in other tests
     shutil.copytree(tiny_result.parent / "store", tmp_path / "store")
     for stage in left_out:
         shutil.rmtree(tmp_path / "store" / stage)

@@ -18,6 +18,7 @@ import pytest
 
 from experiments.judge import tables
 from experiments.methods.aligner_calls import end_children
+from experiments.show.figures import drawing
 from mapfusion import se2
 from mapfusion.landmark_map import write_map
 from tests.helpers.made_up_maps import landmark_map
@@ -140,8 +141,13 @@ def test_errors_name_it(maps: tuple[Path, Path], capsys: pytest.CaptureFixture[s
 
 
 def test_a_scenario_with_the_example_and_peers(
-    site: Path, tiny_results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    site: Path,
+    tiny_results: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(drawing, "FIGURES", ("fig04_translation_error",))
     scenario = tmp_path / "plugged.yaml"
     scenario.write_text(PLUGGED, encoding="utf-8")
     results = tmp_path / "results"
