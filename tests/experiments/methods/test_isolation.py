@@ -23,6 +23,7 @@ from experiments.methods.aligner_calls import (
 from experiments.scenario.randomness import generator
 from mapfusion.align.registration import Registration
 from mapfusion.align.result import Alignment, Status
+from tests.helpers.answered_here import answered_here
 from tests.helpers.made_up_maps import landmark_map, paired
 from tests.helpers.made_up_plugin import install, look_again
 from tests.helpers.waiting import PATIENCE_S, has_ended, wait_until
@@ -83,23 +84,7 @@ def test_degenerate_is_an_answer_too() -> None:
         ("exits at once", "^ended its process with exit code 3$"),
         ("segfaults", "^ended its process with SIGSEGV$"),
         ("kills itself", "^ended its process with SIGKILL$"),
-        ("wrong type", "^returned tuple, expected Alignment$"),
-        ("none", "^returned NoneType, expected Alignment$"),
         ("NaN", "^T_a_b is not finite, but accepted$"),
-        ("list", r"^T_a_b is list, expected an array \(3,\) of float$"),
-        ("4 numbers", r"^T_a_b is an array \(4,\) of float64, expected an array \(3,\) of float$"),
-        ("theta out of range", "^theta is 4 rad, expected -pi to pi$"),
-        ("inlier of another length", r"^inlier is an array \(6,\) of bool, expected an array "),
-        ("inlier of numbers", r"^inlier is an array \(5,\) of float64, expected .* of bool$"),
-        ("infinite covariance", "^covariance is not finite$"),
-        ("asymmetric covariance", "^covariance is not symmetric$"),
-        ("negative variance", "^covariance has a negative variance$"),
-        ("covariance of the plane", r"^covariance is an array \(2, 2\)"),
-        ("claims to have failed", "^status is .*failed.*, expected one of accepted, refused"),
-        ("refuses without a reason", "^refused without a reason$"),
-        ("reason is no text", "^reason is int, expected str$"),
-        ("drift is no number", "^drift_sigma_m is NoneType, expected float$"),
-        ("degenerate with a motion", "^T_a_b is not NaN, but degenerate$"),
     ],
 )
 def test_misbehaviour_is_a_status_with_a_reason(what: str, reason: str) -> None:
@@ -117,6 +102,34 @@ def test_misbehaviour_is_a_status_with_a_reason(what: str, reason: str) -> None:
     assert done.refined is done.applied is done.estimated
     assert (done.verdict.accepted, done.verdict.reason) == (False, done.estimated.reason)
     assert answer("good").status is Status.ACCEPTED
+
+
+@pytest.mark.parametrize(
+    ("what", "reason"),
+    [
+        ("wrong type", "^returned tuple, expected Alignment$"),
+        ("none", "^returned NoneType, expected Alignment$"),
+        ("list", r"^T_a_b is list, expected an array \(3,\) of float$"),
+        ("4 numbers", r"^T_a_b is an array \(4,\) of float64, expected an array \(3,\) of float$"),
+        ("theta out of range", "^theta is 4 rad, expected -pi to pi$"),
+        ("inlier of another length", r"^inlier is an array \(6,\) of bool, expected an array "),
+        ("inlier of numbers", r"^inlier is an array \(5,\) of float64, expected .* of bool$"),
+        ("infinite covariance", "^covariance is not finite$"),
+        ("asymmetric covariance", "^covariance is not symmetric$"),
+        ("negative variance", "^covariance has a negative variance$"),
+        ("covariance of the plane", r"^covariance is an array \(2, 2\)"),
+        ("claims to have failed", "^status is .*failed.*, expected one of accepted, refused"),
+        ("refuses without a reason", "^refused without a reason$"),
+        ("reason is no text", "^reason is int, expected str$"),
+        ("drift is no number", "^drift_sigma_m is NoneType, expected float$"),
+        ("degenerate with a motion", "^T_a_b is not NaN, but degenerate$"),
+    ],
+)
+def test_nonsense_is_a_status_with_a_reason(what: str, reason: str) -> None:
+    found = answered_here("made_up", {"what": what}, (*MAPS, PAIRS), generator(0, "test"))
+    assert found.status is Status.FAILED
+    assert re.search(reason, found.reason), found.reason
+    assert np.isnan(found.T_a_b).all()
 
 
 @pytest.mark.parametrize("what", ["hangs", "hangs with the lock held"])
