@@ -22,6 +22,8 @@ from tests.helpers.made_up_plugin import install, look_again
 
 ALL = (*kinds.OF_ALIGN, *kinds.OF_FIND, *kinds.SLOW, *kinds.WHEN_MADE)
 # What is done between two calls shows at the second, or later where the machine is busy.
+# One that has ended by then is started anew, and what it answered stands.
+_ENDED = "dies between two calls"
 _CALLS, _MOST_CALLS, _PAUSE_S = 2, 50, 0.1
 _LIMIT_S, _SHORT_LIMIT_S = 60.0, 1.0
 _POINTS = np.random.default_rng(0).uniform(0, 10, (12, 3))
@@ -73,14 +75,14 @@ def what_got_past(name: str, folder: Path) -> str:
     written = read_rows(path, ESTIMATES)
     failed = written[written["status"] == Status.FAILED]
     if failed.empty:
-        return f"recorded as {', '.join(written['status'])}"
+        return "" if name == _ENDED else f"recorded as {', '.join(written['status'])}"
     wordless = [text for text in failed["reason"] if not text or not text.isprintable()]
     accepted = failed["accepted"].any()
     return f"reasons {wordless}" if wordless else "failed and accepted" if accepted else ""
 
 
 def _is_late(name: str) -> bool:
-    return "between two calls" in name
+    return "between two calls" in name and name != _ENDED
 
 
 def _failed(rows: list[dict[str, Any]]) -> bool:

@@ -122,7 +122,7 @@ class KilledCommand:
     def kill(self, victim: Victim, rng: random.Random) -> None:
         """Send the signal; a worker is waited for."""
         if victim == "worker":
-            assert wait_until(lambda: len(self.workers()) > 0 or self._has_ended)
+            assert wait_until(self._has_workers_or_ended)
             for pid in rng.sample(self.workers(), 1) if self.workers() else ():
                 _send(pid, signal.SIGKILL)
         elif victim == "terminated":
@@ -130,6 +130,14 @@ class KilledCommand:
         else:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self.process.pid, _SIGNALS[victim])
+
+    def _has_workers_or_ended(self) -> bool:
+        """Lets one file more be made where there are none: some come before the first worker."""
+        if self.workers() or self._has_ended:
+            return True
+        if not any(self._permits.glob("permit_*")):
+            (self._permits / "permit_0").touch()
+        return False
 
     @property
     def _has_ended(self) -> bool:
