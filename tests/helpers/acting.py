@@ -2,12 +2,12 @@
 
 import os
 import signal
-import time
 from pathlib import Path
 
 from mapfusion import sealed
 from mapfusion.errors import InputError
 from mapfusion.storage import write_sealed
+from tests.helpers.waiting import wait_until
 
 
 def write(path: Path, text: str) -> None:
@@ -20,7 +20,10 @@ def note(journal: Path, text: str) -> None:
         file.write(f"{text}\n")
 
 
-def collide() -> None:
+def collide(flag: Path | None = None) -> None:
+    """Fails; before that, where there is a flag to raise, it does."""
+    if flag is not None:
+        flag.touch()
     raise InputError("scenario x: R1 drove into\n a wall at (1, 2)")
 
 
@@ -28,7 +31,10 @@ def run_out_of_memory() -> None:
     raise MemoryError
 
 
-def break_down() -> None:
+def break_down(flag: Path | None = None) -> None:
+    """As `collide`, by a defect."""
+    if flag is not None:
+        flag.touch()
     raise ZeroDivisionError("a bug")
 
 
@@ -45,8 +51,7 @@ def die_first(journal: Path, path: Path) -> None:
 
 
 def wait_for(path: Path, output: Path) -> None:
-    while not path.exists():
-        time.sleep(0.01)
+    assert wait_until(path.exists)
     write(output, "done")
 
 

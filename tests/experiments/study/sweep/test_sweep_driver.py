@@ -175,13 +175,13 @@ def test_the_reason_is_of_the_first_failure_in_the_plan(
     scene: Scene, client: Client, late: int
 ) -> None:
     """Whichever of the two fails first."""
-    flag = scene.folder / "flag"
+    flag = scene.folder / "flag"  # the other raises it: one task more might wait behind this one
     for i, function in enumerate((acting.collide, acting.break_down)):
-        needs = ("wait/0",) if i == late else ()
         if i == late:
             scene.add(0, "wait/0", acting.wait_for, flag, scene.folder / "wait_0")
-        scene.add(0, f"slam/{i}", function, needs=needs)
-    scene.add(0, "flag/0", acting.write, flag, "")
+            scene.add(0, f"slam/{i}", function, needs=("wait/0",))
+        else:
+            scene.add(0, f"slam/{i}", function, flag)
     scene.execute(client)
     assert scene.rows()[0][1] == "scenario x: R1 drove into a wall at (1, 2)"
 
