@@ -4,12 +4,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import scipy.linalg  # noqa: F401  # its threads are limited only once it is there
 from hypothesis import HealthCheck, settings
 from xdist.scheduler import LoadFileScheduling
+
+from experiments.methods.threads import single_threaded
 
 # No test may depend on how fast the machine is; by default an example may take 0.2 s.
 settings.register_profile("any_speed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any_speed")
+
+# Threads that wait for one another in small products take many times as long on a busy machine.
+single_threaded()
 
 _MAPFUSION = Path(__file__).parent / "mapfusion"
 # Who comes first compiles: of two workers one the aligners' kernels, one all others. Whole runs,
