@@ -1,9 +1,9 @@
 """What no input may cause is told in one line, with the place and the whole traceback in a file."""
 
-from collections.abc import inspect
+import inspect
+from collections.abc import Callable
 from pathlib import Path
 
-import Callable
 import pytest
 
 from experiments.cli import main as cli
