@@ -11,16 +11,16 @@ from xdist.scheduler import LoadFileScheduling
 settings.register_profile("any_speed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any_speed")
 
-_MAPFUSION = Path(__file__).parent / "mapfusion"
+_TESTS = Path(__file__).parent
 # Who comes first compiles: of two workers one the aligners' kernels, one all others. Whole runs,
 # which take both, find them there.
-_COMPILE = (("align",), ("fastslam", "vision"))
+_COMPILE = (("mapfusion/align",), ("mapfusion/fastslam", "mapfusion/vision", "sim/raycast"))
 
 
 def _place(path: Path) -> int:
     """Which of these packages a file tests; those of none come last."""
     for place, packages in enumerate(_COMPILE):
-        if any(path.is_relative_to(_MAPFUSION / package) for package in packages):
+        if any(path.is_relative_to(_TESTS / package) for package in packages):
             return place
     return len(_COMPILE)
 
