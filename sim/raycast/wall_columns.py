@@ -16,6 +16,7 @@ from sim.raycast.scene import Walls
 # into so many that they cross none of them by more than this, up to a most.
 STEEPEST = 0.5
 MOST_CUTS = 8
+LEAST_TEXELS = 1e-6  # of a strip at a wall's end: sums still tell them apart
 
 
 @njit(cache=True)
@@ -58,7 +59,7 @@ def add_strip(
     begin = (seen[i, 4] + seen[i, 5] * low) / (seen[i, 2] + seen[i, 3] * low) - seen[i, 6]
     end = (seen[i, 4] + seen[i, 5] * high) / (seen[i, 2] + seen[i, 3] * high) - seen[i, 6]
     per_m = texels_along / walls.width_m[i]
-    begin, end = _at_least_a_texel(begin * per_m, end * per_m, texels_along)
+    begin, end = _inside(begin * per_m, end * per_m, float(texels_along))
     # rows of the picture that the strip reaches, and rows of texels that they see
     top = camera.center_v - (walls.height_m - camera.eye_z_m) * camera.focal_px * w
     bottom = camera.center_v + camera.eye_z_m * camera.focal_px * w
@@ -71,11 +72,7 @@ def add_strip(
     lowest, highest = max(int(lowest_q) - 1, 0), min(int(highest_q) + 2, texels_up)
     _column_of_sums(walls, i, begin, end, lowest, highest, column)
     scale = (high - low) / (end - begin)
-    if a_row >= 1:
-        _add_means(column, texels_up, highest_q, a_row, scale, total[first : last + 1])
-    else:
-        share = total[first : last + 1]
-        _add_between(column, texels_up, highest_q, a_row, scale, top, bottom, first, share)
+    _add_means(column, texels_up, highest_q, a_row, scale, total[first : last + 1])
     for v in range(first, last + 1):
         covered[v] += high - low
     covered[first] -= (high - low) * max(top - (first - 0.5), 0.0)
@@ -84,7 +81,7 @@ def add_strip(
 
 @njit(cache=True)
 def _add_means(sums: Float, n: int, q: float, a_row: float, scale: float, total: Float) -> None:
-    """Add means over footprints of `a_row` >= 1 texels each, the first one's upper end at `q`.
+    """Add means over footprints of `a_row` texels each, the first one's upper end at `q`.
 
     What sticks out over the wall's n texels adds nothing: it is the share that is not covered.
     """
@@ -98,22 +95,6 @@ def _add_means(sums: Float, n: int, q: float, a_row: float, scale: float, total:
 
 
 @njit(cache=True)
-def _add_between(
-    sums: Float, n: int, q: float, a_row: float, scale: float, top: float, bottom: float,
-    first: int, total: Float,
-) -> None:  # fmt: skip
-    """Add linear interpolations between texels at footprints' middles, times their shares."""
-    for v in range(len(total)):
-        share = min(first + v + 0.5, bottom) - max(first + v - 0.5, top)
-        x = min(max(q - a_row * (v + 0.5) - 0.5, 0.0), n - 1.0)
-        k = int(x)
-        lower, upper = k + 1, min(k + 2, n)
-        texel = sums[lower] - sums[k]
-        next_texel = sums[upper] - sums[lower] if upper > lower else texel
-        total[v] += scale * share * (texel + (x - k) * (next_texel - texel))
-
-
-@njit(cache=True)
 def _until(sums: Float, n: int, q: float) -> float:
     """The sum of all texels below a place between 0 and n."""
     q = min(max(q, 0.0), n - 1e-9)
@@ -122,12 +103,10 @@ def _until(sums: Float, n: int, q: float) -> float:
 
 
 @njit(cache=True)
-def _at_least_a_texel(low: float, high: float, n: int) -> tuple[float, float]:
-    """An interval of texels, widened to one (linear interpolation), inside of 0 to n."""
-    if high - low < 1:
-        low, high = (low + high - 1) / 2, (low + high + 1) / 2
-    low, high = min(max(low, 0.0), n - 0.5), max(min(high, float(n)), 0.5)
-    return low, high
+def _inside(low: float, high: float, n: float) -> tuple[float, float]:
+    """An interval of texels inside of 0 to n; never empty, since means over it are asked for."""
+    low = min(max(low, 0.0), n - LEAST_TEXELS)
+    return low, min(max(high, low + LEAST_TEXELS), n)
 
 
 @njit(cache=True)
