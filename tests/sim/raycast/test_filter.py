@@ -84,7 +84,7 @@ def test_disparity_on_a_slanted_wall_is_unbiased_to_a_hundredth_of_a_pixel(
     u_right = right_camera.center_u - CAMERA.focal_px * (points[:, 1] + half_m) / points[:, 0]
     kept = (
         (np.abs(t - half_wall_m) < half_wall_m - 6 * per_pixel_m)  # a pixel there shows the end too
-        & (np.abs(u_right - CAMERA.center_u) < CAMERA.width_px / 2 - 20)
+        & (np.abs(u_right - left_camera.center_u) < CAMERA.width_px / 2 - 20)
     )
     rows = np.repeat(np.arange(4, 44), kept.sum())
     at = np.tile(u_right[kept], 40)
