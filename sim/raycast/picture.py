@@ -19,7 +19,6 @@ from sim.raycast.solids import Solids
 from sim.raycast.wall_columns import add_strip, cuts
 
 
-@njit(cache=True)
 def filtered(
     camera: Pinhole, walls: Walls, floor: Level, ceiling: Level, solids: Solids, poses: Float,
     grey: Float,
@@ -37,6 +36,18 @@ def filtered(
     """
     seen = project(camera, walls)
     face, until, count = strips(camera, seen)
+    picture = _still_means(camera, walls, floor, ceiling, seen, face, until, count)
+    if len(poses):
+        draw(camera, seen, face, until, count, solids, poses, grey, picture)
+    return _rounded(picture)
+
+
+@njit(cache=True)
+def _still_means(
+    camera: Pinhole, walls: Walls, floor: Level, ceiling: Level, seen: Float, face: np.ndarray,
+    until: Float, count: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """Means (H, W) float32 over footprints on what stands still; the strips are of `plan`."""
     below, above = footprints(camera, floor), footprints(camera, ceiling)
     picture = np.empty((camera.height_px, camera.width_px), dtype=np.float32)
     total, covered = np.empty(camera.height_px), np.empty(camera.height_px)
@@ -56,8 +67,7 @@ def filtered(
         fill(camera, floor, below, j, total, covered)
         for v in range(camera.height_px):
             picture[v, j] = total[v] + (1 - covered[v]) * BACKGROUND
-    draw(camera, seen, face, until, count, solids, poses, grey, picture)
-    return _rounded(picture)
+    return picture
 
 
 @njit(cache=True)
@@ -69,14 +79,14 @@ def _rounded(picture: np.ndarray) -> np.ndarray:
     return whole
 
 
-@njit(cache=True)
 def depths(
     camera: Pinhole, walls: Walls, floor: Level, ceiling: Level, solids: Solids, poses: Float
 ) -> np.ndarray:
     """Depth (H, W) float32 along the optical axis behind the pixels' middles; NaN for nothing."""
     depth_m = _still_depths(camera, walls, floor, ceiling)
     nothing = np.zeros((0, 0), dtype=np.float32)
-    cast(camera, solids, poses, np.zeros(0), depth_m, nothing)
+    if len(poses):
+        cast(camera, solids, poses, np.zeros(0), depth_m, nothing)
     return depth_m
 
 
@@ -106,14 +116,14 @@ def _still_depths(camera: Pinhole, walls: Walls, floor: Level, ceiling: Level) -
     return depth_m
 
 
-@njit(cache=True)
 def sampled(
     camera: Pinhole, walls: Walls, floor: Level, ceiling: Level, solids: Solids, poses: Float,
     grey: Float,
 ) -> np.ndarray:  # fmt: skip
     """Grey levels (H, W) uint8 of what the pixels' middles hit; arguments as of `filtered`."""
     picture = _still_texels(camera, walls, floor, ceiling)
-    cast(camera, solids, poses, grey, _still_depths(camera, walls, floor, ceiling), picture)
+    if len(poses):
+        cast(camera, solids, poses, grey, _still_depths(camera, walls, floor, ceiling), picture)
     return _rounded(picture)
 
 
