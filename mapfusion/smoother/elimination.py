@@ -38,7 +38,8 @@ class Solution(NamedTuple):
 
 def solve(seen: Sightings, equations: NormalEquations) -> Solution:
     """The step that solves the equations."""
-    landmarks_first = len(equations.pose_block) - 1 < len(equations.point_block)
+    tracked = equations.between is not None  # which only a dense system of the poses can hold
+    landmarks_first = tracked or len(equations.pose_block) - 1 < len(equations.point_block)
     return (_landmarks_first if landmarks_first else _poses_first)(seen, equations)
 
 
@@ -58,10 +59,10 @@ def common_part(seen: Sightings, equations: NormalEquations, solution: Solution)
 
 def _landmarks_first(seen: Sightings, equations: NormalEquations) -> Solution:
     n = len(equations.pose_block)
-    S = np.zeros((3 * n, 3 * n))
+    S = np.zeros((3 * n, 3 * n)) if equations.between is None else equations.between.copy()
     blocks, each = S.reshape(n, 3, n, 3), np.arange(n)
-    blocks[each, :, each, :] = equations.pose_block
-    blocks[each[1:], :, each[:-1], :] = equations.link
+    blocks[each, :, each, :] += equations.pose_block
+    blocks[each[1:], :, each[:-1], :] += equations.link
     own = np.asarray(np.linalg.inv(_regular(seen, equations.point_block)), np.float64)
     gradient = equations.pose_gradient.copy()
     _subtract_landmarks(

@@ -40,6 +40,7 @@ class NormalEquations(NamedTuple):
         point_block: (L, 3, 3).
         point_gradient: (L, 3).
         coupling: (N, 3, 3) a pose's block with a landmark, by observation.
+        between: (3T, 3T) lower half of what errors that views share add between poses, if any.
     """
 
     pose_block: Float
@@ -48,6 +49,7 @@ class NormalEquations(NamedTuple):
     point_block: Float
     point_gradient: Float
     coupling: Float
+    between: Float | None = None
 
 
 def odometry_information(odometry: Float, noise: MotionNoise) -> Float:
@@ -63,20 +65,10 @@ def disturbances(path: Float, odometry: Float) -> Float:
     return found
 
 
-def normal_equations(
-    seen: Sightings, at: Estimate, weight: Float, odometry: Float, information: Float
-) -> NormalEquations:
-    """The equations of the next step.
-
-    Args:
-        seen: the observations.
-        at: where is linearised.
-        weight: (N,) factor on the information of each observation.
-        odometry: (T, 3) increments.
-        information: (T - 1, 3) theirs.
-    """
+def no_equations(seen: Sightings, at: Estimate) -> NormalEquations:
+    """To be added to."""
     n_poses, n_points = len(at.path), len(at.point_m)
-    made = NormalEquations(
+    return NormalEquations(
         np.zeros((n_poses, 3, 3)),
         np.zeros((n_poses - 1, 3, 3)),
         np.zeros((n_poses, 3)),
@@ -84,12 +76,15 @@ def normal_equations(
         np.zeros((n_points, 3)),
         np.empty((len(seen), 3, 3)),
     )
+
+
+def add_observations(seen: Sightings, at: Estimate, weight: Float, made: NormalEquations) -> None:
+    """Add observations whose errors are independent, with factors (N,) on their information."""
     _add_observations(seen.arrays, at, weight, made)
-    _add_odometry(at.path, odometry, information, made)
-    return made
 
 
-def _add_odometry(path: Float, odometry: Float, information: Float, made: NormalEquations) -> None:
+def add_odometry(path: Float, odometry: Float, information: Float, made: NormalEquations) -> None:
+    """Add increments (T, 3) of information (T - 1, 3) on the path (T, 3)."""
     n = len(path) - 1
     d = disturbances(path, odometry)
     to_robot = np.swapaxes(rotation(path[:-1, 2]), 1, 2)

@@ -10,15 +10,17 @@ from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.robot_log import RobotLog
 from mapfusion.se2 import Float, between, wrap
 from mapfusion.smoother.elimination import common_part, solve
+from mapfusion.smoother.errors_of_views import OwnErrors, SharedErrors
 from mapfusion.smoother.normal_equations import (
     Estimate,
+    add_odometry,
     disturbances,
-    normal_equations,
+    no_equations,
     odometry_information,
 )
-from mapfusion.smoother.residuals import first_points, squared_distances
+from mapfusion.smoother.residuals import first_points
 from mapfusion.smoother.sightings import Sightings, sightings_of
-from mapfusion.smoother.student import MOST_DOF, fitted_dof, student_cost, student_weights
+from mapfusion.smoother.tracks import Stray
 
 # The next step would lower the cost, in squared sigmas, by no more than this.
 _CONVERGED = 1e-4
@@ -32,10 +34,12 @@ class SmootherParameters:
 
     Attributes:
         motion: noise of the odometry.
+        stray: how far corners stray from their landmarks along a track.
         min_count: observations that a landmark needs.
     """
 
     motion: MotionNoise = field(default_factory=MotionNoise)
+    stray: Stray = field(default_factory=Stray)
     min_count: Annotated[int, Range(2, 1000, "observations")] = 3
 
     def __post_init__(self) -> None:
@@ -92,33 +96,33 @@ def smooth(
     information = odometry_information(log.odometry, parameters.motion)
     path = between(path[0], path)
     at = Estimate(path, first_points(seen, path))
-    weight, dof, n_steps = np.ones(len(seen)), MOST_DOF, 0
+    stray = parameters.stray
+    errors = SharedErrors(seen, stray, at) if stray.sigma_m > 0 else OwnErrors(seen)
+    n_steps = 0
     while True:
-        equations = normal_equations(seen, at, weight, log.odometry, information)
+        equations = errors.add(at, no_equations(seen, at))
+        add_odometry(at.path, log.odometry, information, equations)
         solution = solve(seen, equations)
         if n_steps == _MOST_STEPS or solution.decrease < _CONVERGED:
             common = common_part(seen, equations, solution)
-            return Smoothed(at, seen, weight, dof, n_steps, solution.own_m2, common)
-        at = _stepped(seen, log.odometry, information, dof, at, solution.step)
-        squares = squared_distances(seen, at, solution.own_m2)
-        dof = fitted_dof(squares, seen.n_dimensions)
-        weight = student_weights(squares, dof, seen.n_dimensions)
+            own_m2 = solution.own_m2
+            return Smoothed(at, seen, errors.weight, errors.dof, n_steps, own_m2, common)
+        at = _stepped(errors, log.odometry, information, at, solution.step)
+        errors.weigh(at, solution.own_m2)
         n_steps += 1
 
 
 def _stepped(
-    seen: Sightings,
+    errors: OwnErrors | SharedErrors,
     odometry: Float,
     information: Float,
-    dof: float,
     at: Estimate,
     step: Estimate,
 ) -> Estimate:
     """The step, or as much of it as lowers the cost: half, a quarter, ..."""
 
     def cost(of: Estimate) -> float:
-        walked = float(np.sum(information * disturbances(of.path, odometry) ** 2))
-        return walked + student_cost(squared_distances(seen, of), dof, seen.n_dimensions)
+        return float(np.sum(information * disturbances(of.path, odometry) ** 2)) + errors.cost(of)
 
     before, share = cost(at), 1.0
     for _ in range(_MOST_HALVINGS):

@@ -9,29 +9,36 @@ from scipy.stats import chi2
 
 from mapfusion.robot_log import RobotLog
 from mapfusion.se2 import Float, between, rotation, wrap
+from mapfusion.smoother import errors_of_views
 from mapfusion.smoother.elimination import Solution, _landmarks_first, _poses_first, common_part
 from mapfusion.smoother.normal_equations import (
     Estimate,
     NormalEquations,
-    normal_equations,
+    add_observations,
+    add_odometry,
+    no_equations,
     odometry_information,
 )
 from mapfusion.smoother.residuals import first_points
 from mapfusion.smoother.sightings import Sightings, sightings_of
 from mapfusion.smoother.smooth import Smoothed, SmootherParameters, smooth
+from mapfusion.smoother.student import MOST_DOF
+from mapfusion.smoother.tracks import Stray
 from tests.mapfusion.smoother.white_noise_logs import (
+    NO_STRAY,
     NOISE,
     Known,
     dead_reckoned,
     white_noise_log,
 )
 
-PARAMETERS = SmootherParameters()
+STRAY = Stray(0.03, 6.0)
 
 
-def smoothed(log: RobotLog) -> Smoothed:
+def smoothed(log: RobotLog, stray: Stray = NO_STRAY) -> Smoothed:
     assert log.observations.label is not None
-    return smooth(log, log.observations.label, dead_reckoned(log), PARAMETERS)
+    parameters = SmootherParameters(stray=stray)
+    return smooth(log, log.observations.label, dead_reckoned(log), parameters)
 
 
 def true_points(known: Known, found: Smoothed) -> Float:
@@ -40,8 +47,12 @@ def true_points(known: Known, found: Smoothed) -> Float:
     return known.point_m[label[found.seen.row[found.seen.starts[:-1]]]]
 
 
-def dense_residuals(log: RobotLog, seen: Sightings, x: Float) -> Float:
-    """All residuals over their sigmas, written down one by one."""
+def dense_residuals(log: RobotLog, found: Smoothed, stray: Stray, x: Float) -> Float:
+    """All residuals over their sigmas, written down one by one, a landmark's made independent.
+
+    Their covariance is that on the path that was found.
+    """
+    seen, heading_rad = found.seen, found.estimate.path[:, 2]
     n = 3 * (len(log) - 1)
     path = np.concatenate([np.zeros((1, 3)), x[:n].reshape(-1, 3)])
     dimensions = seen.n_dimensions
@@ -52,29 +63,46 @@ def dense_residuals(log: RobotLog, seen: Sightings, x: Float) -> Float:
         d[2] = wrap(d[2])
         variance = NOISE.standard_deviations(log.odometry[k]) ** 2 + [1e-8, 1e-8, 1e-10]
         found.append(d / np.sqrt(variance))
-    for row, landmark in zip(seen.row, seen.landmark, strict=True):
-        pose = path[log.iteration[row]]
-        at = points[landmark].copy()
-        at[:2] = rotation(pose[2]).T @ (at[:2] - pose[:2])
-        error = at - log.observations.position_m[row, :dimensions]
-        covariance = log.observations.covariance_m2[row, :dimensions, :dimensions]
-        found.append(np.linalg.solve(np.linalg.cholesky(covariance), error))
+    for landmark, point in enumerate(points):
+        rows = seen.row[seen.landmark == landmark]
+        error, covariance = [], np.zeros((len(rows), dimensions, len(rows), dimensions))
+        for i, row in enumerate(rows):
+            pose = path[log.iteration[row]]
+            at = point.copy()
+            at[:2] = rotation(pose[2]).T @ (at[:2] - pose[:2])
+            error.append(at - log.observations.position_m[row, :dimensions])
+            for k, other in enumerate(rows):
+                frames = abs(int(log.iteration[row]) - int(log.iteration[other]))
+                turn = np.eye(3)
+                turn[:2, :2] = rotation(
+                    heading_rad[log.iteration[other]] - heading_rad[log.iteration[row]]
+                )
+                shared = stray.sigma_m**2 * np.exp(-frames / stray.decay_frames) * turn
+                covariance[i, :, k] = shared[:dimensions, :dimensions]
+            own = log.observations.covariance_m2[row, :dimensions, :dimensions]
+            covariance[i, :, i] += own
+        n = len(rows) * dimensions
+        root = np.linalg.cholesky(covariance.reshape(n, n))
+        found.append(np.linalg.solve(root, np.concatenate(error)))
     return np.concatenate(found)
 
 
+@pytest.mark.parametrize("stray", [NO_STRAY, STRAY], ids=["own", "shared"])
 @pytest.mark.parametrize("planar", [False, True])
 @pytest.mark.parametrize(("n_frames", "n_landmarks"), [(8, 90), (20, 12)])
-def test_equals_the_dense_twin(n_frames: int, n_landmarks: int, planar: bool) -> None:
+def test_equals_the_dense_twin(
+    n_frames: int, n_landmarks: int, planar: bool, stray: Stray, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """With more landmarks than poses, and with fewer: either is eliminated first."""
-    log = white_noise_log(np.random.default_rng(3), n_frames, n_landmarks, planar).log
-    found = smoothed(log)
+    monkeypatch.setattr(errors_of_views, "fitted_dof", lambda *_: MOST_DOF)  # the twin is Gaussian
+    log = white_noise_log(np.random.default_rng(3), n_frames, n_landmarks, planar, stray).log
+    found = smoothed(log, stray)
     assert (len(found.own_m2) >= n_frames) == (n_landmarks > 20)
-    assert found.dof > 1000  # as good as Gaussian, as the twin is
     d, n = found.seen.n_dimensions, 3 * (len(log) - 1)
     start = np.concatenate([found.estimate.path[1:].ravel(), found.estimate.point_m[:, :d].ravel()])
     start += 0.01 * np.random.default_rng(0).standard_normal(len(start))
     twin = least_squares(
-        lambda x: dense_residuals(log, found.seen, x), start, xtol=1e-12, ftol=1e-12
+        lambda x: dense_residuals(log, found, stray, x), start, xtol=1e-12, ftol=1e-12
     )
     path, points = twin.x[:n].reshape(-1, 3), twin.x[n:].reshape(-1, d)
     np.testing.assert_allclose(found.estimate.path[1:], path, atol=1e-4)
@@ -93,7 +121,9 @@ def test_both_orders_of_elimination_give_the_same(planar: bool) -> None:
     at = Estimate(dead_reckoned(log), first_points(seen, dead_reckoned(log)))
     information = odometry_information(log.odometry, NOISE)
     weight = np.random.default_rng(0).uniform(0.1, 1, len(seen))
-    equations = normal_equations(seen, at, weight, log.odometry, information)
+    equations = no_equations(seen, at)
+    add_observations(seen, at, weight, equations)
+    add_odometry(at.path, log.odometry, information, equations)
     one, other = (each(seen, equations) for each in (_landmarks_first, _poses_first))
     np.testing.assert_allclose(one.step.path, other.step.path, atol=1e-9)
     np.testing.assert_allclose(one.step.point_m, other.step.point_m, atol=1e-9)
@@ -121,12 +151,13 @@ def without_gauge(found: Smoothed, error: Float) -> tuple[Float, Float]:
     return P @ error, P @ found.joint_covariance() @ P
 
 
-def test_errors_obey_the_joint_covariance() -> None:
-    """White noise: the squared distance of all landmarks at once is chi-square distributed."""
+@pytest.mark.parametrize("stray", [NO_STRAY, STRAY], ids=["own", "shared"])
+def test_errors_obey_the_joint_covariance(stray: Stray) -> None:
+    """The squared distance of all landmarks at once is chi-square distributed."""
     total, dof, marginal = 0.0, 0, list[float]()
     for seed in range(15):
-        known = white_noise_log(np.random.default_rng(seed), 120, 40)
-        found = smoothed(known.log)
+        known = white_noise_log(np.random.default_rng(seed), 120, 40, stray=stray)
+        found = smoothed(known.log, stray)
         error = (found.estimate.point_m - true_points(known, found)).ravel()
         total += error @ np.linalg.solve(found.joint_covariance(), error)
         dof += len(error)

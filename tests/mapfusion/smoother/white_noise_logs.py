@@ -1,4 +1,4 @@
-"""Logs whose errors are what they say: independent, Gaussian, of the stated covariances."""
+"""Logs whose errors are what they say: Gaussian, of the stated covariances, and a stray if any."""
 
 from typing import NamedTuple
 
@@ -7,9 +7,11 @@ import numpy as np
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.robot_log import Observations, RobotLog
 from mapfusion.se2 import Float, compose, rotation
+from mapfusion.smoother.tracks import Stray
 
 NOISE = MotionNoise()
 HALF_VIEW_RAD, RANGE_M = 0.6, 4.0
+NO_STRAY = Stray(0.0)
 
 
 class Known(NamedTuple):
@@ -21,7 +23,11 @@ class Known(NamedTuple):
 
 
 def white_noise_log(
-    rng: np.random.Generator, n_frames: int, n_landmarks: int, planar: bool = False
+    rng: np.random.Generator,
+    n_frames: int,
+    n_landmarks: int,
+    planar: bool = False,
+    stray: Stray = NO_STRAY,
 ) -> Known:
     """A robot that drives in circles among landmarks that it sees now and then."""
     odometry = np.zeros((n_frames, 3))
@@ -32,7 +38,8 @@ def white_noise_log(
         path[k] = compose(path[k - 1], odometry[k] + disturbance)
     height = np.zeros(n_landmarks) if planar else rng.uniform(0, 1, n_landmarks)
     point_m = np.column_stack([rng.uniform(-3, 4, (n_landmarks, 2)), height])
-    seen = [_sightings(rng, path[k], point_m, planar) for k in range(n_frames)]
+    strays = _strays(rng, stray, n_frames, n_landmarks) * [1, 1, not planar]
+    seen = [_sightings(rng, path[k], point_m + strays[k], planar) for k in range(n_frames)]
     iteration = np.repeat(np.arange(n_frames), [len(label) for label, _, _ in seen])
     label, position, covariance = map(np.concatenate, zip(*seen, strict=True))
     observations = Observations(position, covariance, None, label.astype(np.int32))
@@ -41,6 +48,15 @@ def white_noise_log(
         path,
         point_m,
     )
+
+
+def _strays(rng: np.random.Generator, stray: Stray, n_frames: int, n_landmarks: int) -> Float:
+    """(T, L, 3) by the process's own recursion."""
+    share = np.exp(-1 / stray.decay_frames)
+    found = stray.sigma_m * rng.standard_normal((n_frames, n_landmarks, 3))
+    for k in range(1, n_frames):
+        found[k] = share * found[k - 1] + np.sqrt(1 - share**2) * found[k]
+    return found
 
 
 def _sightings(
