@@ -111,7 +111,7 @@ def _invert(
 
 
 @njit(cache=True)
-def _own_covariance(information: Float, heading_rad: float, dimensions: int) -> Float:
+def _own_covariance(information: Float, heading_rad: float | Float, dimensions: int) -> Float:
     """Of a view's own error, in the map frame."""
     R = np.eye(3)[:dimensions, :dimensions].copy()
     c, s = np.cos(heading_rad), np.sin(heading_rad)

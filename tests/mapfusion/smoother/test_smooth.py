@@ -47,44 +47,49 @@ def true_points(known: Known, found: Smoothed) -> Float:
     return known.point_m[label[found.seen.row[found.seen.starts[:-1]]]]
 
 
-def dense_residuals(log: RobotLog, found: Smoothed, stray: Stray, x: Float) -> Float:
+class DenseTwin:
     """All residuals over their sigmas, written down one by one, a landmark's made independent.
 
     Their covariance is that on the path that was found.
     """
-    seen, heading_rad = found.seen, found.estimate.path[:, 2]
-    n = 3 * (len(log) - 1)
-    path = np.concatenate([np.zeros((1, 3)), x[:n].reshape(-1, 3)])
-    dimensions = seen.n_dimensions
-    points = x[n:].reshape(-1, dimensions)
-    found = []
-    for k in range(1, len(log)):
-        d = between(path[k - 1], path[k]) - log.odometry[k]
-        d[2] = wrap(d[2])
-        variance = NOISE.standard_deviations(log.odometry[k]) ** 2 + [1e-8, 1e-8, 1e-10]
-        found.append(d / np.sqrt(variance))
-    for landmark, point in enumerate(points):
-        rows = seen.row[seen.landmark == landmark]
-        error, covariance = [], np.zeros((len(rows), dimensions, len(rows), dimensions))
-        for i, row in enumerate(rows):
-            pose = path[log.iteration[row]]
-            at = point.copy()
-            at[:2] = rotation(pose[2]).T @ (at[:2] - pose[:2])
-            error.append(at - log.observations.position_m[row, :dimensions])
-            for k, other in enumerate(rows):
-                frames = abs(int(log.iteration[row]) - int(log.iteration[other]))
+
+    def __init__(self, log: RobotLog, found: Smoothed, stray: Stray) -> None:
+        self._log, self._n = log, found.seen.n_dimensions
+        self._rows = np.split(found.seen.row, found.seen.starts[1:-1])
+        heading_rad = found.estimate.path[:, 2]
+        self._root = [self._covariance_root(rows, heading_rad, stray) for rows in self._rows]
+        sigma = np.array([NOISE.standard_deviations(each) for each in log.odometry])
+        self._odometry_sigma = np.hypot(sigma, np.array([1e-4, 1e-4, 1e-5]))
+
+    def _covariance_root(self, rows: np.ndarray, heading_rad: Float, stray: Stray) -> Float:
+        n, at = self._n, self._log.iteration[rows]
+        covariance = np.zeros((len(rows), n, len(rows), n))
+        for i in range(len(rows)):
+            for k in range(len(rows)):
                 turn = np.eye(3)
-                turn[:2, :2] = rotation(
-                    heading_rad[log.iteration[other]] - heading_rad[log.iteration[row]]
-                )
-                shared = stray.sigma_m**2 * np.exp(-frames / stray.decay_frames) * turn
-                covariance[i, :, k] = shared[:dimensions, :dimensions]
-            own = log.observations.covariance_m2[row, :dimensions, :dimensions]
-            covariance[i, :, i] += own
-        n = len(rows) * dimensions
-        root = np.linalg.cholesky(covariance.reshape(n, n))
-        found.append(np.linalg.solve(root, np.concatenate(error)))
-    return np.concatenate(found)
+                turn[:2, :2] = rotation(heading_rad[at[k]] - heading_rad[at[i]])
+                decayed = np.exp(-abs(int(at[k]) - int(at[i])) / stray.decay_frames)
+                covariance[i, :, k] = stray.sigma_m**2 * decayed * turn[:n, :n]
+            covariance[i, :, i] += self._log.observations.covariance_m2[rows[i], :n, :n]
+        return np.linalg.cholesky(covariance.reshape(n * len(rows), n * len(rows)))
+
+    def residuals(self, x: Float) -> Float:
+        """Of a path but for its first pose, and landmarks."""
+        log, n = self._log, 3 * (len(self._log) - 1)
+        path = np.concatenate([np.zeros((1, 3)), x[:n].reshape(-1, 3)])
+        found = []
+        for k in range(1, len(log)):
+            d = between(path[k - 1], path[k]) - log.odometry[k]
+            d[2] = wrap(d[2])
+            found.append(d / self._odometry_sigma[k])
+        points = x[n:].reshape(-1, self._n)
+        for point, rows, root in zip(points, self._rows, self._root, strict=True):
+            pose = path[log.iteration[rows]]
+            at = np.tile(point, (len(rows), 1))
+            at[:, :2] = np.einsum("nji,nj->ni", rotation(pose[:, 2]), at[:, :2] - pose[:, :2])
+            error = at - log.observations.position_m[rows, : self._n]
+            found.append(np.linalg.solve(root, error.ravel()))
+        return np.concatenate(found)
 
 
 @pytest.mark.parametrize("stray", [NO_STRAY, STRAY], ids=["own", "shared"])
@@ -101,9 +106,8 @@ def test_equals_the_dense_twin(
     d, n = found.seen.n_dimensions, 3 * (len(log) - 1)
     start = np.concatenate([found.estimate.path[1:].ravel(), found.estimate.point_m[:, :d].ravel()])
     start += 0.01 * np.random.default_rng(0).standard_normal(len(start))
-    twin = least_squares(
-        lambda x: dense_residuals(log, found, stray, x), start, xtol=1e-12, ftol=1e-12
-    )
+    residuals = DenseTwin(log, found, stray).residuals
+    twin = least_squares(residuals, start, xtol=1e-12, ftol=1e-12)
     path, points = twin.x[:n].reshape(-1, 3), twin.x[n:].reshape(-1, d)
     np.testing.assert_allclose(found.estimate.path[1:], path, atol=1e-4)
     np.testing.assert_allclose(found.estimate.point_m[:, :d], points, atol=1e-4)
