@@ -162,8 +162,9 @@ class KilledCommand:
         try:
             out, err = self.process.communicate(timeout=PATIENCE_S)
         except subprocess.TimeoutExpired:
-            os.killpg(self.process.pid, signal.SIGABRT)
-            err = self.process.communicate()[1]
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self.process.pid, signal.SIGABRT)
+            err = self.process.communicate(timeout=PATIENCE_S)[1]
             raise AssertionError(f"it does not end:\n{err}") from None
         return Ended(self.process.returncode, out, err)
 
