@@ -12,7 +12,8 @@ from scipy.special import gammaln
 
 from mapfusion.se2 import Float
 
-# Below, the variance of a Student-t is infinite; above, nobody can tell it from a Gaussian.
+# Tails heavier than the first give (a Cauchy's are at 1) are no sensor's; above the second nobody
+# can tell it from a Gaussian.
 LEAST_DOF, MOST_DOF = 0.5, 1e4
 
 

@@ -20,10 +20,14 @@ def note(journal: Path, text: str) -> None:
         file.write(f"{text}\n")
 
 
-def collide(flag: Path | None = None) -> None:
-    """Fails; before that, where there is a flag to raise, it does."""
+def _raise_flag(flag: Path | None) -> None:
+    """Others may wait for it."""
     if flag is not None:
         flag.touch()
+
+
+def collide(flag: Path | None = None) -> None:
+    _raise_flag(flag)
     raise InputError("scenario x: R1 drove into\n a wall at (1, 2)")
 
 
@@ -32,9 +36,7 @@ def run_out_of_memory() -> None:
 
 
 def break_down(flag: Path | None = None) -> None:
-    """As `collide`, by a defect."""
-    if flag is not None:
-        flag.touch()
+    _raise_flag(flag)
     raise ZeroDivisionError("a bug")
 
 
