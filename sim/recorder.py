@@ -11,12 +11,36 @@ from mapfusion.camera import StereoCamera
 from mapfusion.errors import InputError
 from mapfusion.se2 import Float, transform_points
 from sim.p3at import P3at
-from sim.renderer import Renderer
+from sim.raycast.caster import RayCaster
+from sim.renderer import BulletRenderer, Renderer
 from sim.stereo_head import RadiometricNoise, StereoFrame, render_stereo
 from sim.visibility import Visibility
 from sim.world import OUT_OF_SIGHT_M, World
 
 SAME_SURFACE = 0.02  # neighbouring pixels whose depths differ by more belong to two surfaces
+
+
+class _Bullet:
+    """PyBullet's world with all robots' bodies in it."""
+
+    def __init__(
+        self, faces: Path, camera: StereoCamera, robots: int, renderer: BulletRenderer
+    ) -> None:
+        self._camera = camera
+        self._world = World(renderer)
+        self._visibility = Visibility(self._world.add_painted_faces(faces), camera)
+        self._bodies = [P3at(self._world, np.zeros(3)) for _ in range(robots)]
+
+    def close(self) -> None:
+        self._world.close()
+
+    def render(
+        self, poses: Float, own: int, noise: RadiometricNoise, rng: np.random.Generator
+    ) -> StereoFrame:
+        for i, (body, pose) in enumerate(zip(self._bodies, poses, strict=True)):
+            body.place(pose, OUT_OF_SIGHT_M if i == own else 0.0)  # it does not see itself
+        self._world.show_faces(self._visibility.seen(poses[own]))
+        return render_stereo(self._world, self._camera, poses[own], noise, rng)
 
 
 class FrameSource:
@@ -26,7 +50,7 @@ class FrameSource:
         faces: folder that `sim.world.write_faces` has filled.
         camera: of all robots.
         robots: their names.
-        renderer: see `sim.world.World`.
+        renderer: what draws; raises InputError where it cannot.
     """
 
     def __init__(
@@ -36,11 +60,12 @@ class FrameSource:
         robots: Sequence[str],
         renderer: Renderer = "tiny",
     ) -> None:
-        self._camera = camera
-        self._world = World(renderer)
-        self._visibility = Visibility(self._world.add_painted_faces(faces), camera)
-        start = np.zeros(3)
-        self._robots = {name: P3at(self._world, start) for name in robots}
+        self._robots = list(robots)
+        self._drawn: RayCaster | _Bullet
+        if renderer == "raycast":
+            self._drawn = RayCaster(faces, camera)
+        else:
+            self._drawn = _Bullet(faces, camera, len(self._robots), renderer)
 
     def __enter__(self) -> "FrameSource":
         return self
@@ -50,7 +75,8 @@ class FrameSource:
 
     def close(self) -> None:
         """Free the world."""
-        self._world.close()
+        if isinstance(self._drawn, _Bullet):
+            self._drawn.close()
 
     def render(
         self,
@@ -58,17 +84,21 @@ class FrameSource:
         robot: str,
         noise: RadiometricNoise,
         rng: np.random.Generator,
+        colour: bool = True,
     ) -> StereoFrame:
-        """What `robot` sees when the robots (in the order of their names) stand at poses (R, 3)."""
+        """What `robot` sees when the robots (in the order of their names) stand at poses (R, 3).
+
+        Without `colour` the frame may come without its picture in colour, which takes time.
+        """
         poses = np.asarray(T_world_robots, dtype=np.float64)
         require_shape("T_world_robots", poses, (len(self._robots), 3))
         if robot not in self._robots:
             raise InputError(f"robot {robot}: unknown, there are {', '.join(self._robots)}")
-        own_pose = poses[list(self._robots).index(robot)]
-        for (name, body), pose in zip(self._robots.items(), poses, strict=True):
-            body.place(pose, OUT_OF_SIGHT_M if name == robot else 0.0)  # it does not see itself
-        self._world.show_faces(self._visibility.seen(own_pose))
-        return render_stereo(self._world, self._camera, own_pose, noise, rng)
+        own = self._robots.index(robot)
+        if isinstance(self._drawn, _Bullet):
+            return self._drawn.render(poses, own, noise, rng)
+        others = np.delete(poses, own, axis=0)
+        return self._drawn.stereo(poses[own], others, noise, rng, colour)
 
 
 def truth_points(

@@ -1,4 +1,4 @@
-"""The renderers: PyBullet's own, and the system's OpenGL without a screen (EGL)."""
+"""The renderers: PyBullet's own, the system's OpenGL without a screen (EGL), our ray caster."""
 
 import functools
 import importlib.util
@@ -9,7 +9,9 @@ from typing import Any, Literal
 
 from mapfusion.errors import InputError
 
-Renderer = Literal["tiny", "egl"]
+BulletRenderer = Literal["tiny", "egl"]
+Renderer = Literal["tiny", "egl", "raycast"]
+NAMES = {"tiny": "TinyRenderer", "raycast": "our ray caster"}
 PLUGIN, PLUGIN_SYMBOL = "eglRenderer", "_eglRendererPlugin"
 PROBE_S = 60  # a first picture takes a second, on a slow disk a few
 NEEDED = (
@@ -45,7 +47,7 @@ def egl_driver() -> str:
 
 def renderer_name(renderer: Renderer) -> str:
     """What results call the renderer that made their images."""
-    return "TinyRenderer" if renderer == "tiny" else f"OpenGL by EGL ({egl_driver()})"
+    return NAMES[renderer] if renderer in NAMES else f"OpenGL by EGL ({egl_driver()})"
 
 
 def probe() -> None:

@@ -55,13 +55,13 @@ class StereoFrame:
         left: (H, W) uint8 gray.
         right: (H, W) uint8 gray.
         depth_m: (H, W) float32 along the optical axis of the left camera; NaN where nothing is.
-        left_rgb: (H, W, 3) uint8 without noise, for figures.
+        left_rgb: (H, W, 3) uint8 without noise, for people; None where nobody asked for it.
     """
 
     left: np.ndarray
     right: np.ndarray
     depth_m: np.ndarray
-    left_rgb: np.ndarray
+    left_rgb: np.ndarray | None
 
 
 def render_stereo(

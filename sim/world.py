@@ -19,7 +19,7 @@ from mapfusion.se2 import Float
 from mapfusion.sealed import LINE, read_sealed
 from mapfusion.storage import write_sealed
 from sim.floorplan import Face, FloorPlan
-from sim.renderer import Renderer, egl_driver, load_egl
+from sim.renderer import BulletRenderer, egl_driver, load_egl
 from sim.textures import AS_PAINTED, Texture, paint, paint_posters
 
 GRAVITY_M_S2 = 9.81
@@ -77,7 +77,7 @@ class World:
         client: id to pass as `physicsClientId`.
     """
 
-    def __init__(self, renderer: Renderer = "tiny") -> None:
+    def __init__(self, renderer: BulletRenderer = "tiny") -> None:
         if renderer == "egl":
             egl_driver()  # raises where there is none
         self.renderer = renderer
@@ -165,7 +165,7 @@ class World:
         corners_m = read_corners(folder / CORNERS)
         with silence():
             for i in range(len(corners_m)):
-                mesh, picture = _face_files(folder, i)
+                mesh, picture = face_files(folder, i)
                 read_sealed(mesh, "mesh", only_ours=True)  # Bullet reads the file by itself
                 shape = p.createVisualShape(p.GEOM_MESH, fileName=str(mesh), physicsClientId=client)
                 body = p.createMultiBody(0, baseVisualShapeIndex=shape, physicsClientId=client)
@@ -213,7 +213,7 @@ def write_faces(
     *children, of_posters = rng.spawn(len(faces) + 1)
     posters = paint_posters(texture, of_posters)
     for i, (face, child) in enumerate(zip(faces, children, strict=True)):
-        mesh, path = _face_files(folder, i)
+        mesh, path = face_files(folder, i)
         picture = cv2.cvtColor(paint(face, child, texture, posters), cv2.COLOR_RGB2BGR)
         encoded = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
         # whole: another run may be painting, or looking at, the same walls
@@ -241,7 +241,8 @@ def read_corners(path: Path) -> Float:
     return corners_m
 
 
-def _face_files(folder: Path, i: int) -> tuple[Path, Path]:
+def face_files(folder: Path, i: int) -> tuple[Path, Path]:
+    """A face's mesh and its picture."""
     return folder / f"face_{i:04d}.obj", folder / f"face_{i:04d}.png"
 
 

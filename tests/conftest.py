@@ -17,16 +17,16 @@ settings.load_profile("any_speed")
 # Threads that wait for one another in small products take many times as long on a busy machine.
 single_threaded()
 
-_MAPFUSION = Path(__file__).parent / "mapfusion"
+_TESTS = Path(__file__).parent
 # Who comes first compiles: of two workers one the aligners' kernels, one all others. Whole runs,
 # which take both, find them there.
-_COMPILE = (("align",), ("fastslam", "vision"))
+_COMPILE = (("mapfusion/align",), ("mapfusion/fastslam", "mapfusion/vision", "sim/raycast"))
 
 
 def _place(path: Path) -> int:
     """Which of these packages a file tests; those of none come last."""
     for place, packages in enumerate(_COMPILE):
-        if any(path.is_relative_to(_MAPFUSION / package) for package in packages):
+        if any(path.is_relative_to(_TESTS / package) for package in packages):
             return place
     return len(_COMPILE)
 

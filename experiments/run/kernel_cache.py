@@ -10,6 +10,7 @@ from pathlib import Path
 
 from experiments.run.code_version import source_hash
 
+KERNELS = ("mapfusion", "sim/raycast")  # where there are any
 _VERSIONS_KEPT = 4  # a few megabytes each; going back and forth between branches stays fast
 
 
@@ -22,7 +23,7 @@ def use_kernel_cache() -> None:
         return
     cache_home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     root = cache_home / "mapfusion" / "kernels"
-    folder = root / source_hash(("mapfusion",))[:16]
+    folder = root / source_hash(KERNELS)[:16]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         os.utime(folder)

@@ -265,5 +265,13 @@ class Simulation(SimulatedScenario):
     robots: Annotated[list[Robot], Field(min_length=1, max_length=32), AfterValidator(different)]
     generated: Generated | None = None
 
+    @model_validator(mode="after")
+    def _drawable(self) -> Self:
+        top_m, camera_m = self.world.wall_height_m, self.camera.mount_z_m
+        if self.render.renderer == "raycast" and camera_m >= top_m:
+            what = f"raycast draws from below the walls' upper edge ({top_m:g} m) only"
+            raise ValueError(f"render.renderer: {what}; camera.mount_z_m is {camera_m:g}")
+        return self
+
 
 AnyScenario = Simulation | Recording

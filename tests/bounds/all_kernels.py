@@ -19,11 +19,16 @@ from numba.core.registry import CPUDispatcher
 
 import experiments
 import mapfusion
+import sim
 from experiments.judge.result import run_scenario
 from experiments.run.code_version import SOURCE_ROOT
 from experiments.scenario.settings import Simulation
 from experiments.scenario.yaml_input import read_mapping
 from mapfusion.align.registry import ALIGNERS
+from mapfusion.camera import StereoCamera
+from sim.floorplan import FloorPlan, Wall
+from sim.raycast.caster import RayCaster
+from sim.world import write_faces
 from tests.experiments.study.refusal.test_refusal import (
     test_calibration_counts_every_motion_of_two_pairs,
 )
@@ -44,7 +49,7 @@ def _beyond(values: np.ndarray) -> float:
 def kernels() -> dict[str, CPUDispatcher]:
     """All kernels of ours by name."""
     found = {}
-    for package in (mapfusion, experiments):
+    for package in (mapfusion, experiments, sim):
         for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
             path = SOURCE_ROOT.joinpath(*module.name.split(".")).with_suffix(".py")
             if not path.is_file() or "njit" not in path.read_text(encoding="utf-8"):
@@ -64,6 +69,17 @@ def run_all_aligners(folder: Path) -> None:
     run_scenario(Simulation.model_validate(asked), folder, 1, lambda *_: None)
 
 
+def draw_robots(folder: Path) -> None:
+    """A wall that ends in the picture, a robot before it, and one that reaches the lens."""
+    wall = Wall(np.array([[2, -1], [2, 0.5], [3, 0.5]]))
+    write_faces(folder, FloorPlan((wall,)), np.random.default_rng(0))
+    others = np.array([[1.4, 0.0, 0.5], [0.4, 0.3, 1.0]])
+    camera = StereoCamera(160, 120, 144.0)
+    RayCaster(folder, camera).depth_m(np.zeros(3), 0.0, others)
+    for sampling in ("footprint", "middle"):
+        RayCaster(folder, camera, sampling).grey(np.zeros(3), 0.0, others)
+
+
 def main() -> int:
     """Exit code 1 where a kernel was not reached."""
     assert numba.config.BOUNDSCHECK
@@ -79,6 +95,7 @@ def main() -> int:
     test_calibration_counts_every_motion_of_two_pairs()
     with tempfile.TemporaryDirectory() as folder:
         run_all_aligners(Path(folder))
+        draw_robots(Path(folder, "faces"))
     found = kernels()
     cached = [name for name, kernel in found.items() if kernel.stats.cache_hits]
     assert not cached, f"not compiled with checks: {cached}"

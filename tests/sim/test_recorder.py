@@ -11,6 +11,7 @@ from mapfusion.camera import StereoCamera
 from mapfusion.errors import InputError
 from sim.p3at import LENGTH_M
 from sim.recorder import FrameSource, truth_points
+from sim.renderer import Renderer
 from sim.stereo_head import RadiometricNoise, StereoFrame
 
 CAMERA = StereoCamera(320, 240, 288.0)
@@ -19,9 +20,14 @@ NOISE = RadiometricNoise()
 POSES = np.array([[1.0, 0.8, np.pi / 2], [1.0, 2.8, 0.0]])
 
 
+@pytest.fixture(scope="module", params=["tiny", "raycast"])
+def renderer(request: pytest.FixtureRequest) -> Renderer:
+    return request.param
+
+
 @pytest.fixture(scope="module")
-def source(faces: Path) -> Iterator[FrameSource]:
-    with FrameSource(faces, CAMERA, "ab") as opened:
+def source(faces: Path, renderer: Renderer) -> Iterator[FrameSource]:
+    with FrameSource(faces, CAMERA, "ab", renderer) as opened:
         yield opened
 
 
@@ -36,7 +42,9 @@ def digest(frames: list[StereoFrame]) -> str:
     return hashlib.sha256(b"".join(picture.tobytes() for picture in pictures)).hexdigest()
 
 
-def test_any_order_and_any_process_give_the_same_bits(source: FrameSource, faces: Path) -> None:
+def test_any_order_and_any_process_give_the_same_bits(
+    source: FrameSource, faces: Path, renderer: Renderer
+) -> None:
     forth = [render(source, k) for k in range(4)]
     source.render(POSES[::-1], "b", NOISE, np.random.default_rng(1))  # something else in between
     back = [render(source, k) for k in reversed(range(4))][::-1]
@@ -46,11 +54,14 @@ def test_any_order_and_any_process_give_the_same_bits(source: FrameSource, faces
         f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
         "from pathlib import Path\n"
         "import test_recorder as t\n"
-        "s = t.FrameSource(Path(sys.argv[1]), t.CAMERA, 'ab')\n"
+        "s = t.FrameSource(Path(sys.argv[1]), t.CAMERA, 'ab', sys.argv[2])\n"
         "print(t.digest([t.render(s, k) for k in (2, 0, 3, 1)][1::2]))\n"
     )
     result = subprocess.run(
-        [sys.executable, "-c", program, str(faces)], capture_output=True, check=True, text=True
+        [sys.executable, "-c", program, str(faces), renderer],
+        capture_output=True,
+        check=True,
+        text=True,
     )
     assert result.stdout.strip() == digest([forth[0], forth[1]])
 
@@ -68,11 +79,11 @@ def test_robots_see_each_other_where_they_are(source: FrameSource) -> None:
     assert width_px == pytest.approx(CAMERA.focal_px * LENGTH_M / (1.85 - 0.497 / 2), abs=4)
 
 
-def test_a_robot_does_not_see_itself(faces: Path) -> None:
+def test_a_robot_does_not_see_itself(faces: Path, renderer: Renderer) -> None:
     """From the rear of the deck it would see the deck; b, behind it, is out of sight too."""
     camera = StereoCamera(320, 240, 288.0, mount_x_m=-0.3)
     poses = np.array([[2.2, 2.8, 0.3], [1.0, 2.8, 0.0]])
-    with FrameSource(faces, camera, "ab") as source:
+    with FrameSource(faces, camera, "ab", renderer) as source:
         depth = source.render(poses, "a", NOISE, np.random.default_rng(0)).depth_m
     lowest_ray = (camera.height_px - 1 - camera.center_px[1]) / camera.focal_px
     assert depth.min() == pytest.approx(camera.mount_z_m / lowest_ray, abs=1e-3)  # the floor

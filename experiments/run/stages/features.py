@@ -107,7 +107,7 @@ def run(settings: FeatureSettings, job: Job) -> dict[str, float]:
         rng = generator(settings.seed, "radiometry", robot, iteration)
         poses = trajectory.T_world_robot[:, iteration]
         started = time.perf_counter()
-        frame = source.render(poses, robot, settings.radiometry, rng)
+        frame = source.render(poses, robot, settings.radiometry, rng, colour=False)
         rendering_s += time.perf_counter() - started
         found = front_end.extract(frame.left, frame.right)
         own_pose = poses[trajectory.index(robot)]

@@ -7,6 +7,8 @@ import pytest
 
 from experiments.judge.judged_run import JudgedRun
 from experiments.judge.result import provenance
+from experiments.run.code_version import SOURCE_ROOT
+from experiments.run.kernel_cache import KERNELS
 from experiments.run.store import Store
 from experiments.scenario.loading import load_scenario
 from sim import renderer
@@ -51,4 +53,31 @@ def test_an_unknown_renderer_lists_the_known(
     tiny_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     reply = command(capsys, "run", tiny_path, "--set", "render.renderer=vulkan")
-    assert_refused(reply, "render.renderer", "'tiny' or 'egl'", "'vulkan'")
+    assert_refused(reply, "render.renderer", "'tiny', 'egl' or 'raycast'", "'vulkan'")
+
+
+def test_the_ray_caster_is_in_the_record_and_in_the_key(tiny_path: Path, tmp_path: Path) -> None:
+    runs = [
+        JudgedRun.of(load_scenario(tiny_path, [f"render.renderer={name}"]), Store(tmp_path))
+        for name in ("tiny", "raycast")
+    ]
+    assert [provenance(run)["renderer"] for run in runs] == ["TinyRenderer", "our ray caster"]
+    tiny, cast = (run.pipeline.simulated[0] for run in runs)
+    assert tiny.features.key != cast.features.key
+    assert "sim/raycast/wall_columns.py" in cast.features.sources
+
+
+def test_the_ray_caster_s_camera_stays_below_the_walls_upper_edge(
+    tiny_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["--set", "world.wall_height_m=0.6", "--set", "camera.mount_z_m=0.8"]
+    reply = command(capsys, "run", tiny_path, "--set", "render.renderer=raycast", *arguments)
+    assert_refused(reply, "render.renderer", "upper edge (0.6 m)", "camera.mount_z_m is 0.8")
+    load_scenario(tiny_path, arguments[1::2])  # tiny looks over them
+
+
+def test_kernels_of_the_ray_caster_are_told_apart_by_their_source() -> None:
+    assert "sim/raycast" in KERNELS
+    for path in SOURCE_ROOT.glob("sim/**/*.py"):
+        compiled = "from numba" in path.read_text(encoding="utf-8")
+        assert not compiled or path.is_relative_to(SOURCE_ROOT / "sim/raycast")

@@ -1,0 +1,165 @@
+"""Whole pictures: each pixel the mean of its footprint, or the texel that its middle hits."""
+
+import numpy as np
+from numba import njit
+
+from mapfusion.se2 import Float
+from sim.raycast.levels import (
+    BACKGROUND,
+    fill,
+    footprints,
+    row_depth_m,
+    shares,
+    texel,
+)
+from sim.raycast.plan import NONE, Pinhole, nearest, project, strips
+from sim.raycast.robots import by_distance, cast, draw
+from sim.raycast.scene import Level, Walls
+from sim.raycast.solids import Solids
+from sim.raycast.wall_columns import add_strip, cuts
+
+
+def filtered(
+    camera: Pinhole, walls: Walls, floor: Level, ceiling: Level, solids: Solids, poses: Float,
+    grey: Float,
+) -> np.ndarray:  # fmt: skip
+    """Grey levels (H, W) uint8, each the mean over the pixel's footprint.
+
+    Args:
+        camera: level.
+        walls: as they stand.
+        floor: below.
+        ceiling: above.
+        solids: of one robot.
+        poses: (R, 3) of the robots in the world.
+        grey: (S,) the solids' grey levels.
+    """
+    seen = project(camera, walls)
+    face, until, count = strips(camera, seen)
+    picture = _still_means(camera, walls, floor, ceiling, seen, face, until, count)
+    if len(poses):
+        in_order = by_distance(camera, poses)
+        draw(camera, seen, face, until, count, solids, in_order, grey, picture)
+    return _rounded(picture)
+
+
+@njit(cache=True)
+def _still_means(
+    camera: Pinhole, walls: Walls, floor: Level, ceiling: Level, seen: Float, face: np.ndarray,
+    until: Float, count: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """Means (H, W) float32 over footprints on what stands still; the strips are of `plan`."""
+    below, above = footprints(camera, floor), footprints(camera, ceiling)
+    picture = np.empty((camera.height_px, camera.width_px), dtype=np.float32)
+    total, covered = np.empty(camera.height_px), np.empty(camera.height_px)
+    column = np.empty(walls.size[:, 1].max() + 2)
+    for j in range(camera.width_px):
+        total[:], covered[:] = 0.0, 0.0
+        low = j - 0.5
+        for s in range(count[j]):
+            i, high = face[j, s], until[j, s]
+            if i != NONE:
+                n = cuts(camera, walls, seen[i], low, high)
+                for k in range(n):
+                    a, b = low + k * (high - low) / n, low + (k + 1) * (high - low) / n
+                    add_strip(camera, walls, seen, i, a, b, total, covered, column)
+            low = high
+        fill(camera, ceiling, above, j, total, covered)
+        fill(camera, floor, below, j, total, covered)
+        for v in range(camera.height_px):
+            picture[v, j] = total[v] + (1 - covered[v]) * BACKGROUND
+    return picture
+
+
+@njit(cache=True)
+def _rounded(picture: np.ndarray) -> np.ndarray:
+    whole = np.empty(picture.shape, dtype=np.uint8)
+    for v in range(picture.shape[0]):
+        for j in range(picture.shape[1]):
+            whole[v, j] = np.uint8(min(max(picture[v, j], 0.0), 255.0) + 0.5)
+    return whole
+
+
+def depths(
+    camera: Pinhole, walls: Walls, floor: Level, ceiling: Level, solids: Solids, poses: Float
+) -> np.ndarray:
+    """Depth (H, W) float32 along the optical axis behind the pixels' middles; NaN for nothing."""
+    depth_m = _still_depths(camera, walls, floor, ceiling)
+    nothing = np.zeros((0, 0), dtype=np.float32)
+    if len(poses):
+        cast(camera, solids, poses, np.zeros(0), depth_m, nothing)
+    return depth_m
+
+
+@njit(cache=True)
+def _still_depths(camera: Pinhole, walls: Walls, floor: Level, ceiling: Level) -> np.ndarray:
+    """Depth (H, W) of what stands still."""
+    seen = project(camera, walls)
+    face = nearest(seen, np.arange(camera.width_px).astype(np.float64))
+    wall_m = np.full(camera.width_px, np.inf, dtype=np.float32)
+    for j in range(camera.width_px):
+        if face[j] != NONE:
+            wall_m[j] = 1 / (seen[face[j], 2] + seen[face[j], 3] * j)
+    depth_m = np.empty((camera.height_px, camera.width_px), dtype=np.float32)
+    for v in range(camera.height_px):
+        level = ceiling if v < camera.center_v else floor
+        level_m = np.float32(row_depth_m(camera, level.height_m, float(v)))
+        for j in range(camera.width_px):
+            depth_m[v, j] = min(wall_m[j], level_m)
+    for j in range(camera.width_px):  # only a column without walls shows where floors end
+        if face[j] == NONE:
+            for v in range(camera.height_px):
+                level = ceiling if v < camera.center_v else floor
+                a, b, c, d = shares(camera, level, float(j))
+                z = row_depth_m(camera, level.height_m, float(v))
+                if not (0 <= a + b * z < 1 and 0 <= c + d * z < 1):
+                    depth_m[v, j] = np.nan
+    return depth_m
+
+
+def sampled(
+    camera: Pinhole, walls: Walls, floor: Level, ceiling: Level, solids: Solids, poses: Float,
+    grey: Float,
+) -> np.ndarray:  # fmt: skip
+    """Grey levels (H, W) uint8 of what the pixels' middles hit; arguments as of `filtered`."""
+    picture = _still_texels(camera, walls, floor, ceiling)
+    if len(poses):
+        cast(camera, solids, poses, grey, _still_depths(camera, walls, floor, ceiling), picture)
+    return _rounded(picture)
+
+
+@njit(cache=True)
+def _still_texels(camera: Pinhole, walls: Walls, floor: Level, ceiling: Level) -> np.ndarray:
+    """Texels (H, W) float32 of what stands still."""
+    seen = project(camera, walls)
+    face = nearest(seen, np.arange(camera.width_px).astype(np.float64))
+    picture = np.empty((camera.height_px, camera.width_px), dtype=np.float32)
+    for j in range(camera.width_px):
+        i, wall_m, right = face[j], np.inf, 0
+        up, down = shares(camera, ceiling, float(j)), shares(camera, floor, float(j))
+        if i != NONE:
+            wall_m = 1 / (seen[i, 2] + seen[i, 3] * j)
+            along = (seen[i, 4] + seen[i, 5] * j) * wall_m - seen[i, 6]
+            right = int(along / walls.width_m[i] * walls.size[i, 0])
+            right = min(max(right, 0), walls.size[i, 0] - 1)
+        for v in range(camera.height_px):
+            level, way = (ceiling, up) if v < camera.center_v else (floor, down)
+            z = row_depth_m(camera, level.height_m, float(v))
+            if wall_m < z:
+                height_m = camera.eye_z_m - (v - camera.center_v) * wall_m / camera.focal_px
+                row = min(int(height_m / walls.height_m * walls.size[i, 1]), walls.size[i, 1] - 1)
+                picture[v, j] = _wall_texel(walls, i, right, row)
+            elif np.isfinite(z):
+                picture[v, j] = texel(level, way[0] + way[1] * z, way[2] + way[3] * z)
+            else:
+                picture[v, j] = BACKGROUND
+    return picture
+
+
+@njit(cache=True)
+def _wall_texel(walls: Walls, i: int, right: int, up: int) -> float:
+    n = walls.size[i, 1] + 1
+    here = walls.first[i] + right * n + up
+    there = here + n
+    sums = walls.sums
+    return float(np.int32(sums[there + 1] - sums[there] - sums[here + 1] + sums[here]))
