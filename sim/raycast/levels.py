@@ -9,14 +9,14 @@ large as it is wide (Heckbert 1989, section 3; McCormack et al. 1999, Feline).
 import numpy as np
 from numba import njit
 
-from mapfusion.se2 import Float
 from sim.raycast.plan import Pinhole
 from sim.raycast.scene import Level
 
 BACKGROUND = 255.0  # grey level of what is nowhere, as PyBullet has it
 MOST_SAMPLES = 64  # along a footprint
 STEP_TEXELS = 2.0  # between samples; floors are painted with a low pass of one texel
-COVERED = 1 - 1e-9
+UNIT, LOW, PER_UNIT = 2.0**32, 2**32 - 1, np.float32(2.0**-32)
+COVERED = 1 - 1e-6  # shares are kept in single precision
 
 
 @njit(cache=True)
@@ -65,54 +65,97 @@ def shares(camera: Pinhole, level: Level, u: float) -> tuple[float, float, float
 
 @njit(cache=True)
 def fill(
-    camera: Pinhole, level: Level, plan: np.ndarray, j: int, total: Float, covered: Float
+    camera: Pinhole, level: Level, plan: np.ndarray, picture: np.ndarray, covered: np.ndarray
 ) -> None:
-    """Add to column j's pixels what a level plane shows in the shares that are not covered yet.
+    """Add what a level plane shows in the shares of pixels that are not covered yet.
+
+    Row by row: there the depth is one, and footprints lie side by side on a line.
 
     Args:
         camera: level.
         level: floor or ceiling.
         plan: from `footprints`.
-        j: the column.
-        total: (H,) grey levels times covered share, added to.
-        covered: (H,) covered share of each pixel.
+        picture: (H, W) grey levels times covered share, added to.
+        covered: (H, W) covered share of each pixel; 1 where the plane fills the rest.
     """
-    rise = (camera.eye_z_m - level.height_m) * camera.focal_px
-    right_0, right_z, up_0, up_z = shares(camera, level, float(j))
-    _, right_aside, _, up_aside = shares(camera, level, j + 0.25)
-    right_aside, up_aside = right_aside - right_z, up_aside - up_z
-    texels = level.texels
+    grey = np.empty(camera.width_px, dtype=np.float32)
     for v in range(camera.height_px):
-        n, across, k = plan[v, 0], plan[v, 1], plan[v, 2]
-        if n == 0 or covered[v] > COVERED:
+        if plan[v, 0] == 0:
             continue
-        height, width, first = level.shape[k, 0], level.shape[k, 1], level.first[k]
-        grey, sign = 0.0, 0.0 if across == 1 else -1.0
-        for _ in range(across):
-            r, u = right_z + sign * right_aside, up_z + sign * up_aside
-            x_0, x_z = right_0 * width - 0.5, r * width
-            y_0, y_z = up_0 * height - 0.5, u * height
-            for s in range(n):
-                z = rise / (v - 0.5 + (s + 0.5) / n - camera.center_v)
-                x, y = x_0 + x_z * z, y_0 + y_z * z
-                if 0 <= x < width - 1 and 0 <= y < height - 1:
-                    column, row = int(x), int(y)
-                    a, b = x - column, y - row
-                    here = first + row * width + column
-                    low = texels[here] + a * (texels[here + 1] - texels[here])
-                    here += width
-                    high = texels[here] + a * (texels[here + 1] - texels[here])
-                    grey += low + b * (high - low)
-                else:
-                    grey += _at_the_edge(level, k, x, y)
-            sign = 1.0
-        total[v] += (1 - covered[v]) * grey / (n * across)
-        covered[v] = 1.0
+        begin = 0
+        while begin < camera.width_px:
+            end = begin
+            while end < camera.width_px and covered[v, end] <= COVERED:
+                end += 1
+            if begin < end:
+                _means(camera, level, plan[v], v, begin, end, grey)
+                for j in range(begin, end):
+                    picture[v, j] += (1 - covered[v, j]) * grey[j]
+                    covered[v, j] = 1.0
+            begin = end + 1
+
+
+@njit(cache=True)
+def _means(
+    camera: Pinhole, level: Level, plan: np.ndarray, v: int, begin: int, end: int, grey: np.ndarray
+) -> None:
+    """Write into `grey` (W,) float32 the means of a row's pixels from `begin` until `end`."""
+    n, across, k = plan
+    height, width = level.shape[k]
+    rise = (camera.eye_z_m - level.height_m) * camera.focal_px
+    for j in range(begin, end):
+        grey[j] = 0.0
+    for side in range(across):
+        aside = 0.0 if across == 1 else side / 2 - 0.25
+        right_0, right_z, up_0, up_z = shares(camera, level, begin + aside)
+        _, right_last, _, up_last = shares(camera, level, end - 1 + aside)
+        for s in range(n):
+            z = rise / (v - 0.5 + (s + 0.5) / n - camera.center_v)
+            x, y = (right_0 + right_z * z) * width - 0.5, (up_0 + up_z * z) * height - 0.5
+            x_last = (right_0 + right_last * z) * width - 0.5
+            y_last = (up_0 + up_last * z) * height - 0.5
+            _add_samples(level, k, x, y, x_last, y_last, grey[begin:end])
+    for j in range(begin, end):
+        grey[j] /= n * across
+
+
+@njit(cache=True)
+def _add_samples(
+    level: Level, k: int, x: float, y: float, x_last: float, y_last: float, grey: np.ndarray
+) -> None:
+    """Add samples of copy k, N of them on a line, to (N,) float32.
+
+    Places are in texels from the middle of the first one.
+    """
+    height, width = level.shape[k]
+    steps = max(len(grey) - 1, 1)
+    x_step, y_step = (x_last - x) / steps, (y_last - y) / steps
+    # with both ends all of a line is between the middles of the outermost texels
+    low, high = min(x, x_last), max(x, x_last)
+    inside = low >= 0 and high < width - 1
+    low, high = min(y, y_last), max(y, y_last)
+    if not (inside and low >= 0 and high < height - 1):
+        for i in range(len(grey)):
+            grey[i] += _at_the_edge(level, k, x + i * x_step, y + i * y_step)
+        return
+    # whole numbers of 2^-32 texels, and places without a sign: half the time of floating point
+    texels, wide, one = level.texels[level.first[k] :], np.uint64(width), np.uint64(1)
+    at_x, at_y = np.int64(x * UNIT), np.int64(y * UNIT)
+    x_step, y_step = np.int64(x_step * UNIT), np.int64(y_step * UNIT)
+    for i in range(len(grey)):
+        here = np.uint64(at_y >> 32) * wide + np.uint64(at_x >> 32)
+        a, b = np.float32(at_x & LOW) * PER_UNIT, np.float32(at_y & LOW) * PER_UNIT
+        low_0, low_1 = texels[here], texels[here + one]
+        high_0, high_1 = texels[here + wide], texels[here + wide + one]
+        low, high = low_0 + a * (low_1 - low_0), high_0 + a * (high_1 - high_0)
+        grey[i] += low + b * (high - low)
+        at_x += x_step
+        at_y += y_step
 
 
 @njit(cache=True)
 def _at_the_edge(level: Level, k: int, x: float, y: float) -> float:
-    """A sample within half a texel of the picture's edge, or beside it, where there is nothing."""
+    """A sample anywhere: within half a texel of the picture's edge, or beside it: nothing there."""
     height, width = level.shape[k]
     if not (-0.5 <= x < width - 0.5 and -0.5 <= y < height - 0.5):
         return BACKGROUND

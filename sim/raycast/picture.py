@@ -16,7 +16,9 @@ from sim.raycast.plan import NONE, Pinhole, nearest, project, strips
 from sim.raycast.robots import by_distance, cast, draw
 from sim.raycast.scene import Level, Walls
 from sim.raycast.solids import Solids
-from sim.raycast.wall_columns import add_strip, cuts
+from sim.raycast.wall_columns import add_column, most_texels_up
+
+COLUMNS = 16  # of single precision are a cache line
 
 
 def filtered(
@@ -51,23 +53,27 @@ def _still_means(
     """Means (H, W) float32 over footprints on what stands still; the strips are of `plan`."""
     below, above = footprints(camera, floor), footprints(camera, ceiling)
     picture = np.empty((camera.height_px, camera.width_px), dtype=np.float32)
-    total, covered = np.empty(camera.height_px), np.empty(camera.height_px)
-    column = np.empty(walls.size[:, 1].max() + 2)
-    for j in range(camera.width_px):
-        total[:], covered[:] = 0.0, 0.0
-        low = j - 0.5
-        for s in range(count[j]):
-            i, high = face[j, s], until[j, s]
-            if i != NONE:
-                n = cuts(camera, walls, seen[i], low, high)
-                for k in range(n):
-                    a, b = low + k * (high - low) / n, low + (k + 1) * (high - low) / n
-                    add_strip(camera, walls, seen, i, a, b, total, covered, column)
-            low = high
-        fill(camera, ceiling, above, j, total, covered)
-        fill(camera, floor, below, j, total, covered)
+    filled = np.empty((camera.height_px, camera.width_px), dtype=np.float32)
+    # some columns at a time, so that whole cache lines of the picture are written
+    total = np.empty((COLUMNS, camera.height_px))
+    covered = np.empty((COLUMNS, camera.height_px))
+    column = np.empty(most_texels_up(walls) + 2)
+    for first in range(0, camera.width_px, COLUMNS):
+        n = min(COLUMNS, camera.width_px - first)
+        for c in range(n):
+            total[c], covered[c] = 0.0, 0.0
+            j = first + c
+            add_column(
+                camera, walls, seen, j, face[j], until[j], count[j], total[c], covered[c], column
+            )
         for v in range(camera.height_px):
-            picture[v, j] = total[v] + (1 - covered[v]) * BACKGROUND
+            for c in range(n):
+                picture[v, first + c], filled[v, first + c] = total[c, v], covered[c, v]
+    fill(camera, ceiling, above, picture, filled)
+    fill(camera, floor, below, picture, filled)
+    for v in range(camera.height_px):
+        for j in range(camera.width_px):
+            picture[v, j] += (1 - filled[v, j]) * BACKGROUND
     return picture
 
 

@@ -33,7 +33,7 @@ def by_distance(camera: Pinhole, poses: Float) -> Float:
 
 @njit(cache=True)
 def pixel_ray(camera: Pinhole, axes: Float, v: int, u: int, ray: Float) -> None:
-    """Fill in the ray (3,) through a pixel's middle, one metre of depth long; axes of `in_robot`."""
+    """Fill in the ray (3,) through a pixel's middle, one metre of depth long."""
     left, up = (camera.center_u - u) / camera.focal_px, (camera.center_v - v) / camera.focal_px
     for k in range(3):
         ray[k] = axes[0, k] + left * axes[1, k] + up * axes[2, k]

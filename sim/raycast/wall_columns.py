@@ -9,28 +9,68 @@ import numpy as np
 from numba import njit
 
 from mapfusion.se2 import Float
-from sim.raycast.plan import Pinhole
+from sim.raycast.plan import NONE, Pinhole
 from sim.raycast.scene import Walls
 
 # A wall's level lines cross a column at a slope, which cuts a footprint's corners. A strip is cut
-# into so many that they cross none of them by more than this, up to a most.
-STEEPEST = 0.5
-MOST_CUTS = 8
+# into so many that lines cross each by no more than this: of cuts twice as fine the picture differs
+# by less than a grey level is rounded, of cuts twice as coarse visibly.
+STEEPEST_ROWS = 0.5
+MOST_CUTS = 8  # reached where a wall is grazed, and a pixel spans so many texels that all are grey
 LEAST_TEXELS = 1e-6  # of a strip at a wall's end: sums still tell them apart
 
 
 @njit(cache=True)
-def cuts(camera: Pinhole, walls: Walls, face: Float, low: float, high: float) -> int:
+def add_column(
+    camera: Pinhole, walls: Walls, seen: Float, j: int, face: np.ndarray, until: Float, count: int,
+    total: Float, covered: Float, sums: Float,
+) -> None:  # fmt: skip
+    """Add what walls show in column j.
+
+    Args:
+        camera: level.
+        walls: all faces.
+        seen: as `sim.raycast.plan.project` gives them.
+        j: the column.
+        face: (MOST_STRIPS,) of its strips, as `sim.raycast.plan.strips` gives them.
+        until: (MOST_STRIPS,) where they end.
+        count: of them.
+        total: (H,) grey levels times covered share, added to.
+        covered: (H,) covered share of each pixel, added to.
+        sums: room for a column of sums.
+    """
+    low = j - 0.5
+    for s in range(count):
+        i, high = face[s], until[s]
+        if i != NONE:
+            n = _cuts(camera, walls, seen[i], low, high)
+            for k in range(n):
+                a, b = low + k * (high - low) / n, low + (k + 1) * (high - low) / n
+                _add_strip(camera, walls, seen, i, a, b, total, covered, sums)
+        low = high
+
+
+@njit(cache=True)
+def _cuts(camera: Pinhole, walls: Walls, face: Float, low: float, high: float) -> int:
     """Into how many strips the one from `low` to `high` in u is cut."""
     w = face[2] + face[3] * (low + high) / 2
     highest = max(camera.eye_z_m, walls.height_m - camera.eye_z_m) * camera.focal_px * w
     from_middle = min(highest, max(camera.center_v, camera.height_px - 1 - camera.center_v))
     crossed = from_middle * abs(face[3]) / w * (high - low)
-    return min(int(crossed / STEEPEST) + 1, MOST_CUTS)
+    return min(int(crossed / STEEPEST_ROWS) + 1, MOST_CUTS)
 
 
 @njit(cache=True)
-def add_strip(
+def most_texels_up(walls: Walls) -> int:
+    """Of all faces."""
+    most = 0
+    for i in range(len(walls.size)):
+        most = max(most, walls.size[i, 1])
+    return most
+
+
+@njit(cache=True)
+def _add_strip(
     camera: Pinhole,
     walls: Walls,
     seen: Float,
@@ -41,19 +81,7 @@ def add_strip(
     covered: Float,
     column: Float,
 ) -> None:
-    """Add what face i shows between `low` and `high` in u to a column's pixels.
-
-    Args:
-        camera: level.
-        walls: all faces.
-        seen: as `sim.raycast.plan.project` gives them.
-        i: the face.
-        low: where the strip begins in u.
-        high: where it ends.
-        total: (H,) grey levels times covered share, added to.
-        covered: (H,) covered share of each pixel, added to.
-        column: room for a column of sums.
-    """
+    """Add what face i shows between `low` and `high` in u to a column's pixels."""
     w = seen[i, 2] + seen[i, 3] * (low + high) / 2
     texels_along, texels_up = walls.size[i]
     begin = (seen[i, 4] + seen[i, 5] * low) / (seen[i, 2] + seen[i, 3] * low) - seen[i, 6]
