@@ -13,10 +13,11 @@ from sim.raycast.levels import (
     texel,
 )
 from sim.raycast.plan import NONE, Pinhole, nearest, project, strips
-from sim.raycast.robots import by_distance, cast, draw
+from sim.raycast.robots import cast, draw
 from sim.raycast.scene import Level, Walls
 from sim.raycast.solids import Solids
 from sim.raycast.wall_columns import add_column, most_texels_up
+from sim.raycast.windows import by_distance
 
 COLUMNS = 16  # of single precision are a cache line
 

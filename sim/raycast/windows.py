@@ -1,0 +1,88 @@
+"""Where the other robots are in a picture: their places before the camera, and their windows."""
+
+import numpy as np
+from numba import njit
+
+from mapfusion.se2 import Float
+from sim.raycast.plan import Pinhole
+from sim.raycast.solids import Solids
+
+
+@njit(cache=True)
+def in_robot(camera: Pinhole, pose: Float) -> tuple[Float, Float]:
+    """The eye (3,) in a robot's frame, and the camera's axes (3, 3) there: ahead, left, up."""
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    x, y = camera.eye_x_m - pose[0], camera.eye_y_m - pose[1]
+    eye, axes = np.empty(3), np.zeros((3, 3))
+    eye[0], eye[1], eye[2] = cos * x + sin * y, cos * y - sin * x, camera.eye_z_m
+    cos, sin = np.cos(camera.theta - pose[2]), np.sin(camera.theta - pose[2])
+    axes[0, 0], axes[0, 1], axes[1, 0], axes[1, 1], axes[2, 2] = cos, sin, -sin, cos, 1.0
+    return eye, axes
+
+
+def by_distance(camera: Pinhole, poses: Float) -> Float:
+    """The poses (R, 3) from the nearest to the farthest."""
+    apart = poses[:, :2] - [camera.eye_x_m, camera.eye_y_m]
+    return poses[np.argsort(np.sum(apart**2, axis=1), kind="stable")]
+
+
+@njit(cache=True)
+def pixel_ray(camera: Pinhole, axes: Float, v: int, u: int, ray: Float) -> None:
+    """Fill in the ray (3,) through a pixel's middle, one metre of depth long."""
+    left, up = (camera.center_u - u) / camera.focal_px, (camera.center_v - v) / camera.focal_px
+    for k in range(3):
+        ray[k] = axes[0, k] + left * axes[1, k] + up * axes[2, k]
+
+
+@njit(cache=True)
+def project_corners(camera: Pinhole, solids: Solids, i: int, pose: Float) -> Float:
+    """A solid's corners (K, 3) in the picture: u, v and depth along the axis in metres."""
+    eye, axes = in_robot(camera, pose)
+    seen = np.empty((solids.n_corners[i], 3))
+    for k in range(len(seen)):
+        x, y = solids.corners_m[i, k, 0] - eye[0], solids.corners_m[i, k, 1] - eye[1]
+        z, up = axes[0, 0] * x + axes[0, 1] * y, solids.corners_m[i, k, 2] - eye[2]
+        left = axes[1, 0] * x + axes[1, 1] * y
+        seen[k, 0] = camera.center_u - camera.focal_px * left / z if z > 0 else np.nan
+        seen[k, 1] = camera.center_v - camera.focal_px * up / z if z > 0 else np.nan
+        seen[k, 2] = z
+    return seen
+
+
+@njit(cache=True)
+def window(camera: Pinhole, corners: Float) -> tuple[int, int, int, int]:
+    """First and last row and column that a solid may show in; the whole picture if it is near."""
+    first, last = extremes(corners)
+    if last[2] <= camera.near_m:
+        return 0, -1, 0, -1
+    if first[2] <= camera.near_m:
+        return 0, camera.height_px - 1, 0, camera.width_px - 1
+    left, top = max(np.floor(first[0] + 0.5), 0.0), max(np.floor(first[1] + 0.5), 0.0)
+    right = min(np.floor(last[0] + 0.5), camera.width_px - 1.0)
+    bottom = min(np.floor(last[1] + 0.5), camera.height_px - 1.0)
+    return int(top), int(bottom), int(left), int(right)
+
+
+@njit(cache=True)
+def all_windows(camera: Pinhole, solids: Solids, poses: Float) -> tuple[int, int, int, int]:
+    """First and last row and column that any robot may show in."""
+    above, below, first, last = camera.height_px, -1, camera.width_px, -1
+    for r in range(len(poses)):
+        for i in range(len(solids.n_corners)):
+            corners = project_corners(camera, solids, i, poses[r])
+            top, bottom, left, right = window(camera, corners)
+            if top <= bottom and left <= right:
+                above, below = min(above, top), max(below, bottom)
+                first, last = min(first, left), max(last, right)
+    return above, below, first, last
+
+
+@njit(cache=True)
+def extremes(corners: Float) -> tuple[Float, Float]:
+    """The least (3,) and the largest (3,) of corners (K, 3) in each coordinate."""
+    first, last = corners[0].copy(), corners[0].copy()
+    for k in range(1, len(corners)):
+        for axis in range(3):
+            first[axis] = min(first[axis], corners[k, axis])
+            last[axis] = max(last[axis], corners[k, axis])
+    return first, last
