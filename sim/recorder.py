@@ -11,9 +11,10 @@ from mapfusion.camera import StereoCamera
 from mapfusion.errors import InputError
 from mapfusion.se2 import Float, transform_points
 from sim.p3at import P3at
+from sim.radiometry import RadiometricNoise
 from sim.raycast.caster import RayCaster
 from sim.renderer import BulletRenderer, Renderer
-from sim.stereo_head import RadiometricNoise, StereoFrame, render_stereo
+from sim.stereo_head import StereoFrame, render_stereo
 from sim.visibility import Visibility
 from sim.world import OUT_OF_SIGHT_M, World
 

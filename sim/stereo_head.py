@@ -1,50 +1,21 @@
 """The stereo head: what a rectified pair of pinhole cameras on a robot sees of a world."""
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mapfusion.arguments import Range, require_in_range
 from mapfusion.camera import StereoCamera
 from mapfusion.se2 import Float, compose
+from sim.exposure import expose
+from sim.radiometry import RadiometricNoise
 from sim.world import World
 
 NEAR_M = 0.1  # nearer than any wall can come to the lens
 FAR_M = 100.0  # beyond the largest building's diagonal
 LAMP_M = (0.0, 0.0, 1000.0)  # so far above that its light is parallel
 BACKGROUND_M = 0.99 * FAR_M  # an untouched depth buffer is not exactly 1
-
-
-@dataclass(frozen=True)
-class RadiometricNoise:
-    """Sensor noise, independent in the two images of a pair.
-
-    Attributes:
-        sigma_gray: standard deviation of each pixel's additive noise, in gray levels of 255.
-        gain: mean gain; below 1 the pictures are dark, and the noise is not.
-        sigma_gain: standard deviation of an image's gain, relative to the mean gain.
-        sigma_offset_gray: standard deviation of an image's offset, in gray levels.
-    """
-
-    sigma_gray: Annotated[float, Range(0, 255, "grey levels")] = 2.0
-    sigma_gain: Annotated[float, Range(0, 10, "1")] = 0.01
-    sigma_offset_gray: Annotated[float, Range(0, 255, "grey levels")] = 1.0
-    gain: Annotated[float, Range(0, 10, "1")] = 1.0
-
-    def __post_init__(self) -> None:
-        require_in_range(self)
-
-    def apply(self, gray: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """A noisy copy of a gray image (H, W) uint8."""
-        gain = self.gain * (1 + self.sigma_gain * rng.standard_normal())
-        offset = self.sigma_offset_gray * rng.standard_normal()
-        noise = rng.standard_normal(gray.shape, dtype=np.float32)
-        noise *= np.float32(self.sigma_gray)
-        noise += np.float32(gain) * gray + np.float32(offset)
-        return np.clip(np.rint(noise), 0, 255).astype(np.uint8)
 
 
 @dataclass(frozen=True)
@@ -77,7 +48,7 @@ def render_stereo(
     left, right = (cv2.cvtColor(rgba, cv2.COLOR_RGBA2GRAY) for rgba in (left_rgba, right_rgba))
     left_rgb = cv2.cvtColor(left_rgba, cv2.COLOR_RGBA2RGB)
     depth_m = _metric_depth(buffer)
-    return StereoFrame(noise.apply(left, rng), noise.apply(right, rng), depth_m, left_rgb)
+    return StereoFrame(expose(left, noise, rng), expose(right, noise, rng), depth_m, left_rgb)
 
 
 def _render(

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from experiments.run.code_version import source_hash
 
-KERNELS = ("mapfusion", "sim/raycast")  # where there are any
+KERNELS = ("mapfusion", "sim/raycast", "sim/exposure.py")  # where there are any
 _VERSIONS_KEPT = 4  # a few megabytes each; going back and forth between branches stays fast
 
 

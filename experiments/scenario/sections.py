@@ -9,8 +9,8 @@ from mapfusion.fastslam.parameters import FastSlamParameters
 from sim.driver import DriverSettings
 from sim.odometry import OdometryNoise
 from sim.p3at import TIRE_FRICTION
+from sim.radiometry import RadiometricNoise
 from sim.renderer import Renderer
-from sim.stereo_head import RadiometricNoise
 from sim.textures import Texture
 
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,40}$"  # names become parts of file names

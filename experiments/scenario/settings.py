@@ -33,7 +33,7 @@ from mapfusion.errors import OutOfRangeError
 from mapfusion.merge import MergeParameters
 from mapfusion.vision.frontend import FrontEndParameters
 from sim.odometry import OdometryNoise
-from sim.stereo_head import RadiometricNoise
+from sim.radiometry import RadiometricNoise
 
 # Of whatever metrics measure; beyond, the screens' numbers say nothing.
 MetricValue = Annotated[float, Range(-1e9, 1e9, "the metric's")]

@@ -10,12 +10,14 @@ from numpy.typing import ArrayLike
 from mapfusion.camera import StereoCamera
 from mapfusion.errors import InputError
 from mapfusion.se2 import Float, compose
+from sim.exposure import expose
 from sim.p3at import URDF
+from sim.radiometry import RadiometricNoise
 from sim.raycast.picture import depths, filtered, sampled
 from sim.raycast.plan import Pinhole
 from sim.raycast.scene import REFUSED, Scene, read_scene
 from sim.raycast.solids import read_solids
-from sim.stereo_head import NEAR_M, RadiometricNoise, StereoFrame
+from sim.stereo_head import NEAR_M, StereoFrame
 
 Sampling = Literal["footprint", "middle"]
 
@@ -59,7 +61,7 @@ class RayCaster:
         left, right = (self.grey(T_world_robot, y_m, others) for y_m in (half_m, -half_m))
         depth_m = self.depth_m(T_world_robot, half_m, others)
         rgb = self.rgb(T_world_robot, half_m, others) if colour else None
-        return StereoFrame(noise.apply(left, rng), noise.apply(right, rng), depth_m, rgb)
+        return StereoFrame(expose(left, noise, rng), expose(right, noise, rng), depth_m, rgb)
 
     def grey(self, T_world_robot: ArrayLike, y_m: float, others: ArrayLike) -> np.ndarray:
         """The grey picture (H, W) uint8 of a camera beside a robot's middle.

@@ -1,4 +1,4 @@
-"""What simulation costs: one stereo frame, one second of physics, one painted world."""
+"""What simulation costs beside pictures: sensor noise, physics, a painted world."""
 
 from pathlib import Path
 
@@ -8,10 +8,11 @@ from pytest_benchmark.fixture import BenchmarkFixture
 
 from mapfusion.camera import StereoCamera
 from sim.driver import DriverSettings, drive
+from sim.exposure import expose
 from sim.floorplan import FloorPlan, Wall
+from sim.radiometry import RadiometricNoise
 from sim.recorder import FrameSource
 from sim.route import Route
-from sim.stereo_head import RadiometricNoise
 from sim.world import write_faces
 
 
@@ -31,12 +32,9 @@ def faces(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("place", ["corridor", "room"])
-def test_stereo_frame_of_640x480(benchmark: BenchmarkFixture, faces: Path, place: str) -> None:
-    poses = np.array([[1.0, 7.5, 0.0], [2.6, 2.0, 0.7]])
-    with FrameSource(faces, StereoCamera(), dict.fromkeys("ab", RadiometricNoise())) as source:
-        robot = "a" if place == "corridor" else "b"
-        benchmark(lambda: source.render(poses, robot, np.random.default_rng(0)))
+def test_exposing_a_pair_of_640x480(benchmark: BenchmarkFixture) -> None:
+    pair, rng = np.full((2, 480, 640), 128, dtype=np.uint8), np.random.default_rng(0)
+    benchmark(lambda: [expose(gray, RadiometricNoise(), rng) for gray in pair])
 
 
 def test_sixty_seconds_of_three_robots(benchmark: BenchmarkFixture) -> None:
@@ -54,6 +52,6 @@ def test_painting_a_world(benchmark: BenchmarkFixture, tmp_path: Path) -> None:
 
 def test_loading_a_world(benchmark: BenchmarkFixture, faces: Path) -> None:
     def load() -> None:
-        FrameSource(faces, StereoCamera(), dict.fromkeys("abc", RadiometricNoise())).close()
+        FrameSource(faces, StereoCamera(), "abc").close()
 
     benchmark.pedantic(load, rounds=3)

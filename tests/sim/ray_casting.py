@@ -8,7 +8,7 @@ import numpy as np
 from mapfusion.camera import StereoCamera
 from mapfusion.se2 import transform_points
 from sim.floorplan import Face, FloorPlan
-from sim.stereo_head import RadiometricNoise
+from sim.radiometry import RadiometricNoise
 
 CAMERA = StereoCamera()
 NO_NOISE = RadiometricNoise(0, 0, 0)

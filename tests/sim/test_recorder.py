@@ -10,9 +10,10 @@ import pytest
 from mapfusion.camera import StereoCamera
 from mapfusion.errors import InputError
 from sim.p3at import LENGTH_M
+from sim.radiometry import RadiometricNoise
 from sim.recorder import FrameSource, truth_points
 from sim.renderer import Renderer
-from sim.stereo_head import RadiometricNoise, StereoFrame
+from sim.stereo_head import StereoFrame
 
 CAMERA = StereoCamera(320, 240, 288.0)
 NOISE = RadiometricNoise()

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from mapfusion.camera import StereoCamera
-from mapfusion.errors import InputError
 from sim.floorplan import FloorPlan
-from sim.stereo_head import RadiometricNoise, StereoFrame, render_stereo
+from sim.radiometry import RadiometricNoise
+from sim.stereo_head import StereoFrame, render_stereo
 from sim.world import World
 from tests.sim.ray_casting import CAMERA, NO_NOISE, POSE, off_surface_m, ray_cast
 
@@ -84,35 +84,9 @@ def test_noise_is_independent_in_both_images(faces: Path, frame: StereoFrame) ->
     np.testing.assert_array_equal(noisy.left_rgb, frame.left_rgb)
 
 
-def test_gain_and_offset_are_those_of_a_whole_image() -> None:
-    noise = RadiometricNoise(sigma_gray=0, sigma_gain=0.05, sigma_offset_gray=4)
-    ramp = np.tile(np.arange(60, 200, dtype=np.uint8), (4, 1))
-    fits = [
-        np.polyfit(ramp[0], noise.apply(ramp, np.random.default_rng(seed))[0], 1)
-        for seed in range(400)
-    ]
-    gain, offset = np.transpose(fits)
-    assert gain.mean() == pytest.approx(1, abs=0.01)
-    assert gain.std() == pytest.approx(0.05, rel=0.15)
-    assert offset.std() == pytest.approx(4, rel=0.15)
-
-
 def test_camera_of_another_size_and_mount_is_exact_too(room: FloorPlan, faces: Path) -> None:
     camera = StereoCamera(321, 200, 250.0, 0.2, mount_x_m=-0.1, mount_z_m=0.8)
     with World() as world:
         world.add_painted_faces(faces)
         frame = render_stereo(world, camera, POSE, NO_NOISE, np.random.default_rng(0))
     assert off_surface_m(room, camera, frame.depth_m).max() < 2e-4
-
-
-def test_a_dark_camera_scales_the_light_and_not_the_noise() -> None:
-    dark = RadiometricNoise(sigma_gray=3.0, sigma_gain=0, sigma_offset_gray=0, gain=0.25)
-    flat = np.full((200, 300), 160, dtype=np.uint8)
-    seen = dark.apply(flat, np.random.default_rng(2)).astype(float)
-    assert seen.mean() == pytest.approx(40, abs=0.05)
-    assert seen.std() == pytest.approx(np.sqrt(9 + 1 / 12), rel=0.02)
-
-
-def test_negative_noise_is_refused() -> None:
-    with pytest.raises(InputError, match="gain: is -1"):
-        RadiometricNoise(gain=-1)

@@ -8,7 +8,8 @@ import pytest
 
 from mapfusion.camera import StereoCamera
 from sim.floorplan import FloorPlan, Wall
-from sim.stereo_head import RadiometricNoise, render_stereo
+from sim.radiometry import RadiometricNoise
+from sim.stereo_head import render_stereo
 from sim.world import World, silence, write_faces
 
 EVERYTHING = """

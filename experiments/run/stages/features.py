@@ -33,9 +33,9 @@ from mapfusion.storage import (
 )
 from mapfusion.vision.features import Features
 from mapfusion.vision.frontend import FrontEnd, FrontEndParameters
+from sim.radiometry import RadiometricNoise
 from sim.recorder import FrameSource, truth_points
 from sim.renderer import Renderer
-from sim.stereo_head import RadiometricNoise
 from sim.trajectory import read_trajectory
 
 # Frames a task: about two seconds of work, so little is lost when a run is interrupted.

@@ -10,9 +10,10 @@ import pytest
 from mapfusion.camera import StereoCamera
 from mapfusion.errors import InputError
 from sim.floorplan import FloorPlan, Wall
+from sim.radiometry import RadiometricNoise
 from sim.raycast.caster import RayCaster
 from sim.recorder import FrameSource
-from sim.stereo_head import RadiometricNoise, StereoFrame
+from sim.stereo_head import StereoFrame
 from sim.world import write_faces
 
 CAMERA = StereoCamera(320, 240, 288.5)
