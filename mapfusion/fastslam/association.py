@@ -180,6 +180,24 @@ def _take_in_order(
 
 
 @njit(cache=True)
+def _sort_inside(distance: Float, gate: float, order: np.ndarray) -> int:
+    """Write the pairs inside the gate into `order`, nearest first, the first on a tie; how many.
+
+    Each is put where it belongs: a particle has about as many as there are observations.
+    """
+    n = 0
+    for i in range(len(distance)):
+        if distance[i] <= gate:
+            place = n
+            while place > 0 and distance[order[place - 1]] > distance[i]:
+                order[place] = order[place - 1]
+                place -= 1
+            order[place] = i
+            n += 1
+    return n
+
+
+@njit(cache=True)
 def _take_nearest(
     slots: Slots,
     pairs: Pairs,
@@ -199,9 +217,9 @@ def _take_nearest(
         for m in range(n_particles):
             if count[m] > 0:
                 distance[m, i] = _distance(point, noise, mean, sigma, m, planar)
+    nearest_first = np.empty(len(place), np.int64)
     for m in range(n_particles):
-        inside = np.flatnonzero(distance[m] <= gate)
-        for i in inside[np.argsort(distance[m][inside], kind="mergesort")]:
+        for i in nearest_first[: _sort_inside(distance[m], gate, nearest_first)]:
             k, j = pairs.observation[i], place[i]
             if chosen[k, m] < 0 and not taken[j, m]:
                 chosen[k, m] = pairs.slot[i]
