@@ -91,6 +91,16 @@ def degeneracy_order(graph: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @njit(cache=True)
+def largest_possible(graph: np.ndarray) -> int:
+    """A bound on the size of cliques: one more than the largest core number (Seidman 1983)."""
+    _, core = degeneracy_order(graph)
+    largest = -1
+    for v in range(len(core)):
+        largest = max(largest, core[v])
+    return largest + 1
+
+
+@njit(cache=True)
 def greedy_clique(graph: np.ndarray, starts: int) -> np.ndarray:
     """A large clique: from each of the vertices of most neighbours, add the next of most that fits.
 

@@ -167,6 +167,35 @@ def test_clique_is_the_largest_set_that_agrees():
         assert error(found.T_a_b, T) == pytest.approx((0, 0), abs=1e-6)
 
 
+@pytest.mark.parametrize("true_share", [0.9, 0.5, 0.25, 0.1])
+def test_what_the_clique_leaves_out_changes_nothing(true_share, monkeypatch):
+    """The same motion as when the whole graph is searched."""
+    pair = with_noise_in_both(3, 400, true_share, drift_m=0.05)
+    quick = estimate("clique", pair)
+    monkeypatch.setattr("mapfusion.align.clique._WORTH_A_LOOK", 1.0)
+    monkeypatch.setattr("mapfusion.align.clique.largest_possible", len)
+    whole = estimate("clique", pair)
+    np.testing.assert_array_equal(quick.inlier, whole.inlier)
+    assert error(quick.T_a_b, whole.T_a_b) == pytest.approx((0, 0), abs=1e-6)
+
+
+@pytest.mark.parametrize("n_true", [190, 120])
+def test_a_clique_that_the_sample_does_not_see_is_found(n_true):
+    """Every third pair is of a second motion, and so are all that the clique looks at first."""
+    n = 300
+    pair, other = with_noise_in_both(1, n, 1.0), with_noise_in_both(2, n, 1.0)
+    chance = with_noise_in_both(3, n, 0.0)
+    position = {}
+    for side in ("map_a", "map_b"):
+        p = getattr(chance, side).position_m.copy()
+        p[::3] = getattr(other, side).position_m[::3]
+        true = np.setdiff1d(np.arange(n), np.arange(0, n, 3))[:n_true]
+        p[true] = getattr(pair, side).position_m[true]
+        position[side] = replace(getattr(pair, side), position_m=p)
+    found = estimate(Clique(), replace(pair, **position))
+    assert error(found.T_a_b, pair.T_a_b)[0] < SUCCESS_M
+
+
 def slow_search(pairs, variance, bound, agreement, max_draws, seed):
     """The search as its docstring has it, with the twins of what it is made of."""
     n, state, draws, needed = len(pairs), seed, 0, max_draws

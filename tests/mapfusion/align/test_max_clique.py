@@ -3,7 +3,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mapfusion.align.max_clique import degeneracy_order, greedy_clique, larger_clique
+from mapfusion.align.max_clique import (
+    degeneracy_order,
+    greedy_clique,
+    larger_clique,
+    largest_possible,
+)
 
 UNLIMITED = 1_000_000
 
@@ -110,3 +115,14 @@ def test_a_spent_budget_is_told_and_what_was_found_is_a_clique(budget):
     clique, finished = larger_clique(on_bits(adjacent), 2, budget)
     assert not finished
     assert is_clique(adjacent, clique)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_no_clique_is_larger_than_possible(seed):
+    adjacent = random_graph(seed, 40, 0.1 * (seed + 1) / 2, planted=seed)
+    assert largest_possible(on_bits(adjacent)) >= bron_kerbosch(adjacent)
+
+
+def test_of_one_clique_beside_single_vertices_the_bound_is_its_size():
+    assert largest_possible(on_bits(random_graph(0, 70, 0.0, planted=9))) == 9
+    assert largest_possible(on_bits(random_graph(0, 70, 0.0))) == 1

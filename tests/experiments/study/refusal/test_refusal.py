@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 
 from experiments.judge.result import run_scenario
+from experiments.scenario.sections import Render
 from experiments.scenario.settings import Simulation
 from experiments.show.figures.drawing import save_figure
 from experiments.show.figures.refusal_figures import draw
@@ -222,6 +223,7 @@ def test_worlds_may_be_scenarios_with_seeds(
     short = tiny.model_copy(
         update={
             "drive": tiny.drive.model_copy(update={"frames": 16}),
+            "render": Render(renderer="raycast"),
             "align": tiny.align.model_copy(update={"aligners": tiny.align.aligners[:2]}),
         }
     )
