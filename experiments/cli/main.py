@@ -17,7 +17,7 @@ from experiments.cli.options import (
     STEPS,
     complain,
 )
-from mapfusion.errors import InputError
+from mapfusion.errors import InputError, one_line
 from mapfusion.recordings.registry import IMPORTERS
 
 REPLACED = {
@@ -89,7 +89,7 @@ def main() -> None:
         code = EXIT_FAILED
     except OSError as error:  # a full disk, a folder that is a file or not ours
         where = "" if error.filename is None else f"{error.filename}: "
-        complain(f"{where}cannot be read or written ({error.strerror or error})")
+        complain(one_line(f"{where}cannot be read or written ({error.strerror or error})"))
         code = EXIT_BAD_INPUT
     except MemoryError:
         kept = "what was finished is kept; --jobs 1 needs least"

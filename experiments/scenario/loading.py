@@ -31,6 +31,7 @@ S = TypeVar("S")
 _MOST_SUGGESTED = 3  # keys that an error message offers
 _UNKNOWN = {"extra_forbidden", "unexpected_keyword_argument"}
 _WORLD = {"world", "robots", "drive"}  # what a simulation must have and a recording cannot
+_LONG_NAME = 64 * "x"  # longer than that of any file of a log
 _EITHER = "give either world, robots and drive, or logs; generate stands for world and robots"
 _FIELDS = GeneratedScenario.model_fields | Simulation.model_fields | Recording.model_fields
 # What says nothing: resolved scenarios of earlier versions name all sections.
@@ -64,9 +65,12 @@ def load_scenario(
 
 def _resolved(path: Path, folder: Path, log: str) -> str:
     try:
-        return str((folder / log).resolve())
+        resolved = (folder / log).resolve()
+        (resolved / _LONG_NAME).exists()  # raises where a path is too long for the system
     except (OSError, RuntimeError, ValueError) as error:  # a loop of links, a name too long
-        raise InputError(f"{path}: logs: {log}: no folder has this path ({error})") from error
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"{path}: logs: {log}: no folder has this path ({reason})") from error
+    return str(resolved)
 
 
 def scenario_of(data: dict[str, Any], where: str) -> AnyScenario:

@@ -55,6 +55,8 @@ LOGS = "schema_version: 1\nname: x\nlogs: [{}]\n"
         (TINY.replace("seed: 3", "seed: " + "9" * 4000), "seed: an integer of 13288 bits"),
         (LOGS.format('"a\\0b"'), "logs.0: 'a\\x00b' holds a character"),
         (LOGS.format("loop"), "logs: loop: no folder has this path"),
+        (LOGS.format("a" * 5000), "no folder has this path (File name too long)"),
+        (LOGS.format("/".join(["a" * 200] * 20)), "no folder has this path (File name too long)"),
         (TINY + 'description: "\\ud800"\n', "description: '\\ud800' holds a character"),
         (TINY + "x: 2001-01-01\n", "x: 2001-01-01 is a date; put it in quotes"),
         (TINY + "? [1, 2]\n: 3\n", "is no text; put it in quotes"),
