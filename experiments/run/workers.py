@@ -49,9 +49,11 @@ class Workers:
 
     def submit(self, tag: Any, function: Callable[..., Any], *arguments: Any) -> None:
         """Have `function(*arguments)` called, after what was submitted before."""
-        submit = functools.partial if self._pool is None else self._pool.submit
+        if self._pool is None:
+            self._pending[functools.partial(function, *arguments)] = tag
+            return
         with held_back_interrupts():  # the first task starts the processes
-            self._pending[submit(function, *arguments)] = tag
+            self._pending[self._pool.submit(function, *arguments)] = tag
 
     @property
     def room(self) -> int:
