@@ -82,6 +82,7 @@ STYLES = {
 POSTER_FOOT_M = 0.2  # lower edge above the floor: the camera looks from 0.45 m, level
 TINT_LEVELS = 35  # colour is for the eye; the cameras are gray
 _SUBTEXEL_BITS = 4
+_MOST_CORNERS = 6  # of a shape
 
 
 def paint(
@@ -158,20 +159,22 @@ def _scatter(
     """Paint n convex polygons of about `scale` texels across."""
     height, width = picture.shape[:2]
     center = rng.uniform((0, 0), (width, height), (n, 2))
-    corners = rng.integers(3, 7, n)
+    corners = rng.integers(3, _MOST_CORNERS + 1, n)
     radius = 0.5 * scale * rng.uniform(0.6, 1.3, n)
     stretch = rng.uniform(0.5, 1.0, n)
     turn = rng.uniform(0, 2 * np.pi, (n, 2))
-    jitter = rng.uniform(-0.3, 0.3, (n, 6))
+    jitter = rng.uniform(-0.3, 0.3, (n, _MOST_CORNERS))
     colour = _colours(n, contrast, rng).tolist()
-    for i in range(n):
-        k = corners[i]
-        angle = turn[i, 0] + 2 * np.pi * (np.arange(k) + jitter[i, :k]) / k
-        x, y = np.cos(angle), stretch[i] * np.sin(angle)
-        cos, sin = np.cos(turn[i, 1]), np.sin(turn[i, 1])
-        points = center[i] + radius[i] * np.stack([cos * x - sin * y, sin * x + cos * y], -1)
-        fixed_point = np.round(points * 2**_SUBTEXEL_BITS).astype(np.int32)
-        cv2.fillConvexPoly(picture, fixed_point, colour[i], cv2.LINE_8, _SUBTEXEL_BITS)
+    # as if all had most corners; the first of each are its own
+    share = (np.arange(_MOST_CORNERS) + jitter) / corners[:, None]
+    angle = turn[:, :1] + 2 * np.pi * share
+    x, y = np.cos(angle), stretch[:, None] * np.sin(angle)
+    cos, sin = np.cos(turn[:, 1:]), np.sin(turn[:, 1:])
+    turned = np.stack([cos * x - sin * y, sin * x + cos * y], -1)
+    points = center[:, None] + radius[:, None, None] * turned
+    fixed_point = np.round(points * 2**_SUBTEXEL_BITS).astype(np.int32)
+    for polygon, k, rgb in zip(fixed_point, corners.tolist(), colour, strict=True):
+        cv2.fillConvexPoly(picture, polygon[:k], rgb, cv2.LINE_8, _SUBTEXEL_BITS)
 
 
 def _colours(n: int, contrast: float, rng: np.random.Generator) -> np.ndarray:
