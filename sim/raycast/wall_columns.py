@@ -16,7 +16,7 @@ from sim.raycast.scene import Walls
 # into so many that lines cross each by no more than this: of cuts twice as fine the picture differs
 # by less than a grey level is rounded, of cuts twice as coarse visibly.
 STEEPEST_ROWS = 0.5
-MOST_CUTS = 8  # reached where a wall is grazed, and a pixel spans so many texels that all are grey
+MOST_CUTS = 8  # a bound on the time of walls that are grazed
 LEAST_TEXELS = 1e-6  # of a strip at a wall's end: sums still tell them apart
 
 

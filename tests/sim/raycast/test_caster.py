@@ -16,7 +16,7 @@ from sim.recorder import FrameSource
 from sim.stereo_head import StereoFrame
 from sim.world import write_faces
 
-CAMERA = StereoCamera(240, 180, 216.4)
+CAMERA = StereoCamera(320, 240, 288.5)
 NO_NOISE = RadiometricNoise(0, 0, 0)
 LEFT_M = CAMERA.baseline_m / 2
 # the robot that looks, and one in its view: two corners of the room, the stub's end, at an arm's

@@ -53,10 +53,10 @@ def test_a_method_that_changed_is_found_and_no_other(
 
 
 def test_chance_alone_is_rarely_taken_for_a_change(tmp_path: Path) -> None:
-    """Other random numbers in everything: of 12 comparisons at 5 %, corrected, some 1 may err."""
+    """Other random numbers in everything: of 20 comparisons at 5 %, corrected, some 1 may err."""
     wrong = 0
     a = write_together(tmp_path / "a", {seed: tables_of(seed) for seed in range(8)})
-    for trial in range(12):
+    for trial in range(20):
         redrawn = {seed: tables_of(1000 * (trial + 1) + seed) for seed in range(8)}
         found = compare(a, write_together(tmp_path / str(trial), redrawn))
         wrong += found.table["verdict"].isin([BETTER, WORSE]).any()
@@ -65,7 +65,7 @@ def test_chance_alone_is_rarely_taken_for_a_change(tmp_path: Path) -> None:
         np.testing.assert_array_equal(found.table["p_holm"], holm(p))
         # the smallest of m is judged at a level of 0.05 / m
         assert np.nanmin(found.table["p_holm"]) == min(1, np.nanmin(p) * np.sum(~np.isnan(p)))
-    assert wrong <= 3  # 12 trials at 5 %: more than 3 in 0.2 % of all seeds
+    assert wrong <= 4  # 20 trials at 5 %: more than 4 in 0.3 % of all seeds
 
 
 def test_lost_maps_are_worse_success(tmp_path: Path) -> None:
