@@ -20,6 +20,7 @@ from experiments.scenario.settings import (
     GeneratedScenario,
     Recording,
     Scenario,
+    SimulatedScenario,
     Simulation,
 )
 from experiments.scenario.yaml_input import apply_overrides, read_mapping
@@ -34,11 +35,12 @@ _WORLD = {"world", "robots", "drive"}  # what a simulation must have and a recor
 _LONG_NAME = 64 * "x"  # longer than that of any file of a log
 _EITHER = "give either world, robots and drive, or logs; generate stands for world and robots"
 _FIELDS = GeneratedScenario.model_fields | Simulation.model_fields | Recording.model_fields
-# What says nothing: resolved scenarios of earlier versions name all sections.
-_SILENT = {
-    name: [None, [], *([] if field.is_required() else [to_jsonable_python(field.default)])]
-    for name, field in _FIELDS.items()
-    if name not in Scenario.model_fields
+# Resolved recordings of earlier versions name all sections, also a simulation's, which say nothing.
+_OF_ONE_KIND = _FIELDS.keys() - Scenario.model_fields.keys()
+_SIMULATION_S_OWN = {
+    name: to_jsonable_python(field.default)
+    for name, field in SimulatedScenario.model_fields.items()
+    if name in _OF_ONE_KIND and not field.is_required()
 }
 
 
@@ -79,8 +81,11 @@ def scenario_of(data: dict[str, Any], where: str) -> AnyScenario:
     Raises:
         InputError: one line that begins with `where`.
     """
-    data = {key: value for key, value in data.items() if value not in _SILENT.get(key, [])}
+    data = {k: v for k, v in data.items() if k not in _OF_ONE_KIND or v not in (None, [])}
     drawn, recorded = "generate" in data, "logs" in data
+    if recorded:
+        own = _SIMULATION_S_OWN.items()
+        data = {k: v for k, v in data.items() if (k, v) not in own}
     if drawn and data.keys() & {"world", "robots", "logs"}:
         raise InputError(f"{where}: give either generate, or world and robots, or logs")
     needed = {"drive"} if drawn else _WORLD
@@ -93,6 +98,7 @@ def scenario_of(data: dict[str, Any], where: str) -> AnyScenario:
             made = expanded(asked.generate, asked.seed)
         except InputError as error:
             raise InputError(f"{where}: generate.{error}") from error
+        made["render"] = asked.render.model_dump()
         data = {key: value for key, value in data.items() if key != "generate"} | made
     return _validated(where, Recording if recorded else Simulation, data)
 

@@ -232,9 +232,11 @@ class GeneratedScenario(SimulatedScenario):
 
     Attributes:
         generate: what is drawn.
+        render: what draws the images; drawn worlds are many, so the fast one unless it is named.
     """
 
     generate: Generate
+    render: Render = Render(renderer="raycast")
 
 
 class Generated(Section):

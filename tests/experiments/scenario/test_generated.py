@@ -42,6 +42,15 @@ def test_the_loaded_scenario_holds_world_and_robots(path: Path) -> None:
     assert scenario.generated.overlap == pytest.approx(0.4, abs=0.05)
 
 
+def test_a_drawn_world_is_drawn_by_the_ray_caster_unless_another_is_named(path: Path) -> None:
+    named = load_scenario(path, ["render.renderer=tiny"])
+    assert isinstance(named, Simulation)
+    assert named.render.renderer == "tiny"
+    unnamed = load_scenario(path)
+    assert isinstance(unnamed, Simulation)
+    assert unnamed.render.renderer == "raycast"
+
+
 def test_the_resolved_scenario_is_a_scenario_with_the_same_keys(path: Path, tmp_path: Path) -> None:
     scenario = load_scenario(path)
     resolved = tmp_path / "scenario.json"

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from experiments.scenario.loading import load_scenario
+from experiments.scenario.settings import Simulation
 from experiments.scenario.suite import SHIPPED as SUITE
 from experiments.scenario.suite import copy_to_edit, entries, scenarios_of
 from mapfusion.errors import InputError
@@ -145,7 +146,14 @@ def test_worlds_of_the_suite_are_small(name: str) -> None:
     assert scenario.drive is not None
     assert scenario.drive.frames <= 500
     assert (scenario.camera.width_px, scenario.camera.height_px) == (640, 480)
-    assert scenario.render.renderer == "tiny"  # needs nothing of the system
+    assert scenario.render.renderer == "raycast"  # of all, also where the file does not say it
+
+
+@pytest.mark.parametrize("name", ["quick", "paper"])
+def test_the_mission_s_own_scenarios_keep_pybullet_s_pictures(name: str) -> None:
+    scenario = load_scenario(SCENARIOS / f"{name}.yaml")
+    assert isinstance(scenario, Simulation)
+    assert scenario.render.renderer == "tiny"
 
 
 def test_the_default_suite_is_five_worlds_that_fit_the_hour() -> None:
