@@ -149,6 +149,9 @@ def _to_arrow(values: Any, kind: pa.DataType) -> pa.Array:
         return pa.FixedSizeListArray.from_arrays(
             pa.array(matrix.ravel(), kind.value_type), kind.list_size
         )
+    if pa.types.is_fixed_size_binary(kind):
+        matrix = np.ascontiguousarray(values, np.uint8)
+        return pa.Array.from_buffers(kind, len(matrix), [None, pa.py_buffer(matrix)])
     return pa.array(values, kind)
 
 
@@ -212,8 +215,13 @@ def text_attributes(path: Path, table: pa.Table) -> dict[str, str]:
 
 
 def column(table: pa.Table, name: str) -> np.ndarray:
-    """One column as an array: (N,), or (N, k) for a column of fixed-size lists."""
+    """One column as an array: (N,), or (N, k) for fixed-size lists, and for k bytes each."""
     values = table.column(name).combine_chunks()
+    if pa.types.is_fixed_size_binary(values.type):
+        k, buffer = values.type.byte_width, values.buffers()[1]
+        return np.frombuffer(buffer, np.uint8)[k * values.offset :][: k * len(values)].reshape(
+            -1, k
+        )
     if pa.types.is_fixed_size_list(values.type):
         return values.flatten().to_numpy(zero_copy_only=False).reshape(-1, values.type.list_size)
     return values.to_numpy(zero_copy_only=False)

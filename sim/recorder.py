@@ -115,6 +115,27 @@ def truth_points(
     return transform_points(T_world_robot, p_robot)
 
 
+def truth_slopes(
+    camera: StereoCamera, depth_m: np.ndarray, uv_px: ArrayLike, T_world_robot: ArrayLike
+) -> Float:
+    """Derivatives (N, 3, 2) of `truth_points` by the pixel, on the surface that is seen there.
+
+    The difference to the next pixel, or to the one before where that is another surface's; 0 where
+    both are.
+    """
+    uv = np.asarray(uv_px, dtype=np.float64).reshape(-1, 2)
+    here, depth = truth_points(camera, depth_m, uv, T_world_robot), _depth_at(depth_m, uv)
+    slope = np.zeros((len(uv), 3, 2))
+    for axis in range(2):
+        for step in (-1.0, 1.0):  # the next pixel counts where both are on the surface
+            there = uv + step * np.eye(2)[axis]
+            change = np.abs(_depth_at(depth_m, there) - depth)
+            same = change <= SAME_SURFACE * depth
+            moved = truth_points(camera, depth_m, there, T_world_robot) - here
+            slope[same, :, axis] = step * moved[same]
+    return slope
+
+
 def _depth_at(depth_m: np.ndarray, uv_px: Float) -> Float:
     height, width = depth_m.shape
     uv = np.clip(uv_px, 0, [width - 1, height - 1])

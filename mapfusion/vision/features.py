@@ -7,6 +7,7 @@ import numpy as np
 from mapfusion.arguments import require_finite, require_shape
 from mapfusion.robot_log import DESCRIPTOR_LENGTH
 from mapfusion.se2 import Float
+from mapfusion.vision.patch_fit import PATCH_SIDE_PX
 
 
 @dataclass(frozen=True)
@@ -18,12 +19,17 @@ class Features:
         disparity_px: (N,) positive.
         sigma_disparity_px: (N,) standard deviation of the disparity.
         descriptor: (N, 64) float32, unit length.
+        slope: (N, 2) change of the disparity along u and v, on the corner's surface; None: none.
+        patch: (N, P, P) uint8, what the left image shows around the pixel nearest to the corner,
+            see `cut_patches`; None: corners are followed by their own places.
     """
 
     uv_px: Float
     disparity_px: Float
     sigma_disparity_px: Float
     descriptor: np.ndarray
+    slope: Float | None = None
+    patch: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         n = len(self.uv_px)
@@ -31,6 +37,11 @@ class Features:
         require_shape("disparity_px", self.disparity_px, (n,))
         require_shape("sigma_disparity_px", self.sigma_disparity_px, (n,))
         require_shape("descriptor", self.descriptor, (n, DESCRIPTOR_LENGTH))
+        if self.slope is not None:
+            require_shape("slope", self.slope, (n, 2))
+            require_finite("slope", self.slope)
+        if self.patch is not None:
+            require_shape("patch", self.patch, (n, PATCH_SIDE_PX, PATCH_SIDE_PX))
         for name in ("uv_px", "disparity_px", "sigma_disparity_px", "descriptor"):
             require_finite(name, getattr(self, name))
         if np.any(self.disparity_px <= 0):

@@ -10,6 +10,7 @@ from mapfusion.camera import StereoCamera
 from mapfusion.robot_log import Observations
 from mapfusion.vision.features import Features
 from mapfusion.vision.harris import HarrisParameters, detect
+from mapfusion.vision.patch_fit import cut_patches
 from mapfusion.vision.stereo import StereoParameters, match
 from mapfusion.vision.tracks import TrackParameters
 from mapfusion.vision.usurf import USurfParameters, describe
@@ -22,7 +23,7 @@ class FrontEndParameters:
 
     Attributes:
         harris, stereo, usurf, tracks: of the parts.
-        sigma_uv_px: standard deviation of a corner's place in the image, each axis.
+        sigma_uv_px: standard deviation of the place of a track's point in an image, each axis.
         max_depth_m: points farther away are tracked but not observed,
         max_sigma_depth_m: nor are points whose depth has a larger standard deviation.
     """
@@ -31,7 +32,7 @@ class FrontEndParameters:
     stereo: StereoParameters = field(default_factory=StereoParameters)
     usurf: USurfParameters = field(default_factory=USurfParameters)
     tracks: TrackParameters = field(default_factory=TrackParameters)
-    sigma_uv_px: Annotated[float, Range(1e-3, 100, "px")] = 0.3
+    sigma_uv_px: Annotated[float, Range(1e-3, 100, "px")] = 0.08
     max_depth_m: Annotated[float, Range(0.1, 1000, "m")] = 8.0
     max_sigma_depth_m: Annotated[float, Range(1e-4, 1000, "m")] = 0.4
 
@@ -65,7 +66,8 @@ class FrontEnd:
         depth = self.camera.focal_px * self.camera.baseline_m / disparity
         scale = self.parameters.usurf.scales_px(depth, self.camera.focal_px)
         descriptor = describe(left, uv, scale)
-        return Features(uv, disparity, matches.sigma_px[matched], descriptor)
+        sigma, slope = matches.sigma_px[matched], matches.slope[matched]
+        return Features(uv, disparity, sigma, descriptor, slope, cut_patches(left, uv))
 
 
 def observable(

@@ -83,11 +83,13 @@ class StereoMatches:
     Attributes:
         disparity_px: (N,) NaN where the verdict is not MATCHED.
         sigma_px: (N,) standard deviation of the disparity, likewise.
+        slope: (N, 2) change of the disparity along u and v, likewise.
         verdict: (N,) int8, MATCHED or the reason against it.
     """
 
     disparity_px: Float
     sigma_px: Float
+    slope: Float
     verdict: np.ndarray
 
 
@@ -122,6 +124,7 @@ def match(
     pixel = np.rint(uv).astype(np.int64)
     found, verdict = _search(left, right, pixel, camera, parameters)
     disparity, sigma = np.full(len(uv), np.nan), np.full(len(uv), np.nan)
+    slope = np.full((len(uv), 2), np.nan)
 
     rows = np.nonzero(verdict == Verdict.MATCHED)[0]
     plane, disparity[rows], sigma[rows] = _refine(
@@ -132,6 +135,7 @@ def match(
     verdict[rows[lost]] = Verdict.DIVERGED
 
     rows, plane = rows[~lost], plane[~lost]
+    slope[rows] = plane[:, 1:]
     bad = disagrees(
         left,
         right,
@@ -144,8 +148,8 @@ def match(
     verdict[rows[bad]] = Verdict.SILHOUETTE
 
     unmatched = verdict != Verdict.MATCHED
-    disparity[unmatched] = sigma[unmatched] = np.nan
-    return StereoMatches(disparity, sigma, verdict)
+    disparity[unmatched] = sigma[unmatched] = slope[unmatched] = np.nan
+    return StereoMatches(disparity, sigma, slope, verdict)
 
 
 def _search(

@@ -1,4 +1,8 @@
-"""Features followed over consecutive frames; a landmark counts only after some frames in a row."""
+"""Features followed over consecutive frames; a landmark counts only after some frames in a row.
+
+Features are linked by their descriptors. What is followed is the point of the wall that the track
+began with: a corner detector finds another one as the robot draws near.
+"""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -10,6 +14,7 @@ from mapfusion.arguments import Probability, Range, require_in_range
 from mapfusion.camera import StereoCamera
 from mapfusion.se2 import Float
 from mapfusion.vision.features import Features
+from mapfusion.vision.followed import Followed, begin_again, begun, followed
 from mapfusion.vision.rigid_links import rigid_links
 
 _NO_MATCH = -1
@@ -28,6 +33,10 @@ class TrackParameters:
         max_disparity_ratio: largest change of disparity, as a factor: the robot's step against the
             nearest depth, and noise at the farthest.
         max_descriptor_distance: between unit vectors.
+        noise_grey: noise of one image, grey levels; what residuals of a followed point's
+            surroundings are held against.
+        max_misfit_px: these may differ by noise and by what this error of the point's place would
+            explain; what differs more begins a new track.
         rigid_probability: share of true links that agree with the robot's motion as far as noise
             lets them (chi-square); what agrees less is cut.
     """
@@ -37,6 +46,8 @@ class TrackParameters:
     max_shift_v_px: Annotated[float, Range(0.1, 8192, "px")] = 25.0
     max_disparity_ratio: Annotated[float, Range(1.001, 100, "1")] = 1.3
     max_descriptor_distance: Annotated[float, Range(1e-3, 2, "1")] = 0.3
+    noise_grey: Annotated[float, Range(0, 255, "grey levels")] = 2.0
+    max_misfit_px: Annotated[float, Range(1e-3, 100, "px")] = 0.5
     rigid_probability: Probability = 0.999
 
     def __post_init__(self) -> None:
@@ -50,10 +61,14 @@ class Tracks:
     Attributes:
         track_id: (N,) int64, never used twice by one tracker.
         length: (N,) int64 frames in a row up to this one, 1 for a new track.
+        uv_px: (N, 2) where the point lies that the track began with.
+        disparity_px: (N,) there.
     """
 
     track_id: np.ndarray
     length: np.ndarray
+    uv_px: Float
+    disparity_px: Float
 
 
 class Tracker:
@@ -68,43 +83,58 @@ class Tracker:
         self.parameters = parameters
         self._camera = camera
         self._sigma_uv_px = sigma_uv_px
-        self._previous: Features | None = None
-        self._tracks = Tracks(np.zeros(0, np.int64), np.zeros(0, np.int64))
+        self._previous: tuple[Features, Followed, Tracks] | None = None
         self._next_id = 0
 
     def update(self, features: Features) -> Tracks:
         """Tracks of this frame's features."""
         n = len(features)
-        source = np.full(n, _NO_MATCH)
+        source, points = np.full(n, _NO_MATCH), begun(features)
+        track_id, length = np.empty(n, np.int64), np.ones(n, np.int64)
         if self._previous is not None:
-            source = link(self._previous, features, self.parameters)
-            self._cut_slips(self._previous, features, source)
-        linked = source != _NO_MATCH
-        born = n - np.count_nonzero(linked)
-        track_id = np.empty(n, np.int64)
-        track_id[linked] = self._tracks.track_id[source[linked]]
-        track_id[~linked] = np.arange(self._next_id, self._next_id + born)
-        length = np.ones(n, np.int64)
-        length[linked] += self._tracks.length[source[linked]]
-        self._next_id += born
-        self._previous = features
-        self._tracks = Tracks(track_id, length)
-        return self._tracks
+            before, points_before, tracks = self._previous
+            limits = self.parameters
+            source = link(before, features, limits)
+            points, found = followed(
+                points_before, before, features, source, limits.noise_grey, limits.max_misfit_px
+            )
+            source[~found] = _NO_MATCH
+            rows = np.flatnonzero(found)
+            slips = rows[~self._agree(points_before, before, points, features, source, rows)]
+            source[slips] = _NO_MATCH
+            begin_again(points, features, slips)
+            linked = source != _NO_MATCH
+            track_id[linked] = tracks.track_id[source[linked]]
+            length[linked] += tracks.length[source[linked]]
+        born = source == _NO_MATCH
+        track_id[born] = np.arange(self._next_id, self._next_id + born.sum())
+        self._next_id += int(born.sum())
+        made = Tracks(track_id, length, points.uv_px, points.disparity_px)
+        self._previous = features, points, made
+        return made
 
-    def _cut_slips(self, previous: Features, current: Features, source: np.ndarray) -> None:
-        """Set to -1, in place, what no motion of the robot explains together with the others."""
-        rows = np.flatnonzero(source != _NO_MATCH)
-        agree = rigid_links(
-            *self._points(previous, source[rows]),
-            *self._points(current, rows),
+    def _agree(
+        self,
+        points_before: Followed,
+        before: Features,
+        points: Followed,
+        after: Features,
+        source: np.ndarray,
+        rows: np.ndarray,
+    ) -> np.ndarray:
+        """Which links (those of `rows` of `after`) one motion of the robot explains."""
+        return rigid_links(
+            *self._points(points_before, before, source[rows]),
+            *self._points(points, after, rows),
             self.parameters.rigid_probability,
         )
-        source[rows[~agree]] = _NO_MATCH
 
-    def _points(self, features: Features, rows: np.ndarray) -> tuple[Float, Float]:
+    def _points(
+        self, points: Followed, features: Features, rows: np.ndarray
+    ) -> tuple[Float, Float]:
         return self._camera.triangulate(
-            features.uv_px[rows],
-            features.disparity_px[rows],
+            points.uv_px[rows],
+            points.disparity_px[rows],
             self._sigma_uv_px,
             features.sigma_disparity_px[rows],
         )

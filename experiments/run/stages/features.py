@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -33,8 +34,9 @@ from mapfusion.storage import (
 )
 from mapfusion.vision.features import Features
 from mapfusion.vision.frontend import FrontEnd, FrontEndParameters
+from mapfusion.vision.patch_fit import PATCH_SIDE_PX
 from sim.radiometry import RadiometricNoise
-from sim.recorder import FrameSource, truth_points
+from sim.recorder import FrameSource, truth_points, truth_slopes
 from sim.renderer import Renderer
 from sim.trajectory import read_trajectory
 
@@ -43,17 +45,21 @@ FRAMES_PER_CHUNK = 20
 
 _PIXEL = ["u_px", "v_px"]
 _ONE_EACH = ["disparity_px", "sigma_disparity_px", "descriptor"]
+_SLOPE = ["disparity_per_u", "disparity_per_v"]
 FEATURES = schema(
     "features",
-    1,
+    2,
     [
         pa.field("iteration", pa.int32()),
-        *float_fields([*_PIXEL, "disparity_px", "sigma_disparity_px"]),
+        *float_fields([*_PIXEL, "disparity_px", "sigma_disparity_px", *_SLOPE]),
         pa.field("descriptor", pa.list_(pa.float32(), DESCRIPTOR_LENGTH)),
+        pa.field("patch", pa.binary(PATCH_SIDE_PX**2)),
     ],
 )
-# Row i is the world point behind row i of the features. Kept apart: estimators never read it.
-TRUTH = schema("features.truth", 1, float_fields(POSITION_FIELDS))
+# Row i is the world point behind row i of the features, and how it moves with the pixel. Kept
+# apart: estimators never read it.
+_POINT_SLOPE = [f"{name}_per_{axis}" for name in POSITION_FIELDS for axis in "uv"]
+TRUTH = schema("features.truth", 2, float_fields([*POSITION_FIELDS, *_POINT_SLOPE]))
 
 LABEL = "render and find features"
 WRITES = ("truth_{part}.parquet", "features_{part}.parquet")
@@ -112,29 +118,49 @@ def run(settings: FeatureSettings, job: Job) -> dict[str, float]:
         found = front_end.extract(frame.left, frame.right)
         own_pose = poses[trajectory.index(robot)]
         features.append(found)
-        truth.append(truth_points(settings.camera, frame.depth_m, found.uv_px, own_pose))
+        seen = (settings.camera, frame.depth_m, found.uv_px, own_pose)
+        slopes = truth_slopes(*seen).reshape(-1, len(_POINT_SLOPE))
+        truth.append(np.concatenate([truth_points(*seen), slopes], axis=1))
         if 0 <= iteration - settings.images_at < settings.images:
             encoded = cv2.imencode(".png", frame.left)[1].tobytes()
             write_sealed(job.output / f"image_{iteration:06d}.png", encoded + LINE)
     truth_path, features_path = (job.output / name.format(part=job.part) for name in WRITES)
     joined = {
         name: np.concatenate([getattr(found, name) for found in features])
-        for name in ("uv_px", *_ONE_EACH)
+        for name in ("uv_px", "slope", "patch", *_ONE_EACH)
     }
-    joined |= named_columns(_PIXEL, joined["uv_px"])
+    joined |= named_columns(_PIXEL, joined["uv_px"]) | named_columns(_SLOPE, joined["slope"])
     joined["iteration"] = np.repeat(np.array(frames), [len(found) for found in features])
     write_table(truth_path, named_columns(TRUTH.names, np.concatenate(truth)), TRUTH)
     write_table(features_path, joined, FEATURES)
     return {"rendering_s": rendering_s}
 
 
-def read_features(folder: Path, n_frames: int) -> Iterator[tuple[Features, Float]]:
-    """Features and their true world points (N, 3), frame by frame, in order."""
+class TruePoints(NamedTuple):
+    """World points (N, 3) behind features, and their derivatives (N, 3, 2) by the pixel."""
+
+    point_m: Float
+    slope: Float
+
+    def at(self, shift_px: Float) -> Float:
+        """World points (N, 3) behind pixels that are shifted by (N, 2) on the same surface."""
+        return self.point_m + np.einsum("nij,nj->ni", self.slope, shift_px)
+
+
+def read_features(folder: Path, n_frames: int) -> Iterator[tuple[Features, TruePoints]]:
+    """Features and what is truly behind them, frame by frame, in order."""
     for part in chunks(n_frames):
         truth_path, features_path = (folder / name.format(part=part) for name in WRITES)
         table, _ = read_table(features_path, FEATURES)
-        found = Features(columns(table, _PIXEL), *(column(table, name) for name in _ONE_EACH))
-        truth = columns(read_table(truth_path, TRUTH)[0], TRUTH.names)
+        found = Features(
+            columns(table, _PIXEL),
+            **{name: column(table, name) for name in _ONE_EACH},
+            slope=columns(table, _SLOPE),
+            patch=column(table, "patch").reshape(-1, PATCH_SIDE_PX, PATCH_SIDE_PX),
+        )
+        true_table, _ = read_table(truth_path, TRUTH)
+        point = columns(true_table, POSITION_FIELDS)
+        slope = columns(true_table, _POINT_SLOPE).reshape(-1, 3, 2)
         for k in _chunk(part, n_frames):
             rows = slice(*np.searchsorted(column(table, "iteration"), [k, k + 1]))
-            yield with_rows(found, rows), truth[rows]
+            yield with_rows(found, rows), TruePoints(point[rows], slope[rows])

@@ -1,6 +1,6 @@
 """Stage: one robot's features, tracked into observations; odometry plays no part in them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -40,10 +40,12 @@ def run(settings: ObservedSettings, job: Job) -> None:
     for iteration, (found, points) in enumerate(frames):
         state = tracker.update(found)
         lasting = tracker.landmarks(state)
-        observed.append(observe(camera, found, lasting, vision))
-        truth.append(points[observable(camera, found, lasting, vision)])
+        own = replace(found, uv_px=state.uv_px, disparity_px=state.disparity_px)
+        observed.append(observe(camera, own, lasting, vision))
+        true_m = points.at(state.uv_px - found.uv_px)
+        truth.append(true_m[observable(camera, own, lasting, vision)])
         if iteration in kept:
-            seen = pd.DataFrame(found.uv_px, columns=pd.Index(["u_px", "v_px"]))
+            seen = pd.DataFrame(state.uv_px, columns=pd.Index(["u_px", "v_px"]))
             seen = seen.assign(robot=settings.robot, iteration=iteration)
             tracks.append(seen.assign(track=state.track_id, length=state.length))
     iterations = np.repeat(np.arange(len(observed)), [len(own) for own in observed])
