@@ -5,6 +5,7 @@ any width, lists of any list type; in CSV a list is columns NAME_0, NAME_1, ... 
 (z_m and its covariances) data are planar. `experiments/docs/formats.md` lists all columns.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -58,7 +59,7 @@ def read_open_table(path: Path, table_schema: pa.Schema) -> tuple[pa.Table, dict
     kind = table_schema.metadata[b"mapfusion.kind"].decode()
     table = _read_csv(path, kind) if path.suffix == ".csv" else read_parquet(path, f"{kind} table")
     attributes = text_attributes(path, table)
-    if "kind" in attributes:
+    if "kind" in attributes and not _is_earlier(attributes, table_schema):
         require_kind(path, table, attributes, table_schema)
     names = table.column_names
     if twice := sorted({name for name in names if names.count(name) > 1}):
@@ -72,6 +73,16 @@ def read_open_table(path: Path, table_schema: pa.Schema) -> tuple[pa.Table, dict
         attributes = {"planar": "true"} | attributes
     plain = [pa.field(field.name, field.type) for field in table_schema]
     return pa.table(found, schema=pa.schema(plain)), attributes
+
+
+def _is_earlier(attributes: Mapping[str, str], table_schema: pa.Schema) -> bool:
+    """Whether an earlier version of this program wrote it: columns that came later have defaults."""
+    wanted = (
+        table_schema.metadata[f"mapfusion.{key}".encode()] for key in ("kind", "schema_version")
+    )
+    kind, version = (text.decode() for text in wanted)
+    found = attributes.get("schema_version", "")
+    return attributes["kind"] == kind and found.isdecimal() and 0 < int(found) < int(version)
 
 
 def _read_csv(path: Path, kind: str) -> pa.Table:

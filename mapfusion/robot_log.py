@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 
 DESCRIPTOR_LENGTH = 64
 NO_LABEL = -1
+NO_TRACK = -1
 TRUTH_FILES = ("truth_poses.parquet", "truth_points.parquet")
 Arrays = TypeVar("Arrays", bound="DataclassInstance")
 LOOK_FIELDS = [
@@ -71,7 +72,7 @@ FRAMES = schema(
 )
 OBSERVATIONS = schema(
     "robot_log.observations",
-    1,
+    2,  # 1 had no tracks
     [
         told(_ITERATION, "frame of the sighting; rows are ordered by it"),
         *(told(field, "of the sighting, in the robot frame") for field in point_fields()),
@@ -80,6 +81,11 @@ OBSERVATIONS = schema(
             for name in _PIXEL_FIELDS
         ),
         *LOOK_FIELDS,
+        told(
+            pa.field("track", pa.int32()),
+            "number of the track it belongs to, in frames that follow on each other; -1 for none",
+            NO_TRACK,
+        ),
     ],
 )
 TRUTH_POSES = schema(
@@ -136,6 +142,8 @@ class Observations:
         descriptor: (N, 64) float32, or None.
         label: (N,) int32 known identities, or None.
         uvd_px: (N, 3) float32 u, v, disparity in the left image, or None.
+        track: (N,) int32, NO_TRACK or what the observations of one track share: these are of one
+            point, where other observations of the landmark are of points nearby. None: no tracks.
     """
 
     position_m: Float
@@ -143,6 +151,7 @@ class Observations:
     descriptor: np.ndarray | None = None
     label: np.ndarray | None = None
     uvd_px: np.ndarray | None = None
+    track: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         n = len(self.position_m)
@@ -156,6 +165,8 @@ class Observations:
             require_shape("label", self.label, (n,))
         if self.uvd_px is not None:
             require_shape("uvd_px", self.uvd_px, (n, 3))
+        if self.track is not None:
+            require_shape("track", self.track, (n,))
 
     def __len__(self) -> int:
         return len(self.position_m)
@@ -214,6 +225,7 @@ def write_observations(folder: Path, iteration: np.ndarray, observations: Observ
     """Write `observations.parquet` into a log's folder."""
     n = len(observations)
     uvd = observations.uvd_px if observations.uvd_px is not None else np.full((n, 3), np.nan)
+    track = np.full(n, NO_TRACK) if observations.track is None else observations.track
     write_table(
         folder / "observations.parquet",
         {
@@ -221,6 +233,7 @@ def write_observations(folder: Path, iteration: np.ndarray, observations: Observ
             **point_columns(observations.position_m, observations.covariance_m2),
             **named_columns(_PIXEL_FIELDS, uvd.astype(np.float32)),
             **look_columns(n, observations.descriptor, observations.label),
+            "track": track.astype(np.int32),
         },
         OBSERVATIONS,
     )
@@ -236,10 +249,14 @@ def _observations(folder: Path) -> tuple[np.ndarray, Observations, bool]:
     path = table_path(folder, "observations")
     table, attributes = read_open_table(path, OBSERVATIONS)
     position, covariance = points_from(table)
-    uvd = columns(table, _PIXEL_FIELDS)
+    uvd, track = columns(table, _PIXEL_FIELDS), column(table, "track")
     try:
         observations = Observations(
-            position, covariance, *looks_from(table), None if np.isnan(uvd).all() else uvd
+            position,
+            covariance,
+            *looks_from(table),
+            None if np.isnan(uvd).all() else uvd,
+            None if np.all(track == NO_TRACK) else track,
         )
     except ValueError as error:
         raise InputError(f"{path}: {error}") from error

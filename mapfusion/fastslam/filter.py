@@ -23,6 +23,7 @@ from mapfusion.fastslam.resampling import (
 )
 from mapfusion.fastslam.sensor import Sightings, log_density_at_gate, sightings
 from mapfusion.fastslam.update import DROPPED, NEW, update_landmarks
+from mapfusion.fastslam.tracked import Tracked
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import NO_LABEL, Observations
 from mapfusion.se2 import Float, compose
@@ -76,6 +77,7 @@ class FastSlam:
         self._poses = np.zeros((parameters.n_particles, 3))
         self._log_weights = np.full(parameters.n_particles, -np.log(parameters.n_particles))
         self._planar = bool(parameters.planar)
+        self._tracked, self._stray_m2 = Tracked(), 2 * parameters.stray_m**2
         self._maps = ParticleMaps(parameters.n_particles, parameters.gate)
         self._best = 0
         self._n_observations = 0
@@ -108,12 +110,14 @@ class FastSlam:
         noise, log_new = self._noise(observations)
         planar = self._planar
 
+        self._maps.widen(self._tracked.ended(observations.track, self._maps.slots), self._stray_m2)
         self._poses, log_ratio = self._propose(odometry, observations, noise)
         seen = sightings(self._poses, observations.position_m, noise, planar)
         chosen, changed = self._associate(seen, observations)
         log_likelihood = update_landmarks(self._maps.slots, chosen, seen, log_new, planar)
         self._maps.moved(changed)
-        self._start_landmarks(chosen, seen, observations)
+        created = self._start_landmarks(chosen, seen, observations)
+        self._tracked.went_into(observations.track, chosen, created, self._maps.slots)
         log_evidence = self._weigh(log_likelihood + log_ratio)
         self._remember(chosen)
         return self._resample(log_evidence)
@@ -233,10 +237,10 @@ class FastSlam:
 
     def _start_landmarks(
         self, chosen: np.ndarray, seen: Sightings, observations: Observations
-    ) -> None:
-        """A landmark for each observation that is NEW in some particle."""
+    ) -> np.ndarray:
+        """A landmark for each observation that is NEW in some particle: rows and slots (n, 2)."""
         if len(observations) == 0:
-            return
+            return np.empty((0, 2), dtype=np.int64)
         created, rows = self._maps.create(chosen, seen, observations, self._n_observations)
         if self.parameters.association is Association.LABEL:
             assert observations.label is not None
@@ -244,6 +248,7 @@ class FastSlam:
             self._slot_of_label.update(zip(labels, created.tolist(), strict=True))
         self._has_descriptors |= observations.descriptor is not None
         self._has_labels |= observations.label is not None
+        return np.stack([rows, created], axis=1)
 
     def _weigh(self, log_likelihood: Float) -> float:
         """Multiply the weights by the frame's likelihood (eq. 10).

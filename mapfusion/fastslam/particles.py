@@ -66,6 +66,13 @@ class ParticleMaps:
         """Tell that landmarks of these slots, up to date, have changed: they may lie elsewhere."""
         _bound(self.slots, which, self._gate)
 
+    def widen(self, which: np.ndarray, variance_m2: float) -> None:
+        """Add to the covariances of these slots' landmarks, along each axis."""
+        which = which[self.bring_up_to_date(which)]
+        for axis in (0, 3, 5):
+            self.slots.covariance_m2[which, :, axis] += variance_m2
+        self.moved(which)
+
     def create(
         self, chosen: np.ndarray, seen: Sightings, observations: Observations, first_source: int
     ) -> tuple[np.ndarray, np.ndarray]:

@@ -34,16 +34,17 @@ def run(settings: ObservedSettings, job: Job) -> None:
     """Track features over the frames and write the observations and their truth."""
     camera, vision = settings.camera, settings.vision
     tracker = Tracker(vision.tracks, camera, vision.sigma_uv_px)
-    observed, truth, tracks = [], [], []
+    observed, track, truth, tracks = [], [], [], []
     kept = range(settings.images_at, settings.images_at + settings.images)
     frames = read_features(job.inputs["features"], settings.n_frames)
     for iteration, (found, points) in enumerate(frames):
         state = tracker.update(found)
         lasting = tracker.landmarks(state)
         own = replace(found, uv_px=state.uv_px, disparity_px=state.disparity_px)
+        rows = observable(camera, own, lasting, vision)
         observed.append(observe(camera, own, lasting, vision))
-        true_m = points.at(state.uv_px - found.uv_px)
-        truth.append(true_m[observable(camera, own, lasting, vision)])
+        track.append(state.track_id[rows])
+        truth.append(points.at(state.uv_px - found.uv_px)[rows])
         if iteration in kept:
             seen = pd.DataFrame(state.uv_px, columns=pd.Index(["u_px", "v_px"]))
             seen = seen.assign(robot=settings.robot, iteration=iteration)
@@ -51,6 +52,7 @@ def run(settings: ObservedSettings, job: Job) -> None:
     iterations = np.repeat(np.arange(len(observed)), [len(own) for own in observed])
     names = ("position_m", "covariance_m2", "descriptor", "uvd_px")
     joined = {name: np.concatenate([getattr(own, name) for own in observed]) for name in names}
-    write_observations(job.output, iterations, Observations(**joined))
+    observations = Observations(**joined, track=np.concatenate(track))
+    write_observations(job.output, iterations, observations)
     write_truth_points(job.output, np.concatenate(truth))
     write_rows(job.output / "tracks.parquet", TRACKS, pd.concat(tracks) if tracks else [])

@@ -1,0 +1,42 @@
+"""Which landmarks the tracks of the last frame went into.
+
+All observations of a track are of one point, which lies somewhat beside the landmark: what is sure
+about the one is less so about the other, and about the point that the next track will be of.
+"""
+
+import numpy as np
+
+from mapfusion.fastslam.slots import Slots
+
+
+class Tracked:
+    """The slots of each track that the last frame held."""
+
+    def __init__(self) -> None:
+        self._track = np.empty(0, dtype=np.int64)
+        self._slot = np.empty(0, dtype=np.int64)
+        self._source = np.empty(0, dtype=np.int64)
+
+    def ended(self, track: np.ndarray | None, slots: Slots) -> np.ndarray:
+        """Slots (n,) of tracks that go on in none of this frame's observations (K,); once each."""
+        over = np.isin(self._track, [] if track is None else track, invert=True)
+        over &= slots.source[self._slot] == self._source  # else it has become another landmark's
+        return np.unique(self._slot[over])
+
+    def went_into(
+        self, track: np.ndarray | None, chosen: np.ndarray, created: np.ndarray, slots: Slots
+    ) -> None:
+        """Keep the slots of a frame.
+
+        Args:
+            track: (K,) of its observations.
+            chosen: (K, M) the slots, or something negative.
+            created: (n, 2) rows of observations that began a slot, and the slot.
+            slots: the landmarks.
+        """
+        if track is None:
+            return
+        row, m = np.nonzero(chosen >= 0)
+        pairs = np.unique(np.concatenate([np.stack([row, chosen[row, m]], 1), created]), axis=0)
+        self._track, self._slot = track[pairs[:, 0]], pairs[:, 1]
+        self._source = slots.source[self._slot]
