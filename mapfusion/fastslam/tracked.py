@@ -13,9 +13,7 @@ class Tracked:
     """The slots of each track that the last frame held."""
 
     def __init__(self) -> None:
-        self._track = np.empty(0, dtype=np.int64)
-        self._slot = np.empty(0, dtype=np.int64)
-        self._source = np.empty(0, dtype=np.int64)
+        self._track = self._slot = self._source = np.empty(0, dtype=np.int64)
 
     def ended(self, track: np.ndarray | None, slots: Slots) -> np.ndarray:
         """Slots (n,) of tracks that go on in none of this frame's observations (K,); once each."""
@@ -35,6 +33,7 @@ class Tracked:
             slots: the landmarks.
         """
         if track is None:
+            self._track = self._slot = self._source = np.empty(0, dtype=np.int64)
             return
         row, m = np.nonzero(chosen >= 0)
         pairs = np.unique(np.concatenate([np.stack([row, chosen[row, m]], 1), created]), axis=0)

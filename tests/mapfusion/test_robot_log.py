@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 
 from mapfusion.errors import InputError
@@ -26,6 +27,7 @@ def a_log(descriptor=True, label=True, uvd=True, n=6, planar=False):
         rng.normal(size=(n, 64)).astype(np.float32) if descriptor else None,
         rng.integers(0, 9, n).astype(np.int32) if label else None,
         rng.normal(size=(n, 3)).astype(np.float32) if uvd else None,
+        rng.integers(-1, 4, n).astype(np.int32) if uvd else None,
     )
     odometry = rng.normal(size=(4, 3))
     odometry[0] = 0
@@ -52,6 +54,20 @@ def test_round_trip(tmp_path, optional, planar):
     log = a_log(optional, optional, optional, planar=planar)
     write_log(tmp_path / "north", log)
     assert_equal(read_log(tmp_path / "north"), log)
+
+
+def test_a_log_of_the_version_before_has_no_tracks(tmp_path):
+    log = a_log()
+    write_log(tmp_path, log)
+    earlier = pq.read_table(tmp_path / "observations.parquet").drop_columns("track")
+    about = earlier.schema.metadata | {b"mapfusion.schema_version": b"1"}
+    pq.write_table(earlier.replace_schema_metadata(about), tmp_path / "observations.parquet")
+    without = replace(log, observations=replace(log.observations, track=None))
+    assert_equal(read_log(tmp_path), without)
+    later = about | {b"mapfusion.schema_version": b"3"}
+    pq.write_table(earlier.replace_schema_metadata(later), tmp_path / "observations.parquet")
+    with pytest.raises(InputError, match="schema_version is 3, this program reads 2"):
+        read_log(tmp_path)
 
 
 def test_log_that_saw_nothing(tmp_path):

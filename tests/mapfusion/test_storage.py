@@ -49,6 +49,16 @@ def test_round_trip(tmp_path):
     assert list(pd.read_parquet(path).columns) == list(COLUMNS)
 
 
+def test_rows_of_bytes_come_back_as_bytes(tmp_path):
+    things = schema("test.bytes", 1, [pa.field("patch", pa.binary(5))])
+    rows = np.arange(35, dtype=np.uint8).reshape(7, 5)[::-1]
+    for written in (rows, rows[:0]):
+        write_table(tmp_path / "b.parquet", {"patch": written}, things)
+        table, _ = read_table(tmp_path / "b.parquet", things)
+        np.testing.assert_array_equal(column(table, "patch"), written)
+        np.testing.assert_array_equal(column(table.slice(2), "patch"), written[2:])
+
+
 def test_empty_table_keeps_its_types(tmp_path):
     path = tmp_path / "things.parquet"
     write_table(path, {name: values[:0] for name, values in COLUMNS.items()}, THINGS)

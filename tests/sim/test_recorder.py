@@ -6,12 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import map_coordinates
 
 from mapfusion.camera import StereoCamera
 from mapfusion.errors import InputError
 from sim.p3at import LENGTH_M
 from sim.radiometry import RadiometricNoise
-from sim.recorder import FrameSource, truth_points
+from mapfusion.se2 import transform_points
+from sim.recorder import FrameSource, truth_points, truth_slopes
 from sim.renderer import Renderer
 from sim.stereo_head import StereoFrame
 
@@ -124,6 +126,27 @@ def test_at_an_edge_the_nearest_pixel_counts() -> None:
     np.testing.assert_allclose(
         points[:, 0] - CAMERA.mount_x_m, [2, 5, 5, np.nan, np.nan], atol=1e-6
     )
+
+
+def test_truth_follows_the_pixel_on_its_own_surface() -> None:
+    """Two slanted planes that meet at a step in depth: the points of either move along it."""
+    v, u = np.mgrid[:240, :320]
+    planes = [1 / (0.2 + 0.0005 * u + 0.0002 * v), 1 / (0.4 - 0.0004 * u + 0.0003 * v)]
+    depth = np.where(u < 150, *planes).astype(np.float32)
+    uv = np.random.default_rng(3).uniform([3, 3], [316, 236], (500, 2))
+    uv = np.concatenate([uv, [[149.0, 100.0], [150.0, 100.0]]])  # at the step, on either side
+    pose = np.array([1.0, 2.0, 0.7])
+    slope = truth_slopes(CAMERA, depth, uv, pose)
+    for own, left in zip(planes, (uv[:, 0] < 149.01, uv[:, 0] > 149.99), strict=True):
+        for axis, step in enumerate(0.01 * np.eye(2)):
+            there, here = (
+                CAMERA.back_project(at, map_coordinates(own, at[:, ::-1].T, order=3))
+                for at in (uv[left] + step, uv[left] - step)
+            )
+            along = (transform_points(pose, there) - transform_points(pose, here)) / 0.02
+            np.testing.assert_allclose(slope[left, :, axis], along, atol=3e-4)
+    gone = np.where(u < 150, planes[0], np.nan).astype(np.float32)
+    assert np.all(truth_slopes(CAMERA, gone, np.array([[200.0, 50.0]]), pose) == 0)
 
 
 def test_no_pixels_no_points() -> None:

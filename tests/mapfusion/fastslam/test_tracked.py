@@ -1,0 +1,64 @@
+"""A landmark is less certain than the point of a track, from the frame in which the track ends."""
+
+import numpy as np
+import pytest
+
+from mapfusion.fastslam.filter import FastSlam
+from mapfusion.robot_log import Observations
+from tests.mapfusion.fastslam.landmark_worlds import EXACT_MOTION, nothing, parameters
+
+NOISE_M2 = 1e-4
+STRAY_M = 0.02
+
+
+def frame(tracks: list[int] | None, labels: tuple[int, ...] = (0, 1)) -> Observations:
+    """Two landmarks, as observations of these tracks."""
+    at = np.array([[2.0, 0.5, 0.1], [3.0, -0.5, 0.2]])[list(labels)]
+    return Observations(
+        at,
+        np.tile(NOISE_M2 * np.eye(3), (len(at), 1, 1)),
+        label=np.array(labels, dtype=np.int32),
+        track=None if tracks is None else np.array(tracks, dtype=np.int32),
+    )
+
+
+def variances(frames: list[Observations], particles: int = 1) -> np.ndarray:
+    """(2,) of the two landmarks after these frames, which all axes share."""
+    settings = parameters(
+        n_particles=particles, motion=EXACT_MOTION, association="label", stray_m=STRAY_M
+    )
+    slam = FastSlam(settings, np.random.default_rng(0))
+    for each in frames:
+        slam.step(np.zeros(3), each)
+    landmarks = slam.best_map(min_count=1)
+    diagonal = np.diagonal(landmarks.covariance_m2, axis1=1, axis2=2)
+    np.testing.assert_allclose(diagonal, diagonal[:, :1] * np.ones(3), rtol=1e-9)
+    return diagonal[np.argsort(landmarks.label), 0]
+
+
+def after(*counts: int) -> float:
+    """Of a Kalman filter that sees a track for so many frames, and then another, and so on."""
+    information = 0.0
+    for k, count in enumerate(counts):
+        if k:
+            information = 1 / (1 / information + 2 * STRAY_M**2)
+        information += count / NOISE_M2
+    return 1 / information
+
+
+@pytest.mark.parametrize("particles", [1, 30])
+def test_each_track_s_end_widens_its_landmark_once(particles: int) -> None:
+    frames = [frame([5, 6])] * 4
+    np.testing.assert_allclose(variances(frames, particles), after(4))
+    frames += [frame([7], (0,))] * 3  # 5 and 6 have ended; the second landmark is out of view
+    widened = after(4) + 2 * STRAY_M**2
+    np.testing.assert_allclose(variances(frames, particles), [after(4, 3), widened])
+    frames += [frame([7, 9])] * 2
+    np.testing.assert_allclose(variances(frames, particles), [after(4, 5), after(4, 2)])
+    frames += [nothing()] * 2
+    ended = np.array([after(4, 5), after(4, 2)]) + 2 * STRAY_M**2
+    np.testing.assert_allclose(variances(frames, particles), ended)
+
+
+def test_observations_without_tracks_are_each_news_of_the_landmark() -> None:
+    np.testing.assert_allclose(variances([frame(None)] * 4 + [nothing()]), after(4))
