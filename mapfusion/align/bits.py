@@ -7,6 +7,11 @@ import numpy as np
 from numba import njit, types
 from numba.extending import intrinsic
 
+WORD = 64
+
+# Times eight bytes of 0 or 1: bit 56 + k of the product is byte k (a sum of shifts by 7 to 56).
+_GATHER = np.uint64(0x0102040810204080)
+
 # Two instructions of every processor that Numba has no name for.
 
 
@@ -42,3 +47,41 @@ def count_common(first: np.ndarray, second: np.ndarray) -> int:
     for w in range(len(first)):
         count += ones(first[w] & second[w])
     return count
+
+
+@njit(cache=True)
+def packed(eights: np.ndarray, w: int) -> np.uint64:
+    """Word w of a set whose members are bytes of 1, the others 0; `eights` are eight bytes each."""
+    word = np.uint64(0)
+    for k in range(8):
+        word |= ((eights[8 * w + k] * _GATHER) >> np.uint64(56)) << np.uint64(8 * k)
+    return word
+
+
+@njit(cache=True)
+def transpose(square: np.ndarray) -> None:
+    """Exchange rows and columns of 64 words: halves of halves change places (Warren 2012, 7-3)."""
+    size, low = WORD // 2, np.uint64(0xFFFFFFFF)
+    while size:
+        shift = np.uint64(size)
+        for first in range(0, WORD, 2 * size):
+            for k in range(first, first + size):
+                differs = ((square[k] >> shift) ^ square[k + size]) & low
+                square[k] ^= differs << shift
+                square[k + size] ^= differs
+        size //= 2
+        low ^= low << np.uint64(size)
+
+
+@njit(cache=True)
+def mirror(graph: np.ndarray) -> None:
+    """Make a graph (N, W) symmetric of which only the edges to later vertices are there."""
+    n, words = graph.shape
+    square = np.empty(WORD, np.uint64)
+    for r in range(words):
+        for c in range(r, words):
+            for k in range(WORD):
+                square[k] = graph[r * WORD + k, c] if r * WORD + k < n else np.uint64(0)
+            transpose(square)
+            for k in range(min(WORD, n - c * WORD)):
+                graph[c * WORD + k, r] |= square[k]

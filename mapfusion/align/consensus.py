@@ -50,14 +50,22 @@ class Consensus:
 
     def settled(self, T_a_b: Float, pairs: Pairs, planar: PlanarPairs) -> Fit | Undetermined:
         """T_a_b (3,) fitted to its support at the likeliest s_drift; NaN when there is none."""
+        inlier, level = np.zeros(len(pairs), dtype=bool), -1
+        if np.all(np.isfinite(T_a_b)):
+            _, level = settle_at_best_scale(T_a_b, planar, self.variances_m2, self.bound, inlier)
+        return self.fit_of(T_a_b, inlier, level, pairs, planar)
+
+    def fit_of(
+        self, T_a_b: Float, inlier: np.ndarray, level: int, pairs: Pairs, planar: PlanarPairs
+    ) -> Fit | Undetermined:
+        """The fit of a settled motion: its support (N,) at that level of s_drift, -1 for none."""
         if not np.all(np.isfinite(T_a_b)):
             return Undetermined(f"no two of {len(pairs)} correspondences agree on a motion")
-        inlier = np.zeros(len(pairs), dtype=bool)
-        _, level = settle_at_best_scale(T_a_b, planar, self.variances_m2, self.bound, inlier)
         if level < 0:
             return Undetermined("fewer than 2 correspondences support the motion found")
-        variance_m2 = self.variances_m2[level]
-        reason = why_one_place(pairs[inlier], variance_m2)
+        variance_m2, support = self.variances_m2[level], pairs[inlier]
+        reason = why_one_place(support, variance_m2)
         if reason:
             return Undetermined(reason)
-        return Fit(T_a_b, inlier, weight=1 / mean_variances(planar, variance_m2)[inlier])
+        weight = 1 / mean_variances(planar, variance_m2)[inlier]
+        return Fit(T_a_b, inlier, weight=weight, fitted=support)

@@ -5,17 +5,22 @@ noise, whatever the motion (Mangelson et al. 2018, PCM; Lusk et al. 2021, CLIPPE
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
-from mapfusion.align.bits import trailing_zeros
+from mapfusion.align.bits import WORD, mirror, packed, trailing_zeros
 from mapfusion.align.mahalanobis_gate import PlanarPairs
 from mapfusion.se2 import Float
 
-WORD = 64
-_BYTES = 8  # answers looked at together: nearly all are no
-_ROUNDING = 1e-14  # share of the fourth power of distances that cancellation may leave
+# What single precision may add to the difference of two distances: coordinates of at most 1, read
+# to 2^-25, subtracted, squared and added, in two maps, make 15 roundings of 2^-24.
+_ROUNDING = 16 * 2.0**-24
+# (d + r)^2 is at most (1 + s) d^2 + (1 + 1 / s) r^2: a small share s of the pairs looked at more
+# closely pays for a rounding r that is larger than it.
+_SHARE = 1 / 16
+_LEAST_EXTENT_M = 1e-6  # of a map: all its landmarks in one place must not divide by zero
 
 
 @njit(cache=True)
@@ -28,91 +33,175 @@ def largest_variances(S: Float) -> Float:
     return largest
 
 
+class _Coarse(NamedTuple):
+    """N correspondences (N,) in single precision, in units of the larger map's extent.
+
+    Attributes:
+        ax, ay, bx, by: positions about the first pair's.
+        most: what each adds to the most that the squared difference of two distances may be.
+    """
+
+    ax: np.ndarray
+    ay: np.ndarray
+    bx: np.ndarray
+    by: np.ndarray
+    most: np.ndarray
+
+
+@njit(cache=True)
+def _coarse(pairs: PlanarPairs, variance_m2: float, bound: float) -> _Coarse:
+    """The pairs under their landmarks' worst variances, so that rounding loses none."""
+    p_a, p_b, S_a, S_b = pairs
+    n = len(p_a)
+    extent = _LEAST_EXTENT_M
+    for i in range(n):
+        for axis in range(2):
+            extent = max(extent, abs(p_a[i, axis] - p_a[0, axis]))
+            extent = max(extent, abs(p_b[i, axis] - p_b[0, axis]))
+    worst_a, worst_b = largest_variances(S_a), largest_variances(S_b)
+    coarse = _Coarse(
+        np.empty(n, np.float32),
+        np.empty(n, np.float32),
+        np.empty(n, np.float32),
+        np.empty(n, np.float32),
+        np.empty(n, np.float32),
+    )
+    for i in range(n):
+        coarse.ax[i] = (p_a[i, 0] - p_a[0, 0]) / extent
+        coarse.ay[i] = (p_a[i, 1] - p_a[0, 1]) / extent
+        coarse.bx[i] = (p_b[i, 0] - p_b[0, 0]) / extent
+        coarse.by[i] = (p_b[i, 1] - p_b[0, 1]) / extent
+        most = bound * (worst_a[i] + worst_b[i] + variance_m2) / (extent * extent)
+        coarse.most[i] = (1 + _SHARE) * most + (1 + 1 / _SHARE) * _ROUNDING * _ROUNDING / 2
+    return coarse
+
+
 @njit(cache=True)
 def _mark_near(
-    ax: Float,
-    ay: Float,
-    bx: Float,
-    by: Float,
-    most: Float,
+    ax: np.ndarray,
+    ay: np.ndarray,
+    bx: np.ndarray,
+    by: np.ndarray,
+    most: np.ndarray,
     at: tuple[float, float, float, float, float],
     near: np.ndarray,
 ) -> None:
-    """Mark in `near` (n,) those with |d_a - d_b|^2 <= the sum of two `most`, without a root.
+    """Mark in `near` (n,) those with (d_a - d_b)^2 <= m, the sum of two `most`, without a root.
 
-    Written so that the compiler compares several at once: no index but the loop's own, no branch.
+    With p = d_a^2 and q = d_b^2 that is (p - q)^2 <= m (2 (p + q) - m) where m <= p + q, and
+    always so beyond. Written so that the compiler compares several at once: no index but the loop's
+    own, no branch.
     """
     ax0, ay0, bx0, by0, most0 = at
     for j in range(len(near)):
         dx, dy, ex, ey = ax[j] - ax0, ay[j] - ay0, bx[j] - bx0, by[j] - by0
         p, q = dx * dx + dy * dy, ex * ex + ey * ey
-        t = p + q - (most[j] + most0)
-        near[j] = (t <= 0) | (t * t <= 4 * p * q + _ROUNDING * (p + q) * (p + q))
+        m = min(most[j] + most0, p + q)
+        near[j] = (p - q) * (p - q) <= m * (p + q + (p + q) - m)
 
 
-@njit(cache=True)
-def variance_along(dx: float, dy: float, S: Float, i: int, j: int) -> float:
-    """Variance of landmarks i and j together along the line (dx, dy) between them."""
-    square = dx * dx + dy * dy
-    if square == 0:
-        return 0.0
-    xx, xy, yy = S[i, 0, 0] + S[j, 0, 0], S[i, 0, 1] + S[j, 0, 1], S[i, 1, 1] + S[j, 1, 1]
-    return (dx * dx * xx + 2 * dx * dy * xy + dy * dy * yy) / square
+@njit(cache=True, error_model="numpy")
+def _variance_along(dx: float, dy: float, square: float, xx: float, xy: float, yy: float) -> float:
+    """Variance along the line (dx, dy) of this squared length; 0 where there is no line."""
+    along = dx * dx * xx + 2 * dx * dy * xy + dy * dy * yy
+    return along / square if square > 0 else 0.0
 
 
-@njit(cache=True)
-def drift_needed(pairs: PlanarPairs, i: int, j: int, bound: float) -> float:
-    """s_drift^2 from which on correspondences i and j agree; negative: even without drift.
-
-    To first order the difference of the two distances has the variance v that the four landmarks
-    have along the lines between them, and s_drift^2 for each correspondence.
-    """
-    p_a, p_b, S_a, S_b = pairs
-    ax, ay = p_a[j, 0] - p_a[i, 0], p_a[j, 1] - p_a[i, 1]
-    bx, by = p_b[j, 0] - p_b[i, 0], p_b[j, 1] - p_b[i, 1]
-    difference = math.sqrt(ax * ax + ay * ay) - math.sqrt(bx * bx + by * by)
-    v = variance_along(ax, ay, S_a, i, j) + variance_along(bx, by, S_b, i, j)
+@njit(cache=True, error_model="numpy")
+def _needed(one: tuple[float, ...], other: tuple[float, ...], bound: float) -> float:
+    """`drift_needed` of two correspondences, each a row of `in_rows`."""
+    ax, ay, bx, by = other[0] - one[0], other[1] - one[1], other[2] - one[2], other[3] - one[3]
+    p, q = ax * ax + ay * ay, bx * bx + by * by
+    difference = math.sqrt(p) - math.sqrt(q)
+    v = _variance_along(ax, ay, p, one[4] + other[4], one[5] + other[5], one[6] + other[6])
+    v += _variance_along(bx, by, q, one[7] + other[7], one[8] + other[8], one[9] + other[9])
     return (difference * difference / bound - v) / 2
 
 
 @njit(cache=True)
-def consistency(pairs: PlanarPairs, variances_m2: Float, bound: float) -> np.ndarray:
-    """Graphs of consistent correspondences, one for each s_drift.
+def in_rows(pairs: PlanarPairs) -> Float:
+    """The pairs (N, 10): p_a, p_b, and xx, xy, yy of S_a and of S_b; a row is read as one piece."""
+    p_a, p_b, S_a, S_b = pairs
+    rows = np.empty((len(p_a), 10))
+    for i in range(len(p_a)):
+        rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3] = p_a[i, 0], p_a[i, 1], p_b[i, 0], p_b[i, 1]
+        rows[i, 4], rows[i, 5], rows[i, 6] = S_a[i, 0, 0], S_a[i, 0, 1], S_a[i, 1, 1]
+        rows[i, 7], rows[i, 8], rows[i, 9] = S_b[i, 0, 0], S_b[i, 0, 1], S_b[i, 1, 1]
+    return rows
 
-    Every two are first compared under the landmarks' worst variances; only the few that pass are
-    looked at along their own lines.
+
+@njit(cache=True)
+def _numbers(rows: Float, i: int) -> tuple[float, ...]:
+    r = rows[i]
+    return r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9]
+
+
+@njit(cache=True)
+def drift_needed(rows: Float, i: int, j: int, bound: float) -> float:
+    """s_drift^2 from which on correspondences i and j of `in_rows` agree; negative: even without.
+
+    To first order the difference of the two distances has the variance v that the four landmarks
+    have along the lines between them, and s_drift^2 for each correspondence.
+    """
+    return _needed(_numbers(rows, i), _numbers(rows, j), bound)
+
+
+@njit(cache=True)
+def _agreeing(
+    near: np.uint64,
+    first: int,
+    one: tuple[float, ...],
+    rows: Float,
+    scales_m2: tuple[float, float],
+    bound: float,
+) -> tuple[np.uint64, np.uint64]:
+    """Which of the 64 correspondences from `first` on agree with `one` at two s_drift^2.
+
+    Only those in the set `near` are looked at.
+    """
+    low = high = np.uint64(0)
+    while near:
+        needed = _needed(one, _numbers(rows, first + trailing_zeros(near)), bound)
+        rest = near & (near - np.uint64(1))
+        low |= near ^ rest if needed <= scales_m2[0] else np.uint64(0)
+        high |= near ^ rest if needed <= scales_m2[1] else np.uint64(0)
+        near = rest
+    return low, high
+
+
+@njit(cache=True)
+def consistency(pairs: PlanarPairs, scales_m2: tuple[float, float], bound: float) -> np.ndarray:
+    """Graphs of consistent correspondences, for a small and a large s_drift.
+
+    Every two are first compared coarsely, under the landmarks' worst variances; only the few that
+    pass are looked at along their own lines.
 
     Args:
         pairs: N correspondences.
-        variances_m2: (L,) s_drift^2, ascending.
+        scales_m2: two s_drift^2, the smaller one first.
         bound: most for the squared difference of distances over its variance.
 
     Returns:
-        (L, N, ceil(N / 64)) uint64: bit j of row i tells whether i and j agree; symmetric, without
+        (2, N, ceil(N / 64)) uint64: bit j of row i tells whether i and j agree; symmetric, without
         the diagonal.
     """
-    p_a, p_b, S_a, S_b = pairs
-    n, levels = len(p_a), len(variances_m2)
-    ax, ay, bx, by = p_a[:, 0].copy(), p_a[:, 1].copy(), p_b[:, 0].copy(), p_b[:, 1].copy()
-    most = bound * (largest_variances(S_a) + largest_variances(S_b) + variances_m2[levels - 1])
-    graphs = np.zeros((levels, n, (n + WORD - 1) // WORD), np.uint64)
-    eight = np.zeros((n + _BYTES - 1) // _BYTES, np.uint64)
-    near = eight.view(np.uint8)
+    n = len(pairs.p_a)
+    words = (n + WORD - 1) // WORD
+    graphs = np.zeros((2, n, words), np.uint64)
+    eights = np.zeros(words * WORD // 8, np.uint64)
+    near = eights.view(np.uint8)
+    rows = in_rows(pairs)
+    ax, ay, bx, by, most = _coarse(pairs, scales_m2[1], bound)
     for i in range(n - 1):
         at = ax[i], ay[i], bx[i], by[i], most[i]
         _mark_near(ax[i:], ay[i:], bx[i:], by[i:], most[i:], at, near[i:n])
         near[i] = 0
-        own_bit = np.uint64(1) << np.uint64(i & 63)
-        for group in range(i // _BYTES, len(eight)):
-            word = eight[group]
-            while word:
-                j = (group << 3) + (trailing_zeros(word) >> 3)
-                word &= word - np.uint64(1)
-                needed = drift_needed(pairs, i, j, bound)
-                bit = np.uint64(1) << np.uint64(j & 63)
-                for level in range(levels - 1, -1, -1):
-                    if needed > variances_m2[level]:
-                        break
-                    graphs[level, i, j >> 6] |= bit
-                    graphs[level, j, i >> 6] |= own_bit
+        one = _numbers(rows, i)
+        for w in range(i // WORD, words):
+            word = packed(eights, w)
+            if word:
+                low, high = _agreeing(word, w * WORD, one, rows, scales_m2, bound)
+                graphs[0, i, w], graphs[1, i, w] = low, high
+    mirror(graphs[0])
+    mirror(graphs[1])
     return graphs

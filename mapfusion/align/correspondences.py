@@ -1,20 +1,17 @@
 """Pairs of landmarks, one of each map, that may be the same point of the world."""
 
+import math
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import numpy as np
-from numba import njit
 
+from mapfusion.align.nearest_descriptors import nearest_both_ways
 from mapfusion.arguments import Probability, Range, require_finite, require_in_range, require_shape
 from mapfusion.chi_square import chi_square_bound
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import NO_LABEL
 from mapfusion.se2 import Float
-
-_BLOCK_ROWS = 1024  # rows of the descriptor distance matrix held at once: 20 MB at 5000 columns
-# stands for the NaN of a landmark without a descriptor, far from all others
-_ABSENT = 1e9
 
 
 @dataclass(frozen=True)
@@ -134,68 +131,12 @@ def _row_of_label(landmarks: LandmarkMap) -> tuple[np.ndarray, np.ndarray]:
 def _match_descriptors(
     map_a: LandmarkMap, map_b: LandmarkMap, parameters: MatchParameters
 ) -> Correspondences:
-    nearest_b, distance2, nearest_a = _nearest_both_ways(map_a, map_b, parameters)
+    planar = map_a.planar or map_b.planar
+    height_bound = math.inf if planar else parameters.height.bound
+    nearest_b, distance2, nearest_a = nearest_both_ways(
+        map_a, map_b, height_bound, parameters.height.floor_m**2
+    )
     rows = np.arange(len(map_a))
     distance = np.sqrt(np.maximum(distance2, 0.0))
     kept = (nearest_a[nearest_b] == rows) & (distance <= parameters.max_descriptor_distance)
     return Correspondences(rows[kept], nearest_b[kept], distance[kept])
-
-
-def _nearest_both_ways(
-    map_a: LandmarkMap, map_b: LandmarkMap, parameters: MatchParameters
-) -> tuple[np.ndarray, Float, np.ndarray]:
-    """Nearest b of each a, its squared distance (infinite: none fits), and nearest a of each b."""
-    assert map_a.descriptor is not None
-    assert map_b.descriptor is not None
-    descriptor_a = np.nan_to_num(map_a.descriptor.astype(np.float32), nan=_ABSENT)
-    descriptor_b = np.nan_to_num(map_b.descriptor.astype(np.float32), nan=-_ABSENT)
-    a = _Side.of(map_a, descriptor_a, 0.0)
-    b = _Side.of(map_b, descriptor_b, parameters.height.floor_m**2)
-    height_bound = np.inf if map_a.planar or map_b.planar else parameters.height.bound
-    for start in range(0, len(map_a), _BLOCK_ROWS):
-        product = descriptor_a[start : start + _BLOCK_ROWS] @ descriptor_b.T
-        _take_nearer(product, start, a, b, height_bound)
-    return a.nearest, a.distance2, b.nearest
-
-
-class _Side(NamedTuple):
-    """The N landmarks of one map, and the nearest of the other map so far, for the kernel."""
-
-    square: np.ndarray  # (N,) squared norms of the descriptors
-    z_m: Float  # (N,)
-    variance_m2: Float  # (N,) of the heights
-    nearest: np.ndarray  # (N,)
-    distance2: Float  # (N,) to that
-
-    @classmethod
-    def of(cls, landmarks: LandmarkMap, descriptor: np.ndarray, floor_m2: float) -> "_Side":
-        n = len(landmarks)
-        return cls(
-            np.einsum("ij,ij->i", descriptor, descriptor),
-            landmarks.position_m[:, 2],
-            landmarks.covariance_m2[:, 2, 2] + floor_m2,
-            np.zeros(n, np.int64),
-            np.full(n, np.inf),
-        )
-
-
-@njit(cache=True)
-def _take_nearer(product: np.ndarray, start: int, a: _Side, b: _Side, height_bound: float) -> None:
-    """Update the nearest both ways from scalar products of descriptors.
-
-    `product` (n, N_b) is of rows `start` to `start` + n of map a with all of map b, `height_bound`
-    the most for the squared difference of heights over its variance.
-    """
-    for k in range(product.shape[0]):
-        i = start + k
-        for j in range(product.shape[1]):
-            distance2 = a.square[i] + b.square[j] - 2 * product[k, j]
-            if distance2 >= a.distance2[i] and distance2 >= b.distance2[j]:
-                continue
-            dz = a.z_m[i] - b.z_m[j]
-            if dz * dz > height_bound * (a.variance_m2[i] + b.variance_m2[j]):
-                continue
-            if distance2 < a.distance2[i]:
-                a.nearest[i], a.distance2[i] = j, distance2
-            if distance2 < b.distance2[j]:
-                b.nearest[j], b.distance2[j] = i, distance2

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from mapfusion.align.closest import Grid, runs_about
 from mapfusion.align.pairs import MIN_PAIRS
 from mapfusion.align.rigid import fit_rigid
 from mapfusion.planar import moved_point
@@ -18,6 +19,7 @@ from mapfusion.se2 import Float
 _CANDIDATES = 20
 # Halving ends above this: p is not known from fewer pairs, and 8 of them could hardly be accepted.
 _SMALLEST_SELECTION = 16
+_ROUNDING = 1e-12  # share of a squared distance that rounding may make it larger
 
 
 class IndependentPairs(NamedTuple):
@@ -28,41 +30,43 @@ class IndependentPairs(NamedTuple):
         heights: (N, 4) z of a and of b, and the most that the squared difference of two heights may
             be, as the sum of a part of a's and one of b's.
         possible: (N,) `possible_repairings`.
-        by_x: (N,) rows by ascending p_a[:, 0].
+        near_a: the grid over p_a.
     """
 
     p_a: Float
     p_b: Float
     heights: Float
     possible: np.ndarray
-    by_x: np.ndarray
+    near_a: Grid
 
 
 def independent_pairs(p_a: Float, p_b: Float, heights: Float) -> IndependentPairs:
     """Of positions (N, 2) and heights (N, 4), with all that no motion changes."""
-    by_x = np.argsort(p_a[:, 0], kind="stable")
-    return IndependentPairs(p_a, p_b, heights, possible_repairings(heights), by_x)
+    return IndependentPairs(p_a, p_b, heights, possible_repairings(heights), Grid.of(p_a))
 
 
-@njit(cache=True)
 def thin(p_a: Float, p_b: Float, patch_m: float) -> np.ndarray:
     """Rows (n,) of the pairs (N, 2 or 3), in order, that are no neighbours of a kept one.
 
     Neighbours are less than patch_m apart in both maps.
     """
-    kept = np.empty(len(p_a), np.int64)
-    n = 0
+    return np.flatnonzero(_mark_thinned(p_a, p_b, patch_m, Grid.of(p_a)))
+
+
+@njit(cache=True)
+def _mark_thinned(p_a: Float, p_b: Float, patch_m: float, near_a: Grid) -> np.ndarray:
+    kept = np.zeros(len(p_a), np.bool_)
+    runs = np.empty((near_a.shape[1], 2), np.int64)
     for i in range(len(p_a)):
         free = True
-        for m in range(n):
-            j = kept[m]
-            if apart_by_less(p_a, i, j, patch_m) and apart_by_less(p_b, i, j, patch_m):
-                free = False
-                break
-        if free:
-            kept[n] = i
-            n += 1
-    return kept[:n].copy()
+        for run in range(runs_about(p_a[i, 0], p_a[i, 1], patch_m, near_a, runs)):
+            for k in range(runs[run, 0], runs[run, 1]):
+                j = near_a.row[k]
+                if not (kept[j] and apart_by_less(p_a, i, j, patch_m)):
+                    continue
+                free = free and not apart_by_less(p_b, i, j, patch_m)
+        kept[i] = free
+    return kept
 
 
 @njit(cache=True)
@@ -120,34 +124,29 @@ def residuals_m(T_a_b: Float, p_a: Float, p_b: Float) -> Float:
 
 @njit(cache=True)
 def nearest_first(distance: Float, n: int, gate_m: float) -> np.ndarray:
-    """Rows (k,) among the first n whose distance (N,) is within the gate, by ascending distance.
+    """Rows (k,) among the first n whose distance (N,) is within the gate.
 
-    By insertion: Numba takes seconds to compile its sorts, and k is a few hundred at most.
+    The nearest, as many as `minimal_motion` seeks among, come first, by ascending distance; they
+    are kept by insertion, since Numba takes seconds to compile its sorts.
     """
     rows = np.empty(n, np.int64)
     k = 0
     for i in range(n):
         if distance[i] <= gate_m:
-            place = k
+            place, rows[k] = k, i
+            if k >= _CANDIDATES:
+                place = _CANDIDATES - 1
+                if distance[rows[place]] > distance[i]:
+                    rows[k] = rows[place]
+                else:
+                    place = -1
+            k += 1
             while place > 0 and distance[rows[place - 1]] > distance[i]:
                 rows[place] = rows[place - 1]
                 place -= 1
-            rows[place] = i
-            k += 1
+            if place >= 0:
+                rows[place] = i
     return rows[:k]
-
-
-@njit(cache=True)
-def first_from(p: Float, by_x: np.ndarray, x: float) -> int:
-    """Place in by_x (N,) of the first of the points p (N, 2) that lies at x or beyond it."""
-    low, high = 0, len(by_x)
-    while low < high:
-        middle = (low + high) // 2
-        if p[by_x[middle], 0] < x:
-            low = middle + 1
-        else:
-            high = middle
-    return low
 
 
 @njit(cache=True)
@@ -191,11 +190,15 @@ def same_height(heights: Float, i: int, j: int) -> bool:
 def possible_repairings(heights: Float) -> np.ndarray:
     """How many (i, j), i not j, can have one height, both among the first m + 1 pairs: (N,)."""
     counts = np.zeros(len(heights), np.int64)
+    # a column as one piece, so that the compiler compares several at once
+    z_a, z_b = heights[:, 0].copy(), heights[:, 1].copy()
+    most_a, most_b = heights[:, 2].copy(), heights[:, 3].copy()
     total = 0
     for m in range(len(heights)):
         for i in range(m):
-            total += same_height(heights, i, m)
-            total += same_height(heights, m, i)
+            there, back = z_a[i] - z_b[m], z_a[m] - z_b[i]
+            total += there * there <= most_a[i] + most_b[m]
+            total += back * back <= most_a[m] + most_b[i]
         counts[m] = total
     return counts
 
@@ -208,23 +211,27 @@ def agreeing_repairings(
 
     Counts (2, G), for ascending gates: among the `first` pairs only, among all.
     """
-    p_a, p_b, heights, _, by_x = pairs
+    _, p_b, heights, _, near_a = pairs
     moved = moved_points(T_a_b, p_b)
     agreeing = np.zeros((2, len(gates_m)), np.int64)
+    runs = np.empty((near_a.shape[1], 2), np.int64)
     widest = gates_m[-1]
+    beyond = widest * widest * (1 + _ROUNDING)
     for j in range(len(p_b)):
-        for m in range(first_from(p_a, by_x, moved[j, 0] - widest), len(p_a)):
-            i = by_x[m]
-            if p_a[i, 0] > moved[j, 0] + widest:
-                break
-            distance = math.hypot(p_a[i, 0] - moved[j, 0], p_a[i, 1] - moved[j, 1])
-            if distance > widest or i == j or not same_height(heights, i, j):
-                continue
-            for g in range(len(gates_m)):
-                if distance <= gates_m[g]:
-                    agreeing[1, g] += 1
-                    if i < first and j < first:
-                        agreeing[0, g] += 1
+        x, y = moved[j, 0], moved[j, 1]
+        for run in range(runs_about(x, y, widest, near_a, runs)):
+            for k in range(runs[run, 0], runs[run, 1]):
+                dx, dy = near_a.p[k, 0] - x, near_a.p[k, 1] - y
+                if dx * dx + dy * dy > beyond:  # without the root, most are told already
+                    continue
+                i, distance = near_a.row[k], math.hypot(dx, dy)
+                if distance > widest or i == j or not same_height(heights, i, j):
+                    continue
+                for g in range(len(gates_m)):
+                    if distance <= gates_m[g]:
+                        agreeing[1, g] += 1
+                        if i < first and j < first:
+                            agreeing[0, g] += 1
     return agreeing
 
 

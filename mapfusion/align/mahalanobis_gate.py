@@ -16,6 +16,9 @@ from mapfusion.planar import add_turned, residual
 from mapfusion.se2 import Float
 
 _ROUNDS = 20  # of fit and support; two to five are the rule
+# e^T C^-1 e from which on a density, e^-100 of its peak, is lost in rounding beside the false ones'
+_BEYOND = 200.0
+_LARGE = 1e100  # where a product of likelihood ratios goes into the logarithm, far from overflow
 
 
 class PlanarPairs(NamedTuple):
@@ -104,14 +107,20 @@ def log_likelihood(
     """
     p_a, p_b, S_a, S_b = pairs
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
-    log = 0.0
+    log, product = 0.0, 1.0
     for i in range(len(p_a)):
         ex, ey = residual(T_a_b, cos, sin, p_a, p_b, i)
         xx, xy, yy = residual_covariance(cos, sin, S_a, S_b, i, variance_m2)
-        square, det = _square_and_det(ex, ey, xx, xy, yy)
-        density = math.exp(-square / 2) / (2 * math.pi * math.sqrt(det))
-        log += math.log(1 - share + share * area_m2 * density)
-    return log
+        ratio = 1 - share
+        if ex * ex + ey * ey <= _BEYOND * (xx + yy):  # no direction's variance is above the trace
+            square, det = _square_and_det(ex, ey, xx, xy, yy)
+            density = math.exp(-square / 2) / (2 * math.pi * math.sqrt(det))
+            ratio += share * area_m2 * density
+        product *= ratio
+        if not 1 / _LARGE < product < _LARGE:
+            log += math.log(product)
+            product = 1.0
+    return log + math.log(product)
 
 
 @njit(cache=True)
@@ -123,21 +132,19 @@ def settle(
     Returns the number of supporters; below two T_a_b is not fitted again.
     """
     mean = mean_variances(pairs, variance_m2)
-    n = len(mean)
-    before, weight = np.empty(n, np.bool_), np.empty(n)
+    inverse, weight = 1 / mean, np.empty(len(mean))
     count, _ = mark_supporters(T_a_b, pairs, mean, variance_m2, bound, inside)
     for _ in range(_ROUNDS):
         if count < 2:
             break
-        for i in range(n):
-            weight[i] = inside[i] / mean[i]
-            before[i] = inside[i]
+        for i in range(len(mean)):
+            weight[i] = inverse[i] if inside[i] else 0.0
         fit_weighted(pairs.p_a, pairs.p_b, weight, T_a_b)
         count, _ = mark_supporters(T_a_b, pairs, mean, variance_m2, bound, inside)
-        same = True
-        for i in range(n):
-            same = same and inside[i] == before[i]
-        if same:
+        changed = 0
+        for i in range(len(mean)):
+            changed += inside[i] != (weight[i] > 0)
+        if changed == 0:
             break
     return count
 

@@ -1,16 +1,14 @@
 """The largest set of vertices of a graph that are all joined to one another, on bitsets.
 
-First the cliques that a greedy walk finds; then branch and bound in degeneracy order, pruned by
-core numbers and by greedy colouring (Tomita and Seki 2003; San Segundo et al. 2011, BBMC; the order
-of steps is that of Rossi et al. 2015, PMC).
+First the cliques that a greedy walk finds; then branch and bound in the order of degrees, pruned
+by cores and by greedy colouring (Tomita and Seki 2003; San Segundo et al. 2011, BBMC; the order of
+steps is that of Rossi et al. 2015, PMC).
 """
 
 import numpy as np
 from numba import njit
 
-from mapfusion.align.bits import count_common, trailing_zeros
-
-WORD = 64
+from mapfusion.align.bits import WORD, count_common, trailing_zeros
 
 
 @njit(cache=True)
@@ -42,62 +40,59 @@ def members(bits: np.ndarray, into: np.ndarray) -> int:
 
 
 @njit(cache=True)
-def by_degree(degree: np.ndarray) -> np.ndarray:
-    """Vertices (N,) by ascending degree, those of one degree in their order (a counting sort)."""
+def most_first(degree: np.ndarray) -> np.ndarray:
+    """Vertices by descending degree (N,), those of one degree in their order (a counting sort).
+
+    Those of a negative degree are left out.
+    """
     start = np.zeros(len(degree) + 1, np.int64)
+    for d in degree:
+        if d >= 0:
+            start[d] += 1
+    for d in range(len(degree) - 1, -1, -1):
+        start[d] += start[d + 1]
+    order = np.empty(start[0], np.int64)
     for v in range(len(degree)):
-        start[degree[v] + 1] += 1
-    for d in range(1, len(start)):
-        start[d] += start[d - 1]
-    order = np.empty(len(degree), np.int64)
-    for v in range(len(degree)):
-        order[start[degree[v]]] = v
-        start[degree[v]] += 1
+        if degree[v] >= 0:
+            order[start[degree[v] + 1]] = v
+            start[degree[v] + 1] += 1
     return order
 
 
 @njit(cache=True)
-def degeneracy_order(graph: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices in the order of taking away the one with the fewest neighbours left (N,).
-
-    Batagelj and Zaversnik (2003), with vertices kept sorted by degree.
-
-    Returns:
-        The order, and the core number (N,) of each vertex: it is in no clique of more than one
-        above that.
-    """
-    n = len(graph)
-    core = degrees(graph)
-    order = by_degree(core)
-    place, start = np.empty(n, np.int64), np.zeros(n + 1, np.int64)
-    for k in range(n):
-        place[order[k]] = k
-        start[core[order[k]] + 1] = k + 1
-    for d in range(1, n + 1):
-        start[d] = max(start[d], start[d - 1])
-    neighbours = np.empty(n, np.int64)
-    for k in range(n):
-        v = order[k]
-        for i in range(members(graph[v], neighbours)):
-            u = neighbours[i]
-            if core[u] > core[v]:  # u leaves its block by changing places with the block's first
-                first = max(start[core[u]], k + 1)
-                other = order[first]
-                order[place[u]], order[first] = other, u
-                place[other], place[u] = place[u], first
-                start[core[u]] = first + 1
-                core[u] -= 1
-    return order, core
+def everyone(n: int) -> np.ndarray:
+    """The set (W,) of all numbers below n."""
+    bits = np.zeros((n + WORD - 1) // WORD, np.uint64)
+    for v in range(n):
+        bits[v // WORD] |= np.uint64(1) << np.uint64(v % WORD)
+    return bits
 
 
 @njit(cache=True)
-def largest_possible(graph: np.ndarray) -> int:
-    """A bound on the size of cliques: one more than the largest core number (Seidman 1983)."""
-    _, core = degeneracy_order(graph)
-    largest = -1
-    for v in range(len(core)):
-        largest = max(largest, core[v])
-    return largest + 1
+def keep_core(graph: np.ndarray, chosen: np.ndarray, least: int, rows: np.ndarray) -> int:
+    """Take away from `chosen` (W,) until all that remain have `least` neighbours among them.
+
+    They are the core of that order (Seidman 1983): all cliques of more vertices than `least` are in
+    it. Their numbers go into `rows`; returns how many, 0 where too few are left to have so many.
+    """
+    n, before = members(chosen, rows), -1
+    while n != before:
+        before = n
+        for i in range(before):
+            if n <= least:  # the others need no look
+                return 0
+            v = rows[i]
+            if count_common(graph[v], chosen) < least:
+                chosen[v // WORD] &= ~(np.uint64(1) << np.uint64(v % WORD))
+                n -= 1
+        members(chosen, rows)
+    return n if n > least else 0
+
+
+@njit(cache=True)
+def may_hold(graph: np.ndarray, among: np.ndarray, size: int) -> bool:
+    """Whether some vertices (W,) have neighbours enough for a clique of more than `size`."""
+    return keep_core(graph, among.copy(), size, np.empty(len(graph), np.int64)) > 0
 
 
 @njit(cache=True)
@@ -107,22 +102,29 @@ def greedy_clique(graph: np.ndarray, starts: int) -> np.ndarray:
     From `starts` vertices; of all walks (K,) the largest, the first on a tie.
     """
     n, words = graph.shape
-    order = by_degree(n - 1 - degrees(graph))
+    order = most_first(degrees(graph))
     best, clique = np.zeros(n, np.int64), np.zeros(n, np.int64)
     size_of_best = 0
     left = np.empty(words, np.uint64)
     for start in range(min(starts, n)):
         clique[0], size = order[start], 1
-        left[:] = graph[order[start]]
-        for k in range(n):
-            v = order[k]
+        some = np.uint64(0)
+        for w in range(words):
+            left[w] = graph[order[start], w]
+            some |= left[w]
+        for v in order:
+            if not some:
+                break
             if has(left, v):
                 clique[size] = v
                 size += 1
+                some = np.uint64(0)
                 for w in range(words):
                     left[w] &= graph[v, w]
+                    some |= left[w]
         if size > size_of_best:
-            best[:size] = clique[:size]
+            for k in range(size):
+                best[k] = clique[k]
             size_of_best = size
     return best[:size_of_best].copy()
 
@@ -215,67 +217,54 @@ def _branch_and_bound(graph: np.ndarray, at_least: int, budget: int) -> tuple[np
 
 
 @njit(cache=True)
-def _among(graph: np.ndarray, chosen: np.ndarray, needed: int) -> tuple[np.ndarray, np.ndarray]:
-    """The graph of the vertices `chosen` (W,) with at least `needed` neighbours among them.
-
-    Takes vertices away from `chosen` until all that remain have enough.
-
-    Returns:
-        Their numbers (n,), none where they are too few to have so many neighbours, and the graph
-        (n, ceil(n / 64)) in which they are numbered 0 to n - 1.
-    """
-    rows = np.empty(len(graph), np.int64)
-    n, before = members(chosen, rows), -1
-    while n > needed and n != before:
-        before = n
-        for i in range(before):
-            v = rows[i]
-            if count_common(graph[v], chosen) < needed:
-                chosen[v // WORD] &= ~(np.uint64(1) << np.uint64(v % WORD))
-                n -= 1
-                if n <= needed:  # too few are left, the others need no look
-                    break
-        members(chosen, rows)
-    if n <= needed:
-        n = 0
-    rows = rows[:n].copy()
+def _subgraph(graph: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """The graph (n, ceil(n / 64)) of some vertices (n,), numbered 0 to n - 1."""
+    n = len(rows)
     small = np.zeros((n, (n + WORD - 1) // WORD), np.uint64)
     for i in range(n):
         for j in range(n):
             if has(graph[rows[i]], rows[j]):
                 small[i, j // WORD] |= np.uint64(1) << np.uint64(j % WORD)
-    return rows, small
+    return small
 
 
 @njit(cache=True)
-def larger_clique(graph: np.ndarray, at_least: int, budget: int) -> tuple[np.ndarray, bool]:
-    """A maximum clique, if there is one of more than `at_least` vertices.
+def larger_clique(
+    graph: np.ndarray, among: np.ndarray, at_least: int, budget: int
+) -> tuple[np.ndarray, bool]:
+    """A maximum clique among some vertices, if there is one of more than `at_least`.
 
-    Vertices are taken from the densest core outwards; each with its neighbours that come later in
-    degeneracy order, which are few, so that every clique is looked for where its first vertex is.
+    Of those that have enough neighbours, from the one of most on; each with its neighbours that
+    came before, which are half of them where degrees are alike, so that every clique is looked for
+    where the last of its vertices is.
 
-    The graph (N, W) is symmetric, bit j of row i for an edge, no diagonal. After `budget` nodes of
-    the search the largest found so far is returned. Returns (K,) vertices, none when no clique is
-    larger; and whether the search came to its end.
+    The graph (N, W) is symmetric, bit j of row i for an edge, no diagonal; `among` (W,) is the set
+    of vertices. After `budget` nodes of the search the largest found so far is returned. Returns
+    (K,) vertices, none when no clique is larger; and whether the search came to its end.
     """
     n, words = graph.shape
-    order, core = degeneracy_order(graph)
-    best = np.zeros(0, np.int64)
-    later, chosen = np.zeros(words, np.uint64), np.empty(words, np.uint64)
-    for k in range(n - 1, -1, -1):
-        v = order[k]
-        if core[v] >= at_least:  # a clique of one vertex more than core[v] may begin here
+    best, rows = np.zeros(0, np.int64), np.empty(n, np.int64)
+    chosen, before = among.copy(), np.zeros(words, np.uint64)
+    degree = np.full(n, -1)
+    for v in rows[: keep_core(graph, chosen, at_least, rows)]:
+        degree[v] = count_common(graph[v], chosen)
+    for v in most_first(degree):
+        if degree[v] < at_least:  # a larger clique was found since
+            break
+        if count_common(before, graph[v]) >= at_least:
             for w in range(words):
-                chosen[w] = later[w] & graph[v, w]
-            rows, small = _among(graph, chosen, at_least - 1)
-            if len(rows):
+                chosen[w] = before[w] & graph[v, w]
+            count = keep_core(graph, chosen, at_least - 1, rows)
+            if count:
+                small = _subgraph(graph, rows[:count])
                 found, budget = _branch_and_bound(small, at_least - 1, budget)
                 if len(found):
                     at_least = len(found) + 1
                     best = np.empty(at_least, np.int64)
                     best[0] = v
-                    best[1:] = rows[found]
+                    for k in range(len(found)):
+                        best[k + 1] = rows[found[k]]
                 if budget <= 0:
                     return best, False
-        later[v // WORD] |= np.uint64(1) << np.uint64(v % WORD)
+        before[v // WORD] |= np.uint64(1) << np.uint64(v % WORD)
     return best, True

@@ -86,5 +86,6 @@ def supported(
     n = int(np.count_nonzero(inlier))
     if n < 2:
         return Fit(T_a_b, inlier, refusal=refusal or f"{n} correspondences support the motion")
-    reason = why_one_place(pairs[inlier])
-    return Undetermined(reason) if reason else Fit(T_a_b, inlier, refusal=refusal)
+    support = pairs[inlier]
+    reason = why_one_place(support)
+    return Undetermined(reason) if reason else Fit(T_a_b, inlier, fitted=support, refusal=refusal)

@@ -64,22 +64,22 @@ class Pairs:
     @cached_property
     def p_a(self) -> Float:
         """(N, 3) positions in metres, in frame a."""
-        return self.map_a.position_m[self.index_a]
+        return self.map_a.position_m.take(self.index_a, axis=0)
 
     @cached_property
     def p_b(self) -> Float:
         """(N, 3) positions in metres, in frame b."""
-        return self.map_b.position_m[self.index_b]
+        return self.map_b.position_m.take(self.index_b, axis=0)
 
     @cached_property
     def covariance_a(self) -> Float:
         """(N, 3, 3) in frame a."""
-        return self.map_a.covariance_m2[self.index_a]
+        return self.map_a.covariance_m2.take(self.index_a, axis=0)
 
     @cached_property
     def covariance_b(self) -> Float:
         """(N, 3, 3) in frame b."""
-        return self.map_b.covariance_m2[self.index_b]
+        return self.map_b.covariance_m2.take(self.index_b, axis=0)
 
     def points(self) -> tuple[Float, Float]:
         """Positions (N, 3) in both frames, (N, 2) where heights carry no information."""

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from mapfusion.align.consensus import Consensus
-from mapfusion.align.consistency import drift_needed
+from mapfusion.align.consistency import drift_needed, in_rows
 from mapfusion.align.mahalanobis_gate import PlanarPairs, mark_supporters, mean_variances, settle
 from mapfusion.align.method import Fit, Undetermined
 from mapfusion.align.pairs import Pairs
@@ -75,14 +75,14 @@ def least_truncated_squares(
     """
     p_a, p_b = pairs.p_a, pairs.p_b
     n = len(p_a)
-    mean = mean_variances(pairs, variance_m2)
+    mean, rows = mean_variances(pairs, variance_m2), in_rows(pairs)
     best_T, T_a_b, inside = np.full(3, np.nan), np.empty(3), np.empty(n, np.bool_)
     best_score, best_raw = 0.0, 0.0
     needed, draws, state = float(max_draws), 0, seed
     while draws < needed:
         draws += 1
         state, i, j = draw_pair(state, n)
-        if drift_needed(pairs, i, j, agreement) > variance_m2:
+        if drift_needed(rows, i, j, agreement) > variance_m2:
             continue
         if fit_two(p_a, p_b, i, j, T_a_b) < min_baseline_m:
             continue

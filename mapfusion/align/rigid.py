@@ -74,7 +74,10 @@ def residuals(T_a_b: Float, p_a: Float, p_b: Float) -> Float:
 def residual_covariances(T_a_b: Float, covariance_a: Float, covariance_b: Float) -> Float:
     """S_a + R S_b R^T in the plane (N, 2, 2): what the landmarks' own noise makes of a residual."""
     R_a_b = rotation(T_a_b[2])
-    return covariance_a[:, :2, :2] + R_a_b @ covariance_b[:, :2, :2] @ R_a_b.T
+    # R S R^T, row by row of S: one product of matrices instead of two for every landmark
+    turn = (R_a_b[:, None, :, None] * R_a_b[None, :, None, :]).reshape(4, 4)
+    turned = covariance_b[:, :2, :2].reshape(-1, 4) @ turn.T
+    return covariance_a[:, :2, :2] + turned.reshape(-1, 2, 2)
 
 
 def least_squares_gain(T_a_b: Float, p_b: Float, weight: Float | None = None) -> Float:
@@ -88,7 +91,8 @@ def least_squares_gain(T_a_b: Float, p_b: Float, weight: Float | None = None) ->
         weight = np.ones(len(p_b))
     weighted = jacobian * weight[:, None, None]
     normal = weighted.reshape(-1, 3).T @ jacobian.reshape(-1, 3)
-    return np.linalg.inv(normal) @ np.swapaxes(weighted, 1, 2)
+    gain = weighted.reshape(-1, 3) @ np.linalg.inv(normal)  # which is symmetric
+    return np.swapaxes(gain.reshape(-1, 2, 3), 1, 2)
 
 
 def motion_covariance(gain: Float, covariance_m2: Float) -> Float:
@@ -97,8 +101,9 @@ def motion_covariance(gain: Float, covariance_m2: Float) -> Float:
     Weights that are not the inverse covariances make it larger than the inverse of the normal
     matrix: this is the sandwich of the two.
     """
-    weighted = gain @ covariance_m2
-    return np.swapaxes(weighted, 0, 1).reshape(3, -1) @ np.swapaxes(gain, 0, 1).reshape(3, -1).T
+    x, y = gain[:, :, 0], gain[:, :, 1]
+    xx, xy, yy = covariance_m2[:, 0, 0], covariance_m2[:, 0, 1], covariance_m2[:, 1, 1]
+    return (x.T * xx + y.T * xy) @ x + (x.T * xy + y.T * yy) @ y
 
 
 def motion_jacobian(T_a_b: Float, p_b: Float) -> Float:

@@ -24,7 +24,7 @@ from experiments.judge.result import run_scenario
 from experiments.run.code_version import SOURCE_ROOT
 from experiments.scenario.settings import Simulation
 from experiments.scenario.yaml_input import read_mapping
-from mapfusion.align.max_clique import larger_clique
+from mapfusion.align.max_clique import everyone, larger_clique
 from mapfusion.align.registry import ALIGNERS
 from mapfusion.camera import StereoCamera
 from sim.floorplan import FloorPlan, Wall
@@ -94,7 +94,7 @@ def main() -> int:
     test_near_finds_the_gates_that_touch_a_box_and_no_freed_slot()
     test_without_landmarks_nothing_is_near()
     test_equals_the_dense_twin(8, 90, planar=False)
-    larger_clique(on_bits(random_graph(0, 130, 0.3)), 0, 1000)
+    larger_clique(on_bits(random_graph(0, 130, 0.3)), everyone(130), 0, 1000)
     test_calibration_counts_every_motion_of_two_pairs()
     with tempfile.TemporaryDirectory() as folder:
         run_all_aligners(Path(folder))

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from mapfusion.align.closest import Grid, nearest_two
+from mapfusion.align.closest import Grid, nearest_two, runs_about
 
 
 def points(kind, rng):
@@ -33,3 +33,27 @@ def test_one_point_has_no_second():
     grid = Grid.of(np.zeros((1, 3)))
     k, first, second = nearest_two(3.0, 4.0, 0.0, grid)
     assert (k, first, second) == (0, 5.0, np.inf)
+
+
+@pytest.mark.parametrize("kind", ["spread", "one wall", "far outlier", "one place", "two"])
+def test_all_within_a_radius_are_in_the_runs_about_a_point(kind):
+    rng = np.random.default_rng(1)
+    p = points(kind, rng)
+    grid, looked_at = Grid.of(p), 0
+    runs = np.empty((grid.shape[1], 2), np.int64)
+    queries = np.vstack([rng.uniform(-2, 22, (200, 3)), rng.uniform(-1000, 1000, (20, 3)), p[:20]])
+    for q, radius in zip(queries, rng.uniform(0, 3, len(queries)), strict=True):
+        ranges = runs[: runs_about(q[0], q[1], radius, grid, runs)]
+        found = np.concatenate([grid.row[first:end] for first, end in ranges] + [np.zeros(0, int)])
+        near = np.flatnonzero(np.hypot(*(p - q)[:, :2].T) <= radius)
+        assert len(set(found)) == len(found)
+        assert set(near) <= set(found)
+        looked_at += len(found)
+    assert kind != "spread" or looked_at < 0.2 * len(queries) * len(p)
+
+
+def test_of_no_points_there_is_a_grid():
+    grid = Grid.of(np.zeros((0, 2)))
+    runs = np.empty((grid.shape[1], 2), np.int64)
+    assert runs_about(0.0, 0.0, 1.0, grid, runs) <= 1
+    np.testing.assert_array_equal(grid.start, 0)

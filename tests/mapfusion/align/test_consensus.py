@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from scipy.stats import f as f_distribution
 
 from mapfusion import se2
-from mapfusion.align.clique import Clique
+from mapfusion.align.clique import Clique, CliqueSearch
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.gnc import Gnc
 from mapfusion.align.mahalanobis_gate import settle
@@ -173,10 +173,32 @@ def test_what_the_clique_leaves_out_changes_nothing(true_share, monkeypatch):
     pair = with_noise_in_both(3, 400, true_share, drift_m=0.05)
     quick = estimate("clique", pair)
     monkeypatch.setattr("mapfusion.align.clique._WORTH_A_LOOK", 1.0)
-    monkeypatch.setattr("mapfusion.align.clique.largest_possible", len)
+    monkeypatch.setattr("mapfusion.align.clique._PART", 100)
+    parts = estimate("clique", pair)
+    monkeypatch.setattr("mapfusion.align.clique._PART", 400)
+    monkeypatch.setattr("mapfusion.align.clique.may_hold", lambda *_: True)
     whole = estimate("clique", pair)
-    np.testing.assert_array_equal(quick.inlier, whole.inlier)
-    assert error(quick.T_a_b, whole.T_a_b) == pytest.approx((0, 0), abs=1e-6)
+    for found in (quick, parts):
+        np.testing.assert_array_equal(found.inlier, whole.inlier)
+        assert error(found.T_a_b, whole.T_a_b) == pytest.approx((0, 0), abs=1e-6)
+
+
+@pytest.mark.parametrize(("n_other", "none"), [(14, True), (30, False)])
+def test_parts_without_half_as_large_a_clique_rule_out_another_motion(n_other, none):
+    """Half of 42 pairs are 21, of which either of two parts would hold more than ten."""
+    n, motions = 200, {0: with_noise_in_both(1, 200, 1.0), 50: with_noise_in_both(2, 200, 1.0)}
+    chance, sizes, position = with_noise_in_both(3, n, 0.0), {0: 42, 50: n_other}, {}
+    for side in ("map_a", "map_b"):
+        p = getattr(chance, side).position_m.copy()
+        for first, pair in motions.items():
+            members = slice(first, first + sizes[first])
+            p[members] = getattr(pair, side).position_m[members]
+        position[side] = replace(getattr(chance, side), position_m=p)
+    search = CliqueSearch(
+        Clique(), Pairs(**position, correspondences=chance.correspondences).in_plan()
+    )
+    search.offer(np.arange(42))
+    assert search.none_in_parts([np.arange(0, n, 2), np.arange(1, n, 2)]) == none
 
 
 @pytest.mark.parametrize("n_true", [190, 120])

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapfusion.align import correspondences as module
+from mapfusion.align import nearest_descriptors as module
 from mapfusion.align.correspondences import Correspondences, HeightGate, MatchParameters, match
 from tests.mapfusion.align.map_pairs import landmarks, unit_vectors
 
@@ -42,6 +42,38 @@ def test_pairs_are_those_of_the_definition(noise, monkeypatch):
     assert len(found) > 20
     expected = np.linalg.norm(a.descriptor[found.index_a] - b.descriptor[found.index_b], axis=1)
     np.testing.assert_allclose(found.distance, expected, atol=1e-3)
+
+
+def test_heights_of_all_certainties_a_kilometre_up(monkeypatch):
+    """Some are sure to a millimetre and some to a metre; blocks of alike heights leave none out."""
+    monkeypatch.setattr(module, "_BLOCK_ROWS", 16)
+    rng = np.random.default_rng(5)
+    maps = []
+    for landmarks_of in two_maps(rng, 150)[:2]:
+        covariance = landmarks_of.covariance_m2.copy()
+        covariance[:, 2, 2] = 10 ** rng.uniform(-6, 0, 150)
+        up = landmarks_of.position_m.copy()
+        up[:, 2] += 1000 + rng.normal(0, 0.1, 150)
+        maps.append(replace(landmarks_of, position_m=up, covariance_m2=covariance))
+    parameters = MatchParameters(2.0, HeightGate(0.999, floor_m=0.0))
+    found = match(*maps, parameters)
+    assert set(zip(found.index_a, found.index_b, strict=True)) == slow_match(*maps, parameters)
+    assert 50 < len(found) < 140
+
+
+def test_of_equally_near_ones_the_first_is_taken():
+    p, descriptor = np.zeros((3, 3)), np.eye(3, 64)[[0, 0, 1]]
+    a, b = landmarks(p, descriptor=descriptor), landmarks(p[:2], descriptor=descriptor[:2])
+    found = match(a, b)
+    assert set(zip(found.index_a, found.index_b, strict=True)) == {(0, 0)}
+
+
+@pytest.mark.parametrize("floor_m", [0.0, 0.035])
+def test_planar_maps_without_variance_of_heights(floor_m):
+    a, b, _ = two_maps(np.random.default_rng(6))
+    flat = [replace(m, planar=True, covariance_m2=0 * m.covariance_m2) for m in (a, b)]
+    found = match(*flat, MatchParameters(0.5, HeightGate(floor_m=floor_m)))
+    assert len(found) == len(a)
 
 
 def test_true_pairs_are_found():
