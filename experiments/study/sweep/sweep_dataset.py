@@ -75,11 +75,14 @@ class SweepDataset:
         told: dict[str, Any] = {"run_id": run.run_id, "scenario": run.scenario, "seed": run.seed}
         told |= dict(run.settings)
         leading = fields(**dict.fromkeys(told, TEXT) | {"seed": pa.int64()})
-        frame = pd.DataFrame(rows, columns=pd.Index([field.name for field in own]))
+        own_schema = schema(
+            f"sweep.{table}", SCHEMA_VERSION, [field.remove_metadata() for field in leading + own]
+        )
+        if not len(rows):
+            return own_schema.empty_table()
+        frame = rows if isinstance(rows, pd.DataFrame) else pd.DataFrame(rows)
         columns = [pa.repeat(pa.scalar(told[f.name], f.type), len(frame)) for f in leading]
         columns += [pa.array(frame[field.name].to_numpy(), field.type) for field in own]
-        columns_of = [field.remove_metadata() for field in leading + own]
-        own_schema = schema(f"sweep.{table}", SCHEMA_VERSION, columns_of)
         return pa.Table.from_arrays(columns, schema=own_schema)
 
     def finish(

@@ -90,14 +90,13 @@ def write_rows(
     run: SweepRun, judged: JudgedRun, stages: Sequence[str], dataset: SweepDataset
 ) -> None:
     """Write a run's rows of all tables; no maps, no images."""
-    made = all_tables(judged, judged.load_team())
+    made = all_tables(judged, judged.load_team(), _TABLES)
     times = [
         {"stage": folder.name, "key": folder.key, "figure": name, "seconds": seconds}
         for folder in judged.folders()
         for name, seconds in folder.figures().items()
     ]
-    rows = {name: made[name] for name in _TABLES} | {RUN_TIMES: times}
-    dataset.finish(run, renderer(judged.scenario), stages, rows)
+    dataset.finish(run, renderer(judged.scenario), stages, {**made, RUN_TIMES: times})
 
 
 @dataclass
