@@ -35,8 +35,8 @@ from mapfusion.errors import DamagedFileError, InputError, MendedWarning
 from mapfusion.sealed import parquet_with_seal, read_sealed
 from mapfusion.storage import read_json, read_parquet, write_json, write_sealed
 
-# Runs a file: of runs of 20 frames some 100 kB, of long ones some 50 MB.
-RUNS_PER_FILE = 500
+# Runs a file: of runs of 20 frames up to 1 MB, of long ones some 100 MB.
+RUNS_PER_FILE = 1000
 # Rows that are in memory at one time, some 20 MB; whole runs, so that readers get them whole.
 _ROWS_PER_GROUP = 100_000
 _TOLD = ("status", "stages", "libraries", "source_hash")

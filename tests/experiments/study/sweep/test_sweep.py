@@ -74,7 +74,7 @@ def test_no_table_but_that_of_times_tells_times(swept: Path) -> None:
         timed = {column for column in columns if column.endswith("_s") or column == "seconds"}
         assert bool(timed) == (name == RUN_TIMES)
     times = pd.read_parquet(swept / RUN_TIMES)
-    assert (times["seconds"] >= 0).all()
+    assert (np.isfinite(times["seconds"]) & (times["seconds"] >= 0)).all()
     assert {"features", "slam", "aligner", "align", "judge"} <= set(times["stage"])
 
 
@@ -226,21 +226,3 @@ def test_two_sweeps_at_once_on_one_store(swept: Path, short_path: Path, tmp_path
             assert code == 0, complaints
     for name in ("one", "two"):
         assert same_rows(tmp_path / name, swept, seed=1)
-
-
-def test_an_existing_cluster_does_the_same(
-    swept: Path, short_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from distributed import LocalCluster
-
-    with LocalCluster(
-        n_workers=2, threads_per_worker=2, dashboard_address="localhost:0", silence_logs=50
-    ) as cluster:
-        reply = command(
-            capsys,
-            *("sweep", short_path, "--seeds", "1", *GRID, "--results", tmp_path),
-            *("--scheduler", cluster.scheduler_address),
-        )
-    assert reply.code == 0
-    assert same_rows(tmp_path / "sweeps" / "short", swept, seed=1)
-    assert np.isfinite(pd.read_parquet(tmp_path / "sweeps" / "short" / RUN_TIMES)["seconds"]).all()
