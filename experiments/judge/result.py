@@ -6,9 +6,10 @@
 
 import platform
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -151,39 +152,61 @@ def _time_pair(scenario: AnyScenario, a: EvaluatedRobot, b: EvaluatedRobot) -> l
     return rows
 
 
-def all_tables(run: JudgedRun, team: FusedTeam) -> dict[str, pd.DataFrame]:
-    """The tables of a finished run's last maps, paths, estimates and errors, by their names."""
-    paths, clouds, landmarks = [], [], []
-    for stages, robot in zip(run.pipeline.robots, team.robots, strict=True):
-        log, maps = run.robot_folders(stages)
-        poses = read_rows(maps / "poses.parquet", slam.POSES).assign(robot=robot.name)
-        paths.append(robot_paths(poses, read_log(log).odometry, robot.path))
-        clouds.append(read_rows(maps / "clouds.parquet", slam.CLOUDS).assign(robot=robot.name))
-        landmarks.append(fused_landmarks.landmark_rows(robot, *robot.at(team.iteration)))
-    joined, settings = pd.concat(paths, ignore_index=True), run.settings
-    rows: dict[str, Any] = {
-        "paths": joined,
-        "robots": joined,
-        "path_statistics": [] if run.no_truth else path_statistics_rows(joined),
-        "clouds": pd.concat(clouds, ignore_index=True),
-        "landmarks": pd.concat(landmarks, ignore_index=True),
-        "fused": fused_landmarks.fused_rows(team),
-        "fused_motions": fused_landmarks.fused_motion_rows(
+def all_tables(
+    run: JudgedRun, team: FusedTeam, only: Collection[str] = tuple(tables.ALL)
+) -> dict[str, pd.DataFrame]:
+    """The tables of a finished run's last maps, paths, estimates and errors, by their names.
+
+    Of `only` those, if it is given: a sweep of short runs spends its time on the others.
+    """
+    settings, paths = run.settings, _paths(run, team)
+    makers: dict[str, Callable[[], Any]] = {
+        "paths": lambda: paths,
+        "robots": lambda: paths,
+        "clouds": lambda: _clouds(run),
+        "landmarks": lambda: pd.concat(
+            [fused_landmarks.landmark_rows(r, *r.at(team.iteration)) for r in team.robots],
+            ignore_index=True,
+        ),
+        "fused": lambda: fused_landmarks.fused_rows(team),
+        "fused_motions": lambda: fused_landmarks.fused_motion_rows(
             team, settings.merge.parameters.use_drift
         ),
-        "map_fits": [] if run.no_truth else fused_landmarks.map_fit_rows(team),
-        "landmark_nees": []
-        if run.no_truth
-        else fused_landmarks.landmark_nees_rows(team, settings.true_pair_radius_m),
-        "timings": [
+        "timings": lambda: [
             {"stage": stage.name, "name": f"{stage.key}:{name}", "elapsed_s": seconds}
             for stage in run.folders()
             for name, seconds in stage.figures().items()
         ],
     }
+    judged: dict[str, Callable[[], Any]] = {
+        "path_statistics": lambda: path_statistics_rows(paths),
+        "map_fits": lambda: fused_landmarks.map_fit_rows(team),
+        "landmark_nees": lambda: fused_landmarks.landmark_nees_rows(
+            team, settings.true_pair_radius_m
+        ),
+    }
+    makers |= dict.fromkeys(judged, list) if run.no_truth else judged
     for name in ("estimates", "correspondences", "errors", "fusion"):
-        rows[name] = run.pair_table(name)
-    return {name: tables.framed(name, table) for name, table in rows.items()}
+        makers[name] = partial(run.pair_table, name)
+    return {name: tables.framed(name, make()) for name, make in makers.items() if name in only}
+
+
+def _paths(run: JudgedRun, team: FusedTeam) -> pd.DataFrame:
+    paths = []
+    for stages, robot in zip(run.pipeline.robots, team.robots, strict=True):
+        log, maps = run.robot_folders(stages)
+        poses = read_rows(maps / "poses.parquet", slam.POSES).assign(robot=robot.name)
+        paths.append(robot_paths(poses, read_log(log).odometry, robot.path))
+    return pd.concat(paths, ignore_index=True)
+
+
+def _clouds(run: JudgedRun) -> pd.DataFrame:
+    folders = ((each.name, run.robot_folders(each).slam) for each in run.pipeline.robots)
+    clouds = [
+        read_rows(folder / "clouds.parquet", slam.CLOUDS).assign(robot=name)
+        for name, folder in folders
+    ]
+    return pd.concat(clouds, ignore_index=True)
 
 
 def history_tables(team: FusedTeam, settings: JudgeSettings) -> dict[str, pd.DataFrame]:

@@ -7,6 +7,7 @@ import itertools
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
+from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -135,9 +136,9 @@ def _recorded(scenario: Recording) -> Iterable[RobotStages]:
     """Robots of recorded logs give their names to files, as those of scenarios do."""
     robots: dict[str, RobotStages] = {}
     for folder in map(Path, scenario.logs):
-        known, frames = read_log(folder), folder / "frames.parquet"
-        name = known.robot
-        if not len(known):
+        frames = folder / "frames.parquet"
+        recorded, name, n_frames = _known(folder, _stamps(folder))
+        if not n_frames:
             raise InputError(f"{folder}: frames.parquet holds no frame")
         if not re.fullmatch(NAME_PATTERN, name):
             raise InputError(f"{frames}: robot is named {name!r}, expected {NAME_PATTERN}")
@@ -145,9 +146,21 @@ def _recorded(scenario: Recording) -> Iterable[RobotStages]:
             raise InputError(f"{frames}: robot is named {name}, a name of the evaluation's own")
         if name in robots:
             raise InputError(f"{frames}: robot {name} is in another log already")
-        recorded = RecordedLog(folder)
-        robots[name] = RobotStages(name, len(known), recorded, _slam(scenario, recorded))
+        robots[name] = RobotStages(name, n_frames, recorded, _slam(scenario, recorded))
     return robots.values()
+
+
+def _stamps(folder: Path) -> tuple[tuple[str, int, int], ...]:
+    """What changes with a log's files."""
+    files = ((path.name, path.stat()) for path in sorted(folder.glob("*")))
+    return tuple((name, stat.st_mtime_ns, stat.st_size) for name, stat in files)
+
+
+@lru_cache(maxsize=256)  # a sweep lays out the same logs for every run
+def _known(folder: Path, _: object) -> tuple[RecordedLog, str, int]:
+    """A recorded log, its robot's name and number of frames; read again when it has changed."""
+    log = read_log(folder)
+    return RecordedLog(folder), log.robot, len(log)
 
 
 def _slam(scenario: Scenario, logged: Stage | RecordedLog) -> Stage:

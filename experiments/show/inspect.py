@@ -31,6 +31,7 @@ _JSON_KEYS = {
     "finished stage": {"stage", "key"},
     "times of a part of a stage": {"elapsed_s"},
 }
+_NAMES_SHOWN = 10
 _DESCRIPTIONS = ("sweep.json", "scenario.json", "provenance.json", "done.json")
 # The first that a folder holds tells its kind.
 _FOLDER_MARKS = {
@@ -114,10 +115,16 @@ def _brief(found: dict[str, Any]) -> dict[str, Any]:
     facts = {}
     for name, value in found.items():
         is_names = isinstance(value, list) and all(isinstance(each, str) for each in value)
-        shown = ", ".join(value) if is_names else value
+        shown = _listed(value) if is_names else value
         if name != _KIND and isinstance(shown, str | float | int) and shown != "":
             facts[name] = shown
     return facts
+
+
+def _listed(names: list[str]) -> str:
+    if len(names) > _NAMES_SHOWN:
+        return f"{len(names)}, from {names[0]} to {names[-1]}"
+    return ", ".join(names)
 
 
 def _folder(path: Path) -> Contents:

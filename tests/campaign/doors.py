@@ -14,7 +14,9 @@ from experiments.judge.result_files import read_provenance
 from experiments.run.store import StageFolder
 from experiments.show.figures.result_tables import ResultTables
 from experiments.study.statistics.run_tables import find_runs
-from experiments.study.sweep.sweep_dataset import open_dataset
+from experiments.study.sweep.combinations import SweepRun
+from experiments.study.sweep.joined_tables import JoinedTables, open_dataset
+from experiments.study.sweep.sweep_dataset import SweepDataset
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map
 from mapfusion.recordings.mrclam import MrclamSettings, import_mrclam
 from mapfusion.robot_log import (
@@ -105,21 +107,21 @@ def _logs(folder: Path, rng: np.random.Generator) -> list[Door]:
 
 
 def _of_a_result(folder: Path, rng: np.random.Generator) -> list[Door]:
-    result, sweep = folder / "result", folder / "sweep"
+    result, sweep = folder / "result", SweepDataset(folder / "sweep", ("slam.every",))
     fits = tables.table_path(result, "map_fits")
     rows = {"map": ["R1", "fused"], "n_landmarks": [3, 4], "rmse_m": rng.normal(size=2)}
     tables.write(fits, "map_fits", pd.DataFrame(rows))
     write_json(result / "scenario.json", {"name": "x", "seed": 3, "description": "a\ud800"})
     write_json(result / "provenance.json", {"stages": {}, "libraries": {"numpy": "2"}})
     write_json(result / "world.json", {"walls": [[[0, 0], [1, 0]]], "robots": {"R1": [0, 1, 0.5]}})
-    open_dataset(sweep, ["slam.every"])
+    open_dataset(sweep, [SweepRun(folder, "x", 0)])
     return [
         Door(fits, partial(tables.read, fits, "map_fits")),
         Door(fits, lambda: find_runs(result).read("map_fits")),
         Door(result / "scenario.json", lambda: find_runs(result).results[0].run),
         Door(result / "provenance.json", lambda: read_provenance(result / "provenance.json")),
         Door(result / "world.json", lambda: (ResultTables(result).walls, _start(result))),
-        Door(sweep / "sweep.json", lambda: open_dataset(sweep, ["slam.every"]).keys),
+        Door(sweep.folder / "sweep.json", lambda: JoinedTables.of(sweep).run_ids),
     ]
 
 

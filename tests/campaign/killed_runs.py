@@ -142,9 +142,8 @@ class Story:
 
 
 def _finished(results: Path) -> Iterator[Path]:
-    """What says that a stage's part, or a run of a sweep, is finished."""
+    """What says that a stage's part is finished."""
     yield from results.glob("store/*/*/done*.json")
-    yield from results.glob("sweeps/*/runs/*.parquet")
 
 
 def _files(results: Path) -> Iterator[tuple[Path, bytes]]:

@@ -12,6 +12,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple, Self
 
+import pandas as pd
+
 from tests.helpers.waiting import PATIENCE_S, wait_until
 
 Victim = Literal["worker", "everything", "interrupted", "terminated"]
@@ -187,23 +189,16 @@ def _read(path: Path) -> bytes:
         return b""
 
 
-def same_files(sweep: Path, other: Path, seed: int | None = None) -> list[str]:
-    """Files of the tables that two sweeps hold, times apart; asserts that they are the same.
-
-    Of the other one, the files of one seed alone if it is given.
-    """
-    first, second = _files(sweep), _files(other)
-    if seed is not None:
-        second = {name: data for name, data in second.items() if f"-{seed}-" in Path(name).stem}
-    assert sorted(first) == sorted(second)
-    assert [name for name in first if first[name] != second[name]] == []
-    return sorted(first)
-
-
-def _files(sweep: Path) -> dict[str, bytes]:
+def same_rows(sweep: Path, other: Path, seed: int) -> bool:
+    """Whether the tables of two sweeps, times apart, hold the same of the runs of one seed."""
     timed = {"run_times", "aligner_timings"}
-    return {
-        str(path.relative_to(sweep)): path.read_bytes()
-        for path in sweep.glob("*/*.parquet")
-        if path.parent.name not in timed
-    }
+    names = [{path.parent.name for path in each.glob("*/*.parquet")} for each in (sweep, other)]
+    both = (
+        [_rows(each / name, seed) for name in sorted(names[0] - timed)] for each in (sweep, other)
+    )
+    return names[0] == names[1] and all(one.equals(two) for one, two in zip(*both, strict=True))
+
+
+def _rows(table: Path, seed: int) -> pd.DataFrame:
+    rows = pd.read_parquet(table)
+    return rows[rows["seed"] == seed].reset_index(drop=True)

@@ -11,7 +11,8 @@ from experiments.show.terminal.layout import (
     print_table,
 )
 from experiments.study.sweep.combinations import SweepRun
-from experiments.study.sweep.sweep_dataset import ERRORS, GIVEN, SweepDataset, medians_over_runs
+from experiments.study.sweep.run_medians import ERRORS, GIVEN, medians_over_runs
+from experiments.study.sweep.sweep_dataset import SweepDataset
 from experiments.study.sweep.sweep_driver import SweepProgress
 from experiments.study.sweep.sweep_plan import Survey
 

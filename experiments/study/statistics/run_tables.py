@@ -12,12 +12,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pandas as pd
+import pyarrow as pa
 
 from experiments.judge import tables
 from experiments.judge.judged_maps import RUN_KEYS, setting_columns
 from experiments.judge.result_files import read_scenario
+from experiments.run.frames import row_groups
 from mapfusion.errors import InputError
-from mapfusion.storage import read_parquet, text_attributes
+from mapfusion.storage import text_attributes
 
 _VERSION = b"mapfusion.schema_version"
 _TOLD = ("status", "reason")  # of each run of a sweep
@@ -26,10 +28,14 @@ BATCH_ROWS = 100_000
 
 
 class RunPath(NamedTuple):
-    """A result folder or a table of one run, and the run's columns where the rows lack them."""
+    """A result folder or a table of runs; a run's columns where the rows lack them.
+
+    Of a sweep that goes on, rows of all but the `finished` runs are not complete, and left out.
+    """
 
     path: Path
     run: dict[str, Any]
+    finished: frozenset[str] | None = None
 
 
 @dataclass(frozen=True)
@@ -40,18 +46,20 @@ class Runs:
     sweeps: tuple[Path, ...]
 
     def files(self, table: str) -> list[RunPath]:
-        """The files of one table, one a run, in a fixed order; none where no run has it.
-
-        Of a sweep that goes on, rows of unfinished runs are not complete, and left out.
-        """
-        paths = [RunPath(tables.table_path(path, table), run) for path, run in self.results]
+        """The files of one table in a fixed order; none where no run has it."""
+        paths = [RunPath(tables.table_path(path, table), run) for path, run, _ in self.results]
         found = [file for file in paths if file.path.is_file()]
         for sweep in self.sweeps:
-            told = self._told[self._told["sweep"] == str(sweep)]
-            finished = set(told.loc[told["status"] == "finished", "run_id"])
-            whole = _whole_files(sweep / table)
-            found += [file for file in whole if told.empty or file.path.stem in finished]
+            finished = self._finished(sweep)
+            if finished is None or finished:
+                found += [RunPath(path, {}, finished) for path in _whole_files(sweep / table)]
         return found
+
+    def _finished(self, sweep: Path) -> frozenset[str] | None:
+        """The runs of a sweep that are in all its tables; None where nothing says so."""
+        told = self._told[self._told["sweep"] == str(sweep)]
+        is_finished = told["status"] == "finished"
+        return None if told.empty else frozenset(told.loc[is_finished, "run_id"])
 
     def has(self, table: str) -> bool:
         """Whether any run has this table."""
@@ -65,20 +73,26 @@ class Runs:
             where = ", ".join(map(str, [*(result.path for result in self.results), *self.sweeps]))
             what = f"no table {table} (expected the results of `run` or `sweep`)"
             raise InputError(f"{where}: {what}")
-        seen: dict[str, Path] = {}
+        seen: dict[str, RunPath] = {}
         batch: list[pd.DataFrame] = []
-        for file in self.files(table):
-            rows = _read(file, table, columns, optional)
+        for file, rows in self._pieces(table, columns, optional):
             for run_id in rows["run_id"].unique():
-                if run_id in seen:
-                    raise InputError(f"{file.path}: run {run_id} is also in {seen[run_id]}")
-                seen[run_id] = file.path
+                if seen.setdefault(run_id, file) is not file:
+                    also = f"run {run_id} is also in {seen[run_id].path}"
+                    raise InputError(f"{file.path}: {also}")
             batch.append(rows)
             if sum(map(len, batch)) >= BATCH_ROWS:
                 yield pd.concat(batch, ignore_index=True)
                 batch = []
         if batch:
             yield pd.concat(batch, ignore_index=True)
+
+    def _pieces(
+        self, table: str, columns: Sequence[str] | None, optional: Sequence[str]
+    ) -> Iterator[tuple[RunPath, pd.DataFrame]]:
+        for file in self.files(table):
+            for rows in _read(file, table, columns, optional):
+                yield file, rows
 
     def read(
         self, table: str, columns: Sequence[str] | None = None, optional: Sequence[str] = ()
@@ -111,9 +125,10 @@ class Runs:
     def _told(self) -> pd.DataFrame:
         """The tables `runs` of all sweeps that have one, with the sweep's folder."""
         parts = [
-            _read(file, "runs", _TOLD, ()).assign(sweep=str(sweep))
+            rows.assign(sweep=str(sweep))
             for sweep in self.sweeps
-            for file in _whole_files(sweep / "runs")
+            for path in _whole_files(sweep / "runs")
+            for rows in _read(RunPath(path, {}), "runs", _TOLD, ())
         ]
         none = pd.DataFrame(columns=["sweep", *RUN_KEYS, *_TOLD])
         return pd.concat(parts, ignore_index=True) if parts else none
@@ -152,9 +167,9 @@ def match_names(frame: pd.DataFrame) -> pd.Series:
     return names
 
 
-def _whole_files(folder: Path) -> list[RunPath]:
+def _whole_files(folder: Path) -> list[Path]:
     """The tables in a folder; names with a dot in front are files still being written."""
-    return [RunPath(path, {}) for path in sorted(folder.glob("[!.]*.parquet"))]
+    return sorted(folder.glob("[!.]*.parquet"))
 
 
 def _run_of(path: Path) -> dict[str, Any]:
@@ -166,23 +181,30 @@ def _run_of(path: Path) -> dict[str, Any]:
 
 def _read(
     file: RunPath, table: str, columns: Sequence[str] | None, optional: Sequence[str]
-) -> pd.DataFrame:
-    data = read_parquet(file.path, f"table {table}")
-    _require_readable(file.path, table, text_attributes(file.path, data))
-    found, of_run = data.column_names, () if file.run else RUN_KEYS
-    missing = [name for name in (*of_run, *(columns or ())) if name not in found]
-    if missing:
-        raise InputError(f"{file.path}: has no column {', '.join(missing)} (a table {table})")
-    wanted = found
-    if columns is not None:
+) -> Iterator[pd.DataFrame]:
+    """Rows of whole runs, as many at a time as were written together."""
+
+    def wanted(found: pa.Schema) -> Sequence[str]:
+        _require_readable(file.path, table, text_attributes(file.path, found.empty_table()))
+        of_run = () if file.run else RUN_KEYS
+        missing = [name for name in (*of_run, *(columns or ())) if name not in found.names]
+        if missing:
+            raise InputError(f"{file.path}: has no column {', '.join(missing)} (a table {table})")
+        if columns is None:
+            return found.names
         own = set(tables.ALL[table].names) if table in tables.ALL else set(_TOLD)
-        leading = [] if file.run else takewhile(lambda name: name not in own, found)
-        there = (name for name in optional if name in found)
-        wanted = list(dict.fromkeys([*leading, *columns, *there]))
-    rows = data.select(wanted).to_pandas()
-    for place, (name, value) in enumerate(file.run.items()):
-        rows.insert(place, name, value)
-    return rows.assign(**{name: float("nan") for name in optional if name not in rows})
+        leading = [] if file.run else takewhile(lambda name: name not in own, found.names)
+        there = (name for name in optional if name in found.names)
+        return list(dict.fromkeys([*leading, *columns, *there]))
+
+    for piece in row_groups(file.path, f"table {table}", wanted):
+        rows = piece.to_pandas()
+        for place, (name, value) in enumerate(file.run.items()):
+            rows.insert(place, name, value)
+        if file.finished is not None:
+            is_finished = rows["run_id"].isin(file.finished)
+            rows = rows if is_finished.all() else rows[is_finished]
+        yield rows.assign(**{name: float("nan") for name in optional if name not in rows})
 
 
 def _require_readable(path: Path, table: str, attributes: Mapping[str, str]) -> None:

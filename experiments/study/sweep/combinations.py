@@ -84,8 +84,7 @@ def runs_of(paths: Sequence[Path], seeds: Sequence[int], axes: Axes) -> list[Swe
     runs: list[SweepRun] = []
     names: dict[str, Path] = {}
     for path in paths:
-        loaded = [SweepRun(path, "", seeds[0], settings).load() for settings in combinations]
-        name = loaded[0].name
+        (name,) = {SweepRun(path, "", seeds[0], each).load().name for each in combinations}
         if names.setdefault(name, path) != path:
             raise InputError(f"{path}: is named {name}, as {names[name]} is; names must differ")
         runs += [SweepRun(path, name, *each) for each in itertools.product(seeds, combinations)]

@@ -1,5 +1,6 @@
 """Runs a sweep: its tasks on Dask, a window of runs at a time, and then its aligners' times."""
 
+import itertools
 import pickle
 import shutil
 import tempfile
@@ -12,6 +13,8 @@ from functools import partial
 from pathlib import Path
 from typing import cast
 
+import pandas as pd
+import pyarrow as pa
 from distributed import Client, Future, as_completed
 from distributed.scheduler import KilledWorker
 
@@ -23,7 +26,12 @@ from experiments.run.dask_cluster import connected
 from experiments.run.store import mending
 from experiments.run.tasks import OnProgress, Task
 from experiments.study.sweep.combinations import SweepRun
-from experiments.study.sweep.sweep_dataset import ALIGNER_TIMINGS, open_dataset
+from experiments.study.sweep.joined_tables import (
+    JoinedTables,
+    open_dataset,
+    written_by_nobody_else,
+)
+from experiments.study.sweep.sweep_dataset import ALIGNER_TIMINGS
 from experiments.study.sweep.sweep_plan import PlannedRun, Sweep, planned
 from mapfusion.errors import InputError
 from mapfusion.storage import PART, remove_abandoned, temporary_prefix
@@ -37,6 +45,9 @@ _COUNT_WORKERS_EVERY_S = 10.0
 # while at the same task it is the task.
 RETRIES = 3
 _ATTEMPTS = "attempts"
+# Rows that wait are joined, and so can be read, in a minute; or later, as that must not take more
+# than a twentieth of the time: each time a file is written anew.
+_JOIN_EVERY_S, _TIMES_AS_LONG = 60.0, 20.0
 _OLD_S = 24 * 3600  # in a sweep that runs, tasks begin and end in the meantime
 
 
@@ -66,12 +77,14 @@ class SweepDriver:
         self,
         client: Client,
         sweep: Sweep,
+        tables: JoinedTables,
         terms: dask_worker.Terms,
         on_progress: OnSweepProgress,
         jobs: int | None = None,
     ) -> None:
         """`jobs` are the workers on this machine; None if they are a cluster's."""
-        self._client, self._sweep, self._terms, self._jobs = client, sweep, terms, jobs
+        self._client, self._sweep, self._tables = client, sweep, tables
+        self._terms, self._jobs = terms, jobs
         self._on_progress = on_progress
         # Of this sweep alone: another client's tasks of the same key might write elsewhere.
         self._suffix = uuid.uuid4().hex[:8]
@@ -82,6 +95,8 @@ class SweepDriver:
         self._mended = Counter[Path]()  # damaged files of the store
         self._again: set[PlannedRun] = set()  # to be planned anew, since a stage was damaged
         self._n_workers, self._counted_at = 0, -_COUNT_WORKERS_EVERY_S
+        self._left_in = Counter(map(tables.number, sweep.runs))  # runs by the file they go into
+        self._join_at = time.monotonic() + _JOIN_EVERY_S
         self.progress = SweepProgress(len(sweep.runs))
 
     def execute(self) -> None:
@@ -96,8 +111,9 @@ class SweepDriver:
                 self._begin(run)
             self._on_progress(self.progress)
             if not self._open:
-                return
+                break
             self._task_ended(next(self._ended))
+        self._tables.join()
 
     def _has_room(self) -> bool:
         if time.monotonic() - self._counted_at > _COUNT_WORKERS_EVERY_S:
@@ -107,12 +123,12 @@ class SweepDriver:
 
     def _begin(self, run: SweepRun) -> None:
         try:
-            laid_out = planned(run, self._sweep.store, self._sweep.dataset, self._jobs)
+            laid_out = planned(run, self._sweep.store, self._tables, self._jobs)
         except InputError as error:  # no world can be made from this seed, a log is damaged, ...
             reason = " ".join(str(error).split())
-            self.progress.done += 1
             self.progress.failed[run.run_id] = reason
             self._sweep.dataset.fail(run, reason)
+            self._run_ended(run)
             return
         self._open[laid_out] = set()
         blocked: set[str] = set()
@@ -181,7 +197,6 @@ class SweepDriver:
             self._again.remove(laid_out)
             self._begin(laid_out.run)
             return
-        self.progress.done += 1
         # All tasks that could be done were done, so which comes first does not depend on chance.
         failures = (self._failures.get(task.name) for task in laid_out.left)
         if first := next(filter(None, failures), None):
@@ -191,6 +206,19 @@ class SweepDriver:
                 reason += f"; its traceback: {details}"
                 self.progress.defects.add(run.run_id)
             self.progress.failed[run.run_id] = reason
+        self._run_ended(laid_out.run)
+
+    def _run_ended(self, run: SweepRun) -> None:
+        """Count it; its rows are joined with those of the last run that goes into their file."""
+        self.progress.done += 1
+        number, began = self._tables.number(run), time.monotonic()
+        self._left_in[number] -= 1
+        if not self._left_in[number]:
+            self._tables.join(number)
+        elif began >= self._join_at:
+            self._tables.join()
+            took_s = time.monotonic() - began
+            self._join_at = began + max(_JOIN_EVERY_S, _TIMES_AS_LONG * took_s)
 
 
 def _label_and_name(key: object) -> tuple[str, str]:
@@ -205,36 +233,51 @@ def execute(
     """Run a sweep; returns how it ended.
 
     Raises:
-        InputError: the output folder is of another sweep, no scheduler or no worker is of use.
+        InputError: the output folder is of another sweep, or another command is at work in it; no
+            scheduler or no worker is of use.
     """
     folder = sweep.dataset.folder
-    open_dataset(folder, sweep.dataset.keys)
-    for left_behind in folder.glob(f".{_ATTEMPTS}.*"):  # by a sweep killed on any machine
-        if time.time() - left_behind.stat().st_mtime > _OLD_S:  # else another one may be running
-            shutil.rmtree(left_behind, ignore_errors=True)
-    named = PART, temporary_prefix(_ATTEMPTS)
-    own = tempfile.TemporaryDirectory(*named, folder, ignore_cleanup_errors=True)
-    with own as attempts, connected(jobs, scheduler) as client:
-        terms = dask_worker.Terms(Path(attempts), RETRIES, dask_worker.code_version())
-        driver = SweepDriver(client, sweep, terms, on_progress, None if scheduler else jobs)
-        driver.execute()
-    remove_abandoned(folder)  # by earlier sweeps, and by workers of this one, that were killed
+    with written_by_nobody_else(folder):
+        tables = open_dataset(sweep.dataset, sweep.runs)
+        for left_behind in folder.glob(f".{_ATTEMPTS}.*"):  # by a sweep killed on any machine
+            if time.time() - left_behind.stat().st_mtime > _OLD_S:  # else another may be running
+                shutil.rmtree(left_behind, ignore_errors=True)
+        named = PART, temporary_prefix(_ATTEMPTS)
+        own = tempfile.TemporaryDirectory(*named, folder, ignore_cleanup_errors=True)
+        with own as attempts, connected(jobs, scheduler) as client:
+            terms = dask_worker.Terms(Path(attempts), RETRIES, dask_worker.code_version())
+            local = None if scheduler else jobs
+            driver = SweepDriver(client, sweep, tables, terms, on_progress, local)
+            driver.execute()
+        remove_abandoned(folder)  # by earlier sweeps, and by workers of this one, that were killed
     return driver.progress
 
 
 def measure_times(sweep: Sweep, failed: Collection[str], on_progress: OnProgress) -> None:
-    """Aligners' times, serial, for all runs without that did not fail: nothing else may run."""
+    """Aligners' times, serial, for all runs without that did not fail: nothing else may run.
+
+    They are in the store run by run, and go into the table file by file.
+    """
     single_threaded()
+    label, done = "time the aligners", 0
     runs = [run for run in sweep.runs if run.run_id not in failed]
-    for done, run in enumerate(runs):
-        on_progress("time the aligners", done, len(runs))
-        if not sweep.dataset.path(ALIGNER_TIMINGS, run).is_file():
-            mending(sweep.store, partial(_measure, sweep, run))
-    on_progress("time the aligners", len(runs), len(runs))
+    with written_by_nobody_else(sweep.dataset.folder):
+        tables = open_dataset(sweep.dataset, runs)
+        for number, group in itertools.groupby(sorted(runs, key=tables.place), key=tables.number):
+            timed, rows = tables.runs_in(ALIGNER_TIMINGS, number), dict[int, pa.Table]()
+            for run in group:
+                on_progress(label, done, len(runs))
+                done += 1
+                if run.run_id not in timed:
+                    measured = mending(sweep.store, partial(_measured, sweep, run))
+                    rows[tables.place(run)] = sweep.dataset.rows(ALIGNER_TIMINGS, run, measured)
+            if rows:
+                tables.replace(ALIGNER_TIMINGS, number, rows)
+    on_progress(label, len(runs), len(runs))
 
 
-def _measure(sweep: Sweep, run: SweepRun) -> None:
+def _measured(sweep: Sweep, run: SweepRun) -> pd.DataFrame:
     judged = JudgedRun.of(run.load(), sweep.store)
     judged.execute(1, lambda *_: None)  # what is there already, but for a damaged stage
     measure_aligners(judged, judged.load_robots())
-    sweep.dataset.write(ALIGNER_TIMINGS, run, judged.pair_table(ALIGNER_TIMINGS))
+    return judged.pair_table(ALIGNER_TIMINGS)

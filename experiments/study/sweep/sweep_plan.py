@@ -13,11 +13,8 @@ from experiments.run.store import Store
 from experiments.run.tasks import Task, task_names, unfinished
 from experiments.scenario.suite import scenarios_of
 from experiments.study.sweep.combinations import SweepRun, parse_axes, runs_of
-from experiments.study.sweep.sweep_dataset import (
-    ALIGNER_TIMINGS,
-    RUN_TIMES,
-    SweepDataset,
-)
+from experiments.study.sweep.joined_tables import JoinedTables
+from experiments.study.sweep.sweep_dataset import RUN_TIMES, SweepDataset
 from mapfusion.errors import InputError
 
 _LONGEST_NAME = 80
@@ -69,7 +66,7 @@ class PlannedRun:
 
 
 def planned(
-    run: SweepRun, store: Store, dataset: SweepDataset, jobs: int | None = None
+    run: SweepRun, store: Store, tables: JoinedTables, jobs: int | None = None
 ) -> PlannedRun:
     """Lay out a run; nothing is computed. Raises InputError for what cannot be run.
 
@@ -82,28 +79,24 @@ def planned(
     read = [stage for robot in pipeline.robots for stage in (robot.log, robot.slam)]
     read += [*(pair.estimates for pair in pipeline.pairs), *judged.judgements]
     needs = tuple(name for stage in read for name in task_names(stage))
-    name, arguments = f"run/{run.run_id}", (run, judged, stages, dataset)
+    name, arguments = f"run/{run.run_id}", (run, judged, stages, tables.dataset)
     last = Task(name, "write the tables", write_rows, arguments, (), needs)
     tasks = judged.tasks | {name: last}
-    left = [] if dataset.holds(run, stages) else unfinished(tasks, [name])
+    left = [] if tables.holds(run, stages) else unfinished(tasks, [name])
     return PlannedRun(run, stages, tasks, left)
 
 
 def write_rows(
     run: SweepRun, judged: JudgedRun, stages: Sequence[str], dataset: SweepDataset
 ) -> None:
-    """Write a run's rows of all tables, `runs` last; no maps, no images."""
-    dataset.path(ALIGNER_TIMINGS, run).unlink(missing_ok=True)  # of an earlier state of the run
-    made = all_tables(judged, judged.load_team())
-    for name in _TABLES:
-        dataset.write(name, run, made[name])
+    """Write a run's rows of all tables; no maps, no images."""
+    made = all_tables(judged, judged.load_team(), _TABLES)
     times = [
         {"stage": folder.name, "key": folder.key, "figure": name, "seconds": seconds}
         for folder in judged.folders()
         for name, seconds in folder.figures().items()
     ]
-    dataset.write(RUN_TIMES, run, times)
-    dataset.finish(run, renderer(judged.scenario), stages)
+    dataset.finish(run, renderer(judged.scenario), stages, {**made, RUN_TIMES: times})
 
 
 @dataclass
@@ -123,11 +116,11 @@ class Survey:
 
 def survey(sweep: Sweep) -> Survey:
     """Count the tasks of runs, how many are shared between runs and how many are done."""
-    found = Survey(len(sweep.runs))
+    found, tables = Survey(len(sweep.runs)), JoinedTables.of(sweep.dataset)
     known: set[str] = set()
     for run in sweep.runs:
         try:
-            laid_out = planned(run, sweep.store, sweep.dataset)
+            laid_out = planned(run, sweep.store, tables)
         except InputError:
             found.runs_refused += 1
             continue

@@ -6,13 +6,10 @@ from pathlib import Path
 import pyarrow as pa
 
 from experiments.judge import tables
-from experiments.study.sweep.combinations import SweepRun, parse_axes
-from experiments.study.sweep.sweep_dataset import (
-    ERRORS,
-    GIVEN,
-    medians_over_runs,
-    open_dataset,
-)
+from experiments.study.sweep.combinations import SweepRun
+from experiments.study.sweep.joined_tables import open_dataset
+from experiments.study.sweep.run_medians import ERRORS, GIVEN, medians_over_runs
+from experiments.study.sweep.sweep_dataset import SweepDataset
 
 EMPTY = {pa.string(): "", pa.bool_(): False}
 
@@ -23,19 +20,29 @@ def row(aligner: str, n_true: int, error_m: float) -> dict[str, object]:
     return blank | {"aligner": aligner, "n_true": n_true} | errors
 
 
+def _joined(
+    folder: Path, keys: tuple[str, ...], made: dict[SweepRun, list[dict[str, object]]]
+) -> SweepDataset:
+    dataset = SweepDataset(folder / "sweep", keys)
+    tables_of = open_dataset(dataset, list(made))
+    for run, rows in made.items():
+        dataset.finish(run, "", [], {"errors": rows})
+    tables_of.join()
+    return dataset
+
+
 def test_medians_over_runs_of_the_runs_own_medians(tmp_path: Path) -> None:
     """A run counts once, however many rows it has; maps with fewer than 3 true pairs do not."""
-    dataset = open_dataset(tmp_path / "sweep", parse_axes(["slam.min_count=2,3"]))
     written = {
         (0, "2"): [row("svd", 3, error) for error in (1.0, 2.0, 9.0)] + [row("svd", 2, 99.0)],
         (1, "2"): [row("svd", 30, 4.0)],
         (0, "3"): [row("svd", 30, 5.0), row("ransac", 2, 7.0)],
     }
-    runs = []
-    for (seed, count), rows in written.items():
-        runs.append(SweepRun(Path("x.yaml"), "x", seed, (("slam.min_count", count),)))
-        dataset.write("errors", runs[-1], rows)
-    found = medians_over_runs(dataset, runs)
+    made = {
+        SweepRun(Path("x.yaml"), "x", seed, (("slam.min_count", count),)): rows
+        for (seed, count), rows in written.items()
+    }
+    found = medians_over_runs(_joined(tmp_path, ("slam.min_count",), made), list(made))
     assert found.drop(columns=GIVEN).values.tolist() == [
         ["x 2", "svd", 3.0, 0.375, 2],
         ["x 3", "svd", 5.0, 0.625, 1],
@@ -44,8 +51,8 @@ def test_medians_over_runs_of_the_runs_own_medians(tmp_path: Path) -> None:
 
 
 def test_what_has_no_estimate_is_infinitely_far_off(tmp_path: Path) -> None:
-    dataset = open_dataset(tmp_path / "sweep", ())
     run = SweepRun(Path("x.yaml"), "x", 0)
-    dataset.write("errors", run, [row("svd", 9, error) for error in (1.0, nan, 2.0, nan, nan)])
-    (found,) = medians_over_runs(dataset, [run]).to_dict("records")
+    made = {run: [row("svd", 9, error) for error in (1.0, nan, 2.0, nan, nan)]}
+    made[SweepRun(Path("x.yaml"), "x", 1)] = [row("svd", 9, 5.0)]  # not asked for
+    (found,) = medians_over_runs(_joined(tmp_path, (), made), [run]).to_dict("records")
     assert [found[name] for name in (*ERRORS, *GIVEN)] == [inf, inf, 0.4, 0.4]

@@ -14,10 +14,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from experiments.judge import tables
+from experiments.study.sweep.joined_tables import JoinedTables
 from experiments.study.sweep.sweep_dataset import RUN_TIMES
 from experiments.study.sweep.sweep_driver import execute
 from experiments.study.sweep.sweep_plan import planned, prepare
-from tests.helpers.killing import KilledCommand, same_files
+from tests.helpers.killing import KilledCommand, same_rows
 from tests.helpers.tiny_scenario import SHORT, command
 
 GRID = ("--set", "slam.filter.n_particles=5,10", "--set", "align.repetitions=1")
@@ -73,7 +74,7 @@ def test_no_table_but_that_of_times_tells_times(swept: Path) -> None:
         timed = {column for column in columns if column.endswith("_s") or column == "seconds"}
         assert bool(timed) == (name == RUN_TIMES)
     times = pd.read_parquet(swept / RUN_TIMES)
-    assert (times["seconds"] >= 0).all()
+    assert (np.isfinite(times["seconds"]) & (times["seconds"] >= 0)).all()
     assert {"features", "slam", "aligner", "align", "judge"} <= set(times["stage"])
 
 
@@ -121,7 +122,7 @@ def test_the_same_again_does_nothing_and_more_adds(
     dry = command(capsys, *arguments[:2], *more, "--results", results, "--dry-run")
     assert dry.code == 0
     assert "4 runs, 2 of them finished" in dry.out
-    assert len(list((swept / "runs").iterdir())) == 4
+    assert len(pd.read_parquet(swept / "runs")) == 4
 
 
 def test_other_settings_do_not_go_into_the_same_folder(
@@ -153,7 +154,8 @@ def test_a_run_that_collides_is_a_row(
     assert runs.loc["[1.2, 1.2, 0.6]", "status"] == "finished"
     assert runs.loc["[0.2, 0.2, 3.9]", "status"] == "failed"
     assert "R1" in runs.loc["[0.2, 0.2, 3.9]", "reason"]
-    assert len(list((sweep / "errors").iterdir())) == 1
+    assert pd.read_parquet(sweep / "errors")["seed"].tolist()
+    assert pd.read_parquet(sweep / "errors")["robots.0.start"].unique() == "[1.2, 1.2, 0.6]"
     timings = pd.read_parquet(sweep / "aligner_timings")
     assert set(timings["aligner"]) == {"ransac", "svd"}
     assert set(timings["seed"]) == {0}
@@ -169,7 +171,7 @@ def test_a_run_that_needs_more_memory_than_there_is_is_a_row(
     assert "in each of 2 processes (--jobs 1 needs least), this machine has 0.6 GB" in reason
     rows = pd.read_parquet(asked.dataset.folder / "runs")
     assert rows[["status", "reason"]].to_numpy().tolist() == [["failed", reason]]
-    assert planned(asked.runs[0], asked.store, asked.dataset).left
+    assert planned(asked.runs[0], asked.store, JoinedTables.of(asked.dataset)).left
 
 
 def test_killed_sweeps_go_on_and_readers_always_find_whole_runs(
@@ -193,7 +195,7 @@ def test_killed_sweeps_go_on_and_readers_always_find_whole_runs(
             stop.set()
     assert (code, "Traceback" in complaints) == (0, False), complaints
     assert victims == ["worker", "everything", "worker"]
-    assert len(same_files(sweep, swept, seed=1)) == 2 * 7
+    assert same_rows(sweep, swept, seed=1)
     assert not list(tmp_path.rglob(".*"))  # what the killed ones had begun to write
     assert reader.result() == 2  # raises what any of its readings did
 
@@ -223,22 +225,4 @@ def test_two_sweeps_at_once_on_one_store(swept: Path, short_path: Path, tmp_path
             code, complaints = sweep.finish()
             assert code == 0, complaints
     for name in ("one", "two"):
-        assert len(same_files(tmp_path / name, swept, seed=1)) == 2 * 7
-
-
-def test_an_existing_cluster_does_the_same(
-    swept: Path, short_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from distributed import LocalCluster
-
-    with LocalCluster(
-        n_workers=2, threads_per_worker=2, dashboard_address="localhost:0", silence_logs=50
-    ) as cluster:
-        reply = command(
-            capsys,
-            *("sweep", short_path, "--seeds", "1", *GRID, "--results", tmp_path),
-            *("--scheduler", cluster.scheduler_address),
-        )
-    assert reply.code == 0
-    assert len(same_files(tmp_path / "sweeps" / "short", swept, seed=1)) == 2 * 7
-    assert np.isfinite(pd.read_parquet(tmp_path / "sweeps" / "short" / RUN_TIMES)["seconds"]).all()
+        assert same_rows(tmp_path / name, swept, seed=1)

@@ -18,8 +18,9 @@ from experiments.run.tasks import Task, unfinished
 from experiments.study.sweep import sweep_driver as driver_module
 from experiments.study.sweep import sweep_plan as plan_module
 from experiments.study.sweep.combinations import SweepRun
-from experiments.study.sweep.sweep_dataset import SweepDataset, open_dataset
-from experiments.study.sweep.sweep_driver import SweepDriver, SweepProgress
+from experiments.study.sweep.joined_tables import JoinedTables, open_dataset
+from experiments.study.sweep.sweep_dataset import SweepDataset
+from experiments.study.sweep.sweep_driver import OnSweepProgress, SweepDriver, SweepProgress
 from experiments.study.sweep.sweep_plan import PlannedRun, Sweep
 from mapfusion import sealed
 from mapfusion.errors import InputError, MendedWarning
@@ -39,7 +40,7 @@ class Scene:
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.folder = folder
-        self.dataset = open_dataset(folder / "sweep", [])
+        self.dataset = SweepDataset(folder / "sweep", ())
         self.terms = Terms(folder / "attempts", 3, code_version())
         self.terms.attempts.mkdir()
         self.tasks: dict[int, list[Task]] = {}
@@ -58,16 +59,21 @@ class Scene:
         self.add(seed, name, acting.write, output, name, needs=tuple(needs))
 
     def _planned(
-        self, run: SweepRun, store: Store, dataset: SweepDataset, jobs: int | None = None
+        self, run: SweepRun, store: Store, joined: JoinedTables, jobs: int | None = None
     ) -> PlannedRun:
         tasks = {task.name: task for task in self.tasks[run.seed]}
         name = f"run/{run.run_id}"
-        tasks[name] = Task(name, "tables", dataset.finish, (run, "", []), (), tuple(tasks))
-        left = [] if dataset.holds(run, []) else unfinished(tasks, [name])
+        finish = self.dataset.finish
+        tasks[name] = Task(name, "tables", finish, (run, "", [], {}), (), tuple(tasks))
+        left = [] if joined.holds(run, []) else unfinished(tasks, [name])
         return PlannedRun(run, [], tasks, left)
 
     def execute(self, client: Client) -> SweepDriver:
-        driver = SweepDriver(client, self.sweep, self.terms, self.told.append)
+        return self.execute_telling(client, self.told.append)
+
+    def execute_telling(self, client: Client, tell: OnSweepProgress) -> SweepDriver:
+        joined = open_dataset(self.dataset, self.sweep.runs)
+        driver = SweepDriver(client, self.sweep, joined, self.terms, tell)
         driver.execute()
         return driver
 
@@ -217,9 +223,7 @@ def test_the_scheduler_holds_a_window_of_tasks_alone(
         most = max(most, sum(progress.tasks.values()) - sum(progress.tasks_done.values()))
         tell(progress)
 
-    driver = SweepDriver(client, scene.sweep, scene.terms, count)
-    driver.execute()
-    ended = driver.progress
+    ended = scene.execute_telling(client, count).progress
     assert most <= 5 * driver_module.MIN_WORKERS + 2
     assert (ended.done, ended.failed) == (n_runs, {})
     assert ended.tasks == ended.tasks_done == Counter({"slam": n_runs, "tables": n_runs})
