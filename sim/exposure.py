@@ -46,8 +46,12 @@ def _exposed(
 ) -> np.ndarray:
     """`levels` (256,) of what is seen plus `deviations` (VALUES,) that bits choose, rounded."""
     exposed = np.empty(gray.shape, dtype=np.uint8)
+    seen = np.empty(gray.shape[1], dtype=np.float32)
     for v in range(gray.shape[0]):
-        for u in range(gray.shape[1]):
-            level = levels[gray[v, u]] + deviations[bits[v, u]]
-            exposed[v, u] = np.uint8(min(max(level, np.float32(0)), np.float32(255)) + HALF)
+        # what looks up and what reckons are apart, so that the latter runs in vectors
+        for u in range(len(seen)):
+            seen[u] = levels[gray[v, u]] + deviations[bits[v, u]]
+        for u in range(len(seen)):
+            level = min(max(seen[u], np.float32(0)), np.float32(255))
+            exposed[v, u] = np.uint8(np.int32(level + HALF))
     return exposed

@@ -4,22 +4,13 @@ import numpy as np
 from numba import njit
 
 from mapfusion.se2 import Float
-from sim.raycast.levels import (
-    BACKGROUND,
-    fill,
-    footprints,
-    row_depth_m,
-    shares,
-    texel,
-)
+from sim.raycast.levels import BACKGROUND, Way, fill, row_depth_m, texel, ways
 from sim.raycast.plan import NONE, Pinhole, nearest, project, strips
 from sim.raycast.robots import cast, draw
 from sim.raycast.scene import Level, Walls
 from sim.raycast.solids import Solids
-from sim.raycast.wall_columns import add_column, most_texels_up
+from sim.raycast.wall_columns import draw_walls, open_rows
 from sim.raycast.windows import by_distance
-
-COLUMNS = 16  # of single precision are a cache line
 
 
 def filtered(
@@ -39,52 +30,15 @@ def filtered(
     """
     seen = project(camera, walls)
     face, until, count = strips(camera, seen)
-    picture = _still_means(camera, walls, floor, ceiling, seen, face, until, count)
+    above, below = open_rows(camera, walls, seen, face, until, count)
+    picture = np.empty((camera.height_px, camera.width_px), dtype=np.uint8)
+    fill(camera, ceiling, True, above, picture)
+    fill(camera, floor, False, below, picture)
+    draw_walls(camera, walls, seen, face, until, count, picture)
     if len(poses):
         in_order = by_distance(camera, poses)
         draw(camera, seen, face, until, count, solids, in_order, grey, picture)
-    return _rounded(picture)
-
-
-@njit(cache=True)
-def _still_means(
-    camera: Pinhole, walls: Walls, floor: Level, ceiling: Level, seen: Float, face: np.ndarray,
-    until: Float, count: np.ndarray,
-) -> np.ndarray:  # fmt: skip
-    """Means (H, W) float32 over footprints on what stands still; the strips are of `plan`."""
-    below, above = footprints(camera, floor), footprints(camera, ceiling)
-    picture = np.empty((camera.height_px, camera.width_px), dtype=np.float32)
-    filled = np.empty((camera.height_px, camera.width_px), dtype=np.float32)
-    # some columns at a time, so that whole cache lines of the picture are written
-    total = np.empty((COLUMNS, camera.height_px))
-    covered = np.empty((COLUMNS, camera.height_px))
-    column = np.empty(most_texels_up(walls) + 2)
-    for first in range(0, camera.width_px, COLUMNS):
-        n = min(COLUMNS, camera.width_px - first)
-        for c in range(n):
-            total[c], covered[c] = 0.0, 0.0
-            j = first + c
-            add_column(
-                camera, walls, seen, j, face[j], until[j], count[j], total[c], covered[c], column
-            )
-        for v in range(camera.height_px):
-            for c in range(n):
-                picture[v, first + c], filled[v, first + c] = total[c, v], covered[c, v]
-    fill(camera, ceiling, above, picture, filled)
-    fill(camera, floor, below, picture, filled)
-    for v in range(camera.height_px):
-        for j in range(camera.width_px):
-            picture[v, j] += (1 - filled[v, j]) * BACKGROUND
     return picture
-
-
-@njit(cache=True)
-def _rounded(picture: np.ndarray) -> np.ndarray:
-    whole = np.empty(picture.shape, dtype=np.uint8)
-    for v in range(picture.shape[0]):
-        for j in range(picture.shape[1]):
-            whole[v, j] = np.uint8(min(max(picture[v, j], 0.0), 255.0) + 0.5)
-    return whole
 
 
 def depths(
@@ -92,7 +46,7 @@ def depths(
 ) -> np.ndarray:
     """Depth (H, W) float32 along the optical axis behind the pixels' middles; NaN for nothing."""
     depth_m = _still_depths(camera, walls, floor, ceiling)
-    nothing = np.zeros((0, 0), dtype=np.float32)
+    nothing = np.zeros((0, 0), dtype=np.uint8)
     if len(poses):
         cast(camera, solids, poses, np.zeros(0), depth_m, nothing)
     return depth_m
@@ -117,9 +71,9 @@ def _still_depths(camera: Pinhole, walls: Walls, floor: Level, ceiling: Level) -
         if face[j] == NONE:
             for v in range(camera.height_px):
                 level = ceiling if v < camera.center_v else floor
-                a, b, c, d = shares(camera, level, float(j))
+                right, up = ways(camera, level)
                 z = row_depth_m(camera, level.height_m, float(v))
-                if not (0 <= a + b * z < 1 and 0 <= c + d * z < 1):
+                if not (0 <= _along(right, j, z) < 1 and 0 <= _along(up, j, z) < 1):
                     depth_m[v, j] = np.nan
     return depth_m
 
@@ -132,35 +86,41 @@ def sampled(
     picture = _still_texels(camera, walls, floor, ceiling)
     if len(poses):
         cast(camera, solids, poses, grey, _still_depths(camera, walls, floor, ceiling), picture)
-    return _rounded(picture)
+    return picture
 
 
 @njit(cache=True)
 def _still_texels(camera: Pinhole, walls: Walls, floor: Level, ceiling: Level) -> np.ndarray:
-    """Texels (H, W) float32 of what stands still."""
+    """Texels (H, W) uint8 of what stands still."""
     seen = project(camera, walls)
     face = nearest(seen, np.arange(camera.width_px).astype(np.float64))
-    picture = np.empty((camera.height_px, camera.width_px), dtype=np.float32)
+    picture = np.empty((camera.height_px, camera.width_px), dtype=np.uint8)
+    ways_up, ways_down = ways(camera, ceiling), ways(camera, floor)
     for j in range(camera.width_px):
         i, wall_m, right = face[j], np.inf, 0
-        up, down = shares(camera, ceiling, float(j)), shares(camera, floor, float(j))
         if i != NONE:
             wall_m = 1 / (seen[i, 2] + seen[i, 3] * j)
             along = (seen[i, 4] + seen[i, 5] * j) * wall_m - seen[i, 6]
             right = int(along / walls.width_m[i] * walls.size[i, 0])
             right = min(max(right, 0), walls.size[i, 0] - 1)
         for v in range(camera.height_px):
-            level, way = (ceiling, up) if v < camera.center_v else (floor, down)
+            level, way = (ceiling, ways_up) if v < camera.center_v else (floor, ways_down)
             z = row_depth_m(camera, level.height_m, float(v))
             if wall_m < z:
                 height_m = camera.eye_z_m - (v - camera.center_v) * wall_m / camera.focal_px
                 row = min(int(height_m / walls.height_m * walls.size[i, 1]), walls.size[i, 1] - 1)
                 picture[v, j] = _wall_texel(walls, i, right, row)
             elif np.isfinite(z):
-                picture[v, j] = texel(level, way[0] + way[1] * z, way[2] + way[3] * z)
+                picture[v, j] = texel(level, _along(way[0], j, z), _along(way[1], j, z))
             else:
                 picture[v, j] = BACKGROUND
     return picture
+
+
+@njit(cache=True)
+def _along(way: Way, u: float, z: float) -> float:
+    """Where on a level's picture a column's ray is at a depth, see `ways`."""
+    return way[0] + (way[1] + way[2] * u) * z
 
 
 @njit(cache=True)

@@ -136,12 +136,13 @@ def draw(
         solids: of one robot.
         poses: of the robots, from the nearest to the farthest.
         grey: (S,) the solids' grey levels.
-        picture: (H, W) float32, changed.
+        picture: (H, W) uint8, changed.
     """
     above, below, first, last = all_windows(camera, solids, poses)
     if above > below or first > last:
         return
-    under = picture[above : below + 1, first : last + 1].copy()
+    under = picture[above : below + 1, first : last + 1].astype(np.float32)
+    shown = under.copy()
     rest = np.ones(under.shape, dtype=np.float32)
     for r in range(len(poses)):
         eye, _ = in_robot(camera, poses[r])
@@ -164,7 +165,10 @@ def draw(
                     left_over = rest[v - above, j - first]
                     share = min(covered[v - top, j - left] * open_share[j - left], left_over)
                     rest[v - above, j - first] -= share
-                    picture[v, j] += share * (grey[i] - under[v - above, j - first])
+                    shown[v - above, j - first] += share * (grey[i] - under[v - above, j - first])
+    for v in range(above, below + 1):
+        for j in range(first, last + 1):
+            picture[v, j] = np.uint8(shown[v - above, j - first] + 0.5)
 
 
 @njit(cache=True)

@@ -49,8 +49,10 @@ class Level(NamedTuple):
         up_per_m2: (2,) along its left edge, likewise.
         size_m: (2,) its edges' lengths.
         shape: (K, 2) int64 rows and columns of the picture and of its smaller copies.
-        first: (K,) int64, where each begins in `texels`.
-        texels: float32 grey levels, rows from the lower edge up.
+        first: (K,) int64, where each begins in `cells`.
+        cells: uint32, rows from the lower edge up: what lies between the middles of four texels,
+            whose grey levels are its bytes: lower left, lower right, upper left, upper right. A
+            copy of (H, W) texels has (H + 1, W + 1) cells, the outermost half beside it.
     """
 
     height_m: float
@@ -60,7 +62,7 @@ class Level(NamedTuple):
     size_m: Float
     shape: np.ndarray
     first: np.ndarray
-    texels: np.ndarray
+    cells: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -180,7 +182,8 @@ def _level(corners_m: Float, grey: np.ndarray) -> Level:
         # of odd sizes too each texel is the mean of what it covers
         half = (-(-width // 2), -(-height // 2))
         copies.append(cv2.resize(copies[-1], half, interpolation=cv2.INTER_AREA))
-    first = np.concatenate([[0], np.cumsum([copy.size for copy in copies])[:-1]])
+    cells = [_cells(copy) for copy in copies]
+    first = np.concatenate([[0], np.cumsum([len(copy) for copy in cells])[:-1]])
     return Level(
         float(corners_m[0, 2]),
         corner.copy(),
@@ -189,5 +192,13 @@ def _level(corners_m: Float, grey: np.ndarray) -> Level:
         np.array([np.linalg.norm(right), np.linalg.norm(up)], dtype=np.float64),
         np.array([copy.shape for copy in copies]),
         first,
-        np.concatenate([copy.ravel() for copy in copies]),
+        np.concatenate(cells),
     )
+
+
+def _cells(grey: np.ndarray) -> np.ndarray:
+    """A picture's cells, see `Level`; beyond its edge its outermost texels go on."""
+    texels = np.pad(np.rint(grey).astype(np.uint32), 1, mode="edge")
+    lower, upper = texels[:-1], texels[1:]
+    corners = (lower[:, :-1], lower[:, 1:], upper[:, :-1], upper[:, 1:])
+    return np.bitwise_or.reduce([grey << 8 * k for k, grey in enumerate(corners)]).ravel()
