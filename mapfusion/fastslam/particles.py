@@ -69,8 +69,9 @@ class ParticleMaps:
     def widen(self, which: np.ndarray, variance_m2: float) -> None:
         """Add to the covariances of these slots' landmarks, along each axis."""
         which = which[self.bring_up_to_date(which)]
-        for axis in (0, 3, 5):
-            self.slots.covariance_m2[which, :, axis] += variance_m2
+        with np.errstate(invalid="ignore"):  # what particles without the landmark have there
+            for axis in (0, 3, 5):
+                self.slots.covariance_m2[which, :, axis] += variance_m2
         self.moved(which)
 
     def create(
