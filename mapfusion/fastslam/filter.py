@@ -22,8 +22,8 @@ from mapfusion.fastslam.resampling import (
     systematic_ancestors,
 )
 from mapfusion.fastslam.sensor import Sightings, log_density_at_gate, sightings
-from mapfusion.fastslam.update import DROPPED, NEW, update_landmarks
 from mapfusion.fastslam.tracked import Tracked
+from mapfusion.fastslam.update import DROPPED, NEW, update_landmarks
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import NO_LABEL, Observations
 from mapfusion.se2 import Float, compose

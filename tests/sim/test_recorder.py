@@ -10,9 +10,9 @@ from scipy.ndimage import map_coordinates
 
 from mapfusion.camera import StereoCamera
 from mapfusion.errors import InputError
+from mapfusion.se2 import transform_points
 from sim.p3at import LENGTH_M
 from sim.radiometry import RadiometricNoise
-from mapfusion.se2 import transform_points
 from sim.recorder import FrameSource, truth_points, truth_slopes
 from sim.renderer import Renderer
 from sim.stereo_head import StereoFrame

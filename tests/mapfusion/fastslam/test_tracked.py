@@ -48,6 +48,8 @@ def after(*counts: int) -> float:
 
 @pytest.mark.parametrize("particles", [1, 30])
 def test_each_track_s_end_widens_its_landmark_once(particles: int) -> None:
+    once = [frame([3, 4]), nothing()]
+    np.testing.assert_allclose(variances(once, particles), after(1) + 2 * STRAY_M**2)
     frames = [frame([5, 6])] * 4
     np.testing.assert_allclose(variances(frames, particles), after(4))
     frames += [frame([7], (0,))] * 3  # 5 and 6 have ended; the second landmark is out of view

@@ -34,10 +34,14 @@ def before_and_after(
 
 
 def fitted(
-    before: np.ndarray, after: np.ndarray, start: np.ndarray = START, noise: float = 2.0
+    before: np.ndarray,
+    after: np.ndarray,
+    start: np.ndarray = START,
+    noise: float = 2.0,
+    max_misfit: float = 0.5,
 ) -> tuple[bool, np.ndarray]:
     warp = start[None].copy()
-    found = fit_patches(before[None], POINT[None], after[None], warp, noise, 0.5)
+    found = fit_patches(before[None], POINT[None], after[None], warp, noise, max_misfit)
     return bool(found[0]), warp[0]
 
 
@@ -57,7 +61,9 @@ def test_equals_a_general_least_squares_solver() -> None:
     assert found
     v, u = (k.ravel() for k in np.mgrid[-10:11, -10:11].astype(float))
     weight = np.exp(-(u**2 + v**2) / (4 * 6.0**2))  # the root
-    level = map_coordinates(before.astype(float), [HALF + POINT[1] + v, HALF + POINT[0] + u], order=1)
+    level = map_coordinates(
+        before.astype(float), [HALF + POINT[1] + v, HALF + POINT[0] + u], order=1
+    )
 
     def residuals(p: np.ndarray) -> np.ndarray:
         at_u, at_v = p[0] + p[2] * u + p[3] * v, p[1] + p[4] * u + p[5] * v
@@ -102,6 +108,15 @@ def test_what_does_not_fit_is_told() -> None:
     hidden = after.copy()
     hidden[:, HALF:] = 128 + np.uint8(20)  # another surface before one half
     assert not fitted(before, hidden)[0]
+
+
+def test_differences_beyond_noise_and_misfit_are_no_fit() -> None:
+    """Between two pixels some of the noise averages out, so no more than stated is there."""
+    for seed in range(10):
+        pair = before_and_after(seed, noise=6.0)
+        assert fitted(*pair, noise=6.0, max_misfit=0.001)[0]
+        assert not fitted(*pair, noise=3.0, max_misfit=0.001)[0]
+        assert fitted(*pair, noise=3.0, max_misfit=1.0)[0]
 
 
 def test_patches_are_cut_around_the_nearest_pixel_and_repeat_the_border() -> None:
