@@ -76,7 +76,7 @@ def read_open_table(path: Path, table_schema: pa.Schema) -> tuple[pa.Table, dict
 
 
 def _is_earlier(attributes: Mapping[str, str], table_schema: pa.Schema) -> bool:
-    """Whether an earlier version of this program wrote it: columns that came later have defaults."""
+    """Whether an earlier version of this program wrote it; later columns have defaults."""
     wanted = (
         table_schema.metadata[f"mapfusion.{key}".encode()] for key in ("kind", "schema_version")
     )

@@ -28,7 +28,7 @@ _N = 8  # parameters: shift u and v, their derivatives by u and v, offset and ga
 
 
 def cut_patches(image: np.ndarray, uv_px: Float) -> np.ndarray:
-    """Surroundings (N, P, P) of the pixels nearest to points (N, 2), the border repeated outside."""
+    """What is around the pixels nearest to points (N, 2), (N, P, P); outside the border repeats."""
     side = np.arange(-_PATCH_HALF_PX, _PATCH_HALF_PX + 1)
     u, v = np.rint(uv_px).astype(np.int64).T
     rows = np.clip(v[:, None] + side, 0, image.shape[0] - 1)

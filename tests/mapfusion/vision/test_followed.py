@@ -28,7 +28,7 @@ def on_wall(pose: np.ndarray, uv: np.ndarray) -> np.ndarray:
 
 
 def test_the_point_stays_where_the_corner_strays() -> None:
-    """Two metres towards a slanted wall, on which the places that tracks and corners show differ."""
+    """Two metres towards a slanted wall, where each view's rays meet it."""
     rng = np.random.default_rng(0)
     room = [wall(rng, START, END, texels_per_m=120.0)]
     front_end, tracker = FrontEnd(CAMERA), Tracker(TrackParameters(), CAMERA, 0.1)

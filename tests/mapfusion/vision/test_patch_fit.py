@@ -1,4 +1,4 @@
-"""The affine fit of a patch: pictures that are warped exactly, a general solver, the law of noise."""
+"""The affine fit of a patch: pictures warped exactly, a general solver, the law of noise."""
 
 import numpy as np
 import pytest
