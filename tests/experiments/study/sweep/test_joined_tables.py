@@ -20,6 +20,7 @@ from experiments.study.sweep.joined_tables import (
 )
 from experiments.study.sweep.sweep_dataset import SweepDataset
 from mapfusion.errors import InputError, MendedWarning
+from mapfusion.storage import write_json
 
 KEYS = ("slam.min_count",)
 STAGES = ["drive/1", "judge/2"]
@@ -257,10 +258,10 @@ def test_a_folder_is_opened_again_for_the_same_settings_alone(dataset: SweepData
     assert JoinedTables.of(dataset).run_ids == [each.run_id for each in RUNS]
     with pytest.raises(InputError, match=r"sweep over slam\.min_count, .* over seeds alone"):
         open_dataset(SweepDataset(dataset.folder, ()))
-    (dataset.folder / "sweep.json").write_text("{}")
+    write_json(dataset.folder / "sweep.json", {})
     with pytest.raises(InputError, match=r"sweep\.json: damaged"):
         open_dataset(dataset)
-    (dataset.folder / "sweep.json").write_text('{"schema_version": 1, "settings": []}')
+    write_json(dataset.folder / "sweep.json", {"schema_version": 1, "settings": []})
     with pytest.raises(InputError, match=r"schema_version is 1, .*; give it another --output"):
         open_dataset(dataset)
 
