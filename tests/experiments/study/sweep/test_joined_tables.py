@@ -209,6 +209,7 @@ def test_damaged_tables_are_told_and_made_again(dataset: SweepDataset, table: st
     with pytest.warns(MendedWarning, match=rf"{table}/00001\.parquet: damaged"):
         held = [joined.holds(each, STAGES) for each in RUNS]
     assert held == [True] * 3 + [False] * 3 + [True]
+    assert path.is_file()  # only looked at, as by --dry-run
     finish(dataset, RUNS[3:6])
     joined.join()
     assert files(dataset) == before
@@ -220,8 +221,9 @@ def test_rows_that_are_damaged_while_they_wait_are_made_again(dataset: SweepData
         finish(dataset, RUNS[:1])
         dataset.waiting_path(RUNS[0]).write_bytes(b"half a file")
         with pytest.warns(MendedWarning, match="makes its run again"):
-            find()
-        assert not joined.holds(RUNS[0], STAGES)
+            assert not find()
+    assert not dataset.waiting.exists()
+    assert not joined.holds(RUNS[0], STAGES)
 
 
 def test_a_failed_run_is_one_row_and_nothing_else(dataset: SweepDataset) -> None:
