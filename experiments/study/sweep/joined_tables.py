@@ -58,6 +58,7 @@ class JoinedTables:
         self.dataset = dataset
         self._place = {run_id: place for place, run_id in enumerate(runs)}
         self._held: dict[int, dict[str, str]] = {}  # by file: what its runs were made from
+        self._damaged: set[int] = set()  # files that go before others take their place
 
     @classmethod
     def of(cls, dataset: SweepDataset) -> "JoinedTables":
@@ -97,7 +98,7 @@ class JoinedTables:
 
     def _told(self, run: SweepRun) -> str | None:
         path = self.dataset.waiting_path(run)
-        if path.is_file() and (tables := _waiting_or_mended(path)):
+        if path.is_file() and (tables := _waiting_or_none(path)):
             return _digests(tables[RUNS])[run.run_id]
         if run.run_id not in self._place:
             return None
@@ -116,10 +117,9 @@ class JoinedTables:
                 read_sealed(file, "table of a sweep")
             return _digests(read_parquet(path, RUNS, ["run_id", *_TOLD]))
         except DamagedFileError as error:
-            told = f"{error}; the tables of its runs are written again"
+            told = f"{error}; the runs in it are made again, when a sweep asks for them"
             warnings.warn(told, MendedWarning, stacklevel=2)
-            for file in (path, *files):
-                file.unlink(missing_ok=True)
+            self._damaged.add(number)
             return {}
 
     def _files(self, number: int) -> list[Path]:
@@ -142,7 +142,11 @@ class JoinedTables:
             self.dataset.waiting.rmdir()
 
     def _join(self, number: int, waiting: Mapping[int, Path]) -> None:
-        made = {place: _waiting_or_mended(path) for place, path in waiting.items()}
+        if number in self._damaged:
+            for file in (self.dataset.path(RUNS, number), *self._files(number)):
+                file.unlink(missing_ok=True)
+            self._damaged.remove(number)
+        made = {place: _waiting_or_none(path) for place, path in waiting.items()}
         names = {path.parent.name for path in self._files(number)}
         names |= {name for tables in made.values() for name in tables}
         if not self.runs_in(RUNS, number).isdisjoint(path.stem for path in waiting.values()):
@@ -238,12 +242,11 @@ def _described(path: Path, keys: tuple[str, ...]) -> tuple[str, ...]:
     return found.runs
 
 
-def _waiting_or_mended(path: Path) -> dict[str, pa.Table]:
-    """Rows that wait; of a damaged file, which is told and removed, none."""
+def _waiting_or_none(path: Path) -> dict[str, pa.Table]:
+    """Rows that wait; of a damaged file, which is told, none."""
     try:
         return read_waiting(path)
     except DamagedFileError as error:
-        path.unlink(missing_ok=True)
         told = f"{error}; the same command makes its run again"
         warnings.warn(told, MendedWarning, stacklevel=2)
         return {}

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import grimp
+import numpy as np
 import pytest
 from pydantic_core import to_jsonable_python
 
@@ -15,12 +16,14 @@ from experiments.methods.catalogue import find_method
 from experiments.run import stage as stage_module
 from experiments.run.code_version import imported_sources
 from experiments.run.job import Job
+from experiments.run.pipeline import lay_out
 from experiments.run.stage import RecordedLog, Stage
 from experiments.run.store import Store
 from experiments.scenario.loading import load_scenario, scenario_of
 from experiments.scenario.settings import Simulation
 from mapfusion.align.registry import ALIGNERS
 from mapfusion.errors import InputError
+from mapfusion.robot_log import Observations, RobotLog, write_log
 from sim.renderer import egl_driver
 from tests.helpers.tiny_scenario import TINY
 
@@ -226,6 +229,21 @@ def test_recorded_logs_are_known_by_their_content(tmp_path: Path) -> None:
     assert RecordedLog(tmp_path).key != before
     (tmp_path / "frames.parquet").write_bytes(b"1")
     assert RecordedLog(tmp_path).key == before
+
+
+def test_a_recorded_log_that_has_changed_is_read_again(tmp_path: Path) -> None:
+    """Though one process lays out many runs of the same log."""
+    nothing, path = Observations(np.empty((0, 3)), np.empty((0, 3, 3))), tmp_path / "x.yaml"
+    path.write_text("schema_version: 1\nname: x\nlogs: [log]\n", encoding="utf-8")
+    found = []
+    for n_frames in (4, 5):
+        times_s, still = np.arange(float(n_frames)), np.zeros((n_frames, 3))
+        write_log(tmp_path / "log", RobotLog("R1", True, times_s, still, np.empty(0), nothing))
+        (robot,) = lay_out(load_scenario(path)).robots
+        found.append((robot.n_frames, robot.log.key))
+    (before, old_key), (after, new_key) = found
+    assert (before, after) == (4, 5)
+    assert new_key != old_key
 
 
 # The folder of whose modules it lies in.

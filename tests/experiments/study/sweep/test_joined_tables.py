@@ -20,6 +20,7 @@ from experiments.study.sweep.joined_tables import (
 )
 from experiments.study.sweep.sweep_dataset import SweepDataset
 from mapfusion.errors import InputError, MendedWarning
+from mapfusion.storage import write_json
 
 KEYS = ("slam.min_count",)
 STAGES = ["drive/1", "judge/2"]
@@ -208,6 +209,7 @@ def test_damaged_tables_are_told_and_made_again(dataset: SweepDataset, table: st
     with pytest.warns(MendedWarning, match=rf"{table}/00001\.parquet: damaged"):
         held = [joined.holds(each, STAGES) for each in RUNS]
     assert held == [True] * 3 + [False] * 3 + [True]
+    assert path.is_file()  # only looked at, as by --dry-run
     finish(dataset, RUNS[3:6])
     joined.join()
     assert files(dataset) == before
@@ -219,8 +221,9 @@ def test_rows_that_are_damaged_while_they_wait_are_made_again(dataset: SweepData
         finish(dataset, RUNS[:1])
         dataset.waiting_path(RUNS[0]).write_bytes(b"half a file")
         with pytest.warns(MendedWarning, match="makes its run again"):
-            find()
-        assert not joined.holds(RUNS[0], STAGES)
+            assert not find()
+    assert not dataset.waiting.exists()
+    assert not joined.holds(RUNS[0], STAGES)
 
 
 def test_a_failed_run_is_one_row_and_nothing_else(dataset: SweepDataset) -> None:
@@ -257,10 +260,10 @@ def test_a_folder_is_opened_again_for_the_same_settings_alone(dataset: SweepData
     assert JoinedTables.of(dataset).run_ids == [each.run_id for each in RUNS]
     with pytest.raises(InputError, match=r"sweep over slam\.min_count, .* over seeds alone"):
         open_dataset(SweepDataset(dataset.folder, ()))
-    (dataset.folder / "sweep.json").write_text("{}")
+    write_json(dataset.folder / "sweep.json", {})
     with pytest.raises(InputError, match=r"sweep\.json: damaged"):
         open_dataset(dataset)
-    (dataset.folder / "sweep.json").write_text('{"schema_version": 1, "settings": []}')
+    write_json(dataset.folder / "sweep.json", {"schema_version": 1, "settings": []})
     with pytest.raises(InputError, match=r"schema_version is 1, .*; give it another --output"):
         open_dataset(dataset)
 
