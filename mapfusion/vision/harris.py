@@ -12,6 +12,7 @@ from mapfusion.se2 import Float
 
 _SOBEL_APERTURE_PX = 3
 _SOBEL_GAIN = 2.0  # OpenCV divides its Sobel sum, 8 times the slope per pixel, by 4
+_BAND_PX = 64  # rows of which the response is reckoned at a time
 
 
 @dataclass(frozen=True)
@@ -68,21 +69,31 @@ def detect(image: np.ndarray, parameters: HarrisParameters) -> Float:
     if min(image.shape) <= 2 * parameters.border_px:
         return np.zeros((0, 2))
     smooth = cv2.GaussianBlur(image, (0, 0), parameters.smoothing_px)
-    response = cv2.cornerHarris(smooth, parameters.block_px, _SOBEL_APERTURE_PX, parameters.k)
+    response = harris_response(smooth, parameters)
     pixels = _strongest(response, parameters)
     if len(pixels) == 0:
         return np.zeros((0, 2))
     return _peak(response, pixels)
 
 
+def harris_response(image: np.ndarray, parameters: HarrisParameters) -> np.ndarray:
+    """Response (H, W) float32, band by band: what is needed on the way then stays in the cache."""
+    margin = parameters.block_px + _SOBEL_APERTURE_PX
+    response = np.empty(image.shape, dtype=np.float32)
+    for top in range(0, len(image), _BAND_PX):
+        low, bottom = max(top - margin, 0), min(top + _BAND_PX, len(image))
+        band = cv2.cornerHarris(
+            image[low : bottom + margin], parameters.block_px, _SOBEL_APERTURE_PX, parameters.k
+        )
+        response[top:bottom] = band[top - low : bottom - low]
+    return response
+
+
 def _strongest(response: np.ndarray, parameters: HarrisParameters) -> np.ndarray:
     """Pixels (N, 2) int64 of the corners to keep, strongest first."""
-    border = parameters.border_px
-    inner = response[border:-border, border:-border]
-    local_maximum = inner == cv2.dilate(response, np.ones((3, 3)))[border:-border, border:-border]
-    v, u = np.nonzero(local_maximum & (inner > parameters.min_response))
-    order = np.argsort(-inner[v, u], kind="stable")
-    candidates = np.stack([u[order], v[order]], -1) + border
+    maxima = local_maxima(response, parameters.border_px, np.float32(parameters.min_response))
+    u, v = maxima.T
+    candidates = maxima[np.argsort(-response[v, u], kind="stable")]
     height, width = response.shape
     cells = -(-height // parameters.cell_px) * -(-width // parameters.cell_px)
     kept = _spread(
@@ -95,6 +106,27 @@ def _strongest(response: np.ndarray, parameters: HarrisParameters) -> np.ndarray
         parameters.max_corners,
     )
     return candidates[kept]
+
+
+@njit(cache=True)
+def local_maxima(response: np.ndarray, border: int, least: np.float32) -> np.ndarray:
+    """Pixels (N, 2) int64, row by row, above `least` that no neighbour's response exceeds."""
+    height, width = response.shape[0], response.shape[1]
+    found = np.empty(((height - 2 * border) * (width - 2 * border), 2), dtype=np.int64)
+    count = 0
+    for v in range(border, height - border):
+        for u in range(border, width - border):
+            here = response[v, u]
+            if not here > least:
+                continue
+            most = here
+            for y in range(v - 1, v + 2):
+                for x in range(u - 1, u + 2):
+                    most = max(most, response[y, x])
+            if most == here:
+                found[count, 0], found[count, 1] = u, v
+                count += 1
+    return found[:count].copy()
 
 
 @njit(cache=True)

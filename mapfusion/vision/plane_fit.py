@@ -10,6 +10,10 @@ from mapfusion.symmetric import cholesky, solve_lower, solve_upper
 
 _MAX_STEPS = 8
 _CONVERGED_PX = 0.005  # far below what noise lets one measure
+# Noise adds half its variance to the mean square of slopes, which promise that much more than they
+# keep: the variance grows by the square (errors in variables, Fuller 1987, section 1.1). So much of
+# it is taken for texture at least.
+_LEAST_TEXTURE = 0.25
 _SINGULAR = 1e-9  # pivot, as a share of its diagonal element, that is rounding error
 
 
@@ -23,6 +27,7 @@ def fit_planes(
     half: int,
     slope_sigma: float,
     noise: float,
+    alike_px: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Fit disparity, slopes and an offset in brightness to each window.
 
@@ -35,18 +40,19 @@ def fit_planes(
         start: (N,) disparities right to a pixel or two.
         half: half side of the window, pixels.
         slope_sigma: standard deviation of the prior on a and b, around zero.
-        noise: standard deviation of one image's grey levels, for the first step's prior.
+        noise: standard deviation of one image's grey levels.
+        alike_px: what residuals hold beyond noise is alike over so many pixels each way.
 
     Returns:
-        Planes (N, 3) of d, a, b, and the variances (N,) of d + a x + b y at the offsets, as if the
-        residuals were independent; NaN where the fit left the image or the texture is too poor.
+        Planes (N, 3) of d, a, b, and the variances (N,) of d + a x + b y at the offsets; NaN where
+        the fit left the image or the texture is too poor.
     """
     plane = np.zeros((len(pixel), 3))
     variance = np.empty(len(pixel))
     for n in range(len(pixel)):
         plane[n, 0] = start[n]
         variance[n] = _fit_plane(
-            left, right, pixel[n], offset[n], half, slope_sigma, noise, plane[n]
+            left, right, pixel[n], offset[n], half, slope_sigma, noise, alike_px, plane[n]
         )
     return plane, variance
 
@@ -72,6 +78,7 @@ def _fit_plane(
     half: int,
     slope_sigma: float,
     noise: float,
+    alike_px: float,
     plane: np.ndarray,
 ) -> float:
     """Move `plane` (3,) to the least squares and return the variance at the offset.
@@ -120,7 +127,15 @@ def _fit_plane(
     step[:] = row
     solve_lower(factor, step)
     solve_upper(factor, step)
-    return variance_grey * np.dot(row, step)
+    kept = max(1 - count * noise**2 / 2 / normal[1, 1], _LEAST_TEXTURE)
+    return _counted(variance_grey, noise, alike_px) / kept**2 * np.dot(row, step)
+
+
+@njit(cache=True)
+def _counted(variance_grey: float, noise: float, alike_px: float) -> float:
+    """Variance of residuals as if all were independent: noise is, what exceeds it is not."""
+    independent = min(variance_grey, 2 * noise**2)
+    return independent + alike_px**2 * (variance_grey - independent)
 
 
 @njit(cache=True)

@@ -5,7 +5,8 @@
 2. Least squares after Lucas and Kanade (1981) on the grey levels, for a disparity that varies over
    the window like a plane's does, d + a x + b y. Without a and b the estimate would belong to
    wherever the window's texture lies and not to the corner. A prior keeps them to what a wall at
-   some distance can show. Variance of d: inverse normal matrix times the residuals' variance.
+   some distance can show. Variance of d: inverse normal matrix times the residuals' variance, of
+   which more counts as what exceeds the sensor's noise.
 3. Each half of a larger window (left, right, upper, lower) must agree with that plane, or the
    corner sits on a silhouette, where two surfaces meet in the image and nothing in the world.
 """
@@ -49,11 +50,10 @@ class StereoParameters:
         silhouette_half_px: half side of the window of the silhouette test.
         max_misfit_px: a half window may differ from the plane by noise and by what this error in
             disparity would explain.
-        residual_correlation_px: residuals are alike over so many pixels each way (staircase edges,
-            texture seen through a lens), so that many squared count as one.
-        sigma_floor_px: error that stays however much texture there is. This and the one before
-            are the most probable values for the errors against rendered depth, where edges
-            fall on whole pixels; a lens and a sensor do better.
+        residual_correlation_px: what residuals hold beyond noise (staircase edges, a surface that
+            is no plane) is alike over so many pixels each way: that many squared count as one.
+        sigma_floor_px: error that stays however much texture there is. With this and the one before
+            errors against rendered depth are as stated, drawn with a filter or without.
     """
 
     min_depth_m: Annotated[float, Range(0.01, 100, "m")] = 0.5
@@ -67,8 +67,8 @@ class StereoParameters:
     noise_grey: Annotated[float, Range(0, 255, "grey levels")] = 2.0
     silhouette_half_px: Annotated[int, Range(2, 100, "px")] = 12
     max_misfit_px: Annotated[float, Range(1e-3, 100, "px")] = 1.0
-    residual_correlation_px: Annotated[float, Range(0, 100, "px")] = 3.0
-    sigma_floor_px: Annotated[float, Range(0, 100, "px")] = 0.1
+    residual_correlation_px: Annotated[float, Range(0, 100, "px")] = 6.0
+    sigma_floor_px: Annotated[float, Range(0, 100, "px")] = 0.01
 
     def __post_init__(self) -> None:
         require_in_range(self)
@@ -193,7 +193,7 @@ def _refine(
         parameters.half_px,
         camera.baseline_m / parameters.nearest_plane_m,
         parameters.noise_grey,
+        parameters.residual_correlation_px,
     )
     disparity = plane[:, 0] + np.sum(plane[:, 1:] * offset, -1)
-    variance = variance * parameters.residual_correlation_px**2 + parameters.sigma_floor_px**2
-    return plane, disparity, np.sqrt(variance)
+    return plane, disparity, np.sqrt(variance + parameters.sigma_floor_px**2)

@@ -16,6 +16,11 @@ from tests.mapfusion.vision.rendered_scene import Plane, render, wall
 CAMERA = StereoCamera()
 
 
+# from a corner of the room, on a side wall that is seen at a slant: half a window is 8 px, a
+# hundredth of a metre each at 5 m, three and more times that along the slant
+FOLD_M = 0.3
+
+
 @pytest.fixture(scope="module")
 def room() -> list[Plane]:
     """A corridor of 3.4 m with an end wall at x = 5 m; the planes fill the image."""
@@ -46,10 +51,12 @@ def test_points_lie_on_the_walls_within_their_covariance(room: list[Plane]) -> N
     normal = transform_points([0, 0, -0.1], normal_world)
     sigma = np.sqrt(np.einsum("ni,nij,nj->n", normal, seen.covariance_m2, normal))
     deviation = distance[np.arange(len(seen)), nearest] / sigma
-    # the renderer draws the edge between two walls on whole pixels only
-    assert np.mean(np.abs(deviation) < 3) > 0.95
-    # clean pictures do better than the sigma, which is that of unfiltered textures
-    assert 0.2 < np.sqrt(np.mean(deviation[np.abs(deviation) < 3] ** 2)) < 1.2
+    # a window that reaches around a corner of the room shows no plane
+    off_m = np.sort(np.abs(distance), axis=1)
+    folded = off_m[:, 1] < FOLD_M
+    assert np.mean(np.abs(deviation[~folded]) < 3) > 0.98
+    assert 0.6 < np.sqrt(np.mean(deviation[~folded] ** 2)) < 1.2
+    assert off_m[folded, 0].max() < 0.1
 
 
 def test_features_fill_the_frame_in_a_fixed_order(room: list[Plane]) -> None:

@@ -4,7 +4,13 @@ import cv2
 import numpy as np
 import pytest
 
-from mapfusion.vision.harris import HarrisParameters, _spread, detect
+from mapfusion.vision.harris import (
+    HarrisParameters,
+    _spread,
+    detect,
+    harris_response,
+    local_maxima,
+)
 
 
 def quadrant(u: float, v: float, shape: tuple[int, int] = (80, 100)) -> np.ndarray:
@@ -139,3 +145,24 @@ def test_wrong_images_are_refused(image: np.ndarray) -> None:
 def test_wrong_parameters_are_named(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=f"^{name}:"):
         HarrisParameters(**{name: value})
+
+
+@pytest.mark.parametrize("block_px", [1, 3, 8])
+def test_the_response_of_bands_is_that_of_the_whole_image(block_px: int) -> None:
+    image = cv2.GaussianBlur(
+        np.random.default_rng(5).integers(0, 256, (150, 90), dtype=np.uint8), (0, 0), 1.5
+    )
+    parameters = HarrisParameters(block_px=block_px)
+    whole = cv2.cornerHarris(image, block_px, 3, parameters.k)
+    bands = harris_response(image, parameters)
+    np.testing.assert_allclose(bands, whole, rtol=0, atol=1e-6 * np.abs(whole).max())
+
+
+def test_maxima_are_pixels_that_dilation_leaves_as_they_are() -> None:
+    response = np.random.default_rng(6).integers(0, 9, (40, 50)).astype(np.float32)  # with plateaus
+    inner = (slice(3, -3), slice(3, -3))
+    highest = cv2.dilate(response, np.ones((3, 3)))[inner]
+    v, u = np.nonzero((response[inner] == highest) & (response[inner] > 4))
+    np.testing.assert_array_equal(
+        local_maxima(response, 3, np.float32(4)), np.stack([u, v], -1) + 3
+    )
