@@ -32,7 +32,7 @@ class Pairs(NamedTuple):
     slot: np.ndarray  # (P,)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def boxes_of(seen: Sightings, gate: float) -> Float:
     """Boxes (K, 4) of observations and their gates over all particles."""
     boxes = np.empty((len(seen.point_m), 4))
@@ -92,7 +92,7 @@ def pairs_of_labels(
     return Pairs(known, slot[known]), first & (slot < 0)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _touching(
     slots: Slots, names: np.ndarray, boxes: Float, descriptor: np.ndarray, threshold: np.float32
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -150,13 +150,13 @@ def choose(
     return chosen, alive[taken.any(axis=1)]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _distance(point: Float, noise: Float, mean: Float, sigma: Float, m: int, planar: bool) -> float:
     difference, inverse, _ = innovation(point, noise, mean, sigma, m, planar)
     return quadratic_form(difference, inverse)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _take_in_order(
     slots: Slots,
     pairs: Pairs,
@@ -179,7 +179,7 @@ def _take_in_order(
                 taken[j, m] = True
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _sort_inside(distance: Float, gate: float, order: np.ndarray) -> int:
     """Write the pairs inside the gate into `order`, nearest first, the first on a tie; how many.
 
@@ -197,7 +197,7 @@ def _sort_inside(distance: Float, gate: float, order: np.ndarray) -> int:
     return n
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _take_nearest(
     slots: Slots,
     pairs: Pairs,

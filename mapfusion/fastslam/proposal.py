@@ -46,7 +46,7 @@ def widened(
     return Sightings(predicted.point_m, covariance)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _widen(point: Float, covariance: Float, pose: Float, turn: float, sigma: Float) -> None:
     for m in range(len(pose)):
         # the disturbance is added in the frame that the robot had before the motion
@@ -61,7 +61,7 @@ def _widen(point: Float, covariance: Float, pose: Float, turn: float, sigma: Flo
             covariance[k, m, 3] += yy + w * dx * dx
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def informed_disturbance(
     slots: Slots,
     chosen: np.ndarray,
@@ -104,7 +104,7 @@ def informed_disturbance(
     return eta, log_ratio
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _gather_pairs(
     slots: Slots,
     chosen: np.ndarray,
@@ -134,7 +134,7 @@ def _gather_pairs(
     return n
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _normal_equations(
     pairs: Float, before: float, sigma: Float, gate: float, eta: Float, normal: Float, right: Float
 ) -> None:

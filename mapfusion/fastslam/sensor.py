@@ -39,7 +39,7 @@ def sightings(
     return seen
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _turn_into_map(
     T_map_robot: Float, position: Float, covariance: Float, planar: bool, seen: Sightings
 ) -> None:
@@ -62,7 +62,9 @@ def _turn_into_map(
             turned[m, 5] = zz
 
 
-@njit(cache=True)
+# Division is NumPy's in the filter's kernels (`error_model`): a check for zero at each one keeps
+# LLVM from inlining what divides. No Z is singular: a frame with a singular R_t is refused.
+@njit(cache=True, error_model="numpy")
 def inverse_and_determinant(
     xx: float, xy: float, xz: float, yy: float, yz: float, zz: float
 ) -> tuple[Upper, float]:
@@ -72,7 +74,7 @@ def inverse_and_determinant(
     return (f * axx, f * axy, f * axz, f * ayy, f * ayz, f * azz), determinant
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def innovation(
     point: Float, noise: Float, mean: Float, covariance: Float, m: int, planar: bool
 ) -> tuple[Vector, Upper, float]:
@@ -85,18 +87,18 @@ def innovation(
     xx = covariance[m, 0] + noise[m, 0]
     xy = covariance[m, 1] + noise[m, 1]
     yy = covariance[m, 3] + noise[m, 3]
-    if planar:
-        xz, yz, zz, dz = 0.0, 0.0, 1.0, 0.0
-    else:
-        xz = covariance[m, 2] + noise[m, 2]
-        yz = covariance[m, 4] + noise[m, 4]
-        zz = covariance[m, 5] + noise[m, 5]
-        dz = point[m, 2] - mean[m, 2]
+    xz = covariance[m, 2] + noise[m, 2]
+    yz = covariance[m, 4] + noise[m, 4]
+    zz = covariance[m, 5] + noise[m, 5]
+    dz = point[m, 2] - mean[m, 2]
+    if planar:  # after the reads: a branch between them costs as much as all the arithmetic
+        xz = yz = dz = 0.0
+        zz = 1.0
     inverse, determinant = inverse_and_determinant(xx, xy, xz, yy, yz, zz)
     return (point[m, 0] - mean[m, 0], point[m, 1] - mean[m, 1], dz), inverse, determinant
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def quadratic_form(difference: Vector, inverse: Upper) -> float:
     """Squared Mahalanobis distance: d^T Z^-1 d."""
     dx, dy, dz = difference

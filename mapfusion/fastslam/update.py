@@ -11,7 +11,7 @@ NEW = -1  # the particle has no such landmark yet
 DROPPED = -2  # the observation is used for nothing
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def update_landmarks(
     slots: Slots, chosen: np.ndarray, seen: Sightings, log_new: Float, planar: bool
 ) -> Float:
@@ -39,7 +39,7 @@ def update_landmarks(
     return log_likelihood
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _correct(
     mean: Float, sigma: Float, noise: Float, m: int, difference: Vector, inverse: Upper
 ) -> None:
