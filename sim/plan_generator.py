@@ -41,7 +41,7 @@ class PlanParameters:
         door_m: width of every door.
     """
 
-    rooms_a_side: Annotated[int, Range(1, 12, "rooms")] = 3
+    rooms_a_side: Annotated[int, Range(1, 50, "rooms")] = 3
     doors_a_room: Annotated[int, Range(1, 2, "doors")] = 2
     room_width_m: tuple[_RoomSide, _RoomSide] = (3.8, 4.8)
     room_depth_m: tuple[_RoomSide, _RoomSide] = (3.0, 4.0)

@@ -6,6 +6,7 @@ the corridor in the same direction, as a camera that looks ahead sees a wall fro
 """
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
@@ -26,6 +27,7 @@ MOST_PLANS = 20  # drawn until one offers the overlap asked for
 NEAR_ENOUGH = 0.03  # of the overlap asked for: drawing stops
 TOLERANCE = 0.13  # of the overlap asked for: farther off is refused (half the gap below 1)
 MOST_CHOICES = 3000  # sets of loops compared in one plan
+MOST_LISTED = 200_000  # sets of loops that are listed to draw from; of more, any are drawn
 
 _LoopLength = Annotated[float, Range(0.1, 1000, "m")]
 
@@ -40,7 +42,7 @@ class RouteParameters:
         loop_m: shortest and longest loop.
     """
 
-    robots: Annotated[int, Range(1, 4, "robots")] = 2
+    robots: Annotated[int, Range(1, 20, "robots")] = 2
     overlap: Annotated[float, Range(0, 1, "1")] = 0.5
     loop_m: tuple[_LoopLength, _LoopLength] = (12.0, 22.0)
 
@@ -128,21 +130,33 @@ def _best_routes(
     if not all(per_wing):
         return None
     offered = per_wing if len(per_wing) > 1 else per_wing * parameters.robots
-    choices = list(itertools.islice(itertools.product(*map(range, map(len, offered))), 200_000))
-    order = rng.permutation(len(choices))[:MOST_CHOICES]
+    choices = _choices([len(loops) for loops in offered], rng)
     shared = _pairwise([np.concatenate([loop, loop[:1]]) for loops in per_wing for loop in loops])
     first = (
         np.cumsum([0, *map(len, per_wing)]) if len(per_wing) > 1 else np.zeros(len(offered), int)
     )
     best, best_miss = None, np.inf
-    overlaps = _mean_pair(shared, np.array(choices)[order] + first[: len(offered)])
-    for k, overlap in zip(order, overlaps.tolist(), strict=True):
+    overlaps = _mean_pair(shared, choices + first[: len(offered)])
+    for choice, overlap in zip(choices.tolist(), overlaps.tolist(), strict=True):
         if abs(overlap - parameters.overlap) < best_miss:
-            starts = _starts([offered[i][loop] for i, loop in enumerate(choices[k])], rng)
+            starts = _starts([loops[i] for loops, i in zip(offered, choice, strict=True)], rng)
             if starts is not None:
                 best_miss = abs(overlap - parameters.overlap)
                 best = GeneratedWorld(plan, starts, overlap)
     return best
+
+
+def _choices(n_offered: list[int], rng: np.random.Generator) -> np.ndarray:
+    """Which loop each robot takes: sets (C, R), MOST_CHOICES of all there are at most."""
+    if math.prod(n_offered) > MOST_LISTED:
+        shape = MOST_CHOICES, len(n_offered)
+        drawn = rng.integers(n_offered, size=shape)
+        # robots share some of the loops drawn, or all have one: any overlap is among such sets
+        n_taken = rng.integers(1, len(n_offered), size=MOST_CHOICES, endpoint=True)
+        taken = rng.integers(n_taken[:, None], size=shape)
+        return np.take_along_axis(drawn, taken, axis=1) % n_offered
+    choices = np.array(list(itertools.product(*map(range, n_offered))))
+    return choices[rng.permutation(len(choices))[:MOST_CHOICES]]
 
 
 def _mean_pair(shared: Float, rows: np.ndarray) -> Float:
@@ -206,22 +220,33 @@ def ground_overlap(path_a_m: Float, path_b_m: Float) -> float:
 
 def _pairwise(paths: Sequence[Float]) -> Float:
     """`ground_overlap` of all pairs (P, P)."""
+    # Here, so that a command that draws no routes does not pay for it.
+    from scipy.sparse import csr_array
+
     points = np.concatenate(paths)
     low, high = points.min(axis=0) - GROUND_HALF_WIDTH_M, points.max(axis=0) + GROUND_HALF_WIDTH_M
-    axes = [np.arange(low[i] + CELL_M / 2, high[i], CELL_M) for i in (0, 1)]
-    cells = np.stack(np.meshgrid(*axes), -1).reshape(-1, 2)
-    visited = np.stack([_near(cells, path) for path in paths]).astype(np.float64)
-    both = visited @ visited.T
-    size = np.diag(both)
+    x, y = (np.arange(low[i] + CELL_M / 2, high[i], CELL_M) for i in (0, 1))
+    visited = [_visited(x, y, path) for path in paths]
+    size = np.array([len(cells) for cells in visited])
+    starts = np.concatenate([[0], np.cumsum(size)])
+    # a path visits some thousandths of a large building, so the table is kept sparse
+    table = csr_array(
+        (np.ones(starts[-1]), np.concatenate(visited), starts), shape=(len(paths), len(x) * len(y))
+    )
+    both = (table @ table.T).toarray()
     return both / (size[:, None] + size - both)
 
 
-def _near(cells: Float, path_m: Float) -> np.ndarray:
-    """Which cells' middles (C, 2) lie within `GROUND_HALF_WIDTH_M` of a path (N, 2)."""
-    near = np.zeros(len(cells), dtype=bool)
+def _visited(x: Float, y: Float, path_m: Float) -> np.ndarray:
+    """Cells of a grid, ascending, whose middles lie near a path (N, 2)."""
+    visited = []
     reach_m = GROUND_HALF_WIDTH_M + CELL_M
     for start, end in itertools.pairwise(path_m):
         low, high = np.minimum(start, end) - reach_m, np.maximum(start, end) + reach_m
-        rows = np.flatnonzero(np.all((cells > low) & (cells < high), axis=1))
-        near[rows] |= segment_distance_m(cells[rows], start, end) <= GROUND_HALF_WIDTH_M
-    return near
+        across = np.arange(*np.searchsorted(x, [low[0], high[0]]))
+        along = np.arange(*np.searchsorted(y, [low[1], high[1]]))
+        column, row = (index.ravel() for index in np.meshgrid(across, along))
+        cells = np.stack([x[column], y[row]], -1)
+        near = segment_distance_m(cells, start, end) <= GROUND_HALF_WIDTH_M
+        visited.append((row * len(x) + column)[near])
+    return np.unique(np.concatenate(visited))

@@ -19,17 +19,24 @@ from sim.textures import STYLES
 
 _GB = 1e9
 _PROCESS_BYTES = 300e6  # a worker with the numerical libraries and compiled kernels
-# A slot holds a mean (3 numbers), a covariance (6) and a count for each particle; while the slots
-# are doubled the old half is there too, so half as much again.
-_LANDMARK_BYTES = 1.5 * (9 * 8 + 4)
+# A landmark's row holds a mean (3 numbers), a covariance (6) and a count for each particle; while
+# rows are doubled the old half is there too, so half as much again. Its slot has a descriptor.
+_ROW_BYTES, _SLOT_BYTES = 1.5 * (9 * 8 + 4), 1.5 * 400
 # Of the corners seen in a frame so many are taken for new landmarks: 0.5 to 2 % in the suite.
 _NEW_SHARE = 0.02
 _POSE_BYTES = 3 * 8 + 4  # kept of each particle and frame: its pose and its ancestor
 _ASSOCIATION_BYTES = 4  # and of each observation: the landmark it went into
+# Both are kept of all particles only since these had one ancestor. That is 2 M resamplings ago on
+# average where weights differ little, fewer elsewhere, and each takes ten frames or more.
+_FRAMES_A_PARTICLE = 30
+# An observation of a log: position, covariance, descriptor, label, pixels, frame.
+_OBSERVATION_BYTES = 3 * 8 + 9 * 8 + 64 * 4 + 4 + 3 * 4 + 4
 # Two images with their depth, noise and corner responses: 60 to 80 bytes measured at 2048 x 2048.
 _PIXEL_BYTES = 100
 # The renderer's copy of a texture, and what one face needs while it is painted.
 _TEXEL_BYTES, _PAINTED_BYTES = 4, 20
+# A landmark of an evaluated map is a row of twelve numbers, and there once more when it is written.
+_EVALUATED_BYTES = 2 * 12 * 8
 _CGROUP_LIMITS = ("memory.max", "memory/memory.limit_in_bytes")  # of version 2 and 1
 
 
@@ -62,7 +69,7 @@ def needs(pipeline: Pipeline) -> Iterator[Need]:
     """What the tasks that need most of a process need."""
     scenario = pipeline.scenario
     for robot in pipeline.robots:
-        yield _of_filter(scenario, robot)
+        yield from _of_filter(scenario, robot)
     if isinstance(scenario, Simulation):
         camera = scenario.camera
         pixels = camera.width_px * camera.height_px
@@ -71,18 +78,31 @@ def needs(pipeline: Pipeline) -> Iterator[Need]:
         yield _of_textures(scenario)
 
 
-def _of_filter(scenario: Scenario, robot: RobotStages) -> Need:
-    """Particles x landmarks, and the particles' past: frames x particles x observations."""
-    particles = scenario.slam.filter.n_particles
-    n_observations = robot.n_frames
+def _of_filter(scenario: Scenario, robot: RobotStages) -> Iterator[Need]:
+    """The log, its landmarks, and of late: particles x landmarks, frames and observations."""
+    settings = scenario.slam.filter
+    n_frames = n_observations = robot.n_frames
+    where = "drive.frames"
     if isinstance(robot.log, RecordedLog):
         n_observations = pq.read_metadata(robot.log.path / "observations.parquet").num_rows
+        where = "logs"
     elif isinstance(scenario, SimulatedScenario):
-        n_observations = robot.n_frames * scenario.vision.harris.max_corners
-    landmarks = _NEW_SHARE * n_observations * _LANDMARK_BYTES
-    past = robot.n_frames * _POSE_BYTES + n_observations * _ASSOCIATION_BYTES
-    why = f"{particles} particles with {n_observations} observations in {robot.n_frames} frames"
-    return Need(particles * (landmarks + past), "slam.filter.n_particles", why)
+        n_observations = n_frames * scenario.vision.harris.max_corners
+    n_landmarks, late = _NEW_SHARE * n_observations, 1.0  # share of frames since particles differ
+    if settings.resample_fraction > 0:
+        late = min(1.0, _FRAMES_A_PARTICLE * settings.n_particles / max(n_frames, 1))
+    a_particle = late * (
+        n_landmarks * _ROW_BYTES + n_observations * _ASSOCIATION_BYTES + n_frames * _POSE_BYTES
+    )
+    once = n_observations * _OBSERVATION_BYTES + n_landmarks * _SLOT_BYTES
+    of_particles = settings.n_particles * a_particle
+    setting = "slam.filter.n_particles" if of_particles > once else where
+    why = f"{n_observations} observations in {n_frames} frames"
+    yield Need(of_particles + once, setting, f"{settings.n_particles} particles with {why}")
+    # maps grow from nothing, so their mean is half of the last
+    n_rows = n_frames / scenario.evaluate.every * n_landmarks / 2
+    often = f"maps each {scenario.evaluate.every} of {n_frames} frames"
+    yield Need(n_rows * _EVALUATED_BYTES, "evaluate.every", often)
 
 
 def _of_textures(scenario: Simulation) -> Need:

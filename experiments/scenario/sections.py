@@ -15,7 +15,7 @@ from sim.textures import Texture
 
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,40}$"  # names become parts of file names
 TAKEN_NAMES = {"fused", "oracle"}  # of a map and of an estimate beside the robots' and aligners'
-MAX_FRAMES = 20_000  # an hour at five frames a second
+MAX_FRAMES = 100_000  # five hours and a half at five frames a second
 MAX_COUNT = 1_000_000  # of frames or sightings in a log: a day at ten a second
 MAX_POINTS = 1000  # of one wall or route
 MAX_NAMED = 100  # things with names of their own: more do not fit into any table or figure

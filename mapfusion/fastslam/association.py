@@ -10,11 +10,14 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from mapfusion.fastslam.boxes import touches
 from mapfusion.fastslam.particles import ParticleMaps
 from mapfusion.fastslam.sensor import Sightings, innovation, quadratic_form
-from mapfusion.fastslam.slots import Slots
+from mapfusion.fastslam.slots import Estimates, Slots
 from mapfusion.fastslam.update import DROPPED, NEW
 from mapfusion.se2 import Float
+
+_PART = 16  # entries of a descriptor that are compared at a time
 
 
 class Association(StrEnum):
@@ -32,7 +35,7 @@ class Pairs(NamedTuple):
     slot: np.ndarray  # (P,)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def boxes_of(seen: Sightings, gate: float) -> Float:
     """Boxes (K, 4) of observations and their gates over all particles."""
     boxes = np.empty((len(seen.point_m), 4))
@@ -92,7 +95,7 @@ def pairs_of_labels(
     return Pairs(known, slot[known]), first & (slot < 0)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _touching(
     slots: Slots, names: np.ndarray, boxes: Float, descriptor: np.ndarray, threshold: np.float32
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -102,17 +105,31 @@ def _touching(
     n = 0
     for k in range(len(boxes)):
         for s in names:
-            box, other = boxes[k], slots.box_m[s]
-            if other[0] > box[2] or other[2] < box[0] or other[1] > box[3] or other[3] < box[1]:
+            if not touches(slots.box_m, s, boxes[k]):
                 continue
-            apart = np.float32(0.0)
-            for i in range(descriptor.shape[1]):
-                apart += (descriptor[k, i] - slots.descriptor[s, i]) ** 2
-            apart = np.sqrt(apart)
+            apart = _unlikeness(descriptor, k, slots.descriptor, s, threshold)
             if apart < threshold:
                 observation[n], slot[n], distance[n] = k, s, apart
                 n += 1
     return observation[:n], slot[:n], distance[:n]
+
+
+@njit(cache=True, error_model="numpy")
+def _unlikeness(
+    descriptor: np.ndarray, k: int, known: np.ndarray, s: int, threshold: np.float32
+) -> np.float32:
+    """Distance of row k of one table from row s of the other; infinite if beyond the threshold.
+
+    Most are far beyond it, which a part of their squares tells.
+    """
+    enough = np.float32(1.001) * threshold * threshold  # rounding is far below a thousandth
+    squares = np.float32(0.0)
+    for first in range(0, descriptor.shape[1], _PART):
+        for i in range(first, min(first + _PART, descriptor.shape[1])):
+            squares += (descriptor[k, i] - known[s, i]) ** 2
+        if squares > enough:
+            return np.float32(np.inf)
+    return np.sqrt(squares)
 
 
 def choose(
@@ -138,25 +155,25 @@ def choose(
     Returns:
         (K, M) int64 slot, NEW or DROPPED; and the slots that were chosen, ascending.
     """
-    used = np.unique(pairs.slot)
-    alive = used[maps.bring_up_to_date(used)]
-    kept = np.isin(pairs.slot, alive)
-    pairs = Pairs(pairs.observation[kept], pairs.slot[kept])
+    used, place = np.unique(pairs.slot, return_inverse=True)
+    alive = maps.bring_up_to_date(used)
+    if not alive.all():
+        pairs, place = Pairs(*(values[alive[place]] for values in pairs)), place[alive[place]]
     chosen = np.empty(seen.point_m.shape[:2], dtype=np.int64)
     chosen[:] = np.where(may_create, NEW, DROPPED)[:, None]
-    taken = np.zeros((len(alive), seen.point_m.shape[1]), dtype=bool)
+    taken = np.zeros((len(used), seen.point_m.shape[1]), dtype=bool)
     take = _take_nearest if nearest else _take_in_order
-    take(maps.slots, pairs, np.searchsorted(alive, pairs.slot), taken, seen, gate, planar, chosen)
-    return chosen, alive[taken.any(axis=1)]
+    take(maps.slots, pairs, place, taken, seen, gate, planar, chosen)
+    return chosen, used[taken.any(axis=1)]
 
 
-@njit(cache=True)
-def _distance(point: Float, noise: Float, mean: Float, sigma: Float, m: int, planar: bool) -> float:
-    difference, inverse, _ = innovation(point, noise, mean, sigma, m, planar)
+@njit(cache=True, error_model="numpy")
+def _distance(seen: Sightings, k: int, own: Estimates, r: int, m: int, planar: bool) -> float:
+    difference, inverse, _ = innovation(seen, k, own, r, m, planar)
     return quadratic_form(difference, inverse)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _take_in_order(
     slots: Slots,
     pairs: Pairs,
@@ -169,17 +186,16 @@ def _take_in_order(
 ) -> None:
     for i in range(len(place)):
         k, s, j = pairs.observation[i], pairs.slot[i], place[i]
-        point, noise = seen.point_m[k], seen.covariance_m2[k]
-        mean, sigma, count = slots.mean_m[s], slots.covariance_m2[s], slots.count[s]
+        r = int(slots.row[s])
         for m in range(chosen.shape[1]):
-            if chosen[k, m] >= 0 or taken[j, m] or count[m] == 0:
+            if chosen[k, m] >= 0 or taken[j, m] or slots.own.count[r, m] == 0:
                 continue
-            if _distance(point, noise, mean, sigma, m, planar) <= gate:
+            if _distance(seen, k, slots.own, r, m, planar) <= gate:
                 chosen[k, m] = s
                 taken[j, m] = True
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _sort_inside(distance: Float, gate: float, order: np.ndarray) -> int:
     """Write the pairs inside the gate into `order`, nearest first, the first on a tie; how many.
 
@@ -197,7 +213,7 @@ def _sort_inside(distance: Float, gate: float, order: np.ndarray) -> int:
     return n
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _take_nearest(
     slots: Slots,
     pairs: Pairs,
@@ -211,12 +227,10 @@ def _take_nearest(
     n_particles = chosen.shape[1]
     distance = np.full((n_particles, len(place)), np.inf)
     for i in range(len(place)):
-        k, s = pairs.observation[i], pairs.slot[i]
-        point, noise = seen.point_m[k], seen.covariance_m2[k]
-        mean, sigma, count = slots.mean_m[s], slots.covariance_m2[s], slots.count[s]
+        k, r = pairs.observation[i], int(slots.row[pairs.slot[i]])
         for m in range(n_particles):
-            if count[m] > 0:
-                distance[m, i] = _distance(point, noise, mean, sigma, m, planar)
+            if slots.own.count[r, m] > 0:
+                distance[m, i] = _distance(seen, k, slots.own, r, m, planar)
     nearest_first = np.empty(len(place), np.int64)
     for m in range(n_particles):
         for i in nearest_first[: _sort_inside(distance[m], gate, nearest_first)]:
@@ -224,3 +238,20 @@ def _take_nearest(
             if chosen[k, m] < 0 and not taken[j, m]:
                 chosen[k, m] = pairs.slot[i]
                 taken[j, m] = True
+
+
+@njit(cache=True)
+def sources(slots: Slots, chosen: np.ndarray, first_source: int) -> np.ndarray:
+    """(K, M) int32 source of the landmark that each observation went into, -1 if it was dropped.
+
+    `first_source` is the running number of the first observation.
+    """
+    source = np.empty(chosen.shape, dtype=np.int32)
+    for k in range(chosen.shape[0]):
+        for m in range(chosen.shape[1]):
+            s = chosen[k, m]
+            if s == NEW:
+                source[k, m] = first_source + k
+            else:
+                source[k, m] = -1 if s == DROPPED else slots.source[s]
+    return source

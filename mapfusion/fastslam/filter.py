@@ -10,7 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapfusion.arguments import require_finite, require_shape
-from mapfusion.fastslam.association import Association, choose, pairs_nearby, pairs_of_labels
+from mapfusion.fastslam.association import (
+    Association,
+    choose,
+    pairs_nearby,
+    pairs_of_labels,
+    sources,
+)
 from mapfusion.fastslam.history import History
 from mapfusion.fastslam.motion import sample_motion
 from mapfusion.fastslam.parameters import FastSlamParameters
@@ -23,7 +29,7 @@ from mapfusion.fastslam.resampling import (
 )
 from mapfusion.fastslam.sensor import Sightings, log_density_at_gate, sightings
 from mapfusion.fastslam.tracked import Tracked
-from mapfusion.fastslam.update import DROPPED, NEW, update_landmarks
+from mapfusion.fastslam.update import update_landmarks
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import NO_LABEL, Observations
 from mapfusion.se2 import Float, compose
@@ -62,8 +68,9 @@ class FastSlam:
     Args:
         parameters: settings.
         rng: of the motion and the resampling.
-        keep_history: keep what `best_path` and `best_associations` tell. It grows with every step;
-            without it the filter's memory grows with the map alone.
+        keep_history: keep what `best_path` and `best_associations` tell. It grows with every step,
+            by one particle's share once the particles' lines have met; without it the filter's
+            memory grows with the map alone.
     """
 
     def __init__(
@@ -87,8 +94,13 @@ class FastSlam:
 
     @property
     def n_slots(self) -> int:
-        """Distinct landmarks that the particles hold between them; the memory grows with these."""
+        """Distinct landmarks that the particles hold between them."""
         return self._maps.n_slots
+
+    @property
+    def n_rows(self) -> int:
+        """Those of them that the particles may estimate differently, M times the memory each."""
+        return self._maps.n_rows
 
     def step(self, odometry: Float, observations: Observations) -> StepResult:
         """Take in one frame: predict, associate, update, weigh, resample.
@@ -124,14 +136,13 @@ class FastSlam:
 
     def best_map(self, min_count: int = 3) -> LandmarkMap:
         """The heaviest particle's landmarks that were seen at least `min_count` times, by age."""
-        which, column = self._maps.of_particle(self._best, min_count)
+        which, known = self._maps.of_particle(self._best, min_count)
         slots = self._maps.slots
-        upper = slots.covariance_m2[which, column]
-        covariance = upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+        covariance = known.covariance_m2[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
         return LandmarkMap(
-            position_m=slots.mean_m[which, column],
+            position_m=known.mean_m,
             covariance_m2=covariance,
-            count=slots.count[which, column],
+            count=known.count,
             source_observation=slots.source[which],
             descriptor=slots.descriptor[which] if self._has_descriptors else None,
             label=slots.label[which] if self._has_labels else None,
@@ -263,9 +274,8 @@ class FastSlam:
     def _remember(self, chosen: np.ndarray) -> None:
         """Number the observations, and keep what became of them."""
         if self._history is not None:
-            number = self._n_observations + np.arange(len(chosen))
-            source = np.where(chosen == NEW, number[:, None], self._maps.slots.source[chosen])
-            self._history.add(self._poses, np.where(chosen == DROPPED, -1, source))
+            source = sources(self._maps.slots, chosen, self._n_observations)
+            self._history.add(self._poses, source)
         self._n_observations += len(chosen)
 
     def _resample(self, log_evidence: float) -> StepResult:

@@ -20,21 +20,30 @@ class Genealogy:
         self.generation = 0
         self.ancestors = np.zeros((MEMORY, n_particles), dtype=np.int32)
         self.ancestors[0] = np.arange(n_particles)
+        self._shared = -1  # up to this generation all particles have one and the same ancestor
 
     def resampled(self, ancestors: np.ndarray) -> None:
         """A new generation: its particle m is a child of the present particle ancestors[m] (M,)."""
         self.generation += 1
-        _compose(self.ancestors, ancestors, self.generation % MEMORY)
+        self._shared = _compose(self.ancestors, ancestors, self.generation, self._shared)
 
     # `ancestors[g % MEMORY, m]` is the ancestor in generation g of the present particle m.
 
 
 @njit(cache=True)
-def _compose(table: np.ndarray, ancestors: np.ndarray, newest: int) -> None:
+def _compose(table: np.ndarray, ancestors: np.ndarray, newest: int, shared: int) -> int:
+    """Follow a resampling, in the generations where it makes a difference; the new `shared`."""
     n_particles = table.shape[1]
     old = np.empty(n_particles, dtype=table.dtype)
-    for row in range(len(table)):
-        old[:] = table[row]
+    for generation in range(max(shared + 1, newest - len(table) + 1), newest):
+        g, is_shared = generation % len(table), True
         for m in range(n_particles):
-            table[row, m] = old[ancestors[m]]
-    table[newest] = np.arange(n_particles)
+            old[m] = table[g, m]
+        for m in range(n_particles):
+            table[g, m] = old[ancestors[m]]
+            is_shared &= table[g, m] == table[g, 0]
+        if is_shared:
+            shared = generation
+    for m in range(n_particles):
+        table[newest % len(table), m] = m
+    return shared

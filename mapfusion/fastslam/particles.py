@@ -1,25 +1,35 @@
 """The maps of M particles, laid out so that a resampling copies none of them.
 
-A slot is one landmark that one observation gave rise to, with the estimates of all particles that
-have it side by side. Particles share descriptor and label, which never change. A resampling only
-notes who descends from whom (`genealogy.py`); a slot is brought up to date when it comes into view.
-Slots that no surviving particle has are freed.
+A resampling only notes who descends from whom (`genealogy.py`); the row of a slot is brought up to
+date when it comes into view. Slots that no surviving particle has are freed, and so is the row of a
+slot that all particles have from one ancestor. So a map out of view takes one estimate a landmark
+once the particles' lines have met, and a step costs what is in view.
 """
 
 import numpy as np
 from numba import njit
 
+from mapfusion.fastslam.boxes import bound, near
 from mapfusion.fastslam.genealogy import MEMORY, Genealogy
 from mapfusion.fastslam.sensor import Sightings
-from mapfusion.fastslam.slots import NEVER, Slots, allocate
+from mapfusion.fastslam.slots import (
+    BLOCK,
+    COMMON,
+    FREE,
+    NOWHERE,
+    Estimates,
+    Slots,
+    allocate,
+    copy_estimate,
+    with_room,
+)
 from mapfusion.fastslam.update import NEW
 from mapfusion.robot_log import Observations
 from mapfusion.se2 import Float
 
-_FIRST_CAPACITY = 256
-_NOWHERE = (np.inf, np.inf, -np.inf, -np.inf)  # a box that touches none
-# In so many resamplings all slots are visited once, wherever they lie. Two visits of a slot are
-# then less than twice this apart, which is what the genealogy remembers.
+_FIRST_SLOTS, _FIRST_ROWS = 4 * BLOCK, 64
+# In so many resamplings all rows are visited once, wherever their landmarks lie. Two visits of a
+# row are then less than twice this apart, which is what the genealogy remembers.
 _ROUND = MEMORY // 2
 
 
@@ -30,48 +40,53 @@ class ParticleMaps:
     """
 
     def __init__(self, n_particles: int, gate: float) -> None:
-        self.slots = allocate(_FIRST_CAPACITY, n_particles)
+        self.slots = allocate(_FIRST_SLOTS, _FIRST_ROWS, n_particles)
         self.n_landmarks = np.zeros(n_particles, dtype=np.int64)
         self._gate = gate
         self._genealogy = Genealogy(n_particles)
-        self._free: list[int] = []
-        self._n_used = 0
+        self._used_slots, self._used_rows = _Pool(), _Pool()
         self._n_visited = 0
 
     @property
     def n_slots(self) -> int:
         """Slots in use."""
-        return self._n_used - len(self._free)
+        return len(self._used_slots)
+
+    @property
+    def n_rows(self) -> int:
+        """Those of them that have a row."""
+        return len(self._used_rows)
 
     def near(self, box_m: Float) -> np.ndarray:
         """Slots whose box touches `box_m` (4,); they may be out of date."""
-        return _near(self.slots.box_m[: self._n_used], box_m)
+        return near(self.slots, box_m)
 
     def bring_up_to_date(self, which: np.ndarray) -> np.ndarray:
-        """Write the particle axis of slots for the present generation; free those nobody has.
+        """Write the rows of slots for the present generation; free those that nobody has.
 
         Returns:
             (n,) bool, which of them are still in use.
         """
         genealogy = self._genealogy
+        self._give_rows(which[self.slots.generation[which] == COMMON])
         alive = _inherit(self.slots, which, genealogy.ancestors, genealogy.generation)
         if not alive.all():
             dead = which[~alive]
-            self.slots.generation[dead] = NEVER
-            self.slots.box_m[dead] = _NOWHERE
-            self._free.extend(dead.tolist())
+            self._free_rows(dead, FREE)
+            self.slots.box_m[dead] = NOWHERE
+            self._used_slots.give_back(dead)
         return alive
 
     def moved(self, which: np.ndarray) -> None:
         """Tell that landmarks of these slots, up to date, have changed: they may lie elsewhere."""
-        _bound(self.slots, which, self._gate)
+        bound(self.slots, which, self._gate)
 
     def widen(self, which: np.ndarray, variance_m2: float) -> None:
         """Add to the covariances of these slots' landmarks, along each axis."""
         which = which[self.bring_up_to_date(which)]
         with np.errstate(invalid="ignore"):  # what particles without the landmark have there
             for axis in (0, 3, 5):
-                self.slots.covariance_m2[which, :, axis] += variance_m2
+                self.slots.own.covariance_m2[self.slots.row[which], :, axis] += variance_m2
         self.moved(which)
 
     def create(
@@ -83,7 +98,11 @@ class ParticleMaps:
         and the rows of their observations.
         """
         rows = np.flatnonzero(np.any(chosen == NEW, axis=1))
-        created = np.array([self._take_slot() for _ in rows], dtype=np.int64)
+        if len(rows) == 0:
+            return rows, rows
+        created = self._used_slots.take(len(rows))
+        self.slots = with_room(self.slots, self._used_slots.n_ever, 0)
+        self._give_rows(created)
         slots = self.slots
         slots.generation[created] = self._genealogy.generation
         slots.source[created] = first_source + rows
@@ -101,66 +120,119 @@ class ParticleMaps:
         self.n_landmarks = self.n_landmarks[ancestors]
         self._visit_some()
 
-    def of_particle(self, particle: int, min_count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Slots (n,) of one particle's landmarks, by age, and whose column to read them in (n,)."""
+    def of_particle(self, particle: int, min_count: int) -> tuple[np.ndarray, Estimates]:
+        """Slots (n,) of one particle's landmarks, by age, and what it knows of them (n, ...)."""
         slots, genealogy = self.slots, self._genealogy
-        used = np.flatnonzero(slots.generation[: self._n_used] != NEVER)
-        column = genealogy.ancestors[slots.generation[used] % MEMORY, particle]
-        has = slots.count[used, column] >= max(min_count, 1)
-        by_age = np.argsort(slots.source[used[has]])
-        return used[has][by_age], column[has][by_age]
+        used = np.flatnonzero(slots.generation != FREE)
+        used = used[np.argsort(slots.source[used])]
+        has_row = slots.generation[used] != COMMON
+        rowed = used[has_row]
+        column = genealogy.ancestors[slots.generation[rowed] % MEMORY, particle]
+        known = Estimates(*(values[used, 0] for values in slots.common))
+        for values, own in zip(known, slots.own, strict=True):
+            values[has_row] = own[slots.row[rowed], column]
+        has = known.count >= max(min_count, 1)
+        return used[has], Estimates(*(values[has] for values in known))
 
     def _visit_some(self) -> None:
-        """Bring the next slots up to date, so that a round takes exactly _ROUND resamplings."""
+        """Bring the next rows up to date, so that a round takes exactly _ROUND resamplings.
+
+        Rows in which all particles have the same are freed.
+        """
         left = _ROUND - (self._genealogy.generation - 1) % _ROUND
-        stop = self._n_visited + -(-(self._n_used - self._n_visited) // left)
-        which = np.arange(self._n_visited, stop)
-        which = which[self.slots.generation[which] != NEVER]
+        stop = self._n_visited + -(-(self._used_rows.n_ever - self._n_visited) // left)
+        which = self.slots.slot_of_row[self._n_visited : stop]
+        which = which[which != FREE]
         which = which[self.bring_up_to_date(which)]
+        self._free_rows(which[_settle(self.slots, which)], COMMON)
         self.moved(which)
         self._n_visited = 0 if left == 1 else stop
 
-    def _take_slot(self) -> int:
-        if self._free:
-            return self._free.pop()
-        if self._n_used == len(self.slots.source):
-            self._grow()
-        self._n_used += 1
-        return self._n_used - 1
+    def _give_rows(self, which: np.ndarray) -> None:
+        """Rows for slots that have none; what is in them means nothing."""
+        rows = self._used_rows.take(len(which))
+        self.slots = with_room(self.slots, 0, self._used_rows.n_ever)
+        self.slots.row[which] = rows
+        self.slots.slot_of_row[rows] = which
 
-    def _grow(self) -> None:
-        old = self.slots
-        capacity, n_particles = old.count.shape
-        self.slots = allocate(2 * capacity, n_particles)
-        for new_column, old_column in zip(self.slots, old, strict=True):
-            new_column[:capacity] = old_column
+    def _free_rows(self, which: np.ndarray, generation: int) -> None:
+        """Take the rows of slots away; what their `generation` says of them from now on."""
+        rows = self.slots.row[which]
+        self._used_rows.give_back(rows)
+        self.slots.slot_of_row[rows] = FREE
+        self.slots.generation[which] = generation
+
+
+class _Pool:
+    """Which of the numbers 0, 1, 2, ... are in use; the last to be given back is taken first."""
+
+    def __init__(self) -> None:
+        self.n_ever = 0  # all that were ever in use lie below
+        self._free: list[int] = []
+
+    def __len__(self) -> int:
+        return self.n_ever - len(self._free)
+
+    def take(self, n: int) -> np.ndarray:
+        """(n,) int64 numbers, in use from now on."""
+        again = [self._free.pop() for _ in range(min(n, len(self._free)))]
+        first, self.n_ever = self.n_ever, self.n_ever + n - len(again)
+        return np.array([*again, *range(first, self.n_ever)], dtype=np.int64)
+
+    def give_back(self, numbers: np.ndarray) -> None:
+        """These are in use no longer."""
+        self._free.extend(numbers.tolist())
 
 
 @njit(cache=True)
 def _inherit(slots: Slots, which: np.ndarray, ancestors: np.ndarray, generation: int) -> np.ndarray:
-    n_particles = slots.count.shape[1]
+    own, common = slots.own, slots.common
+    n_particles = own.count.shape[1]
     alive = np.zeros(len(which), dtype=np.bool_)
-    mean = np.empty((n_particles, 3))
-    covariance = np.empty((n_particles, 6))
-    count = np.empty(n_particles, dtype=np.int32)
+    old = Estimates(
+        np.empty((1, n_particles, 3)),
+        np.empty((1, n_particles, 6)),
+        np.empty((1, n_particles), dtype=np.int32),
+    )
     for i in range(len(which)):
-        s = which[i]
-        if slots.generation[s] == generation:
-            alive[i] = True
-            continue
-        parents = ancestors[slots.generation[s] % len(ancestors)]
+        s = int(which[i])
+        r = int(slots.row[s])
+        written = slots.generation[s]
         slots.generation[s] = generation
-        mean[:], covariance[:], count[:] = slots.mean_m[s], slots.covariance_m2[s], slots.count[s]
-        for m in range(n_particles):
-            parent = parents[m]
-            slots.count[s, m] = count[parent]
-            if count[parent] > 0:
-                alive[i] = True
-                for k in range(3):
-                    slots.mean_m[s, m, k] = mean[parent, k]
-                for k in range(6):
-                    slots.covariance_m2[s, m, k] = covariance[parent, k]
+        if written == generation:
+            alive[i] = True
+        elif written == COMMON:
+            alive[i] = True
+            for m in range(n_particles):
+                copy_estimate(common, s, 0, own, r, m)
+        else:
+            for m in range(n_particles):
+                copy_estimate(own, r, m, old, 0, m)
+            for m in range(n_particles):
+                parent = ancestors[written % len(ancestors), m]
+                copy_estimate(old, 0, parent, own, r, m)
+                alive[i] |= own.count[r, m] > 0
     return alive
+
+
+@njit(cache=True)
+def _settle(slots: Slots, which: np.ndarray) -> np.ndarray:
+    """Note what is common to all particles; for each slot whether all is."""
+    own = slots.own
+    same = np.ones(len(which), dtype=np.bool_)
+    for i in range(len(which)):
+        s = int(which[i])
+        r = int(slots.row[s])
+        copy_estimate(own, r, 0, slots.common, s, 0)
+        for m in range(1, own.count.shape[1]):
+            same[i] &= own.count[r, m] == own.count[r, 0]
+            for k in range(3):
+                same[i] &= own.mean_m[r, m, k] == own.mean_m[r, 0, k]
+            for k in range(6):
+                same[i] &= own.covariance_m2[r, m, k] == own.covariance_m2[r, 0, k]
+            if not same[i]:
+                break
+    return same
 
 
 @njit(cache=True)
@@ -172,46 +244,13 @@ def _initialise(
     seen: Sightings,
     n_landmarks: np.ndarray,
 ) -> None:
+    own = slots.own
     for i in range(len(created)):
-        s, k = created[i], rows[i]
+        r, k = slots.row[created[i]], rows[i]
         for m in range(len(n_landmarks)):
-            if chosen[k, m] != NEW:
-                slots.count[s, m] = 0
-                continue
-            slots.count[s, m] = 1
-            slots.mean_m[s, m] = seen.point_m[k, m]
-            slots.covariance_m2[s, m] = seen.covariance_m2[k, m]
-            n_landmarks[m] += 1
-
-
-@njit(cache=True)
-def _near(boxes: Float, box: Float) -> np.ndarray:
-    """Rows of boxes (N, 4) that touch a box; looking at all costs little beside a step."""
-    touches = np.empty(len(boxes), dtype=np.bool_)
-    for s in range(len(boxes)):
-        x = (boxes[s, 0] <= box[2]) & (boxes[s, 2] >= box[0])
-        y = (boxes[s, 1] <= box[3]) & (boxes[s, 3] >= box[1])
-        touches[s] = x & y
-    return np.flatnonzero(touches)
-
-
-@njit(cache=True)
-def _bound(slots: Slots, which: np.ndarray, gate: float) -> None:
-    for s in which:
-        box = slots.box_m[s]
-        box[:2], box[2:] = np.inf, -np.inf
-        spread_x = spread_y = 0.0
-        for m in range(slots.count.shape[1]):
-            if slots.count[s, m] == 0:
-                continue
-            x, y = slots.mean_m[s, m, 0], slots.mean_m[s, m, 1]
-            box[0], box[1] = min(box[0], x), min(box[1], y)
-            box[2], box[3] = max(box[2], x), max(box[3], y)
-            spread_x = max(spread_x, slots.covariance_m2[s, m, 0])
-            spread_y = max(spread_y, slots.covariance_m2[s, m, 3])
-        # Inside the gate |dx| <= sqrt(gate (Sigma_xx + R_xx)), at most the sum of both roots: one
-        # is the landmark's margin, the other the observation's.
-        box[0] -= np.sqrt(gate * spread_x)
-        box[2] += np.sqrt(gate * spread_x)
-        box[1] -= np.sqrt(gate * spread_y)
-        box[3] += np.sqrt(gate * spread_y)
+            own.count[r, m] = int(chosen[k, m] == NEW)
+            n_landmarks[m] += own.count[r, m]
+            for j in range(3):
+                own.mean_m[r, m, j] = seen.point_m[k, m, j]
+            for j in range(6):
+                own.covariance_m2[r, m, j] = seen.covariance_m2[k, m, j]

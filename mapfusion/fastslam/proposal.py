@@ -46,7 +46,7 @@ def widened(
     return Sightings(predicted.point_m, covariance)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _widen(point: Float, covariance: Float, pose: Float, turn: float, sigma: Float) -> None:
     for m in range(len(pose)):
         # the disturbance is added in the frame that the robot had before the motion
@@ -61,7 +61,7 @@ def _widen(point: Float, covariance: Float, pose: Float, turn: float, sigma: Flo
             covariance[k, m, 3] += yy + w * dx * dx
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def informed_disturbance(
     slots: Slots,
     chosen: np.ndarray,
@@ -93,18 +93,21 @@ def informed_disturbance(
             cholesky(root, 0.0)
             solve_lower(root, right)
             solve_upper(root, right)
-            eta[m] += right
+            for i in range(3):
+                eta[m, i] += right[i]
         # the precision is root root^T, so root^-T times a standard normal has its inverse
-        pull[:] = standard_normal[m]
+        for i in range(3):
+            pull[i] = standard_normal[m, i]
         solve_upper(root, pull)
-        eta[m] += pull
+        for i in range(3):
+            eta[m, i] += pull[i]
         prior = eta[m, 0] ** 2 + eta[m, 1] ** 2 + eta[m, 2] ** 2
         drawn = standard_normal[m, 0] ** 2 + standard_normal[m, 1] ** 2 + standard_normal[m, 2] ** 2
         log_ratio[m] = 0.5 * (drawn - prior) - np.log(root[0, 0] * root[1, 1] * root[2, 2])
     return eta, log_ratio
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _gather_pairs(
     slots: Slots,
     chosen: np.ndarray,
@@ -123,10 +126,8 @@ def _gather_pairs(
         s = chosen[k, m]
         if s < 0:
             continue
-        point, row = predicted.point_m[k], pairs[n]
-        difference, inverse, _ = innovation(
-            point, predicted.covariance_m2[k], slots.mean_m[s], slots.covariance_m2[s], m, planar
-        )
+        point, row, r = predicted.point_m[k], pairs[n], int(slots.row[s])
+        difference, inverse, _ = innovation(predicted, k, slots.own, r, m, planar)
         row[0], row[1], row[2] = difference
         row[3], row[4], row[5], row[6], row[7], row[8] = inverse
         row[9], row[10] = point[m, 0] - pose[m, 0], point[m, 1] - pose[m, 1]
@@ -134,7 +135,7 @@ def _gather_pairs(
     return n
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _normal_equations(
     pairs: Float, before: float, sigma: Float, gate: float, eta: Float, normal: Float, right: Float
 ) -> None:
@@ -143,10 +144,9 @@ def _normal_equations(
     bx, by = -sigma[1] * np.sin(before), sigma[1] * np.cos(before)  # d(x, y) / d eta_1
     cos, sin = np.cos(sigma[2] * eta[2]), np.sin(sigma[2] * eta[2])
     shift_x, shift_y = ax * eta[0] + bx * eta[1], ay * eta[0] + by * eta[1]
-    normal[:] = 0.0
-    for i in range(3):
-        normal[i, i] = 1.0
-        right[i] = -eta[i]
+    n00 = n11 = n22 = 1.0
+    n10 = n20 = n21 = 0.0
+    r0, r1, r2 = -eta[0], -eta[1], -eta[2]
     for n in range(len(pairs)):
         dz, ixx, ixy, ixz = pairs[n, 2], pairs[n, 3], pairs[n, 4], pairs[n, 5]
         iyy, iyz, izz = pairs[n, 6], pairs[n, 7], pairs[n, 8]
@@ -160,13 +160,16 @@ def _normal_equations(
         cx, cy = -sigma[2] * ty, sigma[2] * tx  # d(point) / d eta_2
         wx = weight * (ixx * dx + ixy * dy + ixz * dz)
         wy = weight * (ixy * dx + iyy * dy + iyz * dz)
-        right[0] -= ax * wx + ay * wy
-        right[1] -= bx * wx + by * wy
-        right[2] -= cx * wx + cy * wy
+        r0 -= ax * wx + ay * wy
+        r1 -= bx * wx + by * wy
+        r2 -= cx * wx + cy * wy
         axx, axy, ayy = weight * ixx, weight * ixy, weight * iyy
-        normal[0, 0] += ax * ax * axx + 2 * ax * ay * axy + ay * ay * ayy
-        normal[1, 1] += bx * bx * axx + 2 * bx * by * axy + by * by * ayy
-        normal[2, 2] += cx * cx * axx + 2 * cx * cy * axy + cy * cy * ayy
-        normal[1, 0] += ax * bx * axx + (ax * by + ay * bx) * axy + ay * by * ayy
-        normal[2, 0] += ax * cx * axx + (ax * cy + ay * cx) * axy + ay * cy * ayy
-        normal[2, 1] += bx * cx * axx + (bx * cy + by * cx) * axy + by * cy * ayy
+        n00 += ax * ax * axx + 2 * ax * ay * axy + ay * ay * ayy
+        n11 += bx * bx * axx + 2 * bx * by * axy + by * by * ayy
+        n22 += cx * cx * axx + 2 * cx * cy * axy + cy * cy * ayy
+        n10 += ax * bx * axx + (ax * by + ay * bx) * axy + ay * by * ayy
+        n20 += ax * cx * axx + (ax * cy + ay * cx) * axy + ay * cy * ayy
+        n21 += bx * cx * axx + (bx * cy + by * cx) * axy + by * cy * ayy
+    normal[0, 0], normal[1, 1], normal[2, 2] = n00, n11, n22
+    normal[1, 0], normal[2, 0], normal[2, 1] = n10, n20, n21
+    right[0], right[1], right[2] = r0, r1, r2

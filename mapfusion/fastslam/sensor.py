@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from mapfusion.fastslam.slots import Estimates
 from mapfusion.planar import add_turned
 from mapfusion.se2 import Float
 from mapfusion.symmetric import cofactors
@@ -39,14 +40,14 @@ def sightings(
     return seen
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _turn_into_map(
     T_map_robot: Float, position: Float, covariance: Float, planar: bool, seen: Sightings
 ) -> None:
     cos, sin = np.cos(T_map_robot[:, 2]), np.sin(T_map_robot[:, 2])
     for k in range(len(position)):
-        x, y, z = position[k]
-        xx, xy, xz = covariance[k, 0]
+        x, y, z = position[k, 0], position[k, 1], position[k, 2]
+        xx, xy, xz = covariance[k, 0, 0], covariance[k, 0, 1], covariance[k, 0, 2]
         yy, yz, zz = covariance[k, 1, 1], covariance[k, 1, 2], covariance[k, 2, 2]
         if planar:
             z = xz = yz = zz = 0.0
@@ -62,7 +63,9 @@ def _turn_into_map(
             turned[m, 5] = zz
 
 
-@njit(cache=True)
+# Division is NumPy's in the filter's kernels (`error_model`): a check for zero at each one keeps
+# LLVM from inlining what divides. No Z is singular: a frame with a singular R_t is refused.
+@njit(cache=True, error_model="numpy")
 def inverse_and_determinant(
     xx: float, xy: float, xz: float, yy: float, yz: float, zz: float
 ) -> tuple[Upper, float]:
@@ -72,31 +75,32 @@ def inverse_and_determinant(
     return (f * axx, f * axy, f * axz, f * ayy, f * ayz, f * azz), determinant
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def innovation(
-    point: Float, noise: Float, mean: Float, covariance: Float, m: int, planar: bool
+    seen: Sightings, k: int, own: Estimates, r: int, m: int, planar: bool
 ) -> tuple[Vector, Upper, float]:
-    """Innovation, inverse of Z (eq. 6) and |Z| of one observation and one landmark in particle m.
+    """Innovation, inverse of Z (eq. 6) and |Z| of observation k and the landmark of row r.
 
-    In planar data the height says nothing: its innovation is 0 and its variance in Z 1, so that it
-    leaves the Mahalanobis distance and the determinant alone.
-    Points are (M, 3), covariances (M, 6): passing rows would cost more than the arithmetic.
+    Both as particle m has them. In planar data the height says nothing: its innovation is 0 and its
+    variance in Z 1, so that it leaves the Mahalanobis distance and the determinant alone.
     """
-    xx = covariance[m, 0] + noise[m, 0]
-    xy = covariance[m, 1] + noise[m, 1]
-    yy = covariance[m, 3] + noise[m, 3]
-    if planar:
-        xz, yz, zz, dz = 0.0, 0.0, 1.0, 0.0
-    else:
-        xz = covariance[m, 2] + noise[m, 2]
-        yz = covariance[m, 4] + noise[m, 4]
-        zz = covariance[m, 5] + noise[m, 5]
-        dz = point[m, 2] - mean[m, 2]
+    point, noise, mean, covariance = seen.point_m, seen.covariance_m2, own.mean_m, own.covariance_m2
+    xx = covariance[r, m, 0] + noise[k, m, 0]
+    xy = covariance[r, m, 1] + noise[k, m, 1]
+    xz = covariance[r, m, 2] + noise[k, m, 2]
+    yy = covariance[r, m, 3] + noise[k, m, 3]
+    yz = covariance[r, m, 4] + noise[k, m, 4]
+    zz = covariance[r, m, 5] + noise[k, m, 5]
+    dz = point[k, m, 2] - mean[r, m, 2]
+    if planar:  # after the reads: a branch between them costs as much as all the arithmetic
+        xz = yz = dz = 0.0
+        zz = 1.0
     inverse, determinant = inverse_and_determinant(xx, xy, xz, yy, yz, zz)
-    return (point[m, 0] - mean[m, 0], point[m, 1] - mean[m, 1], dz), inverse, determinant
+    difference = (point[k, m, 0] - mean[r, m, 0], point[k, m, 1] - mean[r, m, 1], dz)
+    return difference, inverse, determinant
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def quadratic_form(difference: Vector, inverse: Upper) -> float:
     """Squared Mahalanobis distance: d^T Z^-1 d."""
     dx, dy, dz = difference

@@ -6,9 +6,12 @@ view, others than the frame before, and landmarks come into view that were not t
 of resamplings. Odometry is good, so that the laps meet and the map keeps its size.
 """
 
+import os
+import subprocess
 import sys
 import tracemalloc
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,6 +31,7 @@ STEP_M = 0.1
 LANDMARKS_PER_M = 40.0
 MOTION = MotionNoise(0.002, 0.0002, 0.0005, 0, 0, lateral_slip_m_per_rad=0)
 MEASURED_STEPS = 300
+LONG_DRIVE_FRAMES = os.environ.get("LONG_DRIVE_FRAMES", "5000")
 MIB = 2**20
 
 
@@ -145,3 +149,15 @@ def test_peak_memory_with_10_000_landmarks(benchmark):
     benchmark.extra_info["peak_mib"] = round(peak / MIB, 1)
     sys.stdout.write(f"\npeak memory with 10 000 landmarks: {peak / MIB:.0f} MiB\n")
     assert peak < 1024 * MIB
+
+
+def test_a_long_drive(benchmark):
+    """In a process of its own, for its memory; `make bench LONG_DRIVE_FRAMES=100000` for all."""
+    command = [sys.executable, "-m", "tests.benchmarks.long_drive"]
+    command += ["--frames", LONG_DRIVE_FRAMES, "--landmarks", LONG_DRIVE_FRAMES]
+    root = Path(__file__).parents[2]
+
+    def drive() -> str:
+        return subprocess.run(command, cwd=root, check=True, capture_output=True, text=True).stdout
+
+    sys.stdout.write("\n" + benchmark.pedantic(drive, rounds=1))

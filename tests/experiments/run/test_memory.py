@@ -23,6 +23,7 @@ def need(path: Path, *overrides: str) -> dict[str, float]:
     ("overrides", "named"),
     [
         (["slam.filter.n_particles=10000", "drive.frames=20000"], "slam.filter.n_particles"),
+        (["drive.frames=100000", "evaluate.every=10"], "evaluate.every"),
         (["camera.width_px=4096", "camera.height_px=4096"], "camera.width_px"),
         (["world.walls.0.points=[[0, 0], [500, 0], [500, 400], [0, 400]]"], "world.walls"),
     ],
@@ -43,15 +44,31 @@ def test_each_process_needs_its_own(tiny_path: Path) -> None:
         require_memory(pipeline, 8, GB)
 
 
-def test_the_filter_needs_what_its_slots_take(tiny_path: Path) -> None:
-    """Twice the particles take twice as much; a landmark no less than its slot holds."""
-    one, two = (need(tiny_path, f"slam.filter.n_particles={n}") for n in (100, 200))
+def test_the_filter_needs_what_its_rows_take(tiny_path: Path) -> None:
+    """Each hundred particles take as much again; a landmark no less than its row holds."""
     name = "slam.filter.n_particles"
-    assert two[name] == pytest.approx(2 * one[name])
-    slots = allocate(256, 100)
-    per_landmark = sum(part.nbytes for part in slots[:3]) / 256
+    one, two, three = (need(tiny_path, f"{name}={n}")[name] for n in (100, 200, 300))
+    assert three - two == pytest.approx(two - one)
+    own = allocate(64, 256, 100).own
+    per_landmark = sum(part.nbytes for part in own) / 256
     n_observations = 44 * 110
-    assert one[name] > 0.02 * n_observations * per_landmark
+    assert two - one > 0.02 * n_observations * per_landmark
+
+
+def test_a_long_drive_needs_a_row_for_what_was_seen_lately(tiny_path: Path) -> None:
+    """All particles descend from one before; unless they are never resampled."""
+    particles = "slam.filter.n_particles=200"
+    rarely = "evaluate.every=10000"
+    long = (particles, "drive.frames=100000", "vision.harris.max_corners=50", rarely)
+    fits, never = (
+        lay_out(load_scenario(tiny_path, [*long, f"slam.filter.resample_fraction={share}"]))
+        for share in (0.5, 0.0)
+    )
+    require_memory(fits, 1, 8 * GB)
+    with pytest.raises(InputError, match=r"^slam\.filter\.n_particles: .* 100000 frames"):
+        require_memory(never, 1, 5 * GB)
+    with pytest.raises(InputError, match=r"^drive\.frames: .* 100000 frames"):
+        require_memory(fits, 1, GB)
 
 
 def test_shipped_scenarios_fit_into_4_gb() -> None:

@@ -217,6 +217,22 @@ def test_landmarks_that_no_particle_has_any_more_are_forgotten():
     assert slam.n_slots < 1.5 * result.n_landmarks
 
 
+def test_a_long_drive_keeps_each_particles_estimates_of_what_was_seen_lately_alone():
+    """One new landmark a frame, each seen in four frames."""
+    rng = np.random.default_rng(0)
+    motion = MotionNoise(0.02, 0, 0.01, 0, 0, lateral_slip_m_per_rad=0)
+    slam = FastSlam(parameters(n_particles=5, motion=motion, association="gate"), rng)
+    ahead, covariance = np.array([1.0, 2.0, 3.0, 4.0]), np.tile(1e-4 * np.eye(3), (4, 1, 1))
+    n_rows = []
+    for frame in range(1500):
+        position = np.stack([ahead, 0.3 * (-1) ** (frame + ahead), np.full(4, 0.5)], -1)
+        position += rng.normal(0, 0.01, position.shape)
+        slam.step(np.array([1.0, 0, 0]), Observations(position, covariance))
+        n_rows.append(slam.n_rows)
+    assert slam.n_slots > 1400
+    assert max(n_rows[750:]) <= 1.3 * max(n_rows[150:300]) < 300
+
+
 @pytest.mark.parametrize(
     ("changes", "name"),
     [

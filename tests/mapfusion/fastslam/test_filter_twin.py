@@ -5,6 +5,7 @@ import pytest
 
 from mapfusion.fastslam.filter import FastSlam
 from mapfusion.fastslam.genealogy import MEMORY
+from mapfusion.se2 import between
 from tests.mapfusion.fastslam.copying_filter import CopyingFilter
 from tests.mapfusion.fastslam.landmark_worlds import drive, nothing, observe, parameters
 
@@ -82,7 +83,29 @@ def test_equals_the_filter_that_copies_longer_than_the_genealogy_remembers():
     for _ in range(3 * MEMORY + 17):
         slam.step(np.zeros(3), nothing())
         twin.step(np.zeros(3), nothing())
+    assert slam.n_rows == 4, "nothing told the particles apart"
     frame = observe(pose, world.landmarks, world.descriptor, np.arange(4), rng)
     result = slam.step(np.zeros(3), frame)
     twin.step(np.zeros(3), frame)
+    assert_same(slam, result, twin, planar=False)
+
+
+def test_equals_the_filter_that_copies_when_all_descend_from_one_particle():
+    """Two landmarks out of view while the other two decide which particles live on."""
+    world = drive(3, n_landmarks=4, per_frame=4, n_frames=2)
+    settings = parameters(n_particles=4, association="label", resample_fraction=1.0)
+    slam = FastSlam(settings, np.random.default_rng(1))
+    twin = CopyingFilter(settings, np.random.default_rng(1))
+    rng = np.random.default_rng(2)
+    views = [np.arange(4), np.arange(4), *[np.array([2, 3])] * MEMORY, np.arange(4)]
+    pose, n_rows = world.path[0], []
+    for frame, view in enumerate(views):
+        odometry = between(pose, world.path[frame % 2])
+        pose = world.path[frame % 2]
+        seen = observe(pose, world.landmarks[view], world.descriptor[view], view, rng)
+        result = slam.step(odometry, seen)
+        twin.step(odometry, seen)
+        n_rows.append(slam.n_rows)
+    assert n_rows[1] == 4
+    assert n_rows[-2] == 2 < n_rows[-1], "those out of view were kept once, and came back"
     assert_same(slam, result, twin, planar=False)

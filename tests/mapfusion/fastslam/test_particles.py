@@ -1,8 +1,9 @@
 import numpy as np
 
+from mapfusion.fastslam.genealogy import MEMORY
 from mapfusion.fastslam.particles import ParticleMaps
 from mapfusion.fastslam.sensor import sightings
-from mapfusion.fastslam.slots import NEVER
+from mapfusion.fastslam.slots import BLOCK, FREE, allocate
 from mapfusion.fastslam.update import DROPPED, NEW
 from mapfusion.robot_log import Observations
 
@@ -33,10 +34,52 @@ def test_near_finds_the_gates_that_touch_a_box_and_no_freed_slot():
 
     assert_found(np.ones(n, dtype=bool))
     maps.resampled(np.array([0, 0], dtype=np.int32))
-    maps.bring_up_to_date(slots[maps.slots.generation[slots] != NEVER])  # some were visited
+    maps.bring_up_to_date(slots[maps.slots.generation[slots] != FREE])  # some were visited
     left = np.arange(n) % 3 != 2
     assert maps.n_slots == left.sum()
     assert_found(left)
+
+
+def test_what_all_particles_have_from_one_ancestor_is_kept_once_and_comes_back():
+    """Landmarks that differ between particles, then all descend from the third particle."""
+    n, n_particles = 300, 4  # more than there are rows for at first
+    rng = np.random.default_rng(1)
+    observations = Observations(rng.uniform(-5, 5, (n, 3)), np.tile(0.01 * np.eye(3), (n, 1, 1)))
+    poses = rng.normal(0, 0.5, (n_particles, 3))
+    seen = sightings(poses, observations.position_m, observations.covariance_m2, planar=False)
+    maps = ParticleMaps(n_particles, 9.0)
+    slots, _ = maps.create(np.full((n, n_particles), NEW), seen, observations, 0)
+    ancestors = np.arange(n_particles, dtype=np.int32)
+    for _ in range(2 * MEMORY):
+        maps.resampled(ancestors)
+    assert maps.n_rows == n, "particles differ, however long ago they were written"
+    maps.resampled(np.full(n_particles, 2, dtype=np.int32))
+    for _ in range(MEMORY):
+        maps.resampled(ancestors)
+    assert (maps.n_slots, maps.n_rows) == (n, 0)
+
+    def assert_known(particle: int) -> None:
+        which, known = maps.of_particle(particle, 1)
+        np.testing.assert_array_equal(which, slots)
+        np.testing.assert_array_equal(known.mean_m, seen.point_m[:, 2])
+        np.testing.assert_array_equal(known.covariance_m2, seen.covariance_m2[:, 2])
+        assert known.count.tolist() == [1] * n
+
+    assert_known(0)
+    box = np.array([*seen.point_m[7, 2, :2], *seen.point_m[7, 2, :2]])
+    assert slots[7] in maps.near(box)
+    assert maps.bring_up_to_date(slots[::2]).all()
+    assert maps.n_rows == n // 2
+    assert_known(1)
+
+
+def test_a_landmark_takes_a_row_of_76_bytes_a_particle_and_less_than_500_once():
+    n_slots, n_rows, n_particles = 4 * BLOCK, 10, 200
+    slots = allocate(n_slots, n_rows, n_particles)
+    of_rows = [*slots.own, slots.slot_of_row]
+    of_slots = [*slots.common, *slots[3:]]
+    assert sum(part.nbytes for part in of_rows) == n_rows * (76 * n_particles + 8)
+    assert sum(part.nbytes for part in of_slots) < 500 * n_slots
 
 
 def test_without_landmarks_nothing_is_near():

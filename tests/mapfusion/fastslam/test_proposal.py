@@ -78,10 +78,10 @@ def test_a_translation_alone_is_the_kalman_filter_s_answer() -> None:
     eta, _ = draw(slots, seen, pose, sigma, np.zeros((1, 3)))
     turn = np.array([[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]])
     prior = turn @ np.diag(sigma[:2] ** 2) @ turn.T
-    Z = full(slots.covariance_m2[0, 0]) + full(seen.covariance_m2[0, 0])
+    Z = full(slots.own.covariance_m2[0, 0]) + full(seen.covariance_m2[0, 0])
     H = np.eye(3)[:, :2]
     K = prior @ H.T @ np.linalg.inv(H @ prior @ H.T + Z)
-    shift = K @ (slots.mean_m[0, 0] - seen.point_m[0, 0])
+    shift = K @ (slots.own.mean_m[0, 0] - seen.point_m[0, 0])
     np.testing.assert_allclose(turn @ (sigma[:2] * eta[0, :2]), shift, atol=1e-12)
     posterior = (np.eye(2) - K @ H) @ prior
     spread = np.stack(
@@ -108,7 +108,7 @@ def test_a_false_pair_does_not_take_the_pose_along() -> None:
     points = rng.uniform((1, -2, 0), (4, 2, 1), (20, 3))
     pose = np.array([0.02, -0.01, 0.03])
     slots = slots_of(transform_points(pose, points), 1e-4)
-    slots.mean_m[7, 0, :2] += [0.5, -0.5]
+    slots.own.mean_m[7, 0, :2] += [0.5, -0.5]
     seen = sightings(np.zeros((1, 3)), points, np.tile(1e-4 * np.eye(3), (20, 1, 1)), False)
     chosen = np.arange(20)[:, None]
     eta, _ = informed_disturbance(
@@ -156,9 +156,10 @@ START = np.array([[0.5, 0.2, 0.4]])  # a predicted pose, reached without turning
 def slots_of(mean_m: np.ndarray, variance_m2: float) -> Slots:
     """Landmarks (S, 3) of one particle, equally certain in all directions."""
     slots, n = ParticleMaps(1, 21.0).slots, len(mean_m)
-    slots.mean_m[:n, 0] = mean_m
-    slots.covariance_m2[:n, 0] = np.array([1, 0, 0, 1, 0, 1]) * variance_m2
-    slots.count[:n, 0] = 1
+    slots.row[:n] = np.arange(n)
+    slots.own.mean_m[:n, 0] = mean_m
+    slots.own.covariance_m2[:n, 0] = np.array([1, 0, 0, 1, 0, 1]) * variance_m2
+    slots.own.count[:n, 0] = 1
     return slots
 
 

@@ -4,11 +4,13 @@ from scipy.stats import chi2, multivariate_normal
 
 from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.fastslam.sensor import (
+    Sightings,
     innovation,
     log_density_at_gate,
     quadratic_form,
     sightings,
 )
+from mapfusion.fastslam.slots import Estimates
 from mapfusion.se2 import rotation_about_z, transform_points
 
 UPPER = np.triu_indices(3)
@@ -45,9 +47,11 @@ def test_innovation_gives_the_distance_and_determinant_of_the_matrix(planar):
     n = 2 if planar else 3
     point, mean = rng.normal(size=(2, 50, 3))
     noise, sigma = covariances(rng, 50), covariances(rng, 50)
-    flat_noise, flat_sigma = noise[:, UPPER[0], UPPER[1]], sigma[:, UPPER[0], UPPER[1]]
+    flat_noise, flat_sigma = (matrix[None, :, UPPER[0], UPPER[1]] for matrix in (noise, sigma))
+    seen = Sightings(point[None], flat_noise)
+    own = Estimates(mean[None], flat_sigma, np.ones((1, 50), dtype=np.int32))
     for m in range(50):
-        *form, determinant = innovation(point, flat_noise, mean, flat_sigma, m, planar)
+        *form, determinant = innovation(seen, 0, own, 0, m, planar)
         Z = (noise[m] + sigma[m])[:n, :n]
         difference = (point[m] - mean[m])[:n]
         assert quadratic_form(*form) == pytest.approx(difference @ np.linalg.solve(Z, difference))
