@@ -81,11 +81,7 @@ OBSERVATIONS = schema(
             for name in _PIXEL_FIELDS
         ),
         *LOOK_FIELDS,
-        told(
-            pa.field("track", pa.int32()),
-            "number of the track it belongs to, in frames that follow on each other; -1 for none",
-            NO_TRACK,
-        ),
+        told(pa.field("track", pa.int32()), "number of its track, -1 for none", NO_TRACK),
     ],
 )
 TRUTH_POSES = schema(
@@ -159,14 +155,10 @@ class Observations:
         require_shape("covariance_m2", self.covariance_m2, (n, 3, 3))
         require_finite("position_m", self.position_m)
         require_finite("covariance_m2", self.covariance_m2)
-        if self.descriptor is not None:
-            require_shape("descriptor", self.descriptor, (n, DESCRIPTOR_LENGTH))
-        if self.label is not None:
-            require_shape("label", self.label, (n,))
-        if self.uvd_px is not None:
-            require_shape("uvd_px", self.uvd_px, (n, 3))
-        if self.track is not None:
-            require_shape("track", self.track, (n,))
+        optional = {"descriptor": (DESCRIPTOR_LENGTH,), "label": (), "uvd_px": (3,), "track": ()}
+        for name, shape in optional.items():
+            if getattr(self, name) is not None:
+                require_shape(name, getattr(self, name), (n, *shape))
 
     def __len__(self) -> int:
         return len(self.position_m)
