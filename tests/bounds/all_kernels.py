@@ -57,7 +57,9 @@ def kernels() -> dict[str, CPUDispatcher]:
             if not path.is_file() or "njit" not in path.read_text(encoding="utf-8"):
                 continue
             for name, value in vars(importlib.import_module(module.name)).items():
-                if isinstance(value, CPUDispatcher):
+                # what is inlined by Numba is compiled, and checked, within its callers
+                inlined = isinstance(value, CPUDispatcher) and "inline" in value.targetoptions
+                if isinstance(value, CPUDispatcher) and not inlined:
                     found[f"{value.py_func.__module__}.{name}"] = value
     return found
 
