@@ -25,8 +25,12 @@ _NAMES_OF = {
     "fastslam.parameters": ("FastSlamParameters",),
     "fastslam.proposal": ("Proposal",),
     "fastslam.run": ("build_map", "run_log"),
+    "fused_map": ("AlignedPair", "FusedMap", "Fusion"),
     "landmark_map": ("LandmarkMap", "read_map", "write_map"),
-    "merge": ("FusedMap", "MergeParameters", "merge_maps"),
+    "fuse.parameters": ("MergeParameters",),
+    "fuse.registry": ("make_fuser",),
+    "merge": ("merge_maps",),
+    "team.team_graph": ("Place", "TeamParameters", "Unconfirmed"),
     "recordings.registry": ("import_recording",),
     "robot_log": ("Observations", "RobotLog", "read_log", "write_log"),
 }

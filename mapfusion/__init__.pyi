@@ -18,17 +18,23 @@ from mapfusion.fastslam.parameters import FastSlamParameters as FastSlamParamete
 from mapfusion.fastslam.proposal import Proposal as Proposal
 from mapfusion.fastslam.run import build_map as build_map
 from mapfusion.fastslam.run import run_log as run_log
+from mapfusion.fuse.parameters import MergeParameters as MergeParameters
+from mapfusion.fuse.registry import make_fuser as make_fuser
+from mapfusion.fused_map import AlignedPair as AlignedPair
+from mapfusion.fused_map import FusedMap as FusedMap
+from mapfusion.fused_map import Fusion as Fusion
 from mapfusion.landmark_map import LandmarkMap as LandmarkMap
 from mapfusion.landmark_map import read_map as read_map
 from mapfusion.landmark_map import write_map as write_map
-from mapfusion.merge import FusedMap as FusedMap
-from mapfusion.merge import MergeParameters as MergeParameters
 from mapfusion.merge import merge as _merge
 from mapfusion.recordings.registry import import_recording as import_recording
 from mapfusion.robot_log import Observations as Observations
 from mapfusion.robot_log import RobotLog as RobotLog
 from mapfusion.robot_log import read_log as read_log
 from mapfusion.robot_log import write_log as write_log
+from mapfusion.team.team_graph import Place as Place
+from mapfusion.team.team_graph import TeamParameters as TeamParameters
+from mapfusion.team.team_graph import Unconfirmed as Unconfirmed
 
 merge_maps = _merge  # `merge` is the module
 __version__: str

@@ -1,6 +1,6 @@
-"""Landmarks of several maps in one frame, and the Kalman fusion of pairs of them (eq. 12 to 16)."""
+"""Landmarks of several maps in one frame."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,20 +13,8 @@ from mapfusion.se2 import Float, transform_covariances, transform_points
 ABSENT = -1
 
 
-def fuse(
-    position_i: Float, covariance_i: Float, position_j: Float, covariance_j: Float
-) -> tuple[Float, Float]:
-    """Stationary Kalman filter on pairs of landmarks in one frame (eq. 12 to 14).
-
-    Eq. 13 is printed with L_i - L_j, which moves the result away from L_j; the sign here is right.
-
-    Positions are (N, D), covariances (N, D, D), those returned as well.
-    """
-    # S_i and S_i + S_j are symmetric, so K^T solves (S_i + S_j) K^T = S_i
-    gain = np.swapaxes(np.linalg.solve(covariance_i + covariance_j, covariance_i), 1, 2)  # eq. 12
-    position = position_i + np.einsum("nij,nj->ni", gain, position_j - position_i)  # eq. 13
-    covariance = covariance_i - gain @ covariance_i  # eq. 14
-    return position, (covariance + np.swapaxes(covariance, 1, 2)) / 2
+# Two landmarks made one: positions (N, D) and covariances (N, D, D) of the one and of the other.
+FusePairs = Callable[[Float, Float, Float, Float], tuple[Float, Float]]
 
 
 @dataclass(frozen=True)
@@ -94,13 +82,18 @@ class AlignedLandmarks:
         return with_rows(self, rows)
 
     def joined(
-        self, other: "AlignedLandmarks", rows: np.ndarray, others: np.ndarray, dimensions: int
+        self,
+        other: "AlignedLandmarks",
+        rows: np.ndarray,
+        others: np.ndarray,
+        dimensions: int,
+        fuse_pairs: FusePairs,
     ) -> "AlignedLandmarks":
         """These, with `rows` fused with the other's `others`, and the other's rest at the end."""
         a, b = self[rows], other[others]
         seen_more = b.count > a.count
         position, covariance = a.position_m.copy(), a.covariance_m2.copy()
-        position[:, :dimensions], covariance[:, :dimensions, :dimensions] = fuse(
+        position[:, :dimensions], covariance[:, :dimensions, :dimensions] = fuse_pairs(
             a.position_m[:, :dimensions],
             a.covariance_m2[:, :dimensions, :dimensions],
             b.position_m[:, :dimensions],

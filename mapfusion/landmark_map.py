@@ -1,10 +1,11 @@
 """LandmarkMap: what one robot believes the world's landmarks to be, in its own frame.
 
 One map is one Parquet file, readable with plain pandas, complete in itself: the descriptor (or
-label) of the observation that each landmark came from is carried with it.
+label) of the observation that each landmark came from is carried with it. What the landmarks'
+errors have in common, where it is known, lies in a file beside it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,8 @@ from mapfusion.arguments import (
     require_shape,
 )
 from mapfusion.errors import InputError
+from mapfusion.joint_covariance import JointCovariance
+from mapfusion.joint_files import read_joint, write_joint
 from mapfusion.open_tables import read_open_table, told
 from mapfusion.robot_log import (
     DESCRIPTOR_LENGTH,
@@ -64,6 +67,7 @@ class LandmarkMap:
         label: (N,) int32, or None.
         planar: z is 0 and carries no information (2 degrees of freedom).
         name: whose map it is.
+        joint: what the landmarks' errors have in common, or None; its marginals are covariance_m2.
     """
 
     position_m: Float
@@ -74,6 +78,7 @@ class LandmarkMap:
     label: np.ndarray | None = None
     planar: bool = False
     name: str = "map"
+    joint: JointCovariance | None = None
 
     def __post_init__(self) -> None:
         n = len(self.position_m)
@@ -87,16 +92,20 @@ class LandmarkMap:
             require_shape("descriptor", self.descriptor, (n, DESCRIPTOR_LENGTH))
         if self.label is not None:
             require_shape("label", self.label, (n,))
+        if self.joint is not None and len(self.joint) != n:
+            raise ValueError(f"joint: of {len(self.joint)} landmarks, the map has {n}")
 
     def __len__(self) -> int:
         return len(self.position_m)
 
     def __getitem__(self, rows: np.ndarray) -> "LandmarkMap":
-        return with_rows(self, rows)
+        joint = None if self.joint is None else self.joint[rows]
+        return replace(with_rows(replace(self, joint=None), rows), joint=joint)
 
 
 def write_map(path: Path, landmarks: LandmarkMap) -> None:
-    """Write one map to one file."""
+    """Write a map to a file, its joint covariance (if it has one) to `NAME.joint.parquet`."""
+    write_joint(path, landmarks.joint)
     write_table(
         path,
         {
@@ -111,7 +120,7 @@ def write_map(path: Path, landmarks: LandmarkMap) -> None:
 
 
 def read_map(path: Path) -> LandmarkMap:
-    """Read a map; raises InputError that names the file."""
+    """Read a map, with the joint covariance beside it; raises InputError that names the file."""
     table, attributes = read_open_table(path, LANDMARKS)
     position, covariance = points_from(table)
     planar = attributes.get("planar") == "true"
@@ -127,6 +136,6 @@ def read_map(path: Path) -> LandmarkMap:
         )
         require_points(position, covariance, planar)
         require_no_twins("landmarks", position, covariance.reshape(-1, 9))
-        return found
     except ValueError as error:
         raise InputError(f"{path}: {error}") from error
+    return replace(found, joint=read_joint(path, covariance))

@@ -1,170 +1,206 @@
-"""Merging aligned maps into one (eq. 12 to 16, corrected)."""
+"""Maps of a team made one: which alignments are believed, then a fuser for what they connect."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Annotated
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mapfusion.align.correspondences import Correspondences, HeightGate
-from mapfusion.align.result import Alignment
-from mapfusion.aligned_landmarks import AlignedLandmarks
-from mapfusion.arguments import Probability, Range, require_in_range, require_shape
+from mapfusion.arguments import require_shape
+from mapfusion.fuse.component import Component
+from mapfusion.fuse.fuser import Fuser
+from mapfusion.fuse.parameters import MergeParameters
+from mapfusion.fuse.registry import make_fuser
+from mapfusion.fused_map import AlignedPair, Fusion
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.same_point import SamePoint, one_to_one
-from mapfusion.se2 import IDENTITY, Float
+from mapfusion.name_order import name_order
+from mapfusion.se2 import Float
+from mapfusion.smoother.recording import Recording
+from mapfusion.team.relations import Relations, whole_map_covariance
+from mapfusion.team.team_graph import Place, TeamGraph, TeamParameters, team_graph
+
+DEFAULTS = MergeParameters()
 
 
 @dataclass(frozen=True)
-class MergeParameters:
-    """How maps are merged.
+class ConnectedMaps:
+    """Maps of a team, and what its alignments say together.
 
     Attributes:
-        max_descriptor_distance: of landmarks that the second pass takes for one point; with labels
-            on both sides these decide instead.
-        gate_probability: of keeping two landmarks of one point in the second pass (chi-square, 2
-            degrees of freedom, drift included).
-        height: which landmarks of the second pass can have one height (not for planar maps).
-        use_drift: weigh with, and report, S + s_drift^2 I instead of the paper's S. An alignment's
-            s_drift^2 belongs to two maps and is given half to each; the first map, which is in all
-            alignments, gets the mean of its halves.
-        use_alignment_uncertainty: add J S_T J^T, the alignment's own covariance to first order, to
-            the landmarks it moves. The paper does not. This error is common to all of them, which
-            per-landmark covariances cannot say.
+        components: maps that believed alignments connect, those of the most maps first. Maps that
+            nothing connects are none; if that is so of all, the first is there alone.
+        place: of each pair, what the team's others say of its alignment.
     """
 
-    max_descriptor_distance: Annotated[float, Range(1e-3, 2, "1")] = 0.3
-    gate_probability: Probability = 0.99
-    height: HeightGate = field(default_factory=HeightGate)
-    use_drift: bool = True
-    use_alignment_uncertainty: bool = False
+    components: tuple[Component, ...]
+    place: tuple[Place, ...]
 
-    def __post_init__(self) -> None:
-        require_in_range(self)
+    def fused_by(
+        self,
+        fuser: Fuser,
+        parameters: MergeParameters,
+        smoothed: Sequence[LandmarkMap] | None = None,
+        recordings: Sequence[Recording | None] = (),
+    ) -> Fusion:
+        """Each component made one map.
 
-
-@dataclass(frozen=True)
-class FusedMap:
-    """N landmarks fused from M maps, in the frame of the first.
-
-    Attributes:
-        landmarks: the fused map.
-        parents: (N, M) row of each map that went into each landmark, ABSENT for none.
-        T_first_map: (M, 3) motion of each map into the fused frame; NaN for maps left out.
-        drift_sigma_m: (M,) share of each map in s_drift; NaN for maps left out.
-        duplicate_share: share of the landmarks that another one still passes for, by the gate and
-            descriptor test of the second pass.
-        left_out: name of each map whose alignment was not accepted, with the reason.
-    """
-
-    landmarks: LandmarkMap
-    parents: np.ndarray
-    T_first_map: Float
-    drift_sigma_m: Float
-    duplicate_share: float
-    left_out: tuple[tuple[str, str], ...]
+        Args:
+            fuser: what makes it.
+            parameters: its settings.
+            smoothed: the same robots' maps by the smoother, for fusers that take these.
+            recordings: what each of these was smoothed from, for fusers that smooth again.
+        """
+        given = [replace(each, recordings=tuple(recordings)) for each in self.components]
+        if fuser.smoothed and smoothed is not None:
+            given = [component.on(smoothed) for component in given]
+        return Fusion(tuple(fuser.fuse(each, parameters) for each in given), self.place)
 
 
 def merge(
     maps: Sequence[LandmarkMap],
-    alignments: Sequence[Alignment],
-    correspondences: Sequence[Correspondences],
-    parameters: MergeParameters = MergeParameters(),
-) -> FusedMap:
-    """Fuse two or more maps in the frame of the first.
+    pairs: Sequence[AlignedPair],
+    parameters: MergeParameters = DEFAULTS,
+    fuser: Fuser | None = None,
+) -> Fusion:
+    """Fuse two or more maps, as far as alignments connect them.
 
-    Each further map's refined inliers are fused with the first map's landmarks; then what these
-    missed is paired with any fused landmark by gate and descriptor; the rest is carried over.
+    The order in which maps and pairs are given decides on frames alone, and where two answers are
+    equally good.
 
     Args:
         maps: M of them.
-        alignments: M - 1 refined ones, T_first_map of maps[1:]. Maps whose alignment was not
-            accepted are left out.
-        correspondences: M - 1, between the first map (a) and each other (b), as they were aligned.
+        pairs: each two of them at most once. Alignments that were not accepted are left out.
         parameters: how to merge.
+        fuser: what makes connected maps one; the `joint` one if None.
 
     Raises:
-        ValueError: lengths that do not fit, or fewer than two maps.
+        ValueError: pairs that do not fit the maps, or fewer than two maps.
     """
-    _require_fitting(maps, alignments, correspondences)
-    kept = [k for k, alignment in enumerate(alignments, start=1) if alignment.ok]
-    T_first_map, drift = _motions(alignments, kept)
-    planar = any(landmarks.planar for landmarks in maps)
-    test = SamePoint(
-        parameters.max_descriptor_distance, parameters.gate_probability, parameters.height, planar
-    )
-
-    fused = AlignedLandmarks.of(maps, 0, T_first_map[0], None, drift[0], parameters.use_drift)
-    for k in kept:
-        alignment, pairs = alignments[k - 1], correspondences[k - 1]
-        sigma_T = alignment.covariance if parameters.use_alignment_uncertainty else None
-        other = AlignedLandmarks.of(
-            maps, k, T_first_map[k], sigma_T, drift[k], parameters.use_drift
-        )
-        rows, others = _paired(fused, other, pairs[alignment.inlier], test)
-        fused = fused.joined(other, rows, others, 2 if planar else 3)
-
-    first, second, _ = test.candidates(fused, fused)
-    duplicates = np.unique(first[first != second])
-    left_out = tuple(
-        (maps[k].name, alignment.reason)
-        for k, alignment in enumerate(alignments, start=1)
-        if not alignment.ok
-    )
-    return FusedMap(
-        fused.landmark_map(planar, maps[0].name),
-        fused.parents,
-        T_first_map,
-        drift,
-        len(duplicates) / max(len(fused), 1),
-        left_out,
-    )
+    return connect(maps, pairs, parameters.team).fused_by(fuser or make_fuser(), parameters)
 
 
-def _motions(alignments: Sequence[Alignment], kept: Sequence[int]) -> tuple[Float, Float]:
-    """T_first_map (M, 3) and s_drift (M,) of each map; NaN for those that are left out."""
-    T_first_map = np.full((len(alignments) + 1, 3), np.nan)
-    T_first_map[0] = IDENTITY
-    drift = np.full(len(alignments) + 1, np.nan)
-    for k in kept:
-        T_first_map[k] = alignments[k - 1].T_a_b
-        drift[k] = alignments[k - 1].drift_sigma_m / np.sqrt(2)
-    drift[0] = np.sqrt(np.mean(drift[kept] ** 2)) if kept else 0.0
-    return T_first_map, drift
-
-
-def _paired(
-    fused: AlignedLandmarks, other: AlignedLandmarks, inliers: Correspondences, test: SamePoint
-) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of the fused and of the other map that are one: the inliers, then what they missed."""
-    # the first map's landmarks are the first rows of the fused map, in their order
-    rows, others = inliers.index_a, inliers.index_b
-    missed_rows = np.setdiff1d(np.arange(len(fused)), rows)
-    missed_others = np.setdiff1d(np.arange(len(other)), others)
-    more_rows, more_others = one_to_one(*test.candidates(fused[missed_rows], other[missed_others]))
-    return (
-        np.concatenate([rows, missed_rows[more_rows]]),
-        np.concatenate([others, missed_others[more_others]]),
-    )
-
-
-def _require_fitting(
+def connect(
     maps: Sequence[LandmarkMap],
-    alignments: Sequence[Alignment],
-    correspondences: Sequence[Correspondences],
-) -> None:
+    pairs: Sequence[AlignedPair],
+    parameters: TeamParameters = DEFAULTS.team,
+) -> ConnectedMaps:
+    """Judge all accepted alignments together (`mapfusion/team`), and place the maps by them.
+
+    Raises:
+        ValueError: pairs that do not fit the maps, or fewer than two maps.
+    """
+    _require_fitting(maps, pairs)
+    rank = _ranks(maps)
+    order = sorted(range(len(pairs)), key=lambda e: sorted((rank[pairs[e].a], rank[pairs[e].b])))
+    accepted = [e for e in order if pairs[e].alignment.ok]
+    graph = _graph(maps, [pairs[e] for e in accepted], rank, parameters)
+    said = dict(zip(accepted, graph.place, strict=True))
+    place = tuple(said.get(e, Place.REFUSED) for e in range(len(pairs)))
+    believed = [pairs[e] for e in order if place[e] in (Place.CONFIRMED, Place.BRIDGE)]
+    several = np.flatnonzero(np.bincount(graph.component) > 1)
+    components = []
+    for name in several if len(several) else graph.component[:1]:
+        members = np.flatnonzero(graph.component == name)
+        own = tuple(pair for pair in believed if graph.component[pair.a] == name)
+        left_out = _left_out(maps, members, pairs, place)
+        T, covariance = _of_members(graph, members)
+        components.append(Component(tuple(maps), members, own, T, covariance, left_out))
+    return ConnectedMaps(tuple(components), place)
+
+
+def _of_members(graph: TeamGraph, members: np.ndarray) -> tuple[Float, Float]:
+    """Motions (M, 3) with their covariances (M, 3, 3), NaN for all but the members."""
+    T, covariance = np.full_like(graph.T_root_robot, np.nan), np.full_like(graph.covariance, np.nan)
+    T[members], covariance[members] = graph.T_root_robot[members], graph.covariance[members]
+    return T, covariance
+
+
+def _ranks(maps: Sequence[LandmarkMap]) -> np.ndarray:
+    """(M,) place of each map in the order of their names; of one name, that of the maps."""
+    rank = np.empty(len(maps), dtype=np.int64)
+    rank[sorted(range(len(maps)), key=lambda k: name_order(maps[k].name))] = np.arange(len(maps))
+    return rank
+
+
+def _graph(
+    maps: Sequence[LandmarkMap],
+    accepted: Sequence[AlignedPair],
+    rank: np.ndarray,
+    parameters: TeamParameters,
+) -> TeamGraph:
+    """All alignments judged together, robots by their rank; each component's root is its first."""
+    by_rank = np.argsort(rank)
+    relations = _relations(maps, accepted)
+    ranked = replace(relations, robots=rank[relations.robots])
+    graph = team_graph(ranked, parameters, by_rank)
+    return TeamGraph(
+        graph.component[rank], graph.T_root_robot[rank], graph.covariance[rank], graph.place
+    )
+
+
+def _relations(maps: Sequence[LandmarkMap], accepted: Sequence[AlignedPair]) -> Relations:
+    covariance = [
+        whole_map_covariance(
+            pair.alignment.T_a_b,
+            pair.alignment.covariance,
+            pair.alignment.drift_sigma_m,
+            maps[pair.a].position_m[pair.inliers.index_a, :2],
+        )
+        for pair in accepted
+    ]
+    return Relations(
+        len(maps),
+        np.array([(pair.a, pair.b) for pair in accepted], dtype=np.int64).reshape(-1, 2),
+        np.array([pair.alignment.T_a_b for pair in accepted]).reshape(-1, 3),
+        np.array(covariance).reshape(-1, 3, 3),
+        np.array([pair.log10_false_alarms for pair in accepted], dtype=np.float64),
+    )
+
+
+def _left_out(
+    maps: Sequence[LandmarkMap],
+    members: np.ndarray,
+    pairs: Sequence[AlignedPair],
+    place: Sequence[Place],
+) -> tuple[tuple[str, str], ...]:
+    """Name of each other map, in their order, with the reason."""
+    inside, why = set(members.tolist()), []
+    for k in sorted(set(range(len(maps))) - inside):
+        told = {
+            said: pair
+            for pair, said in zip(reversed(pairs), reversed(place), strict=True)
+            if (pair.a == k and pair.b in inside) or (pair.b == k and pair.a in inside)
+        }
+        if Place.AMBIGUOUS in told or Place.CONTRADICTED in told:
+            reason = "the team's alignments contradict each other about it"
+        elif Place.UNCONFIRMED in told:
+            reason = "no other alignment confirms its own"
+        elif told:
+            reason = told[Place.REFUSED].alignment.reason
+        else:
+            reason = "no alignment connects it"
+        why.append((maps[k].name, reason))
+    return tuple(why)
+
+
+def _require_fitting(maps: Sequence[LandmarkMap], pairs: Sequence[AlignedPair]) -> None:
     if len(maps) < 2:
         raise ValueError(f"maps: {len(maps)} given, at least 2 are needed")
-    for name, values in (("alignments", alignments), ("correspondences", correspondences)):
-        if len(values) != len(maps) - 1:
-            raise ValueError(f"{name}: {len(values)} given, expected {len(maps) - 1}")
-    for k, (alignment, pairs) in enumerate(zip(alignments, correspondences, strict=True)):
-        require_shape(f"alignments[{k}].inlier", alignment.inlier, (len(pairs),))
+    met: set[frozenset[int]] = set()
+    for k, pair in enumerate(pairs):
+        both = frozenset((pair.a, pair.b))
+        if len(both) < 2 or not 0 <= min(both) <= max(both) < len(maps):
+            raise ValueError(f"pairs[{k}]: {pair.a} and {pair.b} are no two of {len(maps)} maps")
+        if both in met:
+            raise ValueError(f"pairs[{k}]: {pair.a} and {pair.b} are given twice")
+        met.add(both)
+        require_shape(
+            f"pairs[{k}].alignment.inlier", pair.alignment.inlier, (len(pair.correspondences),)
+        )
         for name, index, landmarks in (
-            ("index_a", pairs.index_a[alignment.inlier], maps[0]),
-            ("index_b", pairs.index_b[alignment.inlier], maps[k + 1]),
+            ("index_a", pair.inliers.index_a, maps[pair.a]),
+            ("index_b", pair.inliers.index_b, maps[pair.b]),
         ):
             if len(np.unique(index)) < len(index):
-                raise ValueError(f"correspondences[{k}].{name}: inliers are not one to one")
+                raise ValueError(f"pairs[{k}].{name}: inliers are not one to one")
             if len(index) and not 0 <= index.min() <= index.max() < len(landmarks):
-                raise ValueError(f"correspondences[{k}].{name}: lies outside its map")
+                raise ValueError(f"pairs[{k}].{name}: lies outside its map")

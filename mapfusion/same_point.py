@@ -48,6 +48,11 @@ class SamePoint:
             np.concatenate([np.zeros(len(known_i)), unlike[passes]]),
         )
 
+    def duplicate_share(self, landmarks: AlignedLandmarks) -> float:
+        """Share of the landmarks that another one still passes for."""
+        first, second, _ = self.candidates(landmarks, landmarks)
+        return len(np.unique(first[first != second])) / max(len(landmarks), 1)
+
     def _bound(self) -> float:
         return chi_square_bound(self.gate_probability, 2)
 

@@ -139,8 +139,17 @@ def write_table(
     own = pa.schema([field.remove_metadata() for field in table_schema], metadata=metadata)
     table = pa.Table.from_arrays(arrays, schema=own)
     buffer = pa.BufferOutputStream()
-    pq.write_table(table, buffer, compression="zstd", write_page_checksum=True)
+    # measured values and pixels hardly repeat: a dictionary of them takes as long as all the rest
+    repeats = [field.name for field in table_schema if not _is_measured(field.type)]
+    options = {"compression": "zstd", "use_dictionary": repeats}
+    pq.write_table(table, buffer, **options, write_page_checksum=True)
     write_sealed(path, parquet_with_seal(buffer.getvalue().to_pybytes()))
+
+
+def _is_measured(kind: pa.DataType) -> bool:
+    if pa.types.is_fixed_size_list(kind):
+        kind = kind.value_type
+    return pa.types.is_floating(kind) or pa.types.is_fixed_size_binary(kind)
 
 
 def _to_arrow(values: Any, kind: pa.DataType) -> pa.Array:
@@ -250,16 +259,26 @@ _UPPER = np.triu_indices(3)
 
 def point_columns(position_m: np.ndarray, covariance_m2: np.ndarray) -> dict[str, np.ndarray]:
     """Positions (N, 3) and covariances (N, 3, 3) as the nine flat columns they are stored in."""
-    upper = covariance_m2[:, _UPPER[0], _UPPER[1]]
-    return named_columns(POSITION_FIELDS, position_m) | named_columns(COVARIANCE_FIELDS, upper)
+    upper = covariance_columns(COVARIANCE_FIELDS, covariance_m2)
+    return named_columns(POSITION_FIELDS, position_m) | upper
 
 
 def points_from(table: pa.Table) -> tuple[np.ndarray, np.ndarray]:
     """The inverse of `point_columns`."""
-    upper = columns(table, COVARIANCE_FIELDS)
+    return columns(table, POSITION_FIELDS), covariances_from(table, COVARIANCE_FIELDS)
+
+
+def covariance_columns(names: Sequence[str], covariance_m2: np.ndarray) -> dict[str, np.ndarray]:
+    """Covariances (N, 3, 3) as six flat columns of these names, the upper halves row by row."""
+    return named_columns(names, covariance_m2[:, _UPPER[0], _UPPER[1]])
+
+
+def covariances_from(table: pa.Table, names: Sequence[str]) -> np.ndarray:
+    """The inverse of `covariance_columns`."""
+    upper = columns(table, names)
     covariance = np.empty((len(upper), 3, 3))
     covariance[:, _UPPER[0], _UPPER[1]] = covariance[:, _UPPER[1], _UPPER[0]] = upper
-    return columns(table, POSITION_FIELDS), covariance
+    return covariance
 
 
 def point_fields() -> list[pa.Field]:

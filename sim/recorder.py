@@ -124,15 +124,17 @@ def truth_slopes(
     both are.
     """
     uv = np.asarray(uv_px, dtype=np.float64).reshape(-1, 2)
-    here, depth = truth_points(camera, depth_m, uv, T_world_robot), _depth_at(depth_m, uv)
+    steps = np.array([[0, 0], [-1, 0], [1, 0], [0, -1], [0, 1]], dtype=np.float64)
+    there = (uv + steps[:, None]).reshape(-1, 2)
+    depth = _depth_at(depth_m, there)
+    point = transform_points(T_world_robot, camera.back_project(there, depth)).reshape(5, -1, 3)
+    depth = depth.reshape(5, -1)
+    same = np.abs(depth - depth[0]) <= SAME_SURFACE * depth[0]
     slope = np.zeros((len(uv), 3, 2))
-    for axis in range(2):
-        for step in (-1.0, 1.0):  # the next pixel counts where both are on the surface
-            there = uv + step * np.eye(2)[axis]
-            change = np.abs(_depth_at(depth_m, there) - depth)
-            same = change <= SAME_SURFACE * depth
-            moved = truth_points(camera, depth_m, there, T_world_robot) - here
-            slope[same, :, axis] = step * moved[same]
+    for step, own, moved in zip(steps[1:], same[1:], point[1:], strict=True):
+        # the next pixel comes last, so it counts where both are on the surface
+        axis = int(step[0] == 0)
+        slope[own, :, axis] = step[axis] * (moved - point[0])[own]
     return slope
 
 

@@ -39,6 +39,7 @@ def run(
         several = f"is one folder for {len(checked)} runs; give --results"
         raise InputError(f"--output {output}: {several}")
     # What draws takes seconds to import: a scenario is refused before.
+    from experiments.judge.nothing_merged import nothing_merged
     from experiments.judge.result import run_scenario
     from experiments.show.figures.drawing import draw_all
     from experiments.show.terminal import layout, run_screen
@@ -48,6 +49,8 @@ def run(
             folder = run_scenario(loaded, results, jobs, show, fresh, output)
             drawn = draw_all(folder, jobs, partial(show, _DRAWING))
         run_screen.print_result(folder, drawn.skipped)
+        if nothing := nothing_merged(folder):
+            options.complain(f"warning: {nothing.text}")
 
 
 @app.command(rich_help_panel=options.LOOK)
@@ -78,6 +81,28 @@ def report(
     layout.print_lines([f"{path} ({path.stat().st_size / 1e6:.1f} MB)"])
 
 
+@app.command(rich_help_panel=options.LOOK)
+def export(
+    result: options.ResultFolder,
+    *,
+    kind: Annotated[
+        str,
+        typer.Option("--format", metavar="FORMAT", help="tum (paths), g2o (graph) or ply (maps)."),
+    ],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Folder; RESULT/export by default.")
+    ] = None,
+) -> None:
+    """Write a result in other programs' formats: `mapfusion export results/quick-0 --format tum`.
+
+    What files, frames and keys mean, experiments/docs/export.md says.
+    """
+    from experiments.show.exported import export_result
+    from experiments.show.terminal.layout import print_lines
+
+    print_lines(map(str, export_result(result, kind, output)))
+
+
 @app.command("inspect", rich_help_panel=options.LOOK)
 def inspect_command(
     path: Annotated[Path, typer.Argument(metavar="FILE", help="A file or folder of mapfusion's.")],
@@ -103,6 +128,7 @@ def check(
 ) -> None:
     """Hold runs to their `expect` blocks, exit code 1 if one fails: `mapfusion check ci`.
 
+    A run that merges no two maps although some share ground fails, too.
     Exit code 2 if a scenario cannot be read, and then none is run, or if it cannot be run.
     """
     from experiments.judge.checking import CheckedScenario, check_all

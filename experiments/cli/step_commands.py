@@ -95,19 +95,22 @@ def merge(
     seed: options.Seed = None,
     as_json: options.AsJson = False,
 ) -> None:
-    """Fuse maps in the frame of the first: `mapfusion merge A.parquet B.parquet -o F.parquet`."""
+    """Fuse maps that alignments connect: `mapfusion merge A.parquet B.parquet -o F.parquet`."""
     from experiments.judge import user_files as single
     from experiments.scenario.suite import settings_of
     from experiments.show import json_document
     from experiments.show.terminal.step_screen import print_fused
 
     settings = settings_of(scenario, overrides, seed)
-    fused = single.merge(maps, settings)
-    single.save_map(output, fused.landmarks)
-    found = json_document.of_fused(output, settings.seed, fused, maps)
+    fusion = single.merge(maps, settings)
+    paths = single.save_fused(output, fusion)
+    found = json_document.of_fusion(paths, settings.seed, fusion, maps)
     json_document.publish("merge", found, as_json)
     if not as_json:
-        print_fused(output, fused, maps)
+        for path, fused in zip(paths, fusion.fused, strict=True):
+            print_fused(path, fused, maps)
+    if len(fusion.fused[0].members) < 2:
+        options.complain("warning: no two maps were merged")
 
 
 def import_command(format_name: str) -> Callable[..., None]:

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from experiments.judge.expectations import Outcome, check, load_checked
+from experiments.judge.metrics import MERGED_ROBOTS
+from experiments.judge.nothing_merged import NothingMerged, nothing_merged
 from experiments.scenario.settings import AnyScenario
 from experiments.scenario.suite import scenarios_of
 from mapfusion.errors import InputError
@@ -16,19 +18,21 @@ class CheckedScenario:
     """A scenario's outcomes, or the error that kept it from having any.
 
     `elapsed_s` are seconds on the clock by seed, of all that were begun: an error is of the last.
-    Without any of the three it was not begun, since another scenario cannot be read.
+    Without any of the three it was not begun, since another scenario cannot be read. `unmerged` are
+    the seeds whose maps were not merged though they should have been.
     """
 
     scenario: str
     outcomes: Sequence[Outcome] = ()
     error: str = ""
     elapsed_s: Mapping[int, float] = field(default_factory=dict)
+    unmerged: Mapping[int, NothingMerged] = field(default_factory=dict)
 
     @property
     def passed(self) -> bool:
-        """Whether it ran and all that it expects holds."""
+        """Whether it ran, all that it expects holds, and what can be merged was."""
         ran = bool(self.elapsed_s) and not self.error
-        return ran and all(outcome.passed for outcome in self.outcomes)
+        return ran and not self.unmerged and all(outcome.passed for outcome in self.outcomes)
 
 
 def check_all(
@@ -81,11 +85,22 @@ def _checked(
                 folders[scenario.seed] = run(scenario)
             finally:
                 elapsed_s[scenario.seed] = time.perf_counter() - started_s
-        outcomes = check(runs[0], folders)
+        outcomes, unmerged = check(runs[0], folders), _unmerged(runs[0], folders)
     except InputError as error:
         yield CheckedScenario(name, error=str(error), elapsed_s=elapsed_s)
     except Exception as error:
         yield CheckedScenario(name, error=f"{type(error).__name__}: {error}", elapsed_s=elapsed_s)
         raise
     else:
-        yield CheckedScenario(name, outcomes, elapsed_s=elapsed_s)
+        yield CheckedScenario(name, outcomes, elapsed_s=elapsed_s, unmerged=unmerged)
+
+
+def _unmerged(scenario: AnyScenario, folders: Mapping[int, Path]) -> dict[int, NothingMerged]:
+    """Of the runs by seed those that fail by having merged nothing.
+
+    A scenario that bounds the number of merged robots has said itself what is to come out.
+    """
+    if MERGED_ROBOTS in scenario.expect:
+        return {}
+    found = {seed: nothing_merged(folder) for seed, folder in folders.items()}
+    return {seed: each for seed, each in found.items() if each is not None and each.failed}

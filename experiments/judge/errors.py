@@ -16,7 +16,7 @@ from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.oracle import Oracle
 from mapfusion.align.pairs import Pairs
 from mapfusion.align.refine import Refinement
-from mapfusion.align.result import Alignment
+from mapfusion.fused_map import AlignedPair
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.se2 import Float
 
@@ -64,10 +64,15 @@ class MetMaps:
         pairs = self.offered
         return true_pairs(*self.points_world_m, pairs.index_a, pairs.index_b, radius_m)
 
-    def alignment(self, aligner: str) -> Alignment:
-        """What maps are merged by: repetitions are for the spread of a method, not for the map."""
+    def aligned(self, aligner: str, a: int, b: int) -> AlignedPair:
+        """What maps are merged by: repetitions are for the spread of a method, not for the map.
+
+        The two are the `a`th and the `b`th of those that are merged.
+        """
         chosen = (self.estimates["aligner"] == aligner) & (self.estimates["repetition"] == 0)
-        return alignment_of(self.estimates[chosen].iloc[0].to_dict(), len(self.offered))
+        row = self.estimates[chosen].iloc[0].to_dict()
+        alignment = alignment_of(row, len(self.offered))
+        return AlignedPair(a, b, alignment, self.offered, row["log10_false_alarms"])
 
 
 def met_maps(

@@ -25,8 +25,9 @@ def load_checked(path: Path, overrides: Sequence[str] = (), seed: int | None = N
     if unknown:
         there = f"known: {', '.join(known)}{did_you_mean(unknown[0], known)}"
         raise InputError(f"{path}: expect.{unknown[0]}: unknown; {there}")
-    if scenario.expect and (reason := why_no_truth(scenario)):
-        name = next(iter(scenario.expect))
+    judged = [name for name in scenario.expect if name not in metrics.WITHOUT_TRUTH]
+    if judged and (reason := why_no_truth(scenario)):
+        name = judged[0]
         raise InputError(f"{path}: expect.{name}: {reason}; leave `expect` out, or add the file")
     return scenario
 

@@ -7,7 +7,7 @@ pose, without a fit: what the path's drift does to a landmark is part of its err
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,12 +18,18 @@ from experiments.judge.truth import degrees_of_freedom, fit_rmse_m, squared_maha
 from mapfusion import se2
 from mapfusion.aligned_landmarks import ABSENT
 from mapfusion.chi_square import chi_square_bound
+from mapfusion.fuse.fuser import Fuser
+from mapfusion.fuse.kalman import Kalman
+from mapfusion.fuse.kalman_drift import KalmanDrift
+from mapfusion.fuse.parameters import MergeParameters
+from mapfusion.fused_map import FusedMap, Fusion
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.merge import FusedMap, MergeParameters, merge
+from mapfusion.merge import merge
 from mapfusion.se2 import Float
 from mapfusion.storage import named_columns, point_columns
 
 GATE_PROBABILITY = 0.95
+PAPERS = KalmanDrift()  # what the tables of fused landmarks are of: eq. 12 to 16, with drift
 
 
 @dataclass(frozen=True)
@@ -36,31 +42,40 @@ class MergeSettings:
 
 @dataclass(frozen=True)
 class FusedTeam:
-    """Robots' maps at one iteration, and what they were merged into, in the first one's frame."""
+    """Robots' maps at one iteration, and what they were merged into."""
 
     robots: Sequence[EvaluatedRobot]
     met: Sequence[MetMaps]  # at all iterations
     iteration: int
-    fused: FusedMap | None  # None for a single robot
+    fusion: Fusion | None  # None for a single robot
 
     @classmethod
     def of(
-        cls, robots: Sequence[EvaluatedRobot], met: Sequence[MetMaps], settings: MergeSettings
+        cls,
+        robots: Sequence[EvaluatedRobot],
+        met: Sequence[MetMaps],
+        settings: MergeSettings,
+        fuser: Fuser = PAPERS,
     ) -> "FusedTeam":
-        """Merge the robots' last maps by their last alignments with the first one's."""
+        """Merge the robots' last maps by their last alignments with each other."""
         last = max(max(robot.maps) for robot in robots)
         if len(robots) < 2:
             return cls(robots, met, last, None)
-        first, *others = robots
+        place = {robot.name: k for k, robot in enumerate(robots)}
         # a pair's last iteration is at the later of its two robots' last frames
-        ends = {each.b.name: each for each in met if each.a is first}
-        fused = merge(
-            [robot.at(last)[0] for robot in robots],
-            [ends[other.name].alignment(settings.aligner) for other in others],
-            [ends[other.name].offered for other in others],
-            settings.parameters,
-        )
-        return cls(robots, met, last, fused)
+        ends = {(place[each.a.name], place[each.b.name]): each for each in met}
+        pairs = [each.aligned(settings.aligner, a, b) for (a, b), each in ends.items()]
+        maps = [robot.at(last)[0] for robot in robots]
+        return cls(robots, met, last, merge(maps, pairs, settings.parameters, fuser))
+
+    @property
+    def fused(self) -> FusedMap | None:
+        """The map of the most robots."""
+        return None if self.fusion is None else self.fusion.fused[0]
+
+    def frame_of(self, fused: FusedMap) -> EvaluatedRobot:
+        """The robot in whose frame a fused map is."""
+        return self.robots[fused.members[0]]
 
     def truth_of(self, fused: FusedMap) -> Float:
         """True points (N, 3) of fused landmarks: the mean of their parents'; NaN if unknown."""
@@ -88,9 +103,8 @@ class FusedTeam:
 def fusion_rows(met: Sequence[MetMaps], settings: MergeSettings, radius_m: float) -> pd.DataFrame:
     """Rows of the table `fusion`: landmarks of one pair fused at the last iteration."""
     robots, keys, fused = (met[0].a, met[0].b), ["landmark_a", "landmark_b"], []
-    for use_drift in (True, False):
-        parameters = replace(settings.parameters, use_drift=use_drift)
-        fused.append(FusedTeam.of(robots, met, replace(settings, parameters=parameters)))
+    for fuser in (KalmanDrift(), Kalman()):
+        fused.append(FusedTeam.of(robots, met, settings, fuser))
     with_drift, without_drift = map(_pair_rows, fused)
     other, suffixes = without_drift[[*keys, "nees"]], ("_with_drift", "_without_drift")
     rows = with_drift.merge(other, "left", keys, suffixes=suffixes)
@@ -140,7 +154,7 @@ def fused_rows(team: FusedTeam) -> pd.DataFrame:
     fused = team.fused
     if fused is None:
         return pd.DataFrame()
-    rows = landmark_rows(team.robots[0], fused.landmarks, team.truth_of(fused))
+    rows = landmark_rows(team.frame_of(fused), fused.landmarks, team.truth_of(fused))
     has = fused.parents != ABSENT
     names = np.array([robot.name for robot in team.robots], dtype=object)
     first = np.argmax(has, axis=1)
@@ -156,15 +170,24 @@ def fused_rows(team: FusedTeam) -> pd.DataFrame:
     )
 
 
-def fused_motion_rows(team: FusedTeam, use_drift: bool) -> pd.DataFrame:
+def fused_motion_rows(team: FusedTeam) -> pd.DataFrame:
     """Rows of the table `fused_motions`: how each robot's map was moved into the fused one."""
     if team.fused is None:
         return pd.DataFrame()
     why = dict(team.fused.left_out)
     rows = pd.DataFrame(team.fused.T_first_map, columns=["tx_m", "ty_m", "theta_rad"])
-    rows["drift_sigma_m"] = team.fused.drift_sigma_m if use_drift else 0.0
+    rows["drift_sigma_m"] = team.fused.drift_sigma_m
     rows["robot"] = [robot.name for robot in team.robots]
     return rows.assign(left_out=[why.get(name, "") for name in rows["robot"]])
+
+
+def team_edge_rows(team: FusedTeam) -> pd.DataFrame:
+    """Rows of the table `team_edges`: what the others say of each two robots' alignment."""
+    if team.fusion is None:
+        return pd.DataFrame()
+    pairs = list(dict.fromkeys((each.a.name, each.b.name) for each in team.met))
+    rows = pd.DataFrame(pairs, columns=["robot_a", "robot_b"])
+    return rows.assign(place=[str(place) for place in team.fusion.place])
 
 
 def map_fit_rows(team: FusedTeam) -> pd.DataFrame:
@@ -208,7 +231,9 @@ def landmark_nees_rows(team: FusedTeam, radius_m: float) -> list[dict[str, Any]]
             fused_nees = nees[parents[parents != ABSENT]]
             rows.append(_row(robot.name, "before fusing", landmarks, fused_nees))
     if fused is not None:
-        nees = landmark_nees(fused.landmarks, team.robots[0].in_map_frame(team.truth_of(fused)))
+        nees = landmark_nees(
+            fused.landmarks, team.frame_of(fused).in_map_frame(team.truth_of(fused))
+        )
         single = np.count_nonzero(fused.parents != ABSENT, axis=1) == 1
         rows.append(_row("fused", "fused", fused.landmarks, nees[true_rows]))
         rows.append(_row("fused", "carried over", fused.landmarks, nees[single]))

@@ -9,17 +9,21 @@ import pandas as pd
 from experiments.judge import judging, tables
 from experiments.judge.errors import EvaluatedRobot, met_maps
 from experiments.judge.fused_landmarks import FusedTeam, MergeSettings
+from experiments.judge.judged_fusers import GivenMap, JudgedFusion
 from experiments.judge.judging import JudgeSettings
 from experiments.judge.known_truth import why_no_truth
+from experiments.judge.smoothed_robots import SmoothedRobot, load_smoothed
 from experiments.run.memory import require_memory
 from experiments.run.pipeline import PairStages, Pipeline, RobotStages, lay_out
 from experiments.run.stage import Stage
+from experiments.run.stages.fuse import read_fusions
 from experiments.run.stages.slam import RobotFolders
 from experiments.run.store import StageFolder, Store
 from experiments.run.tasks import OnProgress, Task, run_tasks, task_names, tasks_of, unfinished
 from experiments.run.workers import workers
 from experiments.scenario.settings import AnyScenario
 from mapfusion.errors import DamagedFileError, InputError
+from mapfusion.fuse.registry import make_fuser
 
 _JUDGED = {"errors", "fusion"}  # the other tables of pairs come from the aligners
 
@@ -37,7 +41,8 @@ class JudgedRun:
     @classmethod
     def of(cls, scenario: AnyScenario, store: Store) -> "JudgedRun":
         """Lay out a scenario; nothing is computed."""
-        pipeline, merge = lay_out(scenario), MergeSettings(**dict(scenario.merge))
+        pipeline, chosen = lay_out(scenario), scenario.merge
+        merge = MergeSettings(chosen.aligner, chosen.parameters)
         align, radius_m = scenario.align, scenario.evaluate.true_pair_radius_m
         settings = JudgeSettings(align.refinement, align.acceptance, merge, radius_m)
         no_truth = why_no_truth(scenario)
@@ -71,8 +76,28 @@ class JudgedRun:
         """All robots' maps joined with the truth."""
         return [judging.load_robot(self.robot_folders(robot)) for robot in self.pipeline.robots]
 
+    def load_smoothed(self, robots: Sequence[EvaluatedRobot]) -> list[SmoothedRobot]:
+        """What the smoother made of all robots' logs, joined with the truth."""
+        return [
+            load_smoothed(robot, self.robot_folders(stages), self.store.path(stages.smooth))
+            for robot, stages in zip(robots, self.pipeline.robots, strict=True)
+        ]
+
+    def load_fusions(
+        self, robots: Sequence[EvaluatedRobot], smoothed: Sequence[SmoothedRobot]
+    ) -> list[JudgedFusion]:
+        """All fusers' maps at all iterations that maps are fused at, joined with the truth."""
+        names, found = [robot.name for robot in robots], []
+        for fuser, stage in self.pipeline.fusers.items():
+            folder, takes = self.store.path(stage), make_fuser(fuser).smoothed
+            beside = smoothed if takes else [None] * len(robots)
+            for k, fusion in read_fusions(folder, names).items():
+                given = [GivenMap.at(*both, k) for both in zip(robots, beside, strict=True)]
+                found.append(JudgedFusion(fuser, k, fusion, given))
+        return found
+
     def load_team(self) -> FusedTeam:
-        """The same, their last maps merged."""
+        """All robots' last maps, merged by the paper's fuser."""
         robots = self.load_robots()
         met = met_maps(robots, self.pair_table("estimates"), self.pair_table("correspondences"))
         return FusedTeam.of(robots, met, self.settings.merge)

@@ -31,7 +31,7 @@ class JudgeSettings:
     true_pair_radius_m: float
 
 
-def _truth_of(folder: Path, log: RobotLog) -> RobotTruth:
+def truth_of(folder: Path, log: RobotLog) -> RobotTruth:
     """The truth beside a log; NaN where there is none."""
     if all((folder / name).is_file() for name in TRUTH_FILES):
         return read_truth(folder)
@@ -41,7 +41,7 @@ def _truth_of(folder: Path, log: RobotLog) -> RobotTruth:
 def load_robot(folders: RobotFolders) -> EvaluatedRobot:
     """A robot's maps joined with the truth, which is NaN where it is unknown."""
     log = read_log(folders.log)
-    truth = _truth_of(folders.log, log)
+    truth = truth_of(folders.log, log)
     poses, points = (truth.T_world_robot, log), (truth.point_world_m, log.observations)
     for file, (true, logged) in (("truth_poses", poses), ("truth_points", points)):
         if len(true) != len(logged):

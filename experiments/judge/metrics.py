@@ -17,11 +17,17 @@ import pandas as pd
 from experiments.judge import criteria
 from experiments.judge.criteria import ORACLE, rich
 from experiments.judge.judged_maps import error_over_oracle, maps_of
+from experiments.judge.nothing_merged import merged_robots
 from experiments.judge.path_errors import path_rms, rms
+from experiments.judge.team_figures import edge_precision, edge_recall
+from mapfusion.fuse.registry import FUSERS
 
 # The four methods of the paper, algorithm 1 in both readings, as the default list names them.
 PAPER_ALIGNERS = ("ransac", "svd", "svd-solved", "icp", "impicp")
-USED_TABLES = ("robots", "errors", "fusion", "map_fits")
+USED_TABLES = ("robots", "errors", "fusion", "map_fits", "fused_motions", "team", "team_pairs")
+USED_TABLES += ("smoother", "fusers")
+MERGED_ROBOTS = "team.merged_robots"
+WITHOUT_TRUTH = (MERGED_ROBOTS,)  # those that can be measured where no truth is known
 
 Tables = Mapping[str, pd.DataFrame]
 Metric = Callable[..., float]
@@ -57,6 +63,30 @@ def _path_rmse_m(tables: Tables, which: str) -> float:
 def path_over_odometry(tables: Tables) -> float:
     """FastSLAM's path RMSE over odometry's (ratio of the medians)."""
     return METRICS["path_rmse_m"](tables) / METRICS["odometry_rmse_m"](tables)
+
+
+_SMOOTHER = ("path_rmse_m", "filter_over_smoother", "landmark_rmse_m", "gross_share")
+_SMOOTHER += ("nees_per_dof", "coverage_95")
+
+
+_FUSER = ("landmark_rmse_m", "gross_share", "fitted_rmse_m", "fitted_median_m")
+_FUSER += ("over_better_parent", "over_better_filter", "nees_per_dof", "frame_nees_per_dof")
+_FUSER += ("coverage_95", "frame_coverage_95", "alignment_nees_per_dof", "duplicate_share")
+
+
+@metric(**{f"{fuser}.{name}": f"{fuser} {name}" for fuser in FUSERS for name in _FUSER})
+def _of_a_fuser(tables: Tables, which: str) -> float:
+    """A column of the table `fusers` at the last iteration, median over seeds."""
+    fuser, _, name = which.partition(" ")
+    rows = tables["fusers"]
+    rows = rows[rows["fuser"] == fuser].sort_values("iteration", kind="stable")
+    return rows.groupby("seed")[name].last().median()
+
+
+@metric(**{f"smoother.{name}": name for name in _SMOOTHER})
+def _of_the_smoother(tables: Tables, which: str) -> float:
+    """A column of the table `smoother`, median over robots and seeds."""
+    return tables["smoother"][which].median()
 
 
 @metric(
@@ -102,6 +132,36 @@ def _landmark_rmse_m(tables: Tables, which: str) -> float:
 def fused_landmark_rmse_m(tables: Tables) -> float:
     """The fused map's landmark RMSE after the best rigid fit, median over the seeds."""
     return tables["map_fits"].query("map == 'fused'")["rmse_m"].median()
+
+
+@metric(**{MERGED_ROBOTS: "tx_m"})
+def _merged_robots(tables: Tables, which: str) -> float:
+    """Robots whose maps became one map, median over the seeds; 0 where none were merged."""
+    return tables["fused_motions"].groupby("seed")[which].agg(merged_robots).median()
+
+
+@metric(**{"team.ate_rmse_m": "rmse"})
+def _team_ate_m(tables: Tables, which: str) -> float:
+    """ATE (RMSE) of all merged robots' final paths under one rigid fit, median over the seeds."""
+    return tables["team"].query("component == 1 and source == 'final'")[which].median()
+
+
+@metric(
+    **{
+        "team.translation_m": "team_translation_error_m",
+        "team.rotation_rad": "team_rotation_error_rad",
+    }
+)
+def _team_pair_error(tables: Tables, which: str) -> float:
+    """Error of T_a_b as the team places a and b, median over seeds and pairs in one map."""
+    return tables["team_pairs"][which].abs().median()
+
+
+@metric(**{"team.edge_precision": "precision", "team.edge_recall": "recall"})
+def _team_edges(tables: Tables, which: str) -> float:
+    """Of all seeds' pairs: right among the believed; right and believed among those that met."""
+    of = {"precision": edge_precision, "recall": edge_recall}[which]
+    return of(tables["team_pairs"])
 
 
 @metric()

@@ -17,7 +17,7 @@ from mapfusion.align.rigid import fit_rigid
 from mapfusion.se2 import Float
 from mapfusion.storage import POSE_FIELDS
 
-SOURCES = ("final", "online", "odometry")
+SOURCES = ("final", "online", "odometry", "smoothed")
 # From frame to frame, and along a metre of the way: what a filter step and a short drive add.
 RPE_DELTA = 1
 STATISTICS: dict[str, Callable[[Float], float]] = {
@@ -114,16 +114,22 @@ def robot_paths(poses: pd.DataFrame, odometry: Float, truth: PathTruth) -> pd.Da
 
 
 def path_statistics_rows(paths: pd.DataFrame) -> list[dict[str, Any]]:
-    """Rows of the table `path_statistics` from those of the table `paths`."""
+    """Rows of the table `path_statistics` from those of the table `paths`.
+
+    These may have a smoothed path beside the columns of the table.
+    """
     rows = []
     for robot, own in paths.groupby("robot", sort=False):
         all_poses = {
             source: own[[f"{source}_{name}" for name in POSE_FIELDS]].to_numpy()
             for source in (*SOURCES, "truth")
+            if f"{source}_{POSE_FIELDS[0]}" in own
+            and own[f"{source}_{POSE_FIELDS[0]}"].notna().any()
         }
-        known = np.asarray(np.isfinite(all_poses["truth"]).all(axis=1))
-        truth = all_poses["truth"][known]
-        for source in SOURCES:
+        truth = all_poses.pop("truth", np.full((len(own), 3), np.nan))
+        known = np.asarray(np.isfinite(truth).all(axis=1))
+        truth = truth[known]
+        for source in all_poses:
             for quantity, delta, unit, errors in _errors(all_poses[source][known], truth, known):
                 what = {"quantity": quantity, "delta": delta, "delta_unit": unit, "n": len(errors)}
                 rows.append({"robot": robot, "source": source} | what | seven_statistics(errors))

@@ -1,13 +1,13 @@
 """The result folder of a run: everything that figures, checks and people read.
 
-`RESULT/tables/*.parquet`, `maps/` (one file a robot, and the fused map), `keyframes/`, `figures/`,
-`scenario.json` (resolved), `world.json`, `provenance.json`.
+`RESULT/tables/*.parquet`, `maps/` (one file a robot, the fused map, and `fused.2` and so on for
+robots that only each other's alignments connect), `keyframes/`, `figures/`, `scenario.json`
+(resolved), `world.json`, `provenance.json`.
 """
 
 import platform
 import shutil
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -17,29 +17,35 @@ import numpy as np
 import pandas as pd
 
 from experiments.judge import fused_landmarks, tables
-from experiments.judge.errors import EvaluatedRobot, MetMaps
-from experiments.judge.fused_landmarks import FusedTeam, MergeSettings
+from experiments.judge.errors import EvaluatedRobot
+from experiments.judge.fused_landmarks import FusedTeam
+from experiments.judge.fuser_coverage import coverage_rows
+from experiments.judge.judged_fusers import JudgedFusion, fuser_rows
 from experiments.judge.judged_run import JudgedRun
-from experiments.judge.judging import JudgeSettings
+from experiments.judge.map_history import history_tables
 from experiments.judge.path_errors import path_statistics_rows, robot_paths
+from experiments.judge.smoothed_robots import SmoothedRobot, smoothed_path_rows, smoother_rows
+from experiments.judge.team_figures import team_pair_rows, team_rows
 from experiments.judge.truth import common_landmarks
 from experiments.methods.aligner_calls import callable_aligner
 from experiments.methods.catalogue import find_method
 from experiments.run.code_version import library_versions
 from experiments.run.frames import read_rows
 from experiments.run.stages import slam
+from experiments.run.stages.fuse import read_fused_maps
+from experiments.run.stages.smooth import read_smoothed
 from experiments.run.store import Store, mending
 from experiments.run.store_files import link_or_copy
 from experiments.run.tasks import OnProgress
 from experiments.scenario.randomness import generator
 from experiments.scenario.settings import AnyScenario, Simulation
-from mapfusion.align.correspondences import Correspondences, match
+from mapfusion.align.correspondences import match
 from mapfusion.errors import InputError
-from mapfusion.landmark_map import LandmarkMap, write_map
-from mapfusion.merge import merge
+from mapfusion.landmark_map import write_map
 from mapfusion.robot_log import read_log
 from mapfusion.storage import (
-    point_columns,
+    POSE_FIELDS,
+    named_columns,
     remove_abandoned,
     require_writable,
     write_json,
@@ -104,8 +110,15 @@ def write_result(run: JudgedRun, folder: Path) -> None:
         tables.write(tables.table_path(folder, name), name, table)
     for outdated in ("maps", "keyframes"):  # of robots or frames that are no longer there
         shutil.rmtree(folder / outdated, ignore_errors=True)
-    for name, landmarks, _ in team.judged():
-        write_map(folder / "maps" / f"{name}.parquet", landmarks)
+    for robot in team.robots:
+        write_map(folder / "maps" / f"{robot.name}.parquet", robot.at(team.iteration)[0])
+    for robot in run.pipeline.robots:
+        if smoothed := read_smoothed(run.store.path(robot.smooth)).get(robot.n_frames - 1):
+            write_map(folder / "maps" / f"{robot.name}.smoothed.parquet", smoothed)
+    if fuser := run.pipeline.fusers.get(run.scenario.merge.fuser):
+        for k, fused in enumerate(read_fused_maps(run.store.path(fuser)), start=1):
+            name = "fused.parquet" if k == 1 else f"fused.{k}.parquet"
+            write_map(folder / "maps" / name, fused)
     _write_images(run, folder)
     write_json(folder / "scenario.json", run.scenario.resolved())
     write_json(folder / "world.json", _world(run.scenario, team.robots))
@@ -159,19 +172,23 @@ def all_tables(
 
     Of `only` those, if it is given: a sweep of short runs spends its time on the others.
     """
-    settings, paths = run.settings, _paths(run, team)
+    settings, smoothed = run.settings, run.load_smoothed(team.robots)
+    paths, fusions = _paths(run, smoothed), run.load_fusions(team.robots, smoothed)
     makers: dict[str, Callable[[], Any]] = {
         "paths": lambda: paths,
         "robots": lambda: paths,
+        "frame_times": lambda: _frame_times(run),
+        "smoother": lambda: smoother_rows(smoothed),
+        "smoothed_paths": lambda: smoothed_path_rows(smoothed),
         "clouds": lambda: _clouds(run),
         "landmarks": lambda: pd.concat(
             [fused_landmarks.landmark_rows(r, *r.at(team.iteration)) for r in team.robots],
             ignore_index=True,
         ),
         "fused": lambda: fused_landmarks.fused_rows(team),
-        "fused_motions": lambda: fused_landmarks.fused_motion_rows(
-            team, settings.merge.parameters.use_drift
-        ),
+        "fused_map": lambda: _fused_map_rows(run, fusions),
+        "team_edges": lambda: fused_landmarks.team_edge_rows(team),
+        "fused_motions": lambda: fused_landmarks.fused_motion_rows(team),
         "timings": lambda: [
             {"stage": stage.name, "name": f"{stage.key}:{name}", "elapsed_s": seconds}
             for stage in run.folders()
@@ -180,7 +197,13 @@ def all_tables(
     }
     judged: dict[str, Callable[[], Any]] = {
         "path_statistics": lambda: path_statistics_rows(paths),
+        "team": lambda: team_rows(team, paths),
+        "team_pairs": lambda: team_pair_rows(
+            team, run.pair_table("errors"), settings.merge.aligner
+        ),
         "map_fits": lambda: fused_landmarks.map_fit_rows(team),
+        "fusers": lambda: fuser_rows(fusions),
+        "fuser_coverage": lambda: coverage_rows(fusions),
         "landmark_nees": lambda: fused_landmarks.landmark_nees_rows(
             team, settings.true_pair_radius_m
         ),
@@ -191,13 +214,31 @@ def all_tables(
     return {name: tables.framed(name, make()) for name, make in makers.items() if name in only}
 
 
-def _paths(run: JudgedRun, team: FusedTeam) -> pd.DataFrame:
+def _fused_map_rows(run: JudgedRun, fusions: Sequence[JudgedFusion]) -> pd.DataFrame:
+    named = [fusion for fusion in fusions if fusion.fuser == run.scenario.merge.fuser]
+    last = max(named, key=lambda fusion: fusion.iteration, default=None)
+    return pd.DataFrame() if last is None else fused_landmarks.fused_rows(last.team())
+
+
+def _paths(run: JudgedRun, smoothed: Sequence[SmoothedRobot]) -> pd.DataFrame:
+    """Rows of the table `paths`, with the smoothed path beside its columns."""
     paths = []
-    for stages, robot in zip(run.pipeline.robots, team.robots, strict=True):
+    for stages, each in zip(run.pipeline.robots, smoothed, strict=True):
         log, maps = run.robot_folders(stages)
-        poses = read_rows(maps / "poses.parquet", slam.POSES).assign(robot=robot.name)
-        paths.append(robot_paths(poses, read_log(log).odometry, robot.path))
+        poses = read_rows(maps / "poses.parquet", slam.POSES).assign(robot=each.robot.name)
+        rows = robot_paths(poses, read_log(log).odometry, each.robot.path)
+        names = [f"smoothed_{name}" for name in POSE_FIELDS]
+        paths.append(rows.assign(**named_columns(names, each.last_path)))
     return pd.concat(paths, ignore_index=True)
+
+
+def _frame_times(run: JudgedRun) -> pd.DataFrame:
+    logs = {each.name: read_log(run.robot_folders(each).log) for each in run.pipeline.robots}
+    parts = [
+        pd.DataFrame({"robot": name, "iteration": np.arange(len(log)), "time_s": log.time_s})
+        for name, log in logs.items()
+    ]
+    return pd.concat(parts, ignore_index=True)
 
 
 def _clouds(run: JudgedRun) -> pd.DataFrame:
@@ -207,54 +248,6 @@ def _clouds(run: JudgedRun) -> pd.DataFrame:
         for name, folder in folders
     ]
     return pd.concat(clouds, ignore_index=True)
-
-
-def history_tables(team: FusedTeam, settings: JudgeSettings) -> dict[str, pd.DataFrame]:
-    """The tables `map_history`, `true_pairs` and `fused_history`.
-
-    The stages keep the maps whole in the store; what leaves with the result is what one needs to
-    look at them in plan.
-    """
-    maps = [
-        _plan_rows(landmarks).assign(robot=robot.name, iteration=k)
-        for robot in team.robots
-        for k, landmarks in robot.maps.items()
-    ]
-    true_pairs, fused = [], []
-    for met in team.met:
-        bits = np.packbits(met.is_true(settings.true_pair_radius_m)).tobytes()
-        true_pairs.append(met.names | {"n_correspondences": len(met.offered), "true_pair": bits})
-        fused.append(_joined_rows(met, settings.merge))
-    return {
-        "map_history": pd.concat(maps, ignore_index=True),
-        "true_pairs": pd.DataFrame(true_pairs),
-        "fused_history": pd.concat(fused, ignore_index=True) if fused else pd.DataFrame(),
-    }
-
-
-def _plan_rows(landmarks: LandmarkMap) -> pd.DataFrame:
-    columns = point_columns(landmarks.position_m, landmarks.covariance_m2)
-    return pd.DataFrame({"landmark": np.arange(len(landmarks)), **columns})
-
-
-def _joined_rows(met: MetMaps, settings: MergeSettings) -> pd.DataFrame:
-    """The inliers of the merging aligner's first repetition, fused; none where it was refused.
-
-    Only they are given to the merge: its second pass, which looks for what they missed, takes ten
-    times as long as all the rest of this table.
-    """
-    (map_a, map_b), alignment = met.maps, met.alignment(settings.aligner)
-    pairs = met.offered[np.flatnonzero(alignment.inlier & alignment.ok)]
-    fused, each = map_a[pairs.index_a], np.arange(len(pairs))
-    if alignment.ok:
-        fused = merge(
-            [fused, map_b[pairs.index_b]],
-            [replace(alignment, inlier=np.ones(len(each), dtype=bool))],
-            [Correspondences(each, each, pairs.distance)],
-            settings.parameters,
-        ).landmarks
-    joined = {"landmark_a": pairs.index_a, "landmark_b": pairs.index_b}
-    return _plan_rows(fused).assign(**met.names, **joined)
 
 
 def _world(scenario: AnyScenario, robots: Sequence[EvaluatedRobot]) -> dict[str, object]:

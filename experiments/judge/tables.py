@@ -18,10 +18,11 @@ from mapfusion.storage import COVARIANCE_FIELDS, POSITION_FIELDS, schema
 
 # Names that are no floats.
 _NAMES = {
-    frames.TEXT: """aligner delta_unit landmarks left_out map name quantity reason refined_reason
-        refined_status robot robot_a robot_b source stage status""",
-    frames.INT: """count degrees_of_freedom iteration landmark landmark_a landmark_b n n_common
-        n_correspondences n_inliers n_landmarks n_parents n_true particle repetition""",
+    frames.TEXT: """aligner delta_unit fuser landmarks left_out map name not_smoothed place quantity
+        reason refined_reason refined_status robot robot_a robot_b source stage status""",
+    frames.INT: """component count degrees_of_freedom frame iteration landmark landmark_a landmark_b
+        n n_common n_correspondences n_inliers n_landmarks n_parents n_robots n_steps n_team n_true
+        particle repetition""",
     frames.BOOL: "accepted resampled true_pair",
 }
 # In plan: single precision, for looking at and not for computing with, takes half the size.
@@ -57,14 +58,64 @@ _COLUMNS = {
     "paths": """robot iteration final_x_m final_y_m final_theta_rad
         online_x_m online_y_m online_theta_rad odometry_x_m odometry_y_m odometry_theta_rad
         truth_x_m truth_y_m truth_theta_rad""",
+    # When the frames of `paths` were, by the robot's log.
+    "frame_times": "robot iteration time_s",
+    # What the filter loses against a batch: each robot's log smoothed whole, its last map and path;
+    # see experiments/judge/smoothed_robots.py and map_consistency.py. Paths from the same start;
+    # landmarks after the best rigid fit without the gross ones, which are counted; their
+    # consistency with the gauge removed. filter_: of FastSLAM's last map and final path. The
+    # degrees of freedom are of the Student-t's that observations and tracks' offsets were found to
+    # be of. not_smoothed: why there is nothing (else empty).
+    "smoother": """robot n_landmarks path_rmse_m filter_path_rmse_m filter_over_smoother
+        landmark_rmse_m gross_share filter_landmark_rmse_m filter_gross_share
+        nees_per_dof marginal_nees_per_dof coverage_95
+        n_steps observation_dof offset_dof not_smoothed""",
+    # The smoothed path, in the robot's own frame, up to each iteration that maps are fused at.
+    "smoothed_paths": "robot iteration frame x_m y_m theta_rad",
     # Particles at the kept iterations, in the robot's own frame.
     "clouds": "robot iteration particle x_m y_m theta_rad log_weight",
     # The robots' last maps, each in its own frame; the true point is given in the same frame.
     "landmarks": f"robot landmark {_POINT} count truth_x_m truth_y_m truth_z_m",
-    # The fused map in the frame of the first robot. The parents are rows of the robots' last maps;
+    # The maps fused as the paper does (eq. 12 to 16 with drift, the fuser kalman-drift), in the
+    # frame of the first robot that is in them. The parents are rows of the robots' last maps;
     # robot_b is empty for a landmark that was carried over from one map.
     "fused": f"""landmark {_POINT} n_parents robot_a landmark_a robot_b landmark_b
         truth_x_m truth_y_m truth_z_m""",
+    # The map that `merge.fuser` made of the robots' last maps, likewise; the parents are rows of
+    # the maps that it was given: the smoothed ones, where it takes these.
+    "fused_map": f"""landmark {_POINT} n_parents robot_a landmark_a robot_b landmark_b
+        truth_x_m truth_y_m truth_z_m""",
+    # One row per (fuser, iteration): the map of the most robots against the truth; see
+    # experiments/judge/judged_fusers.py and map_consistency.py. landmark_rmse_m: in the frame of
+    # the first robot in it; fitted: after the best rigid fit; gross landmarks are left out of both
+    # and counted. over_better_parent: landmarks that two robots have, over the better of the maps
+    # that the fuser was given, over_better_filter: of FastSLAM's, each map fitted for itself;
+    # medians over pairs of robots. nees_per_dof, marginal_nees_per_dof and coverage_95: with the
+    # gauge removed, the first of all landmarks at once; a map that has no joint covariance (all but
+    # the last of each fuser) is taken for one of independent errors. frame_: in the frame, of each
+    # landmark for itself. alignment_: how the other robots' maps were moved, medians.
+    "fusers": """fuser iteration n_robots n_landmarks landmark_rmse_m fitted_rmse_m fitted_median_m
+        gross_share over_better_parent over_better_filter
+        nees_per_dof marginal_nees_per_dof coverage_95 frame_nees_per_dof frame_coverage_95
+        alignment_error_m alignment_error_rad alignment_nees_per_dof duplicate_share""",
+    # Share of the true points inside the ellipses of a nominal probability, at the last iteration,
+    # of each fuser's map and before: map is fused, or filter or smoothed with no fuser, which are
+    # all robots' maps together. coverage: each map after its best rigid fit, with the gauge
+    # removed; frame_coverage: in its own frame. Without the gross ones, n_landmarks in all.
+    "fuser_coverage": "map fuser iteration n_landmarks nominal coverage frame_coverage",
+    # What becomes of the alignment of each two robots' last maps in the team: confirmed by a loop
+    # of others, a bridge that nothing confirms, contradicted, ambiguous, unconfirmed or refused.
+    "team_edges": "robot_a robot_b place",
+    # Each two robots against the truth: the merging aligner's last alignment by itself, as in
+    # `errors`, and T_a_b between the two as all believed alignments together place them; NaN where
+    # they are in no map together.
+    "team_pairs": """robot_a robot_b place accepted n_common
+        refined_translation_error_m refined_rotation_error_rad
+        team_translation_error_m team_rotation_error_rad""",
+    # Position errors of n_robots of a run's n_team: moved into one frame as their maps were, then
+    # all of them by one rigid fit. component: 1 for the fused map of most robots. source: as in
+    # `path_statistics`; n: poses.
+    "team": "component source n_robots n_team n rmse mean median std min max sse",
     # How each robot's last map was moved into the fused map, the first robot's own among them; NaN
     # for a map that was left out, with the reason (else empty). drift_sigma_m: as added to the
     # landmarks' covariance in x and y.

@@ -23,12 +23,14 @@ def landmark_truth(
     """
     point_m, has_point = truth.point_world_m, np.isfinite(truth.point_world_m).all(axis=1)
     owner = np.full(len(point_m), -1, dtype=np.int64)
-    changes = dict(iter(associations.groupby("from_iteration")))
-    points = {}
+    points, done = {}, -1
     for iteration, landmarks in sorted(maps.items()):
-        if iteration in changes:
-            rows = changes[iteration]
-            owner[rows["observation"].to_numpy()] = rows["source_observation"].to_numpy()
+        # also those of iterations that have no map here, each after the ones before it
+        since = associations["from_iteration"].between(done, iteration, inclusive="right")
+        rows = associations[since].sort_values("from_iteration", kind="stable")
+        observation, source = rows[["observation", "source_observation"]].to_numpy(np.int64).T
+        owner[observation] = source
+        done = iteration
         known = has_point & (owner >= 0)
         medians = pd.DataFrame(point_m[known]).groupby(owner[known]).median()
         points[iteration] = medians.reindex(landmarks.source_observation).to_numpy(np.float64)

@@ -1,5 +1,6 @@
 """The stages one by one, on files of the user's own."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,11 @@ from mapfusion.align.registration import Registration
 from mapfusion.align.result import NOT_RUN, Status
 from mapfusion.errors import InputError
 from mapfusion.fastslam.run import run_log
+from mapfusion.fuse.registry import make_fuser
+from mapfusion.fused_map import AlignedPair, Fusion
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map
-from mapfusion.merge import FusedMap
 from mapfusion.merge import merge as merge_maps
+from mapfusion.name_order import name_order
 from mapfusion.robot_log import read_log
 
 
@@ -64,6 +67,14 @@ def save_map(path: Path, landmarks: LandmarkMap) -> None:
         raise InputError(f"{path}: cannot be written ({error.strerror})") from error
 
 
+def save_fused(path: Path, fusion: Fusion) -> list[Path]:
+    """Write the fused maps: that of the most maps to `path`, others beside it, from `.2` on."""
+    paths = [path.with_stem(f"{path.stem}.{k}") for k in range(2, len(fusion.fused) + 1)]
+    for place, fused in zip([path, *paths], fusion.fused, strict=True):
+        save_map(place, fused.landmarks)
+    return [path, *paths]
+
+
 def _registration(entry: AlignerEntry, settings: Align) -> Registration:
     aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
     return Registration(aligner, settings.refinement, settings.acceptance)
@@ -97,18 +108,21 @@ def verdict_on(row: Mapping[str, Any]) -> tuple[Status, str]:
     return status, row["reason"] or row["refined_reason"] or row["acceptance_reason"]
 
 
-def merge(paths: Sequence[Path], settings: Scenario) -> FusedMap:
-    """Fuse maps in the frame of the first."""
+def merge(paths: Sequence[Path], settings: Scenario) -> Fusion:
+    """Fuse maps by the alignments of each with each, a pair in the order of its robots' names."""
     if len(paths) < 2:
         raise InputError("merge: give two maps or more")
     name, entries = settings.merge.aligner, {each.name: each for each in settings.align.aligners}
     if name not in entries:
         raise InputError(f"merge.aligner: {name} is not among {', '.join(entries)}")
-    first, *others = maps = [read_map(path) for path in paths]
-    registration = _registration(entries[name], settings.align)
-    offered, alignments = [], []
-    for number, other in enumerate(others, start=1):
-        rng = generator(settings.seed, "align", name, number)
-        offered.append(match(first, other, settings.align.match))
-        alignments.append(registration.register(first, other, offered[-1], rng).applied)
-    return merge_maps(maps, alignments, offered, settings.merge.parameters)
+    maps = [read_map(path) for path in paths]
+    registration, pairs = _registration(entries[name], settings.align), []
+    order = sorted(range(len(maps)), key=lambda k: (name_order(maps[k].name), str(paths[k])))
+    for a, b in itertools.combinations(order, 2):
+        rng = generator(settings.seed, "align", name, maps[a].name, maps[b].name)
+        offered = match(maps[a], maps[b], settings.align.match)
+        done = registration.register(maps[a], maps[b], offered, rng)
+        sureness = done.verdict.log10_false_alarms
+        pairs.append(AlignedPair(a, b, done.applied, offered, sureness))
+    chosen = settings.merge
+    return merge_maps(maps, pairs, chosen.parameters, make_fuser(chosen.fuser))

@@ -5,14 +5,14 @@ Each stage is handed its own settings, taken from the scenario here and nowhere 
 
 import itertools
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from experiments.methods.catalogue import Kind, find_method
+from experiments.methods.catalogue import Kind, find_method, fingerprint
 from experiments.run.stage import RecordedLog, Stage, with_those_before
 from experiments.run.stages import (
     align,
@@ -20,16 +20,21 @@ from experiments.run.stages import (
     drive,
     faces,
     features,
+    fuse,
     log,
     match,
     observed,
     slam,
+    smooth,
 )
 from experiments.run.stages.walls import Walls
 from experiments.scenario.sections import NAME_PATTERN, TAKEN_NAMES, Section
 from experiments.scenario.settings import AnyScenario, Recording, Scenario, Simulation
 from mapfusion.errors import InputError
+from mapfusion.fuse.registry import FUSERS, target_of
+from mapfusion.name_order import name_order
 from mapfusion.robot_log import read_log
+from mapfusion.smoother.smooth import SmootherParameters
 from mapfusion.vision.frontend import FrontEndParameters
 from sim.renderer import renderer_name
 
@@ -42,6 +47,7 @@ class RobotStages:
     n_frames: int
     log: Stage | RecordedLog
     slam: Stage
+    smooth: Stage
 
 
 @dataclass(frozen=True)
@@ -64,11 +70,12 @@ class PairStages:
 
 @dataclass(frozen=True)
 class Pipeline:
-    """What a scenario's stages lead to: the maps of each robot, the estimates of every two."""
+    """What a scenario's stages lead to: maps of each robot, estimates of every two, fused maps."""
 
     scenario: AnyScenario
     robots: tuple[RobotStages, ...]
     pairs: tuple[PairStages, ...]
+    fusers: Mapping[str, Stage]  # by name; none for a single robot
 
     @property
     def simulated(self) -> list[SimulatedRobotStages]:
@@ -77,8 +84,9 @@ class Pipeline:
 
     def stages(self) -> list[Stage]:
         """All stages, each after those before it; a robot is done before the next one's images."""
-        maps = (robot.slam for robot in self.robots)
-        return with_those_before([*maps, *(pair.estimates for pair in self.pairs)])
+        maps = (robot.smooth for robot in self.robots)
+        estimates = (pair.estimates for pair in self.pairs)
+        return with_those_before([*maps, *estimates, *self.fusers.values()])
 
 
 def lay_out(scenario: AnyScenario) -> Pipeline:
@@ -89,8 +97,9 @@ def lay_out(scenario: AnyScenario) -> Pipeline:
     """
     recorded = isinstance(scenario, Recording)
     robots = tuple(_recorded(scenario) if recorded else _simulated(scenario))
-    pairs = tuple(_pair(scenario, a, b) for a, b in itertools.combinations(robots, 2))
-    return Pipeline(scenario, robots, pairs)
+    pairs = tuple(_pair(scenario, *both) for both in itertools.combinations(robots, 2))
+    fusers = _fusers(scenario, robots, pairs) if pairs else {}
+    return Pipeline(scenario, robots, pairs, fusers)
 
 
 def _stage(module: ModuleType, *sections: Section, own: dict[str, Any], **more: Any) -> Stage:
@@ -129,12 +138,13 @@ def _simulated(scenario: Simulation) -> Iterable[RobotStages]:
         tracked = _stage(observed, scenario, keep, own=to_track, before=images)
         logged = _stage(log, scenario, own=own, before={"drive": driven, "observed": tracked})
         mapped = _slam(scenario, logged)
-        yield SimulatedRobotStages(robot.name, n_frames, logged, mapped, found, tracked)
+        smoothed = _smooth(scenario, logged, mapped, n_frames, n_frames)
+        yield SimulatedRobotStages(robot.name, n_frames, logged, mapped, smoothed, found, tracked)
 
 
 def _recorded(scenario: Recording) -> Iterable[RobotStages]:
     """Robots of recorded logs give their names to files, as those of scenarios do."""
-    robots: dict[str, RobotStages] = {}
+    robots: dict[str, tuple[int, RecordedLog]] = {}
     for folder in map(Path, scenario.logs):
         frames = folder / "frames.parquet"
         recorded, name, n_frames = _known(folder, _stamps(folder))
@@ -146,8 +156,12 @@ def _recorded(scenario: Recording) -> Iterable[RobotStages]:
             raise InputError(f"{frames}: robot is named {name}, a name of the evaluation's own")
         if name in robots:
             raise InputError(f"{frames}: robot {name} is in another log already")
-        robots[name] = RobotStages(name, n_frames, recorded, _slam(scenario, recorded))
-    return robots.values()
+        robots[name] = n_frames, recorded
+    n_most = max(n_frames for n_frames, _ in robots.values())
+    for name, (n_frames, recorded) in robots.items():
+        mapped = _slam(scenario, recorded)
+        smoothed = _smooth(scenario, recorded, mapped, n_frames, n_most)
+        yield RobotStages(name, n_frames, recorded, mapped, smoothed)
 
 
 def _stamps(folder: Path) -> tuple[tuple[str, int, int], ...]:
@@ -168,7 +182,34 @@ def _slam(scenario: Scenario, logged: Stage | RecordedLog) -> Stage:
     return _stage(slam, *sections, own={}, before={"log": logged})
 
 
-def _pair(scenario: Scenario, a: RobotStages, b: RobotStages) -> PairStages:
+def _smooth(
+    scenario: Scenario, logged: Stage | RecordedLog, mapped: Stage, n_frames: int, n_most: int
+) -> Stage:
+    """By the filter's own noise model; `n_most` are the frames of the team's longest log."""
+    fused = smooth.fused_iterations(n_most, scenario.evaluate.every, scenario.fuse.every)
+    settings, iterations = scenario.slam.filter, smooth.iterations_of(n_frames, fused)
+    return _stage(
+        smooth,
+        scenario.smooth,
+        own={
+            "smoother": _smoother(scenario),
+            "iterations": iterations,
+            "noise_floor_m": settings.noise_floor_m,
+        },
+        before={"log": logged, "slam": mapped},
+        parts=smooth.parts(iterations),
+    )
+
+
+def _smoother(scenario: Scenario) -> SmootherParameters:
+    """The filter's own noise model."""
+    settings = scenario.slam.filter
+    return SmootherParameters(settings.motion, settings.stray_m, scenario.slam.min_count)
+
+
+def _pair(scenario: Scenario, *robots: RobotStages) -> PairStages:
+    """Two robots, in the order of their names: whichever a scenario lists first."""
+    a, b = sorted(robots, key=lambda robot: name_order(robot.name))
     n_frames = max(a.n_frames, b.n_frames)
     iterations = tuple(slam.evaluated_iterations(n_frames, scenario.evaluate.every))
     parts = match.batches(iterations)
@@ -191,3 +232,30 @@ def _pair(scenario: Scenario, a: RobotStages, b: RobotStages) -> PairStages:
         )
     joined = _stage(align, own={"batches": parts}, before=matched | estimates)
     return PairStages(a, b, joined)
+
+
+def _fusers(
+    scenario: Scenario, robots: Sequence[RobotStages], pairs: Sequence[PairStages]
+) -> dict[str, Stage]:
+    n_frames = max(robot.n_frames for robot in robots)
+    iterations = smooth.fused_iterations(n_frames, scenario.evaluate.every, scenario.fuse.every)
+    before: dict[str, Stage | RecordedLog] = {}
+    for robot in robots:
+        before |= {f"log {robot.name}": robot.log, f"slam {robot.name}": robot.slam}
+        before[f"smooth {robot.name}"] = robot.smooth
+    before |= {f"align {pair.a.name} {pair.b.name}": pair.estimates for pair in pairs}
+    own = {"robots": tuple(robot.name for robot in robots), "iterations": tuple(iterations)}
+    own |= {"smoother": _smoother(scenario), "noise_floor_m": scenario.slam.filter.noise_floor_m}
+    stages = {}
+    for name in scenario.fuse.fusers:
+        target = target_of(name)
+        module, ours = target.partition(":")[0], name in FUSERS
+        origin = "" if ours else f"{target} {fingerprint(module.partition('.')[0])}"
+        stages[name] = _stage(
+            fuse,
+            scenario.merge,
+            own=own | {"fuser": name, "origin": origin},
+            before=before,
+            loads=(module if ours else "mapfusion.fuse",),
+        )
+    return stages

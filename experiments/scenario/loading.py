@@ -31,6 +31,12 @@ OWN = Path("scenarios")  # what shipped files name lies beside it, as it does in
 S = TypeVar("S")
 _MOST_SUGGESTED = 3  # keys that an error message offers
 _UNKNOWN = {"extra_forbidden", "unexpected_keyword_argument"}
+# Settings that were, and what says the same now.
+_RETIRED = {
+    "slam.filter.noise_scale": "errors that are alike from frame to frame are "
+    "slam.filter.stray_m, those of single observations vision.sigma_uv_px",
+    "merge.parameters.use_drift": "every run has both fusers, kalman and kalman-drift",
+}
 _WORLD = {"world", "robots", "drive"}  # what a simulation must have and a recording cannot
 _LONG_NAME = 64 * "x"  # longer than that of any file of a log
 _EITHER = "give either world, robots and drive, or logs; generate stands for world and robots"
@@ -190,6 +196,8 @@ def _first_problem(kind: type, error: ValidationError) -> str:
 
 def _about_unknown(location: tuple[int | str, ...], known: list[tuple[str, ...]]) -> str:
     """The names that would have been right there, and those that may have been meant."""
+    if told := _RETIRED.get(".".join(map(str, location))):
+        return f"retired; {told}"
     *above, wrong = location
     beside = [path for path in known if len(path) == len(location)]
     for i, part in enumerate(above):

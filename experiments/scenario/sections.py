@@ -6,6 +6,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 
 from mapfusion.arguments import Range, require_in_range
 from mapfusion.fastslam.parameters import FastSlamParameters
+from mapfusion.fuse.registry import FUSERS, REFERENCE, target_of
 from sim.driver import DriverSettings
 from sim.odometry import OdometryNoise
 from sim.p3at import TIRE_FRICTION
@@ -154,3 +155,40 @@ class Slam(Section):
 
     filter: FastSlamParameters = FastSlamParameters()
     min_count: Annotated[int, Range(1, MAX_COUNT, "sightings")] = 3
+
+
+class Smooth(Section):
+    """The batch smoother, beside the filter.
+
+    Attributes:
+        max_memory_gb: of its matrices, which grow with the square of the log: a robot is not
+            smoothed beyond the iteration where they would take more; 0 for no robot at all.
+    """
+
+    max_memory_gb: Annotated[float, Range(0, 10_000, "GB")] = 1.0
+
+
+_FUSERS = tuple(name for name in FUSERS if name != REFERENCE)
+
+
+def _known_fusers(names: list[str]) -> list[str]:
+    """Refuse a fuser that nobody has, or that is named twice."""
+    for name in names:
+        target_of(name)
+    return different(names, "fusers: ")
+
+
+class Fuse(Section):
+    """How and when robots' maps are fused to one, so that fusers can be compared.
+
+    Attributes:
+        fusers: names; all are given the same maps and alignments. All of ours but `batch`, which
+            smooths all logs as one and takes long, are in every run.
+        every: at every so-manieth frame, a multiple of `evaluate.every`, and at the last. None: at
+            the last, and at four evaluated iterations evenly spread before it.
+    """
+
+    fusers: Annotated[list[Name], AfterValidator(_known_fusers)] = [
+        each for each in FUSERS if each != REFERENCE
+    ]
+    every: Annotated[int, Range(1, MAX_COUNT, "frames")] | None = None

@@ -14,12 +14,14 @@ from experiments.scenario.sections import (
     MAX_COUNT,
     MAX_NAMED,
     Drive,
+    Fuse,
     Keep,
     Name,
     Render,
     Robot,
     Section,
     Slam,
+    Smooth,
     World,
     different,
     free,
@@ -30,7 +32,8 @@ from mapfusion.align.refine import Refinement
 from mapfusion.arguments import Range
 from mapfusion.camera import StereoCamera
 from mapfusion.errors import OutOfRangeError
-from mapfusion.merge import MergeParameters
+from mapfusion.fuse.parameters import MergeParameters
+from mapfusion.fuse.registry import USUAL
 from mapfusion.vision.frontend import FrontEndParameters
 from sim.odometry import OdometryNoise
 from sim.radiometry import RadiometricNoise
@@ -112,10 +115,13 @@ class Merge(Section):
 
     Attributes:
         aligner: whose refined result the maps are merged with; a name of `align.aligners`.
+        fuser: whose map is the fused one, of figure 10 and of `maps/fused.parquet`; a name of
+            `fuse.fusers`.
         parameters: how they are merged.
     """
 
     aligner: Name = "ransac"
+    fuser: Name = USUAL
     parameters: MergeParameters = MergeParameters()
 
 
@@ -165,8 +171,10 @@ class Scenario(Section):
         tags: words that commands take in place of this scenario's name.
         seed: of all that is random.
         slam: how maps are made.
+        smooth: the batch smoother beside it.
         align: alignment of two maps.
         merge: the fused map.
+        fuse: when maps are fused.
         evaluate: when and how it is judged.
         keep: what is kept for the figures.
         expect: bounds by metric, which `mapfusion check` holds runs to.
@@ -178,8 +186,10 @@ class Scenario(Section):
     tags: list[Name] = Field(default_factory=list, max_length=MAX_NAMED)
     seed: Annotated[int, Range(0, 2**32 - 1, "1")] = 0
     slam: Slam = Slam()
+    smooth: Smooth = Smooth()
     align: Align = Align()
     merge: Merge = Merge()
+    fuse: Fuse = Fuse()
     evaluate: Evaluate = Evaluate()
     keep: Keep = Keep()
     expect: dict[str, Bound] = Field(default_factory=dict)
@@ -190,6 +200,17 @@ class Scenario(Section):
         if self.merge.aligner not in aligners:
             known = f"is not among align.aligners ({', '.join(aligners)})"
             raise ValueError(f"merge.aligner: {self.merge.aligner} {known}")
+        if self.merge.fuser not in self.fuse.fusers:
+            known = f"is not among fuse.fusers ({', '.join(self.fuse.fusers)})"
+            raise ValueError(f"merge.fuser: {self.merge.fuser} {known}")
+        return self
+
+    @model_validator(mode="after")
+    def _fuses_what_it_evaluates(self) -> Self:
+        every, evaluated = self.fuse.every, self.evaluate.every
+        if every is not None and every % evaluated:
+            wanted = f"must be a multiple of evaluate.every ({evaluated} frames)"
+            raise ValueError(f"fuse.every: is {every}, {wanted}")
         return self
 
     def resolved(self) -> dict[str, Any]:

@@ -9,13 +9,17 @@ import pyarrow as pa
 from experiments.judge import tables
 from experiments.show.export import write_text
 from experiments.show.inspect import unit_of
-from mapfusion import landmark_map, robot_log
+from mapfusion import joint_files, landmark_map, robot_log
+from mapfusion.joint_covariance import RANK
 from mapfusion.open_tables import HEIGHT, about, default_of
 
 PAGE = Path(__file__).parents[1] / "docs" / "formats.md"
 TABLES_BEGIN = "<!-- From here on made by `python -m experiments.show.formats` -->"
 _OPEN = {
     "A map: one file, `NAME.parquet` or `NAME.csv`": landmark_map.LANDMARKS,
+    "A map's joint covariance: `NAME.joint.parquet` beside it, one row a landmark": (
+        joint_files.joint_schema(RANK)
+    ),
     "A log: `frames`, one row an iteration, also of those that saw nothing": robot_log.FRAMES,
     "A log: `observations`, one row a sighting": robot_log.OBSERVATIONS,
     "A log's truth: `truth_poses`, one row an iteration": robot_log.TRUTH_POSES,

@@ -19,8 +19,8 @@ from experiments.judge.user_files import verdict_on
 from experiments.run.stage_tables import COVARIANCE, MOTION
 from experiments.show.export import write_text
 from mapfusion.align.result import Status
+from mapfusion.fused_map import FusedMap, Fusion
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.merge import FusedMap
 
 SCHEMA_VERSION = 1
 _AXES = ("xx_m2", "xy_m2", "xt_m_rad", "yy_m2", "yt_m_rad", "tt_rad2")  # those of COVARIANCE
@@ -82,7 +82,17 @@ def of_map(path: Path, log: Path, seed: int, landmarks: LandmarkMap) -> dict[str
     return {"log": log, "seed": seed, "map": path} | made
 
 
-def of_fused(path: Path, seed: int, fused: FusedMap, maps: Sequence[Path]) -> dict[str, Any]:
+def of_fusion(
+    paths: Sequence[Path], seed: int, fusion: Fusion, maps: Sequence[Path]
+) -> dict[str, Any]:
+    """What maps became: the fused map of the most of them, and others beside it."""
+    first, *others = (
+        _fused(path, fused, maps) for path, fused in zip(paths, fusion.fused, strict=True)
+    )
+    return {"seed": seed, **first, "others": others}
+
+
+def _fused(path: Path, fused: FusedMap, maps: Sequence[Path]) -> dict[str, Any]:
     """What a fused map was made of; `T_first_map` is null for a map that was left out."""
     reasons = (reason for _, reason in fused.left_out)
     motions = zip(maps, map(_motion, fused.T_first_map), strict=True)
@@ -93,7 +103,7 @@ def of_fused(path: Path, seed: int, fused: FusedMap, maps: Sequence[Path]) -> di
     several = int(((fused.parents >= 0).sum(axis=1) > 1).sum())
     found = {"n_landmarks": len(fused.landmarks), "n_fused_of_several": several}
     found |= {"duplicate_share": fused.duplicate_share}
-    return {"seed": seed, "map": path, "maps": sources} | found
+    return {"map": path, "maps": sources} | found
 
 
 def of_checks(checks: Sequence[CheckedScenario]) -> dict[str, Any]:
@@ -108,4 +118,5 @@ def _check(check: CheckedScenario) -> dict[str, Any]:
         for each in check.outcomes
     ]
     told = {"scenario": check.scenario, "passed": check.passed, "error": check.error or None}
+    told |= {"merged_nothing": list(check.unmerged)}
     return told | {"elapsed_s_by_seed": check.elapsed_s, "outcomes": outcomes}

@@ -23,6 +23,8 @@ def write_junit(path: Path, checks: Sequence[CheckedScenario]) -> None:
                 ET.SubElement(case, "error", message=plain(check.error))
             elif seed is None:
                 ET.SubElement(case, "skipped", message="another scenario cannot be read")
+            elif seed in check.unmerged:
+                ET.SubElement(case, "failure", message=check.unmerged[seed].text)
         for outcome in check.outcomes:
             _add_outcome(_case(suite, check, outcome.metric), outcome)
         _count(suite)

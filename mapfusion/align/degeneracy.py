@@ -1,6 +1,7 @@
 """Whether the landmarks of pairs can determine a motion of the plane."""
 
 import numpy as np
+from numba import njit
 
 from mapfusion.align.pairs import Pairs
 from mapfusion.chi_square import chi_square_bound
@@ -10,44 +11,57 @@ from mapfusion.se2 import Float
 SHAPE_FALSE_ALARM = 1e-3
 
 
-def lacks_extent(p: Float, covariance_m2: Float, dimensions: int) -> bool:
-    """Whether points (N, 2) may lie on one point (dimensions 1) or on one line (dimensions 2).
+def lacks_extent(p: Float, covariance_m2: Float, drift_m2: float, dimensions: int) -> bool:
+    """Whether points may lie on one point of the plane (dimensions 1) or on one line (2).
 
-    Exact zeros never occur: the spread along the weakest of the strongest `dimensions` principal
-    axes is compared with what the landmarks' own noise, (2, 2) in the mean, along it would give
-    (chi-square).
+    Points are (N, 2 or more), N at least 1, with covariances (N, 2 or more, likewise) and s_drift^2
+    on top of each. Exact zeros never occur: the spread along the weakest of the strongest
+    `dimensions` principal axes is compared with what the noise along it would give (chi-square).
     """
-    centred = p - _mean(p)
-    spread, axes = np.linalg.eigh(centred.T @ centred)  # ascending
+    scatter, noise_m2, largest = _moments(p, covariance_m2)
+    spread, axes = np.linalg.eigh(scatter)  # ascending
     axis = axes[:, 2 - dimensions]
-    noise = axis @ covariance_m2 @ axis
+    noise = axis @ noise_m2 @ axis + drift_m2
     # rounding alone leaves this much, as in numpy.linalg.matrix_rank
-    rounding = (len(p) * np.finfo(np.float64).eps * np.abs(p).max()) ** 2
+    rounding = (len(p) * np.finfo(np.float64).eps * largest) ** 2
     freedom = max(len(p) - dimensions, 1)
     most = noise * chi_square_bound(1 - SHAPE_FALSE_ALARM, freedom) + rounding
     return bool(spread[2 - dimensions] <= most)
 
 
-def _mean(values: Float) -> Float:
-    """Mean of N small arrays: as one product, since NumPy sums short rows slowly."""
-    n = len(values)
-    return (np.full(n, 1 / n) @ values.reshape(n, -1)).reshape(values.shape[1:])
+@njit(cache=True)
+def _moments(p: Float, covariance_m2: Float) -> tuple[Float, Float, float]:
+    """In plan: scatter about the mean (2, 2), mean covariance (2, 2), largest coordinate."""
+    n = len(p)
+    middle, scatter, mean = np.zeros(2), np.zeros((2, 2)), np.zeros((2, 2))
+    largest = 0.0
+    for i in range(n):
+        for k in range(2):
+            middle[k] += (p[i, k] - p[0, k]) / n  # far from the origin as exact as near it
+            largest = max(largest, abs(p[i, k]))
+            for j in range(2):
+                mean[k, j] += covariance_m2[i, k, j] / n
+    for i in range(n):
+        for k in range(2):
+            for j in range(2):
+                off_j = p[i, j] - p[0, j] - middle[j]
+                scatter[k, j] += (p[i, k] - p[0, k] - middle[k]) * off_j
+    return scatter, mean, largest
 
 
 def why_one_place(pairs: Pairs, drift_m2: float = 0.0) -> str:
     """Why the angle between the maps is open: all pairs (1 or more) lie on one point of either."""
-    drift = drift_m2 * np.eye(2)
     for name, p, covariance in (
         ("a", pairs.p_a, pairs.covariance_a),
         ("b", pairs.p_b, pairs.covariance_b),
     ):
-        if lacks_extent(p[:, :2], _mean(covariance)[:2, :2] + drift, 1):
+        if lacks_extent(p, covariance, drift_m2, 1):
             return f"in plan map {name}'s landmarks lie on one point, as far as noise can tell"
     return ""
 
 
 def why_one_line(pairs: Pairs) -> str:
     """Why an affine map from b to a is open: in plan all of map b's landmarks lie on one line."""
-    if lacks_extent(pairs.p_b[:, :2], _mean(pairs.covariance_b)[:2, :2], 2):
+    if lacks_extent(pairs.p_b, pairs.covariance_b, 0.0, 2):
         return "in plan the landmarks of map b lie on one line, as far as their noise can tell"
     return ""

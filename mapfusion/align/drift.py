@@ -13,23 +13,24 @@ from mapfusion.se2 import Float
 
 # Below this nothing is measured: it only keeps the weights of noise-free data finite.
 DRIFT_FLOOR_M = 1e-6
-_TOLERANCE = 1e-9  # relative change of s_drift^2 that ends the search
-_MAX_STEPS = 100
+_TOLERANCE = 1e-9  # relative step of s_drift^2 that ends the search
+_MAX_STEPS = 100  # a dozen are the rule
+# g^2 / 2v from which on the gate's term is lost in rounding: x exp(-x) is below 2^-53
+_BEYOND = 41.0
 _MOTION_PARAMETERS = 3
 
 
 @njit(cache=True)
-def drift_step(
+def _scoring(
     residual_m: Float, covariance_m2: Float, weight: Float, variance_m2: float, gate_m: float
 ) -> float:
-    """One step of Fisher scoring for s_drift^2, the variance per axis common to all residuals.
+    """How far Fisher scoring moves s_drift^2, the variance per axis common to all residuals.
 
     The log-likelihood of a residual e with C = S + s_drift^2 I, given that it fell inside a gate of
     radius g, is -log|C|/2 - e' C^-1 e/2 - log(1 - exp(-g^2 / 2v)) with v = tr C / 2. The last term
     is exact for isotropic C and small otherwise, since a gate is wide. The three parameters that
     the fitted motion took from the 2N numbers are made good by their share.
-    S = S_a + R S_b R^T is (N, 2, 2), `weight` (N,) 0 to 1 how surely each pair is true. The next
-    s_drift^2 is at least DRIFT_FLOOR_M squared.
+    S = S_a + R S_b R^T is (N, 2, 2), `weight` (N,) 0 to 1 how surely each pair is true.
     """
     numbers = 2 * np.sum(weight)
     share = numbers / max(numbers - _MOTION_PARAMETERS, 1.0)
@@ -43,23 +44,50 @@ def drift_step(
         wx = ixx * residual_m[i, 0] + ixy * residual_m[i, 1]
         wy = ixy * residual_m[i, 0] + iyy * residual_m[i, 1]
         expected = ixx + iyy
-        if gate_m < math.inf:
-            v = (xx + yy) / 2
+        v = (xx + yy) / 2
+        if gate_m * gate_m < 2 * _BEYOND * v:
             outside = math.exp(-gate_m * gate_m / (2 * v))
             expected -= outside / (1 - outside) * gate_m * gate_m / (v * v)
         score += weight[i] * (share * (wx * wx + wy * wy) - expected)
         information += weight[i] * (ixx * ixx + 2 * ixy * ixy + iyy * iyy)
-    return max(variance_m2 + score / information, DRIFT_FLOOR_M * DRIFT_FLOOR_M)
+    return score / information
+
+
+@njit(cache=True)
+def drift_step(
+    residual_m: Float, covariance_m2: Float, weight: Float, variance_m2: float, gate_m: float
+) -> float:
+    """s_drift^2 after one step of Fisher scoring, at least DRIFT_FLOOR_M squared."""
+    step = _scoring(residual_m, covariance_m2, weight, variance_m2, gate_m)
+    return max(variance_m2 + step, DRIFT_FLOOR_M * DRIFT_FLOOR_M)
 
 
 @njit(cache=True)
 def _climb(residual_m: Float, covariance_m2: Float, variance_m2: float, gate_m: float) -> float:
-    weight = np.ones(len(residual_m))
+    """s_drift^2 (at least the floor) where Fisher scoring takes no step.
+
+    Of landmarks known to a micrometre and to a decimetre, the sure ones make the information and
+    the others the score: plain steps creep, or go to and fro for ever. The secant through the last
+    two of them meets zero soon, and between a place that is too low and one that is too high there
+    is one.
+    """
+    floor, weight = DRIFT_FLOOR_M * DRIFT_FLOOR_M, np.ones(len(residual_m))
+    low, high = 0.0, math.inf
+    before, step_before = math.inf, 0.0
     for _ in range(_MAX_STEPS):
-        before = variance_m2
-        variance_m2 = drift_step(residual_m, covariance_m2, weight, variance_m2, gate_m)
-        if abs(variance_m2 - before) <= _TOLERANCE * variance_m2:
+        step = _scoring(residual_m, covariance_m2, weight, variance_m2, gate_m)
+        if abs(step) <= _TOLERANCE * variance_m2 or (variance_m2 <= floor and step < 0):
             break
+        if step > 0:
+            low = variance_m2
+        else:
+            high = variance_m2
+        # of a constant, which all landmarks equally sure leave, the slope is -1
+        slope = (step - step_before) / (variance_m2 - before) if before < math.inf else -1.0
+        before, step_before = variance_m2, step
+        variance_m2 = max(variance_m2 - step / (slope if slope < 0 else -1.0), floor)
+        if not low < variance_m2 < high:
+            variance_m2 = math.sqrt(max(low, floor) * high)
     return variance_m2
 
 

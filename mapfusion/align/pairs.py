@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numba import njit
 
 from mapfusion.align.correspondences import Correspondences, HeightGate
 from mapfusion.align.mahalanobis_gate import PlanarPairs
@@ -91,12 +92,7 @@ class Pairs:
 
     def in_plan(self) -> PlanarPairs:
         """The pairs without their heights, for the kernels."""
-        return PlanarPairs(
-            np.ascontiguousarray(self.p_a[:, :2]),
-            np.ascontiguousarray(self.p_b[:, :2]),
-            np.ascontiguousarray(self.covariance_a[:, :2, :2]),
-            np.ascontiguousarray(self.covariance_b[:, :2, :2]),
-        )
+        return _in_plan(self.p_a, self.p_b, self.covariance_a, self.covariance_b)
 
     def of_one_height(self, gate: HeightGate) -> np.ndarray:
         """Rows (n,) of the pairs whose heights agree; of planar maps all."""
@@ -110,6 +106,18 @@ class Pairs:
                 self.covariance_b[:, 2, 2],
             )
         )
+
+
+@njit(cache=True)
+def _in_plan(p_a: Float, p_b: Float, covariance_a: Float, covariance_b: Float) -> PlanarPairs:
+    n = len(p_a)
+    plan = PlanarPairs(np.empty((n, 2)), np.empty((n, 2)), np.empty((n, 2, 2)), np.empty((n, 2, 2)))
+    for i in range(n):
+        for k in range(2):
+            plan.p_a[i, k], plan.p_b[i, k] = p_a[i, k], p_b[i, k]
+            for j in range(2):
+                plan.S_a[i, k, j], plan.S_b[i, k, j] = covariance_a[i, k, j], covariance_b[i, k, j]
+    return plan
 
 
 def why_too_few(map_a: LandmarkMap, map_b: LandmarkMap, n_pairs: int, needed: int) -> str:

@@ -5,7 +5,8 @@ import math
 import numpy as np
 from numba import njit
 
-from mapfusion.se2 import Float, rotation, transform_points
+from mapfusion.planar import add_turned, lever, residual
+from mapfusion.se2 import Float, rotation
 
 
 @njit(cache=True)
@@ -66,18 +67,29 @@ def fit_two(p_a: Float, p_b: Float, i: int, j: int, T_a_b: Float) -> float:
     return math.sqrt(min(ax * ax + ay * ay, bx * bx + by * by))
 
 
+@njit(cache=True)
 def residuals(T_a_b: Float, p_a: Float, p_b: Float) -> Float:
     """p_a - T_a_b p_b in the plane (N, 2)."""
-    return (p_a - transform_points(T_a_b, p_b))[:, :2]
+    cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+    found = np.empty((len(p_a), 2))
+    for i in range(len(p_a)):
+        found[i, 0], found[i, 1] = residual(T_a_b, cos, sin, p_a, p_b, i)
+    return found
 
 
+@njit(cache=True)
 def residual_covariances(T_a_b: Float, covariance_a: Float, covariance_b: Float) -> Float:
     """S_a + R S_b R^T in the plane (N, 2, 2): what the landmarks' own noise makes of a residual."""
-    R_a_b = rotation(T_a_b[2])
-    # R S R^T, row by row of S: one product of matrices instead of two for every landmark
-    turn = (R_a_b[:, None, :, None] * R_a_b[None, :, None, :]).reshape(4, 4)
-    turned = covariance_b[:, :2, :2].reshape(-1, 4) @ turn.T
-    return covariance_a[:, :2, :2] + turned.reshape(-1, 2, 2)
+    cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+    found = np.empty((len(covariance_a), 2, 2))
+    for i in range(len(covariance_a)):
+        S_a, S_b = covariance_a[i], covariance_b[i]
+        xx, xy, yy = S_a[0, 0], S_a[0, 1], S_a[1, 1]
+        xx, xy, yy = add_turned(xx, xy, yy, cos, sin, S_b[0, 0], S_b[0, 1], S_b[1, 1])
+        found[i, 0, 0] = xx
+        found[i, 0, 1] = found[i, 1, 0] = xy
+        found[i, 1, 1] = yy
+    return found
 
 
 def least_squares_gain(T_a_b: Float, p_b: Float, weight: Float | None = None) -> Float:
@@ -86,24 +98,57 @@ def least_squares_gain(T_a_b: Float, p_b: Float, weight: Float | None = None) ->
     To first order T_a_b's error is the sum of the gains (N, 3, 2) times the residuals.
     p_b are (N, 2 or more), not all in one place; weights (N,) are all equal by default.
     """
-    jacobian = motion_jacobian(T_a_b, p_b)
-    if weight is None:
-        weight = np.ones(len(p_b))
-    weighted = jacobian * weight[:, None, None]
-    normal = weighted.reshape(-1, 3).T @ jacobian.reshape(-1, 3)
-    gain = weighted.reshape(-1, 3) @ np.linalg.inv(normal)  # which is symmetric
-    return np.swapaxes(gain.reshape(-1, 2, 3), 1, 2)
+    given = np.ones(len(p_b)) if weight is None else weight
+    inverse: Float = np.linalg.inv(_normal_matrix(T_a_b, p_b, given)).astype(np.float64, copy=False)
+    return _gain(T_a_b, p_b, given, inverse)
 
 
+@njit(cache=True)
+def _normal_matrix(T_a_b: Float, p_b: Float, weight: Float) -> Float:
+    """Sum of weight J'J (3, 3), J the `motion_jacobian` of a point."""
+    cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+    total = x = y = square = 0.0
+    for i in range(len(p_b)):
+        jx, jy = lever(cos, sin, p_b, i)
+        total += weight[i]
+        x += weight[i] * jx
+        y += weight[i] * jy
+        square += weight[i] * (jx * jx + jy * jy)
+    return np.array([[total, 0.0, x], [0.0, total, y], [x, y, square]])
+
+
+@njit(cache=True)
+def _gain(T_a_b: Float, p_b: Float, weight: Float, inverse: Float) -> Float:
+    """Weight times the normal matrix' inverse (3, 3) times J' (N, 3, 2)."""
+    cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+    gain = np.empty((len(p_b), 3, 2))
+    for i in range(len(p_b)):
+        jx, jy = lever(cos, sin, p_b, i)
+        for k in range(3):
+            gain[i, k, 0] = weight[i] * (inverse[k, 0] + inverse[k, 2] * jx)
+            gain[i, k, 1] = weight[i] * (inverse[k, 1] + inverse[k, 2] * jy)
+    return gain
+
+
+@njit(cache=True)
 def motion_covariance(gain: Float, covariance_m2: Float) -> Float:
     """Covariance (3, 3) of a motion from its gains (N, 3, 2) and independent residuals' (N, 2, 2).
 
     Weights that are not the inverse covariances make it larger than the inverse of the normal
     matrix: this is the sandwich of the two.
     """
-    x, y = gain[:, :, 0], gain[:, :, 1]
-    xx, xy, yy = covariance_m2[:, 0, 0], covariance_m2[:, 0, 1], covariance_m2[:, 1, 1]
-    return (x.T * xx + y.T * xy) @ x + (x.T * xy + y.T * yy) @ y
+    total = np.zeros((3, 3))
+    for i in range(len(gain)):
+        xx, xy, yy = covariance_m2[i, 0, 0], covariance_m2[i, 0, 1], covariance_m2[i, 1, 1]
+        for k in range(3):
+            x, y = gain[i, k, 0], gain[i, k, 1]
+            along_x, along_y = x * xx + y * xy, x * xy + y * yy
+            for j in range(k + 1):
+                total[k, j] += along_x * gain[i, j, 0] + along_y * gain[i, j, 1]
+    for k in range(3):
+        for j in range(k):
+            total[j, k] = total[k, j]
+    return total
 
 
 def motion_jacobian(T_a_b: Float, p_b: Float) -> Float:

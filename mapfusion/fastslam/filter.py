@@ -184,9 +184,12 @@ class FastSlam:
     def _noise(self, observations: Observations) -> tuple[Float, Float]:
         """R_t (K, 3, 3) with the filter's own additions, and log p_new (K,)."""
         settings = self.parameters
-        noise = settings.noise_scale**2 * observations.covariance_m2
-        noise = noise + settings.noise_floor_m**2 * np.eye(3)
-        log_new = log_density_at_gate(noise, settings.gate, self._planar)
+        noise = observations.covariance_m2 + settings.noise_floor_m**2 * np.eye(3)
+        # The landmark seen once has lost its track. Without its stray no match, however good, would
+        # outweigh a new landmark at a near wall, where R is a fraction of a millimetre.
+        stray_m = 0.0 if observations.track is None else settings.stray_m
+        seen_once = noise + stray_m**2 * np.eye(3)
+        log_new = log_density_at_gate(seen_once, settings.gate, self._planar)
         if settings.log_new_landmark_density is not None:
             log_new[:] = settings.log_new_landmark_density
         return noise, log_new

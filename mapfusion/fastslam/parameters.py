@@ -26,16 +26,12 @@ class FastSlamParameters:
         descriptor_threshold: largest Euclidean distance of matching descriptors (unit vectors).
         resample_fraction: resample when the effective sample size is at most this share of M;
             0 never, 1 in every step.
-        noise_scale: factor on the observations' standard deviations; the paper's is 1. Above 1 for
-            errors that are alike from frame to frame, as those of a corner are. Taken as
-            independent news they make each particle's map so certain that no particle finds its
-            old landmarks again when a loop closes.
         stray_m: standard deviation, along each axis, by which the point that one track of
             observations is of lies beside the landmark; the next track's lies elsewhere.
         noise_floor_m: standard deviation added to each coordinate of an observation.
         log_new_landmark_density: log of p_new in 1/m^3 (1/m^2 in planar data), the density of an
             observation that matches nothing; None: that of a match exactly at the gate, with the
-            covariance of a landmark seen once.
+            covariance of a landmark seen once, and its stray if it has a track.
         planar: z carries no information; gates and weights have 2 degrees of freedom. None: as the
             log says; of a filter without a log, no.
     """
@@ -47,7 +43,6 @@ class FastSlamParameters:
     gate_probability: Probability = 0.9999
     descriptor_threshold: Annotated[float, Range(1e-3, 2, "1")] = 0.5
     resample_fraction: Annotated[float, Range(0, 1, "1")] = 0.5
-    noise_scale: Annotated[float, Range(0.01, 100, "1")] = 1.0
     stray_m: Annotated[float, Range(0, 10, "m")] = 0.004
     noise_floor_m: Annotated[float, Range(0, 10, "m")] = 0.0
     log_new_landmark_density: Annotated[float, Range(-100, 100, "ln 1/m^3")] | None = None

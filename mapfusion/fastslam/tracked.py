@@ -5,6 +5,7 @@ about the one is less so about the other, and about the point that the next trac
 """
 
 import numpy as np
+from numba import njit
 
 from mapfusion.fastslam.slots import Slots
 
@@ -35,7 +36,26 @@ class Tracked:
         if track is None:
             self._track = self._slot = self._source = np.empty(0, dtype=np.int64)
             return
-        row, m = np.nonzero(chosen >= 0)
-        pairs = np.unique(np.concatenate([np.stack([row, chosen[row, m]], 1), created]), axis=0)
+        pairs = np.concatenate([_distinct(chosen), created])
         self._track, self._slot = track[pairs[:, 0]], pairs[:, 1]
         self._source = slots.source[self._slot]
+
+
+@njit(cache=True)
+def _distinct(chosen: np.ndarray) -> np.ndarray:
+    """Rows and slots (n, 2) of `chosen` (K, M), each once: most particles choose the same slot."""
+    pairs = np.empty((chosen.size, 2), dtype=np.int64)
+    n = 0
+    for k in range(chosen.shape[0]):
+        first = n
+        for m in range(chosen.shape[1]):
+            s = chosen[k, m]
+            if s < 0:
+                continue
+            known = False
+            for i in range(first, n):
+                known = known or pairs[i, 1] == s
+            if not known:
+                pairs[n, 0], pairs[n, 1] = k, s
+                n += 1
+    return pairs[:n].copy()

@@ -1,8 +1,8 @@
-"""The normal equations solved: either all landmarks are eliminated first, or all poses.
+"""The normal equations solved: landmarks and their tracks are eliminated first, or all poses.
 
-Both are exact. With the landmarks gone a dense system of the poses is left, with the poses gone,
-which are a chain, one of the landmarks: the smaller of the two is taken. The first pose is the
-frame and no unknown.
+Both are exact. With the landmarks gone a dense system of the poses is left; with the poses gone,
+which are a chain, one of the landmarks and tracks: the smaller of the two is taken. The first pose
+is the frame and no unknown.
 """
 
 from typing import NamedTuple
@@ -13,8 +13,12 @@ from numba import njit
 
 from mapfusion.se2 import Float
 from mapfusion.smoother.normal_equations import Estimate, NormalEquations
+from mapfusion.smoother.offsets import Reduced, without_offsets
 from mapfusion.smoother.sightings import Sightings
 
+_ITEM = np.dtype(np.float64).itemsize
+_COPIES = 3  # of a matrix that are there at once: as it is made, in LAPACK's order, and solved
+_AT_ONCE = 256  # landmarks whose part in all poses is made as a matrix of its own
 _BAND = 5  # below the diagonal of a chain of poses of three coordinates
 
 
@@ -22,38 +26,94 @@ class Solution(NamedTuple):
     """A step, and what the landmarks' joint covariance is: block diagonal plus common' common.
 
     Attributes:
-        step: of the poses, the first one's zero, and of the landmarks.
-        decrease: of the squared sigmas, twice what the step would gain if all were linear.
-        own_m2: (L, 3, 3) covariance of each landmark if all that is eliminated later were known.
+        step: of the poses, the first one's zero, of the landmarks and of the offsets.
+        moved: how far the step moves what was eliminated last, in squared sigmas.
+        own_m2: (L, 3, 3) covariance of each landmark if the path were known.
+        offset_m2: (B, 3, 3) of each track's offset, likewise.
+        track_m2: (B, 3, 3) of each track's point, likewise.
         factor: lower Cholesky factor of the information of what was eliminated last.
-        landmarks_first: whether these are the poses (else the landmarks).
+        landmarks_first: whether these are the poses (else the offsets and, after them, landmarks).
     """
 
     step: Estimate
-    decrease: float
+    moved: float
     own_m2: Float
+    offset_m2: Float
+    track_m2: Float
     factor: Float
     landmarks_first: bool
 
 
 def solve(seen: Sightings, equations: NormalEquations) -> Solution:
     """The step that solves the equations."""
-    landmarks_first = len(equations.pose_block) - 1 < len(equations.point_block)
-    return (_landmarks_first if landmarks_first else _poses_first)(seen, equations)
+    first = _is_landmarks_first(seen, len(equations.pose_block))
+    return (_landmarks_first if first else _poses_first)(seen, equations)
+
+
+def matrix_bytes(seen: Sightings, n_poses: int) -> int:
+    """Memory that the dense matrices take at most, in bytes: grows as the square of the log."""
+    if _is_landmarks_first(seen, n_poses):  # the last factor, then a system or the common part
+        n, n_landmarks = 3 * n_poses, 3 * seen.n_landmarks
+        return _ITEM * n * (2 * n + max(n, n_landmarks))
+    n = 3 * _n_points(seen)
+    return _ITEM * _COPIES * n * (n + 3 * n_poses)
+
+
+def _is_landmarks_first(seen: Sightings, n_poses: int) -> bool:
+    return n_poses - 1 < _n_points(seen)
+
+
+def _n_points(seen: Sightings) -> int:
+    return seen.n_landmarks + int(np.count_nonzero(seen.strays))
 
 
 def common_part(seen: Sightings, equations: NormalEquations, solution: Solution) -> Float:
     """(R, 3L) Y: the landmarks' joint covariance is block diagonal of `own_m2` plus Y' Y."""
     if not solution.landmarks_first:
-        n = len(solution.factor)
-        return scipy.linalg.solve_triangular(solution.factor, np.eye(n), lower=True)
-    n_poses, n_points = len(equations.pose_block), len(equations.point_block)
-    wide = np.zeros((n_poses, n_points, 3, 3))
-    np.add.at(
-        wide, (seen.frame, seen.landmark), equations.coupling @ solution.own_m2[seen.landmark]
-    )
-    right = wide.transpose(0, 2, 1, 3).reshape(3 * n_poses, 3 * n_points)[3:]
-    return scipy.linalg.solve_triangular(solution.factor, right, lower=True, check_finite=False)
+        return _beside_own(solution)
+    coupling = without_offsets(seen, equations).coupling @ solution.own_m2[seen.landmark]
+    n, n_landmarks = len(solution.factor), seen.n_landmarks
+    common = np.zeros((n // 3, 3, n_landmarks, 3))
+    first_seen = np.maximum(np.minimum.reduceat(seen.frame, seen.starts[:-1]) - 1, 0)
+    order = np.argsort(first_seen, kind="stable")
+    for at in range(0, n_landmarks, _AT_ONCE):
+        some = order[at : at + _AT_ONCE]
+        first = first_seen[some].min()  # poses before these landmarks were seen have no part
+        place = np.full(n_landmarks, -1)
+        place[some] = np.arange(len(some))
+        rows = np.flatnonzero((place[seen.landmark] >= 0) & (seen.frame > 0))
+        wide = np.zeros((n // 3 - first, len(some), 3, 3))
+        np.add.at(wide, (seen.frame[rows] - 1 - first, place[seen.landmark[rows]]), coupling[rows])
+        right = wide.transpose(0, 2, 1, 3).reshape(n - 3 * first, -1)
+        below = solution.factor[3 * first :, 3 * first :]
+        solved = scipy.linalg.solve_triangular(below, right, lower=True, check_finite=False)
+        common[first:, :, some] = solved.reshape(-1, 3, len(some), 3)
+    return common.reshape(n, -1)
+
+
+def pose_covariances(
+    seen: Sightings, equations: NormalEquations, solution: Solution, frames: np.ndarray
+) -> Float:
+    """(n, 3, 3) covariance of each pose of these frames (n,), none the first."""
+    n_unknown, n = len(equations.pose_block) - 1, len(frames)
+    chosen = np.zeros((n_unknown, 3, n, 3))
+    chosen[frames - 1, :, np.arange(n)] = np.eye(3)
+    right, alone = chosen.reshape(3 * n_unknown, 3 * n), 0.0
+    if not solution.landmarks_first:  # the errors of the path if all points were known, and theirs
+        solved = scipy.linalg.cho_solve_banded((_chain(equations), True), right)
+        right, alone = _points(seen, equations)[0].T @ solved, right.T @ solved
+    root = scipy.linalg.solve_triangular(solution.factor, right, lower=True, check_finite=False)
+    return (root.T @ root + alone).reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
+
+
+def _beside_own(solution: Solution) -> Float:
+    """Y (3L, 3L) from the landmarks' information: what the path's errors add to `own_m2`."""
+    n, each = len(solution.own_m2), np.arange(len(solution.own_m2))
+    factor = solution.factor[-3 * n :, -3 * n :]  # the last rows are that of what is left
+    joint = scipy.linalg.cho_solve((factor, True), np.eye(3 * n), check_finite=False)
+    joint.reshape(n, 3, n, 3)[each, :, each, :] -= solution.own_m2
+    variance, direction = np.linalg.eigh(joint)
+    return (np.sqrt(np.maximum(variance, 0.0)) * direction).T[::-1]
 
 
 def _landmarks_first(seen: Sightings, equations: NormalEquations) -> Solution:
@@ -62,30 +122,50 @@ def _landmarks_first(seen: Sightings, equations: NormalEquations) -> Solution:
     blocks, each = S.reshape(n, 3, n, 3), np.arange(n)
     blocks[each, :, each, :] = equations.pose_block
     blocks[each[1:], :, each[:-1], :] = equations.link
-    own = np.asarray(np.linalg.inv(_regular(seen, equations.point_block)), np.float64)
-    gradient = equations.pose_gradient.copy()
-    _subtract_landmarks(
-        seen.arrays[:2], equations.coupling, own, equations.point_gradient, S, gradient
+    gradient, left = equations.pose_gradient.copy(), without_offsets(seen, equations)
+    own = np.asarray(np.linalg.inv(_regular(seen, left.point_block)), np.float64)
+    _subtract(
+        seen.track_starts, seen.frame, equations.coupling, left.own_m2, left.pull, S, gradient
     )
+    _subtract(seen.starts, seen.frame, left.coupling, own, left.point_gradient, S, gradient)
     factor = scipy.linalg.cholesky(S[3:, 3:], lower=True, check_finite=False)
     way = np.zeros((n, 3))
     way[1:] = -scipy.linalg.cho_solve((factor, True), gradient[1:].ravel()).reshape(-1, 3)
-    moved = seen.sum_by_landmark(np.einsum("nij,ni->nj", equations.coupling, way[seen.frame]))
-    points = -np.einsum("lij,lj->li", own, equations.point_gradient + moved)
-    return _solution(seen, equations, Estimate(way, points), own, factor, True)
+    moved = seen.sum_by_landmark(_along(left.coupling, way[seen.frame]))
+    points = -np.einsum("lij,lj->li", own, left.point_gradient + moved)
+    step = Estimate(way, points, _offsets(seen, equations, left, way, points))
+    return _solution(seen, left, step, own, factor, True)
+
+
+def _along(coupling: Float, way: Float) -> Float:
+    """Coupling' way, (N, 3), by observation."""
+    return np.einsum("nij,ni->nj", coupling, way)
+
+
+def _offsets(
+    seen: Sightings, equations: NormalEquations, left: Reduced, way: Float, points: Float
+) -> Float:
+    """The step (B, 3) of the offsets that belongs to one of path and landmarks."""
+    moved = seen.sum_by_track(_along(equations.coupling, way[seen.frame]))
+    pulled = np.einsum("tij,tj->ti", equations.track_block, points[seen.landmark_of_track])
+    return -np.einsum("tij,tj->ti", left.own_m2, left.pull + moved + pulled)
 
 
 @njit(cache=True)
-def _subtract_landmarks(
-    seen: tuple[np.ndarray, np.ndarray],
+def _subtract(
+    starts: np.ndarray,
+    frame: np.ndarray,
     coupling: Float,
     own: Float,
     point_gradient: Float,
     S: Float,
     gradient: Float,
 ) -> None:
-    """Coupling A^-1 coupling' of each landmark, between all frames that saw it; the lower half."""
-    starts, frame = seen
+    """Coupling A^-1 coupling' of each point, between all frames that saw it; the lower half.
+
+    Points are tracks' offsets or landmarks, each with the rows from one of `starts` to the next.
+    Those that are not known to any extent (own covariance 0) have nothing to be subtracted.
+    """
     gain = np.empty((3, 3))
     for j in range(len(starts) - 1):
         b = point_gradient[j]
@@ -101,34 +181,58 @@ def _subtract_landmarks(
                 column, G = 3 * frame[k], coupling[k]
                 for r in range(3):
                     for q in range(3):
-                        S[row + r, column + q] -= (
-                            gain[r, 0] * G[q, 0] + gain[r, 1] * G[q, 1] + gain[r, 2] * G[q, 2]
-                        )
+                        value = gain[r, 0] * G[q, 0] + gain[r, 1] * G[q, 1] + gain[r, 2] * G[q, 2]
+                        if column <= row:
+                            S[row + r, column + q] -= value
+                        if column >= row and k != i:  # tracks are not in the order of frames
+                            S[column + q, row + r] -= value
 
 
 def _poses_first(seen: Sightings, equations: NormalEquations) -> Solution:
-    n_poses, n_points = len(equations.pose_block), len(equations.point_block)
-    wide = np.zeros((n_poses, n_points, 3, 3))
-    np.add.at(wide, (seen.frame, seen.landmark), equations.coupling)
-    B = wide.transpose(0, 2, 1, 3).reshape(3 * n_poses, 3 * n_points)[3:]
-    chain = scipy.linalg.cholesky_banded(_banded(equations)[:, 3:], lower=True, check_finite=False)
+    n_poses, n_offsets = len(equations.pose_block), 3 * np.count_nonzero(seen.strays)
+    B, K, gradient = _points(seen, equations)
+    chain = _chain(equations)
     right = np.column_stack([B, equations.pose_gradient[1:].ravel()])
     solved = scipy.linalg.cho_solve_banded((chain, True), right, check_finite=False)
-    K = -B.T @ solved[:, :-1]
-    each = np.arange(n_points)
-    blocks = K.reshape(n_points, 3, n_points, 3)
-    blocks[each, :, each, :] += _regular(seen, equations.point_block)
-    factor = scipy.linalg.cholesky(K, lower=True, check_finite=False)
-    right = equations.point_gradient.ravel() - B.T @ solved[:, -1]
-    points = -scipy.linalg.cho_solve((factor, True), right)
-    way = np.zeros((n_poses, 3))
+    factor = scipy.linalg.cholesky(K - B.T @ solved[:, :-1], lower=True, check_finite=False)
+    points = -scipy.linalg.cho_solve((factor, True), gradient - B.T @ solved[:, -1])
+    way, offsets = np.zeros((n_poses, 3)), np.zeros((len(seen.strays), 3))
     way[1:] = -(solved[:, -1] + solved[:, :-1] @ points).reshape(-1, 3)
-    step = Estimate(way, points.reshape(-1, 3))
-    return _solution(seen, equations, step, np.zeros((n_points, 3, 3)), factor, False)
+    offsets[seen.strays] = points[:n_offsets].reshape(-1, 3)
+    step = Estimate(way, points[n_offsets:].reshape(-1, 3), offsets)
+    left = without_offsets(seen, equations)
+    own = np.asarray(np.linalg.inv(_regular(seen, left.point_block)), np.float64)
+    return _solution(seen, left, step, own, factor, False)
 
 
-def _banded(equations: NormalEquations) -> Float:
-    """The chain of the poses as LAPACK takes a band: row d is the d-th diagonal below the main."""
+def _points(seen: Sightings, equations: NormalEquations) -> tuple[Float, Float, Float]:
+    """Of the offsets and, after them, the landmarks: block with the poses, own block, gradient."""
+    strays, n_poses = seen.strays, len(equations.pose_block)
+    row, stray = strays[seen.track], np.cumsum(strays) - 1
+    n, n_points = np.count_nonzero(strays), np.count_nonzero(strays) + seen.n_landmarks
+    wide, K = np.zeros((n_poses, n_points, 3, 3)), np.zeros((n_points, n_points, 3, 3))
+    np.add.at(wide, (seen.frame[row], stray[seen.track[row]]), equations.coupling[row])
+    np.add.at(wide, (seen.frame, n + seen.landmark), equations.coupling)
+    S, each, landmark = equations.track_block, np.arange(n_points), n + seen.landmark_of_track
+    own = np.concatenate([S[strays], _regular(seen, seen.sum_tracks(S))])
+    own[:n] += equations.offset_information[strays, None, None] * np.eye(3)
+    K[each, each] = own
+    K[landmark[strays], each[:n]] = S[strays]
+    K[each[:n], landmark[strays]] = S[strays]
+    gradient = [
+        (equations.track_gradient + equations.offset_gradient)[strays],
+        seen.sum_tracks(equations.track_gradient),
+    ]
+    as_matrix = wide.transpose(0, 2, 1, 3).reshape(3 * n_poses, 3 * n_points)[3:]
+    K = K.transpose(0, 2, 1, 3).reshape(3 * n_points, 3 * n_points)
+    return as_matrix, K, np.concatenate(gradient).ravel()
+
+
+def _chain(equations: NormalEquations) -> Float:
+    """Cholesky factor of the poses, which are a chain, but for the first.
+
+    As LAPACK takes a band: row d is the d-th diagonal below the main.
+    """
     n = 3 * len(equations.pose_block)
     band = np.zeros((_BAND + 1, n))
     for r in range(3):
@@ -136,7 +240,7 @@ def _banded(equations: NormalEquations) -> Float:
             if r >= q:
                 band[r - q, q::3] = equations.pose_block[:, r, q]
             band[3 + r - q, q : n - 3 : 3] = equations.link[:, r, q]
-    return band
+    return scipy.linalg.cholesky_banded(band[:, 3:], lower=True, check_finite=False)
 
 
 def _regular(seen: Sightings, point_block: Float) -> Float:
@@ -150,13 +254,16 @@ def _regular(seen: Sightings, point_block: Float) -> Float:
 
 def _solution(
     seen: Sightings,
-    equations: NormalEquations,
+    left: Reduced,
     step: Estimate,
     own_m2: Float,
     factor: Float,
     landmarks_first: bool,
 ) -> Solution:
-    gained = np.sum(equations.pose_gradient * step.path) + np.sum(
-        equations.point_gradient * step.point_m
-    )
-    return Solution(step, -float(gained), own_m2, factor, landmarks_first)
+    last = step.path[1:] if landmarks_first else step.point_m
+    moved = float(np.sum((factor[-last.size :, -last.size :].T @ last.ravel()) ** 2))
+    of_landmark, kept = own_m2[seen.landmark_of_track], left.kept
+    follows = np.eye(3) - kept  # -db / dl
+    offset_m2 = left.own_m2 + follows @ of_landmark @ np.swapaxes(follows, 1, 2)
+    track_m2 = left.own_m2 + kept @ of_landmark @ np.swapaxes(kept, 1, 2)
+    return Solution(step, moved, own_m2, offset_m2, track_m2, factor, landmarks_first)

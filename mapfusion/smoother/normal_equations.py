@@ -1,12 +1,16 @@
-"""The normal equations of a log at a guess of path and landmarks.
+"""The normal equations of a log at a guess of path, landmarks and tracks.
 
-An observation z of landmark l from pose x = (p, theta) has the residual e = R (R^T (l - p) - z),
-turned into the map frame, so that de/dl = I and de/dx = J = [-I, lever]. The lever arm of the
-rotation is the landmark's own position: with the observed point instead, whose error is also in z,
-rotations are biased. With W the information in the map frame the equations of a step are
+An observation z of landmark l on track t from pose x = (p, theta) is of the point l + b_t, and has
+the residual e = R (R^T (l + b_t - p) - z), turned into the map frame, so that de/dl = de/db_t = I
+and de/dx = J = [-I, lever]. The lever arm of the rotation is where the point is thought to be: with
+the observed point instead, whose error is also in z, rotations are biased. With W the information
+in the map frame and P_t that of the offset b_t the equations of a step are
 
-    pose_block dx + link dx' + coupling dl = -pose_gradient,    coupling = J' W
-    coupling' dx + point_block dl = -point_gradient,            point_block = sum W
+    pose_block dx + link dx' + sum coupling (dl + db_t) = -pose_gradient,     coupling = J' W
+    sum over tracks of (coupling' dx + track_block (dl + db_t)) = -sum track_gradient
+    coupling' dx + track_block (dl + db_t) + P_t db_t = -(track_gradient + P_t b_t)
+
+with track_block = sum W and track_gradient = sum W e over the observations of a track.
 """
 
 from typing import NamedTuple
@@ -24,29 +28,46 @@ _STILL = np.array([1e-4, 1e-4, 1e-5])  # m, m, rad
 
 
 class Estimate(NamedTuple):
-    """Path (T, 3) and landmarks (L, 3), in the frame of the first pose."""
+    """Path (T, 3), landmarks (L, 3) and tracks' offsets (B, 3), in the frame of the first pose."""
 
     path: Float
     point_m: Float
+    offset_m: Float
+
+
+class Weights(NamedTuple):
+    """What robust losses make of the information: factors on it.
+
+    Attributes:
+        observation: (N,) of each observation.
+        offset: (B,) of each track's offset.
+    """
+
+    observation: Float
+    offset: Float
 
 
 class NormalEquations(NamedTuple):
-    """Of T poses and L landmarks, by blocks.
+    """Of T poses, L landmarks and B tracks, by blocks.
 
     Attributes:
         pose_block: (T, 3, 3).
         link: (T - 1, 3, 3) each pose's block with the pose before it.
         pose_gradient: (T, 3).
-        point_block: (L, 3, 3).
-        point_gradient: (L, 3).
+        track_block: (B, 3, 3).
+        track_gradient: (B, 3).
+        offset_information: (B,) P_t, the same along each axis.
+        offset_gradient: (B, 3) P_t b_t.
         coupling: (N, 3, 3) a pose's block with a landmark, by observation.
     """
 
     pose_block: Float
     link: Float
     pose_gradient: Float
-    point_block: Float
-    point_gradient: Float
+    track_block: Float
+    track_gradient: Float
+    offset_information: Float
+    offset_gradient: Float
     coupling: Float
 
 
@@ -64,27 +85,36 @@ def disturbances(path: Float, odometry: Float) -> Float:
 
 
 def normal_equations(
-    seen: Sightings, at: Estimate, weight: Float, odometry: Float, information: Float
+    seen: Sightings,
+    at: Estimate,
+    weights: Weights,
+    stray_information: float,
+    odometry: Float,
+    information: Float,
 ) -> NormalEquations:
     """The equations of the next step.
 
     Args:
         seen: the observations.
         at: where is linearised.
-        weight: (N,) factor on the information of each observation.
+        weights: of observations and offsets.
+        stray_information: of an offset along each axis, in 1/m^2.
         odometry: (T, 3) increments.
         information: (T - 1, 3) theirs.
     """
-    n_poses, n_points = len(at.path), len(at.point_m)
+    n_poses, n_tracks = len(at.path), len(at.offset_m)
+    of_offset = weights.offset * stray_information
     made = NormalEquations(
         np.zeros((n_poses, 3, 3)),
         np.zeros((n_poses - 1, 3, 3)),
         np.zeros((n_poses, 3)),
-        np.zeros((n_points, 3, 3)),
-        np.zeros((n_points, 3)),
+        np.zeros((n_tracks, 3, 3)),
+        np.zeros((n_tracks, 3)),
+        of_offset,
+        of_offset[:, None] * at.offset_m,
         np.empty((len(seen), 3, 3)),
     )
-    _add_observations(seen.arrays, at, weight, made)
+    _add_observations(seen.arrays, at, weights.observation, made)
     _add_odometry(at.path, odometry, information, made)
     return made
 
@@ -107,17 +137,18 @@ def _add_odometry(path: Float, odometry: Float, information: Float, made: Normal
 
 @njit(cache=True)
 def _add_observations(
-    seen: tuple[np.ndarray, np.ndarray, Float, Float],
+    seen: tuple[np.ndarray, np.ndarray, np.ndarray, Float, Float],
     at: Estimate,
     weight: Float,
     made: NormalEquations,
 ) -> None:
-    starts, frame, position, information = seen
-    for j in range(len(starts) - 1):
-        A, b = made.point_block[j], made.point_gradient[j]
-        for i in range(starts[j], starts[j + 1]):
+    starts, owner, frame, position, information = seen
+    for t in range(len(starts) - 1):
+        point = at.point_m[owner[t]] + at.offset_m[t]
+        A, b = made.track_block[t], made.track_gradient[t]
+        for i in range(starts[t], starts[t + 1]):
             k = frame[i]
-            W, e, J = linearised(at.path[k], at.point_m[j], position[i], information[i])
+            W, e, J = linearised(at.path[k], point, position[i], information[i])
             H, block = made.coupling[i], made.pose_block[k]
             for r in range(3):
                 for q in range(3):

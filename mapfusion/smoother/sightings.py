@@ -1,20 +1,26 @@
-"""A log as the smoother takes it: observations ordered by landmark."""
+"""A log as the smoother takes it: observations ordered by landmark and by track."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
 from mapfusion.arguments import require_shape
-from mapfusion.robot_log import RobotLog
+from mapfusion.robot_log import NO_TRACK, RobotLog
 from mapfusion.se2 import Float
 
 
 @dataclass(frozen=True)
 class Sightings:
-    """N observations of L landmarks from T poses, ordered by landmark and then by frame.
+    """N observations of L landmarks from T poses, ordered by landmark, track and frame.
+
+    All observations of a track are of one point, which lies beside the landmark. A track that went
+    into several landmarks is one for each of them. What a landmark was observed without a track
+    counts as one track, which is of the landmark itself.
 
     Attributes:
         starts: (L + 1,) row of each landmark's first observation.
+        track_starts: (B + 1,) row of each track's first observation.
+        strays: (B,) whether the track's point lies beside the landmark.
         frame: (N,) frame that each observation was made in.
         position_m: (N, 3) in the robot frame.
         information: (N, 3, 3) inverse of the stated covariances, in 1/m^2; zero in z if planar.
@@ -23,6 +29,8 @@ class Sightings:
     """
 
     starts: np.ndarray
+    track_starts: np.ndarray
+    strays: np.ndarray
     frame: np.ndarray
     position_m: Float
     information: Float
@@ -33,23 +41,56 @@ class Sightings:
         return len(self.frame)
 
     @property
-    def arrays(self) -> tuple[np.ndarray, np.ndarray, Float, Float]:
-        """What kernels take."""
-        return self.starts, self.frame, self.position_m, self.information
+    def n_landmarks(self) -> int:
+        """L."""
+        return len(self.starts) - 1
+
+    @property
+    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, Float, Float]:
+        """What kernels take: by track its rows and landmark, by row what was observed."""
+        return (
+            self.track_starts,
+            self.landmark_of_track,
+            self.frame,
+            self.position_m,
+            self.information,
+        )
 
     @property
     def landmark(self) -> np.ndarray:
         """(N,) the landmark of each observation: 0, 1, ..."""
-        return np.repeat(np.arange(len(self.starts) - 1), np.diff(self.starts))
+        return np.repeat(np.arange(self.n_landmarks), np.diff(self.starts))
+
+    @property
+    def track(self) -> np.ndarray:
+        """(N,) the track of each observation: 0, 1, ..."""
+        return np.repeat(np.arange(len(self.strays)), np.diff(self.track_starts))
+
+    @property
+    def landmark_of_track(self) -> np.ndarray:
+        """(B,)."""
+        return self.landmark[self.track_starts[:-1]]
 
     def sum_by_landmark(self, values: Float) -> Float:
         """(L, ...) sums of values (N, ...) over the observations of each landmark."""
-        if not len(self):
-            return np.zeros((0, *values.shape[1:]))
-        return np.add.reduceat(values, self.starts[:-1])
+        return _sums(values, self.starts)
+
+    def sum_by_track(self, values: Float) -> Float:
+        """(B, ...) sums of values (N, ...) over the observations of each track."""
+        return _sums(values, self.track_starts)
+
+    def sum_tracks(self, values: Float) -> Float:
+        """(L, ...) sums of values (B, ...) over the tracks of each landmark."""
+        return _sums(values, np.searchsorted(self.track_starts, self.starts))
 
 
-def sightings_of(log: RobotLog, landmark: np.ndarray, min_count: int) -> Sightings:
+def _sums(values: Float, starts: np.ndarray) -> Float:
+    if not len(values):
+        return np.zeros((0, *values.shape[1:]))
+    return np.add.reduceat(values, starts[:-1])
+
+
+def sightings_of(log: RobotLog, landmark: np.ndarray, min_count: int, *, stray: bool) -> Sightings:
     """The observations of landmarks that were seen at least `min_count` times.
 
     Args:
@@ -57,6 +98,7 @@ def sightings_of(log: RobotLog, landmark: np.ndarray, min_count: int) -> Sightin
         landmark: (N,) number of the landmark that each observation of the log is of, any integers;
             negative for none.
         min_count: observations that a landmark needs.
+        stray: whether tracks are of points beside their landmarks, else of the landmarks.
 
     Raises:
         ValueError: `landmark` is not of the log's length.
@@ -64,9 +106,14 @@ def sightings_of(log: RobotLog, landmark: np.ndarray, min_count: int) -> Sightin
     require_shape("landmark", landmark, (len(log.observations),))
     names, inverse, count = np.unique(landmark, return_inverse=True, return_counts=True)
     taken = np.flatnonzero(((names >= 0) & (count >= min_count))[inverse])
-    row = taken[np.argsort(inverse[taken], kind="stable")]
-    own = inverse[row]
-    starts = np.append(np.flatnonzero(np.diff(own, prepend=-1)), len(row))
+    track = log.observations.track
+    track = track if stray and track is not None else np.full(len(landmark), NO_TRACK)
+    row = taken[np.lexsort((track[taken], inverse[taken]))]
+    another = np.diff(inverse[row], prepend=-1) != 0
+    starts = np.append(np.flatnonzero(another), len(row))
+    another |= np.diff(track[row], prepend=NO_TRACK) != 0
+    first = np.flatnonzero(another)
+    strays, track_starts = track[row[first]] != NO_TRACK, np.append(first, len(row))
     information = np.zeros((len(row), 3, 3))
     n = 2 if log.planar else 3
     covariance = log.observations.covariance_m2[row, :n, :n]
@@ -74,4 +121,5 @@ def sightings_of(log: RobotLog, landmark: np.ndarray, min_count: int) -> Sightin
     position = np.ascontiguousarray(log.observations.position_m[row], dtype=np.float64)
     if log.planar:
         position[:, 2] = 0.0
-    return Sightings(starts, log.iteration[row].astype(np.int64), position, information, row, n)
+    frame = log.iteration[row].astype(np.int64)
+    return Sightings(starts, track_starts, strays, frame, position, information, row, n)

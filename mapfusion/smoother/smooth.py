@@ -1,6 +1,6 @@
-"""The most probable path and landmarks of a whole log: Gauss-Newton on the poses."""
+"""The most probable path and landmarks of a whole log."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import numpy as np
@@ -8,22 +8,18 @@ import numpy as np
 from mapfusion.arguments import Range, require_in_range, require_shape
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.robot_log import RobotLog
-from mapfusion.se2 import Float, between, wrap
-from mapfusion.smoother.elimination import common_part, solve
-from mapfusion.smoother.normal_equations import (
-    Estimate,
-    disturbances,
-    normal_equations,
-    odometry_information,
-)
-from mapfusion.smoother.residuals import first_points, squared_distances
+from mapfusion.se2 import Float, between
+from mapfusion.smoother.elimination import common_part
+from mapfusion.smoother.normal_equations import Estimate, Weights, odometry_information
+from mapfusion.smoother.residuals import first_points
+from mapfusion.smoother.robust import Tails
+from mapfusion.smoother.settle import Problem, Settled, settled
 from mapfusion.smoother.sightings import Sightings, sightings_of
-from mapfusion.smoother.student import MOST_DOF, fitted_dof, student_cost, student_weights
 
-# The next step would lower the cost, in squared sigmas, by no more than this.
-_CONVERGED = 1e-4
-_MOST_STEPS = 50
-_MOST_HALVINGS = 12
+# Factor on the observations' standard deviations in a first round (graduated non-convexity): where
+# the path to start from is far off, most observations look gross and lose the weight to mend it.
+# It need not end closer than this, in squared sigmas, to where the next one goes on.
+_THOUGHT_WORSE, _CLOSE = 4.0, 1.0
 
 
 @dataclass(frozen=True)
@@ -32,14 +28,22 @@ class SmootherParameters:
 
     Attributes:
         motion: noise of the odometry.
+        stray_m: standard deviation, along each axis, of where the point that a track is of lies
+            beside the landmark; 0: it is the landmark.
         min_count: observations that a landmark needs.
     """
 
     motion: MotionNoise = field(default_factory=MotionNoise)
-    min_count: Annotated[int, Range(2, 1000, "observations")] = 3
+    stray_m: Annotated[float, Range(0, 10, "m")] = 0.004
+    min_count: Annotated[int, Range(1, 1_000_000, "observations")] = 3
 
     def __post_init__(self) -> None:
         require_in_range(self)
+
+    @property
+    def stray_information(self) -> float:
+        """Of a track's offset along each axis, in 1/m^2; 0 where there are no offsets."""
+        return 1 / self.stray_m**2 if self.stray_m else 0.0
 
 
 @dataclass(frozen=True)
@@ -47,10 +51,10 @@ class Smoothed:
     """What a log says, all at once.
 
     Attributes:
-        estimate: path and landmarks.
+        estimate: path, landmarks and tracks' offsets.
         seen: the observations that went into them.
-        weight: (N,) of each observation.
-        dof: degrees of freedom of the observations' Student-t.
+        weights: of observations and offsets.
+        tails: of their Student-t's.
         n_steps: Gauss-Newton steps that were taken.
         own_m2: (L, 3, 3), see `common`.
         common: (R, 3L) the landmarks' joint covariance is block diagonal of `own_m2` plus
@@ -59,11 +63,18 @@ class Smoothed:
 
     estimate: Estimate
     seen: Sightings
-    weight: Float
-    dof: float
+    weights: Weights
+    tails: Tails
     n_steps: int
     own_m2: Float
     common: Float
+
+    @classmethod
+    def of(cls, end: Settled, steps_before: int = 0) -> "Smoothed":
+        """Where steps ended, after some of an earlier round."""
+        common = common_part(end.seen, end.equations, end.solution)
+        n_steps, own_m2 = steps_before + end.n_steps, end.solution.own_m2
+        return cls(end.estimate, end.seen, end.weights, end.tails, n_steps, own_m2, common)
 
     def joint_covariance(self) -> Float:
         """(3L, 3L), dense: for small maps."""
@@ -88,44 +99,12 @@ def smooth(
         ValueError: shapes that do not fit.
     """
     require_shape("path", path, (len(log), 3))
-    seen = sightings_of(log, landmark, parameters.min_count)
-    information = odometry_information(log.odometry, parameters.motion)
+    seen = sightings_of(log, landmark, parameters.min_count, stray=parameters.stray_m > 0)
     path = between(path[0], path)
-    at = Estimate(path, first_points(seen, path))
-    weight, dof, n_steps = np.ones(len(seen)), MOST_DOF, 0
-    while True:
-        equations = normal_equations(seen, at, weight, log.odometry, information)
-        solution = solve(seen, equations)
-        if n_steps == _MOST_STEPS or solution.decrease < _CONVERGED:
-            common = common_part(seen, equations, solution)
-            return Smoothed(at, seen, weight, dof, n_steps, solution.own_m2, common)
-        at = _stepped(seen, log.odometry, information, dof, at, solution.step)
-        squares = squared_distances(seen, at, solution.own_m2)
-        dof = fitted_dof(squares, seen.n_dimensions)
-        weight = student_weights(squares, dof, seen.n_dimensions)
-        n_steps += 1
-
-
-def _stepped(
-    seen: Sightings,
-    odometry: Float,
-    information: Float,
-    dof: float,
-    at: Estimate,
-    step: Estimate,
-) -> Estimate:
-    """The step, or as much of it as lowers the cost: half, a quarter, ..."""
-
-    def cost(of: Estimate) -> float:
-        walked = float(np.sum(information * disturbances(of.path, odometry) ** 2))
-        return walked + student_cost(squared_distances(seen, of), dof, seen.n_dimensions)
-
-    before, share = cost(at), 1.0
-    for _ in range(_MOST_HALVINGS):
-        path = at.path + share * step.path
-        path[:, 2] = wrap(path[:, 2])
-        further = Estimate(path, at.point_m + share * step.point_m)
-        if cost(further) <= before:
-            return further
-        share /= 2
-    return at
+    at = Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
+    information = odometry_information(log.odometry, parameters.motion)
+    known = Problem(seen, log.odometry, information, parameters.stray_information)
+    blurred = replace(seen, information=seen.information / _THOUGHT_WORSE**2)
+    first = settled(known._replace(seen=blurred), at, _CLOSE)
+    end = settled(known, first.estimate)
+    return Smoothed.of(end, first.n_steps)

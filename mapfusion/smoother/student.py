@@ -17,22 +17,23 @@ from mapfusion.se2 import Float
 LEAST_DOF, MOST_DOF = 0.5, 1e4
 
 
-def student_weights(squares: Float, dof: float, n_dimensions: int) -> Float:
-    """Weights (N,) of observations at these squared Mahalanobis distances (N,)."""
+def student_weights(squares: Float, dof: float, n_dimensions: Float | int) -> Float:
+    """Weights (N,) of errors at these squared Mahalanobis distances (N,), in n dimensions each."""
     return (dof + n_dimensions) / (dof + squares)
 
 
-def student_cost(squares: Float, dof: float, n_dimensions: int) -> float:
+def student_cost(squares: Float, dof: float, n_dimensions: Float | int) -> float:
     """Twice the negative log likelihood, up to what does not depend on the distances."""
-    return float((dof + n_dimensions) * np.sum(np.log1p(squares / dof)))
+    return float(np.sum((dof + n_dimensions) * np.log1p(squares / dof)))
 
 
-def fitted_dof(squares: Float, n_dimensions: int) -> float:
+def fitted_dof(squares: Float, n_dimensions: Float | int) -> float:
     """The degrees of freedom under which these squared distances (N,) are most likely."""
+    n = np.broadcast_to(np.asarray(n_dimensions, dtype=np.float64), len(squares))
 
     def cost(log_dof: float) -> float:
         dof = float(np.exp(log_dof))
-        normal = gammaln((dof + n_dimensions) / 2) - gammaln(dof / 2) - n_dimensions / 2 * log_dof
-        return student_cost(squares, dof, n_dimensions) - 2 * len(squares) * float(normal)
+        normal = gammaln((dof + n) / 2) - gammaln(dof / 2) - n / 2 * log_dof
+        return student_cost(squares, dof, n) - 2 * float(np.sum(normal))
 
     return float(np.exp(fminbound(cost, np.log(LEAST_DOF), np.log(MOST_DOF))))

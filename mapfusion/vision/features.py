@@ -7,7 +7,7 @@ import numpy as np
 from mapfusion.arguments import require_finite, require_shape
 from mapfusion.robot_log import DESCRIPTOR_LENGTH
 from mapfusion.se2 import Float
-from mapfusion.vision.patch_fit import PATCH_SIDE_PX
+from mapfusion.vision.patches import PATCH_SIDE_PX
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,19 @@ import numpy as np
 from mapfusion.se2 import Float
 from mapfusion.vision.features import Features
 from mapfusion.vision.patch_fit import fit_patches
+from mapfusion.vision.template import Templates
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """How a point's surroundings may differ from view to view, see `Templates.of`."""
+
+    noise_grey: float
+    max_misfit_px: float
+
+    def templates(self, patch: np.ndarray, point: Float) -> Templates:
+        """Of points (N, 2) in patches (N, P, P)."""
+        return Templates.of(patch, point, self.noise_grey, self.max_misfit_px)
 
 
 @dataclass(frozen=True)
@@ -16,83 +29,82 @@ class Followed:
     Attributes:
         uv_px: (N, 2) where the point lies, beside the feature's own corner.
         disparity_px: (N,) there.
-        patch: (N, P, P) uint8 of the picture that the point is fitted to, None without patches.
-        point_px: (N, 2) the point in it, from its middle.
-        warp: (N, 2, 2) affine map from there to this frame's picture.
+        warp: (N, 2, 2) affine map from how it looked at first to this frame's picture.
+        templates: how it looked; None without patches.
     """
 
     uv_px: Float
     disparity_px: Float
-    patch: np.ndarray | None
-    point_px: Float
     warp: Float
+    templates: Templates | None
 
+    @classmethod
+    def unseen(cls, features: Features) -> "Followed":
+        """Points at the corners themselves, before `begin` says how they look."""
+        templates = None if features.patch is None else Templates.room(len(features))
+        uv, disparity = features.uv_px.copy(), features.disparity_px.copy()
+        return cls(uv, disparity, _upright(len(uv)), templates)
 
-def begun(features: Features) -> Followed:
-    """Points that have been seen in this frame only: the corners themselves."""
-    uv, patch = features.uv_px.copy(), features.patch
-    patch = None if patch is None else patch.copy()
-    point, warp = uv - np.rint(uv), _upright(len(uv))
-    return Followed(uv, features.disparity_px.copy(), patch, point, warp)
+    def begin(self, features: Features, rows: np.ndarray, likeness: Likeness) -> None:
+        """Let the corners of some features be points that are seen for the first time."""
+        uv = features.uv_px[rows]
+        self.uv_px[rows], self.disparity_px[rows] = uv, features.disparity_px[rows]
+        self.warp[rows] = np.eye(2)
+        if self.templates is not None and features.patch is not None:
+            fresh = likeness.templates(features.patch[rows], uv - np.rint(uv))
+            self.templates.put(rows, fresh, slice(None))
 
 
 def followed(
-    points: Followed,
-    before: Features,
-    after: Features,
-    source: np.ndarray,
-    noise: float,
-    max_misfit: float,
+    points: Followed, before: Features, after: Features, source: np.ndarray, likeness: Likeness
 ) -> tuple[Followed, np.ndarray]:
     """The points of the next frame, and which of its features are (N,) of points seen before.
 
     A point is fitted to the picture that its track began with; where that fails, as it does when
-    the robot has come too near, to the picture before.
+    the robot has come too near, to the picture before. The others are `unseen`.
 
     Args:
         points: of the frame before.
         before: that frame's features.
         after: the next frame's.
         source: (N,) row of `before` that each feature of `after` is linked to, or -1.
-        noise: see `fit_patches`.
-        max_misfit: likewise.
+        likeness: beyond which two views show different points.
     """
-    new, rows = begun(after), np.flatnonzero(source >= 0)
-    if new.patch is None or before.patch is None or points.patch is None:
+    new, rows = Followed.unseen(after), np.flatnonzero(source >= 0)
+    if before.patch is None or after.patch is None:
         return new, source >= 0
+    assert points.templates is not None
+    assert new.templates is not None
     old = source[rows]
     middle = np.rint(after.uv_px[rows])
     start = after.uv_px[rows] + points.uv_px[old] - before.uv_px[old] - middle
-    patch, point = points.patch[old], points.point_px[old]
-    warp = np.concatenate([points.warp[old], start[:, :, None]], axis=2)
-    fits = fit_patches(patch, point, new.patch[rows], warp, noise, max_misfit)
+    shown, warp = after.patch[rows], _with_place(points.warp[old], start)
+    fits = fit_patches(points.templates, old, shown, warp)
     again = np.flatnonzero(~fits)
-    patch[again] = before.patch[old[again]]
-    point[again] = points.uv_px[old[again]] - np.rint(before.uv_px[old[again]])
-    nearer = np.concatenate([_upright(len(again)), start[again, :, None]], axis=2)
-    shown = new.patch[rows[again]]
-    fits[again] = fit_patches(patch[again], point[again], shown, nearer, noise, max_misfit)
-    warp[again] = nearer
+    beside = points.uv_px[old[again]] - np.rint(before.uv_px[old[again]])
+    nearer = likeness.templates(before.patch[old[again]], beside)
+    from_nearer = _with_place(_upright(len(again)), start[again])
+    fits[again] = fit_patches(nearer, np.arange(len(again)), shown[again], from_nearer)
+    warp[again] = from_nearer
 
-    uv = middle + warp[:, :, 2]
-    disparity = after.disparity_px[rows]
+    uv, disparity = middle + warp[:, :, 2], after.disparity_px[rows]
     if after.slope is not None:
         disparity = disparity + np.sum(after.slope[rows] * (uv - after.uv_px[rows]), axis=1)
     fits &= disparity > 0
+    kept = rows[fits]
+    new.uv_px[kept], new.disparity_px[kept] = uv[fits], disparity[fits]
+    new.warp[kept] = warp[fits, :, :2]
+    new.templates.put(kept, points.templates, old[fits])
+    new.templates.put(rows[again[fits[again]]], nearer, fits[again])
     found = np.zeros(len(after), dtype=bool)
-    found[rows[fits]] = True
-    made = (uv, disparity, patch, point, warp[:, :, :2])
-    for of_all, own in zip(vars(new).values(), made, strict=True):
-        of_all[found] = own[fits]
+    found[kept] = True
     return new, found
-
-
-def begin_again(points: Followed, features: Features, rows: np.ndarray) -> None:
-    """Set points, in place, back to the corners of this frame's features."""
-    for of_all, corners in zip(vars(points).values(), vars(begun(features)).values(), strict=True):
-        if of_all is not None:
-            of_all[rows] = corners[rows]
 
 
 def _upright(n: int) -> Float:
     return np.tile(np.eye(2), (n, 1, 1))
+
+
+def _with_place(linear: Float, place: Float) -> Float:
+    """Affine maps (N, 2, 3) of linear maps (N, 2, 2) and where the point lies (N, 2)."""
+    return np.concatenate([linear, place[:, :, None]], axis=2)

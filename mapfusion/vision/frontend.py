@@ -10,7 +10,7 @@ from mapfusion.camera import StereoCamera
 from mapfusion.robot_log import Observations
 from mapfusion.vision.features import Features
 from mapfusion.vision.harris import HarrisParameters, detect
-from mapfusion.vision.patch_fit import cut_patches
+from mapfusion.vision.patches import cut_patches
 from mapfusion.vision.stereo import StereoParameters, match
 from mapfusion.vision.tracks import TrackParameters
 from mapfusion.vision.usurf import USurfParameters, describe

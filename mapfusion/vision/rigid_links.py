@@ -6,10 +6,14 @@ the rest errs by a tenth; one in twenty is enough to turn a map. The world stand
 links agree on one motion in the plane.
 """
 
+import math
+
 import numpy as np
+from numba import njit
 
 from mapfusion.chi_square import chi_square_bound
-from mapfusion.se2 import Float, rotation, rotation_about_z
+from mapfusion.se2 import Float
+from mapfusion.symmetric import cofactors
 
 _MIN_LINKS = 4  # two links determine a motion; one slip among three would be anyone's guess
 # Added to the noise: from a tolerance beside which all points are equally certain to none.
@@ -17,6 +21,7 @@ _TOLERANCES_M = (1.0, 0.25, 0.06, 0.015, 0.004, 0.001, 0.0)
 _ALL_AFTER = 3  # place in it after which all links are used, whatever the start left out
 _STEPS = 2  # of Gauss-Newton at each tolerance; the answer of the one before is near
 _PARTS = 3  # near, middle and far links; each start but one leaves one of them out
+_ONE_PLACE = 1e-12  # share of a normal matrix's diagonal that its determinant is by rounding alone
 
 
 def rigid_links(
@@ -41,50 +46,118 @@ def rigid_links(
     if n < _MIN_LINKS:
         return np.ones(n, dtype=bool)
     gate = chi_square_bound(probability, 3)
-    by_distance = np.argsort(np.argsort(np.linalg.norm(p_before_m, axis=1), kind="stable"))
-    part = by_distance * _PARTS // n
-    left_out = np.array([-1, *range(_PARTS)])[:, None]
-    start = np.not_equal(part, left_out)  # (B, N); the first leaves out none
-    motion, agree = np.zeros((len(start), 3)), start
-    for i, tolerance_m in enumerate(_TOLERANCES_M):
-        S_before = covariance_before_m2 + tolerance_m**2 * np.eye(3)
-        for _ in range(_STEPS):
-            motion, square = _step(
-                motion, agree, p_before_m, S_before, p_after_m, covariance_after_m2
-            )
-        agree = np.less_equal(square, gate)
-        if i < _ALL_AFTER:
-            agree &= start
+    start = starts(p_before_m)
+    agree = start.copy()
+    _narrow(start, agree, p_before_m, covariance_before_m2, p_after_m, covariance_after_m2, gate)
     return agree[np.argmax(agree.sum(axis=1))]
 
 
-def _step(
-    motion: Float,
-    used: np.ndarray,
+def starts(p_before_m: Float) -> np.ndarray:
+    """Links (4, N) bool that each start uses: all, and without a third by distance."""
+    by_distance = np.argsort(np.argsort(np.linalg.norm(p_before_m, axis=1), kind="stable"))
+    part = by_distance * _PARTS // len(p_before_m)
+    return np.not_equal(part, np.array([-1, *range(_PARTS)])[:, None])
+
+
+@njit(cache=True, error_model="numpy")
+def _narrow(
+    start: np.ndarray,
+    agree: np.ndarray,
     p_before: Float,
     S_before: Float,
     p_after: Float,
     S_after: Float,
-) -> tuple[Float, Float]:
-    """A Gauss-Newton step for B motions T_before_after (B, 3), each over its own links (B, N).
+    gate: float,
+) -> None:
+    """Fill in the links (B, N) that agree in the end, from those of the starts (B, N)."""
+    n = start.shape[1]
+    lever, residual, information = np.empty((n, 2)), np.empty((n, 3)), np.empty((n, 6))
+    for b in range(len(start)):
+        motion, step = np.zeros(3), np.zeros(3)
+        for i in range(len(_TOLERANCES_M)):
+            variance = _TOLERANCES_M[i] ** 2
+            for _ in range(_STEPS):
+                _differences(motion, p_before, p_after, lever, residual)
+                _information(motion[2], variance, S_before, S_after, information)
+                _solve(lever, residual, information, agree[b], step)
+                for k in range(3):
+                    motion[k] += step[k]
+            for j in range(n):
+                near = _square(lever[j], residual[j], information[j], step) <= gate
+                agree[b, j] = near and (i >= _ALL_AFTER or start[b, j])
 
-    Returns:
-        The motions, and all squared distances (B, N) after the step.
-    """
-    turn = rotation_about_z(motion[:, 2])[:, None]
-    information = np.linalg.inv(S_before + turn @ S_after @ turn.swapaxes(-1, -2))
-    arm = p_after[:, :2] @ rotation(motion[:, 2]).swapaxes(-1, -2)
-    residual = np.empty((*used.shape, 3))
-    residual[..., :2] = p_before[:, :2] - arm - motion[:, None, :2]
-    residual[..., 2] = p_before[:, 2] - p_after[:, 2]
-    jacobian = np.zeros((*used.shape, 3, 3))  # d(moved point) / d(x, y, theta)
-    jacobian[..., 0, 0] = jacobian[..., 1, 1] = 1
-    jacobian[..., 0, 2], jacobian[..., 1, 2] = -arm[..., 1], arm[..., 0]
-    weighted = used[..., None, None] * (jacobian.swapaxes(-1, -2) @ information)
-    normal = np.sum(weighted @ jacobian, axis=1)
-    right = np.sum(weighted @ residual[..., None], axis=1)
-    # the pseudo-inverse: points on one line of sight, or too few, leave a direction open
-    step = (np.linalg.pinv(normal, hermitian=True) @ right)[..., 0]
-    residual = residual - (jacobian @ step[:, None, :, None])[..., 0]
-    square = np.sum(residual * (information @ residual[..., None])[..., 0], axis=-1)
-    return motion + step, square
+
+@njit(cache=True, error_model="numpy")
+def _differences(
+    motion: Float, p_before: Float, p_after: Float, lever: Float, residual: Float
+) -> None:
+    """Before minus after (N, 3) under a motion T_before_after, and d(after) / d(turn) (N, 2)."""
+    cos, sin = math.cos(motion[2]), math.sin(motion[2])
+    for j in range(len(residual)):
+        x = cos * p_after[j, 0] - sin * p_after[j, 1]
+        y = sin * p_after[j, 0] + cos * p_after[j, 1]
+        lever[j, 0], lever[j, 1] = -y, x
+        residual[j, 0] = p_before[j, 0] - x - motion[0]
+        residual[j, 1] = p_before[j, 1] - y - motion[1]
+        residual[j, 2] = p_before[j, 2] - p_after[j, 2]
+
+
+@njit(cache=True, error_model="numpy")
+def _information(
+    turn: float, variance: float, S_before: Float, S_after: Float, information: Float
+) -> None:
+    """Of the differences: the inverse covariances' upper entries (N, 6) under a turn."""
+    c, s = math.cos(turn), math.sin(turn)
+    for j in range(len(information)):
+        before, after = S_before[j], S_after[j]
+        xx, xy, yy = after[0, 0], after[0, 1], after[1, 1]
+        axx, axy, axz, ayy, ayz, azz, determinant = cofactors(
+            before[0, 0] + variance + c * c * xx - 2 * c * s * xy + s * s * yy,
+            before[0, 1] + c * s * (xx - yy) + (c * c - s * s) * xy,
+            before[0, 2] + c * after[0, 2] - s * after[1, 2],
+            before[1, 1] + variance + s * s * xx + 2 * c * s * xy + c * c * yy,
+            before[1, 2] + s * after[0, 2] + c * after[1, 2],
+            before[2, 2] + variance + after[2, 2],
+        )
+        own, scale = information[j], 1 / determinant
+        own[0], own[1], own[2] = scale * axx, scale * axy, scale * axz
+        own[3], own[4], own[5] = scale * ayy, scale * ayz, scale * azz
+
+
+@njit(cache=True, error_model="numpy")
+def _solve(
+    lever: Float, residual: Float, information: Float, used: np.ndarray, step: Float
+) -> None:
+    """The Gauss-Newton step (3,) of x, y and turn over the links in use."""
+    xx = xy = xt = yy = yt = tt = x = y = t = 0.0
+    for j in range(len(used)):
+        if used[j]:
+            own = information[j]
+            ixx, ixy, ixz, iyy, iyz = own[0], own[1], own[2], own[3], own[4]
+            lx, ly = lever[j, 0], lever[j, 1]
+            rx, ry, rz = residual[j, 0], residual[j, 1], residual[j, 2]
+            tx, ty = ixx * lx + ixy * ly, ixy * lx + iyy * ly
+            gx, gy = ixx * rx + ixy * ry + ixz * rz, ixy * rx + iyy * ry + iyz * rz
+            xx, xy, yy = xx + ixx, xy + ixy, yy + iyy
+            xt, yt, tt = xt + tx, yt + ty, tt + lx * tx + ly * ty
+            x, y, t = x + gx, y + gy, t + lx * gx + ly * gy
+    axx, axy, axt, ayy, ayt, att, determinant = cofactors(xx, xy, xt, yy, yt, tt)
+    if determinant > _ONE_PLACE * xx * yy * tt:
+        step[0] = (axx * x + axy * y + axt * t) / determinant
+        step[1] = (axy * x + ayy * y + ayt * t) / determinant
+        step[2] = (axt * x + ayt * y + att * t) / determinant
+    else:  # one point leaves the turn open, so it stays; none leaves all
+        step[0] = (yy * x - xy * y) / att if att > 0 else 0.0
+        step[1] = (xx * y - xy * x) / att if att > 0 else 0.0
+        step[2] = 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def _square(lever: Float, residual: Float, information: Float, step: Float) -> float:
+    """Squared distance of a link's points, in standard deviations, after the step."""
+    xx, xy, xz = information[0], information[1], information[2]
+    yy, yz, zz = information[3], information[4], information[5]
+    x = residual[0] - step[0] - lever[0] * step[2]
+    y = residual[1] - step[1] - lever[1] * step[2]
+    z = residual[2]
+    return xx * x * x + yy * y * y + zz * z * z + 2 * (xy * x * y + xz * x * z + yz * y * z)

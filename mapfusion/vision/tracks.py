@@ -14,7 +14,7 @@ from mapfusion.arguments import Probability, Range, require_in_range
 from mapfusion.camera import StereoCamera
 from mapfusion.se2 import Float
 from mapfusion.vision.features import Features
-from mapfusion.vision.followed import Followed, begin_again, begun, followed
+from mapfusion.vision.followed import Followed, Likeness, followed
 from mapfusion.vision.rigid_links import rigid_links
 
 _NO_MATCH = -1
@@ -83,32 +83,30 @@ class Tracker:
         self.parameters = parameters
         self._camera = camera
         self._sigma_uv_px = sigma_uv_px
+        self._likeness = Likeness(parameters.noise_grey, parameters.max_misfit_px)
         self._previous: tuple[Features, Followed, Tracks] | None = None
         self._next_id = 0
 
     def update(self, features: Features) -> Tracks:
         """Tracks of this frame's features."""
         n = len(features)
-        source, points = np.full(n, _NO_MATCH), begun(features)
+        source, points = np.full(n, _NO_MATCH), Followed.unseen(features)
         track_id, length = np.empty(n, np.int64), np.ones(n, np.int64)
         if self._previous is not None:
             before, points_before, tracks = self._previous
-            limits = self.parameters
-            source = link(before, features, limits)
-            points, found = followed(
-                points_before, before, features, source, limits.noise_grey, limits.max_misfit_px
-            )
+            source = link(before, features, self.parameters)
+            points, found = followed(points_before, before, features, source, self._likeness)
             source[~found] = _NO_MATCH
             rows = np.flatnonzero(found)
-            slips = rows[~self._agree(points_before, before, points, features, source, rows)]
-            source[slips] = _NO_MATCH
-            begin_again(points, features, slips)
+            agree = self._agree(points_before, before, points, features, source, rows)
+            source[rows[~agree]] = _NO_MATCH
             linked = source != _NO_MATCH
             track_id[linked] = tracks.track_id[source[linked]]
             length[linked] += tracks.length[source[linked]]
-        born = source == _NO_MATCH
-        track_id[born] = np.arange(self._next_id, self._next_id + born.sum())
-        self._next_id += int(born.sum())
+        born = np.flatnonzero(source == _NO_MATCH)
+        points.begin(features, born, self._likeness)
+        track_id[born] = np.arange(self._next_id, self._next_id + len(born))
+        self._next_id += len(born)
         made = Tracks(track_id, length, points.uv_px, points.disparity_px)
         self._previous = features, points, made
         return made

@@ -186,7 +186,7 @@ def _add_samples(
     """
     wide = level.shape[k, 1] + 1
     corner = np.uint64(level.first[k] + row * wide + column)
-    at_x, at_y, place, cell = room[0], room[1], room[2], room[3]
+    at_x, at_y, place, cell = room[0], room[1], room[2], room[3].view(np.uint32)
     first_x, step_x = np.int32((x - column) * PLACE_UNIT), np.int32(x_step * PLACE_UNIT)
     first_y, step_y = np.int32((y - row) * PLACE_UNIT), np.int32(y_step * PLACE_UNIT)
     for i in range(count):
@@ -197,7 +197,7 @@ def _add_samples(
     for i in range(count):
         cell[i] = level.cells[corner + np.uint64(place[i])]
     for i in range(count):
-        sums[i] += _between(np.uint32(cell[i]), np.uint32(at_x[i]), np.uint32(at_y[i]))
+        sums[i] += _between(cell[i], np.uint32(at_x[i]), np.uint32(at_y[i]))
 
 
 @njit(cache=True, inline="always")

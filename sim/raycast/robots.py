@@ -54,7 +54,7 @@ def cast(
         eye, axes = in_robot(camera, poses[r])
         for i in range(len(solids.n_corners)):
             corners = project_corners(camera, solids, i, poses[r])
-            top, bottom, left, right = window(camera, corners)
+            top, bottom, left, right = window(camera, solids, i, poses[r], corners)
             if top > bottom or left > right:
                 continue
             wholly_before = extremes(corners)[0][2] > camera.near_m
@@ -148,7 +148,7 @@ def draw(
         eye, _ = in_robot(camera, poses[r])
         for i in front_to_back(solids, eye):
             corners = project_corners(camera, solids, i, poses[r])
-            top, bottom, left, right = window(camera, corners)
+            top, bottom, left, right = window(camera, solids, i, poses[r], corners)
             if top > bottom or left > right:
                 continue
             open_share, most = np.zeros(right - left + 1), 0.0

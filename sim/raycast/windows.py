@@ -35,28 +35,68 @@ def pixel_ray(camera: Pinhole, axes: Float, v: int, u: int, ray: Float) -> None:
 
 
 @njit(cache=True)
+def _in_camera(camera: Pinhole, solids: Solids, i: int, pose: Float) -> Float:
+    """A solid's corners (K, 3) ahead, to the left and above the eye, metres."""
+    eye, axes = in_robot(camera, pose)
+    placed = np.empty((solids.n_corners[i], 3))
+    for k in range(len(placed)):
+        x, y = solids.corners_m[i, k, 0] - eye[0], solids.corners_m[i, k, 1] - eye[1]
+        placed[k, 0] = axes[0, 0] * x + axes[0, 1] * y
+        placed[k, 1] = axes[1, 0] * x + axes[1, 1] * y
+        placed[k, 2] = solids.corners_m[i, k, 2] - eye[2]
+    return placed
+
+
+@njit(cache=True)
+def _project(camera: Pinhole, ahead: float, left: float, up: float, seen: Float) -> None:
+    """Fill in u, v and depth (3,) of a point."""
+    seen[0] = camera.center_u - camera.focal_px * left / ahead if ahead > 0 else np.nan
+    seen[1] = camera.center_v - camera.focal_px * up / ahead if ahead > 0 else np.nan
+    seen[2] = ahead
+
+
+@njit(cache=True)
 def project_corners(camera: Pinhole, solids: Solids, i: int, pose: Float) -> Float:
     """A solid's corners (K, 3) in the picture: u, v and depth along the axis in metres."""
-    eye, axes = in_robot(camera, pose)
-    seen = np.empty((solids.n_corners[i], 3))
+    seen = _in_camera(camera, solids, i, pose)
     for k in range(len(seen)):
-        x, y = solids.corners_m[i, k, 0] - eye[0], solids.corners_m[i, k, 1] - eye[1]
-        z, up = axes[0, 0] * x + axes[0, 1] * y, solids.corners_m[i, k, 2] - eye[2]
-        left = axes[1, 0] * x + axes[1, 1] * y
-        seen[k, 0] = camera.center_u - camera.focal_px * left / z if z > 0 else np.nan
-        seen[k, 1] = camera.center_v - camera.focal_px * up / z if z > 0 else np.nan
-        seen[k, 2] = z
+        _project(camera, seen[k, 0], seen[k, 1], seen[k, 2], seen[k])
     return seen
 
 
 @njit(cache=True)
-def window(camera: Pinhole, corners: Float) -> tuple[int, int, int, int]:
-    """First and last row and column that a solid may show in; the whole picture if it is near."""
+def _project_before_lens(camera: Pinhole, solids: Solids, i: int, pose: Float) -> Float:
+    """The same (M, 3) of what is left of a solid that the plane through the lens cuts.
+
+    Its corners before the plane, and where the plane meets the lines from them to the others: the
+    edges that it cuts are among those, and all of them lie in the solid.
+    """
+    placed, near = _in_camera(camera, solids, i, pose), camera.near_m
+    seen, m = np.empty((len(placed) * (len(placed) + 1), 3)), 0
+    for p in placed:
+        if p[0] <= near:
+            continue
+        _project(camera, p[0], p[1], p[2], seen[m])
+        m += 1
+        for q in placed:
+            if q[0] <= near:
+                t = (p[0] - near) / (p[0] - q[0])
+                left, up = p[1] + t * (q[1] - p[1]), p[2] + t * (q[2] - p[2])
+                _project(camera, near, left, up, seen[m])
+                m += 1
+    return seen[:m]
+
+
+@njit(cache=True)
+def window(
+    camera: Pinhole, solids: Solids, i: int, pose: Float, corners: Float
+) -> tuple[int, int, int, int]:
+    """First and last row and column that a solid may show in; `corners` are its projected ones."""
     first, last = extremes(corners)
     if last[2] <= camera.near_m:
         return 0, -1, 0, -1
     if first[2] <= camera.near_m:
-        return 0, camera.height_px - 1, 0, camera.width_px - 1
+        first, last = extremes(_project_before_lens(camera, solids, i, pose))
     left, top = max(np.floor(first[0] + 0.5), 0.0), max(np.floor(first[1] + 0.5), 0.0)
     right = min(np.floor(last[0] + 0.5), camera.width_px - 1.0)
     bottom = min(np.floor(last[1] + 0.5), camera.height_px - 1.0)
@@ -70,7 +110,7 @@ def all_windows(camera: Pinhole, solids: Solids, poses: Float) -> tuple[int, int
     for r in range(len(poses)):
         for i in range(len(solids.n_corners)):
             corners = project_corners(camera, solids, i, poses[r])
-            top, bottom, left, right = window(camera, corners)
+            top, bottom, left, right = window(camera, solids, i, poses[r], corners)
             if top <= bottom and left <= right:
                 above, below = min(above, top), max(below, bottom)
                 first, last = min(first, left), max(last, right)

@@ -116,7 +116,7 @@ def main() -> None:
     log = log_of(house, asked.frames, asked.association is Association.DESCRIPTOR, rng)
     del house
     settings = FastSlamParameters(
-        n_particles=asked.particles, motion=MOTION, association=asked.association, noise_scale=1.0
+        n_particles=asked.particles, motion=MOTION, association=asked.association
     )
     say(f"{len(log)} frames, {len(log.observations)} observations, log: {peak_mib():.0f} MiB")
     tenth = -(-asked.frames // 10)

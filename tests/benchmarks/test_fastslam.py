@@ -96,7 +96,6 @@ def mapped(
         motion=MOTION,
         proposal=Proposal(proposal),
         association=Association(association),
-        noise_scale=1.0,
         resample_fraction=1.0,
     )
     slam, frames = FastSlam(settings, np.random.default_rng(1)), road.frames()

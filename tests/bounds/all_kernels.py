@@ -1,113 +1,103 @@
-"""All kernels, called in this process on small arrays; says which were not.
+"""All kernels, called in this process on small arrays."""
 
-`test_bounds.py` starts it with Numba's bounds checks on. To compile is what takes the time, so it
-calls what reaches many kernels at once, and each with one kind of arguments where that is enough.
-"""
-
-import importlib
-import pkgutil
-import sys
 import tempfile
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
-import numba
 import numpy as np
-import pytest
-from numba import njit
-from numba.core.registry import CPUDispatcher
 
-import experiments
-import mapfusion
-import sim
-from experiments.judge.result import run_scenario
-from experiments.run.code_version import SOURCE_ROOT
-from experiments.scenario.settings import Simulation
-from experiments.scenario.yaml_input import read_mapping
+from mapfusion.align.correspondences import match
 from mapfusion.align.max_clique import everyone, larger_clique
-from mapfusion.align.registry import ALIGNERS
+from mapfusion.align.registration import Registration
+from mapfusion.align.registry import ALIGNERS, make_aligner
 from mapfusion.camera import StereoCamera
+from mapfusion.vision.frontend import FrontEnd, FrontEndParameters
+from mapfusion.vision.harris import HarrisParameters
+from mapfusion.vision.tracks import Tracker, TrackParameters
+from sim.exposure import expose
 from sim.floorplan import FloorPlan, Wall
+from sim.radiometry import RadiometricNoise
 from sim.raycast.caster import RayCaster
 from sim.world import write_faces
 from tests.experiments.study.refusal.test_refusal import (
     test_calibration_counts_every_motion_of_two_pairs,
 )
-from tests.helpers.tiny_scenario import SHORT
+from tests.mapfusion.align.map_pairs import given_pairs
+from tests.mapfusion.align.test_correspondences import two_maps
 from tests.mapfusion.align.test_max_clique import on_bits, random_graph
 from tests.mapfusion.fastslam.test_filter_twin import test_equals_the_filter_that_copies
 from tests.mapfusion.fastslam.test_particles import (
     test_near_finds_the_gates_that_touch_a_box_and_no_freed_slot,
     test_without_landmarks_nothing_is_near,
 )
-from tests.mapfusion.smoother.test_smooth import test_equals_the_dense_twin
+from tests.mapfusion.fastslam.test_tracked import test_each_track_s_end_widens_its_landmark_once
+from tests.mapfusion.smoother.test_smooth import smoothed
+from tests.mapfusion.smoother.white_noise_logs import white_noise_log, with_tracks
+from tests.mapfusion.vision.rendered_scene import render, wall
 
 
-@njit
-def _beyond(values: np.ndarray) -> float:
-    return values[len(values)]
-
-
-def kernels() -> dict[str, CPUDispatcher]:
-    """All kernels of ours by name."""
-    found = {}
-    for package in (mapfusion, experiments, sim):
-        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
-            path = SOURCE_ROOT.joinpath(*module.name.split(".")).with_suffix(".py")
-            if not path.is_file() or "njit" not in path.read_text(encoding="utf-8"):
-                continue
-            for name, value in vars(importlib.import_module(module.name)).items():
-                # what is inlined by Numba is compiled, and checked, within its callers
-                inlined = isinstance(value, CPUDispatcher) and "inline" in value.targetoptions
-                if isinstance(value, CPUDispatcher) and not inlined:
-                    found[f"{value.py_func.__module__}.{name}"] = value
-    return found
-
-
-def run_all_aligners(folder: Path) -> None:
-    """A run from the cameras to the tables, with all of our methods."""
-    path = folder / "short.yaml"
-    path.write_text(SHORT, encoding="utf-8")
-    asked = read_mapping(path)
-    asked["align"]["aligners"] = [{"name": name, "method": name} for name in ALIGNERS]
-    run_scenario(Simulation.model_validate(asked), folder, 1, lambda *_: None)
-
-
-def draw_robots(folder: Path) -> None:
-    """A wall that ends in the picture, a robot before it, and one that reaches the lens."""
-    wall = Wall(np.array([[2, -1], [2, 0.5], [3, 0.5]]))
-    write_faces(folder, FloorPlan((wall,)), np.random.default_rng(0))
-    others = np.array([[1.4, 0.0, 0.5], [0.4, 0.3, 1.0]])
-    camera = StereoCamera(160, 120, 144.0)
-    RayCaster(folder, camera).depth_m(np.zeros(3), 0.0, others)
-    for sampling in ("footprint", "middle"):
-        RayCaster(folder, camera, sampling).grey(np.zeros(3), 0.0, others)
-
-
-def main() -> int:
-    """Exit code 1 where a kernel was not reached."""
-    assert numba.config.BOUNDSCHECK
-    with pytest.raises(IndexError):  # the checks are on
-        _beyond(np.zeros(3))
-    # particles that have less than a handful of landmarks, and so of slots for them
+def filter_steps() -> None:
+    """Particles that have less than a handful of landmarks, and so of slots for them."""
     for ways in product(["gate", "descriptor", "label"], [True, False], ["informed", "motion"]):
         association, planar, proposal = ways
         test_equals_the_filter_that_copies(association, planar, 0.5, proposal)
     test_near_finds_the_gates_that_touch_a_box_and_no_freed_slot()
     test_without_landmarks_nothing_is_near()
-    test_equals_the_dense_twin(8, 90, planar=False)
+    test_each_track_s_end_widens_its_landmark_once(particles=3)
+
+
+def smoothers() -> None:
+    """More landmarks than poses and fewer, with tracks."""
+    for n_frames, n_landmarks, planar in ((12, 30, False), (40, 5, True)):
+        rng = np.random.default_rng(3)
+        smoothed(with_tracks(white_noise_log(rng, n_frames, n_landmarks, planar), rng, 0.05).log)
+
+
+def alignments() -> None:
+    """Every method of ours, its refinement and its judgement, on a few pairs."""
+    for name, planar in product(ALIGNERS, [False, True]):
+        pair = given_pairs(np.random.default_rng(0), 30, 0.6, 0.02, planar=planar)
+        map_a, map_b = (
+            replace(landmarks, covariance_m2=landmarks.covariance_m2 + 1e-4 * np.eye(3))
+            for landmarks in (pair.map_a, pair.map_b)
+        )
+        of = Registration(make_aligner(name)).on(map_a, map_b, pair.correspondences)
+        of.register(np.random.default_rng(1))
+    first, second, _ = two_maps(np.random.default_rng(0), 40)
+    match(first, second)
     larger_clique(on_bits(random_graph(0, 130, 0.3)), everyone(130), 0, 1000)
     test_calibration_counts_every_motion_of_two_pairs()
+
+
+def pictures(folder: Path) -> None:
+    """A wall that ends in the picture, a robot before it, and one that reaches the lens."""
+    corner = Wall(np.array([[2, -1], [2, 0.5], [3, 0.5]]))
+    write_faces(folder, FloorPlan((corner,)), np.random.default_rng(0))
+    others = np.array([[1.4, 0.0, 0.5], [0.4, 0.3, 1.0]])
+    camera = StereoCamera(160, 120, 144.0)
+    RayCaster(folder, camera).depth_m(np.zeros(3), 0.0, others)
+    for sampling in ("footprint", "middle"):
+        picture = RayCaster(folder, camera, sampling).grey(np.zeros(3), 0.0, others)
+        expose(picture, RadiometricNoise(), np.random.default_rng(0))
+
+
+def front_end() -> None:
+    """Corners all over a small picture, followed into the next one."""
+    camera, rng = StereoCamera(80, 60, 72.0), np.random.default_rng(0)
+    room = [wall(rng, (1.6, 2.0), (1.4, -2.0))]
+    few = replace(FrontEndParameters(), harris=HarrisParameters(max_corners=20))
+    tracker = Tracker(TrackParameters(), camera, 0.1)
+    for t in range(3):
+        left, right, _ = render(room, camera, (0.02 * t, 0.0, 0.0), 1.0, rng)
+        tracker.update(FrontEnd(camera, few).extract(left, right))
+
+
+def call_all() -> None:
+    """All of the above."""
+    filter_steps()
+    smoothers()
+    alignments()
+    front_end()
     with tempfile.TemporaryDirectory() as folder:
-        run_all_aligners(Path(folder))
-        draw_robots(Path(folder, "faces"))
-    found = kernels()
-    cached = [name for name, kernel in found.items() if kernel.stats.cache_hits]
-    assert not cached, f"not compiled with checks: {cached}"
-    unreached = sorted(name for name, kernel in found.items() if not kernel.signatures)
-    sys.stdout.write(f"{len(found)} kernels, not reached: {' '.join(unreached) or 'none'}\n")
-    return bool(unreached)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        pictures(Path(folder))

@@ -12,10 +12,10 @@ from tests.campaign.mutated_scenarios import DRAWN, bomb, complaint, explore
 from tests.helpers.tiny_scenario import TINY
 
 
-def test_each_of_300_mutants_is_a_scenario_or_one_line(tmp_path: Path) -> None:
-    seen, faults = explore(seed="7", count=300, runs=0, folder=tmp_path)
+def test_each_of_150_mutants_is_a_scenario_or_one_line(tmp_path: Path) -> None:
+    seen, faults = explore(seed="7", count=150, runs=0, folder=tmp_path)
     assert not faults
-    assert min(seen["valid"], seen["refused"]) > 30  # both were tried
+    assert min(seen["valid"], seen["refused"]) > 15  # both were tried
 
 
 ALIASES = [f"a{i}: &a{i} [" + ", ".join([f"*a{i - 1}"] * 10) + "]" for i in range(1, 11)]
@@ -61,7 +61,10 @@ LOGS = "schema_version: 1\nname: x\nlogs: [{}]\n"
         (TINY + "x: 2001-01-01\n", "x: 2001-01-01 is a date; put it in quotes"),
         (TINY + "? [1, 2]\n: 3\n", "is no text; put it in quotes"),
         (TINY.replace("n_particles: 30", "n_particles: 1e9"), "[1, 10000] particles"),
-        (TINY.replace("noise_scale: 1", "noise_scale: 1e-320"), "[0.01, 100]"),
+        (
+            TINY.replace("n_particles: 30", "n_particles: 30, descriptor_threshold: 1e-320"),
+            "[0.001, 2]",
+        ),
         (TINY.replace("focal_px: 144.25", "focal_px: 1e308"), "camera.focal_px: is 1e+308"),
         ("#" * 4_000_001, "larger than 4 MB"),
     ],
@@ -81,7 +84,7 @@ def test_what_once_got_past_is_one_line(tmp_path: Path, text: str, said: str) ->
 
 def test_bombs_are_told_at_once(tmp_path: Path) -> None:
     rng, path = random.Random(1), tmp_path / "bomb.yaml"
-    for _ in range(20):
+    for _ in range(10):
         path.write_text(bomb(rng), encoding="utf-8")
         fault, scenario = complaint(lambda: load_checked(path))
         assert not fault

@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sysconfig
 import venv
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from experiments.run.code_version import PACKAGES, SOURCE_ROOT
@@ -37,8 +37,8 @@ class OtherMachine:
         self._environment = inherited | {"HOME": str(self.home)} | environment
 
     @contextlib.contextmanager
-    def running(self, *commands: Sequence[str], ready: Path) -> Iterator[None]:
-        """`python -m COMMAND` in the machine's home, for a `with` block, once a file is there."""
+    def running(self, *commands: Sequence[str], ready: Callable[[], bool]) -> Iterator[None]:
+        """`python -m COMMAND` in the machine's home, for a `with` block, once they are ready."""
         python = str(self.prefix / "bin" / "python")
         with contextlib.ExitStack() as stack:
             log = stack.enter_context((self.home / "log.txt").open("ab"))
@@ -55,8 +55,8 @@ class OtherMachine:
             ]
             for process in started:
                 stack.callback(_end, process)
-            wait_until(lambda: ready.is_file() or any(each.poll() is not None for each in started))
-            assert ready.is_file(), (self.home / "log.txt").read_text()
+            wait_until(lambda: ready() or any(each.poll() is not None for each in started))
+            assert ready(), (self.home / "log.txt").read_text()
             yield
 
 

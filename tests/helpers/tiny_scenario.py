@@ -22,7 +22,7 @@ robots:
   - {name: R2, start: [1.2, 2.8, -0.2], route: [[3.2, 2.8], [3.2, 1.6]]}
 drive: {frames: 44}
 camera: {width_px: 160, height_px: 120, focal_px: 144.25}
-slam: {filter: {n_particles: 30, proposal: motion, noise_scale: 1}}
+slam: {filter: {n_particles: 30, proposal: motion}}
 align:
   repetitions: 2
   aligners:
@@ -30,6 +30,7 @@ align:
     - {name: svd, method: svd}
     - {name: icp, method: icp}
 evaluate: {every: 10, timing_points: 2, timing_repeats: 1}
+fuse: {every: 40}
 keep: {images_at: 30, images: 2}
 expect:
   path_rmse_m: {max: 1}

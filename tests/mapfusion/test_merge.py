@@ -6,78 +6,15 @@ from scipy.stats import chi2
 
 from mapfusion import se2
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.result import Alignment, Status, degenerate
+from mapfusion.align.result import degenerate
 from mapfusion.aligned_landmarks import ABSENT
-from mapfusion.landmark_map import LandmarkMap
-from mapfusion.merge import MergeParameters, merge
+from mapfusion.fuse.kalman import Kalman
+from mapfusion.fuse.kalman_drift import KalmanDrift
+from mapfusion.fuse.parameters import MergeParameters
+from mapfusion.fused_map import AlignedPair
+from mapfusion.merge import merge
 from mapfusion.same_point import one_to_one
-from tests.mapfusion.align.map_pairs import covariances
-
-DRIFT_M = 0.05
-
-
-class Robots:
-    """Maps of one world by robots that saw parts of it, and the alignments to the first."""
-
-    def __init__(self, parts, drift_m=DRIFT_M, planar=False, labels=False, seed=0, false_T=None):
-        rng = np.random.default_rng(seed)
-        n = 1 + max(p.stop for p in parts) - 1
-        self.world = rng.uniform(0, [20, 20, 0 if planar else 2.5], (n, 3))
-        descriptor = rng.standard_normal((n, 64))
-        descriptor /= np.linalg.norm(descriptor, axis=1, keepdims=True)
-        self.rows = [np.arange(p.start, p.stop) for p in parts]
-        self.T_world_map = rng.uniform([-5, -5, -3], [5, 5, 3], (len(parts), 3))
-        free = np.array([1, 1, 0 if planar else 1])
-        self.maps = []
-        for k, rows in enumerate(self.rows):
-            rows = rng.permutation(rows)
-            self.rows[k] = rows
-            S = covariances(rng, len(rows)) * 0.2 * np.outer(free, free)
-            noise = rng.standard_normal((len(rows), 3, 1))
-            p = se2.transform_points(se2.inverse(self.T_world_map[k]), self.world[rows])
-            p += (np.linalg.cholesky(S + 1e-18 * np.eye(3)) @ noise)[:, :, 0] * free
-            p += rng.normal(0, drift_m, (len(rows), 3)) * [1, 1, 0]
-            seen = descriptor[rows] + rng.normal(0, 0.01, (len(rows), 64))
-            self.maps.append(
-                LandmarkMap(
-                    p,
-                    S,
-                    rng.integers(3, 20, len(rows)).astype(np.int32),
-                    np.arange(len(rows)),
-                    None if labels else seen.astype(np.float32),
-                    rows.astype(np.int32) if labels else None,
-                    planar,
-                    f"robot {k}",
-                )
-            )
-        self.correspondences, self.alignments = [], []
-        for k in range(1, len(parts)):
-            _, at_a, at_b = np.intersect1d(self.rows[0], self.rows[k], return_indices=True)
-            self.correspondences.append(Correspondences(at_a, at_b, np.zeros(len(at_a))))
-            T = se2.between(self.T_world_map[0], self.T_world_map[k])
-            accepted = np.ones(len(at_a), dtype=bool)
-            covariance = np.diag([0.02, 0.03, 0.004]) ** 2
-            self.alignments.append(
-                Alignment(T, covariance, accepted, 0.0, Status.ACCEPTED, "", drift_m * 2**0.5)
-            )
-
-    def merge(self, **parameters):
-        return merge(
-            self.maps, self.alignments, self.correspondences, MergeParameters(**parameters)
-        )
-
-    def point_of(self, fused):
-        """Row of the world that each fused landmark is, after its first parent."""
-        points = np.full(len(fused.landmarks), -1)
-        for rows, parents in zip(self.rows, fused.parents.T, strict=True):
-            points[(parents != ABSENT) & (points < 0)] = rows[
-                parents[(parents != ABSENT) & (points < 0)]
-            ]
-        return points
-
-    def errors(self, fused):
-        truth = se2.transform_points(se2.inverse(self.T_world_map[0]), self.world)
-        return fused.landmarks.position_m - truth[self.point_of(fused)]
+from tests.mapfusion.robots_of_one_world import DRIFT_M, Robots
 
 
 def test_every_landmark_once():
@@ -107,7 +44,7 @@ def test_each_map_has_half_of_its_alignments_drift_and_the_first_their_mean():
 def test_order_of_the_sums():
     """Fusing three in a row is the information form of all three."""
     robots = Robots([slice(0, 30)] * 3)
-    fused = robots.merge(use_drift=False)
+    fused = robots.merge(Kalman())
     total, weighted = np.zeros((30, 3, 3)), np.zeros((30, 3))
     for k in range(3):
         T = fused.T_first_map[k]
@@ -126,7 +63,7 @@ def test_order_of_the_sums():
 
 def test_unmatched_landmarks_move_with_their_covariance():
     robots = Robots([slice(0, 40), slice(30, 70)])
-    fused = robots.merge(use_drift=False)
+    fused = robots.merge(Kalman())
     alone = np.flatnonzero(fused.parents[:, 0] == ABSENT)
     source = robots.maps[1][fused.parents[alone, 1]]
     T, c, s = fused.T_first_map[1], *(f(fused.T_first_map[1][2]) for f in (np.cos, np.sin))
@@ -140,15 +77,15 @@ def test_unmatched_landmarks_move_with_their_covariance():
     np.testing.assert_array_equal(fused.landmarks.descriptor[alone], source.descriptor)
 
 
-@pytest.mark.parametrize("use_drift", [True, False])
-def test_drift_makes_the_covariances_honest(use_drift):
+@pytest.mark.parametrize("fuser", [KalmanDrift(), Kalman()])
+def test_drift_makes_the_covariances_honest(fuser):
     robots = Robots([slice(0, 800), slice(200, 1000)])
-    fused = robots.merge(use_drift=use_drift)
+    fused, use_drift = robots.merge(fuser), isinstance(fuser, KalmanDrift)
     e = robots.errors(fused)
     nees = np.einsum("ni,nij,nj->n", e, np.linalg.inv(fused.landmarks.covariance_m2), e)
     low, high = chi2.ppf([1e-4, 1 - 1e-4], 3 * len(e)) / len(e)
     assert (low < nees.mean() < high) == use_drift
-    np.testing.assert_allclose(fused.drift_sigma_m, DRIFT_M)
+    np.testing.assert_allclose(fused.drift_sigma_m, DRIFT_M * use_drift)
 
 
 def test_fused_landmarks_beat_their_parents():
@@ -165,10 +102,10 @@ def test_fused_landmarks_beat_their_parents():
 
 def test_alignment_uncertainty_against_monte_carlo():
     """A landmark far from the origin of its map, moved by motions drawn from the covariance."""
-    robots = Robots([slice(0, 5), slice(3, 8)])
+    robots = Robots([slice(0, 5), slice(3, 8)], drift_m=0.0)
     T, S_T = robots.alignments[0].T_a_b, robots.alignments[0].covariance
     plain, widened = (
-        robots.merge(use_drift=False, use_alignment_uncertainty=u).landmarks for u in (False, True)
+        robots.merge(Kalman(), use_alignment_uncertainty=u).landmarks for u in (False, True)
     )
     fused = robots.merge()
     row = int(np.flatnonzero(fused.parents[:, 0] == ABSENT)[0])
@@ -189,11 +126,11 @@ def test_second_pass_finds_what_the_alignment_missed():
     assert np.all(fused.parents != ABSENT)
 
 
-@pytest.mark.parametrize("use_drift", [True, False])
-def test_second_pass_keeps_the_share_its_gate_promises(use_drift):
+@pytest.mark.parametrize("fuser", [KalmanDrift(), Kalman()])
+def test_second_pass_keeps_the_share_its_gate_promises(fuser):
     robots = Robots([slice(0, 1500), slice(0, 1500)])
     robots.alignments[0] = replace(robots.alignments[0], inlier=np.zeros(1500, dtype=bool))
-    fused = robots.merge(use_drift=use_drift, gate_probability=0.9)
+    fused = robots.merge(fuser, gate_probability=0.9)
     # heights keep more than theirs, 0.999: their floor covers errors that these maps do not have
     found = np.mean(np.all(fused.parents != ABSENT, axis=1)[fused.parents[:, 0] != ABSENT])
     assert found == pytest.approx(0.9, abs=0.025)
@@ -295,22 +232,24 @@ def test_empty_maps_merge():
 
 def test_wrong_arguments_are_named():
     robots = Robots([slice(0, 20), slice(0, 20)])
-    maps, alignments, pairs = robots.maps, robots.alignments, robots.correspondences
+    maps, alignment, found = robots.maps, robots.alignments[0], robots.correspondences[0]
+
+    def refused(match, *pairs):
+        with pytest.raises(ValueError, match=match):
+            merge(maps, pairs)
+
     with pytest.raises(ValueError, match="maps: 1 given"):
-        merge(maps[:1], [], [])
-    with pytest.raises(ValueError, match="alignments: 0 given"):
-        merge(maps, [], pairs)
-    with pytest.raises(ValueError, match="correspondences: 2 given"):
-        merge(maps, alignments, pairs * 2)
-    short = replace(alignments[0], inlier=np.ones(3, dtype=bool))
-    with pytest.raises(ValueError, match="inlier"):
-        merge(maps, [short], pairs)
+        merge(maps[:1], [])
+    pair = AlignedPair(0, 1, alignment, found)
+    refused(r"pairs\[1\]: 1 and 0 are given twice", pair, replace(pair, a=1, b=0))
+    refused(r"pairs\[0\]: 0 and 2 are no two of 2 maps", replace(pair, b=2))
+    refused("1 and 1 are no two", replace(pair, a=1))
+    short = replace(alignment, inlier=np.ones(3, dtype=bool))
+    refused("inlier", replace(pair, alignment=short))
     double = Correspondences(np.zeros(20, np.int64), np.arange(20), np.zeros(20))
-    with pytest.raises(ValueError, match="index_a: inliers are not one to one"):
-        merge(maps, alignments, [double])
+    refused("index_a: inliers are not one to one", replace(pair, correspondences=double))
     outside = Correspondences(np.arange(20), np.arange(20) + 1, np.zeros(20))
-    with pytest.raises(ValueError, match="index_b: lies outside"):
-        merge(maps, alignments, [outside])
+    refused("index_b: lies outside", replace(pair, correspondences=outside))
     with pytest.raises(ValueError, match="gate_probability"):
         MergeParameters(gate_probability=1.0)
     with pytest.raises(ValueError, match="max_descriptor_distance"):

@@ -34,7 +34,7 @@ from mapfusion.storage import (
 )
 from mapfusion.vision.features import Features
 from mapfusion.vision.frontend import FrontEnd, FrontEndParameters
-from mapfusion.vision.patch_fit import PATCH_SIDE_PX
+from mapfusion.vision.patches import PATCH_SIDE_PX
 from sim.radiometry import RadiometricNoise
 from sim.recorder import FrameSource, truth_points, truth_slopes
 from sim.renderer import Renderer

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
-from experiments.run.frames import BOOL, FLOAT, INT, fields, write_rows
+from experiments.run.frames import BOOL, FLOAT, INT, fields, read_rows, write_rows
 from experiments.run.job import Job
 from experiments.scenario.randomness import generator
 from mapfusion.fastslam.filter import StepResult
@@ -16,6 +16,7 @@ from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.fastslam.run import run_log
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import RobotLog, read_log, with_rows
+from mapfusion.se2 import Float
 from mapfusion.storage import (
     POSE_FIELDS,
     column,
@@ -131,3 +132,21 @@ def read_snapshots(slam: Path, log: RobotLog) -> dict[int, LandmarkMap]:
     evaluated = map(int, attributes["iterations"].split(","))
     rows = {k: slice(*np.searchsorted(iteration, [k, k + 1])) for k in evaluated}
     return {k: with_rows(landmarks, own) for k, own in rows.items()}
+
+
+def associations_at(slam: Path, iteration: int, n_observations: int) -> np.ndarray:
+    """Which landmark each of the log's first observations is of, as an evaluated iteration had it.
+
+    (n_observations,) int64 by the observation that the landmark came from, -1 for none.
+    """
+    changes = read_rows(slam / "associations.parquet", ASSOCIATIONS)
+    counts_for = np.full(n_observations, -1, dtype=np.int64)
+    # in the order of iterations, so the last change of an observation is the one that stays
+    so_far = changes[changes["from_iteration"] <= iteration]
+    counts_for[so_far["observation"].to_numpy()] = so_far["source_observation"].to_numpy()
+    return counts_for
+
+
+def final_path(slam: Path) -> Float:
+    """(T, 3) the most probable particle's whole path, at the end."""
+    return read_rows(slam / "poses.parquet", POSES)[_FINAL].to_numpy(np.float64)

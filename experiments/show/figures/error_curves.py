@@ -14,6 +14,7 @@ from experiments.show.figures.style import PAGE_WIDTH_IN, PALE_GRAY, aligner_leg
 from experiments.study.statistics.error_bands import error_bands, scarce_spans
 
 _PANEL_HEIGHT_IN, _EXTRA_HEIGHT_IN = 1.9, 0.9  # the latter of legend and common x label
+_MOST_PAIRS = 10  # a figure of half a metre; 190 pairs would take minutes to draw
 _MARKERS_PER_LINE = 8
 _BAND_STYLE = {"alpha": 0.16, "linewidth": 0}
 _SCARCE_STYLE = {"color": PALE_GRAY, "alpha": 0.5, "linewidth": 0}
@@ -25,14 +26,16 @@ _MAX_VECTOR_POINTS = 200
 def draw_error_curves(data: ResultTables, quantity: str, label: str) -> tuple[Figure, np.ndarray]:
     """One row of panels per robot pair: as estimated on the left, refined on the right.
 
-    `quantity` is a column of the `errors` table. Also returns all values drawn, by which the y axis
-    that all panels share is to be set.
+    Of many pairs the first are drawn, which the label of the x axis then says. `quantity` is a
+    column of the `errors` table. Also returns all values drawn, by which the y axis that all panels
+    share is to be set.
     """
     if not data.pairs:
         raise NothingToDraw("no robot pair was aligned")
     if data.no_truth:
         raise NothingToDraw("no truth: errors are unknown")
-    errors = data.table("errors")
+    pairs, errors = data.pairs[:_MOST_PAIRS], data.table("errors")
+    errors = errors[pd.MultiIndex.from_frame(errors[["robot_a", "robot_b"]]).isin(pairs)]
     bands = error_bands(errors)
     kinds = {"as estimated": quantity, "refined": f"refined_{quantity}"}
     columns = [f"{column}{end}" for column in kinds.values() for end in ("_low", "", "_high")]
@@ -40,20 +43,21 @@ def draw_error_curves(data: ResultTables, quantity: str, label: str) -> tuple[Fi
     drawn = drawn[np.isfinite(drawn)]
     if not len(drawn):
         raise NothingToDraw("no aligner found an estimate at any iteration")
-    n_pairs = len(data.pairs)
-    figure = Figure(figsize=(PAGE_WIDTH_IN, n_pairs * _PANEL_HEIGHT_IN + _EXTRA_HEIGHT_IN))
-    panels = figure.subplots(n_pairs, 2, sharex=True, sharey=True, squeeze=False)
-    for row, pair in zip(panels, data.pairs, strict=True):
+    figure = Figure(figsize=(PAGE_WIDTH_IN, len(pairs) * _PANEL_HEIGHT_IN + _EXTRA_HEIGHT_IN))
+    panels = figure.subplots(len(pairs), 2, sharex=True, sharey=True, squeeze=False)
+    for row, pair in zip(panels, pairs, strict=True):
         for axes, (kind, column) in zip(row, kinds.items(), strict=True):
             for start, stop in scarce_spans(of_pair(errors, pair)):
                 axes.axvspan(start, stop, zorder=0, **_SCARCE_STYLE)
             _draw_panel(axes, data, of_pair(bands, pair), column)
             axes.set_title(f"{pair[0]} - {pair[1]}, {kind}")
         row[0].set_ylabel(label)
-    figure.supxlabel("FastSLAM iteration k", fontsize=8)
+    left_out = len(data.pairs) > len(pairs)
+    note = f" (first {len(pairs)} of {len(data.pairs)} robot pairs)" if left_out else ""
+    figure.supxlabel(f"FastSLAM iteration k{note}", fontsize=8)
     over = f"{errors['run_id'].nunique()} runs" if data.several_runs else "repetitions"
     explained = []
-    if any(len(list(scarce_spans(of_pair(errors, pair)))) for pair in data.pairs):
+    if any(len(list(scarce_spans(of_pair(errors, pair)))) for pair in pairs):
         explained.append(Patch(label=f"< {ANSWERABLE_PAIRS} true pairs", **_SCARCE_STYLE))
     if banded := _with_band(bands, list(kinds.values())):
         shown = next(name for name in data.aligners if name in banded)

@@ -11,7 +11,7 @@ from mapfusion.se2 import Float
 
 
 def draw(data: ResultTables) -> Figure:
-    """Landmarks with their ellipses, the best particle's path and the last particles."""
+    """Landmarks with their ellipses, paths of best particle and smoother, the last particles."""
     robots = [robot for robot in data.robots if len(data.landmarks_of(robot)[0])][:2]
     if not robots:
         raise NothingToDraw("no robot has a landmark in its map")
@@ -52,6 +52,8 @@ def _draw_map(axes: Axes, data: ResultTables, robot: str, enlarged: int) -> None
     ellipses = {"edgecolors": colour, "linewidths": 0.4, "alpha": 0.6, "zorder": 2}
     plan.add_ellipses(axes, position, covariance, rasterized=True, **ellipses)
     axes.plot(*path.T, color=GRAY, label="path of the best particle", zorder=3)
+    if len(smoothed := data.smoothed_path_of(robot)):
+        axes.plot(*smoothed.T, color=BLACK, linewidth=0.5, label="path of the smoother", zorder=4)
     axes.plot(0, 0, linestyle="none", marker="o", color=BLACK, label="start pose, the map's frame")
     last = _last_particles(data, robot)
     middle = last.mean(axis=0) if len(last) else 0.0

@@ -40,7 +40,7 @@ def draw(data: ResultTables) -> Figure:
     centre = position[2, :2]
     reach = (np.abs(position[:, :2] - centre).max(axis=1) + plan.semi_axes(covariance)[0]).max()
     plan.set_square(axes, centre, _MARGIN * reach)
-    plan.label_plan(axes, data.robots[0])
+    plan.label_plan(axes, data.fused_frame)
     note = "thin: the maps' own covariances, before drift is added"
     if (n_more := pairs.n_parents[chosen] - 2) > 0:
         note += f"; {n_more} more robot{'s' if n_more > 1 else ''} knew it"

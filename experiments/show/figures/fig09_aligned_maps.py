@@ -28,7 +28,7 @@ def draw(data: ResultTables) -> Figure:
     part = choose_zoom(pairs.position_m, pairs.covariance_m2)
     (x, y), side = part.corner_m, part.side_m
     for axes, rows, scale in ((overview, slice(None), 0.3), (zoom, part.whole, 1.0)):
-        plan.start_plan(axes, data, data.robots[0])
+        plan.start_plan(axes, data, data.fused_frame)
         _draw_landmarks(axes, data, pairs, rows, scale)
     plan.set_view(overview, fused)
     zoom.set(xlim=(x, x + side), ylim=(y, y + side), aspect="equal")

@@ -12,12 +12,12 @@ _ROBOT_MARKERS = ("*", "^", "v", "x", "d")
 
 def draw(data: ResultTables) -> Figure:
     """Landmarks by where they come from: one robot's map, or fused from several."""
-    fused = data.table("fused")
+    fused = data.table("fused_map" if data.has("fused_map") else "fused")
     if fused.empty:
         raise NothingToDraw("the fused map is empty")
     figure = Figure(figsize=(PAGE_WIDTH_IN, PAGE_WIDTH_IN))
     axes = figure.subplots()
-    walls = plan.start_plan(axes, data, data.robots[0])
+    walls = plan.start_plan(axes, data, data.fused_frame)
     kinds = []
     for place, (robot, colour) in enumerate(data.colours.items()):
         own = (fused["n_parents"] == 1) & (fused["robot_a"] == robot)

@@ -149,6 +149,20 @@ class ResultTables:
         """Positions (T, 2) of the best particle's whole path at the end, in the robot's frame."""
         return self.of_robot("paths", robot)[["final_x_m", "final_y_m"]].to_numpy()
 
+    def smoothed_path_of(self, robot: str) -> Float:
+        """Positions (T, 2) of the whole smoothed path in the robot's frame; (0, 2) where none."""
+        rows = self.rows("smoothed_paths")
+        own = rows[rows["robot"] == robot]
+        last = own[own["iteration"] == own["iteration"].max()].sort_values("frame")
+        return last[["x_m", "y_m"]].to_numpy()
+
+    @property
+    def fused_frame(self) -> str:
+        """The robot in whose frame the fused map is: the first that is in it."""
+        motions = self.rows("fused_motions")
+        inside = motions.loc[motions["tx_m"].notna(), "robot"].tolist()
+        return inside[0] if inside else self.robots[0]
+
     def moved_map(self, robot: str) -> tuple[Float, Float, Float]:
         """A robot's last map as it went into the merge.
 

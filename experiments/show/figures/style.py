@@ -12,6 +12,8 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
 from experiments.judge.criteria import ORACLE
+from experiments.judge.fuser_coverage import FILTERED, SMOOTHED
+from mapfusion.fuse.registry import REFERENCE
 
 PAGE_WIDTH_IN = 7.2  # two columns of a journal page
 # Okabe and Ito (2008): told apart by readers with any common colour blindness. Their yellow is left
@@ -56,6 +58,18 @@ _KNOWN_ALIGNERS: dict[str, tuple[Any, ...]] = {
     "kiss_matcher": (TEAL, (0, (3, 1, 1, 1, 1, 1)), ">"),
     ORACLE: (BLACK, (0, (4, 2)), "x"),
 }
+# What fusers make of maps, solid and dark where it is to be read first, and what they are given.
+_KNOWN_FUSERS: dict[str, tuple[Any, ...]] = {
+    "kalman": (ORANGE, (0, (1, 1)), "D"),
+    "kalman-drift": (VERMILLION, (0, (6, 1, 1, 1)), "s"),
+    "covariance_intersection": (GREEN, (0, (5, 1)), "^"),
+    "joint": (BLUE, "-", "o"),
+    REFERENCE: (BLACK, (0, (4, 2)), "x"),
+}
+GIVEN_STYLES: dict[str, dict[str, Any]] = {
+    FILTERED: {"color": GRAY, "linestyle": (0, (3, 1, 1, 1)), "marker": "v"},
+    SMOOTHED: {"color": GRAY, "linestyle": "-", "marker": "P"},
+}
 # All others (plug-ins, names of a scenario's own) by their place among themselves. The lengths have
 # no common factor, so 99 styles come before one repeats.
 _OTHER_COLOURS = (INDIGO, OLIVE, BLUE, WINE, TEAL, VERMILLION, SKY, ORANGE, PURPLE, GREEN, GRAY)
@@ -79,9 +93,20 @@ def house_style() -> AbstractContextManager[None]:
 
 def aligner_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Line style of each aligner: its own if it has one, else by its place among those without."""
-    others = [name for name in names if name not in _KNOWN_ALIGNERS]
+    return _styles(_KNOWN_ALIGNERS, names)
+
+
+def fuser_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Line style of each fuser, likewise."""
+    return _styles(_KNOWN_FUSERS, names)
+
+
+def _styles(
+    known: Mapping[str, tuple[Any, ...]], names: Sequence[str]
+) -> dict[str, dict[str, Any]]:
+    others = [name for name in names if name not in known]
     looks = zip(cycle(_OTHER_COLOURS), cycle(_OTHER_DASHES), cycle(_OTHER_MARKERS), strict=False)
-    chosen = _KNOWN_ALIGNERS | dict(zip(others, looks, strict=False))
+    chosen = {**known} | dict(zip(others, looks, strict=False))
     parts = ("color", "linestyle", "marker")
     return {name: dict(zip(parts, look, strict=True)) for name, look in chosen.items()}
 

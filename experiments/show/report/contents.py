@@ -3,7 +3,7 @@
 import base64
 import importlib
 import io
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from ruamel.yaml import YAML
 from experiments.judge import metrics
 from experiments.judge.criteria import that_ever_meet
 from experiments.judge.expectations import Outcome
+from experiments.judge.judged_fusers import last_fused
 from experiments.judge.judged_maps import methods_in, setting_columns
 from experiments.judge.path_errors import path_rms
 from experiments.judge.result import require_result
@@ -25,12 +26,21 @@ from experiments.show.report.charts import error_curves, success_curves, time_cu
 from experiments.show.report.map_view import MAP_TABLES, map_view
 from experiments.show.report.origin import natural, provenance_of, stage_times
 from experiments.show.report.theme import chart_style
+from experiments.show.team_lines import team_lines
 from experiments.study.statistics.run_tables import Runs, find_runs
 from experiments.study.statistics.standing import recommend
 from experiments.study.statistics.summary import ALL_SCENARIOS, configurations, reduced_errors
 from mapfusion.errors import InputError
 from mapfusion.sealed import read_sealed
 
+# Figures that stand beside the table of fusers, and how they are to be read.
+_OF_FUSERS = {
+    "fig11_fusers": "Lower is better. A map can be right as such and still lie askew in its frame:"
+    " the fit takes that away, so the two panels differ by it. A median (thin) far below the RMS"
+    " tells of a few landmarks that are much worse than the others.",
+    "fig12_coverage": "On the gray diagonal as many true points lie inside the ellipses as these"
+    " say. Below it a map is too sure of itself, above it less sure than it may be.",
+}
 _TABLES = tuple(dict.fromkeys((*MAP_TABLES, *metrics.USED_TABLES, "timings")))
 
 
@@ -95,7 +105,8 @@ def _without_truth(path: Path, runs: Runs, data: ResultTables) -> dict[str, Any]
 
 def _of_sweep(path: Path, maps: pd.DataFrame) -> dict[str, Any]:
     """Title of a sweep, and the sections that it has not."""
-    none = ("outcomes", "robots", "fits", "figures", "missing", "scenario_text")
+    none = ("outcomes", "robots", "fits", "smoother", "team", "edges", "figures", "missing")
+    none += ("scenario_text", "fusers", "fuser_figures")
     return dict.fromkeys(none, ()) | {
         "title": f"{path.name}, {maps['run_id'].nunique()} runs",
         "description": ", ".join(maps["scenario"].unique()),
@@ -128,7 +139,12 @@ def _of_result(data: ResultTables) -> dict[str, Any]:
         "outcomes": list(_outcomes(data)),
         "robots": path_rms(data.table("robots")).to_dict("records"),
         "fits": data.rows("map_fits").to_dict("records"),
-        "figures": list(_pictures(data.folder)),
+        "smoother": data.rows("smoother").to_dict("records"),
+        "team": list(team_lines(*map(data.rows, ("fused_motions", "team", "team_pairs")))),
+        "edges": data.rows("team_pairs").to_dict("records"),
+        "fusers": last_fused(data.rows("fusers")).to_dict("records"),
+        "fuser_figures": list(_pictures(data.folder, _OF_FUSERS)),
+        "figures": list(_pictures(data.folder, [n for n in FIGURES if n not in _OF_FUSERS])),
         "scenario_text": _as_yaml(data.scenario),
         "missing": [name for name in _TABLES if not data.has(name)],
     }
@@ -144,16 +160,17 @@ def _by_robots(errors: pd.DataFrame, pairs: list[Pair]) -> Iterator[tuple[str, p
 
 def _outcomes(data: ResultTables) -> Iterator[Outcome]:
     """The scenario's expectations, measured on this run alone."""
-    if all(map(data.has, metrics.USED_TABLES)):
-        used = {name: data.table(name).assign(seed=0) for name in metrics.USED_TABLES}
+    needed = set(metrics.USED_TABLES) - {"smoother", "fusers"}  # which older results lack
+    if all(map(data.has, needed)):
+        used = {name: data.rows(name).assign(seed=0) for name in metrics.USED_TABLES}
         for metric, bound in data.scenario.get("expect", {}).items():
             value, limits = metrics.compute(metric, used), Bound.model_validate(bound)
             yield Outcome(data.scenario["name"], metric, value, limits, {0: value})
 
 
-def _pictures(folder: Path) -> Iterator[dict[str, Any]]:
-    """The drawn figures; a reference folder keeps them beside its tables."""
-    for name in FIGURES:
+def _pictures(folder: Path, names: Collection[str]) -> Iterator[dict[str, Any]]:
+    """Those of the figures that are drawn; a reference folder keeps them beside its tables."""
+    for name in names:
         files = (folder / "figures" / f"{name}.png", folder / f"{name}.png")
         if file := next(filter(Path.is_file, files), None):
             about = importlib.import_module(f"experiments.show.figures.{name}").__doc__ or name
@@ -164,7 +181,8 @@ def _pictures(folder: Path) -> Iterator[dict[str, Any]]:
             except (OSError, SyntaxError, ValueError) as error:  # how Pillow reports damaged files
                 raise InputError(f"{file}: not a readable PNG image ({error})") from error
             png = base64.b64encode(data).decode()
-            yield {"about": about.splitlines()[0], "png": png, **size}
+            how = _OF_FUSERS.get(name, "")
+            yield {"about": about.splitlines()[0], "how": how, "png": png, **size}
 
 
 def _as_yaml(scenario: dict[str, Any]) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 import jinja2
 
 from experiments.judge import criteria, tables
+from experiments.judge.map_consistency import GROSS_M
 from experiments.show import numbers
 from experiments.show.export import write_text
 from experiments.show.report.contents import contents_of
@@ -39,6 +40,7 @@ def templates() -> jinja2.Environment:
         lstrip_blocks=True,
     )
     environment.globals |= {"text": numbers, "criteria": criteria, "shown": tables.SHOWN}
+    environment.globals["gross_m"] = GROSS_M
     environment.tests["nan"] = math.isnan
     return environment
 

@@ -9,9 +9,12 @@ from rich.text import Text
 from experiments.judge import tables
 from experiments.judge.checking import CheckedScenario
 from experiments.judge.criteria import ANSWERABLE_PAIRS, ORACLE, answerable, at_the_end
+from experiments.judge.judged_fusers import last_fused
 from experiments.judge.judged_maps import methods_in
+from experiments.judge.map_consistency import GROSS_M
 from experiments.judge.path_errors import path_rms
 from experiments.judge.tables import SHOWN
+from experiments.show.team_lines import edge_lines, team_lines
 from experiments.show.terminal.layout import (
     NO_ESTIMATE,
     columns,
@@ -51,10 +54,52 @@ def print_result(result: Path, skipped_figures: Sequence[str]) -> None:
     print_lines(
         ["  Maps and figures hold the landmarks that were seen often enough (slam.min_count)."]
     )
-    left_out = table("fused_motions")[["robot", "left_out"]].itertuples(index=False)
-    print_lines(f"  {robot} is left out of the fused map: {why}" for robot, why in left_out if why)
+    _print_smoother(table("smoother"))
+    _print_fusers(table("fusers"))
+    pairs = table("team_pairs")
+    _print_team_pairs(pairs)
+    told = team_lines(table("fused_motions"), table("team"), pairs)
+    print_lines(f"  {line}" for line in (*told, *edge_lines(table("team_edges"))))
     print_lines([f"Figures: {result / 'figures'}   tables: {result / 'tables'}"])
     print_skipped(skipped_figures)
+
+
+def _print_smoother(rows: pd.DataFrame) -> None:
+    smoothed = rows[rows["not_smoothed"] == ""]
+    if smoothed["path_rmse_m"].notna().any() or smoothed["landmark_rmse_m"].notna().any():
+        shown = columns("", robot="robot") | columns(".3f", path_rmse_m="path, m")
+        shown |= columns(".1f", filter_over_smoother="FastSLAM's\nover it")
+        shown |= columns(".3f", landmark_rmse_m="landmarks\nm")
+        shown |= columns(".3f", filter_landmark_rmse_m="FastSLAM's\nm")
+        shown |= columns(".1%", gross_share="gross\n") | columns(".2f", nees_per_dof="NEES\n/ dof")
+        shown |= columns(".0%", coverage_95="in\n95 %")
+        note = f"paths from the start; landmarks fitted, without gross ones (over {GROSS_M} m)"
+        print_frame(smoothed, shown, "Batch smoother: what the filter loses against it", note)
+    reasons = rows[["robot", "not_smoothed"]].itertuples(index=False)
+    print_lines(f"  {robot} is not smoothed: it {why}" for robot, why in reasons if why)
+
+
+def _print_fusers(rows: pd.DataFrame) -> None:
+    shown = columns("", fuser="fuser") | columns(".3f", landmark_rmse_m="frame\nm")
+    shown |= columns(".3f", fitted_rmse_m="fitted\nm") | columns(".1%", gross_share="gross\n")
+    shown |= columns(".2f", over_better_parent="over\nparent", over_better_filter="over\nfilter")
+    shown |= columns(".2f", nees_per_dof="NEES\n/ dof") | columns(".0%", coverage_95="in\n95 %")
+    note = f"RMS errors in the map's frame and fitted, without gross ones (over {GROSS_M} m)\n"
+    note += "over: fitted error over the better of the maps given, and of FastSLAM's"
+    print_frame(last_fused(rows), shown, "Fusers: maps of all robots together, at the end", note)
+
+
+def _print_team_pairs(pairs: pd.DataFrame) -> None:
+    """Of three robots or more: T_a_b by the pair's own alignment, and by all of the team."""
+    if len(pairs) > 1:
+        names = pairs["robot_a"] + " - " + pairs["robot_b"]
+        shown = columns("", pair="pair", place="its alignment")
+        shown |= columns(".3f", refined_translation_error_m="alone\nm")
+        shown |= columns("+.4f", refined_rotation_error_rad="\nrad")
+        shown |= columns(".3f", team_translation_error_m="in the team\nm")
+        shown |= columns("+.4f", team_rotation_error_rad="\nrad") | columns("d", n_common="common")
+        note = "its alignment: what loops of the others say of it; common: landmarks of both maps"
+        print_frame(pairs.assign(pair=names), shown, "Pairs as the team places them", note)
 
 
 def _print_answers(estimates: pd.DataFrame) -> None:
@@ -126,11 +171,17 @@ def print_checks(checks: Sequence[CheckedScenario]) -> None:
         what = (outcome.scenario, outcome.metric, outcome.value, outcome.bound_text)
         rows.append((*what, seeds, verdict))
     print_table(shown.values(), rows, "Checks against the truth")
-    failed = sum(not outcome.passed for outcome in outcomes)
+    print_lines(
+        f"{check.scenario}, seed {seed}: {nothing.text}"
+        for check in checks
+        for seed, nothing in check.unmerged.items()
+    )
+    n_passed = sum(outcome.passed for outcome in outcomes)
+    n_failed = len(outcomes) - n_passed + sum(len(check.unmerged) for check in checks)
     not_run = sum(bool(check.error) for check in checks)
     of_all = f"{not_run} of {len(checks)} scenarios"
     errors = f"; {of_all} could not be checked" if not_run else ""
-    print_lines([f"{len(outcomes) - failed} passed, {failed} failed{errors}"])
+    print_lines([f"{n_passed} passed, {n_failed} failed{errors}"])
 
 
 def _by_seed(values: Sequence[float]) -> str:

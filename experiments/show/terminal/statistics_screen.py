@@ -1,6 +1,7 @@
 """What `mapfusion statistics` and `mapfusion compare` show."""
 
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from experiments.study.statistics.intervals import MAPS_OF_ONE_RUN
 from experiments.study.statistics.summary import ALL_SCENARIOS, Summary
 
 _MAX_CONFIGURATIONS = 6  # more would fill screens; the files hold all
+_TEXT_WIDTH = 80  # columns of a terminal that nobody has widened
 # In the order of a comparison's rows: what the table calls it, in which colour.
 _VERDICTS = {
     versions.WORSE: ("worse", "bold red"),
@@ -42,6 +44,17 @@ _AGAINST = {
 }
 _PATHS = columns("", source="path", error="error")
 _PATHS |= columns(".3g", rmse="RMSE", median="median", max="max")
+_SMOOTHER = columns(".3g", path_rmse_m="path, m", filter_over_smoother="ratio")
+_SMOOTHER |= columns(".3g", landmark_rmse_m="landmarks, m", nees_per_dof="NEES / dof")
+_SMOOTHER |= columns(".1%", gross_share="gross", coverage_95="in 95 %")
+_FUSERS = columns("", fuser="fuser") | columns(".2g", landmark_rmse_m="landmarks, m")
+_FUSERS |= columns(".2g", over_better_filter="over filter", nees_per_dof="NEES / dof")
+_FUSERS |= columns(".0%", coverage_95="in 95 %")
+_TEAM = columns("", source="path") | columns(">", robots="robots")
+_TEAM |= columns(".3g", rmse="RMSE, m", median="median", max="max")
+_TEAM_PAIRS = columns("d", n_pairs="pairs", n_met="met") | columns(".0%", precision="precision")
+_TEAM_PAIRS |= columns(".0%", recall="recall")
+_TEAM_PAIRS |= columns(".3g", alone_m="alone, m", team_m="in the team, m")
 _NEES = columns("", landmarks="landmarks") | columns("d", n_landmarks="n")
 _NEES |= columns(".3g", nees_per_dof="NEES") | columns(">", band="chi-square")
 _NEES |= columns(".0%", share_in_gate="in gate")
@@ -62,6 +75,9 @@ def print_summary(summary: Summary, written: Path | None, skipped: Sequence[str]
         )
     _print_best_against_others(_rows(summary, "methods_compared"), ratios)
     _print_paths(_rows(summary, "paths"))
+    _print_smoother(_rows(summary, "smoother"))
+    _print_fusers(_rows(summary, "fusers"))
+    _print_team(_rows(summary, "team"), _rows(summary, "team_pairs"))
     _print_nees(_rows(summary, "nees"))
     layout.print_lines(_caveats(summary))
     layout.print_skipped(skipped)
@@ -153,6 +169,34 @@ def _print_paths(rows: pd.DataFrame) -> None:
         _print(rows, _PATHS, title, note)
 
 
+def _print_smoother(rows: pd.DataFrame) -> None:
+    title = "Batch smoother, median over robots and runs"
+    note = (
+        "ratio: FastSLAM's final path over the smoothed one; landmarks: fitted; (95 %, bootstrap)"
+    )
+    if len(rows):
+        _print(rows, _SMOOTHER, title, note)
+
+
+def _print_fusers(rows: pd.DataFrame) -> None:
+    if len(rows):
+        title = "Fused maps by fuser at the end, median over runs"
+        note = "landmarks: RMS in the frame of the first robot, without gross ones; over filter:\n"
+        note += "fitted error over that of the better FastSLAM map; (95 %, bootstrap)"
+        _print(rows, _FUSERS, title, note)
+
+
+def _print_team(rows: pd.DataFrame, pairs: pd.DataFrame) -> None:
+    if len(rows):
+        robots = rows["n_robots"].map(str) + "/" + rows["n_team"].map(str)
+        note = "all merged robots under one rigid fit, median over runs; (95 %, bootstrap)"
+        _print(rows.assign(robots=robots), _TEAM, "Path errors of teams (ATE)", note)
+    if len(pairs):
+        note = "precision: right of those believed; recall: found of those that met;\n"
+        note += "errors of T_a_b, medians over pairs in one map; (95 %, Wilson, bootstrap)"
+        _print(pairs, _TEAM_PAIRS, "Alignments between robots at the end", note)
+
+
 def _print_nees(rows: pd.DataFrame) -> None:
     if len(rows):
         low, high = (rows[name].map("{:.2f}".format) for name in ("band_low", "band_high"))
@@ -176,7 +220,7 @@ def _caveats(summary: Summary) -> list[str]:
     for row in summary.failed.to_dict("records"):
         lines.append(f"failed, left out: {row['scenario']} seed {row['seed']}: {row['reason']}")
     if summary.missing:
-        lines.append(f"No run has: {', '.join(summary.missing)}")
+        lines += textwrap.wrap(f"No run has: {', '.join(summary.missing)}", _TEXT_WIDTH)
     return lines
 
 

@@ -10,7 +10,7 @@ import pandas as pd
 from experiments.judge.user_files import verdict_on
 from experiments.show.numbers import two_digits
 from experiments.show.terminal.layout import columns, print_frame, print_lines
-from mapfusion.merge import FusedMap
+from mapfusion.fused_map import FusedMap
 
 _MOTIONS = columns("", aligner="aligner")
 _MOTIONS |= columns(".3f", tx_m="estim.\ntx, m", ty_m="\nty, m")
@@ -43,13 +43,14 @@ def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
 def print_fused(path: Path, fused: FusedMap, maps: Sequence[Path]) -> None:
     """What a fused map was made of."""
     several = int(((fused.parents >= 0).sum(axis=1) > 1).sum())
+    n_maps = len(fused.members)
+    what = f"fused from {n_maps} maps" if n_maps > 1 else "nothing was fused, it is the first map"
     lines = [
-        f"{len(fused.landmarks)} landmarks in {path}, {several} of them fused from several maps; "
-        f"{fused.duplicate_share:.1%} look like duplicates that remain"
+        f"{len(fused.landmarks)} landmarks in {path}: {what}; {several} landmarks are of several "
+        f"maps, {fused.duplicate_share:.1%} look like duplicates that remain"
     ]
     for name, (x_m, y_m, theta_rad) in zip(maps, fused.T_first_map, strict=True):
         if not math.isnan(x_m):
             lines.append(f"  {name}: T_first_map = ({x_m:.3f} m, {y_m:.3f} m, {theta_rad:.4f} rad)")
-    for name, reason in fused.left_out:
-        lines.append(f"  {name}: left out, its alignment was not accepted ({reason})")
+    lines += [f"  {name}: left out ({reason})" for name, reason in fused.left_out]
     print_lines(lines)

@@ -4,22 +4,22 @@ Only what both have counts: the same scenario, seed and settings, robot pair, it
 """
 
 import json
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from experiments.judge import judged_maps
-from experiments.judge.criteria import ANSWERABLE_PAIRS, COMMON_LANDMARKS, ORACLE, RICH_PAIRS
-from experiments.judge.judged_maps import MAP_KEYS, MAP_PAIR
-from experiments.judge.path_errors import path_rms
+from experiments.judge.criteria import (
+    ORACLE,
+)
+from experiments.judge.judged_maps import MAP_PAIR
 from experiments.judge.result_files import read_scenario
+from experiments.study.compare.quantities import EACH_METHOD, QUANTITIES, READ, Quantity
 from experiments.study.statistics import better
-from experiments.study.statistics.error_bands import ROBOT_PAIR
 from experiments.study.statistics.intervals import MAPS_OF_ONE_RUN, RUN
 from experiments.study.statistics.run_tables import RunPath, Runs, find_runs, match_names
 from mapfusion.errors import InputError
@@ -30,29 +30,7 @@ BETTER, WORSE, SAME = "better", "worse", "identical"
 NOISE, UNKNOWN = "no difference beyond noise", "cannot be judged"
 _SHOWN_NAMES = 3
 _NOT_SHOWN = ["table", "column", "of", "where", "higher_is_better"]
-_ROBOT = ("run_id", "robot")
-_KEYS = (*MAP_PAIR, "aligner", "robot", "map")
-_NEES, _REFINED = "nees_with_drift", "refined_translation_error_m"
-_EACH = "each method"
-
-
-class Quantity(NamedTuple):
-    """What two versions are compared in: a column of the rows of a table, or of those `where`.
-
-    Their counts are the lesser ones of the two versions. A change is told as a ratio b / a, as a
-    difference of shares, or as one of distances from consistency |ln(NEES per degree of freedom)|.
-    It is `of` each method, of the oracle, or of no aligner. What is timed depends on the machine
-    and its load, which runs share.
-    """
-
-    table: str
-    metric: str
-    column: str
-    scale: Literal["ratio", "share", "ln"] = "ratio"
-    of: str = ""
-    higher_is_better: bool = False
-    where: str = ""
-    timed: bool = False
+_KEYS = (*MAP_PAIR, "aligner", "robot", "map", "component", "source")
 
 
 class VersionComparison(NamedTuple):
@@ -181,7 +159,7 @@ def _flat(result: RunPath) -> dict[str, str]:
 
 def _all_values(a: Runs, b: Runs) -> Iterator[tuple[Quantity, str, pd.DataFrame]]:
     """All quantities that both have tables for, the method, and columns run_id, a, b, change."""
-    for table in _READ:
+    for table in READ:
         if not (a.has(table) and b.has(table)):
             continue
         rows = _joined(a, b, table)
@@ -190,8 +168,8 @@ def _all_values(a: Runs, b: Runs) -> Iterator[tuple[Quantity, str, pd.DataFrame]
             "",
         ]:
             own = rows[rows["aligner"] == method] if method else rows
-            of = method if method in ("", ORACLE) else _EACH
-            for quantity in _QUANTITIES:
+            of = method if method in ("", ORACLE) else EACH_METHOD
+            for quantity in QUANTITIES:
                 if (quantity.table, quantity.of) == (table, of):
                     values = _changes(quantity, own)
                     if len(values):
@@ -200,7 +178,7 @@ def _all_values(a: Runs, b: Runs) -> Iterator[tuple[Quantity, str, pd.DataFrame]
 
 def _joined(a: Runs, b: Runs, table: str) -> pd.DataFrame:
     """Rows of both by run and keys, values with the suffixes _a and _b; the lesser counts."""
-    columns, optional, reduce = _READ[table]
+    columns, optional, reduce = READ[table]
     frames = []
     for runs in (a, b):
         parts = []
@@ -230,46 +208,3 @@ def _changes(quantity: Quantity, rows: pd.DataFrame) -> pd.DataFrame:
         change = b - a if quantity.scale == "share" else better.log_ratio(b, a)
     frame = pd.DataFrame({"run_id": rows["run_id"], "a": a, "b": b, "change": change})
     return frame[np.isfinite(a) & np.isfinite(change)]
-
-
-def _maps_over_oracle(errors: pd.DataFrame) -> pd.DataFrame:
-    """Rows of `maps_of`, with each map's refined error over the oracle's there."""
-    maps = judged_maps.maps_of(errors)
-    of_oracle = maps.assign(oracle=maps[_REFINED].where(maps["aligner"] == ORACLE))
-    reference = of_oracle.groupby(MAP_PAIR)["oracle"].transform("first")
-    return maps.assign(over_oracle=maps[_REFINED] / reference)
-
-
-def _nees_per_dof(fusion: pd.DataFrame) -> pd.DataFrame:
-    true = fusion[fusion["true_pair"]]
-    per_dof = true.assign(nees=true[_NEES] / true["degrees_of_freedom"])
-    return per_dof.groupby(["run_id", *ROBOT_PAIR], sort=False)["nees"].mean().reset_index()
-
-
-# What is read of each table, what older runs may lack of it, and how a run's rows are reduced.
-_READ: dict[str, tuple[Sequence[str], Sequence[str], Callable[..., pd.DataFrame]]] = {
-    "errors": (judged_maps.NEEDED, judged_maps.OPTIONAL, _maps_over_oracle),
-    "robots": (["robot", "path_error_m", "odometry_error_m"], (), partial(path_rms, by=_ROBOT)),
-    "map_fits": (["map", "rmse_m"], (), pd.DataFrame),
-    "fusion": ([*ROBOT_PAIR, "true_pair", _NEES, "degrees_of_freedom"], (), _nees_per_dof),
-    "aligner_timings": ([*MAP_KEYS, "aligner", "elapsed_s"], (), pd.DataFrame),
-}
-_GROUND = f"n_common >= {COMMON_LANDMARKS}"
-_ENOUGH, _RICH = f"n_true >= {ANSWERABLE_PAIRS}", f"n_true >= {RICH_PAIRS}"
-_OFFERED = f"aligner == '{ORACLE}' and {_ENOUGH}"
-_QUANTITIES = (
-    Quantity("errors", "success estimated", "estimated_success", "share", _EACH, True),
-    Quantity("errors", "success refined", "refined_success", "share", _EACH, True),
-    Quantity("errors", "wrongly accepted", "false_accepted", "share", _EACH),
-    Quantity("errors", "accepted", "accepted", "share", _EACH, True, _GROUND),
-    Quantity("errors", "estimated error, m", "translation_error_m", of=_EACH, where=_ENOUGH),
-    Quantity("errors", "refined / oracle", "over_oracle", of=_EACH, where=_RICH),
-    Quantity("errors", "refined error, m", _REFINED, of=ORACLE, where=_ENOUGH),
-    Quantity("errors", "true pairs", "n_true", higher_is_better=True, where=_OFFERED),
-    Quantity("robots", "path RMSE, m", "path_m"),
-    Quantity("robots", "odometry RMSE, m", "odometry_m"),
-    Quantity("map_fits", "landmark RMSE, m", "rmse_m", where="map != 'fused'"),
-    Quantity("map_fits", "fused RMSE, m", "rmse_m", where="map == 'fused'"),
-    Quantity("fusion", "fused NEES / dof", "nees", "ln"),
-    Quantity("aligner_timings", "time, s", "elapsed_s", of=_EACH, timed=True),
-)

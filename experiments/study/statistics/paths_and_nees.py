@@ -1,13 +1,20 @@
 """Path errors of many runs, and landmark NEES beside the band that consistent maps keep to."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pandas as pd
 
 from experiments.judge.fused_landmarks import mean_nees_band
+from experiments.judge.judged_fusers import last_fused
 from experiments.judge.path_errors import STATISTICS
 from experiments.study.statistics import intervals
 
 FUSION_COLUMNS = ("nees_with_drift", "nees_without_drift", "degrees_of_freedom", "true_pair")
+SMOOTHER_COLUMNS = ("path_rmse_m", "filter_over_smoother", "landmark_rmse_m", "gross_share")
+SMOOTHER_COLUMNS += ("nees_per_dof", "coverage_95")
+_FUSER_FIGURES = ("landmark_rmse_m", "over_better_filter", "nees_per_dof", "coverage_95")
+FUSER_COLUMNS = ("fuser", "iteration", *_FUSER_FIGURES)
 _PATH_KEYS = ["source", "quantity", "delta", "delta_unit"]
 
 
@@ -64,3 +71,36 @@ def nees_of_pairs(fusion: pd.DataFrame, rng: np.random.Generator) -> pd.DataFram
     keys, values = ["run_id", "degrees_of_freedom"], list(labels.values())
     known = true.melt(keys, values, "landmarks", "nees_mean").dropna(subset="nees_mean")
     return nees_of_maps(known.assign(n_landmarks=1, share_in_gate=np.nan), rng)
+
+
+def smoother_summary(smoother: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
+    """One row: the batch smoother beside the filter (table `smoother`), medians over the robots.
+
+    Returns:
+        n_runs, n_robots, and each column of numbers with the interval of its median over the runs.
+    """
+    about = {"n_runs": intervals.clusters_of(smoother).n, "n_robots": len(smoother)}
+    return pd.DataFrame([about | _medians(smoother, SMOOTHER_COLUMNS, rng)])
+
+
+def fuser_summary(fusers: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
+    """One row per fuser (table `fusers`): medians over the runs, each at its last iteration.
+
+    Returns:
+        fuser, n_runs, and each column of numbers with the interval of its median over the runs.
+    """
+    rows = []
+    for fuser, own in last_fused(fusers).groupby("fuser", sort=False):
+        about = {"fuser": fuser, "n_runs": intervals.clusters_of(own).n}
+        rows.append(about | _medians(own, _FUSER_FIGURES, rng))
+    return pd.DataFrame(rows)
+
+
+def _medians(
+    rows: pd.DataFrame, names: Sequence[str], rng: np.random.Generator
+) -> dict[str, float]:
+    runs, found = intervals.clusters_of(rows), dict[str, float]()
+    for name in names:
+        values = intervals.median_interval(rows[name].to_numpy(), runs, rng)
+        found |= dict(zip((name, f"{name}_low", f"{name}_high"), values, strict=True))
+    return found

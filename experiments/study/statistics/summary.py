@@ -10,7 +10,7 @@ import pandas as pd
 from experiments.judge.criteria import that_ever_meet
 from experiments.judge.judged_maps import MAP_KEYS, NEEDED, OPTIONAL, maps_of, setting_columns
 from experiments.scenario.randomness import generator
-from experiments.study.statistics import paths_and_nees
+from experiments.study.statistics import paths_and_nees, team_statistics
 from experiments.study.statistics.error_bands import (
     ROBOT_PAIR,
     error_bands,
@@ -36,7 +36,16 @@ _TIMING_COLUMNS = (*MAP_KEYS, "aligner", "n_correspondences", "n_common", "elaps
 _FURTHER: dict[str, tuple[Any, str, Callable[..., pd.DataFrame], str]] = {
     "aligner_timings": (_TIMING_COLUMNS, "time_by_overlap", time_bands, ""),
     "path_statistics": (None, "paths", paths_and_nees.path_summary, "paths"),
+    "team": (None, "team", team_statistics.team_paths, "team"),
+    "team_pairs": (None, "team_pairs", team_statistics.team_alignments, "team_pairs"),
     "landmark_nees": (None, "nees", paths_and_nees.nees_of_maps, "nees"),
+    "smoother": (
+        paths_and_nees.SMOOTHER_COLUMNS,
+        "smoother",
+        paths_and_nees.smoother_summary,
+        "smoother",
+    ),
+    "fusers": (paths_and_nees.FUSER_COLUMNS, "fusers", paths_and_nees.fuser_summary, "fusers"),
     "fusion": (paths_and_nees.FUSION_COLUMNS, "nees", paths_and_nees.nees_of_pairs, "fusion"),
 }
 

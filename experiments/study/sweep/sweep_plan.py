@@ -19,6 +19,7 @@ from mapfusion.errors import InputError
 
 _LONGEST_NAME = 80
 _TABLES = ("errors", "fusion", "robots", "path_statistics", "map_fits", "landmark_nees")
+_TABLES += ("smoother", "team", "team_pairs", "fusers")
 
 
 class Sweep(NamedTuple):
@@ -76,8 +77,9 @@ def planned(
     if jobs is not None:
         require_memory(judged.pipeline, jobs)
     pipeline, stages = judged.pipeline, [f"{each.name}/{each.key}" for each in judged.stages()]
-    read = [stage for robot in pipeline.robots for stage in (robot.log, robot.slam)]
+    read = [stage for robot in pipeline.robots for stage in (robot.log, robot.slam, robot.smooth)]
     read += [*(pair.estimates for pair in pipeline.pairs), *judged.judgements]
+    read += pipeline.fusers.values()
     needs = tuple(name for stage in read for name in task_names(stage))
     name, arguments = f"run/{run.run_id}", (run, judged, stages, tables.dataset)
     last = Task(name, "write the tables", write_rows, arguments, (), needs)

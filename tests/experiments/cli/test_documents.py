@@ -124,7 +124,16 @@ def test_statistics(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sweep = write_sweep(tmp_path / "sweep", range(3))
     found = document(command(capsys, "statistics", sweep, "--json"), "statistics")
     assert (found["n_runs"], found["written"]) == (3, None)
-    assert found["missing_tables"] == ["path_statistics", "landmark_nees", "fusion"]
+    unknown = [
+        "path_statistics",
+        "team",
+        "team_pairs",
+        "landmark_nees",
+        "smoother",
+        "fusers",
+        "fusion",
+    ]
+    assert found["missing_tables"] == unknown
     rows = found["tables"]["error_over_oracle"]
     assert {"ransac", "oracle"} <= {row["aligner"] for row in rows}
     assert all(row["estimated_m"] is None or math.isfinite(row["estimated_m"]) for row in rows)

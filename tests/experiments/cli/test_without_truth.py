@@ -19,7 +19,7 @@ schema_version: 1
 name: recorded
 seed: 3
 logs: [R1, R2]
-slam: {filter: {n_particles: 30, proposal: motion, noise_scale: 1}}
+slam: {filter: {n_particles: 30, proposal: motion}}
 align:
   repetitions: 2
   aligners:
@@ -29,6 +29,7 @@ align:
 evaluate: {every: 10, timing_points: 2, timing_repeats: 1}
 """
 NEED_THE_TRUTH = {"errors", "fusion", "true_pairs", "path_statistics", "map_fits", "landmark_nees"}
+NEED_THE_TRUTH |= {"team", "team_pairs"}
 
 
 @pytest.fixture(scope="module")

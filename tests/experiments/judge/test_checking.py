@@ -39,6 +39,7 @@ def test_one_that_cannot_run_ends_itself_alone(
 
     monkeypatch.setattr("experiments.judge.result.run_scenario", run)
     monkeypatch.setattr("experiments.judge.checking.check", lambda *_: [])
+    monkeypatch.setattr("experiments.judge.checking.nothing_merged", lambda _: None)
     out = tmp_path / "deep" / "junit.xml"
     reply = command(capsys, "check", *three, "--seeds", "0..2", "--junit", out)
     assert reply.code == 2

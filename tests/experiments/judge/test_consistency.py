@@ -13,7 +13,9 @@ from experiments.judge.fused_landmarks import (
 from mapfusion import se2
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.result import Alignment, Status
-from mapfusion.merge import MergeParameters, merge
+from mapfusion.fuse.kalman_drift import KalmanDrift
+from mapfusion.fused_map import AlignedPair
+from mapfusion.merge import merge
 from mapfusion.se2 import Float
 from tests.helpers.made_up_maps import ITERATION, landmark_map, robot
 
@@ -55,8 +57,9 @@ def merged(a: EvaluatedRobot, b: EvaluatedRobot, pairs: np.ndarray) -> FusedTeam
     found = Alignment(T_a_b, np.eye(3), np.ones(n, bool), 0.0, Status.ACCEPTED, drift_sigma_m=0.0)
     offered = Correspondences(pairs[:, 0], pairs[:, 1], np.zeros(n))
     maps = [a.maps[ITERATION], b.maps[ITERATION]]
-    fused = merge(maps, [found], [offered], MergeParameters())
-    return FusedTeam([a, b], [], ITERATION, fused)
+    return FusedTeam(
+        [a, b], [], ITERATION, merge(maps, [AlignedPair(0, 1, found, offered)], fuser=KalmanDrift())
+    )
 
 
 def two_robots(points_a: Float, points_b: Float) -> tuple[EvaluatedRobot, EvaluatedRobot]:

@@ -17,7 +17,8 @@ from mapfusion import se2
 from mapfusion.align.acceptance import Verdict
 from mapfusion.align.result import Alignment, Status
 from mapfusion.aligned_landmarks import ABSENT
-from mapfusion.merge import FusedMap, MergeParameters
+from mapfusion.fuse.parameters import MergeParameters
+from mapfusion.fused_map import FusedMap, Fusion
 from tests.helpers.made_up_maps import ACCEPTED, ITERATION, offered, paired, robot
 
 T_WORLD_A = np.array([1.0, 2.0, 0.3])
@@ -117,7 +118,7 @@ def test_only_accepted_alignments_are_fused() -> None:
         assert fused.left_out == left_out
         assert len(fused.landmarks) == n  # fused with B's, or A's alone
         assert (fused.parents[:, 1] == ABSENT).all() == bool(left_out)
-        motions = pd.DataFrame(fused_motion_rows(team, use_drift=True)).set_index("robot")
+        motions = pd.DataFrame(fused_motion_rows(team)).set_index("robot")
         assert motions["left_out"].to_dict() == {"A": "", "B": dict(left_out).get("B", "")}
         assert np.isnan(motions.loc["B", "tx_m"]) == bool(left_out)
 
@@ -128,8 +129,10 @@ def test_truth_of_fused_landmarks_and_fits() -> None:
     a.points_world_m[ITERATION][1] = np.nan
     parents = np.array([[0, ABSENT], [1, ABSENT], [2, 0], [3, 2], [ABSENT, 3]])
     landmarks = robot("A", np.zeros((5, 3)), np.zeros(3)).maps[ITERATION]
-    fused = FusedMap(landmarks, parents, np.zeros((2, 3)), np.zeros(2), 0.0, ())
-    team = FusedTeam([a, b], [], ITERATION, fused)
+    fused = FusedMap(
+        landmarks, parents, np.zeros((2, 3)), np.zeros((2, 3, 3)), np.zeros(2), 0.0, ()
+    )
+    team = FusedTeam([a, b], [], ITERATION, Fusion((fused,), ()))
     truth = team.truth_of(fused)
     np.testing.assert_array_equal(truth[0], points[0])
     assert np.isnan(truth[1]).all()

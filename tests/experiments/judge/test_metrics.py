@@ -9,6 +9,7 @@ import pytest
 from experiments.judge import metrics
 from experiments.judge.criteria import is_false_merge
 from experiments.judge.metrics import ALIGNER_METRICS, METRICS, compute, known_metrics
+from mapfusion.fuse.registry import FUSERS
 
 
 def error(
@@ -19,6 +20,43 @@ def error(
     row |= {"refined_rotation_error_rad": 0.0, "oracle_distance_m": 0.0, "n_true": 40}
     row |= {"accepted": True, "n_common": 60, "n_correspondences": 80, "rotation_error_rad": 0.0}
     return row | more
+
+
+def team_tables() -> dict[str, pd.DataFrame]:
+    return {
+        # three robots of seed 0 merged, of seed 1 two, of seed 2 none: the first alone
+        "team": pd.DataFrame(
+            [
+                {"seed": seed, "component": component, "source": source, "rmse": rmse}
+                for seed, component, source, rmse in (
+                    (0, 1, "final", 0.1),
+                    (0, 1, "odometry", 9.0),
+                    (0, 2, "final", 9.0),
+                    (1, 1, "final", 0.3),
+                )
+            ]
+        ),
+        "team_pairs": pd.DataFrame(
+            [
+                {"place": place, "accepted": place != "refused", "n_common": n_common}
+                | {"refined_translation_error_m": alone_m, "refined_rotation_error_rad": 0.0}
+                | {"team_translation_error_m": team_m, "team_rotation_error_rad": -team_m / 10}
+                for place, n_common, alone_m, team_m in (
+                    ("confirmed", 40, 0.1, 0.1),
+                    ("bridge", 3, 0.6, 0.2),  # wrong and believed
+                    ("contradicted", 50, 9.0, 0.6),
+                    ("refused", 0, math.nan, math.nan),
+                )
+            ]
+        ),
+        "fused_motions": pd.DataFrame(
+            [
+                {"seed": seed, "tx_m": 0.0 if k < n_placed else math.nan}
+                for seed, n_placed in ((0, 3), (1, 2), (2, 1))
+                for k in range(3)
+            ]
+        ),
+    }
 
 
 @pytest.fixture
@@ -56,14 +94,30 @@ def tables() -> dict[str, pd.DataFrame]:
     columns = ["seed", "error_a_m", "error_b_m", "error_fused_m", "nees_with_drift"]
     columns += ["nees_without_drift", "degrees_of_freedom", "true_pair"]
     fits = [(0, "A", 1.0), (0, "B", 3.0), (0, "fused", 7.0), (1, "A", 6.0), (1, "fused", 9.0)]
+    smoother = {name: [1.0 * k, 5.0 * k, 3.0 * k, np.nan] for k, name in enumerate(SMOOTHER, 1)}
     return {
         "robots": pd.DataFrame(robots),
         "errors": pd.DataFrame(errors),
         "fusion": pd.DataFrame(fusion, columns=pd.Index(columns)).assign(robot_a="A", robot_b="B"),
         "map_fits": pd.DataFrame(fits, columns=pd.Index(["seed", "map", "rmse_m"])),
-    }
+        "smoother": pd.DataFrame(smoother),
+        "fusers": pd.DataFrame(
+            [
+                {"seed": seed, "fuser": fuser, "iteration": iteration}
+                | {name: times * k for k, name in enumerate(FUSER, 1)}
+                for fuser in FUSERS
+                # the last of each seed counts
+                for seed, iteration, times in ((0, 20, 1.0), (0, 10, 9.0), (1, 20, 3.0))
+            ]
+        ),
+    } | team_tables()
 
 
+SMOOTHER = ["path_rmse_m", "filter_over_smoother", "landmark_rmse_m", "gross_share"]
+SMOOTHER += ["nees_per_dof", "coverage_95"]
+FUSER = ["landmark_rmse_m", "gross_share", "fitted_rmse_m", "fitted_median_m"]
+FUSER += ["over_better_parent", "over_better_filter", "nees_per_dof", "frame_nees_per_dof"]
+FUSER += ["coverage_95", "frame_coverage_95", "alignment_nees_per_dof", "duplicate_share"]
 KNOWN = {
     "path_rmse_m": 2.0,
     "odometry_rmse_m": math.sqrt(50),
@@ -77,6 +131,12 @@ KNOWN = {
     "landmark_rmse_median_m": 4.0,
     "landmark_rmse_worst_m": 6.0,
     "fused_landmark_rmse_m": 8.0,
+    "team.merged_robots": 2.0,
+    "team.ate_rmse_m": 0.2,
+    "team.translation_m": 0.2,
+    "team.rotation_rad": 0.02,
+    "team.edge_precision": 1 / 2,
+    "team.edge_recall": 1 / 3,
     "ransac.refined_oracle_distance_m": 0.03,  # 0.01, 0.03 and none
     "ransac.refined_over_oracle": 0.5 / 0.3,  # no estimate is infinitely far off
     "ransac.estimated_over_oracle": 0.7 / 0.3,
@@ -87,6 +147,8 @@ KNOWN = {
     "svd.scatter_m": 0.0,
     "ransac.false_merges": 2 / 5,  # those 99 m off
     "ransac.missed_merges": 1 / 3,
+    **{f"smoother.{name}": 3.0 * k for k, name in enumerate(SMOOTHER, 1)},
+    **{f"{fuser}.{name}": 2.0 * k for fuser in FUSERS for k, name in enumerate(FUSER, 1)},
 }
 
 
@@ -113,7 +175,9 @@ def test_false_merge(changed: dict[str, object], false: bool) -> None:
 
 
 def test_no_metric_is_left_untested() -> None:
-    assert set(METRICS) | set(ALIGNER_METRICS) == {name.rpartition(".")[2] for name in KNOWN}
+    of_aligners = {name.rpartition(".")[2] for name in KNOWN.keys() - METRICS.keys()}
+    assert set(METRICS) <= set(KNOWN)
+    assert set(ALIGNER_METRICS) == of_aligners
     assert set(known_metrics(["ransac", "svd"])) >= set(KNOWN)
 
 

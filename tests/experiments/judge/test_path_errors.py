@@ -5,6 +5,7 @@ from evo.core import metrics
 from evo.core.trajectory import PosePath3D
 
 from experiments.judge.path_errors import (
+    SOURCES,
     STATISTICS,
     ate_m,
     pairs_by_frames,
@@ -126,3 +127,14 @@ def test_rms_over_a_run_is_of_what_is_known() -> None:
     assert found.loc["A", "over_odometry"] == pytest.approx(0.5)
     assert np.isnan(found.loc["B", "over_odometry"])
     assert found[["n_landmarks", "n_frames"]].to_numpy().tolist() == [[5, 2], [7, 2]]
+
+
+def test_a_smoothed_path_is_a_source_where_there_is_one() -> None:
+    truth, path = wander(np.random.default_rng(4), 40)
+    with_one = paths_table(truth, path)
+    for name in ("x_m", "y_m", "theta_rad"):
+        with_one[f"smoothed_{name}"] = with_one[f"truth_{name}"]
+    rows = pd.DataFrame(path_statistics_rows(with_one))
+    assert rows.loc[rows["source"] == "smoothed", "rmse"].to_numpy() == pytest.approx(0, abs=1e-9)
+    without = with_one.assign(smoothed_x_m=np.nan, smoothed_y_m=np.nan, smoothed_theta_rad=np.nan)
+    assert set(pd.DataFrame(path_statistics_rows(without))["source"]) == {*SOURCES} - {"smoothed"}

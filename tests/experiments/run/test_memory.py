@@ -58,8 +58,8 @@ def test_the_filter_needs_what_its_rows_take(tiny_path: Path) -> None:
 def test_a_long_drive_needs_a_row_for_what_was_seen_lately(tiny_path: Path) -> None:
     """All particles descend from one before; unless they are never resampled."""
     particles = "slam.filter.n_particles=200"
-    rarely = "evaluate.every=10000"
-    long = (particles, "drive.frames=100000", "vision.harris.max_corners=50", rarely)
+    rarely = ("evaluate.every=10000", "fuse.every=10000")
+    long = (particles, "drive.frames=100000", "vision.harris.max_corners=50", *rarely)
     fits, never = (
         lay_out(load_scenario(tiny_path, [*long, f"slam.filter.resample_fraction={share}"]))
         for share in (0.5, 0.0)

@@ -23,6 +23,7 @@ from experiments.scenario.loading import load_scenario, scenario_of
 from experiments.scenario.settings import Simulation
 from mapfusion.align.registry import ALIGNERS
 from mapfusion.errors import InputError
+from mapfusion.fuse.registry import FUSERS
 from mapfusion.robot_log import Observations, RobotLog, write_log
 from sim.renderer import egl_driver
 from tests.helpers.tiny_scenario import TINY
@@ -37,7 +38,7 @@ TOLD = {
     "seed": "drive faces features log slam aligner",
     "world": "drive faces",
     "world.texture": "faces",
-    "robots.name": "drive features observed log",
+    "robots.name": "drive features observed log fuse",
     "robots.start": "drive",
     "robots.route": "drive",
     "robots.loop": "drive",
@@ -45,7 +46,7 @@ TOLD = {
     "robots.odometry": "log",
     "robots.radiometry": "features",
     "drive": "drive",
-    "drive.frames": "drive observed match aligner",
+    "drive.frames": "drive observed smooth match aligner fuse",
     "render": "features",
     "camera": "features observed",
     "radiometry": "features",
@@ -55,12 +56,20 @@ TOLD = {
     "vision.stereo": "features",
     "vision.usurf": "features",
     "slam": "slam",
+    "slam.filter.motion": "slam smooth fuse",
+    "slam.filter.noise_floor_m": "slam smooth fuse",
+    "slam.filter.stray_m": "slam smooth fuse",
+    "slam.min_count": "slam smooth fuse",
+    "smooth": "smooth",
     "align.match": "match",
     "align.aligners": "aligner",
     "align.refinement": "aligner judge",
     "align.acceptance": "aligner judge",
     "align.repetitions": "aligner",
-    "merge": "judge",
+    "merge": "judge fuse",
+    "merge.fuser": "",
+    "fuse": "smooth fuse",
+    "fuse.fusers": "fuse",
     "evaluate.every": "slam match aligner",
     "evaluate.true_pair_radius_m": "judge",
     "evaluate.timing_points": "",
@@ -78,6 +87,9 @@ NO_OTHER_VALUE = {
     "align.aligners.0.name",
     "align.aligners.0.method",
     "merge.aligner",
+    "merge.fuser",
+    # names that there are
+    *(f"fuse.fusers.{i}" for i in range(len(FUSERS))),
 }
 WORDS = (
     "motion",
@@ -90,6 +102,7 @@ WORDS = (
     "other",
     "raycast",
     "pixels",
+    "drop",
 )
 
 
@@ -106,6 +119,7 @@ def resolved(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     for name in ("odometry", "radiometry"):
         data["robots"][0][name] = copy.deepcopy(data[name])
     data["align"]["aligners"][0]["parameters"] = {"gate_m": 0.25}
+    data["fuse"]["every"] = 2 * data["evaluate"]["every"]
     data["expect"] = {"path_rmse_m": {"min": 0.0, "max": 1.0}}
     return data
 

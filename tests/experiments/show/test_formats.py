@@ -32,4 +32,5 @@ def test_maps_made_as_the_page_says_align_and_merge(
     np.testing.assert_allclose(found.T_a_b, [2.0, -1.0, 0.4], atol=0.02)
     reply = command(capsys, "merge", "north.parquet", "south.parquet", "-o", "fused.parquet")
     assert reply.code == 0, reply.err
-    assert len(read_map(Path("fused.parquet"))) == 60
+    n_fused = len(read_map(Path("fused.parquet")))
+    assert 60 <= n_fused <= 62  # of 60 points; the gate keeps 99 of 100 pairs

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from scipy.optimize import minimize_scalar
+from scipy.optimize import brentq, minimize_scalar
 from scipy.stats import chi2
 
 from mapfusion.align.drift import DRIFT_FLOOR_M, estimate_drift_m
@@ -26,6 +26,41 @@ def test_is_the_most_likely_value():
     best = minimize_scalar(minus_log_likelihood, bounds=(0.0, 1.0), options={"xatol": 1e-9}).x
     # three of 4000 numbers went into the motion
     assert estimate_drift_m(e, S) == pytest.approx(best, rel=1e-3)
+
+
+def slow_score(e, S, variance_m2, gate_m):
+    """Derivative of the log-likelihood by s_drift^2, as the text has it."""
+    share = 2 * len(e) / (2 * len(e) - 3)
+    C = S + variance_m2 * np.eye(2)
+    inverse, v = np.linalg.inv(C), np.trace(C, axis1=1, axis2=2) / 2
+    explained = np.einsum("ni,nij,njk,nk->", e, inverse, inverse, e)
+    inside = -np.expm1(-(gate_m**2) / (2 * v))
+    truncated = np.exp(-(gate_m**2) / (2 * v)) * gate_m**2 / v**2 if gate_m < np.inf else 0 * v
+    return (
+        share * explained - np.trace(inverse, axis1=1, axis2=2).sum() + np.sum(truncated / inside)
+    )
+
+
+@pytest.mark.parametrize("gate_m", [0.3, np.inf])
+def test_landmarks_of_all_certainties_leave_it_where_no_step_is_taken(gate_m):
+    """Heavy tails: plain steps of Fisher scoring go to and fro for ever on one in fifteen."""
+    rng = np.random.default_rng(5)
+    above = 0
+    for _ in range(60):
+        variance = 10 ** rng.uniform(-8, -3, 200)
+        sigma = np.sqrt(variance + 10 ** rng.uniform(-12, -6))
+        e = sigma[:, None] * rng.standard_t(1.5, (200, 2))
+        kept = np.hypot(*e.T) < gate_m
+        e, S = e[kept], variance[kept, None, None] * np.eye(2)
+        found = estimate_drift_m(e, S, gate_m) ** 2
+        if found > 1.001 * DRIFT_FLOOR_M**2:
+            near = found * np.array([1 - 1e-3, 1 + 1e-3])
+            true = brentq(lambda x, e=e, S=S: slow_score(e, S, x, gate_m), *near, xtol=1e-18)
+            assert found == pytest.approx(true, rel=1e-8)
+            above += 1
+        else:
+            assert slow_score(e, S, DRIFT_FLOOR_M**2, gate_m) < 0
+    assert above > 20
 
 
 def test_three_fitted_parameters_leave_the_variance_unbiased():

@@ -13,7 +13,7 @@ from mapfusion.align.rigid import (
     residual_covariances,
     residuals,
 )
-from tests.mapfusion.align.map_pairs import error, motion
+from tests.mapfusion.align.map_pairs import covariances, error, motion
 
 
 @pytest.fixture
@@ -82,6 +82,27 @@ def test_motion_covariance_against_monte_carlo(noisy, weighted):
     expected = motion_covariance(gain, covariance)
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
     np.testing.assert_allclose(np.cov(fits.T) / scale, expected / scale, atol=0.1)
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_kernels_equal_their_twins(noisy, weighted):
+    """The same in products of whole arrays."""
+    T_a_b, p_a, p_b = noisy
+    rng = np.random.default_rng(4)
+    S_a, S_b = covariances(rng, 30), covariances(rng, 30)
+    R = se2.rotation(T_a_b[2])
+    own = S_a[:, :2, :2] + R @ S_b[:, :2, :2] @ R.T
+    np.testing.assert_allclose(residual_covariances(T_a_b, S_a, S_b), own, rtol=1e-12)
+    moved = se2.transform_points(T_a_b, p_b)
+    np.testing.assert_allclose(residuals(T_a_b, p_a, p_b), (p_a - moved)[:, :2], atol=1e-13)
+    weight, J = rng.uniform(0.1, 5, 30) if weighted else None, motion_jacobian(T_a_b, p_b)
+    W = np.ones(30) if weight is None else weight
+    normal = np.einsum("n,nik,nil->kl", W, J, J)
+    true = np.einsum("n,kl,nil->nki", W, np.linalg.inv(normal), J)
+    gain = least_squares_gain(T_a_b, p_b, weight)
+    np.testing.assert_allclose(gain, true, rtol=1e-10, atol=1e-14)
+    expected = np.einsum("nki,nij,nlj->kl", true, own, true)
+    np.testing.assert_allclose(motion_covariance(gain, own), expected, rtol=1e-10, atol=1e-16)
 
 
 def test_equal_weights_are_none(noisy):

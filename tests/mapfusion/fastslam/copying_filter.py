@@ -209,7 +209,7 @@ class CopyingFilter:
 
     def observation(self, observations: Observations, k: int) -> tuple[np.ndarray, np.ndarray]:
         n = self.n_dof
-        R = self.parameters.noise_scale**2 * observations.covariance_m2[k][:n, :n]
+        R = observations.covariance_m2[k][:n, :n]
         R = R + self.parameters.noise_floor_m**2 * np.eye(n)
         return observations.position_m[k][:n], R
 

@@ -79,7 +79,5 @@ def nothing() -> Observations:
 
 def parameters(**changes) -> FastSlamParameters:
     """The paper's own filter, with changes."""
-    plain = FastSlamParameters(
-        n_particles=15, motion=LOOSE_MOTION, proposal=Proposal.MOTION, noise_scale=1.0
-    )
+    plain = FastSlamParameters(n_particles=15, motion=LOOSE_MOTION, proposal=Proposal.MOTION)
     return replace(plain, **changes)

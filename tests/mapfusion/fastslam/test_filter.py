@@ -240,7 +240,6 @@ def test_a_long_drive_keeps_each_particles_estimates_of_what_was_seen_lately_alo
         ({"gate_probability": 1.0}, "gate_probability"),
         ({"resample_fraction": 1.5}, "resample_fraction"),
         ({"descriptor_threshold": 0.0}, "descriptor_threshold"),
-        ({"noise_scale": 0.0}, "noise_scale"),
         ({"noise_floor_m": -1.0}, "noise_floor_m"),
         ({"association": "smell"}, "smell"),
     ],

@@ -52,7 +52,6 @@ def test_equals_the_filter_that_copies(association, planar, resample_fraction, p
         resample_fraction=resample_fraction,
         gate_probability=0.9,
         descriptor_threshold=0.6,
-        noise_scale=1.1,
         noise_floor_m=0.005,
     )
     slam = FastSlam(settings, np.random.default_rng(5))

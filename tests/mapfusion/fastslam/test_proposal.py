@@ -24,7 +24,7 @@ DESCRIPTOR = unit(np.random.default_rng(9).standard_normal((4, 64)))
 
 def settings_of(proposal: Proposal) -> FastSlamParameters:
     """The noise of the observations is what it says it is."""
-    return FastSlamParameters(n_particles=20, motion=MOTION, proposal=proposal, noise_scale=1.0)
+    return FastSlamParameters(n_particles=20, motion=MOTION, proposal=proposal)
 
 
 def after_two_frames(proposal: str, n: int, seed: int, sigma_m: float = 0.03, **changes):

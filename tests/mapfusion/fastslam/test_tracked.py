@@ -64,3 +64,33 @@ def test_each_track_s_end_widens_its_landmark_once(particles: int) -> None:
 
 def test_observations_without_tracks_are_each_news_of_the_landmark() -> None:
     np.testing.assert_allclose(variances([frame(None)] * 4 + [nothing()]), after(4))
+
+
+@pytest.mark.parametrize("sigma_m", [1e-4, 0.01, 1.0])
+@pytest.mark.parametrize("tracks", [(3, 4), None])
+def test_the_density_has_no_step_at_the_gate(
+    sigma_m: float, tracks: tuple[int, int] | None
+) -> None:
+    """However sharp: a match inside never says less than a new landmark of the same place."""
+    settings = parameters(
+        n_particles=1, motion=EXACT_MOTION, association="gate", stray_m=STRAY_M, planar=False
+    )
+
+    def seen(x_m: float, k: int) -> Observations:
+        at = np.array([[2.0 + x_m, 0.5, 0.1]])
+        covariance = sigma_m**2 * np.eye(3)[None]
+        track = None if tracks is None else np.array([tracks[k]], dtype=np.int32)
+        return Observations(at, covariance, track=track)
+
+    def log_evidence(distance: float) -> float:
+        """Of the second sighting, so many deviations beside the first."""
+        stray_m = 0.0 if tracks is None else STRAY_M
+        slam = FastSlam(settings, np.random.default_rng(0))
+        slam.step(np.zeros(3), seen(0.0, 0))
+        slam.step(np.zeros(3), nothing())
+        x_m = distance * np.sqrt(2 * sigma_m**2 + 2 * stray_m**2)
+        return slam.step(np.zeros(3), seen(x_m, 1)).log_evidence
+
+    inside, outside = 0.999 * np.sqrt(settings.gate), 1.001 * np.sqrt(settings.gate)
+    assert log_evidence(inside) == pytest.approx(log_evidence(outside), abs=0.002 * settings.gate)
+    assert log_evidence(0.0) == pytest.approx(log_evidence(outside) + settings.gate / 2)

@@ -149,7 +149,6 @@ def test_the_filter_finds_the_landmarks(recording: Path, tmp_path: Path):
     settings = FastSlamParameters(
         n_particles=20,
         proposal=Proposal.MOTION,
-        noise_scale=1.0,
         association="label",
         motion=MotionNoise(0.005, 0, 0.005, 0, 0, lateral_slip_m_per_rad=0),
     )

@@ -1,5 +1,6 @@
 """Logs whose errors are what they say: independent, Gaussian, of the stated covariances."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -21,17 +22,20 @@ class Known(NamedTuple):
 
 
 def white_noise_log(
-    rng: np.random.Generator, n_frames: int, n_landmarks: int, planar: bool = False
+    rng: np.random.Generator,
+    n_frames: int,
+    n_landmarks: int,
+    planar: bool = False,
+    point_m: Float | None = None,
 ) -> Known:
-    """A robot that drives in circles among landmarks that it sees now and then."""
+    """A robot that drives in circles among landmarks, drawn unless given, that it sees at times."""
     odometry = np.zeros((n_frames, 3))
     odometry[1:] = [0.08, 0.0, 0.08]
     path = np.zeros((n_frames, 3))
     for k in range(1, n_frames):
         disturbance = rng.standard_normal(3) * NOISE.standard_deviations(odometry[k])
         path[k] = compose(path[k - 1], odometry[k] + disturbance)
-    height = np.zeros(n_landmarks) if planar else rng.uniform(0, 1, n_landmarks)
-    point_m = np.column_stack([rng.uniform(-3, 4, (n_landmarks, 2)), height])
+    point_m = scattered(rng, n_landmarks, planar) if point_m is None else point_m
     seen = [_sightings(rng, path[k], point_m, planar) for k in range(n_frames)]
     iteration = np.repeat(np.arange(n_frames), [len(label) for label, _, _ in seen])
     label, position, covariance = map(np.concatenate, zip(*seen, strict=True))
@@ -41,6 +45,12 @@ def white_noise_log(
         path,
         point_m,
     )
+
+
+def scattered(rng: np.random.Generator, n_landmarks: int, planar: bool) -> Float:
+    """Landmarks (L, 3) all around."""
+    height = np.zeros(n_landmarks) if planar else rng.uniform(0, 1, n_landmarks)
+    return np.column_stack([rng.uniform(-3, 4, (n_landmarks, 2)), height])
 
 
 def _sightings(
@@ -68,3 +78,50 @@ def dead_reckoned(log: RobotLog) -> Float:
     for k in range(1, len(log)):
         path[k] = compose(path[k - 1], log.odometry[k])
     return path
+
+
+def with_tracks(
+    known: Known, rng: np.random.Generator, stray_m: float, most_frames: int = 6
+) -> Known:
+    """The same log, where each track is of a point beside the landmark.
+
+    A track holds a landmark's observations in consecutive frames, but no more than `most_frames`;
+    every tenth observation is of the landmark itself and belongs to none.
+    """
+    log, seen = known.log, known.log.observations
+    assert seen.label is not None
+    track, open_tracks, n_tracks = np.full(len(seen), -1, dtype=np.int32), {}, 0
+    for row, (label, frame) in enumerate(zip(seen.label, log.iteration, strict=True)):
+        if rng.uniform() < 0.1:
+            continue
+        own, last, count = open_tracks.get(label, (-1, -2, 0))
+        if last != frame - 1 or count == most_frames:
+            own, count, n_tracks = n_tracks, 0, n_tracks + 1
+        open_tracks[label], track[row] = (own, frame, count + 1), own
+    offset = stray_m * rng.standard_normal((n_tracks, 3))
+    tracked = known._replace(log=replace(log, observations=replace(seen, track=track)))
+    return tracked._replace(log=_displaced(tracked, offset))
+
+
+def moved_tracks(
+    known: Known, rng: np.random.Generator, tracks: np.ndarray, distance_m: float
+) -> RobotLog:
+    """The log with some tracks (n,) moved as a whole, each by this distance and its own way."""
+    track = known.log.observations.track
+    assert track is not None
+    offset = np.zeros((track.max() + 1, 3))
+    way = rng.standard_normal((len(tracks), 3))
+    offset[tracks] = distance_m * way / np.linalg.norm(way, axis=1, keepdims=True)
+    return _displaced(known, offset)
+
+
+def _displaced(known: Known, offset: Float) -> RobotLog:
+    """The log with the tracks' points moved by offsets (B, 3) in the frame of the truth."""
+    log, seen = known.log, known.log.observations
+    assert seen.track is not None
+    by = np.where(seen.track[:, None] >= 0, offset[seen.track], 0.0)
+    by[:, 2] *= not log.planar
+    position, heading = seen.position_m.copy(), known.path[log.iteration, 2]
+    position[:, :2] += np.einsum("nji,nj->ni", rotation(heading), by[:, :2])
+    position[:, 2] += by[:, 2]
+    return replace(log, observations=replace(seen, position_m=position))

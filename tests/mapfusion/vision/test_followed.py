@@ -9,7 +9,7 @@ from mapfusion.camera import StereoCamera
 from mapfusion.se2 import transform_points
 from mapfusion.vision.features import Features
 from mapfusion.vision.frontend import FrontEnd
-from mapfusion.vision.patch_fit import PATCH_SIDE_PX
+from mapfusion.vision.patches import PATCH_SIDE_PX
 from mapfusion.vision.tracks import Tracker, TrackParameters
 from tests.mapfusion.vision.rendered_scene import render, wall
 from tests.mapfusion.vision.shifted_pictures import Picture

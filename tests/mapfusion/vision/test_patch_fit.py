@@ -5,7 +5,9 @@ import pytest
 from scipy.ndimage import map_coordinates
 from scipy.optimize import least_squares
 
-from mapfusion.vision.patch_fit import PATCH_SIDE_PX, cut_patches, fit_patches
+from mapfusion.vision.patch_fit import fit_patches
+from mapfusion.vision.patches import PATCH_SIDE_PX, cut_patches
+from mapfusion.vision.template import Templates
 from tests.mapfusion.vision.shifted_pictures import Picture
 
 HALF = PATCH_SIDE_PX // 2
@@ -40,8 +42,8 @@ def fitted(
     noise: float = 2.0,
     max_misfit: float = 0.5,
 ) -> tuple[bool, np.ndarray]:
-    warp = start[None].copy()
-    found = fit_patches(before[None], POINT[None], after[None], warp, noise, max_misfit)
+    warp, template = start[None].copy(), Templates.of(before[None], POINT[None], noise, max_misfit)
+    found = fit_patches(template, np.zeros(1, int), after[None], warp)
     return bool(found[0]), warp[0]
 
 
@@ -90,12 +92,26 @@ def test_noise_moves_the_place_as_the_normal_matrix_says() -> None:
     start = np.eye(2, 3)
     for _ in range(300):
         pair = [grey(clean + noise * rng.standard_normal(clean.shape))[None] for _ in range(2)]
-        warp = start[None].copy()
-        assert fit_patches(pair[0], np.zeros((1, 2)), pair[1], warp, noise, 0.5)[0]
+        warp, template = start[None].copy(), Templates.of(pair[0], np.zeros((1, 2)), noise, 0.5)
+        assert fit_patches(template, np.zeros(1, int), pair[1], warp)[0]
         errors.append(warp[0, :, 2])
     ratio = np.std(errors, axis=0) / np.sqrt(np.diag(expected)[:2])
     # bilinear values between two pixels have less noise than a pixel; 300 draws know 4 %
     assert np.all((ratio > 0.75) & (ratio < 1.15)), ratio
+
+
+def test_each_is_fitted_to_its_own_template() -> None:
+    """In any order, some twice, among one without texture."""
+    pairs = np.stack([before_and_after(seed) for seed in range(4)])
+    before, after = pairs[:, 0], pairs[:, 1]
+    before[2] = 128
+    templates = Templates.of(before, np.tile(POINT, (4, 1)), 2.0, 0.5)
+    rows = np.array([3, 0, 2, 1, 0])
+    warp = np.tile(START, (5, 1, 1))
+    found = fit_patches(templates, rows, after[rows], warp)
+    assert found.tolist() == [True, True, False, True, True]
+    for row, own in zip(rows[found], warp[found], strict=True):
+        np.testing.assert_array_equal(own, fitted(before[row], after[row])[1])
 
 
 def test_what_does_not_fit_is_told() -> None:

@@ -8,6 +8,7 @@ import pytest
 from mapfusion.camera import StereoCamera
 from mapfusion.se2 import transform_points
 from mapfusion.vision.rigid_links import rigid_links
+from tests.mapfusion.vision.rigid_links_twin import rigid_links_twin
 
 CAMERA = StereoCamera()
 SIGMA_UV_PX, SIGMA_DISPARITY_PX = 0.3, 0.2
@@ -122,3 +123,18 @@ def test_one_point_seen_many_times_is_no_error() -> None:
     p = np.tile([3.0, 0.0, 1.0], (6, 1))
     S = np.tile(np.eye(3) * 1e-4, (6, 1, 1))
     assert rigid_links(p, S, p, S, 0.999).all()
+
+
+@pytest.mark.parametrize("n", [4, 5, 12, 80])
+def test_equals_the_twin(n: int) -> None:
+    """Among slips small and large, and where all points but a few, or all, are one."""
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        before, S_before, after, S_after = frames(n, rng, rng.normal(0, [0.1, 0.02, 0.2]))
+        slipped = rng.random(n) < rng.uniform(0, 0.5)
+        before[slipped] += rng.normal(0, 10 ** rng.uniform(-2, 0), (slipped.sum(), 3))
+        same = rng.random(n) < (0.0, 0.0, 0.5, 1.0)[seed % 4]
+        before[same], after[same] = [3.1, 0.1, 1.0], [3.0, 0.0, 1.0]
+        S_before[same], S_after[same] = 1e-4 * np.eye(3), 2e-4 * np.eye(3)
+        links = before, S_before, after, S_after, 0.99
+        assert rigid_links(*links).tolist() == rigid_links_twin(*links).tolist()

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 from experiments.judge import tables
-from experiments.show.figures import drawing, fig02_two_maps
+from experiments.show.figures import drawing, fig02_two_maps, fig11_fusers, fig12_coverage
 from experiments.show.figures.drawing import FIGURES, draw_all, draw_figure
 from experiments.show.figures.fig03_dispersion import choose_moments, spread_over_time
 from experiments.show.figures.result_tables import ResultTables
@@ -32,7 +32,7 @@ def test_all_figures_are_drawn(trio_copy: Path) -> None:
     assert [file.name for file in files] == [
         f"{name}.{kind}" for name in FIGURES for kind in ("png", "svg")
     ]
-    assert done == [(n + 1, 10) for n in range(10)]
+    assert done == [(n + 1, 12) for n in range(12)]
     assert skipped == []
     for file in files:
         if file.suffix == ".png":
@@ -84,11 +84,33 @@ def test_one_robot_has_no_pairs_to_show(trio_copy: Path) -> None:
         rows = data.table(name)
         if "robot" in rows:
             change(trio_copy, name, rows[rows["robot"] == "R1"])
-        elif "robot_a" in rows:
+        elif "robot_a" in rows or "fuser" in rows:
             change(trio_copy, name, rows.iloc[:0])
     reasons = skipped_figures(trio_copy)
-    assert sorted(reasons) == [name for name in FIGURES if "04" <= name[3:5] <= "10"]
+    assert sorted(reasons) == [name for name in FIGURES if name[3:5] >= "04"]
     assert reasons["fig04_translation_error"] == "no robot pair was aligned"
+
+
+@pytest.mark.usefixtures("quick_save")
+def test_of_older_results_all_but_the_fusers_is_drawn(trio_copy: Path) -> None:
+    for name in ("fusers", "fuser_coverage"):
+        tables.table_path(trio_copy, name).unlink()
+    assert list(skipped_figures(trio_copy)) == ["fig11_fusers", "fig12_coverage"]
+
+
+def test_each_fuser_has_a_line_of_its_own_a_plug_in_s_too(trio_copy: Path) -> None:
+    data = ResultTables(trio_copy)
+    names = {"kalman": "mine", "joint": "theirs"}
+    changed = {name: data.table(name) for name in ("fusers", "fuser_coverage")}
+    for name, rows in changed.items():
+        change(trio_copy, name, rows.assign(fuser=rows["fuser"].replace(names)))
+    for module in (fig11_fusers, fig12_coverage):
+        figure = module.draw(ResultTables(trio_copy))
+        fusers = list(dict.fromkeys(changed["fusers"]["fuser"].replace(names)))
+        labels = [text.get_text() for text in figure.legends[0].get_texts()]
+        assert [label for label in labels if label in fusers] == fusers
+        looks = {(line.get_color(), line.get_marker()) for line in figure.axes[0].lines}
+        assert len(looks) >= len(fusers)
 
 
 @pytest.mark.usefixtures("quick_save")
@@ -109,7 +131,7 @@ def test_nothing_is_drawn_of_what_failed(trio_copy: Path) -> None:
     errors = data.table("errors").assign(status="degenerate", refined_status="degenerate")
     numbers = [name for name in errors if str(name).endswith(("error_m", "error_rad"))]
     change(trio_copy, "errors", errors.assign(**dict.fromkeys(numbers, np.nan)))
-    for name in ("correspondences", "fused", "aligner_timings"):
+    for name in ("correspondences", "fused", "fused_map", "aligner_timings"):
         change(trio_copy, name, data.table(name).iloc[:0])
     assert list(skipped_figures(trio_copy)) == [
         name for name in FIGURES if "04" <= name[3:5] <= "10"
@@ -136,7 +158,8 @@ def test_the_maps_in_space_fill_their_page(trio_copy: Path) -> None:
 
 
 def test_missing_table_is_an_error_that_names_the_file(trio_copy: Path) -> None:
-    tables.table_path(trio_copy, "fused").unlink()
+    for name in ("fused", "fused_map"):
+        tables.table_path(trio_copy, name).unlink()
     with pytest.raises(InputError, match=r"fused\.parquet: no such file"):
         draw_figure(ResultTables(trio_copy), "fig10_fused_map")
 

@@ -11,6 +11,8 @@ import pandas as pd
 import pytest
 
 from experiments.judge import tables
+from experiments.show.figures.drawing import draw_figure
+from experiments.show.figures.result_tables import ResultTables
 from experiments.show.report.document import write_report
 from mapfusion.storage import read_json, write_json
 from tests.helpers.report_page import HOSTILE, Page, hostile, page_of
@@ -74,6 +76,28 @@ def test_numbers_that_json_does_not_know_are_left_out(trio_copy: Path) -> None:
         raise AssertionError(constant)
 
     json.loads(found.json, parse_constant=refuse)
+
+
+def test_fusers_stand_with_their_figures_and_how_to_read_them(trio_copy: Path) -> None:
+    for name in ("fig11_fusers", "fig12_coverage"):
+        draw_figure(ResultTables(trio_copy), name)
+    page = page_of(trio_copy, trio_copy / "r.html")
+    rows = tables.read(tables.table_path(trio_copy, "fusers"), "fusers")
+    section = page.words.split("Maps of all robots together")[1]
+    assert all(name in section for name in rows["fuser"])
+    assert "Figure 11" in section
+    assert "Below it a map is too sure" in section
+    assert "fusers" in [attributes.get("id") for tag, attributes in page.tags if tag == "section"]
+
+
+def test_a_result_without_fusers_has_no_such_section(trio_copy: Path) -> None:
+    for name in ("fusers", "fuser_coverage"):
+        tables.table_path(trio_copy, name).unlink()
+    scenario = read_json(trio_copy / "scenario.json", "scenario")
+    write_json(trio_copy / "scenario.json", scenario | {"expect": {"path_rmse_m": {"max": 9}}})
+    page = page_of(trio_copy, trio_copy / "r.html")
+    assert "fusers" not in [a.get("id") for tag, a in page.tags if tag == "section"]
+    assert "All 1 expectations" in page.words  # the rest is measured all the same
 
 
 @pytest.mark.parametrize("name", ["aligner_timings", "clouds", "fusion", "map_history"])

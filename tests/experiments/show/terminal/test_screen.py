@@ -8,10 +8,11 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from experiments.judge import tables
 from experiments.show.plain_text import plain
 from experiments.show.terminal import layout
 from experiments.show.terminal.layout import print_lines, print_table
-from experiments.show.terminal.run_screen import not_run_lines
+from experiments.show.terminal.run_screen import not_run_lines, print_result
 from experiments.study.statistics.standing import aligner_summary
 
 
@@ -57,6 +58,31 @@ def test_one_line_for_each_aligner_that_did_not_run() -> None:
         "ill: failed in 2 of 3 rows: raised KeyError",
         "far: absent: install it",
     ]
+
+
+def test_fusers_are_shown_at_the_end_on_a_narrow_screen(
+    trio_copy: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    path = tables.table_path(trio_copy, "fusers")
+    known = tables.read(path, "fusers")
+    later = known.assign(iteration=known["iteration"] + 1, nees_per_dof=77.0)
+    tables.write(path, "fusers", pd.concat([later, known]))
+    print_result(trio_copy, [])
+    shown = capsys.readouterr().out.split("Fusers: maps of all robots")[1].split("\n\n")[0]
+    assert all(len(line) <= 80 for line in shown.splitlines())
+    fusers = list(dict.fromkeys(known["fuser"]))
+    lines = {line.split()[0]: line for line in shown.splitlines()}
+    assert [name for name in lines if name in fusers] == fusers
+    assert all("77.00" in lines[name] for name in fusers)
+
+
+def test_of_one_robot_or_without_truth_no_fusers_are_shown(
+    trio_copy: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tables.write(tables.table_path(trio_copy, "fusers"), "fusers", [])
+    print_result(trio_copy, [])
+    assert "Fusers" not in capsys.readouterr().out
 
 
 def test_absent_is_neither_accepted_nor_not() -> None:

@@ -37,7 +37,8 @@ def test_screen_files_and_figures(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert reply.code == 0, reply.err
     for text in ("Right at the end of 7 runs", "over the oracle", "ransac against each other"):
         assert text in reply.out
-    assert "No run has: path_statistics, landmark_nees, fusion" in reply.out
+    unknown = "path_statistics, team, team_pairs, landmark_nees, smoother, fusers, fusion"
+    assert f"No run has: {unknown}" in " ".join(reply.out.split())
     assert max(map(len, reply.out.split("All ")[0].splitlines())) <= 80
     names = {path.name for path in (tmp_path / "out").iterdir()}
     for name in ("success_by_iteration", "error_over_oracle", "methods_compared"):

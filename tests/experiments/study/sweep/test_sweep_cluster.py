@@ -67,9 +67,20 @@ def scheduler(other_machine: OtherMachine, tmp_path: Path) -> Iterator[str]:
     at = ("--host", "127.0.0.1", "--no-dashboard", *file)
     worker = ("dask", "worker", "--nthreads", "2", "--no-nanny", *at)  # one too many
     with other_machine.running(
-        ("dask", "scheduler", "--port", "0", *at), worker, worker, ready=told
+        ("dask", "scheduler", "--port", "0", *at),
+        worker,
+        worker,
+        ready=lambda: bool(_address(told)),
     ):
-        yield json.loads(told.read_text())["address"]
+        yield _address(told)
+
+
+def _address(told: Path) -> str:
+    """What the scheduler's file says; empty as long as it is not written to its end."""
+    try:
+        return json.loads(told.read_text())["address"]
+    except (FileNotFoundError, json.JSONDecodeError):
+        return ""
 
 
 def test_workers_elsewhere_make_the_same_tables(

@@ -1,0 +1,106 @@
+"""What the filter loses against a batch: each robot's smoothed map and path against the truth."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from experiments.judge.errors import EvaluatedRobot
+from experiments.judge.judging import truth_of
+from experiments.judge.map_consistency import fitted, relative_consistency
+from experiments.judge.path_errors import ate_m
+from experiments.judge.truth import landmark_truth
+from experiments.run.frames import read_rows
+from experiments.run.stages.slam import ASSOCIATIONS, RobotFolders, final_path
+from experiments.run.stages.smooth import read_endings, read_smoothed, read_smoothed_path
+from mapfusion.landmark_map import LandmarkMap
+from mapfusion.robot_log import read_log
+from mapfusion.se2 import Float
+from mapfusion.storage import POSE_FIELDS, named_columns
+
+
+@dataclass(frozen=True)
+class SmoothedRobot:
+    """What the smoother made of a robot's log, by the iterations that have a smoothed map.
+
+    Attributes:
+        robot: its filter's maps, and its true path.
+        filter_path: (T, 3) the filter's whole path at the end.
+        maps: with their joint covariances.
+        points_world_m: (N, 3) true points for each map, NaN where unknown.
+        paths: (k + 1, 3) up to each iteration k.
+        ending: how smoothing ended at the robot's last iteration.
+    """
+
+    robot: EvaluatedRobot
+    filter_path: Float
+    maps: dict[int, LandmarkMap]
+    points_world_m: dict[int, Float]
+    paths: dict[int, Float]
+    ending: dict[str, Any]
+
+    @property
+    def last_path(self) -> Float:
+        """(T, 3); NaN where the whole log was not smoothed."""
+        unknown = np.full_like(self.filter_path, np.nan)
+        return self.paths.get(len(self.filter_path) - 1, unknown)
+
+
+def load_smoothed(robot: EvaluatedRobot, folders: RobotFolders, smooth: Path) -> SmoothedRobot:
+    """A robot's smoothed maps joined with the truth, which is NaN where it is unknown."""
+    truth, maps = truth_of(folders.log, read_log(folders.log)), read_smoothed(smooth)
+    associations = read_rows(folders.slam / "associations.parquet", ASSOCIATIONS)
+    points = landmark_truth(truth, associations, maps)
+    ending = read_endings(smooth).to_dict("records")[-1]
+    paths = read_smoothed_path(smooth)
+    whole = {str(name): value for name, value in ending.items()}
+    return SmoothedRobot(robot, final_path(folders.slam), maps, points, paths, whole)
+
+
+def smoothed_path_rows(smoothed: Sequence[SmoothedRobot]) -> pd.DataFrame:
+    """Rows of the table `smoothed_paths`."""
+    rows = [
+        pd.DataFrame(named_columns(POSE_FIELDS, path)).assign(
+            robot=each.robot.name, iteration=k, frame=np.arange(len(path))
+        )
+        for each in smoothed
+        for k, path in each.paths.items()
+    ]
+    return pd.concat(rows, ignore_index=True) if rows else pd.DataFrame()
+
+
+def smoother_rows(smoothed: Sequence[SmoothedRobot]) -> list[dict[str, Any]]:
+    """Rows of the table `smoother`: each robot's last maps and whole paths."""
+    return [_row(each) for each in smoothed]
+
+
+def _row(smoothed: SmoothedRobot) -> dict[str, Any]:
+    robot, last = smoothed.robot, len(smoothed.filter_path) - 1
+    path_m, filter_m = (
+        _path_rmse_m(path, robot.path.T_map_robot)
+        for path in (smoothed.last_path, smoothed.filter_path)
+    )
+    row = {"robot": robot.name, "path_rmse_m": path_m, "filter_path_rmse_m": filter_m}
+    row |= {"filter_over_smoother": filter_m / path_m if path_m > 0 else np.nan} | smoothed.ending
+    of_filter = fitted(robot.maps[last], robot.points_world_m[last])
+    row |= {"filter_landmark_rmse_m": of_filter.rmse_m, "filter_gross_share": of_filter.gross_share}
+    if last not in smoothed.maps:
+        return row | {"n_landmarks": 0}
+    landmarks = smoothed.maps[last]
+    fit = fitted(landmarks, smoothed.points_world_m[last])
+    row |= {"landmark_rmse_m": fit.rmse_m, "gross_share": fit.gross_share}
+    row |= {"n_landmarks": len(landmarks)}
+    consistency = relative_consistency(landmarks, fit)
+    names = ("nees_per_dof", "marginal_nees_per_dof", "coverage_95")
+    return row | {name: getattr(consistency, name) for name in names}
+
+
+def _path_rmse_m(path: Float, truth: Float) -> float:
+    """RMS distance of the positions both know, from the same start; NaN where there is none."""
+    known = np.isfinite(path).all(axis=1) & np.isfinite(truth).all(axis=1)
+    if not known.any():
+        return np.nan
+    return float(np.sqrt(np.mean(ate_m(path[known], truth[known], fit=False) ** 2)))

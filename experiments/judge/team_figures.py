@@ -1,0 +1,119 @@
+"""All robots of a run against the truth together: paths in one frame, and the alignments believed.
+
+The ATE of a team moves the paths of all its robots by the motions that merged their maps, and then
+all of them by one rigid fit to the truth: what the robots are off against each other counts. Of one
+robot it is evo's.
+"""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from experiments.judge import criteria
+from experiments.judge.fused_landmarks import FusedTeam, team_edge_rows
+from experiments.judge.path_errors import SOURCES, ate_m, seven_statistics
+from mapfusion import se2
+from mapfusion.se2 import Float
+from mapfusion.storage import POSE_FIELDS
+from mapfusion.team.team_graph import Place
+
+_PAIR = ["robot_a", "robot_b"]
+# What a pair of robots takes over from its row of `errors`.
+_ALONE = ["accepted", "n_common", "refined_translation_error_m", "refined_rotation_error_rad"]
+
+
+def team_rows(team: FusedTeam, paths: pd.DataFrame) -> list[dict[str, Any]]:
+    """Rows of the table `team` from those of the table `paths`; none where nothing was merged."""
+    own = dict(iter(paths.groupby("robot", sort=False)))
+    rows = []
+    for number, T_first_map in enumerate(_placements(team), start=1):
+        placed = np.isfinite(T_first_map[:, 0])
+        members = [(k, robot) for k, robot in enumerate(team.robots) if placed[k]]
+        row = {"component": number, "n_robots": len(members), "n_team": len(team.robots)}
+        for source in _sources_of([own[robot.name] for _, robot in members]):
+            together = [
+                _in_one_frame(own[robot.name], source, T_first_map[k], robot.path.T_world_map)
+                for k, robot in members
+            ]
+            path, truth = (np.concatenate(poses) for poses in zip(*together, strict=True))
+            errors = ate_m(path, truth)
+            rows.append(row | {"source": source, "n": len(errors)} | seven_statistics(errors))
+    return rows
+
+
+def _sources_of(paths: list[pd.DataFrame]) -> list[str]:
+    """The kinds of paths that all of these robots have; not every log is smoothed."""
+    first = {source: f"{source}_{POSE_FIELDS[0]}" for source in SOURCES}
+    return [
+        source
+        for source, column in first.items()
+        if all(column in own and own[column].notna().any() for own in paths)
+    ]
+
+
+def _placements(team: FusedTeam) -> Iterator[Float]:
+    """T_first_map (M, 3) of each set of robots that were merged, or of a robot that was alone."""
+    if team.fusion is None:
+        yield np.zeros((1, 3))
+    else:
+        yield from (each.T_first_map for each in team.fusion.fused if len(each.members) > 1)
+
+
+def _in_one_frame(
+    paths: pd.DataFrame, source: str, T_first_map: Float, T_world_map: Float
+) -> tuple[Float, Float]:
+    """Estimated poses (n, 3) in the fused frame and true ones in the world, where known."""
+    poses, truth = (
+        paths[[f"{which}_{name}" for name in POSE_FIELDS]].to_numpy() for which in (source, "truth")
+    )
+    known = np.isfinite(truth).all(axis=1)
+    return se2.compose(T_first_map, poses[known]), se2.compose(T_world_map, truth[known])
+
+
+def team_pair_rows(team: FusedTeam, errors: pd.DataFrame, aligner: str) -> pd.DataFrame:
+    """Rows of the table `team_pairs`: each two robots, aligned alone and placed with all others."""
+    edges = team_edge_rows(team)
+    if edges.empty:
+        return edges
+    used = (errors["aligner"] == aligner) & (errors["repetition"] == 0)
+    rows = edges.merge(criteria.at_the_end(errors[used])[[*_PAIR, *_ALONE]], "left", _PAIR)
+    place = {robot.name: k for k, robot in enumerate(team.robots)}
+    index = rows[_PAIR].map(place.get).to_numpy()
+    off = _placed_errors(team, index)
+    return rows.assign(team_translation_error_m=off[:, 0], team_rotation_error_rad=off[:, 1])
+
+
+def _placed_errors(team: FusedTeam, pairs: np.ndarray) -> Float:
+    """Errors (E, 2) in m and rad of T_a_b between robots (E, 2) as the team places them.
+
+    NaN where it does not place both in one map.
+    """
+    T_world_map = np.array([robot.path.T_world_map for robot in team.robots])
+    a, b = pairs.T
+    off = np.full((len(pairs), 2), np.nan)
+    for T_first_map in _placements(team):
+        error = se2.between(T_first_map[a], T_first_map[b]) - se2.between(
+            T_world_map[a], T_world_map[b]
+        )
+        own = np.column_stack([np.hypot(error[:, 0], error[:, 1]), se2.wrap(error[:, 2])])
+        off = np.where(np.isfinite(own), own, off)
+    return off
+
+
+def believed(pairs: pd.DataFrame) -> pd.Series:
+    """Bool per row of `team_pairs`: whether the team's map was placed by this alignment."""
+    return pairs["place"].isin([Place.CONFIRMED, Place.BRIDGE])
+
+
+def edge_precision(pairs: pd.DataFrame) -> float:
+    """Share of right ones among the alignments that were believed; NaN where none were."""
+    used = pairs[believed(pairs)]
+    return float(1 - criteria.is_false_merge(used).mean())
+
+
+def edge_recall(pairs: pd.DataFrame) -> float:
+    """Share of the pairs with common ground whose alignment is right and was believed."""
+    met = pairs[criteria.has_common_ground(pairs)]
+    return float((criteria.right_refined(met) & believed(met)).mean())

@@ -1,0 +1,243 @@
+"""Stage: one fuser's maps of all robots together, at each iteration that maps are fused at.
+
+The maps, the alignments and what the team says of them are the same for all fusers; those that
+take smoothed maps are given these, where there are any.
+"""
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+
+from experiments.run.estimates import alignment_of, correspondences_of
+from experiments.run.frames import FLOAT, INT, TEXT, fields, read_rows, write_rows
+from experiments.run.job import Job
+from experiments.run.stage_tables import CORRESPONDENCES, COVARIANCE, ESTIMATES
+from experiments.run.stages.slam import associations_at, read_snapshots
+from experiments.run.stages.smooth import log_until, read_smoothed, read_smoothed_path
+from mapfusion.aligned_landmarks import ABSENT
+from mapfusion.fuse.parameters import MergeParameters
+from mapfusion.fuse.registry import make_fuser
+from mapfusion.fused_map import AlignedPair, FusedMap
+from mapfusion.landmark_map import LandmarkMap, read_map, write_map
+from mapfusion.merge import connect
+from mapfusion.robot_log import RobotLog, read_log
+from mapfusion.smoother.recording import Recording
+from mapfusion.smoother.smooth import SmootherParameters
+from mapfusion.storage import (
+    COVARIANCE_FIELDS,
+    POSE_FIELDS,
+    POSITION_FIELDS,
+    float_fields,
+    named_columns,
+    point_columns,
+    point_fields,
+    points_from,
+    schema,
+)
+
+LABEL = "fuse the maps"
+WRITES = ("landmarks.parquet", "parents.parquet", "motions.parquet", "map.parquet")
+_OF = {"iteration": INT, "component": INT}  # the component of the most robots is 1
+LANDMARKS = schema("fuse.landmarks", 1, [*fields(**_OF, count=INT), *point_fields()])
+# Which landmarks of the robots' maps at that iteration went into the fused ones.
+PARENTS = schema("fuse.parents", 1, fields(**_OF, landmark=INT, robot=TEXT, parent=INT))
+_UPPER = np.triu_indices(3)
+# How the robots' maps were moved; of robots that are in no component nothing is said.
+MOTIONS = schema(
+    "fuse.motions",
+    1,
+    [
+        *fields(**_OF, robot=TEXT),
+        *float_fields([*POSE_FIELDS, *COVARIANCE]),
+        *fields(drift_sigma_m=FLOAT, duplicate_share=FLOAT, fallback=TEXT),
+    ],
+)
+
+
+@dataclass(frozen=True)
+class FuseSettings:
+    """All that a fuser's maps depend on, beside the robots' and their alignments.
+
+    `origin` says where a fuser that is not ours comes from; empty for ours.
+    """
+
+    fuser: str
+    origin: str
+    aligner: str
+    parameters: MergeParameters
+    smoother: SmootherParameters
+    noise_floor_m: float
+    robots: tuple[str, ...]
+    iterations: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class _Robot:
+    """What is known of a robot at all iterations."""
+
+    log: RobotLog
+    filtered: Mapping[int, LandmarkMap]
+    smoothed: Mapping[int, LandmarkMap]  # none for a fuser that does not take them
+
+
+def run(settings: FuseSettings, job: Job) -> dict[str, float]:
+    """Fuse the maps at each iteration; write the maps, their parents and their motions."""
+    fuser = make_fuser(settings.fuser)
+    robots = {name: _read_robot(job, name, fuser.smoothed) for name in settings.robots}
+    fusions, times = {}, {}
+    for k in settings.iterations:
+        maps = [_at(robot.filtered, k) for robot in robots.values()]
+        given, recordings = [], list[Recording | None]()
+        for name, robot in robots.items():
+            known = {i: own for i, own in robot.smoothed.items() if i <= k}
+            given.append(_at(known, k) if known else _at(robot.filtered, k))
+            recordings.append(_recording(settings, job, robot.log, name, known))
+        connected = connect(maps, list(_pairs(settings, job, k)), settings.parameters.team)
+        started_s = time.perf_counter()
+        fused = connected.fused_by(fuser, settings.parameters, given, recordings).fused
+        times[f"{settings.fuser}:{k}"] = time.perf_counter() - started_s
+        fusions[k] = fused
+    write_fusions(job.output, fusions, settings.robots)
+    return times
+
+
+def _read_robot(job: Job, name: str, smoothed: bool) -> _Robot:
+    log = read_log(job.inputs[f"log {name}"])
+    maps = read_smoothed(job.inputs[f"smooth {name}"]) if smoothed else {}
+    return _Robot(log, read_snapshots(job.inputs[f"slam {name}"], log), maps)
+
+
+def _at(maps: Mapping[int, LandmarkMap], iteration: int) -> LandmarkMap:
+    """A robot's map at an iteration; its last one if its log ended earlier."""
+    return maps[max(k for k in maps if k <= iteration)]
+
+
+def _recording(
+    settings: FuseSettings,
+    job: Job,
+    log: RobotLog,
+    name: str,
+    smoothed: Mapping[int, LandmarkMap],
+) -> Recording | None:
+    """What the last smoothed map was made of, and the path that was found; None without a map."""
+    if not smoothed:
+        return None
+    k = max(smoothed)
+    log = log_until(log, k, settings.noise_floor_m)
+    landmark = associations_at(job.inputs[f"slam {name}"], k, len(log.observations))
+    path = read_smoothed_path(job.inputs[f"smooth {name}"])[k]
+    return Recording(log, landmark, path, settings.smoother)
+
+
+def _pairs(settings: FuseSettings, job: Job, iteration: int) -> Iterator[AlignedPair]:
+    """What the aligner that maps are merged by said, its first repetition, where it was asked."""
+    place = {name: k for k, name in enumerate(settings.robots)}
+    for name, folder in job.inputs.items():
+        kind, *both = name.split(" ")
+        if kind != "align":
+            continue
+        estimates = read_rows(folder / "estimates.parquet", ESTIMATES)
+        chosen = (estimates["aligner"] == settings.aligner) & (estimates["repetition"] == 0)
+        known = estimates[chosen & (estimates["iteration"] <= iteration)]
+        if known.empty:
+            continue
+        row = known.sort_values("iteration").iloc[-1].to_dict()
+        offered = read_rows(folder / "correspondences.parquet", CORRESPONDENCES)
+        pairs = correspondences_of(offered[offered["iteration"] == row["iteration"]])
+        a, b = (place[robot] for robot in both)
+        yield AlignedPair(a, b, alignment_of(row, len(pairs)), pairs, row["log10_false_alarms"])
+
+
+def _map_path(folder: Path, component: int = 1) -> Path:
+    """Where the last map of a component is; those beyond the first have their number in it."""
+    return folder / ("map.parquet" if component == 1 else f"map.{component}.parquet")
+
+
+def write_fusions(
+    folder: Path, fusions: Mapping[int, Sequence[FusedMap]], robots: Sequence[str]
+) -> None:
+    """All components by iteration; those of the last also whole, with their joint covariances."""
+    names = np.array(robots, dtype=object)
+    landmarks, parents, motions = [], [], []
+    for k, fused in fusions.items():
+        for component, each in enumerate(fused, start=1):
+            of, own = {"iteration": k, "component": component}, each.landmarks
+            points = point_columns(own.position_m, own.covariance_m2) | {"count": own.count}
+            landmarks.append(pd.DataFrame(points).assign(**of))
+            row, place = np.nonzero(each.parents != ABSENT)
+            went = {"landmark": row, "robot": names[place], "parent": each.parents[row, place]}
+            parents.append(pd.DataFrame(went).assign(**of))
+            motions.append(_motion_rows(each, robots).assign(**of))
+    for component, each in enumerate(fusions[max(fusions)], start=1):
+        write_map(_map_path(folder, component), each.landmarks)
+    tables = ((LANDMARKS, landmarks), (PARENTS, parents), (MOTIONS, motions))
+    for file, (table, rows) in zip(WRITES[:3], tables, strict=True):
+        write_rows(folder / file, table, pd.concat(rows))
+
+
+def _motion_rows(fused: FusedMap, robots: Sequence[str]) -> pd.DataFrame:
+    members = fused.members
+    motion = named_columns(POSE_FIELDS, fused.T_first_map[members])
+    upper = fused.motion_covariance[members][:, _UPPER[0], _UPPER[1]]
+    motion |= named_columns(COVARIANCE, upper) | {"robot": [robots[k] for k in members]}
+    motion["drift_sigma_m"] = fused.drift_sigma_m[members]
+    about = {"duplicate_share": fused.duplicate_share, "fallback": fused.fallback}
+    return pd.DataFrame(motion).assign(**about)
+
+
+def read_fusions(folder: Path, robots: Sequence[str]) -> dict[int, FusedMap]:
+    """The map of the most robots at each iteration, without the reasons of those left out.
+
+    The last one is whole; earlier ones have neither descriptors nor joint covariances.
+    """
+    last = read_map(_map_path(folder))
+    tables = [
+        read_rows(folder / file, table)
+        for file, table in zip(WRITES[:3], (LANDMARKS, PARENTS, MOTIONS), strict=True)
+    ]
+    first = [rows[rows["component"] == 1] for rows in tables]
+    found = {}
+    for k in sorted(first[0]["iteration"].unique().tolist()):
+        landmarks, parents, motions = (rows[rows["iteration"] == k] for rows in first)
+        found[k] = _fused(landmarks, parents, motions, robots, last)
+    if found:
+        found[k] = replace(found[k], landmarks=last)
+    return found
+
+
+def _fused(
+    landmarks: pd.DataFrame,
+    parents: pd.DataFrame,
+    motions: pd.DataFrame,
+    robots: Sequence[str],
+    last: LandmarkMap,
+) -> FusedMap:
+    place, n = {name: k for k, name in enumerate(robots)}, len(robots)
+    points = points_from(pa.Table.from_pandas(landmarks[POSITION_FIELDS + COVARIANCE_FIELDS]))
+    origin = np.full(len(landmarks), ABSENT, dtype=np.int64)
+    count = landmarks["count"].to_numpy(np.int32)
+    made = LandmarkMap(*points, count, origin, planar=last.planar, name=last.name)
+    of = np.full((len(landmarks), n), ABSENT)
+    of[parents["landmark"], parents["robot"].map(place)] = parents["parent"]
+    at = motions["robot"].map(place).to_numpy()
+    T, covariance, drift = np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan), np.full(n, np.nan)
+    T[at], drift[at] = motions[POSE_FIELDS], motions["drift_sigma_m"]
+    upper = motions[list(COVARIANCE)].to_numpy()
+    covariance[at[:, None], _UPPER[0], _UPPER[1]] = upper
+    covariance[at[:, None], _UPPER[1], _UPPER[0]] = upper
+    said = motions.iloc[0]
+    duplicates, fallback = float(said["duplicate_share"]), str(said["fallback"])
+    return FusedMap(made, of, T, covariance, drift, duplicates, (), fallback)
+
+
+def read_fused_maps(folder: Path) -> list[LandmarkMap]:
+    """The last maps of all components, that of the most robots first."""
+    motions = read_rows(folder / WRITES[2], MOTIONS)
+    of_last = motions[motions["iteration"] == motions["iteration"].max()]
+    components = range(1, 1 + int(of_last["component"].max()))
+    return [read_map(_map_path(folder, component)) for component in components]

@@ -1,0 +1,166 @@
+"""Stage: one robot's log smoothed in one batch, at each iteration that maps are fused at.
+
+It takes the filter's associations and its noise model, so what it finds differs from the filter's
+map by what a batch knows more, and by the correlations of all landmarks that come with it.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from experiments.run.frames import INT, fields
+from experiments.run.job import Job
+from experiments.run.stages.slam import associations_at, evaluated_iterations, final_path
+from mapfusion.landmark_map import LandmarkMap, read_map, write_map
+from mapfusion.robot_log import RobotLog, read_log
+from mapfusion.se2 import Float
+from mapfusion.smoother.elimination import matrix_bytes
+from mapfusion.smoother.sightings import sightings_of
+from mapfusion.smoother.smooth import Smoothed, SmootherParameters, smooth
+from mapfusion.smoother.smoothed_map import smoothed_map
+from mapfusion.storage import (
+    POSE_FIELDS,
+    columns,
+    float_fields,
+    named_columns,
+    read_table,
+    schema,
+    write_table,
+)
+
+# Its attributes tell how smoothing ended: `n_steps`, the degrees of freedom of the Student-t's of
+# observations and offsets (`observation_dof`, `offset_dof`), and `not_smoothed`, why there is no
+# path (else empty).
+PATH = schema("smooth.path", 1, [*fields(iteration=INT), *float_fields(POSE_FIELDS)])
+
+LABEL = "smooth the logs"
+WRITES = ("map_{part}.parquet", "map_{part}.joint.parquet", "path_{part}.parquet")
+# Unless they are said, maps are fused at so many evenly spread iterations, the last among them.
+_FUSED_ITERATIONS = 5
+_GB = 1e9
+_ENDED = ("n_steps", "observation_dof", "offset_dof", "not_smoothed")
+
+
+@dataclass(frozen=True)
+class SmoothSettings:
+    """All that a robot's smoothed maps depend on, beside its log and its filter."""
+
+    smoother: SmootherParameters
+    noise_floor_m: float
+    iterations: tuple[int, ...]
+    max_memory_gb: float
+
+
+def fused_iterations(n_frames: int, evaluated_every: int, fused_every: int | None) -> list[int]:
+    """The evaluated iterations that maps are fused at: each multiple, or evenly spread ones."""
+    if fused_every is not None:
+        return evaluated_iterations(n_frames, fused_every)
+    known = np.array(evaluated_iterations(n_frames, evaluated_every))
+    wanted = np.linspace(0, n_frames - 1, _FUSED_ITERATIONS + 1)[1:]
+    return np.unique(known[np.abs(known[:, None] - wanted).argmin(axis=0)]).tolist()
+
+
+def iterations_of(n_frames: int, fused: list[int]) -> tuple[int, ...]:
+    """Those of a robot; one whose log ends earlier takes part with its last map from then on."""
+    return tuple(sorted({min(k, n_frames - 1) for k in fused}))
+
+
+def parts(iterations: tuple[int, ...]) -> tuple[str, ...]:
+    """The stage's parts, one an iteration."""
+    return tuple(map(str, iterations))
+
+
+def run(settings: SmoothSettings, job: Job) -> None:
+    """Smooth the log up to one iteration; write the map with its joint covariance, and the path."""
+    k = int(job.part)
+    log = log_until(read_log(job.inputs["log"]), k, settings.noise_floor_m)
+    landmark = associations_at(job.inputs["slam"], k, len(log.observations))
+    found = _smoothed(log, landmark, final_path(job.inputs["slam"])[: k + 1], settings)
+    if isinstance(found, str):
+        landmarks, path, ended = _no_map(log), np.empty((0, 3)), (0, np.nan, np.nan, found)
+    else:
+        landmarks, path = smoothed_map(log, landmark, found), found.estimate.path
+        ended = (found.n_steps, *found.tails, "")
+    write_map(_map_path(job.output, job.part), landmarks)
+    rows = {"iteration": np.arange(len(path))} | named_columns(POSE_FIELDS, path)
+    attributes = {name: str(value) for name, value in zip(_ENDED, ended, strict=True)}
+    write_table(_path_path(job.output, job.part), rows, PATH, attributes)
+
+
+def log_until(log: RobotLog, iteration: int, noise_floor_m: float = 0.0) -> RobotLog:
+    """A log as it was at an iteration, its observations as noisy as the filter takes them."""
+    n_frames = iteration + 1
+    n = int(np.searchsorted(log.iteration, n_frames))
+    seen = log.observations[:n]
+    covariance = seen.covariance_m2 + noise_floor_m**2 * np.eye(3)
+    return replace(
+        log,
+        time_s=log.time_s[:n_frames],
+        odometry=log.odometry[:n_frames],
+        iteration=log.iteration[:n],
+        observations=replace(seen, covariance_m2=covariance),
+    )
+
+
+def _smoothed(
+    log: RobotLog, landmark: np.ndarray, path: Float, settings: SmoothSettings
+) -> Smoothed | str:
+    """What the smoother finds, or why it cannot."""
+    least, stray = settings.smoother.min_count, settings.smoother.stray_m > 0
+    needed_gb = matrix_bytes(sightings_of(log, landmark, least, stray=stray), len(log)) / _GB
+    if needed_gb > settings.max_memory_gb:
+        return f"takes {needed_gb:.1f} GB, smooth.max_memory_gb is {settings.max_memory_gb:g}"
+    try:
+        return smooth(log, landmark, path, settings.smoother)
+    except np.linalg.LinAlgError:
+        return "its covariances are of sizes too different to be computed with"
+
+
+def _no_map(log: RobotLog) -> LandmarkMap:
+    none = np.empty((0, 3))
+    counts, sources = np.empty(0, dtype=np.int32), np.empty(0, dtype=np.int64)
+    return LandmarkMap(
+        none, np.empty((0, 3, 3)), counts, sources, None, None, log.planar, log.robot
+    )
+
+
+def _map_path(folder: Path, part: str) -> Path:
+    return folder / WRITES[0].format(part=part)
+
+
+def _path_path(folder: Path, part: str) -> Path:
+    return folder / WRITES[2].format(part=part)
+
+
+def read_smoothed(folder: Path) -> dict[int, LandmarkMap]:
+    """The robot's smoothed map, with its joint covariance, at each iteration that has one."""
+    return {k: read_map(_map_path(folder, str(k))) for k in read_smoothed_path(folder)}
+
+
+def read_smoothed_path(folder: Path) -> dict[int, Float]:
+    """The smoothed path (k + 1, 3) up to each iteration k that has one, in order."""
+    paths = {}
+    for k in _iterations(folder):
+        table, attributes = read_table(_path_path(folder, str(k)), PATH)
+        if not attributes["not_smoothed"]:
+            paths[k] = columns(table, POSE_FIELDS)
+    return paths
+
+
+def read_endings(folder: Path) -> pd.DataFrame:
+    """How smoothing ended, one row an iteration.
+
+    Columns: iteration, n_steps, observation_dof, offset_dof, not_smoothed.
+    """
+    ends = {k: read_table(_path_path(folder, str(k)), PATH)[1] for k in _iterations(folder)}
+    rows = pd.DataFrame([{name: end[name] for name in _ENDED} for end in ends.values()])
+    kinds = {"n_steps": int, "observation_dof": float, "offset_dof": float}
+    return rows.astype(kinds).assign(iteration=list(ends))
+
+
+def _iterations(folder: Path) -> list[int]:
+    begin, _, end = WRITES[2].partition("{part}")
+    files = (path.name for path in folder.glob(f"{begin}[0-9]*{end}"))
+    return sorted(int(name.removeprefix(begin).removesuffix(end)) for name in files)

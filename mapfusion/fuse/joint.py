@@ -1,0 +1,162 @@
+"""Joint fusion: motions, shared errors and points of all maps at once, each with the others' help.
+
+Where maps carry joint covariances, landmarks that meet straighten their maps as a whole, so that
+also those move that one robot alone has seen. Maps without one are fused by what they have.
+"""
+
+from collections.abc import Sequence
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from mapfusion.aligned_landmarks import ABSENT
+from mapfusion.chi_square import chi_square_bound
+from mapfusion.fuse.clusters import Pair, joined
+from mapfusion.fuse.component import Component
+from mapfusion.fuse.joint_estimate import JointEstimate, JointMap, estimate_jointly
+from mapfusion.fuse.jointly_fused import JointlyFused
+from mapfusion.fuse.parameters import MergeParameters
+from mapfusion.fused_map import FusedMap
+from mapfusion.landmark_map import LandmarkMap
+from mapfusion.robot_log import NO_LABEL
+from mapfusion.se2 import Float
+
+# What is one point is judged anew with each estimate, until nothing changes or for so many rounds.
+_MOST_ROUNDS = 5
+
+
+class JointFuser:
+    """All maps at once; the first member's frame is the frame."""
+
+    smoothed = True
+
+    def fuse(self, component: Component, parameters: MergeParameters) -> FusedMap:
+        """Fuse the component's members."""
+        n_dimensions = 2 if component.planar else 3
+        drift = component.drift_sigma_m
+        given = [component.maps[k] for k in component.members]
+        maps = [
+            JointMap.of(landmarks, float(drift[k]), n_dimensions)
+            for landmarks, k in zip(given, component.members, strict=True)
+        ]
+        sizes = [len(landmarks) for landmarks in given]
+        points = joined(_inliers(component), sizes)
+        start = component.T_first_map[component.members]
+        estimate = _estimated(maps, start, points)
+        for _ in range(_MOST_ROUNDS):
+            pairs = _candidates(given, _placed(maps, estimate), parameters)
+            before, points = points, joined(pairs, sizes)
+            if np.array_equal(before, points):
+                break
+            estimate = _estimated(maps, estimate.T_first_map, points)
+        return JointlyFused(component, maps, points, estimate).fused_map(parameters)
+
+
+def _estimated(maps: Sequence[JointMap], T_first_map: Float, points: np.ndarray) -> JointEstimate:
+    """From the points of several maps: those of one map alone say nothing."""
+    several = np.count_nonzero(points != ABSENT, axis=1) > 1
+    return estimate_jointly(maps, T_first_map, points[several])
+
+
+def _inliers(component: Component) -> list[Pair]:
+    """What alignments say is one; places are among the members."""
+    place = {int(k): row for row, k in enumerate(component.members)}
+    return [
+        Pair(place[p.a], place[p.b], p.inliers.index_a, p.inliers.index_b, p.inliers.distance)
+        for p in component.pairs
+    ]
+
+
+class _Placed(NamedTuple):
+    """A map's n landmarks in the common frame.
+
+    Attributes:
+        position_m: (n, D).
+        own_m2: (n, D, D) covariance of what is each landmark's own.
+        shared_m: (n, D, U) how far one sigma of U independent shared variables moves it.
+    """
+
+    position_m: Float
+    own_m2: Float
+    shared_m: Float
+
+    @property
+    def widest_m2(self) -> Float:
+        """(n,) no less than half of what any variance of a difference has from this landmark."""
+        own = np.trace(self.own_m2, axis1=1, axis2=2)
+        return own + 2 * np.sum(self.shared_m**2, axis=(1, 2))
+
+
+def _placed(maps: Sequence[JointMap], estimate: JointEstimate) -> list[_Placed]:
+    factor = np.linalg.cholesky(estimate.covariance)
+    said = [estimate.said(maps, k, np.arange(len(own))) for k, own in enumerate(maps)]
+    return [_Placed(own.y_m, own.own_m2, own.by_unknown @ factor) for own in said]
+
+
+def _candidates(
+    given: Sequence[LandmarkMap], placed: Sequence[_Placed], parameters: MergeParameters
+) -> list[Pair]:
+    """Landmarks of every two maps that may be one point, by identity or by gate and descriptor.
+
+    A known identity needs no gate, and its landmarks are not unlike at all.
+    """
+    bound = chi_square_bound(parameters.gate_probability, placed[0].position_m.shape[1])
+    found = []
+    for a, b in combinations(range(len(given)), 2):
+        known_i, known_j = _of_one_label(given[a], given[b])
+        i, j, unlike = _alike(given[a], given[b], *_near(placed[a], placed[b], bound))
+        near = unlike <= parameters.max_descriptor_distance  # False for NaN
+        i, j, unlike = i[near], j[near], unlike[near]
+        kept = _inside(placed[a], placed[b], i, j, bound)
+        i, j = np.concatenate([known_i, i[kept]]), np.concatenate([known_j, j[kept]])
+        found.append(Pair(a, b, i, j, np.concatenate([np.zeros(len(known_i)), unlike[kept]])))
+    return found
+
+
+def _inside(a: _Placed, b: _Placed, i: np.ndarray, j: np.ndarray, bound: float) -> np.ndarray:
+    """Which differences (n,) can be zero: what both share cancels."""
+    shared = a.shared_m[i] - b.shared_m[j]
+    S = a.own_m2[i] + b.own_m2[j] + shared @ np.swapaxes(shared, 1, 2)
+    off = a.position_m[i] - b.position_m[j]
+    return np.einsum("ni,ni->n", off, np.linalg.solve(S, off[:, :, None])[:, :, 0]) <= bound
+
+
+def _of_one_label(a: LandmarkMap, b: LandmarkMap) -> tuple[np.ndarray, np.ndarray]:
+    named_a, named_b = (np.flatnonzero(_labels(own) != NO_LABEL) for own in (a, b))
+    i, j = np.nonzero(_labels(a)[named_a][:, None] == _labels(b)[named_b])
+    return named_a[i], named_b[j]
+
+
+def _labels(landmarks: LandmarkMap) -> np.ndarray:
+    return np.full(len(landmarks), NO_LABEL) if landmarks.label is None else landmarks.label
+
+
+def _alike(
+    a: LandmarkMap, b: LandmarkMap, i: np.ndarray, j: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, Float]:
+    """The pairs of rows that not both carry labels, with the distance of their descriptors."""
+    unnamed = (_labels(a)[i] == NO_LABEL) | (_labels(b)[j] == NO_LABEL)
+    i, j = i[unnamed], j[unnamed]
+    if a.descriptor is None or b.descriptor is None:
+        return i, j, np.full(len(i), np.nan)
+    return i, j, np.linalg.norm(a.descriptor[i] - b.descriptor[j], axis=1).astype(np.float64)
+
+
+def _near(a: _Placed, b: _Placed, bound: float) -> tuple[np.ndarray, np.ndarray]:
+    """All pairs of landmarks whose difference a gate could hold, and some more.
+
+    Landmarks of the one map are taken by how uncertain they are, a factor of two at a time: few
+    that are far and uncertain would make the gates of all others wide.
+    """
+    wide_a, octave = a.widest_m2, np.ceil(np.log2(b.widest_m2))
+    rows_a, rows_b = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+    for each in np.unique(octave):
+        rows = np.flatnonzero(octave == each)
+        radius_m = np.sqrt(bound * (wide_a + 2.0**each))
+        tree = KDTree(b.position_m[rows])
+        found = tree.query_ball_point(a.position_m, radius_m, return_sorted=True)
+        rows_a.append(np.repeat(np.arange(len(wide_a)), [len(own) for own in found]))
+        rows_b.append(rows[np.concatenate([*found, []]).astype(np.int64)])
+    return np.concatenate(rows_a), np.concatenate(rows_b)

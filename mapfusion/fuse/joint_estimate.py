@@ -1,0 +1,263 @@
+"""Maps with joint covariances, laid over each other: all motions and all shared errors at once.
+
+Of map k the landmarks are x = m + C' z_k + e (`joint_covariance.py`): z_k is standard normal and
+shared, e is the landmark's own. Landmarks of several maps that are one point g say
+
+    T_k (m + C' z_k + e) = g,    so that    y_k(u) = T_k (m + C' z_k) is g but for e
+
+and u = (T_1, ..., z_0, z_1, ...) is all that has to be found: some hundred unknowns, whatever the
+number of landmarks. Given u each point is the weighted mean of what its maps say, and goes first:
+
+    g = V sum W_k y_k,   V = (sum W_k)^-1,    cost = |z|^2 + sum (y_k - g)' W_k (y_k - g)
+
+with W_k the inverse covariance of T_k e, times the weight of a Student-t: a landmark may be another
+point than it is taken for. The first map's frame is the frame, so T_0 is no unknown.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+
+from mapfusion.align.rigid import motion_jacobian
+from mapfusion.aligned_landmarks import ABSENT
+from mapfusion.joint_covariance import JointCovariance
+from mapfusion.landmark_map import LandmarkMap
+from mapfusion.se2 import Float, rotation_about_z, transform_points, wrap
+from mapfusion.smoother.student import MOST_DOF, fitted_dof, student_weights
+
+# The next step would move what is sought, as a whole and in squared sigmas, by no more than this.
+_CONVERGED = 1e-3
+_MOST_STEPS = 50
+
+
+@dataclass(frozen=True)
+class JointMap:
+    """N landmarks of a map as they enter.
+
+    Attributes:
+        position_m: (N, D); D is 2 for planar maps.
+        joint: of the positions, in three dimensions.
+    """
+
+    position_m: Float
+    joint: JointCovariance
+
+    def __len__(self) -> int:
+        return len(self.position_m)
+
+    @classmethod
+    def of(cls, landmarks: LandmarkMap, own_sigma_m: float, n_dimensions: int) -> "JointMap":
+        """A map without a joint covariance has no shared errors, but more of its landmarks' own.
+
+        Args:
+            landmarks: the map.
+            own_sigma_m: that is added in the plane where a map has no joint covariance: s_drift.
+            n_dimensions: 2 or 3.
+        """
+        joint = landmarks.joint
+        if joint is None:
+            own = landmarks.covariance_m2.copy()
+            own[:, [0, 1], [0, 1]] += own_sigma_m**2
+            joint = JointCovariance(own, np.zeros((len(landmarks), 0, 3)))
+        return cls(landmarks.position_m[:, :n_dimensions], joint)
+
+
+class Said(NamedTuple):
+    """What a map says of some landmarks, at a guess of the unknowns.
+
+    Attributes:
+        y_m: (n, D) where they are, in the common frame.
+        own_m2: (n, D, D) covariance of their own errors, there.
+        by_unknown: (n, D, U) dy / du.
+    """
+
+    y_m: Float
+    own_m2: Float
+    by_unknown: Float
+
+
+@dataclass(frozen=True)
+class JointEstimate:
+    """K maps in the frame of the first.
+
+    Attributes:
+        T_first_map: (K, 3), the first is no motion.
+        shared: of each map, (R_k,) its shared variables z.
+        covariance: (U, U) of all unknowns: three for each motion but the first, then the z.
+        weight: (C, K) of the Student-t, 0 where a map has no part.
+        dof: degrees of freedom of the Student-t.
+        n_steps: Gauss-Newton steps that were taken.
+    """
+
+    T_first_map: Float
+    shared: tuple[Float, ...]
+    covariance: Float
+    weight: Float
+    dof: float
+    n_steps: int
+
+    @property
+    def motion_covariance(self) -> Float:
+        """(K, 3, 3) of each motion; the first is known."""
+        found = np.zeros((len(self.T_first_map), 3, 3))
+        for k in range(1, len(found)):
+            own = slice(3 * k - 3, 3 * k)
+            found[k] = self.covariance[own, own]
+        return found
+
+    def said(self, maps: Sequence[JointMap], k: int, rows: np.ndarray) -> Said:
+        """What map k says of its landmarks `rows` (n,)."""
+        said = _said(maps[k], rows, self.T_first_map[k], self.shared[k])
+        return said._replace(by_unknown=_placed(said.by_unknown, _columns(maps, k), self._size))
+
+    @property
+    def _size(self) -> int:
+        return len(self.covariance)
+
+
+def _said(own_map: JointMap, rows: np.ndarray, T: Float, shared: Float) -> Said:
+    """The same with dy / d(T, z_k) alone."""
+    n_dimensions = own_map.position_m.shape[1]
+    common = own_map.joint.common_m[rows][:, :, :n_dimensions]
+    R = rotation_about_z(T[2])[:n_dimensions, :n_dimensions]
+    point = own_map.position_m[rows] + np.einsum("nri,r->ni", common, shared)
+    by = np.zeros((len(rows), n_dimensions, 3 + len(shared)))
+    by[:, :2, :3] = motion_jacobian(T, point)
+    by[:, :, 3:] = R @ np.swapaxes(common, 1, 2)
+    own = R @ own_map.joint.own_m2[rows][:, :n_dimensions, :n_dimensions] @ R.T
+    return Said(transform_points(T, point), own, by)
+
+
+def _columns(maps: Sequence[JointMap], k: int) -> np.ndarray:
+    """Where in u motion and shared variables of map k stand; the first map's motion nowhere."""
+    ranks = [each.joint.rank for each in maps]
+    first = 3 * (len(maps) - 1) + sum(ranks[:k])
+    motion = np.arange(3 * k - 3, 3 * k) if k else np.full(3, ABSENT)
+    return np.concatenate([motion, np.arange(first, first + ranks[k])])
+
+
+def _placed(by: Float, columns: np.ndarray, n_unknowns: int) -> Float:
+    """Derivatives (n, D, U_k) among those by all unknowns."""
+    placed = np.zeros((*by.shape[:2], n_unknowns))
+    placed[:, :, columns[columns != ABSENT]] = by[:, :, columns != ABSENT]
+    return placed
+
+
+def estimate_jointly(
+    maps: Sequence[JointMap], T_first_map: Float, parents: np.ndarray
+) -> JointEstimate:
+    """Gauss-Newton steps from given motions, each with new weights.
+
+    Args:
+        maps: K of them.
+        T_first_map: (K, 3) where to start from; the first stays.
+        parents: (C, K) rows of the maps that are one point, ABSENT for none; points of one map
+            alone say nothing here.
+    """
+    T, shared = np.array(T_first_map), [np.zeros(each.joint.rank) for each in maps]
+    columns = [_columns(maps, k) for k in range(len(maps))]
+    has = parents != ABSENT
+    weight, dof, n_steps = has.astype(np.float64), MOST_DOF, 0
+    while True:
+        said = [_said(maps[k], parents[has[:, k], k], T[k], shared[k]) for k in range(len(maps))]
+        points = _points(said, has, weight)
+        A, gradient = _equations(said, has, weight, points, columns, shared)
+        factor = scipy.linalg.cholesky(A, lower=True)
+        step = -scipy.linalg.cho_solve((factor, True), gradient)
+        moved = float(np.sum((factor.T @ step) ** 2))
+        if n_steps == _MOST_STEPS or moved < _CONVERGED:
+            covariance = scipy.linalg.cho_solve((factor, True), np.eye(len(A)))
+            return JointEstimate(T, tuple(shared), covariance, weight, dof, n_steps)
+        for k, own in enumerate(columns):
+            shared[k] = shared[k] + step[own[3:]]
+            if k:
+                T[k] += step[own[:3]]
+        T[:, 2] = wrap(T[:, 2])
+        weight, dof = _reweighted(maps, T, shared, parents, weight)
+        n_steps += 1
+
+
+class _Points(NamedTuple):
+    """Points g (C, D) as the weighted means of what maps say, and their covariances V (C, D, D)."""
+
+    g_m: Float
+    covariance_m2: Float
+
+
+def weighted_information(said: Said, weight: Float) -> Float:
+    """W (n, D, D)."""
+    return weight[:, None, None] * np.linalg.inv(said.own_m2)
+
+
+def _points(said: Sequence[Said], has: np.ndarray, weight: Float) -> _Points:
+    n_dimensions = said[0].y_m.shape[1]
+    information = np.zeros((len(has), n_dimensions, n_dimensions))
+    total = np.zeros((len(has), n_dimensions))
+    for k, own in enumerate(said):
+        W = weighted_information(own, weight[has[:, k], k])
+        information[has[:, k]] += W
+        total[has[:, k]] += np.einsum("nij,nj->ni", W, own.y_m)
+    V = np.asarray(np.linalg.inv(information), np.float64)
+    return _Points(np.einsum("nij,nj->ni", V, total), V)
+
+
+def _equations(
+    said: Sequence[Said],
+    has: np.ndarray,
+    weight: Float,
+    points: _Points,
+    columns: Sequence[np.ndarray],
+    shared: Sequence[Float],
+) -> tuple[Float, Float]:
+    """The normal equations of a step: matrix (U, U) and gradient (U,)."""
+    n_unknowns = 1 + max(int(own.max(initial=ABSENT)) for own in columns)
+    A, gradient = np.zeros((n_unknowns + 1,) * 2), np.zeros(n_unknowns + 1)  # the last: ABSENT
+    W = [weighted_information(own, weight[has[:, k], k]) for k, own in enumerate(said)]
+    for k, own in enumerate(said):
+        off = own.y_m - points.g_m[has[:, k]]
+        gradient[columns[k]] += np.einsum("ndu,nde,ne->u", own.by_unknown, W[k], off, optimize=True)
+        for m, other in enumerate(said[: k + 1]):
+            both = has[:, k] & has[:, m]
+            here, there = both[has[:, k]], both[has[:, m]]
+            between = -W[k][here] @ points.covariance_m2[both] @ W[m][there]
+            if m == k:
+                between += W[k]
+            left = own.by_unknown[here].reshape(-1, len(columns[k]))
+            right = between @ other.by_unknown[there]
+            block = left.T @ right.reshape(-1, len(columns[m]))
+            A[np.ix_(columns[k], columns[m])] += block
+            if m != k:
+                A[np.ix_(columns[m], columns[k])] += block.T
+        z = columns[k][3:]
+        A[z, z] += 1.0
+        gradient[z] += shared[k]
+    return A[:-1, :-1], gradient[:-1]
+
+
+def _reweighted(
+    maps: Sequence[JointMap],
+    T: Float,
+    shared: Sequence[Float],
+    parents: np.ndarray,
+    weight: Float,
+) -> tuple[Float, float]:
+    """Weights (C, K) of the Student-t, and its degrees of freedom, for what is off now.
+
+    The squares are those expected about the true points (the E step of Lange et al., 1989).
+    """
+    has, new = parents != ABSENT, np.zeros_like(weight)
+    said = [_said(maps[k], parents[has[:, k], k], T[k], shared[k]) for k in range(len(maps))]
+    points = _points(said, has, weight)
+    squares: list[Float] = []
+    for k, own in enumerate(said):
+        off = own.y_m - points.g_m[has[:, k]]
+        spread = off[:, :, None] * off[:, None, :] + points.covariance_m2[has[:, k]]
+        squares.append(np.einsum("nij,nij->n", np.linalg.inv(own.own_m2), spread))
+    n_dimensions = maps[0].position_m.shape[1]
+    dof = fitted_dof(np.concatenate(squares), n_dimensions)
+    for k, own_squares in enumerate(squares):
+        new[has[:, k], k] = student_weights(own_squares, dof, n_dimensions)
+    return new, dof

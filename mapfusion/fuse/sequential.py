@@ -1,0 +1,92 @@
+"""One map after the other is fused with those before, in the order of their names.
+
+First by the inliers of its alignments with these, then what they missed is paired by gate and
+descriptor with any fused landmark; the rest is carried over.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mapfusion.aligned_landmarks import ABSENT, AlignedLandmarks, FusePairs
+from mapfusion.fuse.component import Component
+from mapfusion.fuse.parameters import MergeParameters
+from mapfusion.fused_map import AlignedPair, FusedMap
+from mapfusion.same_point import SamePoint, one_to_one
+
+
+def fused_in_turn(
+    component: Component, parameters: MergeParameters, fuse_pairs: FusePairs, use_drift: bool
+) -> FusedMap:
+    """The members fused.
+
+    Args:
+        component: what is fused.
+        parameters: how landmarks are paired that no alignment names.
+        fuse_pairs: what becomes of two landmarks.
+        use_drift: weigh with, and report, S + s_drift^2 I instead of the paper's S.
+    """
+    members, planar = component.by_name, component.planar
+    test, drift = parameters.same_point(planar), component.drift_sigma_m
+
+    def moved(k: int) -> AlignedLandmarks:
+        sigma_T = component.motion_covariance[k] if parameters.use_alignment_uncertainty else None
+        T = component.T_first_map[k]
+        return AlignedLandmarks.of(component.maps, k, T, sigma_T, drift[k], use_drift)
+
+    fused = moved(members[0])
+    for k in members[1:]:
+        other = moved(k)
+        rows, others = _paired(fused, other, *_inliers(fused, k, component.pairs), test)
+        fused = fused.joined(other, rows, others, 2 if planar else 3, fuse_pairs)
+    return FusedMap(
+        fused.landmark_map(planar, component.maps[component.members[0]].name),
+        fused.parents,
+        component.T_first_map,
+        component.motion_covariance,
+        drift if use_drift else np.where(np.isnan(drift), np.nan, 0.0),
+        test.duplicate_share(fused),
+        component.left_out,
+    )
+
+
+def _inliers(
+    fused: AlignedLandmarks, k: int, pairs: Sequence[AlignedPair]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of the fused map and of map k that alignments with maps in it say are one.
+
+    Where two say different things, what is most alike counts.
+    """
+    rows, others, unlike = [np.empty(0, np.int64)], [np.empty(0, np.int64)], [np.empty(0)]
+    for pair in pairs:
+        if k not in (pair.a, pair.b):
+            continue
+        known, index, own = pair.a, pair.inliers.index_a, pair.inliers.index_b
+        if k == pair.a:
+            known, index, own = pair.b, own, index
+        row_of = np.full(1 + index.max(initial=-1), ABSENT)
+        parent = fused.parents[:, known]
+        inside = (parent != ABSENT) & (parent < len(row_of))
+        row_of[parent[inside]] = np.flatnonzero(inside)
+        has = row_of[index] != ABSENT
+        rows.append(row_of[index[has]])
+        others.append(own[has])
+        unlike.append(pair.inliers.distance[has])
+    return one_to_one(np.concatenate(rows), np.concatenate(others), np.concatenate(unlike))
+
+
+def _paired(
+    fused: AlignedLandmarks,
+    other: AlignedLandmarks,
+    rows: np.ndarray,
+    others: np.ndarray,
+    test: SamePoint,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of the fused and of the other map that are one: those given, then what they missed."""
+    missed_rows = np.setdiff1d(np.arange(len(fused)), rows)
+    missed_others = np.setdiff1d(np.arange(len(other)), others)
+    more_rows, more_others = one_to_one(*test.candidates(fused[missed_rows], other[missed_others]))
+    return (
+        np.concatenate([rows, missed_rows[more_rows]]),
+        np.concatenate([others, missed_others[more_others]]),
+    )

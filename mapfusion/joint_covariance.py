@@ -1,0 +1,93 @@
+"""The joint covariance of a map's landmarks: block diagonal plus low rank.
+
+What landmarks have in common, the drift of the path that saw them, has few directions that count.
+So a landmark is its estimate plus an error of its own plus what a few shared, independent, standard
+normal variables z do to all of them: x_i = m_i + C_i' z + e_i, with e_i of covariance `own_m2`.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapfusion.arguments import require_finite, require_shape
+from mapfusion.se2 import Float
+
+# Of the shared variables that a log gives, three a frame, as many are kept: their variances fall
+# fast, and what they leave goes to the landmarks' own part.
+RANK = 100
+# The subspace of the largest variances is found by iteration, with so many directions to spare; at
+# each what is not wanted shrinks by the ratio of its variance to the wanted ones.
+_TO_SPARE, _ITERATIONS = 20, 3
+
+
+@dataclass(frozen=True)
+class JointCovariance:
+    """Of N landmarks and R shared variables.
+
+    Attributes:
+        own_m2: (N, 3, 3) of what is each landmark's own.
+        common_m: (N, R, 3) C_i: how far one sigma of each shared variable moves the landmark.
+    """
+
+    own_m2: Float
+    common_m: Float
+
+    def __post_init__(self) -> None:
+        n = len(self.own_m2)
+        require_shape("own_m2", self.own_m2, (n, 3, 3))
+        require_shape("common_m", self.common_m, (n, self.rank, 3))
+        require_finite("own_m2", self.own_m2)
+        require_finite("common_m", self.common_m)
+
+    def __len__(self) -> int:
+        return len(self.own_m2)
+
+    def __getitem__(self, rows: np.ndarray | slice) -> "JointCovariance":
+        return JointCovariance(self.own_m2[rows], self.common_m[rows])
+
+    @property
+    def rank(self) -> int:
+        """R."""
+        return self.common_m.shape[1]
+
+    @property
+    def marginal_m2(self) -> Float:
+        """(N, 3, 3) covariance of each landmark for itself."""
+        return self.own_m2 + np.swapaxes(self.common_m, 1, 2) @ self.common_m
+
+    def dense_m2(self) -> Float:
+        """(3N, 3N), for small maps."""
+        n, each = len(self), np.arange(len(self))
+        stacked = self.common_m.transpose(1, 0, 2).reshape(self.rank, 3 * n)
+        joint = stacked.T @ stacked
+        joint.reshape(n, 3, n, 3)[each, :, each, :] += self.own_m2
+        return joint
+
+
+def condensed(own_m2: Float, common: Float, rank: int = RANK) -> JointCovariance:
+    """A joint covariance of own (N, 3, 3) and common (R, 3N), by its largest `rank` directions.
+
+    Marginal covariances stay as they are: what is left out is counted as the landmarks' own.
+    Subspace iteration (Halko, Martinsson, Tropp 2011, alg. 4.4), from rows of `common`, which are
+    of frames, evenly spread over the path.
+    """
+    n = len(own_m2)
+    kept = common
+    if len(common) > rank:
+        n_start = min(rank + _TO_SPARE, len(common))
+        start = np.linspace(0, len(common) - 1, n_start).round().astype(int)
+        basis = np.eye(len(common))[:, np.unique(start)]
+        for _ in range(_ITERATIONS):
+            basis = np.linalg.qr(common @ (common.T @ basis))[0]
+        within = basis.T @ common
+        largest = np.linalg.eigh(within @ within.T).eigenvectors[:, ::-1][:, :rank]
+        kept = largest.T @ within
+    by_landmark = np.ascontiguousarray(kept.reshape(len(kept), n, 3).transpose(1, 0, 2))
+    whole, part = _squares(common, n), _squares(kept, n)
+    return JointCovariance(own_m2 + whole - part, by_landmark)
+
+
+def _squares(common: Float, n: int) -> Float:
+    """(N, 3, 3) covariance that common (R, 3N) gives each landmark."""
+    blocks = common.reshape(len(common), n, 3)
+    return np.einsum("rni,rnj->nij", blocks, blocks)

@@ -1,0 +1,82 @@
+"""Gauss-Newton steps on poses, landmarks and offsets, each with new robust weights."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from mapfusion.se2 import Float, wrap
+from mapfusion.smoother.elimination import Solution, solve
+from mapfusion.smoother.normal_equations import (
+    Estimate,
+    NormalEquations,
+    Weights,
+    disturbances,
+    normal_equations,
+)
+from mapfusion.smoother.robust import NO_TAILS, Tails, cost, reweighted, unweighted
+from mapfusion.smoother.sightings import Sightings
+
+# The next step would move the path, as a whole and in squared sigmas, by no more than this. Single
+# landmarks, whose tracks contradict each other, may go on changing their minds for long.
+_CONVERGED = 1e-3
+_MOST_STEPS = 50
+_MOST_HALVINGS = 12
+
+
+class Problem(NamedTuple):
+    """What is to be found is all that explains this.
+
+    Attributes:
+        seen: the observations.
+        odometry: (T, 3) increments.
+        information: (T - 1, 3) theirs after the first; 0 where they say nothing.
+        stray_information: of a track's offset along each axis, in 1/m^2.
+    """
+
+    seen: Sightings
+    odometry: Float
+    information: Float
+    stray_information: float
+
+    def cost(self, at: Estimate, tails: Tails) -> float:
+        """Twice the negative log likelihood, but for a constant."""
+        walked = float(np.sum(self.information * disturbances(at.path, self.odometry) ** 2))
+        return walked + cost(self.seen, at, tails, self.stray_information)
+
+
+class Settled(NamedTuple):
+    """Where the steps ended, with the equations there and what their solution is."""
+
+    seen: Sightings
+    estimate: Estimate
+    weights: Weights
+    tails: Tails
+    n_steps: int
+    equations: NormalEquations
+    solution: Solution
+
+
+def settled(problem: Problem, at: Estimate, least_move: float = _CONVERGED) -> Settled:
+    """Take steps from an estimate until the next would move less than this, in squared sigmas."""
+    seen, odometry, information, stray_information = problem
+    weights, tails, n_steps = unweighted(seen), NO_TAILS, 0
+    while True:
+        equations = normal_equations(seen, at, weights, stray_information, odometry, information)
+        solution = solve(seen, equations)
+        if n_steps == _MOST_STEPS or solution.moved < least_move:
+            return Settled(seen, at, weights, tails, n_steps, equations, solution)
+        at = _stepped(problem, tails, at, solution.step)
+        weights, tails = reweighted(seen, at, weights, solution, stray_information)
+        n_steps += 1
+
+
+def _stepped(problem: Problem, tails: Tails, at: Estimate, step: Estimate) -> Estimate:
+    """The step, or as much of it as lowers the cost: half, a quarter, ..."""
+    before, share = problem.cost(at, tails), 1.0
+    for _ in range(_MOST_HALVINGS):
+        further = Estimate(*(old + share * new for old, new in zip(at, step, strict=True)))
+        further.path[:, 2] = wrap(further.path[:, 2])
+        if problem.cost(further, tails) <= before:
+            return further
+        share /= 2
+    return at

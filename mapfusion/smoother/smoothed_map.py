@@ -1,0 +1,39 @@
+"""The smoother's landmarks as a map that carries its joint covariance."""
+
+import numpy as np
+
+from mapfusion.joint_covariance import RANK, JointCovariance, condensed
+from mapfusion.landmark_map import LandmarkMap
+from mapfusion.robot_log import RobotLog
+from mapfusion.se2 import Float
+from mapfusion.smoother.smooth import Smoothed
+
+
+def smoothed_map(
+    log: RobotLog, landmark: np.ndarray, smoothed: Smoothed, rank: int = RANK
+) -> LandmarkMap:
+    """The landmarks in the frame of the first pose.
+
+    Args:
+        log: what was smoothed.
+        landmark: (N,) which landmark each observation is of, as it was given to the smoother; where
+            these are rows of the log they tell what the landmarks came from.
+        smoothed: what came out.
+        rank: shared variables that are kept.
+    """
+    seen, (point, joint) = smoothed.seen, condensed_points(smoothed, rank)
+    source = landmark[seen.row[seen.starts[:-1]]].astype(np.int64)
+    look = log.observations[source]
+    count = np.diff(seen.starts).astype(np.int32)
+    about = (count, source, look.descriptor, look.label, log.planar, log.robot)
+    return LandmarkMap(point, joint.marginal_m2, *about, joint)
+
+
+def condensed_points(smoothed: Smoothed, rank: int = RANK) -> tuple[Float, JointCovariance]:
+    """Landmarks (L, 3) and what is kept of their joint covariance; of planar ones z is known."""
+    point = smoothed.estimate.point_m.copy()
+    joint = condensed(smoothed.own_m2, smoothed.common, rank)
+    if smoothed.seen.n_dimensions == 2:
+        point[:, 2] = 0.0
+        joint.own_m2[:, 2, :] = joint.own_m2[:, :, 2] = joint.common_m[:, :, 2] = 0.0
+    return point, joint

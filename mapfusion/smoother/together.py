@@ -1,0 +1,117 @@
+"""Several robots' logs smoothed as one: the points that they share hold them together.
+
+The logs are put one after the other. Between the last frame of one and the first of the next the
+odometry says nothing, so where a robot began is only known by what it saw; the first robot's first
+pose is the frame.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapfusion.robot_log import NO_TRACK, Observations, RobotLog
+from mapfusion.se2 import IDENTITY, Float, between, compose
+from mapfusion.smoother.elimination import matrix_bytes, pose_covariances
+from mapfusion.smoother.normal_equations import Estimate, odometry_information
+from mapfusion.smoother.recording import Recording
+from mapfusion.smoother.residuals import first_points
+from mapfusion.smoother.settle import Problem, settled
+from mapfusion.smoother.sightings import sightings_of
+from mapfusion.smoother.smooth import Smoothed
+
+_NOTHING = np.zeros((1, 3))  # what odometry says of the way from one robot's end to another's start
+_GB = 1e9
+# The next step would move the poses by no more than this, in squared sigmas a coordinate: the third
+# of a hundredth of a sigma. A step costs as the cube of all logs, and there is little left to win.
+_CONVERGED = 1e-5
+
+
+@dataclass(frozen=True)
+class SmoothedTogether:
+    """What K logs say, all at once, in the frame of the first robot's first pose.
+
+    Attributes:
+        smoothed: poses of one log after the other, points and their joint covariance.
+        points: (L,) their numbers, as they were given.
+        T_first_robot: (K, 3) first pose of each robot.
+        motion_covariance: (K, 3, 3) theirs; zero for the first.
+    """
+
+    smoothed: Smoothed
+    points: np.ndarray
+    T_first_robot: Float
+    motion_covariance: Float
+
+
+def smooth_together(
+    recordings: Sequence[Recording],
+    points: Sequence[np.ndarray],
+    T_first_robot: Float,
+    max_memory_gb: float,
+) -> SmoothedTogether:
+    """The most probable paths and points of K robots whose tracks stray alike.
+
+    It starts near where it ends, so there is no round of thinking the observations worse.
+
+    Args:
+        recordings: K of them; `stray_m` is that of the first.
+        points: of each, (N_k,) which point each observation is of, whoever saw it; negative for
+            none.
+        T_first_robot: (K, 3) where the robots' frames lie in the first one's, to start from.
+        max_memory_gb: of the matrices.
+
+    Raises:
+        LinAlgError: nothing says where a robot is.
+        MemoryError: they would take more.
+    """
+    log, point = _one_log([each.log for each in recordings]), np.concatenate(points)
+    stray_information = recordings[0].parameters.stray_information
+    seen = sightings_of(log, point, min_count=1, stray=stray_information > 0)
+    needed_gb = matrix_bytes(seen, len(log)) / _GB
+    if needed_gb > max_memory_gb:
+        raise MemoryError(f"takes {needed_gb:.1f} GB, allowed are {max_memory_gb:g}")
+    starts = np.cumsum([0, *(len(each.log) for each in recordings[:-1])])
+    path = np.concatenate(
+        [
+            compose(T, between(each.path[0], each.path))
+            for T, each in zip(T_first_robot, recordings, strict=True)
+        ]
+    )
+    path[0] = IDENTITY  # but for rounding it is that already
+    information = [
+        np.concatenate([odometry_information(each.log.odometry, each.parameters.motion), _NOTHING])
+        for each in recordings
+    ]
+    problem = Problem(seen, log.odometry, np.concatenate(information)[:-1], stray_information)
+    start = Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
+    end = settled(problem, start, _CONVERGED * path.size)
+    covariance = np.zeros((len(starts), 3, 3))
+    covariance[1:] = pose_covariances(seen, end.equations, end.solution, starts[1:])
+    names = point[seen.row[seen.starts[:-1]]]
+    return SmoothedTogether(Smoothed.of(end), names, end.estimate.path[starts], covariance)
+
+
+def _one_log(logs: Sequence[RobotLog]) -> RobotLog:
+    """One after the other; no two have a track in common."""
+    n_before = np.cumsum([0, *(len(log) for log in logs[:-1])])
+    tracks, first_free = [], 0
+    for log in logs:
+        track = log.observations.track
+        track = np.full(len(log.observations), NO_TRACK) if track is None else track
+        tracks.append(np.where(track == NO_TRACK, NO_TRACK, track.astype(np.int64) + first_free))
+        first_free = max(first_free, int(tracks[-1].max(initial=NO_TRACK)) + 1)
+    iteration = [log.iteration + n for log, n in zip(logs, n_before, strict=True)]
+    seen = Observations(
+        np.concatenate([log.observations.position_m for log in logs]),
+        np.concatenate([log.observations.covariance_m2 for log in logs]),
+        track=np.concatenate(tracks),
+    )
+    return RobotLog(
+        logs[0].robot,
+        any(log.planar for log in logs),
+        np.arange(n_before[-1] + len(logs[-1])) * 1.0,
+        np.concatenate([log.odometry for log in logs]),
+        np.concatenate(iteration),
+        seen,
+    )

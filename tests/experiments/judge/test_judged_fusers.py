@@ -1,0 +1,88 @@
+"""The table of fusers, against figures computed landmark by landmark."""
+
+import numpy as np
+import pytest
+
+from experiments.judge.errors import EvaluatedRobot
+from experiments.judge.judged_fusers import GivenMap, JudgedFusion
+from experiments.judge.smoothed_robots import SmoothedRobot
+from mapfusion import se2
+from mapfusion.aligned_landmarks import ABSENT
+from mapfusion.merge import merge
+from tests.experiments.judge.judged_teams import BENT_M, PARTS, K, evaluated_robots, judged_team
+from tests.mapfusion.fuse.drawn_maps import DrawnTeam
+
+
+def _fitted_errors(position: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Lengths after the rigid fit in the plane, by the singular values (Umeyama 1991)."""
+    p, q = position - position.mean(axis=0), truth - truth.mean(axis=0)
+    U, _, Vt = np.linalg.svd(q[:, :2].T @ p[:, :2])
+    R = (U @ np.diag([1, np.linalg.det(U @ Vt)]) @ Vt).T
+    plane = p[:, :2] - q[:, :2] @ R.T
+    return np.linalg.norm(np.column_stack([plane, position[:, 2] - truth[:, 2]]), axis=1)
+
+
+def test_figures_are_those_of_the_landmarks_one_by_one() -> None:
+    team = DrawnTeam(PARTS, 1, bent_m=BENT_M)
+    judged = judged_team(team)
+    row, fused = judged.row(), judged.fusion
+    truth = np.full((len(fused.landmarks), 3), np.nan)
+    for k, part in enumerate(team.parts):
+        has = fused.parents[:, k] != ABSENT
+        truth[has] = team.world_m[part][fused.parents[has, k]]
+    truth = se2.transform_points(se2.inverse(team.T_world_map[0]), truth)
+    off = np.linalg.norm(fused.landmarks.position_m - truth, axis=1)
+    errors = _fitted_errors(fused.landmarks.position_m, truth)
+    assert errors.max() < 0.15  # none is gross
+    assert row["landmark_rmse_m"] == pytest.approx(np.sqrt(np.mean(off**2)), rel=1e-9)
+    assert row["fitted_rmse_m"] == pytest.approx(np.sqrt(np.mean(errors**2)), rel=1e-6)
+    assert row["fitted_median_m"] == pytest.approx(np.median(errors), rel=1e-6)
+    assert (row["gross_share"], row["n_robots"], row["fuser"]) == (0.0, 3, "joint")
+    ratios = []
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        both = np.all(fused.parents[:, [a, b]] != ABSENT, axis=1)
+        rms = [np.sqrt(np.mean(errors[both] ** 2))]
+        for k in (a, b):
+            own = _fitted_errors(team.maps[k].position_m, team.truth(k))
+            rms.append(np.sqrt(np.mean(own[fused.parents[both, k]] ** 2)))
+        ratios.append(rms[0] / min(rms[1:]))
+    assert row["over_better_parent"] == pytest.approx(np.median(ratios), rel=1e-6)
+    assert row["over_better_filter"] == row["over_better_parent"]  # it was given the filter's maps
+    nees = []
+    for k in (1, 2):
+        T = fused.T_first_map[k] - se2.between(team.T_world_map[0], team.T_world_map[k])
+        T[2] = se2.wrap(T[2])
+        nees.append(T @ np.linalg.solve(fused.motion_covariance[k], T) / 3)
+    assert row["alignment_nees_per_dof"] == pytest.approx(np.median(nees))
+
+
+def test_over_the_filter_is_of_the_same_landmarks_in_the_filter_s_maps() -> None:
+    """Maps given are half as far off as the filter's, which lists its landmarks backwards."""
+    team = DrawnTeam(PARTS, 2, bent_m=BENT_M)
+    filters = evaluated_robots(team)
+    rough = []
+    for k, robot in enumerate(filters):
+        own, points = robot.at(K)
+        worse = team.truth(k) + 2 * (own.position_m - team.truth(k))
+        backwards = np.arange(len(own))[::-1]
+        rough_map = type(own)(
+            worse, own.covariance_m2, own.count, own.source_observation, own.descriptor
+        )[backwards]
+        rough.append(EvaluatedRobot(robot.name, {K: rough_map}, {K: points[backwards]}, robot.path))
+    fused = merge(team.maps, team.pairs).fused[0]
+    given = []
+    for robot, good in zip(rough, filters, strict=True):
+        smoothed = SmoothedRobot(
+            robot, np.zeros((1, 3)), good.maps, good.points_world_m, {}, {"not_smoothed": ""}
+        )
+        given.append(GivenMap.at(robot, smoothed, K))
+    row = JudgedFusion("joint", K, fused, given).row()
+    assert row["over_better_filter"] == pytest.approx(row["over_better_parent"] / 2, rel=0.1)
+
+
+def test_a_map_of_one_robot_has_no_parents_to_be_better_than() -> None:
+    team = DrawnTeam(PARTS, 3, bent_m=BENT_M)
+    team.pairs = []
+    row = judged_team(team).row()
+    assert np.isnan([row["over_better_parent"], row["alignment_nees_per_dof"]]).all()
+    assert row["n_robots"] == 1

@@ -1,0 +1,113 @@
+"""A run that merged nothing says so; a check fails by it, unless nothing could be merged."""
+
+import math
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from experiments.judge import tables
+from experiments.judge.checking import CheckedScenario, check_all
+from experiments.judge.expectations import load_checked
+from experiments.judge.metrics import USED_TABLES
+from experiments.judge.nothing_merged import nothing_merged
+from mapfusion.errors import InputError
+from tests.helpers.made_up_runs import complete
+from tests.helpers.tiny_scenario import TINY, command
+
+# Robots placed, landmarks common at 10 and at the last iteration (none: no truth), and the verdict.
+CASES = {
+    "merged": (2, (0, 40), None),
+    "one of three left out": (2, (0, 40), None),
+    "refused though there is ground": (1, (0, 3), True),
+    "ground that is not enough": (1, (9, 2), False),
+    "no truth": (1, (), None),
+}
+
+
+def write_run(folder: Path, n_robots: int, n_placed: int, n_common: tuple[int, ...]) -> Path:
+    """The tables that say what was merged."""
+    motions = [
+        {"robot": f"R{k}", "tx_m": 0.0 if k < n_placed else math.nan} for k in range(n_robots)
+    ]
+    pair = {"robot_a": "R0", "robot_b": "R1", "aligner": "ransac"}
+    errors = [pair | {"iteration": 10 * k, "n_common": n} for k, n in enumerate(n_common, 1)]
+    for name, rows in (("fused_motions", motions), ("errors", errors)):
+        frame = complete(name, pd.DataFrame(rows)) if rows else tables.framed(name, [])
+        tables.write(tables.table_path(folder, name), name, frame)
+    for name in {*USED_TABLES} - {"fused_motions", "errors"}:
+        tables.write(tables.table_path(folder, name), name, [])
+    return folder
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_what_a_result_says(tmp_path: Path, case: str) -> None:
+    n_placed, n_common, ground = CASES[case]
+    found = nothing_merged(write_run(tmp_path, 2 + case.startswith("one of"), n_placed, n_common))
+    if n_placed > 1:
+        assert found is None
+        return
+    assert found is not None
+    assert found.common_ground is ground
+    assert found.failed == (ground is not False)
+    assert "\n" not in found.text
+
+
+def test_one_robot_has_nothing_to_merge(tmp_path: Path) -> None:
+    assert nothing_merged(write_run(tmp_path, 0, 0, ())) is None
+
+
+def checked(tmp_path: Path, n_common: tuple[int, ...], expect: str) -> CheckedScenario:
+    path = tmp_path / "tiny.yaml"
+    path.write_text(TINY.partition("expect:")[0] + f"expect: {expect}", encoding="utf-8")
+
+    def run(scenario: object) -> Path:
+        return write_run(tmp_path / "result", 2, 1, n_common)
+
+    (told,) = check_all([str(path)], [3], (), run)
+    assert not told.error
+    return told
+
+
+@pytest.mark.parametrize(
+    ("n_common", "expect", "passed"),
+    [
+        ((40,), "{}", False),
+        ((0,), "{}", True),
+        ((40,), "{team.merged_robots: {max: 0}}", True),
+        ((0,), "{team.merged_robots: {min: 2}}", False),
+        ((40,), "{team.merged_robots: {min: 2}}", False),
+    ],
+)
+def test_the_expect_block_has_the_last_word(
+    tmp_path: Path, n_common: tuple[int, ...], expect: str, passed: bool
+) -> None:
+    told = checked(tmp_path, n_common, expect)
+    assert told.passed == passed
+    assert list(told.unmerged) == ([3] if expect == "{}" and not passed else [])
+
+
+def test_only_what_needs_no_truth_can_be_expected_without(tmp_path: Path) -> None:
+    (tmp_path / "R1").mkdir()
+    path = tmp_path / "recorded.yaml"
+    text = "schema_version: 1\nname: x\nlogs: [R1]\nexpect: {team.merged_robots: {max: 0}"
+    path.write_text(text + "}\n")
+    assert load_checked(path).expect.keys() == {"team.merged_robots"}
+    path.write_text(text + ", path_rmse_m: {max: 1}}\n")
+    with pytest.raises(InputError, match=r"expect\.path_rmse_m: no truth is known"):
+        load_checked(path)
+
+
+def test_check_says_so_in_one_line_and_exits_with_1(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result = write_run(tmp_path / "result", 2, 1, (40,))
+    monkeypatch.setattr("experiments.judge.result.run_scenario", lambda *_: result)
+    path = tmp_path / "tiny.yaml"
+    path.write_text(TINY.partition("expect:")[0], encoding="utf-8")
+    junit = tmp_path / "junit.xml"
+    reply = command(capsys, "check", path, "--seeds", "3", "--junit", junit)
+    assert reply.code == 1
+    assert "tiny, seed 3: no two maps were merged, though some share ground" in reply.out
+    assert "0 passed, 1 failed" in reply.out
+    assert '<failure message="no two maps were merged' in junit.read_text()

@@ -1,0 +1,43 @@
+"""What the stage `fuse` writes is what it reads again."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.run.stages.fuse import read_fused_maps, read_fusions, write_fusions
+from mapfusion.fuse.parameters import MergeParameters
+from mapfusion.fuse.registry import FUSERS, make_fuser
+from mapfusion.merge import merge
+from tests.mapfusion.fuse.drawn_maps import DrawnTeam
+
+NAMES = ("R1", "R2", "R3", "R4")
+# the first and the third share landmarks, and so do the other two
+PARTS = [slice(0, 40), slice(60, 100), slice(20, 60), slice(70, 120)]
+
+
+@pytest.mark.parametrize("fuser", FUSERS)
+def test_what_is_written_is_read_again(fuser: str, tmp_path: Path) -> None:
+    team = DrawnTeam(PARTS, 0)
+    fused = merge(team.maps, team.pairs, MergeParameters(), make_fuser(fuser)).fused
+    assert [each.members.tolist() for each in fused] == [[0, 2], [1, 3]]
+    alone = merge(team.maps, [], MergeParameters(), make_fuser(fuser)).fused
+    write_fusions(tmp_path, {3: alone, 7: fused}, NAMES)
+    found = read_fusions(tmp_path, NAMES)
+    assert list(found) == [3, 7]
+    for read, one in ((found[3], alone[0]), (found[7], fused[0])):
+        np.testing.assert_array_equal(read.parents, one.parents)
+        np.testing.assert_array_equal(read.members, one.members)
+        np.testing.assert_array_equal(read.T_first_map, one.T_first_map)
+        np.testing.assert_array_equal(read.drift_sigma_m, one.drift_sigma_m)
+        symmetric = (one.motion_covariance + np.swapaxes(one.motion_covariance, 1, 2)) / 2
+        np.testing.assert_allclose(read.motion_covariance, symmetric, rtol=1e-9, atol=1e-15)
+        assert (read.duplicate_share, read.fallback) == (one.duplicate_share, one.fallback)
+        own = one.landmarks
+        np.testing.assert_array_equal(read.landmarks.position_m, own.position_m)
+        np.testing.assert_array_equal(read.landmarks.count, own.count)
+        # only the upper half of a covariance is stored
+        np.testing.assert_allclose(read.landmarks.covariance_m2, own.covariance_m2, atol=1e-15)
+    assert found[3].landmarks.joint is None  # kept for the last alone
+    assert (found[7].landmarks.joint is None) == (fused[0].landmarks.joint is None)
+    assert [len(each) for each in read_fused_maps(tmp_path)] == [len(e.landmarks) for e in fused]

@@ -1,0 +1,15 @@
+"""How the stages of a scenario are laid out; nothing is run."""
+
+from experiments.run.pipeline import lay_out
+from experiments.scenario.settings import Simulation
+
+
+def test_two_robots_are_aligned_in_the_order_of_their_names(tiny: Simulation) -> None:
+    """R10 comes after R2, whichever is listed first: T_a_b and its random numbers are the same."""
+    first, second = tiny.robots
+    renamed = [first.model_copy(update={"name": "R10"}), second]
+    for robots in (renamed, renamed[::-1]):
+        pipeline = lay_out(tiny.model_copy(update={"robots": robots}))
+        (pair,) = pipeline.pairs
+        assert (pair.a.name, pair.b.name) == ("R2", "R10")
+        assert [robot.name for robot in pipeline.robots] == [robot.name for robot in robots]

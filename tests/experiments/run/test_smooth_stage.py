@@ -1,0 +1,121 @@
+"""The smoother as a stage: what it is given, what it writes, and when it cannot."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from experiments.run.frames import write_rows
+from experiments.run.job import Job
+from experiments.run.stages.slam import ASSOCIATIONS, POSES, associations_at
+from experiments.run.stages.smooth import (
+    SmoothSettings,
+    fused_iterations,
+    iterations_of,
+    log_until,
+    parts,
+    read_endings,
+    read_smoothed,
+    read_smoothed_path,
+    run,
+)
+from mapfusion.robot_log import RobotLog, write_log
+from mapfusion.smoother.smooth import SmootherParameters, smooth
+from mapfusion.smoother.smoothed_map import smoothed_map
+from mapfusion.storage import POSE_FIELDS
+from tests.mapfusion.smoother.white_noise_logs import dead_reckoned, white_noise_log
+
+N_FRAMES, CHANGED_AT = 40, 20
+
+
+def owners(log: RobotLog) -> np.ndarray:
+    """Of each observation the first of its landmark."""
+    assert log.observations.label is not None
+    _, first, inverse = np.unique(log.observations.label, return_index=True, return_inverse=True)
+    return first[inverse]
+
+
+def filtered(folder: Path, log: RobotLog, owner: np.ndarray) -> dict[str, Path]:
+    """A log and what a filter left of it, which till `CHANGED_AT` took all for one landmark."""
+    write_log(folder / "log", log)
+    at = np.maximum(log.iteration, CHANGED_AT)
+    rows = {"from_iteration": at, "observation": np.arange(len(owner)), "source_observation": owner}
+    early = np.flatnonzero(log.iteration < CHANGED_AT)
+    wrong = {"from_iteration": log.iteration[early], "observation": early, "source_observation": 0}
+    changes = pd.concat([pd.DataFrame(wrong), pd.DataFrame(rows)]).sort_values("from_iteration")
+    write_rows(folder / "slam" / "associations.parquet", ASSOCIATIONS, changes)
+    poses = pd.DataFrame(dead_reckoned(log), columns=[f"final_{name}" for name in POSE_FIELDS])
+    poses = poses.assign(iteration=np.arange(len(poses)), resampled=False, n_landmarks=0)
+    write_rows(folder / "slam" / "poses.parquet", POSES, poses)
+    return {"log": folder / "log", "slam": folder / "slam"}
+
+
+def smoothed_at(
+    inputs: dict[str, Path], folder: Path, *iterations: int, max_memory_gb: float = 1.0
+) -> None:
+    settings = SmoothSettings(SmootherParameters(), 0.0, iterations, max_memory_gb)
+    for part in parts(iterations):
+        run(settings, Job(inputs, folder, part))
+
+
+def test_it_is_the_smoother_on_the_log_so_far(tmp_path: Path) -> None:
+    log = white_noise_log(np.random.default_rng(0), N_FRAMES, 25).log
+    owner = owners(log)
+    inputs, k = filtered(tmp_path, log, owner), 30
+    smoothed_at(inputs, tmp_path / "out", k, N_FRAMES - 1)
+    maps, paths = read_smoothed(tmp_path / "out"), read_smoothed_path(tmp_path / "out")
+    assert list(maps) == list(paths) == [k, N_FRAMES - 1]
+    early = log_until(log, k)
+    assert early.iteration.max() == k
+    seen = owner[: len(early.observations)]
+    alone = smooth(early, seen, dead_reckoned(early), SmootherParameters())
+    np.testing.assert_allclose(paths[k], alone.estimate.path, atol=1e-9)
+    expected = smoothed_map(early, seen, alone)
+    np.testing.assert_allclose(maps[k].position_m, expected.position_m, atol=1e-9)
+    np.testing.assert_allclose(maps[k].covariance_m2, expected.covariance_m2, atol=1e-9)
+    np.testing.assert_array_equal(maps[k].source_observation, expected.source_observation)
+    assert maps[k].joint is not None
+    assert len(maps[N_FRAMES - 1]) >= len(maps[k]) > 5
+    assert read_endings(tmp_path / "out")["n_steps"].min() >= 1
+
+
+def test_associations_are_those_of_the_filter_at_that_time(tmp_path: Path) -> None:
+    log = white_noise_log(np.random.default_rng(1), N_FRAMES, 25).log
+    slam = filtered(tmp_path, log, owners(log))["slam"]
+    n = len(log_until(log, CHANGED_AT - 1).observations)
+    np.testing.assert_array_equal(associations_at(slam, CHANGED_AT - 1, n), np.zeros(n))
+    n = len(log_until(log, CHANGED_AT).observations)
+    np.testing.assert_array_equal(associations_at(slam, CHANGED_AT, n), owners(log)[:n])
+    whole = associations_at(slam, CHANGED_AT, len(log.observations))
+    np.testing.assert_array_equal(whole[log.iteration > CHANGED_AT], -1)
+
+
+@pytest.mark.parametrize("planar", [False, True])
+def test_a_robot_that_saw_nothing_has_an_empty_map(tmp_path: Path, planar: bool) -> None:
+    log = white_noise_log(np.random.default_rng(2), N_FRAMES, 25, planar).log
+    inputs = filtered(tmp_path, log, np.full(len(log.observations), -1))
+    smoothed_at(inputs, tmp_path / "out", N_FRAMES - 1)
+    (found,) = read_smoothed(tmp_path / "out").values()
+    assert (len(found), found.planar, found.name) == (0, planar, log.robot)
+    path = read_smoothed_path(tmp_path / "out")[N_FRAMES - 1]
+    np.testing.assert_allclose(path, dead_reckoned(log), atol=1e-9)
+
+
+def test_a_log_too_long_for_the_memory_given_has_no_map(tmp_path: Path) -> None:
+    log = white_noise_log(np.random.default_rng(3), N_FRAMES, 25).log
+    inputs = filtered(tmp_path, log, owners(log))
+    smoothed_at(inputs, tmp_path / "out", 5, N_FRAMES - 1, max_memory_gb=1e-4)
+    assert list(read_smoothed(tmp_path / "out")) == [5]
+    reasons = read_endings(tmp_path / "out").set_index("iteration")["not_smoothed"]
+    assert reasons[5] == ""
+    assert "smooth.max_memory_gb is 0.0001" in reasons[N_FRAMES - 1]
+
+
+def test_fused_iterations_are_evaluated_ones() -> None:
+    assert fused_iterations(1200, 25, None) == [250, 475, 725, 950, 1199]
+    assert fused_iterations(1200, 25, 500) == [500, 1000, 1199]
+    assert fused_iterations(44, 20, None) == [20, 40, 43]
+    assert fused_iterations(2, 25, None) == [1]
+    assert iterations_of(700, [250, 475, 725, 950, 1199]) == (250, 475, 699)
+    assert iterations_of(1200, [500, 1199]) == (500, 1199)

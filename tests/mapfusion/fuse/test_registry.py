@@ -1,0 +1,60 @@
+"""Fusers by name, our own and those of installed packages."""
+
+from importlib.metadata import EntryPoint
+
+import pytest
+
+from mapfusion.fuse import registry
+from mapfusion.fuse.joint import JointFuser
+from mapfusion.fuse.registry import FUSERS, GROUP, make_fuser
+
+
+class Other:
+    """A fuser of another package."""
+
+    smoothed = False
+
+    def fuse(self, component: object, parameters: object) -> None:
+        """Never called here."""
+
+
+class NoFuser:
+    """Lacks `fuse`."""
+
+    smoothed = False
+
+
+@pytest.fixture
+def offered(monkeypatch: pytest.MonkeyPatch) -> None:
+    entries = [
+        EntryPoint("other", f"{__name__}:Other", GROUP),
+        EntryPoint("joint", f"{__name__}:Other", GROUP),
+        EntryPoint("none", f"{__name__}:NoFuser", GROUP),
+        EntryPoint("gone", f"{__name__}:Gone", GROUP),
+    ]
+    monkeypatch.setattr(registry, "entry_points", lambda group: entries)
+
+
+@pytest.mark.parametrize("name", FUSERS)
+def test_all_of_ours_can_be_made(name: str) -> None:
+    assert isinstance(make_fuser(name).smoothed, bool)
+
+
+@pytest.mark.usefixtures("offered")
+def test_others_are_found_and_ours_come_first() -> None:
+    assert isinstance(make_fuser("other"), Other)
+    assert isinstance(make_fuser("joint"), JointFuser)
+
+
+@pytest.mark.usefixtures("offered")
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("jont", "unknown fuser 'jont', known are kalman, .*; did you mean joint"),
+        ("none", "fuser none: .*NoFuser has no fuse"),
+        ("gone", "fuser gone: .*Gone cannot be made"),
+    ],
+)
+def test_what_cannot_be_used_is_told(name: str, told: str) -> None:
+    with pytest.raises(ValueError, match=told):
+        make_fuser(name)

@@ -1,0 +1,70 @@
+"""Robots placed by alignments: exact along a chain, and as sure as many tries show."""
+
+import numpy as np
+import pytest
+
+from mapfusion.se2 import between, compose, wrap
+from mapfusion.team.placement import placed
+from mapfusion.team.relations import Motions
+from tests.mapfusion.team.teams import SIGMA, all_pairs, measured, poses
+
+
+def test_a_chain_is_what_its_motions_say() -> None:
+    rng = np.random.default_rng(0)
+    robots = np.array([[2, 0], [2, 4], [1, 4]])
+    relations = measured(robots, poses(3, rng), 5, rng)
+    found = placed(relations, np.arange(3))
+    T_2_0, T_2_4, T_1_4 = relations.T_a_b
+    T_0_4 = compose(between(T_2_0, np.zeros(3)), T_2_4)
+    np.testing.assert_array_equal(found.row, [0, 1, 2, -1, 3])
+    np.testing.assert_allclose(found.T_root_robot[3], T_0_4, atol=1e-12)
+    np.testing.assert_allclose(
+        found.T_root_robot[1], compose(T_0_4, between(T_1_4, np.zeros(3))), atol=1e-12
+    )
+    there = Motions(relations.T_a_b, relations.covariance)
+    along = there[np.array([0])].inverse().then(there[np.array([1])])
+    np.testing.assert_allclose(found.covariance[3, 3], along.covariance[0], rtol=1e-9)
+
+
+def test_as_sure_as_many_tries_show() -> None:
+    """The squared error over the covariance has the mean of a chi-square variable."""
+    n, tries = 5, 200
+    rng = np.random.default_rng(1)
+    robots, true = all_pairs(n), poses(n, rng)
+    T_a_b, squares = between(true[robots[:, 0]], true[robots[:, 1]]), []
+    for _ in range(tries):
+        found = placed(measured(robots, T_a_b, n, rng), np.arange(len(robots)))
+        off = found.T_root_robot - between(true[0], true)
+        off[:, 2] = wrap(off[:, 2])
+        joint = found.covariance[1:, 1:].swapaxes(1, 2).reshape(3 * (n - 1), -1)
+        squares.append(off[1:].ravel() @ np.linalg.solve(joint, off[1:].ravel()))
+        best = np.sqrt(np.diagonal(found.covariance[1, 1]))
+        assert np.all(best < SIGMA * [20, 20, 1])  # turns move what is far
+    dof = 3 * (n - 1)
+    assert np.mean(squares) == pytest.approx(dof, abs=4 * np.sqrt(2 * dof / tries))
+
+
+def test_a_motion_s_distance_counts_both_covariances() -> None:
+    rng = np.random.default_rng(2)
+    robots = np.array([[0, 1], [1, 2]])
+    relations = measured(robots, poses(2, rng), 3, rng)
+    found = placed(relations, np.arange(2))
+    pair = np.array([[0, 2]])
+    exact = found.relative(pair)
+    # what both poses share, the first step of the chain, is no error between them
+    second = found.relative(np.array([[1, 2], [2, 1]])).covariance
+    np.testing.assert_allclose(second[0], relations.covariance[1], atol=1e-9)
+    back = Motions(relations.T_a_b, relations.covariance).inverse().covariance[1]
+    np.testing.assert_allclose(second[1], back, atol=1e-9)
+    root = np.linalg.cholesky(exact.covariance[0] + np.diag(SIGMA**2))
+    off = Motions(exact.T + root @ [0.0, 3.0, 0.0], np.diag(SIGMA**2)[None])
+    distance, S = found.squared_distances(pair, off)
+    assert distance[0] == pytest.approx(9.0, rel=1e-6)
+    np.testing.assert_allclose(S[0], root @ root.T, rtol=1e-6)
+
+
+def test_robots_that_nothing_connects() -> None:
+    rng = np.random.default_rng(3)
+    relations = measured(np.array([[0, 1], [2, 3]]), poses(2, rng), 4, rng)
+    with pytest.raises(ValueError, match="do not connect"):
+        placed(relations, np.arange(2))

@@ -1,0 +1,72 @@
+"""Motions chain as se2 does, and their covariances as those of many noisy ones."""
+
+import numpy as np
+import pytest
+
+from mapfusion.se2 import compose, inverse
+from mapfusion.team.relations import Motions, Relations, whole_map_covariance
+
+T = np.array([[1.0, -2.0, 0.7], [-3.0, 0.5, -2.5]])
+L = np.array([[3e-3, 0, 0], [1e-3, 2e-3, 0], [5e-4, -4e-4, 1e-3]])
+C = np.stack([L @ L.T, 4 * L.T @ L])
+
+
+def spread(of, *motions: Motions) -> np.ndarray:
+    """(3, 3) by central differences, through the covariances' roots."""
+    total = np.zeros((3, 3))
+    for k, motion in enumerate(motions):
+        root, J = np.linalg.cholesky(motion.covariance[0]), np.empty((3, 3))
+        for i, step in enumerate(1e-4 * np.eye(3)):
+            ends = []
+            for sign in (1, -1):
+                at = [each.T[0] for each in motions]
+                at[k] = at[k] + sign * step
+                ends.append(of(*at))
+            J[:, i] = (ends[0] - ends[1]) / 2e-4
+        total += J @ root @ root.T @ J.T
+    return total
+
+
+def test_the_way_back() -> None:
+    motions = Motions(T, C)
+    np.testing.assert_allclose(motions.inverse().T, inverse(T))
+    np.testing.assert_allclose(motions.inverse().covariance[0], spread(inverse, motions), rtol=1e-6)
+    np.testing.assert_allclose(motions.inverse().inverse().covariance, C)
+
+
+def test_one_after_the_other() -> None:
+    first, second = Motions(T[:1], C[:1]), Motions(T[1:], C[1:])
+    both = first.then(second)
+    np.testing.assert_allclose(both.T, compose(T[:1], T[1:]))
+    np.testing.assert_allclose(both.covariance[0], spread(compose, first, second), rtol=1e-6)
+
+
+def test_a_bent_map_shifts_and_turns_as_a_whole() -> None:
+    """Of many maps, each shifted by s along each axis and turned about its middle by s / r."""
+    rng, drift_m, n = np.random.default_rng(1), 0.01, 100_000
+    p_a = rng.uniform([5.0, -4.0], [9.0, -1.0], (40, 2))
+    middle = p_a.mean(axis=0)
+    arm_m = np.sqrt(np.sum((p_a - middle) ** 2, axis=1).mean())
+    shift, turn = drift_m * rng.normal(size=(n, 2)), drift_m / arm_m * rng.normal(size=n)
+    about = np.column_stack([np.tile(middle, (n, 1)), turn])
+    moved = compose(compose(about, [*-middle, 0.0]), T[0]) + np.column_stack([shift, 0 * turn])
+    expected = C[0] + np.cov((moved - T[0]).T)
+    found = whole_map_covariance(T[0], C[0], drift_m, p_a)
+    np.testing.assert_allclose(found, expected, rtol=0.03, atol=0.03 * drift_m**2)
+    np.testing.assert_array_equal(whole_map_covariance(T[0], C[0], 0.0, p_a), C[0])
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"robots": np.array([[0, 3]])}, "robots: outside 0 to 2"),
+        ({"robots": np.array([[1, 1]])}, "alignment of a map with itself"),
+        ({"T_a_b": np.full((1, 3), np.nan)}, "T_a_b"),
+        ({"covariance": np.zeros((1, 2, 2))}, "covariance"),
+    ],
+)
+def test_what_is_no_relation_is_refused(change: dict, told: str) -> None:
+    good = {"robots": np.array([[0, 1]]), "T_a_b": T[:1], "covariance": C[:1]}
+    Relations(3, **good, log10_false_alarms=np.zeros(1))
+    with pytest.raises(ValueError, match=told):
+        Relations(3, **(good | change), log10_false_alarms=np.zeros(1))

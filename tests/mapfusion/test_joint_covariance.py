@@ -1,0 +1,56 @@
+"""Block diagonal plus low rank, against the dense covariance that it stands for."""
+
+import numpy as np
+import pytest
+
+from mapfusion.joint_covariance import JointCovariance, condensed
+
+
+def _parts(
+    rng: np.random.Generator, n: int, variances: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Own blocks, and a common part whose directions have these variances."""
+    rotation = np.linalg.qr(rng.normal(size=(len(variances), len(variances))))[0]
+    across = np.linalg.qr(rng.normal(size=(3 * n, len(variances))))[0].T
+    root = rng.normal(size=(n, 3, 3))
+    return root @ np.swapaxes(root, 1, 2), rotation @ (np.sqrt(variances)[:, None] * across)
+
+
+def _dense(own_m2: np.ndarray, common: np.ndarray) -> np.ndarray:
+    joint = common.T @ common
+    for k, block in enumerate(own_m2):
+        joint[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += block
+    return joint
+
+
+def test_all_directions_kept_are_the_dense_covariance() -> None:
+    own, common = _parts(np.random.default_rng(0), 7, np.geomspace(1, 1e-3, 12))
+    joint = condensed(own, common, rank=12)
+    np.testing.assert_allclose(joint.dense_m2(), _dense(own, common), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("rank", [5, 20])
+def test_what_is_left_out_is_the_smallest_and_goes_to_the_landmarks_own(rank: int) -> None:
+    variances = np.geomspace(1, 1e-6, 60)
+    own, common = _parts(np.random.default_rng(1), 40, variances)
+    joint, whole = condensed(own, common, rank), _dense(own, common)
+    assert joint.rank == rank
+    blocks = whole.reshape(40, 3, 40, 3)[np.arange(40), :, np.arange(40)]
+    np.testing.assert_allclose(joint.marginal_m2, blocks, rtol=0, atol=1e-12)
+    # Eckart and Young: nothing of that rank can be closer than the next variance
+    stacked = joint.common_m.transpose(1, 0, 2).reshape(rank, -1)
+    off = np.linalg.norm(common.T @ common - stacked.T @ stacked, ord=2)
+    assert off == pytest.approx(variances[rank], rel=1e-3)
+    assert np.all(np.linalg.eigvalsh(joint.own_m2 - own) > -1e-12)
+
+
+def test_rows_are_those_of_the_dense_covariance() -> None:
+    own, common = _parts(np.random.default_rng(2), 6, np.ones(4))
+    joint, rows = condensed(own, common), np.array([4, 1])
+    of = (3 * rows[:, None] + np.arange(3)).ravel()
+    np.testing.assert_allclose(joint[rows].dense_m2(), _dense(own, common)[np.ix_(of, of)])
+
+
+def test_parts_of_different_landmarks_are_refused() -> None:
+    with pytest.raises(ValueError, match="common_m"):
+        JointCovariance(np.zeros((2, 3, 3)), np.zeros((3, 1, 3)))
