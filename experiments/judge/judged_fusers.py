@@ -114,6 +114,7 @@ class JudgedFusion:
             "frame_nees_per_dof": in_frame.marginal_nees_per_dof,
             "frame_coverage_95": in_frame.coverage_95,
             "duplicate_share": self.fusion.duplicate_share,
+            "fallback": self.fusion.fallback,
         } | self._motions()
 
     def _over_better(self, fit: FittedMap, of_filter: bool) -> float:

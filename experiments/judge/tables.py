@@ -18,8 +18,8 @@ from mapfusion.storage import COVARIANCE_FIELDS, POSITION_FIELDS, schema
 
 # Names that are no floats.
 _NAMES = {
-    frames.TEXT: """aligner delta_unit fuser landmarks left_out map name not_smoothed place quantity
-        reason refined_reason refined_status robot robot_a robot_b source stage status""",
+    frames.TEXT: """aligner delta_unit fallback fuser landmarks left_out map name not_smoothed place
+        quantity reason refined_reason refined_status robot robot_a robot_b source stage status""",
     frames.INT: """component count degrees_of_freedom frame iteration landmark landmark_a landmark_b
         n n_common n_correspondences n_inliers n_landmarks n_parents n_robots n_steps n_team n_true
         particle repetition""",
@@ -93,11 +93,12 @@ _COLUMNS = {
     # medians over pairs of robots. nees_per_dof, marginal_nees_per_dof and coverage_95: with the
     # gauge removed, the first of all landmarks at once; a map that has no joint covariance (all but
     # the last of each fuser) is taken for one of independent errors. frame_: in the frame, of each
-    # landmark for itself. alignment_: how the other robots' maps were moved, medians.
+    # landmark for itself. alignment_: how the other robots' maps were moved, medians. fallback: why
+    # a simpler fuser stood in (else empty).
     "fusers": """fuser iteration n_robots n_landmarks landmark_rmse_m fitted_rmse_m fitted_median_m
         gross_share over_better_parent over_better_filter
         nees_per_dof marginal_nees_per_dof coverage_95 frame_nees_per_dof frame_coverage_95
-        alignment_error_m alignment_error_rad alignment_nees_per_dof duplicate_share""",
+        alignment_error_m alignment_error_rad alignment_nees_per_dof duplicate_share fallback""",
     # Share of the true points inside the ellipses of a nominal probability, at the last iteration,
     # of each fuser's map and before: map is fused, or filter or smoothed with no fuser, which are
     # all robots' maps together. coverage: each map after its best rigid fit, with the gauge

@@ -5,18 +5,23 @@ also those move that one robot alone has seen. Maps without one are fused by wha
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from mapfusion.align.pairs import MIN_PAIRS
 from mapfusion.aligned_landmarks import ABSENT
 from mapfusion.chi_square import chi_square_bound
 from mapfusion.fuse.clusters import Pair, joined
 from mapfusion.fuse.component import Component
 from mapfusion.fuse.joint_estimate import JointEstimate, JointMap, estimate_jointly
 from mapfusion.fuse.jointly_fused import JointlyFused
+from mapfusion.fuse.kalman_drift import KalmanDrift
 from mapfusion.fuse.parameters import MergeParameters
 from mapfusion.fused_map import FusedMap
 from mapfusion.landmark_map import LandmarkMap
@@ -28,7 +33,10 @@ _MOST_ROUNDS = 5
 
 
 class JointFuser:
-    """All maps at once; the first member's frame is the frame."""
+    """All maps at once; the first member's frame is the frame.
+
+    Where landmarks do not tie the maps to each other, Kalman fusion with drift stands in.
+    """
 
     smoothed = True
 
@@ -41,17 +49,29 @@ class JointFuser:
             JointMap.of(landmarks, float(drift[k]), n_dimensions)
             for landmarks, k in zip(given, component.members, strict=True)
         ]
-        sizes = [len(landmarks) for landmarks in given]
-        points = joined(_inliers(component), sizes)
-        start = component.T_first_map[component.members]
-        estimate = _estimated(maps, start, points)
+        sizes, inliers = [len(landmarks) for landmarks in given], _inliers(component)
+        points = joined(inliers, sizes)
+        if not _tied(points):
+            why = f"fewer than {MIN_PAIRS} landmarks tie some map to the others"
+            return replace(KalmanDrift().fuse(component, parameters), fallback=why)
+        estimate = _estimated(maps, component.T_first_map[component.members], points)
         for _ in range(_MOST_ROUNDS):
-            pairs = _candidates(given, _placed(maps, estimate), parameters)
-            before, points = points, joined(pairs, sizes)
-            if np.array_equal(before, points):
+            pairs = _candidates(given, _placed(maps, estimate), inliers, parameters)
+            now = joined(pairs, sizes)
+            if np.array_equal(points, now) or not _tied(now):
                 break
-            estimate = _estimated(maps, estimate.T_first_map, points)
+            points, estimate = now, _estimated(maps, estimate.T_first_map, now)
         return JointlyFused(component, maps, points, estimate).fused_map(parameters)
+
+
+def _tied(points: np.ndarray) -> bool:
+    """Whether each map's motion is determined by points (C, K) that it has in common with others.
+
+    Maps hang together by pairs of maps with enough points in common.
+    """
+    has = (points != ABSENT).astype(np.int64)
+    n_components, _ = connected_components(csr_matrix(has.T @ has >= MIN_PAIRS), directed=False)
+    return n_components == 1
 
 
 def _estimated(maps: Sequence[JointMap], T_first_map: Float, points: np.ndarray) -> JointEstimate:
@@ -61,12 +81,14 @@ def _estimated(maps: Sequence[JointMap], T_first_map: Float, points: np.ndarray)
 
 
 def _inliers(component: Component) -> list[Pair]:
-    """What alignments say is one; places are among the members."""
+    """What alignments say is one; places are among the members, the lesser first."""
     place = {int(k): row for row, k in enumerate(component.members)}
-    return [
-        Pair(place[p.a], place[p.b], p.inliers.index_a, p.inliers.index_b, p.inliers.distance)
-        for p in component.pairs
-    ]
+    found = []
+    for p in component.pairs:
+        sides = [(place[p.a], p.inliers.index_a), (place[p.b], p.inliers.index_b)]
+        (a, row_a), (b, row_b) = sorted(sides, key=lambda side: side[0])
+        found.append(Pair(a, b, row_a, row_b, p.inliers.distance))
+    return found
 
 
 class _Placed(NamedTuple):
@@ -84,7 +106,7 @@ class _Placed(NamedTuple):
 
     @property
     def widest_m2(self) -> Float:
-        """(n,) no less than half of what any variance of a difference has from this landmark."""
+        """(n,) two landmarks' together are no less than any variance of their difference."""
         own = np.trace(self.own_m2, axis1=1, axis2=2)
         return own + 2 * np.sum(self.shared_m**2, axis=(1, 2))
 
@@ -96,20 +118,27 @@ def _placed(maps: Sequence[JointMap], estimate: JointEstimate) -> list[_Placed]:
 
 
 def _candidates(
-    given: Sequence[LandmarkMap], placed: Sequence[_Placed], parameters: MergeParameters
+    given: Sequence[LandmarkMap],
+    placed: Sequence[_Placed],
+    inliers: Sequence[Pair],
+    parameters: MergeParameters,
 ) -> list[Pair]:
-    """Landmarks of every two maps that may be one point, by identity or by gate and descriptor.
+    """Landmarks of every two maps that may be one point.
 
-    A known identity needs no gate, and its landmarks are not unlike at all.
+    Those of one label need nothing else and are not unlike at all. All others have to pass the
+    gate, and their descriptors have to be alike unless an alignment named the two.
     """
     bound = chi_square_bound(parameters.gate_probability, placed[0].position_m.shape[1])
     found = []
     for a, b in combinations(range(len(given)), 2):
-        known_i, known_j = _of_one_label(given[a], given[b])
         i, j, unlike = _alike(given[a], given[b], *_near(placed[a], placed[b], bound))
         near = unlike <= parameters.max_descriptor_distance  # False for NaN
-        i, j, unlike = i[near], j[near], unlike[near]
+        named = [pair for pair in inliers if (pair.a, pair.b) == (a, b)]
+        i = np.concatenate([i[near], *(pair.row_a for pair in named)]).astype(np.int64)
+        j = np.concatenate([j[near], *(pair.row_b for pair in named)]).astype(np.int64)
+        unlike = np.concatenate([unlike[near], *(pair.unlike for pair in named)])
         kept = _inside(placed[a], placed[b], i, j, bound)
+        known_i, known_j = _of_one_label(given[a], given[b])
         i, j = np.concatenate([known_i, i[kept]]), np.concatenate([known_j, j[kept]])
         found.append(Pair(a, b, i, j, np.concatenate([np.zeros(len(known_i)), unlike[kept]])))
     return found

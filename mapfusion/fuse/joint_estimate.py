@@ -26,7 +26,7 @@ from mapfusion.aligned_landmarks import ABSENT
 from mapfusion.joint_covariance import JointCovariance
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.se2 import Float, rotation_about_z, transform_points, wrap
-from mapfusion.smoother.student import MOST_DOF, fitted_dof, student_weights
+from mapfusion.smoother.student import fitted_dof, student_weights
 
 # The next step would move what is sought, as a whole and in squared sigmas, by no more than this.
 _CONVERGED = 1e-3
@@ -88,16 +88,12 @@ class JointEstimate:
         shared: of each map, (R_k,) its shared variables z.
         covariance: (U, U) of all unknowns: three for each motion but the first, then the z.
         weight: (C, K) of the Student-t, 0 where a map has no part.
-        dof: degrees of freedom of the Student-t.
-        n_steps: Gauss-Newton steps that were taken.
     """
 
     T_first_map: Float
     shared: tuple[Float, ...]
     covariance: Float
     weight: Float
-    dof: float
-    n_steps: int
 
     @property
     def motion_covariance(self) -> Float:
@@ -160,7 +156,7 @@ def estimate_jointly(
     T, shared = np.array(T_first_map), [np.zeros(each.joint.rank) for each in maps]
     columns = [_columns(maps, k) for k in range(len(maps))]
     has = parents != ABSENT
-    weight, dof, n_steps = has.astype(np.float64), MOST_DOF, 0
+    weight, n_steps = has.astype(np.float64), 0
     while True:
         said = [_said(maps[k], parents[has[:, k], k], T[k], shared[k]) for k in range(len(maps))]
         points = _points(said, has, weight)
@@ -170,13 +166,13 @@ def estimate_jointly(
         moved = float(np.sum((factor.T @ step) ** 2))
         if n_steps == _MOST_STEPS or moved < _CONVERGED:
             covariance = scipy.linalg.cho_solve((factor, True), np.eye(len(A)))
-            return JointEstimate(T, tuple(shared), covariance, weight, dof, n_steps)
+            return JointEstimate(T, tuple(shared), covariance, weight)
         for k, own in enumerate(columns):
             shared[k] = shared[k] + step[own[3:]]
             if k:
                 T[k] += step[own[:3]]
         T[:, 2] = wrap(T[:, 2])
-        weight, dof = _reweighted(maps, T, shared, parents, weight)
+        weight = _reweighted(maps, T, shared, parents, weight)
         n_steps += 1
 
 
@@ -243,8 +239,8 @@ def _reweighted(
     shared: Sequence[Float],
     parents: np.ndarray,
     weight: Float,
-) -> tuple[Float, float]:
-    """Weights (C, K) of the Student-t, and its degrees of freedom, for what is off now.
+) -> Float:
+    """Weights (C, K) of the Student-t for what is off now.
 
     The squares are those expected about the true points (the E step of Lange et al., 1989).
     """
@@ -260,4 +256,4 @@ def _reweighted(
     dof = fitted_dof(np.concatenate(squares), n_dimensions)
     for k, own_squares in enumerate(squares):
         new[has[:, k], k] = student_weights(own_squares, dof, n_dimensions)
-    return new, dof
+    return new

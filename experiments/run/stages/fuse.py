@@ -202,7 +202,7 @@ def read_fusions(folder: Path, robots: Sequence[str]) -> dict[int, FusedMap]:
     ]
     first = [rows[rows["component"] == 1] for rows in tables]
     found = {}
-    for k in sorted(first[0]["iteration"].unique().tolist()):
+    for k in sorted(first[2]["iteration"].unique().tolist()):  # a map may have no landmarks
         landmarks, parents, motions = (rows[rows["iteration"] == k] for rows in first)
         found[k] = _fused(landmarks, parents, motions, robots, last)
     if found:

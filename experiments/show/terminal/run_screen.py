@@ -86,7 +86,10 @@ def _print_fusers(rows: pd.DataFrame) -> None:
     shown |= columns(".2f", nees_per_dof="NEES\n/ dof") | columns(".0%", coverage_95="in\n95 %")
     note = f"RMS errors in the map's frame and fitted, without gross ones (over {GROSS_M} m)\n"
     note += "over: fitted error over the better of the maps given, and of FastSLAM's"
-    print_frame(last_fused(rows), shown, "Fusers: maps of all robots together, at the end", note)
+    last = last_fused(rows)
+    print_frame(last, shown, "Fusers: maps of all robots together, at the end", note)
+    reasons = last[["fuser", "fallback"]].itertuples(index=False)
+    print_lines(f"  {fuser} fell back on a simpler fuser: {why}" for fuser, why in reasons if why)
 
 
 def _print_team_pairs(pairs: pd.DataFrame) -> None:

@@ -29,7 +29,7 @@ align:
 evaluate: {every: 10, timing_points: 2, timing_repeats: 1}
 """
 NEED_THE_TRUTH = {"errors", "fusion", "true_pairs", "path_statistics", "map_fits", "landmark_nees"}
-NEED_THE_TRUTH |= {"team", "team_pairs"}
+NEED_THE_TRUTH |= {"team", "team_pairs", "fusers", "fuser_coverage"}
 
 
 @pytest.fixture(scope="module")

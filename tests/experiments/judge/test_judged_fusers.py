@@ -38,6 +38,7 @@ def test_figures_are_those_of_the_landmarks_one_by_one() -> None:
     assert row["fitted_rmse_m"] == pytest.approx(np.sqrt(np.mean(errors**2)), rel=1e-6)
     assert row["fitted_median_m"] == pytest.approx(np.median(errors), rel=1e-6)
     assert (row["gross_share"], row["n_robots"], row["fuser"]) == (0.0, 3, "joint")
+    assert row["fallback"] == ""
     ratios = []
     for a, b in ((0, 1), (0, 2), (1, 2)):
         both = np.all(fused.parents[:, [a, b]] != ABSENT, axis=1)

@@ -16,6 +16,15 @@ NAMES = ("R1", "R2", "R3", "R4")
 PARTS = [slice(0, 40), slice(60, 100), slice(20, 60), slice(70, 120)]
 
 
+def test_a_map_without_landmarks_is_read_again(tmp_path: Path) -> None:
+    team = DrawnTeam(PARTS[:2], 0)
+    nothing = merge([own[:0] for own in team.maps], []).fused
+    something = merge(team.maps, []).fused
+    write_fusions(tmp_path, {3: something, 7: nothing}, NAMES[:2])
+    found = read_fusions(tmp_path, NAMES[:2])
+    assert {k: len(each.landmarks) for k, each in found.items()} == {3: 40, 7: 0}
+
+
 @pytest.mark.parametrize("fuser", FUSERS)
 def test_what_is_written_is_read_again(fuser: str, tmp_path: Path) -> None:
     team = DrawnTeam(PARTS, 0)

@@ -201,3 +201,39 @@ def test_neighbours_that_look_alike_are_no_duplicates() -> None:
     )
     fused = _fused(team, [])
     assert fused.duplicate_share < 0.1
+
+
+def test_landmarks_that_nothing_describes_are_joined_by_what_alignments_say() -> None:
+    """Neither descriptors nor labels: nothing else tells which are one."""
+    team = DrawnTeam(OPPOSITE, 3)
+    named = _fused(team)
+    team.maps = [replace(own, descriptor=None) for own in team.maps]
+    found = _fused(team)
+    several = np.count_nonzero(found.parents != ABSENT, axis=1) > 1
+    assert np.count_nonzero(several) >= 0.95 * sum(len(pair.inliers) for pair in team.pairs)
+    assert np.nanmax(np.abs(_errors(team, found))) < 1.5 * np.nanmax(np.abs(_errors(team, named)))
+    assert found.fallback == ""
+
+
+@pytest.mark.parametrize("n_left", [0, 2])
+def test_maps_that_no_landmarks_tie_are_fused_by_what_stands_in(n_left: int) -> None:
+    """As after smoothing, which may leave none of an alignment's landmarks in a map."""
+    team = DrawnTeam([slice(0, 40), slice(20, 60)], 4)
+    pair = team.pairs[0]
+    few = replace(pair.alignment, inlier=np.arange(len(pair.inliers)) < n_left)
+    pairs = [replace(pair, alignment=few)]
+    found, instead = _fused(team, pairs), _fused(team, pairs, KalmanDrift())
+    np.testing.assert_array_equal(found.landmarks.position_m, instead.landmarks.position_m)
+    assert "tie some map to the others" in found.fallback
+
+
+def test_a_wrong_alignment_whose_pairs_pass_no_gate_breaks_nothing() -> None:
+    """A motion metres off, of landmarks that do not look alike: the gate refuses them all."""
+    team = DrawnTeam([slice(0, 40), slice(20, 60)], 5)
+    rng = np.random.default_rng(0)
+    pair = team.pairs[0]
+    wrong = replace(pair.correspondences, index_b=rng.permutation(pair.inliers.index_b))
+    team.maps[1] = replace(team.maps[1], descriptor=-team.maps[1].descriptor)
+    found = _fused(team, [replace(pair, correspondences=wrong)])
+    assert np.isfinite(found.landmarks.position_m).all()
+    assert np.isfinite(found.T_first_map).all()
