@@ -162,10 +162,10 @@ def _ply_files(data: ResultTables) -> Iterator[tuple[str, str]]:
 
 def _colour_single(colours: np.ndarray, data: ResultTables, landmarks: LandmarkMap) -> None:
     """Give fused landmarks that are of one robot alone its colour."""
-    rows: pd.DataFrame = data.table(_FUSED).sort_values("landmark")
+    rows: pd.DataFrame = data.fused_map().sort_values("landmark")
     if len(rows) != len(landmarks):
         counts = f"{len(rows)} rows, the fused map has {len(landmarks)} landmarks"
-        raise InputError(f"{data.folder}: table {_FUSED} has {counts}")
+        raise InputError(f"{data.folder}: table of fused landmarks has {counts}")
     for robot, colour in data.colours.items():
         alone = (rows["n_parents"] == 1) & (rows["robot_a"] == robot)
         colours[alone.to_numpy()] = _rgb(colour)

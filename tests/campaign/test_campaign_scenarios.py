@@ -32,7 +32,10 @@ LOGS = "schema_version: 1\nname: x\nlogs: [{}]\n"
         (TINY.replace("name: R1", "name: fused"), "robots.0.name: the name fused is taken"),
         (TINY.replace("name: R1", "name: oracle"), "robots.0.name: the name oracle is taken"),
         (TINY.replace("  path_rmse_m:", "  1:"), "expect: the key 1 is no text"),
-        (TINY.replace("path_rmse_m", "path_rmse"), "did you mean path_rmse_m?"),
+        (
+            TINY.replace("path_rmse_m", "path_rmse"),
+            "did you mean path_rmse_m or smoother.path_rmse_m?",
+        ),
         (TINY.replace("n_particles", "n_particle"), "did you mean n_particles?"),
         (TINY.replace("method: icp", "method: icq"), "did you mean icp"),
         (TINY.replace("ransac}", "ransac, parameters: {name: x}}"), "name: unknown; known: gate_m"),

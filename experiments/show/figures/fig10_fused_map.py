@@ -12,7 +12,7 @@ _ROBOT_MARKERS = ("*", "^", "v", "x", "d")
 
 def draw(data: ResultTables) -> Figure:
     """Landmarks by where they come from: one robot's map, or fused from several."""
-    fused = data.table("fused_map" if data.has("fused_map") else "fused")
+    fused = data.fused_map()
     if fused.empty:
         raise NothingToDraw("the fused map is empty")
     figure = Figure(figsize=(PAGE_WIDTH_IN, PAGE_WIDTH_IN))

@@ -177,6 +177,10 @@ class ResultTables:
         drift_m2 = motions["drift_sigma_m"] ** 2 * np.diag([1.0, 1.0, 0.0])  # heights do not drift
         return transform_points(T_fused_robot, position), turned + drift_m2, turned
 
+    def fused_map(self) -> pd.DataFrame:
+        """The map of `merge.fuser`; of results made before fusers had names, the paper's."""
+        return self.table("fused_map" if self.has("fused_map") else "fused")
+
     def fused_pairs(self) -> FusedPairs:
         """The fused landmarks of the robot pair that shares most; NothingToDraw where none."""
         fused = self.table("fused")

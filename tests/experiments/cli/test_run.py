@@ -58,7 +58,7 @@ def test_maps_are_those_of_the_tables(tiny_result: Path) -> None:
         np.testing.assert_array_equal(landmarks.position_m, rows[["x_m", "y_m", "z_m"]])
         assert landmarks.name == robot
     fused = read_map(tiny_result / "maps" / "fused.parquet")
-    np.testing.assert_array_equal(fused.position_m, found["fused"][["x_m", "y_m", "z_m"]])
+    np.testing.assert_array_equal(fused.position_m, found["fused_map"][["x_m", "y_m", "z_m"]])
 
 
 def test_estimates_lie_near_the_truth(tiny_result: Path) -> None:

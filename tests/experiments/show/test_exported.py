@@ -251,7 +251,7 @@ def test_ply(trio_result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[st
         colours = [f"#{int(r):02X}{int(g):02X}{int(b):02X}" for r, g, b in colours_of(cloud)]
         if name.partition(".")[0] in ROBOTS:
             assert set(colours) == {data.colours[name.partition(".")[0]]}
-    fused = data.table("fused")
+    fused = data.table("fused_map")
     cloud = colours_of(read_ply(folder / "fused.ply"))
     black = (cloud == 0).all(axis=1)
     np.testing.assert_array_equal(black, fused["n_parents"].to_numpy() > 1)
