@@ -82,3 +82,12 @@ def transform_covariances(T_a_b: ArrayLike, covariance_m2: ArrayLike) -> Float:
     """Covariances (N, 3, 3) of frame b in frame a: R S R^T (eq. 15 with our sign of theta)."""
     rotation_a_b = rotation_about_z(np.asarray(T_a_b, dtype=np.float64)[2])
     return rotation_a_b @ np.asarray(covariance_m2, dtype=np.float64) @ rotation_a_b.T
+
+
+def motion_sigma(covariance: Float) -> tuple[Float, Float]:
+    """What covariances (..., 3, 3) of motions state: sigma in m, of the distance, and in rad.
+
+    That of the distance is the root of its mean square, as RMS errors are: sqrt(xx + yy).
+    """
+    m2 = covariance[..., 0, 0] + covariance[..., 1, 1]
+    return np.sqrt(m2), np.sqrt(covariance[..., 2, 2])

@@ -29,6 +29,8 @@ from mapfusion.fused_map import FusedMap, Fusion
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.se2 import Float
 
+_MOTION_FIGURES = ("alignment_error_m", "alignment_error_rad")
+_MOTION_FIGURES += ("alignment_sigma_m", "alignment_sigma_rad", "alignment_nees_per_dof")
 _LEAST = 3  # landmarks in common: two fit any two
 
 
@@ -168,13 +170,12 @@ class JudgedFusion:
             )
             off = self.fusion.T_first_map[k] - T_true
             off[2] = se2.wrap(off[2])
-            nees = alignment_nees(
-                self.fusion.T_first_map[k], self.fusion.motion_covariance[k], T_true
-            )
-            errors.append([np.hypot(off[0], off[1]), abs(off[2]), nees / 3])
-        middle = np.median(errors, axis=0) if errors else np.full(3, np.nan)
-        names = ("alignment_error_m", "alignment_error_rad", "alignment_nees_per_dof")
-        return dict(zip(names, middle.tolist(), strict=True))
+            covariance = self.fusion.motion_covariance[k]
+            nees = alignment_nees(self.fusion.T_first_map[k], covariance, T_true)
+            stated = se2.motion_sigma(covariance)
+            errors.append([np.hypot(off[0], off[1]), abs(off[2]), *stated, nees / 3])
+        middle = np.median(errors, axis=0) if errors else np.full(len(_MOTION_FIGURES), np.nan)
+        return dict(zip(_MOTION_FIGURES, middle.tolist(), strict=True))
 
 
 def fuser_rows(fusions: Sequence[JudgedFusion]) -> list[dict[str, Any]]:

@@ -93,12 +93,14 @@ _COLUMNS = {
     # medians over pairs of robots. nees_per_dof, marginal_nees_per_dof and coverage_95: with the
     # gauge removed, the first of all landmarks at once; a map that has no joint covariance (all but
     # the last of each fuser) is taken for one of independent errors. frame_: in the frame, of each
-    # landmark for itself. alignment_: how the other robots' maps were moved, medians. fallback: why
+    # landmark for itself. alignment_: how the other robots' maps were moved, medians; sigma:
+    # as stated, see se2.motion_sigma. fallback: why
     # a simpler fuser stood in (else empty).
     "fusers": """fuser iteration n_robots n_landmarks landmark_rmse_m fitted_rmse_m fitted_median_m
         gross_share over_better_parent over_better_filter
         nees_per_dof marginal_nees_per_dof coverage_95 frame_nees_per_dof frame_coverage_95
-        alignment_error_m alignment_error_rad alignment_nees_per_dof duplicate_share fallback""",
+        alignment_error_m alignment_error_rad alignment_sigma_m alignment_sigma_rad
+        alignment_nees_per_dof duplicate_share fallback""",
     # Share of the true points inside the ellipses of a nominal probability, at the last iteration,
     # of each fuser's map and before: map is fused, or filter or smoothed with no fuser, which are
     # all robots' maps together. coverage: each map after its best rigid fit, with the gauge

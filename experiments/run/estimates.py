@@ -10,6 +10,7 @@ from experiments.run.stage_tables import COVARIANCE, MOTION
 from mapfusion.align.acceptance import Verdict
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.result import Alignment, Status
+from mapfusion.se2 import Float
 
 _UPPER = np.triu_indices(3)
 
@@ -36,6 +37,14 @@ def estimate_row(
 def inlier_mask(bits: bytes, n_correspondences: int) -> np.ndarray:
     """The mask (n,) that `estimate_row` packed."""
     return np.unpackbits(np.frombuffer(bits, np.uint8), count=n_correspondences).astype(bool)
+
+
+def covariances_of(rows: pd.DataFrame) -> Float:
+    """(n, 3, 3) of motions, from the columns COVARIANCE that hold their upper halves."""
+    covariance = np.empty((len(rows), 3, 3))
+    upper = rows[list(COVARIANCE)].to_numpy(dtype=np.float64)
+    covariance[:, _UPPER[0], _UPPER[1]] = covariance[:, _UPPER[1], _UPPER[0]] = upper
+    return covariance
 
 
 def alignment_of(row: Mapping[Any, Any], n_correspondences: int) -> Alignment:

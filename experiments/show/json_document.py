@@ -55,6 +55,11 @@ def _motion(values: Iterable[float]) -> dict[str, float] | None:
     return None if any(map(math.isnan, found.values())) else found
 
 
+def _covariance(upper: Iterable[float]) -> dict[str, float]:
+    """Of a motion, from its upper half row by row."""
+    return {f"cov_{axes}": float(x) for axes, x in zip(_AXES, upper, strict=True)}
+
+
 def of_alignment(
     maps: Sequence[Path], seed: int, rows: Sequence[Mapping[str, Any]]
 ) -> dict[str, Any]:
@@ -66,7 +71,7 @@ def _aligner(row: Mapping[str, Any]) -> dict[str, Any]:
     status, reason = verdict_on(row)
     accepted, estimated = status is Status.ACCEPTED, row["status"] == Status.ACCEPTED
     refined = {name: row[f"refined_{name}"] for name in MOTION}
-    refined |= {f"cov_{axes}": row[name] for axes, name in zip(_AXES, COVARIANCE, strict=True)}
+    refined |= _covariance([row[name] for name in COVARIANCE])
     refined |= {"drift_sigma_m": row["drift_sigma_m"]}
     told = {"aligner": row["aligner"], "status": status, "reason": reason or None}
     told |= {"estimated": _motion([row[name] for name in MOTION]) if estimated else None}
@@ -95,11 +100,13 @@ def of_fusion(
 def _fused(path: Path, fused: FusedMap, maps: Sequence[Path]) -> dict[str, Any]:
     """What a fused map was made of; `T_first_map` is null for a map that was left out."""
     reasons = (reason for _, reason in fused.left_out)
-    motions = zip(maps, map(_motion, fused.T_first_map), strict=True)
-    sources = [
-        {"map": name, "T_first_map": T, "reason": None if T else next(reasons)}
-        for name, T in motions
-    ]
+    sources = []
+    for name, T, S in zip(maps, fused.T_first_map, fused.motion_covariance, strict=True):
+        motion = _motion(T)
+        stated = _covariance(S[np.triu_indices(3)]) if motion else None
+        reason = None if motion else next(reasons)
+        told = {"map": name, "T_first_map": motion, "covariance": stated, "reason": reason}
+        sources.append(told)
     several = int(((fused.parents >= 0).sum(axis=1) > 1).sum())
     found = {"n_landmarks": len(fused.landmarks), "n_fused_of_several": several}
     found |= {"duplicate_share": fused.duplicate_share}

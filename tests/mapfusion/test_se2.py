@@ -100,3 +100,11 @@ def test_covariance_moves_as_samples_do():
     p = np.random.default_rng(0).multivariate_normal([1, 2, 3], S, 200_000)
     expected = se2.transform_covariances(T_a_b, S[None])[0]
     np.testing.assert_allclose(np.cov(se2.transform_points(T_a_b, p).T), expected, atol=0.01)
+
+
+def test_stated_sigma_is_the_rms_of_what_is_drawn():
+    S = np.array([[0.5, 0.2, 0.1], [0.2, 0.3, 0.0], [0.1, 0.0, 0.2]])
+    drawn = np.random.default_rng(1).multivariate_normal(np.zeros(3), S, 200_000)
+    sigma_m, sigma_rad = se2.motion_sigma(S)
+    assert sigma_m == pytest.approx(np.sqrt(np.mean(np.sum(drawn[:, :2] ** 2, axis=1))), rel=0.01)
+    assert sigma_rad == pytest.approx(np.sqrt(np.mean(drawn[:, 2] ** 2)), rel=0.01)

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
-from experiments.run.estimates import alignment_of, correspondences_of
+from experiments.run.estimates import alignment_of, correspondences_of, covariances_of
 from experiments.run.frames import FLOAT, INT, TEXT, fields, read_rows, write_rows
 from experiments.run.job import Job
 from experiments.run.stage_tables import CORRESPONDENCES, COVARIANCE, ESTIMATES
@@ -227,9 +227,7 @@ def _fused(
     at = motions["robot"].map(place).to_numpy()
     T, covariance, drift = np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan), np.full(n, np.nan)
     T[at], drift[at] = motions[POSE_FIELDS], motions["drift_sigma_m"]
-    upper = motions[list(COVARIANCE)].to_numpy()
-    covariance[at[:, None], _UPPER[0], _UPPER[1]] = upper
-    covariance[at[:, None], _UPPER[1], _UPPER[0]] = upper
+    covariance[at] = covariances_of(motions)
     said = motions.iloc[0]
     duplicates, fallback = float(said["duplicate_share"]), str(said["fallback"])
     return FusedMap(made, of, T, covariance, drift, duplicates, (), fallback)

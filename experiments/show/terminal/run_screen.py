@@ -84,8 +84,10 @@ def _print_fusers(rows: pd.DataFrame) -> None:
     shown |= columns(".3f", fitted_rmse_m="fitted\nm") | columns(".1%", gross_share="gross\n")
     shown |= columns(".2f", over_better_parent="over\nparent", over_better_filter="over\nfilter")
     shown |= columns(".2f", nees_per_dof="NEES\n/ dof") | columns(".0%", coverage_95="in\n95 %")
+    shown |= columns(".3f", alignment_error_m="T_a_b\nm", alignment_sigma_m="sigma\nm")
     note = f"RMS errors in the map's frame and fitted, without gross ones (over {GROSS_M} m)\n"
-    note += "over: fitted error over the better of the maps given, and of FastSLAM's"
+    note += "over: fitted error over the better of the maps given, and of FastSLAM's\n"
+    note += "T_a_b: error of the other robots' places, median, with the sigma that is stated"
     last = last_fused(rows)
     print_frame(last, shown, "Fusers: maps of all robots together, at the end", note)
     reasons = last[["fuser", "fallback"]].itertuples(index=False)

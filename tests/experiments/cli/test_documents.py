@@ -84,15 +84,20 @@ def test_merge(maps: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert first == {
         "map": str(maps[0]),
         "T_first_map": {"tx_m": 0.0, "ty_m": 0.0, "theta_rad": 0.0},
+        "covariance": dict.fromkeys(second["covariance"], 0.0),
         "reason": None,
     }
-    assert apart["T_first_map"] is None
+    assert apart["T_first_map"] is apart["covariance"] is None
     assert apart["reason"]
     np.testing.assert_allclose([*second["T_first_map"].values()], T_A_B, atol=1e-9)
+    stated = second["covariance"]
+    assert min(stated["cov_xx_m2"], stated["cov_yy_m2"], stated["cov_tt_rad2"]) > 0
     assert found["n_fused_of_several"] == found["n_landmarks"] == 20
     shown = command(capsys, *arguments)
     assert shown.code == 0
     assert f"20 landmarks in {fused}" in shown.out
+    sigma_m = (stated["cov_xx_m2"] + stated["cov_yy_m2"]) ** 0.5
+    assert f"sigma {sigma_m:.3f} m, {stated['cov_tt_rad2'] ** 0.5:.4f} rad" in shown.out
 
 
 def test_slam(tiny_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

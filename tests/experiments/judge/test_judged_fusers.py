@@ -55,6 +55,10 @@ def test_figures_are_those_of_the_landmarks_one_by_one() -> None:
         T[2] = se2.wrap(T[2])
         nees.append(T @ np.linalg.solve(fused.motion_covariance[k], T) / 3)
     assert row["alignment_nees_per_dof"] == pytest.approx(np.median(nees))
+    stated = [fused.motion_covariance[k] for k in (1, 2)]
+    sigma_m = np.median([np.sqrt(S[0, 0] + S[1, 1]) for S in stated])
+    assert row["alignment_sigma_m"] == pytest.approx(sigma_m)
+    assert row["alignment_sigma_rad"] == pytest.approx(np.median([S[2, 2] ** 0.5 for S in stated]))
 
 
 def test_over_the_filter_is_of_the_same_landmarks_in_the_filter_s_maps() -> None:
