@@ -16,7 +16,6 @@ from scipy.spatial import KDTree
 
 from mapfusion.align.pairs import MIN_PAIRS
 from mapfusion.aligned_landmarks import ABSENT
-from mapfusion.chi_square import chi_square_bound
 from mapfusion.fuse.clusters import Pair, joined
 from mapfusion.fuse.component import Component
 from mapfusion.fuse.joint_estimate import JointEstimate, JointMap, estimate_jointly
@@ -27,9 +26,12 @@ from mapfusion.fused_map import FusedMap
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import NO_LABEL
 from mapfusion.se2 import Float
+from mapfusion.smoother.student import student_bound
 
 # What is one point is judged anew with each estimate, until nothing changes or for so many rounds.
 _MOST_ROUNDS = 5
+# Heavier tails have no variance: they are of false pairs, not of landmarks.
+_LEAST_DOF = 2.0
 
 
 class JointFuser:
@@ -56,7 +58,7 @@ class JointFuser:
             return replace(KalmanDrift().fuse(component, parameters), fallback=why)
         estimate = _estimated(maps, component.T_first_map[component.members], points)
         for _ in range(_MOST_ROUNDS):
-            pairs = _candidates(given, _placed(maps, estimate), inliers, parameters)
+            pairs = _candidates(given, _placed(maps, estimate), inliers, parameters, estimate.dof)
             now = joined(pairs, sizes)
             if np.array_equal(points, now) or not _tied(now):
                 break
@@ -122,26 +124,37 @@ def _candidates(
     placed: Sequence[_Placed],
     inliers: Sequence[Pair],
     parameters: MergeParameters,
+    dof: float,
 ) -> list[Pair]:
     """Landmarks of every two maps that may be one point.
 
     Those of one label need nothing else and are not unlike at all. All others have to pass the
-    gate, and their descriptors have to be alike unless an alignment named the two.
+    gate, and their descriptors have to be alike; without descriptors, an alignment has to have
+    named them. The gate is that of the Student-t with `dof` degrees of freedom which the points
+    agreed on so far follow: a Gaussian's would cut its tails off, and then none would be seen.
     """
-    bound = chi_square_bound(parameters.gate_probability, placed[0].position_m.shape[1])
+    bound = student_bound(
+        parameters.gate_probability, max(dof, _LEAST_DOF), placed[0].position_m.shape[1]
+    )
     found = []
     for a, b in combinations(range(len(given)), 2):
         i, j, unlike = _alike(given[a], given[b], *_near(placed[a], placed[b], bound))
-        near = unlike <= parameters.max_descriptor_distance  # False for NaN
-        named = [pair for pair in inliers if (pair.a, pair.b) == (a, b)]
-        i = np.concatenate([i[near], *(pair.row_a for pair in named)]).astype(np.int64)
-        j = np.concatenate([j[near], *(pair.row_b for pair in named)]).astype(np.int64)
-        unlike = np.concatenate([unlike[near], *(pair.unlike for pair in named)])
+        near = unlike <= parameters.max_descriptor_distance
+        i, j, unlike = i[near], j[near], unlike[near]
+        if given[a].descriptor is None or given[b].descriptor is None:
+            i, j, unlike = _named(inliers, a, b)
         kept = _inside(placed[a], placed[b], i, j, bound)
         known_i, known_j = _of_one_label(given[a], given[b])
         i, j = np.concatenate([known_i, i[kept]]), np.concatenate([known_j, j[kept]])
         found.append(Pair(a, b, i, j, np.concatenate([np.zeros(len(known_i)), unlike[kept]])))
     return found
+
+
+def _named(inliers: Sequence[Pair], a: int, b: int) -> tuple[np.ndarray, np.ndarray, Float]:
+    named = [pair for pair in inliers if (pair.a, pair.b) == (a, b)]
+    rows = [(pair.row_a, pair.row_b) for pair in named]
+    i, j = np.concatenate([np.empty((2, 0), np.int64), *map(np.stack, rows)], axis=1)
+    return i, j, np.concatenate([np.empty(0), *(pair.unlike for pair in named)])
 
 
 def _inside(a: _Placed, b: _Placed, i: np.ndarray, j: np.ndarray, bound: float) -> np.ndarray:
@@ -166,10 +179,10 @@ def _alike(
     a: LandmarkMap, b: LandmarkMap, i: np.ndarray, j: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, Float]:
     """The pairs of rows that not both carry labels, with the distance of their descriptors."""
+    if a.descriptor is None or b.descriptor is None:
+        return i[:0], j[:0], np.empty(0)
     unnamed = (_labels(a)[i] == NO_LABEL) | (_labels(b)[j] == NO_LABEL)
     i, j = i[unnamed], j[unnamed]
-    if a.descriptor is None or b.descriptor is None:
-        return i, j, np.full(len(i), np.nan)
     return i, j, np.linalg.norm(a.descriptor[i] - b.descriptor[j], axis=1).astype(np.float64)
 
 

@@ -26,7 +26,7 @@ from mapfusion.aligned_landmarks import ABSENT
 from mapfusion.joint_covariance import JointCovariance
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.se2 import Float, rotation_about_z, transform_points, wrap
-from mapfusion.smoother.student import fitted_dof, student_weights
+from mapfusion.smoother.student import MOST_DOF, fitted_dof, information_share, student_weights
 
 # The next step would move what is sought, as a whole and in squared sigmas, by no more than this.
 _CONVERGED = 1e-3
@@ -87,13 +87,15 @@ class JointEstimate:
         T_first_map: (K, 3), the first is no motion.
         shared: of each map, (R_k,) its shared variables z.
         covariance: (U, U) of all unknowns: three for each motion but the first, then the z.
-        weight: (C, K) of the Student-t, 0 where a map has no part.
+        weight: (C, K) of the Student-t, as information; 0 where a map has no part.
+        dof: degrees of freedom of the Student-t.
     """
 
     T_first_map: Float
     shared: tuple[Float, ...]
     covariance: Float
     weight: Float
+    dof: float
 
     @property
     def motion_covariance(self) -> Float:
@@ -156,7 +158,7 @@ def estimate_jointly(
     T, shared = np.array(T_first_map), [np.zeros(each.joint.rank) for each in maps]
     columns = [_columns(maps, k) for k in range(len(maps))]
     has = parents != ABSENT
-    weight, n_steps = has.astype(np.float64), 0
+    weight, dof, n_steps = has.astype(np.float64), MOST_DOF, 0
     while True:
         said = [_said(maps[k], parents[has[:, k], k], T[k], shared[k]) for k in range(len(maps))]
         points = _points(said, has, weight)
@@ -165,14 +167,16 @@ def estimate_jointly(
         step = -scipy.linalg.cho_solve((factor, True), gradient)
         moved = float(np.sum((factor.T @ step) ** 2))
         if n_steps == _MOST_STEPS or moved < _CONVERGED:
-            covariance = scipy.linalg.cho_solve((factor, True), np.eye(len(A)))
-            return JointEstimate(T, tuple(shared), covariance, weight)
+            weight *= information_share(dof, maps[0].position_m.shape[1])
+            A, _ = _equations(said, has, weight, _points(said, has, weight), columns, shared)
+            covariance = scipy.linalg.inv(A)
+            return JointEstimate(T, tuple(shared), covariance, weight, dof)
         for k, own in enumerate(columns):
             shared[k] = shared[k] + step[own[3:]]
             if k:
                 T[k] += step[own[:3]]
         T[:, 2] = wrap(T[:, 2])
-        weight = _reweighted(maps, T, shared, parents, weight)
+        weight, dof = _reweighted(maps, T, shared, parents, weight)
         n_steps += 1
 
 
@@ -239,21 +243,31 @@ def _reweighted(
     shared: Sequence[Float],
     parents: np.ndarray,
     weight: Float,
-) -> Float:
-    """Weights (C, K) of the Student-t for what is off now.
+) -> tuple[Float, float]:
+    """Weights (C, K) of the Student-t, and its degrees of freedom, for what is off now.
 
     The squares are those expected about the true points (the E step of Lange et al., 1989).
     """
     has, new = parents != ABSENT, np.zeros_like(weight)
     said = [_said(maps[k], parents[has[:, k], k], T[k], shared[k]) for k in range(len(maps))]
     points = _points(said, has, weight)
-    squares: list[Float] = []
+    n_dimensions = maps[0].position_m.shape[1]
+    dof = fitted_dof(_disagreement(said, has), n_dimensions * (np.count_nonzero(has, axis=1) - 1))
     for k, own in enumerate(said):
         off = own.y_m - points.g_m[has[:, k]]
         spread = off[:, :, None] * off[:, None, :] + points.covariance_m2[has[:, k]]
-        squares.append(np.einsum("nij,nij->n", np.linalg.inv(own.own_m2), spread))
-    n_dimensions = maps[0].position_m.shape[1]
-    dof = fitted_dof(np.concatenate(squares), n_dimensions)
-    for k, own_squares in enumerate(squares):
-        new[has[:, k], k] = student_weights(own_squares, dof, n_dimensions)
-    return new
+        squares = np.einsum("nij,nij->n", np.linalg.inv(own.own_m2), spread)
+        new[has[:, k], k] = student_weights(squares, dof, n_dimensions)
+    return new, dof
+
+
+def _disagreement(said: Sequence[Said], has: np.ndarray) -> Float:
+    """(C,) how far what maps say of a point lies from its mean, all with their whole weight.
+
+    Of M maps in D dimensions a chi-square with D (M - 1) degrees of freedom, if Gaussian.
+    """
+    points, total = _points(said, has, has.astype(np.float64)), np.zeros(len(has))
+    for k, own in enumerate(said):
+        off = own.y_m - points.g_m[has[:, k]]
+        total[has[:, k]] += np.einsum("ni,nij,nj->n", off, np.linalg.inv(own.own_m2), off)
+    return total

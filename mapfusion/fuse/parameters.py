@@ -18,7 +18,7 @@ class MergeParameters:
         max_descriptor_distance: of landmarks that are taken for one point though no alignment names
             them; with labels on both sides these decide instead.
         gate_probability: of keeping two landmarks of one point there (chi-square, 2 degrees of
-            freedom, drift included; for joint covariances as many as there are coordinates).
+            freedom, drift included; in joint fusion of the Student-t that is fitted).
         height: which landmarks can have one height (not for planar maps and joint covariances).
         use_alignment_uncertainty: add J S_T J^T, the covariance of the map's place to first order,
             to the landmarks that the Kalman fusers move. The paper does not. This error is common

@@ -13,7 +13,13 @@ from mapfusion.smoother.elimination import Solution
 from mapfusion.smoother.normal_equations import Estimate, Weights
 from mapfusion.smoother.residuals import known_dimensions, offset_squares, squared_distances
 from mapfusion.smoother.sightings import Sightings
-from mapfusion.smoother.student import MOST_DOF, fitted_dof, student_cost, student_weights
+from mapfusion.smoother.student import (
+    MOST_DOF,
+    fitted_dof,
+    information_share,
+    student_cost,
+    student_weights,
+)
 
 
 class Tails(NamedTuple):
@@ -24,6 +30,15 @@ class Tails(NamedTuple):
 
 
 NO_TAILS = Tails(MOST_DOF, MOST_DOF)
+
+
+def informative(seen: Sightings, weights: Weights, tails: Tails) -> Weights:
+    """The weights' parts that are information, for the covariances of what was estimated."""
+    n = seen.n_dimensions
+    return Weights(
+        weights.observation * information_share(tails.observation, n),
+        weights.offset * information_share(tails.offset, n),
+    )
 
 
 def unweighted(seen: Sightings) -> Weights:

@@ -13,7 +13,7 @@ from mapfusion.smoother.normal_equations import (
     disturbances,
     normal_equations,
 )
-from mapfusion.smoother.robust import NO_TAILS, Tails, cost, reweighted, unweighted
+from mapfusion.smoother.robust import NO_TAILS, Tails, cost, informative, reweighted, unweighted
 from mapfusion.smoother.sightings import Sightings
 
 # The next step would move the path, as a whole and in squared sigmas, by no more than this. Single
@@ -45,7 +45,7 @@ class Problem(NamedTuple):
 
 
 class Settled(NamedTuple):
-    """Where the steps ended, with the equations there and what their solution is."""
+    """Where the steps ended, with the equations of the covariances there and their solution."""
 
     seen: Sightings
     estimate: Estimate
@@ -64,6 +64,9 @@ def settled(problem: Problem, at: Estimate, least_move: float = _CONVERGED) -> S
         equations = normal_equations(seen, at, weights, stray_information, odometry, information)
         solution = solve(seen, equations)
         if n_steps == _MOST_STEPS or solution.moved < least_move:
+            known = informative(seen, weights, tails)
+            equations = normal_equations(seen, at, known, stray_information, odometry, information)
+            solution = solve(seen, equations)
             return Settled(seen, at, weights, tails, n_steps, equations, solution)
         at = _stepped(problem, tails, at, solution.step)
         weights, tails = reweighted(seen, at, weights, solution, stray_information)

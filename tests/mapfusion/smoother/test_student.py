@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from mapfusion.smoother.student import fitted_dof, student_cost, student_weights
+from mapfusion.smoother.student import (
+    MOST_DOF,
+    fitted_dof,
+    information_share,
+    student_bound,
+    student_cost,
+    student_weights,
+)
 
 
 @pytest.mark.parametrize("n_dimensions", [2, 3])
@@ -29,3 +36,26 @@ def test_weights_are_the_slope_of_the_cost() -> None:
         about = [student_cost(np.array([square + h]), 4.0, 3) for h in (-1e-5, 1e-5)]
         slope = (about[1] - about[0]) / 2e-5
         assert slope == pytest.approx(student_weights(np.array([square]), 4.0, 3)[0], rel=1e-6)
+
+
+@pytest.mark.parametrize("dof", [2.5, 30.0])
+def test_as_many_as_stated_are_beyond_the_bound(dof: float) -> None:
+    rng = np.random.default_rng(2)
+    normal, scale = rng.standard_normal((200_000, 3)), rng.chisquare(dof, 200_000) / dof
+    squares = np.sum(normal**2, axis=1) / scale
+    beyond = np.mean(squares > student_bound(0.99, dof, 3))
+    assert beyond == pytest.approx(0.01, abs=4 * np.sqrt(0.01 / 200_000))
+
+
+@pytest.mark.parametrize("dof", [3.0, 10.0, MOST_DOF])
+def test_estimates_are_as_far_off_as_the_information_says(dof: float) -> None:
+    """Many locations, each the robust mean of 50 draws: their spread is that of the information."""
+    rng, n_draws = np.random.default_rng(3), 50
+    normal = rng.standard_normal((4_000, n_draws, 2))
+    drawn = normal / np.sqrt(rng.chisquare(dof, (4_000, n_draws, 1)) / dof)
+    at = np.zeros((4_000, 1, 2))
+    for _ in range(60):
+        weight = student_weights(np.sum((drawn - at) ** 2, axis=2), dof, 2)[:, :, None]
+        at = np.sum(weight * drawn, axis=1, keepdims=True) / np.sum(weight, axis=1, keepdims=True)
+    information = information_share(dof, 2) * np.sum(weight, axis=1).mean()
+    assert np.mean(at**2) * information == pytest.approx(1, abs=0.06)
