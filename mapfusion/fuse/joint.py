@@ -133,9 +133,8 @@ def _candidates(
     named them. The gate is that of the Student-t with `dof` degrees of freedom which the points
     agreed on so far follow: a Gaussian's would cut its tails off, and then none would be seen.
     """
-    bound = student_bound(
-        parameters.gate_probability, max(dof, _LEAST_DOF), placed[0].position_m.shape[1]
-    )
+    dof = max(dof, _LEAST_DOF)
+    bound = student_bound(parameters.gate_probability, dof, placed[0].position_m.shape[1])
     found = []
     for a, b in combinations(range(len(given)), 2):
         i, j, unlike = _alike(given[a], given[b], *_near(placed[a], placed[b], bound))
