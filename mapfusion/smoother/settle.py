@@ -16,9 +16,10 @@ from mapfusion.smoother.normal_equations import (
 from mapfusion.smoother.robust import NO_TAILS, Tails, cost, informative, reweighted, unweighted
 from mapfusion.smoother.sightings import Sightings
 
-# The next step would move the path, as a whole and in squared sigmas, by no more than this. Single
-# landmarks, whose tracks contradict each other, may go on changing their minds for long.
-_CONVERGED = 1e-3
+# The next step would move the poses by no more than this, in squared sigmas a coordinate: the third
+# of a hundredth of a sigma. A step costs as the cube of the log, and there is little left to win:
+# single landmarks, whose tracks contradict each other, may go on changing their minds for long.
+_CONVERGED = 1e-5
 _MOST_STEPS = 50
 _MOST_HALVINGS = 12
 
@@ -56,14 +57,23 @@ class Settled(NamedTuple):
     solution: Solution
 
 
-def settled(problem: Problem, at: Estimate, least_move: float = _CONVERGED) -> Settled:
-    """Take steps from an estimate until the next would move less than this, in squared sigmas."""
+def settled(
+    problem: Problem,
+    at: Estimate,
+    least_move: float = _CONVERGED,
+    weights: Weights | None = None,
+    tails: Tails = NO_TAILS,
+) -> Settled:
+    """Take steps from an estimate until the next would move the poses by less than `least_move`.
+
+    It is in squared sigmas a coordinate. Weights and tails to begin with are those of an earlier round; all ones by default.
+    """
     seen, odometry, information, stray_information = problem
-    weights, tails, n_steps = unweighted(seen), NO_TAILS, 0
+    weights, n_steps = unweighted(seen) if weights is None else weights, 0
     while True:
         equations = normal_equations(seen, at, weights, stray_information, odometry, information)
         solution = solve(seen, equations)
-        if n_steps == _MOST_STEPS or solution.moved < least_move:
+        if n_steps == _MOST_STEPS or solution.moved < least_move * at.path.size:
             known = informative(seen, weights, tails)
             equations = normal_equations(seen, at, known, stray_information, odometry, information)
             solution = solve(seen, equations)

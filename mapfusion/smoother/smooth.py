@@ -18,8 +18,8 @@ from mapfusion.smoother.sightings import Sightings, sightings_of
 
 # Factor on the observations' standard deviations in a first round (graduated non-convexity): where
 # the path to start from is far off, most observations look gross and lose the weight to mend it.
-# It need not end closer than this, in squared sigmas, to where the next one goes on.
-_THOUGHT_WORSE, _CLOSE = 4.0, 1.0
+# It need not end closer than this, in squared sigmas a coordinate, to where the next one goes on.
+_THOUGHT_WORSE, _CLOSE = 4.0, 1e-2
 
 
 @dataclass(frozen=True)
@@ -106,5 +106,5 @@ def smooth(
     known = Problem(seen, log.odometry, information, parameters.stray_information)
     blurred = replace(seen, information=seen.information / _THOUGHT_WORSE**2)
     first = settled(known._replace(seen=blurred), at, _CLOSE)
-    end = settled(known, first.estimate)
+    end = settled(known, first.estimate, weights=first.weights, tails=first.tails)
     return Smoothed.of(end, first.n_steps)

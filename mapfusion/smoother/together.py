@@ -22,9 +22,6 @@ from mapfusion.smoother.smooth import Smoothed
 
 _NOTHING = np.zeros((1, 3))  # what odometry says of the way from one robot's end to another's start
 _GB = 1e9
-# The next step would move the poses by no more than this, in squared sigmas a coordinate: the third
-# of a hundredth of a sigma. A step costs as the cube of all logs, and there is little left to win.
-_CONVERGED = 1e-5
 
 
 @dataclass(frozen=True)
@@ -85,7 +82,7 @@ def smooth_together(
     ]
     problem = Problem(seen, log.odometry, np.concatenate(information)[:-1], stray_information)
     start = Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
-    end = settled(problem, start, _CONVERGED * path.size)
+    end = settled(problem, start)
     covariance = np.zeros((len(starts), 3, 3))
     covariance[1:] = pose_covariances(seen, end.equations, end.solution, starts[1:])
     names = point[seen.row[seen.starts[:-1]]]
