@@ -66,7 +66,8 @@ def settled(
 ) -> Settled:
     """Take steps from an estimate until the next would move the poses by less than `least_move`.
 
-    It is in squared sigmas a coordinate. Weights and tails to begin with are those of an earlier round; all ones by default.
+    It is in squared sigmas a coordinate. Weights and tails to begin with are those of an earlier
+    round; all ones by default.
     """
     seen, odometry, information, stray_information = problem
     weights, n_steps = unweighted(seen) if weights is None else weights, 0
