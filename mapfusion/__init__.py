@@ -32,6 +32,7 @@ _NAMES_OF = {
     "merge": ("merge_maps",),
     "team.team_graph": ("Place", "TeamParameters", "Unconfirmed"),
     "recordings.registry": ("import_recording",),
+    "smoother.recording": ("Recording",),
     "robot_log": ("Observations", "RobotLog", "read_log", "write_log"),
 }
 _MODULE_OF = {name: module for module, names in _NAMES_OF.items() for name in names}

@@ -32,6 +32,7 @@ from mapfusion.robot_log import Observations as Observations
 from mapfusion.robot_log import RobotLog as RobotLog
 from mapfusion.robot_log import read_log as read_log
 from mapfusion.robot_log import write_log as write_log
+from mapfusion.smoother.recording import Recording as Recording
 from mapfusion.team.team_graph import Place as Place
 from mapfusion.team.team_graph import TeamParameters as TeamParameters
 from mapfusion.team.team_graph import Unconfirmed as Unconfirmed

@@ -20,7 +20,8 @@ def load_checked(path: Path, overrides: Sequence[str] = (), seed: int | None = N
     Raises InputError also for unknown metrics, and where the truth that they need is.
     """
     scenario = load_scenario(path, overrides, seed)
-    known = metrics.known_metrics([entry.name for entry in scenario.align.aligners])
+    aligners = [entry.name for entry in scenario.align.aligners]
+    known = metrics.known_metrics(aligners, scenario.fuse.fusers)
     unknown = sorted(set(scenario.expect) - set(known))
     if unknown:
         there = f"known: {', '.join(known)}{did_you_mean(unknown[0], known)}"

@@ -8,7 +8,7 @@ is of each aligner; several of one shape are one function with `@metric(NAME=WHI
 """
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 import numpy as np
@@ -20,7 +20,6 @@ from experiments.judge.judged_maps import error_over_oracle, maps_of
 from experiments.judge.nothing_merged import merged_robots
 from experiments.judge.path_errors import path_rms, rms
 from experiments.judge.team_figures import edge_precision, edge_recall
-from mapfusion.fuse.registry import FUSERS
 
 # The four methods of the paper, algorithm 1 in both readings, as the default list names them.
 PAPER_ALIGNERS = ("ransac", "svd", "svd-solved", "icp", "impicp")
@@ -69,15 +68,16 @@ _SMOOTHER = ("path_rmse_m", "filter_over_smoother", "landmark_rmse_m", "gross_sh
 _SMOOTHER += ("nees_per_dof", "coverage_95")
 
 
-_FUSER = ("landmark_rmse_m", "gross_share", "fitted_rmse_m", "fitted_median_m")
-_FUSER += ("over_better_parent", "over_better_filter", "nees_per_dof", "frame_nees_per_dof")
-_FUSER += ("coverage_95", "frame_coverage_95", "alignment_nees_per_dof", "duplicate_share")
+# Of each fuser that runs, under its name: columns of the table `fusers`.
+FUSER_METRICS = ("landmark_rmse_m", "gross_share", "fitted_rmse_m", "fitted_median_m")
+FUSER_METRICS += ("over_better_parent", "over_better_filter", "nees_per_dof", "frame_nees_per_dof")
+FUSER_METRICS += ("coverage_95", "frame_coverage_95", "alignment_nees_per_dof", "duplicate_share")
+FUSER_METRICS += ("alignment_error_m", "alignment_error_rad")
+FUSER_METRICS += ("alignment_sigma_m", "alignment_sigma_rad")
 
 
-@metric(**{f"{fuser}.{name}": f"{fuser} {name}" for fuser in FUSERS for name in _FUSER})
-def _of_a_fuser(tables: Tables, which: str) -> float:
+def _of_a_fuser(tables: Tables, fuser: str, name: str) -> float:
     """A column of the table `fusers` at the last iteration, median over seeds."""
-    fuser, _, name = which.partition(" ")
     rows = tables["fusers"]
     rows = rows[rows["fuser"] == fuser].sort_values("iteration", kind="stable")
     return rows.groupby("seed")[name].last().median()
@@ -227,14 +227,18 @@ def missed_merges(tables: Tables, aligner: str) -> float:
     return (~criteria.mergeable(_of(tables["errors"], aligner))["accepted"]).mean()
 
 
-def known_metrics(aligners: list[str]) -> list[str]:
-    """Every metric name a scenario with these aligners may use."""
-    return [*METRICS, *(f"{aligner}.{name}" for aligner in aligners for name in ALIGNER_METRICS)]
+def known_metrics(aligners: Sequence[str], fusers: Sequence[str]) -> list[str]:
+    """Every metric name a scenario with these aligners and fusers may use."""
+    of_fusers = [f"{fuser}.{name}" for fuser in fusers for name in FUSER_METRICS]
+    of_aligners = [f"{aligner}.{name}" for aligner in aligners for name in ALIGNER_METRICS]
+    return [*METRICS, *of_fusers, *of_aligners]
 
 
 def compute(name: str, tables: Tables) -> float:
-    """The metric `name`, or `aligner.name` for those of one aligner."""
+    """The metric `name`, or `method.name` for those of one aligner or fuser."""
     if name in METRICS:
         return float(METRICS[name](tables))
-    aligner, _, of_aligner = name.rpartition(".")
-    return float(ALIGNER_METRICS[of_aligner](tables, aligner))
+    method, _, of_method = name.rpartition(".")
+    if of_method in FUSER_METRICS:
+        return float(_of_a_fuser(tables, method, of_method))
+    return float(ALIGNER_METRICS[of_method](tables, method))

@@ -8,7 +8,13 @@ import pytest
 
 from experiments.judge import metrics
 from experiments.judge.criteria import is_false_merge
-from experiments.judge.metrics import ALIGNER_METRICS, METRICS, compute, known_metrics
+from experiments.judge.metrics import (
+    ALIGNER_METRICS,
+    FUSER_METRICS,
+    METRICS,
+    compute,
+    known_metrics,
+)
 from mapfusion.fuse.registry import FUSERS
 
 
@@ -118,6 +124,8 @@ SMOOTHER += ["nees_per_dof", "coverage_95"]
 FUSER = ["landmark_rmse_m", "gross_share", "fitted_rmse_m", "fitted_median_m"]
 FUSER += ["over_better_parent", "over_better_filter", "nees_per_dof", "frame_nees_per_dof"]
 FUSER += ["coverage_95", "frame_coverage_95", "alignment_nees_per_dof", "duplicate_share"]
+FUSER += ["alignment_error_m", "alignment_error_rad"]
+FUSER += ["alignment_sigma_m", "alignment_sigma_rad"]
 KNOWN = {
     "path_rmse_m": 2.0,
     "odometry_rmse_m": math.sqrt(50),
@@ -175,13 +183,27 @@ def test_false_merge(changed: dict[str, object], false: bool) -> None:
 
 
 def test_no_metric_is_left_untested() -> None:
-    of_aligners = {name.rpartition(".")[2] for name in KNOWN.keys() - METRICS.keys()}
+    of_methods = {name.rpartition(".")[2] for name in KNOWN.keys() - METRICS.keys()}
     assert set(METRICS) <= set(KNOWN)
-    assert set(ALIGNER_METRICS) == of_aligners
-    assert set(known_metrics(["ransac", "svd"])) >= set(KNOWN)
+    assert set(ALIGNER_METRICS) | set(FUSER_METRICS) == of_methods
+    assert set(known_metrics(["ransac", "svd"], FUSERS)) >= set(KNOWN)
 
 
-@pytest.mark.parametrize("name", [*METRICS, *(f"ransac.{name}" for name in ALIGNER_METRICS)])
+def test_a_fuser_of_a_package_has_metrics_under_its_name(tables: dict[str, pd.DataFrame]) -> None:
+    known = known_metrics([], ["kalman", "mine"])
+    assert "mine.coverage_95" in known
+    assert "joint.coverage_95" not in known  # it is not run
+    rows = tables["fusers"]
+    mine = rows[rows["fuser"] == "joint"].assign(fuser="mine")
+    found = compute("mine.coverage_95", tables | {"fusers": mine})
+    assert found == compute("joint.coverage_95", tables)
+
+
+METHODS_METRICS = [f"ransac.{name}" for name in ALIGNER_METRICS]
+METHODS_METRICS += [f"joint.{name}" for name in FUSER_METRICS]
+
+
+@pytest.mark.parametrize("name", [*METRICS, *METHODS_METRICS])
 def test_nothing_to_measure_is_nan(tables: dict[str, pd.DataFrame], name: str) -> None:
     """One robot alone, or a run in which nothing was found: no error, no warning, no pass."""
     empty = {key: table.iloc[:0] for key, table in tables.items()}
