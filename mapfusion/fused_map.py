@@ -50,6 +50,8 @@ class FusedMap:
             descriptor test of the second pass.
         left_out: name of each map that has no part in it, with the reason.
         fallback: why it is by a simpler fuser than was asked for; empty if it is not.
+        paths: (T_k, 3) the members' poses in the fused frame, in their order, by a fuser that finds
+            them anew; else empty.
     """
 
     landmarks: LandmarkMap
@@ -60,6 +62,7 @@ class FusedMap:
     duplicate_share: float
     left_out: tuple[tuple[str, str], ...]
     fallback: str = ""
+    paths: tuple[Float, ...] = ()
 
     @property
     def members(self) -> np.ndarray:

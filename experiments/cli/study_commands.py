@@ -1,4 +1,4 @@
-"""Commands over many runs or many maps: sweeps, statistics, refusal, the benchmark."""
+"""Commands over many runs or many maps: sweeps, statistics, comparisons and studies."""
 
 from pathlib import Path
 from typing import Annotated
@@ -8,7 +8,9 @@ import typer
 from experiments.cli import options
 
 app = typer.Typer()
-studies = typer.Typer(no_args_is_help=True, help="Measure the methods themselves: refusal, times.")
+studies = typer.Typer(
+    no_args_is_help=True, help="Measure the methods themselves: refusal, times, costs."
+)
 app.add_typer(studies, name="study", rich_help_panel=options.LOOK)
 
 
@@ -179,3 +181,44 @@ def benchmark(
     summary = cells.summarise(rows)
     write_benchmark(folder, design, rows, summary)
     study_screen.print_benchmark(folder, summary)
+
+
+@studies.command()
+def independence(
+    scenario: options.OneScenario,
+    *,
+    seeds: options.Seeds = "0",
+    robots: Annotated[
+        str | None,
+        typer.Option(
+            metavar="N,...",
+            help="Sizes of teams, 3,5: the first so many robots of the scenario; all by default.",
+        ),
+    ] = None,
+    overrides: options.Overrides,
+    output: options.OutputFolder = None,
+    jobs: options.Jobs = options.ALL_CORES,
+    results: options.Results = options.RESULTS,
+) -> None:
+    """Time, memory, bytes and errors of maps made alone and fused, and of one smoother of all logs.
+
+    For example: `mapfusion study independence paper --seeds 0..2`. What is measured is measured
+    serially; finished pieces are reused.
+    """
+    from experiments.run.store import Store
+    from experiments.scenario.loading import load_scenario
+    from experiments.scenario.seeds import parse_seeds
+    from experiments.scenario.suite import one_scenario
+    from experiments.show.independence_files import write_independence
+    from experiments.show.terminal import layout, study_screen
+    from experiments.study.independence import independence_trial, recorded_teams
+
+    path = one_scenario(scenario)
+    loaded = [load_scenario(path, overrides, seed) for seed in parse_seeds(seeds)]
+    sizes = recorded_teams.team_sizes(robots, loaded[0])
+    folder = output or results / f"independence-{loaded[0].name}"
+    with layout.progress() as show:
+        store = Store.of(results)
+        found = independence_trial.run_independence(loaded, sizes, store, jobs, show)
+        skipped = write_independence(folder, loaded, found)
+    study_screen.print_independence(folder, independence_trial.at_the_end(found), skipped)

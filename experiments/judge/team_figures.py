@@ -5,7 +5,8 @@ all of them by one rigid fit to the truth: what the robots are off against each 
 robot it is evo's.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -33,12 +34,17 @@ def team_rows(team: FusedTeam, paths: pd.DataFrame) -> list[dict[str, Any]]:
         members = [(k, robot) for k, robot in enumerate(team.robots) if placed[k]]
         row = {"component": number, "n_robots": len(members), "n_team": len(team.robots)}
         for source in _sources_of([own[robot.name] for _, robot in members]):
-            together = [
-                _in_one_frame(own[robot.name], source, T_first_map[k], robot.path.T_world_map)
-                for k, robot in members
-            ]
-            path, truth = (np.concatenate(poses) for poses in zip(*together, strict=True))
-            errors = ate_m(path, truth)
+            errors = team_ate_m(
+                [
+                    PlacedPath(
+                        _poses(own[robot.name], source),
+                        _poses(own[robot.name], "truth"),
+                        T_first_map[k],
+                        robot.path.T_world_map,
+                    )
+                    for k, robot in members
+                ]
+            )
             rows.append(row | {"source": source, "n": len(errors)} | seven_statistics(errors))
     return rows
 
@@ -61,15 +67,39 @@ def _placements(team: FusedTeam) -> Iterator[Float]:
         yield from (each.T_first_map for each in team.fusion.fused if len(each.members) > 1)
 
 
-def _in_one_frame(
-    paths: pd.DataFrame, source: str, T_first_map: Float, T_world_map: Float
-) -> tuple[Float, Float]:
-    """Estimated poses (n, 3) in the fused frame and true ones in the world, where known."""
-    poses, truth = (
-        paths[[f"{which}_{name}" for name in POSE_FIELDS]].to_numpy() for which in (source, "truth")
-    )
-    known = np.isfinite(truth).all(axis=1)
-    return se2.compose(T_first_map, poses[known]), se2.compose(T_world_map, truth[known])
+def _poses(paths: pd.DataFrame, source: str) -> Float:
+    """(T, 3) of a robot, from one source or the truth."""
+    return paths[[f"{source}_{name}" for name in POSE_FIELDS]].to_numpy()
+
+
+@dataclass(frozen=True)
+class PlacedPath:
+    """One robot's path beside the truth.
+
+    Attributes:
+        poses: (T, 3) estimated, in the robot's map frame.
+        truth: (T, 3) true ones, in its own; NaN where unknown.
+        T_first_map: (3,) how the robot's map was moved when it was merged.
+        T_world_map: (3,) where its frame truly is.
+    """
+
+    poses: Float
+    truth: Float
+    T_first_map: Float
+    T_world_map: Float
+
+    def in_one_frame(self) -> tuple[Float, Float]:
+        """Estimated poses (n, 3) in the fused frame and true ones in the world, where known."""
+        known = np.isfinite(self.truth).all(axis=1)
+        poses, truth = self.poses[known], self.truth[known]
+        return se2.compose(self.T_first_map, poses), se2.compose(self.T_world_map, truth)
+
+
+def team_ate_m(paths: Sequence[PlacedPath]) -> Float:
+    """Errors (N,) in m of the positions of all robots, after one rigid fit of all of them."""
+    together = zip(*(own.in_one_frame() for own in paths), strict=True)
+    path, truth = (np.concatenate(poses) for poses in together)
+    return ate_m(path, truth)
 
 
 def team_pair_rows(team: FusedTeam, errors: pd.DataFrame, aligner: str) -> pd.DataFrame:

@@ -95,4 +95,5 @@ def _fused_map(joint: FusedMap, members: np.ndarray, together: SmoothedTogether)
         parents=joint.parents[together.points],
         T_first_map=T,
         motion_covariance=motion_covariance,
+        paths=together.paths,
     )

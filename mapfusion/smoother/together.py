@@ -33,12 +33,14 @@ class SmoothedTogether:
         points: (L,) their numbers, as they were given.
         T_first_robot: (K, 3) first pose of each robot.
         motion_covariance: (K, 3, 3) theirs; zero for the first.
+        paths: (T_k, 3) of each robot.
     """
 
     smoothed: Smoothed
     points: np.ndarray
     T_first_robot: Float
     motion_covariance: Float
+    paths: tuple[Float, ...]
 
 
 def smooth_together(
@@ -86,7 +88,8 @@ def smooth_together(
     covariance = np.zeros((len(starts), 3, 3))
     covariance[1:] = pose_covariances(seen, end.equations, end.solution, starts[1:])
     names = point[seen.row[seen.starts[:-1]]]
-    return SmoothedTogether(Smoothed.of(end), names, end.estimate.path[starts], covariance)
+    paths = tuple(np.split(end.estimate.path, starts[1:]))
+    return SmoothedTogether(Smoothed.of(end), names, end.estimate.path[starts], covariance, paths)
 
 
 def _one_log(logs: Sequence[RobotLog]) -> RobotLog:

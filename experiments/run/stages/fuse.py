@@ -24,7 +24,7 @@ from mapfusion.fuse.parameters import MergeParameters
 from mapfusion.fuse.registry import make_fuser
 from mapfusion.fused_map import AlignedPair, FusedMap
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map
-from mapfusion.merge import connect
+from mapfusion.merge import ConnectedMaps, connect
 from mapfusion.robot_log import RobotLog, read_log
 from mapfusion.smoother.recording import Recording
 from mapfusion.smoother.smooth import SmootherParameters
@@ -77,6 +77,32 @@ class FuseSettings:
 
 
 @dataclass(frozen=True)
+class GivenTeam:
+    """What a team's robots have at an iteration, in their order, and how their maps were aligned.
+
+    Attributes:
+        maps: the filter's.
+        pairs: the alignments of these.
+        smoothed: for fusers that take them; the filter's where there is none.
+        recordings: what those were smoothed from.
+    """
+
+    maps: Sequence[LandmarkMap]
+    pairs: Sequence[AlignedPair]
+    smoothed: Sequence[LandmarkMap]
+    recordings: Sequence[Recording | None]
+
+    def connected(self, settings: FuseSettings) -> ConnectedMaps:
+        """The maps placed by the alignments that the team believes."""
+        return connect(self.maps, self.pairs, settings.parameters.team)
+
+    def fused(self, connected: ConnectedMaps, settings: FuseSettings) -> Sequence[FusedMap]:
+        """All components made maps."""
+        fuser, given = make_fuser(settings.fuser), (self.smoothed, self.recordings)
+        return connected.fused_by(fuser, settings.parameters, *given).fused
+
+
+@dataclass(frozen=True)
 class _Robot:
     """What is known of a robot at all iterations."""
 
@@ -87,23 +113,28 @@ class _Robot:
 
 def run(settings: FuseSettings, job: Job) -> dict[str, float]:
     """Fuse the maps at each iteration; write the maps, their parents and their motions."""
-    fuser = make_fuser(settings.fuser)
-    robots = {name: _read_robot(job, name, fuser.smoothed) for name in settings.robots}
     fusions, times = {}, {}
+    for k, given in given_teams(settings, job):
+        connected = given.connected(settings)
+        started_s = time.perf_counter()
+        fusions[k] = given.fused(connected, settings)
+        times[f"{settings.fuser}:{k}"] = time.perf_counter() - started_s
+    write_fusions(job.output, fusions, settings.robots)
+    return times
+
+
+def given_teams(settings: FuseSettings, job: Job) -> Iterator[tuple[int, GivenTeam]]:
+    """What there is to be fused, at each iteration."""
+    takes = make_fuser(settings.fuser).smoothed
+    robots = {name: _read_robot(job, name, takes) for name in settings.robots}
     for k in settings.iterations:
-        maps = [_at(robot.filtered, k) for robot in robots.values()]
         given, recordings = [], list[Recording | None]()
         for name, robot in robots.items():
             known = {i: own for i, own in robot.smoothed.items() if i <= k}
             given.append(_at(known, k) if known else _at(robot.filtered, k))
             recordings.append(_recording(settings, job, robot.log, name, known))
-        connected = connect(maps, list(_pairs(settings, job, k)), settings.parameters.team)
-        started_s = time.perf_counter()
-        fused = connected.fused_by(fuser, settings.parameters, given, recordings).fused
-        times[f"{settings.fuser}:{k}"] = time.perf_counter() - started_s
-        fusions[k] = fused
-    write_fusions(job.output, fusions, settings.robots)
-    return times
+        maps = [_at(robot.filtered, k) for robot in robots.values()]
+        yield k, GivenTeam(maps, list(_pairs(settings, job, k)), given, recordings)
 
 
 def _read_robot(job: Job, name: str, smoothed: bool) -> _Robot:

@@ -60,11 +60,16 @@ def _maps(log: Path, slam: Path) -> dict[int, LandmarkMap]:
     return read_snapshots(slam, read_log(log))
 
 
+def maps_of_both(job: Job) -> list[dict[int, LandmarkMap]]:
+    """All maps of the job's two robots, by iteration."""
+    return [_maps(job.inputs[f"log_{side}"], job.inputs[f"slam_{side}"]) for side in "ab"]
+
+
 def pairs_of_maps(
     job: Job, iterations: tuple[int, ...]
 ) -> Iterator[tuple[int, LandmarkMap, LandmarkMap]]:
     """(iteration, map a, map b) of the job's batch."""
-    a, b = (_maps(job.inputs[f"log_{side}"], job.inputs[f"slam_{side}"]) for side in "ab")
+    a, b = maps_of_both(job)
     start = int(job.part) * _ITERATIONS_PER_BATCH
     for k in iterations[start : start + _ITERATIONS_PER_BATCH]:
         yield k, map_at(a, k), map_at(b, k)

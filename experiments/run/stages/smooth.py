@@ -74,15 +74,8 @@ def parts(iterations: tuple[int, ...]) -> tuple[str, ...]:
 
 def run(settings: SmoothSettings, job: Job) -> None:
     """Smooth the log up to one iteration; write the map with its joint covariance, and the path."""
-    k = int(job.part)
-    log = log_until(read_log(job.inputs["log"]), k, settings.noise_floor_m)
-    landmark = associations_at(job.inputs["slam"], k, len(log.observations))
-    found = _smoothed(log, landmark, final_path(job.inputs["slam"])[: k + 1], settings)
-    if isinstance(found, str):
-        landmarks, path, ended = _no_map(log), np.empty((0, 3)), (0, np.nan, np.nan, found)
-    else:
-        landmarks, path = smoothed_map(log, landmark, found), found.estimate.path
-        ended = (found.n_steps, *found.tails, "")
+    given = filtered_until(job, read_log(job.inputs["log"]), int(job.part), settings.noise_floor_m)
+    landmarks, path, ended = smoothed_anew(settings, *given)
     write_map(_map_path(job.output, job.part), landmarks)
     rows = {"iteration": np.arange(len(path))} | named_columns(POSE_FIELDS, path)
     attributes = {name: str(value) for name, value in zip(_ENDED, ended, strict=True)}
@@ -102,6 +95,26 @@ def log_until(log: RobotLog, iteration: int, noise_floor_m: float = 0.0) -> Robo
         iteration=log.iteration[:n],
         observations=replace(seen, covariance_m2=covariance),
     )
+
+
+def filtered_until(
+    job: Job, log: RobotLog, iteration: int, noise_floor_m: float
+) -> tuple[RobotLog, np.ndarray, Float]:
+    """What is smoothed: the log until then, the filter's associations as they were, its path."""
+    log = log_until(log, iteration, noise_floor_m)
+    landmark = associations_at(job.inputs["slam"], iteration, len(log.observations))
+    return log, landmark, final_path(job.inputs["slam"])[: iteration + 1]
+
+
+def smoothed_anew(
+    settings: SmoothSettings, log: RobotLog, landmark: np.ndarray, path: Float
+) -> tuple[LandmarkMap, Float, tuple[object, ...]]:
+    """Map, path and how smoothing ended, as `_ENDED` names it."""
+    found = _smoothed(log, landmark, path, settings)
+    if isinstance(found, str):
+        return _no_map(log), np.empty((0, 3)), (0, np.nan, np.nan, found)
+    ended = (found.n_steps, *found.tails, "")
+    return smoothed_map(log, landmark, found), found.estimate.path, ended
 
 
 def _smoothed(
@@ -124,6 +137,11 @@ def _no_map(log: RobotLog) -> LandmarkMap:
     return LandmarkMap(
         none, np.empty((0, 3, 3)), counts, sources, None, None, log.planar, log.robot
     )
+
+
+def map_files(folder: Path, iteration: int) -> list[Path]:
+    """The files of the map at an iteration: the map, and its joint covariance."""
+    return [folder / name.format(part=iteration) for name in WRITES[:2]]
 
 
 def _map_path(folder: Path, part: str) -> Path:

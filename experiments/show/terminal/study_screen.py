@@ -1,4 +1,4 @@
-"""What `study refusal`, `study benchmark` and `scenarios` show."""
+"""What the commands `study ...` and `scenarios` show."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -8,8 +8,17 @@ import pandas as pd
 
 from experiments.judge.criteria import MERGEABLE_PAIRS, RIGHT_WITHIN_M, RIGHT_WITHIN_RAD
 from experiments.methods.catalogue import known_methods, name_clashes
+from experiments.show.independence_files import SHOWN, shown_numbers
 from experiments.show.numbers import two_digits
-from experiments.show.terminal.layout import Column, columns, print_frame, print_lines, print_table
+from experiments.show.terminal.layout import (
+    Column,
+    columns,
+    print_frame,
+    print_lines,
+    print_skipped,
+    print_table,
+)
+from experiments.study.independence.strategies import STRATEGIES
 from mapfusion.align.result import Status
 
 _RATES = columns(
@@ -80,6 +89,20 @@ def _benchmark_cell(row: dict[Any, Any]) -> str:
     if row["status"] == Status.ABSENT:
         return "absent"
     return f"{100 * row['success']:.0f}, {two_digits(1e3 * row['elapsed_s'])}"
+
+
+def print_independence(folder: Path, summary: pd.DataFrame, skipped: Sequence[str]) -> None:
+    """Costs and errors of each way to one map (rows of `at_the_end`), and where the rest is."""
+    headings = [("way", ""), *((heading, ">") for _, heading in SHOWN.values())]
+    note = "; ".join(f"{strategy.name}: {strategy.label}" for strategy in STRATEGIES)
+    for n_robots, rows in summary.groupby("n_robots"):
+        numbers = (shown_numbers(rows, name).map(two_digits) for name in SHOWN)
+        cells = zip(rows["strategy"], *numbers, strict=True)
+        whole = f"{rows['n_whole'].min()} of {rows['n_seeds'].max()} runs"
+        title = f"{n_robots} robots, at the end (one map of all in {whole})"
+        print_table(headings, cells, title, note)
+    print_lines([f"Tables and figure: {folder}"])
+    print_skipped(skipped)
 
 
 def print_methods() -> None:

@@ -14,7 +14,7 @@ from mapfusion.fuse.parameters import MergeParameters
 from mapfusion.fused_map import FusedMap
 from mapfusion.merge import connect
 from mapfusion.robot_log import NO_TRACK
-from mapfusion.se2 import Float, between, rotation, wrap
+from mapfusion.se2 import Float, between, compose, rotation, wrap
 from mapfusion.smoother.together import SmoothedTogether, smooth_together
 from tests.mapfusion.fuse.logged_team import STRAY_M, LoggedTeam, labels, log_labels
 from tests.mapfusion.smoother.white_noise_logs import NOISE, Known
@@ -103,6 +103,21 @@ def test_equals_a_dense_solver_that_knows_of_no_robots(
     joint = found.smoothed.joint_covariance().reshape(n, 3, n, 3)[:, :d, :, :d]
     off = joint.reshape(d * n, d * n) - covariance[of_points, of_points]
     assert np.abs(off / np.outer(sigma[of_points], sigma[of_points])).max() < 5e-3
+
+
+@pytest.mark.parametrize("members", [(0, 1, 2), (1, 2)])
+def test_paths_are_the_members_in_the_fused_frame(members: tuple[int, ...]) -> None:
+    team = LoggedTeam(3, 3, 30, 40)
+    fused = Batch().fuse(team.component(*members), MergeParameters())
+    assert len(fused.paths) == len(members)
+    np.testing.assert_array_equal(fused.paths[0][0], 0.0)
+    for k, path in zip(members, fused.paths, strict=True):
+        np.testing.assert_array_equal(path[0], fused.T_first_map[k])
+        truth = compose(team.motion(members[0], k), team.known[k].path)
+        off = path - truth
+        assert path.shape == truth.shape
+        assert np.hypot(off[:, 0], off[:, 1]).max() < 0.1  # the robots drive metres apart
+    assert JointFuser().fuse(team.component(*members), MergeParameters()).paths == ()
 
 
 @pytest.mark.parametrize("planar", [False, True])

@@ -1,0 +1,229 @@
+"""The whole study on robots of a run, against what the run itself says of them."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from experiments.judge import tables
+from experiments.judge.judged_run import JudgedRun
+from experiments.run.frames import read_rows
+from experiments.run.stages.fuse import read_fusions
+from experiments.run.store import Store
+from experiments.scenario.loading import load_scenario
+from experiments.scenario.settings import Simulation
+from experiments.show.figures.independence_figure import draw, since_shared_ground
+from experiments.show.figures.result_tables import NothingToDraw
+from experiments.study.independence.independence_trial import (
+    COSTS,
+    TEAMS,
+    Independence,
+    at_the_end,
+    run_independence,
+)
+from experiments.study.independence.recorded_teams import team_sizes
+from mapfusion import se2
+from mapfusion.errors import InputError
+from tests.helpers.tiny_scenario import assert_refused, command
+
+
+@pytest.fixture(scope="module")
+def scenario(trio_result: Path) -> Simulation:
+    found = load_scenario(trio_result.parent / "trio.yaml")
+    assert isinstance(found, Simulation)
+    return found
+
+
+@pytest.fixture(scope="module")
+def results(trio_result: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of results with the logs of that run alone."""
+    folder = tmp_path_factory.mktemp("results")
+    shutil.copytree(trio_result.parent / "store" / "log", folder / "store" / "log")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def found(scenario: Simulation, results: Path) -> Independence:
+    store = Store.of(results)
+    return run_independence([scenario], [2, 3], store, 1, lambda label, done, total: None)
+
+
+def last(found: pd.DataFrame, strategy: str, n_robots: int = 3) -> pd.Series:
+    own = found[(found["strategy"] == strategy) & (found["n_robots"] == n_robots)]
+    return own[own["iteration"] == own["iteration"].max()].iloc[0]
+
+
+@pytest.mark.parametrize(
+    ("strategy", "fuser"), [("filters", "kalman-drift"), ("once", "joint"), ("anew", "joint")]
+)
+def test_maps_are_those_of_the_run(
+    found: Independence, trio_result: Path, strategy: str, fuser: str
+) -> None:
+    fusers = tables.read(tables.table_path(trio_result, "fusers"), "fusers")
+    theirs = fusers[fusers["fuser"] == fuser].set_index("iteration")
+    ours = found.teams[(found.teams["strategy"] == strategy) & (found.teams["n_robots"] == 3)]
+    assert ours["iteration"].tolist() == theirs.index.tolist() == [40, 43]
+    for row in ours.to_dict("records"):
+        same = theirs.loc[row["iteration"]]
+        assert row["n_merged"] == same["n_robots"] > 1
+        for name in ("landmark_rmse_m", "fitted_rmse_m", "gross_share"):
+            assert row[name] == same[name]
+
+
+def fitted_rmse_m(positions: np.ndarray, truth: np.ndarray) -> float:
+    """After the best motion of all of them, by the singular values (Umeyama 1991)."""
+    p, q = positions - positions.mean(axis=0), truth - truth.mean(axis=0)
+    U, _, Vt = np.linalg.svd(q.T @ p)
+    R = U @ np.diag([1, np.linalg.det(U @ Vt)]) @ Vt
+    return float(np.sqrt(np.mean(np.sum((p @ R.T - q) ** 2, axis=1))))
+
+
+def test_paths_are_those_of_the_run(
+    found: Independence, scenario: Simulation, trio_result: Path
+) -> None:
+    team = tables.read(tables.table_path(trio_result, "team"), "team").set_index("source")
+    assert last(found.teams, "filters")["path_rmse_m"] == pytest.approx(team.loc["final", "rmse"])
+    run = JudgedRun.of(scenario, Store.of(trio_result.parent))
+    robots = run.load_robots()
+    smoothed = run.load_smoothed(robots)
+    folder = run.store.path(run.pipeline.fusers["joint"])
+    for k, fused in read_fusions(folder, [robot.name for robot in robots]).items():
+        both = []
+        for T, own in zip(fused.T_first_map, smoothed, strict=True):
+            truth = own.robot.path
+            true = se2.compose(truth.T_world_map, truth.T_map_robot[: k + 1])
+            both.append((se2.compose(T, own.paths[k])[:, :2], true[:, :2]))
+        error_m = fitted_rmse_m(*map(np.concatenate, zip(*both, strict=True)))
+        rows = found.teams[(found.teams["n_robots"] == 3) & (found.teams["iteration"] == k)]
+        by_strategy = rows.set_index("strategy")["path_rmse_m"]
+        assert by_strategy["once"] == by_strategy["anew"] == pytest.approx(error_m, rel=1e-9)
+        assert 0 < by_strategy["together"] < 2 * error_m  # in the frame that its fuser found
+
+
+def test_shared_ground_is_where_errors_are_told_of_it(
+    found: Independence, trio_result: Path
+) -> None:
+    errors = tables.read(tables.table_path(trio_result, "errors"), "errors")
+    shared = errors[errors["n_common"] >= 3]["iteration"].min()
+    assert last(found.teams, "once")["first_shared"] == shared
+
+
+def test_bytes_are_those_of_the_files_that_hold_it(
+    found: Independence, scenario: Simulation, trio_result: Path
+) -> None:
+    maps = trio_result / "maps"
+    run = JudgedRun.of(scenario, Store.of(trio_result.parent))
+    logs = [run.store.path(robot.log) for robot in run.pipeline.robots]
+    files = {
+        "filters": [[maps / f"{robot}.parquet"] for robot in ("R1", "R2", "R3")],
+        "once": [
+            [maps / f"{robot}.smoothed.parquet", maps / f"{robot}.smoothed.joint.parquet"]
+            for robot in ("R1", "R2", "R3")
+        ],
+        "together": [[log / "frames.parquet", log / "observations.parquet"] for log in logs],
+    }
+    for strategy, by_robot in files.items():
+        sizes_mb = [sum(file.stat().st_size for file in own) / 1e6 for own in by_robot]
+        row = last(found.teams, strategy)
+        # of a map or log at the end; a path or a name more or less in the header is a few bytes
+        assert row["sent_mb"] == pytest.approx(sum(sizes_mb), rel=0.01)
+        assert row["most_sent_mb"] == pytest.approx(max(sizes_mb), rel=0.01)
+    assert last(found.teams, "anew")["sent_mb"] > 1.5 * last(found.teams, "once")["sent_mb"]
+
+
+def test_a_second_study_measures_nothing_and_says_the_same(
+    found: Independence, scenario: Simulation, results: Path
+) -> None:
+    told: list[tuple[str, int, int]] = []
+    store = Store.of(results)
+    again = run_independence([scenario], [2, 3], store, 1, lambda *now: told.append(now))
+    pd.testing.assert_frame_equal(again.teams, found.teams, check_exact=True)
+    pd.testing.assert_frame_equal(again.costs, found.costs, check_exact=True)
+    assert not any("smooth" in label or "FastSLAM" in label for label, *_ in told)
+
+
+def test_costs_are_of_what_each_way_takes(found: Independence) -> None:
+    costs = found.costs
+    assert len(costs) == len(found.teams) == 2 * 4 * 2
+    filters, once, anew, together = (
+        last(costs, name) for name in ("filters", "once", "anew", "together")
+    )
+    assert filters["smoothing_s"] == 0 < once["smoothing_s"] < anew["smoothing_s"]
+    assert filters["filter_s"] == once["filter_s"] == together["filter_s"] > 0
+    assert once["fusion_s"] < anew["fusion_s"]
+    seconds = costs.filter(like="_s").to_numpy(dtype=float)
+    assert np.isfinite(seconds).all()
+    assert (seconds >= 0).all()
+
+
+def test_summary_is_of_the_last_maps(found: Independence) -> None:
+    summary = at_the_end(found)
+    assert summary["n_robots"].tolist() == [2] * 4 + [3] * 4
+    assert summary["strategy"].tolist() == 2 * ["filters", "once", "anew", "together"]
+    row, own = summary.iloc[5], last(found.costs, "once")
+    assert row["fitted_rmse_m"] == last(found.teams, "once")["fitted_rmse_m"]
+    assert row["robots_s"] == own["filter_s"] + own["smoothing_s"]
+    assert row["team_s"] == own["alignment_s"] + own["fusion_s"]
+    assert (row["n_seeds"], row["n_whole"]) == (1, 1)
+
+
+def test_figure_counts_from_shared_ground_and_leaves_out_who_never_meets(
+    found: Independence,
+) -> None:
+    drawn = since_shared_ground(found.teams, found.costs)
+    assert (drawn["since"] == drawn["iteration"] - drawn["first_shared"]).all()
+    own = found.costs.drop(columns=["robot_peak_mb", "team_peak_mb"])
+    total = own.filter(["filter_s", "smoothing_s", "alignment_s", "fusion_s"]).sum(axis=1)
+    assert drawn["cpu_s"].to_numpy() == pytest.approx(total.to_numpy())
+    figure = draw(found.teams, found.costs)
+    assert len(figure.axes) == 6 * 2
+    apart = found.teams.assign(first_shared=-1)
+    with pytest.raises(NothingToDraw):
+        draw(apart, found.costs)
+
+
+@pytest.mark.usefixtures("quick_save", "found")
+def test_command_writes_tables_page_and_figure(
+    results: Path, trio_result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    where = ["--results", results, "-o", tmp_path / "out", "--jobs", 1]
+    path = trio_result.parent / "trio.yaml"
+    reply = command(capsys, "study", "independence", path, "--robots", "3", *where)
+    assert reply.code == 0, reply.err
+    assert "3 robots, at the end (one map of all in 1 of 1 runs)" in reply.out
+    assert {file.name for file in (tmp_path / "out").iterdir()} == {
+        "costs.parquet",
+        "independence.png",
+        "independence.svg",
+        "provenance.json",
+        "summary.csv",
+        "summary.md",
+        "teams.parquet",
+    }
+    assert len(read_rows(tmp_path / "out" / "teams.parquet", TEAMS)) == 8
+    assert len(read_rows(tmp_path / "out" / "costs.parquet", COSTS)) == 8
+    page = (tmp_path / "out" / "summary.md").read_text(encoding="utf-8")
+    assert "## 3 robots" in page
+    assert "all logs in one smoother" in page
+
+
+@pytest.mark.parametrize("text", ["", "1", "4", "2,2", "2,x", "2,,3", "-2", "2.5"])
+def test_sizes_that_no_team_can_have(text: str, scenario: Simulation) -> None:
+    with pytest.raises(InputError, match=r"^--robots .*from 2 to 3.*trio has 3 robots$"):
+        team_sizes(text, scenario)
+
+
+def test_sizes_are_of_the_scenario(scenario: Simulation) -> None:
+    assert team_sizes(None, scenario) == [3]
+    assert team_sizes("3,2", scenario) == [2, 3]
+    alone = scenario.model_copy(update={"robots": scenario.robots[:1]})
+    with pytest.raises(InputError, match="trio: has one robot"):
+        team_sizes(None, alone)
+
+
+def test_bad_input_is_one_line(trio_result: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = trio_result.parent / "trio.yaml"
+    assert_refused(command(capsys, "study", "independence", path, "--robots", "5"), "--robots 5")
+    assert_refused(command(capsys, "study", "independence", "no_such"), "no_such")
