@@ -23,7 +23,7 @@ from experiments.study.independence.independence_trial import (
     at_the_end,
     run_independence,
 )
-from experiments.study.independence.recorded_teams import team_sizes
+from experiments.study.independence.recorded_teams import team_of, team_sizes
 from mapfusion import se2
 from mapfusion.errors import InputError
 from tests.helpers.tiny_scenario import assert_refused, command
@@ -47,11 +47,11 @@ def results(trio_result: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 @pytest.fixture(scope="module")
 def found(scenario: Simulation, results: Path) -> Independence:
     store = Store.of(results)
-    return run_independence([scenario], [2, 3], store, 1, lambda label, done, total: None)
+    return run_independence([scenario], [3], store, 1, lambda label, done, total: None)
 
 
-def last(found: pd.DataFrame, strategy: str, n_robots: int = 3) -> pd.Series:
-    own = found[(found["strategy"] == strategy) & (found["n_robots"] == n_robots)]
+def last(found: pd.DataFrame, strategy: str) -> pd.Series:
+    own = found[found["strategy"] == strategy]
     return own[own["iteration"] == own["iteration"].max()].iloc[0]
 
 
@@ -63,7 +63,7 @@ def test_maps_are_those_of_the_run(
 ) -> None:
     fusers = tables.read(tables.table_path(trio_result, "fusers"), "fusers")
     theirs = fusers[fusers["fuser"] == fuser].set_index("iteration")
-    ours = found.teams[(found.teams["strategy"] == strategy) & (found.teams["n_robots"] == 3)]
+    ours = found.teams[found.teams["strategy"] == strategy]
     assert ours["iteration"].tolist() == theirs.index.tolist() == [40, 43]
     for row in ours.to_dict("records"):
         same = theirs.loc[row["iteration"]]
@@ -96,7 +96,7 @@ def test_paths_are_those_of_the_run(
             true = se2.compose(truth.T_world_map, truth.T_map_robot[: k + 1])
             both.append((se2.compose(T, own.paths[k])[:, :2], true[:, :2]))
         error_m = fitted_rmse_m(*map(np.concatenate, zip(*both, strict=True)))
-        rows = found.teams[(found.teams["n_robots"] == 3) & (found.teams["iteration"] == k)]
+        rows = found.teams[found.teams["iteration"] == k]
         by_strategy = rows.set_index("strategy")["path_rmse_m"]
         assert by_strategy["once"] == by_strategy["anew"] == pytest.approx(error_m, rel=1e-9)
         assert 0 < by_strategy["together"] < 2 * error_m  # in the frame that its fuser found
@@ -138,7 +138,7 @@ def test_a_second_study_measures_nothing_and_says_the_same(
 ) -> None:
     told: list[tuple[str, int, int]] = []
     store = Store.of(results)
-    again = run_independence([scenario], [2, 3], store, 1, lambda *now: told.append(now))
+    again = run_independence([scenario], [3], store, 1, lambda *now: told.append(now))
     pd.testing.assert_frame_equal(again.teams, found.teams, check_exact=True)
     pd.testing.assert_frame_equal(again.costs, found.costs, check_exact=True)
     assert not any("smooth" in label or "FastSLAM" in label for label, *_ in told)
@@ -146,7 +146,7 @@ def test_a_second_study_measures_nothing_and_says_the_same(
 
 def test_costs_are_of_what_each_way_takes(found: Independence) -> None:
     costs = found.costs
-    assert len(costs) == len(found.teams) == 2 * 4 * 2
+    assert len(costs) == len(found.teams) == 4 * 2
     filters, once, anew, together = (
         last(costs, name) for name in ("filters", "once", "anew", "together")
     )
@@ -160,9 +160,9 @@ def test_costs_are_of_what_each_way_takes(found: Independence) -> None:
 
 def test_summary_is_of_the_last_maps(found: Independence) -> None:
     summary = at_the_end(found)
-    assert summary["n_robots"].tolist() == [2] * 4 + [3] * 4
-    assert summary["strategy"].tolist() == 2 * ["filters", "once", "anew", "together"]
-    row, own = summary.iloc[5], last(found.costs, "once")
+    assert summary["n_robots"].tolist() == [3] * 4
+    assert summary["strategy"].tolist() == ["filters", "once", "anew", "together"]
+    row, own = summary.iloc[1], last(found.costs, "once")
     assert row["fitted_rmse_m"] == last(found.teams, "once")["fitted_rmse_m"]
     assert row["robots_s"] == own["filter_s"] + own["smoothing_s"]
     assert row["team_s"] == own["alignment_s"] + own["fusion_s"]
@@ -178,7 +178,7 @@ def test_figure_counts_from_shared_ground_and_leaves_out_who_never_meets(
     total = own.filter(["filter_s", "smoothing_s", "alignment_s", "fusion_s"]).sum(axis=1)
     assert drawn["cpu_s"].to_numpy() == pytest.approx(total.to_numpy())
     figure = draw(found.teams, found.costs)
-    assert len(figure.axes) == 6 * 2
+    assert len(figure.axes) == 6
     apart = found.teams.assign(first_shared=-1)
     with pytest.raises(NothingToDraw):
         draw(apart, found.costs)
@@ -190,7 +190,7 @@ def test_command_writes_tables_page_and_figure(
 ) -> None:
     where = ["--results", results, "-o", tmp_path / "out", "--jobs", 1]
     path = trio_result.parent / "trio.yaml"
-    reply = command(capsys, "study", "independence", path, "--robots", "3", *where)
+    reply = command(capsys, "study", "independence", path, "--seeds", 3, "--robots", 3, *where)
     assert reply.code == 0, reply.err
     assert "3 robots, at the end (one map of all in 1 of 1 runs)" in reply.out
     assert {file.name for file in (tmp_path / "out").iterdir()} == {
@@ -207,6 +207,20 @@ def test_command_writes_tables_page_and_figure(
     page = (tmp_path / "out" / "summary.md").read_text(encoding="utf-8")
     assert "## 3 robots" in page
     assert "all logs in one smoother" in page
+
+
+def test_a_smaller_team_is_some_of_the_larger_one(scenario: Simulation, results: Path) -> None:
+    """What two robots do by themselves, and their alignment, is measured for both teams at once."""
+    run = JudgedRun.of(scenario, Store.of(results))
+    two, three = (team_of(run, n) for n in (2, 3))
+    keys = {name: stage.key for name, stage in three.by_robot.items()}
+    assert {name: stage.key for name, stage in two.by_robot.items()} == {
+        name: keys[name] for name in ("R1", "R2")
+    }
+    assert [stage.key for stage in two.by_pair] == [three.by_pair[0].key]
+    assert two.iterations == three.iterations
+    of_three = {stage.key for stage in three.by_fuser.values()}
+    assert not {stage.key for stage in two.by_fuser.values()} & of_three
 
 
 @pytest.mark.parametrize("text", ["", "1", "4", "2,2", "2,x", "2,,3", "-2", "2.5"])
