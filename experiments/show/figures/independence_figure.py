@@ -1,5 +1,6 @@
 """Figure of the study `independence`: costs and errors since robots first share ground."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -20,9 +21,9 @@ _PANELS = (
     ("CPU time (s)", "cpu_s", "team_s"),
     ("peak memory (MB)", "peak_mb", "team_peak_mb"),
     ("sent by all (MB)", "sent_mb", ""),
-    ("map, in its frame,\nRMS (m)", "landmark_rmse_m", ""),
-    ("map, after a fit,\nRMS (m)", "fitted_rmse_m", ""),
-    ("paths, after a fit,\nRMS (m)", "path_rmse_m", ""),
+    ("map, in its frame,\nRMS (mm)", "landmark_rmse_m", ""),
+    ("map, after a fit,\nRMS (mm)", "fitted_rmse_m", ""),
+    ("paths, after a fit,\nRMS (mm)", "path_rmse_m", ""),
 )
 _LOOKS: dict[str, tuple[Any, ...]] = {
     "filters": (style.ORANGE, (0, (1, 1)), "D"),
@@ -30,9 +31,12 @@ _LOOKS: dict[str, tuple[Any, ...]] = {
     "anew": (style.GREEN, (0, (5, 1)), "^"),
     "together": (style.BLACK, (0, (4, 2)), "x"),
 }
+_WIDE = 2.2  # points, of what another line may lie upon
 _OF_TEAM: dict[str, Any] = {"linewidth": 0.6, "marker": ""}
 _HOLLOW: dict[str, Any] = {"linestyle": "", "markerfacecolor": "white", "zorder": 3}
-_TICKS = (1.0, 2.0, 5.0)  # of each decade
+_TICKS = (1.0, 2.0, 5.0)  # of each decade, and more where an axis spans less than one
+_MANY_TICKS = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0)
+_MM_A_M = 1000.0
 _LEAST_SPAN = 3.0  # of a logarithmic axis, end over end: differences of a few per cent stay small
 
 
@@ -41,6 +45,7 @@ def draw(teams: pd.DataFrame, costs: pd.DataFrame) -> Figure:
 
     Zero is where two robots' maps first have common ground. Thin: the team's part of the work
     alone. Errors are drawn where robots' maps were merged, hollow where not those of all robots.
+    Fused once and fused anew give the same map.
     """
     rows = since_shared_ground(teams, costs)
     sizes = sorted(rows["n_robots"].unique())
@@ -54,8 +59,8 @@ def draw(teams: pd.DataFrame, costs: pd.DataFrame) -> Figure:
         column[0].set_title(f"{size} robots")
         column[-1].set_xlabel("iterations since robots first share ground")
         column[-1].xaxis.set_major_locator(MaxNLocator(6, integer=True))
-    for (label, *_), row in zip(_PANELS, panels, strict=True):
-        _finish(row[0], label)
+    for (label, bold, _), row in zip(_PANELS, panels, strict=True):
+        _finish(row[0], label, _MANY_TICKS if _is_error(bold) else _TICKS)
     looks = {strategy.label: _look(strategy.name) for strategy in STRATEGIES}
     thin = Line2D([], [], color=style.BLACK, label="the team's part alone", **_OF_TEAM)
     style.aligner_legend(figure, looks, 3, [thin])
@@ -80,28 +85,33 @@ def since_shared_ground(teams: pd.DataFrame, costs: pd.DataFrame) -> pd.DataFram
     )
 
 
+def _is_error(column: str) -> bool:
+    return column.endswith("rmse_m")
+
+
 def _look(name: str) -> dict[str, Any]:
-    return dict(zip(("color", "linestyle", "marker"), _LOOKS[name], strict=True))
+    look = dict(zip(("color", "linestyle", "marker"), _LOOKS[name], strict=True))
+    return look | ({"linewidth": _WIDE} if name == "once" else {})
 
 
 def _add_lines(axes: Axes, rows: pd.DataFrame, bold: str, thin: str) -> None:
     for strategy in STRATEGIES:
         mine, look = rows[rows["strategy"] == strategy.name], _look(strategy.name)
         for _, own in mine.groupby("seed"):
-            axes.plot(own["since"], own[bold], **look)
+            axes.plot(own["since"], own[bold] * (_MM_A_M if _is_error(bold) else 1.0), **look)
             if thin:
                 axes.plot(own["since"], own[thin], **look | _OF_TEAM)
-            part = own[(own["n_merged"] < own["n_robots"]) & own["path_rmse_m"].notna()]
-            if bold.endswith("rmse_m"):
-                axes.plot(part["since"], part[bold], **look | _HOLLOW)
+            part = own[own["n_merged"] < own["n_robots"]]
+            if _is_error(bold):
+                axes.plot(part["since"], part[bold] * _MM_A_M, **look | _HOLLOW)
     axes.axvline(0.0, color=style.GRAY, linewidth=0.8)
     axes.set_yscale("log")
 
 
-def _finish(axes: Axes, label: str) -> None:
+def _finish(axes: Axes, label: str, ticks: Sequence[float]) -> None:
     """The first of a row, whose axis the others share."""
     axes.set_ylabel(label)
-    axes.yaxis.set_major_locator(LogLocator(subs=_TICKS))
+    axes.yaxis.set_major_locator(LogLocator(subs=ticks))
     axes.yaxis.set_major_formatter(style.plain_numbers())
     axes.yaxis.set_minor_formatter(NullFormatter())
     low, high = axes.get_ylim()
