@@ -212,11 +212,13 @@ def independence(
     from experiments.show.independence_files import write_independence
     from experiments.show.terminal import layout, study_screen
     from experiments.study.independence import independence_trial, recorded_teams
+    from mapfusion.storage import require_writable
 
     path = one_scenario(scenario)
     loaded = [load_scenario(path, overrides, seed) for seed in parse_seeds(seeds)]
     sizes = recorded_teams.team_sizes(robots, loaded[0])
     folder = output or results / f"independence-{loaded[0].name}"
+    require_writable(folder)  # hours before it is written
     with layout.progress() as show:
         store = Store.of(results)
         found = independence_trial.run_independence(loaded, sizes, store, jobs, show)

@@ -241,3 +241,5 @@ def test_bad_input_is_one_line(trio_result: Path, capsys: pytest.CaptureFixture[
     path = trio_result.parent / "trio.yaml"
     assert_refused(command(capsys, "study", "independence", path, "--robots", "5"), "--robots 5")
     assert_refused(command(capsys, "study", "independence", "no_such"), "no_such")
+    taken = command(capsys, "study", "independence", path, "-o", path / "out")
+    assert_refused(taken, "cannot be written")
