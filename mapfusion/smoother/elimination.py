@@ -100,8 +100,8 @@ def pose_covariances(
     chosen[frames - 1, :, np.arange(n)] = np.eye(3)
     right, alone = chosen.reshape(3 * n_unknown, 3 * n), 0.0
     if not solution.landmarks_first:  # the errors of the path if all points were known, and theirs
-        solved = scipy.linalg.cho_solve_banded((_chain(equations), True), right)
-        right, alone = _points(seen, equations)[0].T @ solved, right.T @ solved
+        solved = scipy.linalg.cho_solve_banded((chain_factor(equations), True), right)
+        right, alone = pose_point_blocks(seen, equations)[0].T @ solved, right.T @ solved
     root = scipy.linalg.solve_triangular(solution.factor, right, lower=True, check_finite=False)
     return (root.T @ root + alone).reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
 
@@ -190,8 +190,8 @@ def _subtract(
 
 def _poses_first(seen: Sightings, equations: NormalEquations) -> Solution:
     n_poses, n_offsets = len(equations.pose_block), 3 * np.count_nonzero(seen.strays)
-    B, K, gradient = _points(seen, equations)
-    chain = _chain(equations)
+    B, K, gradient = pose_point_blocks(seen, equations)
+    chain = chain_factor(equations)
     right = np.column_stack([B, equations.pose_gradient[1:].ravel()])
     solved = scipy.linalg.cho_solve_banded((chain, True), right, check_finite=False)
     factor = scipy.linalg.cholesky(K - B.T @ solved[:, :-1], lower=True, check_finite=False)
@@ -205,7 +205,7 @@ def _poses_first(seen: Sightings, equations: NormalEquations) -> Solution:
     return _solution(seen, left, step, own, factor, False)
 
 
-def _points(seen: Sightings, equations: NormalEquations) -> tuple[Float, Float, Float]:
+def pose_point_blocks(seen: Sightings, equations: NormalEquations) -> tuple[Float, Float, Float]:
     """Of the offsets and, after them, the landmarks: block with the poses, own block, gradient."""
     strays, n_poses = seen.strays, len(equations.pose_block)
     row, stray = strays[seen.track], np.cumsum(strays) - 1
@@ -228,7 +228,7 @@ def _points(seen: Sightings, equations: NormalEquations) -> tuple[Float, Float, 
     return as_matrix, K, np.concatenate(gradient).ravel()
 
 
-def _chain(equations: NormalEquations) -> Float:
+def chain_factor(equations: NormalEquations) -> Float:
     """Cholesky factor of the poses, which are a chain, but for the first.
 
     As LAPACK takes a band: row d is the d-th diagonal below the main.

@@ -84,6 +84,18 @@ def disturbances(path: Float, odometry: Float) -> Float:
     return found
 
 
+def disturbance_jacobians(path: Float) -> tuple[Float, Float]:
+    """(T - 1, 3, 3) of each disturbance by the pose before it, and by the one after it."""
+    n = len(path) - 1
+    to_robot = np.swapaxes(rotation(path[:-1, 2]), 1, 2)
+    way = path[1:, :2] - path[:-1, :2]
+    before, after = np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
+    after[:, :2, :2], after[:, 2, 2] = to_robot, 1.0
+    before[:, :2, :2], before[:, 2, 2] = -to_robot, -1.0
+    before[:, :2, 2] = np.einsum("nij,nj->ni", to_robot, np.stack([way[:, 1], -way[:, 0]], 1))
+    return before, after
+
+
 def normal_equations(
     seen: Sightings,
     at: Estimate,
@@ -122,12 +134,7 @@ def normal_equations(
 def _add_odometry(path: Float, odometry: Float, information: Float, made: NormalEquations) -> None:
     n = len(path) - 1
     d = disturbances(path, odometry)
-    to_robot = np.swapaxes(rotation(path[:-1, 2]), 1, 2)
-    way = path[1:, :2] - path[:-1, :2]
-    before, after = np.zeros((n, 3, 3)), np.zeros((n, 3, 3))  # of d, by either pose
-    after[:, :2, :2], after[:, 2, 2] = to_robot, 1.0
-    before[:, :2, :2], before[:, 2, 2] = -to_robot, -1.0
-    before[:, :2, 2] = np.einsum("nij,nj->ni", to_robot, np.stack([way[:, 1], -way[:, 0]], 1))
+    before, after = disturbance_jacobians(path)
     for J, at in ((before, slice(0, n)), (after, slice(1, n + 1))):
         weighted = np.swapaxes(J, 1, 2) * information[:, None, :]
         made.pose_block[at] += weighted @ J

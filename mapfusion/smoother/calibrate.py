@@ -1,0 +1,201 @@
+"""Odometry calibrated from logs alone: constant errors of each robot, noise levels of all.
+
+By turns the logs are smoothed, the constants take a Gauss-Newton step on the likelihood that the
+poses and landmarks have been integrated out of, and the noise levels a step of `noise_levels`. What
+robots saw again tells their odometry's errors; no truth is needed.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapfusion.arguments import require_shape
+from mapfusion.errors import InputError
+from mapfusion.fastslam.motion import MotionNoise
+from mapfusion.robot_log import RobotLog
+from mapfusion.se2 import IDENTITY, Float, compose
+from mapfusion.smoother import noise_levels
+from mapfusion.smoother.motion_posterior import motion_posterior
+from mapfusion.smoother.noise_levels import NOTHING, Told, plain, relative_errors, told, updated
+from mapfusion.smoother.normal_equations import Estimate, odometry_information
+from mapfusion.smoother.odometry_error import OdometryError, sensitivity
+from mapfusion.smoother.residuals import first_points
+from mapfusion.smoother.settle import Problem, settled
+from mapfusion.smoother.sightings import Sightings, sightings_of
+from mapfusion.smoother.smooth import SmootherParameters
+
+# What is known of any odometry before: standard deviations of its constants. They hold those that
+# a log says nothing about, as of a robot that never turns, and weigh nothing beside one that does.
+_PRIOR = np.array([0.2, 0.5, 0.5, 0.3])
+# Where smoothing starts: noise that most wheels stay below.
+_FIRST = MotionNoise(0.05, 0.1, 0.3, 0, 0, lateral_slip_m_per_rad=0)
+_CLOSE = 1.0  # squared sigmas that the next step of a round would move the path by
+_MOST_ROUNDS = 40
+# Rounds end where none changes a constant by more than this many of its standard errors, or a
+# level by more than this share of it.
+_SETTLED = 0.03
+# A path is found first for so many frames with observations, then for so many times as many.
+_FIRST_FRAMES, _GROWTH = 60, 1.5
+
+
+@dataclass(frozen=True)
+class RobotCalibration:
+    """One robot's odometry.
+
+    Attributes:
+        robot: its name.
+        error: its constant errors.
+        standard_errors: (4,) theirs.
+        path: (T, 3) smoothed with them.
+    """
+
+    robot: str
+    error: OdometryError
+    standard_errors: Float
+    path: Float
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What logs tell of their odometry.
+
+    Attributes:
+        robots: in the order of the logs.
+        motion: noise of the corrected odometry, one for all robots.
+        relative_errors: (3,) of its levels in the order of `noise_levels.LEVELS`, standard errors
+            as shares of them.
+        n_rounds: that it took.
+    """
+
+    robots: tuple[RobotCalibration, ...]
+    motion: MotionNoise
+    relative_errors: Float
+    n_rounds: int
+
+
+@dataclass
+class _Robot:
+    """A log as it is being calibrated."""
+
+    log: RobotLog
+    seen: Sightings
+    stray_information: float
+    path: Float
+    constants: Float
+    covariance: Float
+
+    def round(self, motion: MotionNoise) -> tuple[Told, float]:
+        """Smooth, step the constants: what is told of the noise, and the step in sigmas."""
+        odometry = OdometryError.of(self.constants).corrected(self.log.odometry)
+        information = odometry_information(odometry, motion)
+        problem = Problem(self.seen, odometry, information, self.stray_information)
+        points = first_points(self.seen, self.path)
+        start = Estimate(self.path, points, np.zeros((len(self.seen.strays), 3)))
+        end = settled(problem, start, _CLOSE)
+        self.path = end.estimate.path
+        by_constants = sensitivity(self.log.odometry)[1:]
+        posterior = motion_posterior(end, odometry, information, by_constants)
+        known = posterior.constants_information + np.diag(_PRIOR**-2)
+        self.covariance = np.linalg.inv(known)
+        step = self.covariance @ (posterior.constants_gradient - self.constants / _PRIOR**2)
+        self.constants = self.constants + step
+        return told(posterior, odometry, information, motion), float(np.sqrt(step @ known @ step))
+
+
+def calibrate(
+    logs: Sequence[RobotLog],
+    landmarks: Sequence[np.ndarray],
+    paths: Sequence[Float | None],
+    parameters: SmootherParameters,
+    on_round: Callable[[int, int], None] = lambda done, most: None,
+) -> Calibration:
+    """The most likely constants and noise levels.
+
+    Args:
+        logs: of one robot each; the noise levels are common to all.
+        landmarks: of each, (N,) which landmark each observation is of, negative for none.
+        paths: of each, (T, 3) where to start from; None: found from the log, by smoothing more and
+            more of it, which needs landmarks that are known for sure.
+        parameters: of the smoother; what they say of the odometry is not used.
+        on_round: told the rounds done, and how many there are at most.
+
+    Raises:
+        InputError: a log has too little motion or too few observations to tell.
+        ValueError: shapes that do not fit.
+    """
+    motion = plain(_FIRST)
+    robots = [
+        _begun(log, landmark, path, parameters, motion)
+        for log, landmark, path in zip(logs, landmarks, paths, strict=True)
+    ]
+    n_rounds, all_told = 0, NOTHING
+    for n_rounds in range(1, _MOST_ROUNDS + 1):
+        rounds = [robot.round(motion) for robot in robots]
+        all_told = sum((each for each, _ in rounds), NOTHING)
+        before, motion = motion, updated(motion, all_told)
+        levels = [[getattr(each, name) for name in noise_levels.LEVELS] for each in (before, motion)]
+        moved = max(max(step for _, step in rounds), *np.abs(np.log(levels[1]) - np.log(levels[0])))
+        on_round(n_rounds, _MOST_ROUNDS)
+        if moved < _SETTLED:
+            break
+    calibrated = tuple(
+        RobotCalibration(
+            robot.log.robot,
+            OdometryError.of(robot.constants),
+            np.sqrt(np.diag(robot.covariance)),
+            robot.path,
+        )
+        for robot in robots
+    )
+    return Calibration(calibrated, motion, relative_errors(all_told), n_rounds)
+
+
+def _begun(
+    log: RobotLog,
+    landmark: np.ndarray,
+    path: Float | None,
+    parameters: SmootherParameters,
+    motion: MotionNoise,
+) -> _Robot:
+    require_shape("landmark", landmark, (len(log.observations),))
+    stray = parameters.stray_information
+    if path is not None:
+        require_shape("path", path, (len(log), 3))
+        seen = sightings_of(log, landmark, parameters.min_count, stray=stray > 0)
+        return _checked(_Robot(log, seen, stray, path, np.zeros(4), np.diag(_PRIOR**2)))
+    observed = np.unique(log.iteration)
+    grown = _Robot(
+        log, sightings_of(log, landmark, 1, stray=False), stray, IDENTITY[None], np.zeros(4), _PRIOR
+    )
+    n_seen = _FIRST_FRAMES
+    while True:
+        whole = n_seen >= len(observed)
+        n_frames = len(log) if whole else int(observed[n_seen]) + 1
+        part = log if whole else log.until(n_frames)
+        least = parameters.min_count if whole else 1
+        grown.log, grown.seen = part, sightings_of(
+            part, landmark[: len(part.observations)], least, stray=stray > 0
+        )
+        odometry = OdometryError.of(grown.constants).corrected(part.odometry)
+        grown.path = _extended(grown.path, odometry)
+        _checked(grown).round(motion)
+        if whole:
+            return grown
+        n_seen = int(n_seen * _GROWTH)
+
+
+def _extended(path: Float, odometry: Float) -> Float:
+    """A path, and how the odometry (T, 3) goes on from its end."""
+    made = np.concatenate([path, np.empty((len(odometry) - len(path), 3))])
+    for k in range(len(path), len(odometry)):
+        made[k] = compose(made[k - 1], odometry[k])
+    return made
+
+
+def _checked(robot: _Robot) -> _Robot:
+    if not len(robot.seen):
+        raise InputError(
+            f"log {robot.log.robot}: no landmark was seen often enough to tell how the robot moved"
+        )
+    return robot

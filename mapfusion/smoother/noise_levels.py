@@ -1,0 +1,93 @@
+"""The levels of odometry noise under which what was smoothed is most likely.
+
+The variance of a disturbance is a sum of levels, each times what the robot moved by: v = sum q_j
+a_j. With the disturbances' means d and variances C given all observations, a level is right where
+
+    sum of s_j d^2 / v = sum of s_j (1 - C / v),      s_j = q_j a_j / v,
+
+the share of it in v: what is found, squared and in sigmas, is as much as the observations can tell.
+The right side counts the disturbances that they do tell. Each round multiplies a level by the ratio
+of the two (MacKay 1992, "Bayesian interpolation", eq. 4.9), which ends where the marginal
+likelihood is stationary, in far fewer rounds than EM.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from mapfusion.fastslam.motion import MotionNoise
+from mapfusion.se2 import Float
+from mapfusion.smoother.motion_posterior import MotionPosterior
+
+LEVELS = ("translation_m_per_sqrt_m", "rotation_rad_per_sqrt_m", "rotation_rad_per_sqrt_rad")
+# A round changes a level's square by no more than this: far off, the counts say too little.
+_MOST_CHANGE = 4.0
+# Below, a level is nothing to the filter, and its share can no longer be told from none.
+_LEAST_LEVEL = 1e-4
+# Disturbances that have to be told before a level is: of fewer its relative error is above 0.3.
+LEAST_TOLD = 5.0
+
+
+class Told(NamedTuple):
+    """What a smoothed log tells of the levels, in the order of `LEVELS`.
+
+    Attributes:
+        found: (3,) left sides: squares, in sigmas.
+        known: (3,) right sides: disturbances that the observations tell.
+    """
+
+    found: Float
+    known: Float
+
+    def __add__(self, other: tuple) -> "Told":
+        """Of two logs together."""
+        return Told(self.found + other[0], self.known + other[1])
+
+
+NOTHING = Told(np.zeros(3), np.zeros(3))
+
+
+def plain(motion: MotionNoise) -> MotionNoise:
+    """The noise with random walks alone: systematic errors are estimated, not covered."""
+    return replace(motion, scale_error=0, track_error=0, lateral_slip_m_per_rad=0)
+
+
+def told(
+    posterior: MotionPosterior, odometry: Float, information: Float, motion: MotionNoise
+) -> Told:
+    """What the disturbances of a log tell.
+
+    Args:
+        posterior: the disturbances.
+        odometry: (T, 3) increments.
+        information: (T - 1, 3) that they were smoothed with.
+        motion: the levels that it came from.
+    """
+    distance, angle = np.hypot(odometry[1:, 0], odometry[1:, 1]), np.abs(odometry[1:, 2])
+    amounts = np.stack([distance, distance, angle], axis=1)
+    parts = amounts * np.array([getattr(motion, name) for name in LEVELS]) ** 2
+    squares, tells = np.zeros(3), np.zeros(3)
+    found = posterior.mean**2 * information
+    known = np.clip(1 - posterior.variance * information, 0, 1)
+    for levels, axes in ((slice(0, 1), (0, 1)), (slice(1, 3), (2,))):
+        for axis in axes:
+            share = parts[:, levels] * information[:, axis, None]
+            squares[levels] += share.T @ found[:, axis]
+            tells[levels] += share.T @ known[:, axis]
+    return Told(squares, tells)
+
+
+def updated(motion: MotionNoise, of_all: Told) -> MotionNoise:
+    """The levels after a round; those that nothing is told about stay as they are."""
+    levels = {}
+    for name, found, known in zip(LEVELS, *of_all, strict=True):
+        before, ratio = getattr(motion, name), found / max(known, LEAST_TOLD)
+        factor = np.sqrt(np.clip(ratio, 1 / _MOST_CHANGE, _MOST_CHANGE))
+        levels[name] = max(float(before * factor), _LEAST_LEVEL) if known >= LEAST_TOLD else before
+    return replace(motion, **levels)
+
+
+def relative_errors(of_all: Told) -> Float:
+    """(3,) standard errors of the levels, as shares of them: of n squares, 1 / sqrt(2 n)."""
+    return 1 / np.sqrt(2 * np.maximum(of_all.known, 0.5))
