@@ -15,9 +15,16 @@ from mapfusion.errors import InputError
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.robot_log import RobotLog
 from mapfusion.se2 import IDENTITY, Float, compose
-from mapfusion.smoother import noise_levels
 from mapfusion.smoother.motion_posterior import motion_posterior
-from mapfusion.smoother.noise_levels import NOTHING, Told, plain, relative_errors, told, updated
+from mapfusion.smoother.noise_levels import (
+    LEVELS,
+    Told,
+    plain,
+    pooled,
+    relative_errors,
+    told,
+    updated,
+)
 from mapfusion.smoother.normal_equations import Estimate, odometry_information
 from mapfusion.smoother.odometry_error import OdometryError, sensitivity
 from mapfusion.smoother.residuals import first_points
@@ -27,16 +34,19 @@ from mapfusion.smoother.smooth import SmootherParameters
 
 # What is known of any odometry before: standard deviations of its constants. They hold those that
 # a log says nothing about, as of a robot that never turns, and weigh nothing beside one that does.
-_PRIOR = np.array([0.2, 0.5, 0.5, 0.3])
+# Wheels are measured to a hundredth; ranges with lasting errors would claim more than that.
+_PRIOR = np.array([0.01, 0.5, 0.5, 0.3])
 # Where smoothing starts: noise that most wheels stay below.
 _FIRST = MotionNoise(0.05, 0.1, 0.3, 0, 0, lateral_slip_m_per_rad=0)
-_CLOSE = 1.0  # squared sigmas that the next step of a round would move the path by
+_CLOSE = 1e-2  # squared sigmas that the next step of a round would move the path by
+# Rounds for each part of a log on the way to a first path: constants are soon well enough known.
+_PART_ROUNDS = 3
 _MOST_ROUNDS = 40
 # Rounds end where none changes a constant by more than this many of its standard errors, or a
 # level by more than this share of it.
-_SETTLED = 0.03
+_SETTLED = 0.1
 # A path is found first for so many frames with observations, then for so many times as many.
-_FIRST_FRAMES, _GROWTH = 60, 1.5
+_FIRST_FRAMES, _GROWTH = 30, 1.4
 
 
 @dataclass(frozen=True)
@@ -63,7 +73,7 @@ class Calibration:
     Attributes:
         robots: in the order of the logs.
         motion: noise of the corrected odometry, one for all robots.
-        relative_errors: (3,) of its levels in the order of `noise_levels.LEVELS`, standard errors
+        relative_errors: (3,) of its levels in the order of `LEVELS`, standard errors
             as shares of them.
         n_rounds: that it took.
     """
@@ -129,15 +139,15 @@ def calibrate(
         _begun(log, landmark, path, parameters, motion)
         for log, landmark, path in zip(logs, landmarks, paths, strict=True)
     ]
-    n_rounds, all_told = 0, NOTHING
-    for n_rounds in range(1, _MOST_ROUNDS + 1):
+    n_rounds = 0
+    while True:
+        n_rounds += 1
         rounds = [robot.round(motion) for robot in robots]
-        all_told = sum((each for each, _ in rounds), NOTHING)
+        all_told = pooled([each for each, _ in rounds])
         before, motion = motion, updated(motion, all_told)
-        levels = [[getattr(each, name) for name in noise_levels.LEVELS] for each in (before, motion)]
-        moved = max(max(step for _, step in rounds), *np.abs(np.log(levels[1]) - np.log(levels[0])))
+        moved = max(0.0, *(step for _, step in rounds), _change(before, motion))
         on_round(n_rounds, _MOST_ROUNDS)
-        if moved < _SETTLED:
+        if moved < _SETTLED or n_rounds == _MOST_ROUNDS:
             break
     calibrated = tuple(
         RobotCalibration(
@@ -149,6 +159,11 @@ def calibrate(
         for robot in robots
     )
     return Calibration(calibrated, motion, relative_errors(all_told), n_rounds)
+
+
+def _change(before: MotionNoise, after: MotionNoise) -> float:
+    """The largest relative change of a level."""
+    return max(abs(getattr(after, name) / getattr(before, name) - 1) for name in LEVELS)
 
 
 def _begun(
@@ -174,12 +189,14 @@ def _begun(
         n_frames = len(log) if whole else int(observed[n_seen]) + 1
         part = log if whole else log.until(n_frames)
         least = parameters.min_count if whole else 1
-        grown.log, grown.seen = part, sightings_of(
-            part, landmark[: len(part.observations)], least, stray=stray > 0
+        grown.log, grown.seen = (
+            part,
+            sightings_of(part, landmark[: len(part.observations)], least, stray=stray > 0),
         )
         odometry = OdometryError.of(grown.constants).corrected(part.odometry)
         grown.path = _extended(grown.path, odometry)
-        _checked(grown).round(motion)
+        for _ in range(_PART_ROUNDS):
+            _checked(grown).round(motion)
         if whole:
             return grown
         n_seen = int(n_seen * _GROWTH)

@@ -11,6 +11,7 @@ of the two (MacKay 1992, "Bayesian interpolation", eq. 4.9), which ends where th
 likelihood is stationary, in far fewer rounds than EM.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -35,17 +36,18 @@ class Told(NamedTuple):
     Attributes:
         found: (3,) left sides: squares, in sigmas.
         known: (3,) right sides: disturbances that the observations tell.
+        information: (3, 3) of the levels' logarithms: of each disturbance, 2 k^2 s_i s_j with the
+            share k = 1 - C / v of it that the observations tell.
     """
 
     found: Float
     known: Float
-
-    def __add__(self, other: tuple) -> "Told":
-        """Of two logs together."""
-        return Told(self.found + other[0], self.known + other[1])
+    information: Float
 
 
-NOTHING = Told(np.zeros(3), np.zeros(3))
+def pooled(of_each: Sequence[Told]) -> Told:
+    """What several logs tell together."""
+    return Told(*(np.sum(np.stack(values), axis=0) for values in zip(*of_each, strict=True)))
 
 
 def plain(motion: MotionNoise) -> MotionNoise:
@@ -67,7 +69,7 @@ def told(
     distance, angle = np.hypot(odometry[1:, 0], odometry[1:, 1]), np.abs(odometry[1:, 2])
     amounts = np.stack([distance, distance, angle], axis=1)
     parts = amounts * np.array([getattr(motion, name) for name in LEVELS]) ** 2
-    squares, tells = np.zeros(3), np.zeros(3)
+    squares, tells, information_of = np.zeros(3), np.zeros(3), np.zeros((3, 3))
     found = posterior.mean**2 * information
     known = np.clip(1 - posterior.variance * information, 0, 1)
     for levels, axes in ((slice(0, 1), (0, 1)), (slice(1, 3), (2,))):
@@ -75,13 +77,15 @@ def told(
             share = parts[:, levels] * information[:, axis, None]
             squares[levels] += share.T @ found[:, axis]
             tells[levels] += share.T @ known[:, axis]
-    return Told(squares, tells)
+            weighted = known[:, axis, None] * share
+            information_of[levels, levels] += 2 * weighted.T @ weighted
+    return Told(squares, tells, information_of)
 
 
 def updated(motion: MotionNoise, of_all: Told) -> MotionNoise:
     """The levels after a round; those that nothing is told about stay as they are."""
     levels = {}
-    for name, found, known in zip(LEVELS, *of_all, strict=True):
+    for name, found, known in zip(LEVELS, of_all.found, of_all.known, strict=True):
         before, ratio = getattr(motion, name), found / max(known, LEAST_TOLD)
         factor = np.sqrt(np.clip(ratio, 1 / _MOST_CHANGE, _MOST_CHANGE))
         levels[name] = max(float(before * factor), _LEAST_LEVEL) if known >= LEAST_TOLD else before
@@ -89,5 +93,5 @@ def updated(motion: MotionNoise, of_all: Told) -> MotionNoise:
 
 
 def relative_errors(of_all: Told) -> Float:
-    """(3,) standard errors of the levels, as shares of them: of n squares, 1 / sqrt(2 n)."""
-    return 1 / np.sqrt(2 * np.maximum(of_all.known, 0.5))
+    """(3,) standard errors of the levels, as shares of them; 1 of what nothing is told about."""
+    return np.sqrt(np.diag(np.linalg.inv(of_all.information + np.eye(3))))

@@ -73,7 +73,7 @@ def test_a_long_drive_needs_a_row_for_what_was_seen_lately(tiny_path: Path) -> N
 
 def test_shipped_scenarios_fit_into_4_gb() -> None:
     for path in (Path(__file__).parents[3] / "scenarios").glob("*.yaml"):
-        if path.stem != "mrclam7":  # its logs are not there
+        if path.stem not in ("mrclam7", "mrclam9"):  # their logs are not there
             require_memory(lay_out(load_scenario(path)), 2, 4 * GB)
 
 

@@ -1,0 +1,51 @@
+"""`mapfusion calibrate`: corrected logs beside the truth, and refusals in one line."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapfusion.robot_log import (
+    read_log,
+    read_truth,
+    write_log,
+    write_truth_points,
+    write_truth_poses,
+)
+from tests.helpers.tiny_scenario import assert_refused, command
+from tests.mapfusion.smoother.test_calibrate import planar_log
+
+
+@pytest.fixture
+def raw(tmp_path: Path) -> Path:
+    """A log with its truth, short."""
+    log = planar_log(np.random.default_rng(1), 60)
+    write_log(tmp_path / "raw", log)
+    write_truth_poses(tmp_path / "raw", np.full((60, 3), np.nan))
+    write_truth_points(tmp_path / "raw", np.full((len(log.observations), 3), 2.0))
+    return tmp_path / "raw"
+
+
+def test_corrected_logs_are_what_the_constants_say(
+    raw: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reply = command(capsys, "calibrate", raw, "-o", tmp_path / "logs", "--json")
+    assert reply.code == 0
+    (robot,) = json.loads(reply.out)["robots"]
+    before, after = read_log(raw), read_log(tmp_path / "logs" / "R1")
+    np.testing.assert_allclose(
+        after.odometry[:, :2], (1 + robot["distance"]) * before.odometry[:, :2]
+    )
+    np.testing.assert_array_equal(after.observations.position_m, before.observations.position_m)
+    assert np.all(read_truth(tmp_path / "logs" / "R1").point_world_m == 2.0)
+    shown = command(capsys, "calibrate", raw, "-o", tmp_path / "again").out
+    assert "rotation_rad_per_sqrt_rad" in shown
+    assert "R1" in shown
+
+
+def test_a_log_is_not_written_over(raw: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    own = raw.rename(raw.parent / "R1")
+    assert_refused(command(capsys, "calibrate", own, "-o", own.parent), "--output", "overwritten")
+    reply = command(capsys, "calibrate", own, own, "-o", own.parent / "logs")
+    assert_refused(reply, "R1", "more than one log")

@@ -1,0 +1,140 @@
+"""Calibration against logs whose constants and noise are known, and against dense algebra."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mapfusion.errors import InputError
+from mapfusion.fastslam.motion import MotionNoise
+from mapfusion.robot_log import Observations, RobotLog
+from mapfusion.se2 import Float, compose, rotation
+from mapfusion.smoother.calibrate import Calibration, calibrate
+from mapfusion.smoother.elimination import pose_point_blocks
+from mapfusion.smoother.motion_posterior import motion_posterior
+from mapfusion.smoother.noise_levels import LEVELS
+from mapfusion.smoother.normal_equations import (
+    Estimate,
+    disturbance_jacobians,
+    odometry_information,
+)
+from mapfusion.smoother.odometry_error import OdometryError, sensitivity
+from mapfusion.smoother.residuals import first_points
+from mapfusion.smoother.settle import Problem, settled
+from mapfusion.smoother.sightings import sightings_of
+from mapfusion.smoother.smooth import SmootherParameters
+from tests.mapfusion.smoother.white_noise_logs import dead_reckoned, white_noise_log
+
+TRUE = np.array([0.01, -0.12, 0.1, -0.04])
+NOISE = MotionNoise(0.04, 0.05, 0.08, 0, 0, lateral_slip_m_per_rad=0)
+RANGE_M, OBSERVED_M = 6.0, 0.03
+
+
+def planar_log(rng: np.random.Generator, n_frames: int = 400) -> RobotLog:
+    """A robot that wanders among landmarks all around, whose odometry errs as `TRUE` says."""
+    point = rng.uniform(-6, 6, (15, 2))
+    odometry = np.zeros((n_frames, 3))
+    odometry[1:, 0] = rng.choice([0.0, 0.1, 0.2], n_frames - 1)
+    odometry[1:, 2] = rng.choice([-0.4, -0.1, 0.0, 0.1, 0.4], n_frames - 1)
+    moved = OdometryError.of(TRUE).corrected(odometry)
+    path, rows = np.zeros((n_frames, 3)), []
+    for k in range(n_frames):
+        if k:
+            sigma = NOISE.standard_deviations(moved[k])
+            path[k] = compose(path[k - 1], moved[k] + sigma * rng.standard_normal(3))
+        local = (point - path[k, :2]) @ rotation(path[k, 2])
+        for label in rng.permutation(np.flatnonzero(np.hypot(*local.T) < RANGE_M))[:3]:
+            rows.append((k, label, *(local[label] + OBSERVED_M * rng.standard_normal(2))))
+    seen = np.array(rows)
+    position = np.column_stack([seen[:, 2:], np.zeros(len(seen))])
+    covariance = np.tile(OBSERVED_M**2 * np.eye(3), (len(seen), 1, 1))
+    observations = Observations(position, covariance, None, seen[:, 1].astype(np.int32))
+    time_s = np.arange(n_frames) * 1.0
+    return RobotLog("R1", True, time_s, odometry, seen[:, 0].astype(np.int64), observations)
+
+
+def calibrated(*logs: RobotLog) -> Calibration:
+    labels = [log.observations.label for log in logs]
+    assert all(label is not None for label in labels)
+    return calibrate(logs, labels, [None] * len(logs), SmootherParameters(stray_m=0))  # type: ignore[arg-type]
+
+
+def test_constants_and_levels_are_found_within_their_errors() -> None:
+    """Pooled over robots and seeds: squared errors in sigmas have the mean of a chi-square."""
+    z, levels = list[Float](), list[Float]()
+    for seed in range(4):
+        found = calibrated(*(planar_log(np.random.default_rng([seed, k]), 250) for k in range(2)))
+        z += [(each.error.constants - TRUE) / each.standard_errors for each in found.robots]
+        true = [getattr(NOISE, name) for name in LEVELS]
+        got = np.array([getattr(found.motion, name) for name in LEVELS])
+        levels.append(np.log(got / true) / found.relative_errors)
+        assert all(np.all(each.standard_errors < 0.05) for each in found.robots)
+    assert 0.4 < np.mean(np.square(z)) < 1.9  # 32 values: 99.9 %
+    assert 0.2 < np.mean(np.square(levels)) < 2.8  # 12 values
+
+
+def test_a_robot_s_calibration_does_not_change_while_it_stands() -> None:
+    """A log that goes on standing still tells the same of its odometry."""
+    log = planar_log(np.random.default_rng(3), 120)
+    idle = np.zeros((30, 3))
+    longer = replace(
+        log, time_s=np.arange(150) * 1.0, odometry=np.concatenate([log.odometry, idle])
+    )
+    a, b = calibrated(log), calibrated(longer)
+    for one, other in zip(a.robots, b.robots, strict=True):
+        off = np.abs(one.error.constants - other.error.constants) / one.standard_errors
+        assert np.all(off < 0.3)
+
+
+def test_a_correction_undoes_its_error() -> None:
+    odometry = np.random.default_rng(0).normal(0, 0.2, (6, 3))
+    odometry[:, 2] = 0.0
+    given = OdometryError(distance=0.25, bias_rad_per_m=0.5).corrected(odometry)
+    np.testing.assert_allclose(given[:, :2], 1.25 * odometry[:, :2])
+    np.testing.assert_allclose(given[:, 2], 0.5 * np.hypot(*odometry[:, :2].T))
+    turned = np.zeros((3, 3))
+    turned[1, 2] = 0.8
+    late = OdometryError(turn=-0.25, late_turn=0.25).corrected(turned)
+    np.testing.assert_allclose(late[:, 2], [0.0, 0.6, 0.2])
+
+
+def test_the_posterior_equals_dense_algebra() -> None:
+    """Variances of the disturbances, and the information on the constants, all unknowns at once."""
+    log = white_noise_log(np.random.default_rng(2), 30, 12, planar=True).log
+    label = log.observations.label
+    assert label is not None
+    seen = sightings_of(log, label, 1, stray=False)
+    information = odometry_information(log.odometry, MotionNoise())
+    path = dead_reckoned(log)
+    start = Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
+    end = settled(Problem(seen, log.odometry, information, 0.0), start)
+    by = sensitivity(log.odometry)[1:]
+    found = motion_posterior(end, log.odometry, information, by)
+
+    n, (B, K, _) = len(log) - 1, pose_point_blocks(seen, end.equations)
+    before, after = disturbance_jacobians(end.estimate.path)
+    D = np.zeros((n, 3, n, 3))
+    for k in range(n):
+        D[k, :, k] = after[k]
+        if k:
+            D[k, :, k - 1] = before[k]
+    D = D.reshape(3 * n, 3 * n)
+    H = np.zeros((n, 3, n, 3))
+    for k in range(n):
+        H[k, :, k] = end.equations.pose_block[k + 1]
+        if k:
+            H[k, :, k - 1] = end.equations.link[k]
+            H[k - 1, :, k] = end.equations.link[k].T
+    H = np.block([[H.reshape(3 * n, -1), B], [B.T, K]])
+    covariance = D @ np.linalg.inv(H)[: 3 * n, : 3 * n] @ D.T
+    np.testing.assert_allclose(found.variance.ravel(), np.diag(covariance), rtol=1e-7)
+    W, S = information.ravel(), by.reshape(3 * n, -1)
+    free = (S.T * W) @ S - (S.T * W) @ covariance @ (W[:, None] * S)
+    np.testing.assert_allclose(found.constants_information, free, rtol=1e-6, atol=1e-6)
+
+
+def test_a_log_that_saw_nothing_is_refused() -> None:
+    log = planar_log(np.random.default_rng(0), 20)
+    nothing = np.full(len(log.observations), -1)
+    with pytest.raises(InputError, match="R1"):
+        calibrate([log], [nothing], [dead_reckoned(log)], SmootherParameters())
