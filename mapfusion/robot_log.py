@@ -204,17 +204,6 @@ class RobotLog:
         """(T + 1,) row of each frame's first observation."""
         return np.searchsorted(self.iteration, np.arange(len(self) + 1))
 
-    def until(self, n_frames: int) -> "RobotLog":
-        """The log as it was after its first frames."""
-        n = int(np.searchsorted(self.iteration, n_frames))
-        return replace(
-            self,
-            time_s=self.time_s[:n_frames],
-            odometry=self.odometry[:n_frames],
-            iteration=self.iteration[:n],
-            observations=self.observations[:n],
-        )
-
 
 @dataclass(frozen=True)
 class RobotTruth:

@@ -13,6 +13,7 @@ import numpy as np
 from mapfusion.arguments import require_shape
 from mapfusion.errors import InputError
 from mapfusion.fastslam.motion import MotionNoise
+from mapfusion.log_part import first_frames
 from mapfusion.robot_log import RobotLog
 from mapfusion.se2 import IDENTITY, Float, compose
 from mapfusion.smoother.motion_posterior import motion_posterior
@@ -187,7 +188,7 @@ def _begun(
     while True:
         whole = n_seen >= len(observed)
         n_frames = len(log) if whole else int(observed[n_seen]) + 1
-        part = log if whole else log.until(n_frames)
+        part = log if whole else first_frames(log, n_frames)
         least = parameters.min_count if whole else 1
         grown.log, grown.seen = (
             part,

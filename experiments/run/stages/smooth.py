@@ -14,6 +14,7 @@ from experiments.run.frames import INT, fields
 from experiments.run.job import Job
 from experiments.run.stages.slam import associations_at, evaluated_iterations, final_path
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map
+from mapfusion.log_part import first_frames
 from mapfusion.robot_log import RobotLog, read_log
 from mapfusion.se2 import Float
 from mapfusion.smoother.elimination import matrix_bytes
@@ -84,17 +85,9 @@ def run(settings: SmoothSettings, job: Job) -> None:
 
 def log_until(log: RobotLog, iteration: int, noise_floor_m: float = 0.0) -> RobotLog:
     """A log as it was at an iteration, its observations as noisy as the filter takes them."""
-    n_frames = iteration + 1
-    n = int(np.searchsorted(log.iteration, n_frames))
-    seen = log.observations[:n]
-    covariance = seen.covariance_m2 + noise_floor_m**2 * np.eye(3)
-    return replace(
-        log,
-        time_s=log.time_s[:n_frames],
-        odometry=log.odometry[:n_frames],
-        iteration=log.iteration[:n],
-        observations=replace(seen, covariance_m2=covariance),
-    )
+    part = first_frames(log, iteration + 1)
+    covariance = part.observations.covariance_m2 + noise_floor_m**2 * np.eye(3)
+    return replace(part, observations=replace(part.observations, covariance_m2=covariance))
 
 
 def filtered_until(
