@@ -108,7 +108,7 @@ class _Robot:
         by_constants = sensitivity(self.log.odometry)[1:]
         posterior = motion_posterior(end, odometry, information, by_constants)
         known = posterior.constants_information + np.diag(_PRIOR**-2)
-        self.covariance = np.linalg.inv(known)
+        self.covariance = np.asarray(np.linalg.inv(known), np.float64)
         step = self.covariance @ (posterior.constants_gradient - self.constants / _PRIOR**2)
         self.constants = self.constants + step
         return told(posterior, odometry, information, motion), float(np.sqrt(step @ known @ step))

@@ -49,7 +49,7 @@ def planar_log(rng: np.random.Generator, n_frames: int = 400) -> RobotLog:
     position = np.column_stack([seen[:, 2:], np.zeros(len(seen))])
     covariance = np.tile(OBSERVED_M**2 * np.eye(3), (len(seen), 1, 1))
     observations = Observations(position, covariance, None, seen[:, 1].astype(np.int32))
-    time_s = np.arange(n_frames) * 1.0
+    time_s = np.arange(n_frames, dtype=np.float64)
     return RobotLog("R1", True, time_s, odometry, seen[:, 0].astype(np.int64), observations)
 
 
