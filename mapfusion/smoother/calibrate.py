@@ -39,7 +39,7 @@ from mapfusion.smoother.smooth import SmootherParameters
 _PRIOR = np.array([0.01, 0.5, 0.5, 0.3])
 # Where smoothing starts: noise that most wheels stay below.
 _FIRST = MotionNoise(0.05, 0.1, 0.3, 0, 0, lateral_slip_m_per_rad=0)
-_CLOSE = 1e-2  # squared sigmas that the next step of a round would move the path by
+_CLOSE = 1e-5  # squared sigmas a coordinate that the next step of a round would move the path by
 # Rounds for each part of a log on the way to a first path: constants are soon well enough known.
 _PART_ROUNDS = 3
 _MOST_ROUNDS = 40
