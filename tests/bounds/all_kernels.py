@@ -32,6 +32,7 @@ from tests.mapfusion.fastslam.test_particles import (
     test_without_landmarks_nothing_is_near,
 )
 from tests.mapfusion.fastslam.test_tracked import test_each_track_s_end_widens_its_landmark_once
+from tests.mapfusion.smoother.test_calibrate import test_the_posterior_equals_dense_algebra
 from tests.mapfusion.smoother.test_smooth import smoothed
 from tests.mapfusion.smoother.white_noise_logs import white_noise_log, with_tracks
 from tests.mapfusion.vision.rendered_scene import render, wall
@@ -52,6 +53,7 @@ def smoothers() -> None:
     for n_frames, n_landmarks, planar in ((12, 30, False), (40, 5, True)):
         rng = np.random.default_rng(3)
         smoothed(with_tracks(white_noise_log(rng, n_frames, n_landmarks, planar), rng, 0.05).log)
+    test_the_posterior_equals_dense_algebra()
 
 
 def alignments() -> None:
