@@ -1,4 +1,4 @@
-"""Commands that do one step on files: record, calibrate, slam, align, merge, import."""
+"""Commands that do one step on files: record, slam, align, merge, import."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -32,32 +32,6 @@ def record(
     with progress() as show:
         paths = single.record(loaded, output, results, jobs, show)
     print_paths(output, paths)
-
-
-@app.command(rich_help_panel=options.STEPS)
-def calibrate(
-    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Robot logs (folders).")],
-    *,
-    output: options.OutputFolder = None,
-    scenario: options.SettingsOf = None,
-    overrides: options.Overrides,
-    seed: options.Seed = None,
-    as_json: options.AsJson = False,
-) -> None:
-    """Correct odometry by what logs say of it: `mapfusion calibrate raw/robot* -o logs`."""
-    from experiments.judge.user_calibration import calibrated
-    from experiments.scenario.suite import settings_of
-    from experiments.show import json_document
-    from experiments.show.terminal import calibration_screen, layout
-
-    settings = settings_of(scenario, overrides, seed)
-    with layout.progress() as show:
-        found = calibrated(logs, output, settings, show)
-    written = [] if output is None else [output / each.robot for each in found.robots]
-    made = calibration_screen.document(found, written)
-    json_document.publish("calibrate", made, as_json)
-    if not as_json:
-        calibration_screen.print_calibration(found, written)
 
 
 @app.command(rich_help_panel=options.STEPS)

@@ -9,7 +9,7 @@ from experiments.cli import options
 
 app = typer.Typer()
 studies = typer.Typer(
-    no_args_is_help=True, help="Measure the methods themselves: refusal, times, costs."
+    no_args_is_help=True, help="Measure methods: refusal, times, costs; and odometry."
 )
 app.add_typer(studies, name="study", rich_help_panel=options.LOOK)
 
@@ -224,3 +224,29 @@ def independence(
         found = independence_trial.run_independence(loaded, sizes, store, jobs, show)
         skipped = write_independence(folder, loaded, found)
     study_screen.print_independence(folder, independence_trial.at_the_end(found), skipped)
+
+
+@studies.command()
+def calibrate(
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Robot logs (folders).")],
+    *,
+    output: options.OutputFolder = None,
+    scenario: options.SettingsOf = None,
+    overrides: options.Overrides,
+    seed: options.Seed = None,
+    as_json: options.AsJson = False,
+) -> None:
+    """Correct odometry by what logs say of it: `mapfusion study calibrate raw/robot* -o logs`."""
+    from experiments.judge.user_calibration import calibrated
+    from experiments.scenario.suite import settings_of
+    from experiments.show import json_document
+    from experiments.show.terminal import calibration_screen, layout
+
+    settings = settings_of(scenario, overrides, seed)
+    with layout.progress() as show:
+        found = calibrated(logs, output, settings, show)
+    written = [] if output is None else [output / each.robot for each in found.robots]
+    made = calibration_screen.document(found, written)
+    json_document.publish("calibrate", made, as_json)
+    if not as_json:
+        calibration_screen.print_calibration(found, written)

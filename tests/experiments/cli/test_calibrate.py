@@ -1,4 +1,4 @@
-"""`mapfusion calibrate`: corrected logs beside the truth, and refusals in one line."""
+"""`mapfusion study calibrate`: corrected logs beside the truth, and refusals in one line."""
 
 import json
 from pathlib import Path
@@ -30,7 +30,7 @@ def raw(tmp_path: Path) -> Path:
 def test_corrected_logs_are_what_the_constants_say(
     raw: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    reply = command(capsys, "calibrate", raw, "-o", tmp_path / "logs", "--json")
+    reply = command(capsys, "study", "calibrate", raw, "-o", tmp_path / "logs", "--json")
     assert reply.code == 0
     (robot,) = json.loads(reply.out)["robots"]
     before, after = read_log(raw), read_log(tmp_path / "logs" / "R1")
@@ -39,13 +39,15 @@ def test_corrected_logs_are_what_the_constants_say(
     )
     np.testing.assert_array_equal(after.observations.position_m, before.observations.position_m)
     assert np.all(read_truth(tmp_path / "logs" / "R1").point_world_m == 2.0)
-    shown = command(capsys, "calibrate", raw, "-o", tmp_path / "again").out
+    shown = command(capsys, "study", "calibrate", raw, "-o", tmp_path / "again").out
     assert "rotation_rad_per_sqrt_rad" in shown
     assert "R1" in shown
 
 
 def test_a_log_is_not_written_over(raw: Path, capsys: pytest.CaptureFixture[str]) -> None:
     own = raw.rename(raw.parent / "R1")
-    assert_refused(command(capsys, "calibrate", own, "-o", own.parent), "--output", "overwritten")
-    reply = command(capsys, "calibrate", own, own, "-o", own.parent / "logs")
+    assert_refused(
+        command(capsys, "study", "calibrate", own, "-o", own.parent), "--output", "overwritten"
+    )
+    reply = command(capsys, "study", "calibrate", own, own, "-o", own.parent / "logs")
     assert_refused(reply, "R1", "more than one log")
