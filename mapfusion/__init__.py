@@ -31,7 +31,7 @@ _NAMES_OF = {
     "fuse.registry": ("make_fuser",),
     "merge": ("merge_maps",),
     "team.team_graph": ("Place", "TeamParameters", "Unconfirmed"),
-    "recordings.registry": ("import_recording",),
+    "recordings.registry": ("import_recording", "read_recording"),
     "smoother.recording": ("Recording",),
     "robot_log": ("Observations", "RobotLog", "read_log", "write_log"),
 }

@@ -28,6 +28,7 @@ from mapfusion.landmark_map import read_map as read_map
 from mapfusion.landmark_map import write_map as write_map
 from mapfusion.merge import merge as _merge
 from mapfusion.recordings.registry import import_recording as import_recording
+from mapfusion.recordings.registry import read_recording as read_recording
 from mapfusion.robot_log import Observations as Observations
 from mapfusion.robot_log import RobotLog as RobotLog
 from mapfusion.robot_log import read_log as read_log

@@ -8,7 +8,7 @@ import typer
 from typer.core import TyperGroup
 
 import mapfusion
-from experiments.cli import run_commands, step_commands, study_commands
+from experiments.cli import import_commands, run_commands, step_commands, study_commands
 from experiments.cli.options import (
     EXIT_BAD_INPUT,
     EXIT_DEFECT,
@@ -18,7 +18,6 @@ from experiments.cli.options import (
     complain,
 )
 from mapfusion.errors import InputError, one_line
-from mapfusion.recordings.registry import IMPORTERS
 
 REPLACED = {
     "aligners": "scenarios --aligners",
@@ -48,13 +47,7 @@ app = typer.Typer(
 )
 for commands in (run_commands, study_commands, step_commands):
     app.add_typer(commands.app)
-import_app = typer.Typer(
-    no_args_is_help=True, help="Turn recordings in foreign formats into robot logs."
-)
-for name, importer in IMPORTERS.items():
-    usage = f"`mapfusion import {name} {importer.example} -o logs/{name}`"
-    import_app.command(name, help=f"{importer.what}: {usage}.")(step_commands.import_command(name))
-app.add_typer(import_app, name="import", rich_help_panel=STEPS)
+app.add_typer(import_commands.app, name="import", rich_help_panel=STEPS)
 
 
 def _tell_version(wanted: bool) -> None:

@@ -1,13 +1,11 @@
-"""Commands that do one step on files: record, slam, align, merge, import."""
+"""Commands that do one step on files: record, slam, align, merge."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from experiments.cli import options
-from mapfusion.recordings.registry import import_recording, settings_class
 
 app = typer.Typer()
 
@@ -111,20 +109,3 @@ def merge(
             print_fused(path, fused, maps)
     if len(fusion.fused[0].members) < 2:
         options.complain("warning: no two maps were merged")
-
-
-def import_command(format_name: str) -> Callable[..., None]:
-    """The command that reads recordings of one format; `--param` takes what its settings have."""
-
-    def command(
-        folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="The recording.")],
-        output: options.Output,
-        overrides: options.ImportOverrides,
-    ) -> None:
-        from experiments.scenario.loading import made_settings
-        from experiments.show.terminal.layout import print_paths
-
-        settings = made_settings(format_name, settings_class(format_name), overrides)
-        print_paths(output, import_recording(format_name, folder, output, settings))
-
-    return command

@@ -109,9 +109,15 @@ def scenario_of(data: dict[str, Any], where: str) -> AnyScenario:
     return _validated(where, Recording if recorded else Simulation, data)
 
 
-def made_settings(where: str, kind: type[S], overrides: Sequence[str]) -> S:
-    """Settings of that kind alone: defaults, with overrides; raises InputError."""
-    return _validated(where, kind, apply_overrides({}, overrides))
+def made_settings(
+    where: str, kind: type[S], overrides: Sequence[str], base: dict[str, Any] | None = None
+) -> S:
+    """Settings of that kind alone: defaults, or what `base` says, with overrides.
+
+    Raises:
+        InputError: one line that begins with `where`.
+    """
+    return _validated(where, kind, apply_overrides(base or {}, overrides))
 
 
 class _StepSettings(Scenario):

@@ -15,28 +15,39 @@ _MOST_BYTES = 4_000_000  # the largest resolved scenario of ours takes 0.03 of t
 _MOST_VALUES = 200_000  # with every alias written out
 _MOST_DEPTH = 50  # a scenario needs 8
 _TOO_DEEP = "nested too deeply, or holds itself"
+_OPENCV_HEADER = "%YAML:1.0"  # of its own dialect, which only looks like a YAML directive
 _LARGEST_INTEGER = 2**63  # what tables and other people's readers of JSON can hold
 
 
-def read_mapping(path: Path) -> dict[str, Any]:
-    """Read one YAML mapping; raises InputError that names the file and the line."""
+def read_mapping(
+    path: Path, what: str = "a scenario, for example quick.yaml", keys: str = "scenario keys"
+) -> dict[str, Any]:
+    """Read one YAML mapping, of `what` with its `keys`.
+
+    Raises:
+        InputError: names the file and the line.
+    """
     try:
         with path.open("rb") as file:  # not by its size: a pipe has none
             data = file.read(_MOST_BYTES + 1)
         text = data.decode("utf-8")
     except FileNotFoundError:
-        expected = "expected a scenario, for example quick.yaml"
-        raise InputError(f"{path}: no such file ({expected})") from None
+        raise InputError(f"{path}: no such file (expected {what})") from None
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read as UTF-8 text ({error})") from error
     if len(data) > _MOST_BYTES:
-        raise InputError(f"{path}: is larger than {_MOST_BYTES / 1e6:g} MB, no scenario is")
-    value = parse_value(text, str(path))
+        raise InputError(f"{path}: is larger than {_MOST_BYTES / 1e6:g} MB, none is")
+    value = parse_value(text.removeprefix(_OPENCV_HEADER), str(path))
     if not isinstance(value, dict):
         found = "nothing" if value is None else f"a {type(value).__name__}"
-        raise InputError(f"{path}: holds {found}, expected a mapping of scenario keys")
+        raise InputError(f"{path}: holds {found}, expected a mapping of {keys}")
     value.pop(SEAL, None)  # of a result's scenario.json, which may have been edited
     return value
+
+
+def read_calibration(path: Path) -> dict[str, Any]:
+    """Read a camera's calibration; raises InputError that names the file and the line."""
+    return read_mapping(path, "a calibration in YAML", "a calibration's keys")
 
 
 def parse_value(text: str, where: str) -> Any:

@@ -1,16 +1,23 @@
-"""Trajectories in the TUM format, as evo and others read them.
+"""Trajectories in the TUM format, as evo and others read and write them.
 
 One pose a line: time in seconds, position in metres, orientation as a quaternion with its real part
 last (Sturm et al. 2012, "A benchmark for the evaluation of RGB-D SLAM systems").
 """
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 
+from mapfusion import se3
 from mapfusion.arguments import require_shape
+from mapfusion.errors import InputError
+from mapfusion.recordings.text_tables import NS, timed_numbers
+from mapfusion.recordings.timed_poses import TimedPoses
 from mapfusion.se2 import Float
 
+# What lies under these names beside the pictures of a recording is read without being asked for.
+ODOMETRY_FILE, TRUTH_FILE = "odometry.tum", "truth.tum"
 _COLUMNS = "# timestamp_s tx_m ty_m tz_m qx qy qz qw"
 
 
@@ -28,3 +35,17 @@ def _lines(time_s: Float, T_frame_robot: Float) -> Iterator[str]:
     for when, (x, y, theta) in zip(time_s[known].tolist(), T_frame_robot[known], strict=True):
         qz, qw = float(np.sin(theta / 2)), float(np.cos(theta / 2))
         yield f"{when} {float(x)} {float(y)} 0 0 0 {qz} {qw}"
+
+
+def read_tum(path: Path) -> TimedPoses:
+    """A trajectory of the robot (x ahead, y left, z up) in whatever frame.
+
+    Raises:
+        InputError: the file is missing, damaged or foreign; names the line.
+    """
+    time_ns, values = timed_numbers(path, "a trajectory in the TUM format", 7, NS)
+    if not len(values):
+        raise InputError(f"{path}: holds no pose")
+    if not np.all(np.linalg.norm(values[:, 3:], axis=1) > 0):
+        raise InputError(f"{path}: holds a quaternion of length 0")
+    return TimedPoses(time_ns, se3.from_quaternions(values[:, :3], values[:, 3:]))

@@ -18,6 +18,7 @@ from mapfusion.vision.followed import Followed, Likeness, followed
 from mapfusion.vision.rigid_links import rigid_links
 
 _NO_MATCH = -1
+_ANY_RATIO = 1e6  # of two disparities: a limit that a long pause has left behind
 
 
 @dataclass(frozen=True)
@@ -87,14 +88,18 @@ class Tracker:
         self._previous: tuple[Features, Followed, Tracks] | None = None
         self._next_id = 0
 
-    def update(self, features: Features) -> Tracks:
-        """Tracks of this frame's features."""
+    def update(self, features: Features, steps: float = 1.0) -> Tracks:
+        """Tracks of this frame's features.
+
+        `steps` is how many usual steps of time have passed since the frame before: after a pause
+        the limits on shift and disparity allow as much more.
+        """
         n = len(features)
         source, points = np.full(n, _NO_MATCH), Followed.unseen(features)
         track_id, length = np.empty(n, np.int64), np.ones(n, np.int64)
         if self._previous is not None:
             before, points_before, tracks = self._previous
-            source = link(before, features, self.parameters)
+            source = link(before, features, self.parameters, steps)
             points, found = followed(points_before, before, features, source, self._likeness)
             source[~found] = _NO_MATCH
             rows = np.flatnonzero(found)
@@ -142,11 +147,13 @@ class Tracker:
         return tracks.length >= self.parameters.min_length
 
 
-def link(previous: Features, current: Features, parameters: TrackParameters) -> np.ndarray:
+def link(
+    previous: Features, current: Features, parameters: TrackParameters, steps: float = 1.0
+) -> np.ndarray:
     """For each feature of `current` (N,) its row in `previous`, or -1.
 
     Two features are linked when each is the other's nearest descriptor among those that the limits
-    on shift and disparity allow, and the distance is within its limit.
+    on shift and disparity allow over so many steps, and the distance is within its limit.
     """
     return _link(
         previous.uv_px,
@@ -155,9 +162,9 @@ def link(previous: Features, current: Features, parameters: TrackParameters) -> 
         current.uv_px,
         current.disparity_px,
         current.descriptor,
-        parameters.max_shift_u_px,
-        parameters.max_shift_v_px,
-        parameters.max_disparity_ratio,
+        steps * parameters.max_shift_u_px,
+        steps * parameters.max_shift_v_px,
+        min(parameters.max_disparity_ratio**steps, _ANY_RATIO),
         parameters.max_descriptor_distance**2,
     )
 

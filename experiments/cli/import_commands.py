@@ -1,0 +1,122 @@
+"""Commands that turn recordings in foreign formats into robot logs, one a format."""
+
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from experiments.cli import options
+from mapfusion.errors import InputError
+from mapfusion.recordings.registry import (
+    IMPORTERS,
+    import_recording,
+    read_recording,
+    robot_name,
+    settings_class,
+)
+
+if TYPE_CHECKING:
+    from mapfusion.recordings.stereo_import import Cut
+
+app = typer.Typer(
+    no_args_is_help=True, help="Turn recordings in foreign formats into robot logs."
+)
+Folder = Annotated[Path, typer.Argument(metavar="FOLDER", help="The recording.")]
+_CUT = re.compile(r"(?:(?P<name>[^=]*)=)?(?P<rows>-?\d*:-?\d*(?::\d*)?)")
+_NAME = re.compile("[A-Za-z0-9][A-Za-z0-9_-]{0,40}")  # as scenarios have it
+
+
+def _log_command(format_name: str) -> Callable[..., None]:
+    """The command that reads logs of one format; `--param` takes what its settings have."""
+
+    def command(
+        folder: Folder, output: options.Output, overrides: options.ImportOverrides
+    ) -> None:
+        from experiments.scenario.loading import made_settings
+        from experiments.show.terminal.layout import print_paths
+
+        settings = made_settings(format_name, settings_class(format_name), overrides)
+        print_paths(output, import_recording(format_name, folder, output, settings))
+
+    return command
+
+
+def _stereo_command(format_name: str) -> Callable[..., None]:
+    """The command that makes logs of stereo pictures of one format."""
+
+    def command(
+        folder: Folder,
+        output: options.Output,
+        overrides: options.ImportOverrides,
+        frames: Annotated[
+            list[str] | None,
+            typer.Option(
+                "--frames",
+                metavar="[NAME=]FROM:TO",
+                help="These pairs are a robot, as Python slices (FROM:TO:STEP, too); may be repeated.",
+            ),
+        ] = None,
+        odometry: Annotated[
+            Path | None,
+            typer.Option(help="Dead reckoning of the robot, a trajectory in the TUM format."),
+        ] = None,
+        truth: Annotated[
+            Path | None, typer.Option(help="True poses of the robot in the world, likewise.")
+        ] = None,
+        vision: Annotated[
+            list[str] | None,
+            typer.Option(
+                "--set",
+                metavar="KEY=VALUE",
+                help="Replaces a setting of the front end that follows from the camera, "
+                "e.g. vision.harris.max_corners=300.",
+            ),
+        ] = None,
+    ) -> None:
+        from experiments.run.stereo_logs import import_stereo
+        from experiments.scenario.loading import made_settings
+        from experiments.scenario.yaml_input import read_calibration
+        from experiments.show.terminal.import_screen import print_imported
+        from experiments.show.terminal.layout import progress
+
+        settings = made_settings(format_name, settings_class(format_name), overrides)
+        recording = read_recording(format_name, folder, settings, read_calibration)
+        cuts = _cuts(robot_name(recording.name), frames or ())
+        with progress() as show:
+            done = import_stereo(recording, output, cuts, (odometry, truth), vision or (), show)
+        print_imported(done)
+        if done.too_little:
+            options.complain(done.too_little[0])
+            raise typer.Exit(options.EXIT_FAILED)
+
+    return command
+
+
+def _cuts(recording: str, frames: Sequence[str]) -> "list[Cut]":
+    """Robots by what `--frames` says; raises InputError."""
+    from mapfusion.recordings.stereo_import import Cut
+
+    if not frames:
+        return [Cut(recording, slice(None))]
+    cuts = []
+    for number, text in enumerate(frames, start=1):
+        match = _CUT.fullmatch(text)
+        usual = recording if len(frames) == 1 else f"{recording}-{number}"
+        name = usual if match is None or match["name"] is None else match["name"]
+        if match is None or match["rows"].endswith(":0") or not _NAME.fullmatch(name):
+            expected = "[NAME=]FROM:TO or FROM:TO:STEP, for example R1=0:500"
+            raise InputError(f"--frames {text}: expected {expected}")
+        bounds = [int(part) if part else None for part in match["rows"].split(":")]
+        cuts.append(Cut(name, slice(*bounds)))
+    names = [cut.robot for cut in cuts]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise InputError(f"--frames: two robots are named {twice[0]}")
+    return cuts
+
+
+for _name, _importer in IMPORTERS.items():
+    _usage = f"`mapfusion import {_name} {_importer.example} -o logs/{_name}`"
+    _make = _stereo_command if _importer.stereo else _log_command
+    app.command(_name, help=f"{_importer.what}: {_usage}.")(_make(_name))

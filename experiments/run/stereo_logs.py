@@ -1,0 +1,82 @@
+"""Stereo recordings as logs, with the settings and files that a user gives."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+from experiments.scenario.loading import made_settings
+from mapfusion.recordings.stereo_import import Cut, Imported, StereoImport, write_imported
+from mapfusion.recordings.stereo_recording import StereoRecording
+from mapfusion.recordings.tum import read_tum
+from mapfusion.vision.frontend import FrontEndParameters
+
+
+@dataclass(frozen=True)
+class ImportedRecording:
+    """What was made of a recording.
+
+    Attributes:
+        recording: what was read.
+        camera: the rectified pair, as a line for people.
+        robots: their logs.
+        folders: where these are.
+    """
+
+    recording: StereoRecording
+    camera: str
+    robots: list[Imported]
+    folders: list[Path]
+
+    @property
+    def too_little(self) -> list[str]:
+        """Of each robot that carries too little to map, a line that says so."""
+        return [one.too_little for one in self.robots if one.too_little]
+
+
+@dataclass(frozen=True)
+class _Vision:
+    """The root of the keys that `--set` takes."""
+
+    vision: FrontEndParameters
+
+
+def import_stereo(
+    recording: StereoRecording,
+    destination: Path,
+    cuts: Sequence[Cut],
+    trajectories: tuple[Path | None, Path | None],
+    overrides: Sequence[str],
+    on_progress: Callable[[str, int, int], None],
+) -> ImportedRecording:
+    """Make and write the logs of a recording's robots.
+
+    Args:
+        recording: what was read.
+        destination: each robot's folder goes there.
+        cuts: the robots.
+        trajectories: files of odometry and truth in place of the recording's own.
+        overrides: `vision.KEY=VALUE`.
+        on_progress: told what is done.
+
+    Raises:
+        InputError: names file or setting; nothing is written then.
+    """
+    odometry, truth = (None if path is None else read_tum(path) for path in trajectories)
+    recording = replace(
+        recording,
+        odometry=recording.odometry if odometry is None else odometry,
+        truth=recording.truth if truth is None else truth,
+    )
+
+    def adjusted(derived: FrontEndParameters) -> FrontEndParameters:
+        return made_settings("--set", _Vision, overrides, {"vision": asdict(derived)}).vision
+
+    work = StereoImport(recording, adjusted)
+    robots = [work.log_of(cut, on_progress) for cut in cuts]
+    camera = work.camera
+    about = (
+        f"{camera.width_px}x{camera.height_px} px, f {camera.focal_px:.1f} px, "
+        f"baseline {camera.baseline_m:.3f} m, depths {work.vision.stereo.min_depth_m:.2g} to "
+        f"{work.vision.max_depth_m:.2g} m"
+    )
+    return ImportedRecording(recording, about, robots, write_imported(destination, robots))

@@ -1,0 +1,47 @@
+"""What `mapfusion import` shows of a stereo recording."""
+
+import numpy as np
+
+from experiments.run.stereo_logs import ImportedRecording
+from experiments.show.terminal.layout import print_lines, print_table
+from mapfusion.recordings.stereo_import import Imported
+
+_MOST_DROPPED = 5  # pictures that are named one by one
+_COLUMNS = [
+    ("robot", ""),
+    ("frames", "d"),
+    ("seconds", ".1f"),
+    ("way, m", ".1f"),
+    ("observations\na frame", ".0f"),
+    ("\nat least", "d"),
+    ("linked\n%", ".0f"),
+    ("truth", ""),
+]
+
+
+def print_imported(done: ImportedRecording) -> None:
+    """The camera, a line a robot, what was dropped, and where the logs are."""
+    recording = done.recording
+    print_lines([f"{recording.name}: {len(recording)} pairs; rectified {done.camera}"])
+    note = "median over the frames; linked: share of the features of the frame before"
+    print_table(_COLUMNS, [_row(one) for one in done.robots], "", note)
+    dropped = recording.dropped
+    print_lines(f"  dropped: {each}" for each in dropped[:_MOST_DROPPED])
+    if len(dropped) > _MOST_DROPPED:
+        print_lines([f"  dropped: {len(dropped) - _MOST_DROPPED} more"])
+    print_lines(map(str, done.folders))
+
+
+def _row(one: Imported) -> tuple[object, ...]:
+    log, seen = one.log, one.observations
+    known = 0 if one.truth is None else int(np.isfinite(one.truth).all(axis=1).sum())
+    return (
+        log.robot,
+        len(log),
+        float(log.time_s[-1] - log.time_s[0]),
+        float(np.hypot(*log.odometry[:, :2].T).sum()),
+        float(np.median(seen)),
+        int(seen.min()),
+        100 * float(np.nanmedian(one.linked)),
+        f"{known} frames" if known else "none",
+    )

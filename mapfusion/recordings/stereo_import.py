@@ -1,0 +1,173 @@
+"""Stereo recordings as robot logs: rectified, tracked, levelled by the mount, cut into robots."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mapfusion import se3
+from mapfusion.camera import StereoCamera
+from mapfusion.errors import InputError
+from mapfusion.recordings.derived_vision import derived_vision, seen_depths, with_window_for
+from mapfusion.recordings.mount import levelled
+from mapfusion.recordings.pictures import sampled
+from mapfusion.recordings.rectify import Rectification
+from mapfusion.recordings.stereo_recording import StereoRecording
+from mapfusion.robot_log import TRUTH_FILES, RobotLog, write_log, write_truth_poses
+from mapfusion.se2 import Float
+from mapfusion.vision.frontend import FrontEnd, FrontEndParameters
+from mapfusion.vision.observing import Observer, joined
+from mapfusion.vision.row_errors import row_errors
+
+# Windows of the row search are 17 px: what lies a row off is found there still, two rows cost
+# half of the matches.
+_MOST_ROWS_OFF = 1.0
+_LEAST_MATCHES = 20  # corners whose median row error is worth a refusal
+_LONGEST_ODOMETRY_GAP_S = 1.0  # over which a trajectory is interpolated: wheels report often
+_LONGEST_TRUTH_GAP_S = 0.1  # as in MRCLAM's recordings: the truth must not be guessed
+_LEAST_OBSERVATIONS = 4  # a frame: one more than fix a motion
+
+OnProgress = Callable[[str, int, int], None]
+Vision = Callable[[FrontEndParameters], FrontEndParameters]
+
+
+@dataclass(frozen=True)
+class Cut:
+    """A robot, and which pairs of the recording are its frames."""
+
+    robot: str
+    rows: slice
+
+
+@dataclass(frozen=True)
+class Imported:
+    """What became of one robot's frames.
+
+    Attributes:
+        log: as written.
+        truth: (T, 3) T_world_robot, or None.
+        linked: (T,) share of the features of the frame before that were found again; NaN for the
+            first frame.
+    """
+
+    log: RobotLog
+    truth: Float | None
+    linked: Float
+
+    @property
+    def observations(self) -> np.ndarray:
+        """(T,) how many each frame has."""
+        return np.diff(self.log.frame_starts())
+
+    @property
+    def too_little(self) -> str:
+        """Why nothing can be mapped with it; empty where it can."""
+        usual = float(np.median(self.observations))
+        if usual >= _LEAST_OBSERVATIONS:
+            return ""
+        seen = f"{usual:g} observations a frame (median), {_LEAST_OBSERVATIONS} are the least"
+        return f"{self.log.robot}: too little to map: {seen}"
+
+
+class StereoImport:
+    """One recording on its way into logs: its camera, and the settings of the front end.
+
+    Args:
+        recording: what was read.
+        adjust: from settings that follow from the camera and what it sees to those to be used.
+
+    Raises:
+        InputError: no camera can be made of the calibration, pictures have another size, or their
+            rows do not fit.
+    """
+
+    def __init__(self, recording: StereoRecording, adjust: Vision = lambda vision: vision) -> None:
+        self._recording = recording
+        try:
+            self._rectification = Rectification.of(recording.calibration)
+        except InputError as error:
+            raise InputError(f"{recording.name}: {error}") from error
+        self.camera: StereoCamera = self._rectification.camera
+        pairs = [self._pair(k) for k in sampled(len(recording))]
+        derived = derived_vision(self.camera)
+        self._require_rows(pairs, derived)
+        depth_m = seen_depths(self.camera, derived, pairs)
+        self.vision = adjust(with_window_for(derived, self.camera, depth_m))
+        turn = se3.pose(self._rectification.R_left_rectified, np.zeros(3))
+        self.T_robot_camera: Float = recording.T_robot_left @ turn
+
+    def _pair(self, k: int) -> tuple[np.ndarray, np.ndarray]:
+        try:
+            return self._rectification.apply(self._recording.pair(k))
+        except InputError as error:
+            raise InputError(f"{self._recording.name}, pair {k}: {error}") from error
+
+    def _require_rows(
+        self, pairs: Sequence[tuple[np.ndarray, np.ndarray]], vision: FrontEndParameters
+    ) -> None:
+        off = np.concatenate([row_errors(*pair, vision.harris) for pair in pairs])
+        rows = float(np.median(np.abs(off))) if len(off) >= _LEAST_MATCHES else 0.0
+        if rows > _MOST_ROWS_OFF:
+            found = f"points lie {rows:.1f} rows apart in the two images (median of {len(off)})"
+            remedy = "the pair is not rectified, or its calibration is another's"
+            raise InputError(f"{self._recording.name}: {found}; {remedy}")
+
+    def log_of(self, cut: Cut, on_progress: OnProgress = lambda *_: None) -> Imported:
+        """The log of one robot, with its truth.
+
+        Raises:
+            InputError: fewer than two frames, or no odometry for one of them.
+        """
+        rows = range(len(self._recording))[cut.rows]
+        if len(rows) < 2:
+            found = f"frames of {cut.robot} are {len(rows)} of {len(self._recording)} pairs"
+            raise InputError(f"{self._recording.name}: {found}; 2 are the least")
+        time_ns = self._recording.time_ns[rows]
+        odometry, truth = self._odometry(time_ns), self._truth(time_ns)
+        steps = np.diff(time_ns) / np.median(np.diff(self._recording.time_ns))
+        front_end = FrontEnd(self.camera, self.vision)
+        observer = Observer.of(self.camera, self.vision)
+        observed, linked, before = [], [np.nan], 0
+        for n, k in enumerate(rows):
+            found = front_end.extract(*self._pair(k))
+            frame = observer.observe(found, float(steps[n - 1]) if n else 1.0)
+            if n:
+                linked.append(float(np.sum(frame.tracks.length > 1)) / max(before, 1))
+            before = len(found)
+            observed.append(levelled(frame.observations, self.camera, self.T_robot_camera))
+            on_progress(f"{cut.robot}: track features", n + 1, len(rows))
+        time_s = (time_ns - self._recording.time_ns[0]) / 1e9
+        log = RobotLog(cut.robot, False, time_s, odometry, *joined(observed))
+        return Imported(log, truth, np.array(linked))
+
+    def _odometry(self, time_ns: np.ndarray) -> Float:
+        """Increments (T, 3) between frames, of the recorded dead reckoning."""
+        recorded = self._recording.odometry
+        if recorded is None:
+            raise InputError(f"{self._recording.name}: has no odometry; give --odometry FILE.tum")
+        T = recorded.at(time_ns, _LONGEST_ODOMETRY_GAP_S)
+        unknown = np.flatnonzero(np.isnan(T[:, 0, 0]))
+        if len(unknown):
+            when = f"{(int(time_ns[unknown[0]]) - int(self._recording.time_ns[0])) / 1e9:g} s"
+            missing = f"at {len(unknown)} of {len(T)} frames, the first {when} after the beginning"
+            raise InputError(f"{self._recording.name}: no odometry {missing}")
+        increments = np.zeros((len(T), 3))
+        increments[1:] = se3.planar(se3.between(T[:-1], T[1:]))
+        return increments
+
+    def _truth(self, time_ns: np.ndarray) -> Float | None:
+        truth = self._recording.truth
+        return None if truth is None else se3.planar(truth.at(time_ns, _LONGEST_TRUTH_GAP_S))
+
+
+def write_imported(destination: Path, imported: Sequence[Imported]) -> list[Path]:
+    """Write the logs, with the truth beside them, to folders named by robot; returns these."""
+    folders = [destination / one.log.robot for one in imported]
+    for folder, one in zip(folders, imported, strict=True):
+        write_log(folder, one.log)
+        for outdated in TRUTH_FILES:  # of an import into the same folder
+            (folder / outdated).unlink(missing_ok=True)
+        if one.truth is not None:
+            write_truth_poses(folder, one.truth)
+    return folders

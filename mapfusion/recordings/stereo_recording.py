@@ -1,0 +1,112 @@
+"""A stereo recording in memory: pairs of pictures in time, a calibration, and what came with it."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mapfusion.errors import InputError
+from mapfusion.recordings.lens import StereoCalibration
+from mapfusion.recordings.pictures import Load, eight_bit, sampled, unused_bits
+from mapfusion.recordings.timed_poses import TimedPoses
+from mapfusion.se2 import Float
+
+# The library reads no YAML itself: whoever calls hands in a function from a path to its mapping,
+# which raises InputError.
+ReadYaml = Callable[[Path], Mapping[str, Any]]
+# Pictures of one pair: at 1 rad/s and a focal length of 500 px, 2 ms are a pixel.
+MOST_APART_NS = 2_000_000
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One picture of one camera: when, what it is called in messages, and how to load it."""
+
+    time_ns: int
+    name: str
+    load: Load
+
+
+@dataclass(frozen=True)
+class StereoRecording:
+    """What an importer of stereo recordings reads.
+
+    Attributes:
+        name: of the recording.
+        time_ns: (T,) int64, increasing, of each pair.
+        pictures: T pairs, loaded when they are called for.
+        calibration: of the pair as it is recorded.
+        T_robot_left: (4, 4) mount of the left camera as recorded; axes x ahead, y left, z up.
+        truth: T_world_robot, where it is known.
+        odometry: T_start_robot by dead reckoning, where it was recorded.
+        dropped: pictures without a partner, and why, for people.
+    """
+
+    name: str
+    time_ns: np.ndarray
+    pictures: Sequence[tuple[Load, Load]]
+    calibration: StereoCalibration
+    T_robot_left: Float
+    truth: TimedPoses | None = None
+    odometry: TimedPoses | None = None
+    dropped: tuple[str, ...] = ()
+    _shift: list[int] = field(default_factory=list, repr=False)
+
+    def __len__(self) -> int:
+        """Number of pairs."""
+        return len(self.pictures)
+
+    def pair(self, k: int) -> tuple[np.ndarray, np.ndarray]:
+        """Raw pictures (H, W) uint8 of pair k; raises InputError that names the file."""
+        if not self._shift:  # one for all, so that the same grey means the same light
+            both = [load for n in sampled(len(self)) for load in self.pictures[n]]
+            self._shift.append(unused_bits(both))
+        left, right = (eight_bit(load(), self._shift[0]) for load in self.pictures[k])
+        return left, right
+
+    def __iter__(self) -> Iterator[tuple[float, np.ndarray, np.ndarray]]:
+        """Seconds since the first pair, and the raw pictures, pair by pair."""
+        for k in range(len(self)):
+            yield (int(self.time_ns[k]) - int(self.time_ns[0])) / 1e9, *self.pair(k)
+
+
+def paired(
+    left: Sequence[Shot], right: Sequence[Shot], most_apart_ns: int = MOST_APART_NS
+) -> tuple[np.ndarray, list[tuple[Load, Load]], tuple[str, ...]]:
+    """Pictures of two cameras that were taken together, each camera's in the order of time.
+
+    Returns:
+        Times (T,) of the left ones, the pairs, and what was dropped, and why.
+
+    Raises:
+        InputError: there are no two pairs.
+    """
+    left_ns, right_ns = (np.array([shot.time_ns for shot in s], np.int64) for s in (left, right))
+    partner, back = _nearest(left_ns, right_ns), _nearest(right_ns, left_ns)
+    both = [
+        (i, j)
+        for i, j in enumerate(partner.tolist())
+        if back[j] == i and abs(int(right_ns[j]) - int(left_ns[i])) <= most_apart_ns
+    ]
+    if len(both) < 2:
+        found = f"{len(left)} pictures of the left camera and {len(right)} of the right one"
+        raise InputError(
+            f"{found} make {len(both)} pairs within {most_apart_ns / 1e6:g} ms; 2 are the least"
+        )
+    alone = f"no partner within {most_apart_ns / 1e6:g} ms"
+    paired_left, paired_right = (set(rows) for rows in zip(*both, strict=True))
+    dropped = [f"{s.name} ({alone})" for i, s in enumerate(left) if i not in paired_left]
+    dropped += [f"{s.name} ({alone})" for j, s in enumerate(right) if j not in paired_right]
+    pictures = [(left[i].load, right[j].load) for i, j in both]
+    return left_ns[[i for i, _ in both]], pictures, tuple(dropped)
+
+
+def _nearest(these: np.ndarray, those: np.ndarray) -> np.ndarray:
+    """For each of these times (N,) the row of the nearest of those (M,), both increasing."""
+    if not len(those):
+        return np.empty(0, dtype=np.int64)
+    after = np.clip(np.searchsorted(those, these), 0, len(those) - 1)
+    before = np.maximum(after - 1, 0)
+    return np.where(np.abs(those[before] - these) <= np.abs(those[after] - these), before, after)

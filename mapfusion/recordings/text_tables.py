@@ -1,0 +1,84 @@
+"""Text files of recordings: rows of words, numbers and times, refused by file and line."""
+
+from collections.abc import Iterator
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+
+from mapfusion.errors import InputError
+from mapfusion.se2 import Float
+
+NS = 1_000_000_000  # in a second
+_LATEST_NS = 2**62  # the year 2116, from 1970; sums of two fit 64 bits
+_LARGEST = 1e12  # any number
+
+
+def rows_of(path: Path, what: str, separator: str | None = None) -> Iterator[tuple[int, list[str]]]:
+    """Line number and words of each line that is neither empty nor a comment (#).
+
+    Raises:
+        InputError: there is no such file (`what` it is), or it is no text.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file ({what})") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not a readable text file ({what})") from error
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = [word.strip() for word in line.split(separator)]
+        if any(words) and not words[0].startswith("#"):
+            yield number, words
+
+
+def numbers(path: Path, line: int, words: list[str], n: int) -> list[float]:
+    """The n numbers of a line; raises InputError for another count, no numbers, or huge ones."""
+    if len(words) != n:
+        raise InputError(f"{path}, line {line}: has {len(words)} columns, expected {n}")
+    try:
+        found = [float(word) for word in words]
+    except ValueError:
+        raise InputError(f"{path}, line {line}: not a number in {' '.join(words)!r}") from None
+    if not all(abs(each) <= _LARGEST for each in found):  # NaN is not
+        raise InputError(f"{path}, line {line}: not finite, or above {_LARGEST:g}")
+    return found
+
+
+def time_in_ns(path: Path, line: int, word: str, unit_ns: int) -> int:
+    """A time as written, in whole nanoseconds; `unit_ns` of its unit. Raises InputError."""
+    try:
+        time_ns = int((Decimal(word) * unit_ns).to_integral_value())
+    except (InvalidOperation, ValueError, OverflowError):
+        raise InputError(f"{path}, line {line}: {word!r} is no time") from None
+    if abs(time_ns) > _LATEST_NS:
+        raise InputError(f"{path}, line {line}: {word} is beyond all clocks; another unit?")
+    return time_ns
+
+
+def require_increasing(path: Path, lines: list[int], time_ns: np.ndarray) -> None:
+    """Raise InputError for the first line whose time is not after that of the line before."""
+    wrong = np.flatnonzero(np.diff(time_ns) <= 0)
+    if len(wrong):
+        k = int(wrong[0]) + 1
+        step_s = (int(time_ns[k]) - int(time_ns[k - 1])) / NS
+        back = "repeats the time before" if step_s == 0 else f"runs back by {-step_s:g} s"
+        raise InputError(f"{path}, line {lines[k]}: {back}; times must increase")
+
+
+def timed_numbers(
+    path: Path, what: str, n: int, unit_ns: int, separator: str | None = None
+) -> tuple[np.ndarray, Float]:
+    """Times (N,) int64 ns and the n numbers (N, n) behind them, of lines in the order of time.
+
+    Raises:
+        InputError: names file and line.
+    """
+    lines, times, values = [], [], []
+    for line, words in rows_of(path, what, separator):
+        lines.append(line)
+        times.append(time_in_ns(path, line, words[0], unit_ns))
+        values.append(numbers(path, line, words[1:], n))
+    time_ns = np.array(times, dtype=np.int64)
+    require_increasing(path, lines, time_ns)
+    return time_ns, np.array(values, dtype=np.float64).reshape(-1, n)
