@@ -1,4 +1,4 @@
-"""Poses and rigid motions of space, as homogeneous matrices (..., 4, 4), and what is planar in them."""
+"""Poses and rigid motions of space, as matrices (..., 4, 4), and what is planar in them."""
 
 import numpy as np
 from numpy.typing import ArrayLike

@@ -20,9 +20,7 @@ from mapfusion.recordings.registry import (
 if TYPE_CHECKING:
     from mapfusion.recordings.stereo_import import Cut
 
-app = typer.Typer(
-    no_args_is_help=True, help="Turn recordings in foreign formats into robot logs."
-)
+app = typer.Typer(no_args_is_help=True, help="Turn recordings in foreign formats into robot logs.")
 Folder = Annotated[Path, typer.Argument(metavar="FOLDER", help="The recording.")]
 _CUT = re.compile(r"(?:(?P<name>[^=]*)=)?(?P<rows>-?\d*:-?\d*(?::\d*)?)")
 _NAME = re.compile("[A-Za-z0-9][A-Za-z0-9_-]{0,40}")  # as scenarios have it
@@ -31,9 +29,7 @@ _NAME = re.compile("[A-Za-z0-9][A-Za-z0-9_-]{0,40}")  # as scenarios have it
 def _log_command(format_name: str) -> Callable[..., None]:
     """The command that reads logs of one format; `--param` takes what its settings have."""
 
-    def command(
-        folder: Folder, output: options.Output, overrides: options.ImportOverrides
-    ) -> None:
+    def command(folder: Folder, output: options.Output, overrides: options.ImportOverrides) -> None:
         from experiments.scenario.loading import made_settings
         from experiments.show.terminal.layout import print_paths
 
@@ -55,7 +51,7 @@ def _stereo_command(format_name: str) -> Callable[..., None]:
             typer.Option(
                 "--frames",
                 metavar="[NAME=]FROM:TO",
-                help="These pairs are a robot, as Python slices (FROM:TO:STEP, too); may be repeated.",
+                help="Pairs that are a robot, as a slice of Python (FROM:TO:STEP); may be repeated.",
             ),
         ] = None,
         odometry: Annotated[

@@ -85,7 +85,7 @@ def section(where: Path, document: Mapping[str, Any], key: str) -> Mapping[str, 
 def _numbers(
     where: str, camera: Mapping[str, Any], key: str, n: int | None, names: tuple[str, ...]
 ) -> list[float]:
-    value = camera.get(key)
+    value: Any = camera.get(key)
     is_list = isinstance(value, list) and all(
         isinstance(each, int | float) and not isinstance(each, bool) for each in value
     )

@@ -33,7 +33,10 @@ def derived_vision(camera: StereoCamera) -> FrontEndParameters:
     tracks = replace(
         usual.tracks,
         max_shift_u_px=usual.tracks.max_shift_u_px * wide,
-        max_shift_v_px=usual.tracks.max_shift_v_px * _ROBOT_STEP * camera.height_px / _USUAL.height_px,
+        max_shift_v_px=usual.tracks.max_shift_v_px
+        * _ROBOT_STEP
+        * camera.height_px
+        / _USUAL.height_px,
         max_disparity_ratio=usual.tracks.max_disparity_ratio**_ROBOT_STEP,
     )
     return replace(

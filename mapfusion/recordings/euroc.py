@@ -2,9 +2,9 @@
 
 Burri et al. (2016), "The EuRoC micro aerial vehicle datasets". A folder `mav0`, or the one above:
 
-- `cam0` (left), `cam1` (right): `data.csv` (timestamp in ns, file name), the pictures in `data/`, and
-  `sensor.yaml` with resolution, intrinsics, distortion and T_BS, which maps points of the camera
-  into the body's frame.
+- `cam0` (left), `cam1` (right): `data.csv` (timestamp in ns, file name), the pictures in `data/`,
+  and `sensor.yaml` with resolution, intrinsics, distortion and T_BS, which maps points of the
+  camera into the body's frame.
 - `state_groundtruth_estimate0/data.csv`: time in ns, position, quaternion (real part first) of the
   body and more that is not read; optional.
 - `odometry.tum`: dead reckoning of the robot's axes, which EuRoC has not; ours, optional.
@@ -59,10 +59,12 @@ def read_euroc(folder: Path, settings: EurocSettings, read_yaml: ReadYaml) -> St
     cameras = [root / "cam0", root / "cam1"]
     if not all((camera / "data.csv").is_file() for camera in cameras):
         raise InputError(f"{folder}: no cam0/data.csv and cam1/data.csv (a EuRoC recording's mav0)")
-    lenses, mounts = zip(*(_camera(camera / "sensor.yaml", read_yaml) for camera in cameras), strict=True)
+    lenses, mounts = zip(
+        *(_camera(camera / "sensor.yaml", read_yaml) for camera in cameras), strict=True
+    )
     T_left_right = se3.between(mounts[0], mounts[1])
     try:
-        calibration = StereoCalibration(*lenses, T_left_right)
+        calibration = StereoCalibration(lenses[0], lenses[1], T_left_right)
     except InputError as error:
         raise InputError(f"{root}: sensor.yaml of cam0 and cam1: {error}") from error
     (left, lost_left), (right, lost_right) = (_shots(camera) for camera in cameras)
@@ -74,7 +76,7 @@ def read_euroc(folder: Path, settings: EurocSettings, read_yaml: ReadYaml) -> St
     odometry = root / ODOMETRY_FILE
     states = root / _STATES / "data.csv"
     return StereoRecording(
-        folder.resolve().name if root == folder.resolve() / "mav0" else folder.resolve().name,
+        (root.resolve().parent if root.name == "mav0" else root.resolve()).name,
         time_ns,
         pictures,
         calibration,

@@ -1,15 +1,15 @@
-"""Stereo recordings as anybody may have them: two folders of pictures, or a list, and a calibration.
+"""Stereo recordings as anybody has them: two folders of pictures, or a list, and a calibration.
 
 - Two folders, `left` and `right` by default. Pictures are named by their time, in nanoseconds (15
-  digits or more) or in seconds (with a decimal point); or a file `times.txt` holds a time in seconds
-  for each picture of either folder, in the order of their names.
+  digits or more) or in seconds (with a decimal point); or a file `times.txt` holds a time in
+  seconds for each picture of either folder, in the order of their names.
 - In place of folders a list: a CSV file, a line a pair: time in seconds, file of the left picture,
   file of the right one; files are relative to the list.
 - The calibration is a YAML file as Kalibr writes it: `cam0` (left) and `cam1` (right) with
   `camera_model: pinhole`, `intrinsics`, `distortion_model` (`radtan`, `equidistant`, `none`),
-  `distortion_coeffs`, `resolution`, and `T_cn_cnm1` of `cam1`, which maps points of the left camera
-  into the right one's frame. `T_BS` of `cam0`, where it is there, maps points of the left camera into
-  the robot's frame.
+  `distortion_coeffs`, `resolution`, and `T_cn_cnm1` of `cam1`, which maps points of the left
+  camera into the right one's frame. `T_BS` of `cam0`, where it is there, maps points of the left
+  camera into the robot's frame.
 """
 
 import re
@@ -128,7 +128,9 @@ def _named(folder: Path, times: Path) -> list[Shot]:
     if times.is_file():
         rows = list(rows_of(times, "times of pictures"))
         if len(rows) != len(paths):
-            raise InputError(f"{times}: has {len(rows)} times for {len(paths)} pictures of {folder}")
+            raise InputError(
+                f"{times}: has {len(rows)} times for {len(paths)} pictures of {folder}"
+            )
         time_ns = [time_in_ns(times, line, words[0], NS) for line, words in rows]
         require_increasing(times, [line for line, _ in rows], np.array(time_ns, dtype=np.int64))
     else:

@@ -1,4 +1,4 @@
-"""How a camera is mounted on its robot, and observations of a tilted camera in the robot's frame."""
+"""How a camera is mounted on its robot, and what a tilted one sees in the robot's frame."""
 
 from dataclasses import dataclass, replace
 from typing import Annotated
@@ -47,7 +47,9 @@ class MountSettings:
         turned = [theirs if ours is None else ours for ours, theirs in own]
         moved = [
             theirs if ours is None else ours
-            for ours, theirs in zip((self.x_m, self.y_m, self.z_m), T_robot_left[:3, 3], strict=True)
+            for ours, theirs in zip(
+                (self.x_m, self.y_m, self.z_m), T_robot_left[:3, 3], strict=True
+            )
         ]
         if turned == angles.tolist():
             return pose(T_robot_left[:3, :3], moved)

@@ -18,6 +18,7 @@ from mapfusion.se2 import Float
 
 _SAME_PX = 0.01  # by which rows and focal lengths of a rectified pair may differ: a tenth of noise
 _WIDEST = 1.2  # tangent of half the angle of view; a pinhole's pixels beyond 50 degrees are smears
+_COS_APART = 0.7  # cosine of 45 degrees: cameras that both turn away further share no view
 _LEAST_SIDE_PX = 48  # corners keep 12 px from each border
 _BORDER_POINTS = 64  # of each edge of an image, to find what is inside both
 
@@ -43,7 +44,7 @@ class Rectification:
 
     @classmethod
     def of(cls, calibration: StereoCalibration) -> "Rectification":
-        """Raises InputError for a pair that cannot be rectified: no common view, one above other."""
+        """Raises InputError for a pair that cannot be rectified: there is no common view."""
         made = _cropped(calibration)
         return _drawn_anew(calibration) if made is None else made
 
@@ -116,10 +117,11 @@ def _drawn_anew(calibration: StereoCalibration) -> Rectification:
     left, right = calibration.left, calibration.right
     T_right_left = np.linalg.inv(calibration.T_left_right)
     # Only the rotations are taken; those do not depend on the lenses.
-    R_left, R_right, *_ = cv2.stereoRectify(
+    found = cv2.stereoRectify(
         np.eye(3), np.zeros(4), np.eye(3), np.zeros(4), (1, 1), T_right_left[:3, :3],
         np.ascontiguousarray(T_right_left[:3, 3]),
     )  # fmt: skip
+    R_left, R_right = (np.asarray(R, dtype=np.float64) for R in found[:2])
     f = float(np.mean([*left.focal_px, *right.focal_px]))
     reach = np.min([_reach(left, R_left), _reach(right, R_right)], axis=0)
     width, height = (int(np.floor(2 * f * each)) + 1 for each in reach)
@@ -128,7 +130,9 @@ def _drawn_anew(calibration: StereoCalibration) -> Rectification:
     camera = _camera(width, height, f, baseline)
     (cu, cv), K = camera.center_px, np.eye(3) * [f, f, 1.0]
     K[:2, 2] = cu, cv
-    maps = tuple(_maps(lens, R, K, (width, height)) for lens, R in ((left, R_left), (right, R_right)))
+    maps = tuple(
+        _maps(lens, R, K, (width, height)) for lens, R in ((left, R_left), (right, R_right))
+    )
     return Rectification(
         camera,
         R_ROBOT_OPTICAL @ R_left.T @ R_ROBOT_OPTICAL.T,
@@ -144,6 +148,8 @@ def _reach(lens: Lens, R: Float) -> Float:
     share = np.linspace(0, 1, _BORDER_POINTS)
     u, v = share * (width - 1), share * (height - 1)
     edges = [(0 * v, v), (0 * v + width - 1, v), (u, 0 * u), (u, 0 * u + height - 1)]
+    if R[2, 2] < _COS_APART:
+        return np.zeros(2)
     least = np.full(2, _WIDEST)
     for k, edge in enumerate(edges):
         rays = lens.rays(np.column_stack(edge)) @ R.T

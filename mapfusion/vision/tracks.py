@@ -18,7 +18,7 @@ from mapfusion.vision.followed import Followed, Likeness, followed
 from mapfusion.vision.rigid_links import rigid_links
 
 _NO_MATCH = -1
-_ANY_RATIO = 1e6  # of two disparities: a limit that a long pause has left behind
+_LONGEST_PAUSE = 50.0  # steps: after these no limit on shift or disparity is left
 
 
 @dataclass(frozen=True)
@@ -155,6 +155,7 @@ def link(
     Two features are linked when each is the other's nearest descriptor among those that the limits
     on shift and disparity allow over so many steps, and the distance is within its limit.
     """
+    steps = min(steps, _LONGEST_PAUSE)
     return _link(
         previous.uv_px,
         previous.disparity_px,
@@ -164,7 +165,7 @@ def link(
         current.descriptor,
         steps * parameters.max_shift_u_px,
         steps * parameters.max_shift_v_px,
-        min(parameters.max_disparity_ratio**steps, _ANY_RATIO),
+        parameters.max_disparity_ratio**steps,
         parameters.max_descriptor_distance**2,
     )
 

@@ -147,6 +147,20 @@ def test_each_limit_holds(
     assert source.tolist() == [0 if linked else -1]
 
 
+@pytest.mark.parametrize(
+    ("uv", "disparity", "steps"),
+    [((200.0, 100.0), 10.0, 2.0), ((100.0, 140.0), 10.0, 2.0), ((100.0, 100.0), 16.0, 2.0)],
+)
+def test_a_pause_widens_the_limits(uv: tuple[float, float], disparity: float, steps: float) -> None:
+    descriptor = unit(np.random.default_rng(0), 1)
+    before = features(np.array([[100.0, 100.0]]), descriptor)
+    after = features(np.array([uv]), descriptor, disparity)
+    limits = TrackParameters(max_shift_u_px=60, max_shift_v_px=25, max_disparity_ratio=1.3)
+    assert link(before, after, limits).tolist() == [-1]
+    assert link(before, after, limits, steps).tolist() == [0]
+    assert link(before, after, limits, 1e9).tolist() == [0]
+
+
 def test_of_two_claims_the_nearer_wins() -> None:
     descriptor = np.zeros((2, 64), np.float32)
     descriptor[:, 0] = 1

@@ -1,0 +1,89 @@
+"""Importing stereo pictures on the command line: robots by frames, the summary, exit codes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapfusion.robot_log import read_log
+from tests.helpers.tiny_scenario import assert_refused, command
+from tests.mapfusion.recordings.written_layouts import POSES, drive, tum_lines, write_kitti
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_kitti(tmp_path_factory.mktemp("kitti"), drive())
+
+
+def test_frames_cut_a_recording_into_robots(
+    sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = ("--frames", "A=0:3", "--frames", "1:", "--set", "vision.tracks.min_length=2")
+    reply = command(capsys, "import", "kitti", sequence, "-o", tmp_path, *own)
+    assert reply.code == 0, reply.err
+    assert {path.name for path in tmp_path.iterdir()} == {"A", "07-2"}
+    assert len(read_log(tmp_path / "A")) == 3
+    assert len(read_log(tmp_path / "07-2")) == 4
+    for words in ("07: 5 pairs", "240x180 px", "A ", "07-2", "3 frames", str(tmp_path / "A")):
+        assert words in reply.out
+
+
+def test_too_little_to_map_is_exit_code_1(
+    sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    few = ("--set", "vision.harris.max_corners=2")
+    reply = command(capsys, "import", "kitti", sequence, "-o", tmp_path, *few)
+    assert reply.code == 1
+    assert reply.complaints[-1].startswith("mapfusion: 07: too little to map: ")
+    assert len(reply.complaints) == 1
+
+
+def test_trajectories_are_taken_from_files(
+    sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "turned.tum"
+    path.write_text(tum_lines(0, POSES * [1, 1, -1]))
+    logs = tmp_path / "logs"
+    given = ("--odometry", path, "--truth", path, "--set", "vision.tracks.min_length=1")
+    assert command(capsys, "import", "kitti", sequence, "-o", logs, *given).code == 0
+    turned = read_log(logs / "07").odometry[:, 2]
+    np.testing.assert_allclose(turned[1:], -np.diff(POSES[:, 2]), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (("--frames", "3"), ["--frames 3", "FROM:TO"]),
+        (("--frames", "0:4:0"), ["--frames 0:4:0"]),
+        (("--frames", "a b=0:4"), ["--frames a b=0:4"]),
+        (("--frames", "A=0:2", "--frames", "A=2:4"), ["two robots are named A"]),
+        (("--frames", "4:"), ["07: frames of 07 are 1 of 5 pairs"]),
+        (("--set", "vision.haris.k=1"), ["haris", "harris"]),
+        (("--set", "harris.k=1"), ["vision"]),
+        (("--param", "cameras=red"), ["kitti: cameras", "grey"]),
+        (("--param", "mount.pitch_rad=3"), ["pitch_rad", "[-1.5, 1.5] rad"]),
+        (("--odometry", "none.tum"), ["none.tum: no such file"]),
+    ],
+)
+def test_what_is_wrong_is_one_line(
+    given: tuple[str, ...],
+    words: list[str],
+    sequence: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    reply = command(capsys, "import", "kitti", sequence, "-o", tmp_path / "logs", *given)
+    assert_refused(reply, *words)
+    assert not (tmp_path / "logs").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [("%YAML:1.0\ncam2: 1\n", "cam0: missing"), ("%YAML:1.0\n", "holds nothing"), ("[", "line")],
+)
+def test_a_calibration_that_is_none_is_one_line(
+    text: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "calibration.yaml").write_text(text)
+    reply = command(capsys, "import", "images", tmp_path, "-o", tmp_path / "logs")
+    assert_refused(reply, "calibration.yaml", words)

@@ -1,0 +1,120 @@
+"""Recordings that are damaged, foreign or contradict themselves: one line each, nothing written."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from mapfusion.errors import InputError
+from mapfusion.recordings.registry import import_recording
+from tests.mapfusion.recordings.written_layouts import (
+    WRITERS,
+    Pair,
+    drive,
+    read_yaml,
+    write_calibration,
+)
+
+
+@pytest.fixture(scope="module")
+def pairs() -> list[Pair]:
+    return drive()
+
+
+ONE_POSE = "1 0 0 0 0 1 0 0 0 0 1 0\n"
+SENSOR = "mav0/cam0/sensor.yaml"
+STATES = "mav0/state_groundtruth_estimate0/data.csv"
+
+
+def _draw(path: Path, side: int) -> None:
+    cv2.imwrite(str(path), np.zeros((side, side), np.uint8))
+
+
+def _edit(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+
+
+# Layout, what is done to its folder, and what must be said of it.
+DAMAGE: dict[str, tuple[str, Callable[[Path], Any], str]] = {
+    "no times": ("kitti", lambda f: (f / "times.txt").unlink(), "times.txt: no such file"),
+    "back": (
+        "kitti",
+        lambda f: (f / "times.txt").write_text("0\n.2\n.1\n.6\n1\n"),
+        "line 3: runs back",
+    ),
+    "few times": ("kitti", lambda f: (f / "times.txt").write_text("0\n"), "has 1 times, none for"),
+    "no number": ("kitti", lambda f: (f / "times.txt").write_text("0\nsoon\n"), "line 2: 'soon'"),
+    "no matrix": ("kitti", lambda f: (f / "calib.txt").write_text("P0: 1\n"), "no line P1:|12"),
+    "no folder": (
+        "kitti",
+        lambda f: (f / "image_1").rename(f / "other"),
+        "image_1: no such folder",
+    ),
+    "few poses": (
+        "kitti",
+        lambda f: (f.parents[1] / "poses/07.txt").write_text(ONE_POSE),
+        "has 1 poses for 5",
+    ),
+    "truncated": (
+        "kitti",
+        lambda f: (f / "image_0/000002.png").write_bytes(b"\x89PNG"),
+        "000002.png: damaged",
+    ),
+    "mixed sizes": (
+        "kitti",
+        lambda f: _draw(f / "image_1/000004.png", 99),
+        "pair 4: right image: is 99x99 px",
+    ),
+    "no calibration": ("euroc", lambda f: (f / "mav0/cam1/sensor.yaml").unlink(), "sensor.yaml"),
+    "no mount": ("euroc", lambda f: _edit(f / SENSOR, "T_BS:", "T_B:"), "T_BS"),
+    "model": (
+        "euroc",
+        lambda f: _edit(f / SENSOR, "model: pinhole", "model: omni"),
+        "only pinhole",
+    ),
+    "lens": ("euroc", lambda f: _edit(f / SENSOR, "radial-tangential", "fov"), "'fov' is unknown"),
+    "no cameras": ("euroc", lambda f: (f / "mav0").rename(f / "other"), "no cam0/data.csv"),
+    "states": ("euroc", lambda f: (f / STATES).write_text("1,2,3\n"), "has 3 columns"),
+    "no names": (
+        "images",
+        lambda f: next((f / "left").iterdir()).rename(f / "left/a.png"),
+        "named by no time",
+    ),
+    "other size": (
+        "images",
+        lambda f: write_calibration(f / "calibration.yaml", resolution=[300, 200]),
+        "calibration's 300x200",
+    ),
+    "no focal": (
+        "images",
+        lambda f: write_calibration(f / "calibration.yaml", intrinsics=[1, 2]),
+        "intrinsics: is ",
+    ),
+    "text": (
+        "images",
+        lambda f: write_calibration(f / "calibration.yaml", resolution="big"),
+        "resolution",
+    ),
+    "tum": ("images", lambda f: (f / "odometry.tum").write_text("1 2 3\n"), "odometry.tum, line 1"),
+    "short tum": (
+        "images",
+        lambda f: (f / "odometry.tum").write_text("1 0 0 0 0 0 0 1\n"),
+        "no odometry at 5 of 5",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", list(DAMAGE))
+def test_what_is_wrong_is_one_line(what: str, pairs: list[Pair], tmp_path: Path) -> None:
+    name, harm, words = DAMAGE[what]
+    folder = WRITERS[name](tmp_path / "recording", pairs)
+    harm(folder)
+    with pytest.raises((InputError, FileNotFoundError), match=words) as told:
+        import_recording(name, folder, tmp_path / "logs", None, read_yaml)
+    assert "\n" not in str(told.value)
+    assert not (tmp_path / "logs").exists()

@@ -1,0 +1,148 @@
+"""Points projected with published lens models lie, rectified, where the library has them."""
+
+from math import atan, hypot
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mapfusion.errors import InputError
+from mapfusion.recordings.lens import R_ROBOT_OPTICAL, Lens, StereoCalibration
+from mapfusion.recordings.rectify import Rectification
+
+BROWN = (-0.28, 0.07, 2e-4, 2e-5)
+KANNALA = (-0.01, 0.02, -0.01, 0.002)
+
+
+def distorted(kind: str, x: float, y: float) -> tuple[float, float]:
+    """One point of the plane one metre ahead, by the formulas as published."""
+    r = hypot(x, y)
+    if kind == "equidistant":
+        theta = atan(r)
+        k1, k2, k3, k4 = KANNALA
+        bent = theta * (1 + k1 * theta**2 + k2 * theta**4 + k3 * theta**6 + k4 * theta**8)
+        return x * bent / r, y * bent / r
+    k1, k2, p1, p2 = BROWN if kind == "radial-tangential" else (0, 0, 0, 0)
+    radial = 1 + k1 * r**2 + k2 * r**4
+    return (
+        x * radial + 2 * p1 * x * y + p2 * (r**2 + 2 * x**2),
+        y * radial + p1 * (r**2 + 2 * y**2) + 2 * p2 * x * y,
+    )
+
+
+def head(kind: str) -> StereoCalibration:
+    """Two cameras that squint by a degree or two and stand a little apart in all directions."""
+    coefficients = {"radial-tangential": BROWN, "equidistant": KANNALA, "none": ()}[kind]
+    lenses = [
+        Lens((640, 400), focal, center, kind, coefficients)
+        for focal, center in (((300, 301), (322.5, 190)), ((298, 299), (310, 205.5)))
+    ]
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec([0.02, -0.015, 0.03]).as_matrix()
+    T[:3, 3] = [0.11, 0.003, -0.002]
+    return StereoCalibration(*lenses, T)
+
+
+@pytest.mark.parametrize("kind", ["none", "radial-tangential", "equidistant"])
+def test_rectified_pixels_show_what_the_raw_lens_shows(kind: str) -> None:
+    calibration = head(kind)
+    made = Rectification.of(calibration)
+    assert made.maps is not None
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(1, 8, 300)
+    p_left = depth[:, None] * np.column_stack(
+        [rng.uniform(-0.9, 0.9, 300), rng.uniform(-0.5, 0.5, 300), np.ones(300)]
+    )
+    turned = (p_left @ R_ROBOT_OPTICAL.T) @ made.R_left_rectified  # rows: R^T p
+    uvd = made.camera.project(turned + made.camera.p_robot_left)
+    T_right_left = np.linalg.inv(calibration.T_left_right)
+    p_right = p_left @ T_right_left[:3, :3].T + T_right_left[:3, 3]
+    n = 0
+    for row, *points in zip(uvd, p_left, p_right, strict=True):
+        for point, lens, maps, shift in zip(
+            points, (calibration.left, calibration.right), made.maps, (0, row[2]), strict=True
+        ):
+            u, v = row[0] - shift, row[1]
+            column, line = round(u), round(v)
+            if not (
+                1 <= column < made.camera.width_px - 1 and 1 <= line < made.camera.height_px - 1
+            ):
+                continue
+            x, y = distorted(kind, *(point[:2] / point[2]))
+            raw = np.array(
+                [lens.focal_px[0] * x + lens.center_px[0], lens.focal_px[1] * y + lens.center_px[1]]
+            )
+            # the map between whole pixels, by its slope
+            here = np.array([m[line, column] for m in maps])
+            along = np.array([(m[line, column + 1] - m[line, column - 1]) / 2 for m in maps])
+            down = np.array([(m[line + 1, column] - m[line - 1, column]) / 2 for m in maps])
+            np.testing.assert_allclose(
+                here + along * (u - column) + down * (v - line), raw, atol=0.01
+            )
+            n += 1
+    assert n > 300
+
+
+@pytest.mark.parametrize("kind", ["none", "radial-tangential", "equidistant"])
+def test_all_of_a_rectified_picture_is_filled(kind: str) -> None:
+    made = Rectification.of(head(kind))
+    assert made.maps is not None
+    assert made.camera.width_px > 300
+    for columns, rows in made.maps:
+        assert columns.min() >= -0.51
+        assert columns.max() <= 639.51
+        assert rows.min() >= -0.51
+        assert rows.max() <= 399.51
+
+
+@pytest.mark.parametrize("center", [(319.5, 199.5), (300.0, 180.0), (301.4, 190.2), (331.9, 215.7)])
+@pytest.mark.parametrize("shift", [0, 12])
+def test_a_rectified_pair_keeps_its_grey_levels(center: tuple[float, float], shift: int) -> None:
+    """And its points their places, though the crop's middle is off by parts of a pixel."""
+    sizes, f, baseline = (640, 400), 500.0, 0.2
+    T = np.eye(4)
+    T[0, 3] = baseline
+    right_center = (center[0] + shift, center[1])
+    calibration = StereoCalibration(
+        Lens(sizes, (f, f), center), Lens(sizes, (f, f), right_center), T
+    )
+    made = Rectification.of(calibration)
+    rng = np.random.default_rng(0)
+    raw = tuple(rng.integers(0, 255, (400, 640), dtype=np.uint8) for _ in "lr")
+    left, right = made.apply(raw)
+    assert made.crops is not None
+    (column, row), (column_right, _) = made.crops
+    assert (left == raw[0][row : row + len(left), column : column + left.shape[1]]).all()
+    assert (
+        right == raw[1][row : row + len(left), column_right : column_right + left.shape[1]]
+    ).all()
+    middle = np.array([column, row]) + (np.array(left.shape[::-1]) - 1) / 2
+    assert np.abs(middle - center).max() <= 0.25 + 1e-9
+    p_left = rng.uniform([-1, -0.5, 4], [1, 0.5, 6], (100, 3))
+    uv = f * p_left[:, :2] / p_left[:, 2:] + center - [column, row]
+    disparity = f * baseline / p_left[:, 2]
+    found, _ = made.camera.triangulate(uv, disparity, 0.1, 0.1)
+    found = (found - made.camera.p_robot_left) @ made.R_left_rectified.T
+    # a turn is a shift of the principal point but for the second order of the angle of view
+    np.testing.assert_allclose(found, p_left @ R_ROBOT_OPTICAL.T, atol=1e-3)
+
+
+def test_a_pair_that_is_central_already_is_not_touched() -> None:
+    T = np.eye(4)
+    T[0, 3] = 0.1
+    lens = Lens((320, 240), (200, 200), (159.5, 119.5))
+    made = Rectification.of(StereoCalibration(lens, lens, T))
+    assert (made.camera.width_px, made.camera.height_px) == (320, 240)
+    assert made.crops == ((0, 0), (0, 0))
+    np.testing.assert_array_equal(made.R_left_rectified, np.eye(3))
+
+
+def test_what_cannot_be_rectified_is_one_line() -> None:
+    lens, T = Lens((320, 240), (200, 200), (159.5, 119.5)), np.eye(4)
+    for t, words in (([-0.1, 0, 0], "other way round"), ([0.01, 0.2, 0], "to the right")):
+        T[:3, 3] = t
+        with pytest.raises(InputError, match=words):
+            StereoCalibration(lens, lens, T)
+    T[:3, :3], T[:3, 3] = Rotation.from_euler("y", 170, degrees=True).as_matrix(), [0.1, 0, 0]
+    with pytest.raises(InputError, match="both cameras see"):
+        Rectification.of(StereoCalibration(lens, lens, T))
