@@ -51,7 +51,7 @@ def _stereo_command(format_name: str) -> Callable[..., None]:
             typer.Option(
                 "--frames",
                 metavar="[NAME=]FROM:TO",
-                help="Pairs that are a robot, as a slice of Python (FROM:TO:STEP); may be repeated.",
+                help="Pairs that are one robot, a slice (FROM:TO:STEP, too); may be repeated.",
             ),
         ] = None,
         odometry: Annotated[

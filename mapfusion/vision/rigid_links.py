@@ -1,27 +1,50 @@
-"""Which links between two frames one motion of the robot explains; the others are slips.
+"""Which links between two frames one motion of the camera explains; the others are slips.
 
 A corner may jump along an edge, sit where one wall ends before another, or belong to something that
 moves. Such links look like the others, descriptor by descriptor, and err by several pixels where
 the rest errs by a tenth; one in twenty is enough to turn a map. The world stands still, so all true
-links agree on one motion in the plane.
+links agree on one motion in space: what it is, with its covariance, is visual odometry.
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 
 from mapfusion.chi_square import chi_square_bound
 from mapfusion.se2 import Float
-from mapfusion.symmetric import cofactors
+from mapfusion.symmetric import cholesky, cofactors, solve_lower, solve_upper
 
-_MIN_LINKS = 4  # two links determine a motion; one slip among three would be anyone's guess
+MIN_LINKS = 4  # three links determine a motion; one slip among four is the first that shows
 # Added to the noise: from a tolerance beside which all points are equally certain to none.
 _TOLERANCES_M = (1.0, 0.25, 0.06, 0.015, 0.004, 0.001, 0.0)
 _ALL_AFTER = 3  # place in it after which all links are used, whatever the start left out
 _STEPS = 2  # of Gauss-Newton at each tolerance; the answer of the one before is near
 _PARTS = 3  # near, middle and far links; each start but one leaves one of them out
-_ONE_PLACE = 1e-12  # share of a normal matrix's diagonal that its determinant is by rounding alone
+_SIZE = 6  # of a motion's change: shift along the axes before, and turn about them
+# Added to a normal matrix, as a share of its diagonal: what the links leave open (a turn about the
+# line that all lie on) stays as it is. Rounding is far below, what they do tell far above.
+_OPEN = 1e-10
+# Residuals of true links, in standard deviations: half of them lie below this squared distance.
+_MEDIAN_SQUARE = chi_square_bound(0.5, 3)
+
+
+@dataclass(frozen=True)
+class RigidMotion:
+    """How the camera moved from one frame to the next, by what it sees.
+
+    Attributes:
+        T_before_after: (4, 4).
+        covariance: (6, 6) of its error: a shift along the axes of the frame before, and a turn
+            about them through its origin, in that order. As large as the residuals say, where these
+            exceed what is stated of the points.
+        n_links: how many links agree with it.
+    """
+
+    T_before_after: Float
+    covariance: Float
+    n_links: int
 
 
 def rigid_links(
@@ -30,8 +53,8 @@ def rigid_links(
     p_after_m: Float,
     covariance_after_m2: Float,
     probability: float,
-) -> np.ndarray:
-    """Links (N,) bool that agree with the motion on which most agree.
+) -> tuple[np.ndarray, RigidMotion | None]:
+    """Links (N,) bool that agree with the motion on which most agree, and that motion.
 
     Least squares over the links inside the gate, again and again, while a tolerance that is added
     to all covariances falls from far above the noise to nothing. At first every link has one vote;
@@ -39,17 +62,26 @@ def rigid_links(
     not always of another robot nearby: some points known to a millimetre pull at one end, where a
     wall at one distance leaves open whether the robot turned or slid. So there are four starts, of
     all links and without the near, the middle and the far third; that with most links wins.
-    Points (N, 3) are in the robot frame of either frame; all True where fewer than four links leave
-    nothing to compare.
+    Points (N, 3) are in the robot frame of either frame. Fewer than four links leave nothing to
+    compare: all True then, and no motion; none either where fewer than four agree.
     """
     n = len(p_before_m)
-    if n < _MIN_LINKS:
-        return np.ones(n, dtype=bool)
+    if n < MIN_LINKS:
+        return np.ones(n, dtype=bool), None
     gate = chi_square_bound(probability, 3)
     start = starts(p_before_m)
-    agree = start.copy()
-    _narrow(start, agree, p_before_m, covariance_before_m2, p_after_m, covariance_after_m2, gate)
-    return agree[np.argmax(agree.sum(axis=1))]
+    agree, T = start.copy(), np.tile(np.eye(4), (len(start), 1, 1))
+    square, normal = np.empty((len(start), n)), np.empty((len(start), _SIZE, _SIZE))
+    points = (p_before_m, covariance_before_m2, p_after_m, covariance_after_m2)
+    _narrow(start, agree, *points, gate, T, square, normal)
+    best = int(np.argmax(agree.sum(axis=1)))
+    own = agree[best]
+    if own.sum() < MIN_LINKS:
+        return own, None
+    # The median of what has passed the gate lies a little low, by less than a part in a hundred.
+    excess = max(float(np.median(square[best][own])) / _MEDIAN_SQUARE, 1.0)
+    covariance = excess * np.linalg.inv(normal[best])
+    return own, RigidMotion(T[best], (covariance + covariance.T) / 2, int(own.sum()))
 
 
 def starts(p_before_m: Float) -> np.ndarray:
@@ -68,56 +100,70 @@ def _narrow(
     p_after: Float,
     S_after: Float,
     gate: float,
+    T: Float,
+    square: Float,
+    normal: Float,
 ) -> None:
-    """Fill in the links (B, N) that agree in the end, from those of the starts (B, N)."""
+    """Fill in what agrees in the end (B, N), from the links of the starts (B, N).
+
+    And of each start the motion (B, 4, 4), the squared distances (B, N), the normal matrix
+    (B, 6, 6), damped.
+    """
     n = start.shape[1]
-    lever, residual, information = np.empty((n, 2)), np.empty((n, 3)), np.empty((n, 6))
+    lever, residual, information = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 6))
+    step, factor = np.zeros(_SIZE), np.empty((_SIZE, _SIZE))
     for b in range(len(start)):
-        motion, step = np.zeros(3), np.zeros(3)
         for i in range(len(_TOLERANCES_M)):
             variance = _TOLERANCES_M[i] ** 2
             for _ in range(_STEPS):
-                _differences(motion, p_before, p_after, lever, residual)
-                _information(motion[2], variance, S_before, S_after, information)
-                _solve(lever, residual, information, agree[b], step)
-                for k in range(3):
-                    motion[k] += step[k]
+                _differences(T[b], p_before, p_after, lever, residual)
+                _information(T[b], variance, S_before, S_after, information)
+                _normal_equations(lever, residual, information, agree[b], normal[b], step)
+                factor[:] = normal[b]
+                if cholesky(factor, 0.0):
+                    solve_lower(factor, step)
+                    solve_upper(factor, step)
+                else:  # no link is in use
+                    step[:] = 0.0
+                _move(T[b], step)
             for j in range(n):
-                near = _square(lever[j], residual[j], information[j], step) <= gate
-                agree[b, j] = near and (i >= _ALL_AFTER or start[b, j])
+                square[b, j] = _square(lever[j], residual[j], information[j], step)
+                agree[b, j] = square[b, j] <= gate and (i >= _ALL_AFTER or start[b, j])
 
 
 @njit(cache=True, error_model="numpy")
-def _differences(
-    motion: Float, p_before: Float, p_after: Float, lever: Float, residual: Float
-) -> None:
-    """Before minus after (N, 3) under a motion T_before_after, and d(after) / d(turn) (N, 2)."""
-    cos, sin = math.cos(motion[2]), math.sin(motion[2])
+def _differences(T: Float, p_before: Float, p_after: Float, lever: Float, residual: Float) -> None:
+    """Before minus after (N, 3) under a motion, and the turned points (N, 3), which are levers."""
     for j in range(len(residual)):
-        x = cos * p_after[j, 0] - sin * p_after[j, 1]
-        y = sin * p_after[j, 0] + cos * p_after[j, 1]
-        lever[j, 0], lever[j, 1] = -y, x
-        residual[j, 0] = p_before[j, 0] - x - motion[0]
-        residual[j, 1] = p_before[j, 1] - y - motion[1]
-        residual[j, 2] = p_before[j, 2] - p_after[j, 2]
+        x, y, z = p_after[j, 0], p_after[j, 1], p_after[j, 2]
+        for k in range(3):
+            lever[j, k] = T[k, 0] * x + T[k, 1] * y + T[k, 2] * z
+            residual[j, k] = p_before[j, k] - lever[j, k] - T[k, 3]
 
 
 @njit(cache=True, error_model="numpy")
 def _information(
-    turn: float, variance: float, S_before: Float, S_after: Float, information: Float
+    T: Float, variance: float, S_before: Float, S_after: Float, information: Float
 ) -> None:
-    """Of the differences: the inverse covariances' upper entries (N, 6) under a turn."""
-    c, s = math.cos(turn), math.sin(turn)
+    """Of the differences: the inverse covariances' upper entries (N, 6) under a motion."""
+    a, b, c = T[0, 0], T[0, 1], T[0, 2]
+    d, e, f = T[1, 0], T[1, 1], T[1, 2]
+    g, h, i = T[2, 0], T[2, 1], T[2, 2]
     for j in range(len(information)):
         before, after = S_before[j], S_after[j]
-        xx, xy, yy = after[0, 0], after[0, 1], after[1, 1]
+        xx, xy, xz = after[0, 0], after[0, 1], after[0, 2]
+        yy, yz, zz = after[1, 1], after[1, 2], after[2, 2]
+        # rows of R S, then R S R^T
+        ax, ay, az = a * xx + b * xy + c * xz, a * xy + b * yy + c * yz, a * xz + b * yz + c * zz
+        dx, dy, dz = d * xx + e * xy + f * xz, d * xy + e * yy + f * yz, d * xz + e * yz + f * zz
+        gx, gy, gz = g * xx + h * xy + i * xz, g * xy + h * yy + i * yz, g * xz + h * yz + i * zz
         axx, axy, axz, ayy, ayz, azz, determinant = cofactors(
-            before[0, 0] + variance + c * c * xx - 2 * c * s * xy + s * s * yy,
-            before[0, 1] + c * s * (xx - yy) + (c * c - s * s) * xy,
-            before[0, 2] + c * after[0, 2] - s * after[1, 2],
-            before[1, 1] + variance + s * s * xx + 2 * c * s * xy + c * c * yy,
-            before[1, 2] + s * after[0, 2] + c * after[1, 2],
-            before[2, 2] + variance + after[2, 2],
+            before[0, 0] + variance + ax * a + ay * b + az * c,
+            before[0, 1] + ax * d + ay * e + az * f,
+            before[0, 2] + ax * g + ay * h + az * i,
+            before[1, 1] + variance + dx * d + dy * e + dz * f,
+            before[1, 2] + dx * g + dy * h + dz * i,
+            before[2, 2] + variance + gx * g + gy * h + gz * i,
         )
         own, scale = information[j], 1 / determinant
         own[0], own[1], own[2] = scale * axx, scale * axy, scale * axz
@@ -125,31 +171,72 @@ def _information(
 
 
 @njit(cache=True, error_model="numpy")
-def _solve(
-    lever: Float, residual: Float, information: Float, used: np.ndarray, step: Float
+def _normal_equations(
+    lever: Float, residual: Float, information: Float, used: np.ndarray, normal: Float, right: Float
 ) -> None:
-    """The Gauss-Newton step (3,) of x, y and turn over the links in use."""
-    xx = xy = xt = yy = yt = tt = x = y = t = 0.0
+    """Sums of J^T I J (6, 6) and J^T I r (6,) over the links in use, J = (1, -[lever]x)."""
+    normal[:], right[:] = 0.0, 0.0
     for j in range(len(used)):
-        if used[j]:
-            own = information[j]
-            ixx, ixy, ixz, iyy, iyz = own[0], own[1], own[2], own[3], own[4]
-            lx, ly = lever[j, 0], lever[j, 1]
-            rx, ry, rz = residual[j, 0], residual[j, 1], residual[j, 2]
-            tx, ty = ixx * lx + ixy * ly, ixy * lx + iyy * ly
-            gx, gy = ixx * rx + ixy * ry + ixz * rz, ixy * rx + iyy * ry + iyz * rz
-            xx, xy, yy = xx + ixx, xy + ixy, yy + iyy
-            xt, yt, tt = xt + tx, yt + ty, tt + lx * tx + ly * ty
-            x, y, t = x + gx, y + gy, t + lx * gx + ly * gy
-    axx, axy, axt, ayy, ayt, att, determinant = cofactors(xx, xy, xt, yy, yt, tt)
-    if determinant > _ONE_PLACE * xx * yy * tt:
-        step[0] = (axx * x + axy * y + axt * t) / determinant
-        step[1] = (axy * x + ayy * y + ayt * t) / determinant
-        step[2] = (axt * x + ayt * y + att * t) / determinant
-    else:  # one point leaves the turn open, so it stays; none leaves all
-        step[0] = (yy * x - xy * y) / att if att > 0 else 0.0
-        step[1] = (xx * y - xy * x) / att if att > 0 else 0.0
-        step[2] = 0.0
+        if not used[j]:
+            continue
+        xx, xy, xz = information[j, 0], information[j, 1], information[j, 2]
+        yy, yz, zz = information[j, 3], information[j, 4], information[j, 5]
+        x, y, z = lever[j, 0], lever[j, 1], lever[j, 2]
+        # I J of the turn, column by column: about x, y and z
+        u0, u1, u2 = xz * y - xy * z, yz * y - yy * z, zz * y - yz * z
+        v0, v1, v2 = xx * z - xz * x, xy * z - yz * x, xz * z - zz * x
+        w0, w1, w2 = xy * x - xx * y, yy * x - xy * y, yz * x - xz * y
+        normal[0, 0] += xx
+        normal[1, 0] += xy
+        normal[1, 1] += yy
+        normal[2, 0] += xz
+        normal[2, 1] += yz
+        normal[2, 2] += zz
+        normal[3, 0] += u0
+        normal[3, 1] += u1
+        normal[3, 2] += u2
+        normal[4, 0] += v0
+        normal[4, 1] += v1
+        normal[4, 2] += v2
+        normal[5, 0] += w0
+        normal[5, 1] += w1
+        normal[5, 2] += w2
+        normal[3, 3] += u2 * y - u1 * z
+        normal[4, 3] += u0 * z - u2 * x
+        normal[4, 4] += v0 * z - v2 * x
+        normal[5, 3] += u1 * x - u0 * y
+        normal[5, 4] += v1 * x - v0 * y
+        normal[5, 5] += w1 * x - w0 * y
+        rx, ry, rz = residual[j, 0], residual[j, 1], residual[j, 2]
+        right[0] += xx * rx + xy * ry + xz * rz
+        right[1] += xy * rx + yy * ry + yz * rz
+        right[2] += xz * rx + yz * ry + zz * rz
+        right[3] += u0 * rx + u1 * ry + u2 * rz
+        right[4] += v0 * rx + v1 * ry + v2 * rz
+        right[5] += w0 * rx + w1 * ry + w2 * rz
+    for r in range(_SIZE):
+        for c in range(r):
+            normal[c, r] = normal[r, c]
+        normal[r, r] *= 1 + _OPEN
+
+
+@njit(cache=True, error_model="numpy")
+def _move(T: Float, step: Float) -> None:
+    """Shift, and turn about the origin's axes by the step's rotation vector (Rodrigues)."""
+    x, y, z = step[3], step[4], step[5]
+    angle = math.sqrt(x * x + y * y + z * z)
+    # sin(a) / a and (1 - cos(a)) / a^2, exact through zero
+    sine = math.sin(angle) / angle if angle > 0 else 1.0
+    half = math.sin(angle / 2) / angle if angle > 0 else 0.5
+    versine = 2 * half * half
+    for c in range(3):
+        a, b, d = T[0, c], T[1, c], T[2, c]
+        cx, cy, cz = y * d - z * b, z * a - x * d, x * b - y * a
+        T[0, c] += sine * cx + versine * (y * cz - z * cy)
+        T[1, c] += sine * cy + versine * (z * cx - x * cz)
+        T[2, c] += sine * cz + versine * (x * cy - y * cx)
+    for k in range(3):
+        T[k, 3] += step[k]
 
 
 @njit(cache=True, error_model="numpy")
@@ -157,7 +244,7 @@ def _square(lever: Float, residual: Float, information: Float, step: Float) -> f
     """Squared distance of a link's points, in standard deviations, after the step."""
     xx, xy, xz = information[0], information[1], information[2]
     yy, yz, zz = information[3], information[4], information[5]
-    x = residual[0] - step[0] - lever[0] * step[2]
-    y = residual[1] - step[1] - lever[1] * step[2]
-    z = residual[2]
+    x = residual[0] - step[0] - (step[4] * lever[2] - step[5] * lever[1])
+    y = residual[1] - step[1] - (step[5] * lever[0] - step[3] * lever[2])
+    z = residual[2] - step[2] - (step[3] * lever[1] - step[4] * lever[0])
     return xx * x * x + yy * y * y + zz * z * z + 2 * (xy * x * y + xz * x * z + yz * y * z)

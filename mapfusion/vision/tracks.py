@@ -15,7 +15,7 @@ from mapfusion.camera import StereoCamera
 from mapfusion.se2 import Float
 from mapfusion.vision.features import Features
 from mapfusion.vision.followed import Followed, Likeness, followed
-from mapfusion.vision.rigid_links import rigid_links
+from mapfusion.vision.rigid_links import RigidMotion, rigid_links
 
 _NO_MATCH = -1
 _LONGEST_PAUSE = 50.0  # steps: after these no limit on shift or disparity is left
@@ -64,12 +64,15 @@ class Tracks:
         length: (N,) int64 frames in a row up to this one, 1 for a new track.
         uv_px: (N, 2) where the point lies that the track began with.
         disparity_px: (N,) there.
+        motion: from the frame before, as the links tell it, in the axes of the robot; None where
+            too few do.
     """
 
     track_id: np.ndarray
     length: np.ndarray
     uv_px: Float
     disparity_px: Float
+    motion: RigidMotion | None = None
 
 
 class Tracker:
@@ -96,14 +99,14 @@ class Tracker:
         """
         n = len(features)
         source, points = np.full(n, _NO_MATCH), Followed.unseen(features)
-        track_id, length = np.empty(n, np.int64), np.ones(n, np.int64)
+        track_id, length, motion = np.empty(n, np.int64), np.ones(n, np.int64), None
         if self._previous is not None:
             before, points_before, tracks = self._previous
             source = link(before, features, self.parameters, steps)
             points, found = followed(points_before, before, features, source, self._likeness)
             source[~found] = _NO_MATCH
             rows = np.flatnonzero(found)
-            agree = self._agree(points_before, before, points, features, source, rows)
+            agree, motion = self._agree(points_before, before, points, features, source, rows)
             source[rows[~agree]] = _NO_MATCH
             linked = source != _NO_MATCH
             track_id[linked] = tracks.track_id[source[linked]]
@@ -112,7 +115,7 @@ class Tracker:
         points.begin(features, born, self._likeness)
         track_id[born] = np.arange(self._next_id, self._next_id + len(born))
         self._next_id += len(born)
-        made = Tracks(track_id, length, points.uv_px, points.disparity_px)
+        made = Tracks(track_id, length, points.uv_px, points.disparity_px, motion)
         self._previous = features, points, made
         return made
 
@@ -124,8 +127,8 @@ class Tracker:
         after: Features,
         source: np.ndarray,
         rows: np.ndarray,
-    ) -> np.ndarray:
-        """Which links (those of `rows` of `after`) one motion of the robot explains."""
+    ) -> tuple[np.ndarray, RigidMotion | None]:
+        """Which links (those of `rows` of `after`) one motion explains, and that motion."""
         return rigid_links(
             *self._points(points_before, before, source[rows]),
             *self._points(points, after, rows),
