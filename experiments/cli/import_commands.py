@@ -55,8 +55,12 @@ def _stereo_command(format_name: str) -> Callable[..., None]:
             ),
         ] = None,
         odometry: Annotated[
-            Path | None,
-            typer.Option(help="Dead reckoning of the robot, a trajectory in the TUM format."),
+            str | None,
+            typer.Option(
+                metavar="FILE|images",
+                help="Dead reckoning of the robot, in the TUM format, or what the pictures tell; "
+                "by default as recorded, else by the pictures.",
+            ),
         ] = None,
         truth: Annotated[
             Path | None, typer.Option(help="True poses of the robot in the world, likewise.")

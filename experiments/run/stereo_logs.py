@@ -10,6 +10,8 @@ from mapfusion.recordings.stereo_recording import StereoRecording
 from mapfusion.recordings.tum import read_tum
 from mapfusion.vision.frontend import FrontEndParameters
 
+BY_IMAGES = "images"  # in place of a file of odometry
+
 
 @dataclass(frozen=True)
 class ImportedRecording:
@@ -44,7 +46,7 @@ def import_stereo(
     recording: StereoRecording,
     destination: Path,
     cuts: Sequence[Cut],
-    trajectories: tuple[Path | None, Path | None],
+    trajectories: tuple[str | None, Path | None],
     overrides: Sequence[str],
     on_progress: Callable[[str, int, int], None],
 ) -> ImportedRecording:
@@ -54,19 +56,20 @@ def import_stereo(
         recording: what was read.
         destination: each robot's folder goes there.
         cuts: the robots.
-        trajectories: files of odometry and truth in place of the recording's own.
+        trajectories: files of odometry (or `images`: of the pictures) and truth in place of the
+            recording's own.
         overrides: `vision.KEY=VALUE`.
         on_progress: told what is done.
 
     Raises:
         InputError: names file or setting; nothing is written then.
     """
-    odometry, truth = (None if path is None else read_tum(path) for path in trajectories)
-    recording = replace(
-        recording,
-        odometry=recording.odometry if odometry is None else odometry,
-        truth=recording.truth if truth is None else truth,
-    )
+    odometry, truth = trajectories
+    if odometry is not None:
+        recorded = None if odometry == BY_IMAGES else read_tum(Path(odometry))
+        recording = replace(recording, odometry=recorded)
+    if truth is not None:
+        recording = replace(recording, truth=read_tum(truth))
 
     def adjusted(derived: FrontEndParameters) -> FrontEndParameters:
         return made_settings("--set", _Vision, overrides, {"vision": asdict(derived)}).vision

@@ -9,11 +9,13 @@ import numpy as np
 from mapfusion import se3
 from mapfusion.camera import StereoCamera
 from mapfusion.errors import InputError
+from mapfusion.odometry_covariance import write_odometry_covariance
 from mapfusion.recordings.derived_vision import derived_vision, seen_depths, with_window_for
 from mapfusion.recordings.mount import levelled
 from mapfusion.recordings.pictures import sampled
 from mapfusion.recordings.rectify import Rectification
 from mapfusion.recordings.stereo_recording import StereoRecording
+from mapfusion.recordings.visual_odometry import visual_odometry
 from mapfusion.robot_log import TRUTH_FILES, RobotLog, write_log, write_truth_poses
 from mapfusion.se2 import Float
 from mapfusion.vision.frontend import FrontEnd, FrontEndParameters
@@ -27,6 +29,7 @@ _LEAST_MATCHES = 20  # corners whose median row error is worth a refusal
 _LONGEST_ODOMETRY_GAP_S = 1.0  # over which a trajectory is interpolated: wheels report often
 _LONGEST_TRUTH_GAP_S = 0.1  # as in MRCLAM's recordings: the truth must not be guessed
 _LEAST_OBSERVATIONS = 4  # a frame: one more than fix a motion
+_MOST_GUESSED = 0.1  # of all motions: what lies between guesses must be longer than they are
 
 OnProgress = Callable[[str, int, int], None]
 Vision = Callable[[FrontEndParameters], FrontEndParameters]
@@ -49,11 +52,15 @@ class Imported:
         truth: (T, 3) T_world_robot, or None.
         linked: (T,) share of the features of the frame before that were found again; NaN for the
             first frame.
+        odometry_covariance: (T, 3, 3) of odometry that the pictures told; None: it was recorded.
+        guessed: frames whose motion too few links told.
     """
 
     log: RobotLog
     truth: Float | None
     linked: Float
+    odometry_covariance: Float | None = None
+    guessed: int = 0
 
     @property
     def observations(self) -> np.ndarray:
@@ -63,11 +70,14 @@ class Imported:
     @property
     def too_little(self) -> str:
         """Why nothing can be mapped with it; empty where it can."""
-        usual = float(np.median(self.observations))
-        if usual >= _LEAST_OBSERVATIONS:
-            return ""
-        seen = f"{usual:g} observations a frame (median), {_LEAST_OBSERVATIONS} are the least"
-        return f"{self.log.robot}: too little to map: {seen}"
+        usual, n = float(np.median(self.observations)), len(self.log)
+        if usual < _LEAST_OBSERVATIONS:
+            seen = f"{usual:g} observations a frame (median), {_LEAST_OBSERVATIONS} are the least"
+            return f"{self.log.robot}: too little to map: {seen}"
+        if self.guessed > _MOST_GUESSED * n:
+            lost = f"{self.guessed} of {n} motions could not be told from the pictures"
+            return f"{self.log.robot}: too little to map: {lost}"
+        return ""
 
 
 class StereoImport:
@@ -117,35 +127,41 @@ class StereoImport:
         """The log of one robot, with its truth.
 
         Raises:
-            InputError: fewer than two frames, or no odometry for one of them.
+            InputError: fewer than two frames, or recorded odometry that lacks one of them.
         """
         rows = range(len(self._recording))[cut.rows]
         if len(rows) < 2:
             found = f"frames of {cut.robot} are {len(rows)} of {len(self._recording)} pairs"
             raise InputError(f"{self._recording.name}: {found}; 2 are the least")
         time_ns = self._recording.time_ns[rows]
-        odometry, truth = self._odometry(time_ns), self._truth(time_ns)
-        steps = np.diff(time_ns) / np.median(np.diff(self._recording.time_ns))
+        recorded, truth = self._odometry(time_ns), self._truth(time_ns)
+        usual_ns = np.median(np.diff(self._recording.time_ns))
+        steps = np.diff(time_ns, prepend=time_ns[0]) / usual_ns
         front_end = FrontEnd(self.camera, self.vision)
         observer = Observer.of(self.camera, self.vision)
-        observed, linked, before = [], [np.nan], 0
+        observed, motions, linked, before = [], [], [np.nan], 0
         for n, k in enumerate(rows):
             found = front_end.extract(*self._pair(k))
-            frame = observer.observe(found, float(steps[n - 1]) if n else 1.0)
+            frame = observer.observe(found, float(steps[n]))
             if n:
                 linked.append(float(np.sum(frame.tracks.length > 1)) / max(before, 1))
             before = len(found)
+            motions.append(frame.tracks.motion)
             observed.append(levelled(frame.observations, self.camera, self.T_robot_camera))
             on_progress(f"{cut.robot}: track features", n + 1, len(rows))
         time_s = (time_ns - self._recording.time_ns[0]) / 1e9
+        seen = visual_odometry(motions, steps, self.camera, self.T_robot_camera)
+        odometry = seen.increments if recorded is None else recorded
         log = RobotLog(cut.robot, False, time_s, odometry, *joined(observed))
-        return Imported(log, truth, np.array(linked))
+        if recorded is not None:
+            return Imported(log, truth, np.array(linked))
+        return Imported(log, truth, np.array(linked), seen.covariance, int(seen.guessed.sum()))
 
-    def _odometry(self, time_ns: np.ndarray) -> Float:
-        """Increments (T, 3) between frames, of the recorded dead reckoning."""
+    def _odometry(self, time_ns: np.ndarray) -> Float | None:
+        """Increments (T, 3) between frames, of the recorded dead reckoning; None without it."""
         recorded = self._recording.odometry
         if recorded is None:
-            raise InputError(f"{self._recording.name}: has no odometry; give --odometry FILE.tum")
+            return None
         T = recorded.at(time_ns, _LONGEST_ODOMETRY_GAP_S)
         unknown = np.flatnonzero(np.isnan(T[:, 0, 0]))
         if len(unknown):
@@ -168,6 +184,7 @@ def write_imported(destination: Path, imported: Sequence[Imported]) -> list[Path
         write_log(folder, one.log)
         for outdated in TRUTH_FILES:  # of an import into the same folder
             (folder / outdated).unlink(missing_ok=True)
+        write_odometry_covariance(folder, one.odometry_covariance)
         if one.truth is not None:
             write_truth_poses(folder, one.truth)
     return folders

@@ -15,6 +15,7 @@ _COLUMNS = [
     ("observations\na frame", ".0f"),
     ("\nat least", "d"),
     ("linked\n%", ".0f"),
+    ("odometry", ""),
     ("truth", ""),
 ]
 
@@ -43,5 +44,12 @@ def _row(one: Imported) -> tuple[object, ...]:
         float(np.median(seen)),
         int(seen.min()),
         100 * float(np.nanmedian(one.linked)),
+        _odometry(one),
         f"{known} frames" if known else "none",
     )
+
+
+def _odometry(one: Imported) -> str:
+    if one.odometry_covariance is None:
+        return "recorded"
+    return f"pictures, {one.guessed} guessed" if one.guessed else "pictures"

@@ -180,6 +180,23 @@ def test_a_list_of_pairs_stands_for_folders(pairs: list[Pair], tmp_path: Path) -
     np.testing.assert_array_equal(recording.pair(0)[1], pairs[1][1])
 
 
+def test_pictures_alone_tell_the_way(pairs: list[Pair], tmp_path: Path) -> None:
+    """Also over the pause, which is a step twice as long."""
+    sequence = write_kitti(tmp_path, pairs)
+    (sequence / "odometry.tum").unlink()
+    seen = imported("kitti", sequence)
+    true = se2.between(POSES[:-1], POSES[1:])
+    assert seen.guessed == 0
+    assert seen.odometry_covariance is not None
+    errors = seen.log.odometry[1:] - true
+    assert np.abs(errors[:, :2]).max() < 0.02
+    assert np.abs(errors[:, 2]).max() < 0.005
+    squares = [
+        e @ np.linalg.solve(S, e) for e, S in zip(errors, seen.odometry_covariance[1:], strict=True)
+    ]
+    assert np.mean(squares) / 3 < 3
+
+
 def test_a_recording_is_written_as_a_log(folders: dict[str, Path], tmp_path: Path) -> None:
     (path,) = import_recording("kitti", folders["kitti"], tmp_path)
     assert path.name == "07"

@@ -1,0 +1,66 @@
+"""How sure a log's odometry is, step by step: a file beside the log, where that is known.
+
+Wheels have the filter's motion noise; odometry from pictures has a covariance of its own, which
+grows where little was seen.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from mapfusion.arguments import require_shape
+from mapfusion.errors import InputError
+from mapfusion.open_tables import told
+from mapfusion.se2 import Float
+from mapfusion.storage import (
+    column,
+    columns,
+    float_fields,
+    named_columns,
+    read_table,
+    schema,
+    write_table,
+)
+
+FILE = "odometry_covariance.parquet"
+_FIELDS = ["cov_xx", "cov_xy", "cov_xt", "cov_yy", "cov_yt", "cov_tt"]
+_UPPER = np.triu_indices(3)
+ODOMETRY_COVARIANCE = schema(
+    "robot_log.odometry_covariance",
+    1,
+    [
+        told(pa.field("iteration", pa.int32()), "number of the frame: 0, 1, 2, ..."),
+        *(
+            told(field, "of the motion since the row before: m², m rad, rad²")
+            for field in float_fields(_FIELDS)
+        ),
+    ],
+)
+
+
+def write_odometry_covariance(folder: Path, covariance: Float | None) -> None:
+    """Write (T, 3, 3) of x, y, theta into a log's folder; None removes what is there."""
+    if covariance is None:
+        (folder / FILE).unlink(missing_ok=True)
+        return
+    n = len(covariance)
+    require_shape("covariance", covariance, (n, 3, 3))
+    upper = covariance[:, _UPPER[0], _UPPER[1]]
+    iteration = np.arange(n, dtype=np.int32)
+    rows = {"iteration": iteration, **named_columns(_FIELDS, upper)}
+    write_table(folder / FILE, rows, ODOMETRY_COVARIANCE)
+
+
+def read_odometry_covariance(folder: Path) -> Float | None:
+    """(T, 3, 3) of a log's folder, or None where it holds none; raises InputError."""
+    path = folder / FILE
+    if not path.is_file():
+        return None
+    table, _ = read_table(path, ODOMETRY_COVARIANCE)
+    if not np.array_equal(column(table, "iteration"), np.arange(table.num_rows)):
+        raise InputError(f"{path}: iterations must be 0, 1, 2, ..., one row each")
+    upper = columns(table, _FIELDS)
+    covariance = np.empty((len(upper), 3, 3))
+    covariance[:, _UPPER[0], _UPPER[1]] = covariance[:, _UPPER[1], _UPPER[0]] = upper
+    return covariance

@@ -1,0 +1,75 @@
+"""Odometry from the pictures: the motions that links between frames agree on, in the plane."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapfusion import se3
+from mapfusion.camera import StereoCamera
+from mapfusion.se2 import Float
+from mapfusion.vision.rigid_links import RigidMotion
+
+_PLANE = [0, 1, 5]  # x, y and the turn about z, of shifts and turns in space
+# Standard deviations of a motion that no links told: the robot went on as before, or stopped or
+# turned meanwhile: as large as the motion itself, and at least this, m and rad.
+_GUESSED_SIGMA = np.array([0.1, 0.1, 0.1])
+
+
+@dataclass(frozen=True)
+class VisualOdometry:
+    """Motion since the frame before.
+
+    Attributes:
+        increments: (T, 3) in the plane, in the robot frame of the frame before; the first is zero.
+        covariance: (T, 3, 3) of their errors; the first is zero.
+        guessed: (T,) bool, motions that too few links told: the robot is taken to go on as before.
+    """
+
+    increments: Float
+    covariance: Float
+    guessed: np.ndarray
+
+
+def visual_odometry(
+    motions: Sequence[RigidMotion | None],
+    steps: Float,
+    camera: StereoCamera,
+    T_robot_camera: Float,
+) -> VisualOdometry:
+    """What the links of a log's frames say of the robot's way.
+
+    Args:
+        motions: T of them, as `Tracks.motion` has them, of a camera that was taken for level.
+        steps: (T,) usual steps of time since the frame before.
+        camera: the pair, with the mount that it was taken to have.
+        T_robot_camera: (4, 4) the mount that it has; axes x ahead, y left, z up.
+    """
+    n = len(motions)
+    increments, covariance = np.zeros((n, 3)), np.zeros((n, 3, 3))
+    guessed = np.array([motion is None for motion in motions])
+    guessed[0] = False
+    taken = se3.pose(np.eye(3), camera.p_robot_left)
+    T_robot_taken = T_robot_camera @ se3.inverse(taken)
+    speed = np.zeros(3)  # a step
+    for k in range(1, n):
+        motion = motions[k]
+        if motion is None:
+            increments[k] = steps[k] * speed
+            covariance[k] = np.diag((np.abs(increments[k]) + steps[k] * _GUESSED_SIGMA) ** 2)
+        else:
+            increments[k], covariance[k] = _in_the_plane(motion, T_robot_taken)
+            speed = increments[k] / steps[k]
+    return VisualOdometry(increments, covariance, guessed)
+
+
+def _in_the_plane(motion: RigidMotion, T_robot_taken: Float) -> tuple[Float, Float]:
+    """A motion (3,) of the robot and its covariance (3, 3), from one of its camera."""
+    T = T_robot_taken @ motion.T_before_after @ se3.inverse(T_robot_taken)
+    turn, arm = T_robot_taken[:3, :3], T[:3, :3] @ T_robot_taken[:3, 3]
+    # T = (R, turn t + p - R p): a turn w of the camera's R shifts the robot by (R p) x w
+    jacobian = np.zeros((6, 6))
+    jacobian[:3, :3] = jacobian[3:, 3:] = turn
+    jacobian[:3, 3:] = np.cross(arm, np.eye(3)).T @ turn
+    covariance = jacobian @ motion.covariance @ jacobian.T
+    return se3.planar(T), covariance[np.ix_(_PLANE, _PLANE)]

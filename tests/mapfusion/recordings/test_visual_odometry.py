@@ -1,0 +1,59 @@
+"""The robot's motion from that of its camera: exact, with the covariance of its errors."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mapfusion import se3
+from mapfusion.camera import StereoCamera
+from mapfusion.recordings.visual_odometry import visual_odometry
+from mapfusion.vision.rigid_links import RigidMotion
+
+CAMERA = StereoCamera()
+MOUNT = se3.pose(Rotation.from_euler("ZYX", [0.2, 0.1, -0.05]).as_matrix(), [0.4, 0.1, 1.2])
+MOVED = np.array([[0.5, 0.02, 0.1], [0.3, -0.01, -0.2]])  # of the robot
+
+
+def of_camera(T_robot: np.ndarray) -> np.ndarray:
+    """The motion that a camera on the mount takes it for, which thinks itself level."""
+    taken = se3.pose(np.eye(3), CAMERA.p_robot_left)
+    T = MOUNT @ se3.inverse(taken)
+    return se3.inverse(T) @ T_robot @ T
+
+
+def found(motions: list, steps: list[float]):
+    return visual_odometry(motions, np.array(steps), CAMERA, MOUNT)
+
+
+def test_a_tilted_camera_tells_the_robot_s_motion() -> None:
+    motions = [RigidMotion(of_camera(T), np.eye(6), 9) for T in se3.from_planar(MOVED)]
+    made = found([None, *motions], [0, 1, 1])
+    np.testing.assert_allclose(made.increments[1:], MOVED, atol=1e-12)
+    assert np.all(made.increments[0] == 0)
+    assert not made.guessed.any()
+
+
+def test_the_covariance_is_the_spread_of_the_errors() -> None:
+    rng = np.random.default_rng(0)
+    root = 1e-3 * rng.normal(size=(6, 6))
+    true = of_camera(se3.from_planar(MOVED[0]))
+    drawn = (root @ rng.standard_normal((6, 40_000))).T
+    T = np.tile(true, (len(drawn), 1, 1))
+    T[:, :3, :3] = Rotation.from_rotvec(drawn[:, 3:]).as_matrix() @ T[:, :3, :3]
+    T[:, :3, 3] += drawn[:, :3]
+    covariance = root @ root.T
+    motions = [None, *(RigidMotion(each, covariance, 9) for each in T)]
+    made = found(motions, [1.0] * len(motions))
+    spread = np.cov((made.increments[1:] - MOVED[0]).T)
+    scale = np.sqrt(np.diag(spread))
+    np.testing.assert_allclose(
+        made.covariance[1] / np.outer(scale, scale), spread / np.outer(scale, scale), atol=0.03
+    )
+
+
+def test_without_links_the_robot_goes_on_as_before() -> None:
+    T = RigidMotion(of_camera(se3.from_planar(MOVED[0])), 1e-6 * np.eye(6), 9)
+    made = found([None, T, None, None], [1, 1, 1, 3])
+    np.testing.assert_allclose(made.increments[2], MOVED[0], atol=1e-12)
+    np.testing.assert_allclose(made.increments[3], 3 * MOVED[0], atol=1e-12)
+    assert made.guessed.tolist() == [False, False, True, True]
+    assert np.all(np.diagonal(made.covariance[2]) >= MOVED[0] ** 2)

@@ -1,0 +1,33 @@
+"""The covariance of a log's odometry, on disk."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapfusion.errors import InputError
+from mapfusion.odometry_covariance import (
+    FILE,
+    read_odometry_covariance,
+    write_odometry_covariance,
+)
+
+
+def test_what_is_written_is_read(tmp_path: Path) -> None:
+    assert read_odometry_covariance(tmp_path) is None
+    root = np.random.default_rng(0).normal(size=(5, 3, 3))
+    covariance = root @ root.swapaxes(1, 2)
+    write_odometry_covariance(tmp_path, covariance)
+    found = read_odometry_covariance(tmp_path)
+    assert found is not None
+    np.testing.assert_allclose(found, covariance, rtol=1e-15)
+    write_odometry_covariance(tmp_path, None)
+    assert not (tmp_path / FILE).exists()
+
+
+def test_a_damaged_file_is_one_line(tmp_path: Path) -> None:
+    write_odometry_covariance(tmp_path, np.tile(np.eye(3), (3, 1, 1)))
+    path = tmp_path / FILE
+    path.write_bytes(path.read_bytes()[:-9])
+    with pytest.raises(InputError, match=FILE):
+        read_odometry_covariance(tmp_path)
