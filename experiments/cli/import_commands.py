@@ -1,7 +1,8 @@
 """Commands that turn recordings in foreign formats into robot logs, one a format."""
 
+import inspect
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -74,6 +75,7 @@ def _stereo_command(format_name: str) -> Callable[..., None]:
                 "e.g. vision.harris.max_corners=300.",
             ),
         ] = None,
+        **chosen: str | None,
     ) -> None:
         from experiments.run.stereo_logs import import_stereo
         from experiments.scenario.loading import made_settings
@@ -81,7 +83,8 @@ def _stereo_command(format_name: str) -> Callable[..., None]:
         from experiments.show.terminal.import_screen import print_imported
         from experiments.show.terminal.layout import progress
 
-        settings = made_settings(format_name, settings_class(format_name), overrides)
+        named = {name: value for name, value in chosen.items() if value is not None}
+        settings = made_settings(format_name, settings_class(format_name), overrides, named)
         recording = read_recording(format_name, folder, settings, read_calibration)
         cuts = _cuts(robot_name(recording.name), frames or ())
         with progress() as show:
@@ -91,6 +94,22 @@ def _stereo_command(format_name: str) -> Callable[..., None]:
             options.complain(done.too_little[0])
             raise typer.Exit(options.EXIT_FAILED)
 
+    return _with_options(command, IMPORTERS[format_name].options)
+
+
+def _with_options(command: Callable[..., None], own: Mapping[str, str]) -> Callable[..., None]:
+    """A command that takes, in place of its `**chosen`, options with these names and helps."""
+    *shared, _ = inspect.signature(command).parameters.values()
+    kind = inspect.Parameter.KEYWORD_ONLY
+    named = [
+        inspect.Parameter(
+            name, kind, default=None, annotation=Annotated[str | None, typer.Option(help=told)]
+        )
+        for name, told in own.items()
+    ]
+    parameters = [*shared, *named]
+    command.__annotations__ = {each.name: each.annotation for each in parameters}
+    setattr(command, "__signature__", inspect.Signature(parameters))  # noqa: B010
     return command
 
 

@@ -34,7 +34,7 @@ from mapfusion.recordings.timed_poses import TimedPoses
 from mapfusion.recordings.tum import ODOMETRY_FILE, read_tum
 from mapfusion.se2 import Float
 
-_STATES = "state_groundtruth_estimate0"
+STATES = "state_groundtruth_estimate0"
 _POSE_COLUMNS = 8  # time, position, quaternion; speeds and biases follow
 
 
@@ -74,7 +74,7 @@ def read_euroc(folder: Path, settings: EurocSettings, read_yaml: ReadYaml) -> St
         raise InputError(f"{root}: {error}") from error
     T_body_robot, T_robot_left = robot_in_body(mounts[0])
     odometry = root / ODOMETRY_FILE
-    states = root / _STATES / "data.csv"
+    states = root / STATES / "data.csv"
     return StereoRecording(
         (root.resolve().parent if root.name == "mav0" else root.resolve()).name,
         time_ns,

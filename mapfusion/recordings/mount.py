@@ -91,3 +91,16 @@ def levelled(observed: Observations, camera: StereoCamera, T_robot_left: Float) 
     covariance = R @ observed.covariance_m2 @ R.T
     covariance = (covariance + covariance.swapaxes(1, 2)) / 2  # as rounding left it
     return replace(observed, position_m=position, covariance_m2=covariance)
+
+
+def upright(T_robot_left: Float, up_left: Float) -> Float:
+    """A mount whose roll and pitch are such that a direction (3,) of the left camera is up."""
+    from scipy.spatial.transform import Rotation
+
+    up = T_robot_left[:3, :3] @ (up_left / np.linalg.norm(up_left))
+    axis = np.cross(up, [0.0, 0.0, 1.0])
+    sine = float(np.linalg.norm(axis))
+    if sine == 0:
+        return T_robot_left
+    turn = Rotation.from_rotvec(axis / sine * np.arctan2(sine, up[2])).as_matrix()
+    return pose(turn @ T_robot_left[:3, :3], T_robot_left[:3, 3])

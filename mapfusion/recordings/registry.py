@@ -1,15 +1,16 @@
-"""The formats of recordings that can be read, by name. To add one: its file and one line here."""
+"""The formats of recordings that can be read and written, by name: a file and a line here each."""
 
 import importlib
 import re
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from mapfusion.errors import InputError
 
 if TYPE_CHECKING:
+    from mapfusion.recordings.stereo_drive import StereoDrive
     from mapfusion.recordings.stereo_recording import ReadYaml, StereoRecording
 
 _LONGEST_NAME = 40  # of a robot: names become parts of file names
@@ -29,6 +30,7 @@ class Importer:
         what: the recordings, in a few words.
         example: how such a recording's folder may be called.
         stereo: whether pictures are recorded, of which observations are yet to be made.
+        options: settings that the command takes by their own names, and what they are.
     """
 
     target: str
@@ -36,6 +38,7 @@ class Importer:
     what: str
     example: str
     stereo: bool = False
+    options: Mapping[str, str] = field(default_factory=dict)
 
 
 IMPORTERS = {
@@ -66,6 +69,27 @@ IMPORTERS = {
         "drive1",
         stereo=True,
     ),
+    "rosbag": Importer(
+        "mapfusion.recordings.rosbag:read_rosbag",
+        "RosbagSettings",
+        "Bags of ROS 1 (.bag) and ROS 2 (folder)",
+        "drive.bag",
+        stereo=True,
+        options={
+            "left": "Topic of the left camera's pictures.",
+            "right": "Topic of the right camera's.",
+            "odom": "Topic of the robot's odometry; without it the pictures tell.",
+            "imu": "Topic of an IMU, whose mean acceleration levels the camera.",
+        },
+    ),
+}
+
+
+# By name what writes a `StereoDrive` into a folder and returns the paths to import it from.
+EXPORTERS = {
+    "euroc": "mapfusion.recordings.euroc_writer:write_euroc",
+    "kitti": "mapfusion.recordings.kitti_writer:write_kitti",
+    "rosbag": "mapfusion.recordings.rosbag_writer:write_rosbag",
 }
 
 
@@ -120,6 +144,23 @@ def import_recording(
     recording = read_recording(format_name, folder, settings, read_yaml)
     whole = Cut(robot_name(recording.name), slice(None))
     return write_imported(destination, [StereoImport(recording).log_of(whole)])
+
+
+def export_drive(
+    format_name: str,
+    folder: Path,
+    drive: "StereoDrive",
+    on_frame: Callable[[int, int], None] = lambda *_: None,
+) -> list[Path]:
+    """Write a drive in a format of `EXPORTERS`; returns the paths to import it from.
+
+    Raises:
+        InputError: no exporter has that name.
+    """
+    if format_name not in EXPORTERS:
+        raise InputError(f"--format {format_name}: unknown; known: {', '.join(EXPORTERS)}")
+    module, _, function = EXPORTERS[format_name].partition(":")
+    return getattr(importlib.import_module(module), function)(folder, drive, on_frame)
 
 
 def robot_name(recording: str) -> str:
