@@ -75,9 +75,15 @@ def _stereo_command(format_name: str) -> Callable[..., None]:
                 "e.g. vision.harris.max_corners=300.",
             ),
         ] = None,
+        scenario: Annotated[
+            str | None,
+            typer.Option(
+                metavar="SCENARIO", help="File or name whose settings of the front end to use."
+            ),
+        ] = None,
         **chosen: str | None,
     ) -> None:
-        from experiments.run.stereo_logs import import_stereo
+        from experiments.run.stereo_logs import import_stereo, vision_of
         from experiments.scenario.loading import made_settings
         from experiments.scenario.yaml_input import read_calibration
         from experiments.show.terminal.import_screen import print_imported
@@ -86,9 +92,10 @@ def _stereo_command(format_name: str) -> Callable[..., None]:
         named = {name: value for name, value in chosen.items() if value is not None}
         settings = made_settings(format_name, settings_class(format_name), overrides, named)
         recording = read_recording(format_name, folder, settings, read_calibration)
+        front_end = (None if scenario is None else vision_of(scenario), vision or ())
         cuts = _cuts(robot_name(recording.name), frames or ())
         with progress() as show:
-            done = import_stereo(recording, output, cuts, (odometry, truth), vision or (), show)
+            done = import_stereo(recording, output, cuts, (odometry, truth), front_end, show)
         print_imported(done)
         if done.too_little:
             options.complain(done.too_little[0])

@@ -19,16 +19,28 @@ def record(
     overrides: options.Overrides,
     jobs: options.Jobs = options.ALL_CORES,
     results: options.Results = options.RESULTS,
+    kind: Annotated[
+        str,
+        typer.Option("--format", metavar="FORMAT", help="log, or pictures: euroc, kitti, rosbag."),
+    ] = "log",
 ) -> None:
-    """Simulate only: one robot log (with its truth) per robot: `mapfusion record S -o logs`."""
+    """Simulate only: one robot log (with its truth) per robot: `mapfusion record S -o logs`.
+
+    With `--format` what the robots see, count and truly do, for other people's programs, see
+    experiments/docs/recordings.md.
+    """
     from experiments.judge import user_files as single
     from experiments.judge.expectations import load_checked
+    from experiments.judge.written_drives import write_drives
     from experiments.scenario.suite import one_scenario
     from experiments.show.terminal.layout import print_paths, progress
 
     loaded = load_checked(one_scenario(scenario), overrides, seed)
     with progress() as show:
-        paths = single.record(loaded, output, results, jobs, show)
+        if kind == "log":
+            paths = single.record(loaded, output, results, jobs, show)
+        else:
+            paths = write_drives(loaded, kind, output, results, jobs, show)
     print_paths(output, paths)
 
 

@@ -26,13 +26,18 @@ from mapfusion.name_order import name_order
 from mapfusion.robot_log import read_log
 
 
+def require_simulation(scenario: AnyScenario) -> None:
+    """Raise InputError for a scenario of recorded logs."""
+    if isinstance(scenario, Recording):
+        reason = "uses recorded logs, there is nothing to record"
+        raise InputError(f"scenario {scenario.name}: {reason}")
+
+
 def record(
     scenario: AnyScenario, output: Path, results: Path, jobs: int, on_progress: OnProgress
 ) -> list[Path]:
     """Simulate and write one log a robot into `output`; returns their folders."""
-    if isinstance(scenario, Recording):
-        reason = "uses recorded logs, there is nothing to record"
-        raise InputError(f"scenario {scenario.name}: {reason}")
+    require_simulation(scenario)
     run = JudgedRun.of(scenario, Store.of(results))
 
     def make() -> None:

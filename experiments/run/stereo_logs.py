@@ -5,6 +5,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from experiments.scenario.loading import made_settings
+from experiments.scenario.settings import SimulatedScenario
+from experiments.scenario.suite import settings_of
+from mapfusion.errors import InputError
 from mapfusion.recordings.stereo_import import Cut, Imported, StereoImport, write_imported
 from mapfusion.recordings.stereo_recording import StereoRecording
 from mapfusion.recordings.tum import read_tum
@@ -47,7 +50,7 @@ def import_stereo(
     destination: Path,
     cuts: Sequence[Cut],
     trajectories: tuple[str | None, Path | None],
-    overrides: Sequence[str],
+    vision: tuple[FrontEndParameters | None, Sequence[str]],
     on_progress: Callable[[str, int, int], None],
 ) -> ImportedRecording:
     """Make and write the logs of a recording's robots.
@@ -58,13 +61,14 @@ def import_stereo(
         cuts: the robots.
         trajectories: files of odometry (or `images`: of the pictures) and truth in place of the
             recording's own.
-        overrides: `vision.KEY=VALUE`.
+        vision: settings of the front end, None for what follows from the camera, and what of them
+            is replaced: `vision.KEY=VALUE`.
         on_progress: told what is done.
 
     Raises:
         InputError: names file or setting; nothing is written then.
     """
-    odometry, truth = trajectories
+    (odometry, truth), (chosen, overrides) = trajectories, vision
     if odometry is not None:
         recorded = None if odometry == BY_IMAGES else read_tum(Path(odometry))
         recording = replace(recording, odometry=recorded)
@@ -72,7 +76,8 @@ def import_stereo(
         recording = replace(recording, truth=read_tum(truth))
 
     def adjusted(derived: FrontEndParameters) -> FrontEndParameters:
-        return made_settings("--set", _Vision, overrides, {"vision": asdict(derived)}).vision
+        base = {"vision": asdict(derived if chosen is None else chosen)}
+        return made_settings("--set", _Vision, overrides, base).vision
 
     work = StereoImport(recording, adjusted)
     robots = [work.log_of(cut, on_progress) for cut in cuts]
@@ -83,3 +88,11 @@ def import_stereo(
         f"{work.vision.max_depth_m:.2g} m"
     )
     return ImportedRecording(recording, about, robots, write_imported(destination, robots))
+
+
+def vision_of(scenario: str) -> FrontEndParameters:
+    """The settings of the front end of a simulation, by file or name; raises InputError."""
+    settings = settings_of(scenario)
+    if not isinstance(settings, SimulatedScenario):
+        raise InputError(f"--scenario {scenario}: is no simulation, and has no section vision")
+    return settings.vision

@@ -38,6 +38,7 @@ from mapfusion.vision.patches import PATCH_SIDE_PX
 from sim.radiometry import RadiometricNoise
 from sim.recorder import FrameSource, truth_points, truth_slopes
 from sim.renderer import Renderer
+from sim.stereo_head import StereoFrame
 from sim.trajectory import read_trajectory
 
 # Frames a task: about two seconds of work, so little is lost when a run is interrupted.
@@ -110,10 +111,9 @@ def run(settings: FeatureSettings, job: Job) -> dict[str, float]:
     robot, features, truth, rendering_s = settings.robot, [], [], 0.0
     frames = _chunk(job.part, len(trajectory))
     for iteration in frames:
-        rng = generator(settings.seed, "radiometry", robot, iteration)
         poses = trajectory.T_world_robot[:, iteration]
         started = time.perf_counter()
-        frame = source.render(poses, robot, settings.radiometry, rng, colour=False)
+        frame = rendered(settings, source, poses, iteration)
         rendering_s += time.perf_counter() - started
         found = front_end.extract(frame.left, frame.right)
         own_pose = poses[trajectory.index(robot)]
@@ -134,6 +134,14 @@ def run(settings: FeatureSettings, job: Job) -> dict[str, float]:
     write_table(truth_path, named_columns(TRUTH.names, np.concatenate(truth)), TRUTH)
     write_table(features_path, joined, FEATURES)
     return {"rendering_s": rendering_s}
+
+
+def rendered(
+    settings: FeatureSettings, source: FrameSource, poses: Float, iteration: int
+) -> StereoFrame:
+    """One frame of a robot, without colour, with the robots at poses (R, 3)."""
+    rng = generator(settings.seed, "radiometry", settings.robot, iteration)
+    return source.render(poses, settings.robot, settings.radiometry, rng, colour=False)
 
 
 class TruePoints(NamedTuple):

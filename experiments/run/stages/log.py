@@ -7,8 +7,9 @@ from experiments.run.stages.drive import TRAJECTORY_FILE
 from experiments.run.store_files import link_or_copy
 from experiments.scenario.randomness import generator
 from mapfusion.robot_log import write_frames, write_truth_poses
+from mapfusion.se2 import Float
 from sim.odometry import OdometryNoise, add_noise, calibrated_track_m, encoder_increments
-from sim.trajectory import read_trajectory
+from sim.trajectory import Trajectory, read_trajectory
 
 LABEL = "track features"
 _OBSERVED = ("observations.parquet", "truth_points.parquet")
@@ -28,10 +29,16 @@ def run(settings: LogSettings, job: Job) -> None:
     """Add odometry to the observations: the log's folder, with the truth beside it."""
     trajectory = read_trajectory(job.inputs["drive"] / TRAJECTORY_FILE)
     index = trajectory.index(settings.robot)
-    increments = encoder_increments(trajectory.wheel_rad[index], calibrated_track_m())
-    rng = generator(settings.seed, "odometry", settings.robot)
-    odometry = add_noise(increments, settings.odometry, rng)
+    odometry = measured_odometry(settings, trajectory)
     write_frames(job.output, settings.robot, False, trajectory.time_s, odometry)
     for name in _OBSERVED:
         link_or_copy(job.inputs["observed"] / name, job.output / name)
     write_truth_poses(job.output, trajectory.T_world_robot[index])
+
+
+def measured_odometry(settings: LogSettings, trajectory: Trajectory) -> Float:
+    """What a robot's wheels tell it, increments (T, 3)."""
+    wheel_rad = trajectory.wheel_rad[trajectory.index(settings.robot)]
+    rng = generator(settings.seed, "odometry", settings.robot)
+    increments = encoder_increments(wheel_rad, calibrated_track_m())
+    return add_noise(increments, settings.odometry, rng)

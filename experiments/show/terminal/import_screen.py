@@ -42,7 +42,7 @@ def _row(one: Imported) -> tuple[object, ...]:
         float(log.time_s[-1] - log.time_s[0]),
         float(np.hypot(*log.odometry[:, :2].T).sum()),
         float(np.median(seen)),
-        int(seen.min()),
+        int(seen[np.argmax(seen > 0) :].min()),  # tracks must last before any is observed
         100 * float(np.nanmedian(one.linked)),
         _odometry(one),
         f"{known} frames" if known else "none",
