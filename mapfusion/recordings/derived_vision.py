@@ -1,8 +1,9 @@
-"""The front end's settings for a camera that nobody has tuned it for.
+"""The front end's settings for a camera and surroundings that nobody has tuned it for.
 
 What the defaults of `FrontEndParameters` say in metres was chosen for one head: what is meant are
-disparities and shares of the image. Here they are turned into metres of another camera, and the
-described window spans what it spans there at the depths that are seen.
+disparities and shares of the image, and these are turned into metres of another camera. All else is
+measured on the recording's own pictures: depths, what true surfaces differ by in two pictures
+(`noise_model.py`), how many corners it takes, and how far true points stray from frame to frame.
 """
 
 from collections.abc import Sequence
@@ -12,18 +13,30 @@ import numpy as np
 
 from mapfusion.camera import StereoCamera
 from mapfusion.se2 import Float
+from mapfusion.vision.features import Features
 from mapfusion.vision.frontend import FrontEnd, FrontEndParameters
+from mapfusion.vision.noise_model import limits_for, measured_noise
+from mapfusion.vision.observing import Observer
+
+Pair = tuple[np.ndarray, np.ndarray]
 
 _USUAL = StereoCamera()  # the head that the defaults are for
 _USUAL_DEPTH_M = 3.5  # where that head's robots see walls, median
 _ROBOT_STEP = 4.0  # others move more between two pictures than 0.1 m: a car 1.2 m
+_AREA_PX = 300  # of the image for one corner at most: they keep 10 px apart, on texture
+_MOST_CORNERS = 5000  # that the setting allows
+# Share of true surfaces that keep all limits: of the fifth that does not, most lie near an edge.
+_TRUE_SHARE = 0.8
+_WANTED = 100  # observations a frame: a filter's step takes as long as it has of them
+_SIDE_M = (0.01, 10.0)  # of the described window, what the setting allows
 
 
 def derived_vision(camera: StereoCamera) -> FrontEndParameters:
-    """Settings by the camera alone: depths by disparity, shifts by the image's size."""
+    """Settings by the camera alone: depths by disparity, shifts and corners by the image's size."""
     usual = FrontEndParameters()
     scale = camera.focal_px * camera.baseline_m / (_USUAL.focal_px * _USUAL.baseline_m)
-    wide = camera.width_px / _USUAL.width_px
+    wide, high = camera.width_px / _USUAL.width_px, camera.height_px / _USUAL.height_px
+    corners = camera.width_px * camera.height_px // _AREA_PX
     stereo = replace(
         usual.stereo,
         min_depth_m=usual.stereo.min_depth_m * scale / max(wide, 1.0),
@@ -33,19 +46,47 @@ def derived_vision(camera: StereoCamera) -> FrontEndParameters:
     tracks = replace(
         usual.tracks,
         max_shift_u_px=usual.tracks.max_shift_u_px * wide,
-        max_shift_v_px=usual.tracks.max_shift_v_px
-        * _ROBOT_STEP
-        * camera.height_px
-        / _USUAL.height_px,
+        max_shift_v_px=usual.tracks.max_shift_v_px * _ROBOT_STEP * high,
         max_disparity_ratio=usual.tracks.max_disparity_ratio**_ROBOT_STEP,
     )
     return replace(
         usual,
+        harris=replace(usual.harris, max_corners=min(max(corners, 1), _MOST_CORNERS)),
         stereo=stereo,
         tracks=tracks,
         max_depth_m=usual.max_depth_m * scale,
         max_sigma_depth_m=usual.max_sigma_depth_m * scale,
     )
+
+
+def measured_vision(
+    camera: StereoCamera, apart: Sequence[Pair], run: Sequence[Pair]
+) -> FrontEndParameters:
+    """Settings by the camera and by what a recording shows.
+
+    Args:
+        camera: the rectified pair.
+        apart: pairs (H, W) uint8 from all over the recording.
+        run: pairs that follow one another, for what tracks do.
+    """
+    vision = derived_vision(camera)
+    noise = measured_noise(apart, camera, vision.harris, vision.stereo)
+    if noise is not None:
+        stereo = limits_for(vision.stereo, noise, _TRUE_SHARE)
+        tracks = replace(
+            vision.tracks,
+            noise_grey=noise.noise_grey,
+            max_misfit_px=max(vision.tracks.max_misfit_px, noise.misfit_px),
+        )
+        vision = replace(vision, stereo=stereo, tracks=tracks)
+    front_end = FrontEnd(camera, vision)
+    depth_m = [
+        camera.focal_px * camera.baseline_m / front_end.extract(*pair).disparity_px
+        for pair in apart
+    ]
+    vision = with_window_for(vision, camera, np.concatenate([*depth_m, np.empty(0)]))
+    front_end = FrontEnd(camera, vision)
+    return _by_tracks(camera, vision, [front_end.extract(*pair) for pair in run])
 
 
 def with_window_for(
@@ -58,19 +99,30 @@ def with_window_for(
     """
     if not len(depth_m):
         return vision
-    side_m = vision.usurf.side_m * (np.median(depth_m) / _USUAL_DEPTH_M)
-    side_m *= _USUAL.focal_px / camera.focal_px
-    steps = float(np.round(np.log2(side_m / vision.usurf.side_m)))
-    side_m = min(max(vision.usurf.side_m * 2.0**steps, 0.01), 10.0)  # what the setting allows
-    return replace(vision, usurf=replace(vision.usurf, side_m=side_m))
+    usual_m = vision.usurf.side_m
+    fits = np.median(depth_m) / _USUAL_DEPTH_M * _USUAL.focal_px / camera.focal_px
+    side_m = usual_m * 2.0 ** float(np.round(np.log2(fits)))
+    return replace(vision, usurf=replace(vision.usurf, side_m=float(np.clip(side_m, *_SIDE_M))))
 
 
-def seen_depths(
-    camera: StereoCamera,
-    vision: FrontEndParameters,
-    pairs: Sequence[tuple[np.ndarray, np.ndarray]],
-) -> Float:
-    """Depths (N,) of the corners matched in some rectified pairs."""
-    front_end = FrontEnd(camera, vision)
-    disparity = [front_end.extract(*pair).disparity_px for pair in pairs]
-    return camera.focal_px * camera.baseline_m / np.concatenate([*disparity, np.empty(0)])
+def _by_tracks(
+    camera: StereoCamera, vision: FrontEndParameters, frames: Sequence[Features]
+) -> FrontEndParameters:
+    """With as many corners as give the observations wanted, and noise as links have it."""
+    observer = Observer.of(camera, vision)
+    seen = [observer.observe(found) for found in frames]
+    excess = [each.tracks.motion.excess for each in seen if each.tracks.motion is not None]
+    lasting = [len(each.rows) for each in seen[vision.tracks.min_length - 1 :]]
+    if excess:
+        # stray from frame to frame is as much larger than stated in all directions alike
+        stray = max(float(np.sqrt(np.median(excess))), 1.0)
+        floor_px = vision.stereo.sigma_floor_px * stray
+        vision = replace(
+            vision,
+            sigma_uv_px=vision.sigma_uv_px * stray,
+            stereo=replace(vision.stereo, sigma_floor_px=floor_px),
+        )
+    if lasting and np.median(lasting) > _WANTED:
+        corners = int(vision.harris.max_corners * _WANTED / np.median(lasting))
+        vision = replace(vision, harris=replace(vision.harris, max_corners=corners))
+    return vision

@@ -75,7 +75,7 @@ class Rectification:
 def _cropped(calibration: StereoCalibration) -> Rectification | None:
     """For a pair that is rectified already; None where its pixels must be drawn anew."""
     left, right, T = calibration.left, calibration.right, calibration.T_left_right
-    f = left.focal_px[0]
+    f = float(left.focal_px[0])
     off_px = f * np.abs(T[:3, :3] - np.eye(3)).max() + f * np.abs(T[1:3, 3]).max() / T[0, 3]
     shift = right.center_px[0] - left.center_px[0]
     differences = [each - f for each in (*left.focal_px, *right.focal_px)]

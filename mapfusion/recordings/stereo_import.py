@@ -10,7 +10,7 @@ from mapfusion import se3
 from mapfusion.camera import StereoCamera
 from mapfusion.errors import InputError
 from mapfusion.odometry_covariance import write_odometry_covariance
-from mapfusion.recordings.derived_vision import derived_vision, seen_depths, with_window_for
+from mapfusion.recordings.derived_vision import derived_vision, measured_vision
 from mapfusion.recordings.mount import levelled
 from mapfusion.recordings.pictures import sampled
 from mapfusion.recordings.rectify import Rectification
@@ -25,6 +25,7 @@ from mapfusion.vision.row_errors import row_errors
 # Windows of the row search are 17 px: what lies a row off is found there still, two rows cost
 # half of the matches.
 _MOST_ROWS_OFF = 1.0
+_RUN = 8  # pairs that follow one another, on which tracks are tried
 _LEAST_MATCHES = 20  # corners whose median row error is worth a refusal
 _LONGEST_ODOMETRY_GAP_S = 1.0  # over which a trajectory is interpolated: wheels report often
 _LONGEST_TRUTH_GAP_S = 0.1  # as in MRCLAM's recordings: the truth must not be guessed
@@ -100,10 +101,10 @@ class StereoImport:
             raise InputError(f"{recording.name}: {error}") from error
         self.camera: StereoCamera = self._rectification.camera
         pairs = [self._pair(k) for k in sampled(len(recording))]
-        derived = derived_vision(self.camera)
-        self._require_rows(pairs, derived)
-        depth_m = seen_depths(self.camera, derived, pairs)
-        self.vision = adjust(with_window_for(derived, self.camera, depth_m))
+        self._require_rows(pairs, derived_vision(self.camera))
+        middle = max((len(recording) - _RUN) // 2, 0)
+        run = [self._pair(k) for k in range(len(recording))[middle : middle + _RUN]]
+        self.vision = adjust(measured_vision(self.camera, pairs, run))
         turn = se3.pose(self._rectification.R_left_rectified, np.zeros(3))
         self.T_robot_camera: Float = recording.T_robot_left @ turn
 

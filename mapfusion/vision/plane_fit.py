@@ -28,6 +28,7 @@ def fit_planes(
     slope_sigma: float,
     noise: float,
     alike_px: float,
+    row_sigma: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Fit disparity, slopes and an offset in brightness to each window.
 
@@ -42,6 +43,8 @@ def fit_planes(
         slope_sigma: standard deviation of the prior on a and b, around zero.
         noise: standard deviation of one image's grey levels.
         alike_px: what residuals hold beyond noise is alike over so many pixels each way.
+        row_sigma: standard deviation of the rows by which the images are off, pixels; one shift for
+            all of a window.
 
     Returns:
         Planes (N, 3) of d, a, b, and the variances (N,) of d + a x + b y at the offsets; NaN where
@@ -52,7 +55,16 @@ def fit_planes(
     for n in range(len(pixel)):
         plane[n, 0] = start[n]
         variance[n] = _fit_plane(
-            left, right, pixel[n], offset[n], half, slope_sigma, noise, alike_px, plane[n]
+            left,
+            right,
+            pixel[n],
+            offset[n],
+            half,
+            slope_sigma,
+            noise,
+            alike_px,
+            row_sigma,
+            plane[n],
         )
     return plane, variance
 
@@ -79,6 +91,7 @@ def _fit_plane(
     slope_sigma: float,
     noise: float,
     alike_px: float,
+    row_sigma: float,
     plane: np.ndarray,
 ) -> float:
     """Move `plane` (3,) to the least squares and return the variance at the offset.
@@ -128,7 +141,28 @@ def _fit_plane(
     solve_lower(factor, step)
     solve_upper(factor, step)
     kept = max(1 - count * noise**2 / 2 / normal[1, 1], _LEAST_TEXTURE)
-    return _counted(variance_grey, noise, alike_px) / kept**2 * np.dot(row, step)
+    variance = _counted(variance_grey, noise, alike_px) / kept**2 * np.dot(row, step)
+    if row_sigma > 0:
+        variance += (row_sigma * _by_row(left, u, v, half, step)) ** 2
+    return variance
+
+
+@njit(cache=True)
+def _by_row(left: np.ndarray, u: int, v: int, half: int, weight: np.ndarray) -> float:
+    """How much an estimate changes when the right window is one row off.
+
+    `weight` (4,) is how it follows from the moments J^T r; such a shift makes r the slope along v.
+    """
+    change = 0.0
+    for y in range(v - half, v + half + 1):
+        # the window's own rows where the next one lies outside the image
+        above, below = max(y - 1, 0), min(y + 1, left.shape[0] - 1)
+        for x in range(-half, half + 1):
+            slope = 0.5 * (float(left[y, u + x + 1]) - float(left[y, u + x - 1]))
+            down = (float(left[below, u + x]) - float(left[above, u + x])) / (below - above)
+            along = weight[1] + weight[2] * x + weight[3] * (y - v)
+            change += (weight[0] + slope * along) * down
+    return change
 
 
 @njit(cache=True)
@@ -173,11 +207,13 @@ def disagrees(
     half: int,
     noise: float,
     max_misfit: float,
+    max_rows: float,
 ) -> np.ndarray:
     """Whether any half (left, right, upper, lower) of each window does not fit the plane.
 
-    An error e in disparity changes the grey level by g e, g its slope. So a half fits when
-    sum r^2 <= n 2 noise^2 + max_misfit^2 sum g^2.
+    An error e in disparity changes the grey level by g e, g its slope along u, and rows that are
+    off by f change it by h f, h its slope along v. So a half fits when
+    sum r^2 <= n 2 noise^2 + max_misfit^2 sum g^2 + max_rows^2 sum h^2.
 
     Args:
         left: (H, W) uint8.
@@ -187,46 +223,68 @@ def disagrees(
         half: half side of the window, pixels.
         noise: standard deviation of one image's grey levels.
         max_misfit: e, pixels.
+        max_rows: f, pixels.
 
     Returns:
         (N,) bool.
     """
     verdict = np.empty(len(pixel), dtype=np.bool_)
+    square = np.empty((4, 4))
     for n in range(len(pixel)):
-        verdict[n] = _disagrees(left, right, pixel[n], plane[n], half, noise, max_misfit)
+        _halves(left, right, pixel[n], plane[n], half, square)
+        verdict[n] = False
+        for k in range(4):
+            tolerated = square[k, 0] * 2 * noise**2 + max_misfit**2 * square[k, 2]
+            if square[k, 1] > tolerated + max_rows**2 * square[k, 3]:
+                verdict[n] = True
     return verdict
 
 
 @njit(cache=True)
-def _disagrees(
+def half_squares(
+    left: np.ndarray, right: np.ndarray, pixel: np.ndarray, plane: np.ndarray, half: int
+) -> np.ndarray:
+    """What `disagrees` looks at, of each half of each window (N, 4, 4).
+
+    In the last axis: pixels, sum of squared residuals, of squared slopes along u and along v.
+    """
+    squares = np.empty((len(pixel), 4, 4))
+    for n in range(len(pixel)):
+        _halves(left, right, pixel[n], plane[n], half, squares[n])
+    return squares
+
+
+@njit(cache=True)
+def _halves(
     left: np.ndarray,
     right: np.ndarray,
     pixel: np.ndarray,
     plane: np.ndarray,
     half: int,
-    noise: float,
-    max_misfit: float,
-) -> bool:
+    squares: np.ndarray,
+) -> None:
+    """Fill in (4, 4), see `half_squares`; residuals without the window's offset in brightness."""
     height, width = left.shape
     u, v = pixel[0], pixel[1]
-    sums = np.zeros((4, 4))  # left, right, upper, lower; n, sum r, sum r^2, sum g^2
+    residuals = np.zeros(4)  # their sums: left, right, upper, lower
+    squares[:] = 0.0
     for y in range(max(-half, -v), min(half, height - 1 - v) + 1):
+        above, below = max(v + y - 1, 0), min(v + y + 1, height - 1)
         for x in range(max(-half, 1 - u), min(half, width - 2 - u) + 1):
             at = u + x - plane[0] - plane[1] * x - plane[2] * y
             if not 1 <= at < width - 2:
                 continue
             residual = _grey(right, at, v + y) - float(left[v + y, u + x])
             slope = 0.5 * (float(left[v + y, u + x + 1]) - float(left[v + y, u + x - 1]))
+            down = (float(left[below, u + x]) - float(left[above, u + x])) / (below - above)
             for k in range(4):
                 if (x < 0, x > 0, y < 0, y > 0)[k]:
-                    sums[k, 0] += 1
-                    sums[k, 1] += residual
-                    sums[k, 2] += residual**2
-                    sums[k, 3] += slope**2
-    count = sums[2, 0] + sums[3, 0]
-    offset = (sums[2, 1] + sums[3, 1]) / count if count > 0 else 0.0  # in brightness
+                    residuals[k] += residual
+                    squares[k, 0] += 1
+                    squares[k, 1] += residual**2
+                    squares[k, 2] += slope**2
+                    squares[k, 3] += down**2
+    count = squares[2, 0] + squares[3, 0]
+    offset = (residuals[2] + residuals[3]) / count if count > 0 else 0.0  # in brightness
     for k in range(4):
-        square = sums[k, 2] - 2 * offset * sums[k, 1] + sums[k, 0] * offset**2
-        if square > sums[k, 0] * 2 * noise**2 + max_misfit**2 * sums[k, 3]:
-            return True
-    return False
+        squares[k, 1] += squares[k, 0] * offset**2 - 2 * offset * residuals[k]

@@ -49,7 +49,10 @@ class StereoParameters:
         noise_grey: noise of one image, grey levels; what residuals are held against.
         silhouette_half_px: half side of the window of the silhouette test.
         max_misfit_px: a half window may differ from the plane by noise and by what this error in
-            disparity would explain.
+            disparity would explain,
+        max_rows_px: and by what rows that are so far off would.
+        row_sigma_px: standard deviation of the rows by which the two images are off; 0 of a pair
+            that is rectified exactly, as simulated ones are. It adds to that of disparities.
         residual_correlation_px: what residuals hold beyond noise (staircase edges, a surface that
             is no plane) is alike over so many pixels each way: that many squared count as one.
         sigma_floor_px: error that stays however much texture there is. With this and the one before
@@ -67,6 +70,8 @@ class StereoParameters:
     noise_grey: Annotated[float, Range(0, 255, "grey levels")] = 2.0
     silhouette_half_px: Annotated[int, Range(2, 100, "px")] = 12
     max_misfit_px: Annotated[float, Range(1e-3, 100, "px")] = 1.0
+    max_rows_px: Annotated[float, Range(0, 100, "px")] = 0.0
+    row_sigma_px: Annotated[float, Range(0, 100, "px")] = 0.0
     residual_correlation_px: Annotated[float, Range(0, 100, "px")] = 6.0
     sigma_floor_px: Annotated[float, Range(0, 100, "px")] = 0.01
 
@@ -144,6 +149,7 @@ def match(
         parameters.silhouette_half_px,
         parameters.noise_grey,
         parameters.max_misfit_px,
+        parameters.max_rows_px,
     )
     verdict[rows[bad]] = Verdict.SILHOUETTE
 
@@ -194,6 +200,7 @@ def _refine(
         camera.baseline_m / parameters.nearest_plane_m,
         parameters.noise_grey,
         parameters.residual_correlation_px,
+        parameters.row_sigma_px,
     )
     disparity = plane[:, 0] + np.sum(plane[:, 1:] * offset, -1)
     return plane, disparity, np.sqrt(variance + parameters.sigma_floor_px**2)

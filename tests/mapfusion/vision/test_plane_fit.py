@@ -15,7 +15,7 @@ def test_fit_equals_a_general_least_squares_solver() -> None:
     pixel = np.rint(grid(step=40)).astype(np.int64)
     start = np.rint(9.3 + pixel @ [0.02, -0.01])
     plane, _ = fit_planes(
-        left, right, pixel, np.zeros(pixel.shape), start, half, slope_sigma, 1.0, 1.0
+        left, right, pixel, np.zeros(pixel.shape), start, half, slope_sigma, 1.0, 1.0, 0.0
     )
     y, x = (k.ravel() for k in np.mgrid[-half : half + 1, -half : half + 1])
     for n, (u, v) in enumerate(pixel):
@@ -47,7 +47,8 @@ def test_variance_is_that_of_the_disparity_at_the_corner() -> None:
     start, half = np.rint(9.3 + pixel @ [0.02, -0.01]), 6
     offset = np.random.default_rng(0).uniform(-6, 6, pixel.shape)
     fits = (
-        fit_planes(left, right, pixel, o, start, half, 1e6, 4.0, 1.0) for o in (offset, 0 * offset)
+        fit_planes(left, right, pixel, o, start, half, 1e6, 4.0, 1.0, 0.0)
+        for o in (offset, 0 * offset)
     )
     (_, there), (_, here) = fits
     for n, (u, v) in enumerate(pixel):
@@ -62,10 +63,10 @@ def test_the_prior_pulls_the_slopes_towards_zero() -> None:
     pixel = np.rint(grid(step=30)).astype(np.int64)
     start, half = np.rint(9.0 + 0.03 * pixel[:, 0]), 6
     offset = np.zeros(pixel.shape)
-    free, _ = fit_planes(left, right, pixel, offset, start, half, 1e6, 3.0, 1.0)
+    free, _ = fit_planes(left, right, pixel, offset, start, half, 1e6, 3.0, 1.0, 0.0)
     texture = np.median([normal_matrix(left, u, v, half)[2, 2] for u, v in pixel])
     as_sure = np.sqrt(2 * 3.0**2 / texture)
-    held, _ = fit_planes(left, right, pixel, offset, start, half, as_sure, 3.0, 1.0)
+    held, _ = fit_planes(left, right, pixel, offset, start, half, as_sure, 3.0, 1.0, 0.0)
     assert np.nanmedian(free[:, 1]) == pytest.approx(0.03, rel=0.05)
     # a half where the noise is all there is to the residuals; the slope that is kept back is, too
     assert 0.008 < np.nanmedian(held[:, 1]) < 0.015
@@ -99,6 +100,6 @@ def test_the_worst_half_of_the_window_decides() -> None:
         worst.append(int(np.argmax(misfit)))
         for share, expected in ((0.999, True), (1.001, False)):
             most = share * misfit.max()
-            found = disagrees(left, right, np.array([[u, v]]), plane, 12, 1.0, most)
+            found = disagrees(left, right, np.array([[u, v]]), plane, 12, 1.0, most, 0.0)
             assert found.tolist() == [expected]
     assert min(worst.count(side) for side in range(4)) >= 3
