@@ -100,15 +100,16 @@ class StereoImport:
         except InputError as error:
             raise InputError(f"{recording.name}: {error}") from error
         self.camera: StereoCamera = self._rectification.camera
-        pairs = [self._pair(k) for k in sampled(len(recording))]
+        pairs = [self.rectified(k) for k in sampled(len(recording))]
         self._require_rows(pairs, derived_vision(self.camera))
         middle = max((len(recording) - _RUN) // 2, 0)
-        run = [self._pair(k) for k in range(len(recording))[middle : middle + _RUN]]
+        run = [self.rectified(k) for k in range(len(recording))[middle : middle + _RUN]]
         self.vision = adjust(measured_vision(self.camera, pairs, run))
         turn = se3.pose(self._rectification.R_left_rectified, np.zeros(3))
         self.T_robot_camera: Float = recording.T_robot_left @ turn
 
-    def _pair(self, k: int) -> tuple[np.ndarray, np.ndarray]:
+    def rectified(self, k: int) -> tuple[np.ndarray, np.ndarray]:
+        """The pair k of the recording, rectified; raises InputError."""
         try:
             return self._rectification.apply(self._recording.pair(k))
         except InputError as error:
@@ -142,7 +143,7 @@ class StereoImport:
         observer = Observer.of(self.camera, self.vision)
         observed, motions, linked, before = [], [], [np.nan], 0
         for n, k in enumerate(rows):
-            found = front_end.extract(*self._pair(k))
+            found = front_end.extract(*self.rectified(k))
             frame = observer.observe(found, float(steps[n]))
             if n:
                 linked.append(float(np.sum(frame.tracks.length > 1)) / max(before, 1))

@@ -36,7 +36,7 @@ def test_the_covariance_is_the_spread_of_the_errors() -> None:
     rng = np.random.default_rng(0)
     root = 1e-3 * rng.normal(size=(6, 6))
     true = of_camera(se3.from_planar(MOVED[0]))
-    drawn = (root @ rng.standard_normal((6, 40_000))).T
+    drawn = (root @ rng.standard_normal((6, 10_000))).T
     T = np.tile(true, (len(drawn), 1, 1))
     T[:, :3, :3] = Rotation.from_rotvec(drawn[:, 3:]).as_matrix() @ T[:, :3, :3]
     T[:, :3, 3] += drawn[:, :3]
@@ -46,7 +46,7 @@ def test_the_covariance_is_the_spread_of_the_errors() -> None:
     spread = np.cov((made.increments[1:] - MOVED[0]).T)
     scale = np.sqrt(np.diag(spread))
     np.testing.assert_allclose(
-        made.covariance[1] / np.outer(scale, scale), spread / np.outer(scale, scale), atol=0.03
+        made.covariance[1] / np.outer(scale, scale), spread / np.outer(scale, scale), atol=0.05
     )
 
 

@@ -23,13 +23,22 @@ class Picture:
 
 
 def pair(
-    d: float, a: float = 0.0, b: float = 0.0, noise: float = 0.0, seed: int = 0
+    d: float,
+    a: float = 0.0,
+    b: float = 0.0,
+    noise: float = 0.0,
+    seed: int = 0,
+    rows: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Left and right uint8 images with disparity d + a u + b v at each left pixel."""
+    """Left and right uint8 images with disparity d + a u + b v at each left pixel.
+
+    What the right one shows lies `rows` lower there; only without a slope b.
+    """
     u, v = np.meshgrid(np.arange(CAMERA.width_px), np.arange(CAMERA.height_px))
     picture, rng = Picture(seed), np.random.default_rng(seed)
     u_left = (u + d + b * v) / (1 - a)  # of what the right image shows at u
-    images = (picture(x, v) + noise * rng.standard_normal(u.shape) for x in (u, u_left))
+    shown = ((u, v), (u_left, v - rows))
+    images = (picture(x, y) + noise * rng.standard_normal(u.shape) for x, y in shown)
     left, right = (np.clip(np.rint(i), 0, 255).astype(np.uint8) for i in images)
     return left, right
 

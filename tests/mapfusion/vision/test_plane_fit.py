@@ -103,3 +103,33 @@ def test_the_worst_half_of_the_window_decides() -> None:
             found = disagrees(left, right, np.array([[u, v]]), plane, 12, 1.0, most, 0.0)
             assert found.tolist() == [expected]
     assert min(worst.count(side) for side in range(4)) >= 3
+
+
+def test_rows_that_are_off_add_what_they_shift_the_disparity_by() -> None:
+    """Against the shift itself: pictures a tenth of a row apart, and the same that fit."""
+    pixel = np.rint(grid(step=25)).astype(np.int64)
+    start, half = np.full(len(pixel), 9.0), 6
+    offset = np.random.default_rng(0).uniform(-1, 1, pixel.shape)
+    own = (pixel, offset, start, half, 0.1, 1.0, 1.0)
+    off_rows, found = 0.5, []
+    for rows in (0.0, off_rows):
+        plane, _ = fit_planes(*pair(9.3, rows=rows), *own, 0.0)
+        found.append(plane[:, 0] + np.sum(plane[:, 1:] * offset, -1))
+    shifted = np.abs(found[1] - found[0]) / off_rows
+    images = pair(9.3)
+    stated, alone = (fit_planes(*images, *own, rows)[1] for rows in (1.0, 0.0))
+    predicted = np.sqrt(stated - alone)
+    assert np.median(predicted) > 0.02
+    assert np.corrcoef(predicted, shifted)[0, 1] > 0.97
+    assert np.median(predicted / np.maximum(shifted, 0.02)) == pytest.approx(1, abs=0.15)
+
+
+def test_rows_that_are_off_are_tolerated_where_asked() -> None:
+    left, right = pair(8.0, rows=0.6)
+    pixel = np.rint(grid(step=25)).astype(np.int64)
+    plane = np.tile([8.0, 0.0, 0.0], (len(pixel), 1))
+    refused = [
+        disagrees(left, right, pixel, plane, 12, 1.0, 0.05, rows).mean() for rows in (0, 0.4, 0.8)
+    ]
+    assert refused[0] == refused[1] == 1
+    assert refused[2] == 0

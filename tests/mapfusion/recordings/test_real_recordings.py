@@ -1,0 +1,99 @@
+"""Extracts of KITTI and EuRoC, where MAPFUSION_RECORDINGS names the folder that holds them.
+
+`kitti_extract` is laid out anew, as KITTI publishes its sequences; `euroc_extract` is so already.
+"""
+
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mapfusion import se3
+from mapfusion.errors import InputError
+from mapfusion.recordings.lens import Lens, StereoCalibration
+from mapfusion.recordings.registry import read_recording
+from mapfusion.recordings.stereo_import import Cut, Imported, StereoImport
+from mapfusion.recordings.stereo_recording import StereoRecording
+from mapfusion.vision.frontend import FrontEnd
+from tests.mapfusion.recordings.written_layouts import read_yaml
+
+RECORDINGS = Path(os.environ.get("MAPFUSION_RECORDINGS", "none"))
+pytestmark = pytest.mark.skipif(not RECORDINGS.is_dir(), reason="MAPFUSION_RECORDINGS is not set")
+WHOLE = Cut("R1", slice(None))
+
+
+@pytest.fixture(scope="module")
+def kitti(tmp_path_factory: pytest.TempPathFactory) -> StereoRecording:
+    root, extract = tmp_path_factory.mktemp("kitti"), RECORDINGS / "kitti_extract"
+    sequence = root / "sequences" / "06"
+    sequence.mkdir(parents=True)
+    for camera, name in enumerate(("image_l", "image_r")):
+        (sequence / f"image_{camera}").symlink_to((extract / name).resolve())
+    numbers = (extract / "calib.txt").read_text().split()
+    lines = [f"P{k}: {' '.join(numbers[12 * k : 12 * k + 12])}" for k in (0, 1)]
+    (sequence / "calib.txt").write_text("\n".join(lines))
+    (sequence / "times.txt").write_text("\n".join(f"{0.1 * k:e}" for k in range(26)))
+    (sequence / "poses.txt").write_text((extract / "poses.txt").read_text())
+    return read_recording("kitti", sequence)
+
+
+@pytest.fixture(scope="module")
+def work(kitti: StereoRecording) -> StereoImport:
+    return StereoImport(kitti)
+
+
+@pytest.fixture(scope="module")
+def imported(work: StereoImport) -> Imported:
+    return work.log_of(WHOLE)
+
+
+def sgbm(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    matcher = cv2.StereoSGBM_create(
+        0, 192, 5, 8 * 25, 32 * 25, disp12MaxDiff=1, uniquenessRatio=10,
+        speckleWindowSize=100, speckleRange=2,
+    )  # fmt: skip
+    disparity = matcher.compute(left, right).astype(float) / 16
+    return np.where(disparity > 0, disparity, np.nan)
+
+
+def test_kitti_matches_are_many_and_right(work: StereoImport) -> None:
+    front_end, counts, right = FrontEnd(work.camera, work.vision), [], []
+    for k in range(0, 26, 5):
+        pair = work.rectified(k)
+        found = front_end.extract(*pair)
+        u, v = np.rint(found.uv_px).astype(int).T
+        off = np.abs(sgbm(*pair)[v, u] - found.disparity_px)
+        counts.append(len(found))
+        right.append(np.mean(off[np.isfinite(off)] < 1))
+    assert min(counts) >= 300
+    assert np.mean(right) >= 0.97
+
+
+def test_kitti_is_seen_well_enough_to_map(imported: Imported) -> None:
+    assert np.median(imported.observations[2:]) >= 80
+    assert imported.observations[2:].min() >= 20
+    assert imported.too_little == ""
+
+
+def test_kitti_odometry_from_the_pictures(kitti: StereoRecording, imported: Imported) -> None:
+    assert kitti.truth is not None
+    true = se3.planar(se3.between(kitti.truth.T[:-1], kitti.truth.T[1:]))
+    error = imported.log.odometry[1:] - true
+    assert np.median(np.hypot(*error[:, :2].T)) <= 0.02
+    assert np.degrees(np.median(np.abs(error[:, 2]))) <= 0.04
+
+
+def test_euroc_is_rectified_and_raw_it_is_refused() -> None:
+    recording = read_recording("euroc", RECORDINGS / "euroc_extract", None, read_yaml)
+    log = StereoImport(recording).log_of(WHOLE)
+    assert np.median(log.observations[2:]) >= 60
+    size, f, center = (752, 480), (457.0, 457.0), (375.5, 239.5)
+    lens, T = Lens(size, f, center), se3.pose(np.eye(3), [0.11, 0.0, 0.0])
+    raw = StereoRecording(
+        "raw", recording.time_ns, recording.pictures, StereoCalibration(lens, lens, T),
+        recording.T_robot_left,
+    )  # fmt: skip
+    with pytest.raises(InputError, match="rows apart"):
+        StereoImport(raw)
