@@ -23,6 +23,39 @@ if TYPE_CHECKING:
 
 app = typer.Typer(no_args_is_help=True, help="Turn recordings in foreign formats into robot logs.")
 Folder = Annotated[Path, typer.Argument(metavar="FOLDER", help="The recording.")]
+Frames = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--frames",
+        metavar="[NAME=]FROM:TO",
+        help="Pairs that are one robot, a slice (FROM:TO:STEP, too); may be repeated.",
+    ),
+]
+Odometry = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FILE|images",
+        help="Dead reckoning of the robot, in the TUM format, or what the pictures tell; "
+        "by default as recorded, else by the pictures.",
+    ),
+]
+Truth = Annotated[Path | None, typer.Option(help="True poses of the robot in the world, likewise.")]
+VisionOverrides = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Replaces a setting of the front end, e.g. vision.harris.max_corners=300.",
+    ),
+]
+VisionOf = Annotated[
+    str | None,
+    typer.Option(
+        metavar="SCENARIO",
+        help="File or name whose settings of the front end to use; "
+        "by default they follow from camera and pictures.",
+    ),
+]
 _CUT = re.compile(r"(?:(?P<name>[^=]*)=)?(?P<rows>-?\d*:-?\d*(?::\d*)?)")
 _NAME = re.compile("[A-Za-z0-9][A-Za-z0-9_-]{0,40}")  # as scenarios have it
 
@@ -47,40 +80,11 @@ def _stereo_command(format_name: str) -> Callable[..., None]:
         folder: Folder,
         output: options.Output,
         overrides: options.ImportOverrides,
-        frames: Annotated[
-            list[str] | None,
-            typer.Option(
-                "--frames",
-                metavar="[NAME=]FROM:TO",
-                help="Pairs that are one robot, a slice (FROM:TO:STEP, too); may be repeated.",
-            ),
-        ] = None,
-        odometry: Annotated[
-            str | None,
-            typer.Option(
-                metavar="FILE|images",
-                help="Dead reckoning of the robot, in the TUM format, or what the pictures tell; "
-                "by default as recorded, else by the pictures.",
-            ),
-        ] = None,
-        truth: Annotated[
-            Path | None, typer.Option(help="True poses of the robot in the world, likewise.")
-        ] = None,
-        vision: Annotated[
-            list[str] | None,
-            typer.Option(
-                "--set",
-                metavar="KEY=VALUE",
-                help="Replaces a setting of the front end that follows from the camera, "
-                "e.g. vision.harris.max_corners=300.",
-            ),
-        ] = None,
-        scenario: Annotated[
-            str | None,
-            typer.Option(
-                metavar="SCENARIO", help="File or name whose settings of the front end to use."
-            ),
-        ] = None,
+        frames: Frames = None,
+        odometry: Odometry = None,
+        truth: Truth = None,
+        vision: VisionOverrides = None,
+        scenario: VisionOf = None,
         **chosen: str | None,
     ) -> None:
         from experiments.run.stereo_logs import import_stereo, vision_of

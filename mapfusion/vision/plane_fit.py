@@ -101,16 +101,8 @@ def _fit_plane(
     """
     u, v = pixel[0], pixel[1]
     count = (2 * half + 1) ** 2
-    normal = np.zeros((4, 4))  # of the offset in brightness, d, a, b
-    row = np.empty(4)
-    for y in range(v - half, v + half + 1):
-        for x in range(-half, half + 1):
-            slope = 0.5 * (float(left[y, u + x + 1]) - float(left[y, u + x - 1]))
-            row[0], row[1], row[2], row[3] = 1.0, slope, slope * x, slope * (y - v)
-            for i in range(4):
-                for j in range(i + 1):
-                    normal[i, j] += row[i] * row[j]
-    factor = np.empty((4, 4))
+    normal, factor, row = np.zeros((4, 4)), np.empty((4, 4)), np.empty(4)
+    _normal_matrix(left, u, v, half, normal)
     step = np.empty(4)
     variance_grey = 2 * noise**2
     for _ in range(_MAX_STEPS):
@@ -145,6 +137,19 @@ def _fit_plane(
     if row_sigma > 0:
         variance += (row_sigma * _by_row(left, u, v, half, step)) ** 2
     return variance
+
+
+@njit(cache=True)
+def _normal_matrix(left: np.ndarray, u: int, v: int, half: int, normal: np.ndarray) -> None:
+    """Add up the lower half of J^T J, of the offset in brightness, d, a and b."""
+    row = np.empty(4)
+    for y in range(v - half, v + half + 1):
+        for x in range(-half, half + 1):
+            slope = 0.5 * (float(left[y, u + x + 1]) - float(left[y, u + x - 1]))
+            row[0], row[1], row[2], row[3] = 1.0, slope, slope * x, slope * (y - v)
+            for i in range(4):
+                for j in range(i + 1):
+                    normal[i, j] += row[i] * row[j]
 
 
 @njit(cache=True)

@@ -14,6 +14,7 @@ from mapfusion.align.registry import ALIGNERS, make_aligner
 from mapfusion.camera import StereoCamera
 from mapfusion.vision.frontend import FrontEnd, FrontEndParameters
 from mapfusion.vision.harris import HarrisParameters
+from mapfusion.vision.noise_model import measured_noise
 from mapfusion.vision.tracks import Tracker, TrackParameters
 from sim.exposure import expose
 from sim.floorplan import FloorPlan, Wall
@@ -89,10 +90,12 @@ def front_end() -> None:
     camera, rng = StereoCamera(80, 60, 72.0), np.random.default_rng(0)
     room = [wall(rng, (1.6, 2.0), (1.4, -2.0))]
     few = replace(FrontEndParameters(), harris=HarrisParameters(max_corners=20))
+    off_rows = replace(few, stereo=replace(few.stereo, row_sigma_px=0.5))
     tracker = Tracker(TrackParameters(), camera, 0.1)
     for t in range(3):
         left, right, _ = render(room, camera, (0.02 * t, 0.0, 0.0), 1.0, rng)
-        tracker.update(FrontEnd(camera, few).extract(left, right))
+        tracker.update(FrontEnd(camera, off_rows).extract(left, right))
+        measured_noise([(left, right)], camera, few.harris, few.stereo)
 
 
 def call_all() -> None:
