@@ -6,6 +6,7 @@ measured on the recording's own pictures: depths, what true surfaces differ by i
 (`noise_model.py`), how many corners it takes, and how far true points stray from frame to frame.
 """
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -17,6 +18,7 @@ from mapfusion.vision.features import Features
 from mapfusion.vision.frontend import FrontEnd, FrontEndParameters
 from mapfusion.vision.noise_model import limits_for, measured_noise
 from mapfusion.vision.observing import Observer
+from mapfusion.vision.tracks import Tracks
 
 Pair = tuple[np.ndarray, np.ndarray]
 
@@ -28,6 +30,7 @@ _MOST_CORNERS = 5000  # that the setting allows
 # Share of true surfaces that keep all limits: of the fifth that does not, most lie near an edge.
 _TRUE_SHARE = 0.8
 _WANTED = 100  # observations a frame: a filter's step takes as long as it has of them
+_MEDIAN_ERROR = 0.6745  # of a normal variable, in standard deviations
 _SIDE_M = (0.01, 10.0)  # of the described window, what the setting allows
 
 
@@ -108,21 +111,35 @@ def with_window_for(
 def _by_tracks(
     camera: StereoCamera, vision: FrontEndParameters, frames: Sequence[Features]
 ) -> FrontEndParameters:
-    """With as many corners as give the observations wanted, and noise as links have it."""
+    """With as many corners as give the observations wanted, and noise as tracks have it."""
     observer = Observer.of(camera, vision)
-    seen = [observer.observe(found) for found in frames]
-    excess = [each.tracks.motion.excess for each in seen if each.tracks.motion is not None]
-    lasting = [len(each.rows) for each in seen[vision.tracks.min_length - 1 :]]
-    if excess:
-        # stray from frame to frame is as much larger than stated in all directions alike
-        stray = max(float(np.sqrt(np.median(excess))), 1.0)
-        floor_px = vision.stereo.sigma_floor_px * stray
-        vision = replace(
-            vision,
-            sigma_uv_px=vision.sigma_uv_px * stray,
-            stereo=replace(vision.stereo, sigma_floor_px=floor_px),
-        )
-    if lasting and np.median(lasting) > _WANTED:
-        corners = int(vision.harris.max_corners * _WANTED / np.median(lasting))
+    seen = [observer.observe(found).tracks for found in frames]
+    strays = [
+        strays_px(camera, before, after)
+        for before, after in itertools.pairwise(seen)
+        if after.motion is not None
+    ]
+    if strays:
+        # half of the errors lie within 0.67 deviations; two frames have a share in each
+        sigma_px = float(np.median(np.abs(np.concatenate(strays)))) / _MEDIAN_ERROR / np.sqrt(2)
+        vision = replace(vision, sigma_uv_px=float(max(vision.sigma_uv_px, sigma_px)))
+    observer = Observer.of(camera, vision)
+    lasting = [len(observer.observe(found).rows) for found in frames]
+    usual = np.median(lasting[vision.tracks.min_length - 1 :] or [0])
+    if usual > _WANTED:
+        corners = int(vision.harris.max_corners * _WANTED / usual)
         vision = replace(vision, harris=replace(vision.harris, max_corners=corners))
     return vision
+
+
+def strays_px(camera: StereoCamera, before: Tracks, after: Tracks) -> Float:
+    """By how much points of the tracks lie beside where the motion takes them (2N,), u and v.
+
+    Only where a motion is known.
+    """
+    assert after.motion is not None
+    _, old, new = np.intersect1d(before.track_id, after.track_id, return_indices=True)
+    p_after, _ = camera.triangulate(after.uv_px[new], after.disparity_px[new], 1.0, 1.0)
+    T = after.motion.T_before_after
+    moved = camera.project(p_after @ T[:3, :3].T + T[:3, 3])
+    return (moved[:, :2] - before.uv_px[old]).ravel()

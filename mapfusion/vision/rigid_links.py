@@ -40,13 +40,11 @@ class RigidMotion:
             about them through its origin, in that order. As large as the residuals say, where these
             exceed what is stated of the points.
         n_links: how many links agree with it.
-        excess: median of their squared distances over what the stated covariances promise.
     """
 
     T_before_after: Float
     covariance: Float
     n_links: int
-    excess: float = 1.0
 
 
 def rigid_links(
@@ -81,9 +79,9 @@ def rigid_links(
     if own.sum() < MIN_LINKS:
         return own, None
     # The median of what has passed the gate lies a little low, by less than a part in a hundred.
-    excess = float(np.median(square[best][own])) / _MEDIAN_SQUARE
-    covariance = max(excess, 1.0) * np.linalg.inv(normal[best])
-    return own, RigidMotion(T[best], (covariance + covariance.T) / 2, int(own.sum()), excess)
+    excess = max(float(np.median(square[best][own])) / _MEDIAN_SQUARE, 1.0)
+    covariance = excess * np.linalg.inv(normal[best])
+    return own, RigidMotion(T[best], (covariance + covariance.T) / 2, int(own.sum()))
 
 
 def starts(p_before_m: Float) -> np.ndarray:

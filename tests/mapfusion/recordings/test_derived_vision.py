@@ -3,9 +3,12 @@
 import numpy as np
 import pytest
 
+from mapfusion import se3
 from mapfusion.camera import StereoCamera
-from mapfusion.recordings.derived_vision import derived_vision, with_window_for
+from mapfusion.recordings.derived_vision import derived_vision, strays_px, with_window_for
 from mapfusion.vision.frontend import FrontEndParameters
+from mapfusion.vision.rigid_links import RigidMotion
+from mapfusion.vision.tracks import Tracks
 
 
 @pytest.mark.parametrize(("focal_px", "baseline_m"), [(577, 0.09), (707, 0.54), (300, 0.05)])
@@ -29,3 +32,21 @@ def test_the_window_doubles_with_the_depths_that_are_seen() -> None:
     ]
     assert sides == pytest.approx([0.6, 0.6, 1.2, 2.4])
     assert with_window_for(vision, camera, np.empty(0)) is vision
+
+
+def test_what_tracks_stray_is_the_noise_of_their_places() -> None:
+    rng, camera, n = np.random.default_rng(0), StereoCamera(), 4000
+    T = se3.pose(np.eye(3), [0.1, 0.0, 0.0])
+    p_after = rng.uniform((3, -1, 0), (6, 1, 1), (n, 3))
+    noise = 0.3
+    uvd = [camera.project(p) for p in (p_after + T[:3, 3], p_after)]
+    order = rng.permutation(n)  # a frame has its features in an order of its own
+    motion = RigidMotion(T, np.eye(6), n)
+    before, after = (
+        Tracks(rows, rows, seen[rows, :2] + noise * rng.standard_normal((n, 2)), seen[rows, 2], own)
+        for rows, seen, own in ((np.arange(n), uvd[0], None), (order, uvd[1], motion))
+    )
+    strays = strays_px(camera, before, after)
+    assert len(strays) == 2 * n
+    # the motion hardly scales the picture: two frames have an equal share in what strays
+    assert np.std(strays) == pytest.approx(np.sqrt(2) * noise, rel=0.04)

@@ -161,11 +161,11 @@ def test_pairs_are_each_others_nearest_in_time() -> None:
     def shots(*times_ms: float) -> list[Shot]:
         return [Shot(round(1e6 * t), f"{t}", lambda: np.zeros((1, 1))) for t in times_ms]
 
-    left, right = shots(0, 50, 100, 150, 200), shots(1, 51, 99, 101, 149, 260)
+    left, right = shots(0, 50, 100, 150, 200, 300, 301.5), shots(1, 51, 99, 101, 149, 260, 301)
     times, pictures, dropped = paired(left, right)
-    assert (times / 1e6).tolist() == [0, 50, 100, 150]
-    assert len(pictures) == 4
-    assert [text.split(" (")[0] for text in dropped] == ["200", "101", "260"]
+    assert (times / 1e6).tolist() == [0, 50, 100, 150, 301.5]
+    assert len(pictures) == 5
+    assert [text.split(" (")[0] for text in dropped] == ["200", "300", "101", "260"]
     with pytest.raises(InputError, match="make 1 pairs"):
         paired(shots(0, 50), shots(0, 90))
 
