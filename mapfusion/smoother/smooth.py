@@ -20,6 +20,9 @@ from mapfusion.smoother.sightings import Sightings, sightings_of
 # the path to start from is far off, most observations look gross and lose the weight to mend it.
 # It need not end closer than this, in squared sigmas a coordinate, to where the next one goes on.
 _THOUGHT_WORSE, _CLOSE = 4.0, 1e-2
+# Of a motion that nothing but observations tells: what a robot does between frames is less. Frames
+# that see nothing would else be anywhere.
+_UNTOLD_M, _UNTOLD_RAD = 10.0, 1.0
 
 
 @dataclass(frozen=True)
@@ -44,6 +47,11 @@ class SmootherParameters:
     def stray_information(self) -> float:
         """Of a track's offset along each axis, in 1/m^2; 0 where there are no offsets."""
         return 1 / self.stray_m**2 if self.stray_m else 0.0
+
+    def without_odometry(self) -> "SmootherParameters":
+        """For a log whose odometry was taken from what it observes, which must not count twice."""
+        motion = replace(self.motion, floor_m=_UNTOLD_M, floor_rad=_UNTOLD_RAD)
+        return replace(self, motion=motion)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,12 @@ from experiments.run.frames import FLOAT, INT, TEXT, fields, read_rows, write_ro
 from experiments.run.job import Job
 from experiments.run.stage_tables import CORRESPONDENCES, COVARIANCE, ESTIMATES
 from experiments.run.stages.slam import associations_at, read_snapshots
-from experiments.run.stages.smooth import log_until, read_smoothed, read_smoothed_path
+from experiments.run.stages.smooth import (
+    log_until,
+    read_smoothed,
+    read_smoothed_path,
+    smoother_of,
+)
 from mapfusion.aligned_landmarks import ABSENT
 from mapfusion.fuse.parameters import MergeParameters
 from mapfusion.fuse.registry import make_fuser
@@ -162,7 +167,8 @@ def _recording(
     log = log_until(log, k, settings.noise_floor_m)
     landmark = associations_at(job.inputs[f"slam {name}"], k, len(log.observations))
     path = read_smoothed_path(job.inputs[f"smooth {name}"])[k]
-    return Recording(log, landmark, path, settings.smoother)
+    smoother = smoother_of(settings.smoother, job.inputs[f"log {name}"])
+    return Recording(log, landmark, path, smoother)
 
 
 def _pairs(settings: FuseSettings, job: Job, iteration: int) -> Iterator[AlignedPair]:

@@ -15,6 +15,7 @@ from experiments.run.job import Job
 from experiments.run.stages.slam import associations_at, evaluated_iterations, final_path
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map
 from mapfusion.log_part import first_frames
+from mapfusion.odometry_covariance import read_odometry_covariance
 from mapfusion.robot_log import RobotLog, read_log
 from mapfusion.se2 import Float
 from mapfusion.smoother.elimination import matrix_bytes
@@ -76,11 +77,18 @@ def parts(iterations: tuple[int, ...]) -> tuple[str, ...]:
 def run(settings: SmoothSettings, job: Job) -> None:
     """Smooth the log up to one iteration; write the map with its joint covariance, and the path."""
     given = filtered_until(job, read_log(job.inputs["log"]), int(job.part), settings.noise_floor_m)
-    landmarks, path, ended = smoothed_anew(settings, *given)
+    own = replace(settings, smoother=smoother_of(settings.smoother, job.inputs["log"]))
+    landmarks, path, ended = smoothed_anew(own, *given)
     write_map(_map_path(job.output, job.part), landmarks)
     rows = {"iteration": np.arange(len(path))} | named_columns(POSE_FIELDS, path)
     attributes = {name: str(value) for name, value in zip(_ENDED, ended, strict=True)}
     write_table(_path_path(job.output, job.part), rows, PATH, attributes)
+
+
+def smoother_of(parameters: SmootherParameters, log: Path) -> SmootherParameters:
+    """Those for a log's folder: odometry that pictures told is no news beside what they show."""
+    from_pictures = read_odometry_covariance(log) is not None
+    return parameters.without_odometry() if from_pictures else parameters
 
 
 def log_until(log: RobotLog, iteration: int, noise_floor_m: float = 0.0) -> RobotLog:

@@ -1,5 +1,6 @@
 """The smoother as a stage: what it is given, what it writes, and when it cannot."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,9 @@ from experiments.run.stages.smooth import (
     read_smoothed,
     read_smoothed_path,
     run,
+    smoother_of,
 )
+from mapfusion.odometry_covariance import write_odometry_covariance
 from mapfusion.robot_log import RobotLog, write_log
 from mapfusion.smoother.smooth import SmootherParameters, smooth
 from mapfusion.smoother.smoothed_map import smoothed_map
@@ -119,3 +122,19 @@ def test_fused_iterations_are_evaluated_ones() -> None:
     assert fused_iterations(2, 25, None) == [1]
     assert iterations_of(700, [250, 475, 725, 950, 1199]) == (250, 475, 699)
     assert iterations_of(1200, [500, 1199]) == (500, 1199)
+
+
+def test_odometry_that_pictures_told_does_not_count_twice(tmp_path: Path) -> None:
+    """With a covariance of its own beside the log, right and wrong odometry end in one path."""
+    known = white_noise_log(np.random.default_rng(0), N_FRAMES, 200)
+    wrong = replace(known.log, odometry=known.log.odometry * [1.5, 1, 1])
+    apart = []
+    for covariance in (None, np.zeros((N_FRAMES, 3, 3))):
+        write_odometry_covariance(tmp_path, covariance)
+        own = smoother_of(SmootherParameters(stray_m=0.0), tmp_path)
+        right, pulled = (
+            smooth(log, owners(log), known.path, own).estimate.path for log in (known.log, wrong)
+        )
+        apart.append(np.abs(pulled - right)[:, :2].max())
+    assert apart[0] > 0.01
+    assert apart[1] < 0.001
