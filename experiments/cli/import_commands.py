@@ -43,17 +43,9 @@ Truth = Annotated[Path | None, typer.Option(help="True poses of the robot in the
 VisionOverrides = Annotated[
     list[str] | None,
     typer.Option(
-        "--set",
+        "--vision",
         metavar="KEY=VALUE",
-        help="Replaces a setting of the front end, e.g. vision.harris.max_corners=300.",
-    ),
-]
-VisionOf = Annotated[
-    str | None,
-    typer.Option(
-        metavar="SCENARIO",
-        help="File or name whose settings of the front end to use; "
-        "by default they follow from camera and pictures.",
+        help="Replaces a setting of the front end, e.g. harris.max_corners=300.",
     ),
 ]
 _CUT = re.compile(r"(?:(?P<name>[^=]*)=)?(?P<rows>-?\d*:-?\d*(?::\d*)?)")
@@ -84,7 +76,7 @@ def _stereo_command(format_name: str) -> Callable[..., None]:
         odometry: Odometry = None,
         truth: Truth = None,
         vision: VisionOverrides = None,
-        scenario: VisionOf = None,
+        scenario: options.SettingsOf = None,
         **chosen: str | None,
     ) -> None:
         from experiments.run.stereo_logs import import_stereo, vision_of

@@ -51,6 +51,14 @@ ImportOverrides = Annotated[
         help="Replaces a setting of the importer, e.g. its noise: range_sigma_m=0.2.",
     ),
 ]
+Format = Annotated[
+    str,
+    typer.Option(
+        "--format",
+        metavar="FORMAT",
+        help="tum (paths), g2o (graph), ply (maps) of results; log, euroc, kitti, rosbag of drives.",
+    ),
+]
 Seed = Annotated[int | None, typer.Option(help="Replaces the scenario's seed (0).", min=0)]
 Seeds = Annotated[str, typer.Option(help="A seed, a range 0..4 or a list 0,2,5.")]
 Jobs = Annotated[int, typer.Option(help="Processes.", min=1, show_default="all cores")]

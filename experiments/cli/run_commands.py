@@ -85,10 +85,7 @@ def report(
 def export(
     result: options.ResultFolder,
     *,
-    kind: Annotated[
-        str,
-        typer.Option("--format", metavar="FORMAT", help="tum (paths), g2o (graph) or ply (maps)."),
-    ],
+    kind: options.Format,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Folder; RESULT/export by default.")
     ] = None,

@@ -19,10 +19,7 @@ def record(
     overrides: options.Overrides,
     jobs: options.Jobs = options.ALL_CORES,
     results: options.Results = options.RESULTS,
-    kind: Annotated[
-        str,
-        typer.Option("--format", metavar="FORMAT", help="log, or pictures: euroc, kitti, rosbag."),
-    ] = "log",
+    kind: options.Format = "log",
 ) -> None:
     """Simulate only: one robot log (with its truth) per robot: `mapfusion record S -o logs`.
 

@@ -38,13 +38,6 @@ class ImportedRecording:
         return [one.too_little for one in self.robots if one.too_little]
 
 
-@dataclass(frozen=True)
-class _Vision:
-    """The root of the keys that `--set` takes."""
-
-    vision: FrontEndParameters
-
-
 def import_stereo(
     recording: StereoRecording,
     destination: Path,
@@ -62,7 +55,7 @@ def import_stereo(
         trajectories: files of odometry (or `images`: of the pictures) and truth in place of the
             recording's own.
         vision: settings of the front end, None for what follows from the camera, and what of them
-            is replaced: `vision.KEY=VALUE`.
+            is replaced: `KEY=VALUE`.
         on_progress: told what is done.
 
     Raises:
@@ -76,8 +69,8 @@ def import_stereo(
         recording = replace(recording, truth=read_tum(truth))
 
     def adjusted(derived: FrontEndParameters) -> FrontEndParameters:
-        base = {"vision": asdict(derived if chosen is None else chosen)}
-        return made_settings("--set", _Vision, overrides, base).vision
+        base = asdict(derived if chosen is None else chosen)
+        return made_settings("--vision", FrontEndParameters, overrides, base)
 
     work = StereoImport(recording, adjusted)
     robots = [work.log_of(cut, on_progress) for cut in cuts]

@@ -18,7 +18,7 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_frames_cut_a_recording_into_robots(
     sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    own = ("--frames", "A=0:3", "--frames", "1:", "--set", "vision.tracks.min_length=2")
+    own = ("--frames", "A=0:3", "--frames", "1:", "--vision", "tracks.min_length=2")
     reply = command(capsys, "import", "kitti", sequence, "-o", tmp_path, *own)
     assert reply.code == 0, reply.err
     assert {path.name for path in tmp_path.iterdir()} == {"A", "07-2"}
@@ -31,7 +31,7 @@ def test_frames_cut_a_recording_into_robots(
 def test_too_little_to_map_is_exit_code_1(
     sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    few = ("--set", "vision.harris.max_corners=2")
+    few = ("--vision", "harris.max_corners=2")
     reply = command(capsys, "import", "kitti", sequence, "-o", tmp_path, *few)
     assert reply.code == 1
     assert reply.complaints[-1].startswith("mapfusion: 07: too little to map: ")
@@ -44,7 +44,7 @@ def test_trajectories_are_taken_from_files(
     path = tmp_path / "turned.tum"
     path.write_text(tum_lines(0, POSES * [1, 1, -1]))
     logs = tmp_path / "logs"
-    given = ("--odometry", path, "--truth", path, "--set", "vision.tracks.min_length=1")
+    given = ("--odometry", path, "--truth", path, "--vision", "tracks.min_length=1")
     assert command(capsys, "import", "kitti", sequence, "-o", logs, *given).code == 0
     turned = read_log(logs / "07").odometry[:, 2]
     np.testing.assert_allclose(turned[1:], -np.diff(POSES[:, 2]), atol=1e-12)
@@ -58,8 +58,8 @@ def test_trajectories_are_taken_from_files(
         (("--frames", "a b=0:4"), ["--frames a b=0:4"]),
         (("--frames", "A=0:2", "--frames", "A=2:4"), ["two robots are named A"]),
         (("--frames", "4:"), ["07: frames of 07 are 1 of 5 pairs"]),
-        (("--set", "vision.haris.k=1"), ["haris", "harris"]),
-        (("--set", "harris.k=1"), ["vision"]),
+        (("--vision", "haris.k=1"), ["haris", "harris"]),
+        (("--vision", "harris.k=1"), ["--vision: harris", "k"]),
         (("--param", "cameras=red"), ["kitti: cameras", "grey"]),
         (("--param", "mount.pitch_rad=3"), ["pitch_rad", "[-1.5, 1.5] rad"]),
         (("--odometry", "none.tum"), ["none.tum: no such file"]),
