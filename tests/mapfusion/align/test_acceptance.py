@@ -53,9 +53,9 @@ def random_pairs(rng, n, planar=True):
 
 @pytest.mark.parametrize("planar", [True, False])
 def test_false_alarms_are_at_most_the_stated_number(planar):
-    """RANSAC on 400 pairs of random maps, at a rate high enough to be seen to be exceeded."""
+    """RANSAC on 200 pairs of random maps, at a rate high enough to be seen to be exceeded."""
     rng = np.random.default_rng(4)
-    stated, n = 1.0, 400
+    stated, n = 1.0, 200
     test = Acceptance(false_alarms=stated)
     hits = low = 0
     for _ in range(n):

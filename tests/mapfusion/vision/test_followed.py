@@ -33,8 +33,8 @@ def test_the_point_stays_where_the_corner_strays() -> None:
     room = [wall(rng, START, END, texels_per_m=120.0)]
     front_end, tracker = FrontEnd(CAMERA), Tracker(TrackParameters(), CAMERA, 0.1)
     points, corners = defaultdict(list), defaultdict(list)
-    for t in range(15):
-        pose = np.array([0.13 * t, 0.0, 0.006 * t])
+    for t in range(11):
+        pose = np.array([0.18 * t, 0.0, 0.008 * t])
         left, right, _ = render(room, CAMERA, tuple(pose), 1.0, rng)
         features = front_end.extract(left, right)
         tracks = tracker.update(features)
