@@ -15,9 +15,9 @@ from mapfusion.open_tables import told
 from mapfusion.se2 import Float
 from mapfusion.storage import (
     column,
-    columns,
+    covariance_columns,
+    covariances_from,
     float_fields,
-    named_columns,
     read_table,
     schema,
     write_table,
@@ -25,7 +25,6 @@ from mapfusion.storage import (
 
 FILE = "odometry_covariance.parquet"
 _FIELDS = ["cov_xx", "cov_xy", "cov_xt", "cov_yy", "cov_yt", "cov_tt"]
-_UPPER = np.triu_indices(3)
 ODOMETRY_COVARIANCE = schema(
     "robot_log.odometry_covariance",
     1,
@@ -46,9 +45,8 @@ def write_odometry_covariance(folder: Path, covariance: Float | None) -> None:
         return
     n = len(covariance)
     require_shape("covariance", covariance, (n, 3, 3))
-    upper = covariance[:, _UPPER[0], _UPPER[1]]
     iteration = np.arange(n, dtype=np.int32)
-    rows = {"iteration": iteration, **named_columns(_FIELDS, upper)}
+    rows = {"iteration": iteration, **covariance_columns(_FIELDS, covariance)}
     write_table(folder / FILE, rows, ODOMETRY_COVARIANCE)
 
 
@@ -60,7 +58,4 @@ def read_odometry_covariance(folder: Path) -> Float | None:
     table, _ = read_table(path, ODOMETRY_COVARIANCE)
     if not np.array_equal(column(table, "iteration"), np.arange(table.num_rows)):
         raise InputError(f"{path}: iterations must be 0, 1, 2, ..., one row each")
-    upper = columns(table, _FIELDS)
-    covariance = np.empty((len(upper), 3, 3))
-    covariance[:, _UPPER[0], _UPPER[1]] = covariance[:, _UPPER[1], _UPPER[0]] = upper
-    return covariance
+    return covariances_from(table, _FIELDS)

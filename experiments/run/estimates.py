@@ -5,12 +5,14 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 
 from experiments.run.stage_tables import COVARIANCE, MOTION
 from mapfusion.align.acceptance import Verdict
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.result import Alignment, Status
 from mapfusion.se2 import Float
+from mapfusion.storage import covariances_from
 
 _UPPER = np.triu_indices(3)
 
@@ -41,10 +43,7 @@ def inlier_mask(bits: bytes, n_correspondences: int) -> np.ndarray:
 
 def covariances_of(rows: pd.DataFrame) -> Float:
     """(n, 3, 3) of motions, from the columns COVARIANCE that hold their upper halves."""
-    covariance = np.empty((len(rows), 3, 3))
-    upper = rows[list(COVARIANCE)].to_numpy(dtype=np.float64)
-    covariance[:, _UPPER[0], _UPPER[1]] = covariance[:, _UPPER[1], _UPPER[0]] = upper
-    return covariance
+    return covariances_from(pa.Table.from_pandas(rows[list(COVARIANCE)]), COVARIANCE)
 
 
 def alignment_of(row: Mapping[Any, Any], n_correspondences: int) -> Alignment:

@@ -77,12 +77,14 @@ class Calibration:
         relative_errors: (3,) of its levels in the order of `LEVELS`, standard errors
             as shares of them.
         n_rounds: that it took.
+        settled: whether rounds ended as nothing changed any more; else there were too many.
     """
 
     robots: tuple[RobotCalibration, ...]
     motion: MotionNoise
     relative_errors: Float
     n_rounds: int
+    settled: bool
 
 
 @dataclass
@@ -159,7 +161,7 @@ def calibrate(
         )
         for robot in robots
     )
-    return Calibration(calibrated, motion, relative_errors(all_told), n_rounds)
+    return Calibration(calibrated, motion, relative_errors(all_told), n_rounds, moved < _SETTLED)
 
 
 def _change(before: MotionNoise, after: MotionNoise) -> float:
@@ -182,7 +184,12 @@ def _begun(
         return _checked(_Robot(log, seen, stray, path, np.zeros(4), np.diag(_PRIOR**2)))
     observed = np.unique(log.iteration)
     grown = _Robot(
-        log, sightings_of(log, landmark, 1, stray=False), stray, IDENTITY[None], np.zeros(4), _PRIOR
+        log,
+        sightings_of(log, landmark, 1, stray=False),
+        stray,
+        IDENTITY[None],
+        np.zeros(4),
+        np.diag(_PRIOR**2),
     )
     n_seen = _FIRST_FRAMES
     while True:

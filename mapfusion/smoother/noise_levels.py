@@ -7,7 +7,7 @@ a_j. With the disturbances' means d and variances C given all observations, a le
 
 the share of it in v: what is found, squared and in sigmas, is as much as the observations can tell.
 The right side counts the disturbances that they do tell. Each round multiplies a level by the ratio
-of the two (MacKay 1992, "Bayesian interpolation", eq. 4.9), which ends where the marginal
+of the two (MacKay 1992, "Bayesian interpolation"), which ends where the marginal
 likelihood is stationary, in far fewer rounds than EM.
 """
 

@@ -26,8 +26,8 @@ def information_share(dof: float, n_dimensions: Float | int) -> Float | float:
     """What of the weighted information is there in truth: (dof + n) / (dof + n + 2).
 
     The weights' mean is 1, as if their scales were known; but they are told from the same errors,
-    and where the cost is flatter than a Gaussian's an estimate is less certain (the expected
-    information of Lange et al., section 4). Of Gaussian errors it is 1.
+    and where the cost is flatter than a Gaussian's an estimate is less certain: this is the
+    expected information of a multivariate t's location (Lange et al.). Of Gaussian errors it is 1.
     """
     return (dof + n_dimensions) / (dof + n_dimensions + 2)
 

@@ -37,6 +37,7 @@ from mapfusion.storage import (
     COVARIANCE_FIELDS,
     POSE_FIELDS,
     POSITION_FIELDS,
+    covariance_columns,
     float_fields,
     named_columns,
     point_columns,
@@ -51,7 +52,6 @@ _OF = {"iteration": INT, "component": INT}  # the component of the most robots i
 LANDMARKS = schema("fuse.landmarks", 1, [*fields(**_OF, count=INT), *point_fields()])
 # Which landmarks of the robots' maps at that iteration went into the fused ones.
 PARENTS = schema("fuse.parents", 1, fields(**_OF, landmark=INT, robot=TEXT, parent=INT))
-_UPPER = np.triu_indices(3)
 # How the robots' maps were moved; of robots that are in no component nothing is said.
 MOTIONS = schema(
     "fuse.motions",
@@ -220,8 +220,8 @@ def write_fusions(
 def _motion_rows(fused: FusedMap, robots: Sequence[str]) -> pd.DataFrame:
     members = fused.members
     motion = named_columns(POSE_FIELDS, fused.T_first_map[members])
-    upper = fused.motion_covariance[members][:, _UPPER[0], _UPPER[1]]
-    motion |= named_columns(COVARIANCE, upper) | {"robot": [robots[k] for k in members]}
+    motion |= covariance_columns(COVARIANCE, fused.motion_covariance[members])
+    motion |= {"robot": [robots[k] for k in members]}
     motion["drift_sigma_m"] = fused.drift_sigma_m[members]
     about = {"duplicate_share": fused.duplicate_share, "fallback": fused.fallback}
     return pd.DataFrame(motion).assign(**about)

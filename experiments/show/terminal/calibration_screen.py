@@ -39,6 +39,8 @@ def document(calibration: Calibration, written: Sequence[Path]) -> dict[str, Any
         "robots": calibration_rows(calibration),
         "settings": filter_settings(calibration),
         "relative_errors": {name: float(value) for name, value in errors},
+        "n_rounds": calibration.n_rounds,
+        "settled": calibration.settled,
         "logs": [str(path) for path in written],
     }
 
@@ -56,6 +58,9 @@ def print_calibration(calibration: Calibration, written: Sequence[Path]) -> None
         "What the odometry has to be corrected by",
         "late turn: share of the turn before that is only made now",
     )
+    if not calibration.settled:
+        n_rounds = calibration.n_rounds
+        print_lines([f"  not settled: constants or levels still change after {n_rounds} rounds"])
     print_lines([f"  {path}: corrected" for path in written])
     if written:
         print_lines(["For a scenario with the corrected logs:"])

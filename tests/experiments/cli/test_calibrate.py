@@ -32,7 +32,8 @@ def test_corrected_logs_are_what_the_constants_say(
 ) -> None:
     reply = command(capsys, "study", "calibrate", raw, "-o", tmp_path / "logs", "--json")
     assert reply.code == 0
-    (robot,) = json.loads(reply.out)["robots"]
+    found = json.loads(reply.out)
+    (robot,) = found["robots"]
     before, after = read_log(raw), read_log(tmp_path / "logs" / "R1")
     np.testing.assert_allclose(
         after.odometry[:, :2], (1 + robot["distance"]) * before.odometry[:, :2]
@@ -42,6 +43,16 @@ def test_corrected_logs_are_what_the_constants_say(
     shown = command(capsys, "study", "calibrate", raw, "-o", tmp_path / "again").out
     assert "rotation_rad_per_sqrt_rad" in shown
     assert "R1" in shown
+    assert ("not settled" in shown) == (not found["settled"])
+
+
+def test_rounds_that_end_before_their_time_say_so(
+    raw: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mapfusion.smoother.calibrate._MOST_ROUNDS", 1)
+    assert "not settled" in command(capsys, "study", "calibrate", raw).out
+    found = json.loads(command(capsys, "study", "calibrate", raw, "--json").out)
+    assert (found["n_rounds"], found["settled"]) == (1, False)
 
 
 def test_a_log_is_not_written_over(raw: Path, capsys: pytest.CaptureFixture[str]) -> None:
