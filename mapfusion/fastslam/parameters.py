@@ -28,6 +28,8 @@ class FastSlamParameters:
             0 never, 1 in every step.
         stray_m: standard deviation, along each axis, by which the point that one track of
             observations is of lies beside the landmark; the next track's lies elsewhere.
+        frame_correlation: of what a frame's observations say about a particle's past, each with
+            each other (see `share_of_news`); 0 is eq. 10.
         noise_floor_m: standard deviation added to each coordinate of an observation.
         log_new_landmark_density: log of p_new in 1/m^3 (1/m^2 in planar data), the density of an
             observation that matches nothing; None: that of a match exactly at the gate, with the
@@ -44,6 +46,7 @@ class FastSlamParameters:
     descriptor_threshold: Annotated[float, Range(1e-3, 2, "1")] = 0.5
     resample_fraction: Annotated[float, Range(0, 1, "1")] = 0.5
     stray_m: Annotated[float, Range(0, 10, "m")] = 0.004
+    frame_correlation: Annotated[float, Range(0, 1, "1")] = 0.2
     noise_floor_m: Annotated[float, Range(0, 10, "m")] = 0.0
     log_new_landmark_density: Annotated[float, Range(-100, 100, "ln 1/m^3")] | None = None
     planar: bool | None = None
@@ -57,3 +60,15 @@ class FastSlamParameters:
     def gate(self) -> float:
         """Largest squared Mahalanobis distance of a match."""
         return chi_square_bound(self.gate_probability, 2 if self.planar else 3)
+
+    def share_of_news(self, n_observations: int) -> float:
+        """Power of a frame's likelihood that weighs the particles.
+
+        Eq. 10 multiplies as if the observations of a frame were independent given the path. But all
+        of them err by what a particle's pose was drawn beside the best one, now and when the
+        landmarks were made. So n of them say as much as n / (1 + (n - 1) rho) do that have nothing
+        in common (the design effect of clusters: Kish 1965, "Survey Sampling", 5.4). With all of it
+        in the weights the first frame that shows old landmarks again would choose one particle by
+        such luck, and with it the whole path so far.
+        """
+        return 1 / (1 + max(n_observations - 1, 0) * self.frame_correlation)

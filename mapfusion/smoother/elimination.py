@@ -15,6 +15,7 @@ from mapfusion.se2 import Float
 from mapfusion.smoother.normal_equations import Estimate, NormalEquations
 from mapfusion.smoother.offsets import Reduced, without_offsets
 from mapfusion.smoother.sightings import Sightings
+from mapfusion.smoother.skyline import cholesky_in_envelope, solve_in_envelope
 
 _ITEM = np.dtype(np.float64).itemsize
 _COPIES = 3  # of a matrix that are there at once: as it is made, in LAPACK's order, and solved
@@ -32,7 +33,8 @@ class Solution(NamedTuple):
         offset_m2: (B, 3, 3) of each track's offset, likewise.
         track_m2: (B, 3, 3) of each track's point, likewise.
         factor: lower Cholesky factor of the information of what was eliminated last.
-        landmarks_first: whether these are the poses (else the offsets and, after them, landmarks).
+        landmarks_first: whether these are the poses, in the order of `pose_place` (else the offsets
+            and, after them, landmarks).
     """
 
     step: Estimate
@@ -74,19 +76,21 @@ def common_part(seen: Sightings, equations: NormalEquations, solution: Solution)
     coupling = without_offsets(seen, equations).coupling @ solution.own_m2[seen.landmark]
     n, n_landmarks = len(solution.factor), seen.n_landmarks
     common = np.zeros((n // 3, 3, n_landmarks, 3))
-    first_seen = np.maximum(np.minimum.reduceat(seen.frame, seen.starts[:-1]) - 1, 0)
+    place = seen.pose_place[seen.frame] - 1
+    unknown = np.where(seen.frame > 0, place, n // 3 - 1)
+    first_seen = np.minimum.reduceat(unknown, seen.starts[:-1])
     order = np.argsort(first_seen, kind="stable")
     for at in range(0, n_landmarks, _AT_ONCE):
         some = order[at : at + _AT_ONCE]
-        first = first_seen[some].min()  # poses before these landmarks were seen have no part
-        place = np.full(n_landmarks, -1)
-        place[some] = np.arange(len(some))
-        rows = np.flatnonzero((place[seen.landmark] >= 0) & (seen.frame > 0))
+        first = first_seen[some].min()  # poses before those that saw these landmarks have no part
+        column = np.full(n_landmarks, -1)
+        column[some] = np.arange(len(some))
+        rows = np.flatnonzero((column[seen.landmark] >= 0) & (seen.frame > 0))
         wide = np.zeros((n // 3 - first, len(some), 3, 3))
-        np.add.at(wide, (seen.frame[rows] - 1 - first, place[seen.landmark[rows]]), coupling[rows])
+        np.add.at(wide, (place[rows] - first, column[seen.landmark[rows]]), coupling[rows])
         right = wide.transpose(0, 2, 1, 3).reshape(n - 3 * first, -1)
         below = solution.factor[3 * first :, 3 * first :]
-        solved = scipy.linalg.solve_triangular(below, right, lower=True, check_finite=False)
+        solved = solve_in_envelope(below, right)
         common[first:, :, some] = solved.reshape(-1, 3, len(some), 3)
     return common.reshape(n, -1)
 
@@ -97,7 +101,8 @@ def pose_covariances(
     """(n, 3, 3) covariance of each pose of these frames (n,), none the first."""
     n_unknown, n = len(equations.pose_block) - 1, len(frames)
     chosen = np.zeros((n_unknown, 3, n, 3))
-    chosen[frames - 1, :, np.arange(n)] = np.eye(3)
+    row = seen.pose_place[frames] if solution.landmarks_first else frames
+    chosen[row - 1, :, np.arange(n)] = np.eye(3)
     right, alone = chosen.reshape(3 * n_unknown, 3 * n), 0.0
     if not solution.landmarks_first:  # the errors of the path if all points were known, and theirs
         solved = scipy.linalg.cho_solve_banded((chain_factor(equations), True), right)
@@ -117,24 +122,33 @@ def _beside_own(solution: Solution) -> Float:
 
 
 def _landmarks_first(seen: Sightings, equations: NormalEquations) -> Solution:
-    n = len(equations.pose_block)
-    S = np.zeros((3 * n, 3 * n))
-    blocks, each = S.reshape(n, 3, n, 3), np.arange(n)
-    blocks[each, :, each, :] = equations.pose_block
-    blocks[each[1:], :, each[:-1], :] = equations.link
-    gradient, left = equations.pose_gradient.copy(), without_offsets(seen, equations)
+    n, place = len(equations.pose_block), seen.pose_place
+    S, gradient = np.zeros((3 * n, 3 * n)), np.empty((n, 3))
+    _put_poses(S.reshape(n, 3, n, 3), place, equations)
+    gradient[place] = equations.pose_gradient
+    left, row = without_offsets(seen, equations), place[seen.frame]
     own = np.asarray(np.linalg.inv(_regular(seen, left.point_block)), np.float64)
-    _subtract(
-        seen.track_starts, seen.frame, equations.coupling, left.own_m2, left.pull, S, gradient
-    )
-    _subtract(seen.starts, seen.frame, left.coupling, own, left.point_gradient, S, gradient)
-    factor = scipy.linalg.cholesky(S[3:, 3:], lower=True, check_finite=False)
+    _subtract(seen.track_starts, row, equations.coupling, left.own_m2, left.pull, S, gradient)
+    _subtract(seen.starts, row, left.coupling, own, left.point_gradient, S, gradient)
+    factor = cholesky_in_envelope(S[3:, 3:])
+    # by rows a lower factor is by columns an upper one: as LAPACK takes it, without a copy
+    solved = -scipy.linalg.cho_solve((factor.T, False), gradient[1:].ravel(), check_finite=False)
     way = np.zeros((n, 3))
-    way[1:] = -scipy.linalg.cho_solve((factor, True), gradient[1:].ravel()).reshape(-1, 3)
+    way[1:] = solved.reshape(-1, 3)[place[1:] - 1]
     moved = seen.sum_by_landmark(_along(left.coupling, way[seen.frame]))
     points = -np.einsum("lij,lj->li", own, left.point_gradient + moved)
     step = Estimate(way, points, _offsets(seen, equations, left, way, points))
-    return _solution(seen, left, step, own, factor, True)
+    return _solution(seen, left, step, own, factor, solved)
+
+
+def _put_poses(blocks: Float, place: np.ndarray, equations: NormalEquations) -> None:
+    """What odometry and the poses' own observations say, into blocks (T, 3, T, 3) by `place`."""
+    blocks[place, :, place, :] = equations.pose_block
+    after, before = place[1:], place[:-1]
+    link = np.where(
+        (after > before)[:, None, None], equations.link, np.swapaxes(equations.link, 1, 2)
+    )
+    blocks[np.maximum(after, before), :, np.minimum(after, before), :] = link
 
 
 def _along(coupling: Float, way: Float) -> Float:
@@ -163,7 +177,8 @@ def _subtract(
 ) -> None:
     """Coupling A^-1 coupling' of each point, between all frames that saw it; the lower half.
 
-    Points are tracks' offsets or landmarks, each with the rows from one of `starts` to the next.
+    Points are tracks' offsets or landmarks, each with the rows from one of `starts` to the next;
+    `frame` is the place of each row's pose.
     Those that are not known to any extent (own covariance 0) have nothing to be subtracted.
     """
     gain = np.empty((3, 3))
@@ -184,7 +199,7 @@ def _subtract(
                         value = gain[r, 0] * G[q, 0] + gain[r, 1] * G[q, 1] + gain[r, 2] * G[q, 2]
                         if column <= row:
                             S[row + r, column + q] -= value
-                        if column >= row and k != i:  # tracks are not in the order of frames
+                        if column >= row and k != i:  # rows are not in the order of places
                             S[column + q, row + r] -= value
 
 
@@ -202,7 +217,8 @@ def _poses_first(seen: Sightings, equations: NormalEquations) -> Solution:
     step = Estimate(way, points[n_offsets:].reshape(-1, 3), offsets)
     left = without_offsets(seen, equations)
     own = np.asarray(np.linalg.inv(_regular(seen, left.point_block)), np.float64)
-    return _solution(seen, left, step, own, factor, False)
+    last = step.point_m.ravel()
+    return _solution(seen, left, step, own, factor, last, landmarks_first=False)
 
 
 def pose_point_blocks(seen: Sightings, equations: NormalEquations) -> tuple[Float, Float, Float]:
@@ -258,10 +274,11 @@ def _solution(
     step: Estimate,
     own_m2: Float,
     factor: Float,
-    landmarks_first: bool,
+    last: Float,
+    landmarks_first: bool = True,
 ) -> Solution:
-    last = step.path[1:] if landmarks_first else step.point_m
-    moved = float(np.sum((factor[-last.size :, -last.size :].T @ last.ravel()) ** 2))
+    """With how far the last n unknowns of the factor, (n,), are moved."""
+    moved = float(np.sum((factor[-last.size :, -last.size :].T @ last) ** 2))
     of_landmark, kept = own_m2[seen.landmark_of_track], left.kept
     follows = np.eye(3) - kept  # -db / dl
     offset_m2 = left.own_m2 + follows @ of_landmark @ np.swapaxes(follows, 1, 2)

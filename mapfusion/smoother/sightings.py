@@ -1,12 +1,14 @@
 """A log as the smoother takes it: observations ordered by landmark and by track."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from mapfusion.arguments import require_shape
 from mapfusion.robot_log import NO_TRACK, RobotLog
 from mapfusion.se2 import Float
+from mapfusion.smoother.skyline import envelope_order
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,7 @@ class Sightings:
         information: (N, 3, 3) inverse of the stated covariances, in 1/m^2; zero in z if planar.
         row: (N,) row in the log.
         n_dimensions: 3, or 2 if planar.
+        n_poses: T.
     """
 
     starts: np.ndarray
@@ -36,6 +39,7 @@ class Sightings:
     information: Float
     row: np.ndarray
     n_dimensions: int
+    n_poses: int
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -44,6 +48,14 @@ class Sightings:
     def n_landmarks(self) -> int:
         """L."""
         return len(self.starts) - 1
+
+    @cached_property
+    def pose_place(self) -> np.ndarray:
+        """(T,) order in which poses are solved for; the first, which is known, comes first."""
+        place, later = np.zeros(self.n_poses, dtype=np.int64), self.frame > 0
+        unknown = self.frame[later] - 1
+        place[1:] = 1 + envelope_order(self.landmark[later], unknown, self.n_poses - 1)
+        return place
 
     @property
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, Float, Float]:
@@ -122,4 +134,4 @@ def sightings_of(log: RobotLog, landmark: np.ndarray, min_count: int, *, stray: 
     if log.planar:
         position[:, 2] = 0.0
     frame = log.iteration[row].astype(np.int64)
-    return Sightings(starts, track_starts, strays, frame, position, information, row, n)
+    return Sightings(starts, track_starts, strays, frame, position, information, row, n, len(log))

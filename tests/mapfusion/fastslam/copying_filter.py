@@ -68,7 +68,8 @@ class CopyingFilter:
         for particle, pose, ratio in zip(self.particles, poses, ratios, strict=True):
             particle.pose = pose
             particle.path.append(pose)
-            particle.weight *= self.take_in(particle, observations) * ratio
+            news = 1 / (1 + settings.frame_correlation * max(len(observations) - 1, 0))
+            particle.weight *= (self.take_in(particle, observations) * ratio) ** news
         self.n_observations += len(observations)
         self.weights = np.array([p.weight for p in self.particles])
         self.weights /= self.weights.sum()

@@ -1,0 +1,60 @@
+"""Factors of matrices with zeros, against LAPACK's of the dense matrix."""
+
+import numpy as np
+import pytest
+import scipy.linalg
+
+from mapfusion.smoother import skyline
+from mapfusion.smoother.skyline import cholesky_in_envelope, envelope_order, solve_in_envelope
+
+
+def matrix_of_groups(rng: np.random.Generator, n: int, n_groups: int) -> np.ndarray:
+    """Positive definite (n, n): each group is of three members that have to do with each other."""
+    A = np.eye(n)
+    for _ in range(n_groups):
+        vector = np.zeros(n)
+        vector[rng.choice(n, 3, replace=False)] = rng.normal(size=3)
+        A += np.outer(vector, vector)
+    return A
+
+
+@pytest.mark.parametrize("n", [1, 95, 96, 97, 300])
+@pytest.mark.parametrize("n_groups", [0, 40, 3000])
+def test_factor_is_that_of_the_dense_matrix(n, n_groups):
+    A = matrix_of_groups(np.random.default_rng(n), n, n_groups if n > 2 else 0)
+    given = A.copy()
+    given[np.triu_indices(n, skyline._BLOCK)] = 0  # only the lower half is read
+    found = np.tril(cholesky_in_envelope(given))
+    np.testing.assert_allclose(found, scipy.linalg.cholesky(A, lower=True), atol=1e-12)
+    right = np.random.default_rng(0).normal(size=(n, 7))
+    np.testing.assert_allclose(found @ solve_in_envelope(found, right), right, atol=1e-12)
+
+
+def test_rows_that_are_zero_for_long_stay_so():
+    A = 2 * np.eye(400)
+    A[399, 250] = A[250, 399] = 1.0
+    assert not np.tril(cholesky_in_envelope(A), -1)[:, :250].any()
+
+
+def test_a_matrix_that_is_not_positive_definite_is_refused():
+    A = np.eye(200)
+    A[150, 150] = -1
+    with pytest.raises(np.linalg.LinAlgError):
+        cholesky_in_envelope(A)
+
+
+def test_order_brings_those_together_that_have_to_do_with_each_other():
+    """A circle driven twice: the second lap's poses see what the first lap's did."""
+    n = 100
+    pose = np.arange(2 * n)
+    group, member = np.concatenate([pose % n, (pose + 1) % n]), np.tile(pose, 2)
+    place = envelope_order(group, member, 2 * n)
+    assert sorted(place) == pose.tolist()
+    apart = np.abs(place[:, None] - place)[np.abs(pose[:, None] - pose) == n]
+    assert apart.max() <= 6  # 100 in the order in which they were driven
+
+
+@pytest.mark.parametrize("n_members", [0, 1, 2])
+def test_few_members_without_a_group(n_members):
+    none = np.empty(0, dtype=np.int64)
+    assert sorted(envelope_order(none, none, n_members)) == list(range(n_members))
