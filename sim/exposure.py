@@ -29,7 +29,8 @@ def expose(gray: np.ndarray, noise: RadiometricNoise, rng: np.random.Generator) 
     """A noisy copy of a gray image (H, W) uint8."""
     gain = noise.gain * (1 + noise.sigma_gain * rng.standard_normal())
     offset = noise.sigma_offset_gray * rng.standard_normal()
-    levels = (gain * np.arange(256) + offset).astype(np.float32)
+    light = 255.0 ** (1 - noise.gamma) * np.arange(256.0) ** noise.gamma
+    levels = (gain * light + offset).astype(np.float32)
     bits = draw_bits(gray.size, rng).reshape(gray.shape)
     return _exposed(gray, levels, bits, np.float32(noise.sigma_gray) * normal_values())
 

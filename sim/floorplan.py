@@ -1,5 +1,6 @@
 """Walls in plan: what stands where, which faces can be seen, how much room is left beside them."""
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,11 +22,15 @@ class Wall:
         points_m: (K, 2) middle line, K >= 2.
         height_m: from the floor up.
         thickness_m: half of it lies on either side of the line.
+        look: walls of one look, which have one shape, carry the same pictures; "": its own.
+        mirrored: whether it is the mirror image of the other walls of its look.
     """
 
     points_m: Float
     height_m: float = 2.5
     thickness_m: float = 0.1
+    look: str = ""
+    mirrored: bool = False
 
     def __post_init__(self) -> None:
         points = np.asarray(self.points_m, dtype=np.float64)
@@ -82,10 +87,14 @@ class Face:
     Attributes:
         corners_m: (4, 3) counter-clockwise seen from the front, from the lower left.
         kind: "wall", "floor" or "ceiling".
+        look: faces of one look carry the same picture; "": its own.
+        mirrored: whether it carries that picture left to right.
     """
 
     corners_m: Float
     kind: str
+    look: str = ""
+    mirrored: bool = False
 
     @property
     def size_m(self) -> tuple[float, float]:
@@ -181,22 +190,37 @@ class FloorPlan:
 
     def _wall_faces(self, wall: Wall) -> list[Face]:
         left, right = wall.side(left=True), wall.side(left=False)
+        # what is left of a wall is right of its mirror image
+        on_left, on_right = ("right", "left") if wall.mirrored else ("left", "right")
         # seen from the left side the wall runs from right to left
-        edges = [(left[i + 1], left[i]) for i in range(len(left) - 1)]
-        edges += [(right[i], right[i + 1]) for i in range(len(right) - 1)]
+        edges = [(f"{on_left} {i}", left[i + 1], left[i]) for i in range(len(left) - 1)]
+        edges += [(f"{on_right} {i}", right[i], right[i + 1]) for i in range(len(right) - 1)]
         # a face beyond the floor's edge shows to nobody, nor does an end buried in another wall
-        edges = [edge for edge in edges if np.all(self.contains(np.stack(edge)))]
+        edges = [edge for edge in edges if np.all(self.contains(np.stack(edge[1:])))]
         if not wall.closed:
-            ends = [(left[0], right[0]), (right[-1], left[-1])]
-            edges += [end for end in ends if np.any(self.clearance_m(np.stack(end)) > -BURIED_M)]
-        return [_upright(start, end, wall.height_m) for start, end in edges]
+            ends = [("first end", left[0], right[0]), ("last end", right[-1], left[-1])]
+            bare = [np.any(self.clearance_m(np.stack(end[1:])) > -BURIED_M) for end in ends]
+            edges += itertools.compress(ends, bare)
+        return [_upright(start, end, wall, place) for place, start, end in edges]
 
 
-def _upright(start: Float, end: Float, height_m: float) -> Face:
+def _upright(start: Float, end: Float, wall: Wall, place: str) -> Face:
     corners = np.zeros((4, 3))
     corners[:, :2] = [start, end, end, start]
-    corners[2:, 2] = height_m
-    return Face(corners, "wall")
+    corners[2:, 2] = wall.height_m
+    look = f"{wall.look} {place}" if wall.look else ""
+    return Face(corners, "wall", look, wall.mirrored)
+
+
+def wall_shape(points_m: Float, mirrored: bool) -> Float:
+    """Lengths (m) and turns (rad) of a polyline (K, 2), from its first point on.
+
+    They are equal for polylines that are congruent; of a mirrored one turns change their sign.
+    """
+    steps = np.diff(points_m, axis=0)
+    headings = np.arctan2(steps[:, 1], steps[:, 0])
+    turns = np.angle(np.exp(1j * np.diff(headings)))
+    return np.concatenate([np.hypot(*steps.T), -turns if mirrored else turns])
 
 
 def segment_distance_m(points: Float, starts: Float, ends: Float) -> Float:

@@ -15,12 +15,15 @@ class RadiometricNoise:
         gain: mean gain; below 1 the pictures are dark, and the noise is not.
         sigma_gain: standard deviation of an image's gain, relative to the mean gain.
         sigma_offset_gray: standard deviation of an image's offset, in gray levels.
+        gamma: power of the light, over the full range, that the gain is applied to: other than 1
+            it takes contrast from the dark (above) or from the bright (below).
     """
 
     sigma_gray: Annotated[float, Range(0, 255, "grey levels")] = 2.0
     sigma_gain: Annotated[float, Range(0, 10, "1")] = 0.01
     sigma_offset_gray: Annotated[float, Range(0, 255, "grey levels")] = 1.0
     gain: Annotated[float, Range(0, 10, "1")] = 1.0
+    gamma: Annotated[float, Range(0.1, 10, "1")] = 1.0
 
     def __post_init__(self) -> None:
         require_in_range(self)

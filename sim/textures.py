@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from mapfusion.arguments import Range, require_in_range
+from mapfusion.errors import OutOfRangeError
 from sim.floorplan import Face
 
 _PosterSide = Annotated[float, Range(0.05, 10, "m")]
@@ -49,6 +50,8 @@ class Texture:
         posters: how many different posters there are; each wall has them side by side, drawn at
             random, so the same picture hangs in many places. 0: no posters.
         poster_m: a poster's width and height.
+        poster_width_m: smallest and largest width, from which the seed draws that of all posters of
+            the world, in place of `poster_m`'s; evenly on a logarithmic scale.
         poster_gap_m: between two posters.
     """
 
@@ -57,10 +60,15 @@ class Texture:
     bare: Annotated[float, Range(0, 1, "1")] = 0.0
     posters: Annotated[int, Range(0, 100, "posters")] = 0
     poster_m: tuple[_PosterSide, _PosterSide] = (1.2, 1.6)
+    poster_width_m: tuple[_PosterSide, _PosterSide] | None = None
     poster_gap_m: Annotated[float, Range(0, 100, "m")] = 0.4
 
     def __post_init__(self) -> None:
         require_in_range(self)
+        if self.poster_width_m is not None and self.poster_width_m[0] > self.poster_width_m[1]:
+            low, high = self.poster_width_m
+            said = f"is {low:g} to {high:g}, the smallest is above the largest"
+            raise OutOfRangeError("poster_width_m", said)
 
 
 AS_PAINTED = Texture()
@@ -107,9 +115,10 @@ def paint(
 
 def paint_posters(texture: Texture, rng: np.random.Generator) -> list[np.ndarray]:
     """The world's posters, as rich as a wall is by default."""
-    return [
-        _paint_shapes("wall", texture.poster_m, rng, AS_PAINTED) for _ in range(texture.posters)
-    ]
+    size_m = texture.poster_m
+    if texture.poster_width_m is not None:
+        size_m = float(np.exp(rng.uniform(*np.log(texture.poster_width_m)))), size_m[1]
+    return [_paint_shapes("wall", size_m, rng, AS_PAINTED) for _ in range(texture.posters)]
 
 
 def _hang(

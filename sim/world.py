@@ -208,13 +208,21 @@ class World:
 def write_faces(
     folder: Path, plan: FloorPlan, rng: np.random.Generator, texture: Texture = AS_PAINTED
 ) -> None:
-    """Write each face's mesh and texture into `folder`; each texture has a child generator."""
+    """Write each face's mesh and texture into `folder`; each texture has a child generator.
+
+    Faces of one look have the picture that the first of them has.
+    """
     faces = plan.faces()
     *children, of_posters = rng.spawn(len(faces) + 1)
     posters = paint_posters(texture, of_posters)
+    seen: dict[str, np.ndarray] = {}
     for i, (face, child) in enumerate(zip(faces, children, strict=True)):
         mesh, path = face_files(folder, i)
-        picture = cv2.cvtColor(paint(face, child, texture, posters), cv2.COLOR_RGB2BGR)
+        painted = seen[face.look] if face.look in seen else paint(face, child, texture, posters)
+        if face.look:
+            seen[face.look] = painted
+        shown = np.ascontiguousarray(painted[:, ::-1]) if face.mirrored else painted
+        picture = cv2.cvtColor(shown, cv2.COLOR_RGB2BGR)
         encoded = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
         # whole: another run may be painting, or looking at, the same walls
         write_sealed(path, encoded + LINE)

@@ -123,7 +123,8 @@ def _simulated(scenario: Simulation) -> Iterable[RobotStages]:
         for robot in scenario.robots
     )
     driven = _stage(drive, scenario, scenario.drive, own={"walls": walls, "robots": routes})
-    before = {"drive": driven, "faces": _stage(faces, scenario, world, own={"walls": walls})}
+    to_paint = {"walls": walls, "looks": tuple((wall.look, wall.mirrored) for wall in world.walls)}
+    before = {"drive": driven, "faces": _stage(faces, scenario, world, own=to_paint)}
     n_frames, drawn_by = scenario.drive.frames, renderer_name(render.renderer)
     vision, unread = scenario.vision, FrontEndParameters()
     finding = replace(unread, harris=vision.harris, stereo=vision.stereo, usurf=vision.usurf)

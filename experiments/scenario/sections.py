@@ -2,12 +2,15 @@
 
 from typing import Annotated, Self, TypeVar
 
+import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from mapfusion.arguments import Range, require_in_range
 from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.fuse.registry import FUSERS, REFERENCE, target_of
+from mapfusion.se2 import Float
 from sim.driver import DriverSettings
+from sim.floorplan import wall_shape
 from sim.odometry import OdometryNoise
 from sim.p3at import TIRE_FRICTION
 from sim.radiometry import RadiometricNoise
@@ -20,6 +23,8 @@ MAX_FRAMES = 100_000  # five hours and a half at five frames a second
 MAX_COUNT = 1_000_000  # of frames or sightings in a log: a day at ten a second
 MAX_POINTS = 1000  # of one wall or route
 MAX_NAMED = 100  # things with names of their own: more do not fit into any table or figure
+# Metres and radians by which walls of one look may differ: a texel is 4 mm, corners are written to 1.
+SAME_SHAPE = 0.002
 T = TypeVar("T")
 Name = Annotated[str, Field(pattern=NAME_PATTERN)]
 Coordinate = Annotated[float, Range(-500, 500, "m")]  # beyond any building
@@ -58,9 +63,19 @@ class Wall(Section):
 
     Attributes:
         points: corners x, y of the polyline it stands on, in the world's frame.
+        look: a name; walls of one name are of one shape and carry the same pictures. Empty: its own.
+        mirrored: whether it is the mirror image of the first wall of its look, points and pictures.
     """
 
     points: Annotated[list[Point], Field(min_length=2, max_length=MAX_POINTS)]
+    look: Annotated[str, Field(pattern=f"{NAME_PATTERN}|^$")] = ""
+    mirrored: bool = False
+
+    @model_validator(mode="after")
+    def _mirrors_another(self) -> Self:
+        if self.mirrored and not self.look:
+            raise ValueError("mirrored: needs a look that other walls have too")
+        return self
 
 
 class World(Section):
@@ -77,6 +92,20 @@ class World(Section):
     wall_height_m: Annotated[float, Range(0.5, 6, "m")] = 2.5
     wall_thickness_m: Annotated[float, Range(0.01, 1, "m")] = 0.12
     texture: Texture = Texture()
+
+    @model_validator(mode="after")
+    def _of_one_look_of_one_shape(self) -> Self:
+        first: dict[str, tuple[int, Float]] = {}
+        for i, wall in enumerate(self.walls):
+            if not wall.look:
+                continue
+            shape = wall_shape(np.array(wall.points), wall.mirrored)
+            k, known = first.setdefault(wall.look, (i, shape))
+            if len(shape) != len(known) or np.abs(shape - known).max() > SAME_SHAPE:
+                mirrored = " mirrored" if wall.mirrored else ""
+                what = f"must be of the shape of walls.{k},{mirrored} point by point, to look alike"
+                raise ValueError(f"walls.{i}.points: {what} ({wall.look})")
+        return self
 
 
 class Robot(Section):

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from experiments.run.job import Job
-from experiments.run.stages.walls import Walls
+from experiments.run.stages.walls import Look, Walls
 from experiments.scenario.randomness import generator
 from sim.textures import Texture
 from sim.world import write_faces
@@ -18,10 +18,12 @@ class FacesSettings:
 
     seed: int
     walls: Walls
+    looks: tuple[Look, ...]
     texture: Texture
 
 
 def run(settings: FacesSettings, job: Job) -> None:
     """Write meshes and pictures."""
     rng = generator(settings.seed, "textures")
-    write_faces(job.output, settings.walls.floor_plan(), rng, settings.texture)
+    plan = settings.walls.floor_plan(settings.looks)
+    write_faces(job.output, plan, rng, settings.texture)
