@@ -23,7 +23,7 @@ MAX_FRAMES = 100_000  # five hours and a half at five frames a second
 MAX_COUNT = 1_000_000  # of frames or sightings in a log: a day at ten a second
 MAX_POINTS = 1000  # of one wall or route
 MAX_NAMED = 100  # things with names of their own: more do not fit into any table or figure
-# Metres and radians by which walls of one look may differ: a texel is 4 mm, corners are written to 1.
+# Metres and radians by which walls of one look may differ; corners are written to millimetres.
 SAME_SHAPE = 0.002
 T = TypeVar("T")
 Name = Annotated[str, Field(pattern=NAME_PATTERN)]
@@ -63,8 +63,8 @@ class Wall(Section):
 
     Attributes:
         points: corners x, y of the polyline it stands on, in the world's frame.
-        look: a name; walls of one name are of one shape and carry the same pictures. Empty: its own.
-        mirrored: whether it is the mirror image of the first wall of its look, points and pictures.
+        look: a name; walls of one have one shape and carry the same pictures. Empty: its own.
+        mirrored: whether it is the mirror image of other walls of its look, points and pictures.
     """
 
     points: Annotated[list[Point], Field(min_length=2, max_length=MAX_POINTS)]

@@ -51,6 +51,14 @@ def test_each_pixel_is_its_level_and_its_deviation_rounded_and_kept_in_a_byte() 
     assert {0, 255} <= set(seen.ravel().tolist())
 
 
+def test_gamma_is_a_power_of_the_light_over_the_full_range() -> None:
+    ramp = np.arange(256, dtype=np.uint8)[None]
+    for gamma, gain in ((1.0, 1.0), (2.0, 1.0), (0.5, 0.8)):
+        noise = RadiometricNoise(0, sigma_gain=0, sigma_offset_gray=0, gain=gain, gamma=gamma)
+        seen = expose(ramp, noise, np.random.default_rng(0))[0].astype(float)
+        np.testing.assert_allclose(seen, 255 * gain * (ramp[0] / 255) ** gamma, atol=0.501)
+
+
 def test_gain_and_offset_are_those_of_a_whole_image() -> None:
     noise = RadiometricNoise(sigma_gray=0, sigma_gain=0.05, sigma_offset_gray=4)
     ramp = np.tile(np.arange(60, 200, dtype=np.uint8), (4, 1))

@@ -94,6 +94,18 @@ def test_the_same_posters_hang_on_different_walls() -> None:
     assert len(paint_posters(Texture(posters=3), np.random.default_rng(0))) == 3
 
 
+def test_a_world_s_posters_have_one_width_drawn_evenly_on_a_logarithmic_scale() -> None:
+    texture = Texture(posters=2, poster_width_m=(0.5, 4.0))
+    density, widths = STYLES["wall"].texels_per_m, []
+    for seed in range(40):
+        one, two = paint_posters(texture, np.random.default_rng(seed))
+        assert one.shape == two.shape
+        assert one.shape[0] == 1.6 * density
+        widths.append(one.shape[1] / density)
+    assert 0.5 <= min(widths) < 0.65 < 3.0 < max(widths) <= 4
+    assert 0.25 <= np.mean(np.array(widths) < np.sqrt(2)) <= 0.75  # half expected, sigma 0.08
+
+
 def test_a_poster_hangs_only_where_there_is_room() -> None:
     texture = Texture(posters=1)
     low = Face(WALL.corners_m * [1, 1, 0.5], "wall")
@@ -104,7 +116,8 @@ def test_a_poster_hangs_only_where_there_is_room() -> None:
 
 @pytest.mark.parametrize(
     "settings",
-    [{"contrast": -1}, {"bare": 2}, {"posters": 1000}, {"poster_m": (0, 1)}, {"coverage": np.nan}],
+    [{"contrast": -1}, {"bare": 2}, {"posters": 1000}, {"poster_m": (0, 1)}, {"coverage": np.nan}]
+    + [{"poster_width_m": width} for width in ((2, 1), (0.01, 1))],
 )
 def test_impossible_textures_are_refused(settings: dict) -> None:
     with pytest.raises(InputError, match=f"{next(iter(settings))}"):

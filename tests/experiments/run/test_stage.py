@@ -37,6 +37,8 @@ TOLD = {
     "tags": "",
     "seed": "drive faces features log slam aligner",
     "world": "drive faces",
+    "world.walls.look": "faces",
+    "world.walls.mirrored": "faces",
     "world.texture": "faces",
     "robots.name": "drive features observed log fuse",
     "robots.start": "drive",
@@ -119,6 +121,8 @@ def resolved(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     data = load_scenario(path).resolved()
     for name in ("odometry", "radiometry"):
         data["robots"][0][name] = copy.deepcopy(data[name])
+    data["world"]["walls"][0]["look"] = "room"
+    data["world"]["texture"]["poster_width_m"] = [0.5, 4.0]
     data["align"]["aligners"][0]["parameters"] = {"gate_m": 0.25}
     data["fuse"]["every"] = 2 * data["evaluate"]["every"]
     data["expect"] = {"path_rmse_m": {"min": 0.0, "max": 1.0}}
