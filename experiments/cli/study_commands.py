@@ -24,7 +24,9 @@ def refusal(
     ],
     *,
     output: options.Output,
-    pairs: Annotated[int, typer.Option(help="Pairs of maps without common ground.", min=1)] = 500,
+    pairs: Annotated[
+        int, typer.Option(help="Pairs of maps of different seeds, of each kind.", min=1)
+    ] = 200,
     seeds: options.Seeds = "0",
     jobs: options.Jobs = options.ALL_CORES,
     results: options.Results = options.RESULTS,
@@ -33,20 +35,28 @@ def refusal(
 
     For example, after a sweep of them: `mapfusion study refusal full --seeds 0..2 -o refusal`.
     """
+    import numpy as np
+
     from experiments.scenario.seeds import parse_seeds
-    from experiments.show.figures.drawing import save_figure
-    from experiments.show.figures.refusal_figures import draw
-    from experiments.show.terminal import layout, study_screen
-    from experiments.study.refusal import refusal_rates, refusal_trial
+    from experiments.show.refusal_files import draw_refusals, write_kinds
+    from experiments.show.terminal import layout, refusal_screen
+    from experiments.study.refusal import kind_rates, refusal_rates, refusal_trial
+    from experiments.study.refusal.reliability import judged_answers, reliability
     from experiments.study.refusal.stored_worlds import worlds_of
 
     mapped = worlds_of(worlds, parse_seeds(seeds), results)
     with layout.progress() as show:
         false_alarms = refusal_trial.run(mapped, output, pairs, jobs, show)
     refusals, calibration = (refusal_trial.read(output, name) for name in refusal_trial.TABLES)
-    study_screen.print_refusals(refusal_rates.summary(refusals), false_alarms)
-    data = (refusals, calibration, false_alarms)
-    layout.print_paths(output, save_figure(output / "figures", "refusal", draw, *data))
+    refusal_screen.print_refusals(refusal_rates.summary(refusals), false_alarms)
+    kinds = kind_rates.by_kind(refusals)
+    refusal_screen.print_kinds(kinds)
+    answers = judged_answers(refusals)
+    held = reliability(answers, np.random.default_rng(0)) if len(answers) else None
+    if held is not None:
+        refusal_screen.print_reliability(held)
+    pictures = draw_refusals(output, refusals, calibration, false_alarms, held)
+    layout.print_paths(output, [write_kinds(output, kinds), *pictures])
 
 
 @app.command(rich_help_panel=options.RUN)

@@ -1,4 +1,4 @@
-"""Walls of one look: the same pictures, on a mirror image the mirrored ones, in the right places."""
+"""Walls of one look: the same pictures in the same places, mirrored on a mirror image."""
 
 from pathlib import Path
 
@@ -37,7 +37,7 @@ def seen_from(shown: list[tuple[Float, np.ndarray]], place: Float) -> np.ndarray
         width, height = corners[1] - corners[0], corners[3] - corners[0]
         share = [float((place - corners[0]) @ side / (side @ side)) for side in (width, height)]
         normal = np.cross(width, height) / np.linalg.norm(np.cross(width, height))
-        if abs((place - corners[0]) @ normal) < 1e-9 and 0 < min(share) and max(share) < 1:
+        if abs((place - corners[0]) @ normal) < 1e-9 and min(share) > 0 and max(share) < 1:
             row = int((1 - share[1]) * picture.shape[0])
             return picture[row, int(share[0] * picture.shape[1])]
     raise AssertionError(f"no face at {place}")

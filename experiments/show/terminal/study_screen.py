@@ -1,17 +1,15 @@
 """What the commands `study ...` and `scenarios` show."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-from experiments.judge.criteria import MERGEABLE_PAIRS, RIGHT_WITHIN_M, RIGHT_WITHIN_RAD
 from experiments.methods.catalogue import known_methods, name_clashes
 from experiments.show.independence_files import SHOWN, shown_numbers
 from experiments.show.numbers import two_digits
 from experiments.show.terminal.layout import (
-    Column,
     columns,
     print_frame,
     print_lines,
@@ -20,51 +18,6 @@ from experiments.show.terminal.layout import (
 )
 from experiments.study.independence.strategies import STRATEGIES
 from mapfusion.align.result import Status
-
-_RATES = columns(
-    ">",
-    false="false\nmerges",
-    wrong="wrong\n",
-    missed="missed\nof all",
-    missed_though_right="of right",
-    few_missed_though_right="20 true:\nmissed",
-    few_wrong="wrong",
-)
-
-
-def print_refusals(rows: Sequence[dict[str, Any]], false_alarms: float) -> None:
-    """False and missed merges of each aligner (rows of `refusal_rates`)."""
-    _print_rates(
-        rows,
-        _RATES,
-        f"Accepted where chance gives at most {false_alarms:g} a pair of maps",
-        "false: accepted without common ground; wrong: accepted with some, "
-        f"{RIGHT_WITHIN_M:g} m or {RIGHT_WITHIN_RAD:g} rad off; missed: refused with "
-        f"{MERGEABLE_PAIRS} or more true pairs, of all and of those right; 20 true: just 20 in "
-        "one corner are left",
-    )
-    wide = {
-        name: f"{2 * float(name.removeprefix('poster_')):g} m\nwide"
-        for name in rows[0]
-        if name.startswith("poster_")
-    }
-    repeated = columns(">", **wide, posters_false="posters,\napart", posters_wrong="in common")
-    _print_rates(
-        rows,
-        {name: column for name, column in repeated.items() if rows[0][name].n},
-        "Accepted though wrong: texture that repeats",
-        "wide: one such picture in two worlds; posters: few pictures all over a world, without "
-        "and with common ground",
-    )
-
-
-def _print_rates(
-    rows: Sequence[dict[str, Any]], shown: Mapping[str, Column], title: str, note: str
-) -> None:
-    cells = [
-        [row["aligner"], *(f"{row[name].hits}/{row[name].n}" for name in shown)] for row in rows
-    ]
-    print_table([("aligner", ""), *shown.values()], cells, title, note)
 
 
 def print_benchmark(folder: Path, summary: pd.DataFrame) -> None:

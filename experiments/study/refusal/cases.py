@@ -2,7 +2,6 @@
 
 APART: of two worlds; no landmark is common, whatever the walls' geometry.
 COMMON: of one world, at every evaluated iteration.
-POSTERS: the same, of a world on whose walls the same few pictures hang over and over.
 FEW: a COMMON pair of which only the 20 true correspondences around one landmark are left: the
     first corner of common ground, as hard as the bar for missed merges allows.
 REPEATED: an APART pair, but a poster of world a hangs in world b too: the landmarks of a disc of
@@ -21,7 +20,7 @@ from mapfusion.align.correspondences import Correspondences, MatchParameters, ma
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.se2 import Float
 
-APART, COMMON, POSTERS = "apart", "common", "posters"
+APART, COMMON = "apart", "common"
 FEW, REPEATED = "few", "repeated"
 POSTER_RADII_M = (0.5, 1.0, 2.0)  # of a poster, a mural, and half a wall
 
@@ -31,7 +30,7 @@ class Case:
     """Two maps with their correspondences, and what is true of them.
 
     Attributes:
-        ground: APART, COMMON, POSTERS, FEW or REPEATED.
+        ground: APART, COMMON, FEW or REPEATED.
         n_common: landmarks of both maps that are one point of the world.
         T_true: (3,) NaN without a common world.
         poster_radius_m: NaN without a poster.

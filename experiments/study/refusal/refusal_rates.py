@@ -7,7 +7,7 @@ import pandas as pd
 
 from experiments.judge import criteria
 from experiments.judge.criteria import has_common_ground, right_refined
-from experiments.study.refusal.cases import APART, COMMON, FEW, POSTER_RADII_M, POSTERS
+from experiments.study.refusal.cases import APART, COMMON, FEW, POSTER_RADII_M
 from experiments.study.statistics.intervals import wilson
 from mapfusion.se2 import Float
 
@@ -35,8 +35,13 @@ class Rate(NamedTuple):
         return (float(low), float(high)) if self.n else (np.nan, np.nan)
 
 
+def ordinary(rows: pd.DataFrame) -> pd.DataFrame:
+    """Pairs of maps of worlds that do not repeat themselves."""
+    return rows[~rows["repeats"]]
+
+
 def without_common_ground(rows: pd.DataFrame) -> pd.DataFrame:
-    """Pairs of maps in which every merge is false; those with repeated posters are apart."""
+    """Pairs of maps as they came in which every merge is false."""
     return rows[(rows["ground"] == APART) | ((rows["ground"] == COMMON) & ~has_common_ground(rows))]
 
 
@@ -46,15 +51,15 @@ def mergeable(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def summary(refusals: pd.DataFrame) -> list[dict[str, Any]]:
-    """One row an aligner, in their order: the rates that the operating point has."""
-    groups = refusals.groupby("aligner", sort=False)
+    """One row an aligner, in their order: the rates in ordinary worlds at the operating point."""
+    groups = ordinary(refusals).groupby("aligner", sort=False)
     return [{"aligner": name} | _rates(own) for name, own in groups]
 
 
 def _rates(own: pd.DataFrame) -> dict[str, Rate]:
     accepted, right, ground = own["accepted"], right_refined(own), has_common_ground(own)
     wrong = accepted & ~right
-    common, few, hung = (own["ground"] == kind for kind in (COMMON, FEW, POSTERS))
+    common, few = (own["ground"] == ground for ground in (COMMON, FEW))
     able = own.index.isin(mergeable(own).index)
     hits = {
         "false": without_common_ground(own)["accepted"],
@@ -63,8 +68,6 @@ def _rates(own: pd.DataFrame) -> dict[str, Rate]:
         "missed_though_right": ~accepted[able & right],
         "few_missed_though_right": ~accepted[few & right],
         "few_wrong": wrong[few],
-        "posters_false": accepted[hung & ~ground],
-        "posters_wrong": wrong[hung & ground],
     }
     for radius_m in POSTER_RADII_M:
         hits[f"poster_{radius_m:g}"] = accepted[own["poster_radius_m"] == radius_m]

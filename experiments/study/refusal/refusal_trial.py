@@ -2,9 +2,8 @@
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -13,7 +12,6 @@ from experiments.judge.tables import table_path
 from experiments.methods.aligner_calls import callable_aligner
 from experiments.run.frames import BOOL, FLOAT, INT, TEXT, fields, read_rows, write_rows
 from experiments.run.stages.match import map_at
-from experiments.run.stages.slam import evaluated_iterations
 from experiments.run.tasks import OnProgress
 from experiments.run.workers import workers
 from experiments.scenario.randomness import generator
@@ -27,23 +25,32 @@ from mapfusion.align.registration import Registration
 from mapfusion.storage import schema
 
 REPEATED_PER_WORLDS = 9  # posters hung in each pair of worlds
+REPEATED_WORLDS = 35  # pairs of worlds that posters are hung in
+# Two worlds that are crossed give so many pairs of maps: few, as those of two worlds are alike.
+MEETINGS_PER_WORLDS = 10
+CROSSED = "crossed"  # the kind of maps of two kinds of worlds
 
 # In `FOLDER/tables/`.
 TABLES = {
     # One row per (pair of maps, aligner); errors are NaN for maps of two worlds.
     "refusals": schema(
         "refusal.refusals",
-        1,
+        2,
         fields(
-            ground=TEXT,  # apart, common, posters, few or repeated (see cases.py)
+            kind=TEXT,  # scenario of both worlds; crossed, of two
+            repeats=BOOL,  # pictures of either world are found in several places
+            ground=TEXT,  # apart, common, few or repeated (see cases.py)
             poster_radius_m=FLOAT,  # NaN without a poster
             **dict.fromkeys(("world_a", "robot_a", "world_b", "robot_b"), TEXT),
             iteration=INT,
             aligner=TEXT,
             **dict.fromkeys(("n_correspondences", "n_true", "n_common"), INT),
             n_inliers=INT,  # of the refined alignment: what a threshold on support would go by
+            status=TEXT,  # the verdict on the refined alignment
             accepted=BOOL,
+            beats_chance=BOOL,  # passes the test against chance, whatever else is said
             log10_false_alarms=FLOAT,
+            probability=FLOAT,  # that it is right, as the verdict states it; NaN where it does not
             refined_translation_error_m=FLOAT,
             refined_rotation_error_rad=FLOAT,
         ),
@@ -65,6 +72,22 @@ Rows = list[dict[str, Any]]
 Meeting = tuple[str, str, int]  # a robot of each of two worlds, at one iteration
 
 
+class Crossing(NamedTuple):
+    """Two worlds of different seeds, and what is done with their maps.
+
+    Attributes:
+        a: whose maps are the first of each pair.
+        b: whose are the second.
+        meetings: pairs of maps.
+        hung: whether posters of a are hung in b.
+    """
+
+    a: MappedWorld
+    b: MappedWorld
+    meetings: list[Meeting]
+    hung: bool
+
+
 def read(folder: Path, name: str) -> pd.DataFrame:
     """Read the table of that name; raises InputError that names the file."""
     return read_rows(table_path(folder, name), TABLES[name])
@@ -75,17 +98,17 @@ def run(
 ) -> float:
     """Write the tables into a folder; returns the number of false alarms that was accepted.
 
-    The first world's scenario gives methods and iterations; `n_apart` pairs of maps without common
-    ground are drawn from all there are.
+    The first world's scenario gives methods; `n_apart` pairs of maps without common ground are
+    drawn from all that worlds of one kind have, for each kind, and as many of different kinds.
     """
     scenario = worlds[0].scenario
-    crossings = _crossings(scenario, worlds, n_apart)
+    crossings = crossings_of(worlds, n_apart, generator(scenario.seed, "refusal"))
     done: dict[tuple[str, str], Rows] = {}
     with workers(jobs) as pool:
         for world in worlds:
             pool.submit((world.name, ""), common_rows, scenario, world)
-        for a, b, meetings in crossings:
-            pool.submit((a.name, b.name), apart_rows, scenario, a, b, meetings)
+        for each in crossings:
+            pool.submit((each.a.name, each.b.name), apart_rows, scenario, each)
         for names, rows in pool.completed():
             done[names] = rows
             on_progress("cross the worlds", len(done), len(worlds) + len(crossings))
@@ -99,86 +122,105 @@ def run(
     return acceptance.false_alarms
 
 
-def _iterations(scenario: Simulation) -> list[int]:
-    return evaluated_iterations(scenario.drive.frames, scenario.evaluate.every)
+def crossings_of(worlds: Sequence[MappedWorld], n: int, rng: np.random.Generator) -> list[Crossing]:
+    """Pairs of worlds of different seeds, with the pairs of maps drawn from each.
 
-
-def _crossings(
-    scenario: Simulation, worlds: Sequence[MappedWorld], n: int
-) -> list[tuple[MappedWorld, MappedWorld, list[Meeting]]]:
-    """All pairs of worlds of different seeds, with n of their pairs of maps drawn from all."""
+    Of each kind n pairs of maps, and n of different kinds, or all there are in the pairs of worlds
+    drawn. Posters hang in pairs of worlds that do not repeat themselves.
+    """
     strangers = [
         (a, b) for a, b in itertools.combinations(worlds, 2) if a.scenario.seed != b.scenario.seed
     ]
-    possible = [
-        (number, meeting)
-        for number, (a, b) in enumerate(strangers)
-        for meeting in itertools.product(a.folders, b.folders, _iterations(scenario))
-    ]
-    order = generator(scenario.seed, "refusal").permutation(len(possible))[:n]
-    drawn = [possible[k] for k in np.sort(order)]
-    return [
-        (a, b, [meeting for pair, meeting in drawn if pair == number])
-        for number, (a, b) in enumerate(strangers)
-    ]
+    hung = _drawn(
+        [k for k, pair in enumerate(strangers) if not _repeats(*pair)], REPEATED_WORLDS, rng
+    )
+    meetings: dict[int, list[Meeting]] = {k: [] for k in hung}
+    kinds = [_kind(a, b) for a, b in strangers]
+    for kind in sorted(set(kinds)):
+        of_kind = [k for k, name in enumerate(kinds) if name == kind]
+        met = _drawn(of_kind, -(-n // MEETINGS_PER_WORLDS), rng)
+        possible = [(k, meeting) for k in met for meeting in _possible(*strangers[k])]
+        for place in _drawn(range(len(possible)), n, rng):
+            k, meeting = possible[place]
+            meetings.setdefault(k, []).append(meeting)
+    return [Crossing(*strangers[k], meetings[k], k in hung) for k in sorted(meetings)]
+
+
+def _drawn(items: Sequence[int], n: int, rng: np.random.Generator) -> list[int]:
+    """At most n of the items, in their order."""
+    return [items[k] for k in np.sort(rng.permutation(len(items))[:n])]
+
+
+def _possible(a: MappedWorld, b: MappedWorld) -> list[Meeting]:
+    both = sorted({*a.iterations} & {*b.iterations})
+    return list(itertools.product(a.folders, b.folders, both))
+
+
+def _kind(a: MappedWorld, b: MappedWorld) -> str:
+    return a.kind if a.kind == b.kind else CROSSED
+
+
+def _repeats(a: MappedWorld, b: MappedWorld) -> bool:
+    return a.repeats or b.repeats
 
 
 def common_rows(scenario: Simulation, world: MappedWorld) -> Rows:
-    """COMMON and FEW pairs of one world; POSTERS of one whose pictures repeat."""
+    """COMMON pairs of one world, and FEW ones unless it repeats itself."""
     matching, radius_m = scenario.align.match, scenario.evaluate.true_pair_radius_m
     rows: Rows = []
     for (a, b), iteration in itertools.product(
-        itertools.combinations(world.robots(), 2), _iterations(scenario)
+        itertools.combinations(world.robots(), 2), world.iterations
     ):
-        case = cases.common(a, b, iteration, matching, radius_m)
-        if world.scenario.world.texture.posters:  # the same few pictures hang all over it
-            met = [replace(case, ground=cases.POSTERS)]
-        else:
+        met = [cases.common(a, b, iteration, matching, radius_m)]
+        if not world.repeats:
             rng = generator(scenario.seed, "few", world.name, a.name, b.name, iteration)
-            met = [case, cases.few(case, rng)]
-        for entry in filter(None, met):
-            rows += _answers(scenario, entry, (world.name, world.name), iteration)
+            met += filter(None, [cases.few(met[0], rng)])
+        for case in met:
+            rows += _answers(scenario, case, (world, world), iteration)
     return rows
 
 
-def apart_rows(
-    scenario: Simulation, world_a: MappedWorld, world_b: MappedWorld, meetings: Sequence[Meeting]
-) -> Rows:
+def apart_rows(scenario: Simulation, crossing: Crossing) -> Rows:
     """APART and REPEATED pairs of two worlds."""
-    in_a, in_b = ({robot.name: robot for robot in w.robots()} for w in (world_a, world_b))
-    names, matching = (world_a.name, world_b.name), scenario.align.match
+    worlds, matching = (crossing.a, crossing.b), scenario.align.match
+    in_a, in_b = ({robot.name: robot for robot in world.robots()} for world in worlds)
     rows: Rows = []
-    for robot_a, robot_b, iteration in meetings:
+    for robot_a, robot_b, iteration in crossing.meetings:
         maps = map_at(in_a[robot_a].maps, iteration), map_at(in_b[robot_b].maps, iteration)
-        rows += _answers(scenario, cases.apart(*maps, matching), names, iteration)
-    if len(in_a) < 2:  # no partner has seen what robot a saw
+        rows += _answers(scenario, cases.apart(*maps, matching), worlds, iteration)
+    if len(in_a) < 2 or not crossing.hung:  # no partner has seen what robot a saw
         return rows
-    last = _iterations(scenario)[-1]
+    last = min(world.iterations[-1] for world in worlds)
     first, partner, *_ = in_a.values()
     source = cases.common(first, partner, last, matching, scenario.evaluate.true_pair_radius_m)
     others = [map_at(robot.maps, last) for robot in in_b.values()]
     for number in range(REPEATED_PER_WORLDS):
         each, size = divmod(number, len(cases.POSTER_RADII_M))  # each robot meets each size
-        rng = generator(scenario.seed, "poster", *names, number)
+        rng = generator(scenario.seed, "poster", crossing.a.name, crossing.b.name, number)
         other, radius_m = others[each % len(others)], cases.POSTER_RADII_M[size]
         case = cases.repeated(source, other, radius_m, matching, rng)
         if case is not None:
-            rows += _answers(scenario, case, names, last)
+            rows += _answers(scenario, case, worlds, last)
     return rows
 
 
-def _answers(scenario: Simulation, case: Case, worlds: tuple[str, str], iteration: int) -> Rows:
+def _answers(
+    scenario: Simulation, case: Case, worlds: tuple[MappedWorld, MappedWorld], iteration: int
+) -> Rows:
     """One row an aligner: its refined alignment, judged."""
     settings = scenario.align
-    names: dict[str, Any] = {"ground": case.ground, "poster_radius_m": case.poster_radius_m}
-    names |= {"world_a": worlds[0], "robot_a": case.map_a.name}
-    names |= {"world_b": worlds[1], "robot_b": case.map_b.name, "iteration": iteration}
+    names: dict[str, Any] = {"kind": _kind(*worlds), "repeats": _repeats(*worlds)}
+    names |= {"ground": case.ground, "poster_radius_m": case.poster_radius_m}
+    names |= {"world_a": worlds[0].name, "robot_a": case.map_a.name}
+    names |= {"world_b": worlds[1].name, "robot_b": case.map_b.name, "iteration": iteration}
+    bound = np.log10(settings.acceptance.false_alarms)
     rows = []
     for entry in settings.aligners:
         rng = generator(scenario.seed, *map(str, names.values()), entry.name)
         aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
         registration = Registration(aligner, settings.refinement, settings.acceptance)
-        _, refined, verdict = registration.register(case.map_a, case.map_b, case.pairs, rng)
+        registered = registration.register(case.map_a, case.map_b, case.pairs, rng)
+        refined, verdict = registered.refined, registered.verdict
         error = refined.T_a_b - case.T_true
         found = {
             "aligner": entry.name,
@@ -186,8 +228,11 @@ def _answers(scenario: Simulation, case: Case, worlds: tuple[str, str], iteratio
             "n_true": int(case.is_true.sum()),
             "n_common": case.n_common,
             "n_inliers": int(refined.inlier.sum()),
+            "status": str(registered.applied.status),
             "accepted": verdict.accepted,
+            "beats_chance": bool(verdict.log10_false_alarms <= bound),
             "log10_false_alarms": verdict.log10_false_alarms,
+            "probability": getattr(verdict, "probability", np.nan),
             "refined_translation_error_m": np.hypot(error[0], error[1]),
             "refined_rotation_error_rad": float(se2.wrap(error[2])),
         }

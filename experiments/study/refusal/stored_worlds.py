@@ -10,7 +10,7 @@ from experiments.judge.expectations import load_checked
 from experiments.judge.judged_run import JudgedRun
 from experiments.judge.judging import load_robot
 from experiments.judge.result import require_result
-from experiments.run.stages.slam import RobotFolders
+from experiments.run.stages.slam import RobotFolders, evaluated_iterations
 from experiments.run.store import Store
 from experiments.scenario.settings import AnyScenario, Simulation
 from experiments.scenario.suite import scenarios_of
@@ -34,6 +34,22 @@ class MappedWorld:
     scenario: Simulation
     textures: str
     folders: dict[str, RobotFolders]
+
+    @property
+    def kind(self) -> str:
+        """The scenario's name: worlds of one kind differ in their seeds."""
+        return self.scenario.name
+
+    @property
+    def repeats(self) -> bool:
+        """Whether some of its pictures are found in several places."""
+        world = self.scenario.world
+        return world.texture.posters > 0 or any(wall.look for wall in world.walls)
+
+    @property
+    def iterations(self) -> list[int]:
+        """At which its maps were kept."""
+        return evaluated_iterations(self.scenario.drive.frames, self.scenario.evaluate.every)
 
     def robots(self) -> list[EvaluatedRobot]:
         """All robots' maps joined with the truth."""

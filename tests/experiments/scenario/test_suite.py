@@ -80,7 +80,9 @@ def test_commands_take_tags(
 ) -> None:
     monkeypatch.chdir(folder.parent)
     for name in ("run", "check"):
-        assert_refused(command(capsys, name, "soft"), "soft", "a, alias_copy", "alias, ci, full, hard")
+        assert_refused(
+            command(capsys, name, "soft"), "soft", "a, alias_copy", "alias, ci, full, hard"
+        )
     wrong = ("ci", "--set", "drive.frames=1")  # found, and then refused for their own reasons
     assert_refused(command(capsys, "run", *wrong), "a.yaml", "frames")
     checked = command(capsys, "check", *wrong)
@@ -140,7 +142,9 @@ def test_shipped_scenarios_say_what_they_are(name: str) -> None:
     assert path.read_text().startswith("# ")
 
 
-@pytest.mark.parametrize("name", [path.stem for path in scenarios_of(["full", "hard", "alias"], SCENARIOS)])
+@pytest.mark.parametrize(
+    "name", [path.stem for path in scenarios_of(["full", "hard", "alias"], SCENARIOS)]
+)
 def test_worlds_of_the_suite_are_small(name: str) -> None:
     scenario = load_scenario(SCENARIOS / f"{name}.yaml")
     assert scenario.drive is not None

@@ -11,10 +11,12 @@ import pandas as pd
 import pytest
 
 from experiments.judge.result import run_scenario
+from experiments.run.frames import read_rows
 from experiments.scenario.sections import Render
 from experiments.scenario.settings import Simulation
 from experiments.show.figures.drawing import save_figure
 from experiments.show.figures.refusal_figures import draw
+from experiments.show.refusal_files import KINDS
 from experiments.study.refusal import cases
 from experiments.study.refusal import refusal_trial as results
 from experiments.study.refusal.calibration import (
@@ -96,7 +98,13 @@ def rows_of(*entries: tuple) -> pd.DataFrame:
     """Rows of `refusals` from (ground, n_common, n_true, accepted, error, log10)."""
     names = ["ground", "n_common", "n_true", "accepted", "refined_translation_error_m"]
     frame = pd.DataFrame(list(entries), columns=pd.Index([*names, "log10_false_alarms"]))
+    ground = frame["ground"]
     frame["aligner"] = "ransac"
+    frame["kind"], frame["repeats"], frame["probability"] = "tiny", False, math.nan
+    frame["world_a"], frame["world_b"] = "tiny-1", np.where(ground == "apart", "tiny-2", "tiny-1")
+    frame["robot_a"], frame["robot_b"], frame["iteration"] = "R1", "R2", np.arange(len(frame))
+    frame["status"] = np.where(frame["accepted"], "accepted", "refused")
+    frame["beats_chance"] = frame["accepted"]
     frame["refined_rotation_error_rad"] = 0.0
     frame["poster_radius_m"] = np.where(frame["ground"] == "repeated", 1.0, np.nan)
     frame["n_inliers"] = 10
@@ -118,7 +126,8 @@ TABLE = rows_of(
 
 
 def test_rates_worked_out_by_hand() -> None:
-    (row,) = summary(TABLE)
+    repeating = TABLE.assign(repeats=True, accepted=~TABLE["accepted"])  # left out
+    (row,) = summary(pd.concat([TABLE, repeating]))
     assert row["false"] == Rate(1, 3)
     assert row["wrong"] == Rate(1, 4)
     assert row["missed"] == Rate(2, 3)
@@ -242,17 +251,23 @@ def test_worlds_may_be_scenarios_with_seeds(
     reply = command(capsys, "study", "refusal", *paths, "-o", tmp_path / "out", *asked)
     assert reply.code == 0, reply.err
     rows = results.read(tmp_path / "out", "refusals")
-    by_ground = rows.groupby("ground")["world_a"].unique()
-    assert by_ground["posters"].tolist() == ["hung-5", "hung-6"]
-    assert by_ground["common"].tolist() == ["plain-5", "plain-6"]
-    assert not set(by_ground.get("few", ())) & {"hung-5", "hung-6"}
+    common_ones = rows[rows["ground"] == "common"]
+    assert common_ones["world_a"].unique().tolist() == ["hung-5", "hung-6", "plain-5", "plain-6"]
+    repeats = rows["world_a"].str.startswith("hung") | rows["world_b"].str.startswith("hung")
+    assert (rows["repeats"] == repeats).all()
+    assert not repeats[rows["ground"].isin(["few", "repeated"])].any()
+    apart = rows[rows["ground"] == "apart"].drop_duplicates(
+        ["world_a", "robot_a", "robot_b", "iteration", "world_b"]
+    )
+    assert apart.groupby("kind").size().to_dict() == {"crossed": 2, "hung": 2, "plain": 2}
     crossed = rows[rows["world_a"] != rows["world_b"]]
     assert (crossed["world_a"].str[-1] != crossed["world_b"].str[-1]).all()
     alone = command(
         capsys, "study", "refusal", *paths, "-o", tmp_path / "x", *common[2:], "--seeds", 5
     )
     assert "all worlds have seed 5" in alone.complaints[0]
-    assert ("posters" in reply.out) == bool((rows["ground"] == "posters").any())
+    kinds = read_rows(tmp_path / "out" / "tables" / "kinds.parquet", KINDS)
+    assert kinds["kind"].unique().tolist() == ["crossed", "hung", "plain"]
 
 
 def test_wrong_results_are_named(
