@@ -51,23 +51,27 @@ def print_kinds(rows: Sequence[dict[str, Any]]) -> None:
     """What verdicts make of each kind of world (rows of `kind_rates.by_kind`)."""
     grouped = itertools.groupby(rows, key=lambda row: row["kind"])
     kinds = {kind: list(own) for kind, own in grouped}
-    cells = []
+    false = []
     for kind, own in kinds.items():
         (who, runs), (_, pairs) = (worst(own, name) for name in ("false_runs", "false_pairs"))
-        cells.append([kind, _hits(runs), _hits(pairs), who if runs.hits else "", *_right(own)])
-    shown = columns(">", runs="false:\nruns", pairs="no common\nground")
-    shown |= {"who": ("worst\nmethod", "")}
-    shown |= columns(">", right="right:\naccepted", ambiguous="ambi-\nguous")
-    shown |= columns(">", uncertain="too un-\ncertain", refused="refused")
-    shown |= columns(">", first="first at\niteration", chance="by\nchance")
+        false.append([kind, _hits(runs), _hits(pairs), who if runs.hits else ""])
+    shown = columns(">", runs="runs", pairs="pairs of maps\nwithout common ground")
     print_table(
-        [("kind", ""), *shown.values()],
-        cells,
-        "Kinds of worlds",
-        "false: runs with an accepted answer that is wrong, and pairs of maps without common "
-        "ground, each of the method that is worst; right: answers of all methods with "
-        f"{MERGEABLE_PAIRS} or more true pairs; first: iteration of a run's first right answer "
-        f"accepted (median, {rows[0]['aligner']}), and with the test against chance alone",
+        [("kind of world", ""), *shown.values(), ("worst method\nof runs", "")],
+        false,
+        "Accepted though wrong, by kind of world",
+        "of the method that is worst; runs: any of their maps",
+    )
+    found = [[kind, *_right(own)] for kind, own in kinds.items()]
+    shown = columns(">", kept="accepted", ambiguous="ambi-\nguous", uncertain="too un-\ncertain")
+    shown |= columns(">", refused="refused", first="first at\niteration", chance="by\nchance")
+    print_table(
+        [("kind of world", ""), *shown.values()],
+        [row for row in found if row[1:] != ["–"] * (len(row) - 1)],
+        "Right answers, by kind of world",
+        f"of all methods, with {MERGEABLE_PAIRS} or more true pairs; first: a run's first right "
+        f"answer that is accepted (median, {rows[0]['aligner']}), and by the test against chance "
+        "alone",
     )
 
 

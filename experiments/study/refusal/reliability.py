@@ -53,8 +53,10 @@ def reliability(answers: pd.DataFrame, rng: np.random.Generator) -> Reliability:
     codes, runs = pd.factorize(answers["run"])
     stated = answers["probability"].to_numpy(float)
     right = answers["right"].to_numpy(float)
-    place = np.empty(len(stated), np.int64)  # of equal probabilities by their order
-    place[np.argsort(stated, kind="stable")] = np.arange(len(stated)) * N_BINS // len(stated)
+    # of equal probabilities by lot: they lie in the table kind by kind
+    order = np.lexsort([rng.permutation(len(stated)), stated])
+    place = np.empty(len(stated), np.int64)
+    place[order] = np.arange(len(stated)) * N_BINS // len(stated)
     sums = {
         name: _sums(values, codes, place, len(runs))
         for name, values in (("n", np.ones(len(stated))), ("stated", stated), ("right", right))
