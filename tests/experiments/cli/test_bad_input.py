@@ -54,6 +54,16 @@ SCENARIOS = Path(__file__).parents[3] / "scenarios"
         ("robots=[]", ["world, robots and drive, or logs"]),
         ("logs=[nowhere]", ["world, robots and drive, or logs"]),
         ("world.walls.0.points=[[0, 0]]", ["world.walls.0.points", "2"]),
+        ("world.walls.0.mirrored=true", ["world.walls.0", "mirrored", "needs a look"]),
+        ("world.walls.0.look=a b", ["world.walls.0.look", "pattern"]),
+        (
+            "world.walls=[{points: [[0, 0], [6, 0]], look: a}, {points: [[0, 1], [5, 1]], look: a}]",
+            ["world", "walls.1.points", "of the shape of walls.0", "(a)"],
+        ),
+        (
+            "world.texture.poster_width_m=[2, 1]",
+            ["world.texture", "poster_width_m: is 2 to 1", "the smallest is above the largest"],
+        ),
         ("robots.0.start=[1, 1]", ["robots.0.start.2", "required"]),
         ("robots.9.name=x", ["--set robots.9.name", "9 is not a key"]),
         ("seed.x=1", ["--set seed.x", "x is not a key"]),
