@@ -57,7 +57,7 @@ SCENARIOS = Path(__file__).parents[3] / "scenarios"
         ("world.walls.0.mirrored=true", ["world.walls.0", "mirrored", "needs a look"]),
         ("world.walls.0.look=a b", ["world.walls.0.look", "pattern"]),
         (
-            "world.walls=[{look: a, points: [[0, 0], [6, 0]]}, {look: a, points: [[0, 1], [5, 1]]}]",
+            "world.walls=[{look: a, points: [[0,0], [6,0]]}, {look: a, points: [[0,0], [5,0]]}]",
             ["world", "walls.1.points", "of the shape of walls.0", "(a)"],
         ),
         (
