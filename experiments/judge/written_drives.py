@@ -66,7 +66,7 @@ def _drive_of(
     robot: SimulatedRobotStages, trajectory: Trajectory, source: FrameSource
 ) -> StereoDrive:
     def pair(k: int) -> tuple[np.ndarray, np.ndarray]:
-        frame = rendered(robot.features.settings, source, trajectory.T_world_robot[:, k], k)
+        frame = rendered(robot.features.settings, source, trajectory.bodies(k), k)
         return frame.left, frame.right
 
     return StereoDrive(

@@ -58,18 +58,8 @@ def visual_odometry(
             increments[k] = steps[k] * speed
             covariance[k] = np.diag((np.abs(increments[k]) + steps[k] * _GUESSED_SIGMA) ** 2)
         else:
-            increments[k], covariance[k] = _in_the_plane(motion, T_robot_taken)
+            own = motion.of(T_robot_taken)
+            increments[k] = se3.planar(own.T_before_after)
+            covariance[k] = own.covariance[np.ix_(_PLANE, _PLANE)]
             speed = increments[k] / steps[k]
     return VisualOdometry(increments, covariance, guessed)
-
-
-def _in_the_plane(motion: RigidMotion, T_robot_taken: Float) -> tuple[Float, Float]:
-    """A motion (3,) of the robot and its covariance (3, 3), from one of its camera."""
-    T = T_robot_taken @ motion.T_before_after @ se3.inverse(T_robot_taken)
-    turn, arm = T_robot_taken[:3, :3], T[:3, :3] @ T_robot_taken[:3, 3]
-    # T = (R, turn t + p - R p): a turn w of the camera's R shifts the robot by (R p) x w
-    jacobian = np.zeros((6, 6))
-    jacobian[:3, :3] = jacobian[3:, 3:] = turn
-    jacobian[:3, 3:] = np.cross(arm, np.eye(3)).T @ turn
-    covariance = jacobian @ motion.covariance @ jacobian.T
-    return se3.planar(T), covariance[np.ix_(_PLANE, _PLANE)]
