@@ -1,7 +1,8 @@
 """A rectified pair of pinhole cameras on a robot, and what its pixels mean in metres.
 
-The cameras look along the robot's x axis, unless their mount tilts them. Pixels: u to the right, v down, the centre of the top
-left pixel is (0, 0). A point at depth Z has disparity d = u_left - u_right = f B / Z.
+The cameras look along the robot's x axis, unless their mount tilts them. Pixels: u to the right, v
+down, the centre of the top left pixel is (0, 0). A point at depth Z has disparity
+d = u_left - u_right = f B / Z.
 """
 
 from dataclasses import dataclass
@@ -50,8 +51,8 @@ class StereoCamera:
         return (self.width_px - 1) / 2, (self.height_px - 1) / 2
 
     @property
-    def R_robot_camera(self) -> Float:
-        """Orientation (3, 3) of the cameras; their axes are x ahead, y left, z up."""
+    def camera_axes(self) -> Float:
+        """The cameras' axes ahead, left and up, as columns (3, 3) in the robot frame."""
         return tilt(self.mount_roll_rad, self.mount_pitch_rad)
 
     @property
@@ -62,11 +63,11 @@ class StereoCamera:
     def p_robot_eye(self, y_m: float) -> Float:
         """Optical centre (3,) of a camera so far to the left of the middle of the pair."""
         middle = np.array([self.mount_x_m, 0.0, self.mount_z_m])
-        return middle + y_m * self.R_robot_camera[:, 1]
+        return middle + y_m * self.camera_axes[:, 1]
 
     def project(self, p_robot: ArrayLike) -> Float:
         """Points (N, 3) of the robot frame to (N, 3) u, v (left image) and disparity, in pixels."""
-        p_camera = (np.asarray(p_robot, dtype=np.float64) - self.p_robot_left) @ self.R_robot_camera
+        p_camera = (np.asarray(p_robot, dtype=np.float64) - self.p_robot_left) @ self.camera_axes
         depth = p_camera[:, 0]
         center_u, center_v = self.center_px
         return np.stack(
@@ -91,14 +92,14 @@ class StereoCamera:
             ],
             -1,
         )
-        return p_camera @ self.R_robot_camera.T + self.p_robot_left
+        return p_camera @ self.camera_axes.T + self.p_robot_left
 
     def turned(self, uv_px: ArrayLike, R_robot_before: Float) -> Float:
         """Pixels (N, 2) to where far points are seen after the robot has turned about itself.
 
         `R_robot_before` (3, 3) is how it stood before in the axes that it has now.
         """
-        ray = (self.back_project(uv_px, np.ones(len(np.asarray(uv_px)))) - self.p_robot_left)
+        ray = self.back_project(uv_px, np.ones(len(np.asarray(uv_px)))) - self.p_robot_left
         return self.project(ray @ R_robot_before.T + self.p_robot_left)[:, :2]
 
     def triangulate(
@@ -125,7 +126,7 @@ class StereoCamera:
         jacobian[:, 1, 2] = (uv[:, 0] - center_u) * depth / (self.focal_px * disparity)
         jacobian[:, 2, 1] = -depth / self.focal_px
         jacobian[:, 2, 2] = (uv[:, 1] - center_v) * depth / (self.focal_px * disparity)
-        jacobian = self.R_robot_camera @ jacobian
+        jacobian = self.camera_axes @ jacobian
         variance = np.empty((len(uv), 3))
         variance[:, :2] = sigma_uv_px**2
         variance[:, 2] = np.asarray(sigma_disparity_px, dtype=np.float64) ** 2

@@ -91,7 +91,7 @@ def camera_pose(camera: StereoCamera, T_world_robot: ArrayLike, y_m: float) -> F
     """
     T = np.asarray(T_world_robot, dtype=np.float64)
     body = T if T.shape == (4, 4) else from_planar(T)
-    return body @ pose(camera.R_robot_camera, camera.p_robot_eye(y_m))
+    return body @ pose(camera.camera_axes, camera.p_robot_eye(y_m))
 
 
 def _view_matrix(T_world_camera: Float) -> list[float]:

@@ -93,8 +93,8 @@ class Trajectory:
 def write_trajectory(path: Path, trajectory: Trajectory) -> None:
     """Write a trajectory to one file."""
     n_robots, n_frames = len(trajectory.robots), len(trajectory)
-    level = trajectory.tilt_rad is None
-    tilt_rad = np.zeros((n_robots, n_frames, 2)) if level else trajectory.tilt_rad
+    level = np.zeros((n_robots, n_frames, 2))
+    tilt_rad = level if trajectory.tilt_rad is None else trajectory.tilt_rad
     write_table(
         path,
         {

@@ -3,10 +3,10 @@
 import numpy as np
 
 from mapfusion.attitude import Attitude, levelled, moved
-from mapfusion.attitude_filter import AttitudeFilter, Measured
 from mapfusion.robot_log import Observations
 from mapfusion.se2 import Float
 from mapfusion.se3 import tilt
+from mapfusion.vision.attitude_filter import AttitudeFilter, Measured
 from mapfusion.vision.rigid_links import RigidMotion
 
 

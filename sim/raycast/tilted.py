@@ -60,7 +60,10 @@ class TiltedView:
         fine_px = float(_FINER * f)
         from_left, from_top = fine_px * left / ahead, fine_px * up / ahead
         u, v = float(from_left.max() + _BORDER_PX), float(from_top.max() + _BORDER_PX)
-        size = [math.ceil(c + _BORDER_PX - low) for c, low in ((u, from_left.min()), (v, from_top.min()))]
+        size = [
+            math.ceil(c + _BORDER_PX - low)
+            for c, low in ((u, from_left.min()), (v, from_top.min()))
+        ]
         x, y, z = T_world_camera[:3, 3].tolist()
         level = Pinhole(size[0], size[1], fine_px, u, v, x, y, z, theta, NEAR_M)
         pixel_of = np.array([[1, 0, 0], [u, -fine_px, 0], [v, 0, -fine_px]])

@@ -12,9 +12,9 @@ from experiments.run.stages.drive import TRAJECTORY_FILE
 from experiments.run.stages.features import read_features
 from experiments.scenario.randomness import generator
 from mapfusion.attitude import write_attitude
-from mapfusion.attitude_filter import Measured
 from mapfusion.camera import StereoCamera
 from mapfusion.robot_log import write_observations, write_truth_points
+from mapfusion.vision.attitude_filter import Measured
 from mapfusion.vision.frontend import FrontEndParameters
 from mapfusion.vision.levelling import Levelling
 from mapfusion.vision.observing import Observer, joined

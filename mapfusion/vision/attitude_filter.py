@@ -7,29 +7,15 @@ seen later.
 """
 
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 
 from mapfusion.se2 import Float
 from mapfusion.se3 import roll_pitch, tilt
+from mapfusion.vision.rigid_links import RigidMotion
 
 # Standard deviation of an attitude that nothing has told yet, rad and m: anything.
 _UNKNOWN = np.array([1.0, 1.0, 100.0])
-
-
-class Motion(Protocol):
-    """How a body moved since the frame before, by what it sees."""
-
-    @property
-    def T_before_after(self) -> Float:
-        """(4, 4) in the body's axes."""
-        ...
-
-    @property
-    def covariance(self) -> Float:
-        """(6, 6) of its error: a shift along the axes before, and a turn about them."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -62,7 +48,7 @@ class AttitudeFilter:
         """Standard deviations (3,) of roll, pitch and height."""
         return np.sqrt(np.diag(self.covariance))
 
-    def move(self, motion: Motion | None) -> None:
+    def move(self, motion: RigidMotion | None) -> None:
         """On to the next frame; None: it may have moved in any way."""
         if motion is None:
             self.covariance = np.diag(_UNKNOWN**2)
