@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapfusion import se3
+from mapfusion.attitude import Attitude
 from mapfusion.camera import StereoCamera
 from mapfusion.se2 import Float
 from mapfusion.vision.rigid_links import RigidMotion
@@ -36,6 +37,7 @@ def visual_odometry(
     steps: Float,
     camera: StereoCamera,
     T_robot_camera: Float,
+    attitude: Attitude | None = None,
 ) -> VisualOdometry:
     """What the links of a log's frames say of the robot's way.
 
@@ -44,6 +46,7 @@ def visual_odometry(
         steps: (T,) usual steps of time since the frame before.
         camera: the pair, with the mount that it was taken to have.
         T_robot_camera: (4, 4) the mount that it has; axes x ahead, y left, z up.
+        attitude: of the T frames; None: the body is level.
     """
     n = len(motions)
     increments, covariance = np.zeros((n, 3)), np.zeros((n, 3, 3))
@@ -59,7 +62,9 @@ def visual_odometry(
             covariance[k] = np.diag((np.abs(increments[k]) + steps[k] * _GUESSED_SIGMA) ** 2)
         else:
             own = motion.of(T_robot_taken)
-            increments[k] = se3.planar(own.T_before_after)
-            covariance[k] = own.covariance[np.ix_(_PLANE, _PLANE)]
+            level = np.eye(3) if attitude is None else se3.tilt(*attitude.value[k - 1, :2])
+            increments[k] = se3.planar(se3.pose(level, np.zeros(3)) @ own.T_before_after)
+            turned = np.kron(np.eye(2), level)
+            covariance[k] = (turned @ own.covariance @ turned.T)[np.ix_(_PLANE, _PLANE)]
             speed = increments[k] / steps[k]
     return VisualOdometry(increments, covariance, guessed)

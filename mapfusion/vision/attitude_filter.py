@@ -16,6 +16,7 @@ from mapfusion.vision.rigid_links import RigidMotion
 
 # Standard deviation of an attitude that nothing has told yet, rad and m: anything.
 _UNKNOWN = np.array([1.0, 1.0, 100.0])
+_LOST_M = 0.1  # by how much a height may change in a step that nothing tells of
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,8 @@ class AttitudeFilter:
     def move(self, motion: RigidMotion | None) -> None:
         """On to the next frame; None: it may have moved in any way."""
         if motion is None:
-            self.covariance = np.diag(_UNKNOWN**2)
+            height = self.covariance[2, 2] + _LOST_M**2
+            self.covariance = np.diag([*(_UNKNOWN[:2] ** 2), height])
             return
         before = tilt(self.value[0], self.value[1])
         T = motion.T_before_after

@@ -21,6 +21,7 @@ class Levelling:
     def __init__(self, T_robot_seen: Float | None = None) -> None:
         self._T_robot_seen = T_robot_seen
         self._filter = AttitudeFilter()
+        self._first: Measured | None = None
         self._values: list[Float] = []
         self._sigmas: list[Float] = []
 
@@ -44,11 +45,19 @@ class Levelling:
         return seen.T @ turn @ seen
 
     def add(self, motion: RigidMotion | None, measured: Measured) -> None:
-        """The next frame: how the links say that the camera moved, and what was measured."""
+        """The next frame: how the links say that the camera moved, and what was measured.
+
+        Where neither tells the roll and pitch, they are taken to be what they were at first.
+        """
         if self._values:
             if motion is not None and self._T_robot_seen is not None:
                 motion = motion.of(self._T_robot_seen)
             self._filter.move(motion)
+        self._first = self._first or measured
+        if motion is None and np.isnan(measured.value[:2]).any():
+            measured = Measured(
+                np.array([*self._first.value[:2], measured.value[2]]), self._first.sigma
+            )
         self._filter.measure(measured)
         self._values.append(self._filter.value)
         self._sigmas.append(self._filter.sigma)

@@ -1,5 +1,7 @@
 """Attitude from what is measured and how pictures say it turned: exact, consistent, better."""
 
+import itertools
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -35,11 +37,36 @@ def test_exact_turns_carry_an_exact_attitude() -> None:
     kept = AttitudeFilter()
     first = np.array([*se3.roll_pitch(bodies[0, :3, :3]), 0.0])
     kept.measure(Measured(first, np.zeros(3)))
-    for before, after in zip(bodies[:-1], bodies[1:], strict=True):
+    for before, after in itertools.pairwise(bodies):
         kept.move(RigidMotion(se3.between(before, after), np.zeros((6, 6)), 9))
         expected = [*se3.roll_pitch(after[:3, :3]), after[2, 3]]
         np.testing.assert_allclose(kept.value, expected, atol=1e-12)
     np.testing.assert_allclose(kept.covariance, 0, atol=1e-20)
+
+
+def test_errors_stay_in_the_world_when_the_body_turns() -> None:
+    """Uncertain in roll, and turned by a quarter: uncertain in pitch."""
+    kept = AttitudeFilter()
+    kept.measure(Measured(np.zeros(3), np.array([0.01, 0.001, 0.0])))
+    quarter = se3.from_planar(np.array([0.0, 0.0, np.pi / 2]))
+    kept.move(RigidMotion(quarter, np.zeros((6, 6)), 9))
+    np.testing.assert_allclose(kept.sigma, [0.001, 0.01, 0.0], rtol=1e-3, atol=1e-12)
+    # half a metre ahead of a body whose pitch is uncertain, its height is too
+    kept.move(RigidMotion(se3.from_planar(np.array([0.5, 0.0, 0.0])), np.zeros((6, 6)), 9))
+    np.testing.assert_allclose(kept.sigma[2], 0.005, rtol=1e-3)
+
+
+def test_what_a_tilt_moves_is_expected_there() -> None:
+    rng = np.random.default_rng(5)
+    before, after = rng.normal(0, 0.05, (2, 2))
+    levelling = Levelling()
+    levelling.add(None, Measured(np.array([*before, 0.0]), np.full(3, 1e-9)))
+    turn = levelling.expected_turn(Measured(np.array([*after, 0.0]), INCLINOMETER))
+    ray = rng.normal(size=3)
+    assert turn is not None
+    np.testing.assert_allclose(
+        turn @ se3.tilt(*before).T @ ray, se3.tilt(*after).T @ ray, atol=1e-9
+    )
 
 
 def test_errors_are_as_large_as_stated_and_smaller_than_measured() -> None:
