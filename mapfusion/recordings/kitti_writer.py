@@ -23,11 +23,11 @@ def write_kitti(folder: Path, drive: StereoDrive, on_frame: OnFrame) -> list[Pat
     write_text(sequence / "calib.txt", [_projection(drive, camera) for camera in (0, 1)])
     write_text(sequence / "times.txt", [str(t) for t in drive.time_s.tolist()])
     T_robot_left = drive.mount(0)
-    T_world_left = se3.from_planar(drive.T_world_robot) @ T_robot_left
+    T_world_left = drive.true_bodies @ T_robot_left
     poses = se3.between(T_world_left[0], T_world_left)
     write_text(sequence / "poses.txt", [_numbers(T[:3]) for T in poses])
     about = f"{drive.robot}: dead reckoning by the wheels, in the frame of the first pose"
-    text = tum_text(drive.time_s, drive.dead_reckoned, about)
+    text = tum_text(drive.time_s, drive.reckoned_bodies, about)
     write_text(sequence / ODOMETRY_FILE, text.splitlines())
     return [sequence]
 

@@ -14,6 +14,7 @@ from experiments.scenario.randomness import generator
 from mapfusion.attitude import write_attitude
 from mapfusion.camera import StereoCamera
 from mapfusion.robot_log import write_observations, write_truth_points
+from mapfusion.se2 import Float
 from mapfusion.vision.attitude_filter import Measured
 from mapfusion.vision.frontend import FrontEndParameters
 from mapfusion.vision.levelling import Levelling
@@ -46,19 +47,22 @@ def run(settings: ObservedSettings, job: Job) -> None:
     written beside them.
     """
     observer = Observer.of(settings.camera, settings.vision)
-    measured = _measured(settings, read_trajectory(job.inputs["drive"] / TRAJECTORY_FILE))
-    levelling = None if measured is None else Levelling()
+    told = told_tilt(settings, read_trajectory(job.inputs["drive"] / TRAJECTORY_FILE))
+    levelling = None if told is None else Levelling()
+    # robots drive on one level floor, so their heights are known
+    sigma = np.array([settings.attitude.sigma_rad, settings.attitude.sigma_rad, 0.0])
     observed, truth, tracks = [], [], []
     kept = range(settings.images_at, settings.images_at + settings.images)
     frames = read_features(job.inputs["features"], settings.n_frames)
     for iteration, (found, points) in enumerate(frames):
-        if levelling is None or measured is None:
+        if levelling is None or told is None:
             frame = observer.observe(found)
             observed.append(frame.observations)
         else:
-            turn = levelling.expected_turn(measured[iteration])
+            measured = Measured(np.array([*told[iteration], 0.0]), sigma)
+            turn = levelling.expected_turn(measured)
             frame = observer.observe(found, R_after_before=turn)
-            levelling.add(frame.tracks.motion, measured[iteration])
+            levelling.add(frame.tracks.motion, measured)
             observed.append(levelling.applied(frame.observations))
         state = frame.tracks
         truth.append(points.at(state.uv_px - found.uv_px)[frame.rows])
@@ -72,14 +76,9 @@ def run(settings: ObservedSettings, job: Job) -> None:
     write_rows(job.output / "tracks.parquet", TRACKS, pd.concat(tracks) if tracks else [])
 
 
-def _measured(settings: ObservedSettings, trajectory: Trajectory) -> list[Measured] | None:
-    """What the robot is told of its attitude, frame by frame; None: nothing, it is level to it.
-
-    Robots drive on one level floor, so their heights are known.
-    """
+def told_tilt(settings: ObservedSettings, trajectory: Trajectory) -> Float | None:
+    """Roll and pitch (T, 2) as the robot measures them; None: it takes itself for level."""
     if trajectory.tilt_rad is None or not settings.attitude.measured:
         return None
     rng = generator(settings.seed, "attitude", settings.robot)
-    told = settings.attitude.applied(trajectory.tilt_rad[trajectory.index(settings.robot)], rng)
-    sigma = np.array([settings.attitude.sigma_rad, settings.attitude.sigma_rad, 0.0])
-    return [Measured(np.array([*angles, 0.0]), sigma) for angles in told]
+    return settings.attitude.applied(trajectory.tilt_rad[trajectory.index(settings.robot)], rng)
