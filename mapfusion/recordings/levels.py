@@ -15,9 +15,6 @@ from mapfusion.vision.features import Features
 
 Level = Literal["auto", "mount", "pictures", "floor", "odometry"]
 
-# Standard deviation of a body that is level in the mean: a car's on a road, a robot's on its
-# springs; about a degree and a half.
-_BODY_SIGMA_RAD = 0.025
 # Of an attitude that a trajectory tells, of which nobody says how good it is: an inclinometer's.
 _TOLD_SIGMA_RAD, _TOLD_SIGMA_M = 0.0052, 0.02
 _LEVEL_RAD = 1e-6  # a trajectory that tilts by less is one in the plane
@@ -69,9 +66,8 @@ class Levels:
         seen = self._floor(found, sigma_uv_px) if self._known == "floor" else None
         if seen is not None:
             return seen
-        # the map's first frame defines the floor; a body that is lost is level in the mean
-        value = np.zeros(3) if k == 0 else np.full(3, np.nan)
-        return Measured(value, np.array([_BODY_SIGMA_RAD, _BODY_SIGMA_RAD, 0.0]))
+        # what the first frame takes for level is the plane of the map
+        return Measured(np.full(3, np.nan if k else 0.0), np.zeros(3))
 
     def _floor(self, found: Features, sigma_uv_px: float) -> Measured | None:
         noise = (sigma_uv_px, found.sigma_disparity_px)

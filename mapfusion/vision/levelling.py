@@ -9,6 +9,10 @@ from mapfusion.se3 import tilt
 from mapfusion.vision.attitude_filter import AttitudeFilter, Measured
 from mapfusion.vision.rigid_links import RigidMotion
 
+# Standard deviation of roll and pitch of a body on wheels, a car's on a road or a robot's on its
+# springs, of which nothing is known: about a degree and a half.
+_BODY_RAD = 0.025
+
 
 class Levelling:
     """The attitude of a robot along its log, by what is measured of it and by its links.
@@ -21,7 +25,6 @@ class Levelling:
     def __init__(self, T_robot_seen: Float | None = None) -> None:
         self._T_robot_seen = T_robot_seen
         self._filter = AttitudeFilter()
-        self._first: Measured | None = None
         self._values: list[Float] = []
         self._sigmas: list[Float] = []
 
@@ -47,17 +50,15 @@ class Levelling:
     def add(self, motion: RigidMotion | None, measured: Measured) -> None:
         """The next frame: how the links say that the camera moved, and what was measured.
 
-        Where neither tells the roll and pitch, they are taken to be what they were at first.
+        Where neither tells roll and pitch, the body is level in the mean.
         """
         if self._values:
             if motion is not None and self._T_robot_seen is not None:
                 motion = motion.of(self._T_robot_seen)
             self._filter.move(motion)
-        self._first = self._first or measured
         if motion is None and np.isnan(measured.value[:2]).any():
-            measured = Measured(
-                np.array([*self._first.value[:2], measured.value[2]]), self._first.sigma
-            )
+            told = np.array([0.0, 0.0, measured.value[2]])
+            measured = Measured(told, np.array([_BODY_RAD, _BODY_RAD, measured.sigma[2]]))
         self._filter.measure(measured)
         self._values.append(self._filter.value)
         self._sigmas.append(self._filter.sigma)
