@@ -88,6 +88,7 @@ def build_map(
     parameters: FastSlamParameters,
     rng: np.random.Generator,
     min_count: int = 3,
+    odometry_covariance: Float | None = None,
 ) -> LandmarkMap:
     """The most probable map at the end of a log; arguments and errors as of `run_log`.
 
@@ -95,7 +96,7 @@ def build_map(
         InputError: the log holds no frame.
     """
     last = len(log) - 1
-    for frame in run_log(log, parameters, rng, [last], min_count):
+    for frame in run_log(log, parameters, rng, [last], min_count, odometry_covariance):
         if frame.landmarks is not None:
             return frame.landmarks
     raise InputError(f"log {log.robot}: holds no frame")

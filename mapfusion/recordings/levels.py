@@ -15,6 +15,9 @@ from mapfusion.vision.features import Features
 
 Level = Literal["auto", "mount", "pictures", "floor", "odometry"]
 
+# Standard deviations of a first frame's roll, pitch (rad) and height (m): a car on its springs
+# stands within half a degree of the road, and its height is the map's.
+_FIRST_SIGMA = np.array([0.01, 0.01, 0.0])
 # Of an attitude that a trajectory tells, of which nobody says how good it is: an inclinometer's.
 _TOLD_SIGMA_RAD, _TOLD_SIGMA_M = 0.0052, 0.02
 _LEVEL_RAD = 1e-6  # a trajectory that tilts by less is one in the plane
@@ -66,8 +69,8 @@ class Levels:
         seen = self._floor(found, sigma_uv_px) if self._known == "floor" else None
         if seen is not None:
             return seen
-        # what the first frame takes for level is the plane of the map
-        return Measured(np.full(3, np.nan if k else 0.0), np.zeros(3))
+        # what the first frame takes for level is, but for how the body stands, the map's plane
+        return Measured(np.full(3, np.nan if k else 0.0), _FIRST_SIGMA)
 
     def _floor(self, found: Features, sigma_uv_px: float) -> Measured | None:
         noise = (sigma_uv_px, found.sigma_disparity_px)
