@@ -1,7 +1,8 @@
 """A rectified pair of pinhole cameras on a robot, and what its pixels mean in metres.
 
-The cameras look along the robot's x axis. Pixels: u to the right, v down, the centre of the top
-left pixel is (0, 0). A point at depth Z has disparity d = u_left - u_right = f B / Z.
+The cameras look along the robot's x axis, unless their mount tilts them. Pixels: u to the right, v
+down, the centre of the top left pixel is (0, 0). A point at depth Z has disparity
+d = u_left - u_right = f B / Z.
 """
 
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from mapfusion.arguments import Range, require_in_range
 from mapfusion.se2 import Float
+from mapfusion.se3 import tilt
 
 MAX_IMAGE_SIDE_PX = 4096  # the software renderer takes seconds and 100 MB a frame at this size
 
@@ -27,6 +29,8 @@ class StereoCamera:
         baseline_m: between the two optical centres; the left one is half of it to the left.
         mount_x_m: of the middle between the optical centres, ahead of the middle of the axles.
         mount_z_m: of the same, above the floor.
+        mount_roll_rad: about the axis ahead, the right camera down.
+        mount_pitch_rad: about the axis to the left, looking down.
     """
 
     width_px: Annotated[int, Range(1, MAX_IMAGE_SIDE_PX, "px")] = 640
@@ -35,6 +39,8 @@ class StereoCamera:
     baseline_m: Annotated[float, Range(1e-3, 10, "m")] = 0.09
     mount_x_m: Annotated[float, Range(-10, 10, "m")] = 0.15
     mount_z_m: Annotated[float, Range(0.01, 10, "m")] = 0.45
+    mount_roll_rad: Annotated[float, Range(-1, 1, "rad")] = 0.0
+    mount_pitch_rad: Annotated[float, Range(-1, 1, "rad")] = 0.0
 
     def __post_init__(self) -> None:
         require_in_range(self)
@@ -45,13 +51,23 @@ class StereoCamera:
         return (self.width_px - 1) / 2, (self.height_px - 1) / 2
 
     @property
+    def camera_axes(self) -> Float:
+        """The cameras' axes ahead, left and up, as columns (3, 3) in the robot frame."""
+        return tilt(self.mount_roll_rad, self.mount_pitch_rad)
+
+    @property
     def p_robot_left(self) -> Float:
         """Optical centre of the left camera in the robot frame (3,)."""
-        return np.array([self.mount_x_m, self.baseline_m / 2, self.mount_z_m])
+        return self.p_robot_eye(self.baseline_m / 2)
+
+    def p_robot_eye(self, y_m: float) -> Float:
+        """Optical centre (3,) of a camera so far to the left of the middle of the pair."""
+        middle = np.array([self.mount_x_m, 0.0, self.mount_z_m])
+        return middle + y_m * self.camera_axes[:, 1]
 
     def project(self, p_robot: ArrayLike) -> Float:
         """Points (N, 3) of the robot frame to (N, 3) u, v (left image) and disparity, in pixels."""
-        p_camera = np.asarray(p_robot, dtype=np.float64) - self.p_robot_left
+        p_camera = (np.asarray(p_robot, dtype=np.float64) - self.p_robot_left) @ self.camera_axes
         depth = p_camera[:, 0]
         center_u, center_v = self.center_px
         return np.stack(
@@ -76,7 +92,15 @@ class StereoCamera:
             ],
             -1,
         )
-        return p_camera + self.p_robot_left
+        return p_camera @ self.camera_axes.T + self.p_robot_left
+
+    def turned(self, uv_px: ArrayLike, R_robot_before: Float) -> Float:
+        """Pixels (N, 2) to where far points are seen after the robot has turned about itself.
+
+        `R_robot_before` (3, 3) is how it stood before in the axes that it has now.
+        """
+        ray = self.back_project(uv_px, np.ones(len(np.asarray(uv_px)))) - self.p_robot_left
+        return self.project(ray @ R_robot_before.T + self.p_robot_left)[:, :2]
 
     def triangulate(
         self,
@@ -102,6 +126,7 @@ class StereoCamera:
         jacobian[:, 1, 2] = (uv[:, 0] - center_u) * depth / (self.focal_px * disparity)
         jacobian[:, 2, 1] = -depth / self.focal_px
         jacobian[:, 2, 2] = (uv[:, 1] - center_v) * depth / (self.focal_px * disparity)
+        jacobian = self.camera_axes @ jacobian
         variance = np.empty((len(uv), 3))
         variance[:, :2] = sigma_uv_px**2
         variance[:, 2] = np.asarray(sigma_disparity_px, dtype=np.float64) ** 2

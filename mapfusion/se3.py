@@ -42,6 +42,28 @@ def from_planar(T: ArrayLike) -> Float:
     return pose(R, np.stack([x, y, np.zeros_like(x)], -1))
 
 
+def tilt(roll_rad: ArrayLike, pitch_rad: ArrayLike) -> Float:
+    """R_level_body (..., 3, 3): rolled about x first, then pitched about y."""
+    roll, pitch = (np.asarray(a, dtype=np.float64) for a in (roll_rad, pitch_rad))
+    cr, sr, cp, sp = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
+    rows = [[cp, sp * sr, sp * cr], [np.zeros_like(cr), cr, -sr], [-sp, cp * sr, cp * cr]]
+    return np.stack([np.stack(np.broadcast_arrays(*row), -1) for row in rows], -2)
+
+
+def roll_pitch(R_level_body: Float) -> Float:
+    """Roll and pitch (..., 2) of orientations (..., 3, 3), whatever their heading."""
+    R = R_level_body
+    roll = np.arctan2(R[..., 2, 1], R[..., 2, 2])
+    return np.stack([roll, np.arcsin(np.clip(-R[..., 2, 0], -1.0, 1.0))], -1)
+
+
+def in_space(T_world_robot: ArrayLike, roll_pitch_rad: ArrayLike) -> Float:
+    """Poses (..., 4, 4) of bodies at planar poses (..., 3) that roll and pitch by (..., 2)."""
+    T, angles = from_planar(T_world_robot), np.asarray(roll_pitch_rad, dtype=np.float64)
+    R = T[..., :3, :3] @ tilt(angles[..., 0], angles[..., 1])
+    return pose(R, T[..., :3, 3])
+
+
 def from_quaternions(t: ArrayLike, xyzw: ArrayLike) -> Float:
     """Matrices (N, 4, 4) of positions (N, 3) and quaternions (N, 4), their real part last."""
     from scipy.spatial.transform import Rotation  # takes a quarter of a second to import

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from mapfusion.se2 import Float
+from mapfusion.se3 import from_planar, quaternions
 from sim.world import BODY, GROUND, WHEEL, World
 
 URDF = Path(__file__).with_name("p3at.urdf")
@@ -66,13 +67,14 @@ class P3at:
         self.drive(0.0, 0.0)
 
     def place(self, T_world_robot: Float, height_m: float = 0.0) -> None:
-        """Put it level at a pose (3,), whatever the physics say."""
-        x, y, theta = T_world_robot
+        """Put it level at a pose (3,), or as it tilts at (4, 4), whatever the physics say."""
+        T = np.asarray(T_world_robot)
+        T = T if T.shape == (4, 4) else from_planar(T)
         # the base's own frame lies in its centre of mass, so place that
         self._p.resetBasePositionAndOrientation(
             self.body,
-            [x, y, height_m + CENTER_OF_MASS_M],
-            [0, 0, np.sin(theta / 2), np.cos(theta / 2)],
+            T[:3, 3] + CENTER_OF_MASS_M * T[:3, 2] + [0.0, 0.0, height_m],
+            quaternions(T[None])[0],
             physicsClientId=self._client,
         )
 

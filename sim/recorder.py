@@ -10,6 +10,7 @@ from mapfusion.arguments import require_shape
 from mapfusion.camera import StereoCamera
 from mapfusion.errors import InputError
 from mapfusion.se2 import Float, transform_points
+from sim.depth_image import SAME_SURFACE, depth_at
 from sim.p3at import P3at
 from sim.radiometry import RadiometricNoise
 from sim.raycast.caster import RayCaster
@@ -17,8 +18,6 @@ from sim.renderer import BulletRenderer, Renderer
 from sim.stereo_head import StereoFrame, render_stereo
 from sim.visibility import Visibility
 from sim.world import OUT_OF_SIGHT_M, World
-
-SAME_SURFACE = 0.02  # neighbouring pixels whose depths differ by more belong to two surfaces
 
 
 class _Bullet:
@@ -89,10 +88,12 @@ class FrameSource:
     ) -> StereoFrame:
         """What `robot` sees when the robots (in the order of their names) stand at poses (R, 3).
 
+        Bodies that tilt have poses (R, 4, 4); the ray caster draws the other robots upright.
         Without `colour` the frame may come without its picture in colour, which takes time.
         """
         poses = np.asarray(T_world_robots, dtype=np.float64)
-        require_shape("T_world_robots", poses, (len(self._robots), 3))
+        shape = (4, 4) if poses.ndim == 3 else (3,)
+        require_shape("T_world_robots", poses, (len(self._robots), *shape))
         if robot not in self._robots:
             raise InputError(f"robot {robot}: unknown, there are {', '.join(self._robots)}")
         own = self._robots.index(robot)
@@ -107,12 +108,20 @@ def truth_points(
 ) -> Float:
     """World points (N, 3) behind pixels (N, 2) of the left image; NaN where nothing is.
 
+    The robot is at a pose (3,), or (4, 4) where its body tilts.
     Between pixels of one surface the inverse depth is interpolated (it is linear in the image for a
     plane); at the edge of a surface the nearest pixel's depth counts.
     """
     uv = np.asarray(uv_px, dtype=np.float64).reshape(-1, 2)
-    p_robot = camera.back_project(uv, _depth_at(depth_m, uv))
-    return transform_points(T_world_robot, p_robot)
+    p_robot = camera.back_project(uv, depth_at(depth_m, uv))
+    return _in_world(T_world_robot, p_robot)
+
+
+def _in_world(T_world_robot: ArrayLike, p_robot: Float) -> Float:
+    T = np.asarray(T_world_robot, dtype=np.float64)
+    if T.shape == (4, 4):
+        return p_robot @ T[:3, :3].T + T[:3, 3]
+    return transform_points(T, p_robot)
 
 
 def truth_slopes(
@@ -126,8 +135,8 @@ def truth_slopes(
     uv = np.asarray(uv_px, dtype=np.float64).reshape(-1, 2)
     steps = np.array([[0, 0], [-1, 0], [1, 0], [0, -1], [0, 1]], dtype=np.float64)
     there = (uv + steps[:, None]).reshape(-1, 2)
-    depth = _depth_at(depth_m, there)
-    point = transform_points(T_world_robot, camera.back_project(there, depth)).reshape(5, -1, 3)
+    depth = depth_at(depth_m, there)
+    point = _in_world(T_world_robot, camera.back_project(there, depth)).reshape(5, -1, 3)
     depth = depth.reshape(5, -1)
     same = np.abs(depth - depth[0]) <= SAME_SURFACE * depth[0]
     slope = np.zeros((len(uv), 3, 2))
@@ -136,21 +145,3 @@ def truth_slopes(
         axis = int(step[0] == 0)
         slope[own, :, axis] = step[axis] * (moved - point[0])[own]
     return slope
-
-
-def _depth_at(depth_m: np.ndarray, uv_px: Float) -> Float:
-    height, width = depth_m.shape
-    uv = np.clip(uv_px, 0, [width - 1, height - 1])
-    low = np.minimum(uv.astype(np.intp), [width - 2, height - 2])
-    share = uv - low
-    u, v = low.T
-    corners = np.stack(
-        [depth_m[v, u], depth_m[v, u + 1], depth_m[v + 1, u], depth_m[v + 1, u + 1]], -1
-    ).astype(np.float64)
-    a, b = share.T
-    weights = np.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b], -1)
-    smooth = 1 / np.sum(weights / corners, axis=-1)
-    nearest = corners[np.arange(len(uv)), np.argmax(weights, axis=-1)]
-    # comparisons with NaN are false, so a pixel of the background makes an edge too
-    one_surface = corners.max(axis=-1) - corners.min(axis=-1) <= SAME_SURFACE * nearest
-    return np.where(one_surface, smooth, nearest)

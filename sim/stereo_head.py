@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mapfusion.camera import StereoCamera
-from mapfusion.se2 import Float, compose
+from mapfusion.se2 import Float
+from mapfusion.se3 import from_planar, pose
 from sim.exposure import expose
 from sim.radiometry import RadiometricNoise
 from sim.world import World
@@ -42,7 +43,10 @@ def render_stereo(
     noise: RadiometricNoise,
     rng: np.random.Generator,
 ) -> StereoFrame:
-    """Render both images and the left one's depth for a robot at a pose (3,)."""
+    """Render both images and the left one's depth for a robot.
+
+    Its pose is (3,), or (4, 4) where its body tilts.
+    """
     left_rgba, buffer = _render(world, camera, T_world_robot, camera.baseline_m / 2)
     right_rgba, _ = _render(world, camera, T_world_robot, -camera.baseline_m / 2)
     left, right = (cv2.cvtColor(rgba, cv2.COLOR_RGBA2GRAY) for rgba in (left_rgba, right_rgba))
@@ -58,11 +62,10 @@ def _render(
     p, tiny = world.bullet, world.renderer == "tiny"
     # EGL takes no coefficients; a lamp along all meshes' normals shows the texture as painted
     lamp = {} if tiny else {"lightDirection": LAMP_M}
-    T_world_camera = compose(T_world_robot, [camera.mount_x_m, y_m, 0.0])
     _, _, rgba, buffer, _ = p.getCameraImage(
         camera.width_px,
         camera.height_px,
-        viewMatrix=_view_matrix(T_world_camera, camera.mount_z_m),
+        viewMatrix=_view_matrix(camera_pose(camera, T_world_robot, y_m)),
         projectionMatrix=_projection_matrix(camera, sampled_at_px=0.0 if tiny else 0.5),
         shadow=0,
         # the texture as painted: a wall looks the same from everywhere
@@ -78,13 +81,25 @@ def _render(
     return np.reshape(rgba, (*shape, 4)).astype(np.uint8, copy=False), np.reshape(buffer, shape)
 
 
-def _view_matrix(T_world_camera: Float, z_m: float) -> list[float]:
+def camera_pose(camera: StereoCamera, T_world_robot: ArrayLike, y_m: float) -> Float:
+    """T_world_camera (4, 4): x along the optical axis, y left, z up.
+
+    Args:
+        camera: how the pair is mounted.
+        T_world_robot: (3,), or (4, 4) of a body that tilts.
+        y_m: of the camera, to the left of the middle of the pair.
+    """
+    T = np.asarray(T_world_robot, dtype=np.float64)
+    body = T if T.shape == (4, 4) else from_planar(T)
+    return body @ pose(camera.camera_axes, camera.p_robot_eye(y_m))
+
+
+def _view_matrix(T_world_camera: Float) -> list[float]:
     """World to OpenGL's camera (x right, y up, z backwards), column by column."""
-    x, y, theta = T_world_camera
-    cos, sin = np.cos(theta), np.sin(theta)
+    ahead, left, up = T_world_camera[:3, :3].T
     matrix = np.eye(4)
-    matrix[:3, :3] = [[sin, -cos, 0], [0, 0, 1], [-cos, -sin, 0]]
-    matrix[:3, 3] = -matrix[:3, :3] @ [x, y, z_m]
+    matrix[:3, :3] = [-left, up, -ahead]
+    matrix[:3, 3] = -matrix[:3, :3] @ T_world_camera[:3, 3]
     return matrix.T.ravel().tolist()
 
 

@@ -13,29 +13,32 @@ import pyarrow as pa
 from mapfusion.arguments import require_finite, require_shape
 from mapfusion.errors import InputError
 from mapfusion.se2 import Float
+from mapfusion.se3 import in_space
 from mapfusion.storage import (
     POSE_FIELDS,
     column,
     columns,
     float_fields,
     named_columns,
-    read_table,
+    read_parquet,
+    require_kind,
     schema,
+    text_attributes,
     write_table,
 )
 
 _WHEEL_FIELDS = ["left_wheel_rad", "right_wheel_rad"]
-TRAJECTORY = schema(
-    "trajectory",
-    1,
-    [
-        pa.field("robot", pa.string()),
-        pa.field("iteration", pa.int32()),
-        pa.field("time_s", pa.float64()),
-        *float_fields(POSE_FIELDS),  # T_world_robot
-        *float_fields(_WHEEL_FIELDS),  # encoders since the start, mean of the wheels of a side
-    ],
-)
+_TILT_FIELDS = ["roll_rad", "pitch_rad"]
+_LEVEL_FIELDS = [
+    pa.field("robot", pa.string()),
+    pa.field("iteration", pa.int32()),
+    pa.field("time_s", pa.float64()),
+    *float_fields(POSE_FIELDS),  # T_world_robot
+    *float_fields(_WHEEL_FIELDS),  # encoders since the start, mean of the wheels of a side
+]
+_BEFORE = schema("trajectory", 1, _LEVEL_FIELDS)  # bodies were level
+# and with roll and pitch of the bodies
+TRAJECTORY = schema("trajectory", 2, [*_LEVEL_FIELDS, *float_fields(_TILT_FIELDS)])
 
 
 @dataclass(frozen=True)
@@ -47,15 +50,21 @@ class Trajectory:
         time_s: (T,) since the start, increasing.
         T_world_robot: (R, T, 3) true poses.
         wheel_rad: (R, T, 2) left and right encoder angles since the start.
+        tilt_rad: (R, T, 2) roll (right side down) and pitch (looking down) of the bodies; None:
+            they are level.
     """
 
     robots: tuple[str, ...]
     time_s: Float
     T_world_robot: Float
     wheel_rad: Float
+    tilt_rad: Float | None = None
 
     def __post_init__(self) -> None:
         n_robots, n_frames = len(self.robots), len(self.time_s)
+        if self.tilt_rad is not None:
+            require_shape("tilt_rad", self.tilt_rad, (n_robots, n_frames, 2))
+            require_finite("tilt_rad", self.tilt_rad)
         require_shape("T_world_robot", self.T_world_robot, (n_robots, n_frames, 3))
         require_shape("wheel_rad", self.wheel_rad, (n_robots, n_frames, 2))
         for name in ("time_s", "T_world_robot", "wheel_rad"):
@@ -75,10 +84,17 @@ class Trajectory:
             raise InputError(f"robot {robot}: unknown, there are {', '.join(self.robots)}")
         return self.robots.index(robot)
 
+    def bodies(self, iteration: int) -> Float:
+        """All robots' bodies in the world at a moment: (R, 3) of level ones, else (R, 4, 4)."""
+        poses = self.T_world_robot[:, iteration]
+        return poses if self.tilt_rad is None else in_space(poses, self.tilt_rad[:, iteration])
+
 
 def write_trajectory(path: Path, trajectory: Trajectory) -> None:
     """Write a trajectory to one file."""
     n_robots, n_frames = len(trajectory.robots), len(trajectory)
+    level = np.zeros((n_robots, n_frames, 2))
+    tilt_rad = level if trajectory.tilt_rad is None else trajectory.tilt_rad
     write_table(
         path,
         {
@@ -87,14 +103,28 @@ def write_trajectory(path: Path, trajectory: Trajectory) -> None:
             "time_s": np.tile(trajectory.time_s, n_robots),
             **named_columns(POSE_FIELDS, trajectory.T_world_robot.reshape(-1, 3)),
             **named_columns(_WHEEL_FIELDS, trajectory.wheel_rad.reshape(-1, 2)),
+            **named_columns(_TILT_FIELDS, tilt_rad.reshape(-1, 2)),
         },
         TRAJECTORY,
     )
 
 
+def _table(path: Path) -> pa.Table:
+    """The table, with tilts of 0 where it is of the version that had none."""
+    table = read_parquet(path, "trajectory table")
+    attributes = text_attributes(path, table)
+    if attributes.get("schema_version") == "1":
+        require_kind(path, table, attributes, _BEFORE)
+        for name in _TILT_FIELDS:
+            table = table.append_column(name, pa.array(np.zeros(table.num_rows)))
+        return table
+    require_kind(path, table, attributes, TRAJECTORY)
+    return table
+
+
 def read_trajectory(path: Path) -> Trajectory:
     """Read a trajectory; raises InputError that names the file."""
-    table, _ = read_table(path, TRAJECTORY)
+    table = _table(path)
     names = column(table, "robot")
     robots = tuple(dict.fromkeys(names.tolist()))
     if not robots:
@@ -113,12 +143,14 @@ def read_trajectory(path: Path) -> Trajectory:
             f"{path}: rows must be ordered by robot, then iteration 0, 1, 2, ..., "
             "at the same times for all robots"
         )
+    tilt_rad = columns(table, _TILT_FIELDS).reshape(len(robots), n_frames, 2)
     try:
         return Trajectory(
             robots,
             time_s[:n_frames],
             columns(table, POSE_FIELDS).reshape(len(robots), n_frames, 3),
             columns(table, _WHEEL_FIELDS).reshape(len(robots), n_frames, 2),
+            tilt_rad if tilt_rad.any() else None,
         )
     except ValueError as error:
         raise InputError(f"{path}: {error}") from error

@@ -22,6 +22,7 @@ class Visibility:
 
     def __init__(self, corners_m: Float, camera: StereoCamera) -> None:
         self._camera = camera
+        self._tilts = camera.mount_roll_rad != 0 or camera.mount_pitch_rad != 0
         heights = corners_m[:, :, 2]
         self._is_wall = np.ptp(heights, axis=1) > 0
         self._is_ceiling = ~self._is_wall & (heights[:, 0] > camera.mount_z_m)
@@ -38,7 +39,12 @@ class Visibility:
         self._ceiling_from_m = to_ceiling_m * camera.focal_px / center_v - MARGIN_M
 
     def seen(self, T_world_robot: Float) -> np.ndarray:
-        """Mask (F,) over the faces: False only where no pixel of either image shows the face."""
+        """Mask (F,) over the faces: False only where no pixel of either image shows the face.
+
+        A robot at a pose (4, 4) may tilt: its columns are no rays in plan, and nothing is left out.
+        """
+        if self._tilts or np.ndim(T_world_robot) == 2:
+            return np.ones(len(self._is_wall), dtype=bool)
         camera, half = self._camera, self._camera.baseline_m / 2
         left, right = (compose(T_world_robot, [camera.mount_x_m, y, 0.0]) for y in (half, -half))
         return self._seen_by_one(left) | self._seen_by_one(right)

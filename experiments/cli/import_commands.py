@@ -10,6 +10,7 @@ import typer
 
 from experiments.cli import options
 from mapfusion.errors import InputError
+from mapfusion.recordings.levels import Level
 from mapfusion.recordings.registry import (
     IMPORTERS,
     import_recording,
@@ -48,6 +49,14 @@ VisionOverrides = Annotated[
         help="Replaces a setting of the front end, e.g. harris.max_corners=300.",
     ),
 ]
+LevelOf = Annotated[
+    Level,
+    typer.Option(
+        help="Where the robot's roll, pitch and height are known from: the mount (a level body), "
+        "odometry that tilts, the pictures' motions from a level beginning, or with the floor that "
+        "they show. By default as odometry is recorded, else the pictures."
+    ),
+]
 _CUT = re.compile(r"(?:(?P<name>[^=]*)=)?(?P<rows>-?\d*:-?\d*(?::\d*)?)")
 _NAME = re.compile("[A-Za-z0-9][A-Za-z0-9_-]{0,40}")  # as scenarios have it
 
@@ -77,6 +86,7 @@ def _stereo_command(format_name: str) -> Callable[..., None]:
         truth: Truth = None,
         vision: VisionOverrides = None,
         scenario: options.SettingsOf = None,
+        level: LevelOf = "auto",
         **chosen: str | None,
     ) -> None:
         from experiments.run.stereo_logs import import_stereo, vision_of
@@ -91,7 +101,8 @@ def _stereo_command(format_name: str) -> Callable[..., None]:
         front_end = (None if scenario is None else vision_of(scenario), vision or ())
         cuts = _cuts(robot_name(recording.name), frames or ())
         with progress() as show:
-            done = import_stereo(recording, output, cuts, (odometry, truth), front_end, show)
+            trajectories = (odometry, truth)
+            done = import_stereo(recording, output, cuts, trajectories, front_end, level, show)
         print_imported(done)
         if done.too_little:
             options.complain(done.too_little[0])

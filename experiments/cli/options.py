@@ -56,7 +56,8 @@ Format = Annotated[
     typer.Option(
         "--format",
         metavar="FORMAT",
-        help="tum (paths), g2o (graph), ply (maps) of results; log, euroc, kitti, rosbag of runs.",
+        help="tum, kitti (paths), g2o (graph), ply (maps) of results; "
+        "log, euroc, kitti, rosbag of runs.",
     ),
 ]
 Seed = Annotated[int | None, typer.Option(help="Replaces the scenario's seed (0).", min=0)]

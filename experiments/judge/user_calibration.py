@@ -11,6 +11,7 @@ from experiments.run.store_files import link_or_copy
 from experiments.run.tasks import OnProgress
 from experiments.scenario.randomness import generator
 from experiments.scenario.settings import Scenario
+from mapfusion.attitude import FILE as ATTITUDE_FILE
 from mapfusion.errors import InputError
 from mapfusion.fastslam.run import run_log
 from mapfusion.robot_log import NO_LABEL, TRUTH_FILES, RobotLog, read_log, write_log
@@ -81,7 +82,7 @@ def _associations(
 def _write(folder: Path, log: RobotLog, source: Path) -> None:
     try:
         write_log(folder, log)
-        for name in TRUTH_FILES:
+        for name in (*TRUTH_FILES, ATTITUDE_FILE):
             (folder / name).unlink(missing_ok=True)
             if (source / name).exists():
                 link_or_copy(source / name, folder / name)

@@ -23,6 +23,7 @@ from mapfusion.fused_map import AlignedPair, Fusion
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map
 from mapfusion.merge import merge as merge_maps
 from mapfusion.name_order import name_order
+from mapfusion.odometry_covariance import read_odometry_covariance
 from mapfusion.robot_log import read_log
 
 
@@ -57,7 +58,8 @@ def slam(log: Path, settings: Scenario, on_progress: OnProgress) -> LandmarkMap:
         raise InputError(f"{log}: frames.parquet holds no frame")
     n_frames, rng = len(robot_log), generator(settings.seed, "slam", robot_log.robot)
     wanted, least, landmarks = [n_frames - 1], settings.slam.min_count, None
-    for frame in run_log(robot_log, settings.slam.filter, rng, wanted, least):
+    told = read_odometry_covariance(log)
+    for frame in run_log(robot_log, settings.slam.filter, rng, wanted, least, told):
         on_progress("FastSLAM", frame.iteration + 1, n_frames)
         landmarks = frame.landmarks
     assert landmarks is not None

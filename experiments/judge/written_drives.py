@@ -11,6 +11,7 @@ from experiments.run.stage import Stage
 from experiments.run.stages.drive import TRAJECTORY_FILE
 from experiments.run.stages.features import rendered
 from experiments.run.stages.log import measured_odometry
+from experiments.run.stages.observed import told_tilt
 from experiments.run.store import Store, mending
 from experiments.run.tasks import OnProgress
 from experiments.scenario.settings import AnyScenario
@@ -66,14 +67,17 @@ def _drive_of(
     robot: SimulatedRobotStages, trajectory: Trajectory, source: FrameSource
 ) -> StereoDrive:
     def pair(k: int) -> tuple[np.ndarray, np.ndarray]:
-        frame = rendered(robot.features.settings, source, trajectory.T_world_robot[:, k], k)
+        frame = rendered(robot.features.settings, source, trajectory.bodies(k), k)
         return frame.left, frame.right
 
+    index, tilts = trajectory.index(robot.name), trajectory.tilt_rad
     return StereoDrive(
         robot.name,
         robot.features.settings.camera,
         trajectory.time_s,
-        trajectory.T_world_robot[trajectory.index(robot.name)],
+        trajectory.T_world_robot[index],
         measured_odometry(robot.log.settings, trajectory),
         pair,
+        None if tilts is None else tilts[index],
+        told_tilt(robot.observed.settings, trajectory),
     )

@@ -135,7 +135,7 @@ def _simulated(scenario: Simulation) -> Iterable[RobotStages]:
         own["odometry"] = robot.odometry or scenario.odometry
         chunks, to_find = features.chunks(n_frames), own | {"vision": finding}
         found = _stage(features, scenario, render, keep, own=to_find, before=before, parts=chunks)
-        to_track, images = own | {"vision": tracking}, {"features": found}
+        to_track, images = own | {"vision": tracking}, {"drive": driven, "features": found}
         tracked = _stage(observed, scenario, keep, own=to_track, before=images)
         logged = _stage(log, scenario, own=own, before={"drive": driven, "observed": tracked})
         mapped = _slam(scenario, logged)

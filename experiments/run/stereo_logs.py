@@ -8,6 +8,7 @@ from experiments.scenario.loading import made_settings
 from experiments.scenario.settings import SimulatedScenario
 from experiments.scenario.suite import settings_of
 from mapfusion.errors import InputError
+from mapfusion.recordings.levels import Level
 from mapfusion.recordings.stereo_import import Cut, Imported, StereoImport, write_imported
 from mapfusion.recordings.stereo_recording import StereoRecording
 from mapfusion.recordings.tum import read_tum
@@ -44,6 +45,7 @@ def import_stereo(
     cuts: Sequence[Cut],
     trajectories: tuple[str | None, Path | None],
     vision: tuple[FrontEndParameters | None, Sequence[str]],
+    level: Level,
     on_progress: Callable[[str, int, int], None],
 ) -> ImportedRecording:
     """Make and write the logs of a recording's robots.
@@ -56,6 +58,7 @@ def import_stereo(
             recording's own.
         vision: settings of the front end, None for what follows from the camera, and what of them
             is replaced: `KEY=VALUE`.
+        level: where the robots' attitudes are known from.
         on_progress: told what is done.
 
     Raises:
@@ -73,7 +76,7 @@ def import_stereo(
         return made_settings("--vision", FrontEndParameters, overrides, base)
 
     work = StereoImport(recording, adjusted)
-    robots = [work.log_of(cut, on_progress) for cut in cuts]
+    robots = [work.log_of(cut, on_progress, level) for cut in cuts]
     camera = work.camera
     about = (
         f"{camera.width_px}x{camera.height_px} px, f {camera.focal_px:.1f} px, "

@@ -15,6 +15,7 @@ from sim.odometry import OdometryNoise
 from sim.p3at import TIRE_FRICTION
 from sim.radiometry import RadiometricNoise
 from sim.renderer import Renderer
+from sim.sway import BodySway
 from sim.textures import Texture
 
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,40}$"  # names become parts of file names
@@ -140,6 +141,7 @@ class Drive(Section):
         start_jitter_m: by which the seed moves each start at most, along x and along y.
         start_jitter_rad: by which the seed turns each start at most.
         control: how the robots are driven.
+        body_sway: how their bodies pitch and roll meanwhile.
     """
 
     frames: Annotated[int, Range(2, MAX_FRAMES, "frames")]
@@ -147,6 +149,7 @@ class Drive(Section):
     start_jitter_m: Annotated[float, Range(0, 1, "m")] = 0.1
     start_jitter_rad: Annotated[float, Range(0, 3.2, "rad")] = 0.1
     control: DriverSettings = DriverSettings()
+    body_sway: BodySway = BodySway()
 
 
 class Render(Section):

@@ -37,6 +37,7 @@ from mapfusion.fuse.registry import USUAL
 from mapfusion.vision.frontend import FrontEndParameters
 from sim.odometry import OdometryNoise
 from sim.radiometry import RadiometricNoise
+from sim.sway import AttitudeNoise
 
 # Of whatever metrics measure; beyond, the screens' numbers say nothing.
 MetricValue = Annotated[float, Range(-1e9, 1e9, "the metric's")]
@@ -237,6 +238,7 @@ class SimulatedScenario(Scenario):
         camera: the stereo head of all robots.
         radiometry: noise of the images.
         odometry: noise of the wheels' counts.
+        attitude: what robots whose bodies sway are told of their roll and pitch.
         vision: from images to observations.
     """
 
@@ -245,6 +247,7 @@ class SimulatedScenario(Scenario):
     camera: StereoCamera = StereoCamera()
     radiometry: RadiometricNoise = RadiometricNoise()
     odometry: OdometryNoise = OdometryNoise()
+    attitude: AttitudeNoise = AttitudeNoise()
     vision: FrontEndParameters = FrontEndParameters()
 
 

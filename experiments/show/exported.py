@@ -25,6 +25,7 @@ from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.joint_files import joint_path
 from mapfusion.landmark_map import LandmarkMap, read_map
 from mapfusion.recordings.g2o import G2oGraph
+from mapfusion.recordings.kitti_writer import kitti_text
 from mapfusion.recordings.ply import ply_text
 from mapfusion.recordings.tum import tum_text
 from mapfusion.se2 import Float
@@ -60,11 +61,24 @@ def export_result(result: Path, kind: str, folder: Path | None = None) -> list[P
 
 
 def _tum_files(data: ResultTables) -> Iterator[tuple[str, str]]:
-    """A file a robot and path: in the robot's own frame, in the fused map's and in the world."""
+    """A file a robot and path, with the log's times."""
     if not data.has("frame_times"):
         raise InputError(f"{data.folder}: holds no times of frames; run it again")
-    for robot in data.robots:
+    for robot, source, frame, path in _paths(data):
         time_s = data.of_robot("frame_times", robot)["time_s"].to_numpy()
+        yield f"{robot}.{source}.tum", tum_text(time_s, path, f"{robot}, {source}: {frame}")
+
+
+def _kitti_files(data: ResultTables) -> Iterator[tuple[str, str]]:
+    """A file a robot and path that is known in every frame: the layout can leave none out."""
+    for robot, source, _, path in _paths(data):
+        if np.isfinite(path).all():
+            yield f"{robot}.{source}.kitti.txt", kitti_text(path)
+
+
+def _paths(data: ResultTables) -> Iterator[tuple[str, str, str, Float]]:
+    """Robot, path, its frame in words, and poses (T, 3): in its own, the fused map's, the world."""
+    for robot in data.robots:
         paths = {source: _path(data, robot, source) for source in _SOURCES}
         placed, start = _placed(data, robot), data.start_pose(robot)
         frames = dict.fromkeys(paths, f"in {robot}'s own frame")
@@ -76,8 +90,7 @@ def _tum_files(data: ResultTables) -> Iterator[tuple[str, str]]:
             frames["world"] = "the truth in the world"
         for source, path in paths.items():
             if np.isfinite(path).any():
-                about = f"{robot}, {source}: {frames[source]}"
-                yield f"{robot}.{source}.tum", tum_text(time_s, path, about)
+                yield robot, source, frames[source], path
 
 
 def _path(data: ResultTables, robot: str, source: str) -> Float:
@@ -178,6 +191,7 @@ def _rgb(colour: str) -> np.ndarray:
 
 _FILES: dict[str, Callable[[ResultTables], Iterator[tuple[str, str]]]] = {
     "tum": _tum_files,
+    "kitti": _kitti_files,
     "g2o": _g2o_files,
     "ply": _ply_files,
 }

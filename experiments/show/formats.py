@@ -9,7 +9,7 @@ import pyarrow as pa
 from experiments.judge import tables
 from experiments.show.export import write_text
 from experiments.show.inspect import unit_of
-from mapfusion import joint_files, landmark_map, odometry_covariance, robot_log
+from mapfusion import attitude, joint_files, landmark_map, odometry_covariance, robot_log
 from mapfusion.joint_covariance import RANK
 from mapfusion.open_tables import HEIGHT, about, default_of
 
@@ -25,6 +25,7 @@ _OPEN = {
     f"A log's odometry covariance: `{odometry_covariance.FILE}`, optional, one row an iteration": (
         odometry_covariance.ODOMETRY_COVARIANCE
     ),
+    f"A log's attitude: `{attitude.FILE}`, optional, one row an iteration": attitude.ATTITUDE,
     "A log's truth: `truth_poses`, one row an iteration": robot_log.TRUTH_POSES,
     "A log's truth: `truth_points`, one row an observation, in their order": robot_log.TRUTH_POINTS,
 }

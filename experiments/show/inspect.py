@@ -8,7 +8,7 @@ import pandas as pd
 from experiments.judge import tables
 from experiments.scenario.loading import load_scenario
 from experiments.show.terminal.layout import print_lines, print_table
-from mapfusion import landmark_map, odometry_covariance, robot_log
+from mapfusion import attitude, landmark_map, odometry_covariance, robot_log
 from mapfusion.errors import InputError
 from mapfusion.storage import read_json, read_parquet, read_table, text_attributes
 from sim import trajectory
@@ -17,6 +17,7 @@ _PREFIX, _KIND, _VERSION = "mapfusion.", "kind", "schema_version"
 # What people bring or take away is checked; tables of stages and studies tell what they are.
 _SCHEMAS = [*tables.ALL.values(), landmark_map.LANDMARKS, trajectory.TRAJECTORY]
 _SCHEMAS += [robot_log.FRAMES, robot_log.OBSERVATIONS, odometry_covariance.ODOMETRY_COVARIANCE]
+_SCHEMAS += [attitude.ATTITUDE]
 _SCHEMAS += [robot_log.TRUTH_POSES, robot_log.TRUTH_POINTS]
 _CHECKED = {each.metadata[f"{_PREFIX}{_KIND}".encode()].decode(): each for each in _SCHEMAS}
 _UNITS = {"m": "m", "m2": "m²", "rad": "rad", "s": "s", "ms": "ms", "px": "px"}

@@ -102,12 +102,15 @@ class FastSlam:
         """Those of them that the particles may estimate differently, M times the memory each."""
         return self._maps.n_rows
 
-    def step(self, odometry: Float, observations: Observations) -> StepResult:
+    def step(
+        self, odometry: Float, observations: Observations, sigma: Float | None = None
+    ) -> StepResult:
         """Take in one frame: predict, associate, update, weigh, resample.
 
         Args:
             odometry: (3,) motion since the frame before, in the robot frame of the frame before.
             observations: what the frame shows; may be none.
+            sigma: (3,) standard deviations of the odometry; None: as the motion noise has them.
 
         Returns:
             The particles after weighting and before resampling.
@@ -121,9 +124,10 @@ class FastSlam:
         self._check(odometry, observations)
         noise, log_new = self._noise(observations)
         planar = self._planar
+        sigma = self.parameters.motion.standard_deviations(odometry) if sigma is None else sigma
 
         self._maps.widen(self._tracked.ended(observations.track, self._maps.slots), self._stray_m2)
-        self._poses, log_ratio = self._propose(odometry, observations, noise)
+        self._poses, log_ratio = self._propose(odometry, sigma, observations, noise)
         seen = sightings(self._poses, observations.position_m, noise, planar)
         chosen, changed = self._associate(seen, observations)
         log_likelihood = update_landmarks(self._maps.slots, chosen, seen, log_new, planar)
@@ -195,18 +199,17 @@ class FastSlam:
         return noise, log_new
 
     def _propose(
-        self, odometry: Float, observations: Observations, noise: Float
+        self, odometry: Float, sigma: Float, observations: Observations, noise: Float
     ) -> tuple[Float, Float]:
         """Where the particles are after a motion.
 
         Poses (M, 3), and (M,) log of eq. 3's density over the density they were drawn from.
         """
         settings = self.parameters
-        sigma = settings.motion.standard_deviations(odometry)
         # a robot that stands still is where it was, and without observations there is no news
         informed = settings.proposal is Proposal.INFORMED and len(observations) and sigma.any()
         if not informed:
-            poses = sample_motion(self._poses, odometry, settings.motion, self._rng)
+            poses = sample_motion(self._poses, odometry, sigma, self._rng)
             return poses, np.zeros(settings.n_particles)
         predicted = compose(self._poses, odometry)
         seen = sightings(predicted, observations.position_m, noise, self._planar)

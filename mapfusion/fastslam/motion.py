@@ -66,12 +66,23 @@ class MotionNoise:
         )
         slip = (self.lateral_slip_m_per_rad * angle_rad) ** 2
         variance = np.array([translation, translation + slip, rotation])
-        return np.sqrt(variance + np.array([self.floor_m, self.floor_m, self.floor_rad]) ** 2)
+        return np.sqrt(variance + self._floor**2)
+
+    def with_floor(self, covariance: Float) -> Float:
+        """(3,) of a step whose covariance (3, 3) is known, at least the floor."""
+        return np.sqrt(np.diag(covariance) + self._floor**2)
+
+    @property
+    def _floor(self) -> Float:
+        return np.array([self.floor_m, self.floor_m, self.floor_rad])
 
 
 def sample_motion(
-    T_map_robot: Float, odometry: Float, noise: MotionNoise, rng: np.random.Generator
+    T_map_robot: Float, odometry: Float, sigma: Float, rng: np.random.Generator
 ) -> Float:
-    """Draw the poses (M, 3) after a motion from those before it (M, 3) (eq. 3)."""
-    disturbance = rng.standard_normal(T_map_robot.shape) * noise.standard_deviations(odometry)
+    """Draw the poses (M, 3) after a motion (3,) from those before it (M, 3) (eq. 3).
+
+    `sigma` (3,) are the standard deviations of the motion.
+    """
+    disturbance = rng.standard_normal(T_map_robot.shape) * sigma
     return compose(T_map_robot, odometry + disturbance)

@@ -5,12 +5,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mapfusion.arguments import require_shape
 from mapfusion.errors import InputError
 from mapfusion.fastslam.association import Association
 from mapfusion.fastslam.filter import FastSlam, StepResult
 from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import NO_LABEL, RobotLog
+from mapfusion.se2 import Float
+
+# What one source counts for that may say again what another one says: the information of either,
+# times this, is together never more than there is (Julier and Uhlmann 1997).
+_HALF = 0.5
 
 
 @dataclass(frozen=True)
@@ -36,6 +42,7 @@ def run_log(
     rng: np.random.Generator,
     snapshots: Collection[int] = (),
     min_count: int = 3,
+    odometry_covariance: Float | None = None,
 ) -> Iterator[Frame]:
     """Filter a log frame by frame.
 
@@ -45,6 +52,9 @@ def run_log(
         rng: of the filter.
         snapshots: iterations at which the best map is taken.
         min_count: sightings that a landmark needs to be in it.
+        odometry_covariance: (T, 3, 3) of odometry that was taken from what the log observes, in
+            place of the motion noise, of which only the floor is added. How much both share is not
+            known, so each counts half (covariance intersection).
 
     Yields:
         One `Frame` for each row of the log's frames.
@@ -52,14 +62,21 @@ def run_log(
     Raises:
         InputError: `parameters.planar` contradicts the log, or observations have no labels or
             descriptors where `parameters.association` needs them.
+        ValueError: `odometry_covariance` is of another length than the log.
     """
     _require_looks(log, parameters.association)
+    if odometry_covariance is not None:
+        require_shape("odometry_covariance", odometry_covariance, (len(log), 3, 3))
     wanted = frozenset(snapshots)
     slam = FastSlam(_as_the_log_says(log, parameters), rng)
     starts = log.frame_starts()
     for iteration, odometry in enumerate(log.odometry):
-        frame = log.observations[starts[iteration] : starts[iteration + 1]]
-        result = slam.step(odometry, frame)
+        frame, sigma = log.observations[starts[iteration] : starts[iteration + 1]], None
+        if odometry_covariance is not None:
+            own = odometry_covariance[iteration] / _HALF
+            sigma = parameters.motion.with_floor(own)
+            frame = replace(frame, covariance_m2=frame.covariance_m2 / _HALF)
+        result = slam.step(odometry, frame, sigma)
         landmarks = None
         if iteration in wanted:
             landmarks = replace(slam.best_map(min_count), name=log.robot)
@@ -71,6 +88,7 @@ def build_map(
     parameters: FastSlamParameters,
     rng: np.random.Generator,
     min_count: int = 3,
+    odometry_covariance: Float | None = None,
 ) -> LandmarkMap:
     """The most probable map at the end of a log; arguments and errors as of `run_log`.
 
@@ -78,7 +96,7 @@ def build_map(
         InputError: the log holds no frame.
     """
     last = len(log) - 1
-    for frame in run_log(log, parameters, rng, [last], min_count):
+    for frame in run_log(log, parameters, rng, [last], min_count, odometry_covariance):
         if frame.landmarks is not None:
             return frame.landmarks
     raise InputError(f"log {log.robot}: holds no frame")

@@ -26,12 +26,12 @@ def write_euroc(folder: Path, drive: StereoDrive, on_frame: OnFrame) -> list[Pat
         rows = [f"{stamp},{stamp}.png" for stamp in stamps]
         write_text(root / f"cam{camera}" / "data.csv", ["#timestamp [ns],filename", *rows])
         write_text(root / f"cam{camera}" / "sensor.yaml", _sensor(drive, camera))
-    T = se3.from_planar(drive.T_world_robot)
+    T = drive.true_bodies
     values = np.column_stack([T[:, :3, 3], np.roll(se3.quaternions(T), 1, axis=1)]).tolist()
     rows = [",".join(map(str, [s, *v])) for s, v in zip(stamps, values, strict=True)]
     write_text(root / STATES / "data.csv", [_STATE_COLUMNS, *rows])
     about = f"{drive.robot}: dead reckoning by the wheels, in the frame of the first pose"
-    text = tum_text(drive.time_s, drive.dead_reckoned, about)
+    text = tum_text(drive.time_s, drive.reckoned_bodies, about)
     write_text(root / ODOMETRY_FILE, text.splitlines())
     return [folder / drive.robot]
 

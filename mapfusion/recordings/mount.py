@@ -1,11 +1,12 @@
 """How a camera is mounted on its robot, and what a tilted one sees in the robot's frame."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 
 from mapfusion.arguments import Range, require_in_range
+from mapfusion.attitude import moved
 from mapfusion.camera import StereoCamera
 from mapfusion.recordings.lens import R_ROBOT_OPTICAL
 from mapfusion.robot_log import Observations
@@ -87,10 +88,7 @@ def levelled(observed: Observations, camera: StereoCamera, T_robot_left: Float) 
     R, t = T_robot_left[:3, :3], T_robot_left[:3, 3]
     if np.array_equal(R, np.eye(3)) and np.array_equal(t, camera.p_robot_left):
         return observed
-    position = (observed.position_m - camera.p_robot_left) @ R.T + t
-    covariance = R @ observed.covariance_m2 @ R.T
-    covariance = (covariance + covariance.swapaxes(1, 2)) / 2  # as rounding left it
-    return replace(observed, position_m=position, covariance_m2=covariance)
+    return moved(observed, R, t - R @ camera.p_robot_left)
 
 
 def upright(T_robot_left: Float, up_left: Float) -> Float:

@@ -73,7 +73,8 @@ class _Messages:
 
         times = (drive.time_ns + _FIRST_NS).tolist()
         put("/tf_static", times[0], self._mounts(times[0]))
-        reckoned, true = drive.dead_reckoned, drive.T_world_robot
+        reckoned, true = drive.reckoned_bodies, drive.true_bodies
+        reckoned = reckoned if reckoned.ndim == 3 else se3.from_planar(reckoned)
         for k, time_ns in enumerate(times):
             for camera, image in enumerate(drive.pair(k)):
                 side = _SIDES[camera]
@@ -115,11 +116,11 @@ class _Messages:
 
     def _stamped(self, time_ns: int, pose: Float) -> Any:
         header = self._header(time_ns, "world")
-        return self._new("geometry_msgs/PoseStamped", header, self._pose(se3.from_planar(pose)))
+        return self._new("geometry_msgs/PoseStamped", header, self._pose(pose))
 
     def _odometry(self, time_ns: int, pose: Float) -> Any:
         unknown, still = np.zeros(36), self._new("geometry_msgs/Vector3", 0.0, 0.0, 0.0)
-        own = self._pose(se3.from_planar(pose))
+        own = self._pose(pose)
         return self._new(
             "nav_msgs/Odometry",
             self._header(time_ns, "odom"),

@@ -7,11 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from mapfusion import se3
+from mapfusion.attitude import Attitude, write_attitude
 from mapfusion.camera import StereoCamera
 from mapfusion.errors import InputError
 from mapfusion.odometry_covariance import write_odometry_covariance
 from mapfusion.recordings.derived_vision import derived_vision, measured_vision
-from mapfusion.recordings.mount import levelled
+from mapfusion.recordings.level_frames import LevelFrames
+from mapfusion.recordings.levels import Level, Levels, known_from
 from mapfusion.recordings.pictures import sampled
 from mapfusion.recordings.rectify import Rectification
 from mapfusion.recordings.stereo_recording import StereoRecording
@@ -19,7 +21,7 @@ from mapfusion.recordings.visual_odometry import visual_odometry
 from mapfusion.robot_log import TRUTH_FILES, RobotLog, write_log, write_truth_poses
 from mapfusion.se2 import Float
 from mapfusion.vision.frontend import FrontEnd, FrontEndParameters
-from mapfusion.vision.observing import Observer, joined
+from mapfusion.vision.observing import joined
 from mapfusion.vision.row_errors import row_errors
 
 # Windows of the row search are 17 px: what lies a row off is found there still, two rows cost
@@ -54,6 +56,7 @@ class Imported:
         linked: (T,) share of the features of the frame before that were found again; NaN for the
             first frame.
         odometry_covariance: (T, 3, 3) of odometry that the pictures told; None: it was recorded.
+        attitude: by which the observations were levelled; None: the body was taken for level.
         guessed: frames whose motion too few links told.
     """
 
@@ -61,6 +64,7 @@ class Imported:
     truth: Float | None
     linked: Float
     odometry_covariance: Float | None = None
+    attitude: Attitude | None = None
     guessed: int = 0
 
     @property
@@ -125,8 +129,10 @@ class StereoImport:
             remedy = "the pair is not rectified, or its calibration is another's"
             raise InputError(f"{self._recording.name}: {found}; {remedy}")
 
-    def log_of(self, cut: Cut, on_progress: OnProgress = lambda *_: None) -> Imported:
-        """The log of one robot, with its truth.
+    def log_of(
+        self, cut: Cut, on_progress: OnProgress = lambda *_: None, level: Level = "auto"
+    ) -> Imported:
+        """The log of one robot, with its truth; `level` is where its attitude is known from.
 
         Raises:
             InputError: fewer than two frames, or recorded odometry that lacks one of them.
@@ -136,31 +142,29 @@ class StereoImport:
             found = f"frames of {cut.robot} are {len(rows)} of {len(self._recording)} pairs"
             raise InputError(f"{self._recording.name}: {found}; 2 are the least")
         time_ns = self._recording.time_ns[rows]
-        recorded, truth = self._odometry(time_ns), self._truth(time_ns)
+        reckoned, truth = self._odometry(time_ns), self._truth(time_ns)
+        known = known_from(level, reckoned)
+        if known == "odometry" and reckoned is None:
+            raise InputError(f"--level odometry: {self._recording.name} has no odometry")
         usual_ns = np.median(np.diff(self._recording.time_ns))
         steps = np.diff(time_ns, prepend=time_ns[0]) / usual_ns
         front_end = FrontEnd(self.camera, self.vision)
-        observer = Observer.of(self.camera, self.vision)
-        observed, motions, linked, before = [], [], [np.nan], 0
+        levels = Levels(known, self.camera, self.T_robot_camera, reckoned)
+        frames = LevelFrames(self.vision, levels)
         for n, k in enumerate(rows):
-            found = front_end.extract(*self.rectified(k))
-            frame = observer.observe(found, float(steps[n]))
-            if n:
-                linked.append(float(np.sum(frame.tracks.length > 1)) / max(before, 1))
-            before = len(found)
-            motions.append(frame.tracks.motion)
-            observed.append(levelled(frame.observations, self.camera, self.T_robot_camera))
+            frames.add(front_end.extract(*self.rectified(k)), float(steps[n]))
             on_progress(f"{cut.robot}: track features", n + 1, len(rows))
         time_s = (time_ns - self._recording.time_ns[0]) / 1e9
-        seen = visual_odometry(motions, steps, self.camera, self.T_robot_camera)
-        odometry = seen.increments if recorded is None else recorded
-        log = RobotLog(cut.robot, False, time_s, odometry, *joined(observed))
-        if recorded is not None:
-            return Imported(log, truth, np.array(linked))
-        return Imported(log, truth, np.array(linked), seen.covariance, int(seen.guessed.sum()))
+        attitude, linked = frames.attitude, np.array(frames.linked)
+        seen = visual_odometry(frames.motions, steps, self.camera, self.T_robot_camera, attitude)
+        odometry = seen.increments if reckoned is None else _increments(reckoned)
+        log = RobotLog(cut.robot, False, time_s, odometry, *joined(frames.observed))
+        if reckoned is not None:
+            return Imported(log, truth, linked, attitude=attitude)
+        return Imported(log, truth, linked, seen.covariance, attitude, int(seen.guessed.sum()))
 
     def _odometry(self, time_ns: np.ndarray) -> Float | None:
-        """Increments (T, 3) between frames, of the recorded dead reckoning; None without it."""
+        """Poses (T, 4, 4) at the frames, by the recorded dead reckoning; None without it."""
         recorded = self._recording.odometry
         if recorded is None:
             return None
@@ -170,13 +174,19 @@ class StereoImport:
             when = f"{(int(time_ns[unknown[0]]) - int(self._recording.time_ns[0])) / 1e9:g} s"
             missing = f"at {len(unknown)} of {len(T)} frames, the first {when} after the beginning"
             raise InputError(f"{self._recording.name}: no odometry {missing}")
-        increments = np.zeros((len(T), 3))
-        increments[1:] = se3.planar(se3.between(T[:-1], T[1:]))
-        return increments
+        return T
 
     def _truth(self, time_ns: np.ndarray) -> Float | None:
         truth = self._recording.truth
         return None if truth is None else se3.planar(truth.at(time_ns, _LONGEST_TRUTH_GAP_S))
+
+
+def _increments(T_start_robot: Float) -> Float:
+    """Motions (T, 3) between the poses (T, 4, 4) in the plane; the first is zero."""
+    increments = np.zeros((len(T_start_robot), 3))
+    planar = se3.from_planar(se3.planar(T_start_robot))
+    increments[1:] = se3.planar(se3.between(planar[:-1], planar[1:]))
+    return increments
 
 
 def write_imported(destination: Path, imported: Sequence[Imported]) -> list[Path]:
@@ -187,6 +197,7 @@ def write_imported(destination: Path, imported: Sequence[Imported]) -> list[Path
         for outdated in TRUTH_FILES:  # of an import into the same folder
             (folder / outdated).unlink(missing_ok=True)
         write_odometry_covariance(folder, one.odometry_covariance)
+        write_attitude(folder, one.attitude)
         if one.truth is not None:
             write_truth_poses(folder, one.truth)
     return folders

@@ -22,12 +22,14 @@ _COLUMNS = "# timestamp_s tx_m ty_m tz_m qx qy qz qw"
 
 
 def tum_text(time_s: Float, T_frame_robot: Float, about: str) -> str:
-    """Poses (T, 3) in the plane at times (T,); those that are not known (NaN) are left out.
+    """Poses (T, 3) in the plane or (T, 4, 4) at times (T,); unknown ones (NaN) are left out.
 
     Every number is written so that it is read back exactly.
     """
-    require_shape("T_frame_robot", T_frame_robot, (len(time_s), 3))
-    return "\n".join([f"# {about}", _COLUMNS, *_lines(time_s, T_frame_robot), ""])
+    in_space = T_frame_robot.ndim == 3
+    require_shape("T_frame_robot", T_frame_robot, (len(time_s), *((4, 4) if in_space else (3,))))
+    lines = (_lines_in_space if in_space else _lines)(time_s, T_frame_robot)
+    return "\n".join([f"# {about}", _COLUMNS, *lines, ""])
 
 
 def _lines(time_s: Float, T_frame_robot: Float) -> Iterator[str]:
@@ -35,6 +37,13 @@ def _lines(time_s: Float, T_frame_robot: Float) -> Iterator[str]:
     for when, (x, y, theta) in zip(time_s[known].tolist(), T_frame_robot[known], strict=True):
         qz, qw = float(np.sin(theta / 2)), float(np.cos(theta / 2))
         yield f"{when} {float(x)} {float(y)} 0 0 0 {qz} {qw}"
+
+
+def _lines_in_space(time_s: Float, T_frame_robot: Float) -> Iterator[str]:
+    known = np.isfinite(T_frame_robot).all(axis=(1, 2))
+    T = T_frame_robot[known]
+    values = np.column_stack([time_s[known], T[:, :3, 3], se3.quaternions(T)])
+    yield from (" ".join(map(str, row)) for row in values.tolist())
 
 
 def read_tum(path: Path) -> TimedPoses:

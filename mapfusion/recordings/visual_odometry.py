@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapfusion import se3
+from mapfusion.attitude import Attitude
 from mapfusion.camera import StereoCamera
 from mapfusion.se2 import Float
 from mapfusion.vision.rigid_links import RigidMotion
@@ -36,6 +37,7 @@ def visual_odometry(
     steps: Float,
     camera: StereoCamera,
     T_robot_camera: Float,
+    attitude: Attitude | None = None,
 ) -> VisualOdometry:
     """What the links of a log's frames say of the robot's way.
 
@@ -44,6 +46,7 @@ def visual_odometry(
         steps: (T,) usual steps of time since the frame before.
         camera: the pair, with the mount that it was taken to have.
         T_robot_camera: (4, 4) the mount that it has; axes x ahead, y left, z up.
+        attitude: of the T frames; None: the body is level.
     """
     n = len(motions)
     increments, covariance = np.zeros((n, 3)), np.zeros((n, 3, 3))
@@ -58,18 +61,10 @@ def visual_odometry(
             increments[k] = steps[k] * speed
             covariance[k] = np.diag((np.abs(increments[k]) + steps[k] * _GUESSED_SIGMA) ** 2)
         else:
-            increments[k], covariance[k] = _in_the_plane(motion, T_robot_taken)
+            own = motion.of(T_robot_taken)
+            level = np.eye(3) if attitude is None else se3.tilt(*attitude.value[k - 1, :2])
+            increments[k] = se3.planar(se3.pose(level, np.zeros(3)) @ own.T_before_after)
+            turned = np.kron(np.eye(2), level)
+            covariance[k] = (turned @ own.covariance @ turned.T)[np.ix_(_PLANE, _PLANE)]
             speed = increments[k] / steps[k]
     return VisualOdometry(increments, covariance, guessed)
-
-
-def _in_the_plane(motion: RigidMotion, T_robot_taken: Float) -> tuple[Float, Float]:
-    """A motion (3,) of the robot and its covariance (3, 3), from one of its camera."""
-    T = T_robot_taken @ motion.T_before_after @ se3.inverse(T_robot_taken)
-    turn, arm = T_robot_taken[:3, :3], T[:3, :3] @ T_robot_taken[:3, 3]
-    # T = (R, turn t + p - R p): a turn w of the camera's R shifts the robot by (R p) x w
-    jacobian = np.zeros((6, 6))
-    jacobian[:3, :3] = jacobian[3:, 3:] = turn
-    jacobian[:3, 3:] = np.cross(arm, np.eye(3)).T @ turn
-    covariance = jacobian @ motion.covariance @ jacobian.T
-    return se3.planar(T), covariance[np.ix_(_PLANE, _PLANE)]

@@ -74,6 +74,11 @@ class NormalEquations(NamedTuple):
 def odometry_information(odometry: Float, noise: MotionNoise) -> Float:
     """(T - 1, 3) inverse variances of the increments (T, 3) after the first, which is no motion."""
     sigma = np.array([noise.standard_deviations(each) for each in odometry[1:]]).reshape(-1, 3)
+    return information_of(sigma)
+
+
+def information_of(sigma: Float) -> Float:
+    """Inverse variances (N, 3) of motions with standard deviations (N, 3), bounded."""
     return 1.0 / (sigma**2 + _STILL**2)
 
 

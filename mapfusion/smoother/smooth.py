@@ -10,7 +10,12 @@ from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.robot_log import RobotLog
 from mapfusion.se2 import Float, between
 from mapfusion.smoother.elimination import common_part
-from mapfusion.smoother.normal_equations import Estimate, Weights, odometry_information
+from mapfusion.smoother.normal_equations import (
+    Estimate,
+    Weights,
+    information_of,
+    odometry_information,
+)
 from mapfusion.smoother.residuals import first_points
 from mapfusion.smoother.robust import Tails
 from mapfusion.smoother.settle import Problem, Settled, settled
@@ -20,9 +25,9 @@ from mapfusion.smoother.sightings import Sightings, sightings_of
 # the path to start from is far off, most observations look gross and lose the weight to mend it.
 # It need not end closer than this, in squared sigmas a coordinate, to where the next one goes on.
 _THOUGHT_WORSE, _CLOSE = 4.0, 1e-2
-# Of a motion that nothing but observations tells: what a robot does between frames is less. Frames
-# that see nothing would else be anywhere.
+# Of a motion that nothing but observations tells: what a robot does between frames is less.
 _UNTOLD_M, _UNTOLD_RAD = 10.0, 1.0
+_LEAST_SEEN = 3  # observations that fix a pose, with one to spare
 
 
 @dataclass(frozen=True)
@@ -34,11 +39,15 @@ class SmootherParameters:
         stray_m: standard deviation, along each axis, of where the point that a track is of lies
             beside the landmark; 0: it is the landmark.
         min_count: observations that a landmark needs.
+        odometry_covariance: (T, 3, 3) or longer, of odometry that was taken from what the log
+            observes and must not count twice: it says only how to come to frames that see too
+            little to tell, and from them. None: the odometry is a source of its own.
     """
 
     motion: MotionNoise = field(default_factory=MotionNoise)
     stray_m: Annotated[float, Range(0, 10, "m")] = 0.004
     min_count: Annotated[int, Range(1, 1_000_000, "observations")] = 3
+    odometry_covariance: Float | None = None
 
     def __post_init__(self) -> None:
         require_in_range(self)
@@ -48,10 +57,16 @@ class SmootherParameters:
         """Of a track's offset along each axis, in 1/m^2; 0 where there are no offsets."""
         return 1 / self.stray_m**2 if self.stray_m else 0.0
 
-    def without_odometry(self) -> "SmootherParameters":
-        """For a log whose odometry was taken from what it observes, which must not count twice."""
-        motion = replace(self.motion, floor_m=_UNTOLD_M, floor_rad=_UNTOLD_RAD)
-        return replace(self, motion=motion)
+    def odometry_information(self, log: RobotLog) -> Float:
+        """(T - 1, 3) inverse variances of the log's increments after the first."""
+        if self.odometry_covariance is None:
+            return odometry_information(log.odometry, self.motion)
+        blind = np.diff(log.frame_starts()) < _LEAST_SEEN
+        needed = blind[:-1] | blind[1:]
+        told = self.odometry_covariance[1 : len(log)]
+        sigma = np.array([self.motion.with_floor(own) for own in told]).reshape(-1, 3)
+        sigma[~needed] = [_UNTOLD_M, _UNTOLD_M, _UNTOLD_RAD]
+        return information_of(sigma)
 
 
 @dataclass(frozen=True)
@@ -110,7 +125,7 @@ def smooth(
     seen = sightings_of(log, landmark, parameters.min_count, stray=parameters.stray_m > 0)
     path = between(path[0], path)
     at = Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
-    information = odometry_information(log.odometry, parameters.motion)
+    information = parameters.odometry_information(log)
     known = Problem(seen, log.odometry, information, parameters.stray_information)
     blurred = replace(seen, information=seen.information / _THOUGHT_WORSE**2)
     first = settled(known._replace(seen=blurred), at, _CLOSE)

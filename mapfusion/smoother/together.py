@@ -13,7 +13,7 @@ import numpy as np
 from mapfusion.robot_log import NO_TRACK, Observations, RobotLog
 from mapfusion.se2 import IDENTITY, Float, between, compose
 from mapfusion.smoother.elimination import matrix_bytes, pose_covariances
-from mapfusion.smoother.normal_equations import Estimate, odometry_information
+from mapfusion.smoother.normal_equations import Estimate
 from mapfusion.smoother.recording import Recording
 from mapfusion.smoother.residuals import first_points
 from mapfusion.smoother.settle import Problem, settled
@@ -79,7 +79,7 @@ def smooth_together(
     )
     path[0] = IDENTITY  # but for rounding it is that already
     information = [
-        np.concatenate([odometry_information(each.log.odometry, each.parameters.motion), _NOTHING])
+        np.concatenate([each.parameters.odometry_information(each.log), _NOTHING])
         for each in recordings
     ]
     problem = Problem(seen, log.odometry, np.concatenate(information)[:-1], stray_information)

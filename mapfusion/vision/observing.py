@@ -7,6 +7,7 @@ import numpy as np
 
 from mapfusion.camera import StereoCamera
 from mapfusion.robot_log import Observations
+from mapfusion.se2 import Float
 from mapfusion.vision.features import Features
 from mapfusion.vision.frontend import FrontEndParameters, observable, observe
 from mapfusion.vision.tracks import Tracker, Tracks
@@ -46,9 +47,11 @@ class Observer:
         """One that has seen nothing yet."""
         return cls(Tracker(vision.tracks, camera, vision.sigma_uv_px), camera, vision)
 
-    def observe(self, found: Features, steps: float = 1.0) -> ObservedFrame:
-        """The next frame's observations; `steps` as `Tracker.update` has it."""
-        tracks = self.tracker.update(found, steps)
+    def observe(
+        self, found: Features, steps: float = 1.0, R_after_before: Float | None = None
+    ) -> ObservedFrame:
+        """The next frame's observations; other arguments as `Tracker.update` has them."""
+        tracks = self.tracker.update(found, steps, R_after_before)
         lasting = self.tracker.landmarks(tracks)
         own = replace(found, uv_px=tracks.uv_px, disparity_px=tracks.disparity_px)
         rows = observable(self.camera, own, lasting, self.vision)

@@ -14,6 +14,7 @@ from numba import njit
 
 from mapfusion.chi_square import chi_square_bound
 from mapfusion.se2 import Float
+from mapfusion.se3 import inverse
 from mapfusion.symmetric import cholesky, cofactors, solve_lower, solve_upper
 
 MIN_LINKS = 4  # three links determine a motion; one slip among four is the first that shows
@@ -45,6 +46,16 @@ class RigidMotion:
     T_before_after: Float
     covariance: Float
     n_links: int
+
+    def of(self, T_body_camera: Float) -> "RigidMotion":
+        """The motion of a body that the camera is fixed to, at (4, 4)."""
+        T = T_body_camera @ self.T_before_after @ inverse(T_body_camera)
+        turn, arm = T_body_camera[:3, :3], T[:3, :3] @ T_body_camera[:3, 3]
+        # T = (R, turn t + p - R p): a turn w of the camera's R shifts the body by (R p) x w
+        jacobian = np.zeros((6, 6))
+        jacobian[:3, :3] = jacobian[3:, 3:] = turn
+        jacobian[:3, 3:] = np.cross(arm, np.eye(3)).T @ turn
+        return RigidMotion(T, jacobian @ self.covariance @ jacobian.T, self.n_links)
 
 
 def rigid_links(

@@ -4,7 +4,7 @@ Features are linked by their descriptors. What is followed is the point of the w
 began with: a corner detector finds another one as the robot draws near.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -91,18 +91,25 @@ class Tracker:
         self._previous: tuple[Features, Followed, Tracks] | None = None
         self._next_id = 0
 
-    def update(self, features: Features, steps: float = 1.0) -> Tracks:
+    def update(
+        self, features: Features, steps: float = 1.0, R_after_before: Float | None = None
+    ) -> Tracks:
         """Tracks of this frame's features.
 
         `steps` is how many usual steps of time have passed since the frame before: after a pause
-        the limits on shift and disparity allow as much more.
+        the limits on shift and disparity allow as much more. `R_after_before` (3, 3) is by how much
+        the robot is known to have tilted since, in its axes: limits on shifts count from there.
         """
         n = len(features)
         source, points = np.full(n, _NO_MATCH), Followed.unseen(features)
         track_id, length, motion = np.empty(n, np.int64), np.ones(n, np.int64), None
         if self._previous is not None:
             before, points_before, tracks = self._previous
-            source = link(before, features, self.parameters, steps)
+            expected = before
+            if R_after_before is not None:
+                turned = self._camera.turned(before.uv_px, R_after_before)
+                expected = replace(before, uv_px=turned)
+            source = link(expected, features, self.parameters, steps)
             points, found = followed(points_before, before, features, source, self._likeness)
             source[~found] = _NO_MATCH
             rows = np.flatnonzero(found)

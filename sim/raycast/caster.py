@@ -9,7 +9,8 @@ from numpy.typing import ArrayLike
 
 from mapfusion.camera import StereoCamera
 from mapfusion.errors import InputError
-from mapfusion.se2 import Float, compose
+from mapfusion.se2 import Float
+from mapfusion.se3 import planar
 from sim.exposure import expose
 from sim.p3at import URDF
 from sim.radiometry import RadiometricNoise
@@ -17,7 +18,8 @@ from sim.raycast.picture import depths, filtered, sampled
 from sim.raycast.plan import Pinhole
 from sim.raycast.scene import REFUSED, Scene, read_scene
 from sim.raycast.solids import read_solids
-from sim.stereo_head import NEAR_M, StereoFrame
+from sim.raycast.tilted import TiltedView
+from sim.stereo_head import NEAR_M, StereoFrame, camera_pose
 
 Sampling = Literal["footprint", "middle"]
 
@@ -38,11 +40,8 @@ class RayCaster:
     def __init__(self, faces: Path, camera: StereoCamera, sampling: Sampling = "footprint") -> None:
         self._faces, self._camera, self._sampling = faces, camera, sampling
         self._scene = read_scene(faces)
-        top_m = self._scene.walls.height_m
-        if camera.mount_z_m >= top_m:
-            raise InputError(
-                REFUSED.format(what=f"from {camera.mount_z_m:g} m above walls of {top_m:g} m")
-            )
+        if camera.mount_z_m >= self._scene.walls.height_m:
+            raise self._too_high(camera.mount_z_m)
         self._channels: list[Scene] = []
         self._solids = read_solids(URDF)
         rgb = self._solids.rgb.astype(np.uint8)[None]
@@ -56,7 +55,11 @@ class RayCaster:
         rng: np.random.Generator,
         colour: bool = False,
     ) -> StereoFrame:
-        """Both images and the left one's depth for a robot at a pose (3,), others at (R, 3)."""
+        """Both images and the left one's depth for a robot, others at (R, 3).
+
+        It is at a pose (3,), or (4, 4) where its body tilts; raises InputError where it looks from
+        above the walls, or too far up or down.
+        """
         half_m = self._camera.baseline_m / 2
         left, right = (self.grey(T_world_robot, y_m, others) for y_m in (half_m, -half_m))
         depth_m = self.depth_m(T_world_robot, half_m, others)
@@ -67,7 +70,7 @@ class RayCaster:
         """The grey picture (H, W) uint8 of a camera beside a robot's middle.
 
         Args:
-            T_world_robot: (3,).
+            T_world_robot: (3,), or (4, 4) of a body that tilts.
             y_m: of the optical centre, to the left of the robot's axis.
             others: (R, 3) poses of the robots that may be seen.
         """
@@ -86,26 +89,43 @@ class RayCaster:
 
     def depth_m(self, T_world_robot: ArrayLike, y_m: float, others: ArrayLike) -> np.ndarray:
         """Depth (H, W) float32 along the optical axis behind each pixel's middle; NaN: nothing."""
-        scene, camera = self._scene, self._pinhole(T_world_robot, y_m)
-        return depths(camera, scene.walls, scene.floor, scene.ceiling, self._solids, _poses(others))
+        scene, view = self._scene, self._view(T_world_robot, y_m)
+        camera = view if isinstance(view, Pinhole) else view.level
+        found = depths(
+            camera, scene.walls, scene.floor, scene.ceiling, self._solids, _poses(others)
+        )
+        return found if isinstance(view, Pinhole) else view.depth_m(found)
 
     def _draw(
         self, scene: Scene, T_world_robot: ArrayLike, y_m: float, others: ArrayLike, grey: Float
     ) -> np.ndarray:
         kernel = filtered if self._sampling == "footprint" else sampled
-        camera = self._pinhole(T_world_robot, y_m)
-        return kernel(
+        view = self._view(T_world_robot, y_m)
+        camera = view if isinstance(view, Pinhole) else view.level
+        drawn = kernel(
             camera, scene.walls, scene.floor, scene.ceiling, self._solids, _poses(others), grey
         )
+        return drawn if isinstance(view, Pinhole) else view.picture(drawn)
 
-    def _pinhole(self, T_world_robot: ArrayLike, y_m: float) -> Pinhole:
-        camera = self._camera
-        x, y, theta = compose(T_world_robot, [camera.mount_x_m, y_m, 0.0]).tolist()
-        center_u, center_v = camera.center_px
-        size = (camera.width_px, camera.height_px)
-        focal_px, z_m = float(camera.focal_px), float(camera.mount_z_m)
-        return Pinhole(*size, focal_px, center_u, center_v, x, y, z_m, theta, NEAR_M)
+    def _view(self, T_world_robot: ArrayLike, y_m: float) -> Pinhole | TiltedView:
+        """A level camera, which can be drawn as it is, or a tilted one."""
+        T = camera_pose(self._camera, T_world_robot, y_m)
+        eye_z_m = float(T[2, 3])
+        if eye_z_m >= self._scene.walls.height_m:
+            raise self._too_high(eye_z_m)
+        if T[2, 0] or T[2, 1]:
+            return TiltedView.of(self._camera, T)
+        camera, theta = self._camera, float(np.arctan2(T[1, 0], T[0, 0]))
+        size, x, y = (camera.width_px, camera.height_px), float(T[0, 3]), float(T[1, 3])
+        focal_px = float(camera.focal_px)
+        return Pinhole(*size, focal_px, *camera.center_px, x, y, eye_z_m, theta, NEAR_M)
+
+    def _too_high(self, eye_z_m: float) -> InputError:
+        top_m = self._scene.walls.height_m
+        return InputError(REFUSED.format(what=f"from {eye_z_m:g} m above walls of {top_m:g} m"))
 
 
 def _poses(others: ArrayLike) -> Float:
-    return np.ascontiguousarray(others, dtype=np.float64).reshape(-1, 3)
+    """Poses (R, 3) of robots that are drawn upright, whether they tilt or not."""
+    found = np.asarray(others, dtype=np.float64)
+    return np.ascontiguousarray(planar(found) if found.ndim == 3 else found).reshape(-1, 3)

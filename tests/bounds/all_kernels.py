@@ -12,6 +12,7 @@ from mapfusion.align.max_clique import everyone, larger_clique
 from mapfusion.align.registration import Registration
 from mapfusion.align.registry import ALIGNERS, make_aligner
 from mapfusion.camera import StereoCamera
+from mapfusion.se3 import in_space
 from mapfusion.vision.frontend import FrontEnd, FrontEndParameters
 from mapfusion.vision.harris import HarrisParameters
 from mapfusion.vision.noise_model import measured_noise
@@ -80,6 +81,7 @@ def pictures(folder: Path) -> None:
     others = np.array([[1.4, 0.0, 0.5], [0.4, 0.3, 1.0]])
     camera = StereoCamera(160, 120, 144.0)
     RayCaster(folder, camera).depth_m(np.zeros(3), 0.0, others)
+    RayCaster(folder, camera).depth_m(in_space(np.zeros(3), [0.1, -0.1]), 0.0, others)
     for sampling in ("footprint", "middle"):
         picture = RayCaster(folder, camera, sampling).grey(np.zeros(3), 0.0, others)
         expose(picture, RadiometricNoise(), np.random.default_rng(0))

@@ -2,6 +2,7 @@ import hashlib
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.ndimage import map_coordinates
 from mapfusion.camera import StereoCamera
 from mapfusion.errors import InputError
 from mapfusion.se2 import transform_points
+from mapfusion.se3 import in_space
 from sim.p3at import LENGTH_M
 from sim.radiometry import RadiometricNoise
 from sim.recorder import FrameSource, truth_points, truth_slopes
@@ -152,6 +154,40 @@ def test_truth_follows_the_pixel_on_its_own_surface() -> None:
 def test_no_pixels_no_points() -> None:
     depth = np.ones((240, 320), dtype=np.float32)
     assert truth_points(CAMERA, depth, np.zeros((0, 2)), np.zeros(3)).shape == (0, 3)
+
+
+def test_a_body_that_tilts_sees_the_same_room(source: FrameSource) -> None:
+    """Points behind its pixels, put into the world by its pose, lie on its surfaces."""
+    tilted = in_space(POSES, [[0.06, -0.08], [0.02, 0.03]])
+    frame = source.render(tilted, "a", NOISE, np.random.default_rng(0))
+    rng = np.random.default_rng(2)
+    uv = rng.uniform([30, 3], [290, 236], (2000, 2))
+    points = truth_points(CAMERA, frame.depth_m, uv, tilted[0])
+    # not on b, nor on an edge, where the nearest pixel counts
+    inside = np.all(np.abs(points[:, :2] - POSES[1, :2]) > 0.4, axis=1)
+    surfaces = np.array([[0.05, 4.95], [0.05, 3.95], [0.0, 2.5]])
+    off = np.abs(points[inside, :, None] - surfaces)
+    assert np.quantile(off.min(axis=(1, 2)), 0.95) < 2e-3
+    slope = truth_slopes(CAMERA, frame.depth_m, uv, tilted[0])
+    there = truth_points(CAMERA, frame.depth_m, uv + np.array([0.3, 0.0]), tilted[0])
+    near = np.linalg.norm(there - points - 0.3 * slope[:, :, 0], axis=1)
+    assert np.quantile(near, 0.9) < 1e-3
+
+
+def test_a_tilted_mount_is_a_tilted_body(faces: Path, renderer: Renderer) -> None:
+    """As long as both turn about the same point, here the middle between the optical centres."""
+    mounted = replace(CAMERA, mount_roll_rad=0.05, mount_pitch_rad=-0.1)
+    poses = in_space(POSES[:1], np.array([[0.05, -0.1]]))
+    middle = np.array([CAMERA.mount_x_m, 0.0, CAMERA.mount_z_m])
+    upright = in_space(POSES[:1], np.zeros((1, 2)))
+    poses[0, :3, 3] += (upright[0, :3, :3] - poses[0, :3, :3]) @ middle
+    frames = []
+    for camera, own in ((mounted, POSES[:1]), (CAMERA, poses)):
+        with FrameSource(faces, camera, "a", renderer) as opened:
+            frames.append(opened.render(own, "a", NOISE, np.random.default_rng(0)))
+    same = np.isclose(frames[0].depth_m, frames[1].depth_m, rtol=1e-5)
+    assert same.mean() > 0.999
+    assert np.mean(np.abs(frames[0].left.astype(int) - frames[1].left) > 1) < 1e-3
 
 
 def test_unknown_robots_and_wrong_shapes_are_named(source: FrameSource) -> None:

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from mapfusion.errors import InputError
+from mapfusion.se3 import in_space
 from sim.trajectory import TRAJECTORY, Trajectory, read_trajectory, write_trajectory
 
 RNG = np.random.default_rng(0)
@@ -76,3 +78,30 @@ def test_names_and_times_must_make_sense() -> None:
         Trajectory(("a", "b"), np.array([0.0, 1, 1]), poses, wheels)
     with pytest.raises(ValueError, match="wheel_rad: shape"):
         Trajectory(("a", "b"), np.arange(3.0), poses, wheels[:1])
+
+
+def test_bodies_that_tilt_are_written_and_read(tmp_path: Path) -> None:
+    assert TRAJECTORY_OF_TWO.bodies(1).shape == (2, 3)
+    tilted = replace(TRAJECTORY_OF_TWO, tilt_rad=0.1 * RNG.normal(size=(2, 5, 2)))
+    write_trajectory(tmp_path / "t.parquet", tilted)
+    back = read_trajectory(tmp_path / "t.parquet")
+    assert tilted.tilt_rad is not None
+    assert back.tilt_rad is not None
+    np.testing.assert_array_equal(back.tilt_rad, tilted.tilt_rad)
+    expected = in_space(tilted.T_world_robot[:, 3], tilted.tilt_rad[:, 3])
+    np.testing.assert_array_equal(back.bodies(3), expected)
+
+
+def test_the_version_without_tilts_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "t.parquet"
+    write_trajectory(path, TRAJECTORY_OF_TWO)
+    table = pq.read_table(path)
+    metadata = {**table.schema.metadata, b"mapfusion.schema_version": b"1"}
+    older = table.drop_columns(["roll_rad", "pitch_rad"]).replace_schema_metadata(metadata)
+    pq.write_table(older, path)
+    back = read_trajectory(path)
+    assert back.tilt_rad is None
+    np.testing.assert_array_equal(back.T_world_robot, TRAJECTORY_OF_TWO.T_world_robot)
+    pq.write_table(table.replace_schema_metadata(metadata), path)
+    with pytest.raises(InputError, match=r"t\.parquet: columns are not those of trajectory"):
+        read_trajectory(path)

@@ -1,7 +1,7 @@
 """Stage: physics, all robots in one world, once. Writes the trajectory."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -9,6 +9,7 @@ from experiments.run.job import Job
 from experiments.run.stages.walls import Walls
 from experiments.scenario.randomness import generator
 from sim.driver import DriverSettings, Route, drive
+from sim.sway import BodySway
 from sim.trajectory import write_trajectory
 
 LABEL = "drive the robots"
@@ -39,10 +40,11 @@ class DriveSettings:
     start_jitter_m: float
     start_jitter_rad: float
     control: DriverSettings
+    body_sway: BodySway
 
 
 def run(settings: DriveSettings, job: Job) -> None:
-    """Drive, from the scenario's starts moved by the seed within the jitter.
+    """Drive, from the scenario's starts moved by the seed within the jitter; bodies sway on top.
 
     Raises:
         InputError: a route that fails.
@@ -55,4 +57,10 @@ def run(settings: DriveSettings, job: Job) -> None:
         routes.append(Route(robot.name, start, route, robot.loop, robot.tire_friction))
     plan, interval_s = settings.walls.floor_plan(), settings.frame_interval_s
     trajectory = drive(plan, routes, settings.control, settings.frames, interval_s)
+    if settings.body_sway.sigma_rad:
+        tilts = [
+            settings.body_sway.tilts(trajectory.time_s, generator(settings.seed, "sway", robot))
+            for robot in trajectory.robots
+        ]
+        trajectory = replace(trajectory, tilt_rad=np.stack(tilts))
     write_trajectory(job.output / TRAJECTORY_FILE, trajectory)

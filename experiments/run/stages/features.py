@@ -111,7 +111,7 @@ def run(settings: FeatureSettings, job: Job) -> dict[str, float]:
     robot, features, truth, rendering_s = settings.robot, [], [], 0.0
     frames = _chunk(job.part, len(trajectory))
     for iteration in frames:
-        poses = trajectory.T_world_robot[:, iteration]
+        poses = trajectory.bodies(iteration)
         started = time.perf_counter()
         frame = rendered(settings, source, poses, iteration)
         rendering_s += time.perf_counter() - started
@@ -139,7 +139,7 @@ def run(settings: FeatureSettings, job: Job) -> dict[str, float]:
 def rendered(
     settings: FeatureSettings, source: FrameSource, poses: Float, iteration: int
 ) -> StereoFrame:
-    """One frame of a robot, without colour, with the robots at poses (R, 3)."""
+    """One frame of a robot, without colour, with the robots at poses (R, 3) or (R, 4, 4)."""
     rng = generator(settings.seed, "radiometry", settings.robot, iteration)
     return source.render(poses, settings.robot, settings.radiometry, rng, colour=False)
 

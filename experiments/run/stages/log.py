@@ -6,6 +6,7 @@ from experiments.run.job import Job
 from experiments.run.stages.drive import TRAJECTORY_FILE
 from experiments.run.store_files import link_or_copy
 from experiments.scenario.randomness import generator
+from mapfusion.attitude import FILE as ATTITUDE_FILE
 from mapfusion.robot_log import write_frames, write_truth_poses
 from mapfusion.se2 import Float
 from sim.odometry import OdometryNoise, add_noise, calibrated_track_m, encoder_increments
@@ -33,6 +34,9 @@ def run(settings: LogSettings, job: Job) -> None:
     write_frames(job.output, settings.robot, False, trajectory.time_s, odometry)
     for name in _OBSERVED:
         link_or_copy(job.inputs["observed"] / name, job.output / name)
+    attitude = job.inputs["observed"] / ATTITUDE_FILE
+    if attitude.exists():  # of a body that sways
+        link_or_copy(attitude, job.output / ATTITUDE_FILE)
     write_truth_poses(job.output, trajectory.T_world_robot[index])
 
 

@@ -15,6 +15,7 @@ from mapfusion.fastslam.filter import StepResult
 from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.fastslam.run import run_log
 from mapfusion.landmark_map import LandmarkMap
+from mapfusion.odometry_covariance import read_odometry_covariance
 from mapfusion.robot_log import RobotLog, read_log, with_rows
 from mapfusion.se2 import Float
 from mapfusion.storage import (
@@ -77,7 +78,8 @@ def run(settings: SlamSettings, job: Job) -> None:
     counted, final_path = np.empty(0, dtype=np.int64), np.empty((0, 3))
     iterations = evaluated_iterations(len(log), settings.every)
     rng = generator(settings.seed, "slam", log.robot)
-    for frame in run_log(log, settings.filter, rng, iterations, settings.min_count):
+    told = read_odometry_covariance(job.inputs["log"])
+    for frame in run_log(log, settings.filter, rng, iterations, settings.min_count, told):
         k, result = frame.iteration, frame.result
         steps.append(_step(result))
         if k % settings.clouds_every == 0 or k == last:

@@ -87,8 +87,7 @@ def run(settings: SmoothSettings, job: Job) -> None:
 
 def smoother_of(parameters: SmootherParameters, log: Path) -> SmootherParameters:
     """Those for a log's folder: odometry that pictures told is no news beside what they show."""
-    from_pictures = read_odometry_covariance(log) is not None
-    return parameters.without_odometry() if from_pictures else parameters
+    return replace(parameters, odometry_covariance=read_odometry_covariance(log))
 
 
 def log_until(log: RobotLog, iteration: int, noise_floor_m: float = 0.0) -> RobotLog:

@@ -30,6 +30,7 @@ from experiments.study.independence.measured_work import (
 from experiments.study.independence.strategies import FILTER_MAP, LOG, SMOOTHED_MAP
 from mapfusion.fastslam.run import run_log
 from mapfusion.landmark_map import LandmarkMap, write_map
+from mapfusion.odometry_covariance import read_odometry_covariance
 from mapfusion.robot_log import RobotLog, read_log, write_log
 from mapfusion.se2 import Float
 from mapfusion.storage import POSE_FIELDS, float_fields, named_columns, schema
@@ -59,9 +60,10 @@ def run(settings: RobotCostSettings, job: Job) -> None:
     """Write costs, bytes to send and, at each iteration, the filter's path."""
     single_threaded()
     log, iterations = read_log(job.inputs["log"]), settings.smooth.iterations
-    _filter(settings.slam, log, iterations[:1])  # compiles, and fills caches
+    told = read_odometry_covariance(job.inputs["log"])
+    _filter(settings.slam, log, told, iterations[:1])  # compiles, and fills caches
     _smooth_at(settings.smooth, job, log, iterations[0])
-    filtered = _filter(settings.slam, log, iterations)
+    filtered = _filter(settings.slam, log, told, iterations)
     costs = [cost_row(each.iteration, FILTER, each.cost) for each in filtered]
     for k in iterations:
         costs.append(cost_row(k, SMOOTHING, _smooth_at(settings.smooth, job, log, k)))
@@ -81,10 +83,12 @@ class _Filtered(NamedTuple):
     cost: Cost
 
 
-def _filter(settings: SlamSettings, log: RobotLog, iterations: Sequence[int]) -> list[_Filtered]:
+def _filter(
+    settings: SlamSettings, log: RobotLog, told: Float | None, iterations: Sequence[int]
+) -> list[_Filtered]:
     """The filter over the log, as the stage `slam` runs it, up to the last of the iterations."""
     rng, found, meter = generator(settings.seed, "slam", log.robot), [], Meter()
-    for frame in run_log(log, settings.filter, rng, iterations, settings.min_count):
+    for frame in run_log(log, settings.filter, rng, iterations, settings.min_count, told):
         if frame.landmarks is not None:
             cost = meter.read()
             path = frame.slam.best_path()

@@ -138,3 +138,21 @@ def test_odometry_that_pictures_told_does_not_count_twice(tmp_path: Path) -> Non
         apart.append(np.abs(pulled - right)[:, :2].max())
     assert apart[0] > 0.01
     assert apart[1] < 0.001
+
+
+def test_frames_that_see_nothing_hang_on_what_pictures_told(tmp_path: Path) -> None:
+    """Tracks last some frames before any is observed: there the odometry is all there is."""
+    known = white_noise_log(np.random.default_rng(0), N_FRAMES, 200)
+    later = known.log.iteration >= 2
+    log = replace(
+        known.log, iteration=known.log.iteration[later], observations=known.log.observations[later]
+    )
+    told = np.tile(np.diag([1e-4, 1e-4, 1e-6]), (N_FRAMES, 1, 1))
+    write_odometry_covariance(tmp_path, told)
+    own = smoother_of(SmootherParameters(stray_m=0.0), tmp_path)
+    made = smooth(log, owners(known.log)[later], known.path, own)
+    assert np.hypot(*(made.estimate.path - known.path)[2, :2]) < 0.1
+    # the way to the first frame that sees is known to 2 cm, and so is the map in its frame
+    variance = np.diag(made.joint_covariance()).reshape(-1, 3)
+    sigma = np.sqrt(variance[:, :2].sum(axis=1))
+    assert np.median(sigma) < 0.1

@@ -65,6 +65,8 @@ def bounded() -> Iterator[tuple[str, str, float]]:
 PLACES = {
     "Acceptance": "align.acceptance",
     "Align": "align",
+    "AttitudeNoise": "attitude",
+    "BodySway": "drive.body_sway",
     "AlignerEntry": "align.aligners.0",
     "Bound": "expect.path_rmse_m",
     "Drive": "drive",

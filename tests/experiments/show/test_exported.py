@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from evo.core.metrics import APE, PoseRelation
-from evo.tools.file_interface import read_tum_trajectory_file
+from evo.tools.file_interface import read_kitti_poses_file, read_tum_trajectory_file
 
 from experiments.judge import tables
 from experiments.show.figures.result_tables import ResultTables
@@ -70,6 +70,20 @@ def test_tum(trio_result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[st
             _, poses = read_tum(folder / f"{robot}.fused.tum")
             assert_same_poses(poses, se2.compose(T, poses_of(paths, "final")))
     assert np.all(np.diff(times) > 0)
+
+
+def test_kitti_is_tum_with_the_axes_of_a_camera(
+    trio_result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = exported(capsys, trio_result, "kitti", tmp_path / "out")
+    data = ResultTables(trio_result)
+    for robot in ROBOTS:
+        found = read_kitti_poses_file(folder / f"{robot}.final.kitti.txt")
+        x, y, theta = poses_of(data.of_robot("paths", robot), "final").T
+        # x right, y down, z ahead: what was left is -x, what was ahead is z
+        np.testing.assert_allclose(found.positions_xyz, np.c_[-y, 0 * x, x], atol=1e-15)
+        ahead = np.array(found.poses_se3)[:, :3, 2]
+        np.testing.assert_allclose(ahead, np.c_[-np.sin(theta), 0 * x, np.cos(theta)], atol=1e-12)
 
 
 def test_evo_says_of_the_files_what_the_table_says(
@@ -277,7 +291,7 @@ def test_bad_input_is_one_line_and_writes_nothing(
         )
         assert not (tmp_path / "out").exists()
 
-    refused(trio_copy, "obj", "--format obj: unknown; known: tum, g2o, ply")
+    refused(trio_copy, "obj", "--format obj: unknown; known: tum, kitti, g2o, ply")
     refused(tmp_path / "none", "tum", "not a result folder")
     assert_refused(command(capsys, "export", trio_copy), "--format")
     tables.table_path(trio_copy, "frame_times").unlink()

@@ -64,7 +64,9 @@ class CopyingFilter:
             for m, (particle, draw) in enumerate(zip(self.particles, draws, strict=True)):
                 poses[m], ratios[m] = self.informed(particle, odometry, observations, draw)
         else:
-            poses = sample_motion(poses, odometry, settings.motion, self.rng)
+            poses = sample_motion(
+                poses, odometry, settings.motion.standard_deviations(odometry), self.rng
+            )
         for particle, pose, ratio in zip(self.particles, poses, ratios, strict=True):
             particle.pose = pose
             particle.path.append(pose)

@@ -16,7 +16,9 @@ def test_spread_is_the_stated_one():
     n = 40_000
     start = np.tile([3.0, -1.0, 3.0], (n, 1))  # the heading is near pi: samples wrap
     odometry = np.array([0.3, 0.4, -0.6])
-    poses = sample_motion(start, odometry, NOISE, np.random.default_rng(0))
+    poses = sample_motion(
+        start, odometry, NOISE.standard_deviations(odometry), np.random.default_rng(0)
+    )
     moved = between(start, poses) - odometry
     along = 0.02**2 * 0.5 + 0.05**2 * 4.0 * 0.5
     heading = 0.01**2 * 0.5 + (0.03**2 + 0.04**2 * 2.0) * 0.6
@@ -51,7 +53,11 @@ def test_covers_a_systematic_error_at_the_horizon(relative_error):
 def test_standing_still_adds_only_the_floor():
     start = np.tile([1.0, 2.0, 0.5], (10, 1))
     rng = np.random.default_rng(0)
-    np.testing.assert_allclose(sample_motion(start, np.zeros(3), NOISE, rng), start, atol=1e-15)
+    np.testing.assert_allclose(
+        sample_motion(start, np.zeros(3), NOISE.standard_deviations(np.zeros(3)), rng),
+        start,
+        atol=1e-15,
+    )
     pushed = MotionNoise(floor_m=0.1, floor_rad=0.2)
     np.testing.assert_array_equal(pushed.standard_deviations(np.zeros(3)), [0.1, 0.1, 0.2])
 
@@ -60,7 +66,9 @@ def test_without_noise_it_is_the_odometry():
     rng = np.random.default_rng(1)
     start, odometry = rng.normal(size=(20, 3)), rng.normal(size=3)
     np.testing.assert_allclose(
-        sample_motion(start, odometry, EXACT, rng), compose(start, odometry), atol=1e-15
+        sample_motion(start, odometry, EXACT.standard_deviations(odometry), rng),
+        compose(start, odometry),
+        atol=1e-15,
     )
 
 

@@ -63,3 +63,22 @@ def test_a_log_without_frames_is_refused():
     log = RobotLog("R1", False, np.empty(0), np.empty((0, 3)), no_rows, nothing)
     with pytest.raises(InputError, match="log R1: holds no frame"):
         build_map(log, SETTINGS, np.random.default_rng(0))
+
+
+def test_odometry_that_observations_told_and_they_count_half_each() -> None:
+    """As motion noise and observations of twice the variance do."""
+    log = log_of(planar=False)
+    seen = log.observations
+    motion = replace(SETTINGS.motion, floor_m=0.01, floor_rad=0.002)
+    settings = replace(SETTINGS, motion=motion)
+    floor = np.array([0.01, 0.01, 0.002]) ** 2
+    sigma = np.array([motion.standard_deviations(step) for step in log.odometry])
+    told = np.array([np.diag((own**2 - floor) / 2) for own in sigma])
+    sharper = replace(log, observations=replace(seen, covariance_m2=seen.covariance_m2 / 2))
+    made = run_log(sharper, settings, np.random.default_rng(1), odometry_covariance=told)
+    expected = run_log(log, settings, np.random.default_rng(1))
+    for own, other in zip(made, expected, strict=True):
+        np.testing.assert_allclose(own.result.cloud, other.result.cloud, atol=1e-9)
+        np.testing.assert_allclose(own.result.log_weights, other.result.log_weights, atol=1e-6)
+    with pytest.raises(ValueError, match="odometry_covariance: shape"):
+        next(iter(run_log(log, SETTINGS, np.random.default_rng(0), odometry_covariance=told[1:])))

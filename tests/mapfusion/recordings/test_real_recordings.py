@@ -3,6 +3,7 @@
 `kitti_extract` is laid out anew, as KITTI publishes its sequences; `euroc_extract` is so already.
 """
 
+import itertools
 import os
 from pathlib import Path
 
@@ -10,8 +11,13 @@ import cv2
 import numpy as np
 import pytest
 
-from mapfusion import se3
+from mapfusion import se2, se3
+from mapfusion.align.correspondences import match
+from mapfusion.align.registration import Registration
+from mapfusion.align.registry import make_aligner
 from mapfusion.errors import InputError
+from mapfusion.fastslam.parameters import FastSlamParameters
+from mapfusion.fastslam.run import build_map, run_log
 from mapfusion.recordings.lens import Lens, StereoCalibration
 from mapfusion.recordings.registry import read_recording
 from mapfusion.recordings.stereo_import import Cut, Imported, StereoImport
@@ -83,6 +89,50 @@ def test_kitti_odometry_from_the_pictures(kitti: StereoRecording, imported: Impo
     error = imported.log.odometry[1:] - true
     assert np.median(np.hypot(*error[:, :2].T)) <= 0.02
     assert np.degrees(np.median(np.abs(error[:, 2]))) <= 0.04
+
+
+def dead_reckoned(odometry: np.ndarray) -> np.ndarray:
+    return np.array(list(itertools.accumulate(odometry, se2.compose)))
+
+
+def path_rmse_m(path: np.ndarray, true: np.ndarray) -> float:
+    off = path - se2.between(true[0], true)
+    return float(np.sqrt(np.mean(np.sum(off[:, :2] ** 2, axis=1))))
+
+
+def test_kitti_paths_are_no_worse_than_their_odometry(imported: Imported) -> None:
+    """But for a tenth: the truth of the extract's first twelve frames is a straight line."""
+    log, true = imported.log, imported.truth
+    assert true is not None
+    told, errors = imported.odometry_covariance, []
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        *_, last = run_log(log, FastSlamParameters(), rng, odometry_covariance=told)
+        errors.append(path_rmse_m(last.slam.best_path(), true))
+    assert np.median(errors) <= 1.1 * path_rmse_m(dead_reckoned(log.odometry), true)
+
+
+def test_kitti_seen_by_two_robots_is_one_map(work: StereoImport) -> None:
+    """Even and odd frames from the thirteenth on, from which the truth is good."""
+    pair = [work.log_of(Cut(name, slice(k, None, 2))) for name, k in (("E", 12), ("O", 13))]
+    true = [one.truth[0] for one in pair if one.truth is not None]
+    T = se2.between(*true)
+    for seed in range(5):
+        maps = [
+            build_map(
+                one.log, FastSlamParameters(), np.random.default_rng(seed),
+                odometry_covariance=one.odometry_covariance,
+            )
+            for one in pair
+        ]  # fmt: skip
+        registration = Registration(make_aligner("ransac")).on(*maps, match(*maps))
+        found = registration.register(np.random.default_rng(0)).applied
+        off = found.T_a_b - T
+        assert found.ok
+        assert np.hypot(*off[:2]) <= 0.30
+        assert np.degrees(abs(off[2])) <= 1.1
+        assert off @ np.linalg.solve(found.covariance, off) <= 14.2
+        assert np.sqrt(np.trace(found.covariance[:2, :2])) <= 0.15
 
 
 def test_euroc_is_rectified_and_raw_it_is_refused() -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mapfusion import se2
+from mapfusion import se2, se3
 from mapfusion.camera import StereoCamera
 from mapfusion.recordings.mount import MountSettings
 from mapfusion.recordings.registry import EXPORTERS, export_drive, read_recording, settings_class
@@ -109,3 +109,26 @@ def test_half_a_bag_is_never_there(written: StereoDrive, tmp_path: Path) -> None
     with pytest.raises(KeyboardInterrupt):
         export_drive("rosbag", tmp_path, replace(written, pair=lost))
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", list(OWN))
+def test_a_body_that_tilts_is_written_and_read(
+    written: StereoDrive, name: str, tmp_path: Path
+) -> None:
+    """The truth in space; what it measures of its tilt with the odometry, which stays the same."""
+    tilt_rad = np.array([[0.05, -0.02], [0.01, 0.06], [-0.04, 0.03]])
+    tilted = replace(written, tilt_rad=tilt_rad, told_tilt_rad=tilt_rad + 0.004)
+    (path,) = export_drive(name, tmp_path, tilted)
+    recording = read_recording(name, path, settings_class(name)(**OWN[name]), read_yaml)
+    assert recording.truth is not None
+    assert recording.odometry is not None
+    true, told = recording.truth.T, recording.odometry.T
+    np.testing.assert_allclose(
+        se3.between(true[0], true), se3.between(tilted.true_bodies[0], tilted.true_bodies),
+        atol=1e-9,
+    )  # fmt: skip
+    np.testing.assert_allclose(se3.roll_pitch(told[:, :3, :3]), tilt_rad + 0.004, atol=1e-12)
+    made = StereoImport(recording, every_frame).log_of(Cut("R1", slice(None)))
+    np.testing.assert_allclose(made.log.odometry, WHEELS, atol=1e-12)
+    assert made.attitude is not None
+    np.testing.assert_allclose(made.attitude.value[0, :2], tilt_rad[0] + 0.004, atol=1e-4)

@@ -9,11 +9,14 @@ import pytest
 
 from mapfusion.camera import StereoCamera
 from mapfusion.errors import InputError
+from mapfusion.se3 import in_space
+from sim.depth_image import depth_at
 from sim.floorplan import FloorPlan, Wall
 from sim.radiometry import RadiometricNoise
 from sim.raycast.caster import RayCaster
+from sim.raycast.tilted import TiltedView
 from sim.recorder import FrameSource
-from sim.stereo_head import StereoFrame
+from sim.stereo_head import StereoFrame, camera_pose
 from sim.world import write_faces
 
 CAMERA = StereoCamera(320, 240, 288.5)
@@ -104,6 +107,50 @@ def test_filtered_pictures_are_tinyrenderer_s_of_four_times_the_size_averaged(fa
     assert np.mean(off_edges) < 1.0
 
 
+TILTS = np.array([[0.09, -0.05], [-0.03, 0.1], [0.05, 0.05]])
+
+
+def test_tilted_pictures_are_tinyrenderer_s(faces: Path) -> None:
+    """Of four times the size, averaged, within the bounds of level ones; and so is the depth."""
+    caster, nobody = RayCaster(faces, CAMERA), np.zeros((0, 3))
+    off, off_edges, plain = [], [], []
+    with (
+        FrameSource(faces, finer(CAMERA, 4), "a") as source,
+        FrameSource(faces, CAMERA, "a") as small,
+    ):
+        for own in in_space(VIEWS[:3, 0], TILTS):
+            rng = np.random.default_rng(0)
+            true = averaged(source.render(own[None], "a", NO_NOISE, rng).left, 4)
+            frame = small.render(own[None], "a", NO_NOISE, rng)
+            edge = silhouettes(frame.depth_m)
+            error = np.abs(caster.grey(own, LEFT_M, nobody) - true)
+            off.append(error[~edge].mean())
+            off_edges.append(error[edge].mean())
+            plain.append(np.abs(frame.left - true)[~edge].mean())
+            deep = np.abs(caster.depth_m(own, LEFT_M, nobody) / frame.depth_m - 1)
+            assert deep[~edge].max() < 1e-4
+            assert np.mean(deep > 1e-4) < 0.01
+    assert np.mean(off) < 0.6
+    assert np.mean(off) < 0.6 * np.mean(plain)
+    assert np.mean(off_edges) < 1.0
+
+
+def test_depth_of_a_tilted_view_is_that_between_pixels(faces: Path) -> None:
+    """By the slow way: the level depth image, looked up where the tilted pixels' rays go."""
+    nobody, T = np.zeros((0, 3)), in_space(VIEWS[1, 0], TILTS[0])
+    depth_m = RayCaster(faces, CAMERA).depth_m(T, LEFT_M, nobody)
+    view = TiltedView.of(CAMERA, camera_pose(CAMERA, T, LEFT_M))
+    rng = np.random.default_rng(0)
+    level = (2 + 0.2 * rng.random((view.level.height_px, view.level.width_px))).astype(np.float32)
+    level[:, ::7] = 5.0
+    level[:, ::31] = np.nan
+    v, u = np.mgrid[: CAMERA.height_px, : CAMERA.width_px]
+    ahead, u_ahead, v_ahead = view.to_level @ np.stack([u.ravel(), v.ravel(), np.ones(u.size)])
+    uv = np.stack([u_ahead / ahead, v_ahead / ahead], -1)
+    expected = (depth_at(level, uv) / ahead).reshape(depth_m.shape)
+    np.testing.assert_allclose(view.depth_m(level), expected, rtol=1e-6)
+
+
 def test_filtered_pictures_are_their_own_of_eight_times_the_size_averaged(faces: Path) -> None:
     caster, fine = RayCaster(faces, CAMERA), RayCaster(faces, finer(CAMERA, 8))
     for view in VIEWS:
@@ -120,6 +167,12 @@ def test_what_it_cannot_draw_is_one_line(tmp_path: Path) -> None:
     write_faces(tmp_path, FloorPlan((Wall(around, height_m=0.6),)), np.random.default_rng(0))
     with pytest.raises(InputError, match=r"raycast cannot draw from 0\.8 m above walls of 0\.6 m"):
         RayCaster(tmp_path, replace(CAMERA, mount_z_m=0.8))
+    low_room = RayCaster(tmp_path, CAMERA)
+    tipped = in_space([2.0, 1.5, 0.0], [0.0, -1.0])
+    with pytest.raises(InputError, match=r"raycast cannot draw what a camera sees that tilts so"):
+        RayCaster(tmp_path, replace(CAMERA, mount_z_m=0.2)).grey(tipped, LEFT_M, np.zeros((0, 3)))
+    with pytest.raises(InputError, match=r"cannot draw from 0\.79\d* m above walls of 0\.6 m"):
+        low_room.grey(in_space([2.0, 1.5, 0.0], [1.0, -0.9]), 1.0, np.zeros((0, 3)))
     low = Wall(np.array([[1, 1], [2, 1]]), height_m=0.5)
     write_faces(tmp_path, FloorPlan((Wall(around), low)), np.random.default_rng(0))
     with pytest.raises(

@@ -1,0 +1,127 @@
+"""How a robot's body stands against the level frame that maps are made in, frame by frame.
+
+The robot frame of logs and maps is level: x in the heading of the body, z up, its origin on the
+floor that the map begins on. A body that pitches, rolls or climbs sees points in axes of its own;
+its attitude turns and lifts them, with what is not known of it. A file beside the log keeps it;
+a log without one is of a level body.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from mapfusion.arguments import require_finite, require_shape
+from mapfusion.errors import InputError
+from mapfusion.open_tables import told
+from mapfusion.robot_log import Observations
+from mapfusion.se2 import Float
+from mapfusion.se3 import tilt
+from mapfusion.storage import (
+    column,
+    columns,
+    float_fields,
+    named_columns,
+    read_table,
+    schema,
+    write_table,
+)
+
+FILE = "attitude.parquet"
+_ANGLES = ["roll_rad", "pitch_rad"]
+_FIELDS = [*_ANGLES, "height_m"]
+_SIGMAS = ["sigma_roll_rad", "sigma_pitch_rad", "sigma_height_m"]
+_ABOUT = [
+    "about the heading, the right side down",
+    "about the axis to the left, looking down",
+    "of the robot's origin above the floor that the map begins on",
+]
+ATTITUDE = schema(
+    "robot_log.attitude",
+    1,
+    [
+        told(pa.field("iteration", pa.int32()), "number of the frame: 0, 1, 2, ..."),
+        *(told(f, text) for f, text in zip(float_fields(_FIELDS), _ABOUT, strict=True)),
+        *(told(f, "standard deviation of the same") for f in float_fields(_SIGMAS)),
+    ],
+)
+
+
+@dataclass(frozen=True)
+class Attitude:
+    """Attitudes of T frames (T, 3): roll, pitch in radians, height in metres.
+
+    Attributes:
+        value: roll about the axis ahead (right side down), pitch about the axis to the left
+            (looking down), height of the robot's origin above the floor that the map begins on.
+        sigma: standard deviations of their errors.
+    """
+
+    value: Float
+    sigma: Float
+
+    def __post_init__(self) -> None:
+        for name in ("value", "sigma"):
+            require_shape(name, getattr(self, name), (len(self.value), 3))
+            require_finite(name, getattr(self, name))
+        if np.any(np.abs(self.value[:, :2]) >= np.pi / 2):
+            raise ValueError("value: a body that stands on end or on its head is not level")
+        if np.any(self.sigma < 0):
+            raise ValueError("sigma: is below 0")
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self.value)
+
+
+def moved(observed: Observations, R: Float, t: Float) -> Observations:
+    """The same observations in another frame: turned by R (3, 3), then shifted by t (3,)."""
+    covariance = R @ observed.covariance_m2 @ R.T
+    covariance = (covariance + covariance.swapaxes(1, 2)) / 2  # as rounding left it
+    position = observed.position_m @ R.T + t
+    return replace(observed, position_m=position, covariance_m2=covariance)
+
+
+def levelled(observed: Observations, value: Float, sigma: Float) -> Observations:
+    """One frame's observations in the level frame.
+
+    Args:
+        observed: in the body's frame.
+        value: (3,) roll, pitch and height, as of `Attitude`.
+        sigma: (3,) of their errors, which the covariances then include (first order).
+    """
+    roll, pitch, height_m = value
+    made = moved(observed, tilt(roll, pitch), np.array([0.0, 0.0, height_m]))
+    arm = made.position_m - [0.0, 0.0, height_m]
+    # a roll turns about the pitched axis ahead, a pitch about the axis to the left
+    by_roll = np.cross(tilt(0.0, pitch)[:, 0], arm)
+    by_pitch = np.cross([0.0, 1.0, 0.0], arm)
+    upwards = np.broadcast_to([0.0, 0.0, 1.0], arm.shape)
+    jacobian = np.stack([by_roll, by_pitch, upwards], -1)
+    spread = np.einsum("nij,j,nkj->nik", jacobian, sigma**2, jacobian)
+    return replace(made, covariance_m2=made.covariance_m2 + spread)
+
+
+def write_attitude(folder: Path, attitude: Attitude | None) -> None:
+    """Write `attitude.parquet` into a log's folder; None removes what is there."""
+    if attitude is None:
+        (folder / FILE).unlink(missing_ok=True)
+        return
+    rows = {"iteration": np.arange(len(attitude), dtype=np.int32)}
+    values = named_columns(_FIELDS, attitude.value) | named_columns(_SIGMAS, attitude.sigma)
+    write_table(folder / FILE, rows | values, ATTITUDE)
+
+
+def read_attitude(folder: Path) -> Attitude | None:
+    """Attitude of a log's folder, None for a level one, which has none; raises InputError."""
+    path = folder / FILE
+    if not path.is_file():
+        return None
+    table, _ = read_table(path, ATTITUDE)
+    if not np.array_equal(column(table, "iteration"), np.arange(table.num_rows)):
+        raise InputError(f"{path}: iterations must be 0, 1, 2, ..., one row each")
+    try:
+        return Attitude(columns(table, _FIELDS), columns(table, _SIGMAS))
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from error

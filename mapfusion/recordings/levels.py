@@ -1,0 +1,80 @@
+"""Where a recording knows the attitude of its robot from, frame by frame."""
+
+from typing import Literal
+
+import numpy as np
+
+from mapfusion.camera import StereoCamera
+from mapfusion.recordings.floor import floor_of
+from mapfusion.recordings.mount import levelled
+from mapfusion.robot_log import Observations
+from mapfusion.se2 import Float
+from mapfusion.se3 import roll_pitch
+from mapfusion.vision.attitude_filter import Measured
+from mapfusion.vision.features import Features
+
+Level = Literal["auto", "mount", "pictures", "floor", "odometry"]
+
+# Standard deviations of a first frame's roll, pitch (rad) and height (m): a car on its springs
+# stands within half a degree of the road, and its height is the map's.
+_FIRST_SIGMA = np.array([0.01, 0.01, 0.0])
+# Of an attitude that a trajectory tells, of which nobody says how good it is: an inclinometer's.
+_TOLD_SIGMA_RAD, _TOLD_SIGMA_M = 0.0052, 0.02
+_LEVEL_RAD = 1e-6  # a trajectory that tilts by less is one in the plane
+_ON_THE_FLOOR = 0.99  # share of the floor's own points that its gate keeps
+
+
+def known_from(wanted: Level, odometry: Float | None) -> Level:
+    """What `auto` stands for, by the dead reckoning (T, 4, 4) that was recorded, if any was."""
+    if wanted != "auto":
+        return wanted
+    if odometry is None:
+        return "pictures"
+    tilts = np.abs(roll_pitch(odometry[:, :3, :3])).max() > _LEVEL_RAD
+    return "odometry" if tilts else "mount"
+
+
+class Levels:
+    """What is measured of the attitude in each frame of a log.
+
+    Args:
+        known: where from; not `auto`.
+        camera: the rectified pair, which was taken for level.
+        T_robot_left: (4, 4) its mount.
+        odometry: (T, 4, 4) dead reckoning at the frames, or None.
+
+    Attributes:
+        camera, T_robot_left: as given.
+    """
+
+    def __init__(
+        self, known: Level, camera: StereoCamera, T_robot_left: Float, odometry: Float | None
+    ) -> None:
+        self.camera, self.T_robot_left = camera, T_robot_left
+        self._known: Level = known
+        self._odometry = odometry
+
+    @property
+    def measures(self) -> bool:
+        """Whether the attitude is followed frame by frame; else the body is level."""
+        return self._known != "mount"
+
+    def measured(self, k: int, found: Features, sigma_uv_px: float) -> Measured:
+        """Of frame k, in which these features were found."""
+        if self._known == "odometry":
+            assert self._odometry is not None
+            T = self._odometry[k]
+            told = [*roll_pitch(T[:3, :3]), T[2, 3] - self._odometry[0, 2, 3]]
+            return Measured(np.array(told), np.array([_TOLD_SIGMA_RAD] * 2 + [_TOLD_SIGMA_M]))
+        seen = self._floor(found, sigma_uv_px) if self._known == "floor" else None
+        if seen is not None:
+            return seen
+        # what the first frame takes for level is, but for how the body stands, the map's plane
+        return Measured(np.full(3, np.nan if k else 0.0), _FIRST_SIGMA)
+
+    def _floor(self, found: Features, sigma_uv_px: float) -> Measured | None:
+        noise = (sigma_uv_px, found.sigma_disparity_px)
+        points = Observations(*self.camera.triangulate(found.uv_px, found.disparity_px, *noise))
+        points = levelled(points, self.camera, self.T_robot_left)
+        floor = floor_of(points, float(self.T_robot_left[2, 3]), _ON_THE_FLOOR)
+        return None if floor is None else Measured(*floor.attitude)

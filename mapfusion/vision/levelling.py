@@ -1,0 +1,70 @@
+"""Observations of a body that tilts, in the level frame: what tilts is no error."""
+
+import numpy as np
+
+from mapfusion.attitude import Attitude, levelled, moved
+from mapfusion.robot_log import Observations
+from mapfusion.se2 import Float
+from mapfusion.se3 import tilt
+from mapfusion.vision.attitude_filter import AttitudeFilter, Measured
+from mapfusion.vision.rigid_links import RigidMotion
+
+# Standard deviation of roll and pitch of a body on wheels, a car's on a road or a robot's on its
+# springs, of which nothing is known: about a degree and a half.
+_BODY_RAD = 0.025
+
+
+class Levelling:
+    """The attitude of a robot along its log, by what is measured of it and by its links.
+
+    Args:
+        T_robot_seen: (4, 4) from the frame that the camera's points and motions are given in to the
+            robot's; None where they are the same.
+    """
+
+    def __init__(self, T_robot_seen: Float | None = None) -> None:
+        self._T_robot_seen = T_robot_seen
+        self._filter = AttitudeFilter()
+        self._values: list[Float] = []
+        self._sigmas: list[Float] = []
+
+    @property
+    def attitude(self) -> Attitude:
+        """Of the frames so far."""
+        return Attitude(np.array(self._values), np.array(self._sigmas))
+
+    def expected_turn(self, measured: Measured) -> Float | None:
+        """R_after_before (3, 3) in the camera's frame, by what is measured of the next frame.
+
+        None where nothing is, and for the first frame.
+        """
+        if not self._values or np.isnan(measured.value[:2]).any():
+            return None
+        before, after = (tilt(*value[:2]) for value in (self._values[-1], measured.value))
+        turn = after.T @ before
+        if self._T_robot_seen is None:
+            return turn
+        seen = self._T_robot_seen[:3, :3]
+        return seen.T @ turn @ seen
+
+    def add(self, motion: RigidMotion | None, measured: Measured) -> None:
+        """The next frame: how the links say that the camera moved, and what was measured.
+
+        Where neither tells roll and pitch, the body is level in the mean.
+        """
+        if self._values:
+            if motion is not None and self._T_robot_seen is not None:
+                motion = motion.of(self._T_robot_seen)
+            self._filter.move(motion)
+        if motion is None and np.isnan(measured.value[:2]).any():
+            told = np.array([0.0, 0.0, measured.value[2]])
+            measured = Measured(told, np.array([_BODY_RAD, _BODY_RAD, measured.sigma[2]]))
+        self._filter.measure(measured)
+        self._values.append(self._filter.value)
+        self._sigmas.append(self._filter.sigma)
+
+    def applied(self, observed: Observations) -> Observations:
+        """Observations of the last frame, as the camera's frame has them, in the level frame."""
+        T = self._T_robot_seen
+        own = observed if T is None else moved(observed, T[:3, :3], T[:3, 3])
+        return levelled(own, self._values[-1], self._sigmas[-1])

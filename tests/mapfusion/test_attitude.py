@@ -1,0 +1,112 @@
+"""Attitude: its rotations, what levelling makes of points and covariances, and its file."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mapfusion import se3
+from mapfusion.attitude import FILE, Attitude, levelled, moved, read_attitude, write_attitude
+from mapfusion.errors import InputError
+from mapfusion.robot_log import Observations
+
+
+def seen(rng: np.random.Generator, n: int = 20) -> Observations:
+    root = 0.05 * rng.normal(size=(n, 3, 3))
+    return Observations(rng.uniform([1, -2, 0], [5, 2, 2], (n, 3)), root @ root.swapaxes(1, 2))
+
+
+def test_rotations_are_scipy_s() -> None:
+    rng = np.random.default_rng(0)
+    roll, pitch, yaw = rng.uniform(-1, 1, (3, 50))
+    R = se3.tilt(roll, pitch)
+    expected = Rotation.from_euler("ZYX", np.stack([0 * roll, pitch, roll], -1)).as_matrix()
+    np.testing.assert_allclose(R, expected, atol=1e-15)
+    turned = Rotation.from_euler("z", yaw[:, None]).as_matrix() @ R
+    np.testing.assert_allclose(se3.roll_pitch(turned), np.stack([roll, pitch], -1), atol=1e-12)
+    x_y_yaw = np.stack([roll, pitch, yaw], -1)
+    T = se3.in_space(x_y_yaw, np.stack([roll, pitch], -1))
+    np.testing.assert_allclose(T[:, :3, :3], turned, atol=1e-12)
+    np.testing.assert_allclose(se3.planar(T), x_y_yaw, atol=1e-12)
+
+
+def test_signs_are_those_of_a_body() -> None:
+    """Looking down, what is ahead is lower; the right side down, what is to the left is higher."""
+    ahead, left = np.eye(3)[:2]
+    assert (se3.tilt(0.0, 0.1) @ ahead)[2] < 0
+    assert (se3.tilt(0.1, 0.0) @ left)[2] > 0
+
+
+def test_levelled_points_are_where_the_body_s_pose_has_them() -> None:
+    rng = np.random.default_rng(1)
+    body = seen(rng)
+    value = np.array([0.05, -0.08, 0.3])
+    made = levelled(body, value, np.zeros(3))
+    T = se3.in_space(np.zeros(3), value[:2])
+    T[2, 3] = value[2]
+    expected = (np.c_[body.position_m, np.ones(len(body))] @ T.T)[:, :3]
+    np.testing.assert_allclose(made.position_m, expected, atol=1e-13)
+    turned = T[:3, :3] @ body.covariance_m2 @ T[:3, :3].T
+    np.testing.assert_allclose(made.covariance_m2, turned, atol=1e-15)
+
+
+def test_the_covariance_holds_what_the_attitude_errs_by() -> None:
+    """Against the spread over attitudes drawn from their error."""
+    rng = np.random.default_rng(2)
+    exact = Observations(seen(rng, 3).position_m, np.zeros((3, 3, 3)))
+    value, sigma = np.array([0.06, -0.05, 0.1]), np.array([0.01, 0.02, 0.03])
+    drawn = value + sigma * rng.standard_normal((20_000, 3))
+    R = se3.tilt(drawn[:, 0], drawn[:, 1])
+    points = np.einsum("kij,nj->nki", R, exact.position_m)
+    points[..., 2] += drawn[:, 2]
+    made = levelled(exact, value, sigma)
+    for own, spread in zip(made.covariance_m2, map(np.cov, points.swapaxes(1, 2)), strict=True):
+        scale = np.sqrt(np.diag(spread))
+        np.testing.assert_allclose(own / scale / scale[:, None], spread / scale / scale[:, None],
+                                   atol=0.04)  # fmt: skip
+
+
+def test_moved_there_and_back_they_are_the_same() -> None:
+    rng = np.random.default_rng(3)
+    first, T = seen(rng), se3.pose(se3.tilt(0.3, -0.2), [0.1, 0.2, 0.3])
+    back = se3.inverse(T)
+    made = moved(moved(first, T[:3, :3], T[:3, 3]), back[:3, :3], back[:3, 3])
+    np.testing.assert_allclose(made.position_m, first.position_m, atol=1e-14)
+    np.testing.assert_allclose(made.covariance_m2, first.covariance_m2, atol=1e-15)
+
+
+def test_what_is_written_is_read(tmp_path: Path) -> None:
+    assert read_attitude(tmp_path) is None
+    rng = np.random.default_rng(4)
+    attitude = Attitude(rng.uniform(-0.1, 0.1, (5, 3)), rng.uniform(0, 0.1, (5, 3)))
+    write_attitude(tmp_path, attitude)
+    found = read_attitude(tmp_path)
+    assert found is not None
+    assert len(found) == 5
+    np.testing.assert_array_equal(found.value, attitude.value)
+    np.testing.assert_array_equal(found.sigma, attitude.sigma)
+    write_attitude(tmp_path, None)
+    assert not (tmp_path / FILE).exists()
+
+
+def test_a_damaged_file_is_one_line(tmp_path: Path) -> None:
+    write_attitude(tmp_path, Attitude(np.zeros((3, 3)), np.zeros((3, 3))))
+    path = tmp_path / FILE
+    path.write_bytes(path.read_bytes()[:-9])
+    with pytest.raises(InputError, match=FILE):
+        read_attitude(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("value", "sigma", "message"),
+    [
+        ([[0, 1.6, 0]], [[0, 0, 0]], "on end"),
+        ([[0, 0, 0]], [[0, -1, 0]], "sigma: is below 0"),
+        ([[0, np.nan, 0]], [[0, 0, 0]], "value: contains NaN"),
+        ([[0, 0, 0]], [[0, 0]], "sigma: shape"),
+    ],
+)
+def test_what_no_body_has_is_refused(value: list, sigma: list, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Attitude(np.array(value, dtype=float), np.array(sigma, dtype=float))

@@ -1,0 +1,134 @@
+"""Attitude from what is measured and how pictures say it turned: exact, consistent, better."""
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mapfusion import se3
+from mapfusion.camera import StereoCamera
+from mapfusion.robot_log import Observations
+from mapfusion.vision.attitude_filter import AttitudeFilter, Measured
+from mapfusion.vision.levelling import Levelling
+from mapfusion.vision.rigid_links import RigidMotion
+
+INCLINOMETER = np.array([0.0052, 0.0052, 0.0])
+TURN_SIGMA, STEP_SIGMA = 0.0004, 0.002
+
+
+def swaying_bodies(rng: np.random.Generator, n: int) -> np.ndarray:
+    """Poses (n, 4, 4) along a winding way, pitching and rolling by 3 degrees."""
+    turned = np.cumsum(rng.normal(0, 0.1, n))
+    way = np.stack([0.1 * np.arange(n), np.zeros(n), turned], -1)
+    return se3.in_space(way, rng.normal(0, 0.05, (n, 2)))
+
+
+def measured_motion(rng: np.random.Generator, before: np.ndarray, after: np.ndarray) -> RigidMotion:
+    T = se3.between(before, after)
+    T[:3, :3] = Rotation.from_rotvec(rng.normal(0, TURN_SIGMA, 3)).as_matrix() @ T[:3, :3]
+    T[:3, 3] += rng.normal(0, STEP_SIGMA, 3)
+    return RigidMotion(T, np.diag([STEP_SIGMA**2] * 3 + [TURN_SIGMA**2] * 3), 9)
+
+
+def test_exact_turns_carry_an_exact_attitude() -> None:
+    bodies = swaying_bodies(np.random.default_rng(0), 30)
+    bodies[:, 2, 3] = np.linspace(0, 1, 30)
+    kept = AttitudeFilter()
+    first = np.array([*se3.roll_pitch(bodies[0, :3, :3]), 0.0])
+    kept.measure(Measured(first, np.zeros(3)))
+    for before, after in itertools.pairwise(bodies):
+        kept.move(RigidMotion(se3.between(before, after), np.zeros((6, 6)), 9))
+        expected = [*se3.roll_pitch(after[:3, :3]), after[2, 3]]
+        np.testing.assert_allclose(kept.value, expected, atol=1e-12)
+    np.testing.assert_allclose(kept.covariance, 0, atol=1e-20)
+
+
+def test_errors_stay_in_the_world_when_the_body_turns() -> None:
+    """Uncertain in roll, and turned by a quarter: uncertain in pitch."""
+    kept = AttitudeFilter()
+    kept.measure(Measured(np.zeros(3), np.array([0.01, 0.001, 0.0])))
+    quarter = se3.from_planar(np.array([0.0, 0.0, np.pi / 2]))
+    kept.move(RigidMotion(quarter, np.zeros((6, 6)), 9))
+    np.testing.assert_allclose(kept.sigma, [0.001, 0.01, 0.0], rtol=1e-3, atol=1e-12)
+    # half a metre ahead of a body whose pitch is uncertain, its height is too
+    kept.move(RigidMotion(se3.from_planar(np.array([0.5, 0.0, 0.0])), np.zeros((6, 6)), 9))
+    np.testing.assert_allclose(kept.sigma[2], 0.005, rtol=1e-3)
+
+
+def test_what_a_tilt_moves_is_expected_there() -> None:
+    rng = np.random.default_rng(5)
+    before, after = rng.normal(0, 0.05, (2, 2))
+    levelling = Levelling()
+    levelling.add(None, Measured(np.array([*before, 0.0]), np.full(3, 1e-9)))
+    turn = levelling.expected_turn(Measured(np.array([*after, 0.0]), INCLINOMETER))
+    ray = rng.normal(size=3)
+    assert turn is not None
+    np.testing.assert_allclose(
+        turn @ se3.tilt(*before).T @ ray, se3.tilt(*after).T @ ray, atol=1e-9
+    )
+
+
+def test_errors_are_as_large_as_stated_and_smaller_than_measured() -> None:
+    rng = np.random.default_rng(1)
+    errors, sigmas = [], []
+    for _ in range(60):
+        bodies = swaying_bodies(rng, 25)
+        true = np.c_[se3.roll_pitch(bodies[:, :3, :3]), np.zeros(25)]
+        levelling = Levelling()
+        for k, body in enumerate(bodies):
+            motion = measured_motion(rng, bodies[k - 1], body) if k else None
+            told = np.array([*(true[k, :2] + rng.normal(0, INCLINOMETER[:2])), np.nan])
+            if k == 0:
+                told[2] = 0.0  # the height is known where the map begins, and carried on
+            levelling.add(motion, Measured(told, INCLINOMETER))
+        errors.append(levelling.attitude.value - true)
+        sigmas.append(levelling.attitude.sigma)
+    last, sigma = np.array(errors)[:, -1], np.array(sigmas)[:, -1]
+    assert np.mean((last / sigma) ** 2, axis=0) == pytest.approx([1, 1, 1], abs=0.45)
+    assert np.all(sigma[:, :2] < 0.35 * INCLINOMETER[:2])
+
+
+def test_without_links_what_is_measured_counts_alone() -> None:
+    rng = np.random.default_rng(2)
+    levelling = Levelling()
+    for told in rng.normal(0, 0.05, (5, 2)):
+        levelling.add(None, Measured(np.array([*told, 0.0]), INCLINOMETER))
+        np.testing.assert_allclose(levelling.attitude.value[-1, :2], told, atol=1e-5)
+        np.testing.assert_allclose(levelling.attitude.sigma[-1], INCLINOMETER, rtol=1e-4)
+
+
+def test_a_mount_changes_nothing() -> None:
+    """A camera that is turned on its robot, and points and motions in its own frame."""
+    rng = np.random.default_rng(3)
+    mount = se3.pose(Rotation.from_euler("ZYX", [0.3, 0.1, -0.2]).as_matrix(), [0.3, 0.1, 0.5])
+    bodies = swaying_bodies(rng, 6)
+    own, by_camera = Levelling(), Levelling(mount)
+    p_camera = rng.uniform([1, -1, -1], [4, 1, 1], (7, 3))
+    p_body = p_camera @ mount[:3, :3].T + mount[:3, 3]
+    for k, body in enumerate(bodies):
+        told = Measured(np.array([*se3.roll_pitch(body[:3, :3]), 0.0]), INCLINOMETER)
+        turn, seen_turn = own.expected_turn(told), by_camera.expected_turn(told)
+        motion = measured_motion(rng, bodies[k - 1], body) if k else None
+        seen = None if motion is None else motion.of(se3.inverse(mount))
+        own.add(motion, told)
+        by_camera.add(seen, told)
+        points = [
+            levelling.applied(Observations(p, np.tile(1e-4 * np.eye(3), (7, 1, 1))))
+            for levelling, p in ((own, p_body), (by_camera, p_camera))
+        ]
+        np.testing.assert_allclose(points[1].position_m, points[0].position_m, atol=1e-12)
+        np.testing.assert_allclose(points[1].covariance_m2, points[0].covariance_m2, atol=1e-14)
+        assert (turn is None) == (seen_turn is None) == (k == 0)
+        if turn is not None and seen_turn is not None:
+            R = mount[:3, :3]
+            np.testing.assert_allclose(R @ seen_turn @ R.T, turn, atol=1e-12)
+
+
+def test_far_points_are_expected_where_a_tilt_moves_them() -> None:
+    camera = StereoCamera(mount_pitch_rad=0.1, mount_roll_rad=-0.05)
+    rng = np.random.default_rng(4)
+    before, after = se3.tilt(*rng.normal(0, 0.05, (2, 2)).T)
+    p_world = rng.uniform([1e6, -3e5, -2e5], [2e6, 3e5, 2e5], (30, 3))
+    uv_before, uv_after = (camera.project(p_world @ R)[:, :2] for R in (before, after))
+    np.testing.assert_allclose(camera.turned(uv_before, after.T @ before), uv_after, atol=1e-3)
