@@ -11,6 +11,7 @@ from mapfusion.fastslam.filter import FastSlam, StepResult
 from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import NO_LABEL, RobotLog
+from mapfusion.viewing import viewing_of
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,7 @@ class Frame:
     Attributes:
         iteration: of the log.
         result: of the step.
-        landmarks: the best map, at the iterations that were asked for.
+        landmarks: the best map with its viewing evidence, at the iterations that were asked for.
         slam: the filter itself, as it is after this step (for `best_path`, `best_associations`).
     """
 
@@ -63,6 +64,8 @@ def run_log(
         landmarks = None
         if iteration in wanted:
             landmarks = replace(slam.best_map(min_count), name=log.robot)
+            seen = slam.best_associations(), slam.best_path(), landmarks.source_observation
+            landmarks = replace(landmarks, viewing=viewing_of(log, *seen))
         yield Frame(iteration, result, landmarks, slam)
 
 

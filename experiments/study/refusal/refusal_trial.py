@@ -177,7 +177,7 @@ def _answers(scenario: Simulation, case: Case, worlds: tuple[str, str], iteratio
     for entry in settings.aligners:
         rng = generator(scenario.seed, *map(str, names.values()), entry.name)
         aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
-        registration = Registration(aligner, settings.refinement, settings.acceptance)
+        registration = Registration(aligner, settings.refinement, settings.judge)
         _, refined, verdict = registration.register(case.map_a, case.map_b, case.pairs, rng)
         error = refined.T_a_b - case.T_true
         found = {
