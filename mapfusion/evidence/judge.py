@@ -133,12 +133,17 @@ class PairJudge:
         return Status.ACCEPTED, ""
 
     def _best_rival(self, T_a_b: Float, evidence: PairEvidence, bound: float) -> RivalMotion | None:
-        """Of the other motions that are more than chance the one of most evidence."""
+        """Of the other motions the one of most evidence.
+
+        It is more than chance, or both robots saw what it says: of two copies of a picture each
+        gets half the correspondences.
+        """
         p_b = self._pairs.map_b.position_m[:, :2]
         others = [
             each
             for each in evidence.rivals
-            if each.log10_false_alarms <= bound and apart_m(T_a_b, each.T_a_b, p_b) >= DISTINCT_M
+            if (each.log10_false_alarms <= bound or each.log10_ratio > 0)
+            and apart_m(T_a_b, each.T_a_b, p_b) >= DISTINCT_M
         ]
         return max(others, key=lambda each: each.log10_ratio, default=None)
 

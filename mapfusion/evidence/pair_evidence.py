@@ -18,8 +18,9 @@ from mapfusion.se2 import Float
 N_RIVALS, N_SELF_MOTIONS = 4, 3  # the best tell how much alike the others are
 _PATCH_REACH_M = 0.7  # between neighbouring corners of one picture
 _LEAST_OF_PATCH = 5
-# Jeffreys' prior of that share: half a region each.
-_TWINS_BEFORE, _OTHERS_BEFORE = 0.5, 0.5
+# What is known of the share of twins before any region is seen: between that of worlds in which
+# nothing repeats and that of one with four posters on all walls; worth two regions.
+_TWINS_BEFORE, _OTHERS_BEFORE = 0.2, 1.8
 BETWEEN = "a b"  # of a motion between the maps; of one map onto itself: a, b
 
 
