@@ -39,8 +39,8 @@ def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
         found.assign(inliers=inliers, time=times, verdict=[str(status) for status, _ in verdicts]),
         _VERDICTS,
         "Verdicts on the refined ones",
-        "NFA: expected number of alignments that chance alone supports as well; evidence: how much\n"
-        "likelier what both robots saw is if it is right; time: of the estimate alone",
+        "NFA: expected number of alignments that chance alone supports as well; evidence:\n"
+        "how much likelier what both robots saw is if it is right; time: of the estimate",
     )
     for row, (status, why) in zip(rows, verdicts, strict=True):
         if reason := why or row["reason"]:
