@@ -19,11 +19,10 @@ LEAST_FRAMES = 3  # in which it lay in view: tracks become landmarks after as ma
 # Beyond what was seen in that direction by no more than this a landmark is not hidden: the same
 # wall, a little slanted within a part of the field of view.
 _BEHIND_M = 0.3
+_COS_SLANT = math.cos(MOST_SLANT_RAD)
 # Of the distance r: how far from where it was seen the places lie from which it is seen so again,
 # sqrt((1.4 cos 30 - 1)^2 + (1.4 sin 30)^2) at the most.
-_PLACES = math.hypot(
-    FARTHEST_RATIO * math.cos(MOST_SLANT_RAD) - 1, FARTHEST_RATIO * math.sin(MOST_SLANT_RAD)
-)
+_PLACES = math.hypot(FARTHEST_RATIO * _COS_SLANT - 1, FARTHEST_RATIO * math.sin(MOST_SLANT_RAD))
 
 
 class Watch(NamedTuple):
@@ -31,14 +30,14 @@ class Watch(NamedTuple):
 
     Attributes:
         places: the grid over its poses.
-        pose: (T, 3).
-        reach_m: (T, B).
+        heading: (T, 3) cosine, sine and angle of the poses, in the order of the grid.
+        reach_m: (T, B) likewise.
         bearing_rad, range_m: (2,) of the field of view.
         height_m: (H, 2).
     """
 
     places: Grid
-    pose: Float
+    heading: Float
     reach_m: np.ndarray
     bearing_rad: Float
     range_m: Float
@@ -47,10 +46,11 @@ class Watch(NamedTuple):
     @classmethod
     def of(cls, viewing: Viewing) -> "Watch":
         """Of viewing evidence."""
-        field, pose = viewing.field, np.ascontiguousarray(viewing.pose)
-        reach = np.ascontiguousarray(viewing.reach_m)
+        field, places = viewing.field, Grid.of(viewing.pose[:, :2])
+        theta = viewing.pose[places.row, 2]
+        heading = np.stack([np.cos(theta), np.sin(theta), theta], axis=1)
         limits = (field.bearing_rad, field.range_m, field.height_m)
-        return cls(Grid.of(pose[:, :2]), pose, reach, *limits)
+        return cls(places, heading, viewing.reach_m[places.row], *limits)
 
 
 class Seen(NamedTuple):
@@ -70,17 +70,32 @@ class Seen(NamedTuple):
 @njit(cache=True)
 def must_be_seen(seen: Seen, watch: Watch) -> np.ndarray:
     """Rows (n,) of the landmarks that lay in view, unhidden, in LEAST_FRAMES frames or more."""
-    runs = np.empty((watch.places.shape[1], 2), np.int64)
-    rows, n = np.empty(len(seen.p), np.int64), 0
-    for i in range(len(seen.p)):
-        r = seen.distance_m[i]
-        x = seen.p[i, 0] - r * seen.direction[i, 0]
-        y = seen.p[i, 1] - r * seen.direction[i, 1]
+    p, direction, distance_m = seen
+    # arrays by themselves: taken from a tuple, each access would count its references
+    places, heading, reach_m, bearing_rad, range_m, height_m = watch
+    at, runs = places.p, np.empty((places.shape[1], 2), np.int64)
+    rows, n = np.empty(len(p), np.int64), 0
+    for i in range(len(p)):
+        r, ux, uy = distance_m[i], direction[i, 0], direction[i, 1]
+        least2, most2 = (NEAREST_RATIO * r) ** 2, (FARTHEST_RATIO * r) ** 2
         frames = 0
-        for run in range(runs_about(x, y, _PLACES * r, watch.places, runs)):
-            for k in range(runs[run, 0], runs[run, 1]):
-                if frames < LEAST_FRAMES and in_view(seen, i, watch.places.row[k], watch):
-                    frames += 1
+        about_x, about_y = p[i, 0] - r * ux, p[i, 1] - r * uy
+        for run in range(runs_about(about_x, about_y, _PLACES * r, places, runs)):
+            for t in range(runs[run, 0], runs[run, 1]):
+                dx, dy = p[i, 0] - at[t, 0], p[i, 1] - at[t, 1]
+                square, along = dx * dx + dy * dy, dx * ux + dy * uy
+                if not least2 <= square <= most2 or along <= 0:
+                    continue
+                if along * along < _COS_SLANT * _COS_SLANT * square:
+                    continue
+                ahead = heading[t, 0] * dx + heading[t, 1] * dy
+                left = heading[t, 0] * dy - heading[t, 1] * dx
+                view = (bearing_rad, range_m, height_m)
+                frames += _in_view(math.sqrt(square), ahead, left, p[i, 2], view, reach_m[t])
+                if frames == LEAST_FRAMES:
+                    break
+            if frames == LEAST_FRAMES:
+                break
         if frames == LEAST_FRAMES:
             rows[n] = i
             n += 1
@@ -88,25 +103,27 @@ def must_be_seen(seen: Seen, watch: Watch) -> np.ndarray:
 
 
 @njit(cache=True)
-def in_view(seen: Seen, i: int, t: int, watch: Watch) -> bool:
-    """Whether landmark i lay in frame t as it was seen before, and nothing hid it."""
-    dx, dy = seen.p[i, 0] - watch.pose[t, 0], seen.p[i, 1] - watch.pose[t, 1]
-    range_m, before_m = math.hypot(dx, dy), seen.distance_m[i]
-    if not NEAREST_RATIO * before_m <= range_m <= FARTHEST_RATIO * before_m or range_m == 0:
+def _in_view(
+    range_m: float,
+    ahead_m: float,
+    left_m: float,
+    z_m: float,
+    view: tuple[Float, Float, Float],
+    reach_m: np.ndarray,
+) -> bool:
+    """Whether what lies there, in a frame's own coordinates, was in view and nothing hid it.
+
+    The view is by bearing (2,), range (2,) and heights (H, 2); reach_m (B,) is the frame's.
+    """
+    bearings, ranges, heights = view
+    low, high = bearings[0], bearings[1]
+    if not ranges[0] <= range_m <= ranges[1] or high <= low or range_m == 0:
         return False
-    if not watch.range_m[0] <= range_m <= watch.range_m[1]:
+    bearing = math.atan2(left_m, ahead_m)
+    if not low <= bearing <= high:
         return False
-    along = dx * seen.direction[i, 0] + dy * seen.direction[i, 1]
-    if along < math.cos(MOST_SLANT_RAD) * range_m:
+    step = min(int(range_m / ranges[1] * len(heights)), len(heights) - 1)
+    if not heights[step, 0] <= z_m <= heights[step, 1]:
         return False
-    cos, sin = math.cos(watch.pose[t, 2]), math.sin(watch.pose[t, 2])
-    bearing = math.atan2(cos * dy - sin * dx, cos * dx + sin * dy)
-    low, high = watch.bearing_rad[0], watch.bearing_rad[1]
-    if not low <= bearing <= high or high <= low:
-        return False
-    step = min(int(range_m / watch.range_m[1] * len(watch.height_m)), len(watch.height_m) - 1)
-    if not watch.height_m[step, 0] <= seen.p[i, 2] <= watch.height_m[step, 1]:
-        return False
-    parts = watch.reach_m.shape[1]
-    part = min(int((bearing - low) / (high - low) * parts), parts - 1)
-    return range_m <= watch.reach_m[t, part] + _BEHIND_M
+    part = min(int((bearing - low) / (high - low) * len(reach_m)), len(reach_m) - 1)
+    return range_m <= reach_m[part] + _BEHIND_M

@@ -45,30 +45,40 @@ class Gates(NamedTuple):
 
 @njit(cache=True)
 def has(p: Float, rows: np.ndarray, own: Looks, other: Looks, gates: Gates) -> np.ndarray:
-    """Bool (n,): whether `other` has some `rows` (n,) of `own`, whose places are p (N, 3) there."""
+    """Bool (n,): whether `other` has some `rows` (n,) of `own`, whose places are p (N, 3) there.
+
+    What has no descriptor (NaN) is not found.
+    """
+    # arrays by themselves: taken from a tuple, each access would count its references
+    _, z_own, z2_own, look_own = own
+    near, z_other, z2_other, look_other = other
+    at, row_of, distance_m = near.p, near.row, gates.distance_m
     found = np.zeros(len(rows), np.bool_)
-    runs = np.empty((other.near.shape[1], 2), np.int64)
+    runs = np.empty((near.shape[1], 2), np.int64)
+    most, floor_m2, unlike2 = gates.height_bound, gates.height_floor_m2, gates.unlike**2
     for m in range(len(rows)):
         i = rows[m]
-        for run in range(runs_about(p[i, 0], p[i, 1], gates.distance_m, other.near, runs)):
+        for run in range(runs_about(p[i, 0], p[i, 1], distance_m, near, runs)):
             for k in range(runs[run, 0], runs[run, 1]):
-                if found[m]:
-                    break
-                dx, dy = other.near.p[k, 0] - p[i, 0], other.near.p[k, 1] - p[i, 1]
-                if dx * dx + dy * dy > gates.distance_m * gates.distance_m:
+                dx, dy = at[k, 0] - p[i, 0], at[k, 1] - p[i, 1]
+                if dx * dx + dy * dy > distance_m * distance_m:
                     continue
-                found[m] = _alike(own, i, other, other.near.row[k], gates)
+                j = row_of[k]
+                dz = z_own[i] - z_other[j]
+                if most < math.inf and dz * dz > most * (z2_own[i] + z2_other[j] + floor_m2):
+                    continue
+                if _square_apart(look_own[i], look_other[j]) <= unlike2:
+                    found[m] = True
+                    break
+            if found[m]:
+                break
     return found
 
 
 @njit(cache=True)
-def _alike(own: Looks, i: int, other: Looks, j: int, gates: Gates) -> bool:
-    """Whether landmarks i and j may have one height and look the same; False for NaN."""
-    dz = own.z_m[i] - other.z_m[j]
-    variance = own.z_m2[i] + other.z_m2[j] + gates.height_floor_m2
-    if gates.height_bound < math.inf and dz * dz > gates.height_bound * variance:
-        return False
+def _square_apart(first: np.ndarray, second: np.ndarray) -> float:
+    """Squared distance of two descriptors (D,)."""
     square = 0.0
-    for d in range(own.descriptor.shape[1]):
-        square += (own.descriptor[i, d] - other.descriptor[j, d]) ** 2
-    return square <= gates.unlike * gates.unlike
+    for d in range(len(first)):
+        square += (first[d] - second[d]) ** 2
+    return square

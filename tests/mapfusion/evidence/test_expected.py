@@ -14,7 +14,8 @@ def slowly(seen: Seen, watch: Watch) -> list[int]:
     rows = []
     for i, (p, direction, before) in enumerate(zip(*seen, strict=True)):
         frames = 0
-        for t, (x, y, theta) in enumerate(watch.pose):
+        for t, (x, y) in enumerate(watch.places.p):
+            theta = watch.heading[t, 2]
             sight = np.array([p[0] - x, p[1] - y])
             range_m = float(np.linalg.norm(sight))
             if not 0.7 * before <= range_m <= 1.4 * before or range_m == 0:
