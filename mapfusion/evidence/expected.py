@@ -90,8 +90,8 @@ def must_be_seen(seen: Seen, watch: Watch) -> np.ndarray:
                     continue
                 ahead = heading[t, 0] * dx + heading[t, 1] * dy
                 left = heading[t, 0] * dy - heading[t, 1] * dx
-                view = (bearing_rad, range_m, height_m)
-                frames += _in_view(math.sqrt(square), ahead, left, p[i, 2], view, reach_m[t])
+                sight = (math.sqrt(square), math.atan2(left, ahead), p[i, 2])
+                frames += _in_view(sight, bearing_rad, range_m, height_m, reach_m, t)
                 if frames == LEAST_FRAMES:
                     break
             if frames == LEAST_FRAMES:
@@ -104,26 +104,25 @@ def must_be_seen(seen: Seen, watch: Watch) -> np.ndarray:
 
 @njit(cache=True)
 def _in_view(
-    range_m: float,
-    ahead_m: float,
-    left_m: float,
-    z_m: float,
-    view: tuple[Float, Float, Float],
+    sight: tuple[float, float, float],
+    bearings: Float,
+    ranges: Float,
+    heights: Float,
     reach_m: np.ndarray,
+    t: int,
 ) -> bool:
-    """Whether what lies there, in a frame's own coordinates, was in view and nothing hid it.
+    """Whether what lies at a range, a bearing and a height was in view at t, and nothing hid it.
 
-    The view is by bearing (2,), range (2,) and heights (H, 2); reach_m (B,) is the frame's.
+    The view is by bearing (2,), range (2,) and heights (H, 2); reach_m is (T, B).
     """
-    bearings, ranges, heights = view
-    low, high = bearings[0], bearings[1]
+    range_m, bearing, z_m = sight
+    low, high, parts = bearings[0], bearings[1], reach_m.shape[1]
     if not ranges[0] <= range_m <= ranges[1] or high <= low or range_m == 0:
         return False
-    bearing = math.atan2(left_m, ahead_m)
     if not low <= bearing <= high:
         return False
     step = min(int(range_m / ranges[1] * len(heights)), len(heights) - 1)
     if not heights[step, 0] <= z_m <= heights[step, 1]:
         return False
-    part = min(int((bearing - low) / (high - low) * len(reach_m)), len(reach_m) - 1)
-    return range_m <= reach_m[part] + _BEHIND_M
+    part = min(int((bearing - low) / (high - low) * parts), parts - 1)
+    return range_m <= reach_m[t, part] + _BEHIND_M

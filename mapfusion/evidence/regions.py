@@ -91,8 +91,9 @@ class Witnesses:
         rows_a, found_a, _ = self._asked(self.a, self.b, inverse(T_a_b))
         places = np.concatenate([b_in_a[rows_b], self.a.landmarks.position_m[rows_a]])
         found = np.concatenate([found_b, found_a])
-        square = np.floor(places[:, :2] / region_m).astype(np.int64)
-        _, place = np.unique(square, axis=0, return_inverse=True)
+        column, row = np.floor(places[:, :2].T / region_m).astype(np.int64)
+        width = int(np.ptp(row)) + 1 if len(row) else 1
+        _, place = np.unique(column * width + row, return_inverse=True)
         expected = np.bincount(place)
         n_found = np.bincount(place, found, len(expected)).astype(np.int64)
         counts = expected >= LEAST_EXPECTED
