@@ -24,9 +24,9 @@ from mapfusion.evidence.rivals import DISTINCT_M, apart_m
 from mapfusion.se2 import Float, motion_sigma
 from mapfusion.team.relations import whole_map_covariance
 
-# A right alignment has so many regions changed with a smaller probability than this: one of a
-# hundred right ones is given up for what a few regions could not say by themselves.
-_SURPRISE = 0.01
+# Several regions contradict where a right alignment has so many changed with a smaller probability
+# than this; a single one weighs as its ratio says.
+_SURPRISE, _SEVERAL = 0.1, 2
 
 
 @dataclass(frozen=True)
@@ -106,31 +106,38 @@ class PairJudge:
         self, alignment: Alignment, regions: Regions, ratio: float, evidence: PairEvidence
     ) -> tuple[Status, str]:
         """What the evidence makes of an alignment that is more than chance."""
-        settings, n, against = self._judge.evidence, len(regions), regions.n_contradicted
+        against, n = regions.n_contradicted, len(regions)
         told = f"{regions.n_confirmed} of {n} regions that both must have seen are in both maps"
-        if (
-            ratio < -math.log10(settings.most_against)
-            or binom.sf(against - 1, n, CHANGED) < _SURPRISE
-        ):
+        surprising = against >= _SEVERAL and binom.sf(against - 1, n, CHANGED) < _SURPRISE
+        if surprising or ratio < -math.log10(self._judge.evidence.most_against):
             return Status.REFUSED, f"contradicted: {told}, {against} are missing from one"
+        doubt = self._doubt(alignment, regions, ratio, evidence)
+        if not doubt:
+            return Status.ACCEPTED, ""
+        return Status.AMBIGUOUS, doubt.format(told=told)
+
+    def _doubt(
+        self, alignment: Alignment, regions: Regions, ratio: float, evidence: PairEvidence
+    ) -> str:
+        """Why another place may be the right one, with `{told}` of the regions; else empty."""
+        settings, extent_m = self._judge.evidence, self._extent_m(alignment)
         bound = math.log10(self._judge.acceptance.false_alarms)
         rival = self._best_rival(alignment.T_a_b, evidence, bound)
-        needed = math.log10(settings.least_ratio)
         if rival is not None and rival.log10_ratio > ratio - math.log10(settings.most_against):
-            return Status.AMBIGUOUS, f"{told}; so do {_named(rival)}"
-        if ratio >= needed:
-            return Status.ACCEPTED, ""
+            return f"{{told}}; so do {_named(rival)}"
+        if self._is_one_place(alignment, extent_m):
+            what = f"the maps show little else than this place of {extent_m:.2g} m"
+            return f"{what}; what lies around it tells whether it is another's like"
+        if ratio >= math.log10(settings.least_ratio):
+            return ""
         if rival is not None:
-            return Status.AMBIGUOUS, f"{told}, too few beside {_named(rival)}"
+            return f"{{told}}, too few beside {_named(rival)}"
         if evidence.repeats(bound):
-            return Status.AMBIGUOUS, f"{told}, too few for maps that hold things twice"
-        if regions.n_confirmed <= 1 and self._extent_m(alignment) < evidence.region_m:
+            return "{told}, too few for maps that hold things twice"
+        if regions.n_confirmed <= 1 and extent_m < evidence.region_m:
             what = f"all that agrees lies within {evidence.region_m:.2g} m"
-            return (
-                Status.AMBIGUOUS,
-                f"{what} and could hang elsewhere too; no other region confirms it",
-            )
-        return Status.ACCEPTED, ""
+            return f"{what} and could hang elsewhere too; no other region confirms it"
+        return ""
 
     def _best_rival(self, T_a_b: Float, evidence: PairEvidence, bound: float) -> RivalMotion | None:
         """Of the other motions the one of most evidence.
@@ -150,6 +157,12 @@ class PairJudge:
     def _extent_m(self, alignment: Alignment) -> float:
         """The longer side of where the supporters lie."""
         return float(np.ptp(self._pairs.p_b[alignment.inlier, :2], axis=0).max(initial=0.0))
+
+    def _is_one_place(self, alignment: Alignment, extent_m: float) -> bool:
+        """Whether most of a map is one place that agrees, and no larger than a room."""
+        smaller = min(len(self._pairs.map_a), len(self._pairs.map_b))
+        most = np.count_nonzero(alignment.inlier) > smaller / 2
+        return bool(most) and extent_m < self._judge.evidence.place_m
 
     def _why_unsure(self, alignment: Alignment) -> str:
         """Why an alignment is not sure enough to be used; empty when it is."""

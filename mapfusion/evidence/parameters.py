@@ -16,6 +16,8 @@ class EvidenceParameters:
         max_descriptor_distance: of the two; that of one landmark's sightings in the filter.
         region_m: least side of a region that is one piece of evidence: neighbouring corners are of
             one picture. It grows to the largest thing that the maps hold twice.
+        place_m: longest side of a place that a world may hold twice as a whole, a room: where most
+            of the smaller map lies within it and agrees, nothing around it has been compared.
         least_ratio: by how many times more likely the regions must be if the alignment is right
             than if it is not, where maps resemble themselves or another motion fits them.
         most_against: by how many times less likely they may be before it counts as contradicted.
@@ -27,6 +29,7 @@ class EvidenceParameters:
     gate_m: Annotated[float, Range(0.01, 10, "m")] = 0.3
     max_descriptor_distance: Annotated[float, Range(1e-3, 2, "1")] = 0.5
     region_m: Annotated[float, Range(0.1, 100, "m")] = 2.0
+    place_m: Annotated[float, Range(0, 1000, "m")] = 6.0
     least_ratio: Annotated[float, Range(1, 1e12, "1")] = 30.0
     most_against: Annotated[float, Range(1, 1e12, "1")] = 10.0
     max_sigma_m: Annotated[float, Range(1e-3, 1e6, "m")] = 0.25

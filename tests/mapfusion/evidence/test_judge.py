@@ -25,15 +25,15 @@ def verdict(a: LandmarkMap, b: LandmarkMap, judge: Judge = JUDGE) -> tuple[Verdi
     return done.verdict, done.refined
 
 
-COMMON = Wall(16, seed=1)
-A, B = mapped(COMMON, 1, 9, seed=2, name="A"), mapped(COMMON, 5, 14, seed=3, name="B")
+COMMON = Wall(20, seed=1)
+A, B = mapped(COMMON, 1, 11, seed=2, name="A"), mapped(COMMON, 4, 16, seed=3, name="B")
 
 
 def test_common_ground_is_accepted_with_evidence() -> None:
     said, refined = verdict(A, B)
     assert said.status is Status.ACCEPTED
     assert said.reason == ""
-    np.testing.assert_allclose(refined.T_a_b, between(1, 5), atol=0.03)
+    np.testing.assert_allclose(refined.T_a_b, between(1, 4), atol=0.03)
     assert said.n_confirmed >= 2
     assert said.log10_evidence > 1.5
 
@@ -60,6 +60,18 @@ def test_a_picture_that_hangs_twice_leaves_two_places() -> None:
     said, _ = verdict(mapped(wall, 1, 15, seed=8), mapped(other, 3, 7, seed=9))
     assert said.status is Status.AMBIGUOUS
     assert "T_a_b" in said.reason or "hold things twice" in said.reason
+
+
+def test_a_room_that_is_all_there_is_may_be_another_s_like() -> None:
+    """Both robots see 4 m of one wall and nothing else; with ground around it they are sure."""
+    room = Wall(4, seed=11)
+    said, refined = verdict(mapped(room, 0, 4, seed=12), mapped(room, 0.5, 4, seed=13))
+    assert refined.ok
+    assert said.status is Status.AMBIGUOUS
+    assert "little else than this place" in said.reason
+    small = Judge(evidence=EvidenceParameters(place_m=1.0))
+    trusted, _ = verdict(mapped(room, 0, 4, seed=12), mapped(room, 0.5, 4, seed=13), small)
+    assert trusted.status is Status.ACCEPTED
 
 
 def test_without_viewing_evidence_it_is_said_that_none_was_sought() -> None:
