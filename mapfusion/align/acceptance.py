@@ -13,6 +13,7 @@ from mapfusion.align.false_alarms import (
     independent_pairs,
     thin,
 )
+from mapfusion.align.named_landmarks import named_false_alarms
 from mapfusion.align.pairs import MIN_PAIRS, Pairs
 from mapfusion.align.result import Alignment, Status
 from mapfusion.arguments import Range, require_in_range
@@ -79,6 +80,8 @@ class Acceptance:
     correspondences that are neighbours in both maps only the best-matching one is used. And n false
     ones can hide few true ones: the best-matching half, quarter, ... are tested as well.
 
+    Known identities are another matter: see `named_landmarks.py`.
+
     What it cannot see: texture that repeats is not chance. A poster that hangs on two walls gives
     as many supporters as common ground does (`mapfusion/evidence` sees to that).
 
@@ -107,10 +110,14 @@ class Acceptance:
 
     def on(self, pairs: Pairs) -> "ChanceTest":
         """The test for these correspondences, made ready for any number of alignments."""
+        gates_m = np.array(sorted(self.gates_m))
+        if pairs.by_name:
+            in_plan = pairs.in_plan()
+            return ChanceTest(self.false_alarms, gates_m, (in_plan.p_a, in_plan.p_b))
         pairs = pairs[self._independent(pairs)]
         planar = pairs.in_plan()
         independent = independent_pairs(planar.p_a, planar.p_b, self._heights(pairs))
-        return ChanceTest(self.false_alarms, np.array(sorted(self.gates_m)), independent)
+        return ChanceTest(self.false_alarms, gates_m, independent)
 
     def _independent(self, pairs: Pairs) -> np.ndarray:
         """Rows (n,) of the pairs that count, best match first."""
@@ -137,18 +144,22 @@ class ChanceTest:
     Attributes:
         false_alarms: accepted expected number of chance alignments.
         gates_m: (G,) ascending.
-        pairs: the correspondences.
+        pairs: the correspondences, or the places (N, 2) of namesakes in both maps.
     """
 
     false_alarms: float
     gates_m: Float
-    pairs: IndependentPairs
+    pairs: IndependentPairs | tuple[Float, Float]
 
     def judge(self, alignment: Alignment) -> Verdict:
         """Hold one alignment of the correspondences against chance."""
         if not alignment.ok or not np.all(np.isfinite(alignment.T_a_b)):
             return Verdict(alignment.status, math.nan, alignment.reason)
-        log10, gate_m, n, k = fewest_false_alarms(self.pairs, alignment.T_a_b, self.gates_m)
+        if isinstance(self.pairs, IndependentPairs):
+            found = fewest_false_alarms(self.pairs, alignment.T_a_b, self.gates_m)
+        else:
+            found = named_false_alarms(*self.pairs, alignment.T_a_b, self.gates_m)
+        log10, gate_m, n, k = found
         if log10 <= math.log10(self.false_alarms):
             return Verdict(Status.ACCEPTED, log10)
         return Verdict(Status.REFUSED, log10, self._why(log10, gate_m, n, k))

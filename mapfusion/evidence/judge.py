@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from scipy.stats import binom
 
-from mapfusion.align.acceptance import Acceptance, ChanceTest, Verdict
+from mapfusion.align.acceptance import Acceptance, Verdict
 from mapfusion.align.pairs import Pairs
 from mapfusion.align.refine import Refinement
 from mapfusion.align.result import Alignment, Status
@@ -63,8 +63,7 @@ class PairJudge:
 
     def __init__(self, judge: Judge, pairs: Pairs, known: PairEvidence | None) -> None:
         self._judge, self._pairs, self._known = judge, pairs, known
-        self._chance: ChanceTest = judge.acceptance.on(pairs)
-        self._by_name = pairs.map_a.label is not None and pairs.map_b.label is not None
+        self._chance = judge.acceptance.on(pairs)
 
     @cached_property
     def _witnesses(self) -> Witnesses:
@@ -74,7 +73,7 @@ class PairJudge:
     @cached_property
     def evidence(self) -> PairEvidence | None:
         """What the maps say about motions between them; None where it cannot be sought."""
-        if self._by_name or why_not_sought(self._pairs.map_a, self._pairs.map_b):
+        if self._pairs.by_name or why_not_sought(self._pairs.map_a, self._pairs.map_b):
             return None
         if self._known is not None:
             return self._known
@@ -95,7 +94,7 @@ class PairJudge:
             told = {"log10_evidence": ratio, "n_confirmed": regions.n_confirmed}
             told |= {"n_contradicted": regions.n_contradicted}
             status, reason = self._weighed(alignment, regions, ratio, evidence)
-        elif not self._by_name:
+        elif not self._pairs.by_name:
             why = why_not_sought(self._pairs.map_a, self._pairs.map_b)
             reason = f"no evidence to the contrary could be sought: {why}"
         if status is Status.ACCEPTED and (unsure := self._why_unsure(alignment)):

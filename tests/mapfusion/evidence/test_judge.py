@@ -107,7 +107,7 @@ def test_the_sigma_is_stated_where_the_supporters_are() -> None:
     far = np.array([1000.0, -500.0, 0.0])
     moved = [replace(m, position_m=m.position_m + far, viewing=None) for m in (A, B)]
     near, _ = verdict(replace(A, viewing=None), replace(B, viewing=None))
-    assert verdict(*moved)[0].status == near.status == Status.ACCEPTED
+    assert verdict(moved[0], moved[1])[0].status == near.status == Status.ACCEPTED
 
 
 @pytest.mark.parametrize("field", ["gate_m", "region_m", "least_ratio", "max_sigma_m"])

@@ -24,6 +24,7 @@ def random_map(n: int, seed: int) -> LandmarkMap:
 def test_equals_all_pairs() -> None:
     landmarks = random_map(600, 1)
     p, descriptor = landmarks.position_m, landmarks.descriptor
+    assert descriptor is not None
     unlike = np.linalg.norm(descriptor[:, None] - descriptor, axis=2)
     near = np.linalg.norm(p[:, None, :2] - p[None, :, :2], axis=2) < 1.0
     dz2 = (p[:, None, 2] - p[None, :, 2]) ** 2

@@ -64,7 +64,12 @@ def mapped(
     _, first, own, count = np.unique(owner_row, True, True, True)
     observations = Observations(position, np.tile(1e-4 * np.eye(3), (n, 1, 1)))
     log = RobotLog(
-        name, False, np.arange(len(x)) * 0.3, np.zeros((len(x), 3)), np.array(frame), observations
+        name,
+        False,
+        np.linspace(0.0, 60.0, len(x)),
+        np.zeros((len(x), 3)),
+        np.array(frame),
+        observations,
     )
     kept = count >= 3
     source = first[kept]
