@@ -48,7 +48,7 @@ _COLUMNS = {
         translation_error_m rotation_error_rad
         refined_status refined_reason refined_translation_error_m refined_rotation_error_rad
         verdict accepted log10_false_alarms log10_evidence n_confirmed n_contradicted
-        acceptance_reason oracle_distance_m oracle_distance_rad
+        probability acceptance_reason oracle_distance_m oracle_distance_rad
         n_correspondences n_true n_common n_inliers precision recall alignment_nees""",
     # One row per (robot, iteration); best particle online, anchored at the start, no fit. spread_m:
     # root of the trace of the particles' weighted position covariance. n_landmarks: of the best

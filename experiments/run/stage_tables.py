@@ -28,6 +28,7 @@ ESTIMATES = schema(
         log10_evidence=FLOAT,
         n_confirmed=INT,
         n_contradicted=INT,
+        probability=FLOAT,
         acceptance_reason=TEXT,
         drift_sigma_m=FLOAT,
         # upper triangle of the refined alignment's covariance

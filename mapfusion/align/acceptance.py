@@ -35,6 +35,7 @@ class Verdict:
             right; NaN where none was sought.
         n_confirmed: regions that both must have seen, and have.
         n_contradicted: regions that one of them lacks.
+        probability: that it is right; NaN where no evidence was sought.
     """
 
     status: Status
@@ -43,6 +44,7 @@ class Verdict:
     log10_evidence: float = math.nan
     n_confirmed: int = 0
     n_contradicted: int = 0
+    probability: float = math.nan
 
     @property
     def accepted(self) -> bool:

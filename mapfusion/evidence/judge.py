@@ -19,6 +19,7 @@ from mapfusion.evidence.pair_evidence import (
     why_not_sought,
 )
 from mapfusion.evidence.parameters import EvidenceParameters
+from mapfusion.evidence.probability import Signs, probability
 from mapfusion.evidence.regions import Regions, Witness, Witnesses
 from mapfusion.evidence.rivals import DISTINCT_M, apart_m
 from mapfusion.se2 import Float, motion_sigma
@@ -93,6 +94,7 @@ class PairJudge:
             ratio = regions.log10_ratio(evidence.twin_share)
             told = {"log10_evidence": ratio, "n_confirmed": regions.n_confirmed}
             told |= {"n_contradicted": regions.n_contradicted}
+            told |= {"probability": probability(self._signs(alignment, regions, ratio, evidence))}
             status, reason = self._weighed(alignment, regions, ratio, evidence)
         elif not self._pairs.by_name:
             why = why_not_sought(self._pairs.map_a, self._pairs.map_b)
@@ -100,6 +102,24 @@ class PairJudge:
         if status is Status.ACCEPTED and (unsure := self._why_unsure(alignment)):
             status, reason = Status.TOO_UNCERTAIN, unsure
         return Verdict(status, by_chance.log10_false_alarms, reason, **told)
+
+    def signs(self, alignment: Alignment) -> Signs | None:
+        """What speaks for and against an alignment; None where no evidence can be sought."""
+        if self.evidence is None:
+            return None
+        regions = self._witnesses.regions(alignment.T_a_b, self.evidence.region_m)
+        ratio = regions.log10_ratio(self.evidence.twin_share)
+        return self._signs(alignment, regions, ratio, self.evidence)
+
+    def _signs(
+        self, alignment: Alignment, regions: Regions, ratio: float, evidence: PairEvidence
+    ) -> Signs:
+        counts = (regions.n_confirmed, regions.n_contradicted, int(alignment.inlier.sum()))
+        support = (each.n_support for each in self._others(alignment.T_a_b, evidence))
+        extent_m = self._extent_m(alignment)
+        repeats = evidence.repeats(math.log10(self._judge.acceptance.false_alarms))
+        one_place = self._is_one_place(alignment, extent_m)
+        return Signs(ratio, *counts, max(support, default=0), extent_m, repeats, one_place)
 
     def _weighed(
         self, alignment: Alignment, regions: Regions, ratio: float, evidence: PairEvidence
@@ -144,14 +164,17 @@ class PairJudge:
         It is more than chance, or both robots saw what it says: of two copies of a picture each
         gets half the correspondences.
         """
-        p_b = self._pairs.map_b.position_m[:, :2]
         others = [
             each
-            for each in evidence.rivals
-            if (each.log10_false_alarms <= bound or each.log10_ratio > 0)
-            and apart_m(T_a_b, each.T_a_b, p_b) >= DISTINCT_M
+            for each in self._others(T_a_b, evidence)
+            if each.log10_false_alarms <= bound or each.log10_ratio > 0
         ]
         return max(others, key=lambda each: each.log10_ratio, default=None)
+
+    def _others(self, T_a_b: Float, evidence: PairEvidence) -> list[RivalMotion]:
+        """The rivals that are another motion."""
+        p_b = self._pairs.map_b.position_m[:, :2]
+        return [each for each in evidence.rivals if apart_m(T_a_b, each.T_a_b, p_b) >= DISTINCT_M]
 
     def _extent_m(self, alignment: Alignment) -> float:
         """The longer side of where the supporters lie."""

@@ -22,7 +22,8 @@ _MOTIONS |= columns(".4f", refined_theta_rad="\ntheta, rad")
 _MOTIONS |= columns(".3f", sigma_m="sigma\nm") | columns(".4f", sigma_rad="\nrad")
 _VERDICTS = columns("", aligner="aligner", verdict="verdict") | columns(">", inliers="inliers")
 _VERDICTS |= columns(".0f", log10_false_alarms="NFA\nlog10")
-_VERDICTS |= columns("+.1f", log10_evidence="evidence\nlog10") | columns(">", time="time\nms")
+_VERDICTS |= columns("+.1f", log10_evidence="evidence\nlog10")
+_VERDICTS |= columns(".2f", probability="prob.\nright") | columns(">", time="time\nms")
 
 
 def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
