@@ -19,6 +19,8 @@ _NAMES_OF = {
     "align.registry": ("make_aligner",),
     "align.result": ("Alignment", "Status"),
     "errors": ("InputError",),
+    "evidence.judge": ("Judge",),
+    "evidence.parameters": ("EvidenceParameters",),
     "fastslam.association": ("Association",),
     "fastslam.filter": ("FastSlam", "StepResult"),
     "fastslam.motion": ("MotionNoise",),

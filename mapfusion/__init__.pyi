@@ -10,6 +10,8 @@ from mapfusion.align.registry import make_aligner as make_aligner
 from mapfusion.align.result import Alignment as Alignment
 from mapfusion.align.result import Status as Status
 from mapfusion.errors import InputError as InputError
+from mapfusion.evidence.judge import Judge as Judge
+from mapfusion.evidence.parameters import EvidenceParameters as EvidenceParameters
 from mapfusion.fastslam.association import Association as Association
 from mapfusion.fastslam.filter import FastSlam as FastSlam
 from mapfusion.fastslam.filter import StepResult as StepResult

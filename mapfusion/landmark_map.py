@@ -2,7 +2,7 @@
 
 One map is one Parquet file, readable with plain pandas, complete in itself: the descriptor (or
 label) of the observation that each landmark came from is carried with it. What the landmarks'
-errors have in common, where it is known, lies in a file beside it.
+errors have in common, and from where they were seen, lies in files beside it, where it is known.
 """
 
 from dataclasses import dataclass, replace
@@ -37,6 +37,8 @@ from mapfusion.storage import (
     schema,
     write_table,
 )
+from mapfusion.viewing import Viewing
+from mapfusion.viewing_files import read_viewing, write_viewing
 
 LANDMARKS = schema(
     "landmark_map",
@@ -68,6 +70,7 @@ class LandmarkMap:
         planar: z is 0 and carries no information (2 degrees of freedom).
         name: whose map it is.
         joint: what the landmarks' errors have in common, or None; its marginals are covariance_m2.
+        viewing: from where they were seen and what the robot looked through, or None.
     """
 
     position_m: Float
@@ -79,6 +82,7 @@ class LandmarkMap:
     planar: bool = False
     name: str = "map"
     joint: JointCovariance | None = None
+    viewing: Viewing | None = None
 
     def __post_init__(self) -> None:
         n = len(self.position_m)
@@ -94,18 +98,23 @@ class LandmarkMap:
             require_shape("label", self.label, (n,))
         if self.joint is not None and len(self.joint) != n:
             raise ValueError(f"joint: of {len(self.joint)} landmarks, the map has {n}")
+        if self.viewing is not None and len(self.viewing) != n:
+            raise ValueError(f"viewing: of {len(self.viewing)} landmarks, the map has {n}")
 
     def __len__(self) -> int:
         return len(self.position_m)
 
     def __getitem__(self, rows: np.ndarray) -> "LandmarkMap":
         joint = None if self.joint is None else self.joint[rows]
-        return replace(with_rows(replace(self, joint=None), rows), joint=joint)
+        viewing = None if self.viewing is None else self.viewing[rows]
+        bare = with_rows(replace(self, joint=None, viewing=None), rows)
+        return replace(bare, joint=joint, viewing=viewing)
 
 
 def write_map(path: Path, landmarks: LandmarkMap) -> None:
-    """Write a map to a file, its joint covariance (if it has one) to `NAME.joint.parquet`."""
+    """Write a map to a file; what it has of a joint covariance and viewing evidence beside it."""
     write_joint(path, landmarks.joint)
+    write_viewing(path, landmarks.viewing)
     write_table(
         path,
         {
@@ -120,7 +129,7 @@ def write_map(path: Path, landmarks: LandmarkMap) -> None:
 
 
 def read_map(path: Path) -> LandmarkMap:
-    """Read a map, with the joint covariance beside it; raises InputError that names the file."""
+    """Read a map, with what lies beside it; raises InputError that names the file."""
     table, attributes = read_open_table(path, LANDMARKS)
     position, covariance = points_from(table)
     planar = attributes.get("planar") == "true"
@@ -138,4 +147,5 @@ def read_map(path: Path) -> LandmarkMap:
         require_no_twins("landmarks", position, covariance.reshape(-1, 9))
     except ValueError as error:
         raise InputError(f"{path}: {error}") from error
-    return replace(found, joint=read_joint(path, covariance))
+    viewing = read_viewing(path, len(found))
+    return replace(found, joint=read_joint(path, covariance), viewing=viewing)

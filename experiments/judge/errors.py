@@ -9,13 +9,17 @@ import pandas as pd
 
 from experiments.judge.criteria import ORACLE
 from experiments.judge.truth import PathTruth, common_landmarks, squared_mahalanobis, true_pairs
-from experiments.run.estimates import alignment_of, correspondences_of, estimate_row
+from experiments.run.estimates import (
+    alignment_of,
+    correspondences_of,
+    estimate_row,
+    evidence_of,
+)
 from mapfusion import se2
-from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.oracle import Oracle
 from mapfusion.align.pairs import Pairs
-from mapfusion.align.refine import Refinement
+from mapfusion.evidence.judge import Judge
 from mapfusion.fused_map import AlignedPair
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.se2 import Float
@@ -44,7 +48,10 @@ class EvaluatedRobot:
 
 @dataclass(frozen=True)
 class MetMaps:
-    """Maps of two robots at one iteration, what aligners were offered, and what they answered."""
+    """Maps of two robots at one iteration, what aligners were offered, and what they answered.
+
+    With the rival motions that were found for them.
+    """
 
     a: EvaluatedRobot
     b: EvaluatedRobot
@@ -53,6 +60,7 @@ class MetMaps:
     points_world_m: tuple[Float, Float]
     offered: Correspondences
     estimates: pd.DataFrame
+    rivals: pd.DataFrame
 
     @property
     def names(self) -> dict[str, Any]:
@@ -76,18 +84,23 @@ class MetMaps:
 
 
 def met_maps(
-    robots: Sequence[EvaluatedRobot], estimates: pd.DataFrame, correspondences: pd.DataFrame
+    robots: Sequence[EvaluatedRobot],
+    estimates: pd.DataFrame,
+    correspondences: pd.DataFrame,
+    rivals: pd.DataFrame,
 ) -> list[MetMaps]:
-    """All pairs and iterations of the tables `estimates` and `correspondences`, in their order."""
+    """All pairs and iterations of the tables of these names, in their order."""
     by_name = {robot.name: robot for robot in robots}
-    offered = dict(iter(correspondences.groupby(_MEETING)))
+    offered, rival = (dict(iter(rows.groupby(_MEETING))) for rows in (correspondences, rivals))
     met = []
     for key, rows in estimates.groupby(_MEETING, sort=False):
         name_a, name_b, iteration = cast("tuple[str, str, int]", key)
         a, b = by_name[name_a], by_name[name_b]
         (map_a, points_a), (map_b, points_b) = a.at(iteration), b.at(iteration)
         pairs = correspondences_of(offered.get(key, correspondences.iloc[:0]))
-        met.append(MetMaps(a, b, iteration, (map_a, map_b), (points_a, points_b), pairs, rows))
+        maps, points = (map_a, map_b), (points_a, points_b)
+        others = rival.get(key, rivals.iloc[:0])
+        met.append(MetMaps(a, b, iteration, maps, points, pairs, rows, others))
     return met
 
 
@@ -100,14 +113,13 @@ def alignment_nees(T_estimate: Float, covariance: Float, T_true: Float) -> float
     return float(squared_mahalanobis(error, covariance))
 
 
-def error_rows(
-    met: MetMaps, refinement: Refinement, acceptance: Acceptance, radius_m: float
-) -> pd.DataFrame:
+def error_rows(met: MetMaps, judge: Judge, radius_m: float) -> pd.DataFrame:
     """Rows of the table `errors` of one pair of maps, the oracle's first."""
     is_true, pairs = met.is_true(radius_m), Pairs(*met.maps, met.offered)
-    oracle = Oracle(refinement).align(pairs, is_true)
+    oracle = Oracle(judge.refinement).align(pairs, is_true)
+    evidence = evidence_of(met.rivals, judge.evidence)
     row = met.names | {"aligner": ORACLE, "repetition": 0}
-    row |= estimate_row(len(pairs), oracle, oracle, acceptance.judge(pairs, oracle))
+    row |= estimate_row(len(pairs), oracle, oracle, judge.on(pairs, evidence).judge(oracle))
     records = [row, *met.estimates.to_dict("records")]
     rows, alignments = pd.DataFrame(records), [alignment_of(each, len(pairs)) for each in records]
     T_true = se2.between(met.a.path.T_world_map, met.b.path.T_world_map)

@@ -10,7 +10,7 @@ from experiments.judge import judging, tables
 from experiments.judge.errors import EvaluatedRobot, met_maps
 from experiments.judge.fused_landmarks import FusedTeam, MergeSettings
 from experiments.judge.judged_fusers import GivenMap, JudgedFusion
-from experiments.judge.judging import JudgeSettings
+from experiments.judge.judging import ALIGNED, JudgeSettings
 from experiments.judge.known_truth import why_no_truth
 from experiments.judge.smoothed_robots import SmoothedRobot, load_smoothed
 from experiments.run.memory import require_memory
@@ -44,7 +44,7 @@ class JudgedRun:
         pipeline, chosen = lay_out(scenario), scenario.merge
         merge = MergeSettings(chosen.aligner, chosen.parameters)
         align, radius_m = scenario.align, scenario.evaluate.true_pair_radius_m
-        settings = JudgeSettings(align.refinement, align.acceptance, merge, radius_m)
+        settings = JudgeSettings(align.judge, merge, radius_m)
         no_truth = why_no_truth(scenario)
         judged = () if no_truth else pipeline.pairs
         judgements = tuple(_judgement(settings, pair) for pair in judged)
@@ -99,7 +99,7 @@ class JudgedRun:
     def load_team(self) -> FusedTeam:
         """All robots' last maps, merged by the paper's fuser."""
         robots = self.load_robots()
-        met = met_maps(robots, self.pair_table("estimates"), self.pair_table("correspondences"))
+        met = met_maps(robots, *map(self.pair_table, ALIGNED))
         return FusedTeam.of(robots, met, self.settings.merge)
 
     def pair_table(self, name: str) -> pd.DataFrame:

@@ -13,20 +13,19 @@ from experiments.judge.truth import PathTruth, landmark_truth
 from experiments.run.frames import read_rows
 from experiments.run.job import Job
 from experiments.run.stages.slam import ASSOCIATIONS, RobotFolders, read_snapshots
-from mapfusion.align.acceptance import Acceptance
-from mapfusion.align.refine import Refinement
 from mapfusion.errors import InputError
+from mapfusion.evidence.judge import Judge
 from mapfusion.robot_log import TRUTH_FILES, RobotLog, RobotTruth, read_log, read_truth
 
 WRITES = ("errors.parquet", "fusion.parquet")
+ALIGNED = ("estimates", "correspondences", "rivals")  # tables of the align stage, per pair of maps
 
 
 @dataclass(frozen=True)
 class JudgeSettings:
     """All that the judgement depends on, beside maps, estimates and truth."""
 
-    refinement: Refinement
-    acceptance: Acceptance
+    judge: Judge
     merge: MergeSettings
     true_pair_radius_m: float
 
@@ -59,13 +58,9 @@ def run(settings: JudgeSettings, job: Job) -> None:
         load_robot(RobotFolders(job.inputs[f"log_{side}"], job.inputs[f"slam_{side}"]))
         for side in "ab"
     ]
-    estimates, offered = (
-        tables.read(job.inputs["align"] / f"{name}.parquet", name)
-        for name in ("estimates", "correspondences")
-    )
-    met, radius_m = met_maps(robots, estimates, offered), settings.true_pair_radius_m
-    judged_by = settings.refinement, settings.acceptance, radius_m
-    errors = pd.concat([error_rows(maps, *judged_by) for maps in met])
+    aligned = [tables.read(job.inputs["align"] / f"{name}.parquet", name) for name in ALIGNED]
+    met, radius_m = met_maps(robots, *aligned), settings.true_pair_radius_m
+    errors = pd.concat([error_rows(maps, settings.judge, radius_m) for maps in met])
     tables.write(job.output / "errors.parquet", "errors", errors)
     fusion = fusion_rows(met, settings.merge, radius_m)
     tables.write(job.output / "fusion.parquet", "fusion", fusion)

@@ -22,6 +22,7 @@ from experiments.judge.fused_landmarks import FusedTeam
 from experiments.judge.fuser_coverage import coverage_rows
 from experiments.judge.judged_fusers import JudgedFusion, fuser_rows
 from experiments.judge.judged_run import JudgedRun
+from experiments.judge.judging import ALIGNED
 from experiments.judge.map_history import history_tables
 from experiments.judge.path_errors import path_statistics_rows, robot_paths
 from experiments.judge.smoothed_robots import SmoothedRobot, smoothed_path_rows, smoother_rows
@@ -209,7 +210,7 @@ def all_tables(
         ),
     }
     makers |= dict.fromkeys(judged, list) if run.no_truth else judged
-    for name in ("estimates", "correspondences", "errors", "fusion"):
+    for name in (*ALIGNED, "errors", "fusion"):
         makers[name] = partial(run.pair_table, name)
     return {name: tables.framed(name, make()) for name, make in makers.items() if name in only}
 

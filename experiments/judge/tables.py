@@ -13,16 +13,17 @@ import pandas as pd
 import pyarrow as pa
 
 from experiments.run import frames
-from experiments.run.stage_tables import CORRESPONDENCES, ESTIMATES, TRACKS
+from experiments.run.stage_tables import CORRESPONDENCES, ESTIMATES, RIVALS, TRACKS
 from mapfusion.storage import COVARIANCE_FIELDS, POSITION_FIELDS, schema
 
 # Names that are no floats.
 _NAMES = {
-    frames.TEXT: """aligner delta_unit fallback fuser landmarks left_out map name not_smoothed place
-        quantity reason refined_reason refined_status robot robot_a robot_b source stage status""",
+    frames.TEXT: """acceptance_reason aligner delta_unit fallback fuser landmarks left_out map name
+        not_smoothed place quantity reason refined_reason refined_status robot robot_a robot_b
+        source stage status verdict""",
     frames.INT: """component count degrees_of_freedom frame iteration landmark landmark_a landmark_b
-        n n_common n_correspondences n_inliers n_landmarks n_parents n_robots n_steps n_team n_true
-        particle repetition""",
+        n n_common n_confirmed n_contradicted n_correspondences n_inliers n_landmarks n_parents
+        n_robots n_steps n_team n_true particle repetition""",
     frames.BOOL: "accepted resampled true_pair",
 }
 # In plan: single precision, for looking at and not for computing with, takes half the size.
@@ -32,21 +33,22 @@ _OTHER_TYPES = {
     "fused_history": dict.fromkeys(_PLAN, pa.float32()),
     "true_pairs": {"true_pair": pa.binary()},
 }
-_VERSIONS = {"errors": 3}  # of the others: 1
+_VERSIONS = {"errors": 4}  # of the others: 1
 UNKNOWN = -1  # a count that only the truth could tell
 _POINT = " ".join(POSITION_FIELDS + COVARIANCE_FIELDS)
 _COLUMNS = {
     # One row per (robot pair, iteration, aligner, repetition), the estimates joined with the truth.
     # The aligner named "oracle" was given the true pairs; it has one repetition. rotation_error_rad
-    # is signed, estimate minus truth; accepted and log10_false_alarms are of the refined alignment,
-    # by the test against chance; oracle_distance: of the refined alignment from the oracle's;
+    # is signed, estimate minus truth; verdict to acceptance_reason are of the refined alignment
+    # (mapfusion/evidence); oracle_distance: of the refined alignment from the oracle's;
     # n_true: true ones among the correspondences; n_common: landmarks of the two maps that truly
     # correspond; precision and recall: of the refined inliers; alignment_nees: refined, 3 degrees
     # of freedom.
     "errors": """robot_a robot_b iteration aligner repetition status reason
         translation_error_m rotation_error_rad
         refined_status refined_reason refined_translation_error_m refined_rotation_error_rad
-        accepted log10_false_alarms oracle_distance_m oracle_distance_rad
+        verdict accepted log10_false_alarms log10_evidence n_confirmed n_contradicted
+        probability acceptance_reason oracle_distance_m oracle_distance_rad
         n_correspondences n_true n_common n_inliers precision recall alignment_nees""",
     # One row per (robot, iteration); best particle online, anchored at the start, no fit. spread_m:
     # root of the trace of the particles' weighted position covariance. n_landmarks: of the best
@@ -165,7 +167,8 @@ def _schema(name: str) -> pa.Schema:
     return schema(f"result.{name}", _VERSIONS.get(name, 1), frames.fields(**columns))
 
 
-ALL = {"estimates": ESTIMATES, "correspondences": CORRESPONDENCES, "tracks": TRACKS}
+ALL = {"estimates": ESTIMATES, "correspondences": CORRESPONDENCES, "rivals": RIVALS}
+ALL |= {"tracks": TRACKS}
 ALL |= {name: _schema(name) for name in _COLUMNS}
 
 

@@ -14,6 +14,7 @@ from experiments.run.tasks import OnProgress
 from experiments.scenario.randomness import generator
 from experiments.scenario.settings import Align, AlignerEntry, AnyScenario, Recording, Scenario
 from mapfusion.align.correspondences import match
+from mapfusion.align.pairs import Pairs
 from mapfusion.align.registration import Registration
 from mapfusion.align.result import NOT_RUN, Status
 from mapfusion.errors import InputError
@@ -84,7 +85,7 @@ def save_fused(path: Path, fusion: Fusion) -> list[Path]:
 
 def _registration(entry: AlignerEntry, settings: Align) -> Registration:
     aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
-    return Registration(aligner, settings.refinement, settings.acceptance)
+    return Registration(aligner, settings.refinement, settings.judge)
 
 
 def align(path_a: Path, path_b: Path, settings: Scenario) -> list[dict[str, Any]]:
@@ -95,9 +96,10 @@ def align(path_a: Path, path_b: Path, settings: Scenario) -> list[dict[str, Any]
     """
     map_a, map_b = read_map(path_a), read_map(path_b)
     pairs = match(map_a, map_b, settings.align.match)
+    evidence = settings.align.judge.on(Pairs(map_a, map_b, pairs)).evidence
     rows = []
     for entry in settings.align.aligners:
-        registration = _registration(entry, settings.align).on(map_a, map_b, pairs)
+        registration = _registration(entry, settings.align).on(map_a, map_b, pairs, evidence)
         done = registration.register(generator(settings.seed, "align", entry.name))
         if done.estimated.status not in NOT_RUN:
             done = registration.register(generator(settings.seed, "align", entry.name))
@@ -108,10 +110,12 @@ def align(path_a: Path, path_b: Path, settings: Scenario) -> list[dict[str, Any]
 
 
 def verdict_on(row: Mapping[str, Any]) -> tuple[Status, str]:
-    """What became of an estimate (a row of `align`) in the end, and why it was not accepted."""
-    if row["accepted"]:
-        return Status.ACCEPTED, ""
-    status = Status(row["status"]) if row["status"] in NOT_RUN else Status.REFUSED
+    """What became of an estimate (a row of `align`) in the end, and what is to be said of it."""
+    status = Status(row["verdict"])
+    if row["status"] in NOT_RUN:
+        status = Status(row["status"])
+    elif status is Status.DEGENERATE:
+        status = Status.REFUSED
     return status, row["reason"] or row["refined_reason"] or row["acceptance_reason"]
 
 

@@ -11,9 +11,12 @@ from experiments.run.stage_tables import COVARIANCE, MOTION
 from mapfusion.align.acceptance import Verdict
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.result import Alignment, Status
+from mapfusion.evidence.pair_evidence import PairEvidence, RivalMotion
+from mapfusion.evidence.parameters import EvidenceParameters
 from mapfusion.se2 import Float
 from mapfusion.storage import covariances_from
 
+_RIVAL_COUNTS = ("n_support", "n_confirmed", "n_contradicted", "n_regions")
 _UPPER = np.triu_indices(3)
 
 
@@ -23,8 +26,13 @@ def estimate_row(
     """One estimate, its refinement and the verdict on it as columns of the table `estimates`."""
     row = {
         "n_correspondences": n_correspondences,
+        "verdict": str(verdict.status),
         "accepted": verdict.accepted,
         "log10_false_alarms": verdict.log10_false_alarms,
+        "log10_evidence": verdict.log10_evidence,
+        "n_confirmed": verdict.n_confirmed,
+        "n_contradicted": verdict.n_contradicted,
+        "probability": verdict.probability,
         "acceptance_reason": verdict.reason,
         "drift_sigma_m": refined.drift_sigma_m,
         **dict(zip(COVARIANCE, refined.covariance[_UPPER], strict=True)),
@@ -47,14 +55,50 @@ def covariances_of(rows: pd.DataFrame) -> Float:
 
 
 def alignment_of(row: Mapping[Any, Any], n_correspondences: int) -> Alignment:
-    """The refined alignment a row of `estimates` tells of, refused where the verdict says so."""
+    """The refined alignment a row of `estimates` tells of, with the status of the verdict."""
     covariance = np.empty((3, 3))
     covariance[_UPPER] = covariance.T[_UPPER] = [row[name] for name in COVARIANCE]
-    verdict = Verdict(bool(row["accepted"]), row["log10_false_alarms"], row["acceptance_reason"])
+    sureness, reason = row["log10_false_alarms"], row["acceptance_reason"]
+    verdict = Verdict(Status(row["verdict"]), sureness, reason)
     T_a_b = np.array([row[f"refined_{name}"] for name in MOTION])
     inlier = inlier_mask(row["refined_inliers"], n_correspondences)
     outcome = (Status(row["refined_status"]), row["refined_reason"], row["drift_sigma_m"])
     return verdict.applied_to(Alignment(T_a_b, covariance, inlier, np.nan, *outcome))
+
+
+def rival_rows(names: Mapping[str, Any], evidence: PairEvidence) -> list[dict[str, Any]]:
+    """Rows of the table `rivals` of one pair of maps."""
+    both = {"twin_share": evidence.twin_share, "region_m": evidence.region_m}
+    return [
+        {
+            **names,
+            "of": motion.of,
+            **dict(zip(MOTION, motion.T_a_b, strict=True)),
+            "log10_false_alarms": motion.log10_false_alarms,
+            **{name: getattr(motion, name) for name in _RIVAL_COUNTS},
+            "log10_evidence": motion.log10_ratio,
+            **both,
+        }
+        for motion in evidence.motions
+    ]
+
+
+def evidence_of(rows: pd.DataFrame, parameters: EvidenceParameters) -> PairEvidence:
+    """What rows of `rivals` of one pair and iteration hold: nothing, where no motion was found."""
+    motions = tuple(
+        RivalMotion(
+            row["of"],
+            np.array([row[name] for name in MOTION]),
+            row["log10_false_alarms"],
+            **{name: row[name] for name in _RIVAL_COUNTS},
+            log10_ratio=row["log10_evidence"],
+        )
+        for row in rows.to_dict("records")
+    )
+    if not motions:
+        return PairEvidence.of_nothing(parameters)
+    first = rows.iloc[0]
+    return PairEvidence(motions, float(first["twin_share"]), float(first["region_m"]))
 
 
 def correspondences_of(rows: pd.DataFrame) -> Correspondences:

@@ -13,7 +13,7 @@ _ANSWER = {"status": TEXT, "reason": TEXT} | dict.fromkeys(MOTION, FLOAT)
 # What the aligners said, without any truth: the align stage writes it.
 ESTIMATES = schema(
     "result.estimates",
-    2,
+    3,
     fields(
         **_MAPS,
         aligner=TEXT,
@@ -21,9 +21,14 @@ ESTIMATES = schema(
         n_correspondences=INT,
         **_ANSWER,
         **{f"refined_{name}": kind for name, kind in _ANSWER.items()},
-        # of the refined alignment, against chance; NaN where there was none to judge
+        # of the refined alignment; NaN where there was none to judge, or no evidence to be sought
+        verdict=TEXT,
         accepted=BOOL,
         log10_false_alarms=FLOAT,
+        log10_evidence=FLOAT,
+        n_confirmed=INT,
+        n_contradicted=INT,
+        probability=FLOAT,
         acceptance_reason=TEXT,
         drift_sigma_m=FLOAT,
         # upper triangle of the refined alignment's covariance
@@ -37,6 +42,27 @@ ESTIMATES = schema(
 # The pairs offered to the aligners; rows of the two maps at that iteration.
 _OFFERED = fields(**_MAPS, index_a=INT, index_b=INT, descriptor_distance=FLOAT)
 CORRESPONDENCES = schema("result.correspondences", 1, _OFFERED)
+
+# What was found once for each two maps: the best distinct motions between them (of: "a b"), and of
+# each map onto itself ("a", "b"). log10_evidence: of the first, as of estimates; twin_share: of the
+# regions that a wrong motion lays on their like; region_m: side of a region.
+RIVALS = schema(
+    "result.rivals",
+    1,
+    fields(
+        **_MAPS,
+        of=TEXT,
+        **dict.fromkeys(MOTION, FLOAT),
+        log10_false_alarms=FLOAT,
+        n_support=INT,
+        n_confirmed=INT,
+        n_contradicted=INT,
+        n_regions=INT,
+        log10_evidence=FLOAT,
+        twin_share=FLOAT,
+        region_m=FLOAT,
+    ),
+)
 
 # Harris points of a few consecutive frames, for figure 1.
 _POINT = fields(robot=TEXT, iteration=INT, track=pa.int64(), length=INT, u_px=FLOAT, v_px=FLOAT)

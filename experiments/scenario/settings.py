@@ -32,6 +32,8 @@ from mapfusion.align.refine import Refinement
 from mapfusion.arguments import Range
 from mapfusion.camera import StereoCamera
 from mapfusion.errors import OutOfRangeError
+from mapfusion.evidence.judge import Judge
+from mapfusion.evidence.parameters import EvidenceParameters
 from mapfusion.fuse.parameters import MergeParameters
 from mapfusion.fuse.registry import USUAL
 from mapfusion.vision.frontend import FrontEndParameters
@@ -82,7 +84,7 @@ DEFAULT_ALIGNERS = [
 
 
 class Align(Section):
-    """Correspondences, the aligners on them, the least squares after each, the test against chance.
+    """Correspondences, the aligners on them, the least squares after each, the verdict on each.
 
     Attributes:
         match: how landmarks are paired.
@@ -90,6 +92,7 @@ class Align(Section):
         also: aligners beside those of `aligners`, which need not be repeated then.
         refinement: least squares after each aligner.
         acceptance: the test of each alignment against chance.
+        evidence: what both robots saw, for and against it, and how sure it has to be.
         repetitions: of randomised aligners on each pair of maps, so that their own spread is seen.
     """
 
@@ -100,7 +103,13 @@ class Align(Section):
     also: list[AlignerEntry] = Field(default_factory=list, max_length=MAX_NAMED)
     refinement: Refinement = Refinement()
     acceptance: Acceptance = Acceptance()
+    evidence: EvidenceParameters = EvidenceParameters()
     repetitions: Annotated[int, Range(1, 1000, "repetitions")] = 20
+
+    @property
+    def judge(self) -> Judge:
+        """What gives the verdict on each alignment."""
+        return Judge(self.acceptance, self.evidence, self.refinement)
 
     @model_validator(mode="after")
     def _unique(self) -> Self:

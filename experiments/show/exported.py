@@ -30,6 +30,7 @@ from mapfusion.recordings.ply import ply_text
 from mapfusion.recordings.tum import tum_text
 from mapfusion.se2 import Float
 from mapfusion.storage import POSE_FIELDS
+from mapfusion.viewing_files import viewing_paths
 
 # The least an odometry edge may claim to know: a solver cannot weigh what has no error at all, as
 # standing still has none. A tenth of what encoders resolve over a frame.
@@ -163,7 +164,8 @@ def _believed_alignments(data: ResultTables) -> Iterator[tuple[str, str, dict[An
 def _ply_files(data: ResultTables) -> Iterator[tuple[str, str]]:
     """A file a map, as many as the result has."""
     files = sorted((data.folder / "maps").glob("*.parquet"))
-    beside = set(map(joint_path, files))  # what a map's landmarks have in common is no map
+    # what a map's landmarks have in common, and how they were seen, is no map
+    beside = {each for path in files for each in (joint_path(path), *viewing_paths(path))}
     for path in (file for file in files if file not in beside):
         landmarks, name = read_map(path), path.stem
         robot = name.partition(".")[0]  # R1.smoothed is R1's, too

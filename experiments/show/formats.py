@@ -9,7 +9,14 @@ import pyarrow as pa
 from experiments.judge import tables
 from experiments.show.export import write_text
 from experiments.show.inspect import unit_of
-from mapfusion import attitude, joint_files, landmark_map, odometry_covariance, robot_log
+from mapfusion import (
+    attitude,
+    joint_files,
+    landmark_map,
+    odometry_covariance,
+    robot_log,
+    viewing_files,
+)
 from mapfusion.joint_covariance import RANK
 from mapfusion.open_tables import HEIGHT, about, default_of
 
@@ -19,6 +26,12 @@ _OPEN = {
     "A map: one file, `NAME.parquet` or `NAME.csv`": landmark_map.LANDMARKS,
     "A map's joint covariance: `NAME.joint.parquet` beside it, one row a landmark": (
         joint_files.joint_schema(RANK)
+    ),
+    "A map's viewing evidence: `NAME.viewing.parquet` beside it, one row a landmark": (
+        viewing_files.VIEWING
+    ),
+    "A map's viewing evidence: `NAME.frames.parquet` beside it, one row a frame": (
+        viewing_files.VIEWED_FRAMES
     ),
     "A log: `frames`, one row an iteration, also of those that saw nothing": robot_log.FRAMES,
     "A log: `observations`, one row a sighting": robot_log.OBSERVATIONS,

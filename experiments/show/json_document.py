@@ -77,7 +77,8 @@ def _aligner(row: Mapping[str, Any]) -> dict[str, Any]:
     told |= {"estimated": _motion([row[name] for name in MOTION]) if estimated else None}
     told |= {"estimated_status": row["status"], "estimated_reason": row["reason"] or None}
     told |= {"refined": refined if accepted else None}
-    numbers = ("n_inliers", "n_correspondences", "log10_false_alarms", "elapsed_s")
+    numbers = ("n_inliers", "n_correspondences", "log10_false_alarms", "log10_evidence")
+    numbers += ("n_confirmed", "n_contradicted", "probability", "elapsed_s")
     return told | {name: row[name] for name in numbers}
 
 

@@ -13,6 +13,7 @@ from mapfusion.align.false_alarms import (
     independent_pairs,
     thin,
 )
+from mapfusion.align.named_landmarks import named_false_alarms
 from mapfusion.align.pairs import MIN_PAIRS, Pairs
 from mapfusion.align.result import Alignment, Status
 from mapfusion.arguments import Range, require_in_range
@@ -26,21 +27,35 @@ class Verdict:
     """Whether an alignment may be used.
 
     Attributes:
-        accepted: by the estimator and by the test against chance.
+        status: accepted, or why not; that of the alignment where it failed before.
         log10_false_alarms: decimal logarithm of how many alignments at least this well supported
             chance is expected to give for these two maps; NaN where there was none to judge.
-        reason: empty when accepted, else what a person can act on.
+        reason: what a person can act on, or has to know of an accepted one; else empty.
+        log10_evidence: decimal logarithm of how much likelier what both robots saw is if it is
+            right; NaN where none was sought.
+        n_confirmed: regions that both must have seen, and have.
+        n_contradicted: regions that one of them lacks.
+        probability: that it is right; NaN where no evidence was sought.
     """
 
-    accepted: bool
+    status: Status
     log10_false_alarms: float
     reason: str = ""
+    log10_evidence: float = math.nan
+    n_confirmed: int = 0
+    n_contradicted: int = 0
+    probability: float = math.nan
+
+    @property
+    def accepted(self) -> bool:
+        """By the estimator and by all tests."""
+        return self.status is Status.ACCEPTED
 
     def applied_to(self, alignment: Alignment) -> Alignment:
-        """The alignment, refused where the verdict says so; a failed one stays what it is."""
+        """The alignment with the status of the verdict; a failed one stays what it is."""
         if self.accepted or not alignment.ok:
             return alignment
-        return replace(alignment, status=Status.REFUSED, reason=self.reason)
+        return replace(alignment, status=self.status, reason=self.reason)
 
 
 @dataclass(frozen=True)
@@ -67,8 +82,10 @@ class Acceptance:
     correspondences that are neighbours in both maps only the best-matching one is used. And n false
     ones can hide few true ones: the best-matching half, quarter, ... are tested as well.
 
+    Known identities are another matter: see `named_landmarks.py`.
+
     What it cannot see: texture that repeats is not chance. A poster that hangs on two walls gives
-    as many supporters as common ground does.
+    as many supporters as common ground does (`mapfusion/evidence` sees to that).
 
     Attributes:
         false_alarms: accepted expected number of chance alignments for a pair of maps.
@@ -91,14 +108,18 @@ class Acceptance:
 
     def judge(self, pairs: Pairs, alignment: Alignment) -> Verdict:
         """Hold an alignment of these correspondences against chance."""
-        return self.against_chance(pairs).judge(alignment)
+        return self.on(pairs).judge(alignment)
 
-    def against_chance(self, pairs: Pairs) -> "ChanceTest":
+    def on(self, pairs: Pairs) -> "ChanceTest":
         """The test for these correspondences, made ready for any number of alignments."""
+        gates_m = np.array(sorted(self.gates_m))
+        if pairs.by_name:
+            in_plan = pairs.in_plan()
+            return ChanceTest(self.false_alarms, gates_m, (in_plan.p_a, in_plan.p_b))
         pairs = pairs[self._independent(pairs)]
         planar = pairs.in_plan()
         independent = independent_pairs(planar.p_a, planar.p_b, self._heights(pairs))
-        return ChanceTest(self.false_alarms, np.array(sorted(self.gates_m)), independent)
+        return ChanceTest(self.false_alarms, gates_m, independent)
 
     def _independent(self, pairs: Pairs) -> np.ndarray:
         """Rows (n,) of the pairs that count, best match first."""
@@ -125,21 +146,25 @@ class ChanceTest:
     Attributes:
         false_alarms: accepted expected number of chance alignments.
         gates_m: (G,) ascending.
-        pairs: the correspondences.
+        pairs: the correspondences, or the places (N, 2) of namesakes in both maps.
     """
 
     false_alarms: float
     gates_m: Float
-    pairs: IndependentPairs
+    pairs: IndependentPairs | tuple[Float, Float]
 
     def judge(self, alignment: Alignment) -> Verdict:
         """Hold one alignment of the correspondences against chance."""
         if not alignment.ok or not np.all(np.isfinite(alignment.T_a_b)):
-            return Verdict(False, math.nan, alignment.reason)
-        log10, gate_m, n, k = fewest_false_alarms(self.pairs, alignment.T_a_b, self.gates_m)
+            return Verdict(alignment.status, math.nan, alignment.reason)
+        if isinstance(self.pairs, IndependentPairs):
+            found = fewest_false_alarms(self.pairs, alignment.T_a_b, self.gates_m)
+        else:
+            found = named_false_alarms(*self.pairs, alignment.T_a_b, self.gates_m)
+        log10, gate_m, n, k = found
         if log10 <= math.log10(self.false_alarms):
-            return Verdict(True, log10)
-        return Verdict(False, log10, self._why(log10, gate_m, n, k))
+            return Verdict(Status.ACCEPTED, log10)
+        return Verdict(Status.REFUSED, log10, self._why(log10, gate_m, n, k))
 
     def _why(self, log10: float, gate_m: float, n: int, k: int) -> str:
         if n < MIN_PAIRS:

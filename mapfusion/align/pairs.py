@@ -62,6 +62,11 @@ class Pairs:
         """Whether heights carry no information."""
         return self.map_a.planar or self.map_b.planar
 
+    @property
+    def by_name(self) -> bool:
+        """Whether both maps carry labels, by which landmarks are then paired."""
+        return self.map_a.label is not None and self.map_b.label is not None
+
     @cached_property
     def p_a(self) -> Float:
         """(N, 3) positions in metres, in frame a."""

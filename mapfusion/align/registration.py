@@ -1,4 +1,4 @@
-"""Registration: estimate with a method, refine by least squares, accept or refuse."""
+"""Registration: estimate with a method, refine by least squares, judge."""
 
 import time
 from dataclasses import dataclass, field
@@ -6,7 +6,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from mapfusion.align.acceptance import Acceptance, ChanceTest, Verdict
+from mapfusion.align.acceptance import Verdict
 from mapfusion.align.correspondences import Correspondences, HeightGate
 from mapfusion.align.drift import estimate_drift_m
 from mapfusion.align.method import Fit, Method, Needs, Undetermined
@@ -19,6 +19,8 @@ from mapfusion.align.rigid import (
     residual_covariances,
     residuals,
 )
+from mapfusion.evidence.judge import Judge, PairJudge
+from mapfusion.evidence.pair_evidence import PairEvidence
 from mapfusion.landmark_map import LandmarkMap
 
 
@@ -147,17 +149,17 @@ class Registered(NamedTuple):
 
 @dataclass(frozen=True)
 class Registration:
-    """Estimate, refine, accept.
+    """Estimate, refine, judge.
 
     Attributes:
         method: what finds the motion, or answers with a whole alignment.
         refinement: the least squares after it.
-        acceptance: the test after that; None accepts whatever the refinement does.
+        judge: gives the verdict after that; None accepts whatever the refinement does.
     """
 
     method: Method | Aligner
     refinement: Refinement = field(default_factory=Refinement)
-    acceptance: Acceptance | None = field(default_factory=Acceptance)
+    judge: Judge | None = field(default_factory=Judge)
 
     @property
     def randomised(self) -> bool:
@@ -165,14 +167,24 @@ class Registration:
         return self.method.randomised
 
     def on(
-        self, map_a: LandmarkMap, map_b: LandmarkMap, correspondences: Correspondences
+        self,
+        map_a: LandmarkMap,
+        map_b: LandmarkMap,
+        correspondences: Correspondences,
+        evidence: PairEvidence | None = None,
     ) -> "PairRegistration":
         """Made ready for two maps, to be run any number of times.
+
+        Args:
+            map_a: frame a.
+            map_b: frame b.
+            correspondences: of the two.
+            evidence: what was found for them before; sought where it is needed if None.
 
         Raises:
             ValueError: an index of the correspondences lies outside its map.
         """
-        return PairRegistration(self, Pairs(map_a, map_b, correspondences))
+        return PairRegistration(self, Pairs(map_a, map_b, correspondences), evidence)
 
     def register(
         self,
@@ -192,13 +204,15 @@ class Registration:
 class PairRegistration:
     """A `Registration` on one pair of maps; equal estimates are refined and judged once."""
 
-    def __init__(self, registration: Registration, pairs: Pairs) -> None:
+    def __init__(
+        self, registration: Registration, pairs: Pairs, evidence: PairEvidence | None
+    ) -> None:
         self._registration = registration
         self._aligner = as_aligner(registration.method)
         self._pairs = pairs
-        self._chance: ChanceTest | None = None
-        if registration.acceptance is not None:
-            self._chance = registration.acceptance.against_chance(pairs)
+        self.judge: PairJudge | None = None
+        if registration.judge is not None:
+            self.judge = registration.judge.on(pairs, evidence)
         self._completed: dict[object, tuple[Alignment, Verdict]] = {}
 
     def register(self, rng: np.random.Generator) -> Registered:
@@ -217,6 +231,6 @@ class PairRegistration:
         return self._registration.refinement.refine(self._pairs, estimated.T_a_b)
 
     def _judged(self, refined: Alignment) -> Verdict:
-        if self._chance is None:
-            return Verdict(refined.ok, np.nan, refined.reason)
-        return self._chance.judge(refined)
+        if self.judge is None:
+            return Verdict(refined.status, np.nan, refined.reason)
+        return self.judge.judge(refined)

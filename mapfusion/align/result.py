@@ -13,6 +13,8 @@ class Status(StrEnum):
 
     ACCEPTED = "accepted"
     REFUSED = "refused"  # an answer was found and is not to be trusted
+    AMBIGUOUS = "ambiguous"  # it fits, and so may another: the maps do not tell which
+    TOO_UNCERTAIN = "too_uncertain"  # right by its pairs, useless by its covariance
     DEGENERATE = "degenerate"  # the data do not determine an answer
     FAILED = "failed"  # the method raised, hung, ended its process or answered nonsense
     ABSENT = "absent"  # the package behind the method is not installed
@@ -32,7 +34,8 @@ class Alignment:
             in it, so that real errors are larger: the evaluation reports the NEES.
         inlier: (N,) bool over the correspondences given.
         elapsed_s: time of the estimation.
-        status: accepted, refused or degenerate; failed and absent come from the harness alone.
+        status: accepted, refused or degenerate by its method, ambiguous and too uncertain by the
+            verdict; failed and absent come from the harness alone.
         reason: empty when accepted, else what a person can act on.
         drift_sigma_m: s_drift, the standard deviation per axis of the residuals of pairs beyond
             what the landmarks' covariances explain (both maps together); NaN when degenerate.

@@ -13,6 +13,7 @@ from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import NO_LABEL, RobotLog
 from mapfusion.se2 import Float
+from mapfusion.viewing import viewing_of
 
 # What one source counts for that may say again what another one says: the information of either,
 # times this, is together never more than there is (Julier and Uhlmann 1997).
@@ -26,7 +27,7 @@ class Frame:
     Attributes:
         iteration: of the log.
         result: of the step.
-        landmarks: the best map, at the iterations that were asked for.
+        landmarks: the best map with its viewing evidence, at the iterations that were asked for.
         slam: the filter itself, as it is after this step (for `best_path`, `best_associations`).
     """
 
@@ -80,6 +81,8 @@ def run_log(
         landmarks = None
         if iteration in wanted:
             landmarks = replace(slam.best_map(min_count), name=log.robot)
+            seen = slam.best_associations(), slam.best_path(), landmarks.source_observation
+            landmarks = replace(landmarks, viewing=viewing_of(log, *seen))
         yield Frame(iteration, result, landmarks, slam)
 
 

@@ -7,6 +7,7 @@ from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import RobotLog
 from mapfusion.se2 import Float
 from mapfusion.smoother.smooth import Smoothed
+from mapfusion.viewing import viewing_of
 
 
 def smoothed_map(
@@ -26,7 +27,8 @@ def smoothed_map(
     look = log.observations[source]
     count = np.diff(seen.starts).astype(np.int32)
     about = (count, source, look.descriptor, look.label, log.planar, log.robot)
-    return LandmarkMap(point, joint.marginal_m2, *about, joint)
+    viewing = viewing_of(log, landmark, smoothed.estimate.path, source)
+    return LandmarkMap(point, joint.marginal_m2, *about, joint, viewing)
 
 
 def condensed_points(smoothed: Smoothed, rank: int = RANK) -> tuple[Float, JointCovariance]:

@@ -28,6 +28,10 @@ from tests.experiments.study.refusal.test_refusal import (
 from tests.mapfusion.align.map_pairs import given_pairs
 from tests.mapfusion.align.test_correspondences import two_maps
 from tests.mapfusion.align.test_max_clique import on_bits, random_graph
+from tests.mapfusion.evidence.test_judge import (
+    test_a_picture_that_hangs_twice_leaves_two_places,
+    test_what_was_found_before_gives_the_same_verdict,
+)
 from tests.mapfusion.fastslam.test_filter_twin import test_equals_the_filter_that_copies
 from tests.mapfusion.fastslam.test_particles import (
     test_near_finds_the_gates_that_touch_a_box_and_no_freed_slot,
@@ -70,6 +74,8 @@ def alignments() -> None:
         of.register(np.random.default_rng(1))
     first, second, _ = two_maps(np.random.default_rng(0), 40)
     match(first, second)
+    test_what_was_found_before_gives_the_same_verdict()
+    test_a_picture_that_hangs_twice_leaves_two_places()
     larger_clique(on_bits(random_graph(0, 130, 0.3)), everyone(130), 0, 1000)
     test_calibration_counts_every_motion_of_two_pairs()
 

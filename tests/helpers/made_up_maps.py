@@ -5,14 +5,17 @@ import pandas as pd
 
 from experiments.judge.errors import EvaluatedRobot
 from experiments.judge.truth import PathTruth
+from experiments.run.stage_tables import RIVALS
 from mapfusion import se2
 from mapfusion.align.acceptance import Verdict
 from mapfusion.align.correspondences import Correspondences
+from mapfusion.align.result import Status
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.se2 import Float
 
 ITERATION = 7
-ACCEPTED = Verdict(True, -50.0)
+ACCEPTED = Verdict(Status.ACCEPTED, -50.0)
+NO_RIVALS = pd.DataFrame(columns=pd.Index(RIVALS.names))
 
 
 def landmark_map(

@@ -6,11 +6,11 @@ import pandas as pd
 
 from experiments.run.frames import read_rows, write_rows
 from experiments.run.job import Job
-from experiments.run.stage_tables import CORRESPONDENCES, ESTIMATES
+from experiments.run.stage_tables import CORRESPONDENCES, ESTIMATES, RIVALS
 from experiments.run.stages import match
 
 LABEL = match.LABEL
-WRITES = ("estimates.parquet", "correspondences.parquet")
+WRITES = ("estimates.parquet", "correspondences.parquet", "rivals.parquet")
 
 
 @dataclass(frozen=True)
@@ -21,11 +21,16 @@ class JoinSettings:
 
 
 def run(settings: JoinSettings, job: Job) -> None:
-    """Write one table of estimates and one of correspondences."""
+    """Write one table of estimates, one of correspondences and one of rivals."""
     aligners = [folder for name, folder in job.inputs.items() if name != "match"]
-    tables = ((ESTIMATES, aligners), (CORRESPONDENCES, [job.inputs["match"]]))
-    for file, (schema, folders) in zip(WRITES, tables, strict=True):
-        paths = [match.batch_path(folder, part) for part in settings.batches for folder in folders]
+    matched = [job.inputs["match"]]
+    tables = (
+        (ESTIMATES, match.batch_path, aligners),
+        (CORRESPONDENCES, match.batch_path, matched),
+        (RIVALS, match.rivals_path, matched),
+    )
+    for file, (schema, path_of, folders) in zip(WRITES, tables, strict=True):
+        paths = [path_of(folder, part) for part in settings.batches for folder in folders]
         joined = pd.concat([read_rows(path, schema) for path in paths], ignore_index=True)
         # within an iteration the aligners stay in their order
         joined = joined.sort_values("iteration", kind="stable", ignore_index=True)

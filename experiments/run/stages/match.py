@@ -1,4 +1,4 @@
-"""Stage: the correspondences of two robots' maps, a batch of evaluated iterations at a time.
+"""Stage: correspondences and rival motions of two robots' maps, a batch of iterations at a time.
 
 What matching and aligning read, they read here.
 """
@@ -10,11 +10,17 @@ from pathlib import Path
 
 import pandas as pd
 
+from experiments.run.estimates import rival_rows
 from experiments.run.frames import write_rows
 from experiments.run.job import Job
-from experiments.run.stage_tables import CORRESPONDENCES
+from experiments.run.stage_tables import CORRESPONDENCES, RIVALS
 from experiments.run.stages.slam import read_snapshots
+from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.correspondences import MatchParameters, match
+from mapfusion.align.pairs import Pairs
+from mapfusion.align.refine import Refinement
+from mapfusion.evidence.judge import Judge
+from mapfusion.evidence.parameters import EvidenceParameters
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import read_log
 
@@ -22,26 +28,33 @@ from mapfusion.robot_log import read_log
 # at about the same time, large enough that reading the maps costs little beside aligning them.
 _ITERATIONS_PER_BATCH = 12
 LABEL = "align the maps"
-WRITES = ("batch_{part}.parquet",)
+WRITES = ("batch_{part}.parquet", "rivals_{part}.parquet")
 
 
 @dataclass(frozen=True)
 class MatchSettings:
-    """All that the correspondences depend on, beside the maps."""
+    """All that correspondences and rivals depend on, beside the maps."""
 
     match: MatchParameters
+    acceptance: Acceptance
+    evidence: EvidenceParameters
+    refinement: Refinement
     iterations: tuple[int, ...]
 
 
 def run(settings: MatchSettings, job: Job) -> None:
-    """Find the correspondences of one batch of iterations."""
-    made = []
+    """Find the correspondences of one batch of iterations, and what they say of rival motions."""
+    made, rivals = [], []
+    judge = Judge(settings.acceptance, settings.evidence, settings.refinement)
     for k, map_a, map_b in pairs_of_maps(job, settings.iterations):
         pairs = match(map_a, map_b, settings.match)
-        columns = {"robot_a": map_a.name, "robot_b": map_b.name, "iteration": k}
-        columns |= {"index_a": pairs.index_a, "index_b": pairs.index_b}
+        names = {"robot_a": map_a.name, "robot_b": map_b.name, "iteration": k}
+        if evidence := judge.on(Pairs(map_a, map_b, pairs)).evidence:
+            rivals += rival_rows(names, evidence)
+        columns = names | {"index_a": pairs.index_a, "index_b": pairs.index_b}
         made.append(pd.DataFrame(columns | {"descriptor_distance": pairs.distance}))
     write_rows(batch_path(job.output, job.part), CORRESPONDENCES, pd.concat(made))
+    write_rows(rivals_path(job.output, job.part), RIVALS, rivals)
 
 
 def batches(iterations: tuple[int, ...]) -> tuple[str, ...]:
@@ -52,6 +65,11 @@ def batches(iterations: tuple[int, ...]) -> tuple[str, ...]:
 def batch_path(folder: Path, part: str) -> Path:
     """Where a stage keeps one batch."""
     return folder / WRITES[0].format(part=part)
+
+
+def rivals_path(folder: Path, part: str) -> Path:
+    """Where the stage keeps the rivals of one batch."""
+    return folder / WRITES[1].format(part=part)
 
 
 # The maps of one pair of robots stay in memory: each aligner of the pair wants the same.

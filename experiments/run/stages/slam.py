@@ -1,6 +1,6 @@
 """Stage: one robot's FastSLAM over its log, with its map at each evaluated iteration."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,6 +28,7 @@ from mapfusion.storage import (
     read_table,
     schema,
 )
+from mapfusion.viewing import viewing_of
 
 _ONLINE, _FINAL = ([f"{path}_{name}" for name in POSE_FIELDS] for path in ("online", "final"))
 _ITERATION = fields(iteration=INT)
@@ -42,9 +43,17 @@ _STEP = fields(effective_sample_size=FLOAT, resampled=BOOL, n_landmarks=INT, spr
 POSES = schema("slam.poses", 1, [*_ITERATION, *float_fields(_ONLINE + _FINAL), *_STEP])
 _PARTICLE = fields(iteration=INT, particle=INT)
 CLOUDS = schema("slam.clouds", 1, [*_PARTICLE, *float_fields([*POSE_FIELDS, "log_weight"])])
+# The most probable particle's path at each evaluated iteration, which its map was made along.
+PATHS = schema("slam.paths", 1, [*fields(evaluated=INT), *_ITERATION, *float_fields(POSE_FIELDS)])
 
 LABEL = "FastSLAM"
-WRITES = ("snapshots.parquet", "associations.parquet", "poses.parquet", "clouds.parquet")
+WRITES = (
+    "snapshots.parquet",
+    "associations.parquet",
+    "poses.parquet",
+    "clouds.parquet",
+    "paths.parquet",
+)
 
 
 @dataclass(frozen=True)
@@ -74,8 +83,8 @@ def run(settings: SlamSettings, job: Job) -> None:
     """Run the filter over a log and write maps, poses, associations and particle clouds."""
     log = read_log(job.inputs["log"])
     last = len(log) - 1
-    maps, associations, steps, clouds = [], [], [], []
-    counted, final_path = np.empty(0, dtype=np.int64), np.empty((0, 3))
+    maps, associations, steps, clouds, paths = [], [], [], [], []
+    counted = np.empty(0, dtype=np.int64)
     iterations = evaluated_iterations(len(log), settings.every)
     rng = generator(settings.seed, "slam", log.robot)
     told = read_odometry_covariance(job.inputs["log"])
@@ -97,14 +106,14 @@ def run(settings: SlamSettings, job: Job) -> None:
             columns = {"observation": changed, "source_observation": counts_for[changed]}
             associations.append(pd.DataFrame(columns).assign(from_iteration=k))
             counted = counts_for
-        if k == last:
-            final_path = frame.slam.best_path()
+            path = pd.DataFrame(frame.slam.best_path()[: k + 1], columns=pd.Index(POSE_FIELDS))
+            paths.append(path.rename_axis("iteration").reset_index().assign(evaluated=k))
     poses = pd.DataFrame(steps).rename_axis("iteration").reset_index()
-    poses[_FINAL] = final_path[: len(poses)]
+    poses[_FINAL] = paths[-1][POSE_FIELDS].to_numpy()
     # An empty map has no row: the list tells that its iteration was evaluated all the same.
     evaluated = {"iterations": ",".join(map(str, iterations))}
-    tables = (pd.concat(maps), pd.concat(associations), poses, pd.concat(clouds))
-    schemas = (SNAPSHOTS, ASSOCIATIONS, POSES, CLOUDS)
+    tables = (*map(pd.concat, (maps, associations)), poses, *map(pd.concat, (clouds, paths)))
+    schemas = (SNAPSHOTS, ASSOCIATIONS, POSES, CLOUDS, PATHS)
     for file, table_schema, rows in zip(WRITES, schemas, tables, strict=True):
         write_rows(job.output / file, table_schema, rows, evaluated)
 
@@ -124,7 +133,10 @@ def _step(result: StepResult) -> dict[str, float]:
 
 
 def read_snapshots(slam: Path, log: RobotLog) -> dict[int, LandmarkMap]:
-    """The robot's map at each evaluated iteration, with descriptors and labels from its log."""
+    """The robot's map at each evaluated iteration, with what its log tells of the landmarks.
+
+    These are descriptors, labels, and from where they were seen.
+    """
     table, attributes = read_table(slam / "snapshots.parquet", SNAPSHOTS)
     origin = column(table, "source_observation")
     seen = log.observations[origin]
@@ -133,7 +145,15 @@ def read_snapshots(slam: Path, log: RobotLog) -> dict[int, LandmarkMap]:
     iteration = column(table, "iteration")
     evaluated = map(int, attributes["iterations"].split(","))
     rows = {k: slice(*np.searchsorted(iteration, [k, k + 1])) for k in evaluated}
-    return {k: with_rows(landmarks, own) for k, own in rows.items()}
+    paths = read_rows(slam / "paths.parquet", PATHS)
+    changes = read_rows(slam / "associations.parquet", ASSOCIATIONS)
+    maps = {}
+    for k, own in rows.items():
+        path = paths.loc[paths["evaluated"] == k, POSE_FIELDS].to_numpy(np.float64)
+        counts_for = _associations(changes, k, int(np.searchsorted(log.iteration, k + 1)))
+        viewing = viewing_of(log, counts_for, path, origin[own])
+        maps[k] = replace(with_rows(landmarks, own), viewing=viewing)
+    return maps
 
 
 def associations_at(slam: Path, iteration: int, n_observations: int) -> np.ndarray:
@@ -142,6 +162,11 @@ def associations_at(slam: Path, iteration: int, n_observations: int) -> np.ndarr
     (n_observations,) int64 by the observation that the landmark came from, -1 for none.
     """
     changes = read_rows(slam / "associations.parquet", ASSOCIATIONS)
+    return _associations(changes, iteration, n_observations)
+
+
+def _associations(changes: pd.DataFrame, iteration: int, n_observations: int) -> np.ndarray:
+    """The same, from the table of changes."""
     counts_for = np.full(n_observations, -1, dtype=np.int64)
     # in the order of iterations, so the last change of an observation is the one that stays
     so_far = changes[changes["from_iteration"] <= iteration]

@@ -38,7 +38,13 @@ from mapfusion.storage import (
 PATH = schema("smooth.path", 1, [*fields(iteration=INT), *float_fields(POSE_FIELDS)])
 
 LABEL = "smooth the logs"
-WRITES = ("map_{part}.parquet", "map_{part}.joint.parquet", "path_{part}.parquet")
+WRITES = (
+    "map_{part}.parquet",
+    "map_{part}.joint.parquet",
+    "map_{part}.viewing.parquet",
+    "map_{part}.frames.parquet",
+    "path_{part}.parquet",
+)
 # Unless they are said, maps are fused at so many evenly spread iterations, the last among them.
 _FUSED_ITERATIONS = 5
 _GB = 1e9
@@ -140,8 +146,8 @@ def _no_map(log: RobotLog) -> LandmarkMap:
 
 
 def map_files(folder: Path, iteration: int) -> list[Path]:
-    """The files of the map at an iteration: the map, and its joint covariance."""
-    return [folder / name.format(part=iteration) for name in WRITES[:2]]
+    """The files of the map at an iteration: the map, and what lies beside it."""
+    return [folder / name.format(part=iteration) for name in WRITES[:-1]]
 
 
 def _map_path(folder: Path, part: str) -> Path:
@@ -149,7 +155,7 @@ def _map_path(folder: Path, part: str) -> Path:
 
 
 def _path_path(folder: Path, part: str) -> Path:
-    return folder / WRITES[2].format(part=part)
+    return folder / WRITES[-1].format(part=part)
 
 
 def read_smoothed(folder: Path) -> dict[int, LandmarkMap]:
@@ -179,6 +185,6 @@ def read_endings(folder: Path) -> pd.DataFrame:
 
 
 def _iterations(folder: Path) -> list[int]:
-    begin, _, end = WRITES[2].partition("{part}")
+    begin, _, end = WRITES[-1].partition("{part}")
     files = (path.name for path in folder.glob(f"{begin}[0-9]*{end}"))
     return sorted(int(name.removeprefix(begin).removesuffix(end)) for name in files)

@@ -117,7 +117,7 @@ def _print_answers(estimates: pd.DataFrame) -> None:
     rows = pd.DataFrame(shares | {"accepted": by_aligner["accepted"].mean()}).reset_index()
     shown = columns("", aligner="aligner")
     shown |= columns(".0%", estimated="estimated", refined="refined", accepted="accepted")
-    note = "share of all maps and repetitions; accepted: as more than chance"
+    note = "share of all maps and repetitions; accepted: more than chance, and not contradicted"
     print_frame(rows, shown, "Answers (no truth: errors are unknown)", note)
 
 
@@ -138,7 +138,7 @@ def _print_aligners(errors: pd.DataFrame, summary: pd.DataFrame) -> None:
     shown |= columns(".3f", spread_m="spread\nm") | columns(".2f", time_ms="time\nms")
     maps = answerable(errors)
     note = f"{NO_ESTIMATE}\n"
-    note += "spread: 10-90 % of the repetitions; ok: accepted as more than chance"
+    note += "spread: 10-90 % of the repetitions; ok: accepted"
     if len(maps):
         n_offered = maps["n_correspondences"]
         share = (maps["n_true"] / n_offered).median()

@@ -21,11 +21,13 @@ _MOTIONS |= columns(".3f", refined_tx_m="refined\ntx, m", refined_ty_m="\nty, m"
 _MOTIONS |= columns(".4f", refined_theta_rad="\ntheta, rad")
 _MOTIONS |= columns(".3f", sigma_m="sigma\nm") | columns(".4f", sigma_rad="\nrad")
 _VERDICTS = columns("", aligner="aligner", verdict="verdict") | columns(">", inliers="inliers")
-_VERDICTS |= columns(".0f", log10_false_alarms="NFA\nlog10") | columns(">", time="time\nms")
+_VERDICTS |= columns(".0f", log10_false_alarms="NFA\nlog10")
+_VERDICTS |= columns("+.1f", log10_evidence="evidence\nlog10")
+_VERDICTS |= columns(".2f", probability="prob.\nright") | columns(">", time="time\nms")
 
 
 def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
-    """Estimates of all aligners on two maps, and why those were not accepted that were not."""
+    """Estimates of all aligners on two maps, and what is to be said of each."""
     found = pd.DataFrame(rows)
     sigma_m, sigma_rad = motion_sigma(covariances_of(found))
     stated = found.assign(sigma_m=sigma_m, sigma_rad=sigma_rad)
@@ -38,8 +40,8 @@ def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
         found.assign(inliers=inliers, time=times, verdict=[str(status) for status, _ in verdicts]),
         _VERDICTS,
         "Verdicts on the refined ones",
-        "NFA: expected number of alignments that chance alone supports as well; time: of the\n"
-        "estimate alone, kernels compiled",
+        "NFA: expected number of alignments that chance alone supports as well; evidence:\n"
+        "how much likelier what both robots saw is if it is right; time: of the estimate",
     )
     for row, (status, why) in zip(rows, verdicts, strict=True):
         if reason := why or row["reason"]:

@@ -62,7 +62,7 @@ def run_cell(settings: CellSettings, job: Job) -> None:
     started = time.perf_counter()
     n_pairs, share = settings.n_pairs, settings.outlier_share
     aligner = callable_aligner(settings.method, settings.parameters, settings.time_limit_s)
-    registration = Registration(aligner, acceptance=None)  # methods are ranked by what they find
+    registration = Registration(aligner, judge=None)  # methods are ranked by what they find
     cell = {"method": settings.name, "n_pairs": n_pairs, "outlier_share": share}
     rows: list[dict[str, Any]] = []
     for trial in range(settings.trials):

@@ -18,6 +18,7 @@ from experiments.study.independence.measured_work import (
 )
 from mapfusion.align.correspondences import MatchParameters, match
 from mapfusion.align.registration import Registration
+from mapfusion.evidence.judge import Judge
 from mapfusion.landmark_map import LandmarkMap
 
 LABEL = "measure the team's work"
@@ -47,7 +48,9 @@ def run(settings: PairCostSettings, job: Job) -> None:
 def _align(settings: PairCostSettings, map_a: LandmarkMap, map_b: LandmarkMap) -> Cost:
     own = settings.aligner
     aligner = callable_aligner(own.method, own.parameters, own.time_limit_s)
-    registration = Registration(aligner, own.refinement, own.acceptance)
+    registration = Registration(
+        aligner, own.refinement, Judge(own.acceptance, own.evidence, own.refinement)
+    )
     rng, meter = generator(own.seed, "align", map_a.name, map_b.name), Meter()
     pairs = match(map_a, map_b, settings.match)
     registration.on(map_a, map_b, pairs).register(rng)

@@ -103,5 +103,8 @@ def repeated(
     )
     columns = ("position_m", "covariance_m2", "count", "source_observation", "descriptor")
     both = {name: np.concatenate([getattr(other, name), getattr(hung, name)]) for name in columns}
-    case = apart(source.map_a, replace(other, **both), matching)
+    viewing = None
+    if other.viewing is not None and hung.viewing is not None:
+        viewing = other.viewing.joined(hung.viewing, turn)
+    case = apart(source.map_a, replace(other, viewing=viewing, **both), matching)
     return replace(case, ground=REPEATED, poster_radius_m=radius_m)

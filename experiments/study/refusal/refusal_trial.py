@@ -218,7 +218,7 @@ def _answers(
     for entry in settings.aligners:
         rng = generator(scenario.seed, *map(str, names.values()), entry.name)
         aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
-        registration = Registration(aligner, settings.refinement, settings.acceptance)
+        registration = Registration(aligner, settings.refinement, settings.judge)
         registered = registration.register(case.map_a, case.map_b, case.pairs, rng)
         refined, verdict = registered.refined, registered.verdict
         error = refined.T_a_b - case.T_true

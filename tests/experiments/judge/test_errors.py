@@ -13,10 +13,10 @@ from experiments.judge.path_errors import robot_paths
 from experiments.judge.truth import PathTruth
 from experiments.run.estimates import alignment_of, estimate_row, inlier_mask
 from mapfusion import se2
-from mapfusion.align.acceptance import Acceptance, Verdict
-from mapfusion.align.refine import Refinement
+from mapfusion.align.acceptance import Verdict
 from mapfusion.align.result import Alignment, Status, degenerate
-from tests.helpers.made_up_maps import ACCEPTED, ITERATION, offered, paired, robot
+from mapfusion.evidence.judge import Judge
+from tests.helpers.made_up_maps import ACCEPTED, ITERATION, NO_RIVALS, offered, paired, robot
 
 T_WORLD_A = np.array([1.0, 2.0, 0.3])
 T_WORLD_B = np.array([4.0, -1.0, 3.0])
@@ -30,8 +30,8 @@ def judged(estimated: Alignment, refined: Alignment, index_b: list[int]) -> pd.D
     row = names | {"aligner": "ransac", "repetition": 0}
     estimates = pd.DataFrame([row | estimate_row(len(pairs), estimated, refined, ACCEPTED)])
     a, b = robot("A", POINTS, T_WORLD_A), robot("B", POINTS, T_WORLD_B)
-    (met,) = met_maps([a, b], estimates, offered("A", "B", pairs))
-    return error_rows(met, Refinement(), Acceptance(), 0.1).set_index("aligner")
+    (met,) = met_maps([a, b], estimates, offered("A", "B", pairs), NO_RIVALS)
+    return error_rows(met, Judge(), 0.1).set_index("aligner")
 
 
 def alignment(T_a_b: np.ndarray, inlier: list[bool]) -> Alignment:
@@ -101,7 +101,9 @@ def test_an_alignment_survives_its_row() -> None:
     refined = Alignment(
         rng.normal(size=3), square @ square.T, inlier, 0.1, Status.REFUSED, "a reason", 0.2
     )
-    row = estimate_row(13, degenerate("other", 13), refined, Verdict(False, np.nan, "a reason"))
+    row = estimate_row(
+        13, degenerate("other", 13), refined, Verdict(Status.REFUSED, np.nan, "a reason")
+    )
     found = alignment_of(row, 13)
     np.testing.assert_array_equal(found.T_a_b, refined.T_a_b)
     np.testing.assert_allclose(found.covariance, refined.covariance, rtol=0, atol=1e-15)
@@ -113,7 +115,7 @@ def test_an_alignment_survives_its_row() -> None:
 
 def test_a_refused_alignment_is_refused_when_read_again() -> None:
     accepted = alignment(np.array([1.0, 2.0, 0.3]), [True] * 4)
-    row = estimate_row(4, accepted, accepted, Verdict(False, 1.5, "chance does as well"))
+    row = estimate_row(4, accepted, accepted, Verdict(Status.REFUSED, 1.5, "chance does as well"))
     assert (row["refined_status"], row["accepted"], row["log10_false_alarms"]) == (
         "accepted",
         False,

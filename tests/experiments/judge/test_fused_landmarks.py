@@ -19,7 +19,7 @@ from mapfusion.align.result import Alignment, Status
 from mapfusion.aligned_landmarks import ABSENT
 from mapfusion.fuse.parameters import MergeParameters
 from mapfusion.fused_map import FusedMap, Fusion
-from tests.helpers.made_up_maps import ACCEPTED, ITERATION, offered, paired, robot
+from tests.helpers.made_up_maps import ACCEPTED, ITERATION, NO_RIVALS, offered, paired, robot
 
 T_WORLD_A = np.array([1.0, 2.0, 0.3])
 T_WORLD_B = np.array([4.0, -1.0, 3.0])
@@ -36,7 +36,7 @@ def met(
     row = {"robot_a": "A", "robot_b": "B", "iteration": ITERATION, "aligner": "ransac"}
     row |= {"repetition": 0} | estimate_row(n, found, found, verdict)
     pairs = paired(list(range(n)), list(range(n)))
-    return met_maps([a, b], pd.DataFrame([row]), offered("A", "B", pairs))
+    return met_maps([a, b], pd.DataFrame([row]), offered("A", "B", pairs), NO_RIVALS)
 
 
 def fused_pairs(drift_sigma_m: float, seed: int = 6) -> pd.DataFrame:
@@ -110,7 +110,7 @@ def test_only_accepted_alignments_are_fused() -> None:
     )
     for verdict, n, left_out in (
         (ACCEPTED, 6, ()),
-        (Verdict(False, 1.0, "chance does as well"), 6, (("B", "chance does as well"),)),
+        (Verdict(Status.REFUSED, 1.0, "chance does as well"), 6, (("B", "chance does as well"),)),
     ):
         team = FusedTeam.of([a, b], met(a, b, found, verdict), BY_RANSAC)
         fused = team.fused

@@ -25,7 +25,7 @@ from mapfusion.align.correspondences import Correspondences
 from mapfusion.fused_map import FusedMap, Fusion
 from mapfusion.se2 import Float
 from mapfusion.team.team_graph import Place
-from tests.helpers.made_up_maps import ITERATION, landmark_map
+from tests.helpers.made_up_maps import ITERATION, NO_RIVALS, landmark_map
 
 NAMES = ("x_m", "y_m", "theta_rad")
 STARTS = np.array([[1.0, 2.0, 0.3], [4.0, -1.0, 3.0], [-2.0, 0.5, -1.2]])
@@ -51,7 +51,7 @@ def team_of(
         return FusedTeam(robots, [], ITERATION, None)
     none = Correspondences(np.zeros(0, int), np.zeros(0, int), np.zeros(0))
     met = [
-        MetMaps(a, b, ITERATION, (a.at(0)[0], b.at(0)[0]), (), none, pd.DataFrame())  # type: ignore[arg-type]
+        MetMaps(a, b, ITERATION, (a.at(0)[0], b.at(0)[0]), (), none, pd.DataFrame(), NO_RIVALS)  # type: ignore[arg-type]
         for a, b in itertools.combinations(robots, 2)
     ]
     none_m, none_m2 = np.zeros(len(robots)), np.zeros((len(robots), 3, 3))

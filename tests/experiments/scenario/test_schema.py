@@ -72,6 +72,7 @@ PLACES = {
     "Drive": "drive",
     "DriverSettings": "drive.control",
     "Evaluate": "evaluate",
+    "EvidenceParameters": "align.evidence",
     "FastSlamParameters": "slam.filter",
     "FrontEndParameters": "vision",
     "Fuse": "fuse",

@@ -250,7 +250,7 @@ def test_ply(trio_result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[st
     folder = exported(capsys, trio_result, "ply", tmp_path / "out")
     data = ResultTables(trio_result)
     files = sorted(path.stem for path in (trio_result / "maps").iterdir())
-    maps = [name for name in files if not name.endswith(".joint")]
+    maps = [name for name in files if not name.endswith((".joint", ".viewing", ".frames"))]
     assert {*ROBOTS, "fused", "R1.smoothed"} <= set(maps) < set(files)
     assert sorted(path.stem for path in folder.iterdir()) == maps
     for name in maps:

@@ -182,8 +182,8 @@ def test_a_failed_alignment_is_not_judged():
 
 def test_a_verdict_refuses_an_alignment():
     found = alignment([1, 2, 0.3], 5)
-    assert Verdict(True, -9.0).applied_to(found) is found
-    refused = Verdict(False, 2.0, "chance").applied_to(found)
+    assert Verdict(Status.ACCEPTED, -9.0).applied_to(found) is found
+    refused = Verdict(Status.REFUSED, 2.0, "chance").applied_to(found)
     assert (refused.status, refused.reason, refused.ok) == (Status.REFUSED, "chance", False)
     np.testing.assert_array_equal(refused.T_a_b, found.T_a_b)
 

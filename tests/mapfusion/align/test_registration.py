@@ -1,4 +1,4 @@
-"""Estimate, refine, accept: composed as by hand, and each estimate completed once."""
+"""Estimate, refine, judge: composed as by hand, and each estimate completed once."""
 
 from dataclasses import dataclass, field, replace
 
@@ -21,6 +21,7 @@ from mapfusion.align.rigid import (
     motion_jacobian,
     residual_covariances,
 )
+from mapfusion.evidence.judge import Judge
 from tests.mapfusion.align.map_pairs import given_pairs, landmarks
 
 
@@ -73,12 +74,12 @@ def assert_same(first, second):
 @pytest.mark.parametrize("true_share", [0.0, 0.6])
 def test_equals_the_steps_by_hand(name, true_share):
     pair = given_pairs(np.random.default_rng(0), 80, true_share, 0.05)
-    method, refinement, acceptance = make_aligner(name), Refinement(gate_m=0.4), Acceptance(1e-4)
-    registration = Registration(method, refinement, acceptance)
+    method, refinement, judge = make_aligner(name), Refinement(gate_m=0.4), Judge(Acceptance(1e-4))
+    registration = Registration(method, refinement, judge)
     done = registration.register(*maps_of(pair), np.random.default_rng(1))
     estimated = as_aligner(method).align(*maps_of(pair), np.random.default_rng(1))
     refined = refinement.refine(Pairs(*maps_of(pair)), estimated.T_a_b)
-    verdict = acceptance.judge(Pairs(*maps_of(pair)), refined)
+    verdict = judge.on(Pairs(*maps_of(pair))).judge(refined)
     assert_same(done.estimated, estimated)
     assert_same(done.refined, refined)
     assert done.verdict == pytest.approx(verdict) or done.verdict == verdict
@@ -218,7 +219,7 @@ def test_what_chance_would_give_is_refused_when_applied():
     assert done.refined.ok
     assert done.applied.status is Status.REFUSED
     assert done.applied.reason == done.verdict.reason != ""
-    trusting = Registration(Ransac(), acceptance=None)
+    trusting = Registration(Ransac(), judge=None)
     assert trusting.register(*maps_of(pair), np.random.default_rng(0)).applied.ok
 
 

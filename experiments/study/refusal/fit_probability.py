@@ -1,0 +1,146 @@
+"""Fit the probability that an alignment is right, over worlds whose maps a sweep left in a store.
+
+`python -m experiments.study.refusal.fit_probability alias full posters posters_apart --seeds 0..9`
+writes `mapfusion/evidence/fitted.py`, and says how well kinds of world that were left out are told.
+"""
+
+import argparse
+import itertools
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize
+
+from experiments.judge.criteria import RIGHT_WITHIN_M, RIGHT_WITHIN_RAD
+from experiments.methods.aligner_calls import callable_aligner
+from experiments.run.stages.slam import evaluated_iterations
+from experiments.scenario.randomness import generator
+from experiments.scenario.seeds import parse_seeds
+from experiments.study.refusal import cases
+from experiments.study.refusal.stored_worlds import MappedWorld, worlds_of
+from mapfusion import se2
+from mapfusion.align.pairs import Pairs
+from mapfusion.align.registration import Registration
+from mapfusion.evidence import fitted
+from mapfusion.se2 import Float
+from mapfusion.storage import write_whole
+
+# Pulls weights of scaled features towards 0: a kind of world may have none of a sign.
+_RIDGE = 1e-3
+_BINS = 10  # of equal count
+_TEXT = '''"""Coefficients of `probability.py`.
+
+Written by `python -m experiments.study.refusal.fit_probability`.
+
+Of {n} alignments, {n_right} of them right, of seeds {seeds} of {worlds}.
+"""
+
+VERSION = {version}
+INTERCEPT = {intercept:.3f}
+WEIGHTS = ({weights})
+'''
+
+
+class Answers(NamedTuple):
+    """Alignments that are more than chance: (n, F) features, (n,) right, (n,) kind of world."""
+
+    features: Float
+    right: Float
+    kind: np.ndarray
+
+
+def answers_of(worlds: Sequence[MappedWorld]) -> Answers:
+    """Every aligner's refined answer at each evaluated iteration of each world."""
+    rows = [row for world in worlds for row in _of_world(world)]
+    features, right, kind = zip(*rows, strict=True)
+    return Answers(np.array(features), np.array(right, float), np.array(kind))
+
+
+def _of_world(world: MappedWorld) -> list[tuple[Float, bool, str]]:
+    scenario, rows = world.scenario, []
+    settings, radius_m = scenario.align, scenario.evaluate.true_pair_radius_m
+    iterations = evaluated_iterations(scenario.drive.frames, scenario.evaluate.every)
+    for (a, b), k in itertools.product(itertools.combinations(world.robots(), 2), iterations):
+        case = cases.common(a, b, k, settings.match, radius_m)
+        judged = settings.judge.on(Pairs(case.map_a, case.map_b, case.pairs))
+        for entry in settings.aligners:
+            rng = generator(scenario.seed, "fit", world.name, a.name, b.name, k, entry.name)
+            aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
+            registration = Registration(aligner, settings.refinement, judge=None)
+            refined = registration.register(case.map_a, case.map_b, case.pairs, rng).refined
+            verdict = judged.judge(refined)
+            signs = judged.signs(refined) if np.isfinite(verdict.probability) else None
+            if signs is not None:
+                error = refined.T_a_b - case.T_true
+                right = np.hypot(error[0], error[1]) < RIGHT_WITHIN_M
+                right &= abs(se2.wrap(error[2])) < RIGHT_WITHIN_RAD
+                rows.append((signs.features(), bool(right), scenario.name))
+    return rows
+
+
+def fit(features: Float, right: Float) -> Float:
+    """Intercept and weights (1 + F,) of the likeliest logistic model, weights held back a little.
+
+    Args:
+        features: (n, F).
+        right: (n,) 0 or 1.
+    """
+    mean, scale = features.mean(axis=0), features.std(axis=0) + 1e-9
+    Z = np.column_stack([np.ones(len(features)), (features - mean) / scale])
+    sign = 2 * right - 1
+
+    def cost(w: Float) -> float:
+        return float(np.logaddexp(0, -sign * (Z @ w)).mean() + _RIDGE * np.sum(w[1:] ** 2))
+
+    w = minimize(cost, np.zeros(Z.shape[1]), method="BFGS").x
+    weights = w[1:] / scale
+    return np.array([w[0] - weights @ mean, *weights])
+
+
+def stated(model: Float, features: Float) -> Float:
+    """The probabilities (n,) that a model (1 + F,) states."""
+    return 1 / (1 + np.exp(-(model[0] + features @ model[1:])))
+
+
+def left_out(answers: Answers) -> Float:
+    """The probability (n,) of each answer by a model that saw no world of its kind."""
+    p = np.empty(len(answers.right))
+    for kind in np.unique(answers.kind):
+        own = answers.kind == kind
+        p[own] = stated(fit(answers.features[~own], answers.right[~own]), answers.features[own])
+    return p
+
+
+def calibration_error(p: Float, right: Float) -> float:
+    """Mean distance of what is stated and what holds, over bins of equal count."""
+    bins = np.array_split(np.argsort(p, kind="stable"), _BINS)
+    apart = (abs(p[own].mean() - right[own].mean()) * len(own) for own in bins if len(own))
+    return float(sum(apart)) / len(p)
+
+
+def main() -> None:
+    """Fit, write, and print how well it holds."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("worlds", nargs="+")
+    parser.add_argument("--seeds", default="0")
+    parser.add_argument("--results", type=Path, default=Path("results"))
+    given = parser.parse_args()
+    answers = answers_of(worlds_of(given.worlds, parse_seeds(given.seeds), given.results))
+    intercept, *weights = fit(answers.features, answers.right)
+    numbers = {"n": len(answers.right), "n_right": int(answers.right.sum())}
+    said = {"seeds": given.seeds.replace("..", " to "), "worlds": ", ".join(given.worlds)}
+    model = {"intercept": intercept, "weights": ", ".join(f"{w:.3f}" for w in weights)}
+    text = _TEXT.format(**numbers, **said, **model, version=fitted.VERSION)
+    write_whole(Path(str(fitted.__file__)), lambda path: path.write_text(text, encoding="utf-8"))
+    p = left_out(answers)
+    brier = float(np.mean((p - answers.right) ** 2))
+    error = calibration_error(p, answers.right)
+    told = f"calibration error {error:.4f}, Brier score {brier:.4f}"
+    sys.stdout.write(f"kinds left out one at a time: {told}\n")
+
+
+if __name__ == "__main__":
+    main()

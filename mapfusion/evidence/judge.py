@@ -1,0 +1,210 @@
+"""The verdict on an alignment: chance, evidence against it, rivals, and how sure it is."""
+
+import math
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from scipy.stats import binom
+
+from mapfusion.align.acceptance import Acceptance, Verdict
+from mapfusion.align.pairs import Pairs
+from mapfusion.align.refine import Refinement
+from mapfusion.align.result import Alignment, Status
+from mapfusion.evidence.likelihood import CHANGED
+from mapfusion.evidence.pair_evidence import (
+    PairEvidence,
+    RivalMotion,
+    find_evidence,
+    why_not_sought,
+)
+from mapfusion.evidence.parameters import EvidenceParameters
+from mapfusion.evidence.probability import Signs, probability
+from mapfusion.evidence.regions import Regions, Witness, Witnesses
+from mapfusion.evidence.rivals import DISTINCT_M, apart_m
+from mapfusion.se2 import Float, motion_sigma
+from mapfusion.team.relations import whole_map_covariance
+
+# Several regions contradict where a right alignment has so many changed with a smaller probability
+# than this; a single one weighs as its ratio says.
+_SURPRISE, _SEVERAL = 0.1, 2
+
+
+@dataclass(frozen=True)
+class Judge:
+    """All that is asked before an alignment may be used, the same for every estimator.
+
+    First chance (`Acceptance`). Then what both robots looked at: regions of one map that the other
+    must have seen and has not contradict an alignment, those that it has confirm it. Maps that hold
+    things twice, or that fit in several ways, need evidence; others need only not be contradicted.
+    Then how sure it is. Of maps with labels identities say all of that.
+
+    Attributes:
+        acceptance: the test against chance.
+        evidence: how much evidence is needed, and how sure an alignment has to be.
+        refinement: what rivals are refined by, as alignments are.
+    """
+
+    acceptance: Acceptance = field(default_factory=Acceptance)
+    evidence: EvidenceParameters = field(default_factory=EvidenceParameters)
+    refinement: Refinement = field(default_factory=Refinement)
+
+    def on(self, pairs: Pairs, known: PairEvidence | None = None) -> "PairJudge":
+        """Made ready for any number of alignments of two maps.
+
+        Args:
+            pairs: their correspondences.
+            known: what was found for them before; sought where it is needed if None.
+        """
+        return PairJudge(self, pairs, known)
+
+
+class PairJudge:
+    """A `Judge` on two maps."""
+
+    def __init__(self, judge: Judge, pairs: Pairs, known: PairEvidence | None) -> None:
+        self._judge, self._pairs, self._known = judge, pairs, known
+        self._chance = judge.acceptance.on(pairs)
+
+    @cached_property
+    def _witnesses(self) -> Witnesses:
+        a, b = Witness(self._pairs.map_a), Witness(self._pairs.map_b)
+        return Witnesses(a, b, self._judge.evidence)
+
+    @cached_property
+    def evidence(self) -> PairEvidence | None:
+        """What the maps say about motions between them; None where it cannot be sought."""
+        if self._pairs.by_name or why_not_sought(self._pairs.map_a, self._pairs.map_b):
+            return None
+        if self._known is not None:
+            return self._known
+        judge = self._judge
+        settings = (judge.acceptance, judge.refinement, judge.evidence)
+        return find_evidence(self._pairs, self._witnesses, *settings)
+
+    def judge(self, alignment: Alignment) -> Verdict:
+        """The verdict on one alignment of the correspondences."""
+        by_chance = self._chance.judge(alignment)
+        if not by_chance.accepted:
+            return by_chance
+        status, reason, told = Status.ACCEPTED, "", {}
+        evidence = self.evidence
+        if evidence is not None:
+            regions = self._witnesses.regions(alignment.T_a_b, evidence.region_m)
+            ratio = regions.log10_ratio(evidence.twin_share)
+            told = {"log10_evidence": ratio, "n_confirmed": regions.n_confirmed}
+            told |= {"n_contradicted": regions.n_contradicted}
+            told |= {"probability": probability(self._signs(alignment, regions, ratio, evidence))}
+            status, reason = self._weighed(alignment, regions, ratio, evidence)
+        elif not self._pairs.by_name:
+            why = why_not_sought(self._pairs.map_a, self._pairs.map_b)
+            reason = f"no evidence to the contrary could be sought: {why}"
+        if status is Status.ACCEPTED and (unsure := self._why_unsure(alignment)):
+            status, reason = Status.TOO_UNCERTAIN, unsure
+        return Verdict(status, by_chance.log10_false_alarms, reason, **told)
+
+    def signs(self, alignment: Alignment) -> Signs | None:
+        """What speaks for and against an alignment; None where no evidence can be sought."""
+        if self.evidence is None:
+            return None
+        regions = self._witnesses.regions(alignment.T_a_b, self.evidence.region_m)
+        ratio = regions.log10_ratio(self.evidence.twin_share)
+        return self._signs(alignment, regions, ratio, self.evidence)
+
+    def _signs(
+        self, alignment: Alignment, regions: Regions, ratio: float, evidence: PairEvidence
+    ) -> Signs:
+        counts = (regions.n_confirmed, regions.n_contradicted, int(alignment.inlier.sum()))
+        support = (each.n_support for each in self._others(alignment.T_a_b, evidence))
+        extent_m = self._extent_m(alignment)
+        repeats = evidence.repeats(math.log10(self._judge.acceptance.false_alarms))
+        one_place = self._is_one_place(alignment, extent_m)
+        return Signs(ratio, *counts, max(support, default=0), extent_m, repeats, one_place)
+
+    def _weighed(
+        self, alignment: Alignment, regions: Regions, ratio: float, evidence: PairEvidence
+    ) -> tuple[Status, str]:
+        """What the evidence makes of an alignment that is more than chance."""
+        against, n = regions.n_contradicted, len(regions)
+        told = f"{regions.n_confirmed} of {n} regions that both must have seen are in both maps"
+        surprising = against >= _SEVERAL and binom.sf(against - 1, n, CHANGED) < _SURPRISE
+        if surprising or ratio < -math.log10(self._judge.evidence.most_against):
+            return Status.REFUSED, f"contradicted: {told}, {against} are missing from one"
+        doubt = self._doubt(alignment, regions, ratio, evidence)
+        if not doubt:
+            return Status.ACCEPTED, ""
+        return Status.AMBIGUOUS, doubt.format(told=told)
+
+    def _doubt(
+        self, alignment: Alignment, regions: Regions, ratio: float, evidence: PairEvidence
+    ) -> str:
+        """Why another place may be the right one, with `{told}` of the regions; else empty."""
+        settings, extent_m = self._judge.evidence, self._extent_m(alignment)
+        bound = math.log10(self._judge.acceptance.false_alarms)
+        rival = self._best_rival(alignment.T_a_b, evidence, bound)
+        if rival is not None and rival.log10_ratio > ratio - math.log10(settings.most_against):
+            return f"{{told}}; so do {_named(rival)}"
+        if self._is_one_place(alignment, extent_m):
+            what = f"the maps show little else than this place of {extent_m:.2g} m"
+            return f"{what}; what lies around it tells whether it is another's like"
+        if ratio >= math.log10(settings.least_ratio):
+            return ""
+        if rival is not None:
+            return f"{{told}}, too few beside {_named(rival)}"
+        if evidence.repeats(bound):
+            return "{told}, too few for maps that hold things twice"
+        if regions.n_confirmed <= 1 and extent_m < evidence.region_m:
+            what = f"all that agrees lies within {evidence.region_m:.2g} m"
+            return f"{what} and could hang elsewhere too; no other region confirms it"
+        return ""
+
+    def _best_rival(self, T_a_b: Float, evidence: PairEvidence, bound: float) -> RivalMotion | None:
+        """Of the other motions the one of most evidence.
+
+        It is more than chance, or both robots saw what it says: of two copies of a picture each
+        gets half the correspondences.
+        """
+        others = [
+            each
+            for each in self._others(T_a_b, evidence)
+            if each.log10_false_alarms <= bound or each.log10_ratio > 0
+        ]
+        return max(others, key=lambda each: each.log10_ratio, default=None)
+
+    def _others(self, T_a_b: Float, evidence: PairEvidence) -> list[RivalMotion]:
+        """The rivals that are another motion."""
+        p_b = self._pairs.map_b.position_m[:, :2]
+        return [each for each in evidence.rivals if apart_m(T_a_b, each.T_a_b, p_b) >= DISTINCT_M]
+
+    def _extent_m(self, alignment: Alignment) -> float:
+        """The longer side of where the supporters lie."""
+        return float(np.ptp(self._pairs.p_b[alignment.inlier, :2], axis=0).max(initial=0.0))
+
+    def _is_one_place(self, alignment: Alignment, extent_m: float) -> bool:
+        """Whether most of a map is one place that agrees, and no larger than a room."""
+        smaller = min(len(self._pairs.map_a), len(self._pairs.map_b))
+        most = np.count_nonzero(alignment.inlier) > smaller / 2
+        return bool(most) and extent_m < self._judge.evidence.place_m
+
+    def _why_unsure(self, alignment: Alignment) -> str:
+        """Why an alignment is not sure enough to be used; empty when it is."""
+        settings, p_a = self._judge.evidence, self._pairs.p_a[alignment.inlier, :2]
+        stated = whole_map_covariance(
+            alignment.T_a_b, alignment.covariance, alignment.drift_sigma_m, p_a
+        )
+        x, y = p_a.mean(axis=0)
+        # at the middle of its support: far from it the angle moves everything
+        at_middle = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
+        at_middle[:2, 2] += alignment.T_a_b[1], -alignment.T_a_b[0]
+        sigma_m, sigma_rad = motion_sigma(at_middle @ stated @ at_middle.T)
+        if sigma_m <= settings.max_sigma_m and sigma_rad <= settings.max_sigma_rad:
+            return ""
+        found = f"sigma {sigma_m:.2g} m, {sigma_rad:.2g} rad"
+        return f"{found}; {settings.max_sigma_m:g} m, {settings.max_sigma_rad:g} rad are allowed"
+
+
+def _named(rival: RivalMotion) -> str:
+    """A rival as a person can try it."""
+    x_m, y_m, theta_rad = rival.T_a_b
+    T = f"T_a_b = ({x_m:.2f} m, {y_m:.2f} m, {theta_rad:.2f} rad)"
+    return f"{rival.n_confirmed} of {rival.n_regions} under {T} with {rival.n_support} pairs"

@@ -1,0 +1,145 @@
+"""What is found once for two maps, whatever alignment is to be judged: rivals, and twins."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapfusion.align.acceptance import Acceptance
+from mapfusion.align.pairs import Pairs
+from mapfusion.align.refine import Refinement
+from mapfusion.evidence.parameters import EvidenceParameters
+from mapfusion.evidence.regions import Regions, Witnesses
+from mapfusion.evidence.rivals import Supported, distinct_motions, self_motions
+from mapfusion.evidence.twins import largest_patch_m
+from mapfusion.landmark_map import LandmarkMap
+from mapfusion.se2 import Float
+
+N_RIVALS, N_SELF_MOTIONS = 4, 3  # the best tell how much alike the others are
+_PATCH_REACH_M = 0.7  # between neighbouring corners of one picture
+_LEAST_OF_PATCH = 5
+# What is known of the share of twins before any region is seen: between that of worlds in which
+# nothing repeats and that of one with four posters on all walls; worth two regions.
+_TWINS_BEFORE, _OTHERS_BEFORE = 0.2, 1.8
+BETWEEN = "a b"  # of a motion between the maps; of one map onto itself: a, b
+
+
+@dataclass(frozen=True)
+class RivalMotion:
+    """A motion that correspondences support.
+
+    Attributes:
+        of: BETWEEN, or the map ("a" or "b") that it lays onto itself.
+        T_a_b: (3,).
+        log10_false_alarms: of the test against chance.
+        n_support: correspondences within its widest gate.
+        n_confirmed: regions that are seen again.
+        n_contradicted: regions that are not.
+        n_regions: that must be seen.
+        log10_ratio: of the regions, of a motion between the maps; NaN of one onto itself.
+    """
+
+    of: str
+    T_a_b: Float
+    log10_false_alarms: float
+    n_support: int
+    n_confirmed: int
+    n_contradicted: int
+    n_regions: int
+    log10_ratio: float = math.nan
+
+
+@dataclass(frozen=True)
+class PairEvidence:
+    """What two maps say about motions between them.
+
+    Attributes:
+        motions: the best of each kind, best first.
+        twin_share: of the regions that a wrong motion lays on their like.
+        region_m: side of a region: at least as large as what repeats.
+    """
+
+    motions: tuple[RivalMotion, ...]
+    twin_share: float
+    region_m: float
+
+    @classmethod
+    def of_nothing(cls, parameters: EvidenceParameters) -> "PairEvidence":
+        """Of two maps that no motion fits."""
+        return cls((), _twin_share([], []), parameters.region_m)
+
+    @property
+    def rivals(self) -> tuple[RivalMotion, ...]:
+        """Those between the two maps."""
+        return tuple(each for each in self.motions if each.of == BETWEEN)
+
+    def repeats(self, log10_false_alarms: float) -> bool:
+        """Whether either map holds something twice, by more than so many false alarms."""
+        onto_self = (each for each in self.motions if each.of != BETWEEN)
+        return any(each.log10_false_alarms <= log10_false_alarms for each in onto_self)
+
+
+def why_not_sought(map_a: LandmarkMap, map_b: LandmarkMap) -> str:
+    """Why two maps hold no evidence to be sought; empty where they do."""
+    for landmarks in (map_a, map_b):
+        for what, held in (
+            ("viewing evidence", landmarks.viewing),
+            ("descriptors", landmarks.descriptor),
+        ):
+            if held is None:
+                return f"map {landmarks.name} has no {what}"
+    return ""
+
+
+def find_evidence(
+    pairs: Pairs,
+    witnesses: Witnesses,
+    acceptance: Acceptance,
+    refinement: Refinement,
+    parameters: EvidenceParameters,
+) -> PairEvidence:
+    """All of it, of two maps with viewing evidence and descriptors."""
+    between = distinct_motions(pairs, N_RIVALS, acceptance, refinement)
+    region_m, onto_self = parameters.region_m, []
+    for side, own in zip("ab", (witnesses.a, witnesses.b), strict=True):
+        alike, motions = self_motions(own.landmarks, N_SELF_MOTIONS, acceptance, refinement)
+        onto_self += [(side, motion) for motion in motions]
+        region_m = max(region_m, _largest_twin_m(alike, motions, acceptance))
+    rivals = [(each, witnesses.regions(each.T_a_b, region_m)) for each in between]
+    selves = []
+    for side, motion in onto_self:
+        own = witnesses.a if side == "a" else witnesses.b
+        regions = Witnesses(own, own, parameters).regions(motion.T_a_b, region_m)
+        selves.append((side, motion, regions))
+    twin_share = _twin_share([r for _, r in rivals], [r for *_, r in selves])
+    found = [_rival(BETWEEN, each, r, r.log10_ratio(twin_share)) for each, r in rivals]
+    found += [_rival(side, each, r, math.nan) for side, each, r in selves]
+    return PairEvidence(tuple(found), twin_share, region_m)
+
+
+def _largest_twin_m(alike: Pairs, motions: list[Supported], acceptance: Acceptance) -> float:
+    """The largest thing that a map holds twice."""
+    longest = 0.0
+    for motion in motions:
+        if motion.log10_false_alarms <= math.log10(acceptance.false_alarms):
+            p = np.ascontiguousarray(alike.p_a[motion.inlier, :2])
+            longest = max(longest, largest_patch_m(p, _PATCH_REACH_M, _LEAST_OF_PATCH))
+    return longest
+
+
+def _twin_share(rivals: list[Regions], selves: list[Regions]) -> float:
+    """Share of regions confirmed under wrong motions.
+
+    Of the motions between the maps one may be right: that of most regions confirmed is left out.
+    """
+    by_worth = sorted(rivals, key=lambda r: r.n_contradicted - r.n_confirmed)
+    wrong = [*by_worth[1:], *selves]
+    twins_seen = sum(regions.n_confirmed for regions in wrong)
+    n = sum(map(len, wrong))
+    return (twins_seen + _TWINS_BEFORE) / (n + _TWINS_BEFORE + _OTHERS_BEFORE)
+
+
+def _rival(of: str, motion: Supported, regions: Regions, log10_ratio: float) -> RivalMotion:
+    counts = (regions.n_confirmed, regions.n_contradicted, len(regions))
+    n_support = int(np.count_nonzero(motion.inlier))
+    return RivalMotion(of, motion.T_a_b, motion.log10_false_alarms, n_support, *counts, log10_ratio)

@@ -1,0 +1,62 @@
+"""The probability that an alignment is right, from the signs that its verdict rests on.
+
+Right means within 0.5 m and 0.1 rad. A logistic model whose coefficients are fitted over worlds, of
+which some fool every test of support (`fitted.py`); what is more than chance has one.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from mapfusion.evidence.fitted import INTERCEPT, WEIGHTS
+from mapfusion.se2 import Float
+
+_MOST_EVIDENCE = 3.0  # decades: beyond them it is as sure as anything the model was fitted to
+_CONTRADICTION = 3.0  # regions that confirm make good for one that contradicts
+_FEW = 2.0  # regions: a share of so few is drawn to nothing
+_MOST_EXTENT_M = 12.0  # of support: beyond a hall it is as good as anywhere
+
+
+class Signs(NamedTuple):
+    """What speaks for and against one alignment.
+
+    Attributes:
+        log10_evidence: of the regions.
+        n_confirmed: regions that are seen again.
+        n_contradicted: regions that are not.
+        n_support: correspondences that support it.
+        n_rival: that support the best rival, 0 without one.
+        extent_m: the longer side of where its support lies.
+        repeats: whether either map holds something twice.
+        one_place: whether the maps show little else than the place that they share.
+    """
+
+    log10_evidence: float
+    n_confirmed: int
+    n_contradicted: int
+    n_support: int
+    n_rival: int
+    extent_m: float
+    repeats: bool
+    one_place: bool
+
+    def features(self) -> Float:
+        """What the model weighs (6,)."""
+        against = _CONTRADICTION * self.n_contradicted
+        net = (self.n_confirmed - against) / (self.n_confirmed + against + _FEW)
+        return np.array(
+            [
+                np.clip(self.log10_evidence, -_MOST_EVIDENCE, _MOST_EVIDENCE),
+                net,
+                math.log10((self.n_rival + 1) / (self.n_support + 1)),
+                min(self.extent_m, _MOST_EXTENT_M),
+                float(self.repeats),
+                float(self.one_place),
+            ]
+        )
+
+
+def probability(signs: Signs) -> float:
+    """That the alignment is right."""
+    return float(1 / (1 + np.exp(-(INTERCEPT + signs.features() @ np.array(WEIGHTS)))))

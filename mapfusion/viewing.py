@@ -1,0 +1,144 @@
+"""Viewing evidence of a map: from where its landmarks were seen, and what its robot looked through.
+
+With it one can say of a landmark that another map claims whether this robot must have seen it: it
+lay in the field of view of several frames, and nothing nearer hid it.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mapfusion.arguments import require_finite, require_shape
+from mapfusion.robot_log import RobotLog
+from mapfusion.se2 import Float, wrap
+
+BEARINGS = 16  # across the field of view: 4 degrees each of the STH-MDCS2's
+RANGES = 8  # steps of range up to the farthest, a metre each indoors
+# Of sightings, left out at either end of bearings, ranges and heights: gross ones lie there, and a
+# field of view taken a little too small asks for nothing that could not be seen.
+_STRAY = 0.005
+_LEAST_SIGHTINGS = 20  # of a range of which quantiles of heights can be told
+
+
+@dataclass(frozen=True)
+class FieldOfView:
+    """Where a robot's sightings lie in its own frame.
+
+    Attributes:
+        bearing_rad: (2,) least and greatest.
+        range_m: (2,) least and greatest, in the plane.
+        height_m: (RANGES, 2) least and greatest, at equal steps of range from 0 to the greatest;
+            the least above the greatest where nothing was seen.
+    """
+
+    bearing_rad: Float
+    range_m: Float
+    height_m: Float
+
+    def __post_init__(self) -> None:
+        require_shape("bearing_rad", self.bearing_rad, (2,))
+        require_shape("range_m", self.range_m, (2,))
+        require_shape("height_m", self.height_m, (RANGES, 2))
+
+
+@dataclass(frozen=True)
+class Viewing:
+    """How a map of N landmarks came to be, over T frames.
+
+    Attributes:
+        direction_rad: (N,) mean direction from the robot to the landmark, in the map's frame.
+        distance_m: (N,) mean distance between the two, in the plane.
+        n_views: (N,) int32 sightings behind both; 0 where these mean nothing.
+        pose: (T, 3) of the robot, in the map's frame.
+        reach_m: (T, BEARINGS) float32 range of the farthest landmark seen in each part of the field
+            of view, 0 where none was: nothing that is nearer can have been hidden.
+        field: the field of view.
+    """
+
+    direction_rad: Float
+    distance_m: Float
+    n_views: np.ndarray
+    pose: Float
+    reach_m: np.ndarray
+    field: FieldOfView
+
+    def __post_init__(self) -> None:
+        n, t = len(self.direction_rad), len(self.pose)
+        require_shape("distance_m", self.distance_m, (n,))
+        require_shape("n_views", self.n_views, (n,))
+        require_shape("pose", self.pose, (t, 3))
+        require_shape("reach_m", self.reach_m, (t, BEARINGS))
+        for name in ("direction_rad", "distance_m", "pose", "reach_m"):
+            require_finite(name, getattr(self, name))
+
+    def __len__(self) -> int:
+        """Number of landmarks."""
+        return len(self.direction_rad)
+
+    def __getitem__(self, rows: np.ndarray | slice) -> "Viewing":
+        """Of some of the landmarks; the frames stay."""
+        names = ("direction_rad", "distance_m", "n_views")
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
+
+    def joined(self, other: "Viewing", turn_rad: float) -> "Viewing":
+        """With the landmarks of another map behind its own, turned; the frames stay these."""
+        turned = replace(other, direction_rad=wrap(other.direction_rad + turn_rad))
+        names = ("direction_rad", "distance_m", "n_views")
+        both = {n: np.concatenate([getattr(self, n), getattr(turned, n)]) for n in names}
+        return replace(self, **both)
+
+
+def viewing_of(
+    log: RobotLog, landmark: np.ndarray, path: Float, source_observation: np.ndarray
+) -> Viewing:
+    """The viewing evidence of a map that was made of a log.
+
+    Args:
+        log: at least as long as the path.
+        landmark: (n,) which landmark each of the log's first observations is of, as the observation
+            that it came from; negative for none.
+        path: (T, 3) poses of the first T frames, in the map's frame.
+        source_observation: (N,) of the map's landmarks.
+    """
+    n_seen = min(int(np.searchsorted(log.iteration, len(path))), len(landmark))
+    frame, p = log.iteration[:n_seen], log.observations.position_m[:n_seen]
+    bearing, range_m = np.arctan2(p[:, 1], p[:, 0]), np.hypot(p[:, 0], p[:, 1])
+    field = _field_of_view(bearing, range_m, p[:, 2])
+    row_of = np.full(len(log.observations) + 1, -1, dtype=np.int64)
+    row_of[source_observation] = np.arange(len(source_observation))
+    owner = landmark[:n_seen]
+    row = np.where(owner >= 0, row_of[owner], -1)
+    used = row >= 0
+    row, frame, bearing, range_m = row[used], frame[used], bearing[used], range_m[used]
+    n = len(source_observation)
+    count = np.bincount(row, minlength=n)
+    direction = bearing + path[frame, 2]
+    cos, sin, distance = (
+        np.bincount(row, values, n) for values in (np.cos(direction), np.sin(direction), range_m)
+    )
+    reach = np.zeros((len(path), BEARINGS), dtype=np.float32)
+    np.maximum.at(reach, (frame, part_of(bearing, field)), range_m.astype(np.float32))
+    distance /= np.maximum(count, 1)
+    return Viewing(np.arctan2(sin, cos), distance, count.astype(np.int32), path, reach, field)
+
+
+def part_of(bearing_rad: Float, field: FieldOfView) -> np.ndarray:
+    """Which part of the field of view bearings (n,) lie in; those beyond it in its last ones."""
+    low, high = field.bearing_rad
+    part = np.floor((bearing_rad - low) / max(high - low, 1e-9) * BEARINGS)
+    return np.clip(part, 0, BEARINGS - 1).astype(np.int64)
+
+
+def _field_of_view(bearing_rad: Float, range_m: Float, height_m: Float) -> FieldOfView:
+    """Of sightings (n,); none where there are none."""
+    heights = np.tile([1.0, 0.0], (RANGES, 1))
+    if not len(range_m):
+        return FieldOfView(np.zeros(2), np.zeros(2), heights)
+    ends = (_STRAY, 1 - _STRAY)
+    nearest, farthest = np.quantile(range_m, ends)
+    step = np.floor(range_m / max(farthest, 1e-9) * RANGES).astype(np.int64)
+    for k in range(RANGES):
+        own = height_m[step == k]
+        if len(own) >= _LEAST_SIGHTINGS:
+            heights[k] = np.quantile(own, ends)
+    return FieldOfView(np.quantile(bearing_rad, ends), np.array([nearest, farthest]), heights)

@@ -1,0 +1,66 @@
+"""Chance for known identities: against counting, and what is evidence by itself."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from mapfusion import se2
+from mapfusion.align.acceptance import Acceptance
+from mapfusion.align.correspondences import match
+from mapfusion.align.named_landmarks import named_false_alarms
+from mapfusion.align.registration import Registration
+from mapfusion.align.registry import make_aligner
+from mapfusion.align.result import Status
+from mapfusion.landmark_map import LandmarkMap
+
+GATES_M = np.array(sorted(Acceptance().gates_m))
+T_A_B = np.array([1.0, -2.0, 0.7])
+
+
+def named_map(p: np.ndarray, name: str) -> LandmarkMap:
+    n = len(p)
+    position = np.column_stack([p, np.zeros(n)])
+    covariance = np.tile(np.diag([1e-4, 1e-4, 0.0]), (n, 1, 1))
+    counts, labels = np.full(n, 5, np.int32), np.arange(n, dtype=np.int32)
+    return LandmarkMap(position, covariance, counts, np.arange(n), None, labels, True, name)
+
+
+def test_it_is_what_the_formula_says() -> None:
+    rng = np.random.default_rng(0)
+    p_a = rng.uniform(0, [12, 8], (10, 2))
+    noise = np.zeros((10, 2))
+    noise[7:] = 3.0
+    p_b = se2.transform_points(se2.inverse(T_A_B), p_a + noise)
+    log10, gate_m, n, k = named_false_alarms(p_a, p_b, T_A_B, GATES_M)
+    assert (gate_m, n, k) == (0.05, 10, 7)
+    width, depth = np.ptp(p_a, axis=0) + 0.1
+    tail = binom.sf(4, 8, math.pi * 0.05**2 / (width * depth))
+    assert log10 == pytest.approx(math.log10(4 * 90 / 42 * tail))
+
+
+@pytest.mark.parametrize(("sigma_m", "accepted"), [(0.01, True), (1.5, False)])
+def test_three_namesakes_that_agree_are_evidence(sigma_m: float, accepted: bool) -> None:
+    rng = np.random.default_rng(1)
+    p_a = np.array([[0.0, 0.0], [12.0, 1.0], [5.0, 9.0]])
+    p_b = se2.transform_points(se2.inverse(T_A_B), p_a + rng.normal(0, sigma_m, (3, 2)))
+    a, b = named_map(p_a, "a"), named_map(p_b, "b")
+    done = Registration(make_aligner("clique")).register(a, b, match(a, b), rng)
+    assert (done.verdict.status is Status.ACCEPTED) == accepted
+
+
+def test_maps_that_are_wrong_have_no_more_false_alarms_than_stated() -> None:
+    """Namesakes anywhere on the same ground: every motion of two of them, judged."""
+    rng, bound, n_maps, accepted = np.random.default_rng(2), 0.1, 200, 0
+    for _ in range(n_maps):
+        p_a, p_b = rng.uniform(0, 10, (2, 8, 2))
+        best = math.inf
+        for i in range(8):
+            for j in range(i):
+                turn = math.atan2(*(p_a[i] - p_a[j])[::-1]) - math.atan2(*(p_b[i] - p_b[j])[::-1])
+                middle = se2.rotation(turn) @ (p_b[i] + p_b[j]) / 2
+                T = np.array([*((p_a[i] + p_a[j]) / 2 - middle), turn])
+                best = min(best, named_false_alarms(p_a, p_b, T, GATES_M)[0])
+        accepted += best <= math.log10(bound)
+    assert accepted / n_maps <= bound + 3 * math.sqrt(bound / n_maps)

@@ -1,0 +1,116 @@
+"""The verdict: walls that are common, that hang twice, that fool, and what is too uncertain."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mapfusion.align.acceptance import Verdict
+from mapfusion.align.clique import Clique
+from mapfusion.align.correspondences import match
+from mapfusion.align.registration import Registration
+from mapfusion.align.result import Alignment, Status
+from mapfusion.evidence.judge import Judge
+from mapfusion.evidence.parameters import EvidenceParameters
+from mapfusion.landmark_map import LandmarkMap
+from tests.mapfusion.evidence.two_rooms import Wall, between, mapped
+
+JUDGE = Judge()
+
+
+def verdict(a: LandmarkMap, b: LandmarkMap, judge: Judge = JUDGE) -> tuple[Verdict, Alignment]:
+    registration = Registration(Clique(), judge=judge)
+    done = registration.register(a, b, match(a, b), np.random.default_rng(0))
+    return done.verdict, done.refined
+
+
+COMMON = Wall(20, seed=1)
+A, B = mapped(COMMON, 1, 11, seed=2, name="A"), mapped(COMMON, 4, 16, seed=3, name="B")
+
+
+def test_common_ground_is_accepted_with_evidence() -> None:
+    said, refined = verdict(A, B)
+    assert said.status is Status.ACCEPTED
+    assert said.reason == ""
+    np.testing.assert_allclose(refined.T_a_b, between(1, 4), atol=0.03)
+    assert said.n_confirmed >= 2
+    assert said.log10_evidence > 1.5
+
+
+def test_a_picture_in_two_worlds_is_contradicted_by_all_around_it() -> None:
+    first, second = Wall(16, seed=1), Wall(16, seed=8)
+    inside = (first.p[:, 0] >= 6) & (first.p[:, 0] < 8)
+    hidden = (second.p[:, 0] >= 6) & (second.p[:, 0] < 8)
+    second.p = np.concatenate([second.p[~hidden], first.p[inside]])
+    second.look = np.concatenate([second.look[~hidden], first.look[inside]])
+    said, refined = verdict(mapped(first, 2, 12, seed=4), mapped(second, 2, 12, seed=5))
+    assert refined.ok
+    assert said.status is Status.REFUSED
+    assert said.log10_false_alarms < -3
+    assert "contradicted" in said.reason
+
+
+def test_a_picture_that_hangs_twice_leaves_two_places() -> None:
+    """Map a saw both copies and nothing else of b's ground; map b saw one."""
+    wall = Wall(30, seed=6, copies=[(4, 2.0, 12.0)])
+    other = Wall(30, seed=7)
+    picture = (wall.p[:, 0] >= 4) & (wall.p[:, 0] < 6)
+    other.p, other.look = wall.p[picture], wall.look[picture]  # on a wall that is bare
+    said, _ = verdict(mapped(wall, 1, 15, seed=8), mapped(other, 3, 7, seed=9))
+    assert said.status is Status.AMBIGUOUS
+    assert "T_a_b" in said.reason or "hold things twice" in said.reason
+
+
+def test_a_room_that_is_all_there_is_may_be_another_s_like() -> None:
+    """Both robots see 4 m of one wall and nothing else; with ground around it they are sure."""
+    room = Wall(4, seed=11)
+    said, refined = verdict(mapped(room, 0, 4, seed=12), mapped(room, 0.5, 4, seed=13))
+    assert refined.ok
+    assert said.status is Status.AMBIGUOUS
+    assert "little else than this place" in said.reason
+    small = Judge(evidence=EvidenceParameters(place_m=1.0))
+    trusted, _ = verdict(mapped(room, 0, 4, seed=12), mapped(room, 0.5, 4, seed=13), small)
+    assert trusted.status is Status.ACCEPTED
+
+
+def test_without_viewing_evidence_it_is_said_that_none_was_sought() -> None:
+    said, _ = verdict(replace(A, viewing=None), B)
+    assert said.status is Status.ACCEPTED
+    expected = "no evidence to the contrary could be sought: map A has no viewing evidence"
+    assert said.reason == expected
+    assert math.isnan(said.log10_evidence)
+
+
+def test_an_alignment_that_is_not_sure_enough_says_how_sure_it_is() -> None:
+    strict = Judge(evidence=EvidenceParameters(max_sigma_m=1e-3))
+    said, _ = verdict(A, B, strict)
+    assert said.status is Status.TOO_UNCERTAIN
+    assert "0.001 m, 0.05 rad are allowed" in said.reason
+    applied = said.applied_to(replace(verdict(A, B)[1]))
+    assert applied.status is Status.TOO_UNCERTAIN
+    assert not applied.ok
+
+
+def test_what_was_found_before_gives_the_same_verdict() -> None:
+    pairs = match(A, B)
+    registration = Registration(Clique())
+    sought = registration.on(A, B, pairs)
+    assert sought.judge is not None
+    known = registration.on(A, B, pairs, sought.judge.evidence)
+    both = [each.register(np.random.default_rng(0)).verdict for each in (sought, known)]
+    assert both[0] == both[1]
+
+
+def test_the_sigma_is_stated_where_the_supporters_are() -> None:
+    """Moving both maps' origins far away changes an angle's lever, not the verdict."""
+    far = np.array([1000.0, -500.0, 0.0])
+    moved = [replace(m, position_m=m.position_m + far, viewing=None) for m in (A, B)]
+    near, _ = verdict(replace(A, viewing=None), replace(B, viewing=None))
+    assert verdict(moved[0], moved[1])[0].status == near.status == Status.ACCEPTED
+
+
+@pytest.mark.parametrize("field", ["gate_m", "region_m", "least_ratio", "max_sigma_m"])
+def test_settings_out_of_range_are_named(field: str) -> None:
+    with pytest.raises(ValueError, match=field):
+        EvidenceParameters(**{field: -1.0})

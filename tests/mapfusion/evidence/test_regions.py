@@ -1,0 +1,50 @@
+"""Regions that both maps must share: confirmed, contradicted, and the same both ways."""
+
+import numpy as np
+import pytest
+
+from mapfusion import se2
+from mapfusion.evidence.parameters import EvidenceParameters
+from mapfusion.evidence.regions import Witness, Witnesses
+from tests.mapfusion.evidence.two_rooms import Wall, between, mapped
+
+WALL = Wall(16, seed=1)
+A, B = (Witness(mapped(WALL, *ends, seed=k)) for k, ends in enumerate(((1, 9), (5, 14))))
+T_A_B = between(1, 5)
+PARAMETERS = EvidenceParameters()
+
+
+def regions(T_a_b: np.ndarray, a: Witness = A, b: Witness = B):
+    return Witnesses(a, b, PARAMETERS).regions(T_a_b, 1.0)
+
+
+def test_the_right_motion_is_confirmed_everywhere() -> None:
+    found = regions(T_A_B)
+    assert len(found) >= 3
+    assert found.n_confirmed == len(found)
+    assert found.n_contradicted == 0
+    assert found.log10_ratio(0.05) > 3
+
+
+def test_a_motion_along_the_wall_is_contradicted_everywhere() -> None:
+    found = regions(T_A_B + np.array([0.0, 1.5, 0.0]))
+    assert found.n_contradicted == len(found) >= 3
+    assert found.log10_ratio(0.05) < -3
+
+
+def test_where_nothing_must_be_seen_nothing_is_said() -> None:
+    found = regions(T_A_B + np.array([0.0, 40.0, 0.0]))
+    assert len(found) == 0
+    assert found.log10_ratio(0.05) == 0.0
+
+
+def test_the_other_way_round_as_many_are_found() -> None:
+    there, back = regions(T_A_B), regions(se2.inverse(T_A_B), B, A)
+    assert there.found.sum() == back.found.sum()
+    assert there.expected.sum() == pytest.approx(back.expected.sum(), abs=10)  # cut differently
+
+
+def test_of_another_wall_nothing_is_found() -> None:
+    other = Witness(mapped(Wall(16, seed=9), 5, 14, seed=3))
+    found = regions(T_A_B, b=other)
+    assert found.n_contradicted == len(found) >= 3

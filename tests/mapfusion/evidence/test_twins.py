@@ -1,0 +1,61 @@
+"""What a map holds twice, against all pairs and SciPy's clusters."""
+
+import numpy as np
+import pytest
+from scipy.cluster.hierarchy import fcluster, linkage
+
+from mapfusion.align.acceptance import Acceptance
+from mapfusion.align.refine import Refinement
+from mapfusion.evidence.rivals import self_motions
+from mapfusion.evidence.twins import largest_patch_m, twins
+from mapfusion.landmark_map import LandmarkMap
+from tests.mapfusion.evidence.two_rooms import Wall, mapped
+
+
+def random_map(n: int, seed: int) -> LandmarkMap:
+    rng = np.random.default_rng(seed)
+    descriptor = rng.standard_normal((n, 64)).astype(np.float32) * 0.05
+    descriptor[3] = np.nan
+    covariance = np.tile(0.01 * np.eye(3), (n, 1, 1))
+    counts = np.full(n, 3, np.int32)
+    return LandmarkMap(rng.uniform(0, 4, (n, 3)), covariance, counts, np.arange(n), descriptor)
+
+
+def test_equals_all_pairs() -> None:
+    landmarks = random_map(600, 1)
+    p, descriptor = landmarks.position_m, landmarks.descriptor
+    assert descriptor is not None
+    unlike = np.linalg.norm(descriptor[:, None] - descriptor, axis=2)
+    near = np.linalg.norm(p[:, None, :2] - p[None, :, :2], axis=2) < 1.0
+    dz2 = (p[:, None, 2] - p[None, :, 2]) ** 2
+    level = dz2 <= 10.827566170662733 * (0.02 + 0.035**2)  # chi-square, 0.999
+    unlike[near | ~level | np.isnan(unlike)] = np.inf
+    best = unlike.argmin(axis=1)
+    rows = np.flatnonzero((best[best] == np.arange(600)) & (unlike.min(axis=1) <= 0.6))
+    found = twins(landmarks)
+    np.testing.assert_array_equal(found.index_a, rows)
+    np.testing.assert_array_equal(found.index_b, best[rows])
+    assert len(rows) > 50
+
+
+def test_a_picture_that_hangs_twice_is_found_and_one_that_hangs_once_is_not() -> None:
+    twice = mapped(Wall(16, seed=1, copies=[(2, 1.5, 9.0)]), 1, 14, seed=2)
+    once = mapped(Wall(16, seed=1), 1, 14, seed=2)
+    for landmarks, repeats in ((twice, True), (once, False)):
+        pairs, motions = self_motions(landmarks, 2, Acceptance(), Refinement())
+        best = min((each.log10_false_alarms for each in motions), default=0.0)
+        assert (best < -3) == repeats
+        if repeats:
+            np.testing.assert_allclose(np.abs(motions[0].T_a_b), [0, 7, 0], atol=0.05)
+            p = np.ascontiguousarray(pairs.p_a[motions[0].inlier, :2])
+            assert largest_patch_m(p, 0.7, 5) == pytest.approx(1.5, abs=0.3)
+
+
+def test_patches_are_single_linkage_clusters() -> None:
+    rng = np.random.default_rng(3)
+    for n in (6, 40, 200):
+        p = rng.uniform(0, 8, (n, 2))
+        of = fcluster(linkage(p, "single"), 0.7, "distance")
+        sizes = [np.ptp(p[of == k], axis=0).max() for k in np.unique(of) if (of == k).sum() >= 5]
+        assert largest_patch_m(p, 0.7, 5) == pytest.approx(max(sizes, default=0.0))
+    assert largest_patch_m(np.zeros((0, 2)), 0.7, 5) == 0.0
