@@ -118,8 +118,8 @@ def viewing_of(
     )
     reach = np.zeros((len(path), BEARINGS), dtype=np.float32)
     np.maximum.at(reach, (frame, part_of(bearing, field)), range_m.astype(np.float32))
-    distance /= np.maximum(count, 1)
-    return Viewing(np.arctan2(sin, cos), distance, count.astype(np.int32), path, reach, field)
+    mean_m = distance / np.maximum(count, 1)
+    return Viewing(np.arctan2(sin, cos), mean_m, count.astype(np.int32), path, reach, field)
 
 
 def part_of(bearing_rad: Float, field: FieldOfView) -> np.ndarray:
