@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mapfusion.attitude import read_attitude
 from mapfusion.robot_log import read_log
 from tests.helpers.tiny_scenario import assert_refused, command
 from tests.mapfusion.recordings.written_layouts import POSES, drive, tum_lines, write_kitti
@@ -26,6 +27,20 @@ def test_frames_cut_a_recording_into_robots(
     assert len(read_log(tmp_path / "07-2")) == 4
     for words in ("07: 5 pairs", "240x180 px", "A ", "07-2", "3 frames", str(tmp_path / "A")):
         assert words in reply.out
+
+
+@pytest.mark.parametrize("level", ["pictures", "floor"])
+def test_attitude_stands_beside_a_log_that_is_levelled_by_it(
+    level: str, sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = ("--level", level, "--vision", "tracks.min_length=2")
+    assert command(capsys, "import", "kitti", sequence, "-o", tmp_path, *own).code == 0
+    attitude = read_attitude(tmp_path / "07")
+    assert attitude is not None
+    assert np.abs(attitude.value).max() < 0.05  # the drive is level
+    shown = command(capsys, "inspect", tmp_path / "07" / "attitude.parquet")
+    assert shown.code == 0
+    assert "pitch_rad" in shown.out
 
 
 def test_too_little_to_map_is_exit_code_1(
@@ -63,6 +78,8 @@ def test_trajectories_are_taken_from_files(
         (("--param", "cameras=red"), ["kitti: cameras", "grey"]),
         (("--param", "mount.pitch_rad=3"), ["pitch_rad", "[-1.5, 1.5] rad"]),
         (("--odometry", "none.tum"), ["none.tum: no such file"]),
+        (("--level", "sideways"), ["--level", "mount"]),
+        (("--level", "odometry", "--odometry", "images"), ["--level odometry", "no odometry"]),
     ],
 )
 def test_what_is_wrong_is_one_line(
