@@ -114,7 +114,8 @@ def viewing_of(
     count = np.bincount(row, minlength=n)
     direction = bearing + path[frame, 2]
     cos, sin, distance = (
-        np.bincount(row, values, n) for values in (np.cos(direction), np.sin(direction), range_m)
+        np.bincount(row, values, n).astype(np.float64)
+        for values in (np.cos(direction), np.sin(direction), range_m)
     )
     reach = np.zeros((len(path), BEARINGS), dtype=np.float32)
     np.maximum.at(reach, (frame, part_of(bearing, field)), range_m.astype(np.float32))

@@ -39,6 +39,8 @@ expect:
 TRIO = (
     TINY.replace("name: tiny", "name: trio")
     .replace("drive:", "  - {name: R3, start: [0.9, 2.0, 0.1], route: [[2.5, 2.0]]}\ndrive:")
+    # all that the three see is less than a room
+    .replace("align:", "align:\n  evidence: {place_m: 0}")
     .replace("repetitions: 2", "repetitions: 3")
     .replace("evaluate:", "    - {name: impicp, method: impicp}\nevaluate:")
 )

@@ -117,11 +117,11 @@ def test_bytes_are_those_of_the_files_that_hold_it(
     run = JudgedRun.of(scenario, Store.of(trio_result.parent))
     logs = [run.store.path(robot.log) for robot in run.pipeline.robots]
     files = {
-        "filters": [[maps / f"{robot}.parquet"] for robot in ("R1", "R2", "R3")],
-        "once": [
-            [maps / f"{robot}.smoothed.parquet", maps / f"{robot}.smoothed.joint.parquet"]
+        "filters": [
+            [maps / f"{robot}{part}.parquet" for part in ("", ".viewing", ".frames")]
             for robot in ("R1", "R2", "R3")
         ],
+        "once": [list(maps.glob(f"{robot}.smoothed.*")) for robot in ("R1", "R2", "R3")],
         "together": [[log / "frames.parquet", log / "observations.parquet"] for log in logs],
     }
     for strategy, by_robot in files.items():
