@@ -93,9 +93,12 @@ class PairJudge:
             regions = self._witnesses.regions(alignment.T_a_b, evidence.region_m)
             ratio = regions.log10_ratio(evidence.twin_share)
             told = {"log10_evidence": ratio, "n_confirmed": regions.n_confirmed}
-            told |= {"n_contradicted": regions.n_contradicted}
-            told |= {"probability": probability(self._signs(alignment, regions, ratio, evidence))}
+            p = probability(self._signs(alignment, regions, ratio, evidence))
+            told |= {"n_contradicted": regions.n_contradicted, "probability": p}
             status, reason = self._weighed(alignment, regions, ratio, evidence)
+            if status is Status.ACCEPTED and p < self._judge.evidence.least_probability:
+                status = Status.AMBIGUOUS
+                reason = f"right with probability {p:.2g} alone, by all that speaks for and against"
         elif not self._pairs.by_name:
             why = why_not_sought(self._pairs.map_a, self._pairs.map_b)
             reason = f"no evidence to the contrary could be sought: {why}"

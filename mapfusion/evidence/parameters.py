@@ -21,6 +21,7 @@ class EvidenceParameters:
         least_ratio: by how many times more likely the regions must be if the alignment is right
             than if it is not, where maps resemble themselves or another motion fits them.
         most_against: by how many times less likely they may be before it counts as contradicted.
+        least_probability: that the alignment is right; below a half it is likelier wrong.
         max_sigma_m: of an alignment's translation, at the middle of what supports it. Twice that,
             95 %, is what least squares still mends and what a merged map is used for: 0.5 m.
         max_sigma_rad: of its rotation; twice that moves a landmark at 5 m by as much.
@@ -32,6 +33,7 @@ class EvidenceParameters:
     place_m: Annotated[float, Range(0, 1000, "m")] = 6.0
     least_ratio: Annotated[float, Range(1, 1e12, "1")] = 30.0
     most_against: Annotated[float, Range(1, 1e12, "1")] = 10.0
+    least_probability: Annotated[float, Range(0, 1, "1")] = 0.5
     max_sigma_m: Annotated[float, Range(1e-3, 1e6, "m")] = 0.25
     max_sigma_rad: Annotated[float, Range(1e-4, 10, "rad")] = 0.05
 

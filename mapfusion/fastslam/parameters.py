@@ -46,7 +46,7 @@ class FastSlamParameters:
     descriptor_threshold: Annotated[float, Range(1e-3, 2, "1")] = 0.5
     resample_fraction: Annotated[float, Range(0, 1, "1")] = 0.5
     stray_m: Annotated[float, Range(0, 10, "m")] = 0.004
-    frame_correlation: Annotated[float, Range(0, 1, "1")] = 0.2
+    frame_correlation: Annotated[float, Range(0, 1, "1")] = 0.05
     noise_floor_m: Annotated[float, Range(0, 10, "m")] = 0.0
     log_new_landmark_density: Annotated[float, Range(-100, 100, "ln 1/m^3")] | None = None
     planar: bool | None = None

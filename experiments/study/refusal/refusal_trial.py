@@ -21,6 +21,7 @@ from experiments.study.refusal.calibration import N_PAIRS_OF_MAPS, calibrate
 from experiments.study.refusal.cases import Case
 from experiments.study.refusal.stored_worlds import MappedWorld
 from mapfusion import se2
+from mapfusion.align.pairs import Pairs
 from mapfusion.align.registration import Registration
 from mapfusion.storage import schema
 
@@ -214,13 +215,14 @@ def _answers(
     names |= {"world_a": worlds[0].name, "robot_a": case.map_a.name}
     names |= {"world_b": worlds[1].name, "robot_b": case.map_b.name, "iteration": iteration}
     bound = np.log10(settings.acceptance.false_alarms)
+    known = settings.judge.on(Pairs(case.map_a, case.map_b, case.pairs)).evidence
     rows = []
     for entry in settings.aligners:
         rng = generator(scenario.seed, *map(str, names.values()), entry.name)
         aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
         registration = Registration(aligner, settings.refinement, settings.judge)
-        registered = registration.register(case.map_a, case.map_b, case.pairs, rng)
-        refined, verdict = registered.refined, registered.verdict
+        ready = registration.on(case.map_a, case.map_b, case.pairs, known)
+        _, refined, verdict = ready.register(rng)
         error = refined.T_a_b - case.T_true
         found = {
             "aligner": entry.name,
@@ -228,11 +230,11 @@ def _answers(
             "n_true": int(case.is_true.sum()),
             "n_common": case.n_common,
             "n_inliers": int(refined.inlier.sum()),
-            "status": str(registered.applied.status),
+            "status": str(verdict.status),
             "accepted": verdict.accepted,
             "beats_chance": bool(verdict.log10_false_alarms <= bound),
             "log10_false_alarms": verdict.log10_false_alarms,
-            "probability": getattr(verdict, "probability", np.nan),
+            "probability": verdict.probability,
             "refined_translation_error_m": np.hypot(error[0], error[1]),
             "refined_rotation_error_rad": float(se2.wrap(error[2])),
         }

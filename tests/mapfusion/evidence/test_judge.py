@@ -38,6 +38,15 @@ def test_common_ground_is_accepted_with_evidence() -> None:
     assert said.log10_evidence > 1.5
 
 
+def test_what_is_likelier_wrong_is_not_accepted_whatever_else_speaks_for_it() -> None:
+    said, _ = verdict(A, B)
+    bound = {"least_probability": min(1.0, said.probability + 1e-6)}
+    asked, _ = verdict(A, B, Judge(evidence=EvidenceParameters(**bound)))
+    assert asked.status is Status.AMBIGUOUS
+    assert f"probability {said.probability:.2g}" in asked.reason
+    assert asked.log10_evidence == said.log10_evidence
+
+
 def test_a_picture_in_two_worlds_is_contradicted_by_all_around_it() -> None:
     first, second = Wall(16, seed=1), Wall(16, seed=8)
     inside = (first.p[:, 0] >= 6) & (first.p[:, 0] < 8)
