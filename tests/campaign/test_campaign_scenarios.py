@@ -12,8 +12,8 @@ from tests.campaign.mutated_scenarios import DRAWN, bomb, complaint, explore
 from tests.helpers.tiny_scenario import TINY
 
 
-def test_each_of_150_mutants_is_a_scenario_or_one_line(tmp_path: Path) -> None:
-    seen, faults = explore(seed="7", count=150, runs=0, folder=tmp_path)
+def test_each_of_250_mutants_is_a_scenario_or_one_line(tmp_path: Path) -> None:
+    seen, faults = explore(seed="7", count=250, runs=0, folder=tmp_path)
     assert not faults
     assert min(seen["valid"], seen["refused"]) > 15  # both were tried
 
