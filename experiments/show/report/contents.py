@@ -25,6 +25,7 @@ from experiments.show.figures.style import aligner_styles
 from experiments.show.report.charts import error_curves, success_curves, time_curves
 from experiments.show.report.map_view import MAP_TABLES, map_view
 from experiments.show.report.origin import natural, provenance_of, stage_times
+from experiments.show.report.places import verdicts_and_places
 from experiments.show.report.theme import chart_style
 from experiments.show.team_lines import team_lines
 from experiments.study.statistics.run_tables import Runs, find_runs
@@ -106,7 +107,7 @@ def _without_truth(path: Path, runs: Runs, data: ResultTables) -> dict[str, Any]
 def _of_sweep(path: Path, maps: pd.DataFrame) -> dict[str, Any]:
     """Title of a sweep, and the sections that it has not."""
     none = ("outcomes", "robots", "fits", "smoother", "team", "edges", "figures", "missing")
-    none += ("scenario_text", "fusers", "fuser_figures")
+    none += ("scenario_text", "fusers", "fuser_figures", "places")
     return dict.fromkeys(none, ()) | {
         "title": f"{path.name}, {maps['run_id'].nunique()} runs",
         "description": ", ".join(maps["scenario"].unique()),
@@ -142,6 +143,7 @@ def _of_result(data: ResultTables) -> dict[str, Any]:
         "smoother": data.rows("smoother").to_dict("records"),
         "team": list(team_lines(*map(data.rows, ("fused_motions", "team", "team_pairs")))),
         "edges": data.rows("team_pairs").to_dict("records"),
+        "places": list(verdicts_and_places(data)),
         "fusers": last_fused(data.rows("fusers")).to_dict("records"),
         "fuser_figures": list(_pictures(data.folder, _OF_FUSERS)),
         "figures": list(_pictures(data.folder, [n for n in FIGURES if n not in _OF_FUSERS])),
