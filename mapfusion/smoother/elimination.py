@@ -131,7 +131,7 @@ def _landmarks_first(seen: Sightings, equations: NormalEquations) -> Solution:
     _subtract(seen.track_starts, row, equations.coupling, left.own_m2, left.pull, S, gradient)
     _subtract(seen.starts, row, left.coupling, own, left.point_gradient, S, gradient)
     factor = cholesky_in_envelope(S[3:, 3:])
-    # by rows a lower factor is by columns an upper one: as LAPACK takes it, without a copy
+    # by rows a lower factor is by columns an upper one, as LAPACK takes it
     solved = -scipy.linalg.cho_solve((factor.T, False), gradient[1:].ravel(), check_finite=False)
     way = np.zeros((n, 3))
     way[1:] = solved.reshape(-1, 3)[place[1:] - 1]
