@@ -17,7 +17,6 @@ from mapfusion.smoother.student import (
     MOST_DOF,
     fitted_dof,
     information_share,
-    student_cost,
     student_weights,
 )
 
@@ -44,13 +43,6 @@ def informative(seen: Sightings, weights: Weights, tails: Tails) -> Weights:
 def unweighted(seen: Sightings) -> Weights:
     """All ones; tracks that do not stray have no offsets that anything could be known about."""
     return Weights(np.ones(len(seen)), seen.strays.astype(np.float64))
-
-
-def cost(seen: Sightings, at: Estimate, tails: Tails, stray_information: float) -> float:
-    """Twice the negative log likelihood of observations and offsets, but for a constant."""
-    n = seen.n_dimensions
-    offsets = student_cost(offset_squares(seen, at, stray_information), tails.offset, n)
-    return offsets + student_cost(squared_distances(seen, at), tails.observation, n)
 
 
 def reweighted(

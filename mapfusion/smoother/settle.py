@@ -13,7 +13,8 @@ from mapfusion.smoother.normal_equations import (
     disturbances,
     normal_equations,
 )
-from mapfusion.smoother.robust import NO_TAILS, Tails, cost, informative, reweighted, unweighted
+from mapfusion.smoother.residuals import squared_distances
+from mapfusion.smoother.robust import NO_TAILS, Tails, informative, reweighted, unweighted
 from mapfusion.smoother.sightings import Sightings
 
 # The next step would move the poses by no more than this, in squared sigmas a coordinate: the third
@@ -39,10 +40,12 @@ class Problem(NamedTuple):
     information: Float
     stray_information: float
 
-    def cost(self, at: Estimate, tails: Tails) -> float:
-        """Twice the negative log likelihood, but for a constant."""
-        walked = float(np.sum(self.information * disturbances(at.path, self.odometry) ** 2))
-        return walked + cost(self.seen, at, tails, self.stray_information)
+    def cost(self, at: Estimate, weights: Weights) -> float:
+        """The sum of all squares under weights: twice the negative log likelihood they stand for."""
+        walked = np.sum(self.information * disturbances(at.path, self.odometry) ** 2)
+        seen = np.sum(weights.observation * squared_distances(self.seen, at))
+        offsets = np.sum(weights.offset[:, None] * at.offset_m**2)
+        return float(walked + seen + self.stray_information * offsets)
 
 
 class Settled(NamedTuple):
@@ -79,18 +82,23 @@ def settled(
             equations = normal_equations(seen, at, known, stray_information, odometry, information)
             solution = solve(seen, equations)
             return Settled(seen, at, weights, tails, n_steps, equations, solution)
-        at = _stepped(problem, tails, at, solution.step)
+        at = _stepped(problem, weights, at, solution.step)
         weights, tails = reweighted(seen, at, weights, solution, stray_information)
         n_steps += 1
 
 
-def _stepped(problem: Problem, tails: Tails, at: Estimate, step: Estimate) -> Estimate:
-    """The step, or as much of it as lowers the cost: half, a quarter, ..."""
-    before, share = problem.cost(at, tails), 1.0
+def _stepped(problem: Problem, weights: Weights, at: Estimate, step: Estimate) -> Estimate:
+    """The step, or as much of it as lowers the cost: half, a quarter, ...
+
+    It is the cost under the weights that the step is of (a generalised M step: Dempster, Laird and
+    Rubin 1977). The likelihood of the Student-t's about the *fitted* points has its least elsewhere:
+    it would stop steps that the weights, told from expected squares, still ask for.
+    """
+    before, share = problem.cost(at, weights), 1.0
     for _ in range(_MOST_HALVINGS):
         further = Estimate(*(old + share * new for old, new in zip(at, step, strict=True)))
         further.path[:, 2] = wrap(further.path[:, 2])
-        if problem.cost(further, tails) <= before:
+        if problem.cost(further, weights) <= before:
             return further
         share /= 2
     return at
