@@ -82,6 +82,11 @@ def information_of(sigma: Float) -> Float:
     return 1.0 / (sigma**2 + _STILL**2)
 
 
+def turns(path: Float) -> Float:
+    """(T, 2) cosine and sine of each heading."""
+    return np.stack([np.cos(path[:, 2]), np.sin(path[:, 2])], axis=1)
+
+
 def disturbances(path: Float, odometry: Float) -> Float:
     """(T - 1, 3) d of eq. 3 on this path: x_k = x_(k-1) + (u_k + d)."""
     found = between(path[:-1], path[1:]) - odometry[1:]
@@ -131,7 +136,7 @@ def normal_equations(
         of_offset[:, None] * at.offset_m,
         np.empty((len(seen), 3, 3)),
     )
-    _add_observations(seen.arrays, at, weights.observation, made)
+    _add_observations(seen.arrays, at, turns(at.path), weights.observation, made)
     _add_odometry(at.path, odometry, information, made)
     return made
 
@@ -151,20 +156,22 @@ def _add_odometry(path: Float, odometry: Float, information: Float, made: Normal
 def _add_observations(
     seen: tuple[np.ndarray, np.ndarray, np.ndarray, Float, Float],
     at: Estimate,
+    turn: Float,
     weight: Float,
     made: NormalEquations,
 ) -> None:
     starts, owner, frame, position, information = seen
+    W, e, J = np.empty((3, 3)), np.empty(3), np.zeros((3, 3))
+    half, R = np.empty((3, 3)), np.zeros((3, 3))
     for t in range(len(starts) - 1):
         point = at.point_m[owner[t]] + at.offset_m[t]
         A, b = made.track_block[t], made.track_gradient[t]
         for i in range(starts[t], starts[t + 1]):
             k = frame[i]
-            W, e, J = linearised(at.path[k], point, position[i], information[i])
+            _put_rotation(turn[k], R)
+            _put_in_map_frame(R, information[i], weight[i], half, W)
+            _put_residual(at.path[k], point, R, position[i], e, J)
             H, block = made.coupling[i], made.pose_block[k]
-            for r in range(3):
-                for q in range(3):
-                    W[r, q] *= weight[i]
             for r in range(3):
                 for q in range(3):
                     A[r, q] += W[r, q]
@@ -177,23 +184,34 @@ def _add_observations(
 
 
 @njit(cache=True)
-def linearised(
-    pose: Float, point: Float, seen_at: Float, information: Float
-) -> tuple[Float, Float, Float]:
-    """W, e and de/dx of one observation, in the map frame."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    W, e, J = np.empty((3, 3)), np.empty(3), np.zeros((3, 3))
+def _put_rotation(turn: Float, R: Float) -> None:
+    c, s = turn
+    R[0, 0], R[0, 1], R[1, 0], R[1, 1], R[2, 2] = c, -s, s, c, 1.0
+
+
+@njit(cache=True)
+def _put_in_map_frame(R: Float, information: Float, weight: float, half: Float, W: Float) -> None:
+    """The information of an observation, in the map frame: weight R information R'."""
     for r in range(3):
         for q in range(3):
-            total = 0.0
-            for u in range(3):
-                for v in range(3):
-                    total += R[r, u] * information[u, v] * R[q, v]
-            W[r, q] = total
+            half[r, q] = (
+                R[r, 0] * information[0, q]
+                + R[r, 1] * information[1, q]
+                + R[r, 2] * information[2, q]
+            )
+    for r in range(3):
+        for q in range(3):
+            W[r, q] = weight * (
+                half[r, 0] * R[q, 0] + half[r, 1] * R[q, 1] + half[r, 2] * R[q, 2]
+            )
+
+
+@njit(cache=True)
+def _put_residual(pose: Float, point: Float, R: Float, seen_at: Float, e: Float, J: Float) -> None:
+    """The residual e of one observation in the map frame, and de/dx."""
+    for r in range(3):
         e[r] = point[r] - R[r, 0] * seen_at[0] - R[r, 1] * seen_at[1] - R[r, 2] * seen_at[2]
     e[0] -= pose[0]
     e[1] -= pose[1]
     J[0, 0] = J[1, 1] = -1.0
     J[0, 2], J[1, 2] = point[1] - pose[1], pose[0] - point[0]
-    return W, e, J

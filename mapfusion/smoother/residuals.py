@@ -4,7 +4,7 @@ import numpy as np
 from numba import njit
 
 from mapfusion.se2 import Float, rotation
-from mapfusion.smoother.normal_equations import Estimate, linearised
+from mapfusion.smoother.normal_equations import Estimate, turns
 from mapfusion.smoother.sightings import Sightings
 
 
@@ -22,10 +22,12 @@ def squared_distances(seen: Sightings, at: Estimate, covariance_m2: Float | None
     With the covariances (B, 3, 3) of the tracks' points these are expected ones, as they are about
     the true points: those about points that were fitted to the same observations are smaller.
     """
-    if covariance_m2 is None:
-        covariance_m2 = np.zeros((len(at.offset_m), 3, 3))
     squares = np.empty(len(seen))
-    _squared_distances(seen.arrays, at, covariance_m2, squares)
+    turn = turns(at.path)
+    if covariance_m2 is None:
+        _squared_distances(seen.arrays, at, turn, squares)
+    else:
+        _expected_squares(seen.arrays, at, turn, covariance_m2, squares)
     return squares
 
 
@@ -33,19 +35,52 @@ def squared_distances(seen: Sightings, at: Estimate, covariance_m2: Float | None
 def _squared_distances(
     seen: tuple[np.ndarray, np.ndarray, np.ndarray, Float, Float],
     at: Estimate,
-    covariance_m2: Float,
+    turn: Float,
     squares: Float,
 ) -> None:
+    """In the robot's frame, where the information is: r' W r with r = R'(l + b - p) - z."""
     starts, owner, frame, position, information = seen
     for t in range(len(starts) - 1):
         point = at.point_m[owner[t]] + at.offset_m[t]
         for i in range(starts[t], starts[t + 1]):
-            W, e, _ = linearised(at.path[frame[i]], point, position[i], information[i])
-            total = 0.0
-            for r in range(3):
-                for q in range(3):
-                    total += W[r, q] * (e[r] * e[q] + covariance_m2[t, r, q])
-            squares[i] = total
+            c, s, W = turn[frame[i], 0], turn[frame[i], 1], information[i]
+            x, y = point[0] - at.path[frame[i], 0], point[1] - at.path[frame[i], 1]
+            r0 = c * x + s * y - position[i, 0]
+            r1 = c * y - s * x - position[i, 1]
+            r2 = point[2] - position[i, 2]
+            squares[i] = (
+                r0 * (W[0, 0] * r0 + 2 * W[0, 1] * r1)
+                + r1 * (W[1, 1] * r1 + 2 * W[1, 2] * r2)
+                + r2 * (W[2, 2] * r2 + 2 * W[0, 2] * r0)
+            )
+
+
+@njit(cache=True)
+def _expected_squares(
+    seen: tuple[np.ndarray, np.ndarray, np.ndarray, Float, Float],
+    at: Estimate,
+    turn: Float,
+    covariance_m2: Float,
+    squares: Float,
+) -> None:
+    """The same and the trace of W R' C R: what the uncertainty of the track's point adds."""
+    _squared_distances(seen, at, turn, squares)
+    starts, _, frame, _, information = seen
+    for t in range(len(starts) - 1):
+        C = covariance_m2[t]
+        for i in range(starts[t], starts[t + 1]):
+            c, s, W = turn[frame[i], 0], turn[frame[i], 1], information[i]
+            along = c * c * C[0, 0] + 2 * c * s * C[0, 1] + s * s * C[1, 1]
+            across = s * s * C[0, 0] - 2 * c * s * C[0, 1] + c * c * C[1, 1]
+            mixed = c * s * (C[1, 1] - C[0, 0]) + (c * c - s * s) * C[0, 1]
+            squares[i] += (
+                W[0, 0] * along
+                + W[1, 1] * across
+                + W[2, 2] * C[2, 2]
+                + 2 * W[0, 1] * mixed
+                + 2 * W[0, 2] * (c * C[0, 2] + s * C[1, 2])
+                + 2 * W[1, 2] * (c * C[1, 2] - s * C[0, 2])
+            )
 
 
 def offset_squares(seen: Sightings, at: Estimate, stray_information: float) -> Float:
