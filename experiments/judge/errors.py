@@ -1,6 +1,6 @@
 """Estimates joined with the truth: the rows of the table `errors`."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -15,6 +15,7 @@ from experiments.run.estimates import (
     estimate_row,
     evidence_of,
 )
+from experiments.run.frames import records
 from mapfusion import se2
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.oracle import Oracle
@@ -32,7 +33,7 @@ class EvaluatedRobot:
     """What is known of one robot when its maps are judged; maps and true points by iteration."""
 
     name: str
-    maps: dict[int, LandmarkMap]
+    maps: Mapping[int, LandmarkMap]
     points_world_m: dict[int, Float]  # (N, 3) for each map
     path: PathTruth
 
@@ -120,8 +121,8 @@ def error_rows(met: MetMaps, judge: Judge, radius_m: float) -> pd.DataFrame:
     evidence = evidence_of(met.rivals, judge.evidence)
     row = met.names | {"aligner": ORACLE, "repetition": 0}
     row |= estimate_row(len(pairs), oracle, oracle, judge.on(pairs, evidence).judge(oracle))
-    records = [row, *met.estimates.to_dict("records")]
-    rows, alignments = pd.DataFrame(records), [alignment_of(each, len(pairs)) for each in records]
+    all_rows = [row, *records(met.estimates)]
+    rows, alignments = pd.DataFrame(all_rows), [alignment_of(each, len(pairs)) for each in all_rows]
     T_true = se2.between(met.a.path.T_world_map, met.b.path.T_world_map)
     T_refined = np.array([alignment.T_a_b for alignment in alignments])
     inlier = np.array([alignment.inlier for alignment in alignments])

@@ -10,9 +10,9 @@ from experiments.judge import tables
 from experiments.judge.errors import EvaluatedRobot, error_rows, met_maps
 from experiments.judge.fused_landmarks import MergeSettings, fusion_rows
 from experiments.judge.truth import PathTruth, landmark_truth
-from experiments.run.frames import read_rows
 from experiments.run.job import Job
-from experiments.run.stages.slam import ASSOCIATIONS, RobotFolders, read_snapshots
+from experiments.run.stages.slam import RobotFolders
+from experiments.run.stages.snapshots import Associations, Snapshots
 from mapfusion.errors import InputError
 from mapfusion.evidence.judge import Judge
 from mapfusion.robot_log import TRUTH_FILES, RobotLog, RobotTruth, read_log, read_truth
@@ -46,9 +46,8 @@ def load_robot(folders: RobotFolders) -> EvaluatedRobot:
         if len(true) != len(logged):
             counts = f"{len(true)} rows, the log has {len(logged)} of them"
             raise InputError(f"{folders.log / file}.parquet: {counts}")
-    maps = read_snapshots(folders.slam, log)
-    associations = read_rows(folders.slam / "associations.parquet", ASSOCIATIONS)
-    points = landmark_truth(truth, associations, maps)
+    maps = Snapshots(folders.slam, log)
+    points = landmark_truth(truth, Associations.read(folders.slam), maps)
     return EvaluatedRobot(log.robot, maps, points, PathTruth.of(truth))
 
 

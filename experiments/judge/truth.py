@@ -1,11 +1,13 @@
 """The truth joined to estimates. Only the evaluation imports this; no estimator does."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 from scipy.spatial import KDTree
 
+from experiments.run.stages.snapshots import Associations
 from mapfusion import se2
 from mapfusion.align.rigid import fit_rigid
 from mapfusion.landmark_map import LandmarkMap
@@ -14,23 +16,16 @@ from mapfusion.se2 import Float
 
 
 def landmark_truth(
-    truth: RobotTruth, associations: pd.DataFrame, maps: dict[int, LandmarkMap]
+    truth: RobotTruth, associations: Associations, maps: Mapping[int, LandmarkMap]
 ) -> dict[int, Float]:
     """The true world point (N, 3) of each landmark of each evaluated map; NaN where unknown.
 
-    It is the median of the true points of all observations that went into the landmark;
-    `associations` are changes by iteration, as the SLAM stage lists them.
+    It is the median of the true points of all observations that went into the landmark.
     """
     point_m, has_point = truth.point_world_m, np.isfinite(truth.point_world_m).all(axis=1)
-    owner = np.full(len(point_m), -1, dtype=np.int64)
-    points, done = {}, -1
-    for iteration, landmarks in sorted(maps.items()):
-        # also those of iterations that have no map here, each after the ones before it
-        since = associations["from_iteration"].between(done, iteration, inclusive="right")
-        rows = associations[since].sort_values("from_iteration", kind="stable")
-        observation, source = rows[["observation", "source_observation"]].to_numpy(np.int64).T
-        owner[observation] = source
-        done = iteration
+    points = {}
+    for iteration, landmarks in maps.items():
+        owner = associations.at(iteration, len(point_m))
         known = has_point & (owner >= 0)
         medians = pd.DataFrame(point_m[known]).groupby(owner[known]).median()
         points[iteration] = medians.reindex(landmarks.source_observation).to_numpy(np.float64)

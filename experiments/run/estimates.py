@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
+from experiments.run.frames import records
 from experiments.run.stage_tables import COVARIANCE, MOTION
 from mapfusion.align.acceptance import Verdict
 from mapfusion.align.correspondences import Correspondences
@@ -93,7 +94,7 @@ def evidence_of(rows: pd.DataFrame, parameters: EvidenceParameters) -> PairEvide
             **{name: row[name] for name in _RIVAL_COUNTS},
             log10_ratio=row["log10_evidence"],
         )
-        for row in rows.to_dict("records")
+        for row in records(rows)
     )
     if not motions:
         return PairEvidence.of_nothing(parameters)

@@ -38,6 +38,12 @@ def read_rows(path: Path, table_schema: pa.Schema) -> pd.DataFrame:
     return table.to_pandas()
 
 
+def records(rows: pd.DataFrame) -> list[dict[str, Any]]:
+    """The rows by column; pandas' own takes ten times as long for a few rows of many columns."""
+    names = rows.columns.tolist()
+    return [dict(zip(names, row, strict=True)) for row in rows.itertuples(index=False, name=None)]
+
+
 def row_groups(
     path: Path, what: str, choose: Callable[[pa.Schema], Sequence[str] | None] = lambda _: None
 ) -> Iterator[pa.Table]:

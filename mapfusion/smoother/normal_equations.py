@@ -201,9 +201,7 @@ def _put_in_map_frame(R: Float, information: Float, weight: float, half: Float, 
             )
     for r in range(3):
         for q in range(3):
-            W[r, q] = weight * (
-                half[r, 0] * R[q, 0] + half[r, 1] * R[q, 1] + half[r, 2] * R[q, 2]
-            )
+            W[r, q] = weight * (half[r, 0] * R[q, 0] + half[r, 1] * R[q, 1] + half[r, 2] * R[q, 2])
 
 
 @njit(cache=True)

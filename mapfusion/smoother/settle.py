@@ -41,7 +41,7 @@ class Problem(NamedTuple):
     stray_information: float
 
     def cost(self, at: Estimate, weights: Weights) -> float:
-        """The sum of all squares under weights: twice the negative log likelihood they stand for."""
+        """Sum of all squares under weights: twice the negative log likelihood they stand for."""
         walked = np.sum(self.information * disturbances(at.path, self.odometry) ** 2)
         seen = np.sum(weights.observation * squared_distances(self.seen, at))
         offsets = np.sum(weights.offset[:, None] * at.offset_m**2)
@@ -91,8 +91,8 @@ def _stepped(problem: Problem, weights: Weights, at: Estimate, step: Estimate) -
     """The step, or as much of it as lowers the cost: half, a quarter, ...
 
     It is the cost under the weights that the step is of (a generalised M step: Dempster, Laird and
-    Rubin 1977). The likelihood of the Student-t's about the *fitted* points has its least elsewhere:
-    it would stop steps that the weights, told from expected squares, still ask for.
+    Rubin 1977). The likelihood of the Student-t's about the *fitted* points has its least
+    elsewhere: it would stop steps that weights from expected squares still ask for.
     """
     before, share = problem.cost(at, weights), 1.0
     for _ in range(_MOST_HALVINGS):

@@ -17,13 +17,13 @@ from experiments.run.estimates import alignment_of, correspondences_of, covarian
 from experiments.run.frames import FLOAT, INT, TEXT, fields, read_rows, write_rows
 from experiments.run.job import Job
 from experiments.run.stage_tables import CORRESPONDENCES, COVARIANCE, ESTIMATES
-from experiments.run.stages.slam import associations_at, read_snapshots
 from experiments.run.stages.smooth import (
     log_until,
     read_smoothed,
     read_smoothed_path,
     smoother_of,
 )
+from experiments.run.stages.snapshots import Associations, Snapshots
 from mapfusion.aligned_landmarks import ABSENT
 from mapfusion.fuse.parameters import MergeParameters
 from mapfusion.fuse.registry import make_fuser
@@ -145,7 +145,7 @@ def given_teams(settings: FuseSettings, job: Job) -> Iterator[tuple[int, GivenTe
 def _read_robot(job: Job, name: str, smoothed: bool) -> _Robot:
     log = read_log(job.inputs[f"log {name}"])
     maps = read_smoothed(job.inputs[f"smooth {name}"]) if smoothed else {}
-    return _Robot(log, read_snapshots(job.inputs[f"slam {name}"], log), maps)
+    return _Robot(log, Snapshots(job.inputs[f"slam {name}"], log), maps)
 
 
 def _at(maps: Mapping[int, LandmarkMap], iteration: int) -> LandmarkMap:
@@ -165,7 +165,7 @@ def _recording(
         return None
     k = max(smoothed)
     log = log_until(log, k, settings.noise_floor_m)
-    landmark = associations_at(job.inputs[f"slam {name}"], k, len(log.observations))
+    landmark = Associations.read(job.inputs[f"slam {name}"]).at(k, len(log.observations))
     path = read_smoothed_path(job.inputs[f"smooth {name}"])[k]
     smoother = smoother_of(settings.smoother, job.inputs[f"log {name}"])
     return Recording(log, landmark, path, smoother)

@@ -14,7 +14,7 @@ from experiments.run.estimates import rival_rows
 from experiments.run.frames import write_rows
 from experiments.run.job import Job
 from experiments.run.stage_tables import CORRESPONDENCES, RIVALS
-from experiments.run.stages.slam import read_snapshots
+from experiments.run.stages.snapshots import Snapshots
 from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.correspondences import MatchParameters, match
 from mapfusion.align.pairs import Pairs
@@ -74,11 +74,11 @@ def rivals_path(folder: Path, part: str) -> Path:
 
 # The maps of one pair of robots stay in memory: each aligner of the pair wants the same.
 @functools.lru_cache(maxsize=2)
-def _maps(log: Path, slam: Path) -> dict[int, LandmarkMap]:
-    return read_snapshots(slam, read_log(log))
+def _maps(log: Path, slam: Path) -> Snapshots:
+    return Snapshots(slam, read_log(log))
 
 
-def maps_of_both(job: Job) -> list[dict[int, LandmarkMap]]:
+def maps_of_both(job: Job) -> list[Snapshots]:
     """All maps of the job's two robots, by iteration."""
     return [_maps(job.inputs[f"log_{side}"], job.inputs[f"slam_{side}"]) for side in "ab"]
 

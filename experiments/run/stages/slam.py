@@ -1,6 +1,6 @@
 """Stage: one robot's FastSLAM over its log, with its map at each evaluated iteration."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,21 +14,10 @@ from experiments.scenario.randomness import generator
 from mapfusion.fastslam.filter import StepResult
 from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.fastslam.run import run_log
-from mapfusion.landmark_map import LandmarkMap
 from mapfusion.odometry_covariance import read_odometry_covariance
-from mapfusion.robot_log import RobotLog, read_log, with_rows
+from mapfusion.robot_log import read_log
 from mapfusion.se2 import Float
-from mapfusion.storage import (
-    POSE_FIELDS,
-    column,
-    float_fields,
-    point_columns,
-    point_fields,
-    points_from,
-    read_table,
-    schema,
-)
-from mapfusion.viewing import viewing_of
+from mapfusion.storage import POSE_FIELDS, float_fields, point_columns, point_fields, schema
 
 _ONLINE, _FINAL = ([f"{path}_{name}" for name in POSE_FIELDS] for path in ("online", "final"))
 _ITERATION = fields(iteration=INT)
@@ -130,48 +119,6 @@ def _step(result: StepResult) -> dict[str, float]:
         # root of the trace of the particles' weighted position covariance
         "spread_m": float(np.sqrt(weights @ np.sum(centred**2, axis=1))),
     }
-
-
-def read_snapshots(slam: Path, log: RobotLog) -> dict[int, LandmarkMap]:
-    """The robot's map at each evaluated iteration, with what its log tells of the landmarks.
-
-    These are descriptors, labels, and from where they were seen.
-    """
-    table, attributes = read_table(slam / "snapshots.parquet", SNAPSHOTS)
-    origin = column(table, "source_observation")
-    seen = log.observations[origin]
-    about = (column(table, "count"), origin, seen.descriptor, seen.label, log.planar, log.robot)
-    landmarks = LandmarkMap(*points_from(table), *about)
-    iteration = column(table, "iteration")
-    evaluated = map(int, attributes["iterations"].split(","))
-    rows = {k: slice(*np.searchsorted(iteration, [k, k + 1])) for k in evaluated}
-    paths = read_rows(slam / "paths.parquet", PATHS)
-    changes = read_rows(slam / "associations.parquet", ASSOCIATIONS)
-    maps = {}
-    for k, own in rows.items():
-        path = paths.loc[paths["evaluated"] == k, POSE_FIELDS].to_numpy(np.float64)
-        counts_for = _associations(changes, k, int(np.searchsorted(log.iteration, k + 1)))
-        viewing = viewing_of(log, counts_for, path, origin[own])
-        maps[k] = replace(with_rows(landmarks, own), viewing=viewing)
-    return maps
-
-
-def associations_at(slam: Path, iteration: int, n_observations: int) -> np.ndarray:
-    """Which landmark each of the log's first observations is of, as an evaluated iteration had it.
-
-    (n_observations,) int64 by the observation that the landmark came from, -1 for none.
-    """
-    changes = read_rows(slam / "associations.parquet", ASSOCIATIONS)
-    return _associations(changes, iteration, n_observations)
-
-
-def _associations(changes: pd.DataFrame, iteration: int, n_observations: int) -> np.ndarray:
-    """The same, from the table of changes."""
-    counts_for = np.full(n_observations, -1, dtype=np.int64)
-    # in the order of iterations, so the last change of an observation is the one that stays
-    so_far = changes[changes["from_iteration"] <= iteration]
-    counts_for[so_far["observation"].to_numpy()] = so_far["source_observation"].to_numpy()
-    return counts_for
 
 
 def final_path(slam: Path) -> Float:

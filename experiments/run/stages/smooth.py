@@ -12,7 +12,8 @@ import pandas as pd
 
 from experiments.run.frames import INT, fields
 from experiments.run.job import Job
-from experiments.run.stages.slam import associations_at, evaluated_iterations, final_path
+from experiments.run.stages.slam import evaluated_iterations, final_path
+from experiments.run.stages.snapshots import Associations
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map
 from mapfusion.log_part import first_frames
 from mapfusion.odometry_covariance import read_odometry_covariance
@@ -108,7 +109,7 @@ def filtered_until(
 ) -> tuple[RobotLog, np.ndarray, Float]:
     """What is smoothed: the log until then, the filter's associations as they were, its path."""
     log = log_until(log, iteration, noise_floor_m)
-    landmark = associations_at(job.inputs["slam"], iteration, len(log.observations))
+    landmark = Associations.read(job.inputs["slam"]).at(iteration, len(log.observations))
     return log, landmark, final_path(job.inputs["slam"])[: iteration + 1]
 
 

@@ -1,5 +1,4 @@
 import numpy as np
-import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -11,13 +10,14 @@ from experiments.judge.truth import (
     landmark_truth,
     true_pairs,
 )
+from experiments.run.stages.snapshots import Associations
 from mapfusion import se2
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import RobotTruth
 from tests.helpers.made_up_maps import landmark_map
 
 
-def changes_of(snapshots: dict[int, np.ndarray]) -> pd.DataFrame:
+def changes_of(snapshots: dict[int, np.ndarray]) -> Associations:
     """Only what changed from one snapshot (N,) of owners to the next, as the SLAM stage writes."""
     rows, known = [], {}
     for iteration, owner in snapshots.items():
@@ -25,7 +25,7 @@ def changes_of(snapshots: dict[int, np.ndarray]) -> pd.DataFrame:
             if known.get(observation, -1) != source:
                 rows.append((iteration, observation, source))
                 known[observation] = source
-    return pd.DataFrame(rows, columns=["from_iteration", "observation", "source_observation"])
+    return Associations(*np.array(rows, dtype=np.int64).reshape(-1, 3).T)
 
 
 def map_of(owner: np.ndarray) -> LandmarkMap:

@@ -9,7 +9,7 @@ import pytest
 
 from experiments.run.frames import write_rows
 from experiments.run.job import Job
-from experiments.run.stages.slam import ASSOCIATIONS, POSES, associations_at
+from experiments.run.stages.slam import ASSOCIATIONS, POSES
 from experiments.run.stages.smooth import (
     SmoothSettings,
     fused_iterations,
@@ -22,6 +22,7 @@ from experiments.run.stages.smooth import (
     run,
     smoother_of,
 )
+from experiments.run.stages.snapshots import Associations
 from mapfusion.odometry_covariance import write_odometry_covariance
 from mapfusion.robot_log import RobotLog, write_log
 from mapfusion.smoother.smooth import SmootherParameters, smooth
@@ -85,12 +86,12 @@ def test_it_is_the_smoother_on_the_log_so_far(tmp_path: Path) -> None:
 
 def test_associations_are_those_of_the_filter_at_that_time(tmp_path: Path) -> None:
     log = white_noise_log(np.random.default_rng(1), N_FRAMES, 25).log
-    slam = filtered(tmp_path, log, owners(log))["slam"]
+    associations = Associations.read(filtered(tmp_path, log, owners(log))["slam"])
     n = len(log_until(log, CHANGED_AT - 1).observations)
-    np.testing.assert_array_equal(associations_at(slam, CHANGED_AT - 1, n), np.zeros(n))
+    np.testing.assert_array_equal(associations.at(CHANGED_AT - 1, n), np.zeros(n))
     n = len(log_until(log, CHANGED_AT).observations)
-    np.testing.assert_array_equal(associations_at(slam, CHANGED_AT, n), owners(log)[:n])
-    whole = associations_at(slam, CHANGED_AT, len(log.observations))
+    np.testing.assert_array_equal(associations.at(CHANGED_AT, n), owners(log)[:n])
+    whole = associations.at(CHANGED_AT, len(log.observations))
     np.testing.assert_array_equal(whole[log.iteration > CHANGED_AT], -1)
 
 
