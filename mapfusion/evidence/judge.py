@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from scipy.stats import binom
+from scipy.special import bdtrc
 
 from mapfusion.align.acceptance import Acceptance, Verdict
 from mapfusion.align.pairs import Pairs
@@ -130,7 +130,7 @@ class PairJudge:
         """What the evidence makes of an alignment that is more than chance."""
         against, n = regions.n_contradicted, len(regions)
         told = f"{regions.n_confirmed} of {n} regions that both must have seen are in both maps"
-        surprising = against >= _SEVERAL and binom.sf(against - 1, n, CHANGED) < _SURPRISE
+        surprising = against >= _SEVERAL and bdtrc(against - 1, n, CHANGED) < _SURPRISE
         if surprising or ratio < -math.log10(self._judge.evidence.most_against):
             return Status.REFUSED, f"contradicted: {told}, {against} are missing from one"
         doubt = self._doubt(alignment, regions, ratio, evidence)
