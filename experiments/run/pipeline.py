@@ -61,10 +61,20 @@ class SimulatedRobotStages(RobotStages):
 
 @dataclass(frozen=True)
 class PairStages:
-    """Two robots, and the aligners' estimates from their maps."""
+    """Two robots, and the aligners' estimates from their maps.
+
+    Attributes:
+        a: the first robot by name.
+        b: the second.
+        match: correspondences and rivals.
+        aligners: by the name that the scenario gives them.
+        estimates: all of these joined.
+    """
 
     a: RobotStages
     b: RobotStages
+    match: Stage
+    aligners: Mapping[str, Stage]
     estimates: Stage
 
 
@@ -216,23 +226,24 @@ def _pair(scenario: Scenario, *robots: RobotStages) -> PairStages:
     parts = match.batches(iterations)
     maps = {"log_a": a.log, "slam_a": a.slam, "log_b": b.log, "slam_b": b.slam}
     own = {"iterations": iterations}
-    matched = {"match": _stage(match, scenario.align, own=own, before=maps, parts=parts)}
+    matched = _stage(match, scenario.align, own=own, before=maps, parts=parts)
     estimates: dict[str, Stage] = {}
-    for i, entry in enumerate(scenario.align.aligners):
+    for entry in scenario.align.aligners:
         method = find_method(entry.method)
         module = method.target.partition(":")[0]
         if method.kind is Kind.PLUG_IN:
             module = "mapfusion.align"  # it may import whatever helps it
-        estimates[f"aligner {i}"] = _stage(
+        estimates[entry.name] = _stage(
             aligner,
             *(scenario, scenario.align, entry),
             own=own | {"origin": method.origin()},
-            before=maps | matched,
+            before=maps | {"match": matched},
             parts=parts,
             loads=(module,),
         )
-    joined = _stage(align, own={"batches": parts}, before=matched | estimates)
-    return PairStages(a, b, joined)
+    named = {f"aligner {i}": stage for i, stage in enumerate(estimates.values())}
+    joined = _stage(align, own={"batches": parts}, before={"match": matched} | named)
+    return PairStages(a, b, matched, estimates, joined)
 
 
 def _fusers(
@@ -244,7 +255,10 @@ def _fusers(
     for robot in robots:
         before |= {f"log {robot.name}": robot.log, f"slam {robot.name}": robot.slam}
         before[f"smooth {robot.name}"] = robot.smooth
-    before |= {f"align {pair.a.name} {pair.b.name}": pair.estimates for pair in pairs}
+    for pair in pairs:  # fused maps stay as they are when an aligner changes that does not merge
+        both = f"{pair.a.name} {pair.b.name}"
+        before[f"match {both}"] = pair.match
+        before[f"aligner {both}"] = pair.aligners[scenario.merge.aligner]
     own = {"robots": tuple(robot.name for robot in robots), "iterations": tuple(iterations)}
     own |= {"smoother": _smoother(scenario), "noise_floor_m": scenario.slam.filter.noise_floor_m}
     stages = {}

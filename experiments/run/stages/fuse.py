@@ -17,6 +17,7 @@ from experiments.run.estimates import alignment_of, correspondences_of, covarian
 from experiments.run.frames import FLOAT, INT, TEXT, fields, read_rows, write_rows
 from experiments.run.job import Job
 from experiments.run.stage_tables import CORRESPONDENCES, COVARIANCE, ESTIMATES
+from experiments.run.stages import match
 from experiments.run.stages.smooth import (
     log_until,
     read_smoothed,
@@ -73,7 +74,6 @@ class FuseSettings:
 
     fuser: str
     origin: str
-    aligner: str
     parameters: MergeParameters
     smoother: SmootherParameters
     noise_floor_m: float
@@ -132,6 +132,7 @@ def given_teams(settings: FuseSettings, job: Job) -> Iterator[tuple[int, GivenTe
     """What there is to be fused, at each iteration."""
     takes = make_fuser(settings.fuser).smoothed
     robots = {name: _read_robot(job, name, takes) for name in settings.robots}
+    alignments = _alignments(settings, job)
     for k in settings.iterations:
         given, recordings = [], list[Recording | None]()
         for name, robot in robots.items():
@@ -139,7 +140,8 @@ def given_teams(settings: FuseSettings, job: Job) -> Iterator[tuple[int, GivenTe
             given.append(_at(known, k) if known else _at(robot.filtered, k))
             recordings.append(_recording(settings, job, robot.log, name, known))
         maps = [_at(robot.filtered, k) for robot in robots.values()]
-        yield k, GivenTeam(maps, list(_pairs(settings, job, k)), given, recordings)
+        pairs = [pair for each in alignments if (pair := each.at(k)) is not None]
+        yield k, GivenTeam(maps, pairs, given, recordings)
 
 
 def _read_robot(job: Job, name: str, smoothed: bool) -> _Robot:
@@ -171,23 +173,30 @@ def _recording(
     return Recording(log, landmark, path, smoother)
 
 
-def _pairs(settings: FuseSettings, job: Job, iteration: int) -> Iterator[AlignedPair]:
-    """What the aligner that maps are merged by said, its first repetition, where it was asked."""
-    place = {name: k for k, name in enumerate(settings.robots)}
-    for name, folder in job.inputs.items():
-        kind, *both = name.split(" ")
-        if kind != "align":
-            continue
-        estimates = read_rows(folder / "estimates.parquet", ESTIMATES)
-        chosen = (estimates["aligner"] == settings.aligner) & (estimates["repetition"] == 0)
-        known = estimates[chosen & (estimates["iteration"] <= iteration)]
+class _Alignments:
+    """What the aligner that maps are merged by said of two robots' maps, its first repetition."""
+
+    def __init__(self, settings: FuseSettings, job: Job, name_a: str, name_b: str) -> None:
+        self._a, self._b = (settings.robots.index(name) for name in (name_a, name_b))
+        self._offered = match.read_batches(job.inputs[f"match {name_a} {name_b}"], CORRESPONDENCES)
+        rows = match.read_batches(job.inputs[f"aligner {name_a} {name_b}"], ESTIMATES)
+        self._rows = rows[rows["repetition"] == 0].sort_values("iteration")
+
+    def at(self, iteration: int) -> AlignedPair | None:
+        """At an iteration; None before the aligner was first asked."""
+        known = self._rows[self._rows["iteration"] <= iteration]
         if known.empty:
-            continue
-        row = known.sort_values("iteration").iloc[-1].to_dict()
-        offered = read_rows(folder / "correspondences.parquet", CORRESPONDENCES)
-        pairs = correspondences_of(offered[offered["iteration"] == row["iteration"]])
-        a, b = (place[robot] for robot in both)
-        yield AlignedPair(a, b, alignment_of(row, len(pairs)), pairs, row["log10_false_alarms"])
+            return None
+        row = known.iloc[-1].to_dict()
+        pairs = correspondences_of(self._offered[self._offered["iteration"] == row["iteration"]])
+        alignment = alignment_of(row, len(pairs))
+        return AlignedPair(self._a, self._b, alignment, pairs, row["log10_false_alarms"])
+
+
+def _alignments(settings: FuseSettings, job: Job) -> list[_Alignments]:
+    """Of all pairs of robots that were aligned."""
+    asked = (name.split(" ") for name in job.inputs)
+    return [_Alignments(settings, job, *both) for kind, *both in asked if kind == "aligner"]
 
 
 def _map_path(folder: Path, component: int = 1) -> Path:

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pandas as pd
+import pyarrow as pa
 
 from experiments.run.estimates import rival_rows
-from experiments.run.frames import write_rows
+from experiments.run.frames import read_rows, write_rows
 from experiments.run.job import Job
 from experiments.run.stage_tables import CORRESPONDENCES, RIVALS
 from experiments.run.stages.snapshots import Snapshots
@@ -65,6 +66,12 @@ def batches(iterations: tuple[int, ...]) -> tuple[str, ...]:
 def batch_path(folder: Path, part: str) -> Path:
     """Where a stage keeps one batch."""
     return folder / WRITES[0].format(part=part)
+
+
+def read_batches(folder: Path, table_schema: pa.Schema) -> pd.DataFrame:
+    """All batches of this stage's or an aligner's folder, in their order."""
+    paths = sorted(folder.glob(WRITES[0].format(part="*")))
+    return pd.concat([read_rows(path, table_schema) for path in paths], ignore_index=True)
 
 
 def rivals_path(folder: Path, part: str) -> Path:

@@ -151,10 +151,8 @@ def _robot_stage(robot: RobotStages) -> Stage:
 
 
 def _pair_stage(pair: PairStages, iterations: tuple[int, ...]) -> Stage:
-    matched, aligned = (pair.estimates.before[name] for name in ("match", "aligner 0"))
-    assert isinstance(matched, Stage)
-    assert isinstance(aligned, Stage)
-    match_settings, aligner_settings = matched.settings, aligned.settings
+    aligned = next(iter(pair.aligners.values()))
+    match_settings, aligner_settings = pair.match.settings, aligned.settings
     assert isinstance(match_settings, MatchSettings)
     assert isinstance(aligner_settings, AlignerSettings)
     before = {

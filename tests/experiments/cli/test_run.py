@@ -210,6 +210,20 @@ def test_only_the_changed_aligner_runs_again(tiny: Simulation) -> None:
     assert same == {"match": True, "aligner 0": False, "aligner 1": True, "aligner 2": True}
 
 
+@pytest.mark.parametrize("merges", [False, True])
+def test_maps_are_fused_again_when_the_aligner_changed_that_merges_them(
+    tiny: Simulation, merges: bool
+) -> None:
+    entries = [*tiny.align.aligners]
+    (row,) = [i for i, entry in enumerate(entries) if entry.name == tiny.merge.aligner]
+    if not merges:
+        row = (row + 1) % len(entries)
+    entries[row] = entries[row].model_copy(update={"time_limit_s": 7.5})
+    other = tiny.model_copy(update={"align": tiny.align.model_copy(update={"aligners": entries})})
+    before, after = (lay_out(scenario).fusers for scenario in (tiny, other))
+    assert [before[name].key != after[name].key for name in before] == [merges] * len(before)
+
+
 def test_commands_one_by_one(
     tiny_path: Path, tiny_results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

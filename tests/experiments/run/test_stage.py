@@ -72,6 +72,7 @@ TOLD = {
     "align.evidence": "match aligner judge",
     "align.repetitions": "aligner",
     "merge": "judge fuse",
+    "merge.aligner": "judge",  # fusing begins from that aligner's stage
     "merge.fuser": "",
     "fuse": "smooth fuse",
     "fuse.fusers": "fuse",
