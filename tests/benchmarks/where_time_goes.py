@@ -23,9 +23,11 @@ _NAMES = {
     "observed": "read them, follow tracks",
     "log": "log",
     "slam": "FastSLAM",
-    "match": "match descriptors",
+    "match": "match descriptors, find rivals",
     "aligner": "all aligners, refined",
     "align": "join estimates",
+    "smooth": "smooth the logs",
+    "fuse": "all fusers",
     "judge": "compare with the truth",
 }
 

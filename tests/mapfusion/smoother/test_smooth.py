@@ -142,3 +142,14 @@ def test_landmarks_seen_too_seldom_are_left_out() -> None:
             np.sort(seen.row), np.flatnonzero(np.isin(label, names[count >= min_count]))
         )
     assert len(sightings_of(log, np.full(len(label), -1), 2, stray=True)) == 0
+
+
+def test_heavy_tails_do_not_stop_the_steps_before_their_end() -> None:
+    """Weights come from expected squares: judged by another cost, their steps would be undone."""
+    rng = np.random.default_rng(2)
+    log = with_tracks(white_noise_log(rng, 60, 40), rng, STRAY_M).log
+    seen, n = log.observations, len(log.observations)
+    sigma_m = np.sqrt(np.diagonal(seen.covariance_m2, axis1=1, axis2=2))
+    gross = seen.position_m + sigma_m * rng.standard_t(2.5, (n, 3))
+    found = smoothed(replace(log, observations=replace(seen, position_m=gross)))
+    assert found.n_steps < 40  # of 50 in each of two rounds, at most
