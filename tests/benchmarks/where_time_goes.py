@@ -2,6 +2,8 @@
 
 `python -m tests.benchmarks.where_time_goes results/rooms_high-0 --before old/rooms_high-0`
 
+The floor is that of `floors`, measured where this runs.
+
 Seconds of work as the stages measured them: of one process where runs had `--jobs 1`, and longer
 where others worked beside them. What a run needs beyond its stages (starting, compiling what a
 stage does not, tables, figures) is in none of them.
@@ -12,6 +14,8 @@ import sys
 from pathlib import Path
 
 import pandas as pd
+
+from tests.benchmarks.floors import floors_ms
 
 _A_FRAME = "ms a robot's frame"
 # Stages in the order of the data, and what they are called here.
@@ -55,13 +59,18 @@ def table(results: list[Path], before: list[Path]) -> str:
     columns[f"now, {_A_FRAME}"] = 1e3 * columns["now, s"] / frames(results)
     if before:
         columns = {"before, s": seconds(before)} | columns
+    columns["floor, ms"] = pd.Series(floors_ms()).reindex(list(_NAMES))
     shown = pd.DataFrame(columns)
     shown = pd.concat([shown, shown.sum().to_frame("together").T])
     lines = [f"| stage | {' | '.join(columns)} |", "|---" * (1 + len(columns)) + "|"]
     for stage, row in shown.iterrows():
-        figures = " | ".join(f"{value:.1f}" for value in row)
+        figures = " | ".join(_shown(value) for value in row)
         lines.append(f"| {_NAMES.get(str(stage), stage)} | {figures} |")
     return "\n".join(lines)
+
+
+def _shown(value: float) -> str:
+    return "-" if pd.isna(value) else f"{value:.1f}" if value >= 1 else f"{value:.2g}"
 
 
 def main() -> None:
