@@ -17,17 +17,13 @@ from mapfusion.arguments import (
     require_points,
     require_shape,
 )
+from mapfusion.calibration_error import EXACT, CalibrationError, calibration_from
 from mapfusion.errors import InputError
 from mapfusion.joint_covariance import JointCovariance
 from mapfusion.joint_files import read_joint, write_joint
+from mapfusion.looks import DESCRIPTOR_LENGTH, LOOK_FIELDS, look_columns, looks_from
 from mapfusion.open_tables import read_open_table, told
-from mapfusion.robot_log import (
-    DESCRIPTOR_LENGTH,
-    LOOK_FIELDS,
-    look_columns,
-    looks_from,
-    with_rows,
-)
+from mapfusion.robot_log import with_rows
 from mapfusion.se2 import Float
 from mapfusion.storage import (
     column,
@@ -71,6 +67,7 @@ class LandmarkMap:
         name: whose map it is.
         joint: what the landmarks' errors have in common, or None; its marginals are covariance_m2.
         viewing: from where they were seen and what the robot looked through, or None.
+        calibration: of the camera that saw them, what all share by it; neither covariance has it.
     """
 
     position_m: Float
@@ -83,6 +80,7 @@ class LandmarkMap:
     name: str = "map"
     joint: JointCovariance | None = None
     viewing: Viewing | None = None
+    calibration: CalibrationError = EXACT
 
     def __post_init__(self) -> None:
         n = len(self.position_m)
@@ -124,7 +122,11 @@ def write_map(path: Path, landmarks: LandmarkMap) -> None:
             **look_columns(len(landmarks), landmarks.descriptor, landmarks.label),
         },
         LANDMARKS,
-        {"name": landmarks.name, "planar": str(landmarks.planar).lower()},
+        {
+            "name": landmarks.name,
+            "planar": str(landmarks.planar).lower(),
+            **landmarks.calibration.attributes(),
+        },
     )
 
 
@@ -142,6 +144,7 @@ def read_map(path: Path) -> LandmarkMap:
             *looks_from(table),
             planar,
             attributes.get("name", path.stem),
+            calibration=calibration_from(attributes, path),
         )
         require_points(position, covariance, planar)
         require_no_twins("landmarks", position, covariance.reshape(-1, 9))

@@ -21,7 +21,10 @@ from mapfusion.arguments import (
     require_points,
     require_shape,
 )
+from mapfusion.calibration_error import EXACT, CalibrationError, calibration_from
 from mapfusion.errors import InputError
+from mapfusion.looks import DESCRIPTOR_LENGTH, LOOK_FIELDS, look_columns, looks_from
+from mapfusion.looks import NO_LABEL as NO_LABEL  # of logs, for whoever reads them
 from mapfusion.open_tables import read_open_table, table_path, told
 from mapfusion.se2 import Float
 from mapfusion.storage import (
@@ -41,19 +44,9 @@ from mapfusion.storage import (
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-DESCRIPTOR_LENGTH = 64
-NO_LABEL = -1
 NO_TRACK = -1
 TRUTH_FILES = ("truth_poses.parquet", "truth_points.parquet")
 Arrays = TypeVar("Arrays", bound="DataclassInstance")
-LOOK_FIELDS = [
-    told(pa.field("label", pa.int32()), "known identity of the landmark, -1 for none", NO_LABEL),
-    told(
-        pa.field("descriptor", pa.list_(pa.float32(), DESCRIPTOR_LENGTH)),
-        "what it looks like (U-SURF or another), NaN for none",
-        np.nan,
-    ),
-]
 _ITERATION = told(pa.field("iteration", pa.int32()), "number of the frame: 0, 1, 2, ...")
 _ODOMETRY_FIELDS = ["odometry_x_m", "odometry_y_m", "odometry_theta_rad"]
 _PIXEL_FIELDS = ["u_px", "v_px", "disparity_px"]  # left image; NaN where there are no images
@@ -108,26 +101,6 @@ def with_rows(value: Arrays, rows: slice | np.ndarray) -> Arrays:
     return replace(value, **arrays)
 
 
-def look_columns(
-    n: int, descriptor: np.ndarray | None, label: np.ndarray | None
-) -> dict[str, np.ndarray]:
-    """By what n points are recognised, as the columns of `LOOK_FIELDS`."""
-    if descriptor is None:
-        descriptor = np.full((n, DESCRIPTOR_LENGTH), np.nan)
-    if label is None:
-        label = np.full(n, NO_LABEL)
-    return {"label": label.astype(np.int32), "descriptor": descriptor.astype(np.float32)}
-
-
-def looks_from(table: pa.Table) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Descriptors and labels of a table, None where no row has any."""
-    descriptor, label = column(table, "descriptor"), column(table, "label")
-    return (
-        None if np.isnan(descriptor).all() else descriptor,
-        None if np.all(label == NO_LABEL) else label,
-    )
-
-
 @dataclass(frozen=True)
 class Observations:
     """Landmark sightings, of one frame or of a whole log.
@@ -178,6 +151,7 @@ class RobotLog:
         odometry: (T, 3) motion since the frame before, in the robot frame; the first row is zero.
         iteration: (N,) non-decreasing, the frame each observation belongs to.
         observations: N of them.
+        calibration: what all observations have in common by the camera's calibration.
     """
 
     robot: str
@@ -186,6 +160,7 @@ class RobotLog:
     odometry: Float
     iteration: np.ndarray
     observations: Observations
+    calibration: CalibrationError = EXACT
 
     def __post_init__(self) -> None:
         require_shape("odometry", self.odometry, (len(self.time_s), 3))
@@ -255,7 +230,14 @@ def _observations(folder: Path) -> tuple[np.ndarray, Observations, bool]:
     return column(table, "iteration"), observations, attributes.get("planar") == "true"
 
 
-def write_frames(folder: Path, robot: str, planar: bool, time_s: Float, odometry: Float) -> None:
+def write_frames(
+    folder: Path,
+    robot: str,
+    planar: bool,
+    time_s: Float,
+    odometry: Float,
+    calibration: CalibrationError = EXACT,
+) -> None:
     """Write `frames.parquet` into a log's folder."""
     write_table(
         folder / "frames.parquet",
@@ -265,13 +247,13 @@ def write_frames(folder: Path, robot: str, planar: bool, time_s: Float, odometry
             **named_columns(_ODOMETRY_FIELDS, odometry),
         },
         FRAMES,
-        {"robot": robot, "planar": str(planar).lower()},
+        {"robot": robot, "planar": str(planar).lower(), **calibration.attributes()},
     )
 
 
 def write_log(folder: Path, log: RobotLog) -> None:
     """Write a whole log (without truth) into `folder`."""
-    write_frames(folder, log.robot, log.planar, log.time_s, log.odometry)
+    write_frames(folder, log.robot, log.planar, log.time_s, log.odometry, log.calibration)
     write_observations(folder, log.iteration, log.observations)
 
 
@@ -288,8 +270,9 @@ def read_log(folder: Path) -> RobotLog:
         planar = attributes.get("planar") == "true"
     name, looks = attributes.get("robot", folder.resolve().name), observations.label
     odometry, time_s = columns(frames, _ODOMETRY_FIELDS), column(frames, "time_s")
+    calibration = calibration_from(attributes, path)
     try:
-        log = RobotLog(name, planar, time_s, odometry, iteration, observations)
+        log = RobotLog(name, planar, time_s, odometry, iteration, observations, calibration)
         require_finite("time_s", time_s)
     except ValueError as error:
         raise InputError(f"{folder}: {error}") from error

@@ -49,6 +49,15 @@ VisionOverrides = Annotated[
         help="Replaces a setting of the front end, e.g. harris.max_corners=300.",
     ),
 ]
+CalibrationOverrides = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--calibration",
+        metavar="KEY=VALUE",
+        help="Replaces what is taken to be left open of camera and mount (standard deviations): "
+        "heading_rad=0.001, scale=0.002; 0 of both: it is known exactly.",
+    ),
+]
 LevelOf = Annotated[
     Level,
     typer.Option(
@@ -87,6 +96,7 @@ def _stereo_command(format_name: str) -> Callable[..., None]:
         vision: VisionOverrides = None,
         scenario: options.SettingsOf = None,
         level: LevelOf = "auto",
+        calibration: CalibrationOverrides = None,
         **chosen: str | None,
     ) -> None:
         from experiments.run.stereo_logs import import_stereo, vision_of
@@ -101,8 +111,8 @@ def _stereo_command(format_name: str) -> Callable[..., None]:
         front_end = (None if scenario is None else vision_of(scenario), vision or ())
         cuts = _cuts(robot_name(recording.name), frames or ())
         with progress() as show:
-            trajectories = (odometry, truth)
-            done = import_stereo(recording, output, cuts, trajectories, front_end, level, show)
+            given = ((odometry, truth), front_end, calibration or (), level)
+            done = import_stereo(recording, output, cuts, *given, show)
         print_imported(done)
         if done.too_little:
             options.complain(done.too_little[0])

@@ -7,6 +7,7 @@ from pathlib import Path
 from experiments.scenario.loading import made_settings
 from experiments.scenario.settings import SimulatedScenario
 from experiments.scenario.suite import settings_of
+from mapfusion.calibration_error import CalibrationError
 from mapfusion.errors import InputError
 from mapfusion.recordings.levels import Level
 from mapfusion.recordings.stereo_import import Cut, Imported, StereoImport, write_imported
@@ -45,6 +46,7 @@ def import_stereo(
     cuts: Sequence[Cut],
     trajectories: tuple[str | None, Path | None],
     vision: tuple[FrontEndParameters | None, Sequence[str]],
+    calibration: Sequence[str],
     level: Level,
     on_progress: Callable[[str, int, int], None],
 ) -> ImportedRecording:
@@ -58,6 +60,7 @@ def import_stereo(
             recording's own.
         vision: settings of the front end, None for what follows from the camera, and what of them
             is replaced: `KEY=VALUE`.
+        calibration: what is replaced of what is left open of the camera: `KEY=VALUE`.
         level: where the robots' attitudes are known from.
         on_progress: told what is done.
 
@@ -75,13 +78,17 @@ def import_stereo(
         base = asdict(derived if chosen is None else chosen)
         return made_settings("--vision", FrontEndParameters, overrides, base)
 
-    work = StereoImport(recording, adjusted)
+    def known(usual: CalibrationError) -> CalibrationError:
+        return made_settings("--calibration", CalibrationError, calibration, asdict(usual))
+
+    work = StereoImport(recording, adjusted, known)
     robots = [work.log_of(cut, on_progress, level) for cut in cuts]
-    camera = work.camera
+    camera, left = work.camera, work.calibration_error
     about = (
         f"{camera.width_px}x{camera.height_px} px, f {camera.focal_px:.1f} px, "
         f"baseline {camera.baseline_m:.3f} m, depths {work.vision.stereo.min_depth_m:.2g} to "
-        f"{work.vision.max_depth_m:.2g} m"
+        f"{work.vision.max_depth_m:.2g} m; known to {1e3 * left.heading_rad:.2g} mrad and "
+        f"{100 * left.scale:.2g} % of lengths"
     )
     return ImportedRecording(recording, about, robots, write_imported(destination, robots))
 

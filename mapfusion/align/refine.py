@@ -8,6 +8,7 @@ from typing import Annotated
 import numpy as np
 from numba import njit
 
+from mapfusion.align.calibration_part import calibration_part
 from mapfusion.align.correspondences import HeightGate
 from mapfusion.align.degeneracy import why_one_place
 from mapfusion.align.drift import drift_step
@@ -99,6 +100,7 @@ class Refinement:
             others = PlanarPairs(*(np.delete(part, left_out, axis=0) for part in planar))
             solved, _, T_without, *_ = maximise_likelihood(others, T_a_b, *limits)
             reason = why_one_pair(T_a_b, T_without if solved else None, planar, truth, self.gate_m)
+        covariance = covariance + calibration_part(T_a_b, pairs[inlier], math.sqrt(variance))
         T_a_b[2] = wrap(T_a_b[2])
         return Alignment(
             T_a_b,

@@ -7,6 +7,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from mapfusion.align.acceptance import Verdict
+from mapfusion.align.calibration_part import calibration_part
 from mapfusion.align.correspondences import Correspondences, HeightGate
 from mapfusion.align.drift import estimate_drift_m
 from mapfusion.align.method import Fit, Method, Needs, Undetermined
@@ -112,6 +113,7 @@ def alignment_of_fit(
         e = residuals(found.T_a_b, fitted.p_a, fitted.p_b)
         drift = estimate_drift_m(e, own, found.gate_m)
         covariance = motion_covariance(gain, own + drift**2 * np.eye(2))
+        covariance = covariance + calibration_part(found.T_a_b, fitted, drift)
     return Alignment(
         found.T_a_b,
         covariance,

@@ -29,9 +29,10 @@ class Alignment:
 
     Attributes:
         T_a_b: (3,) tx_m, ty_m, theta_rad (counter-clockwise); NaN when degenerate.
-        covariance: (3, 3) of T_a_b for residuals that are independent, s_drift included; NaN when
-            degenerate. What drift has in common over a whole map leaves no residual and is not
-            in it, so that real errors are larger: the evaluation reports the NEES.
+        covariance: (3, 3) of T_a_b for residuals that are independent, s_drift included, and for
+            what the cameras' calibration leaves open; NaN when degenerate. What drift has in common
+            over a whole map leaves no residual and is not in it, so that real errors are larger:
+            the evaluation reports the NEES.
         inlier: (N,) bool over the correspondences given.
         elapsed_s: time of the estimation.
         status: accepted, refused or degenerate by its method, ambiguous and too uncertain by the

@@ -80,7 +80,9 @@ def run_log(
         result = slam.step(odometry, frame, sigma)
         landmarks = None
         if iteration in wanted:
-            landmarks = replace(slam.best_map(min_count), name=log.robot)
+            landmarks = replace(
+                slam.best_map(min_count), name=log.robot, calibration=log.calibration
+            )
             seen = slam.best_associations(), slam.best_path(), landmarks.source_observation
             landmarks = replace(landmarks, viewing=viewing_of(log, *seen))
         yield Frame(iteration, result, landmarks, slam)

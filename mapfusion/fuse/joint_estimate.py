@@ -50,7 +50,9 @@ class JointMap:
 
     @classmethod
     def of(cls, landmarks: LandmarkMap, own_sigma_m: float, n_dimensions: int) -> "JointMap":
-        """A map without a joint covariance has no shared errors, but more of its landmarks' own.
+        """With what its camera's calibration leaves open among the shared errors.
+
+        A map without a joint covariance has no others, but more of its landmarks' own.
 
         Args:
             landmarks: the map.
@@ -62,6 +64,9 @@ class JointMap:
             own = landmarks.covariance_m2.copy()
             own[:, [0, 1], [0, 1]] += own_sigma_m**2
             joint = JointCovariance(own, np.zeros((len(landmarks), 0, 3)))
+        if not landmarks.calibration.is_none:
+            moved = landmarks.calibration.moves_m(landmarks.position_m)
+            joint = JointCovariance(joint.own_m2, np.concatenate([joint.common_m, moved], axis=1))
         return cls(landmarks.position_m[:, :n_dimensions], joint)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from mapfusion import se3
 from mapfusion.attitude import Attitude, write_attitude
+from mapfusion.calibration_error import CalibrationError, usual_calibration
 from mapfusion.camera import StereoCamera
 from mapfusion.errors import InputError
 from mapfusion.odometry_covariance import write_odometry_covariance
@@ -36,6 +37,7 @@ _MOST_GUESSED = 0.1  # of all motions: what lies between guesses must be longer 
 
 OnProgress = Callable[[str, int, int], None]
 Vision = Callable[[FrontEndParameters], FrontEndParameters]
+Calibration = Callable[[CalibrationError], CalibrationError]
 
 
 @dataclass(frozen=True)
@@ -91,19 +93,26 @@ class StereoImport:
     Args:
         recording: what was read.
         adjust: from settings that follow from the camera and what it sees to those to be used.
+        calibration: from what is usually left open of a camera and its mount to what is of this.
 
     Raises:
         InputError: no camera can be made of the calibration, pictures have another size, or their
             rows do not fit.
     """
 
-    def __init__(self, recording: StereoRecording, adjust: Vision = lambda vision: vision) -> None:
+    def __init__(
+        self,
+        recording: StereoRecording,
+        adjust: Vision = lambda vision: vision,
+        calibration: Calibration = lambda usual: usual,
+    ) -> None:
         self._recording = recording
         try:
             self._rectification = Rectification.of(recording.calibration)
         except InputError as error:
             raise InputError(f"{recording.name}: {error}") from error
         self.camera: StereoCamera = self._rectification.camera
+        self.calibration_error = calibration(usual_calibration(self.camera))
         pairs = [self.rectified(k) for k in sampled(len(recording))]
         self._require_rows(pairs, derived_vision(self.camera))
         middle = max((len(recording) - _RUN) // 2, 0)
@@ -158,7 +167,8 @@ class StereoImport:
         attitude, linked = frames.attitude, np.array(frames.linked)
         seen = visual_odometry(frames.motions, steps, self.camera, self.T_robot_camera, attitude)
         odometry = seen.increments if reckoned is None else _increments(reckoned)
-        log = RobotLog(cut.robot, False, time_s, odometry, *joined(frames.observed))
+        observed = joined(frames.observed)
+        log = RobotLog(cut.robot, False, time_s, odometry, *observed, self.calibration_error)
         if reckoned is not None:
             return Imported(log, truth, linked, attitude=attitude)
         return Imported(log, truth, linked, seen.covariance, attitude, int(seen.guessed.sum()))

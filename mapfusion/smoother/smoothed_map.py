@@ -28,7 +28,7 @@ def smoothed_map(
     count = np.diff(seen.starts).astype(np.int32)
     about = (count, source, look.descriptor, look.label, log.planar, log.robot)
     viewing = viewing_of(log, landmark, smoothed.estimate.path, source)
-    return LandmarkMap(point, joint.marginal_m2, *about, joint, viewing)
+    return LandmarkMap(point, joint.marginal_m2, *about, joint, viewing, log.calibration)
 
 
 def condensed_points(smoothed: Smoothed, rank: int = RANK) -> tuple[Float, JointCovariance]:

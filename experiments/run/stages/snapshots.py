@@ -60,7 +60,7 @@ class Snapshots(Mapping[int, LandmarkMap]):
         origin = column(table, "source_observation")
         seen = log.observations[origin]
         about = (column(table, "count"), origin, seen.descriptor, seen.label, log.planar, log.robot)
-        self._landmarks = LandmarkMap(*points_from(table), *about)
+        self._landmarks = LandmarkMap(*points_from(table), *about, calibration=log.calibration)
         self._rows = _rows(column(table, "iteration"), attributes["iterations"])
         self._made: dict[int, LandmarkMap] = {}
 

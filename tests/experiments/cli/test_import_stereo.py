@@ -1,11 +1,13 @@
 """Importing stereo pictures on the command line: robots by frames, the summary, exit codes."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mapfusion.attitude import read_attitude
+from mapfusion.calibration_error import CalibrationError
 from mapfusion.robot_log import read_log
 from tests.helpers.tiny_scenario import assert_refused, command
 from tests.mapfusion.recordings.written_layouts import POSES, drive, tum_lines, write_kitti
@@ -27,6 +29,27 @@ def test_frames_cut_a_recording_into_robots(
     assert len(read_log(tmp_path / "07-2")) == 4
     for words in ("07: 5 pairs", "240x180 px", "A ", "07-2", "3 frames", str(tmp_path / "A")):
         assert words in reply.out
+
+
+@pytest.mark.parametrize(
+    ("given", "left_open"),
+    [
+        ((), lambda usual: usual.scale > 0 and usual.heading_rad > 0.002),
+        (("heading_rad=0.01",), lambda own: own.heading_rad == 0.01 and own.scale > 0),
+        (("heading_rad=0", "scale=0"), lambda own: own.is_none),
+    ],
+)
+def test_what_calibration_leaves_open_goes_with_the_log(
+    given: tuple[str, ...],
+    left_open: Callable[[CalibrationError], bool],
+    sequence: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    own = [word for each in given for word in ("--calibration", each)]
+    own += ["--vision", "tracks.min_length=2"]
+    assert command(capsys, "import", "kitti", sequence, "-o", tmp_path, *own).code == 0
+    assert left_open(read_log(tmp_path / "07").calibration)
 
 
 @pytest.mark.parametrize("level", ["pictures", "floor"])
@@ -78,6 +101,7 @@ def test_trajectories_are_taken_from_files(
         (("--param", "cameras=red"), ["kitti: cameras", "grey"]),
         (("--param", "mount.pitch_rad=3"), ["pitch_rad", "[-1.5, 1.5] rad"]),
         (("--odometry", "none.tum"), ["none.tum: no such file"]),
+        (("--calibration", "scale=-1"), ["--calibration: scale", "[0, 1]"]),
         (("--level", "sideways"), ["--level", "mount"]),
         (("--level", "odometry", "--odometry", "images"), ["--level odometry", "no odometry"]),
     ],

@@ -100,21 +100,37 @@ def path_rmse_m(path: np.ndarray, true: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.sum(off[:, :2] ** 2, axis=1))))
 
 
-def test_kitti_paths_are_no_worse_than_their_odometry(imported: Imported) -> None:
-    """But for a tenth: the truth of the extract's first twelve frames is a straight line."""
-    log, true = imported.log, imported.truth
-    assert true is not None
-    told, errors = imported.odometry_covariance, []
+def measured_from(truth: np.ndarray) -> int:
+    """The first frame whose true heading was measured.
+
+    In those before it the truth of the extract turns at one rate, to a hundredth of a milliradian,
+    where a car steers, and the pictures by two programs say that this one does, by up to 2.4
+    milliradians a frame: its headings were interpolated.
+    """
+    turns = np.diff(np.unwrap(truth[:, 2]))
+    return int(np.argmax(np.abs(np.diff(turns)) > 1e-4)) + 1
+
+
+def test_kitti_paths_are_no_worse_than_their_odometry(
+    work: StereoImport, imported: Imported
+) -> None:
+    assert imported.truth is not None
+    first = measured_from(imported.truth)
+    assert 8 <= first <= 14
+    one = work.log_of(Cut("M", slice(first, None)))
+    assert one.truth is not None
+    errors = []
     for seed in range(5):
-        rng = np.random.default_rng(seed)
-        *_, last = run_log(log, FastSlamParameters(), rng, odometry_covariance=told)
-        errors.append(path_rmse_m(last.slam.best_path(), true))
-    assert np.median(errors) <= 1.1 * path_rmse_m(dead_reckoned(log.odometry), true)
+        rng, told = np.random.default_rng(seed), one.odometry_covariance
+        *_, last = run_log(one.log, FastSlamParameters(), rng, odometry_covariance=told)
+        errors.append(path_rmse_m(last.slam.best_path(), one.truth))
+    assert np.median(errors) <= path_rmse_m(dead_reckoned(one.log.odometry), one.truth)
 
 
-def test_kitti_seen_by_two_robots_is_one_map(work: StereoImport) -> None:
-    """Even and odd frames from the thirteenth on, from which the truth is good."""
-    pair = [work.log_of(Cut(name, slice(k, None, 2))) for name, k in (("E", 12), ("O", 13))]
+@pytest.mark.parametrize("first", [0, 12])
+def test_kitti_seen_by_two_robots_is_one_map(work: StereoImport, first: int) -> None:
+    """Even and odd frames: all, and those from the thirteenth on, whose truth was measured."""
+    pair = [work.log_of(Cut(f"{k}", slice(first + k, None, 2))) for k in (0, 1)]
     true = [one.truth[0] for one in pair if one.truth is not None]
     T = se2.between(*true)
     for seed in range(5):
