@@ -12,6 +12,7 @@ from mapfusion.chi_square import chi_square_bound
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import NO_LABEL
 from mapfusion.se2 import Float
+from mapfusion.stray import STRAY_M
 
 
 @dataclass(frozen=True)
@@ -55,13 +56,13 @@ class HeightGate:
 
     Attributes:
         probability: of keeping a pair that is one point (chi-square, 1 degree of freedom).
-        floor_m: standard deviation of errors that repeat from sighting to sighting and so do not
-            average out: half a pixel at 8 m (the farthest landmarks) is 0.007 m, and a body that
-            pitches by a quarter of a degree lifts such a point by 0.035 m.
+        floor_m: standard deviation of what the difference of two heights has beside: the stray of
+            both landmarks' tracks, which no number of sightings averages out. How a body stood when
+            it saw them is in the landmarks' own variances, with what is not known of it.
     """
 
     probability: Probability = 0.999
-    floor_m: Annotated[float, Range(0, 10, "m")] = 0.035
+    floor_m: Annotated[float, Range(0, 10, "m")] = math.sqrt(2) * STRAY_M
 
     def __post_init__(self) -> None:
         require_in_range(self)

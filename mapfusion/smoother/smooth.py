@@ -20,6 +20,7 @@ from mapfusion.smoother.residuals import first_points
 from mapfusion.smoother.robust import Tails
 from mapfusion.smoother.settle import Problem, Settled, settled
 from mapfusion.smoother.sightings import Sightings, sightings_of
+from mapfusion.stray import STRAY_M
 
 # Factor on the observations' standard deviations in a first round (graduated non-convexity): where
 # the path to start from is far off, most observations look gross and lose the weight to mend it.
@@ -45,7 +46,7 @@ class SmootherParameters:
     """
 
     motion: MotionNoise = field(default_factory=MotionNoise)
-    stray_m: Annotated[float, Range(0, 10, "m")] = 0.004
+    stray_m: Annotated[float, Range(0, 10, "m")] = STRAY_M
     min_count: Annotated[int, Range(1, 1_000_000, "observations")] = 3
     odometry_covariance: Float | None = None
 

@@ -141,3 +141,12 @@ def test_wrong_arguments_are_named():
         HeightGate(probability=1.0)
     with pytest.raises(ValueError, match="floor_m"):
         HeightGate(floor_m=-1.0)
+
+
+def test_heights_of_one_point_agree_as_often_as_stated():
+    """With what sightings leave of each, and tracks that each stray by the smoother's 4 mm."""
+    rng, n, sigma_m = np.random.default_rng(0), 200_000, 0.003
+    z_a, z_b = rng.normal(0, sigma_m, (2, n)) + rng.normal(0, 0.004, (2, n))
+    variance = np.full(n, sigma_m**2)
+    off = np.mean(~HeightGate().agrees(z_a, variance, z_b, variance))
+    assert off == pytest.approx(0.001, rel=0.25)  # 200 of them: 3.5 standard deviations

@@ -28,7 +28,7 @@ def test_equals_all_pairs() -> None:
     unlike = np.linalg.norm(descriptor[:, None] - descriptor, axis=2)
     near = np.linalg.norm(p[:, None, :2] - p[None, :, :2], axis=2) < 1.0
     dz2 = (p[:, None, 2] - p[None, :, 2]) ** 2
-    level = dz2 <= 10.827566170662733 * (0.02 + 0.035**2)  # chi-square, 0.999
+    level = dz2 <= 10.827566170662733 * (0.02 + 2 * 0.004**2)  # chi-square, 0.999
     unlike[near | ~level | np.isnan(unlike)] = np.inf
     best = unlike.argmin(axis=1)
     rows = np.flatnonzero((best[best] == np.arange(600)) & (unlike.min(axis=1) <= 0.6))
