@@ -56,7 +56,7 @@ Format = Annotated[
     typer.Option(
         "--format",
         metavar="FORMAT",
-        help="tum, kitti (paths), g2o (graph), ply (maps) of results; "
+        help="tum, kitti (paths), g2o (graph), ply (maps), rerun of results; "
         "log, euroc, kitti, rosbag of runs.",
     ),
 ]

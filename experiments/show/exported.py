@@ -19,6 +19,7 @@ from experiments.scenario.sections import NAME_PATTERN
 from experiments.show.export import write_text
 from experiments.show.figures.result_tables import ResultTables
 from experiments.show.figures.style import FUSED_COLOUR
+from experiments.show.rerun_recording import write_rerun
 from mapfusion import se2
 from mapfusion.errors import InputError
 from mapfusion.fastslam.motion import MotionNoise
@@ -38,6 +39,7 @@ _LEAST_SIGMA = np.array([1e-4, 1e-4, 1e-4])  # m, m, rad
 _SOURCES = ("final", "online", "odometry", "truth")
 _MOTION = ["tx_m", "ty_m", "theta_rad"]
 _FUSED = "fused"
+_RERUN = "rerun"
 
 
 def export_result(result: Path, kind: str, folder: Path | None = None) -> list[Path]:
@@ -46,13 +48,17 @@ def export_result(result: Path, kind: str, folder: Path | None = None) -> list[P
     Raises:
         InputError: an unknown format, no result folder, or one that lacks what the format needs.
     """
-    if kind not in _FILES:
-        raise InputError(f"--format {kind}: unknown; known: {', '.join(_FILES)}")
+    if kind not in (*_FILES, _RERUN):
+        raise InputError(f"--format {kind}: unknown; known: {', '.join((*_FILES, _RERUN))}")
     require_result(result)
     data, target = ResultTables(result), folder or result / "export"
     for robot in data.robots:
         if not re.fullmatch(NAME_PATTERN, robot):
             raise InputError(f"{result}: robot is named {robot!r}, expected {NAME_PATTERN}")
+    if kind == _RERUN:
+        path = target / f"{result.resolve().name}.rrd"
+        write_rerun(data, path)
+        return [path]
     made = [
         (target / name, text) for name, text in _FILES[kind](data)
     ]  # all, before any is written
