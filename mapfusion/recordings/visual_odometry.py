@@ -12,9 +12,10 @@ from mapfusion.se2 import Float
 from mapfusion.vision.rigid_links import RigidMotion
 
 _PLANE = [0, 1, 5]  # x, y and the turn about z, of shifts and turns in space
-# Standard deviations of a motion that no links told: the robot went on as before, or stopped or
-# turned meanwhile: as large as the motion itself, and at least this, m and rad.
-_GUESSED_SIGMA = np.array([0.1, 0.1, 0.1])
+# A motion that no links told is one that went on as before, or stopped, or turned: it errs by as
+# much as the motion itself and the largest step that was told so far, together. A robot begins with
+# what one of the simulated kind does from frame to frame at most, m and rad.
+_FIRST_STEP = np.array([0.1, 0.1, 0.1])
 
 
 @dataclass(frozen=True)
@@ -54,12 +55,12 @@ def visual_odometry(
     guessed[0] = False
     taken = se3.pose(np.eye(3), camera.p_robot_left)
     T_robot_taken = T_robot_camera @ se3.inverse(taken)
-    speed = np.zeros(3)  # a step
+    speed, widest = np.zeros(3), _FIRST_STEP  # a step
     for k in range(1, n):
         motion = motions[k]
         if motion is None:
             increments[k] = steps[k] * speed
-            covariance[k] = np.diag((np.abs(increments[k]) + steps[k] * _GUESSED_SIGMA) ** 2)
+            covariance[k] = np.diag((np.abs(increments[k]) + steps[k] * widest) ** 2)
         else:
             own = motion.of(T_robot_taken)
             level = np.eye(3) if attitude is None else se3.tilt(*attitude.value[k - 1, :2])
@@ -67,4 +68,5 @@ def visual_odometry(
             turned = np.kron(np.eye(2), level)
             covariance[k] = (turned @ own.covariance @ turned.T)[np.ix_(_PLANE, _PLANE)]
             speed = increments[k] / steps[k]
+            widest = np.maximum(widest, np.abs(speed))
     return VisualOdometry(increments, covariance, guessed)

@@ -57,3 +57,13 @@ def test_without_links_the_robot_goes_on_as_before() -> None:
     np.testing.assert_allclose(made.increments[3], 3 * MOVED[0], atol=1e-12)
     assert made.guessed.tolist() == [False, False, True, True]
     assert np.all(np.diagonal(made.covariance[2]) >= MOVED[0] ** 2)
+
+
+def test_a_guess_errs_by_the_largest_step_so_far() -> None:
+    """A car that stood still may have begun to move as fast as it was before."""
+    fast, slow = (RigidMotion(of_camera(se3.from_planar(step)), 1e-8 * np.eye(6), 9)
+                  for step in np.array([[2.0, 0.0, 0.3], [0.0, 0.0, 0.0]]))  # fmt: skip
+    made = found([None, None, fast, slow, None], [1, 1, 1, 1, 1])
+    sigma = np.sqrt(np.diagonal(made.covariance, axis1=1, axis2=2))
+    np.testing.assert_allclose(sigma[1], [0.1, 0.1, 0.1])
+    np.testing.assert_allclose(sigma[4], [2.0, 0.1, 0.3], atol=1e-9)
