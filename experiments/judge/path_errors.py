@@ -17,7 +17,8 @@ from mapfusion.align.rigid import fit_rigid
 from mapfusion.se2 import Float
 from mapfusion.storage import POSE_FIELDS
 
-SOURCES = ("final", "online", "odometry", "smoothed")
+SMOOTHED = "smoothed"  # a path that not every robot has
+SOURCES = ("final", "online", "odometry", SMOOTHED)
 # From frame to frame, and along a metre of the way: what a filter step and a short drive add.
 RPE_DELTA = 1
 STATISTICS: dict[str, Callable[[Float], float]] = {

@@ -42,8 +42,10 @@ from experiments.scenario.randomness import generator
 from experiments.scenario.settings import AnyScenario, Simulation
 from mapfusion.align.correspondences import match
 from mapfusion.errors import InputError
+from mapfusion.fuse.registry import make_fuser
 from mapfusion.landmark_map import write_map
 from mapfusion.robot_log import read_log
+from mapfusion.se2 import Float
 from mapfusion.storage import (
     POSE_FIELDS,
     named_columns,
@@ -198,7 +200,7 @@ def all_tables(
     }
     judged: dict[str, Callable[[], Any]] = {
         "path_statistics": lambda: path_statistics_rows(paths),
-        "team": lambda: team_rows(team, paths),
+        "team": lambda: team_rows(team, paths, _placed_by_smoothed(run, fusions)),
         "team_pairs": lambda: team_pair_rows(
             team, run.pair_table("errors"), settings.merge.aligner
         ),
@@ -219,6 +221,14 @@ def _fused_map_rows(run: JudgedRun, fusions: Sequence[JudgedFusion]) -> pd.DataF
     named = [fusion for fusion in fusions if fusion.fuser == run.scenario.merge.fuser]
     last = max(named, key=lambda fusion: fusion.iteration, default=None)
     return pd.DataFrame() if last is None else fused_landmarks.fused_rows(last.team())
+
+
+def _placed_by_smoothed(run: JudgedRun, fusions: Sequence[JudgedFusion]) -> Float | None:
+    """T_first_map (M, 3) of the last map of a fuser of smoothed maps; of `merge.fuser` if it is."""
+    takes = [fusion for fusion in fusions if make_fuser(fusion.fuser).smoothed]
+    named = [fusion for fusion in takes if fusion.fuser == run.scenario.merge.fuser]
+    last = max(named or takes, key=lambda fusion: fusion.iteration, default=None)
+    return None if last is None else last.fusion.T_first_map
 
 
 def _paths(run: JudgedRun, smoothed: Sequence[SmoothedRobot]) -> pd.DataFrame:

@@ -119,7 +119,8 @@ _COLUMNS = {
         team_translation_error_m team_rotation_error_rad""",
     # Position errors of n_robots of a run's n_team: moved into one frame as their maps were, then
     # all of them by one rigid fit. component: 1 for the fused map of most robots. source: as in
-    # `path_statistics`; n: poses.
+    # `path_statistics`, smoothed paths as a fuser of smoothed maps moved
+    # these; n: poses.
     "team": "component source n_robots n_team n rmse mean median std min max sse",
     # How each robot's last map was moved into the fused map, the first robot's own among them; NaN
     # for a map that was left out, with the reason (else empty). drift_sigma_m: as added to the

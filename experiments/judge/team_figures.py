@@ -14,7 +14,7 @@ import pandas as pd
 
 from experiments.judge import criteria
 from experiments.judge.fused_landmarks import FusedTeam, team_edge_rows
-from experiments.judge.path_errors import SOURCES, ate_m, seven_statistics
+from experiments.judge.path_errors import SMOOTHED, SOURCES, ate_m, seven_statistics
 from mapfusion import se2
 from mapfusion.se2 import Float
 from mapfusion.storage import POSE_FIELDS
@@ -25,8 +25,14 @@ _PAIR = ["robot_a", "robot_b"]
 _ALONE = ["accepted", "n_common", "refined_translation_error_m", "refined_rotation_error_rad"]
 
 
-def team_rows(team: FusedTeam, paths: pd.DataFrame) -> list[dict[str, Any]]:
-    """Rows of the table `team` from those of the table `paths`; none where nothing was merged."""
+def team_rows(
+    team: FusedTeam, paths: pd.DataFrame, T_first_smoothed: Float | None = None
+) -> list[dict[str, Any]]:
+    """Rows of the table `team` from those of the table `paths`; none where nothing was merged.
+
+    `T_first_smoothed` (M, 3) is how a fuser of smoothed maps moved them, NaN for those left out:
+    where it merged the same robots, their smoothed paths are moved by it.
+    """
     own = dict(iter(paths.groupby("robot", sort=False)))
     rows = []
     for number, T_first_map in enumerate(_placements(team), start=1):
@@ -34,12 +40,16 @@ def team_rows(team: FusedTeam, paths: pd.DataFrame) -> list[dict[str, Any]]:
         members = [(k, robot) for k, robot in enumerate(team.robots) if placed[k]]
         row = {"component": number, "n_robots": len(members), "n_team": len(team.robots)}
         for source in _sources_of([own[robot.name] for _, robot in members]):
+            T_moved = T_first_map
+            if source == SMOOTHED and T_first_smoothed is not None:
+                same = np.array_equal(np.isfinite(T_first_smoothed[:, 0]), placed)
+                T_moved = T_first_smoothed if same else T_first_map
             errors = team_ate_m(
                 [
                     PlacedPath(
                         _poses(own[robot.name], source),
                         _poses(own[robot.name], "truth"),
-                        T_first_map[k],
+                        T_moved[k],
                         robot.path.T_world_map,
                     )
                     for k, robot in members

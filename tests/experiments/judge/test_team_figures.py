@@ -157,6 +157,27 @@ def test_two_robots_apart_by_d_are_off_by_half_of_it() -> None:
     assert whole["rmse"] == pytest.approx(0, abs=1e-12)
 
 
+def test_smoothed_paths_are_moved_as_their_own_fuser_moved_the_maps() -> None:
+    rng = np.random.default_rng(4)
+    each = [driven(rng, 40), driven(rng, 50)]
+    paths = paths_of(each)
+    for name in NAMES:
+        paths[f"smoothed_{name}"] = paths[f"truth_{name}"]
+    T = se2.between(STARTS[0], STARTS[:2])
+    papers = T + np.array([[0, 0, 0], [0.3, 0.4, 0.1]])
+
+    def smoothed_m(T_first_smoothed: Float | None) -> float:
+        rows = team_rows(team_of(papers, STARTS[:2]), paths, T_first_smoothed)
+        (row,) = (row for row in rows if row["source"] == "smoothed")
+        assert final(rows) == final(team_rows(team_of(papers, STARTS[:2]), paths))
+        return row["rmse"]
+
+    assert smoothed_m(T) == pytest.approx(0, abs=1e-9)
+    assert smoothed_m(None) > 0.1
+    alone = np.array([T[0], np.full(3, np.nan)])
+    assert smoothed_m(alone) == smoothed_m(None), "merged other robots"
+
+
 def test_each_set_of_robots_has_its_row_and_poses_without_truth_none() -> None:
     rng = np.random.default_rng(1)
     starts = np.concatenate([STARTS, STARTS + 1.0])[:5]
