@@ -37,11 +37,25 @@ def bound(slots: Slots, which: np.ndarray, gate: float) -> None:
     for s in which:
         if s // BLOCK != last:
             last = s // BLOCK
-            _bound_block(slots, last)
+            bound_block(slots, last)
 
 
 @njit(cache=True)
-def _bound_block(slots: Slots, block: int) -> None:
+def bend_box(slots: Slots, s: int, motion: Float) -> None:
+    """Put a box around what is in it after a motion (3,) of the plane."""
+    box = slots.box_m[s]
+    cos, sin = np.cos(motion[2]), np.sin(motion[2])
+    x, y = 0.5 * (box[0] + box[2]), 0.5 * (box[1] + box[3])
+    half_x, half_y = 0.5 * (box[2] - box[0]), 0.5 * (box[3] - box[1])
+    wide_x = abs(cos) * half_x + abs(sin) * half_y
+    wide_y = abs(sin) * half_x + abs(cos) * half_y
+    x, y = cos * x - sin * y + motion[0], sin * x + cos * y + motion[1]
+    box[0], box[1], box[2], box[3] = x - wide_x, y - wide_y, x + wide_x, y + wide_y
+
+
+@njit(cache=True)
+def bound_block(slots: Slots, block: int) -> None:
+    """Write the box of a block around those of its slots."""
     around = slots.block_box_m[block]
     around[:2], around[2:] = np.inf, -np.inf
     for s in range(block * BLOCK, (block + 1) * BLOCK):

@@ -2,7 +2,8 @@
 
 Montemerlo, Thrun, Koller, Wegbreit (2002), in the paper's form (eq. 1-10) with these additions:
 association per particle, a density for observations that match nothing, weights that are
-multiplied until a resampling, and resampling by effective sample size.
+multiplied until a resampling, resampling by effective sample size, and paths that bend where a
+loop closes.
 """
 
 from dataclasses import dataclass
@@ -17,6 +18,8 @@ from mapfusion.fastslam.association import (
     pairs_of_labels,
     sources,
 )
+from mapfusion.fastslam.bends import Bends
+from mapfusion.fastslam.closing import Seen, close_loops, motion_by_odometry
 from mapfusion.fastslam.history import History
 from mapfusion.fastslam.motion import sample_motion
 from mapfusion.fastslam.parameters import FastSlamParameters
@@ -91,6 +94,7 @@ class FastSlam:
         self._slot_of_label: dict[int, int] = {}
         self._has_descriptors = self._has_labels = False
         self._history = History() if keep_history else None
+        self._bends = Bends()
 
     @property
     def n_slots(self) -> int:
@@ -133,6 +137,7 @@ class FastSlam:
         log_likelihood = update_landmarks(self._maps.slots, chosen, seen, log_new, planar)
         self._maps.moved(changed)
         created = self._start_landmarks(chosen, seen, observations)
+        self._maps.slots.last_frame[np.concatenate([changed, created[:, 1]])] = self._bends.frame
         self._tracked.went_into(observations.track, chosen, created, self._maps.slots)
         log_evidence = self._weigh(log_likelihood + log_ratio, len(observations))
         self._remember(chosen)
@@ -209,12 +214,17 @@ class FastSlam:
         # a robot that stands still is where it was, and without observations there is no news
         informed = settings.proposal is Proposal.INFORMED and len(observations) and sigma.any()
         if not informed:
+            moved = motion_by_odometry(self._poses[self._best], 0.0, sigma)
+            self._bends.went_on(moved @ moved.T)
             poses = sample_motion(self._poses, odometry, sigma, self._rng)
             return poses, np.zeros(settings.n_particles)
         predicted = compose(self._poses, odometry)
         seen = sightings(predicted, observations.position_m, noise, self._planar)
         wide = widened(seen, predicted, odometry, sigma)
         chosen, _ = self._associate(wide, observations)
+        if settings.close_loops and self._close_loops(chosen, seen, predicted, odometry, sigma):
+            predicted = compose(self._poses, odometry)
+            seen = sightings(predicted, observations.position_m, noise, self._planar)
         eta, log_ratio = informed_disturbance(
             self._maps.slots,
             chosen,
@@ -227,6 +237,24 @@ class FastSlam:
             self._rng.standard_normal(predicted.shape),
         )
         return compose(self._poses, odometry + sigma * eta), log_ratio
+
+    def _close_loops(
+        self, chosen: np.ndarray, seen: Sightings, predicted: Float, odometry: Float, sigma: Float
+    ) -> bool:
+        """Bend all particles' paths and maps by what the best one sees again; whether they were."""
+        m, settings, bends = self._best, self.parameters, self._bends
+        frame = Seen(chosen[:, m].copy(), seen, m, settings.gate, self._planar)
+        by_odometry = motion_by_odometry(predicted[m], odometry[2], sigma)
+        slots, probability = self._maps.slots, settings.gate_probability
+        drift = close_loops(bends, slots, frame, by_odometry, probability)
+        bent = bends.due(predicted[m, :2])
+        if bent is not None:
+            if self._history is not None:
+                self._history.bent(bends.at(bent, np.arange(bends.frame + 1)))
+            self._poses = compose(bent[-1], self._poses)
+            self._maps.bend(bends.at(bent, slots.last_frame))
+        bends.went_on(drift)
+        return bent is not None
 
     def _associate(
         self, seen: Sightings, observations: Observations

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mapfusion.se2 import Float
+from mapfusion.se2 import Float, compose
 
 # Steps between two prunings, at least; as many as half of what the last one looked through, so that
 # a step's share of them does not grow.
@@ -20,6 +20,7 @@ class History:
         self._poses: list[Float] = []
         self._ancestors: list[np.ndarray] = []  # of the next step's particles, or of today's
         self._sources: list[np.ndarray] = []
+        self._bent = np.empty((0, 3))  # motion of the map since each step, for the first steps
         self._n_pruned = 0
         self._next_pruning = _PRUNED_EVERY
 
@@ -35,11 +36,19 @@ class History:
         """After the last step, particle m became a child of ancestors[m] (M,)."""
         self._ancestors[-1] = ancestors
 
+    def bent(self, T_map_bent: Float) -> None:
+        """Every particle's poses (steps, 3) so far move by these motions of the map."""
+        known = np.zeros((len(T_map_bent), 3))
+        known[: len(self._bent)] = self._bent
+        self._bent = compose(T_map_bent, known)
+
     def path(self, particle: int) -> Float:
         """Poses (steps, 3) of a particle of today and its ancestors, before each resampling."""
         line = self._line(particle)
         own = [poses[m] for poses, m in zip(self._poses, line, strict=True)]
-        return np.array(own).reshape(-1, 3)
+        path = np.array(own).reshape(-1, 3)
+        n_bent = len(self._bent)
+        return np.concatenate([compose(self._bent, path[:n_bent]), path[n_bent:]])
 
     def associations(self, particle: int) -> np.ndarray:
         """(n,) int64 source of the landmark each observation went into, -1 where it was dropped."""

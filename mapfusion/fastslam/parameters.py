@@ -31,6 +31,8 @@ class FastSlamParameters:
         frame_correlation: of what a frame's observations say about a particle's past, each with
             each other (see `share_of_news`); 0 is eq. 10. Chosen by paths: over the suite and
             paper.yaml they err less with it, on short and easy logs a little more.
+        close_loops: bend the path so far, and the map that hangs on it, where landmarks come back
+            into view (see `bends.py`); with the informed proposal alone.
         noise_floor_m: standard deviation added to each coordinate of an observation.
         log_new_landmark_density: log of p_new in 1/m^3 (1/m^2 in planar data), the density of an
             observation that matches nothing; None: that of a match exactly at the gate, with the
@@ -48,6 +50,7 @@ class FastSlamParameters:
     resample_fraction: Annotated[float, Range(0, 1, "1")] = 0.5
     stray_m: Annotated[float, Range(0, 10, "m")] = 0.004
     frame_correlation: Annotated[float, Range(0, 1, "1")] = 0.05
+    close_loops: bool = True
     noise_floor_m: Annotated[float, Range(0, 10, "m")] = 0.0
     log_new_landmark_density: Annotated[float, Range(-100, 100, "ln 1/m^3")] | None = None
     planar: bool | None = None

@@ -9,7 +9,7 @@ once the particles' lines have met, and a step costs what is in view.
 import numpy as np
 from numba import njit
 
-from mapfusion.fastslam.boxes import bound, near
+from mapfusion.fastslam.boxes import bend_box, bound, bound_block, near
 from mapfusion.fastslam.genealogy import MEMORY, Genealogy
 from mapfusion.fastslam.sensor import Sightings
 from mapfusion.fastslam.slots import (
@@ -88,6 +88,13 @@ class ParticleMaps:
             for axis in (0, 3, 5):
                 self.slots.own.covariance_m2[self.slots.row[which], :, axis] += variance_m2
         self.moved(which)
+
+    def bend(self, T_map_bent: Float) -> None:
+        """Move the landmarks of all slots (S,) by motions of the plane (S, 3), in every particle.
+
+        The motions are small: covariances keep their directions.
+        """
+        _bend(self.slots, np.flatnonzero(self.slots.generation != FREE), T_map_bent)
 
     def create(
         self, chosen: np.ndarray, seen: Sightings, observations: Observations, first_source: int
@@ -182,6 +189,24 @@ class _Pool:
     def give_back(self, numbers: np.ndarray) -> None:
         """These are in use no longer."""
         self._free.extend(numbers.tolist())
+
+
+@njit(cache=True)
+def _bend(slots: Slots, which: np.ndarray, T_map_bent: Float) -> None:
+    for s in which:
+        motion = T_map_bent[s]
+        cos, sin = np.cos(motion[2]), np.sin(motion[2])
+        if slots.generation[s] == COMMON:
+            means = slots.common.mean_m[s]
+        else:
+            means = slots.own.mean_m[slots.row[s]]
+        for m in range(len(means)):
+            x, y = means[m, 0], means[m, 1]
+            means[m, 0] = cos * x - sin * y + motion[0]
+            means[m, 1] = sin * x + cos * y + motion[1]
+        bend_box(slots, s, motion)
+    for block in range(len(slots.block_box_m)):
+        bound_block(slots, block)
 
 
 @njit(cache=True)

@@ -37,6 +37,7 @@ class Slots(NamedTuple):
     generation: np.ndarray  # (S,) in which the row was written; FREE; COMMON
     row: np.ndarray  # (S,)
     source: np.ndarray  # (S,) the observation it came from
+    last_frame: np.ndarray  # (S,) that showed it, in whatever particle
     box_m: np.ndarray  # (S, 4) min_x, min_y, max_x, max_y of mean and gate over all particles
     block_box_m: np.ndarray  # (S / BLOCK, 4) around the boxes of BLOCK slots
     descriptor: np.ndarray  # (S, 64) float32
@@ -52,6 +53,7 @@ def allocate(capacity: int, n_rows: int, n_particles: int) -> Slots:
         np.full(capacity, FREE, dtype=np.int64),
         np.empty(capacity, dtype=np.int64),
         np.empty(capacity, dtype=np.int64),
+        np.zeros(capacity, dtype=np.int64),
         np.tile(NOWHERE, (capacity, 1)),
         np.tile(NOWHERE, (capacity // BLOCK, 1)),
         np.full((capacity, DESCRIPTOR_LENGTH), np.nan, dtype=np.float32),

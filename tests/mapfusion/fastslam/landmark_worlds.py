@@ -79,5 +79,7 @@ def nothing() -> Observations:
 
 def parameters(**changes) -> FastSlamParameters:
     """The paper's own filter, with changes."""
-    plain = FastSlamParameters(n_particles=15, motion=LOOSE_MOTION, proposal=Proposal.MOTION)
+    plain = FastSlamParameters(
+        n_particles=15, motion=LOOSE_MOTION, proposal=Proposal.MOTION, close_loops=False
+    )
     return replace(plain, **changes)

@@ -1,0 +1,215 @@
+"""What landmarks that come back say, against derivatives by differences, and what a loop is worth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mapfusion.fastslam.bends import SPACING, Bends
+from mapfusion.fastslam.closing import Seen, close_loops, motion_by_odometry
+from mapfusion.fastslam.filter import FastSlam
+from mapfusion.fastslam.genealogy import MEMORY
+from mapfusion.fastslam.motion import MotionNoise
+from mapfusion.fastslam.particles import ParticleMaps
+from mapfusion.fastslam.sensor import sightings
+from mapfusion.fastslam.update import DROPPED, NEW
+from mapfusion.robot_log import Observations
+from mapfusion.se2 import compose, rotation_about_z, transform_points
+from tests.mapfusion.fastslam.landmark_worlds import drive, nothing, parameters
+
+GATE, SIGMA = 16.0, np.array([0.05, 0.03, 0.02])
+
+
+class Evidence(Bends):
+    """Bends that keep what they are told."""
+
+    def closed(self, frame, information, pull, now, probability):
+        self.told = frame, information, pull, now
+
+
+def loop(planar: bool) -> tuple[Evidence, Seen, ParticleMaps, np.ndarray, np.ndarray]:
+    """Ten landmarks in two particles: four in view before, three each seen first and a while on."""
+    rng = np.random.default_rng(2)
+    point = rng.uniform([1, -2, 0], [4, 2, 0 if planar else 1], (12, 3))
+    covariance = np.array([root @ root.T for root in rng.normal(0, 0.02, (12, 3, 3))])
+    covariance += 1e-4 * np.eye(3)
+    poses = np.array([[0, 0, 0.0], [0.4, -0.2, 0.7]])
+    maps = ParticleMaps(2, GATE)
+    first = sightings(poses, point, covariance, planar)
+    frame = Observations(point, covariance)
+    created, _ = maps.create(np.full((12, 2), NEW), first, frame, 0)
+    moved = point + rng.normal(0, 0.02, point.shape) * [1, 1, 0 if planar else 1]
+    seen = sightings(poses, moved, covariance, planar)
+    chosen = created.copy()
+    chosen[10], chosen[11] = NEW, DROPPED
+    bends = Evidence()
+    for _ in range(5 * SPACING):
+        bends.went_on(np.zeros((3, 3)))
+    maps.slots.last_frame[created] = [*[5 * SPACING - 3] * 4, *[3, 4, 6], *[2 * SPACING] * 3, 0, 0]
+    by_odometry = motion_by_odometry(poses[1], 0.2, SIGMA)
+    return bends, Seen(chosen, seen, 1, GATE, planar), maps, by_odometry, poses
+
+
+def log_likelihood(frame: Seen, maps: ParticleMaps, rows, motion) -> float:
+    """By Cauchy's loss, as the proposal weighs pairs, after a motion of the plane (x, y, angle)."""
+    n, total = 2 if frame.planar else 3, 0.0
+    upper = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+    for k in rows:
+        r = maps.slots.row[frame.chosen[k]]
+        Z = maps.slots.own.covariance_m2[r, 1][upper] + frame.sightings.covariance_m2[k, 1][upper]
+        point = rotation_about_z(motion[2]) @ frame.sightings.point_m[k, 1] + [*motion[:2], 0]
+        off = (point - maps.slots.own.mean_m[r, 1])[:n]
+        total -= GATE / 2 * np.log(1 + off @ np.linalg.solve(Z[:n, :n], off) / GATE)
+    return total
+
+
+def slope(function, at) -> np.ndarray:
+    step = 1e-5 * np.eye(3)
+    return np.array([(function(at + h) - function(at - h)) / 2e-5 for h in step])
+
+
+@pytest.mark.parametrize("planar", [False, True])
+def test_evidence_is_the_slope_of_the_likelihood_at_the_pose_in_view(planar):
+    bends, frame, maps, by_odometry, _ = loop(planar)
+    close_loops(bends, maps.slots, frame, by_odometry, 0.9999)
+    when, information, pull, now = bends.told
+    assert when.tolist() == [13 / 3, 2 * SPACING]
+
+    def of_view(motion) -> float:
+        eta = np.linalg.solve(by_odometry, motion)
+        return log_likelihood(frame, maps, range(4), motion) - 0.5 * eta @ eta
+
+    # the pose in view: by Newton's method on what differences tell
+    motion = np.zeros(3)
+    for _ in range(20):
+        motion = motion + now @ slope(of_view, motion)
+    for g, rows in enumerate(([4, 5, 6], [7, 8, 9])):
+        gradient = slope(lambda at, rows=rows: log_likelihood(frame, maps, rows, at), motion)
+        np.testing.assert_allclose(pull[g], gradient, rtol=0.02, atol=0.02 * np.abs(gradient).max())
+    # far from the gate the loss is the squares', and so is its curvature
+    wide = frame._replace(gate=1e12)
+    bends.told = None
+    close_loops(bends, maps.slots, wide, by_odometry, 0.9999)
+    information, now = bends.told[1], bends.told[3]
+    inverse = np.linalg.inv(now) - np.linalg.inv(by_odometry @ by_odometry.T)
+    for rows, found in (([4, 5, 6], information[0]), (range(4), inverse)):
+        points = frame.sightings.point_m[list(rows), 1]
+        expected = np.zeros((3, 3))
+        for k, (x, y, _) in zip(rows, points, strict=True):
+            Z = 2 * frame.sightings.covariance_m2[k, 1][np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])]
+            J = np.array([[1, 0, -y], [0, 1, x], [0, 0, 0]])[: 2 if planar else 3]
+            n = len(J)
+            expected += J.T @ np.linalg.solve(Z[:n, :n], J)
+        np.testing.assert_allclose(found, expected, rtol=0.05, atol=0.05 * np.abs(expected).max())
+
+
+def test_a_path_may_bend_by_the_share_of_the_frame_that_hangs_on_nothing():
+    bends, frame, maps, by_odometry, _ = loop(planar=False)
+    drift = close_loops(bends, maps.slots, frame, by_odometry, 0.9999)
+    # six that come back and a new one, of twelve
+    np.testing.assert_allclose(drift, 7 / 12 * bends.told[3], rtol=1e-12)
+
+
+def test_fewer_than_three_together_close_nothing():
+    bends, frame, maps, by_odometry, _ = loop(planar=False)
+    chosen = frame.chosen.copy()
+    chosen[[4, 7]] = DROPPED
+    bends.told = None
+    close_loops(bends, maps.slots, frame._replace(chosen=chosen), by_odometry, 0.9999)
+    assert bends.told is None
+
+
+def test_odometry_moves_the_plane_as_its_disturbance_moves_the_robot():
+    before, odometry = np.array([2.0, -3.0, 0.7]), np.array([0.3, 0.05, 0.2])
+    predicted, point = compose(before, odometry), np.array([[1.0, 0.5, 0.2]])
+    by_odometry = motion_by_odometry(predicted, odometry[2], SIGMA)
+    seen = transform_points(predicted, point)[0]
+    for i in range(3):
+        eta = 1e-6 * np.eye(3)[i]
+        moved = transform_points(compose(before, odometry + SIGMA * eta), point)[0]
+        by_plane = transform_points(by_odometry @ eta, seen[None])[0]
+        np.testing.assert_allclose(by_plane - seen, moved - seen, atol=1e-12)
+
+
+@pytest.mark.parametrize("settled", [False, True])
+def test_landmarks_of_all_particles_move_and_are_found_where_they_are_now(settled):
+    rng = np.random.default_rng(1)
+    n = 150
+    observations = Observations(rng.uniform(-5, 5, (n, 3)), np.tile(0.01 * np.eye(3), (n, 1, 1)))
+    poses, given = rng.normal(0, 0.1, (3, 3)), (observations.position_m, observations.covariance_m2)
+    seen = sightings(poses, *given, planar=False)
+    maps = ParticleMaps(3, 9.0)
+    slots, _ = maps.create(np.full((n, 3), NEW), seen, observations, 0)
+    same = np.zeros(3, dtype=np.int32)
+    for _ in range(MEMORY if settled else 0):
+        maps.resampled(same)
+    assert (maps.n_rows == 0) == settled
+    T = rng.normal(0, [0.3, 0.3, 0.1], (len(maps.slots.source), 3))
+    maps.bend(T)
+    for particle in range(3):
+        which, known = maps.of_particle(particle, 1)
+        own = seen.point_m[:, 0 if settled else particle]
+        for s, old, new in zip(which, own, known.mean_m, strict=True):
+            np.testing.assert_allclose(new, transform_points(T[s], old[None])[0], atol=1e-12)
+            box = np.array([*new[:2], *new[:2]])
+            assert s in maps.near(box)
+    assert len(slots) == n
+
+
+def blind_loop(seed: int, close_loops: bool) -> FastSlam:
+    """One particle goes away and comes back without a look but one half way, to where it was.
+
+    Its odometry has no error but what is drawn, which grows evenly and leaves the heading alone.
+    """
+    rng, n = np.random.default_rng(seed), 2 * SPACING
+    motion = MotionNoise(0.05, 0, 0, 0, 0, lateral_slip_m_per_rad=0)
+    settings = parameters(
+        n_particles=1,
+        motion=motion,
+        proposal="informed",
+        association="label",
+        gate_probability=1 - 1e-12,
+        close_loops=close_loops,
+    )
+    slam, point = FastSlam(settings, np.random.default_rng(seed)), rng.uniform(-3, 3, (6, 3))
+    label = np.arange(6, dtype=np.int32)
+    start = Observations(point, np.tile(1e-10 * np.eye(3), (6, 1, 1)), label=label)
+    slam.step(np.zeros(3), start)
+    for k in range(1, n):
+        seen = replace(start, label=label + 6) if k == SPACING else nothing()
+        slam.step(np.array([0.1 if k <= SPACING else -0.1, 0, 0]), seen)
+    slam.step(np.array([-0.1, 0, 0]), start)
+    return slam
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_path_and_landmarks_of_a_loop_without_a_look_are_a_line_between_its_ends(seed):
+    """A walk of even steps that is known at both ends: its mean given these adds a line to it."""
+    bent, free = blind_loop(seed, True), blind_loop(seed, False)
+    n = 2 * SPACING
+    drawn, path = free.best_path()[:n], bent.best_path()
+    off = -drawn[-1, :2] + np.array([0.1, 0.0])
+    found = path[:n, :2] - drawn[:, :2]
+    # The last of n steps is the closing frame's, and is left to the proposal. Pairs this far off
+    # say less than they might, as Cauchy's weights have it.
+    expected = np.arange(n)[:, None] / n * off
+    np.testing.assert_allclose(found, expected, atol=0.01 * np.abs(off).max())
+    before, after = (slam.best_map(min_count=1) for slam in (free, bent))
+    half_way = slice(6, 12)
+    moved = after.position_m[half_way] - before.position_m[half_way]
+    np.testing.assert_allclose(moved[:, :2], np.tile(found[SPACING], (6, 1)), atol=1e-9)
+    assert np.abs(off).max() > 0.02
+
+
+def test_without_a_loop_nothing_bends():
+    world = drive(0, n_frames=SPACING)
+    paths = []
+    for close in (True, False):
+        slam = FastSlam(
+            parameters(proposal="informed", close_loops=close), np.random.default_rng(0)
+        )
+        for odometry, frame in zip(world.odometry, world.frames, strict=True):
+            slam.step(odometry, frame)
+        slam.step(np.array([0.1, 0, 0]), nothing())
+        paths.append(slam.best_path())
+    np.testing.assert_array_equal(*paths)
