@@ -1,13 +1,13 @@
 """How far a path may still bend, and how it bends when a loop closes.
 
-Particles that were resampled share their past, and no weight mends what it errs by. Seen as a whole
-it errs as a walk: while the robot goes on, the map that is still to come slowly turns and shifts
-against the one there is. A bend is such a motion of the plane, (x, y, angle) about the map's origin,
-where small ones add; at each knot of the path it is unknown, and when landmarks from before are
-seen again, the difference of two of them is observed. What the path then does between is the mean
-of a Gaussian given that observation: a proposal for a block of past states that knows the
-observation at its end (Doucet, Briers, Senecal 2006), for a chain of poses in closed form
-(Dubbelman, Browning 2015), here with any number of loops, one inside the other.
+Particles that were resampled share their past, and no weight mends what it errs by. That is a walk:
+while the robot goes on, the map to come slowly turns and shifts against the one there is. A bend is
+such a motion of the plane, (x, y, angle) about the map's origin, where small ones add. At each knot
+of the path it is unknown, and when landmarks from before are seen again, the difference of two of
+them is observed. What the path then does between is the mean of a Gaussian given that observation:
+a proposal for a block of past states that knows the observation at its end (Doucet, Briers, Senecal
+2006), for a chain of poses in closed form (Dubbelman, Browning 2015), here with any number of
+loops, one inside the other.
 """
 
 import numpy as np

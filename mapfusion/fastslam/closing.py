@@ -136,7 +136,7 @@ def _add_evidence(
     for k in rows:
         r = int(slots.row[frame.chosen[k]])
         difference, inverse, _ = innovation(seen, k, slots.own, r, m, frame.planar)
-        ixx, ixy, ixz, iyy, iyz, izz = inverse
+        ixx, ixy, ixz, iyy, iyz, _ = inverse
         px, py = seen.point_m[k, m, 0], seen.point_m[k, m, 1]
         x, y = cos * px - sin * py + motion[0], sin * px + cos * py + motion[1]
         dx, dy, dz = difference[0] + x - px, difference[1] + y - py, difference[2]

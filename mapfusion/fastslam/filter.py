@@ -139,7 +139,7 @@ class FastSlam:
         created = self._start_landmarks(chosen, seen, observations)
         self._maps.slots.last_frame[np.concatenate([changed, created[:, 1]])] = self._bends.frame
         self._tracked.went_into(observations.track, chosen, created, self._maps.slots)
-        log_evidence = self._weigh(log_likelihood + log_ratio, len(observations))
+        log_evidence = self._weigh(log_likelihood + log_ratio)
         self._remember(chosen)
         return self._resample(log_evidence)
 
@@ -295,15 +295,13 @@ class FastSlam:
         self._has_labels |= observations.label is not None
         return np.stack([rows, created], axis=1)
 
-    def _weigh(self, log_likelihood: Float, n_observations: int) -> float:
-        """Multiply the weights by the frame's likelihood (eq. 10), as far as it is news.
+    def _weigh(self, log_likelihood: Float) -> float:
+        """Multiply the weights by the frame's likelihood (eq. 10).
 
         Returns:
             Log density of the frame's observations given all before.
         """
-        _, log_evidence = normalised(self._log_weights + log_likelihood)
-        news = self.parameters.share_of_news(n_observations)
-        self._log_weights, _ = normalised(self._log_weights + news * log_likelihood)
+        self._log_weights, log_evidence = normalised(self._log_weights + log_likelihood)
         self._best = int(np.argmax(self._log_weights))
         return log_evidence
 

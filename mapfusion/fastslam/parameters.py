@@ -28,9 +28,6 @@ class FastSlamParameters:
             0 never, 1 in every step.
         stray_m: standard deviation, along each axis, by which the point that one track of
             observations is of lies beside the landmark; the next track's lies elsewhere.
-        frame_correlation: of what a frame's observations say about a particle's past, each with
-            each other (see `share_of_news`); 0 is eq. 10. Chosen by paths: over the suite and
-            paper.yaml they err less with it, on short and easy logs a little more.
         close_loops: bend the path so far, and the map that hangs on it, where landmarks come back
             into view (see `bends.py`); with the informed proposal alone.
         noise_floor_m: standard deviation added to each coordinate of an observation.
@@ -49,7 +46,6 @@ class FastSlamParameters:
     descriptor_threshold: Annotated[float, Range(1e-3, 2, "1")] = 0.5
     resample_fraction: Annotated[float, Range(0, 1, "1")] = 0.5
     stray_m: Annotated[float, Range(0, 10, "m")] = 0.004
-    frame_correlation: Annotated[float, Range(0, 1, "1")] = 0.05
     close_loops: bool = True
     noise_floor_m: Annotated[float, Range(0, 10, "m")] = 0.0
     log_new_landmark_density: Annotated[float, Range(-100, 100, "ln 1/m^3")] | None = None
@@ -64,15 +60,3 @@ class FastSlamParameters:
     def gate(self) -> float:
         """Largest squared Mahalanobis distance of a match."""
         return chi_square_bound(self.gate_probability, 2 if self.planar else 3)
-
-    def share_of_news(self, n_observations: int) -> float:
-        """Power of a frame's likelihood that weighs the particles.
-
-        Eq. 10 multiplies as if the observations of a frame were independent given the path. All of
-        them hang on the poses that a particle happened to be drawn at, now and when the landmarks
-        were made; with all of it in the weights the first frame that shows old landmarks again
-        chooses one of few particles, and with it the whole path so far. So n of them are taken for
-        n / (1 + (n - 1) rho) that have nothing in common, as in a sample by clusters (the design
-        effect: Kish 1965, "Survey Sampling", 5.4).
-        """
-        return 1 / (1 + max(n_observations - 1, 0) * self.frame_correlation)

@@ -32,6 +32,10 @@ from tests.mapfusion.evidence.test_judge import (
     test_a_picture_that_hangs_twice_leaves_two_places,
     test_what_was_found_before_gives_the_same_verdict,
 )
+from tests.mapfusion.fastslam.test_closing import (
+    test_evidence_is_the_slope_of_the_likelihood_at_the_pose_in_view,
+    test_landmarks_of_all_particles_move_and_are_found_where_they_are_now,
+)
 from tests.mapfusion.fastslam.test_filter_twin import test_equals_the_filter_that_copies
 from tests.mapfusion.fastslam.test_particles import (
     test_near_finds_the_gates_that_touch_a_box_and_no_freed_slot,
@@ -49,6 +53,9 @@ def filter_steps() -> None:
     for ways in product(["gate", "descriptor", "label"], [True, False], ["informed", "motion"]):
         association, planar, proposal = ways
         test_equals_the_filter_that_copies(association, planar, 0.5, proposal)
+    for flag in (True, False):
+        test_evidence_is_the_slope_of_the_likelihood_at_the_pose_in_view(planar=flag)
+        test_landmarks_of_all_particles_move_and_are_found_where_they_are_now(settled=flag)
     test_near_finds_the_gates_that_touch_a_box_and_no_freed_slot()
     test_without_landmarks_nothing_is_near()
     test_each_track_s_end_widens_its_landmark_once(particles=3)

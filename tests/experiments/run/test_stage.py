@@ -62,7 +62,7 @@ TOLD = {
     "slam.filter.motion": "slam smooth fuse",
     "slam.filter.noise_floor_m": "slam smooth fuse",
     "slam.filter.stray_m": "slam smooth fuse",
-    "slam.filter.frame_correlation": "slam",
+    "slam.filter.close_loops": "slam",
     "slam.min_count": "slam smooth fuse",
     "smooth": "smooth",
     "align.match": "match",

@@ -70,8 +70,7 @@ class CopyingFilter:
         for particle, pose, ratio in zip(self.particles, poses, ratios, strict=True):
             particle.pose = pose
             particle.path.append(pose)
-            news = 1 / (1 + settings.frame_correlation * max(len(observations) - 1, 0))
-            particle.weight *= (self.take_in(particle, observations) * ratio) ** news
+            particle.weight *= self.take_in(particle, observations) * ratio
         self.n_observations += len(observations)
         self.weights = np.array([p.weight for p in self.particles])
         self.weights /= self.weights.sum()

@@ -1,4 +1,4 @@
-"""What landmarks that come back say, against derivatives by differences, and what a loop is worth."""
+"""What landmarks that come back say, against differences, and where it puts path and map."""
 
 from dataclasses import replace
 

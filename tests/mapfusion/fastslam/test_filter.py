@@ -57,28 +57,6 @@ def test_a_landmark_seen_a_thousand_times_keeps_a_covariance_of_one_thousandth()
     np.testing.assert_allclose(landmarks.position_m, frame.position_m, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("n_observations", "rho", "share"), [(1, 0.3, 1), (7, 0, 1), (6, 0.2, 0.5)]
-)
-def test_observations_of_a_frame_weigh_as_much_as_independent_ones_in_that_share(
-    n_observations, rho, share
-):
-    """Six that are correlated by 0.2 say as much as three: 6 / (1 + 5 * 0.2)."""
-
-    def log_weights(rho: float) -> np.ndarray:
-        settings = parameters(association="label", resample_fraction=0.0, frame_correlation=rho)
-        slam = FastSlam(settings, np.random.default_rng(2))
-        label = np.arange(n_observations, dtype=np.int32)
-        point = np.random.default_rng(3).uniform(1, 4, (n_observations, 3))
-        frame = Observations(point, np.tile(0.01 * np.eye(3), (n_observations, 1, 1)), label=label)
-        slam.step(np.zeros(3), frame)
-        return slam.step(np.array([0.2, 0.0, 0.1]), frame).log_weights
-
-    alone, together = log_weights(0.0), log_weights(rho)
-    assert np.ptp(alone) > 1
-    np.testing.assert_allclose(together - together[0], share * (alone - alone[0]), atol=1e-9)
-
-
 def test_weights_of_two_poses_follow_from_the_density_of_the_difference():
     """One landmark, seen twice: the weight is N(difference; 0, 2 R), in closed form."""
     settings = parameters(
