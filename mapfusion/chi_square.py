@@ -1,6 +1,9 @@
 """Bounds that a chi-square variable keeps with a given probability."""
 
+from functools import cache
 
+
+@cache  # a filter asks for its gate in every step
 def chi_square_bound(probability: float, degrees_of_freedom: float) -> float:
     """The value that a chi-square variable stays below with this probability.
 
