@@ -12,6 +12,7 @@ from experiments.run.stage_tables import COVARIANCE, MOTION
 from mapfusion.align.acceptance import Verdict
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.result import Alignment, Status
+from mapfusion.evidence.likelihood import TwinShares
 from mapfusion.evidence.pair_evidence import PairEvidence, RivalMotion
 from mapfusion.evidence.parameters import EvidenceParameters
 from mapfusion.se2 import Float
@@ -69,7 +70,8 @@ def alignment_of(row: Mapping[Any, Any], n_correspondences: int) -> Alignment:
 
 def rival_rows(names: Mapping[str, Any], evidence: PairEvidence) -> list[dict[str, Any]]:
     """Rows of the table `rivals` of one pair of maps."""
-    both = {"twin_share": evidence.twin_share, "region_m": evidence.region_m}
+    own, copied = evidence.shares
+    both = {"own_share": own, "copied_share": copied, "region_m": evidence.region_m}
     return [
         {
             **names,
@@ -99,7 +101,8 @@ def evidence_of(rows: pd.DataFrame, parameters: EvidenceParameters) -> PairEvide
     if not motions:
         return PairEvidence.of_nothing(parameters)
     first = rows.iloc[0]
-    return PairEvidence(motions, float(first["twin_share"]), float(first["region_m"]))
+    shares = TwinShares(float(first["own_share"]), float(first["copied_share"]))
+    return PairEvidence(motions, shares, float(first["region_m"]))
 
 
 def correspondences_of(rows: pd.DataFrame) -> Correspondences:

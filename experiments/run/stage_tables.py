@@ -44,11 +44,12 @@ _OFFERED = fields(**_MAPS, index_a=INT, index_b=INT, descriptor_distance=FLOAT)
 CORRESPONDENCES = schema("result.correspondences", 1, _OFFERED)
 
 # What was found once for each two maps: the best distinct motions between them (of: "a b"), and of
-# each map onto itself ("a", "b"). log10_evidence: of the first, as of estimates; twin_share: of the
-# regions that a wrong motion lays on their like; region_m: side of a region.
+# each map onto itself ("a", "b"). log10_evidence: of the first, as of estimates; own_share,
+# copied_share: of what a wrong motion lays on its like, where no other motion does and where one
+# does; region_m: side of a region.
 RIVALS = schema(
     "result.rivals",
-    1,
+    2,
     fields(
         **_MAPS,
         of=TEXT,
@@ -59,7 +60,8 @@ RIVALS = schema(
         n_contradicted=INT,
         n_regions=INT,
         log10_evidence=FLOAT,
-        twin_share=FLOAT,
+        own_share=FLOAT,
+        copied_share=FLOAT,
         region_m=FLOAT,
     ),
 )

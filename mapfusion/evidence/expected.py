@@ -10,19 +10,33 @@ from mapfusion.align.closest import Grid, runs_about
 from mapfusion.se2 import Float
 from mapfusion.viewing import Viewing
 
-# A landmark is seen again from about where it was seen: as far off to within these ratios, and
-# from a direction within that angle, descriptors match (U-SURF's window follows the depth, but not
-# the slant).
-NEAREST_RATIO, FARTHEST_RATIO = 0.7, 1.4
-MOST_SLANT_RAD = math.radians(30.0)
 LEAST_FRAMES = 3  # in which it lay in view: tracks become landmarks after as many sightings
+# How a landmark that another robot saw lay in view of this one: not at all; from another distance
+# or side, from where some are found again (U-SURF's window follows the depth, but the window of one
+# picture holds other things at another distance, and the slant changes it); from about where it was
+# seen, from where nearly all are.
+UNSEEN, MAY, MUST = 0, 1, 2
+
+
+class Likeness(NamedTuple):
+    """From where a landmark looks as it did: within a ratio of its distance, and an angle."""
+
+    ratio: float
+    slant_rad: float
+
+
+LIKE = {MUST: Likeness(1.4, math.radians(30.0)), MAY: Likeness(2.0, math.radians(45.0))}
 # Beyond what was seen in that direction by no more than this a landmark is not hidden: the same
 # wall, a little slanted within a part of the field of view.
 _BEHIND_M = 0.3
-_COS_SLANT = math.cos(MOST_SLANT_RAD)
-# Of the distance r: how far from where it was seen the places lie from which it is seen so again,
-# sqrt((1.4 cos 30 - 1)^2 + (1.4 sin 30)^2) at the most.
-_PLACES = math.hypot(FARTHEST_RATIO * _COS_SLANT - 1, FARTHEST_RATIO * math.sin(MOST_SLANT_RAD))
+_MUST_RATIO2, _MAY_RATIO2 = LIKE[MUST].ratio ** 2, LIKE[MAY].ratio ** 2
+_MUST_COS2, _MAY_COS2 = math.cos(LIKE[MUST].slant_rad) ** 2, math.cos(LIKE[MAY].slant_rad) ** 2
+# Of the distance r: how far from where it was seen the places lie from which it may be seen so
+# again: of the places on the edge, the farthest is as far off and as much aside as may be.
+_PLACES = math.hypot(
+    LIKE[MAY].ratio * math.cos(LIKE[MAY].slant_rad) - 1,
+    LIKE[MAY].ratio * math.sin(LIKE[MAY].slant_rad),
+)
 
 
 class Watch(NamedTuple):
@@ -68,38 +82,43 @@ class Seen(NamedTuple):
 
 
 @njit(cache=True)
-def must_be_seen(seen: Seen, watch: Watch) -> np.ndarray:
-    """Rows (n,) of the landmarks that lay in view, unhidden, in LEAST_FRAMES frames or more."""
+def how_seen(seen: Seen, watch: Watch) -> np.ndarray:
+    """UNSEEN, MAY or MUST (N,) of each landmark: LEAST_FRAMES frames or more had it in view so."""
     p, direction, distance_m = seen
     # arrays by themselves: taken from a tuple, each access would count its references
     places, heading, reach_m, bearing_rad, range_m, height_m = watch
     at, runs = places.p, np.empty((places.shape[1], 2), np.int64)
-    rows, n = np.empty(len(p), np.int64), 0
+    how = np.zeros(len(p), np.int64)
     for i in range(len(p)):
         r, ux, uy = distance_m[i], direction[i, 0], direction[i, 1]
-        least2, most2 = (NEAREST_RATIO * r) ** 2, (FARTHEST_RATIO * r) ** 2
-        frames = 0
+        r2, must, may = r * r, 0, 0
         about_x, about_y = p[i, 0] - r * ux, p[i, 1] - r * uy
         for run in range(runs_about(about_x, about_y, _PLACES * r, places, runs)):
             for t in range(runs[run, 0], runs[run, 1]):
                 dx, dy = p[i, 0] - at[t, 0], p[i, 1] - at[t, 1]
                 square, along = dx * dx + dy * dy, dx * ux + dy * uy
-                if not least2 <= square <= most2 or along <= 0:
+                if not r2 <= _MAY_RATIO2 * square <= _MAY_RATIO2 * _MAY_RATIO2 * r2:
                     continue
-                if along * along < _COS_SLANT * _COS_SLANT * square:
+                if along <= 0 or along * along < _MAY_COS2 * square:
+                    continue
+                alike = r2 <= _MUST_RATIO2 * square <= _MUST_RATIO2 * _MUST_RATIO2 * r2
+                alike = alike and along * along >= _MUST_COS2 * square
+                if not alike and may >= LEAST_FRAMES:
                     continue
                 ahead = heading[t, 0] * dx + heading[t, 1] * dy
                 left = heading[t, 0] * dy - heading[t, 1] * dx
                 sight = (math.sqrt(square), math.atan2(left, ahead), p[i, 2])
-                frames += _in_view(sight, bearing_rad, range_m, height_m, reach_m, t)
-                if frames == LEAST_FRAMES:
+                if _in_view(sight, bearing_rad, range_m, height_m, reach_m, t):
+                    must, may = must + alike, may + 1
+                if must == LEAST_FRAMES:
                     break
-            if frames == LEAST_FRAMES:
+            if must == LEAST_FRAMES:
                 break
-        if frames == LEAST_FRAMES:
-            rows[n] = i
-            n += 1
-    return rows[:n]
+        if must == LEAST_FRAMES:
+            how[i] = MUST
+        elif may >= LEAST_FRAMES:
+            how[i] = MAY
+    return how
 
 
 @njit(cache=True)

@@ -5,13 +5,12 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from scipy.special import bdtrc
 
 from mapfusion.align.acceptance import Acceptance, Verdict
 from mapfusion.align.pairs import Pairs
 from mapfusion.align.refine import Refinement
 from mapfusion.align.result import Alignment, Status
-from mapfusion.evidence.likelihood import CHANGED
+from mapfusion.evidence.copies import BETWEEN, Copies
 from mapfusion.evidence.pair_evidence import (
     PairEvidence,
     RivalMotion,
@@ -24,10 +23,6 @@ from mapfusion.evidence.regions import Regions, Witness, Witnesses
 from mapfusion.evidence.rivals import DISTINCT_M, apart_m
 from mapfusion.se2 import Float, motion_sigma
 from mapfusion.team.relations import whole_map_covariance
-
-# Several regions contradict where a right alignment has so many changed with a smaller probability
-# than this; a single one weighs as its ratio says.
-_SURPRISE, _SEVERAL = 0.1, 2
 
 
 @dataclass(frozen=True)
@@ -90,8 +85,8 @@ class PairJudge:
         status, reason, told = Status.ACCEPTED, "", {}
         evidence = self.evidence
         if evidence is not None:
-            regions = self._witnesses.regions(alignment.T_a_b, evidence.region_m)
-            ratio = regions.log10_ratio(evidence.twin_share)
+            regions = self.regions(alignment.T_a_b, evidence)
+            ratio = regions.log10_ratio(evidence.shares)
             told = {"log10_evidence": ratio, "n_confirmed": regions.n_confirmed}
             p = probability(self._signs(alignment, regions, ratio, evidence))
             told |= {"n_contradicted": regions.n_contradicted, "probability": p}
@@ -110,9 +105,26 @@ class PairJudge:
         """What speaks for and against an alignment; None where no evidence can be sought."""
         if self.evidence is None:
             return None
-        regions = self._witnesses.regions(alignment.T_a_b, self.evidence.region_m)
-        ratio = regions.log10_ratio(self.evidence.twin_share)
+        regions = self.regions(alignment.T_a_b, self.evidence)
+        ratio = regions.log10_ratio(self.evidence.shares)
         return self._signs(alignment, regions, ratio, self.evidence)
+
+    def regions(self, T_a_b: Float, evidence: PairEvidence) -> Regions:
+        """What becomes of what both robots must have seen under a motion."""
+        p_b = self._pairs.map_b.position_m[:, :2]
+        others = (
+            copies
+            for each, copies in zip(evidence.motions, self._laid, strict=True)
+            if each.of != BETWEEN or apart_m(T_a_b, each.T_a_b, p_b) >= DISTINCT_M
+        )
+        none = Copies.none(len(self._pairs.map_a), len(self._pairs.map_b))
+        return self._witnesses.regions(BETWEEN, T_a_b, evidence.region_m, none.joined(others))
+
+    @cached_property
+    def _laid(self) -> list[Copies]:
+        """What each motion that was found lays on its like."""
+        assert self.evidence is not None
+        return [self._witnesses.copies(m.of, m.T_a_b) for m in self.evidence.motions]
 
     def _signs(
         self, alignment: Alignment, regions: Regions, ratio: float, evidence: PairEvidence
@@ -130,8 +142,7 @@ class PairJudge:
         """What the evidence makes of an alignment that is more than chance."""
         against, n = regions.n_contradicted, len(regions)
         told = f"{regions.n_confirmed} of {n} regions that both must have seen are in both maps"
-        surprising = against >= _SEVERAL and bdtrc(against - 1, n, CHANGED) < _SURPRISE
-        if surprising or ratio < -math.log10(self._judge.evidence.most_against):
+        if ratio < -math.log10(self._judge.evidence.most_against):
             return Status.REFUSED, f"contradicted: {told}, {against} are missing from one"
         doubt = self._doubt(alignment, regions, ratio, evidence)
         if not doubt:

@@ -26,30 +26,64 @@ class BetaRate(NamedTuple):
         return self.seen / (self.seen + self.missed)
 
 
-# The likeliest for the regions of right alignments in the suite's worlds.
-RIGHT = BetaRate(10.0, 1.74)
-# Of wrong ones, chosen: one landmark in ten is met by another of its look, seldom half of them.
-WRONG = BetaRate(0.55, 5.0)
-# Regions of a right alignment that are as a wrong one's: a picture that was moved, light that
-# changed, a stretch in which one of the maps drifted. It bounds what one region can say against it.
+RIGHT = (BetaRate(12.4, 2.33), BetaRate(1.80, 2.88))
+WRONG = (BetaRate(1.11, 14.8), BetaRate(0.88, 16.0))
 CHANGED = 0.05
-SHARE_CONFIRMED, SHARE_CONTRADICTED = 0.55, 0.30  # of what must be seen there, for words and counts
+# Parts of a region: where no other motion lays it on its like, and where another does.
+OWN, COPIED = 0, 1
+# Decades by which a region is likelier as found if the motion is right than by chance, for counts
+# and words: confirmed from so many on, contradicted from as many against it.
+DECISIVE = 1.0
 
 
-def log_likelihood(k: np.ndarray, n: np.ndarray, rate: BetaRate) -> Float:
-    """Natural logarithm of the beta-binomial probability of k of n, but for the coefficient."""
-    return betaln(k + rate.seen, n - k + rate.missed) - betaln(rate.seen, rate.missed)
+Rates = tuple[BetaRate, BetaRate]  # of what must be seen and of what may be
 
 
-def log10_ratio(k: np.ndarray, n: np.ndarray, twin_share: float) -> Float:
+class TwinShares(NamedTuple):
+    """Of what a wrong motion must find, the share that it lays on its like.
+
+    Attributes:
+        own: where no other motion lays it on its like.
+        copied: where another does.
+    """
+
+    own: float
+    copied: float
+
+
+def log_likelihood(k: np.ndarray, n: np.ndarray, rates: Rates) -> Float:
+    """Natural logarithm (...) of the beta-binomial probability of k of n (..., 2).
+
+    But for the coefficients. Last axis: landmarks that must be seen, and those that may be.
+    """
+    by_class = [
+        betaln(k[..., c] + rate.seen, n[..., c] - k[..., c] + rate.missed) - betaln(*rate)
+        for c, rate in enumerate(rates)
+    ]
+    return np.sum(by_class, axis=0)
+
+
+def log10_against_chance(k: np.ndarray, n: np.ndarray) -> Float:
+    """log10 (...) of how much likelier k of n (..., 2) are under a right motion than by chance."""
+    return (log_likelihood(k, n, RIGHT) - log_likelihood(k, n, WRONG)) / np.log(10.0)
+
+
+def log10_ratio(k: np.ndarray, n: np.ndarray, shares: TwinShares) -> Float:
     """log10 (R,) of how much likelier each region is under a right motion than under a wrong one.
 
+    Under a wrong one all of a region is its like, or what another motion, too, lays on its like, or
+    nothing of it.
+
     Args:
-        k: (R,) landmarks that were found.
-        n: (R,) landmarks that must be there.
-        twin_share: of the regions that a wrong motion lays on their like, above 0 and below 1.
+        k: (R, 2, 2) landmarks that were found: OWN and COPIED, of those that must be seen
+            and that may be.
+        n: (R, 2, 2) landmarks that are looked for.
+        shares: each above 0 and below 1.
     """
     right, chance = log_likelihood(k, n, RIGHT), log_likelihood(k, n, WRONG)
-    wrong = np.logaddexp(np.log(twin_share) + right, np.log1p(-twin_share) + chance)
-    changed = np.logaddexp(np.log1p(-CHANGED) + right, np.log(CHANGED) + wrong)
+    whole = right.sum(axis=1)
+    own, copied = (np.log([share, 1 - share]) for share in shares)
+    copies = np.logaddexp(copied[0] + right[:, COPIED], copied[1] + chance[:, COPIED])
+    wrong = np.logaddexp(own[0] + whole, own[1] + chance[:, OWN] + copies)
+    changed = np.logaddexp(np.log1p(-CHANGED) + whole, np.log(CHANGED) + wrong)
     return (changed - wrong) / np.log(10.0)

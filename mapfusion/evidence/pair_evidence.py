@@ -8,6 +8,8 @@ import numpy as np
 from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.pairs import Pairs
 from mapfusion.align.refine import Refinement
+from mapfusion.evidence.copies import BETWEEN, of_others
+from mapfusion.evidence.likelihood import COPIED, OWN, TwinShares
 from mapfusion.evidence.parameters import EvidenceParameters
 from mapfusion.evidence.regions import Regions, Witnesses
 from mapfusion.evidence.rivals import Supported, distinct_motions, self_motions
@@ -20,8 +22,9 @@ _PATCH_REACH_M = 0.7  # between neighbouring corners of one picture
 _LEAST_OF_PATCH = 5
 # What is known of the share of twins before any region is seen: between that of worlds in which
 # nothing repeats and that of one with four posters on all walls; worth two regions.
-_TWINS_BEFORE, _OTHERS_BEFORE = 0.2, 1.8
-BETWEEN = "a b"  # of a motion between the maps; of one map onto itself: a, b
+_TWINS_BEFORE = 0.2, 2.0
+# Of what another motion lays on its like nothing is known before: worth two regions, too.
+_COPIES_BEFORE = 1.0, 2.0
 
 
 @dataclass(frozen=True)
@@ -55,18 +58,18 @@ class PairEvidence:
 
     Attributes:
         motions: the best of each kind, best first.
-        twin_share: of the regions that a wrong motion lays on their like.
+        shares: of what a wrong motion lays on its like.
         region_m: side of a region: at least as large as what repeats.
     """
 
     motions: tuple[RivalMotion, ...]
-    twin_share: float
+    shares: TwinShares
     region_m: float
 
     @classmethod
     def of_nothing(cls, parameters: EvidenceParameters) -> "PairEvidence":
         """Of two maps that no motion fits."""
-        return cls((), _twin_share([], []), parameters.region_m)
+        return cls((), _twin_shares([], []), parameters.region_m)
 
     @property
     def rivals(self) -> tuple[RivalMotion, ...]:
@@ -105,16 +108,18 @@ def find_evidence(
         alike, motions = self_motions(own.landmarks, N_SELF_MOTIONS, acceptance, refinement)
         onto_self += [(side, motion) for motion in motions]
         region_m = max(region_m, _largest_twin_m(alike, motions, acceptance))
-    rivals = [(each, witnesses.regions(each.T_a_b, region_m)) for each in between]
-    selves = []
-    for side, motion in onto_self:
-        own = witnesses.a if side == "a" else witnesses.b
-        regions = Witnesses(own, own, parameters).regions(motion.T_a_b, region_m)
-        selves.append((side, motion, regions))
-    twin_share = _twin_share([r for _, r in rivals], [r for *_, r in selves])
-    found = [_rival(BETWEEN, each, r, r.log10_ratio(twin_share)) for each, r in rivals]
-    found += [_rival(side, each, r, math.nan) for side, each, r in selves]
-    return PairEvidence(tuple(found), twin_share, region_m)
+    kinds = [*((BETWEEN, each) for each in between), *onto_self]
+    laid = [witnesses.copies(of, each.T_a_b) for of, each in kinds]
+    regions = [
+        witnesses.regions(of, motion.T_a_b, region_m, of_others(laid, k))
+        for k, (of, motion) in enumerate(kinds)
+    ]
+    shares = _twin_shares(regions[: len(between)], regions[len(between) :])
+    found = [
+        _rival(of, each, r, r.log10_ratio(shares) if of == BETWEEN else math.nan)
+        for (of, each), r in zip(kinds, regions, strict=True)
+    ]
+    return PairEvidence(tuple(found), shares, region_m)
 
 
 def _largest_twin_m(alike: Pairs, motions: list[Supported], acceptance: Acceptance) -> float:
@@ -127,16 +132,18 @@ def _largest_twin_m(alike: Pairs, motions: list[Supported], acceptance: Acceptan
     return longest
 
 
-def _twin_share(rivals: list[Regions], selves: list[Regions]) -> float:
-    """Share of regions confirmed under wrong motions.
+def _twin_shares(rivals: list[Regions], selves: list[Regions]) -> TwinShares:
+    """Shares of regions confirmed under wrong motions.
 
-    Of the motions between the maps one may be right: that of most regions confirmed is left out.
+    Of the motions between the maps one may be right: that of most regions confirmed is left out. A
+    motion of a map onto itself was looked for where it holds things twice, and says nothing of the
+    others.
     """
-    by_worth = sorted(rivals, key=lambda r: r.n_contradicted - r.n_confirmed)
-    wrong = [*by_worth[1:], *selves]
-    twins_seen = sum(regions.n_confirmed for regions in wrong)
-    n = sum(map(len, wrong))
-    return (twins_seen + _TWINS_BEFORE) / (n + _TWINS_BEFORE + _OTHERS_BEFORE)
+    wrong = sorted(rivals, key=lambda r: r.n_contradicted - r.n_confirmed)[1:]
+    own = [_TWINS_BEFORE, *(regions.seen_again(OWN) for regions in wrong)]
+    copied = [_COPIES_BEFORE, *(regions.seen_again(COPIED) for regions in [*wrong, *selves])]
+    shares = (np.sum(counts, axis=0) for counts in (own, copied))
+    return TwinShares(*(float(confirmed / n) for confirmed, n in shares))
 
 
 def _rival(of: str, motion: Supported, regions: Regions, log10_ratio: float) -> RivalMotion:

@@ -1,14 +1,17 @@
 """The regions that two maps must share under a motion, and how much of each is in both."""
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from mapfusion.align.closest import Grid
 from mapfusion.align.correspondences import HeightGate
-from mapfusion.evidence.expected import Seen, Watch, must_be_seen
+from mapfusion.evidence.copies import BETWEEN, Copies, laid_on_like
+from mapfusion.evidence.expected import MUST, UNSEEN, Seen, Watch, how_seen
 from mapfusion.evidence.found import Gates, Looks, has
-from mapfusion.evidence.likelihood import SHARE_CONFIRMED, SHARE_CONTRADICTED, log10_ratio
+from mapfusion.evidence.likelihood import DECISIVE, TwinShares, log10_against_chance, log10_ratio
 from mapfusion.evidence.parameters import EvidenceParameters
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.se2 import Float, inverse, transform_points
@@ -21,8 +24,9 @@ class Regions:
     """What became of what must be seen, region by region.
 
     Attributes:
-        found: (R,) landmarks that the other map has.
-        expected: (R,) landmarks that it must have, those of both maps.
+        found: (R, 2, 2) landmarks that the other map has: in places that may be copies or not
+            (OWN, COPIED), of those that it must have and that it may have.
+        expected: (R, 2, 2) landmarks that are looked for, those of both maps.
     """
 
     found: np.ndarray
@@ -31,19 +35,54 @@ class Regions:
     def __len__(self) -> int:
         return len(self.found)
 
+    @cached_property
+    def confirmed(self) -> np.ndarray:
+        """Bool (R,): what is found there speaks for the motion, and nothing of it against."""
+        return (self._all >= DECISIVE) & (self._parts > -DECISIVE).all(axis=1)
+
     @property
     def n_confirmed(self) -> int:
         """Regions of which most is there."""
-        return int(np.sum(self.found >= SHARE_CONFIRMED * self.expected))
+        return int(np.sum(self.confirmed))
 
     @property
     def n_contradicted(self) -> int:
-        """Regions of which hardly anything is there."""
-        return int(np.sum(self.found <= SHARE_CONTRADICTED * self.expected))
+        """Regions of which hardly anything is there, or nothing but what may be a copy."""
+        against = (self._all <= -DECISIVE) | (self._parts <= -DECISIVE).any(axis=1)
+        return int(np.sum(against))
 
-    def log10_ratio(self, twin_share: float) -> float:
+    @cached_property
+    def _parts(self) -> Float:
+        return log10_against_chance(self.found, self.expected)
+
+    @cached_property
+    def _all(self) -> Float:
+        return self._parts.sum(axis=1)
+
+    def seen_again(self, part: int) -> tuple[int, int]:
+        """Of a part (OWN, COPIED) of regions with enough of it, the confirmed, and all."""
+        enough = self.expected[:, part].sum(axis=1) >= LEAST_EXPECTED
+        return int(np.sum(self._parts[enough, part] >= DECISIVE)), int(np.sum(enough))
+
+    def log10_ratio(self, shares: TwinShares) -> float:
         """log10 of how much likelier all of them are if the motion is right; 0 of none."""
-        return float(np.sum(log10_ratio(self.found, self.expected, twin_share)))
+        return float(np.sum(log10_ratio(self.found, self.expected, shares)))
+
+
+class _Asked(NamedTuple):
+    """Landmarks that another robot had in view (n,).
+
+    Attributes:
+        rows: of the map.
+        how: MAY or MUST.
+        found: whether the other map has them.
+        copied: whether another motion lays their place on its like.
+    """
+
+    rows: np.ndarray
+    how: np.ndarray
+    found: np.ndarray
+    copied: np.ndarray
 
 
 class Witness:
@@ -75,37 +114,70 @@ class Witnesses:
     """Two maps that may be asked about any motion between them."""
 
     def __init__(self, a: Witness, b: Witness, parameters: EvidenceParameters) -> None:
-        self.a, self.b = a, b
+        self.a, self.b, self._parameters = a, b, parameters
         height = HeightGate()
         planar = a.landmarks.planar or b.landmarks.planar
         bound = np.inf if planar else height.bound
         unlike = parameters.max_descriptor_distance
         self._gates = Gates(parameters.gate_m, bound, height.floor_m**2, unlike)
 
-    def regions(self, T_a_b: Float, region_m: float) -> Regions:
-        """What each robot must have seen of the other's landmarks, and has, in squares of frame a.
+    @cached_property
+    def _of(self) -> dict[str, "Witnesses"]:
+        """These, and each map beside itself, by what motions are of."""
+        own = {
+            side: Witnesses(w, w, self._parameters) for side, w in (("a", self.a), ("b", self.b))
+        }
+        return {BETWEEN: self, **own}
 
-        Both ways are counted into one square: they are of one part of the world.
+    def regions(self, of: str, T: Float, region_m: float, copies: Copies) -> Regions:
+        """What must have been seen under a motion, and is there, in squares of frame a.
+
+        Of two maps both ways are counted into one square: they are of one part of the world. What
+        lies in `copies` is counted apart.
         """
-        rows_b, found_b, b_in_a = self._asked(self.b, self.a, T_a_b)
-        rows_a, found_a, _ = self._asked(self.a, self.b, inverse(T_a_b))
-        places = np.concatenate([b_in_a[rows_b], self.a.landmarks.position_m[rows_a]])
-        found = np.concatenate([found_b, found_a])
+        if of != BETWEEN:
+            own = copies.in_a if of == "a" else copies.in_b
+            return self._of[of].regions(BETWEEN, T, region_m, Copies(own, own))
+        T_a_b = T
+        asked_b, b_in_a = self._asked(self.b, self.a, T_a_b, copies.in_b)
+        asked_a, _ = self._asked(self.a, self.b, inverse(T_a_b), copies.in_a)
+        asked = _Asked(*map(np.concatenate, zip(asked_b, asked_a, strict=True)))
+        places = np.concatenate([b_in_a[asked_b.rows], self.a.landmarks.position_m[asked_a.rows]])
         column, row = np.floor(places[:, :2].T / region_m).astype(np.int64)
         width = int(np.ptp(row)) + 1 if len(row) else 1
         _, place = np.unique(column * width + row, return_inverse=True)
-        expected = np.bincount(place)
-        n_found = np.bincount(place, found, len(expected)).astype(np.int64)
-        counts = expected >= LEAST_EXPECTED
-        return Regions(n_found[counts], expected[counts])
+        n = int(place.max(initial=-1)) + 1
+        found, expected = np.zeros((n, 2, 2), np.int64), np.zeros((n, 2, 2), np.int64)
+        at = place, asked.copied.astype(np.int64), np.where(asked.how == MUST, 0, 1)
+        np.add.at(expected, at, 1)
+        np.add.at(found, at, asked.found)
+        counts = expected.sum(axis=(1, 2)) >= LEAST_EXPECTED
+        return Regions(found[counts], expected[counts])
+
+    def copies(self, of: str, T: Float) -> Copies:
+        """Landmarks of both maps that a motion lays on their like."""
+        two = self._of[of]
+        in_a, in_b = two._laid(two.a, two.b, inverse(T)), two._laid(two.b, two.a, T)
+        if of == BETWEEN:
+            return Copies(in_a, in_b)
+        none = Copies.none(len(self.a.landmarks), len(self.b.landmarks))
+        return none._replace(**{f"in_{of}": in_a | in_b})
+
+    def _laid(self, own: Witness, other: Witness, T: Float) -> np.ndarray:
+        p = own.landmarks.position_m.copy()
+        p[:, :2] = transform_points(T, p[:, :2])
+        found = has(p, np.arange(len(p)), own.looks, other.looks, self._gates)
+        return laid_on_like(found, own.looks.near)
 
     def _asked(
-        self, own: Witness, other: Witness, T: Float
-    ) -> tuple[np.ndarray, np.ndarray, Float]:
-        """Rows (n,) of `own` that `other` must have seen, which it has, all of own's in its frame.
+        self, own: Witness, other: Witness, T: Float, copied: np.ndarray
+    ) -> tuple[_Asked, Float]:
+        """What `other` has of `own`, and all of own's landmarks in its frame.
 
         T (3,) maps own's frame into that of the other.
         """
         seen = own.seen_from(T)
-        rows = must_be_seen(seen, other.watch)
-        return rows, has(seen.p, rows, own.looks, other.looks, self._gates), seen.p
+        how = how_seen(seen, other.watch)
+        rows = np.flatnonzero(how != UNSEEN)
+        found = has(seen.p, rows, own.looks, other.looks, self._gates)
+        return _Asked(rows, how[rows], found, copied[rows]), seen.p

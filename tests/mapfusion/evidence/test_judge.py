@@ -66,7 +66,8 @@ def test_a_picture_that_hangs_twice_leaves_two_places() -> None:
     other = Wall(30, seed=7)
     picture = (wall.p[:, 0] >= 4) & (wall.p[:, 0] < 6)
     other.p, other.look = wall.p[picture], wall.look[picture]  # on a wall that is bare
-    said, _ = verdict(mapped(wall, 1, 15, seed=8), mapped(other, 3, 7, seed=9))
+    small = Judge(evidence=EvidenceParameters(place_m=1.0))  # b is one place
+    said, _ = verdict(mapped(wall, 1, 15, seed=8), mapped(other, 3, 7, seed=9), small)
     assert said.status is Status.AMBIGUOUS
     assert "T_a_b" in said.reason or "hold things twice" in said.reason
 

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from mapfusion import se2
+from mapfusion.evidence.copies import BETWEEN, Copies
+from mapfusion.evidence.likelihood import COPIED, OWN, TwinShares
 from mapfusion.evidence.parameters import EvidenceParameters
 from mapfusion.evidence.regions import Witness, Witnesses
 from tests.mapfusion.evidence.two_rooms import Wall, between, mapped
@@ -11,11 +13,12 @@ from tests.mapfusion.evidence.two_rooms import Wall, between, mapped
 WALL = Wall(16, seed=1)
 A, B = (Witness(mapped(WALL, *ends, seed=k)) for k, ends in enumerate(((1, 9), (5, 14))))
 T_A_B = between(1, 5)
-PARAMETERS = EvidenceParameters()
+PARAMETERS, SHARES = EvidenceParameters(), TwinShares(0.05, 0.5)
 
 
 def regions(T_a_b: np.ndarray, a: Witness = A, b: Witness = B):
-    return Witnesses(a, b, PARAMETERS).regions(T_a_b, 1.0)
+    none = Copies.none(len(a.landmarks), len(b.landmarks))
+    return Witnesses(a, b, PARAMETERS).regions(BETWEEN, T_a_b, 1.0, none)
 
 
 def test_the_right_motion_is_confirmed_everywhere() -> None:
@@ -23,19 +26,19 @@ def test_the_right_motion_is_confirmed_everywhere() -> None:
     assert len(found) >= 3
     assert found.n_confirmed == len(found)
     assert found.n_contradicted == 0
-    assert found.log10_ratio(0.05) > 3
+    assert found.log10_ratio(SHARES) > 3
 
 
 def test_a_motion_along_the_wall_is_contradicted_everywhere() -> None:
     found = regions(T_A_B + np.array([0.0, 1.5, 0.0]))
     assert found.n_contradicted == len(found) >= 3
-    assert found.log10_ratio(0.05) < -3
+    assert found.log10_ratio(SHARES) < -3
 
 
 def test_where_nothing_must_be_seen_nothing_is_said() -> None:
     found = regions(T_A_B + np.array([0.0, 40.0, 0.0]))
     assert len(found) == 0
-    assert found.log10_ratio(0.05) == 0.0
+    assert found.log10_ratio(SHARES) == 0.0
 
 
 def test_the_other_way_round_as_many_are_found() -> None:
@@ -48,3 +51,14 @@ def test_of_another_wall_nothing_is_found() -> None:
     other = Witness(mapped(Wall(16, seed=9), 5, 14, seed=3))
     found = regions(T_A_B, b=other)
     assert found.n_contradicted == len(found) >= 3
+
+
+def test_copies_are_counted_apart_and_say_little() -> None:
+    all_copies = Copies(np.ones(len(A.landmarks), bool), np.ones(len(B.landmarks), bool))
+    plain = regions(T_A_B)
+    marked = Witnesses(A, B, PARAMETERS).regions(BETWEEN, T_A_B, 1.0, all_copies)
+    np.testing.assert_array_equal(marked.found[:, COPIED], plain.found[:, OWN])
+    assert not marked.expected[:, OWN].any()
+    assert marked.seen_again(OWN) == (0, 0)
+    assert marked.seen_again(COPIED) == plain.seen_again(OWN)
+    assert 0 < marked.log10_ratio(TwinShares(0.05, 0.9)) < 0.05 * len(marked)
