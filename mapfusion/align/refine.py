@@ -18,7 +18,7 @@ from mapfusion.align.pairs import MIN_PAIRS, Pairs, undetermined
 from mapfusion.align.result import Alignment, Status
 from mapfusion.arguments import Range, require_in_range, require_shape
 from mapfusion.planar import add_turned, lever, residual
-from mapfusion.se2 import Float, wrap
+from mapfusion.se2 import Float, transform_points, wrap
 from mapfusion.symmetric import cofactors
 
 # A gate of three standard deviations keeps 99 % of a plane's residuals; a larger s_drift could not
@@ -79,7 +79,7 @@ class Refinement:
             return undetermined("there is no estimate to refine", len(pairs), started_s)
         rows = pairs.of_one_height(self.height)
         planar = pairs[rows].in_plan()
-        limits = (self.gate_m, self.least_drift_m, self.max_rounds)
+        limits = (self._widest_m(pairs, T_a_b), self.least_drift_m, self.max_rounds)
         solved, moved_m, T_a_b, covariance, variance, truth = maximise_likelihood(
             planar, T_a_b, *limits
         )
@@ -99,7 +99,8 @@ class Refinement:
             left_out = most_leverage(T_a_b, planar, variance, truth, covariance)
             others = PlanarPairs(*(np.delete(part, left_out, axis=0) for part in planar))
             solved, _, T_without, *_ = maximise_likelihood(others, T_a_b, *limits)
-            reason = why_one_pair(T_a_b, T_without if solved else None, planar, truth, self.gate_m)
+            # of known identities even one that the motion rests on is no false pair
+            reason = why_one_pair(T_a_b, T_without if solved else None, planar, truth, limits[0])
         covariance = covariance + calibration_part(T_a_b, pairs[inlier], math.sqrt(variance))
         T_a_b[2] = wrap(T_a_b[2])
         return Alignment(
@@ -111,6 +112,18 @@ class Refinement:
             reason,
             math.sqrt(variance),
         )
+
+    def _widest_m(self, pairs: Pairs, T_a_b: Float) -> float:
+        """The gate, for landmarks known by name so wide that it leaves out none that maps bend.
+
+        None of them is false but by a name that was misread, and that lies farther off; a gate that
+        cuts what is bent lays one part of such maps onto its like, and nothing else.
+        """
+        if not pairs.by_name or not len(pairs):
+            return self.gate_m
+        off = pairs.p_a[:, :2] - transform_points(T_a_b, pairs.p_b[:, :2])
+        # s_drift starts at a third of the gate, and as all of them have it none is left out there
+        return max(self.gate_m, _GATE_SIGMAS**2 * math.sqrt(np.mean(np.sum(off**2, axis=1))))
 
 
 @njit(cache=True)

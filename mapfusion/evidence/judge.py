@@ -203,9 +203,9 @@ class PairJudge:
     def _why_unsure(self, alignment: Alignment) -> str:
         """Why an alignment is not sure enough to be used; empty when it is."""
         settings, p_a = self._judge.evidence, self._pairs.p_a[alignment.inlier, :2]
-        stated = whole_map_covariance(
-            alignment.T_a_b, alignment.covariance, alignment.drift_sigma_m, p_a
-        )
+        # Landmarks known by name are few and far apart: where paths bend each is off by itself.
+        drift_m = 0.0 if self._pairs.by_name else alignment.drift_sigma_m
+        stated = whole_map_covariance(alignment.T_a_b, alignment.covariance, drift_m, p_a)
         x, y = p_a.mean(axis=0)
         # at the middle of its support: far from it the angle moves everything
         at_middle = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])

@@ -24,7 +24,6 @@ def planar_map(p: np.ndarray) -> LandmarkMap:
         np.tile(np.eye(3) * SIGMA_M**2, (n, 1, 1)),
         np.full(n, 5, np.int32),
         np.arange(n),
-        label=np.arange(n, dtype=np.int32),
         planar=True,
     )
 

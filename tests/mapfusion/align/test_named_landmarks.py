@@ -13,6 +13,7 @@ from mapfusion.align.named_landmarks import named_false_alarms
 from mapfusion.align.registration import Registration
 from mapfusion.align.registry import make_aligner
 from mapfusion.align.result import Status
+from mapfusion.align.rigid import fit_rigid
 from mapfusion.landmark_map import LandmarkMap
 
 GATES_M = np.array(sorted(Acceptance().gates_m))
@@ -37,7 +38,7 @@ def test_it_is_what_the_formula_says() -> None:
     assert (gate_m, n, k) == (0.05, 10, 7)
     width, depth = np.ptp(p_a, axis=0) + 0.1
     tail = binom.sf(4, 8, math.pi * 0.05**2 / (width * depth))
-    assert log10 == pytest.approx(math.log10(4 * 90 / 42 * tail))
+    assert log10 == pytest.approx(math.log10(5 * 90 / 42 * tail))
 
 
 @pytest.mark.parametrize(("sigma_m", "accepted"), [(0.01, True), (1.5, False)])
@@ -64,3 +65,30 @@ def test_maps_that_are_wrong_have_no_more_false_alarms_than_stated() -> None:
                 best = min(best, named_false_alarms(p_a, p_b, T, GATES_M)[0])
         accepted += best <= math.log10(bound)
     assert accepted / n_maps <= bound + 3 * math.sqrt(bound / n_maps)
+
+
+def test_maps_that_are_bent_are_fitted_by_all_that_has_a_name() -> None:
+    """One half of each map is turned aside: a gate would lay the larger half on its like alone."""
+    rng = np.random.default_rng(3)
+    p_a = rng.uniform(0, [12, 8], (11, 2))
+    bent = p_a.copy()
+    bent[:4] += [1.2, 0.0]
+    p_b = se2.transform_points(se2.inverse(T_A_B), bent)
+    a, b = named_map(p_a, "a"), named_map(p_b, "b")
+    done = Registration(make_aligner("ransac")).register(a, b, match(a, b), rng)
+    every = np.arange(11)
+    T_all = np.array(fit_rigid(p_a, np.ascontiguousarray(p_b), every))
+    assert done.refined.inlier.all()
+    np.testing.assert_allclose(done.refined.T_a_b, T_all, atol=0.02)
+
+
+def test_one_name_that_was_misread_is_left_out() -> None:
+    rng = np.random.default_rng(4)
+    p_a = rng.uniform(0, [12, 8], (15, 2))
+    moved = p_a + rng.normal(0, 0.05, (15, 2))
+    moved[5] += [6.0, 3.0]
+    p_b = se2.transform_points(se2.inverse(T_A_B), moved)
+    a, b = named_map(p_a, "a"), named_map(p_b, "b")
+    done = Registration(make_aligner("ransac")).register(a, b, match(a, b), rng)
+    assert np.flatnonzero(~done.refined.inlier).tolist() == [5]
+    np.testing.assert_allclose(done.refined.T_a_b, T_A_B, atol=0.15)
