@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mapfusion.align.result import Status
 from mapfusion.arguments import require_shape
 from mapfusion.fuse.component import Component
 from mapfusion.fuse.fuser import Fuser
@@ -68,7 +69,9 @@ def merge(
 
     Args:
         maps: M of them.
-        pairs: each two of them at most once. Alignments that were not accepted are left out.
+        pairs: each two of them at most once; of ambiguous ones as many as there are alternatives.
+            Alignments that were not accepted are left out, but for an alternative that those of
+            other maps tell from its rivals.
         parameters: how to merge.
         fuser: what makes connected maps one; the `joint` one if None.
 
@@ -92,8 +95,10 @@ def connect(
     rank = _ranks(maps)
     order = sorted(range(len(pairs)), key=lambda e: sorted((rank[pairs[e].a], rank[pairs[e].b])))
     accepted = [e for e in order if pairs[e].alignment.ok]
-    graph = _graph(maps, [pairs[e] for e in accepted], rank, parameters)
-    said = dict(zip(accepted, graph.place, strict=True))
+    open_ = [e for e in order if pairs[e].alignment.status is Status.AMBIGUOUS]
+    judged = ([pairs[e] for e in some] for some in (accepted, open_))
+    graph = _graph(maps, *judged, rank, parameters)
+    said = dict(zip([*accepted, *open_], graph.place, strict=True))
     place = tuple(said.get(e, Place.REFUSED) for e in range(len(pairs)))
     believed = [pairs[e] for e in order if place[e] in (Place.CONFIRMED, Place.BRIDGE)]
     several = np.flatnonzero(np.bincount(graph.component) > 1)
@@ -124,14 +129,15 @@ def _ranks(maps: Sequence[LandmarkMap]) -> np.ndarray:
 def _graph(
     maps: Sequence[LandmarkMap],
     accepted: Sequence[AlignedPair],
+    alternatives: Sequence[AlignedPair],
     rank: np.ndarray,
     parameters: TeamParameters,
 ) -> TeamGraph:
     """All alignments judged together, robots by their rank; each component's root is its first."""
     by_rank = np.argsort(rank)
-    relations = _relations(maps, accepted)
-    ranked = replace(relations, robots=rank[relations.robots])
-    graph = team_graph(ranked, parameters, by_rank)
+    both = (_relations(maps, some) for some in (accepted, alternatives))
+    ranked, open_ = (replace(each, robots=rank[each.robots]) for each in both)
+    graph = team_graph(ranked, parameters, by_rank, open_)
     return TeamGraph(
         graph.component[rank], graph.T_root_robot[rank], graph.covariance[rank], graph.place
     )
@@ -190,7 +196,7 @@ def _require_fitting(maps: Sequence[LandmarkMap], pairs: Sequence[AlignedPair]) 
         both = frozenset((pair.a, pair.b))
         if len(both) < 2 or not 0 <= min(both) <= max(both) < len(maps):
             raise ValueError(f"pairs[{k}]: {pair.a} and {pair.b} are no two of {len(maps)} maps")
-        if both in met:
+        if both in met and pair.alignment.status is not Status.AMBIGUOUS:
             raise ValueError(f"pairs[{k}]: {pair.a} and {pair.b} are given twice")
         met.add(both)
         require_shape(

@@ -132,8 +132,12 @@ def merge(paths: Sequence[Path], settings: Scenario) -> Fusion:
     for a, b in itertools.combinations(order, 2):
         rng = generator(settings.seed, "align", name, maps[a].name, maps[b].name)
         offered = match(maps[a], maps[b], settings.align.match)
-        done = registration.register(maps[a], maps[b], offered, rng)
+        ready = registration.on(maps[a], maps[b], offered)
+        done = ready.register(rng)
         sureness = done.verdict.log10_false_alarms
         pairs.append(AlignedPair(a, b, done.applied, offered, sureness))
+        if done.applied.status is Status.AMBIGUOUS and ready.judge is not None:
+            rivals = ready.judge.rivals_of(done.refined)
+            pairs += [AlignedPair(a, b, rival, offered, sureness) for rival in rivals]
     chosen = settings.merge
     return merge_maps(maps, pairs, chosen.parameters, make_fuser(chosen.fuser))

@@ -1,7 +1,7 @@
 """The verdict on an alignment: chance, evidence against it, rivals, and how sure it is."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -100,6 +100,14 @@ class PairJudge:
         if status is Status.ACCEPTED and (unsure := self._why_unsure(alignment)):
             status, reason = Status.TOO_UNCERTAIN, unsure
         return Verdict(status, by_chance.log10_false_alarms, reason, **told)
+
+    def rivals_of(self, alignment: Alignment) -> list[Alignment]:
+        """The other motions that the maps support, refined and ambiguous; none without evidence."""
+        if self.evidence is None:
+            return []
+        others = self._others(alignment.T_a_b, self.evidence)
+        refined = (self._judge.refinement.refine(self._pairs, each.T_a_b) for each in others)
+        return [replace(each, status=Status.AMBIGUOUS) for each in refined if each.ok]
 
     def signs(self, alignment: Alignment) -> Signs | None:
         """What speaks for and against an alignment; None where no evidence can be sought."""

@@ -1,9 +1,10 @@
 """How much more likely regions are seen again as they were if a motion is right than if it is not.
 
-Of the n landmarks of a region that must be seen, k are. If the motion is right, k is beta-binomial:
-each region has a rate of its own, since light, slant and texture differ. If it is wrong, a region
-is either the twin of what is there (a poster, a room that repeats), and then no different, or what
-chance leaves.
+Of the n landmarks of a region that are looked for, k are found. If the motion is right, k is
+beta-binomial: each region has a rate of its own, since light, slant and texture differ; it is high
+where landmarks must be seen and middling where they may be. If it is wrong, a region is either the
+twin of what is there (a poster, a room that repeats), and then no different, or what chance leaves.
+What another motion lays on its like is a twin much more often than the rest, and counts apart.
 """
 
 from typing import NamedTuple
@@ -11,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import betaln
 
+from mapfusion.evidence import fitted_rates
 from mapfusion.se2 import Float
 
 
@@ -26,17 +28,20 @@ class BetaRate(NamedTuple):
         return self.seen / (self.seen + self.missed)
 
 
-RIGHT = (BetaRate(12.4, 2.33), BetaRate(1.80, 2.88))
-WRONG = (BetaRate(1.11, 14.8), BetaRate(0.88, 16.0))
+Rates = tuple[BetaRate, BetaRate]  # of what must be seen and of what may be
+RIGHT: Rates = (BetaRate(*fitted_rates.RIGHT[0]), BetaRate(*fitted_rates.RIGHT[1]))
+WRONG: Rates = (BetaRate(*fitted_rates.WRONG[0]), BetaRate(*fitted_rates.WRONG[1]))
+# Regions of a right alignment that are as a wrong one's: a picture that was moved, light that
+# changed, a stretch in which one of the maps drifted. It bounds what one region can say against it.
+# Of simulated worlds, in which nothing moves, the fit says a tenth of this: it is of the world, no
+# map tells it.
 CHANGED = 0.05
 # Parts of a region: where no other motion lays it on its like, and where another does.
 OWN, COPIED = 0, 1
 # Decades by which a region is likelier as found if the motion is right than by chance, for counts
-# and words: confirmed from so many on, contradicted from as many against it.
+# and words: confirmed from so many on, contradicted from as many against it. Ten to one is called
+# strong evidence (Jeffreys 1961).
 DECISIVE = 1.0
-
-
-Rates = tuple[BetaRate, BetaRate]  # of what must be seen and of what may be
 
 
 class TwinShares(NamedTuple):

@@ -42,6 +42,17 @@ class Relations:
     def __len__(self) -> int:
         return len(self.robots)
 
+    def __getitem__(self, rows: np.ndarray) -> "Relations":
+        """Some of them."""
+        parts = (self.robots, self.T_a_b, self.covariance, self.log10_false_alarms)
+        return Relations(self.n_robots, *(part[rows] for part in parts))
+
+    def joined(self, other: "Relations") -> "Relations":
+        """With others between the same robots behind them."""
+        names = ("robots", "T_a_b", "covariance", "log10_false_alarms")
+        both = (np.concatenate([getattr(self, n), getattr(other, n)]) for n in names)
+        return Relations(self.n_robots, *both)
+
     def reach_m(self) -> float:
         """The farthest that any of them moves a map."""
         return float(np.linalg.norm(self.T_a_b[:, :2], axis=1).max(initial=0.0))

@@ -6,12 +6,13 @@ contradict each other, at most one is true. Kim, Mangelson et al. look for the l
 smaller set counts as a warning, too.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
 
 from mapfusion.se2 import Float
+from mapfusion.team.alternatives import told_apart
 from mapfusion.team.placement import placed
 from mapfusion.team.readings import LoopTest, Reading, Team
 from mapfusion.team.relations import Relations
@@ -61,7 +62,8 @@ class TeamGraph:
             first.
         T_root_robot: (N, 3) in the frame of the component's root.
         covariance: (N, 3, 3) of these.
-        place: (E,) what is said of each alignment, a `Place`.
+        place: (E,) what is said of each alignment, a `Place`; behind them of each alternative,
+            which is REFUSED where nothing tells it from its rivals.
     """
 
     component: np.ndarray
@@ -74,6 +76,7 @@ def team_graph(
     relations: Relations,
     parameters: TeamParameters = TeamParameters(),
     rank: np.ndarray | None = None,
+    alternatives: Relations | None = None,
 ) -> TeamGraph:
     """Find the alignments that are true together, and place the robots by them.
 
@@ -84,7 +87,23 @@ def team_graph(
         relations: between the robots' maps.
         parameters: which of them are believed.
         rank: (N,) of the robots; a component's root is the one of least rank, by default its first.
+        alternatives: motions that robots' maps leave open, one or more for two robots. At most one
+            of these is believed, and only where the alignments tell it (`alternatives.py`).
     """
+    if alternatives is None or not len(alternatives):
+        return _judged(relations, parameters, rank)
+    connected = _judged(relations, replace(parameters, unconfirmed=Unconfirmed.KEEP), rank)
+    kept = np.isin(connected.place, [Place.CONFIRMED, Place.BRIDGE])
+    told = told_apart(relations, kept, connected.component, alternatives, parameters.loop)
+    graph = _judged(relations.joined(alternatives[told]), parameters, rank)
+    of_alternatives = np.full(len(alternatives), Place.REFUSED, dtype=object)
+    of_alternatives[told] = graph.place[len(relations) :]
+    place = np.concatenate([graph.place[: len(relations)], of_alternatives])
+    return replace(graph, place=place)
+
+
+def _judged(relations: Relations, parameters: TeamParameters, rank: np.ndarray | None) -> TeamGraph:
+    """The graph of alignments that were accepted, or told apart."""
     team = Team(relations, parameters.loop)
     everything = np.ones(len(relations), dtype=bool)
     confirmed, ambiguous = _without_rivals(team, team.readings(everything), parameters.unconfirmed)

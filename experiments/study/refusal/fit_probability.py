@@ -16,10 +16,10 @@ from scipy.optimize import minimize
 
 from experiments.judge.criteria import RIGHT_WITHIN_M, RIGHT_WITHIN_RAD
 from experiments.methods.aligner_calls import callable_aligner
-from experiments.run.stages.slam import evaluated_iterations
 from experiments.scenario.randomness import generator
 from experiments.scenario.seeds import parse_seeds
 from experiments.study.refusal import cases
+from experiments.study.refusal.reliability import calibration_error
 from experiments.study.refusal.stored_worlds import MappedWorld, worlds_of
 from mapfusion import se2
 from mapfusion.align.pairs import Pairs
@@ -30,7 +30,7 @@ from mapfusion.storage import write_whole
 
 # Pulls weights of scaled features towards 0: a kind of world may have none of a sign.
 _RIDGE = 1e-3
-_BINS = 10  # of equal count
+EVERY = 3  # of the evaluated iterations: maps of neighbouring ones say the same
 _TEXT = '''"""Coefficients of `probability.py`.
 
 Written by `python -m experiments.study.refusal.fit_probability`.
@@ -62,8 +62,8 @@ def answers_of(worlds: Sequence[MappedWorld]) -> Answers:
 def _of_world(world: MappedWorld) -> list[tuple[Float, bool, str]]:
     scenario, rows = world.scenario, []
     settings, radius_m = scenario.align, scenario.evaluate.true_pair_radius_m
-    iterations = evaluated_iterations(scenario.drive.frames, scenario.evaluate.every)
-    for (a, b), k in itertools.product(itertools.combinations(world.robots(), 2), iterations):
+    met = itertools.combinations(world.robots(), 2)
+    for (a, b), k in itertools.product(met, world.iterations[EVERY - 1 :: EVERY]):
         case = cases.common(a, b, k, settings.match, radius_m)
         judged = settings.judge.on(Pairs(case.map_a, case.map_b, case.pairs))
         for entry in settings.aligners:
@@ -112,13 +112,6 @@ def left_out(answers: Answers) -> Float:
         own = answers.kind == kind
         p[own] = stated(fit(answers.features[~own], answers.right[~own]), answers.features[own])
     return p
-
-
-def calibration_error(p: Float, right: Float) -> float:
-    """Mean distance of what is stated and what holds, over bins of equal count."""
-    bins = np.array_split(np.argsort(p, kind="stable"), _BINS)
-    apart = (abs(p[own].mean() - right[own].mean()) * len(own) for own in bins if len(own))
-    return float(sum(apart)) / len(p)
 
 
 def main() -> None:

@@ -54,9 +54,7 @@ def reliability(answers: pd.DataFrame, rng: np.random.Generator) -> Reliability:
     stated = answers["probability"].to_numpy(float)
     right = answers["right"].to_numpy(float)
     # of equal probabilities by lot: they lie in the table kind by kind
-    order = np.lexsort([rng.permutation(len(stated)), stated])
-    place = np.empty(len(stated), np.int64)
-    place[order] = np.arange(len(stated)) * N_BINS // len(stated)
+    place = _bins_of(np.lexsort([rng.permutation(len(stated)), stated]))
     sums = {
         name: _sums(values, codes, place, len(runs))
         for name, values in (("n", np.ones(len(stated))), ("stated", stated), ("right", right))
@@ -80,6 +78,20 @@ def reliability(answers: pd.DataFrame, rng: np.random.Generator) -> Reliability:
         len(answers),
         int(np.count_nonzero(right == 0)),
     )
+
+
+def calibration_error(stated: Float, right: Float) -> float:
+    """Mean distance of what is stated (n,) and what holds (n,), over bins of equal count."""
+    place = _bins_of(np.argsort(stated, kind="stable"))
+    apart = np.bincount(place, stated - right, N_BINS)
+    return float(np.sum(np.abs(apart))) / len(stated)
+
+
+def _bins_of(order: np.ndarray) -> np.ndarray:
+    """The bin (n,) of each, of N_BINS of equal count in this order (n,)."""
+    place = np.empty(len(order), np.int64)
+    place[order] = np.arange(len(order)) * N_BINS // len(order)
+    return place
 
 
 def _sums(values: Float, codes: np.ndarray, place: np.ndarray, n_runs: int) -> Float:

@@ -70,7 +70,8 @@ def worlds_of(words: Sequence[str], seeds: Sequence[int], results: Path) -> list
     if len(worlds) < 2:
         raise InputError("refusal: give two worlds or more: results, or scenarios with --seeds")
     for first, world in itertools.combinations(worlds, 2):
-        if world.textures == first.textures:
+        # two scenarios may drive through one world of a seed; worlds of one seed are never crossed
+        if world.textures == first.textures and world.kind == first.kind:
             raise InputError(f"{world.label}: the same world as {first.name}; give another seed's")
         if world.name == first.name:
             raise InputError(f"{world.label}: is named as {first.label} is; rename one of them")

@@ -5,11 +5,11 @@ import pytest
 
 from experiments.study.refusal.fit_probability import (
     Answers,
-    calibration_error,
     fit,
     left_out,
     stated,
 )
+from experiments.study.refusal.reliability import calibration_error
 
 MODEL = np.array([-0.5, 1.5, -2.0])
 
