@@ -96,8 +96,8 @@ def connect(
     order = sorted(range(len(pairs)), key=lambda e: sorted((rank[pairs[e].a], rank[pairs[e].b])))
     accepted = [e for e in order if pairs[e].alignment.ok]
     open_ = [e for e in order if pairs[e].alignment.status is Status.AMBIGUOUS]
-    judged = ([pairs[e] for e in some] for some in (accepted, open_))
-    graph = _graph(maps, *judged, rank, parameters)
+    by_itself, left_open = ([pairs[e] for e in some] for some in (accepted, open_))
+    graph = _graph(maps, by_itself, left_open, rank, parameters)
     said = dict(zip([*accepted, *open_], graph.place, strict=True))
     place = tuple(said.get(e, Place.REFUSED) for e in range(len(pairs)))
     believed = [pairs[e] for e in order if place[e] in (Place.CONFIRMED, Place.BRIDGE)]

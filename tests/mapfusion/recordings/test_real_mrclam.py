@@ -19,6 +19,7 @@ from mapfusion.align.correspondences import match
 from mapfusion.align.registration import Registration
 from mapfusion.align.registry import make_aligner
 from mapfusion.align.rigid import fit_rigid
+from mapfusion.fastslam.association import Association
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.fastslam.run import run_log
@@ -35,7 +36,7 @@ pytestmark = pytest.mark.skipif(
 # As in scenarios/mrclam7.yaml, but for fewer particles, and the odometry as it was recorded.
 FILTER = FastSlamParameters(
     n_particles=100,
-    association="label",
+    association=Association.LABEL,
     gate_probability=0.9999,
     noise_floor_m=0.15,
     frame_correlation=0,
@@ -62,15 +63,19 @@ def mapped(path: Path, cut_s: float) -> Mapped:
     frames = run_log(part, FILTER, np.random.default_rng(0), [len(part) - 1])
     landmarks = [frame.landmarks for frame in frames][-1]
     assert landmarks is not None
-    assert landmarks.label is not None
-    of_label = (log.observations.label == label for label in landmarks.label)
+    of_label = (log.observations.label == label for label in names(landmarks))
     return landmarks, np.array([np.nanmedian(truth.point_world_m[o, :2], axis=0) for o in of_label])
+
+
+def names(landmarks: LandmarkMap) -> np.ndarray:
+    assert landmarks.label is not None
+    return landmarks.label
 
 
 def pairs_of(maps: list[Mapped]) -> Iterator[tuple[LandmarkMap, LandmarkMap, Float]]:
     """Two maps with three common landmarks or more, and the motion that is right between them."""
     for (a, world_a), (b, world_b) in itertools.combinations(maps, 2):
-        shared, of_a, of_b = np.intersect1d(a.label, b.label, return_indices=True)
+        shared, of_a, of_b = np.intersect1d(names(a), names(b), return_indices=True)
         if len(shared) >= 3:
             every = np.arange(len(shared))
             T_world = [
@@ -92,7 +97,7 @@ def test_every_two_maps_are_accepted_and_right(logs: list[Path], cut_s: float) -
             registration = Registration(make_aligner(method))
             done = registration.register(a, b, match(a, b), np.random.default_rng(0))
             assert done.verdict.accepted, (a.name, b.name, method, done.verdict.reason)
-            T, p_b = done.refined.T_a_b, b.position_m[np.isin(b.label, a.label), :2]
+            T, p_b = done.refined.T_a_b, b.position_m[np.isin(names(b), names(a)), :2]
             apart = se2.transform_points(T, p_b) - se2.transform_points(T_true, p_b)
             assert np.sqrt(np.mean(np.sum(apart**2, axis=1))) < 0.5, (a.name, b.name, method)
             assert abs(se2.wrap(T[2] - T_true[2])) < 0.1, (a.name, b.name, method)
