@@ -89,6 +89,9 @@ def how_seen(seen: Seen, watch: Watch) -> np.ndarray:
     places, heading, reach_m, bearing_rad, range_m, height_m = watch
     at, runs = places.p, np.empty((places.shape[1], 2), np.int64)
     how = np.zeros(len(p), np.int64)
+    # what lies farther aside is not in view: most poses look elsewhere, told without an angle
+    aside = max(abs(bearing_rad[0]), abs(bearing_rad[1]))
+    least_cos = math.cos(aside) * (1 - 1e-9) if aside < math.pi / 2 else -1.0
     for i in range(len(p)):
         r, ux, uy = distance_m[i], direction[i, 0], direction[i, 1]
         r2, must, may = r * r, 0, 0
@@ -106,8 +109,11 @@ def how_seen(seen: Seen, watch: Watch) -> np.ndarray:
                 if not alike and may >= LEAST_FRAMES:
                     continue
                 ahead = heading[t, 0] * dx + heading[t, 1] * dy
+                away_m = math.sqrt(square)
+                if ahead < least_cos * away_m:
+                    continue
                 left = heading[t, 0] * dy - heading[t, 1] * dx
-                sight = (math.sqrt(square), math.atan2(left, ahead), p[i, 2])
+                sight = (away_m, math.atan2(left, ahead), p[i, 2])
                 if _in_view(sight, bearing_rad, range_m, height_m, reach_m, t):
                     must, may = must + alike, may + 1
                 if must == LEAST_FRAMES:

@@ -19,8 +19,10 @@ class EvidenceParameters:
         place_m: longest side of a place that a world may hold twice as a whole, a room: where most
             of the smaller map lies within it and agrees, nothing around it has been compared.
         least_ratio: by how many times more likely the regions must be if the alignment is right
-            than if it is not, where maps resemble themselves or another motion fits them.
-        most_against: by how many times less likely they may be before it counts as contradicted.
+            than if it is not, where maps resemble themselves or another motion fits them: at most
+            one wrong motion of so many gets there (Markov's inequality).
+        most_against: by how many times less likely they may be before it counts as contradicted: at
+            most one right motion of so many gets there.
         least_probability: that the alignment is right; below a half it is likelier wrong.
         max_sigma_m: of an alignment's translation, at the middle of what supports it. Twice that,
             95 %, is what least squares still mends and what a merged map is used for: 0.5 m.
