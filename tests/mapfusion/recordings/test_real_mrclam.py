@@ -39,7 +39,6 @@ FILTER = FastSlamParameters(
     association=Association.LABEL,
     gate_probability=0.9999,
     noise_floor_m=0.15,
-    frame_correlation=0,
     motion=MotionNoise(
         translation_m_per_sqrt_m=0.0854,
         rotation_rad_per_sqrt_m=0.027,
