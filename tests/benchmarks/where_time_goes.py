@@ -1,6 +1,7 @@
 """Where the time of runs goes, stage by stage, beside that of others.
 
-`python -m tests.benchmarks.where_time_goes results/rooms_high-0 --before old/rooms_high-0`
+`python -m tests.benchmarks.where_time_goes results/sweeps/full --before old/sweeps/full`; of single
+runs the folders of their results.
 
 The floor is that of `floors`, measured where this runs.
 
@@ -36,21 +37,39 @@ _NAMES = {
 }
 
 
+def times(result: Path) -> pd.DataFrame:
+    """What stages took, in all runs of a folder; columns stage, figure, seconds."""
+    if (sweep := result / "run_times").is_dir():
+        return pd.read_parquet(sweep)
+    rows = pd.read_parquet(result / "tables" / "timings.parquet")
+    return rows.assign(figure=rows["name"].str.partition(":")[2], seconds=rows["elapsed_s"])
+
+
+def robots(result: Path) -> pd.DataFrame:
+    """One row a robot's frame, in all runs of a folder."""
+    sweep = result / "robots"
+    return pd.read_parquet(sweep if sweep.is_dir() else result / "tables" / "robots.parquet")
+
+
+def n_runs(results: list[Path]) -> int:
+    """How many runs the folders hold."""
+    rows = (robots(result) for result in results)
+    return sum(each["run_id"].nunique() if "run_id" in each else 1 for each in rows)
+
+
 def seconds(results: list[Path]) -> pd.Series:
     """Mean seconds of a run by stage; drawing is a part of its own."""
-    tables = [pd.read_parquet(result / "tables" / "timings.parquet") for result in results]
-    rows = pd.concat(tables)
-    figure = rows["name"].str.partition(":")[2]
-    rows = rows.assign(stage=rows["stage"].where(figure == "elapsed_s", "rendering"))
-    total = rows.groupby("stage")["elapsed_s"].sum() / len(results)
+    rows = pd.concat([times(result) for result in results])
+    rows = rows[rows["figure"].isin(["elapsed_s", "rendering_s"])]
+    rows = rows.assign(stage=rows["stage"].where(rows["figure"] == "elapsed_s", "rendering"))
+    total = rows.groupby("stage")["seconds"].sum() / n_runs(results)
     total["features"] -= total.get("rendering", 0.0)
     return total.reindex(list(_NAMES)).fillna(0.0)
 
 
 def frames(results: list[Path]) -> float:
     """Mean number of robots' frames in a run."""
-    robots = [pd.read_parquet(result / "tables" / "robots.parquet") for result in results]
-    return sum(map(len, robots)) / len(results)
+    return sum(len(robots(result)) for result in results) / n_runs(results)
 
 
 def table(results: list[Path], before: list[Path]) -> str:
