@@ -4,7 +4,6 @@
 writes `mapfusion/evidence/fitted.py`, and says how well kinds of world that were left out are told.
 """
 
-import argparse
 import itertools
 import sys
 from collections.abc import Sequence
@@ -17,10 +16,10 @@ from scipy.optimize import minimize
 from experiments.judge.criteria import RIGHT_WITHIN_M, RIGHT_WITHIN_RAD
 from experiments.methods.aligner_calls import callable_aligner
 from experiments.scenario.randomness import generator
-from experiments.scenario.seeds import parse_seeds
 from experiments.study.refusal import cases
+from experiments.study.refusal.fitting_command import worlds_asked_for
 from experiments.study.refusal.reliability import calibration_error
-from experiments.study.refusal.stored_worlds import MappedWorld, worlds_of
+from experiments.study.refusal.stored_worlds import MappedWorld
 from mapfusion import se2
 from mapfusion.align.pairs import Pairs
 from mapfusion.align.registration import Registration
@@ -116,15 +115,10 @@ def left_out(answers: Answers) -> Float:
 
 def main() -> None:
     """Fit, write, and print how well it holds."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("worlds", nargs="+")
-    parser.add_argument("--seeds", default="0")
-    parser.add_argument("--results", type=Path, default=Path("results"))
-    given = parser.parse_args()
-    answers = answers_of(worlds_of(given.worlds, parse_seeds(given.seeds), given.results))
+    worlds, said = worlds_asked_for(__doc__)
+    answers = answers_of(worlds)
     intercept, *weights = fit(answers.features, answers.right)
     numbers = {"n": len(answers.right), "n_right": int(answers.right.sum())}
-    said = {"seeds": given.seeds.replace("..", " to "), "worlds": ", ".join(given.worlds)}
     model = {"intercept": intercept, "weights": ", ".join(f"{w:.3f}" for w in weights)}
     text = _TEXT.format(**numbers, **said, **model, version=fitted.VERSION)
     write_whole(Path(str(fitted.__file__)), lambda path: path.write_text(text, encoding="utf-8"))

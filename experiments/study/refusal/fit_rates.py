@@ -5,7 +5,6 @@ writes `mapfusion/evidence/fitted_rates.py`. Right motions are the oracle's in w
 repeat themselves; wrong ones those that two maps without a common landmark support best.
 """
 
-import argparse
 import itertools
 import sys
 from collections.abc import Callable, Sequence
@@ -16,9 +15,9 @@ from scipy.optimize import minimize
 from scipy.special import expit
 
 from experiments.judge.criteria import MERGEABLE_PAIRS
-from experiments.scenario.seeds import parse_seeds
 from experiments.study.refusal import cases
-from experiments.study.refusal.stored_worlds import MappedWorld, worlds_of
+from experiments.study.refusal.fitting_command import worlds_asked_for
+from experiments.study.refusal.stored_worlds import MappedWorld
 from mapfusion.align.oracle import Oracle
 from mapfusion.align.pairs import Pairs
 from mapfusion.evidence import fitted_rates
@@ -112,15 +111,10 @@ def _likeliest(cost: Callable[[Float], float], start: Float) -> Float:
 
 def main() -> None:
     """Fit and write."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("worlds", nargs="+")
-    parser.add_argument("--seeds", default="0")
-    parser.add_argument("--results", type=Path, default=Path("results"))
-    given = parser.parse_args()
-    regions = regions_of(worlds_of(given.worlds, parse_seeds(given.seeds), given.results))
+    worlds, said = worlds_asked_for(__doc__)
+    regions = regions_of(worlds)
     right, wrong, changed = fit(*regions)
     numbers = {"n_right": len(regions[0][0]), "n_wrong": len(regions[1][0]), "changed": changed}
-    said = {"seeds": given.seeds.replace("..", " to "), "worlds": ", ".join(given.worlds)}
     rates = {"right": _written(right), "wrong": _written(wrong)}
     text = _TEXT.format(**numbers, **said, **rates)
     path = Path(str(fitted_rates.__file__))
