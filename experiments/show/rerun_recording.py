@@ -51,7 +51,7 @@ class _Recording:
     def __init__(self, name: str, path: Path) -> None:
         rerun: Any = import_module("rerun")
         self._rerun = rerun
-        # an identifier of its own: the same result gives the same recording
+        # an identifier of its own, in place of a random one: the viewer shows a result once
         self._stream: Any = rerun.RecordingStream(f"mapfusion {name}", recording_id=name)
         self._stream.save(path)
         self._stream.set_log_time_enabled(False)

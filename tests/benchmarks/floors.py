@@ -97,7 +97,7 @@ def _linking_s(a: Float, b: Float) -> float:
 
 
 def _updates_s() -> float:
-    """Each particle's gain for each observation: one inverse and two products of 3 x 3."""
+    """Each particle's gain P (P + 1)^-1 for each observation: one inverse, one product of 3 x 3."""
     covariance = np.tile(np.eye(3), (_PARTICLES, _SEEN, 1, 1))
     gain = np.empty_like(covariance)
     return seconds_of(lambda: _gains(covariance, gain))
@@ -105,14 +105,22 @@ def _updates_s() -> float:
 
 @njit(cache=True)
 def _gains(P: Float, gain: Float) -> None:
+    S, adjugate = np.empty((3, 3)), np.empty((3, 3))
     for m in range(P.shape[0]):
         for i in range(P.shape[1]):
-            A = P[m, i]
-            c0 = (A[1, 1] + 1) * (A[2, 2] + 1) - A[1, 2] * A[2, 1]
-            c1 = A[1, 2] * A[2, 0] - A[1, 0] * (A[2, 2] + 1)
-            c2 = A[1, 0] * A[2, 1] - (A[1, 1] + 1) * A[2, 0]
-            scale = 1 / ((A[0, 0] + 1) * c0 + A[0, 1] * c1 + A[0, 2] * c2)
             for r in range(3):
-                gain[m, i, r, 0] = scale * (A[r, 0] * c0 + A[r, 1] * c1 + A[r, 2] * c2)
-                gain[m, i, r, 1] = scale * (A[r, 1] * c0 + A[r, 2] * c1 + A[r, 0] * c2)
-                gain[m, i, r, 2] = scale * (A[r, 2] * c0 + A[r, 0] * c1 + A[r, 1] * c2)
+                for q in range(3):
+                    S[r, q] = P[m, i, r, q] + (r == q)
+            for r in range(3):
+                for q in range(3):  # of the transpose, with rows and columns taken in a circle
+                    a, b, c, d = (q + 1) % 3, (q + 2) % 3, (r + 1) % 3, (r + 2) % 3
+                    adjugate[r, q] = S[a, c] * S[b, d] - S[a, d] * S[b, c]
+            scale = 1 / (
+                S[0, 0] * adjugate[0, 0] + S[0, 1] * adjugate[1, 0] + S[0, 2] * adjugate[2, 0]
+            )
+            for r in range(3):
+                for q in range(3):
+                    total = 0.0
+                    for k in range(3):
+                        total += P[m, i, r, k] * adjugate[k, q]
+                    gain[m, i, r, q] = scale * total

@@ -111,20 +111,26 @@ def measured_from(truth: np.ndarray) -> int:
     return int(np.argmax(np.abs(np.diff(turns)) > 1e-4)) + 1
 
 
-def test_kitti_paths_are_no_worse_than_their_odometry(
-    work: StereoImport, imported: Imported
-) -> None:
-    assert imported.truth is not None
-    first = measured_from(imported.truth)
-    assert 8 <= first <= 14
-    one = work.log_of(Cut("M", slice(first, None)))
+def path_over_odometry(one: Imported) -> float:
+    """Median over filter seeds of FastSLAM's error over that of the odometry."""
     assert one.truth is not None
     errors = []
     for seed in range(5):
         rng, told = np.random.default_rng(seed), one.odometry_covariance
         *_, last = run_log(one.log, FastSlamParameters(), rng, odometry_covariance=told)
         errors.append(path_rmse_m(last.slam.best_path(), one.truth))
-    assert np.median(errors) <= path_rmse_m(dead_reckoned(one.log.odometry), one.truth)
+    return float(np.median(errors)) / path_rmse_m(dead_reckoned(one.log.odometry), one.truth)
+
+
+def test_kitti_paths_are_no_worse_than_their_odometry(
+    work: StereoImport, imported: Imported
+) -> None:
+    """Where the truth was measured; of the whole extract but for a tenth."""
+    assert imported.truth is not None
+    first = measured_from(imported.truth)
+    assert 8 <= first <= 14
+    assert path_over_odometry(work.log_of(Cut("M", slice(first, None)))) <= 1.0
+    assert path_over_odometry(imported) <= 1.1
 
 
 @pytest.mark.parametrize("first", [0, 12])
