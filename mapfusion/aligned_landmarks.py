@@ -7,7 +7,8 @@ import numpy as np
 
 from mapfusion.align.rigid import motion_jacobian
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.robot_log import DESCRIPTOR_LENGTH, NO_LABEL, with_rows
+from mapfusion.looks import DESCRIPTOR_LENGTH, NO_LABEL
+from mapfusion.robot_log import with_rows
 from mapfusion.se2 import Float, transform_covariances, transform_points
 
 ABSENT = -1

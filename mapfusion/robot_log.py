@@ -24,7 +24,6 @@ from mapfusion.arguments import (
 from mapfusion.calibration_error import EXACT, CalibrationError, calibration_from
 from mapfusion.errors import InputError
 from mapfusion.looks import DESCRIPTOR_LENGTH, LOOK_FIELDS, look_columns, looks_from
-from mapfusion.looks import NO_LABEL as NO_LABEL  # of logs, for whoever reads them
 from mapfusion.open_tables import read_open_table, table_path, told
 from mapfusion.se2 import Float
 from mapfusion.storage import (

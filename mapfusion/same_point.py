@@ -8,7 +8,7 @@ from scipy.spatial import KDTree
 from mapfusion.align.correspondences import HeightGate
 from mapfusion.aligned_landmarks import AlignedLandmarks
 from mapfusion.chi_square import chi_square_bound
-from mapfusion.robot_log import NO_LABEL
+from mapfusion.looks import NO_LABEL
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,8 @@ from experiments.scenario.settings import Scenario
 from mapfusion.attitude import FILE as ATTITUDE_FILE
 from mapfusion.errors import InputError
 from mapfusion.fastslam.run import run_log
-from mapfusion.robot_log import NO_LABEL, TRUTH_FILES, RobotLog, read_log, write_log
+from mapfusion.looks import NO_LABEL
+from mapfusion.robot_log import TRUTH_FILES, RobotLog, read_log, write_log
 from mapfusion.se2 import Float
 from mapfusion.smoother.calibrate import Calibration, calibrate
 from mapfusion.smoother.noise_levels import LEVELS

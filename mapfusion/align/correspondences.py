@@ -10,7 +10,7 @@ from mapfusion.align.nearest_descriptors import nearest_both_ways
 from mapfusion.arguments import Probability, Range, require_finite, require_in_range, require_shape
 from mapfusion.chi_square import chi_square_bound
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.robot_log import NO_LABEL
+from mapfusion.looks import NO_LABEL
 from mapfusion.se2 import Float
 from mapfusion.stray import STRAY_M
 

@@ -34,7 +34,8 @@ from mapfusion.fastslam.sensor import Sightings, log_density_at_gate, sightings
 from mapfusion.fastslam.tracked import Tracked
 from mapfusion.fastslam.update import update_landmarks
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.robot_log import NO_LABEL, Observations
+from mapfusion.looks import NO_LABEL
+from mapfusion.robot_log import Observations
 from mapfusion.se2 import Float, compose
 
 

@@ -11,7 +11,8 @@ from mapfusion.fastslam.association import Association
 from mapfusion.fastslam.filter import FastSlam, StepResult
 from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.robot_log import NO_LABEL, RobotLog
+from mapfusion.looks import NO_LABEL
+from mapfusion.robot_log import RobotLog
 from mapfusion.se2 import Float
 from mapfusion.viewing import viewing_of
 

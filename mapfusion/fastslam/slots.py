@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from mapfusion.robot_log import DESCRIPTOR_LENGTH, NO_LABEL
+from mapfusion.looks import DESCRIPTOR_LENGTH, NO_LABEL
 
 FREE = -1  # the generation of a slot in no use, and the slot of a row in no use
 COMMON = -2  # the generation of a slot without a row: all particles have its common estimate

@@ -24,7 +24,7 @@ from mapfusion.fuse.kalman_drift import KalmanDrift
 from mapfusion.fuse.parameters import MergeParameters
 from mapfusion.fused_map import FusedMap
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.robot_log import NO_LABEL
+from mapfusion.looks import NO_LABEL
 from mapfusion.se2 import Float
 from mapfusion.smoother.student import student_bound
 

@@ -12,7 +12,7 @@ from mapfusion.fuse.parameters import MergeParameters
 from mapfusion.fused_map import FusedMap
 from mapfusion.joint_covariance import JointCovariance, condensed
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.robot_log import DESCRIPTOR_LENGTH, NO_LABEL
+from mapfusion.looks import DESCRIPTOR_LENGTH, NO_LABEL
 from mapfusion.se2 import IDENTITY, Float
 
 _SOURCE_UNKNOWN = -1  # a fused landmark comes from no single observation

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapfusion.arguments import require_finite, require_shape
-from mapfusion.robot_log import DESCRIPTOR_LENGTH
+from mapfusion.looks import DESCRIPTOR_LENGTH
 from mapfusion.se2 import Float
 from mapfusion.vision.patches import PATCH_SIDE_PX
 

@@ -18,7 +18,8 @@ from experiments.run.job import Job
 from experiments.run.stages.drive import TRAJECTORY_FILE
 from experiments.scenario.randomness import generator
 from mapfusion.camera import StereoCamera
-from mapfusion.robot_log import DESCRIPTOR_LENGTH, with_rows
+from mapfusion.looks import DESCRIPTOR_LENGTH
+from mapfusion.robot_log import with_rows
 from mapfusion.se2 import Float
 from mapfusion.sealed import LINE
 from mapfusion.storage import (

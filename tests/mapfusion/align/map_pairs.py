@@ -7,7 +7,7 @@ import numpy as np
 from mapfusion import se2
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.robot_log import DESCRIPTOR_LENGTH
+from mapfusion.looks import DESCRIPTOR_LENGTH
 
 SIZE_M = np.array([20.0, 20.0, 2.5])
 

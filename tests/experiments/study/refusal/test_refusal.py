@@ -31,7 +31,7 @@ from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.correspondences import MatchParameters
 from mapfusion.align.false_alarms import fewest_false_alarms, independent_pairs
 from mapfusion.align.rigid import fit_rigid
-from mapfusion.robot_log import DESCRIPTOR_LENGTH
+from mapfusion.looks import DESCRIPTOR_LENGTH
 from tests.helpers.made_up_maps import ITERATION, robot
 from tests.helpers.tiny_scenario import command
 
