@@ -11,7 +11,14 @@ from mapfusion.arguments import Range, require_in_range
 from mapfusion.errors import InputError
 from mapfusion.se2 import Float, between, wrap
 from sim.floorplan import FloorPlan
-from sim.p3at import OUTER_RADIUS_M, SKID_TRACK_M, TOP_SPEED_M_S, WHEEL_RADIUS_M, P3at
+from sim.p3at import (
+    OUTER_RADIUS_M,
+    SKID_TRACK_M,
+    TOP_SPEED_M_S,
+    WHEEL_RADIUS_M,
+    WIDTH_M,
+    P3at,
+)
 from sim.route import Route, check_routes, place
 from sim.trajectory import Trajectory
 from sim.world import PHYSICS_HZ, World
@@ -103,7 +110,7 @@ def drive(
                 parked = [driver.parked for driver in drivers]
                 for i, driver in enumerate(drivers):
                     others = [
-                        _Other(now[j], goes_first=j < i and not parked[j])
+                        _Other(now[j], j, j < i and not parked[j], drivers[j].lets_by == i)
                         for j in range(len(drivers))
                         if j != i
                     ]
@@ -126,10 +133,30 @@ def _controls_per_frame(frame_interval_s: float) -> int:
 
 @dataclass(frozen=True)
 class _Other:
-    """Another robot as a driver sees it; those listed first go first."""
+    """Another robot as a driver sees it.
+
+    Attributes:
+        T_world_robot: (3,).
+        place: in the list of routes.
+        goes_first: those listed first do, until they have come to their end.
+        lets_by: whether it stands because this one is in its way.
+    """
 
     T_world_robot: Float
+    place: int
     goes_first: bool
+    lets_by: bool
+
+    def is_in_the_way(self, x: float, y: float) -> bool:
+        """Whether it is, where it is seen at (x, y).
+
+        Of two that stand before each other one is listed first and has the right of way, but the
+        other has come so far into it that it must go on: past one that stands there needs to be
+        room for its own width alone, and for the other however that one turns.
+        """
+        passes = self.goes_first and self.lets_by
+        beside_m = OUTER_RADIUS_M + (WIDTH_M / 2 if passes else OUTER_RADIUS_M)
+        return x < 2 * OUTER_RADIUS_M + STOPPING_GAP_M and abs(y) < beside_m
 
 
 class _Driver:
@@ -143,8 +170,8 @@ class _Driver:
         self._turn_rad_s = 0.0
         self._nearest_m = np.inf
         self._progress_s = 0.0
-        self._waiting = False
         self._turning = False
+        self.lets_by: int | None = None  # the robot that it waits for
 
     @property
     def parked(self) -> bool:
@@ -157,8 +184,8 @@ class _Driver:
         self._advance(time_s, pose)
         stands = self._done or time_s < settings.stand_s
         speed, turn = (0.0, 0.0) if stands else self._wish(pose)
-        self._waiting = speed > 0 and self._must_wait(pose, others)
-        if self._waiting:
+        self.lets_by = self._first_in_the_way(pose, others) if speed > 0 else None
+        if self.lets_by is not None:
             speed = turn = 0.0
         self._speed_m_s = _towards(self._speed_m_s, speed, settings.acceleration_m_s2 / CONTROL_HZ)
         self._turn_rad_s = _towards(
@@ -181,7 +208,7 @@ class _Driver:
         if self._done or distance < self._nearest_m - PROGRESS_M:
             self._nearest_m, self._progress_s = distance, time_s
         if time_s - self._progress_s > self._settings.patience_s:
-            why = "waits for another robot" if self._waiting else "is stuck"
+            why = "waits for another robot" if self.lets_by is not None else "is stuck"
             raise InputError(
                 f"robot {self._route.robot}: {why} at {place(pose)} since t = "
                 f"{self._progress_s:.1f} s, on the way to waypoint {self._target + 1} "
@@ -207,15 +234,15 @@ class _Driver:
             return 0.0, turn if self._speed_m_s == 0 else 0.0
         return settings.speed_m_s * max(0.0, 1 - abs(error) / settings.turn_in_place_rad), turn
 
-    def _must_wait(self, pose: Float, others: list[_Other]) -> bool:
-        """Whether another robot ahead goes first or stands in the way."""
+    def _first_in_the_way(self, pose: Float, others: list[_Other]) -> int | None:
+        """Another robot ahead that goes first or stands in the way."""
         for other in others:
             x, y, _ = between(pose, other.T_world_robot)
-            in_the_way = x < 2 * OUTER_RADIUS_M + STOPPING_GAP_M and abs(y) < 2 * OUTER_RADIUS_M
-            goes_first = other.goes_first and math.hypot(x, y) < self._settings.give_way_m
-            if x > 0 and (in_the_way or goes_first):
-                return True
-        return False
+            goes_first = other.goes_first and not other.lets_by
+            gives_way = goes_first and math.hypot(x, y) < self._settings.give_way_m
+            if x > 0 and (gives_way or other.is_in_the_way(x, y)):
+                return other.place
+        return None
 
     def refuse_contact(self, time_s: float, ground: int, names: dict[int, str]) -> None:
         """Raise InputError when the robot touches anything but the ground."""

@@ -11,7 +11,7 @@ from mapfusion.errors import InputError
 from sim.driver import DriverSettings, drive
 from sim.floorplan import FloorPlan, Wall
 from sim.odometry import calibrated_track_m, encoder_increments
-from sim.p3at import OUTER_RADIUS_M
+from sim.p3at import OUTER_RADIUS_M, WIDTH_M
 from sim.route import Route, check_routes
 from sim.trajectory import Trajectory
 
@@ -190,6 +190,17 @@ def test_where_ways_cross_the_first_listed_goes_first() -> None:
     assert nearest_m(both, 1, (3.4, 1.0))[-1] < 0.25
     unhindered = drive(HALL, routes[1:], DriverSettings(), 110, 0.2)
     assert np.abs(both.T_world_robot[1] - unhindered.T_world_robot[0]).max() > 0.3
+
+
+def test_of_two_that_stand_before_each_other_the_one_that_came_so_far_goes_on() -> None:
+    """The second has stopped too late: in the way of the first, which it lets by."""
+    first = route("a", [4.0, 5.4, -np.pi / 2], (4.0, 3.0), (6.5, 3.0))
+    second = route("b", [2.2, 3.0, 0.0], (6.0, 3.0), (6.0, 5.0))
+    both = drive(HALL, [first, second], DriverSettings(), 130, 0.2)
+    a, b = both.T_world_robot[:, :, :2]
+    assert np.hypot(*(a - b).T).min() > WIDTH_M  # they pass each other without touching
+    assert nearest_m(both, 1, (6.0, 3.0)).min() < 0.3
+    assert nearest_m(both, 0, (4.0, 3.0)).min() < 0.3
 
 
 @pytest.mark.parametrize("interval_s", [0.21, 1 / 240, 0.0, -0.2, float("nan")])
