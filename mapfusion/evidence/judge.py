@@ -18,10 +18,11 @@ from mapfusion.evidence.pair_evidence import (
     why_not_sought,
 )
 from mapfusion.evidence.parameters import EvidenceParameters
+from mapfusion.evidence.precision import laid_sigma_m
 from mapfusion.evidence.probability import Signs, probability
-from mapfusion.evidence.regions import Regions, Witness, Witnesses
+from mapfusion.evidence.regions import Regions, Squares, Witness, Witnesses
 from mapfusion.evidence.rivals import DISTINCT_M, apart_m
-from mapfusion.se2 import Float, motion_sigma
+from mapfusion.se2 import Float
 from mapfusion.team.relations import whole_map_covariance
 
 
@@ -60,6 +61,7 @@ class PairJudge:
     def __init__(self, judge: Judge, pairs: Pairs, known: PairEvidence | None) -> None:
         self._judge, self._pairs, self._known = judge, pairs, known
         self._chance = judge.acceptance.on(pairs)
+        self._bound = math.log10(judge.acceptance.false_alarms)
 
     @cached_property
     def _witnesses(self) -> Witnesses:
@@ -85,7 +87,7 @@ class PairJudge:
         status, reason, told = Status.ACCEPTED, "", {}
         evidence = self.evidence
         if evidence is not None:
-            regions = self.regions(alignment.T_a_b, evidence)
+            regions = self.regions(alignment, evidence)
             ratio = regions.log10_ratio(evidence.shares)
             told = {"log10_evidence": ratio, "n_confirmed": regions.n_confirmed}
             p = probability(self._signs(alignment, regions, ratio, evidence))
@@ -113,20 +115,21 @@ class PairJudge:
         """What speaks for and against an alignment; None where no evidence can be sought."""
         if self.evidence is None:
             return None
-        regions = self.regions(alignment.T_a_b, self.evidence)
+        regions = self.regions(alignment, self.evidence)
         ratio = regions.log10_ratio(self.evidence.shares)
         return self._signs(alignment, regions, ratio, self.evidence)
 
-    def regions(self, T_a_b: Float, evidence: PairEvidence) -> Regions:
-        """What becomes of what both robots must have seen under a motion."""
-        p_b = self._pairs.map_b.position_m[:, :2]
+    def regions(self, alignment: Alignment, evidence: PairEvidence) -> Regions:
+        """What becomes of what both robots must have seen under an alignment."""
+        T_a_b, p_b = alignment.T_a_b, self._pairs.map_b.position_m[:, :2]
+        squares = Squares.about(self._pairs.p_a[alignment.inlier], evidence.region_m)
         others = (
             copies
             for each, copies in zip(evidence.motions, self._laid, strict=True)
             if each.of != BETWEEN or apart_m(T_a_b, each.T_a_b, p_b) >= DISTINCT_M
         )
         none = Copies.none(len(self._pairs.map_a), len(self._pairs.map_b))
-        return self._witnesses.regions(BETWEEN, T_a_b, evidence.region_m, none.joined(others))
+        return self._witnesses.regions(BETWEEN, T_a_b, squares, none.joined(others))
 
     @cached_property
     def _laid(self) -> list[Copies]:
@@ -138,10 +141,10 @@ class PairJudge:
         self, alignment: Alignment, regions: Regions, ratio: float, evidence: PairEvidence
     ) -> Signs:
         counts = (regions.n_confirmed, regions.n_contradicted, int(alignment.inlier.sum()))
-        support = (each.n_support for each in self._others(alignment.T_a_b, evidence))
+        support = (each.n_support for each in self._rivals(alignment.T_a_b, evidence))
         extent_m = self._extent_m(alignment)
-        repeats = evidence.repeats(math.log10(self._judge.acceptance.false_alarms))
         one_place = self._is_one_place(alignment, extent_m)
+        repeats = evidence.repeats(self._bound)
         return Signs(ratio, *counts, max(support, default=0), extent_m, repeats, one_place)
 
     def _weighed(
@@ -162,8 +165,8 @@ class PairJudge:
     ) -> str:
         """Why another place may be the right one, with `{told}` of the regions; else empty."""
         settings, extent_m = self._judge.evidence, self._extent_m(alignment)
-        bound = math.log10(self._judge.acceptance.false_alarms)
-        rival = self._best_rival(alignment.T_a_b, evidence, bound)
+        rivals = self._rivals(alignment.T_a_b, evidence)
+        rival = max(rivals, key=lambda each: each.log10_ratio, default=None)
         if rival is not None and rival.log10_ratio > ratio - math.log10(settings.most_against):
             return f"{{told}}; so do {_named(rival)}"
         if self._is_one_place(alignment, extent_m):
@@ -173,25 +176,25 @@ class PairJudge:
             return ""
         if rival is not None:
             return f"{{told}}, too few beside {_named(rival)}"
-        if evidence.repeats(bound):
+        if evidence.repeats(self._bound):
             return "{told}, too few for maps that hold things twice"
         if regions.n_confirmed <= 1 and extent_m < evidence.region_m:
             what = f"all that agrees lies within {evidence.region_m:.2g} m"
             return f"{what} and could hang elsewhere too; no other region confirms it"
         return ""
 
-    def _best_rival(self, T_a_b: Float, evidence: PairEvidence, bound: float) -> RivalMotion | None:
-        """Of the other motions the one of most evidence.
+    def _rivals(self, T_a_b: Float, evidence: PairEvidence) -> list[RivalMotion]:
+        """Of the other motions those that are more than chance.
 
-        It is more than chance, or both robots saw what it says: of two copies of a picture each
-        gets half the correspondences.
+        What both robots saw of them counts, too, as of two copies of a picture each gets half the
+        correspondences: under a wrong motion regions are 10^r times likelier than not in at most
+        one of so many cases (Markov), so that chance gives as much that much more seldom.
         """
-        others = [
+        return [
             each
             for each in self._others(T_a_b, evidence)
-            if each.log10_false_alarms <= bound or each.log10_ratio > 0
+            if each.log10_false_alarms - max(each.log10_ratio, 0.0) <= self._bound
         ]
-        return max(others, key=lambda each: each.log10_ratio, default=None)
 
     def _others(self, T_a_b: Float, evidence: PairEvidence) -> list[RivalMotion]:
         """The rivals that are another motion."""
@@ -214,11 +217,8 @@ class PairJudge:
         # Landmarks known by name are few and far apart: where paths bend each is off by itself.
         drift_m = 0.0 if self._pairs.by_name else alignment.drift_sigma_m
         stated = whole_map_covariance(alignment.T_a_b, alignment.covariance, drift_m, p_a)
-        x, y = p_a.mean(axis=0)
-        # at the middle of its support: far from it the angle moves everything
-        at_middle = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
-        at_middle[:2, 2] += alignment.T_a_b[1], -alignment.T_a_b[0]
-        sigma_m, sigma_rad = motion_sigma(at_middle @ stated @ at_middle.T)
+        p_b = self._pairs.map_b.position_m[:, :2]
+        sigma_m, sigma_rad = laid_sigma_m(alignment.T_a_b, stated, p_b), math.sqrt(stated[2, 2])
         if sigma_m <= settings.max_sigma_m and sigma_rad <= settings.max_sigma_rad:
             return ""
         found = f"sigma {sigma_m:.2g} m, {sigma_rad:.2g} rad"

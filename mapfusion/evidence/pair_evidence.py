@@ -11,7 +11,7 @@ from mapfusion.align.refine import Refinement
 from mapfusion.evidence.copies import BETWEEN, of_others
 from mapfusion.evidence.likelihood import COPIED, OWN, TwinShares
 from mapfusion.evidence.parameters import EvidenceParameters
-from mapfusion.evidence.regions import Regions, Witnesses
+from mapfusion.evidence.regions import Regions, Squares, Witnesses
 from mapfusion.evidence.rivals import Supported, distinct_motions, self_motions
 from mapfusion.evidence.twins import largest_patch_m
 from mapfusion.landmark_map import LandmarkMap
@@ -104,14 +104,18 @@ def find_evidence(
     """All of it, of two maps with viewing evidence and descriptors."""
     between = distinct_motions(pairs, N_RIVALS, acceptance, refinement)
     region_m, onto_self = parameters.region_m, []
+    supporters = [pairs.p_a[each.inlier] for each in between]
     for side, own in zip("ab", (witnesses.a, witnesses.b), strict=True):
         alike, motions = self_motions(own.landmarks, N_SELF_MOTIONS, acceptance, refinement)
         onto_self += [(side, motion) for motion in motions]
+        supporters += [alike.p_a[each.inlier] for each in motions]
         region_m = max(region_m, _largest_twin_m(alike, motions, acceptance))
     kinds = [*((BETWEEN, each) for each in between), *onto_self]
     laid = [witnesses.copies(of, each.T_a_b) for of, each in kinds]
     regions = [
-        witnesses.regions(of, motion.T_a_b, region_m, of_others(laid, k))
+        witnesses.regions(
+            of, motion.T_a_b, Squares.about(supporters[k], region_m), of_others(laid, k)
+        )
         for k, (of, motion) in enumerate(kinds)
     ]
     shares = _twin_shares(regions[: len(between)], regions[len(between) :])

@@ -24,8 +24,8 @@ class EvidenceParameters:
         most_against: by how many times less likely they may be before it counts as contradicted: at
             most one right motion of so many gets there.
         least_probability: that the alignment is right; below a half it is likelier wrong.
-        max_sigma_m: of an alignment's translation, at the middle of what supports it. Twice that,
-            95 %, is what least squares still mends and what a merged map is used for: 0.5 m.
+        max_sigma_m: of where an alignment lays the other map's landmarks, RMS over them. Twice
+            that, 95 %, is what least squares still mends and what a merged map is used for: 0.5 m.
         max_sigma_rad: of its rotation; twice that moves a landmark at 5 m by as much.
     """
 

@@ -69,6 +69,32 @@ class Regions:
         return float(np.sum(log10_ratio(self.found, self.expected, shares)))
 
 
+class Squares(NamedTuple):
+    """The squares of the plane that are one region each.
+
+    Attributes:
+        side_m: of a square.
+        middle: (2,) of one of them, in frame a: where what supports a motion has its middle, so
+            that one picture is one region and not the two or four that a line through it makes.
+    """
+
+    side_m: float
+    middle: Float
+
+    @classmethod
+    def about(cls, p_a: Float, side_m: float) -> "Squares":
+        """About the middle of supporters (n, 2 or 3); about the origin without any."""
+        if not len(p_a):
+            return cls(side_m, np.zeros(2))
+        return cls(side_m, (p_a[:, :2].min(axis=0) + p_a[:, :2].max(axis=0)) / 2)
+
+    def of(self, p: Float) -> np.ndarray:
+        """Number (n,) of the square in which each point (n, 2) lies, from 0 on."""
+        column, row = np.floor((p - self.middle).T / self.side_m + 0.5).astype(np.int64)
+        width = int(np.ptp(row)) + 1 if len(row) else 1
+        return np.unique(column * width + row, return_inverse=True)[1]
+
+
 class _Asked(NamedTuple):
     """Landmarks that another robot had in view (n,).
 
@@ -129,7 +155,7 @@ class Witnesses:
         }
         return {BETWEEN: self, **own}
 
-    def regions(self, of: str, T: Float, region_m: float, copies: Copies) -> Regions:
+    def regions(self, of: str, T: Float, squares: Squares, copies: Copies) -> Regions:
         """What must have been seen under a motion, and is there, in squares of frame a.
 
         Of two maps both ways are counted into one square: they are of one part of the world. What
@@ -137,15 +163,13 @@ class Witnesses:
         """
         if of != BETWEEN:
             own = copies.in_a if of == "a" else copies.in_b
-            return self._of[of].regions(BETWEEN, T, region_m, Copies(own, own))
+            return self._of[of].regions(BETWEEN, T, squares, Copies(own, own))
         T_a_b = T
         asked_b, b_in_a = self._asked(self.b, self.a, T_a_b, copies.in_b)
         asked_a, _ = self._asked(self.a, self.b, inverse(T_a_b), copies.in_a)
         asked = _Asked(*map(np.concatenate, zip(asked_b, asked_a, strict=True)))
         places = np.concatenate([b_in_a[asked_b.rows], self.a.landmarks.position_m[asked_a.rows]])
-        column, row = np.floor(places[:, :2].T / region_m).astype(np.int64)
-        width = int(np.ptp(row)) + 1 if len(row) else 1
-        _, place = np.unique(column * width + row, return_inverse=True)
+        place = squares.of(places[:, :2])
         n = int(place.max(initial=-1)) + 1
         found, expected = np.zeros((n, 2, 2), np.int64), np.zeros((n, 2, 2), np.int64)
         at = place, asked.copied.astype(np.int64), np.where(asked.how == MUST, 0, 1)

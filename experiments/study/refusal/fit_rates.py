@@ -24,7 +24,7 @@ from mapfusion.evidence import fitted_rates
 from mapfusion.evidence.copies import BETWEEN, Copies
 from mapfusion.evidence.likelihood import OWN, BetaRate, Rates, log_likelihood
 from mapfusion.evidence.pair_evidence import N_RIVALS
-from mapfusion.evidence.regions import Witness, Witnesses
+from mapfusion.evidence.regions import Squares, Witness, Witnesses
 from mapfusion.evidence.rivals import distinct_motions
 from mapfusion.se2 import Float
 from mapfusion.storage import write_whole
@@ -54,16 +54,19 @@ def regions_of(worlds: Sequence[MappedWorld]) -> tuple[Counts, Counts]:
             settings = world.scenario.align
             pairs = Pairs(case.map_a, case.map_b, case.pairs)
             if case.is_true.sum() >= MERGEABLE_PAIRS:
-                motions = [Oracle(settings.refinement).align(pairs, case.is_true).T_a_b]
+                right_one = Oracle(settings.refinement).align(pairs, case.is_true)
+                motions = [(right_one.T_a_b, right_one.inlier)]
             elif case.n_common:
                 continue
             else:
                 judge = settings.acceptance, settings.refinement
-                motions = [each.T_a_b for each in distinct_motions(pairs, N_RIVALS, *judge)]
+                found = distinct_motions(pairs, N_RIVALS, *judge)
+                motions = [(each.T_a_b, each.inlier) for each in found]
             witnesses = Witnesses(Witness(case.map_a), Witness(case.map_b), settings.evidence)
             none = Copies.none(len(case.map_a), len(case.map_b))
-            for T in motions:
-                found = witnesses.regions(BETWEEN, T, settings.evidence.region_m, none)
+            for T, inlier in motions:
+                squares = Squares.about(pairs.p_a[inlier], settings.evidence.region_m)
+                found = witnesses.regions(BETWEEN, T, squares, none)
                 of_kind = right if case.n_common else wrong
                 of_kind.append((found.found[:, OWN], found.expected[:, OWN]))
     return _joined(right), _joined(wrong)

@@ -11,7 +11,9 @@ from mapfusion.align.clique import Clique
 from mapfusion.align.correspondences import match
 from mapfusion.align.registration import Registration
 from mapfusion.align.result import Alignment, Status
+from mapfusion.evidence.copies import BETWEEN
 from mapfusion.evidence.judge import Judge
+from mapfusion.evidence.pair_evidence import RivalMotion
 from mapfusion.evidence.parameters import EvidenceParameters
 from mapfusion.landmark_map import LandmarkMap
 from tests.mapfusion.evidence.two_rooms import Wall, between, mapped
@@ -45,6 +47,25 @@ def test_what_is_likelier_wrong_is_not_accepted_whatever_else_speaks_for_it() ->
     assert asked.status is Status.AMBIGUOUS
     assert f"probability {said.probability:.2g}" in asked.reason
     assert asked.log10_evidence == said.log10_evidence
+
+
+@pytest.mark.parametrize(("log10_by_chance", "status"), [(4.0, "accepted"), (-0.5, "ambiguous")])
+def test_a_rival_is_more_than_chance_by_pairs_and_regions_together(
+    log10_by_chance: float, status: str
+) -> None:
+    """Another motion, as well seen again: what chance gives anyway is none."""
+    pairs = match(A, B)
+    sought = Registration(Clique()).on(A, B, pairs)
+    assert sought.judge is not None
+    evidence, (said, refined) = sought.judge.evidence, verdict(A, B)
+    assert evidence is not None
+    elsewhere = refined.T_a_b + np.array([0.0, 30.0, 0.0])
+    rival = RivalMotion(BETWEEN, elsewhere, log10_by_chance, 9, 2, 0, 2, said.log10_evidence)
+    assert said.log10_evidence > 2.5
+    known = replace(evidence, motions=(*evidence.motions, rival))
+    registration = Registration(Clique()).on(A, B, pairs, known)
+    told = registration.register(np.random.default_rng(0)).verdict
+    assert str(told.status) == status
 
 
 def test_a_picture_in_two_worlds_is_contradicted_by_all_around_it() -> None:
@@ -112,7 +133,7 @@ def test_what_was_found_before_gives_the_same_verdict() -> None:
     assert both[0] == both[1]
 
 
-def test_the_sigma_is_stated_where_the_supporters_are() -> None:
+def test_the_sigma_is_of_landmarks_wherever_the_origins_are() -> None:
     """Moving both maps' origins far away changes an angle's lever, not the verdict."""
     far = np.array([1000.0, -500.0, 0.0])
     moved = [replace(m, position_m=m.position_m + far, viewing=None) for m in (A, B)]

@@ -7,18 +7,19 @@ from mapfusion import se2
 from mapfusion.evidence.copies import BETWEEN, Copies
 from mapfusion.evidence.likelihood import COPIED, OWN, TwinShares
 from mapfusion.evidence.parameters import EvidenceParameters
-from mapfusion.evidence.regions import Witness, Witnesses
+from mapfusion.evidence.regions import Squares, Witness, Witnesses
 from tests.mapfusion.evidence.two_rooms import Wall, between, mapped
 
 WALL = Wall(16, seed=1)
 A, B = (Witness(mapped(WALL, *ends, seed=k)) for k, ends in enumerate(((1, 9), (5, 14))))
 T_A_B = between(1, 5)
 PARAMETERS, SHARES = EvidenceParameters(), TwinShares(0.05, 0.5)
+SQUARES = Squares(1.0, np.zeros(2))
 
 
 def regions(T_a_b: np.ndarray, a: Witness = A, b: Witness = B):
     none = Copies.none(len(a.landmarks), len(b.landmarks))
-    return Witnesses(a, b, PARAMETERS).regions(BETWEEN, T_a_b, 1.0, none)
+    return Witnesses(a, b, PARAMETERS).regions(BETWEEN, T_a_b, SQUARES, none)
 
 
 def test_the_right_motion_is_confirmed_everywhere() -> None:
@@ -56,9 +57,25 @@ def test_of_another_wall_nothing_is_found() -> None:
 def test_copies_are_counted_apart_and_say_little() -> None:
     all_copies = Copies(np.ones(len(A.landmarks), bool), np.ones(len(B.landmarks), bool))
     plain = regions(T_A_B)
-    marked = Witnesses(A, B, PARAMETERS).regions(BETWEEN, T_A_B, 1.0, all_copies)
+    marked = Witnesses(A, B, PARAMETERS).regions(BETWEEN, T_A_B, SQUARES, all_copies)
     np.testing.assert_array_equal(marked.found[:, COPIED], plain.found[:, OWN])
     assert not marked.expected[:, OWN].any()
     assert marked.seen_again(OWN) == (0, 0)
     assert marked.seen_again(COPIED) == plain.seen_again(OWN)
     assert 0 < marked.log10_ratio(TwinShares(0.05, 0.9)) < 0.05 * len(marked)
+
+
+@pytest.mark.parametrize("corner", [(0.0, 0.0), (0.7, -1.3), (1.0, 2.0)])
+def test_one_picture_is_one_region_wherever_it_hangs(corner: tuple[float, float]) -> None:
+    picture = np.random.default_rng(0).uniform(0, 0.99, (50, 2)) + corner
+    squares = Squares.about(np.column_stack([picture, np.ones(50)]), 1.0)
+    assert len(np.unique(squares.of(picture))) == 1
+    # of a plane of points each square of a metre has its own
+    x, y = np.meshgrid(np.arange(0.25, 5, 0.5), np.arange(0.25, 3, 0.5))
+    plane = np.column_stack([x.ravel(), y.ravel()]) + squares.middle + 0.5
+    np.testing.assert_array_equal(np.bincount(squares.of(plane)), np.full(15, 4))
+
+
+def test_without_supporters_squares_lie_about_the_origin() -> None:
+    np.testing.assert_array_equal(Squares.about(np.zeros((0, 3)), 2.0).middle, [0, 0])
+    assert len(SQUARES.of(np.zeros((0, 2)))) == 0
