@@ -27,6 +27,9 @@ def refusal(
     pairs: Annotated[
         int, typer.Option(help="Pairs of maps of different seeds, of each kind.", min=1)
     ] = 200,
+    every: Annotated[
+        int, typer.Option(help="Of each run's evaluated iterations, one of so many.", min=1)
+    ] = 1,
     seeds: options.Seeds = "0",
     jobs: options.Jobs = options.ALL_CORES,
     results: options.Results = options.RESULTS,
@@ -41,12 +44,13 @@ def refusal(
     from experiments.show.refusal_files import draw_refusals, write_kinds
     from experiments.show.terminal import layout, refusal_screen
     from experiments.study.refusal import kind_rates, refusal_rates, refusal_trial
+    from experiments.study.refusal.refusal_trial import Drawn
     from experiments.study.refusal.reliability import judged_answers, reliability
     from experiments.study.refusal.stored_worlds import worlds_of
 
-    mapped = worlds_of(worlds, parse_seeds(seeds), results)
+    mapped, drawn = worlds_of(worlds, parse_seeds(seeds), results), Drawn(pairs, every)
     with layout.progress() as show:
-        false_alarms = refusal_trial.run(mapped, output, pairs, jobs, show)
+        false_alarms = refusal_trial.run(mapped, output, drawn, jobs, show)
     refusals, calibration = (refusal_trial.read(output, name) for name in refusal_trial.TABLES)
     refusal_screen.print_refusals(refusal_rates.summary(refusals), false_alarms)
     kinds = kind_rates.by_kind(refusals)

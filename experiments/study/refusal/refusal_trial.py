@@ -29,7 +29,8 @@ REPEATED_PER_WORLDS = 9  # posters hung in each pair of worlds
 REPEATED_WORLDS = 35  # pairs of worlds that posters are hung in
 # Two worlds that are crossed give so many pairs of maps: few, as those of two worlds are alike.
 MEETINGS_PER_WORLDS = 10
-CROSSED = "crossed"  # the kind of maps of two kinds of worlds
+# The kind of maps of two kinds of worlds: of ordinary ones, and where either repeats itself.
+CROSSED, CROSSED_REPEATING = "crossed", "crossed_repeating"
 
 # In `FOLDER/tables/`.
 TABLES = {
@@ -38,7 +39,7 @@ TABLES = {
         "refusal.refusals",
         2,
         fields(
-            kind=TEXT,  # scenario of both worlds; crossed, of two
+            kind=TEXT,  # scenario of both worlds; crossed or crossed_repeating, of two
             repeats=BOOL,  # pictures of either world are found in several places
             ground=TEXT,  # apart, common, few or repeated (see cases.py)
             poster_radius_m=FLOAT,  # NaN without a poster
@@ -89,25 +90,42 @@ class Crossing(NamedTuple):
     hung: bool
 
 
+class Drawn(NamedTuple):
+    """How many pairs of maps are judged.
+
+    Attributes:
+        n_apart: of those that worlds of different seeds have, for each kind of world, and as many
+            of worlds of two kinds.
+        every: of each run the maps at its last iteration and at each so many before it: those of
+            neighbouring iterations say the same.
+    """
+
+    n_apart: int
+    every: int = 1
+
+
 def read(folder: Path, name: str) -> pd.DataFrame:
     """Read the table of that name; raises InputError that names the file."""
     return read_rows(table_path(folder, name), TABLES[name])
 
 
 def run(
-    worlds: Sequence[MappedWorld], output: Path, n_apart: int, jobs: int, on_progress: OnProgress
+    worlds: Sequence[MappedWorld],
+    output: Path,
+    drawn: Drawn,
+    jobs: int,
+    on_progress: OnProgress,
 ) -> float:
     """Write the tables into a folder; returns the number of false alarms that was accepted.
 
-    The first world's scenario gives methods; `n_apart` pairs of maps without common ground are
-    drawn from all that worlds of one kind have, for each kind, and as many of different kinds.
+    The first world's scenario gives methods.
     """
     scenario = worlds[0].scenario
-    crossings = crossings_of(worlds, n_apart, generator(scenario.seed, "refusal"))
+    crossings = crossings_of(worlds, drawn.n_apart, generator(scenario.seed, "refusal"))
     done: dict[tuple[str, str], Rows] = {}
     with workers(jobs) as pool:
         for world in worlds:
-            pool.submit((world.name, ""), common_rows, scenario, world)
+            pool.submit((world.name, ""), common_rows, scenario, world, drawn.every)
         for each in crossings:
             pool.submit((each.a.name, each.b.name), apart_rows, scenario, each)
         for names, rows in pool.completed():
@@ -158,19 +176,21 @@ def _possible(a: MappedWorld, b: MappedWorld) -> list[Meeting]:
 
 
 def _kind(a: MappedWorld, b: MappedWorld) -> str:
-    return a.kind if a.kind == b.kind else CROSSED
+    if a.kind == b.kind:
+        return a.kind
+    return CROSSED_REPEATING if _repeats(a, b) else CROSSED
 
 
 def _repeats(a: MappedWorld, b: MappedWorld) -> bool:
     return a.repeats or b.repeats
 
 
-def common_rows(scenario: Simulation, world: MappedWorld) -> Rows:
+def common_rows(scenario: Simulation, world: MappedWorld, every: int) -> Rows:
     """COMMON pairs of one world, and FEW ones unless it repeats itself."""
     matching, radius_m = scenario.align.match, scenario.evaluate.true_pair_radius_m
     rows: Rows = []
     for (a, b), iteration in itertools.product(
-        itertools.combinations(world.robots(), 2), world.iterations
+        itertools.combinations(world.robots(), 2), world.iterations[::-1][::every][::-1]
     ):
         met = [cases.common(a, b, iteration, matching, radius_m)]
         if not world.repeats:
@@ -215,14 +235,15 @@ def _answers(
     names |= {"world_a": worlds[0].name, "robot_a": case.map_a.name}
     names |= {"world_b": worlds[1].name, "robot_b": case.map_b.name, "iteration": iteration}
     bound = np.log10(settings.acceptance.false_alarms)
-    known = settings.judge.on(Pairs(case.map_a, case.map_b, case.pairs)).evidence
+    pairs = Pairs(case.map_a, case.map_b, case.pairs)
+    judged = settings.judge.on(pairs)  # evidence is sought once, where an answer beats chance
     rows = []
     for entry in settings.aligners:
         rng = generator(scenario.seed, *map(str, names.values()), entry.name)
         aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
-        registration = Registration(aligner, settings.refinement, settings.judge)
-        ready = registration.on(case.map_a, case.map_b, case.pairs, known)
-        _, refined, verdict = ready.register(rng)
+        registration = Registration(aligner, settings.refinement, judge=None)
+        refined = registration.register(case.map_a, case.map_b, case.pairs, rng).refined
+        verdict = judged.judge(refined)
         error = refined.T_a_b - case.T_true
         found = {
             "aligner": entry.name,

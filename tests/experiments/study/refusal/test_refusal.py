@@ -259,7 +259,7 @@ def test_worlds_may_be_scenarios_with_seeds(
     apart = rows[rows["ground"] == "apart"].drop_duplicates(
         ["world_a", "robot_a", "robot_b", "iteration", "world_b"]
     )
-    assert apart.groupby("kind").size().to_dict() == {"crossed": 2, "hung": 2, "plain": 2}
+    assert apart.groupby("kind").size().to_dict() == {"crossed_repeating": 2, "hung": 2, "plain": 2}
     crossed = rows[rows["world_a"] != rows["world_b"]]
     assert (crossed["world_a"].str[-1] != crossed["world_b"].str[-1]).all()
     alone = command(
@@ -267,7 +267,7 @@ def test_worlds_may_be_scenarios_with_seeds(
     )
     assert "all worlds have seed 5" in alone.complaints[0]
     kinds = read_rows(tmp_path / "out" / "tables" / "kinds.parquet", KINDS)
-    assert kinds["kind"].unique().tolist() == ["crossed", "hung", "plain"]
+    assert kinds["kind"].unique().tolist() == ["crossed_repeating", "hung", "plain"]
 
 
 def test_wrong_results_are_named(
