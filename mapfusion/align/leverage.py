@@ -10,8 +10,36 @@ import numpy as np
 from numba import njit
 
 from mapfusion.align.mahalanobis_gate import PlanarPairs, residual_covariance
-from mapfusion.planar import lever
+from mapfusion.planar import lever, residual
 from mapfusion.se2 import Float, transform_points
+
+
+# How seldom a true pair may be called false, among all pairs of two maps: as seldom as the test
+# against chance accepts a false alignment.
+_CALLED_FALSE = 1e-3
+
+
+def is_unlike_the_others(
+    T_without: Float, covariance: Float, variance_m2: float, pairs: PlanarPairs, left_out: int
+) -> bool:
+    """Whether a pair lies farther from where the others put it than they explain.
+
+    Its squared distance D under the motion without it, in units of S + s_drift^2 I + J cov J' with
+    an s_drift that m = 2 (n - 1) - 3 numbers of the others leave, is 2 F(2, m) for a true pair
+    (the externally studentised residual; Cook and Weisberg 1982), beyond D with the probability
+    (1 + D / m)^(-m / 2). Any of the n pairs might have been the one.
+    """
+    _, p_b, S_a, S_b = pairs
+    cos, sin = math.cos(T_without[2]), math.sin(T_without[2])
+    m = 2 * (len(p_b) - 1) - 3
+    if m < 1:
+        return False
+    J = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    J[:, 2] = lever(cos, sin, p_b, left_out)
+    xx, xy, yy = residual_covariance(cos, sin, S_a, S_b, left_out, variance_m2)
+    e = np.array(residual(T_without, cos, sin, pairs.p_a, p_b, left_out))
+    D = e @ np.linalg.solve(np.array([[xx, xy], [xy, yy]]) + J @ covariance @ J.T, e)
+    return -m / 2 * math.log1p(D / m) < math.log(_CALLED_FALSE / len(p_b))
 
 
 def why_one_pair(

@@ -21,7 +21,9 @@ from mapfusion.align.false_alarms import log10_tail, residuals_m
 from mapfusion.align.pairs import MIN_PAIRS
 from mapfusion.se2 import Float
 
-_BENT = 2.0  # times the widest gate: either map may be bent by what the gate allows for both
+# Times the widest gate: the next of gates that double. Either map may be bent by what the widest
+# allows for both; and what a gate more costs is counted, as chance has one more to try.
+_BENT = 2.0
 
 
 def named_false_alarms(

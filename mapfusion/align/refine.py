@@ -12,7 +12,7 @@ from mapfusion.align.calibration_part import calibration_part
 from mapfusion.align.correspondences import HeightGate
 from mapfusion.align.degeneracy import why_one_place
 from mapfusion.align.drift import drift_step
-from mapfusion.align.leverage import most_leverage, why_one_pair
+from mapfusion.align.leverage import is_unlike_the_others, most_leverage, why_one_pair
 from mapfusion.align.mahalanobis_gate import PlanarPairs
 from mapfusion.align.pairs import MIN_PAIRS, Pairs, undetermined
 from mapfusion.align.result import Alignment, Status
@@ -98,9 +98,16 @@ class Refinement:
         else:
             left_out = most_leverage(T_a_b, planar, variance, truth, covariance)
             others = PlanarPairs(*(np.delete(part, left_out, axis=0) for part in planar))
-            solved, _, T_without, *_ = maximise_likelihood(others, T_a_b, *limits)
-            # of known identities even one that the motion rests on is no false pair
-            reason = why_one_pair(T_a_b, T_without if solved else None, planar, truth, limits[0])
+            solved, _, T_without, *sure, _ = maximise_likelihood(others, T_a_b, *limits)
+            may_move_m = limits[0]
+            # a known identity that the motion rests on is false only if it is unlike all others
+            if (
+                pairs.by_name
+                and solved
+                and is_unlike_the_others(T_without, *sure, planar, left_out)
+            ):
+                may_move_m = self.gate_m
+            reason = why_one_pair(T_a_b, T_without if solved else None, planar, truth, may_move_m)
         covariance = covariance + calibration_part(T_a_b, pairs[inlier], math.sqrt(variance))
         T_a_b[2] = wrap(T_a_b[2])
         return Alignment(

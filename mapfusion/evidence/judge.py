@@ -141,11 +141,10 @@ class PairJudge:
         self, alignment: Alignment, regions: Regions, ratio: float, evidence: PairEvidence
     ) -> Signs:
         counts = (regions.n_confirmed, regions.n_contradicted, int(alignment.inlier.sum()))
-        support = (each.n_support for each in self._rivals(alignment.T_a_b, evidence))
         extent_m = self._extent_m(alignment)
         one_place = self._is_one_place(alignment, extent_m)
         repeats = evidence.repeats(self._bound)
-        return Signs(ratio, *counts, max(support, default=0), extent_m, repeats, one_place)
+        return Signs(ratio, *counts, extent_m, repeats, one_place)
 
     def _weighed(
         self, alignment: Alignment, regions: Regions, ratio: float, evidence: PairEvidence

@@ -26,7 +26,6 @@ class Signs(NamedTuple):
         n_confirmed: regions that are seen again.
         n_contradicted: regions that are not.
         n_support: correspondences that support it.
-        n_rival: that support the best rival, 0 without one.
         extent_m: the longer side of where its support lies.
         repeats: whether either map holds something twice.
         one_place: whether the maps show little else than the place that they share.
@@ -36,7 +35,6 @@ class Signs(NamedTuple):
     n_confirmed: int
     n_contradicted: int
     n_support: int
-    n_rival: int
     extent_m: float
     repeats: bool
     one_place: bool
@@ -49,7 +47,8 @@ class Signs(NamedTuple):
             [
                 np.clip(self.log10_evidence, -_MOST_EVIDENCE, _MOST_EVIDENCE),
                 net,
-                math.log10((self.n_rival + 1) / (self.n_support + 1)),
+                # at one extent more of them are denser, as a copy of one picture is
+                math.log10(self.n_support + 1),
                 min(self.extent_m, _MOST_EXTENT_M),
                 float(self.repeats),
                 float(self.one_place),

@@ -5,19 +5,19 @@ import pytest
 
 from mapfusion import se2
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.leverage import most_leverage
+from mapfusion.align.leverage import is_unlike_the_others, most_leverage
 from mapfusion.align.mahalanobis_gate import PlanarPairs
 from mapfusion.align.pairs import Pairs
 from mapfusion.align.refine import Refinement
 from mapfusion.align.result import Status
-from mapfusion.align.rigid import motion_jacobian, residual_covariances
+from mapfusion.align.rigid import fit_rigid, motion_jacobian, residual_covariances
 from mapfusion.landmark_map import LandmarkMap
 
 T_TRUE = np.array([1.0, -2.0, 0.7])
 SIGMA_M = 0.01
 
 
-def planar_map(p: np.ndarray) -> LandmarkMap:
+def planar_map(p: np.ndarray, *, named: bool = False) -> LandmarkMap:
     n = len(p)
     return LandmarkMap(
         np.column_stack([p, np.zeros(n)]),
@@ -25,11 +25,12 @@ def planar_map(p: np.ndarray) -> LandmarkMap:
         np.full(n, 5, np.int32),
         np.arange(n),
         planar=True,
+        label=np.arange(n, dtype=np.int32) if named else None,
     )
 
 
 def a_corner_and_one_far(
-    turned_rad: float, seed: int = 0
+    turned_rad: float, seed: int = 0, *, named: bool = False
 ) -> tuple[LandmarkMap, LandmarkMap, Correspondences, np.ndarray]:
     """25 true pairs within 0.3 m, and one 7 m away that is true for a map turned about them."""
     rng = np.random.default_rng(seed)
@@ -38,11 +39,14 @@ def a_corner_and_one_far(
     T_turned = T_TRUE + np.array([0, 0, turned_rad])
     p_a[-1] = se2.transform_points(T_turned, p_b[-1:])[0]
     n = np.arange(26)
-    return planar_map(p_a), planar_map(p_b), Correspondences(n, n, np.zeros(26)), T_turned
+    maps = (planar_map(p, named=named) for p in (p_a, p_b))
+    return *maps, Correspondences(n, n, np.zeros(26)), T_turned
 
 
-def test_a_false_far_pair_turns_the_map_and_is_found_out() -> None:
-    map_a, map_b, pairs, T_turned = a_corner_and_one_far(0.7)
+@pytest.mark.parametrize("named", [False, True])
+def test_a_false_far_pair_turns_the_map_and_is_found_out(named: bool) -> None:
+    """A name that was misread is a false pair, too."""
+    map_a, map_b, pairs, T_turned = a_corner_and_one_far(0.7, named=named)
     found = Refinement().refine(Pairs(map_a, map_b, pairs), T_turned)
     assert np.hypot(*(found.T_a_b - T_turned)[:2]) < 0.1  # it did go there: residuals fit the gate
     assert abs(found.T_a_b[2] - T_TRUE[2]) > 0.5
@@ -50,9 +54,10 @@ def test_a_false_far_pair_turns_the_map_and_is_found_out() -> None:
     assert "rests on one correspondence: without it landmarks move by 4" in found.reason
 
 
+@pytest.mark.parametrize("named", [False, True])
 @pytest.mark.parametrize("seed", range(10))
-def test_a_true_far_pair_is_welcome(seed: int) -> None:
-    map_a, map_b, pairs, start = a_corner_and_one_far(0.0, seed)
+def test_a_true_far_pair_is_welcome(seed: int, named: bool) -> None:
+    map_a, map_b, pairs, start = a_corner_and_one_far(0.0, seed, named=named)
     found = Refinement().refine(Pairs(map_a, map_b, pairs), start)
     assert found.status is Status.ACCEPTED
     assert abs(found.T_a_b[2] - T_TRUE[2]) < 0.01
@@ -72,3 +77,25 @@ def test_leverage_is_the_hat_matrix_s_trace() -> None:
         hat = np.einsum("nki,ij,nlj,nlk->n", J, covariance, J, W)
         assert hat.sum() == pytest.approx(3)  # as many as parameters
         assert most_leverage(T, pairs, variance, truth, covariance) == np.argmax(hat)
+
+
+@pytest.mark.parametrize("n", [4, 6, 12])
+def test_true_pairs_are_called_false_as_seldom_as_promised(n: int) -> None:
+    """Bent maps: all pairs are off alike, and the one of most leverage is as good as the others."""
+    rng, called, tried = np.random.default_rng(n), 0, 300
+    S = np.tile(np.eye(2) * 1e-6, (n, 1, 1))
+    for _ in range(tried):
+        p_b = rng.normal(0, 3, (n, 2))
+        p_a = se2.transform_points(T_TRUE, p_b) + rng.normal(0, 0.3, (n, 2))
+        pairs = PlanarPairs(p_a, p_b, S, S)
+        others = PlanarPairs(*(part[1:] for part in pairs))
+        T = np.array(fit_rigid(others.p_a, others.p_b, np.arange(n - 1)))
+        e = others.p_a - se2.transform_points(T, others.p_b)
+        variance = float(np.sum(e**2)) / (2 * (n - 1) - 3)
+        J = motion_jacobian(T, others.p_b)
+        covariance = np.linalg.inv(np.einsum("nki,nkj->ij", J, J)) * variance
+        called += is_unlike_the_others(T, covariance, variance, pairs, 0)
+    assert called <= 2  # 0.075 are expected at n = 4
+    far = p_a.copy()
+    far[0] += 300.0
+    assert is_unlike_the_others(T, covariance, variance, pairs._replace(p_a=far), 0)

@@ -5,7 +5,7 @@ import pytest
 
 from mapfusion.evidence.probability import Signs, probability
 
-FAIR = Signs(1.0, 4, 0, 50, 10, 8.0, repeats=False, one_place=False)
+FAIR = Signs(1.0, 4, 0, 50, 8.0, repeats=False, one_place=False)
 
 
 @pytest.mark.parametrize(
@@ -24,7 +24,7 @@ def test_it_grows_with_what_speaks_for_it(better: dict, worse: dict) -> None:
 
 
 def test_the_features_are_bounded_so_that_nothing_is_certain() -> None:
-    most = Signs(1e9, 10**6, 0, 10**6, 0, 1e9, repeats=False, one_place=False)
+    most = Signs(1e9, 10**6, 0, 10**6, 1e9, repeats=False, one_place=False)
     assert probability(most) < 1
     assert np.isfinite(most.features()).all()
     np.testing.assert_allclose(most.features()[[0, 3]], [3.0, 12.0])
