@@ -13,7 +13,6 @@ from mapfusion.align.mahalanobis_gate import PlanarPairs, residual_covariance
 from mapfusion.planar import lever, residual
 from mapfusion.se2 import Float, transform_points
 
-
 # How seldom a true pair may be called false, among all pairs of two maps: as seldom as the test
 # against chance accepts a false alignment.
 _CALLED_FALSE = 1e-3

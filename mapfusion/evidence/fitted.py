@@ -2,9 +2,9 @@
 
 Written by `python -m experiments.study.refusal.fit_probability`.
 
-Of 1887 alignments, 1139 of them right, of seeds 0 to 2 of alias, full, posters, posters_apart.
+Of 3193 alignments, 1952 of them right, of seeds 0 to 4 of alias, full, posters, posters_apart.
 """
 
 VERSION = 1
-INTERCEPT = -3.037
-WEIGHTS = (0.585, 3.717, 0.849, 0.588, -1.090, -5.173)
+INTERCEPT = -1.063
+WEIGHTS = (0.750, 2.664, -1.102, 0.530, -1.318, -6.187)
