@@ -60,7 +60,7 @@ def refusal(
     if held is not None:
         refusal_screen.print_reliability(held)
     pictures = draw_refusals(output, refusals, calibration, false_alarms, held)
-    layout.print_paths(output, [write_kinds(output, kinds), *pictures])
+    layout.print_paths(output, [write_kinds(output, refusals, kinds), *pictures])
 
 
 @app.command(rich_help_panel=options.RUN)

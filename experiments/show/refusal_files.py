@@ -10,7 +10,7 @@ from experiments.run.frames import FLOAT, INT, TEXT, fields, write_rows
 from experiments.show.export import to_markdown, write_text
 from experiments.show.figures import refusal_figures, verdict_figures
 from experiments.show.figures.drawing import save_figure
-from experiments.study.refusal.kind_rates import VERDICTS
+from experiments.study.refusal.kind_rates import VERDICTS, of_any_method
 from experiments.study.refusal.refusal_rates import Rate, ordinary
 from experiments.study.refusal.reliability import Reliability
 from mapfusion.storage import schema
@@ -34,12 +34,18 @@ KINDS = schema(
 )
 
 
-def write_kinds(folder: Path, rows: list[dict[str, Any]]) -> Path:
-    """Write rows of `kind_rates.by_kind` as the table `kinds` and, for people, `kinds.md`."""
+def write_kinds(folder: Path, refusals: pd.DataFrame, rows: list[dict[str, Any]]) -> Path:
+    """Write rows of `kind_rates.by_kind` as the table `kinds` and, for people, `kinds.md`.
+
+    The page begins with what any method does (`kind_rates.of_any_method`).
+    """
     write_rows(table_path(folder, "kinds"), KINDS, [_flat(row) for row in rows])
-    shown = [{name: _told(value) for name, value in row.items()} for row in rows]
-    page = folder / "kinds.md"
-    write_text(page, f"# Verdicts by kind of world\n\n{to_markdown(pd.DataFrame(shown))}\n")
+    page, parts = folder / "kinds.md", {"Any method": of_any_method(refusals), "Each method": rows}
+    text = "# Verdicts by kind of world\n"
+    for title, part in parts.items():
+        shown = [{name: _told(value) for name, value in row.items()} for row in part]
+        text += f"\n## {title}\n\n{to_markdown(pd.DataFrame(shown))}\n"
+    write_text(page, text)
     return page
 
 

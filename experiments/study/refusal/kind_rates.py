@@ -20,6 +20,7 @@ from experiments.study.refusal.refusal_rates import Rate, without_common_ground
 
 KEPT, AMBIGUOUS, TOO_UNCERTAIN, REFUSED = "accepted", "ambiguous", "too_uncertain", "refused"
 VERDICTS = (KEPT, AMBIGUOUS, TOO_UNCERTAIN, REFUSED)
+_MAPS = ["world_a", "robot_a", "world_b", "robot_b", "iteration"]
 _RUN = ["kind", "world_a", "robot_a", "robot_b"]  # and method: one series of maps
 
 
@@ -55,6 +56,30 @@ def by_kind(refusals: pd.DataFrame) -> list[dict[str, Any]]:
         for kind, all_methods in of_kind.items()
         for name, own in all_methods.groupby("aligner", sort=False)
     ]
+
+
+def of_any_method(refusals: pd.DataFrame) -> list[dict[str, Any]]:
+    """A row for each kind: false merges by any of the methods, right answers of all of them.
+
+    A pair of maps or a run counts as one however many methods answered for it.
+    """
+    rows = []
+    for kind, own in as_they_came(refusals).groupby("kind"):
+        in_one_world, right = own[own["world_a"] == own["world_b"]], right_answers(own)
+        found = {
+            "false_runs": in_one_world.groupby("world_a")["false"].any(),
+            "false_pairs": _by_any(without_common_ground(own), "false"),
+            "false_by_chance": _by_any(without_common_ground(own), "beats_chance"),
+            "wrong_pairs": _by_any(own[has_common_ground(own)], "false"),
+        }
+        found |= {f"right_{verdict}": right["verdict"] == verdict for verdict in VERDICTS}
+        rows.append({"kind": str(kind)} | {name: Rate.of(hits) for name, hits in found.items()})
+    return rows
+
+
+def _by_any(rows: pd.DataFrame, column: str) -> pd.Series:
+    """Whether it holds of any method's answer for each two maps."""
+    return rows.groupby(_MAPS)[column].any()
 
 
 def _rates(own: pd.DataFrame) -> dict[str, Any]:

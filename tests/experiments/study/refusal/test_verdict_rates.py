@@ -11,7 +11,7 @@ import pytest
 from experiments.show.figures.drawing import save_figure
 from experiments.show.figures.verdict_figures import draw_kinds, draw_reliability, draw_roc
 from experiments.show.terminal.refusal_screen import print_kinds, print_reliability
-from experiments.study.refusal.kind_rates import by_kind, pooled, worst
+from experiments.study.refusal.kind_rates import by_kind, of_any_method, pooled, worst
 from experiments.study.refusal.refusal_rates import Rate
 from experiments.study.refusal.refusal_trial import crossings_of
 from experiments.study.refusal.reliability import N_BINS, judged_answers, reliability
@@ -62,6 +62,15 @@ def test_rates_of_a_kind_worked_out_by_hand() -> None:
     assert {name: row[name] for name in expected} == {k: Rate(*v) for k, v in expected.items()}
     assert (row["first_iteration"], row["first_true_pairs"]) == (40, 45)
     assert (row["first_iteration_by_chance"], row["first_true_pairs_by_chance"]) == (30, 27)
+
+
+def test_what_any_method_does_counts_once_for_two_maps() -> None:
+    """Another method refuses all but one pair of maps that the first refused, and merges it."""
+    other = table(aligner="icp").assign(status="refused", accepted=False)
+    other.loc[5, ["status", "accepted"]] = "accepted", True  # of k-2, without common ground
+    (row,) = of_any_method(pd.concat([table(), other]))
+    told = (row["false_runs"], row["false_pairs"], row["right_accepted"], row["right_refused"])
+    assert told == (Rate(1, 2), Rate(2, 5), Rate(2, 6), Rate(3, 6))
 
 
 def test_a_run_that_never_comes_to_it_is_later_than_all_others() -> None:
