@@ -19,7 +19,8 @@ def refusal(
     worlds: Annotated[
         list[str],
         typer.Argument(
-            metavar="WORLD...", help="Results of runs; or scenarios or tags, for each of --seeds."
+            metavar="WORLD...",
+            help="Results of runs; or scenarios or tags, for each of --seeds (or full@0..9).",
         ),
     ],
     *,

@@ -1,5 +1,6 @@
 """Every aligner on maps with and without common ground, each answer held against chance."""
 
+import functools
 import itertools
 from collections.abc import Sequence
 from pathlib import Path
@@ -204,13 +205,14 @@ def common_rows(scenario: Simulation, world: MappedWorld, every: int) -> Rows:
 def apart_rows(scenario: Simulation, crossing: Crossing) -> Rows:
     """APART and REPEATED pairs of two worlds."""
     worlds, matching = (crossing.a, crossing.b), scenario.align.match
-    in_a, in_b = ({robot.name: robot for robot in world.robots()} for world in worlds)
+    of_a, of_b = functools.cache(crossing.a.maps), functools.cache(crossing.b.maps)
     rows: Rows = []
     for robot_a, robot_b, iteration in crossing.meetings:
-        maps = map_at(in_a[robot_a].maps, iteration), map_at(in_b[robot_b].maps, iteration)
+        maps = map_at(of_a(robot_a), iteration), map_at(of_b(robot_b), iteration)
         rows += _answers(scenario, cases.apart(*maps, matching), worlds, iteration)
-    if len(in_a) < 2 or not crossing.hung:  # no partner has seen what robot a saw
+    if len(crossing.a.folders) < 2 or not crossing.hung:  # no partner has seen what robot a saw
         return rows
+    in_a, in_b = ({robot.name: robot for robot in world.robots()} for world in worlds)
     last = min(world.iterations[-1] for world in worlds)
     first, partner, *_ = in_a.values()
     source = cases.common(first, partner, last, matching, scenario.evaluate.true_pair_radius_m)

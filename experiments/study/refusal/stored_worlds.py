@@ -1,7 +1,7 @@
 """The worlds of earlier runs and sweeps: robots with their maps by iteration, and the truth."""
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,10 +11,14 @@ from experiments.judge.judged_run import JudgedRun
 from experiments.judge.judging import load_robot
 from experiments.judge.result import require_result
 from experiments.run.stages.slam import RobotFolders, evaluated_iterations
+from experiments.run.stages.snapshots import Snapshots
 from experiments.run.store import Store
+from experiments.scenario.seeds import parse_seeds
 from experiments.scenario.settings import AnyScenario, Simulation
 from experiments.scenario.suite import scenarios_of
 from mapfusion.errors import InputError
+from mapfusion.landmark_map import LandmarkMap
+from mapfusion.robot_log import read_log
 
 
 @dataclass(frozen=True)
@@ -51,6 +55,11 @@ class MappedWorld:
         """At which its maps were kept."""
         return evaluated_iterations(self.scenario.drive.frames, self.scenario.evaluate.every)
 
+    def maps(self, robot: str) -> Mapping[int, LandmarkMap]:
+        """One robot's maps by iteration, without the truth."""
+        folders = self.folders[robot]
+        return Snapshots(folders.slam, read_log(folders.log))
+
     def robots(self) -> list[EvaluatedRobot]:
         """All robots' maps joined with the truth."""
         return [load_robot(folders) for folders in self.folders.values()]
@@ -59,8 +68,8 @@ class MappedWorld:
 def worlds_of(words: Sequence[str], seeds: Sequence[int], results: Path) -> list[MappedWorld]:
     """The worlds that the words of a command stand for, all different.
 
-    A word is a result folder of `run`; or a scenario file, name or tag, for each of the seeds,
-    whose maps a sweep or a run left in the store of `results`.
+    A word is a result folder of `run`; or a scenario file, name or tag, for each of the seeds (or
+    of its own, as in full@0..9), whose maps a sweep or a run left in the store of `results`.
 
     Raises:
         InputError: a word that is none of these, fewer than two seeds, not simulated, two of one
@@ -88,7 +97,9 @@ def _worlds(word: str, seeds: Sequence[int], results: Path) -> Iterator[MappedWo
         scenario, folder = load_checked(path / "scenario.json"), path.resolve()
         yield _world(str(path), folder.name, scenario, Store.of(folder.parent))
         return
-    for file, seed in itertools.product(scenarios_of([word]), seeds):
+    name, _, own_seeds = word.partition("@")
+    of_word = parse_seeds(own_seeds) if own_seeds else seeds
+    for file, seed in itertools.product(scenarios_of([name]), of_word):
         scenario = load_checked(file, (), seed)
         name = f"{scenario.name}-{seed}"
         yield _world(name, name, scenario, Store.of(results))

@@ -247,8 +247,9 @@ def test_worlds_may_be_scenarios_with_seeds(
     missing = command(capsys, "study", "refusal", *paths, "-o", tmp_path / "out", *common)
     assert missing.complaints[0].startswith("mapfusion: plain-5: the maps of R1 are not in ")
     assert command(capsys, "sweep", *paths, "-o", tmp_path / "s", *common).code == 0
-    asked = (*common, "--pairs", 2)
-    reply = command(capsys, "study", "refusal", *paths, "-o", tmp_path / "out", *asked)
+    asked = (*common[2:], "--pairs", 2)
+    words = (f"{paths[0]}@5,6", paths[1], "--seeds", "5,6")
+    reply = command(capsys, "study", "refusal", *words, "-o", tmp_path / "out", *asked)
     assert reply.code == 0, reply.err
     rows = results.read(tmp_path / "out", "refusals")
     common_ones = rows[rows["ground"] == "common"]
