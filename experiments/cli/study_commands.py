@@ -45,11 +45,11 @@ def refusal(
     from experiments.show.refusal_files import draw_refusals, write_kinds
     from experiments.show.terminal import layout, refusal_screen
     from experiments.study.refusal import kind_rates, refusal_rates, refusal_trial
-    from experiments.study.refusal.refusal_trial import Drawn
+    from experiments.study.refusal.refusal_trial import PairsDrawn
     from experiments.study.refusal.reliability import judged_answers, reliability
     from experiments.study.refusal.stored_worlds import worlds_of
 
-    mapped, drawn = worlds_of(worlds, parse_seeds(seeds), results), Drawn(pairs, every)
+    mapped, drawn = worlds_of(worlds, parse_seeds(seeds), results), PairsDrawn(pairs, every)
     with layout.progress() as show:
         false_alarms = refusal_trial.run(mapped, output, drawn, jobs, show)
     refusals, calibration = (refusal_trial.read(output, name) for name in refusal_trial.TABLES)

@@ -98,15 +98,13 @@ class Refinement:
         else:
             left_out = most_leverage(T_a_b, planar, variance, truth, covariance)
             others = PlanarPairs(*(np.delete(part, left_out, axis=0) for part in planar))
-            solved, _, T_without, *sure, _ = maximise_likelihood(others, T_a_b, *limits)
+            solved, _, T_without, sure, drift_m2, _ = maximise_likelihood(others, T_a_b, *limits)
             may_move_m = limits[0]
             # a known identity that the motion rests on is false only if it is unlike all others
-            if (
-                pairs.by_name
-                and solved
-                and is_unlike_the_others(T_without, *sure, planar, left_out)
-            ):
-                may_move_m = self.gate_m
+            if pairs.by_name and solved:
+                rest = (T_without, sure, drift_m2)
+                if is_unlike_the_others(*rest, planar, left_out):
+                    may_move_m = self.gate_m
             reason = why_one_pair(T_a_b, T_without if solved else None, planar, truth, may_move_m)
         covariance = covariance + calibration_part(T_a_b, pairs[inlier], math.sqrt(variance))
         T_a_b[2] = wrap(T_a_b[2])

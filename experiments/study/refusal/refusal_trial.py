@@ -91,7 +91,7 @@ class Crossing(NamedTuple):
     hung: bool
 
 
-class Drawn(NamedTuple):
+class PairsDrawn(NamedTuple):
     """How many pairs of maps are judged.
 
     Attributes:
@@ -113,7 +113,7 @@ def read(folder: Path, name: str) -> pd.DataFrame:
 def run(
     worlds: Sequence[MappedWorld],
     output: Path,
-    drawn: Drawn,
+    drawn: PairsDrawn,
     jobs: int,
     on_progress: OnProgress,
 ) -> float:

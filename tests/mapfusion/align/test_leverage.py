@@ -39,8 +39,8 @@ def a_corner_and_one_far(
     T_turned = T_TRUE + np.array([0, 0, turned_rad])
     p_a[-1] = se2.transform_points(T_turned, p_b[-1:])[0]
     n = np.arange(26)
-    maps = (planar_map(p, named=named) for p in (p_a, p_b))
-    return *maps, Correspondences(n, n, np.zeros(26)), T_turned
+    map_a, map_b = (planar_map(p, named=named) for p in (p_a, p_b))
+    return map_a, map_b, Correspondences(n, n, np.zeros(26)), T_turned
 
 
 @pytest.mark.parametrize("named", [False, True])
