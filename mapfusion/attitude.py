@@ -23,8 +23,10 @@ from mapfusion.storage import (
     columns,
     float_fields,
     named_columns,
-    read_table,
+    read_parquet,
+    require_kind,
     schema,
+    text_attributes,
     write_table,
 )
 
@@ -32,20 +34,25 @@ FILE = "attitude.parquet"
 _ANGLES = ["roll_rad", "pitch_rad"]
 _FIELDS = [*_ANGLES, "height_m"]
 _SIGMAS = ["sigma_roll_rad", "sigma_pitch_rad", "sigma_height_m"]
+_CARRIED = ["carried_tilt", "carried_height"]
 _ABOUT = [
     "about the heading, the right side down",
     "about the axis to the left, looking down",
     "of the robot's origin above the floor that the map begins on",
 ]
+_OF_FRAMES = [
+    told(pa.field("iteration", pa.int32()), "number of the frame: 0, 1, 2, ..."),
+    *(told(f, text) for f, text in zip(float_fields(_FIELDS), _ABOUT, strict=True)),
+    *(told(f, "standard deviation of the same") for f in float_fields(_SIGMAS)),
+]
+_ABOUT_CARRIED = "share of the error of the row before that is left in this one's, 0 to 1"
 ATTITUDE = schema(
     "robot_log.attitude",
-    1,
-    [
-        told(pa.field("iteration", pa.int32()), "number of the frame: 0, 1, 2, ..."),
-        *(told(f, text) for f, text in zip(float_fields(_FIELDS), _ABOUT, strict=True)),
-        *(told(f, "standard deviation of the same") for f in float_fields(_SIGMAS)),
-    ],
+    2,
+    [*_OF_FRAMES, *(told(f, _ABOUT_CARRIED) for f in float_fields(_CARRIED))],
 )
+# Of the version before: each frame's error for itself.
+_ATTITUDE_1 = schema("robot_log.attitude", 1, _OF_FRAMES)
 
 
 @dataclass(frozen=True)
@@ -56,19 +63,25 @@ class Attitude:
         value: roll about the axis ahead (right side down), pitch about the axis to the left
             (looking down), height of the robot's origin above the floor that the map begins on.
         sigma: standard deviations of their errors.
+        carried: (T, 2) share of the error of the frame before that is left in each frame's, of roll
+            and pitch and of the height: 0 where each frame is measured for itself, 1 where nothing
+            but motions since the frame before tell.
     """
 
     value: Float
     sigma: Float
+    carried: Float
 
     def __post_init__(self) -> None:
-        for name in ("value", "sigma"):
-            require_shape(name, getattr(self, name), (len(self.value), 3))
+        for name, n in (("value", 3), ("sigma", 3), ("carried", 2)):
+            require_shape(name, getattr(self, name), (len(self.value), n))
             require_finite(name, getattr(self, name))
         if np.any(np.abs(self.value[:, :2]) >= np.pi / 2):
             raise ValueError("value: a body that stands on end or on its head is not level")
         if np.any(self.sigma < 0):
             raise ValueError("sigma: is below 0")
+        if np.any((self.carried < 0) | (self.carried > 1)):
+            raise ValueError("carried: is not between 0 and 1")
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -89,7 +102,8 @@ def levelled(observed: Observations, value: Float, sigma: Float) -> Observations
     Args:
         observed: in the body's frame.
         value: (3,) roll, pitch and height, as of `Attitude`.
-        sigma: (3,) of their errors, which the covariances then include (first order).
+        sigma: (3,) of what is new in their errors with this frame, which the covariances then
+            include (first order).
     """
     roll, pitch, height_m = value
     made = moved(observed, tilt(roll, pitch), np.array([0.0, 0.0, height_m]))
@@ -110,6 +124,7 @@ def write_attitude(folder: Path, attitude: Attitude | None) -> None:
         return
     rows = {"iteration": np.arange(len(attitude), dtype=np.int32)}
     values = named_columns(_FIELDS, attitude.value) | named_columns(_SIGMAS, attitude.sigma)
+    values |= named_columns(_CARRIED, attitude.carried)
     write_table(folder / FILE, rows | values, ATTITUDE)
 
 
@@ -118,10 +133,14 @@ def read_attitude(folder: Path) -> Attitude | None:
     path = folder / FILE
     if not path.is_file():
         return None
-    table, _ = read_table(path, ATTITUDE)
+    table = read_parquet(path, "robot_log.attitude table")
+    attributes = text_attributes(path, table)
+    earlier = attributes.get("schema_version") == "1"
+    require_kind(path, table, attributes, _ATTITUDE_1 if earlier else ATTITUDE)
     if not np.array_equal(column(table, "iteration"), np.arange(table.num_rows)):
         raise InputError(f"{path}: iterations must be 0, 1, 2, ..., one row each")
     try:
-        return Attitude(columns(table, _FIELDS), columns(table, _SIGMAS))
+        carried = np.zeros((table.num_rows, 2)) if earlier else columns(table, _CARRIED)
+        return Attitude(columns(table, _FIELDS), columns(table, _SIGMAS), carried)
     except ValueError as error:
         raise InputError(f"{path}: {error}") from error

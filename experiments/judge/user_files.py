@@ -17,6 +17,7 @@ from mapfusion.align.correspondences import match
 from mapfusion.align.pairs import Pairs
 from mapfusion.align.registration import Registration
 from mapfusion.align.result import NOT_RUN, Status
+from mapfusion.attitude import read_attitude
 from mapfusion.errors import InputError
 from mapfusion.fastslam.run import run_log
 from mapfusion.fuse.registry import make_fuser
@@ -59,8 +60,8 @@ def slam(log: Path, settings: Scenario, on_progress: OnProgress) -> LandmarkMap:
         raise InputError(f"{log}: frames.parquet holds no frame")
     n_frames, rng = len(robot_log), generator(settings.seed, "slam", robot_log.robot)
     wanted, least, landmarks = [n_frames - 1], settings.slam.min_count, None
-    told = read_odometry_covariance(log)
-    for frame in run_log(robot_log, settings.slam.filter, rng, wanted, least, told):
+    told = read_odometry_covariance(log), read_attitude(log)
+    for frame in run_log(robot_log, settings.slam.filter, rng, wanted, least, *told):
         on_progress("FastSLAM", frame.iteration + 1, n_frames)
         landmarks = frame.landmarks
     assert landmarks is not None

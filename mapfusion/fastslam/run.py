@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mapfusion.arguments import require_shape
+from mapfusion.attitude import Attitude
+from mapfusion.attitude_drift import shared_heights
 from mapfusion.errors import InputError
 from mapfusion.fastslam.association import Association
 from mapfusion.fastslam.filter import FastSlam, StepResult
@@ -45,6 +47,7 @@ def run_log(
     snapshots: Collection[int] = (),
     min_count: int = 3,
     odometry_covariance: Float | None = None,
+    attitude: Attitude | None = None,
 ) -> Iterator[Frame]:
     """Filter a log frame by frame.
 
@@ -57,6 +60,7 @@ def run_log(
         odometry_covariance: (T, 3, 3) of odometry that was taken from what the log observes, in
             place of the motion noise, of which only the floor is added. How much both share is not
             known, so each counts half (covariance intersection).
+        attitude: by which the log's observations were levelled; None: of a level body.
 
     Yields:
         One `Frame` for each row of the log's frames.
@@ -86,6 +90,8 @@ def run_log(
             )
             seen = slam.best_associations(), slam.best_path(), landmarks.source_observation
             landmarks = replace(landmarks, viewing=viewing_of(log, *seen))
+            if attitude is not None and not log.planar:
+                landmarks = _with_attitude(landmarks, log, *seen[:2], attitude)
         yield Frame(iteration, result, landmarks, slam)
 
 
@@ -95,6 +101,7 @@ def build_map(
     rng: np.random.Generator,
     min_count: int = 3,
     odometry_covariance: Float | None = None,
+    attitude: Attitude | None = None,
 ) -> LandmarkMap:
     """The most probable map at the end of a log; arguments and errors as of `run_log`.
 
@@ -102,10 +109,32 @@ def build_map(
         InputError: the log holds no frame.
     """
     last = len(log) - 1
-    for frame in run_log(log, parameters, rng, [last], min_count, odometry_covariance):
+    told = odometry_covariance, attitude
+    for frame in run_log(log, parameters, rng, [last], min_count, *told):
         if frame.landmarks is not None:
             return frame.landmarks
     raise InputError(f"log {log.robot}: holds no frame")
+
+
+def _with_attitude(
+    landmarks: LandmarkMap,
+    log: RobotLog,
+    source: np.ndarray,
+    path: Float,
+    attitude: Attitude,
+) -> LandmarkMap:
+    """With what is not known of the attitude in the variances of the landmarks' heights.
+
+    `source` (n,) is what each observation so far went into.
+    """
+    rows = np.flatnonzero(np.isin(source, landmarks.source_observation))
+    order = np.argsort(landmarks.source_observation, kind="stable")
+    place = np.searchsorted(landmarks.source_observation[order], source[rows])
+    frame = log.iteration[rows].astype(np.int64)
+    lifted = shared_heights(attitude, path, frame, order[place], landmarks.position_m)
+    covariance = landmarks.covariance_m2.copy()
+    covariance[:, 2, 2] += np.sum(lifted**2, axis=0)
+    return replace(landmarks, covariance_m2=covariance)
 
 
 def _require_looks(log: RobotLog, association: Association) -> None:

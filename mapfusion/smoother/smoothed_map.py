@@ -1,7 +1,11 @@
 """The smoother's landmarks as a map that carries its joint covariance."""
 
+from dataclasses import replace
+
 import numpy as np
 
+from mapfusion.attitude import Attitude
+from mapfusion.attitude_drift import shared_heights
 from mapfusion.joint_covariance import RANK, JointCovariance, condensed
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import RobotLog
@@ -11,7 +15,11 @@ from mapfusion.viewing import viewing_of
 
 
 def smoothed_map(
-    log: RobotLog, landmark: np.ndarray, smoothed: Smoothed, rank: int = RANK
+    log: RobotLog,
+    landmark: np.ndarray,
+    smoothed: Smoothed,
+    rank: int = RANK,
+    attitude: Attitude | None = None,
 ) -> LandmarkMap:
     """The landmarks in the frame of the first pose.
 
@@ -21,8 +29,12 @@ def smoothed_map(
             these are rows of the log they tell what the landmarks came from.
         smoothed: what came out.
         rank: shared variables that are kept.
+        attitude: by which the observations were levelled; None: of a level body.
     """
-    seen, (point, joint) = smoothed.seen, condensed_points(smoothed, rank)
+    seen = smoothed.seen
+    if attitude is not None and seen.n_dimensions > 2:
+        smoothed = _with_attitude(smoothed, attitude)
+    point, joint = condensed_points(smoothed, rank)
     source = landmark[seen.row[seen.starts[:-1]]].astype(np.int64)
     look = log.observations[source]
     count = np.diff(seen.starts).astype(np.int32)
@@ -39,3 +51,12 @@ def condensed_points(smoothed: Smoothed, rank: int = RANK) -> tuple[Float, Joint
         point[:, 2] = 0.0
         joint.own_m2[:, 2, :] = joint.own_m2[:, :, 2] = joint.common_m[:, :, 2] = 0.0
     return point, joint
+
+
+def _with_attitude(smoothed: Smoothed, attitude: Attitude) -> Smoothed:
+    """With what is not known of the attitude among the landmarks' shared errors."""
+    seen, estimate = smoothed.seen, smoothed.estimate
+    lifted = shared_heights(attitude, estimate.path, seen.frame, seen.landmark, estimate.point_m)
+    moved = np.zeros((*lifted.shape, 3))
+    moved[..., 2] = lifted
+    return replace(smoothed, common=np.vstack([smoothed.common, moved.reshape(len(moved), -1)]))

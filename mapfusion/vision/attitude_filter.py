@@ -39,10 +39,14 @@ class AttitudeFilter:
     Attributes:
         value: (3,) as known now.
         covariance: (3, 3) of its error.
+        fresh: (3, 3) of what came to its error with this frame.
+        carried: (3,) share of the error of the frame before that is left in it.
     """
 
     value: Float = field(default_factory=lambda: np.zeros(3))
     covariance: Float = field(default_factory=lambda: np.diag(_UNKNOWN**2))
+    fresh: Float = field(default_factory=lambda: np.diag(_UNKNOWN**2))
+    carried: Float = field(default_factory=lambda: np.zeros(3))
 
     @property
     def sigma(self) -> Float:
@@ -54,6 +58,8 @@ class AttitudeFilter:
         if motion is None:
             height = self.covariance[2, 2] + _LOST_M**2
             self.covariance = np.diag([*(_UNKNOWN[:2] ** 2), height])
+            self.fresh = np.diag([*(_UNKNOWN[:2] ** 2), _LOST_M**2])
+            self.carried = np.array([0.0, 0.0, 1.0])
             return
         before = tilt(self.value[0], self.value[1])
         T = motion.T_before_after
@@ -72,6 +78,7 @@ class AttitudeFilter:
         self.value = np.array([*roll_pitch(after), self.value[2] + step[2]])
         told = own @ motion.covariance @ own.T
         self.covariance = jacobian @ self.covariance @ jacobian.T + told
+        self.fresh, self.carried = told, np.ones(3)
 
     def measure(self, measured: Measured) -> None:
         """Take in what was measured in this frame."""
@@ -84,3 +91,5 @@ class AttitudeFilter:
         # Joseph's form: stays symmetric and positive
         noise = gain @ np.diag(measured.sigma[rows] ** 2) @ gain.T
         self.covariance = rest @ self.covariance @ rest.T + noise
+        self.fresh = rest @ self.fresh @ rest.T + noise
+        self.carried = np.clip(self.carried * np.diag(rest), 0.0, 1.0)

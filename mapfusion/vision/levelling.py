@@ -27,11 +27,13 @@ class Levelling:
         self._filter = AttitudeFilter()
         self._values: list[Float] = []
         self._sigmas: list[Float] = []
+        self._carried: list[Float] = []
 
     @property
     def attitude(self) -> Attitude:
         """Of the frames so far."""
-        return Attitude(np.array(self._values), np.array(self._sigmas))
+        carried = np.array(self._carried)
+        return Attitude(np.array(self._values), np.array(self._sigmas), carried)
 
     def expected_turn(self, measured: Measured) -> Float | None:
         """R_after_before (3, 3) in the camera's frame, by what is measured of the next frame.
@@ -62,9 +64,11 @@ class Levelling:
         self._filter.measure(measured)
         self._values.append(self._filter.value)
         self._sigmas.append(self._filter.sigma)
+        roll, pitch, height = self._filter.carried
+        self._carried.append(np.array([(roll + pitch) / 2, height]))
 
     def applied(self, observed: Observations) -> Observations:
         """Observations of the last frame, as the camera's frame has them, in the level frame."""
         T = self._T_robot_seen
         own = observed if T is None else moved(observed, T[:3, :3], T[:3, 3])
-        return levelled(own, self._values[-1], self._sigmas[-1])
+        return levelled(own, self._values[-1], np.sqrt(np.diag(self._filter.fresh)))

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -79,19 +80,34 @@ def test_moved_there_and_back_they_are_the_same() -> None:
 def test_what_is_written_is_read(tmp_path: Path) -> None:
     assert read_attitude(tmp_path) is None
     rng = np.random.default_rng(4)
-    attitude = Attitude(rng.uniform(-0.1, 0.1, (5, 3)), rng.uniform(0, 0.1, (5, 3)))
+    value, sigma, carried = rng.uniform(0, 0.1, (3, 5, 3))
+    attitude = Attitude(value, sigma, carried[:, :2])
     write_attitude(tmp_path, attitude)
     found = read_attitude(tmp_path)
     assert found is not None
     assert len(found) == 5
     np.testing.assert_array_equal(found.value, attitude.value)
     np.testing.assert_array_equal(found.sigma, attitude.sigma)
+    np.testing.assert_array_equal(found.carried, attitude.carried)
     write_attitude(tmp_path, None)
     assert not (tmp_path / FILE).exists()
 
 
+def test_of_the_version_before_each_frame_errs_for_itself(tmp_path: Path) -> None:
+    write_attitude(tmp_path, Attitude(*np.full((2, 3, 3), 0.1), np.ones((3, 2))))
+    path = tmp_path / FILE
+    table = pq.read_table(path)
+    metadata = {**table.schema.metadata, b"mapfusion.schema_version": b"1"}
+    table = table.drop_columns(["carried_tilt", "carried_height"])
+    pq.write_table(table.replace_schema_metadata(metadata), path)
+    found = read_attitude(tmp_path)
+    assert found is not None
+    np.testing.assert_array_equal(found.value, np.full((3, 3), 0.1))
+    assert not found.carried.any()
+
+
 def test_a_damaged_file_is_one_line(tmp_path: Path) -> None:
-    write_attitude(tmp_path, Attitude(np.zeros((3, 3)), np.zeros((3, 3))))
+    write_attitude(tmp_path, Attitude(np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 2))))
     path = tmp_path / FILE
     path.write_bytes(path.read_bytes()[:-9])
     with pytest.raises(InputError, match=FILE):
@@ -109,4 +125,10 @@ def test_a_damaged_file_is_one_line(tmp_path: Path) -> None:
 )
 def test_what_no_body_has_is_refused(value: list, sigma: list, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        Attitude(np.array(value, dtype=float), np.array(sigma, dtype=float))
+        Attitude(np.array(value, dtype=float), np.array(sigma, dtype=float), np.zeros((1, 2)))
+
+
+@pytest.mark.parametrize("carried", [-0.1, 1.1])
+def test_no_more_is_carried_than_there_is(carried: float) -> None:
+    with pytest.raises(ValueError, match="carried: is not between"):
+        Attitude(np.zeros((1, 3)), np.zeros((1, 3)), np.array([[carried, 1.0]]))

@@ -11,6 +11,7 @@ import pyarrow as pa
 from experiments.run.frames import BOOL, FLOAT, INT, fields, read_rows, write_rows
 from experiments.run.job import Job
 from experiments.scenario.randomness import generator
+from mapfusion.attitude import read_attitude
 from mapfusion.fastslam.filter import StepResult
 from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.fastslam.run import run_log
@@ -76,8 +77,8 @@ def run(settings: SlamSettings, job: Job) -> None:
     counted = np.empty(0, dtype=np.int64)
     iterations = evaluated_iterations(len(log), settings.every)
     rng = generator(settings.seed, "slam", log.robot)
-    told = read_odometry_covariance(job.inputs["log"])
-    for frame in run_log(log, settings.filter, rng, iterations, settings.min_count, told):
+    told = read_odometry_covariance(job.inputs["log"]), read_attitude(job.inputs["log"])
+    for frame in run_log(log, settings.filter, rng, iterations, settings.min_count, *told):
         k, result = frame.iteration, frame.result
         steps.append(_step(result))
         if k % settings.clouds_every == 0 or k == last:

@@ -14,6 +14,7 @@ from experiments.run.frames import INT, fields
 from experiments.run.job import Job
 from experiments.run.stages.slam import evaluated_iterations, final_path
 from experiments.run.stages.snapshots import Associations
+from mapfusion.attitude import Attitude, read_attitude
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map
 from mapfusion.log_part import first_frames
 from mapfusion.odometry_covariance import read_odometry_covariance
@@ -85,7 +86,7 @@ def run(settings: SmoothSettings, job: Job) -> None:
     """Smooth the log up to one iteration; write the map with its joint covariance, and the path."""
     given = filtered_until(job, read_log(job.inputs["log"]), int(job.part), settings.noise_floor_m)
     own = replace(settings, smoother=smoother_of(settings.smoother, job.inputs["log"]))
-    landmarks, path, ended = smoothed_anew(own, *given)
+    landmarks, path, ended = smoothed_anew(own, *given, read_attitude(job.inputs["log"]))
     write_map(_map_path(job.output, job.part), landmarks)
     rows = {"iteration": np.arange(len(path))} | named_columns(POSE_FIELDS, path)
     attributes = {name: str(value) for name, value in zip(_ENDED, ended, strict=True)}
@@ -114,14 +115,19 @@ def filtered_until(
 
 
 def smoothed_anew(
-    settings: SmoothSettings, log: RobotLog, landmark: np.ndarray, path: Float
+    settings: SmoothSettings,
+    log: RobotLog,
+    landmark: np.ndarray,
+    path: Float,
+    attitude: Attitude | None,
 ) -> tuple[LandmarkMap, Float, tuple[object, ...]]:
     """Map, path and how smoothing ended, as `_ENDED` names it."""
     found = _smoothed(log, landmark, path, settings)
     if isinstance(found, str):
         return _no_map(log), np.empty((0, 3)), (0, np.nan, np.nan, found)
     ended = (found.n_steps, *found.tails, "")
-    return smoothed_map(log, landmark, found), found.estimate.path, ended
+    made = smoothed_map(log, landmark, found, attitude=attitude)
+    return made, found.estimate.path, ended
 
 
 def _smoothed(

@@ -28,6 +28,7 @@ from experiments.study.independence.measured_work import (
     cost_row,
 )
 from experiments.study.independence.strategies import FILTER_MAP, LOG, SMOOTHED_MAP
+from mapfusion.attitude import Attitude, read_attitude
 from mapfusion.fastslam.run import run_log
 from mapfusion.landmark_map import LandmarkMap, write_map
 from mapfusion.odometry_covariance import read_odometry_covariance
@@ -60,7 +61,8 @@ def run(settings: RobotCostSettings, job: Job) -> None:
     """Write costs, bytes to send and, at each iteration, the filter's path."""
     single_threaded()
     log, iterations = read_log(job.inputs["log"]), settings.smooth.iterations
-    told = read_odometry_covariance(job.inputs["log"])
+    folder = job.inputs["log"]
+    told = read_odometry_covariance(folder), read_attitude(folder)
     _filter(settings.slam, log, told, iterations[:1])  # compiles, and fills caches
     _smooth_at(settings.smooth, job, log, iterations[0])
     filtered = _filter(settings.slam, log, told, iterations)
@@ -84,11 +86,14 @@ class _Filtered(NamedTuple):
 
 
 def _filter(
-    settings: SlamSettings, log: RobotLog, told: Float | None, iterations: Sequence[int]
+    settings: SlamSettings,
+    log: RobotLog,
+    told: tuple[Float | None, Attitude | None],
+    iterations: Sequence[int],
 ) -> list[_Filtered]:
     """The filter over the log, as the stage `slam` runs it, up to the last of the iterations."""
     rng, found, meter = generator(settings.seed, "slam", log.robot), [], Meter()
-    for frame in run_log(log, settings.filter, rng, iterations, settings.min_count, told):
+    for frame in run_log(log, settings.filter, rng, iterations, settings.min_count, *told):
         if frame.landmarks is not None:
             cost = meter.read()
             path = frame.slam.best_path()
@@ -102,7 +107,7 @@ def _smooth_at(settings: SmoothSettings, job: Job, log: RobotLog, iteration: int
     """What smoothing the log up to an iteration takes, with the condensing of its covariance."""
     given = smooth.filtered_until(job, log, iteration, settings.noise_floor_m)
     meter = Meter()
-    smooth.smoothed_anew(settings, *given)
+    smooth.smoothed_anew(settings, *given, read_attitude(job.inputs["log"]))
     return meter.read()
 
 

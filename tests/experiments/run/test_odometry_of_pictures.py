@@ -74,7 +74,9 @@ def mapped_by_pictures(path: Path, log: Path, scenario: Simulation) -> Mapped:
     *_, last = run_log(one.log, parameters, np.random.default_rng(0), odometry_covariance=told)
     landmark, path_m = last.slam.best_associations(), last.slam.best_path()
     own = SmootherParameters(odometry_covariance=told)
-    found = smoothed_map(one.log, landmark, smooth(one.log, landmark, path_m, own))
+    found = smoothed_map(
+        one.log, landmark, smooth(one.log, landmark, path_m, own), attitude=one.attitude
+    )
     points = np.array(
         [np.median(truth.point_world_m[landmark == s], axis=0) for s in found.source_observation]
     )
@@ -82,9 +84,9 @@ def mapped_by_pictures(path: Path, log: Path, scenario: Simulation) -> Mapped:
 
 
 def assert_as_sure_as_stated(consistency: Consistency) -> None:
-    """The band of long runs (0.5 to 2, 85 to 99 %) for some fifty landmarks of one short one."""
-    assert 0.4 < consistency.nees_per_dof < 2.0
-    assert 0.8 < consistency.coverage_95 <= 1.0
+    """The band of long runs; of some fifty landmarks all may be covered."""
+    assert 0.5 < consistency.nees_per_dof < 2.0
+    assert 0.85 < consistency.coverage_95 <= 1.0
 
 
 def test_smoothed_maps_are_as_sure_as_they_say(mapped: list[Mapped]) -> None:

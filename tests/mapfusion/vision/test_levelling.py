@@ -71,7 +71,7 @@ def test_what_a_tilt_moves_is_expected_there() -> None:
 
 def test_errors_are_as_large_as_stated_and_smaller_than_measured() -> None:
     rng = np.random.default_rng(1)
-    errors, sigmas = [], []
+    errors, sigmas, carried = [], [], []
     for _ in range(60):
         bodies = swaying_bodies(rng, 25)
         true = np.c_[se3.roll_pitch(bodies[:, :3, :3]), np.zeros(25)]
@@ -84,9 +84,17 @@ def test_errors_are_as_large_as_stated_and_smaller_than_measured() -> None:
             levelling.add(motion, Measured(told, INCLINOMETER))
         errors.append(levelling.attitude.value - true)
         sigmas.append(levelling.attitude.sigma)
+        carried.append(levelling.attitude.carried)
     last, sigma = np.array(errors)[:, -1], np.array(sigmas)[:, -1]
     assert np.mean((last / sigma) ** 2, axis=0) == pytest.approx([1, 1, 1], abs=0.45)
     assert np.all(sigma[:, :2] < 0.35 * INCLINOMETER[:2])
+    # what is left of an error one frame later, by regression
+    before, after = np.array(errors)[:, 9:-1], np.array(errors)[:, 10:]
+    left = np.sum(before * after, axis=(0, 1)) / np.sum(before**2, axis=(0, 1))
+    told = np.mean(np.array(carried)[:, 10:], axis=(0, 1))
+    assert left[:2].mean() == pytest.approx(told[0], abs=0.05)
+    assert told[0] < 0.97
+    assert told[1] == 1.0
 
 
 def test_without_links_what_is_measured_counts_alone() -> None:
