@@ -57,7 +57,7 @@ Format = Annotated[
         "--format",
         metavar="FORMAT",
         help="tum, kitti (paths), g2o (graph), ply (maps), rerun of results; "
-        "log, euroc, kitti, rosbag of runs.",
+        "log, euroc, kitti, rosbag, rosbag2 of runs.",
     ),
 ]
 Seed = Annotated[int | None, typer.Option(help="Replaces the scenario's seed (0).", min=0)]

@@ -90,6 +90,7 @@ EXPORTERS = {
     "euroc": "mapfusion.recordings.euroc_writer:write_euroc",
     "kitti": "mapfusion.recordings.kitti_writer:write_kitti",
     "rosbag": "mapfusion.recordings.rosbag_writer:write_rosbag",
+    "rosbag2": "mapfusion.recordings.rosbag_writer:write_rosbag2",
 }
 
 

@@ -1,20 +1,23 @@
-"""A drive as a bag of ROS 1 (`rosbags-convert` makes one of ROS 2 of it).
+"""A drive as a bag of ROS 1, or of ROS 2.
 
 Topics: `/left/image_rect`, `/right/image_rect` (Image, mono8), `/left/camera_info`,
 `/right/camera_info`, `/odom` (Odometry in the frame `odom`), `/truth` (PoseStamped in the frame
 `world`), `/tf_static` (the cameras on `base_link`).
 """
 
+import shutil
+import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mapfusion import se3
+from mapfusion.errors import InputError
 from mapfusion.recordings.stereo_drive import OnFrame, StereoDrive
 from mapfusion.recordings.text_tables import NS
 from mapfusion.se2 import Float
-from mapfusion.storage import write_whole
+from mapfusion.storage import PART, temporary_prefix, write_whole
 
 _SIDES = ("left", "right")
 _BASE = "base_link"
@@ -26,6 +29,9 @@ _TYPES = {
     "truth": "geometry_msgs/msg/PoseStamped",
     "tf_static": "tf2_msgs/msg/TFMessage",
 }
+_METADATA = "metadata.yaml"  # what makes a folder a bag of ROS 2
+_BAG_VERSION = 8  # of its layout, which ROS 2 Humble and later read
+_QUEUE = 10  # messages that a subscriber may be late by, ROS 2's default
 _FIRST_NS = NS  # added to times: a time of 0 is none in ROS
 
 
@@ -38,21 +44,92 @@ def write_rosbag(folder: Path, drive: StereoDrive, on_frame: OnFrame) -> list[Pa
 
         temporary.unlink()  # the writer wants to make it
         with Writer(temporary) as bag:
-            _Messages(drive).put_all(bag, on_frame)
+            _Messages(drive, _Ros1()).put_all(bag, on_frame)
 
     write_whole(path, fill)
     return [path]
 
 
+def write_rosbag2(folder: Path, drive: StereoDrive, on_frame: OnFrame) -> list[Path]:
+    """Write a drive to the folder `folder/ROBOT.ros2`; returns that.
+
+    Raises:
+        InputError: there is such a folder, and it is no bag.
+    """
+    from rosbags.rosbag2 import Writer
+
+    path = folder / f"{drive.robot}.ros2"
+    if path.exists() and not (path / _METADATA).is_file():
+        raise InputError(f"{path}: is there, and no bag of ROS 2; it is left as it is")
+    folder.mkdir(parents=True, exist_ok=True)
+    # files within a bag are named by its folder, so that stands in a temporary one until it is full
+    around = Path(tempfile.mkdtemp(PART, temporary_prefix(path.name), folder))
+    try:
+        with Writer(around / path.name, version=_BAG_VERSION) as bag:
+            _Messages(drive, _Ros2()).put_all(bag, on_frame)
+        shutil.rmtree(path, ignore_errors=True)
+        (around / path.name).replace(path)
+    finally:
+        shutil.rmtree(around, ignore_errors=True)
+    return [path]
+
+
+class _Ros1:
+    """How ROS 1 has messages."""
+
+    header_begins = (0,)  # number of the message, which none needs
+
+    def __init__(self) -> None:
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        self.store = get_typestore(Stores.ROS1_NOETIC)
+        self.store.register(get_types_from_msg(_TRANSFORMS, _TYPES["tf_static"]))
+        self.serialized = self.store.serialize_ros1
+
+    def connection(self, bag: Any, topic: str, kind: str, keeps: bool) -> Any:
+        """A topic in an open bag; one that keeps its message hands it to whoever comes later."""
+        latching = 1 if keeps else None
+        return bag.add_connection(topic, kind, typestore=self.store, latching=latching)
+
+
+class _Ros2:
+    """How ROS 2 has messages."""
+
+    header_begins = ()
+
+    def __init__(self) -> None:
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        self.store = get_typestore(Stores.ROS2_HUMBLE)
+        if _TYPES["tf_static"] not in self.store.types:
+            self.store.register(get_types_from_msg(_TRANSFORMS, _TYPES["tf_static"]))
+        self.serialized = self.store.serialize_cdr
+
+    def connection(self, bag: Any, topic: str, kind: str, keeps: bool) -> Any:
+        """As of ROS 1."""
+        from rosbags.interfaces import (
+            Qos,
+            QosDurability,
+            QosHistory,
+            QosLiveliness,
+            QosReliability,
+            QosTime,
+        )
+
+        whenever = QosTime(0, 0)
+        durability = QosDurability.TRANSIENT_LOCAL if keeps else QosDurability.VOLATILE
+        own = Qos(
+            QosHistory.KEEP_LAST, _QUEUE, QosReliability.RELIABLE, durability, whenever, whenever,
+            QosLiveliness.SYSTEM_DEFAULT, whenever, False,
+        )  # fmt: skip
+        return bag.add_connection(topic, kind, typestore=self.store, offered_qos_profiles=[own])
+
+
 class _Messages:
     """The messages of a drive."""
 
-    def __init__(self, drive: StereoDrive) -> None:
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-        self._drive = drive
-        self._store = get_typestore(Stores.ROS1_NOETIC)
-        self._store.register(get_types_from_msg(_TRANSFORMS, _TYPES["tf_static"]))
+    def __init__(self, drive: StereoDrive, ros: _Ros1 | _Ros2) -> None:
+        self._drive, self._ros, self._store = drive, ros, ros.store
 
     def put_all(self, bag: Any, on_frame: OnFrame) -> None:
         """Write all into an open bag, in the order of time."""
@@ -62,13 +139,10 @@ class _Messages:
         connections = {}
         for topic in topics:
             kind = _TYPES[topic.rsplit("/", 1)[-1]]
-            latching = 1 if topic == "/tf_static" else None
-            connections[topic] = bag.add_connection(
-                topic, kind, typestore=self._store, latching=latching
-            )
+            connections[topic] = self._ros.connection(bag, topic, kind, topic == "/tf_static")
 
         def put(topic: str, time_ns: int, message: Any) -> None:
-            data = self._store.serialize_ros1(message, connections[topic].msgtype)
+            data = self._ros.serialized(message, connections[topic].msgtype)
             bag.write(connections[topic], time_ns, data)
 
         times = (drive.time_ns + _FIRST_NS).tolist()
@@ -89,7 +163,7 @@ class _Messages:
 
     def _header(self, time_ns: int, frame: str) -> Any:
         stamp = self._new("builtin_interfaces/Time", *divmod(time_ns, NS))
-        return self._new("std_msgs/Header", 0, stamp, frame)
+        return self._new("std_msgs/Header", *self._ros.header_begins, stamp, frame)
 
     def _image(self, time_ns: int, side: str, image: np.ndarray) -> Any:
         height, width = image.shape

@@ -14,6 +14,7 @@ OWN = {
     "kitti": ("R1", ("--param", "mount.x_m=0.15", "--param", "mount.z_m=0.45")),
     "euroc": ("R1", ()),
     "rosbag": ("R1.bag", BAG),
+    "rosbag2": ("R1.ros2", BAG),
 }
 
 
@@ -42,7 +43,9 @@ def test_a_round_trip_changes_nothing(
     own = read_log(record(capsys, scenario, "log") / "R1")
     written, given = OWN[name]
     path, logs = record(capsys, scenario, name) / written, tmp_path / "logs"
-    reply = command(capsys, "import", name, path, "-o", logs, "--scenario", scenario, *given)
+    reply = command(
+        capsys, "import", name.removesuffix("2"), path, "-o", logs, "--scenario", scenario, *given
+    )
     assert reply.code == 0, reply.err
     found = read_log(logs / "R1")
     np.testing.assert_allclose(found.time_s, own.time_s, atol=1e-6)

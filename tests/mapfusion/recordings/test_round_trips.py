@@ -9,10 +9,12 @@ import pytest
 
 from mapfusion import se2, se3
 from mapfusion.camera import StereoCamera
+from mapfusion.errors import InputError
 from mapfusion.recordings.mount import MountSettings
 from mapfusion.recordings.registry import EXPORTERS, export_drive, read_recording, settings_class
 from mapfusion.recordings.stereo_drive import StereoDrive
 from mapfusion.recordings.stereo_import import Cut, Imported, StereoImport
+from mapfusion.recordings.stereo_recording import StereoRecording
 from mapfusion.vision.frontend import FrontEnd, FrontEndParameters
 from mapfusion.vision.observing import Observer, joined
 from tests.mapfusion.recordings.written_layouts import drive, read_yaml
@@ -31,6 +33,12 @@ OWN: dict[str, dict[str, Any]] = {
         "truth": "/truth",
     },
 }
+OWN["rosbag2"] = OWN["rosbag"]
+
+
+def read_again(name: str, path: Path) -> StereoRecording:
+    importer = name.removesuffix("2")  # bags of both kinds have one
+    return read_recording(importer, path, settings_class(importer)(**OWN[name]), read_yaml)
 
 
 @pytest.fixture(scope="module")
@@ -51,8 +59,8 @@ def imported(
 ) -> tuple[str, Any, Imported, StereoImport]:
     name, folder = request.param, tmp_path_factory.mktemp(request.param)
     (path,) = export_drive(name, folder, written)
-    settings = settings_class(name)(**OWN[name])
-    recording = read_recording(name, path, settings, read_yaml)
+    recording = read_again(name, path)
+    assert recording.name == "R1"
     work = StereoImport(recording, every_frame)
     return name, recording, work.log_of(Cut("R1", slice(None))), work
 
@@ -102,13 +110,26 @@ def test_observations_are_those_of_the_pictures_themselves(
         np.testing.assert_array_equal(getattr(log.observations, field), getattr(wanted, field))
 
 
-def test_half_a_bag_is_never_there(written: StereoDrive, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["rosbag", "rosbag2"])
+def test_half_a_bag_is_never_there(written: StereoDrive, name: str, tmp_path: Path) -> None:
     def lost(_: int) -> Any:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        export_drive("rosbag", tmp_path, replace(written, pair=lost))
+        export_drive(name, tmp_path, replace(written, pair=lost))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_bag_of_ros_2_takes_the_place_of_a_bag_alone(
+    written: StereoDrive, tmp_path: Path
+) -> None:
+    for _ in range(2):
+        (path,) = export_drive("rosbag2", tmp_path, written)
+    assert sorted(each.name for each in path.iterdir()) == ["R1.ros2.db3", "metadata.yaml"]
+    (path / "metadata.yaml").rename(path / "notes.txt")
+    with pytest.raises(InputError, match=r"R1\.ros2: is there, and no bag"):
+        export_drive("rosbag2", tmp_path, written)
+    assert (path / "notes.txt").is_file()
 
 
 @pytest.mark.parametrize("name", list(OWN))
@@ -119,7 +140,7 @@ def test_a_body_that_tilts_is_written_and_read(
     tilt_rad = np.array([[0.05, -0.02], [0.01, 0.06], [-0.04, 0.03]])
     tilted = replace(written, tilt_rad=tilt_rad, told_tilt_rad=tilt_rad + 0.004)
     (path,) = export_drive(name, tmp_path, tilted)
-    recording = read_recording(name, path, settings_class(name)(**OWN[name]), read_yaml)
+    recording = read_again(name, path)
     assert recording.truth is not None
     assert recording.odometry is not None
     true, told = recording.truth.T, recording.odometry.T
