@@ -7,6 +7,8 @@ Burri et al. (2016), "The EuRoC micro aerial vehicle datasets". A folder `mav0`,
   camera into the body's frame.
 - `state_groundtruth_estimate0/data.csv`: time in ns, position, quaternion (real part first) of the
   body and more that is not read; optional.
+- `imu0`: `data.csv` (time in ns, angular velocity, which is not read, acceleration in m/s²) and
+  `sensor.yaml` with T_BS; optional.
 - `odometry.tum`: dead reckoning of the robot's axes, which EuRoC has not; ours, optional.
 """
 
@@ -20,6 +22,7 @@ import numpy as np
 from mapfusion import se3
 from mapfusion.errors import InputError
 from mapfusion.recordings.calibration_text import lens_of, motion_of
+from mapfusion.recordings.inertial import Inertial
 from mapfusion.recordings.lens import StereoCalibration
 from mapfusion.recordings.mount import MountSettings, robot_in_body
 from mapfusion.recordings.pictures import PictureFile
@@ -35,6 +38,7 @@ from mapfusion.recordings.tum import ODOMETRY_FILE, read_tum
 from mapfusion.se2 import Float
 
 STATES = "state_groundtruth_estimate0"
+_FELT_COLUMNS = 7  # time, angular velocity, acceleration
 _POSE_COLUMNS = 8  # time, position, quaternion; speeds and biases follow
 
 
@@ -74,7 +78,8 @@ def read_euroc(folder: Path, settings: EurocSettings, read_yaml: ReadYaml) -> St
         raise InputError(f"{root}: {error}") from error
     T_body_robot, T_robot_left = robot_in_body(mounts[0])
     odometry = root / ODOMETRY_FILE
-    states = root / STATES / "data.csv"
+    states, imu = root / STATES / "data.csv", root / "imu0"
+    felt = _felt(imu, T_body_robot, read_yaml) if (imu / "data.csv").exists() else None
     return StereoRecording(
         (root.resolve().parent if root.name == "mav0" else root.resolve()).name,
         time_ns,
@@ -84,6 +89,7 @@ def read_euroc(folder: Path, settings: EurocSettings, read_yaml: ReadYaml) -> St
         _states(states).moved(T_body_robot) if states.exists() else None,
         read_tum(odometry) if odometry.exists() else None,
         (*lost_left, *lost_right, *dropped),
+        felt,
     )
 
 
@@ -108,6 +114,24 @@ def _shots(camera: Path) -> tuple[list[Shot], list[str]]:
             missing.append(f"{name} (no such file)")
     require_increasing(path, lines, np.array([shot.time_ns for shot in shots], dtype=np.int64))
     return shots, missing
+
+
+def _felt(imu: Path, T_body_robot: Float, read_yaml: ReadYaml) -> Inertial:
+    """Accelerations in the robot's axes."""
+    sensor, path = imu / "sensor.yaml", imu / "data.csv"
+    T_body_imu = motion_of(str(sensor), "T_BS", read_yaml(sensor).get("T_BS"))
+    lines, times, rows = list[int](), list[int](), list[list[float]]()
+    for line, words in rows_of(path, "accelerations", ","):
+        lines.append(line)
+        times.append(time_in_ns(path, line, words[0], 1))
+        rows.append(numbers(path, line, words[1:], _FELT_COLUMNS - 1))
+    time_ns = np.array(times, dtype=np.int64)
+    require_increasing(path, lines, time_ns)
+    own = np.array(rows, dtype=np.float64).reshape(-1, _FELT_COLUMNS - 1)[:, 3:]
+    try:
+        return Inertial(time_ns, own @ se3.between(T_body_robot, T_body_imu)[:3, :3].T)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
 
 
 def _states(path: Path) -> TimedPoses:

@@ -34,7 +34,7 @@ class LevelFrames:
         self._levels, self._sigma_uv_px = levels, vision.sigma_uv_px
         camera = levels.camera
         taken = se3.pose(camera.camera_axes, camera.p_robot_left)
-        self._levelling = Levelling(levels.T_robot_left @ se3.inverse(taken))
+        self._levelling = Levelling(levels.T_robot_left @ se3.inverse(taken), levels.shared_rad)
         self._observer = Observer.of(camera, vision)
         self._before = 0
 

@@ -7,7 +7,7 @@ where they connect its frame to the robot's; measured gravity takes the place of
 pitch.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy as np
 from mapfusion import se3
 from mapfusion.errors import InputError
 from mapfusion.recordings.bag import Bag, stamp_ns
+from mapfusion.recordings.inertial import Inertial
 from mapfusion.recordings.lens import R_ROBOT_OPTICAL, StereoCalibration
 from mapfusion.recordings.mount import MountSettings, level_mount, upright
 from mapfusion.recordings.ros_messages import calibration, chained, picture, pose
@@ -26,7 +27,6 @@ from mapfusion.se2 import Float
 _PICTURES = ("Image", "CompressedImage")
 _POSES = ("Odometry", "PoseStamped", "PoseWithCovarianceStamped", "TransformStamped")
 _HEIGHT_M = 0.5  # of a camera whose mount nobody tells; it moves all heights alike
-_LEAST_GRAVITY = 5.0  # m/s²: of a mean acceleration that is to say where up is
 
 
 @dataclass(frozen=True)
@@ -99,12 +99,13 @@ def read_rosbag(path: Path, settings: RosbagSettings, _: ReadYaml) -> StereoReco
         time_ns, pictures, dropped = paired(left, right)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    T_robot_left = settings.mount.applied(_mount(bag, settings, pair))
+    T_robot_left, felt = _mount(bag, settings, pair)
+    T_robot_left = settings.mount.applied(T_robot_left)
     odometry, truth = (
         _poses(bag, topic) if topic else None for topic in (settings.odom, settings.truth)
     )
     return StereoRecording(
-        path.resolve().stem, time_ns, pictures, pair, T_robot_left, truth, odometry, dropped
+        path.resolve().stem, time_ns, pictures, pair, T_robot_left, truth, odometry, dropped, felt
     )
 
 
@@ -153,8 +154,10 @@ def _poses(bag: Bag, topic: str) -> TimedPoses:
         raise InputError(f"{bag.path}: {topic}: {error}") from error
 
 
-def _mount(bag: Bag, settings: RosbagSettings, pair: StereoCalibration) -> Float:
-    """T_robot_left (4, 4), x ahead, y left, z up."""
+def _mount(
+    bag: Bag, settings: RosbagSettings, pair: StereoCalibration
+) -> tuple[Float, Inertial | None]:
+    """T_robot_left (4, 4), x ahead, y left, z up, and what `imu` felt in the robot's axes."""
     transforms: list[Any] = []
     if "/tf_static" in bag.topics:
         transforms = [t for _, m in bag.messages("/tf_static") for t in m.transforms]
@@ -168,15 +171,20 @@ def _mount(bag: Bag, settings: RosbagSettings, pair: StereoCalibration) -> Float
         else T_base_left @ se3.inverse(optical)
     )
     if not settings.imu:
-        return T_robot_left
+        return T_robot_left, None
     imu = bag.first(settings.imu).header.frame_id
     T_left_imu = chained(transforms, camera, imu)
     if T_left_imu is None:
         lost = f"/tf_static leads from {imu!r} to no camera {camera!r}"
         raise InputError(f"{bag.path}: --imu {settings.imu}: {lost}")
-    forces = [message.linear_acceleration for _, message in bag.messages(settings.imu)]
-    up_imu = np.mean([[force.x, force.y, force.z] for force in forces], axis=0)
-    if not np.linalg.norm(up_imu) >= _LEAST_GRAVITY:
-        told = f"mean acceleration is {np.linalg.norm(up_imu):.2g} m/s², too little for gravity"
-        raise InputError(f"{bag.path}: --imu {settings.imu}: {told}")
-    return upright(T_robot_left, (optical @ T_left_imu)[:3, :3] @ up_imu)
+    T_camera_imu = (optical @ T_left_imu)[:3, :3]
+    felt = {stamp_ns(m): m.linear_acceleration for _, m in bag.messages(settings.imu)}
+    time_ns = np.array(sorted(felt), dtype=np.int64)
+    forces = np.array([[felt[t].x, felt[t].y, felt[t].z] for t in time_ns.tolist()])
+    by_camera = forces.reshape(-1, 3) @ T_camera_imu.T
+    try:
+        inertial = Inertial(time_ns, by_camera)
+        T_robot_left = upright(T_robot_left, by_camera.mean(axis=0))
+        return T_robot_left, replace(inertial, acceleration=by_camera @ T_robot_left[:3, :3].T)
+    except InputError as error:
+        raise InputError(f"{bag.path}: --imu {settings.imu}: {error}") from error

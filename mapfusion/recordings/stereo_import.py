@@ -152,13 +152,14 @@ class StereoImport:
             raise InputError(f"{self._recording.name}: {found}; 2 are the least")
         time_ns = self._recording.time_ns[rows]
         reckoned, truth = self._odometry(time_ns), self._truth(time_ns)
-        known = known_from(level, reckoned)
+        known = known_from(level, reckoned, self._recording.inertial)
         if known == "odometry" and reckoned is None:
             raise InputError(f"--level odometry: {self._recording.name} has no odometry")
+        tilts = self._tilts(time_ns) if known == "imu" else None
         usual_ns = np.median(np.diff(self._recording.time_ns))
         steps = np.diff(time_ns, prepend=time_ns[0]) / usual_ns
         front_end = FrontEnd(self.camera, self.vision)
-        levels = Levels(known, self.camera, self.T_robot_camera, reckoned)
+        levels = Levels(known, self.camera, self.T_robot_camera, reckoned, tilts)
         frames = LevelFrames(self.vision, levels)
         for n, k in enumerate(rows):
             frames.add(front_end.extract(*self.rectified(k)), float(steps[n]))
@@ -172,6 +173,15 @@ class StereoImport:
         if reckoned is not None:
             return Imported(log, truth, linked, attitude=attitude)
         return Imported(log, truth, linked, seen.covariance, attitude, int(seen.guessed.sum()))
+
+    def _tilts(self, time_ns: np.ndarray) -> tuple[Float, Float]:
+        felt, name = self._recording.inertial, self._recording.name
+        if felt is None:
+            raise InputError(f"--level imu: {name} has no accelerations that are read")
+        try:
+            return felt.tilts(time_ns)
+        except InputError as error:
+            raise InputError(f"--level imu: {name}: {error}") from error
 
     def _odometry(self, time_ns: np.ndarray) -> Float | None:
         """Poses (T, 4, 4) at the frames, by the recorded dead reckoning; None without it."""

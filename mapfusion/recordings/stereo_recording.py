@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from mapfusion.errors import InputError
+from mapfusion.recordings.inertial import Inertial
 from mapfusion.recordings.lens import StereoCalibration
 from mapfusion.recordings.pictures import Load, eight_bit, sampled, unused_bits
 from mapfusion.recordings.timed_poses import TimedPoses
@@ -42,6 +43,7 @@ class StereoRecording:
         truth: T_world_robot, where it is known.
         odometry: T_start_robot by dead reckoning, where it was recorded.
         dropped: pictures without a partner, and why, for people.
+        inertial: accelerations, where they were recorded.
     """
 
     name: str
@@ -52,6 +54,7 @@ class StereoRecording:
     truth: TimedPoses | None = None
     odometry: TimedPoses | None = None
     dropped: tuple[str, ...] = ()
+    inertial: Inertial | None = None
     _shift: list[int] = field(default_factory=list, repr=False)
 
     def __len__(self) -> int:

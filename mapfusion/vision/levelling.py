@@ -20,10 +20,13 @@ class Levelling:
     Args:
         T_robot_seen: (4, 4) from the frame that the camera's points and motions are given in to the
             robot's; None where they are the same.
+        shared_rad: standard deviation of what all that is measured of roll and pitch errs by alike,
+            which no filter sees.
     """
 
-    def __init__(self, T_robot_seen: Float | None = None) -> None:
+    def __init__(self, T_robot_seen: Float | None = None, shared_rad: float = 0.0) -> None:
         self._T_robot_seen = T_robot_seen
+        self._shared_rad2 = shared_rad**2
         self._filter = AttitudeFilter()
         self._values: list[Float] = []
         self._sigmas: list[Float] = []
@@ -32,8 +35,12 @@ class Levelling:
     @property
     def attitude(self) -> Attitude:
         """Of the frames so far."""
-        carried = np.array(self._carried)
-        return Attitude(np.array(self._values), np.array(self._sigmas), carried)
+        sigma, carried = np.array(self._sigmas), np.array(self._carried)
+        if self._shared_rad2:
+            own = np.mean(sigma[:-1, :2] ** 2, axis=1)
+            carried[1:, 0] = (carried[1:, 0] * own + self._shared_rad2) / (own + self._shared_rad2)
+            sigma[:, :2] = np.sqrt(sigma[:, :2] ** 2 + self._shared_rad2)
+        return Attitude(np.array(self._values), sigma, carried)
 
     def expected_turn(self, measured: Measured) -> Float | None:
         """R_after_before (3, 3) in the camera's frame, by what is measured of the next frame.

@@ -1,0 +1,131 @@
+"""Up by an accelerometer: exact at rest, as sure as stated on a swaying body, read as EuRoC has it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from mapfusion import se3
+from mapfusion.errors import InputError
+from mapfusion.recordings.inertial import SHARED_RAD, Inertial
+from mapfusion.recordings.registry import read_recording
+from mapfusion.recordings.stereo_import import Cut, StereoImport
+from mapfusion.vision.attitude_filter import Measured
+from mapfusion.vision.levelling import Levelling
+from tests.mapfusion.recordings.written_layouts import START_NS, TIMES_S, drive, read_yaml
+from tests.mapfusion.recordings.written_layouts import write_euroc as write_pictures
+from tests.mapfusion.vision.test_levelling import measured_motion
+
+GRAVITY, RATE_HZ, A_FRAME = 9.81, 200, 20  # so ten frames a second
+T_BODY_IMU = se3.pose(se3.tilt(0.4, -0.2), [0.1, 0.0, 0.2])
+
+
+def correlated(rng: np.random.Generator, n: int, rms: float, over: float) -> np.ndarray:
+    """(n, 2) of a first-order process that forgets within so many samples."""
+    keep = np.exp(-1 / over)
+    drawn = rng.standard_normal((n + 2000, 2)) * rms * np.sqrt(1 - keep**2)
+    return lfilter([1.0], [1.0, -keep], drawn, axis=0)[2000:]
+
+
+def at_rest(tilt_rad: np.ndarray) -> np.ndarray:
+    """What is felt (n, 3) in a body's axes by gravity alone."""
+    return GRAVITY * se3.tilt(*tilt_rad.T)[:, 2]
+
+
+def test_at_rest_it_is_the_body_s_tilt() -> None:
+    frames = np.arange(8) * 10**8
+    tilt_rad = np.random.default_rng(0).uniform(-0.3, 0.3, (8, 2))
+    found, sigma = Inertial(frames, at_rest(tilt_rad)).tilts(frames)
+    np.testing.assert_allclose(found, tilt_rad, atol=1e-12)
+    assert np.all(sigma > 0)
+
+
+def test_frames_without_it_are_unknown() -> None:
+    frames = np.arange(8) * 10**8
+    found, _ = Inertial(frames[:4], at_rest(np.zeros((4, 2)))).tilts(frames)
+    assert np.isnan(found[4:]).all()
+    assert np.all(found[:4] == 0)
+    with pytest.raises(InputError, match="felt nothing"):
+        Inertial(frames, at_rest(np.zeros((8, 2)))).tilts(frames + 10**10)
+
+
+def swayed(rng: np.random.Generator, n_frames: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Errors, stated deviations (T, 2) and errors of what was felt alone.
+
+    Of a body that sways by 3 degrees over half a second, speeds up and slows down by 0.4 m/s² over
+    a second, and feels 0.03 m/s² too much.
+    """
+    n = n_frames * A_FRAME
+    true = correlated(rng, n, 0.05, 0.5 * RATE_HZ)
+    felt = at_rest(true) + rng.normal(0, 0.1, (n, 3))
+    felt[:, :2] += correlated(rng, n, 0.4, RATE_HZ) + rng.normal(0, 0.03, 2)
+    sample_ns = np.arange(n) * (10**9 // RATE_HZ)
+    at = np.arange(n_frames) * A_FRAME + A_FRAME // 2
+    measured, sigma = Inertial(sample_ns, felt).tilts(sample_ns[at])
+    way = np.stack([0.05 * np.arange(n_frames), np.zeros(n_frames), 0.03 * np.arange(n_frames)], -1)
+    bodies = se3.in_space(way, true[at])
+    levelling = Levelling(shared_rad=SHARED_RAD)
+    for k in range(n_frames):
+        motion = measured_motion(rng, bodies[k - 1], bodies[k]) if k else None
+        levelling.add(motion, Measured(np.array([*measured[k], 0.0]), np.array([*sigma, 0.0])))
+    made = levelling.attitude
+    return made.value[:, :2] - true[at], made.sigma[:, :2], measured - true[at]
+
+
+def test_of_a_body_that_sways_it_is_as_sure_as_stated() -> None:
+    runs = [swayed(np.random.default_rng(seed), 300) for seed in range(12)]
+    errors, sigmas, alone = (np.array(each)[:, 60:] for each in zip(*runs, strict=True))
+    assert 0.2 < np.mean((errors / sigmas) ** 2) < 1.5
+    rms = np.sqrt(np.mean(errors**2))
+    assert rms < 0.01
+    assert rms < 0.3 * np.sqrt(np.mean(alone**2))
+
+
+def write_felt(root: Path, acceleration: np.ndarray) -> None:
+    """`imu0` of EuRoC's layout beside the pictures, of the body of `written_layouts`."""
+    imu = root / "mav0" / "imu0"
+    imu.mkdir()
+    (imu / "sensor.yaml").write_text(
+        f"%YAML:1.0\nT_BS:\n  cols: 4\n  rows: 4\n  data: {T_BODY_IMU.ravel().tolist()}\n"
+    )
+    stamps = START_NS + np.rint(np.linspace(-0.1, TIMES_S[-1] + 0.1, len(acceleration)) * 1e9)
+    rows = [
+        ",".join([str(int(stamp)), "0", "0", "0", *map(repr, values)])
+        for stamp, values in zip(stamps, acceleration.tolist(), strict=True)
+    ]
+    (imu / "data.csv").write_text("\n".join(["#timestamp [ns],w_x,...", *rows, ""]))
+
+
+@pytest.fixture
+def euroc(tmp_path: Path) -> Path:
+    root = write_pictures(tmp_path, drive())
+    (root / "mav0" / "odometry.tum").unlink()
+    return root
+
+
+def test_what_euroc_s_imu_felt_levels_its_pictures(euroc: Path) -> None:
+    """A body whose x axis looks up, tilted by 0.02 and 0.03 rad, and an IMU turned on it."""
+    robot = at_rest(np.tile([[0.02, 0.03]], (400, 1)))
+    T_body_robot = np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0.0]])
+    shaken = robot + np.random.default_rng(0).normal(0, 0.05, robot.shape)
+    write_felt(euroc, shaken @ T_body_robot.T @ T_BODY_IMU[:3, :3])
+    recording = read_recording("euroc", euroc, None, read_yaml)
+    assert recording.inertial is not None
+    np.testing.assert_allclose(recording.inertial.acceleration, shaken, atol=1e-9)
+    one = StereoImport(recording).log_of(Cut("R", slice(None)))
+    assert one.attitude is not None
+    np.testing.assert_allclose(one.attitude.value[0, :2], [0.02, 0.03], atol=0.004)
+    assert np.all(one.attitude.sigma[:, :2] >= SHARED_RAD)
+
+
+def test_what_cannot_tell_up_is_one_line(euroc: Path) -> None:
+    recording = read_recording("euroc", euroc, None, read_yaml)
+    with pytest.raises(InputError, match=r"--level imu: .* has no accelerations"):
+        StereoImport(recording).log_of(Cut("R", slice(None)), level="imu")
+    write_felt(euroc, np.full((9, 3), 0.1))
+    with pytest.raises(InputError, match=r"imu0.data\.csv: mean acceleration is 0\.17"):
+        read_recording("euroc", euroc, None, read_yaml)
+    (euroc / "mav0" / "imu0" / "data.csv").write_text("#t\n5,0,0,0,0,0\n")
+    with pytest.raises(InputError, match=r"data\.csv, line 2"):
+        read_recording("euroc", euroc, None, read_yaml)
