@@ -63,7 +63,8 @@ LevelOf = Annotated[
     typer.Option(
         help="Where the robot's roll, pitch and height are known from: the mount (a level body), "
         "odometry that tilts, the pictures' motions from a level beginning, or with the floor that "
-        "they show. By default as odometry is recorded, else the pictures."
+        "they show, or with an IMU's accelerations. By default as odometry is recorded, else the "
+        "IMU, else the pictures."
     ),
 ]
 _CUT = re.compile(r"(?:(?P<name>[^=]*)=)?(?P<rows>-?\d*:-?\d*(?::\d*)?)")

@@ -79,7 +79,7 @@ IMPORTERS = {
             "left": "Topic of the left camera's pictures.",
             "right": "Topic of the right camera's.",
             "odom": "Topic of the robot's odometry; without it the pictures tell.",
-            "imu": "Topic of an IMU, whose mean acceleration levels the camera.",
+            "imu": "Topic of an IMU: its accelerations level the camera, and each frame.",
         },
     ),
 }

@@ -37,8 +37,8 @@ class RosbagSettings:
         left: pictures of the left camera.
         right: of the right one.
         odom: dead reckoning of the robot; none: the pictures tell.
-        imu: accelerations, whose mean over the recording is up; none: the mount is as transforms
-            tell.
+        imu: accelerations, whose mean over the recording is up, and which level each frame; none:
+            the mount is as transforms tell.
         truth: true poses of the robot; none: unknown.
         left_info: calibration of the left camera; by default `camera_info` beside its pictures.
         right_info: of the right one.

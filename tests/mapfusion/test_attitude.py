@@ -94,7 +94,8 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
 
 
 def test_of_the_version_before_each_frame_errs_for_itself(tmp_path: Path) -> None:
-    write_attitude(tmp_path, Attitude(*np.full((2, 3, 3), 0.1), np.ones((3, 2))))
+    tenth = np.full((3, 3), 0.1)
+    write_attitude(tmp_path, Attitude(tenth, tenth, np.ones((3, 2))))
     path = tmp_path / FILE
     table = pq.read_table(path)
     metadata = {**table.schema.metadata, b"mapfusion.schema_version": b"1"}
@@ -102,7 +103,7 @@ def test_of_the_version_before_each_frame_errs_for_itself(tmp_path: Path) -> Non
     pq.write_table(table.replace_schema_metadata(metadata), path)
     found = read_attitude(tmp_path)
     assert found is not None
-    np.testing.assert_array_equal(found.value, np.full((3, 3), 0.1))
+    np.testing.assert_array_equal(found.value, tenth)
     assert not found.carried.any()
 
 

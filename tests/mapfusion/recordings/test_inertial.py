@@ -1,4 +1,4 @@
-"""Up by an accelerometer: exact at rest, as sure as stated on a swaying body, read as EuRoC has it."""
+"""Up by an accelerometer: exact at rest, as sure as stated on a swaying body, read as EuRoC is."""
 
 from pathlib import Path
 

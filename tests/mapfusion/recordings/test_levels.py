@@ -10,6 +10,7 @@ from mapfusion import se3
 from mapfusion.attitude import read_attitude
 from mapfusion.errors import InputError
 from mapfusion.recordings.floor import floor_of
+from mapfusion.recordings.inertial import Inertial
 from mapfusion.recordings.levels import known_from
 from mapfusion.recordings.registry import read_recording
 from mapfusion.recordings.stereo_import import Cut, StereoImport, write_imported
@@ -75,6 +76,8 @@ def test_by_default_the_odometry_says_whether_the_body_is_level() -> None:
     found = [known_from("auto", odometry) for odometry in (None, upright, tilted)]
     assert found == ["pictures", "mount", "odometry"]
     assert known_from("floor", upright) == "floor"
+    felt = Inertial(np.zeros(1, np.int64), np.array([[0.0, 0.0, 9.8]]))
+    assert [known_from("auto", each, felt) for each in (None, upright)] == ["imu", "mount"]
 
 
 @pytest.fixture(scope="module")
