@@ -2,8 +2,9 @@
 
 The robot frame of logs and maps is level: x in the heading of the body, z up, its origin on the
 floor that the map begins on. A body that pitches, rolls or climbs sees points in axes of its own;
-its attitude turns and lifts them, with what is not known of it. A file beside the log keeps it;
-a log without one is of a level body.
+its attitude turns and lifts them. What came to its error while a landmark stays in view is in the
+covariances of a frame's points; what is older all have alike, and is added to the landmarks
+(`attitude_drift.py`). A file beside the log keeps it; a log without one is of a level body.
 """
 
 from dataclasses import dataclass, replace
@@ -102,8 +103,8 @@ def levelled(observed: Observations, value: Float, sigma: Float) -> Observations
     Args:
         observed: in the body's frame.
         value: (3,) roll, pitch and height, as of `Attitude`.
-        sigma: (3,) of what is new in their errors with this frame, which the covariances then
-            include (first order).
+        sigma: (3,) of what is not alike in the errors of frames that see the same, which the
+            covariances then include (first order).
     """
     roll, pitch, height_m = value
     made = moved(observed, tilt(roll, pitch), np.array([0.0, 0.0, height_m]))

@@ -16,6 +16,9 @@ from mapfusion.vision.rigid_links import RigidMotion
 
 # Standard deviation of an attitude that nothing has told yet, rad and m: anything.
 _UNKNOWN = np.array([1.0, 1.0, 100.0])
+# Of the error's part that no landmark in view has in common, what the next frame keeps: tracks last
+# for some twenty frames, and what came before them tilts all that is in view alike.
+_IN_VIEW = 1 - 1 / 20
 _LOST_M = 0.1  # by how much a height may change in a step that nothing tells of
 
 
@@ -39,14 +42,16 @@ class AttitudeFilter:
     Attributes:
         value: (3,) as known now.
         covariance: (3, 3) of its error.
-        fresh: (3, 3) of what came to its error with this frame.
+        fresh: (3, 3) of what came to its error while a landmark stays in view; nothing in the first
+            frame, whose plane is the map's.
         carried: (3,) share of the error of the frame before that is left in it.
     """
 
     value: Float = field(default_factory=lambda: np.zeros(3))
     covariance: Float = field(default_factory=lambda: np.diag(_UNKNOWN**2))
-    fresh: Float = field(default_factory=lambda: np.diag(_UNKNOWN**2))
+    fresh: Float = field(default_factory=lambda: np.zeros((3, 3)))
     carried: Float = field(default_factory=lambda: np.zeros(3))
+    _moved: bool = False
 
     @property
     def sigma(self) -> Float:
@@ -59,7 +64,7 @@ class AttitudeFilter:
             height = self.covariance[2, 2] + _LOST_M**2
             self.covariance = np.diag([*(_UNKNOWN[:2] ** 2), height])
             self.fresh = np.diag([*(_UNKNOWN[:2] ** 2), _LOST_M**2])
-            self.carried = np.array([0.0, 0.0, 1.0])
+            self.carried, self._moved = np.array([0.0, 0.0, 1.0]), True
             return
         before = tilt(self.value[0], self.value[1])
         T = motion.T_before_after
@@ -78,7 +83,8 @@ class AttitudeFilter:
         self.value = np.array([*roll_pitch(after), self.value[2] + step[2]])
         told = own @ motion.covariance @ own.T
         self.covariance = jacobian @ self.covariance @ jacobian.T + told
-        self.fresh, self.carried = told, np.ones(3)
+        self.fresh = _IN_VIEW * (jacobian @ self.fresh @ jacobian.T) + told
+        self.carried, self._moved = np.ones(3), True
 
     def measure(self, measured: Measured) -> None:
         """Take in what was measured in this frame."""
@@ -91,5 +97,6 @@ class AttitudeFilter:
         # Joseph's form: stays symmetric and positive
         noise = gain @ np.diag(measured.sigma[rows] ** 2) @ gain.T
         self.covariance = rest @ self.covariance @ rest.T + noise
-        self.fresh = rest @ self.fresh @ rest.T + noise
+        if self._moved:
+            self.fresh = rest @ self.fresh @ rest.T + noise
         self.carried = np.clip(self.carried * np.diag(rest), 0.0, 1.0)
