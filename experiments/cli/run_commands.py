@@ -11,6 +11,7 @@ from mapfusion.errors import InputError
 
 app = typer.Typer()
 _DRAWING = "draw the figures"
+_NEEDED = ("experiments.judge.result", "experiments.show.figures.drawing")  # by worker processes
 
 
 @app.command(rich_help_panel=options.RUN)
@@ -32,6 +33,7 @@ def run(
     Finished stages are reused; an interrupted run goes on where it was.
     """
     from experiments.judge.expectations import load_checked
+    from experiments.run.workers import make_ready
     from experiments.scenario.suite import scenarios_of
 
     checked = [load_checked(path, overrides, seed) for path in scenarios_of(scenarios)]
@@ -39,6 +41,8 @@ def run(
         several = f"is one folder for {len(checked)} runs; give --results"
         raise InputError(f"--output {output}: {several}")
     # What draws takes seconds to import: a scenario is refused before.
+    if jobs > 1:
+        make_ready(_NEEDED)
     from experiments.judge.nothing_merged import nothing_merged
     from experiments.judge.result import run_scenario
     from experiments.show.figures.drawing import draw_all

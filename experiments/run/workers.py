@@ -1,15 +1,21 @@
-"""Processes that share out tasks; results do not depend on how many there are."""
+"""Processes that share out tasks; results do not depend on how many there are.
+
+Where Python can do so safely, they are forked from a server: a process that has imported what they
+need, once for all of them, and has done nothing else. OpenCV's and Numba's threads do not survive a
+fork, so neither the command itself is forked nor anything that has begun to work.
+"""
 
 import functools
 import multiprocessing
 import os
+import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from multiprocessing import connection
+from multiprocessing import connection, forkserver
 from typing import Any
 
 from experiments.methods.threads import single_threaded
@@ -19,6 +25,24 @@ from mapfusion.errors import InputError, UnsealedWarning
 # While a process works on one task, the next is there already. More of them would be begun in the
 # order they were submitted, though a later one may be what others wait for.
 TASKS_PER_PROCESS = 2
+
+# On other systems libraries hold threads or handles from their import on.
+_FORKED = sys.platform == "linux"
+_OURS = ("experiments.", "mapfusion.", "sim.")
+
+
+def make_ready(modules: Iterable[str] = ()) -> None:
+    """Begin to import what worker processes will need, while this one does something else.
+
+    By default these are our modules that are imported here. Only the first call counts.
+    """
+    if not _FORKED:
+        return
+    multiprocessing.set_forkserver_preload(
+        list(modules) or [name for name in list(sys.modules) if name.startswith(_OURS)]
+    )
+    with held_back_interrupts():
+        forkserver.ensure_running()
 
 
 def _start_worker() -> None:
@@ -90,8 +114,8 @@ def workers(jobs: int) -> Iterator[Workers]:
     if jobs == 1:
         yield Workers(1, None)
         return
-    # Spawned, not forked: OpenCV's and Numba's threads do not survive a fork.
-    context = multiprocessing.get_context("spawn")
+    make_ready()
+    context = multiprocessing.get_context("forkserver" if _FORKED else "spawn")
     pool = ProcessPoolExecutor(jobs, context, initializer=_start_worker)
     try:
         yield Workers(jobs, pool)

@@ -146,10 +146,11 @@ class KilledCommand:
         return self.process.poll() is not None
 
     def workers(self) -> list[int]:
-        """Process ids of the workers."""
-        children = Path(f"/proc/{self.process.pid}/task").glob("*/children")
-        pids = [int(pid) for path in children for pid in _read(path).split()]
-        return [pid for pid in pids if b"spawn_main" in _read(Path(f"/proc/{pid}/cmdline"))]
+        """Process ids of the workers: spawned by the command, or forked by its fork server."""
+        started = {pid: _read(Path(f"/proc/{pid}/cmdline")) for pid in _children(self.process.pid)}
+        servers = [pid for pid, line in started.items() if b"forkserver" in line]
+        spawned = [pid for pid, line in started.items() if b"spawn_main" in line]
+        return [*spawned, *(pid for server in servers for pid in _children(server))]
 
     def let_go(self) -> None:
         """Let it make all that is left."""
@@ -180,6 +181,11 @@ class KilledCommand:
 def _send(pid: int, number: int) -> None:
     with contextlib.suppress(ProcessLookupError):  # it ended by itself meanwhile
         os.kill(pid, number)
+
+
+def _children(pid: int) -> list[int]:
+    threads = Path(f"/proc/{pid}/task").glob("*/children")
+    return [int(child) for path in threads for child in _read(path).split()]
 
 
 def _read(path: Path) -> bytes:

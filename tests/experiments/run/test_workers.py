@@ -22,6 +22,36 @@ def test_a_killed_worker_is_told_in_one_line() -> None:
             list(pool.completed())
 
 
+READY = """
+import importlib, os, sys
+from experiments.run.workers import workers
+
+def told():
+    return os.getppid(), "experiments.scenario.schema" in sys.modules
+
+if __name__ == "__main__":
+    importlib.import_module("experiments.scenario.schema")  # the server imports it, too
+    with workers(2) as pool:
+        for tag in range(8):
+            pool.submit(tag, told)
+        for _, (parent, imported) in pool.completed():
+            print(parent, imported)
+    print(os.getpid())
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere they are spawned")
+def test_workers_are_forked_from_a_server_with_what_is_imported_here(tmp_path: Path) -> None:
+    script = tmp_path / "ready.py"
+    script.write_text(READY)
+    command = [sys.executable, str(script)]
+    lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split("\n")
+    *told, own, _ = lines
+    server = told[0].split()[0]
+    assert told == [f"{server} True"] * 8
+    assert server != own
+
+
 PARENT = """
 import os, time
 from experiments.run.workers import workers
