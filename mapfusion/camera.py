@@ -6,6 +6,7 @@ d = u_left - u_right = f B / Z.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated
 
 import numpy as np
@@ -50,10 +51,12 @@ class StereoCamera:
         """Principal point: the middle of the image."""
         return (self.width_px - 1) / 2, (self.height_px - 1) / 2
 
-    @property
+    @cached_property  # asked for several times a frame
     def camera_axes(self) -> Float:
         """The cameras' axes ahead, left and up, as columns (3, 3) in the robot frame."""
-        return tilt(self.mount_roll_rad, self.mount_pitch_rad)
+        axes = tilt(self.mount_roll_rad, self.mount_pitch_rad)
+        axes.flags.writeable = False
+        return axes
 
     @property
     def p_robot_left(self) -> Float:
