@@ -118,7 +118,7 @@ def error_rows(met: MetMaps, judge: Judge, radius_m: float) -> pd.DataFrame:
     """Rows of the table `errors` of one pair of maps, the oracle's first."""
     is_true, pairs = met.is_true(radius_m), Pairs(*met.maps, met.offered)
     oracle = Oracle(judge.refinement).align(pairs, is_true)
-    evidence = evidence_of(met.rivals, judge.evidence)
+    evidence = evidence_of(met.rivals, met.maps, judge.evidence)
     row = met.names | {"aligner": ORACLE, "repetition": 0}
     row |= estimate_row(len(pairs), oracle, oracle, judge.on(pairs, evidence).judge(oracle))
     all_rows = [row, *records(met.estimates)]

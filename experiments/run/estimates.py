@@ -1,6 +1,6 @@
 """What the aligners said, without any truth: rows of the table `estimates` as values."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,9 +12,11 @@ from experiments.run.stage_tables import COVARIANCE, MOTION
 from mapfusion.align.acceptance import Verdict
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.result import Alignment, Status
+from mapfusion.evidence.copies import Copies
 from mapfusion.evidence.likelihood import TwinShares
 from mapfusion.evidence.pair_evidence import PairEvidence, RivalMotion
 from mapfusion.evidence.parameters import EvidenceParameters
+from mapfusion.landmark_map import LandmarkMap
 from mapfusion.se2 import Float
 from mapfusion.storage import covariances_from
 
@@ -46,9 +48,9 @@ def estimate_row(
     return row
 
 
-def inlier_mask(bits: bytes, n_correspondences: int) -> np.ndarray:
-    """The mask (n,) that `estimate_row` packed."""
-    return np.unpackbits(np.frombuffer(bits, np.uint8), count=n_correspondences).astype(bool)
+def unpacked(bits: bytes, n: int) -> np.ndarray:
+    """The mask (n,) that `numpy.packbits` made these of."""
+    return np.unpackbits(np.frombuffer(bits, np.uint8), count=n).astype(bool)
 
 
 def covariances_of(rows: pd.DataFrame) -> Float:
@@ -63,7 +65,7 @@ def alignment_of(row: Mapping[Any, Any], n_correspondences: int) -> Alignment:
     sureness, reason = row["log10_false_alarms"], row["acceptance_reason"]
     verdict = Verdict(Status(row["verdict"]), sureness, reason)
     T_a_b = np.array([row[f"refined_{name}"] for name in MOTION])
-    inlier = inlier_mask(row["refined_inliers"], n_correspondences)
+    inlier = unpacked(row["refined_inliers"], n_correspondences)
     outcome = (Status(row["refined_status"]), row["refined_reason"], row["drift_sigma_m"])
     return verdict.applied_to(Alignment(T_a_b, covariance, inlier, np.nan, *outcome))
 
@@ -80,14 +82,19 @@ def rival_rows(names: Mapping[str, Any], evidence: PairEvidence) -> list[dict[st
             "log10_false_alarms": motion.log10_false_alarms,
             **{name: getattr(motion, name) for name in _RIVAL_COUNTS},
             "log10_evidence": motion.log10_ratio,
+            "copied_a": np.packbits(motion.copies.in_a).tobytes(),
+            "copied_b": np.packbits(motion.copies.in_b).tobytes(),
             **both,
         }
         for motion in evidence.motions
     ]
 
 
-def evidence_of(rows: pd.DataFrame, parameters: EvidenceParameters) -> PairEvidence:
+def evidence_of(
+    rows: pd.DataFrame, maps: Sequence[LandmarkMap], parameters: EvidenceParameters
+) -> PairEvidence:
     """What rows of `rivals` of one pair and iteration hold: nothing, where no motion was found."""
+    n_a, n_b = map(len, maps)
     motions = tuple(
         RivalMotion(
             row["of"],
@@ -95,6 +102,7 @@ def evidence_of(rows: pd.DataFrame, parameters: EvidenceParameters) -> PairEvide
             row["log10_false_alarms"],
             **{name: row[name] for name in _RIVAL_COUNTS},
             log10_ratio=row["log10_evidence"],
+            copies=Copies(unpacked(row["copied_a"], n_a), unpacked(row["copied_b"], n_b)),
         )
         for row in records(rows)
     )

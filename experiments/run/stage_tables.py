@@ -46,10 +46,11 @@ CORRESPONDENCES = schema("result.correspondences", 1, _OFFERED)
 # What was found once for each two maps: the best distinct motions between them (of: "a b"), and of
 # each map onto itself ("a", "b"). log10_evidence: of the first, as of estimates; own_share,
 # copied_share: of what a wrong motion lays on its like, where no other motion does and where one
-# does; region_m: side of a region.
+# does; region_m: side of a region; copied_a, copied_b: the landmarks that it lays on their like, a
+# bit each.
 RIVALS = schema(
     "result.rivals",
-    2,
+    3,
     fields(
         **_MAPS,
         of=TEXT,
@@ -63,6 +64,8 @@ RIVALS = schema(
         own_share=FLOAT,
         copied_share=FLOAT,
         region_m=FLOAT,
+        copied_a=pa.binary(),
+        copied_b=pa.binary(),
     ),
 )
 

@@ -62,6 +62,7 @@ class PairJudge:
         self._judge, self._pairs, self._known = judge, pairs, known
         self._chance = judge.acceptance.on(pairs)
         self._bound = math.log10(judge.acceptance.false_alarms)
+        self._verdicts: dict[tuple[object, ...], Verdict] = {}
 
     @cached_property
     def _witnesses(self) -> Witnesses:
@@ -81,6 +82,15 @@ class PairJudge:
 
     def judge(self, alignment: Alignment) -> Verdict:
         """The verdict on one alignment of the correspondences."""
+        # Refined, most of a randomised method's answers are one and the same, to the last bit.
+        arrays = (alignment.T_a_b, alignment.covariance, alignment.inlier)
+        outcome = alignment.status, alignment.reason, alignment.drift_sigma_m
+        same = (*(each.tobytes() for each in arrays), *outcome)
+        if same not in self._verdicts:
+            self._verdicts[same] = self._verdict(alignment)
+        return self._verdicts[same]
+
+    def _verdict(self, alignment: Alignment) -> Verdict:
         by_chance = self._chance.judge(alignment)
         if not by_chance.accepted:
             return by_chance
@@ -124,18 +134,12 @@ class PairJudge:
         T_a_b, p_b = alignment.T_a_b, self._pairs.map_b.position_m[:, :2]
         squares = Squares.about(self._pairs.p_a[alignment.inlier], evidence.region_m)
         others = (
-            copies
-            for each, copies in zip(evidence.motions, self._laid, strict=True)
+            each.copies
+            for each in evidence.motions
             if each.of != BETWEEN or apart_m(T_a_b, each.T_a_b, p_b) >= DISTINCT_M
         )
         none = Copies.none(len(self._pairs.map_a), len(self._pairs.map_b))
         return self._witnesses.regions(BETWEEN, T_a_b, squares, none.joined(others))
-
-    @cached_property
-    def _laid(self) -> list[Copies]:
-        """What each motion that was found lays on its like."""
-        assert self.evidence is not None
-        return [self._witnesses.copies(m.of, m.T_a_b) for m in self.evidence.motions]
 
     def _signs(
         self, alignment: Alignment, regions: Regions, ratio: float, evidence: PairEvidence

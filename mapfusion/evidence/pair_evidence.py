@@ -8,7 +8,7 @@ import numpy as np
 from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.pairs import Pairs
 from mapfusion.align.refine import Refinement
-from mapfusion.evidence.copies import BETWEEN, of_others
+from mapfusion.evidence.copies import BETWEEN, Copies, of_others
 from mapfusion.evidence.likelihood import COPIED, OWN, TwinShares
 from mapfusion.evidence.parameters import EvidenceParameters
 from mapfusion.evidence.regions import Regions, Squares, Witnesses
@@ -40,6 +40,7 @@ class RivalMotion:
         n_contradicted: regions that are not.
         n_regions: that must be seen.
         log10_ratio: of the regions, of a motion between the maps; NaN of one onto itself.
+        copies: what it lays on its like.
     """
 
     of: str
@@ -49,7 +50,8 @@ class RivalMotion:
     n_confirmed: int
     n_contradicted: int
     n_regions: int
-    log10_ratio: float = math.nan
+    log10_ratio: float
+    copies: Copies
 
 
 @dataclass(frozen=True)
@@ -120,8 +122,8 @@ def find_evidence(
     ]
     shares = _twin_shares(regions[: len(between)], regions[len(between) :])
     found = [
-        _rival(of, each, r, r.log10_ratio(shares) if of == BETWEEN else math.nan)
-        for (of, each), r in zip(kinds, regions, strict=True)
+        _rival(of, each, r, r.log10_ratio(shares) if of == BETWEEN else math.nan, copies)
+        for (of, each), r, copies in zip(kinds, regions, laid, strict=True)
     ]
     return PairEvidence(tuple(found), shares, region_m)
 
@@ -150,7 +152,10 @@ def _twin_shares(rivals: list[Regions], selves: list[Regions]) -> TwinShares:
     return TwinShares(*(float(confirmed / n) for confirmed, n in shares))
 
 
-def _rival(of: str, motion: Supported, regions: Regions, log10_ratio: float) -> RivalMotion:
+def _rival(
+    of: str, motion: Supported, regions: Regions, log10_ratio: float, copies: Copies
+) -> RivalMotion:
     counts = (regions.n_confirmed, regions.n_contradicted, len(regions))
     n_support = int(np.count_nonzero(motion.inlier))
-    return RivalMotion(of, motion.T_a_b, motion.log10_false_alarms, n_support, *counts, log10_ratio)
+    sure = motion.log10_false_alarms
+    return RivalMotion(of, motion.T_a_b, sure, n_support, *counts, log10_ratio, copies)

@@ -49,7 +49,7 @@ def run(settings: AlignerSettings, job: Job) -> None:
     rows = []
     for k, map_a, map_b in match.pairs_of_maps(job, settings.iterations):
         pairs = correspondences_of(offered[offered["iteration"] == k])
-        evidence = evidence_of(rivals[rivals["iteration"] == k], settings.evidence)
+        evidence = evidence_of(rivals[rivals["iteration"] == k], (map_a, map_b), settings.evidence)
         on_pair = registration.on(map_a, map_b, pairs, evidence)
         for repetition in range(settings.repetitions if registration.randomised else 1):
             names = {"robot_a": map_a.name, "robot_b": map_b.name, "iteration": k}

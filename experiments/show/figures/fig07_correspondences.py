@@ -13,7 +13,7 @@ from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from mpl_toolkits.mplot3d.proj3d import proj_transform
 
-from experiments.run.estimates import inlier_mask
+from experiments.run.estimates import unpacked
 from experiments.show.figures.result_tables import NothingToDraw, Pair, ResultTables, of_pair
 from experiments.show.figures.style import BLACK, GRAY, PAGE_WIDTH_IN
 from mapfusion.se2 import Float
@@ -70,14 +70,14 @@ def judge_correspondences(data: ResultTables, pair: Pair) -> tuple[np.ndarray, t
     if not data.no_truth and data.start_pose(pair[0]) is not None:
         judged = of_pair(data.table("true_pairs"), pair).set_index("iteration")["true_pair"]
         names = ("true correspondences", "false correspondences")
-        return inlier_mask(judged[last], n_offered), names
+        return unpacked(judged[last], n_offered), names
     estimates = of_pair(data.table("estimates"), pair)
     found = estimates[(estimates["iteration"] == last) & estimates["accepted"]]
     for name in data.aligners:
         inliers = found[found["aligner"] == name]["refined_inliers"]
         if len(inliers):
             names = (f"{name}'s refined inliers", "other correspondences")
-            return inlier_mask(inliers.iloc[0], n_offered), names
+            return unpacked(inliers.iloc[0], n_offered), names
     return np.zeros(n_offered, dtype=bool), ("inliers", "correspondences")
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from experiments.run.estimates import inlier_mask
+from experiments.run.estimates import unpacked
 from experiments.show.figures.floor_plan import LEVEL_TEXT, semi_axes
 from experiments.show.figures.result_tables import Pair, ResultTables, of_pair
 from experiments.show.report.charts import rounded, thinned
@@ -154,7 +154,7 @@ class _View:
                 continue
             frame: Json = {"iteration": k, "map": place}
             if k in offered and k in judged.index:
-                is_true = inlier_mask(judged["true_pair"][k], judged["n_correspondences"][k])
+                is_true = unpacked(judged["true_pair"][k], judged["n_correspondences"][k])
                 index = offered[k][["index_a", "index_b"]].to_numpy()
                 frame["pairs"] = self._pack(index.astype(self.index_type))
                 frame["true"] = self._pack(is_true.astype(np.uint8))

@@ -11,7 +11,7 @@ from experiments.judge.errors import (
 )
 from experiments.judge.path_errors import robot_paths
 from experiments.judge.truth import PathTruth
-from experiments.run.estimates import alignment_of, estimate_row, inlier_mask
+from experiments.run.estimates import alignment_of, estimate_row, unpacked
 from mapfusion import se2
 from mapfusion.align.acceptance import Verdict
 from mapfusion.align.result import Alignment, Status, degenerate
@@ -110,7 +110,7 @@ def test_an_alignment_survives_its_row() -> None:
     np.testing.assert_array_equal(found.inlier, inlier)
     assert (found.status, found.reason) == (Status.REFUSED, "a reason")
     assert found.drift_sigma_m == 0.2
-    assert not inlier_mask(row["inliers"], 13).any()
+    assert not unpacked(row["inliers"], 13).any()
 
 
 def test_a_refused_alignment_is_refused_when_read_again() -> None:

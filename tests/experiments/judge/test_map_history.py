@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.judge import tables
-from experiments.run.estimates import inlier_mask
+from experiments.run.estimates import unpacked
 from mapfusion import se2
 
 PLAN = ["x_m", "y_m", "cov_xx_m2", "cov_xy_m2", "cov_yy_m2"]
@@ -32,7 +32,7 @@ def test_the_true_pairs_are_as_many_as_the_evaluation_counted(tiny_result: Path)
     judged = read(tiny_result, "true_pairs").set_index(key)
     assert len(judged) == len(errors)
     for index, row in judged.iterrows():
-        bits = inlier_mask(row["true_pair"], row["n_correspondences"])
+        bits = unpacked(row["true_pair"], row["n_correspondences"])
         assert bits.sum() == errors.loc[index, "n_true"]
         assert row["n_correspondences"] == errors.loc[index, "n_correspondences"]
 

@@ -11,7 +11,7 @@ from mapfusion.align.clique import Clique
 from mapfusion.align.correspondences import match
 from mapfusion.align.registration import Registration
 from mapfusion.align.result import Alignment, Status
-from mapfusion.evidence.copies import BETWEEN
+from mapfusion.evidence.copies import BETWEEN, Copies
 from mapfusion.evidence.judge import Judge
 from mapfusion.evidence.pair_evidence import RivalMotion
 from mapfusion.evidence.parameters import EvidenceParameters
@@ -60,12 +60,14 @@ def test_a_rival_is_more_than_chance_by_pairs_and_regions_together(
     evidence, (said, refined) = sought.judge.evidence, verdict(A, B)
     assert evidence is not None
     elsewhere = refined.T_a_b + np.array([0.0, 30.0, 0.0])
-    rival = RivalMotion(BETWEEN, elsewhere, log10_by_chance, 9, 2, 0, 2, said.log10_evidence)
+    none = Copies.none(len(A), len(B))
+    told = log10_by_chance, 9, 2, 0, 2, said.log10_evidence
+    rival = RivalMotion(BETWEEN, elsewhere, *told, none)
     assert said.log10_evidence > 2.5
     known = replace(evidence, motions=(*evidence.motions, rival))
     registration = Registration(Clique()).on(A, B, pairs, known)
-    told = registration.register(np.random.default_rng(0)).verdict
-    assert str(told.status) == status
+    answer = registration.register(np.random.default_rng(0)).verdict
+    assert str(answer.status) == status
 
 
 def test_a_picture_in_two_worlds_is_contradicted_by_all_around_it() -> None:
