@@ -15,6 +15,9 @@ from mapfusion.se2 import Float
 from mapfusion.smoother.elimination import chain_factor, pose_point_blocks
 from mapfusion.smoother.normal_equations import disturbance_jacobians, disturbances
 from mapfusion.smoother.settle import Settled
+from mapfusion.smoother.skyline import solve_in_envelope
+
+_AT_ONCE = 128  # disturbances whose part in all poses is made as a matrix of its own
 
 
 class MotionPosterior(NamedTuple):
@@ -45,11 +48,7 @@ def motion_posterior(
         by_constants: (T - 1, 3, C) how the increments after the first change with the constants.
     """
     path, n = end.estimate.path, len(odometry) - 1
-    factor = chain_factor(end.equations)
-    B, K, _ = pose_point_blocks(end.seen, end.equations)
-    X = scipy.linalg.cho_solve_banded((factor, True), B, check_finite=False)
-    root = scipy.linalg.cholesky(K - B.T @ X, lower=True, check_finite=False)
-    spread = scipy.linalg.solve_triangular(root, X.T, lower=True, check_finite=False).T
+    factor, spread = _covariance_factors(end)
     before, after = disturbance_jacobians(path)
     variance = _of_differences(before, after, *_chain_covariances(factor, n))
     variance += np.sum(_difference(before, after, spread) ** 2, axis=2)
@@ -62,6 +61,45 @@ def motion_posterior(
     of_constants -= pulled.T @ solved + shared.T @ shared
     mean = disturbances(path, odometry)
     return MotionPosterior(mean, variance, of_constants, np.einsum("kdc,kd->c", weighted, mean))
+
+
+def _covariance_factors(end: Settled) -> tuple[Float, Float]:
+    """C's factor, and what is to be added to C^-1: X K^-1 X' as a product of columns."""
+    factor = chain_factor(end.equations)
+    B, K, _ = pose_point_blocks(end.seen, end.equations)
+    X = scipy.linalg.cho_solve_banded((factor, True), B, check_finite=False)
+    root = scipy.linalg.cholesky(K - B.T @ X, lower=True, check_finite=False)
+    return factor, scipy.linalg.solve_triangular(root, X.T, lower=True, check_finite=False).T
+
+
+def disturbance_variances(end: Settled) -> Float:
+    """(T - 1, 3) of the disturbances, whatever was eliminated first."""
+    before, after = disturbance_jacobians(end.estimate.path)
+    if end.solution.landmarks_first:
+        return _from_poses(end, before, after)
+    factor, spread = _covariance_factors(end)
+    variance = _of_differences(before, after, *_chain_covariances(factor, len(after)))
+    return variance + np.sum(_difference(before, after, spread) ** 2, axis=2)
+
+
+def _from_poses(end: Settled, before: Float, after: Float) -> Float:
+    """From the factor L of the poses' information, in their order: squares of L^-1 D'."""
+    n, factor = len(after), end.solution.factor
+    place = end.seen.pose_place[1:] - 1
+    began = np.concatenate([place[:1], place[:-1]])  # the first pose is no unknown
+    first_place = np.minimum(place, began)
+    variance, order = np.empty((n, 3)), np.argsort(first_place, kind="stable")
+    for at in range(0, n, _AT_ONCE):
+        some = order[at : at + _AT_ONCE]
+        first, each = first_place[some[0]], np.arange(len(some))
+        wide = np.zeros((n - first, 3, len(some), 3))
+        wide[place[some] - first, :, each] = np.swapaxes(after[some], 1, 2)
+        later = some > 0
+        wide[began[some[later]] - first, :, each[later]] = np.swapaxes(before[some[later]], 1, 2)
+        below = factor[3 * first :, 3 * first :]
+        solved = solve_in_envelope(below, wide.reshape(3 * (n - first), -1))
+        variance[some] = np.sum(solved**2, axis=0).reshape(-1, 3)
+    return variance
 
 
 def _difference(before: Float, after: Float, of_poses: Float) -> Float:

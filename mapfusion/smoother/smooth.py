@@ -16,6 +16,7 @@ from mapfusion.smoother.normal_equations import (
     information_of,
     odometry_information,
 )
+from mapfusion.smoother.odometry_levels import settled_with_levels
 from mapfusion.smoother.residuals import first_points
 from mapfusion.smoother.robust import Tails
 from mapfusion.smoother.settle import Problem, Settled, settled
@@ -130,5 +131,7 @@ def smooth(
     known = Problem(seen, log.odometry, information, parameters.stray_information)
     blurred = replace(seen, information=seen.information / _THOUGHT_WORSE**2)
     first = settled(known._replace(seen=blurred), at, _CLOSE)
-    end = settled(known, first.estimate, weights=first.weights, tails=first.tails)
+    # odometry that pictures told says only what its own covariance says, and in few frames
+    ends = settled if parameters.odometry_covariance is not None else settled_with_levels
+    end = ends(known, first.estimate, weights=first.weights, tails=first.tails)
     return Smoothed.of(end, first.n_steps)
