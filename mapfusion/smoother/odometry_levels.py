@@ -14,31 +14,38 @@ import numpy as np
 
 from mapfusion.se2 import Float
 from mapfusion.smoother.motion_posterior import disturbance_variances
+from mapfusion.smoother.noise_levels import LEAST_TOLD
 from mapfusion.smoother.normal_equations import Estimate, Weights, disturbances
 from mapfusion.smoother.robust import NO_TAILS, Tails
 from mapfusion.smoother.settle import Problem, Settled, settled
 
-# What is stated counts as so many disturbances that are told: a log that tells of fewer, or of
-# none, stays near it. As many as a level needs to be told to a third of itself.
-_STATED = 5.0
 # Rounds end where none of the standard deviations changes by more than this share.
 _SETTLED = 0.05
-_MOST_ROUNDS = 5
+_MOST_ROUNDS = 10
+# Until then the next step may move the path by so much, in squared sigmas a coordinate.
+_CLOSE = 1e-3
 
 
 def settled_with_levels(
     problem: Problem, at: Estimate, weights: Weights | None = None, tails: Tails = NO_TAILS
-) -> Settled:
-    """Where steps end under the levels that the observations tell; for the rest as `settled`."""
-    end, levels = settled(problem, at, weights=weights, tails=tails), np.ones(3)
+) -> tuple[Settled, Float]:
+    """Where steps end under the levels (3,) that the observations tell, for the rest as `settled`.
+
+    A level that next to nothing is told of stays 1.
+    """
+    levels, n_steps = np.ones(3), 0
     for _ in range(_MOST_ROUNDS):
+        end = settled(_with(problem, levels), at, _CLOSE, weights, tails)
+        at, weights, tails, n_steps = end.estimate, end.weights, end.tails, n_steps + end.n_steps
         before, levels = levels, told_levels(problem, end, levels)
         if np.abs(np.log(levels / before)).max() < 2 * _SETTLED:
             break
-        n_steps, now = end.n_steps, problem._replace(information=problem.information / levels)
-        end = settled(now, end.estimate, weights=end.weights, tails=end.tails)
-        end = end._replace(n_steps=n_steps + end.n_steps)
-    return end
+    end = settled(_with(problem, levels), at, weights=weights, tails=tails)
+    return end._replace(n_steps=n_steps + end.n_steps), levels
+
+
+def _with(problem: Problem, levels: Float) -> Problem:
+    return problem._replace(information=problem.information / levels)
 
 
 def told_levels(problem: Problem, end: Settled, levels: Float) -> Float:
@@ -50,4 +57,6 @@ def told_levels(problem: Problem, end: Settled, levels: Float) -> Float:
     """
     found = np.sum(disturbances(end.estimate.path, problem.odometry) ** 2 * problem.information, 0)
     untold = disturbance_variances(end) * problem.information / levels
-    return (found + _STATED) / (np.sum(np.clip(1 - untold, 0, 1), axis=0) + _STATED)
+    said = problem.information > 0  # nothing is, of the way from one robot's log to another's
+    known = np.sum(np.where(said, np.clip(1 - untold, 0, 1), 0), axis=0)
+    return np.where(known < LEAST_TOLD, 1.0, found / np.maximum(known, LEAST_TOLD))

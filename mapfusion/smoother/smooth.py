@@ -131,7 +131,8 @@ def smooth(
     known = Problem(seen, log.odometry, information, parameters.stray_information)
     blurred = replace(seen, information=seen.information / _THOUGHT_WORSE**2)
     first = settled(known._replace(seen=blurred), at, _CLOSE)
-    # odometry that pictures told says only what its own covariance says, and in few frames
-    ends = settled if parameters.odometry_covariance is not None else settled_with_levels
-    end = ends(known, first.estimate, weights=first.weights, tails=first.tails)
+    if parameters.odometry_covariance is None:
+        end, _ = settled_with_levels(known, first.estimate, first.weights, first.tails)
+    else:  # odometry that pictures told is used where these say nothing: they tell no level
+        end = settled(known, first.estimate, weights=first.weights, tails=first.tails)
     return Smoothed.of(end, first.n_steps)

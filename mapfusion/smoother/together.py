@@ -14,6 +14,7 @@ from mapfusion.robot_log import NO_TRACK, Observations, RobotLog
 from mapfusion.se2 import IDENTITY, Float, between, compose
 from mapfusion.smoother.elimination import matrix_bytes, pose_covariances
 from mapfusion.smoother.normal_equations import Estimate
+from mapfusion.smoother.odometry_levels import settled_with_levels
 from mapfusion.smoother.recording import Recording
 from mapfusion.smoother.residuals import first_points
 from mapfusion.smoother.settle import Problem, settled
@@ -49,7 +50,7 @@ def smooth_together(
     T_first_robot: Float,
     max_memory_gb: float,
 ) -> SmoothedTogether:
-    """The most probable paths and points of K robots whose tracks stray alike.
+    """The most probable paths and points of K robots whose tracks stray and wheels err alike.
 
     It starts near where it ends, so there is no round of thinking the observations worse.
 
@@ -84,7 +85,8 @@ def smooth_together(
     ]
     problem = Problem(seen, log.odometry, np.concatenate(information)[:-1], stray_information)
     start = Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
-    end = settled(problem, start)
+    own_odometry = all(each.parameters.odometry_covariance is None for each in recordings)
+    end = settled_with_levels(problem, start)[0] if own_odometry else settled(problem, start)
     covariance = np.zeros((len(starts), 3, 3))
     covariance[1:] = pose_covariances(seen, end.equations, end.solution, starts[1:])
     names = point[seen.row[seen.starts[:-1]]]

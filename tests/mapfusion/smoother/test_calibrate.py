@@ -11,7 +11,7 @@ from mapfusion.robot_log import Observations, RobotLog
 from mapfusion.se2 import Float, compose, rotation
 from mapfusion.smoother.calibrate import Calibration, calibrate
 from mapfusion.smoother.elimination import pose_point_blocks
-from mapfusion.smoother.motion_posterior import motion_posterior
+from mapfusion.smoother.motion_posterior import disturbance_variances, motion_posterior
 from mapfusion.smoother.noise_levels import LEVELS
 from mapfusion.smoother.normal_equations import (
     Estimate,
@@ -98,9 +98,10 @@ def test_a_correction_undoes_its_error() -> None:
     np.testing.assert_allclose(late[:, 2], [0.0, 0.6, 0.2])
 
 
-def test_the_posterior_equals_dense_algebra() -> None:
+@pytest.mark.parametrize(("n_frames", "n_landmarks"), [(30, 12), (15, 60)])
+def test_the_posterior_equals_dense_algebra(n_frames: int, n_landmarks: int) -> None:
     """Variances of the disturbances, and the information on the constants, all unknowns at once."""
-    log = white_noise_log(np.random.default_rng(2), 30, 12, planar=True).log
+    log = white_noise_log(np.random.default_rng(2), n_frames, n_landmarks, planar=True).log
     label = log.observations.label
     assert label is not None
     seen = sightings_of(log, label, 1, stray=False)
@@ -127,7 +128,9 @@ def test_the_posterior_equals_dense_algebra() -> None:
             H[k - 1, :, k] = end.equations.link[k].T
     H = np.block([[H.reshape(3 * n, -1), B], [B.T, K]])
     covariance = D @ np.linalg.inv(H)[: 3 * n, : 3 * n] @ D.T
-    np.testing.assert_allclose(found.variance.ravel(), np.diag(covariance), rtol=1e-7)
+    assert end.solution.landmarks_first == (n_frames < n_landmarks)
+    for variance in (found.variance, disturbance_variances(end)):
+        np.testing.assert_allclose(variance.ravel(), np.diag(covariance), rtol=1e-6)
     W, S = information.ravel(), by.reshape(3 * n, -1)
     free = (S.T * W) @ S - (S.T * W) @ covariance @ (W[:, None] * S)
     np.testing.assert_allclose(found.constants_information, free, rtol=1e-6, atol=1e-6)
