@@ -14,11 +14,13 @@ import numpy as np
 
 from mapfusion.se2 import Float
 from mapfusion.smoother.motion_posterior import disturbance_variances
-from mapfusion.smoother.noise_levels import LEAST_TOLD
 from mapfusion.smoother.normal_equations import Estimate, Weights, disturbances
 from mapfusion.smoother.robust import NO_TAILS, Tails
 from mapfusion.smoother.settle import Problem, Settled, settled
 
+# Disturbances that have to be told before a level is taken from them: a standard deviation is then
+# known to a tenth of itself, 1 / sqrt(2 n). Of fewer, covariances would be as uncertain as levels.
+_LEAST_TOLD = 50.0
 # Rounds end where none of the standard deviations changes by more than this share.
 _SETTLED = 0.05
 _MOST_ROUNDS = 10
@@ -31,7 +33,7 @@ def settled_with_levels(
 ) -> tuple[Settled, Float]:
     """Where steps end under the levels (3,) that the observations tell, for the rest as `settled`.
 
-    A level that next to nothing is told of stays 1.
+    A level that too little is told of stays 1.
     """
     levels, n_steps = np.ones(3), 0
     for _ in range(_MOST_ROUNDS):
@@ -53,10 +55,11 @@ def told_levels(problem: Problem, end: Settled, levels: Float) -> Float:
 
     Args:
         problem: with the odometry's information as stated.
-        end: where steps ended with these variances times `levels` (3,).
+        end: where steps ended.
+        levels: (3,) that the stated variances were multiplied by.
     """
     found = np.sum(disturbances(end.estimate.path, problem.odometry) ** 2 * problem.information, 0)
     untold = disturbance_variances(end) * problem.information / levels
     said = problem.information > 0  # nothing is, of the way from one robot's log to another's
     known = np.sum(np.where(said, np.clip(1 - untold, 0, 1), 0), axis=0)
-    return np.where(known < LEAST_TOLD, 1.0, found / np.maximum(known, LEAST_TOLD))
+    return np.where(known < _LEAST_TOLD, 1.0, found / np.maximum(known, _LEAST_TOLD))

@@ -37,7 +37,7 @@ class SmootherParameters:
     """Settings of the smoother.
 
     Attributes:
-        motion: noise of the odometry.
+        motion: noise of the odometry as stated; how much of it there is the log tells.
         stray_m: standard deviation, along each axis, of where the point that a track is of lies
             beside the landmark; 0: it is the landmark.
         min_count: observations that a landmark needs.
