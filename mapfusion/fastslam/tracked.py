@@ -7,7 +7,7 @@ about the one is less so about the other, and about the point that the next trac
 import numpy as np
 from numba import njit
 
-from mapfusion.fastslam.slots import Slots
+from mapfusion.fastslam.slots import FREE, Slots
 
 
 class Tracked:
@@ -19,7 +19,9 @@ class Tracked:
     def ended(self, track: np.ndarray | None, slots: Slots) -> np.ndarray:
         """Slots (n,) of tracks that go on in none of this frame's observations (K,); once each."""
         over = np.isin(self._track, [] if track is None else track, invert=True)
-        over &= slots.source[self._slot] == self._source  # else it has become another landmark's
+        # A landmark that no particle has any more is gone, and its slot may be another's by now.
+        over &= slots.generation[self._slot] != FREE
+        over &= slots.source[self._slot] == self._source
         return np.unique(self._slot[over])
 
     def went_into(

@@ -4,6 +4,11 @@ import numpy as np
 import pytest
 
 from mapfusion.fastslam.filter import FastSlam
+from mapfusion.fastslam.particles import ParticleMaps
+from mapfusion.fastslam.sensor import sightings
+from mapfusion.fastslam.slots import FREE
+from mapfusion.fastslam.tracked import Tracked
+from mapfusion.fastslam.update import DROPPED, NEW
 from mapfusion.robot_log import Observations
 from tests.mapfusion.fastslam.landmark_worlds import EXACT_MOTION, nothing, parameters
 
@@ -94,3 +99,17 @@ def test_the_density_has_no_step_at_the_gate(
     inside, outside = 0.999 * np.sqrt(settings.gate), 1.001 * np.sqrt(settings.gate)
     assert log_evidence(inside) == pytest.approx(log_evidence(outside), abs=0.002 * settings.gate)
     assert log_evidence(0.0) == pytest.approx(log_evidence(outside) + settings.gate / 2)
+
+
+def test_the_end_of_a_track_leaves_alone_what_no_particle_has_any_more() -> None:
+    """A row of the dead landmark is another's by then: both would be one from there on."""
+    seen = frame([3, 4])
+    maps, tracked = ParticleMaps(2, 9.0), Tracked()
+    places = sightings(np.zeros((2, 3)), seen.position_m, seen.covariance_m2, planar=False)
+    chosen = np.array([[NEW, NEW], [DROPPED, NEW]])  # the second particle alone has the second
+    slots, rows = maps.create(chosen, places, seen, 0)
+    tracked.went_into(seen.track, chosen, np.stack([rows, slots], axis=1), maps.slots)
+    maps.resampled(np.zeros(2, dtype=np.int32))
+    maps.bring_up_to_date(slots[maps.slots.generation[slots] != FREE])
+    assert maps.slots.generation[slots[1]] == FREE
+    assert tracked.ended(None, maps.slots).tolist() == [slots[0]]
