@@ -11,7 +11,7 @@ from mapfusion.errors import InputError
 
 app = typer.Typer()
 _DRAWING = "draw the figures"
-_NEEDED = ("experiments.judge.result", "experiments.show.figures.drawing")  # by worker processes
+NEEDED = ("experiments.judge.result", "experiments.show.figures.drawing")  # by worker processes
 
 
 @app.command(rich_help_panel=options.RUN)
@@ -42,7 +42,7 @@ def run(
         raise InputError(f"--output {output}: {several}")
     # What draws takes seconds to import: a scenario is refused before.
     if jobs > 1:
-        make_ready(_NEEDED)
+        make_ready(NEEDED)
     from experiments.judge.nothing_merged import nothing_merged
     from experiments.judge.result import run_scenario
     from experiments.show.figures.drawing import draw_all

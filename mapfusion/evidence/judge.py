@@ -62,7 +62,6 @@ class PairJudge:
         self._judge, self._pairs, self._known = judge, pairs, known
         self._chance = judge.acceptance.on(pairs)
         self._bound = math.log10(judge.acceptance.false_alarms)
-        self._verdicts: dict[tuple[object, ...], Verdict] = {}
 
     @cached_property
     def _witnesses(self) -> Witnesses:
@@ -82,15 +81,6 @@ class PairJudge:
 
     def judge(self, alignment: Alignment) -> Verdict:
         """The verdict on one alignment of the correspondences."""
-        # Refined, most of a randomised method's answers are one and the same, to the last bit.
-        arrays = (alignment.T_a_b, alignment.covariance, alignment.inlier)
-        outcome = alignment.status, alignment.reason, alignment.drift_sigma_m
-        same = (*(each.tobytes() for each in arrays), *outcome)
-        if same not in self._verdicts:
-            self._verdicts[same] = self._verdict(alignment)
-        return self._verdicts[same]
-
-    def _verdict(self, alignment: Alignment) -> Verdict:
         by_chance = self._chance.judge(alignment)
         if not by_chance.accepted:
             return by_chance

@@ -1,3 +1,4 @@
+import importlib.util
 import os
 import signal
 import subprocess
@@ -6,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from experiments.cli import run_commands
 from experiments.run.workers import workers
 from mapfusion.errors import InputError
 from tests.helpers.waiting import has_ended, wait_until
@@ -50,6 +52,11 @@ def test_workers_are_forked_from_a_server_with_what_is_imported_here(tmp_path: P
     server = told[0].split()[0]
     assert told == [f"{server} True"] * 8
     assert server != own
+
+
+def test_what_is_to_be_imported_early_is_there() -> None:
+    """The server passes over in silence what it does not find."""
+    assert all(importlib.util.find_spec(name) for name in run_commands.NEEDED)
 
 
 PARENT = """
