@@ -70,7 +70,7 @@ def fit_planes(
 
 
 @njit(cache=True)
-def _grey(image: np.ndarray, x: float, y: int) -> float:
+def grey_at(image: np.ndarray, x: float, y: int) -> float:
     """Grey level between columns by the cubic of Catmull and Rom, for 1 <= x < width - 2."""
     k = int(x)
     t = x - k
@@ -193,7 +193,7 @@ def _residuals(
     for y in range(-half, half + 1):
         start = u - plane[0] - plane[2] * y
         for x in range(-half, half + 1):
-            residual = _grey(right, start + x - plane[1] * x, v + y) - float(left[v + y, u + x])
+            residual = grey_at(right, start + x - plane[1] * x, v + y) - float(left[v + y, u + x])
             slope = 0.5 * (float(left[v + y, u + x + 1]) - float(left[v + y, u + x - 1]))
             square += residual * residual
             moment[0] += residual
@@ -279,7 +279,7 @@ def _halves(
             at = u + x - plane[0] - plane[1] * x - plane[2] * y
             if not 1 <= at < width - 2:
                 continue
-            residual = _grey(right, at, v + y) - float(left[v + y, u + x])
+            residual = grey_at(right, at, v + y) - float(left[v + y, u + x])
             slope = 0.5 * (float(left[v + y, u + x + 1]) - float(left[v + y, u + x - 1]))
             down = (float(left[below, u + x]) - float(left[above, u + x])) / (below - above)
             for k in range(4):
