@@ -103,6 +103,7 @@ def limits_for(stereo: StereoParameters, noise: NoiseModel, probability: float) 
         noise_grey=noise.noise_grey,
         max_misfit_px=max(wide * noise.misfit_px, 1e-3),
         max_rows_px=wide * noise.rows_px,
+        plane_misfit_px=wide * noise.misfit_px,
         row_sigma_px=noise.rows_px,
         min_correlation=min(max(correlation, _SEARCH[0]), stereo.min_correlation),
     )

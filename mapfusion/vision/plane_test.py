@@ -29,6 +29,7 @@ FURTHER_TERMS = len(_FURTHER)
 # others then count nothing.
 _RIDGE = 1e-6
 _SUMS = 14  # of a row: g times 1, L and r, each with x^0 to x^2, and g^2 with x^0 to x^4
+_FLAT = 6  # of a window: 1, L, L^2, r, L r and h^2
 
 
 @njit(cache=True)
@@ -77,73 +78,103 @@ def _add_up(
     """Fill in J^T J (lower half) and J^T r of a window; the mean squares of its slopes."""
     height, width = left.shape
     u, v = pixel[0], pixel[1]
-    shade = float(left[v, u])  # grey levels are counted from it, as small numbers are exact
-    row = np.empty((3, _SUMS))
-    count, down = 0.0, 0.0
-    normal[:] = 0.0
-    moment[:] = 0.0
+    first, last = max(-half, 1 - u), min(half, width - 2 - u)
+    grid, row, flat = np.zeros((3, 5, 3, _SUMS)), np.empty((3, _SUMS)), np.zeros(_FLAT)
     for y in range(max(-half, -v), min(half, height - 1 - v) + 1):
-        row[:] = 0.0
-        above, below = max(v + y - 1, 0), min(v + y + 1, height - 1)
         start = u - plane[0] - plane[2] * y
-        for x in range(max(-half, 1 - u), min(half, width - 2 - u) + 1):
-            at = start + x - plane[1] * x
-            if not 1 <= at < width - 2:
-                continue
-            own = float(left[v + y, u + x])
-            residual = grey_at(right, at, v + y) - own
-            own -= shade
-            slope = 0.5 * (float(left[v + y, u + x + 1]) - float(left[v + y, u + x - 1]))
-            normal[0, 0] += 1
-            normal[1, 0] += own
-            normal[1, 1] += own * own
-            moment[0] += residual
-            moment[1] += own * residual
-            count += 1
-            down += ((float(left[below, u + x]) - float(left[above, u + x])) / (below - above)) ** 2
-            _add_pixel(row[1 + (x > 0) - (x < 0)], x, slope, own, residual)
-        _add_row(row, y, normal, moment)
-    if count == 0:
-        return 0.0, 0.0
-    return normal[_BRIGHTNESS, _BRIGHTNESS] / count, down / count
+        for side in range(3):
+            begin = max(first, (first, 0, 1)[side])
+            end = min(last, (-1, 0, last)[side])
+            _sum_up(left, right, u, v, y, begin, end, start, plane[1], row[side], flat)
+        power = 1.0
+        for q in range(5):
+            lifted = grid[1 + (y > 0) - (y < 0), q]
+            for side in range(3):
+                for k in range(_SUMS):
+                    lifted[side, k] += power * row[side, k]
+            power *= y
+    _fold(grid)
+    _fill_in(grid, normal, moment)
+    normal[0, 0], normal[1, 0], normal[1, 1], moment[0], moment[1] = flat[:5]
+    count = max(flat[0], 1.0)
+    return normal[_BRIGHTNESS, _BRIGHTNESS] / count, flat[5] / count
 
 
 @njit(cache=True)
-def _add_pixel(sums: Float, x: int, slope: float, own: float, residual: float) -> None:
-    """Add g x^k (k to 2) times 1, L and r, and g^2 x^k (k to 4), to the sums of one side."""
-    power = slope
-    for k in range(3):
-        sums[k] += power
-        sums[3 + k] += power * own
-        sums[6 + k] += power * residual
-        power *= x
-    power = slope * slope
-    for k in range(5):
-        sums[9 + k] += power
-        power *= x
+def _sum_up(
+    left: np.ndarray,
+    right: np.ndarray,
+    u: int,
+    v: int,
+    y: int,
+    begin: int,
+    end: int,
+    start: float,
+    lean: float,
+    sums: Float,
+    flat: Float,
+) -> None:
+    """Sums over the pixels `begin` to `end` of a row.
 
-
-@njit(cache=True)
-def _add_row(row: Float, y: int, normal: Float, moment: Float) -> None:
-    """Add a row's sums left of the centre, at it and right of it (3, _SUMS), times powers of y.
-
-    Of a product of two terms the signs multiply to 1, sgn or sgn^2, which is 0 at the centre.
+    Fills `sums`: g x^k (k to 2) times 1, L and r, and g^2 x^k (k to 4); adds to `flat`: 1, L, L^2,
+    r, L r and h^2, with h the slope of the grey levels L along v.
     """
-    along, down = np.empty((3, _SUMS)), np.empty((3, 5))
-    side, power = (y > 0) - (y < 0), 1.0
-    for k in range(_SUMS):
-        along[1, k] = row[2, k] - row[0, k]
-        along[2, k] = row[2, k] + row[0, k]
-        along[0, k] = along[2, k] + row[1, k]
-    for k in range(5):
-        down[0, k], down[1, k], down[2, k] = power, side * power, side * side * power
-        power *= y
+    above, below = max(v + y - 1, 0), min(v + y + 1, len(left) - 1)
+    shade = float(left[v, u])  # grey levels are counted from it: small numbers lose less
+    g0 = g1 = g2 = l0 = l1 = l2 = r0 = r1 = r2 = s0 = s1 = s2 = s3 = s4 = 0.0
+    count = own = own2 = off = own_off = down2 = 0.0
+    for x in range(begin, end + 1):
+        at = start + x - lean * x
+        if not 1 <= at < left.shape[1] - 2:
+            continue
+        L = float(left[v + y, u + x])
+        r = grey_at(right, at, v + y) - L
+        L -= shade
+        g = 0.5 * (float(left[v + y, u + x + 1]) - float(left[v + y, u + x - 1]))
+        h = (float(left[below, u + x]) - float(left[above, u + x])) / (below - above)
+        gx, gxx = g * x, g * x * x
+        g0, g1, g2 = g0 + g, g1 + gx, g2 + gxx
+        l0, l1, l2 = l0 + g * L, l1 + gx * L, l2 + gxx * L
+        r0, r1, r2 = r0 + g * r, r1 + gx * r, r2 + gxx * r
+        s0, s1, s2, s3, s4 = s0 + g * g, s1 + g * gx, s2 + gx * gx, s3 + gx * gxx, s4 + gxx * gxx
+        count, own, own2, down2 = count + 1.0, own + L, own2 + L * L, down2 + h * h
+        off, own_off = off + r, own_off + L * r
+    for k, value in enumerate((g0, g1, g2, l0, l1, l2, r0, r1, r2, s0, s1, s2, s3, s4)):
+        sums[k] = value
+    for k, value in enumerate((count, own, own2, off, own_off, down2)):
+        flat[k] += value
+
+
+@njit(cache=True)
+def _fold(grid: Float) -> None:
+    """From sums (3, 5, 3, _SUMS) by the side of y and of x to sums with signs, in place.
+
+    Along either axis: first of all pixels, then with the sign sgn, then with sgn^2, which is 0 at
+    the centre.
+    """
+    for q in range(5):
+        for k in range(_SUMS):
+            for j in range(3):
+                below, at, beyond = grid[0, q, j, k], grid[1, q, j, k], grid[2, q, j, k]
+                grid[0, q, j, k] = below + at + beyond
+                grid[1, q, j, k] = beyond - below
+                grid[2, q, j, k] = beyond + below
+            for i in range(3):
+                below, at, beyond = grid[i, q, 0, k], grid[i, q, 1, k], grid[i, q, 2, k]
+                grid[i, q, 0, k] = below + at + beyond
+                grid[i, q, 1, k] = beyond - below
+                grid[i, q, 2, k] = beyond + below
+
+
+@njit(cache=True)
+def _fill_in(grid: Float, normal: Float, moment: Float) -> None:
+    """The entries of the disparities' terms: of a product signs and powers add up."""
     for i in range(len(_TERMS)):
         p, s, q, t = _TERMS[i]
         at = _BRIGHTNESS + i
-        normal[at, 0] += along[s, p] * down[t, q]
-        normal[at, 1] += along[s, 3 + p] * down[t, q]
-        moment[at] += along[s, 6 + p] * down[t, q]
+        normal[at, 0] = grid[t, q, s, p]
+        normal[at, 1] = grid[t, q, s, 3 + p]
+        moment[at] = grid[t, q, s, 6 + p]
         for j in range(i + 1):
             pp, ss, qq, tt = _TERMS[j]
-            normal[at, _BRIGHTNESS + j] += along[s + ss, 9 + p + pp] * down[t + tt, q + qq]
+            normal[at, _BRIGHTNESS + j] = grid[t + tt, q + qq, s + ss, 9 + p + pp]

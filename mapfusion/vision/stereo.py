@@ -9,6 +9,8 @@
    which more counts as what exceeds the sensor's noise.
 3. Each half of a larger window (left, right, upper, lower) must agree with that plane, or the
    corner sits on a silhouette, where two surfaces meet in the image and nothing in the world.
+4. What is left must not show that the disparity steps, breaks or bends (`plane_test.py`): where
+   wall and floor meet or another surface begins beside, the plane lies off in every picture alike.
 """
 
 from dataclasses import dataclass
@@ -24,8 +26,10 @@ from mapfusion.arguments import (
     require_shape,
 )
 from mapfusion.camera import StereoCamera
+from mapfusion.chi_square import chi_square_bound
 from mapfusion.se2 import Float
 from mapfusion.vision.plane_fit import disagrees, fit_planes
+from mapfusion.vision.plane_test import FURTHER_TERMS, plane_scores
 from mapfusion.vision.row_search import search_rows
 from mapfusion.vision.verdict import Verdict
 
@@ -51,6 +55,10 @@ class StereoParameters:
         max_misfit_px: a half window may differ from the plane by noise and by what this error in
             disparity would explain,
         max_rows_px: and by what rows that are so far off would.
+        plane_probability: of windows of one plane, the share that is to pass the test for further
+            terms of the disparity,
+        plane_misfit_px: where noise, rows as above and this deviation of disparities from a plane
+            are taken for white.
         row_sigma_px: standard deviation of the rows by which the two images are off; 0 of a pair
             that is rectified exactly, as simulated ones are. It adds to that of disparities.
         residual_correlation_px: what residuals hold beyond noise (staircase edges, a surface that
@@ -71,6 +79,8 @@ class StereoParameters:
     silhouette_half_px: Annotated[int, Range(2, 100, "px")] = 12
     max_misfit_px: Annotated[float, Range(1e-3, 100, "px")] = 1.0
     max_rows_px: Annotated[float, Range(0, 100, "px")] = 0.0
+    plane_probability: Annotated[float, Range(0, 1, "1")] = 0.999
+    plane_misfit_px: Annotated[float, Range(0, 100, "px")] = 0.2
     row_sigma_px: Annotated[float, Range(0, 100, "px")] = 0.0
     residual_correlation_px: Annotated[float, Range(0, 100, "px")] = 6.0
     sigma_floor_px: Annotated[float, Range(0, 100, "px")] = 0.01
@@ -152,6 +162,8 @@ def match(
         parameters.max_rows_px,
     )
     verdict[rows[bad]] = Verdict.SILHOUETTE
+    rows, plane = rows[~bad], plane[~bad]
+    verdict[rows[_bent(left, right, pixel[rows], plane, parameters)]] = Verdict.BENT
 
     unmatched = verdict != Verdict.MATCHED
     disparity[unmatched] = sigma[unmatched] = slope[unmatched] = np.nan
@@ -204,3 +216,21 @@ def _refine(
     )
     disparity = plane[:, 0] + np.sum(plane[:, 1:] * offset, -1)
     return plane, disparity, np.sqrt(variance + parameters.sigma_floor_px**2)
+
+
+def _bent(
+    left: np.ndarray,
+    right: np.ndarray,
+    pixel: np.ndarray,
+    plane: Float,
+    parameters: StereoParameters,
+) -> np.ndarray:
+    """Whether windows show more than one plane or a bent surface (N,) bool.
+
+    The score of noise is chi-square times its variance: 2 n^2, and what a deviation from the plane
+    and rows that are off add to it, by the slopes of the grey levels.
+    """
+    scores = plane_scores(left, right, pixel, plane, parameters.half_px)
+    beyond = scores[:, 1:] @ [parameters.plane_misfit_px**2, parameters.max_rows_px**2]
+    bound = chi_square_bound(parameters.plane_probability, FURTHER_TERMS)
+    return scores[:, 0] > bound * (2 * parameters.noise_grey**2 + beyond)

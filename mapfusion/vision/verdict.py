@@ -14,3 +14,4 @@ class Verdict(IntEnum):
     ONE_SIDED = 5  # the search back from the right image ends elsewhere
     DIVERGED = 6  # the refinement left the pixel that the search had found
     SILHOUETTE = 7  # half of the surroundings lie on another surface
+    BENT = 8  # the surroundings show more than one plane, or a surface that is none
