@@ -58,6 +58,7 @@ def test_a_surer_limit_is_a_wider_one() -> None:
     noise = NoiseModel(2.0, 0.5, 0.4, np.random.default_rng(0).uniform(20, 400, (50, 3)))
     narrow, wide = (limits_for(STEREO, noise, p) for p in (0.6, 0.99))
     assert wide.max_misfit_px > narrow.max_misfit_px > noise.misfit_px
+    assert wide.plane_misfit_px > narrow.plane_misfit_px > noise.misfit_px
     assert wide.max_rows_px > narrow.max_rows_px > noise.rows_px
     assert wide.min_correlation < narrow.min_correlation <= STEREO.min_correlation
     assert narrow.row_sigma_px == noise.rows_px

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
+from scipy.ndimage import maximum_filter
+from scipy.stats import binom, chi2
 
 from mapfusion.vision.harris import HarrisParameters, detect
 from mapfusion.vision.row_search import search_rows
@@ -129,7 +130,7 @@ def test_what_only_the_left_camera_sees_is_one_sided() -> None:
     uv = np.array([[140.0, 110.0]])
     parameters = replace(PARAMETERS, min_depth_m=0.25)  # disparities of both patches, 10 and 70
     assert match(left, right, uv, CAMERA, parameters).verdict == Verdict.ONE_SIDED
-    unchecked = replace(parameters, max_round_trip_px=100)
+    unchecked = replace(parameters, max_round_trip_px=100, plane_probability=1.0)
     assert match(left, right, uv, CAMERA, unchecked).verdict == Verdict.MATCHED
 
 
@@ -148,7 +149,18 @@ def step_px(depth: np.ndarray, uv: np.ndarray, reach: int) -> np.ndarray:
     return np.array(change)
 
 
-def test_silhouettes_are_rejected_and_slanted_walls_are_not() -> None:
+# Neither test of what the window shows, and either alone.
+UNTESTED = replace(PARAMETERS, max_misfit_px=100.0, plane_probability=1.0)
+BY_HALVES = replace(PARAMETERS, plane_probability=1.0)
+BY_PLANE = replace(PARAMETERS, max_misfit_px=100.0)
+
+
+@pytest.mark.parametrize(
+    ("tested", "verdict"), [(BY_HALVES, Verdict.SILHOUETTE), (BY_PLANE, Verdict.BENT)]
+)
+def test_edges_are_rejected_and_slanted_walls_are_not(
+    tested: StereoParameters, verdict: Verdict
+) -> None:
     rng = np.random.default_rng(2)
     corners_of = HarrisParameters(max_corners=400, min_distance_px=5)
     rejected, passed_unchecked, on_edge = 0, 0, 0
@@ -156,21 +168,43 @@ def test_silhouettes_are_rejected_and_slanted_walls_are_not() -> None:
         left, right, depth = render(box_scene(rng), CAMERA, (x, 0.0, 0.05), 2.0, rng)
         uv = detect(left, corners_of)
         edge = step_px(depth, uv, 3) > 2
-        with_test = match(left, right, uv, CAMERA, PARAMETERS).verdict
-        lenient = replace(PARAMETERS, max_misfit_px=100.0)
-        without = match(left, right, uv, CAMERA, lenient).verdict
+        with_test, without = (match(left, right, uv, CAMERA, p).verdict for p in (tested, UNTESTED))
         on_edge += np.sum(edge)
         passed_unchecked += np.sum(edge & (without == Verdict.MATCHED))
-        rejected += np.sum(edge & (without == Verdict.MATCHED) & (with_test != Verdict.MATCHED))
+        rejected += np.sum(edge & (without == Verdict.MATCHED) & (with_test == verdict))
     assert on_edge > 30
     assert passed_unchecked > 10
     assert rejected >= 0.9 * passed_unchecked
 
     slanted = [wall(rng, (2.0, 1.5), (6.0, -2.5), 4.0)]
-    left, right, _ = render(slanted, CAMERA, noise=2.0, rng=rng)
-    verdict = match(left, right, detect(left, corners_of), CAMERA, PARAMETERS).verdict
-    assert np.mean(verdict == Verdict.SILHOUETTE) < 0.02
-    assert np.mean(verdict == Verdict.MATCHED) > 0.8
+    left, right, depth = render(slanted, CAMERA, noise=2.0, rng=rng)
+    uv = detect(left, corners_of)
+    u, v = np.rint(uv).astype(int).T
+    uv = uv[np.isfinite(maximum_filter(depth, 2 * tested.half_px + 1)[v, u])]  # the wall alone
+    found = match(left, right, uv, CAMERA, tested).verdict
+    assert np.mean(found == verdict) < 0.02
+    assert np.mean(found == Verdict.MATCHED) > 0.8
+
+
+def test_planes_are_bent_at_the_stated_rate() -> None:
+    """Of noise alone, in whole grey levels; deviations and rows that are tolerated leave fewer."""
+    noise, share = 3.0, 0.1
+    stated = replace(
+        PARAMETERS,
+        noise_grey=np.sqrt(noise**2 + 1 / 12),
+        plane_probability=1 - share,
+        plane_misfit_px=0.0,
+    )
+    uv, bent = grid(step=17), []
+    for seed in range(4):
+        images = pair(9.0, noise=noise, seed=seed)
+        verdict = match(*images, uv, CAMERA, stated).verdict
+        bent += (verdict[verdict != Verdict.WEAK] == Verdict.BENT).tolist()
+    low, high = binom.interval(0.999, len(bent), share)
+    assert low <= np.sum(bent) <= high
+    for more in ({"plane_misfit_px": 0.5}, {"max_rows_px": 0.5}):
+        verdict = match(*images, uv, CAMERA, replace(stated, **more)).verdict
+        assert np.sum(verdict == Verdict.BENT) <= 1
 
 
 @pytest.mark.parametrize("shape", [(5, 5), (30, 30), (240, 320)])
@@ -225,6 +259,8 @@ def test_wrong_arguments_are_named(name: str, change: dict) -> None:
         ("min_correlation", 1.5),
         ("silhouette_half_px", 3),
         ("sigma_floor_px", -0.1),
+        ("plane_probability", 1.1),
+        ("plane_misfit_px", -0.1),
     ],
 )
 def test_wrong_parameters_are_named(name: str, value: float) -> None:
