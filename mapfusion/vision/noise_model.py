@@ -88,7 +88,8 @@ def limits_for(stereo: StereoParameters, noise: NoiseModel, probability: float) 
 
     A half's square is a sum over so many independent parts as squares of the length over which
     residuals are alike fit into it; the correlation of a window is 1 - r^2 / (2 s^2), with s^2 the
-    variance of its grey levels: the limit is what this share of the windows' textures allow.
+    variance of its grey levels: the limit is what this share of the windows' textures allow. The
+    test for bent surfaces tolerates what a half does, and refuses few that the halves let pass.
     """
     alike = max(stereo.residual_correlation_px, 1.0)
     side = 2 * stereo.silhouette_half_px + 1

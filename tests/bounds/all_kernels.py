@@ -16,6 +16,7 @@ from mapfusion.se3 import in_space
 from mapfusion.vision.frontend import FrontEnd, FrontEndParameters
 from mapfusion.vision.harris import HarrisParameters
 from mapfusion.vision.noise_model import measured_noise
+from mapfusion.vision.plane_test import plane_scores
 from mapfusion.vision.tracks import Tracker, TrackParameters
 from sim.exposure import expose
 from sim.floorplan import FloorPlan, Wall
@@ -102,7 +103,7 @@ def pictures(folder: Path) -> None:
 
 
 def front_end() -> None:
-    """Corners all over a small picture, followed into the next one."""
+    """Corners all over a small picture, followed into the next one, and the picture's own."""
     camera, rng = StereoCamera(80, 60, 72.0), np.random.default_rng(0)
     room = [wall(rng, (1.6, 2.0), (1.4, -2.0))]
     few = replace(FrontEndParameters(), harris=HarrisParameters(max_corners=20))
@@ -112,6 +113,8 @@ def front_end() -> None:
         left, right, _ = render(room, camera, (0.02 * t, 0.0, 0.0), 1.0, rng)
         tracker.update(FrontEnd(camera, off_rows).extract(left, right))
         measured_noise([(left, right)], camera, few.harris, few.stereo)
+        ends = np.array([[0, 0], [79, 0], [0, 59], [79, 59]])
+        plane_scores(left, right, ends, np.tile([2.5, 0.1, -0.1], (4, 1)), 8)
 
 
 def call_all() -> None:
