@@ -58,7 +58,7 @@ class StereoParameters:
         plane_probability: of windows of one plane, the share that is to pass the test for further
             terms of the disparity,
         plane_misfit_px: where noise, rows as above and this deviation of disparities from a plane
-            are taken for white.
+            are taken for white. The default is of pictures with staircase edges.
         row_sigma_px: standard deviation of the rows by which the two images are off; 0 of a pair
             that is rectified exactly, as simulated ones are. It adds to that of disparities.
         residual_correlation_px: what residuals hold beyond noise (staircase edges, a surface that
@@ -80,7 +80,7 @@ class StereoParameters:
     max_misfit_px: Annotated[float, Range(1e-3, 100, "px")] = 1.0
     max_rows_px: Annotated[float, Range(0, 100, "px")] = 0.0
     plane_probability: Annotated[float, Range(0, 1, "1")] = 0.999
-    plane_misfit_px: Annotated[float, Range(0, 100, "px")] = 0.2
+    plane_misfit_px: Annotated[float, Range(0, 100, "px")] = 0.7
     row_sigma_px: Annotated[float, Range(0, 100, "px")] = 0.0
     residual_correlation_px: Annotated[float, Range(0, 100, "px")] = 6.0
     sigma_floor_px: Annotated[float, Range(0, 100, "px")] = 0.01

@@ -51,6 +51,21 @@ def test_a_drawn_world_is_drawn_by_the_ray_caster_unless_another_is_named(path: 
     assert unnamed.render.renderer == "raycast"
 
 
+def test_planes_are_told_more_sharply_where_pictures_are_filtered(path: Path) -> None:
+    """By the renderer, and not where the file says it."""
+    said = "vision.stereo.plane_misfit_px"
+    for overrides, expected in (
+        ([], 0.2),
+        (["vision.stereo.half_px=7"], 0.2),
+        (["render.renderer=tiny"], 0.7),
+        (["render.renderer=tiny", f"{said}=0.3"], 0.3),
+        ([f"{said}=0.4"], 0.4),
+    ):
+        scenario = load_scenario(path, overrides)
+        assert isinstance(scenario, Simulation)
+        assert scenario.vision.stereo.plane_misfit_px == expected
+
+
 def test_the_resolved_scenario_is_a_scenario_with_the_same_keys(path: Path, tmp_path: Path) -> None:
     scenario = load_scenario(path)
     resolved = tmp_path / "scenario.json"

@@ -152,7 +152,7 @@ def step_px(depth: np.ndarray, uv: np.ndarray, reach: int) -> np.ndarray:
 # Neither test of what the window shows, and either alone.
 UNTESTED = replace(PARAMETERS, max_misfit_px=100.0, plane_probability=1.0)
 BY_HALVES = replace(PARAMETERS, plane_probability=1.0)
-BY_PLANE = replace(PARAMETERS, max_misfit_px=100.0)
+BY_PLANE = replace(PARAMETERS, max_misfit_px=100.0, plane_misfit_px=0.2)
 
 
 @pytest.mark.parametrize(
