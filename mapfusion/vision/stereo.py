@@ -58,13 +58,13 @@ class StereoParameters:
         plane_probability: of windows of one plane, the share that is to pass the test for further
             terms of the disparity,
         plane_misfit_px: where noise, rows as above and this deviation of disparities from a plane
-            are taken for white. The default is of pictures with staircase edges.
+            are taken for white.
         row_sigma_px: standard deviation of the rows by which the two images are off; 0 of a pair
             that is rectified exactly, as simulated ones are. It adds to that of disparities.
         residual_correlation_px: what residuals hold beyond noise (staircase edges, a surface that
             is no plane) is alike over so many pixels each way: that many squared count as one.
         sigma_floor_px: error that stays however much texture there is. With this and the one before
-            errors against rendered depth are as stated, drawn with a filter or without.
+            errors against rendered depth are as stated where a filter has drawn.
     """
 
     min_depth_m: Annotated[float, Range(0.01, 100, "m")] = 0.5
@@ -80,7 +80,7 @@ class StereoParameters:
     max_misfit_px: Annotated[float, Range(1e-3, 100, "px")] = 1.0
     max_rows_px: Annotated[float, Range(0, 100, "px")] = 0.0
     plane_probability: Annotated[float, Range(0, 1, "1")] = 0.999
-    plane_misfit_px: Annotated[float, Range(0, 100, "px")] = 0.7
+    plane_misfit_px: Annotated[float, Range(0, 100, "px")] = 0.2
     row_sigma_px: Annotated[float, Range(0, 100, "px")] = 0.0
     residual_correlation_px: Annotated[float, Range(0, 100, "px")] = 6.0
     sigma_floor_px: Annotated[float, Range(0, 100, "px")] = 0.01
