@@ -1,6 +1,7 @@
 """ICP from a random minimal set of correspondences (section 5)."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
@@ -60,9 +61,21 @@ class ClosestPoints:
         self._maps = map_a, map_b
         self._p_b = map_b.position_m * upright
 
-    def cost_m2(self, T_a_b: Float) -> float:
-        """Summed squared distance of map b's landmarks under T_a_b to their nearest in map a."""
-        return summed_square_distance(T_a_b, self._p_b, self._grid)
+    def cost_m2(self, T_a_b: Float, most_m2: float = math.inf) -> float:
+        """Summed squared distance of map b's landmarks under T_a_b to their nearest in map a.
+
+        Beyond `most_m2` it is not summed up: what comes back is more than that.
+        """
+        return summed_square_distance(T_a_b, self._p_b, self._grid, most_m2)
+
+    def nearest_of(self, starts: Sequence[Float]) -> Float:
+        """The first of the motions with the least cost."""
+        nearest, least_m2 = starts[0], math.inf
+        for T_a_b in starts:
+            cost_m2 = self.cost_m2(T_a_b, least_m2)
+            if cost_m2 < least_m2:
+                nearest, least_m2 = T_a_b, cost_m2
+        return nearest
 
     def descend(self, T_a_b: Float, pairs: Pairs, max_rounds: int) -> Fit:
         """Pair and solve from T_a_b on until the pairing repeats; fitted to the last pairing."""
@@ -77,14 +90,19 @@ class ClosestPoints:
 
 
 @njit(cache=True)
-def summed_square_distance(T_a_b: Float, p_b: Float, grid: Grid) -> float:
-    """Sum over p_b (N, 3) of the squared distance under T_a_b to the nearest point of the grid."""
+def summed_square_distance(T_a_b: Float, p_b: Float, grid: Grid, most: float) -> float:
+    """Sum over p_b (N, 3) of the squared distance under T_a_b to the nearest point of the grid.
+
+    It ends with the first that makes it exceed `most`.
+    """
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
     total = 0.0
     for i in range(len(p_b)):
         x, y = moved_point(T_a_b, cos, sin, p_b[i, 0], p_b[i, 1])
         _, distance, _ = nearest_two(x, y, p_b[i, 2], grid)
         total += distance * distance
+        if total > most:
+            break
     return total
 
 

@@ -42,4 +42,4 @@ class ImpIcp:
         best = np.flatnonzero(pairs.distance <= last)
         closest = ClosestPoints(pairs.map_a, pairs.map_b)
         starts = [draw_motion(pairs, best, rng) for _ in range(self.sets)]
-        return closest.descend(min(starts, key=closest.cost_m2), pairs, self.max_rounds)
+        return closest.descend(closest.nearest_of(starts), pairs, self.max_rounds)

@@ -50,6 +50,24 @@ def test_cost_is_the_summed_square_distance():
     assert cost == pytest.approx(np.sum(cdist(moved, pair.map_a.position_m).min(axis=1) ** 2))
 
 
+def test_of_several_starts_the_first_with_the_least_cost_is_taken():
+    pair, rng = given_pairs(np.random.default_rng(1), 80, 0.5, 0.05), np.random.default_rng(2)
+    closest = ClosestPoints(pair.map_a, pair.map_b)
+    for _ in range(20):
+        starts = list(pair.T_a_b + rng.normal(0, 0.5, (4, 3)))
+        starts.insert(2, starts[int(np.argmin([closest.cost_m2(T) for T in starts]))].copy())
+        cost = [closest.cost_m2(T) for T in starts]
+        assert closest.nearest_of(starts) is starts[int(np.argmin(cost))]
+
+
+def test_cost_is_not_summed_up_beyond_what_is_asked():
+    pair = given_pairs(np.random.default_rng(1), 80, 0.5, 0.05)
+    closest = ClosestPoints(pair.map_a, pair.map_b)
+    cost = closest.cost_m2(pair.T_a_b)
+    assert closest.cost_m2(pair.T_a_b, cost) == cost
+    assert cost / 2 < closest.cost_m2(pair.T_a_b, cost / 2) < cost
+
+
 def test_planar_maps_ignore_heights():
     rng = np.random.default_rng(2)
     p = rng.uniform(0, 10, (50, 3))
