@@ -9,6 +9,7 @@ from pkgutil import iter_modules
 from typing import Any, NamedTuple
 
 import matplotlib
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from experiments.run.workers import workers
@@ -72,16 +73,27 @@ def save_figure(folder: Path, name: str, draw: Callable[..., Figure], *data: Any
     files = [folder / f"{name}.{kind}" for kind in _DPI]
     with house_style():
         figure = draw(*data)
-        for file, kind in zip(files, _DPI, strict=True):
-            picture = _picture(figure, kind)
-            if kind == "png":
-                write_sealed(file, picture + LINE)
-            else:
-                write_whole(file, lambda path, picture=picture: path.write_bytes(picture))
-            # As laid out for the first: "none" would draw the next twice, to lay nothing out.
-            with matplotlib.rc_context({"figure.constrained_layout.use": False}):
-                figure.set_layout_engine(None)
+        _lay_out(figure)
+        # Neither before nor after a format would Matplotlib draw it all once more, to lay it out.
+        with matplotlib.rc_context({"figure.constrained_layout.use": False}):
+            figure.set_layout_engine(None)
+            for file, kind in zip(files, _DPI, strict=True):
+                picture = _picture(figure, kind)
+                if kind == "png":
+                    write_sealed(file, picture + LINE)
+                else:
+                    write_whole(file, lambda path, picture=picture: path.write_bytes(picture))
     return files
+
+
+def _lay_out(figure: Figure) -> None:
+    """Place what a figure holds as for the first format, at its resolution, for all of them."""
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        FigureCanvasAgg(figure)
+        own, figure.dpi = figure.dpi, next(iter(_DPI.values()))
+        engine.execute(figure)
+        figure.dpi = own
 
 
 def _picture(figure: Figure, kind: str) -> bytes:
