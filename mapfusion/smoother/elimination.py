@@ -15,7 +15,11 @@ from mapfusion.se2 import Float
 from mapfusion.smoother.normal_equations import Estimate, NormalEquations
 from mapfusion.smoother.offsets import Reduced, without_offsets
 from mapfusion.smoother.sightings import Sightings
-from mapfusion.smoother.skyline import cholesky_in_envelope, solve_in_envelope
+from mapfusion.smoother.skyline import (
+    cholesky_in_envelope,
+    solve_in_envelope,
+    solve_transposed_in_envelope,
+)
 
 _ITEM = np.dtype(np.float64).itemsize
 _COPIES = 3  # of a matrix that are there at once: as it is made, in LAPACK's order, and solved
@@ -131,14 +135,14 @@ def _landmarks_first(seen: Sightings, equations: NormalEquations) -> Solution:
     _subtract(seen.track_starts, row, equations.coupling, left.own_m2, left.pull, S, gradient)
     _subtract(seen.starts, row, left.coupling, own, left.point_gradient, S, gradient)
     factor = cholesky_in_envelope(S[3:, 3:])
-    # by rows a lower factor is by columns an upper one, as LAPACK takes it
-    solved = -scipy.linalg.cho_solve((factor.T, False), gradient[1:].ravel(), check_finite=False)
+    turned = solve_in_envelope(factor, gradient[1:].ravel())  # squared, what the step moves
+    solved = -solve_transposed_in_envelope(factor, turned)
     way = np.zeros((n, 3))
     way[1:] = solved.reshape(-1, 3)[place[1:] - 1]
     moved = seen.sum_by_landmark(_along(left.coupling, way[seen.frame]))
     points = -np.einsum("lij,lj->li", own, left.point_gradient + moved)
     step = Estimate(way, points, _offsets(seen, equations, left, way, points))
-    return _solution(seen, left, step, own, factor, solved)
+    return _solution(seen, left, step, own, factor, float(turned @ turned))
 
 
 def _put_poses(blocks: Float, place: np.ndarray, equations: NormalEquations) -> None:
@@ -218,7 +222,8 @@ def _poses_first(seen: Sightings, equations: NormalEquations) -> Solution:
     left = without_offsets(seen, equations)
     own = np.asarray(np.linalg.inv(_regular(seen, left.point_block)), np.float64)
     last = step.point_m.ravel()
-    return _solution(seen, left, step, own, factor, last, landmarks_first=False)
+    moved = float(np.sum((factor[-last.size :, -last.size :].T @ last) ** 2))
+    return _solution(seen, left, step, own, factor, moved, landmarks_first=False)
 
 
 def pose_point_blocks(seen: Sightings, equations: NormalEquations) -> tuple[Float, Float, Float]:
@@ -274,11 +279,10 @@ def _solution(
     step: Estimate,
     own_m2: Float,
     factor: Float,
-    last: Float,
+    moved: float,
     landmarks_first: bool = True,
 ) -> Solution:
-    """With how far the last n unknowns of the factor, (n,), are moved."""
-    moved = float(np.sum((factor[-last.size :, -last.size :].T @ last) ** 2))
+    """With the landmarks' and the tracks' own covariances."""
     of_landmark, kept = own_m2[seen.landmark_of_track], left.kept
     follows = np.eye(3) - kept  # -db / dl
     offset_m2 = left.own_m2 + follows @ of_landmark @ np.swapaxes(follows, 1, 2)

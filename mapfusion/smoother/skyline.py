@@ -6,6 +6,8 @@ first entry of each row (the envelope: George and Liu 1981, "Computer Solution o
 Positive Definite Systems", ch. 4). Matrices stay dense in memory, the work is done by blocks.
 """
 
+from typing import Literal
+
 import numpy as np
 import scipy.linalg
 from scipy.sparse import csr_matrix
@@ -64,11 +66,21 @@ def cholesky_in_envelope(A: Float) -> Float:
 
 
 def solve_in_envelope(L: Float, right: Float) -> Float:
-    """L^-1 right (n, m) of a lower factor (n, n)."""
+    """L^-1 right (n,) or (n, m) of a lower factor (n, n)."""
     x = right.copy()
     for rows, start in zip(*_envelope(L), strict=True):
         done = slice(start * _BLOCK, rows.start)
         x[rows] = _solved(L[rows, rows], x[rows] - L[rows, done] @ x[done])
+    return x
+
+
+def solve_transposed_in_envelope(L: Float, right: Float) -> Float:
+    """L'^-1 right (n,) or (n, m) of a lower factor (n, n)."""
+    x = right.copy()
+    for rows, start in reversed(list(zip(*_envelope(L), strict=True))):
+        x[rows] = _solved(L[rows, rows], x[rows], "T")
+        before = slice(start * _BLOCK, rows.start)
+        x[before] -= L[rows, before].T @ x[rows]
     return x
 
 
@@ -79,5 +91,5 @@ def _envelope(A: Float) -> tuple[list[slice], list[int]]:
     return blocks, [int(np.argmax(A[rows].any(axis=0))) // _BLOCK for rows in blocks]
 
 
-def _solved(L: Float, right: Float) -> Float:
-    return scipy.linalg.solve_triangular(L, right, lower=True, check_finite=False)
+def _solved(L: Float, right: Float, trans: Literal["N", "T"] = "N") -> Float:
+    return scipy.linalg.solve_triangular(L, right, trans, lower=True, check_finite=False)

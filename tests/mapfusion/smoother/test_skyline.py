@@ -5,7 +5,12 @@ import pytest
 import scipy.linalg
 
 from mapfusion.smoother import skyline
-from mapfusion.smoother.skyline import cholesky_in_envelope, envelope_order, solve_in_envelope
+from mapfusion.smoother.skyline import (
+    cholesky_in_envelope,
+    envelope_order,
+    solve_in_envelope,
+    solve_transposed_in_envelope,
+)
 
 
 def matrix_of_groups(rng: np.random.Generator, n: int, n_groups: int) -> np.ndarray:
@@ -27,7 +32,10 @@ def test_factor_is_that_of_the_dense_matrix(n, n_groups):
     found = np.tril(cholesky_in_envelope(given))
     np.testing.assert_allclose(found, scipy.linalg.cholesky(A, lower=True), atol=1e-12)
     right = np.random.default_rng(0).normal(size=(n, 7))
-    np.testing.assert_allclose(found @ solve_in_envelope(found, right), right, atol=1e-12)
+    for some in (right, right[:, 0]):
+        np.testing.assert_allclose(found @ solve_in_envelope(found, some), some, atol=1e-12)
+        back = solve_transposed_in_envelope(found, some)
+        np.testing.assert_allclose(found.T @ back, some, atol=1e-12)
 
 
 def test_rows_that_are_zero_for_long_stay_so():
