@@ -29,6 +29,8 @@ SETTLING_S = 0.5  # until the wheels have come to rest on the floor
 PROGRESS_M = 0.05  # to count as progress; more than a standing robot trembles
 STOPPING_GAP_M = 0.15  # between robots, kept also by the one that has the right of way
 ALIGNED_RAD = 0.1  # heading error with which a turn in place ends; what is left is steered out
+# Apart by this no robot stands in another's way: as `_Other.is_in_the_way` says at the most.
+_REACH_M = math.hypot(2 * OUTER_RADIUS_M + STOPPING_GAP_M, 2 * OUTER_RADIUS_M)
 HEADING_GAIN_PER_S = 2.0  # turn rate per radian of heading error: half of it gone in 0.35 s
 
 
@@ -172,6 +174,8 @@ class _Driver:
         self._progress_s = 0.0
         self._turning = False
         self.lets_by: int | None = None  # the robot that it waits for
+        # beyond, no other is in the way, whatever is rounded
+        self._looks_m = 1.01 * max(settings.give_way_m, _REACH_M)
 
     @property
     def parked(self) -> bool:
@@ -237,6 +241,8 @@ class _Driver:
     def _first_in_the_way(self, pose: Float, others: list[_Other]) -> int | None:
         """Another robot ahead that goes first or stands in the way."""
         for other in others:
+            if math.dist(pose[:2], other.T_world_robot[:2]) > self._looks_m:
+                continue
             x, y, _ = between(pose, other.T_world_robot)
             goes_first = other.goes_first and not other.lets_by
             gives_way = goes_first and math.hypot(x, y) < self._settings.give_way_m

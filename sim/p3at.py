@@ -81,7 +81,7 @@ class P3at:
     def drive(self, left_rad_s: float, right_rad_s: float) -> None:
         """Set the wheel motors' speeds; their torque is limited."""
         top = TOP_WHEEL_SPEED_RAD_S
-        left, right = np.clip([left_rad_s, right_rad_s], -top, top)
+        left, right = (min(max(speed, -top), top) for speed in (left_rad_s, right_rad_s))
         self._p.setJointMotorControlArray(
             self.body,
             self._wheels,
