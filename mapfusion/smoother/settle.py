@@ -48,8 +48,17 @@ class Problem(NamedTuple):
         return float(walked + seen + self.stray_information * offsets)
 
 
+class Reached(NamedTuple):
+    """Where steps ended, how many they were, and the weights and tails there."""
+
+    estimate: Estimate
+    weights: Weights
+    tails: Tails
+    n_steps: int
+
+
 class Settled(NamedTuple):
-    """Where the steps ended, with the equations of the covariances there and their solution."""
+    """The same of observations, with the equations of the covariances there and their solution."""
 
     seen: Sightings
     estimate: Estimate
@@ -67,6 +76,23 @@ def settled(
     weights: Weights | None = None,
     tails: Tails = NO_TAILS,
 ) -> Settled:
+    """Where steps end, as `reached`, and what is known of it."""
+    seen, odometry, information, stray_information = problem
+    end = reached(problem, at, least_move, weights, tails)
+    known = informative(seen, end.weights, end.tails)
+    equations = normal_equations(
+        seen, end.estimate, known, stray_information, odometry, information
+    )
+    return Settled(seen, *end, equations, solve(seen, equations))
+
+
+def reached(
+    problem: Problem,
+    at: Estimate,
+    least_move: float = _CONVERGED,
+    weights: Weights | None = None,
+    tails: Tails = NO_TAILS,
+) -> Reached:
     """Take steps from an estimate until the next would move the poses by less than `least_move`.
 
     It is in squared sigmas a coordinate. Weights and tails to begin with are those of an earlier
@@ -78,10 +104,7 @@ def settled(
         equations = normal_equations(seen, at, weights, stray_information, odometry, information)
         solution = solve(seen, equations)
         if n_steps == _MOST_STEPS or solution.moved < least_move * at.path.size:
-            known = informative(seen, weights, tails)
-            equations = normal_equations(seen, at, known, stray_information, odometry, information)
-            solution = solve(seen, equations)
-            return Settled(seen, at, weights, tails, n_steps, equations, solution)
+            return Reached(at, weights, tails, n_steps)
         at = _stepped(problem, weights, at, solution.step)
         weights, tails = reweighted(seen, at, weights, solution, stray_information)
         n_steps += 1

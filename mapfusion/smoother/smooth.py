@@ -19,7 +19,7 @@ from mapfusion.smoother.normal_equations import (
 from mapfusion.smoother.odometry_levels import settled_with_levels
 from mapfusion.smoother.residuals import first_points
 from mapfusion.smoother.robust import Tails
-from mapfusion.smoother.settle import Problem, Settled, settled
+from mapfusion.smoother.settle import Problem, Settled, reached, settled
 from mapfusion.smoother.sightings import Sightings, sightings_of
 from mapfusion.stray import STRAY_M
 
@@ -130,7 +130,7 @@ def smooth(
     information = parameters.odometry_information(log)
     known = Problem(seen, log.odometry, information, parameters.stray_information)
     blurred = replace(seen, information=seen.information / _THOUGHT_WORSE**2)
-    first = settled(known._replace(seen=blurred), at, _CLOSE)
+    first = reached(known._replace(seen=blurred), at, _CLOSE)
     if parameters.odometry_covariance is None:
         end, _ = settled_with_levels(known, first.estimate, first.weights, first.tails)
     else:  # odometry that pictures told is used where these say nothing: they tell no level
