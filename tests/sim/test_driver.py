@@ -2,16 +2,17 @@ import hashlib
 import subprocess
 import sys
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
 
 from mapfusion import se2
 from mapfusion.errors import InputError
-from sim.driver import DriverSettings, drive
+from sim.driver import DriverSettings, _Driver, _Other, drive
 from sim.floorplan import FloorPlan, Wall
 from sim.odometry import calibrated_track_m, encoder_increments
-from sim.p3at import OUTER_RADIUS_M, WIDTH_M
+from sim.p3at import OUTER_RADIUS_M, WIDTH_M, P3at
 from sim.route import Route, check_routes
 from sim.trajectory import Trajectory
 
@@ -201,6 +202,26 @@ def test_of_two_that_stand_before_each_other_the_one_that_came_so_far_goes_on() 
     assert np.hypot(*(a - b).T).min() > WIDTH_M  # they pass each other without touching
     assert nearest_m(both, 1, (6.0, 3.0)).min() < 0.3
     assert nearest_m(both, 0, (4.0, 3.0)).min() < 0.3
+
+
+def test_robots_that_are_not_looked_at_are_in_nobodys_way() -> None:
+    """Whether they are skipped as too far or asked for one by one."""
+    rng = np.random.default_rng(0)
+    for give_way_m in (0.05, 1.6, 3.0):
+        settings = DriverSettings(give_way_m=give_way_m)
+        nobody = cast(P3at, None)  # steers by poses alone
+        near, asks_all = (
+            _Driver(route("a", [1, 3, 0], (7, 3)), nobody, settings) for _ in range(2)
+        )
+        asks_all._looks_m = np.inf
+        found = set()
+        for _ in range(300):
+            pose, *there = rng.uniform([-2, -2, -4], [2, 2, 4], (3, 3))
+            flags = rng.random((2, 2)) < 0.5
+            others = [_Other(T, k, *flags[k].tolist()) for k, T in enumerate(there)]
+            found.add(asks_all._first_in_the_way(pose, others))
+            assert near._first_in_the_way(pose, others) == asks_all._first_in_the_way(pose, others)
+        assert found == {None, 0, 1}
 
 
 @pytest.mark.parametrize("interval_s", [0.21, 1 / 240, 0.0, -0.2, float("nan")])
