@@ -6,8 +6,6 @@ first entry of each row (the envelope: George and Liu 1981, "Computer Solution o
 Positive Definite Systems", ch. 4). Matrices stay dense in memory, the work is done by blocks.
 """
 
-from typing import Literal
-
 import numpy as np
 import scipy.linalg
 from scipy.sparse import csr_matrix
@@ -78,7 +76,7 @@ def solve_transposed_in_envelope(L: Float, right: Float) -> Float:
     """L'^-1 right (n,) or (n, m) of a lower factor (n, n)."""
     x = right.copy()
     for rows, start in reversed(list(zip(*_envelope(L), strict=True))):
-        x[rows] = _solved(L[rows, rows], x[rows], "T")
+        x[rows] = _solved(L[rows, rows], x[rows], transposed=True)
         before = slice(start * _BLOCK, rows.start)
         x[before] -= L[rows, before].T @ x[rows]
     return x
@@ -91,5 +89,6 @@ def _envelope(A: Float) -> tuple[list[slice], list[int]]:
     return blocks, [int(np.argmax(A[rows].any(axis=0))) // _BLOCK for rows in blocks]
 
 
-def _solved(L: Float, right: Float, trans: Literal["N", "T"] = "N") -> Float:
+def _solved(L: Float, right: Float, transposed: bool = False) -> Float:
+    trans = int(transposed)
     return scipy.linalg.solve_triangular(L, right, trans, lower=True, check_finite=False)
