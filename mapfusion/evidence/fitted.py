@@ -5,6 +5,6 @@ Written by `python -m experiments.study.refusal.fit_probability`.
 Of 3193 alignments, 1952 of them right, of seeds 0 to 4 of alias, full, posters, posters_apart.
 """
 
-VERSION = 2
-INTERCEPT = 0.133
-WEIGHTS = (0.800, 2.256, -1.557, 0.555, -1.690, -6.285)
+VERSION = 3
+INTERCEPT = -0.240
+WEIGHTS = (0.292, 0.958, 2.132, -2.105, 0.450, -2.060, -6.888)
