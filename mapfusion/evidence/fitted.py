@@ -2,9 +2,11 @@
 
 Written by `python -m experiments.study.refusal.fit_probability`.
 
-Of 3193 alignments, 1952 of them right, of seeds 0 to 4 of alias, full, posters, posters_apart.
+Of 3135 alignments, 1914 of them right, of seeds 0 to 4 of alias_copy, alias_copy_apart,
+alias_light, alias_mirror, alias_posters, alias_posters_apart, alias_rooms, alias_rooms_apart, full,
+posters, posters_apart.
 """
 
 VERSION = 3
-INTERCEPT = -0.240
-WEIGHTS = (0.292, 0.958, 2.132, -2.105, 0.450, -2.060, -6.888)
+INTERCEPT = -2.394
+WEIGHTS = (0.295, 0.667, 3.092, -1.685, 0.512, -1.617, -6.075)

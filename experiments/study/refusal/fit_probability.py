@@ -6,6 +6,7 @@ writes `mapfusion/evidence/fitted.py`, and says how well kinds of world that wer
 
 import itertools
 import sys
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -34,7 +35,7 @@ _TEXT = '''"""Coefficients of `probability.py`.
 
 Written by `python -m experiments.study.refusal.fit_probability`.
 
-Of {n} alignments, {n_right} of them right, of seeds {seeds} of {worlds}.
+{said}
 """
 
 VERSION = {version}
@@ -120,13 +121,15 @@ def main() -> None:
     intercept, *weights = fit(answers.features, answers.right)
     numbers = {"n": len(answers.right), "n_right": int(answers.right.sum())}
     model = {"intercept": intercept, "weights": ", ".join(f"{w:.3f}" for w in weights)}
-    text = _TEXT.format(**numbers, **said, **model, version=fitted.VERSION)
+    of = "Of {n} alignments, {n_right} of them right, of seeds {seeds} of {worlds}."
+    told = textwrap.fill(of.format(**numbers, **said), width=100)
+    text = _TEXT.format(said=told, **model, version=fitted.VERSION)
     write_whole(Path(str(fitted.__file__)), lambda path: path.write_text(text, encoding="utf-8"))
     p = left_out(answers)
     brier = float(np.mean((p - answers.right) ** 2))
     error = calibration_error(p, answers.right)
-    told = f"calibration error {error:.4f}, Brier score {brier:.4f}"
-    sys.stdout.write(f"kinds left out one at a time: {told}\n")
+    held = f"calibration error {error:.4f}, Brier score {brier:.4f}"
+    sys.stdout.write(f"kinds left out one at a time: {held}\n")
 
 
 if __name__ == "__main__":
