@@ -37,7 +37,7 @@ WRONG: Rates = (BetaRate(*fitted_rates.WRONG[0]), BetaRate(*fitted_rates.WRONG[1
 # Regions of a right alignment that are as a wrong one's: a picture that was moved, light that
 # changed, a stretch in which one of the maps drifted. It bounds what one region can say against it.
 # Of simulated worlds, in which nothing moves, the fit says a tenth of this: it is of the world, no
-# map tells it.
+# map tells it. Less than one in ten (`most_against`): one region that is gone contradicts.
 CHANGED = 0.05
 # Parts of a region: where no other motion lays it on its like, and where another does.
 OWN, COPIED = 0, 1
