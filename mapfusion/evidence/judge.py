@@ -174,7 +174,9 @@ class PairJudge:
         if self._is_one_place(alignment, extent_m):
             what = f"the maps show little else than this place of {extent_m:.2g} m"
             return f"{what}; what lies around it tells whether it is another's like"
-        if ratio >= math.log10(settings.least_ratio):
+        # the best of n wrong motions gets there n times as often
+        n_motions = evidence.n_motions(self._bound)
+        if ratio >= math.log10(settings.least_ratio * n_motions):
             return ""
         if rival is not None:
             return f"{{told}}, too few beside {_named(rival)}"

@@ -78,6 +78,10 @@ class PairEvidence:
         """Those between the two maps."""
         return tuple(each for each in self.motions if each.of == BETWEEN)
 
+    def n_motions(self, log10_false_alarms: float) -> int:
+        """Motions between the maps by more than so many false alarms; at least one."""
+        return max(1, sum(each.log10_false_alarms <= log10_false_alarms for each in self.rivals))
+
     def repeats(self, log10_false_alarms: float) -> bool:
         """Whether either map holds something twice, by more than so many false alarms."""
         onto_self = (each for each in self.motions if each.of != BETWEEN)

@@ -30,7 +30,9 @@ from mapfusion.storage import write_whole
 
 # Pulls weights of scaled features towards 0: a kind of world may have none of a sign.
 _RIDGE = 1e-3
-EVERY = 3  # of the evaluated iterations: maps of neighbouring ones say the same
+# Of the evaluated iterations of worlds that repeat: maps of neighbouring ones say the same. Of
+# others all, as they come upon common ground but once, and what is right then is least sure.
+EVERY = 2
 _TEXT = '''"""Coefficients of `probability.py`.
 
 Written by `python -m experiments.study.refusal.fit_probability`.
@@ -63,7 +65,8 @@ def _of_world(world: MappedWorld) -> list[tuple[Float, bool, str]]:
     scenario, rows = world.scenario, []
     settings, radius_m = scenario.align, scenario.evaluate.true_pair_radius_m
     met = itertools.combinations(world.robots(), 2)
-    for (a, b), k in itertools.product(met, world.iterations[EVERY - 1 :: EVERY]):
+    every = EVERY if world.repeats else 1
+    for (a, b), k in itertools.product(met, world.iterations[every - 1 :: every]):
         case = cases.common(a, b, k, settings.match, radius_m)
         judged = settings.judge.on(Pairs(case.map_a, case.map_b, case.pairs))
         for entry in settings.aligners:
