@@ -182,7 +182,9 @@ class PairJudge:
             return f"{{told}}, too few beside {_named(rival)}"
         if evidence.repeats(self._bound):
             return "{told}, too few for maps that hold things twice"
-        if regions.n_confirmed <= 1 and extent_m < evidence.region_m:
+        # nothing repeats and no other motion fits: here the region that led to it counts, too
+        few = regions.log10_ratio(evidence.shares) < math.log10(settings.least_ratio)
+        if few and regions.n_confirmed <= 1 and extent_m < evidence.region_m:
             what = f"all that agrees lies within {evidence.region_m:.2g} m"
             return f"{what} and could hang elsewhere too; no other region confirms it"
         return ""
