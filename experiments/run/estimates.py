@@ -81,7 +81,7 @@ def rival_rows(names: Mapping[str, Any], evidence: PairEvidence) -> list[dict[st
             **dict(zip(MOTION, motion.T_a_b, strict=True)),
             "log10_false_alarms": motion.log10_false_alarms,
             **{name: getattr(motion, name) for name in _RIVAL_COUNTS},
-            "log10_evidence": motion.log10_ratio,
+            "log10_evidence": motion.log10_evidence,
             "copied_a": np.packbits(motion.copies.in_a).tobytes(),
             "copied_b": np.packbits(motion.copies.in_b).tobytes(),
             **both,
@@ -101,7 +101,7 @@ def evidence_of(
             np.array([row[name] for name in MOTION]),
             row["log10_false_alarms"],
             **{name: row[name] for name in _RIVAL_COUNTS},
-            log10_ratio=row["log10_evidence"],
+            log10_evidence=row["log10_evidence"],
             copies=Copies(unpacked(row["copied_a"], n_a), unpacked(row["copied_b"], n_b)),
         )
         for row in records(rows)

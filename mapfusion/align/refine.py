@@ -127,7 +127,8 @@ class Refinement:
         if not pairs.by_name or not len(pairs):
             return self.gate_m
         off = pairs.p_a[:, :2] - transform_points(T_a_b, pairs.p_b[:, :2])
-        # s_drift starts at a third of the gate, and as all of them have it none is left out there
+        # s_drift starts at a third of the gate, three times the RMS, and none of up to 81 names is
+        # left out there: no residual of n is more than sqrt(n) times their RMS
         return max(self.gate_m, _GATE_SIGMAS**2 * math.sqrt(np.mean(np.sum(off**2, axis=1))))
 
 

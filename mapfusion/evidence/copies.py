@@ -8,10 +8,12 @@ from numba import njit
 
 from mapfusion.align.closest import Grid, runs_about
 
-# A place is that of a landmark, half a metre about it: neighbouring corners of one picture. It is
-# laid on its like where so many landmarks of it are found, and so large a share: chance finds one
-# in twenty, and of a copy that both robots saw from elsewhere a third is found at the least.
+# A place is that of a landmark, as far about it as the smallest posters are wide (half a metre):
+# neighbouring corners of one picture.
 _PLACE_M = 0.5
+# It is laid on its like where so many landmarks of it are found, as a region needs to count, and so
+# large a share: from about there on it is ten times likelier that a copy was seen from elsewhere
+# than that chance found as many (`fitted_rates.py`, what may be seen: 7 of 20, 17 of 60).
 _LEAST, _LEAST_SHARE = 5, 0.3
 
 

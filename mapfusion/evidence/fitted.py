@@ -2,9 +2,11 @@
 
 Written by `python -m experiments.study.refusal.fit_probability`.
 
-Of 3193 alignments, 1952 of them right, of seeds 0 to 4 of alias, full, posters, posters_apart.
+Of 6020 alignments, 4158 of them right, of seeds 0 to 4 of alias_copy, alias_copy_apart,
+alias_light, alias_mirror, alias_posters, alias_posters_apart, alias_rooms, alias_rooms_apart,
+full without apart, posters, posters_apart.
 """
 
-VERSION = 2
-INTERCEPT = 0.133
-WEIGHTS = (0.800, 2.256, -1.557, 0.555, -1.690, -6.285)
+VERSION = 3
+INTERCEPT = -0.248
+WEIGHTS = (0.196, 0.726, 2.923, -1.906, 0.491, -2.040, -6.518)

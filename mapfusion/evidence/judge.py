@@ -88,11 +88,12 @@ class PairJudge:
         evidence = self.evidence
         if evidence is not None:
             regions = self.regions(alignment, evidence)
-            ratio = regions.log10_ratio(evidence.shares)
-            told = {"log10_evidence": ratio, "n_confirmed": regions.n_confirmed}
-            p = probability(self._signs(alignment, regions, ratio, evidence))
+            found = regions.log10_evidence(evidence.shares)
+            told = {"log10_evidence": found, "n_confirmed": regions.n_confirmed}
+            signs = self._signs(alignment, regions, evidence, by_chance.log10_false_alarms)
+            p = probability(signs)
             told |= {"n_contradicted": regions.n_contradicted, "probability": p}
-            status, reason = self._weighed(alignment, regions, ratio, evidence)
+            status, reason = self._weighed(alignment, regions, evidence)
             if status is Status.ACCEPTED and p < self._judge.evidence.least_probability:
                 status = Status.AMBIGUOUS
                 reason = f"right with probability {p:.2g} alone, by all that speaks for and against"
@@ -115,9 +116,9 @@ class PairJudge:
         """What speaks for and against an alignment; None where no evidence can be sought."""
         if self.evidence is None:
             return None
+        by_chance = self._chance.judge(alignment).log10_false_alarms
         regions = self.regions(alignment, self.evidence)
-        ratio = regions.log10_ratio(self.evidence.shares)
-        return self._signs(alignment, regions, ratio, self.evidence)
+        return self._signs(alignment, regions, self.evidence, by_chance)
 
     def regions(self, alignment: Alignment, evidence: PairEvidence) -> Regions:
         """What becomes of what both robots must have seen under an alignment."""
@@ -132,46 +133,58 @@ class PairJudge:
         return self._witnesses.regions(BETWEEN, T_a_b, squares, none.joined(others))
 
     def _signs(
-        self, alignment: Alignment, regions: Regions, ratio: float, evidence: PairEvidence
+        self,
+        alignment: Alignment,
+        regions: Regions,
+        evidence: PairEvidence,
+        log10_false_alarms: float,
     ) -> Signs:
+        told = log10_false_alarms, regions.log10_evidence(evidence.shares)
         counts = (regions.n_confirmed, regions.n_contradicted, int(alignment.inlier.sum()))
         extent_m = self._extent_m(alignment)
         one_place = self._is_one_place(alignment, extent_m)
         repeats = evidence.repeats(self._bound)
-        return Signs(ratio, *counts, extent_m, repeats, one_place)
+        return Signs(*told, *counts, extent_m, repeats, one_place)
 
     def _weighed(
-        self, alignment: Alignment, regions: Regions, ratio: float, evidence: PairEvidence
+        self, alignment: Alignment, regions: Regions, evidence: PairEvidence
     ) -> tuple[Status, str]:
-        """What the evidence makes of an alignment that is more than chance."""
+        """What the evidence makes of an alignment that is more than chance.
+
+        It speaks against one where it does so though the region by which it was found counts.
+        """
         against, n = regions.n_contradicted, len(regions)
         told = f"{regions.n_confirmed} of {n} regions that both must have seen are in both maps"
-        if ratio < -math.log10(self._judge.evidence.most_against):
+        least = -math.log10(self._judge.evidence.most_against)
+        if regions.log10_ratio(evidence.shares) < least:
             return Status.REFUSED, f"contradicted: {told}, {against} are missing from one"
-        doubt = self._doubt(alignment, regions, ratio, evidence)
+        doubt = self._doubt(alignment, regions, evidence)
         if not doubt:
             return Status.ACCEPTED, ""
         return Status.AMBIGUOUS, doubt.format(told=told)
 
-    def _doubt(
-        self, alignment: Alignment, regions: Regions, ratio: float, evidence: PairEvidence
-    ) -> str:
+    def _doubt(self, alignment: Alignment, regions: Regions, evidence: PairEvidence) -> str:
         """Why another place may be the right one, with `{told}` of the regions; else empty."""
         settings, extent_m = self._judge.evidence, self._extent_m(alignment)
+        ratio = regions.log10_evidence(evidence.shares)
         rivals = self._rivals(alignment.T_a_b, evidence)
-        rival = max(rivals, key=lambda each: each.log10_ratio, default=None)
-        if rival is not None and rival.log10_ratio > ratio - math.log10(settings.most_against):
+        rival = max(rivals, key=lambda each: each.log10_evidence, default=None)
+        if rival is not None and rival.log10_evidence > ratio - math.log10(settings.most_against):
             return f"{{told}}; so do {_named(rival)}"
         if self._is_one_place(alignment, extent_m):
             what = f"the maps show little else than this place of {extent_m:.2g} m"
             return f"{what}; what lies around it tells whether it is another's like"
-        if ratio >= math.log10(settings.least_ratio):
+        # the best of n wrong motions gets there n times as often
+        n_motions = evidence.n_motions(self._bound)
+        if ratio >= math.log10(settings.least_ratio * n_motions):
             return ""
         if rival is not None:
             return f"{{told}}, too few beside {_named(rival)}"
         if evidence.repeats(self._bound):
             return "{told}, too few for maps that hold things twice"
-        if regions.n_confirmed <= 1 and extent_m < evidence.region_m:
+        # nothing repeats and no other motion fits: here the region that led to it counts, too
+        few = regions.log10_ratio(evidence.shares) < math.log10(settings.least_ratio)
+        if few and regions.n_confirmed <= 1 and extent_m < evidence.region_m:
             what = f"all that agrees lies within {evidence.region_m:.2g} m"
             return f"{what} and could hang elsewhere too; no other region confirms it"
         return ""
@@ -180,13 +193,14 @@ class PairJudge:
         """Of the other motions those that are more than chance.
 
         What both robots saw of them counts, too, as of two copies of a picture each gets half the
-        correspondences: under a wrong motion regions are 10^r times likelier than not in at most
-        one of so many cases (Markov), so that chance gives as much that much more seldom.
+        correspondences: under a wrong motion regions beside the one that it was found by are 10^r
+        times likelier than not in at most one of so many cases (Markov), so that chance gives as
+        much that much more seldom.
         """
         return [
             each
             for each in self._others(T_a_b, evidence)
-            if each.log10_false_alarms - max(each.log10_ratio, 0.0) <= self._bound
+            if each.log10_false_alarms - max(each.log10_evidence, 0.0) <= self._bound
         ]
 
     def _others(self, T_a_b: Float, evidence: PairEvidence) -> list[RivalMotion]:

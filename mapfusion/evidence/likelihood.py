@@ -5,12 +5,15 @@ beta-binomial: each region has a rate of its own, since light, slant and texture
 where landmarks must be seen and middling where they may be. If it is wrong, a region is either the
 twin of what is there (a poster, a room that repeats), and then no different, or what chance leaves.
 What another motion lays on its like is a twin much more often than the rest, and counts apart.
+
+No motion is judged that nothing led to. A wrong one was found by a twin: that this region agrees is
+no evidence for it, and no sample of how often wrong motions lay regions on their like.
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import betaln
+from scipy.special import betaln, logsumexp
 
 from mapfusion.evidence import fitted_rates
 from mapfusion.se2 import Float
@@ -34,7 +37,7 @@ WRONG: Rates = (BetaRate(*fitted_rates.WRONG[0]), BetaRate(*fitted_rates.WRONG[1
 # Regions of a right alignment that are as a wrong one's: a picture that was moved, light that
 # changed, a stretch in which one of the maps drifted. It bounds what one region can say against it.
 # Of simulated worlds, in which nothing moves, the fit says a tenth of this: it is of the world, no
-# map tells it.
+# map tells it. Less than one in ten (`most_against`): one region that is gone contradicts.
 CHANGED = 0.05
 # Parts of a region: where no other motion lays it on its like, and where another does.
 OWN, COPIED = 0, 1
@@ -92,3 +95,15 @@ def log10_ratio(k: np.ndarray, n: np.ndarray, shares: TwinShares) -> Float:
     wrong = np.logaddexp(own[0] + whole, own[1] + chance[:, OWN] + copies)
     changed = np.logaddexp(np.log1p(-CHANGED) + whole, np.log(CHANGED) + wrong)
     return (changed - wrong) / np.log(10.0)
+
+
+def log10_beside_one(log10_ratios: Float) -> float:
+    """log10 of how much likelier regions (R,) are if right than if wrong and found by one of them.
+
+    The one, whichever of them, is then as under a right motion: of ratios r_i it is
+    prod_i r_i / mean_j r_j. 0 of none.
+    """
+    if not len(log10_ratios):
+        return 0.0
+    one = logsumexp(log10_ratios * np.log(10.0)) / np.log(10.0) - np.log10(len(log10_ratios))
+    return float(np.sum(log10_ratios) - one)

@@ -20,11 +20,11 @@ from mapfusion.se2 import Float
 N_RIVALS, N_SELF_MOTIONS = 4, 3  # the best tell how much alike the others are
 _PATCH_REACH_M = 0.7  # between neighbouring corners of one picture
 _LEAST_OF_PATCH = 5
-# What is known of the share of twins before any region is seen: between that of worlds in which
-# nothing repeats and that of one with four posters on all walls; worth two regions.
-_TWINS_BEFORE = 0.2, 2.0
-# Of what another motion lays on its like nothing is known before: worth two regions, too.
-_COPIES_BEFORE = 1.0, 2.0
+# What is known of the shares of twins before any region is seen, as twins of so many regions: the
+# likeliest beta distributions of both under wrong motions in worlds that fool (posters and alias,
+# seeds 0 to 4), the region that led to a motion left out.
+_TWINS_BEFORE = 0.44, 3.85
+_COPIES_BEFORE = 1.14, 6.1
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class RivalMotion:
         n_confirmed: regions that are seen again.
         n_contradicted: regions that are not.
         n_regions: that must be seen.
-        log10_ratio: of the regions, of a motion between the maps; NaN of one onto itself.
+        log10_evidence: of the regions, of a motion between the maps; NaN of one onto itself.
         copies: what it lays on its like.
     """
 
@@ -50,7 +50,7 @@ class RivalMotion:
     n_confirmed: int
     n_contradicted: int
     n_regions: int
-    log10_ratio: float
+    log10_evidence: float
     copies: Copies
 
 
@@ -77,6 +77,10 @@ class PairEvidence:
     def rivals(self) -> tuple[RivalMotion, ...]:
         """Those between the two maps."""
         return tuple(each for each in self.motions if each.of == BETWEEN)
+
+    def n_motions(self, log10_false_alarms: float) -> int:
+        """Motions between the maps by more than so many false alarms; at least one."""
+        return max(1, sum(each.log10_false_alarms <= log10_false_alarms for each in self.rivals))
 
     def repeats(self, log10_false_alarms: float) -> bool:
         """Whether either map holds something twice, by more than so many false alarms."""
@@ -122,7 +126,7 @@ def find_evidence(
     ]
     shares = _twin_shares(regions[: len(between)], regions[len(between) :])
     found = [
-        _rival(of, each, r, r.log10_ratio(shares) if of == BETWEEN else math.nan, copies)
+        _rival(of, each, r, r.log10_evidence(shares) if of == BETWEEN else math.nan, copies)
         for (of, each), r, copies in zip(kinds, regions, laid, strict=True)
     ]
     return PairEvidence(tuple(found), shares, region_m)
@@ -139,7 +143,7 @@ def _largest_twin_m(alike: Pairs, motions: list[Supported], acceptance: Acceptan
 
 
 def _twin_shares(rivals: list[Regions], selves: list[Regions]) -> TwinShares:
-    """Shares of regions confirmed under wrong motions.
+    """Shares of regions confirmed under wrong motions, but for those that led to them.
 
     Of the motions between the maps one may be right: that of most regions confirmed is left out. A
     motion of a map onto itself was looked for where it holds things twice, and says nothing of the
@@ -153,9 +157,9 @@ def _twin_shares(rivals: list[Regions], selves: list[Regions]) -> TwinShares:
 
 
 def _rival(
-    of: str, motion: Supported, regions: Regions, log10_ratio: float, copies: Copies
+    of: str, motion: Supported, regions: Regions, log10_evidence: float, copies: Copies
 ) -> RivalMotion:
     counts = (regions.n_confirmed, regions.n_contradicted, len(regions))
     n_support = int(np.count_nonzero(motion.inlier))
     sure = motion.log10_false_alarms
-    return RivalMotion(of, motion.T_a_b, sure, n_support, *counts, log10_ratio, copies)
+    return RivalMotion(of, motion.T_a_b, sure, n_support, *counts, log10_evidence, copies)

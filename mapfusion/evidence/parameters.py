@@ -19,8 +19,9 @@ class EvidenceParameters:
         place_m: longest side of a place that a world may hold twice as a whole, a room: where most
             of the smaller map lies within it and agrees, nothing around it has been compared.
         least_ratio: by how many times more likely the regions must be if the alignment is right
-            than if it is not, where maps resemble themselves or another motion fits them: at most
-            one wrong motion of so many gets there (Markov's inequality).
+            than if it is not, where maps resemble themselves or another motion fits them, and for
+            each motion that is more than chance: so that at most one pair of maps of so many has a
+            wrong motion that gets there (Markov's and Boole's inequalities).
         most_against: by how many times less likely they may be before it counts as contradicted: at
             most one right motion of so many gets there.
         least_probability: that the alignment is right; below a half it is likelier wrong.

@@ -12,7 +12,8 @@ import numpy as np
 from mapfusion.evidence.fitted import INTERCEPT, WEIGHTS
 from mapfusion.se2 import Float
 
-_MOST_EVIDENCE = 3.0  # decades: beyond them it is as sure as anything the model was fitted to
+# Decades: beyond them it is as sure as anything the model was fitted to.
+_MOST_EVIDENCE, _LEAST_CHANCE = 3.0, 10.0
 _CONTRADICTION = 3.0  # regions that confirm make good for one that contradicts
 _FEW = 2.0  # regions: a share of so few is drawn to nothing
 _MOST_EXTENT_M = 12.0  # of support: beyond a hall it is as good as anywhere
@@ -22,6 +23,7 @@ class Signs(NamedTuple):
     """What speaks for and against one alignment.
 
     Attributes:
+        log10_false_alarms: of the test against chance; infinite where it has no answer.
         log10_evidence: of the regions.
         n_confirmed: regions that are seen again.
         n_contradicted: regions that are not.
@@ -31,6 +33,7 @@ class Signs(NamedTuple):
         one_place: whether the maps show little else than the place that they share.
     """
 
+    log10_false_alarms: float
     log10_evidence: float
     n_confirmed: int
     n_contradicted: int
@@ -40,11 +43,12 @@ class Signs(NamedTuple):
     one_place: bool
 
     def features(self) -> Float:
-        """What the model weighs (6,)."""
+        """What the model weighs (7,)."""
         against = _CONTRADICTION * self.n_contradicted
         net = (self.n_confirmed - against) / (self.n_confirmed + against + _FEW)
         return np.array(
             [
+                np.clip(-self.log10_false_alarms, 0.0, _LEAST_CHANCE),
                 np.clip(self.log10_evidence, -_MOST_EVIDENCE, _MOST_EVIDENCE),
                 net,
                 # at one extent more of them are denser, as a copy of one picture is

@@ -11,7 +11,13 @@ from mapfusion.align.correspondences import HeightGate
 from mapfusion.evidence.copies import BETWEEN, Copies, laid_on_like
 from mapfusion.evidence.expected import MUST, UNSEEN, Seen, Watch, how_seen
 from mapfusion.evidence.found import Gates, Looks, has
-from mapfusion.evidence.likelihood import DECISIVE, TwinShares, log10_against_chance, log10_ratio
+from mapfusion.evidence.likelihood import (
+    DECISIVE,
+    TwinShares,
+    log10_against_chance,
+    log10_beside_one,
+    log10_ratio,
+)
 from mapfusion.evidence.parameters import EvidenceParameters
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.se2 import Float, inverse, transform_points
@@ -60,13 +66,22 @@ class Regions:
         return self._parts.sum(axis=1)
 
     def seen_again(self, part: int) -> tuple[int, int]:
-        """Of a part (OWN, COPIED) of regions with enough of it, the confirmed, and all."""
+        """Of a part (OWN, COPIED) of regions with enough of it, the confirmed, and all.
+
+        But for the region that agrees best, by which the motion was found.
+        """
         enough = self.expected[:, part].sum(axis=1) >= LEAST_EXPECTED
+        if len(self):
+            enough[np.argmax(self._all)] = False
         return int(np.sum(self._parts[enough, part] >= DECISIVE)), int(np.sum(enough))
 
     def log10_ratio(self, shares: TwinShares) -> float:
-        """log10 of how much likelier all of them are if the motion is right; 0 of none."""
+        """log10 of how much likelier all of them are if right than if wrong; 0 of none."""
         return float(np.sum(log10_ratio(self.found, self.expected, shares)))
+
+    def log10_evidence(self, shares: TwinShares) -> float:
+        """The same, if wrong then found by one of them, which is no evidence; 0 of none."""
+        return log10_beside_one(log10_ratio(self.found, self.expected, shares))
 
 
 class Squares(NamedTuple):

@@ -6,6 +6,7 @@ writes `mapfusion/evidence/fitted.py`, and says how well kinds of world that wer
 
 import itertools
 import sys
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -29,12 +30,14 @@ from mapfusion.storage import write_whole
 
 # Pulls weights of scaled features towards 0: a kind of world may have none of a sign.
 _RIDGE = 1e-3
-EVERY = 3  # of the evaluated iterations: maps of neighbouring ones say the same
+# Of the evaluated iterations of worlds that repeat: maps of neighbouring ones say the same. Of
+# others all, as they come upon common ground but once, and what is right then is least sure.
+EVERY = 2
 _TEXT = '''"""Coefficients of `probability.py`.
 
 Written by `python -m experiments.study.refusal.fit_probability`.
 
-Of {n} alignments, {n_right} of them right, of seeds {seeds} of {worlds}.
+{said}
 """
 
 VERSION = {version}
@@ -62,7 +65,8 @@ def _of_world(world: MappedWorld) -> list[tuple[Float, bool, str]]:
     scenario, rows = world.scenario, []
     settings, radius_m = scenario.align, scenario.evaluate.true_pair_radius_m
     met = itertools.combinations(world.robots(), 2)
-    for (a, b), k in itertools.product(met, world.iterations[EVERY - 1 :: EVERY]):
+    every = EVERY if world.repeats else 1
+    for (a, b), k in itertools.product(met, world.iterations[every - 1 :: every]):
         case = cases.common(a, b, k, settings.match, radius_m)
         judged = settings.judge.on(Pairs(case.map_a, case.map_b, case.pairs))
         for entry in settings.aligners:
@@ -120,13 +124,15 @@ def main() -> None:
     intercept, *weights = fit(answers.features, answers.right)
     numbers = {"n": len(answers.right), "n_right": int(answers.right.sum())}
     model = {"intercept": intercept, "weights": ", ".join(f"{w:.3f}" for w in weights)}
-    text = _TEXT.format(**numbers, **said, **model, version=fitted.VERSION)
+    of = "Of {n} alignments, {n_right} of them right, of seeds {seeds} of {worlds}."
+    told = textwrap.fill(of.format(**numbers, **said), width=100)
+    text = _TEXT.format(said=told, **model, version=fitted.VERSION)
     write_whole(Path(str(fitted.__file__)), lambda path: path.write_text(text, encoding="utf-8"))
     p = left_out(answers)
     brier = float(np.mean((p - answers.right) ** 2))
     error = calibration_error(p, answers.right)
-    told = f"calibration error {error:.4f}, Brier score {brier:.4f}"
-    sys.stdout.write(f"kinds left out one at a time: {told}\n")
+    held = f"calibration error {error:.4f}, Brier score {brier:.4f}"
+    sys.stdout.write(f"kinds left out one at a time: {held}\n")
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from experiments.judge import tables
@@ -27,13 +28,18 @@ from tests.helpers.tiny_scenario import TINY, Reply, command
 
 EXAMPLE = Path(__file__).parents[2] / "plugin_example"
 T_A_B = np.array([1.0, -2.0, 0.3])
-PLUGGED = TINY.replace("name: tiny", "name: plugged").replace(
-    "    - {name: icp, method: icp}\n",
-    """\
+PLUGGED = (
+    TINY.replace("name: tiny", "name: plugged")
+    # all that the two see is less than a room
+    .replace("align:", "align:\n  evidence: {place_m: 0}")
+    .replace(
+        "    - {name: icp, method: icp}\n",
+        """\
     - {name: best, method: best_share, parameters: {share: 0.4}}
     - {name: opencv, method: opencv}
     - {name: kiss, method: kiss_matcher}
 """,
+    )
 )
 
 
@@ -166,6 +172,8 @@ def test_a_scenario_with_the_example_and_peers(
     assert estimates["refined_status"].eq("accepted").any()
     svg = (result / "figures" / "fig04_translation_error.svg").read_text(encoding="utf-8")
     assert "best" in svg
+    for theirs in ("best", "opencv", "kiss"):
+        assert_judged_as(estimates, theirs, "ransac")
 
     # two processes give the same tables as one, and a changed plug-in is not taken for the old one
     module = site / "mapfusion_best_share.py"
@@ -180,6 +188,19 @@ def test_a_scenario_with_the_example_and_peers(
     assert len(set((results / "store" / "aligner").iterdir()) - folders) == 1  # its own alone
     again = tables.read(tables.table_path(result, "estimates"), "estimates")
     assert estimates.equals(again)
+
+
+def assert_judged_as(estimates: pd.DataFrame, theirs: str, own: str) -> None:
+    """Where both are refined to one motion, both get one verdict: status, probability, reason."""
+    first = estimates[estimates["repetition"] == 0].set_index("iteration")
+    two = [first[first["aligner"] == name] for name in (theirs, own)]
+    motion = ["refined_tx_m", "refined_ty_m", "refined_theta_rad"]
+    apart = (two[0][motion] - two[1][motion]).abs().max(axis=1)
+    same = apart.index[(apart < 1e-6) & two[0]["probability"].notna()]
+    assert len(same), f"{theirs} never agrees with {own}"
+    words, numbers = ["verdict", "acceptance_reason"], ["probability", "log10_evidence"]
+    assert two[0].loc[same, words].equals(two[1].loc[same, words])
+    np.testing.assert_allclose(two[0].loc[same, numbers], two[1].loc[same, numbers], rtol=1e-4)
 
 
 def test_an_absent_package_is_shown_as_absent(tmp_path: Path, maps: tuple[Path, Path]) -> None:

@@ -70,6 +70,29 @@ def test_a_rival_is_more_than_chance_by_pairs_and_regions_together(
     assert str(answer.status) == status
 
 
+@pytest.mark.parametrize(("n_others", "status"), [(2, "accepted"), (4, "ambiguous")])
+def test_the_best_of_more_motions_needs_more_evidence(n_others: int, status: str) -> None:
+    """Others that are more than chance by their pairs, and fit by no region."""
+    pairs, (said, refined) = match(A, B), verdict(A, B)
+    sought = Registration(Clique()).on(A, B, pairs)
+    assert sought.judge is not None
+    evidence = sought.judge.evidence
+    assert evidence is not None
+    none = Copies.none(len(A), len(B))
+    others = [
+        RivalMotion(
+            BETWEEN, refined.T_a_b + np.array([0.0, 30.0 * k, 0.0]), -5.0, 9, 0, 3, 3, -4.0, none
+        )
+        for k in range(1, n_others + 1)
+    ]
+    known = replace(evidence, motions=(*evidence.motions, *others))
+    enough = EvidenceParameters(least_ratio=10**said.log10_evidence / 4)
+    registration = Registration(Clique(), judge=Judge(evidence=enough)).on(A, B, pairs, known)
+    answer = registration.register(np.random.default_rng(0)).verdict
+    assert str(answer.status) == status
+    assert ("too few beside" in answer.reason) == (status == "ambiguous")
+
+
 def test_a_picture_in_two_worlds_is_contradicted_by_all_around_it() -> None:
     first, second = Wall(16, seed=1), Wall(16, seed=8)
     inside = (first.p[:, 0] >= 6) & (first.p[:, 0] < 8)

@@ -10,6 +10,7 @@ from mapfusion.evidence.likelihood import (
     WRONG,
     TwinShares,
     log10_against_chance,
+    log10_beside_one,
     log10_ratio,
 )
 
@@ -70,3 +71,27 @@ def test_the_ratio_s_mean_under_wrong_motions_is_one() -> None:
     wrong = s * betabinom.pmf(k, n, *RIGHT[0]) + (1 - s) * betabinom.pmf(k, n, *WRONG[0])
     ratio = 10 ** log10_ratio(*must_own(k, np.full(n + 1, n)), TwinShares(s, 0.5))
     assert wrong @ ratio == pytest.approx(1.0)
+
+
+def test_beside_the_region_that_found_it_the_mean_is_one_too() -> None:
+    """The wrong model is enumerated: of two regions either, at even odds, is as if right."""
+    n, s = 7, 0.15
+    k = np.arange(n + 1)
+    twin = betabinom.pmf(k, n, *RIGHT[0])
+    wrong = s * twin + (1 - s) * betabinom.pmf(k, n, *WRONG[0])
+    right = (1 - CHANGED) * twin + CHANGED * wrong
+    found_by_one = (np.outer(right, wrong) + np.outer(wrong, right)) / 2
+    by_region = log10_ratio(*must_own(k, np.full(n + 1, n)), TwinShares(s, 0.5))
+    ratio = [
+        [10 ** log10_beside_one(np.array([first, second])) for second in by_region]
+        for first in by_region
+    ]
+    np.testing.assert_allclose(found_by_one * ratio, np.outer(right, right), rtol=1e-9)
+    assert np.sum(found_by_one * ratio) == pytest.approx(1.0)
+
+
+def test_one_region_alone_is_no_evidence_for_what_it_found() -> None:
+    assert log10_beside_one(np.array([1.3])) == pytest.approx(0.0)
+    assert log10_beside_one(np.zeros(0)) == 0.0
+    assert log10_beside_one(np.full(4, 0.8)) == pytest.approx(3 * 0.8)
+    assert log10_beside_one(np.array([1.3, -1.2])) == pytest.approx(-0.9, abs=0.01)

@@ -5,9 +5,9 @@ import pytest
 
 from mapfusion import se2
 from mapfusion.evidence.copies import BETWEEN, Copies
-from mapfusion.evidence.likelihood import COPIED, OWN, TwinShares
+from mapfusion.evidence.likelihood import COPIED, OWN, TwinShares, log10_ratio
 from mapfusion.evidence.parameters import EvidenceParameters
-from mapfusion.evidence.regions import Squares, Witness, Witnesses
+from mapfusion.evidence.regions import Regions, Squares, Witness, Witnesses
 from tests.mapfusion.evidence.two_rooms import Wall, between, mapped
 
 WALL = Wall(16, seed=1)
@@ -28,6 +28,16 @@ def test_the_right_motion_is_confirmed_everywhere() -> None:
     assert found.n_confirmed == len(found)
     assert found.n_contradicted == 0
     assert found.log10_ratio(SHARES) > 3
+    best = log10_ratio(found.found, found.expected, SHARES).max()
+    assert found.log10_evidence(SHARES) >= found.log10_ratio(SHARES) - best
+    assert found.seen_again(OWN) == (len(found) - 1, len(found) - 1)  # one of them found it
+
+
+def test_of_missing_regions_the_one_that_agrees_best_is_no_sample() -> None:
+    found, expected = np.zeros((3, 2, 2), np.int64), np.zeros((3, 2, 2), np.int64)
+    expected[:, OWN, 0] = 20
+    found[1, OWN, 0] = 19
+    assert Regions(found, expected).seen_again(OWN) == (0, 2)
 
 
 def test_a_motion_along_the_wall_is_contradicted_everywhere() -> None:
