@@ -175,9 +175,7 @@ class StereoImport:
             return Imported(log, truth, linked, attitude=attitude)
         return Imported(log, truth, linked, seen.covariance, attitude, int(seen.guessed.sum()))
 
-    def _felt(
-        self, time_ns: np.ndarray
-    ) -> tuple[tuple[Float, Float], tuple[Float, Float] | None]:
+    def _felt(self, time_ns: np.ndarray) -> tuple[tuple[Float, Float], tuple[Float, Float] | None]:
         """Tilts by the accelerometer, and turns by the gyroscopes, as `Levels` has them."""
         felt, name = self._recording.inertial, self._recording.name
         if felt is None:
