@@ -3,8 +3,9 @@
     python -m tests.benchmarks.two_bags --frames 1000 --folder /tmp/two_bags
 
 Two simulated robots' drives are written as bags first, which is not counted. A bag then has
-pictures alone: the odometry is theirs. Seconds of the clock say something on a quiet machine, those
-of processors on any. Bags that are in the folder already are taken as they are.
+pictures alone: the odometry is theirs. Seconds of the clock say something on a quiet machine; those
+of processors on any, with `--jobs 1`: what worker processes use is not counted. Bags that are in
+the folder already are taken as they are.
 """
 
 import argparse
@@ -40,7 +41,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=int, default=1000)
     parser.add_argument("--folder", type=Path, required=True, help="What is made goes there.")
-    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--jobs", type=int, default=2, help="Processes; 1 to count processors.")
     asked = parser.parse_args()
     root, jobs = asked.folder, ("--jobs", asked.jobs)
     bags = [root / "bags" / f"{robot}.bag" for robot in ("R1", "R2")]
