@@ -14,7 +14,6 @@ from mapfusion.recordings.levels import Level
 from mapfusion.recordings.registry import (
     IMPORTERS,
     import_recording,
-    read_recording,
     robot_name,
     settings_class,
 )
@@ -24,6 +23,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(no_args_is_help=True, help="Turn recordings in foreign formats into robot logs.")
 Folder = Annotated[Path, typer.Argument(metavar="FOLDER", help="The recording.")]
+Folders = Annotated[list[Path], typer.Argument(metavar="FOLDER...", help="The recordings.")]
 Frames = Annotated[
     list[str] | None,
     typer.Option(
@@ -88,7 +88,7 @@ def _stereo_command(format_name: str) -> Callable[..., None]:
     """The command that makes logs of stereo pictures of one format."""
 
     def command(
-        folder: Folder,
+        folders: Folders,
         output: options.Output,
         overrides: options.ImportOverrides,
         frames: Frames = None,
@@ -98,25 +98,30 @@ def _stereo_command(format_name: str) -> Callable[..., None]:
         scenario: options.SettingsOf = None,
         level: LevelOf = "auto",
         calibration: CalibrationOverrides = None,
+        jobs: options.Jobs = options.ALL_CORES,
         **chosen: str | None,
     ) -> None:
-        from experiments.run.stereo_logs import import_stereo, vision_of
+        from experiments.run.stereo_logs import Source, import_stereo, vision_of
         from experiments.scenario.loading import made_settings
-        from experiments.scenario.yaml_input import read_calibration
         from experiments.show.terminal.import_screen import print_imported
         from experiments.show.terminal.layout import progress
 
+        if len(folders) > 1 and (odometry not in (None, "images") or truth is not None):
+            raise InputError("--odometry and --truth: are files of one recording; import one")
         named = {name: value for name, value in chosen.items() if value is not None}
         settings = made_settings(format_name, settings_class(format_name), overrides, named)
-        recording = read_recording(format_name, folder, settings, read_calibration)
-        front_end = (None if scenario is None else vision_of(scenario), vision or ())
-        cuts = _cuts(robot_name(recording.name), frames or ())
+        front_end = None if scenario is None else vision_of(scenario)
+        given = (front_end, tuple(vision or ()), tuple(calibration or ()), level)
+        sources = [
+            Source(format_name, folder, settings, odometry, truth, *given) for folder in folders
+        ]
         with progress() as show:
-            given = ((odometry, truth), front_end, calibration or (), level)
-            done = import_stereo(recording, output, cuts, *given, show)
-        print_imported(done)
-        if done.too_little:
-            options.complain(done.too_little[0])
+            done, written = import_stereo(
+                sources, output, lambda one: _cuts(robot_name(one.name), frames or ()), jobs, show
+            )
+        print_imported(done, written)
+        if too_little := [line for one in done for line in one.too_little]:
+            options.complain(too_little[0])
             raise typer.Exit(options.EXIT_FAILED)
 
     return _with_options(command, IMPORTERS[format_name].options)
@@ -154,9 +159,6 @@ def _cuts(recording: str, frames: Sequence[str]) -> "list[Cut]":
             raise InputError(f"--frames {text}: expected {expected}")
         bounds = [int(part) if part else None for part in match["rows"].split(":")]
         cuts.append(Cut(name, slice(*bounds)))
-    names = [cut.robot for cut in cuts]
-    if twice := [name for name in names if names.count(name) > 1]:
-        raise InputError(f"--frames: two robots are named {twice[0]}")
     return cuts
 
 

@@ -4,7 +4,7 @@ import functools
 import reprlib
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import is_dataclass
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
@@ -117,7 +117,11 @@ def made_settings(
     Raises:
         InputError: one line that begins with `where`.
     """
-    return _validated(where, kind, apply_overrides(base or {}, overrides))
+    made = _validated(where, kind, apply_overrides(base or {}, overrides))
+    if not is_dataclass(kind):
+        return made
+    # of the class itself, which can be sent to another process; pydantic's own one cannot
+    return kind(**{own.name: getattr(made, own.name) for own in fields(kind)})
 
 
 class _StepSettings(Scenario):

@@ -7,7 +7,7 @@ Burri et al. (2016), "The EuRoC micro aerial vehicle datasets". A folder `mav0`,
   camera into the body's frame.
 - `state_groundtruth_estimate0/data.csv`: time in ns, position, quaternion (real part first) of the
   body and more that is not read; optional.
-- `imu0`: `data.csv` (time in ns, angular velocity, which is not read, acceleration in m/s²) and
+- `imu0`: `data.csv` (time in ns, angular velocity in rad/s, acceleration in m/s²) and
   `sensor.yaml` with T_BS; optional.
 - `odometry.tum`: dead reckoning of the robot's axes, which EuRoC has not; ours, optional.
 """
@@ -117,7 +117,7 @@ def _shots(camera: Path) -> tuple[list[Shot], list[str]]:
 
 
 def _felt(imu: Path, T_body_robot: Float, read_yaml: ReadYaml) -> Inertial:
-    """Accelerations in the robot's axes."""
+    """Accelerations and angular velocities in the robot's axes."""
     sensor, path = imu / "sensor.yaml", imu / "data.csv"
     T_body_imu = motion_of(str(sensor), "T_BS", read_yaml(sensor).get("T_BS"))
     lines, times, rows = list[int](), list[int](), list[list[float]]()
@@ -127,9 +127,10 @@ def _felt(imu: Path, T_body_robot: Float, read_yaml: ReadYaml) -> Inertial:
         rows.append(numbers(path, line, words[1:], _FELT_COLUMNS - 1))
     time_ns = np.array(times, dtype=np.int64)
     require_increasing(path, lines, time_ns)
-    own = np.array(rows, dtype=np.float64).reshape(-1, _FELT_COLUMNS - 1)[:, 3:]
+    own = np.array(rows, dtype=np.float64).reshape(-1, _FELT_COLUMNS - 1)
+    turn = se3.between(T_body_robot, T_body_imu)[:3, :3].T
     try:
-        return Inertial(time_ns, own @ se3.between(T_body_robot, T_body_imu)[:3, :3].T)
+        return Inertial(time_ns, own[:, 3:] @ turn, own[:, :3] @ turn)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 

@@ -21,15 +21,15 @@ from mapfusion import se3
 from mapfusion.errors import InputError
 from mapfusion.recordings.lens import R_ROBOT_OPTICAL, Lens, StereoCalibration
 from mapfusion.recordings.mount import MountSettings, level_mount
-from mapfusion.recordings.pictures import PictureFile
-from mapfusion.recordings.stereo_recording import ReadYaml, Shot, StereoRecording, paired
+from mapfusion.recordings.numbered import numbered_shots
+from mapfusion.recordings.stereo_recording import ReadYaml, StereoRecording, paired
 from mapfusion.recordings.text_tables import NS, numbers, require_increasing, rows_of, time_in_ns
 from mapfusion.recordings.timed_poses import TimedPoses
 from mapfusion.recordings.tum import ODOMETRY_FILE, read_tum
 from mapfusion.se2 import Float
 
-_HEIGHT_M = 1.65  # of KITTI's cameras above the road, by its publication
-_NUMBERED = "[0-9]" * 6 + ".png"
+HEIGHT_M = 1.65  # of KITTI's cameras above the road, by its publication
+_DIGITS = 6  # of a picture's name
 
 
 @dataclass(frozen=True)
@@ -53,18 +53,16 @@ def read_kitti(folder: Path, settings: KittiSettings, _: ReadYaml) -> StereoReco
     """
     first = 0 if settings.cameras == "grey" else 2
     folders = [folder / f"image_{camera}" for camera in (first, first + 1)]
-    for each in folders:
-        if not each.is_dir():
-            raise InputError(f"{each}: no such folder (pictures of a KITTI sequence)")
-    times = _times(folder / "times.txt")
-    left, right = (_shots(each, times, folder / "times.txt") for each in folders)
+    timed = folder / "times.txt"
+    times = _times(timed)
+    left, right = (numbered_shots(each, _DIGITS, each.name, times, timed) for each in folders)
     try:
         time_ns, pictures, dropped = paired(left, right)
     except InputError as error:
         raise InputError(f"{folder}: {error}") from error
     calibration = _calibration(folder / "calib.txt", first, pictures[0][0]().shape[:2])
     baseline_m = float(calibration.T_left_right[0, 3])
-    T_robot_left = settings.mount.applied(level_mount(baseline_m, 0.0, _HEIGHT_M))
+    T_robot_left = settings.mount.applied(level_mount(baseline_m, 0.0, HEIGHT_M))
     sequence = folder.resolve()
     beside = sequence.parent.parent / "poses" / f"{sequence.name}.txt"
     truth = next((path for path in (sequence / "poses.txt", beside) if path.exists()), None)
@@ -91,18 +89,6 @@ def _times(path: Path) -> np.ndarray:
     return time_ns
 
 
-def _shots(folder: Path, time_ns: np.ndarray, times: Path) -> list[Shot]:
-    """The pictures of one camera, each with the time that its number has."""
-    pictures = {int(path.stem): path for path in sorted(folder.glob(_NUMBERED))}
-    late = [number for number in pictures if number >= len(time_ns)]
-    if late:
-        raise InputError(f"{times}: has {len(time_ns)} times, none for {pictures[late[0]]}")
-    return [
-        Shot(int(time_ns[number]), f"{folder.name}/{path.name}", PictureFile(path))
-        for number, path in pictures.items()
-    ]
-
-
 def _calibration(path: Path, first: int, shape: tuple[int, int]) -> StereoCalibration:
     matrices = {
         words[0].removesuffix(":"): (line, words[1:])
@@ -114,11 +100,16 @@ def _calibration(path: Path, first: int, shape: tuple[int, int]) -> StereoCalibr
             raise InputError(f"{path}: has no line {name}: (projection matrix of 12 numbers)")
         line, words = matrices[name]
         found.append(np.array(numbers(path, line, words, 12)).reshape(3, 4))
+    return rectified_pair(path, found, (shape[1], shape[0]))
+
+
+def rectified_pair(path: Path, found: list[Float], size_px: tuple[int, int]) -> StereoCalibration:
+    """Two cameras of projection matrices (3, 4) that were read at `path`; raises InputError."""
     lenses = []
     try:
         for P in found:
             focal, center = (P[0, 0], P[1, 1]), (P[0, 2], P[1, 2])
-            lenses.append(Lens((shape[1], shape[0]), focal, center))
+            lenses.append(Lens(size_px, focal, center))
         # Rectified to camera 0; of where the others stand only what lies along the rows counts.
         ahead = np.array([-P[0, 3] / P[0, 0] for P in found])
         T_left_right = se3.pose(np.eye(3), [ahead[1] - ahead[0], 0.0, 0.0])

@@ -47,10 +47,11 @@ class LevelFrames:
         """The next frame; `steps` are usual steps of time since the one before."""
         levels = self._levels
         if levels.measures:
-            measured = levels.measured(len(self.observed), found, self._sigma_uv_px)
+            k = len(self.observed)
+            measured = levels.measured(k, found, self._sigma_uv_px)
             turn = self._levelling.expected_turn(measured)
             frame = self._observer.observe(found, steps, turn)
-            self._levelling.add(frame.tracks.motion, measured)
+            self._levelling.add(frame.tracks.motion, measured, levels.counted(k))
             own = self._levelling.applied(frame.observations)
         else:
             frame = self._observer.observe(found, steps)

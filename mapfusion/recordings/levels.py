@@ -48,6 +48,8 @@ class Levels:
         odometry: (T, 4, 4) dead reckoning at the frames, or None.
         tilts: (T, 2) roll and pitch by the accelerometer, NaN where it tells none, and (2,) their
             deviations; or None.
+        counted: (T, 3) turns since the frame before by gyroscopes, NaN where they tell none, and
+            (T,) the seconds since; or None.
 
     Attributes:
         camera, T_robot_left: as given.
@@ -60,8 +62,10 @@ class Levels:
         T_robot_left: Float,
         odometry: Float | None,
         tilts: tuple[Float, Float] | None = None,
+        counted: tuple[Float, Float] | None = None,
     ) -> None:
         self.camera, self.T_robot_left = camera, T_robot_left
+        self._counted = counted
         self._known: Level = known
         self._odometry, self._tilts = odometry, tilts
 
@@ -74,6 +78,12 @@ class Levels:
     def shared_rad(self) -> float:
         """Standard deviation of what all measured tilts err by alike."""
         return {"imu": SHARED_RAD, "floor": _ROAD_RAD}.get(self._known, 0.0)
+
+    def counted(self, k: int) -> tuple[Float, float] | None:
+        """The turn (3,) since frame k - 1 by gyroscopes, and the seconds since; None: unknown."""
+        if self._counted is None or np.isnan(self._counted[0][k]).any():
+            return None
+        return self._counted[0][k], float(self._counted[1][k])
 
     def measured(self, k: int, found: Features, sigma_uv_px: float) -> Measured:
         """Of frame k, in which these features were found."""

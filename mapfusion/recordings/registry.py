@@ -62,6 +62,13 @@ IMPORTERS = {
         "dataset/sequences/00",
         stereo=True,
     ),
+    "kitti_raw": Importer(
+        "mapfusion.recordings.kitti_raw:read_kitti_raw",
+        "KittiRawSettings",
+        "Drives of KITTI's raw data, rectified and synchronised",
+        "2011_09_26/2011_09_26_drive_0001_sync",
+        stereo=True,
+    ),
     "images": Importer(
         "mapfusion.recordings.images:read_images",
         "ImagesSettings",

@@ -7,7 +7,7 @@ where they connect its frame to the robot's; measured gravity takes the place of
 pitch.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -178,13 +178,22 @@ def _mount(
         lost = f"/tf_static leads from {imu!r} to no camera {camera!r}"
         raise InputError(f"{bag.path}: --imu {settings.imu}: {lost}")
     T_camera_imu = (optical @ T_left_imu)[:3, :3]
-    felt = {stamp_ns(m): m.linear_acceleration for _, m in bag.messages(settings.imu)}
+    felt = {stamp_ns(m): m for _, m in bag.messages(settings.imu)}
     time_ns = np.array(sorted(felt), dtype=np.int64)
-    forces = np.array([[felt[t].x, felt[t].y, felt[t].z] for t in time_ns.tolist()])
-    by_camera = forces.reshape(-1, 3) @ T_camera_imu.T
+    messages = [felt[t] for t in time_ns.tolist()]
+    forces, rates = (
+        np.array([[each.x, each.y, each.z] for each in own]).reshape(-1, 3) @ T_camera_imu.T
+        for own in (
+            [m.linear_acceleration for m in messages],
+            [m.angular_velocity for m in messages],
+        )
+    )
+    # a covariance that begins with -1 says that nothing was measured (sensor_msgs/Imu)
+    counts = all(m.angular_velocity_covariance[0] != -1 for m in messages)
     try:
-        inertial = Inertial(time_ns, by_camera)
-        T_robot_left = upright(T_robot_left, by_camera.mean(axis=0))
-        return T_robot_left, replace(inertial, acceleration=by_camera @ T_robot_left[:3, :3].T)
+        Inertial(time_ns, forces)  # is there gravity at all?
+        T_robot_left = upright(T_robot_left, forces.mean(axis=0))
+        turn = T_robot_left[:3, :3].T
+        return T_robot_left, Inertial(time_ns, forces @ turn, rates @ turn if counts else None)
     except InputError as error:
         raise InputError(f"{bag.path}: --imu {settings.imu}: {error}") from error

@@ -18,6 +18,7 @@ from mapfusion.recordings.levels import Level, Levels, known_from
 from mapfusion.recordings.pictures import sampled
 from mapfusion.recordings.rectify import Rectification
 from mapfusion.recordings.stereo_recording import StereoRecording
+from mapfusion.recordings.text_tables import NS
 from mapfusion.recordings.visual_odometry import visual_odometry
 from mapfusion.robot_log import TRUTH_FILES, RobotLog, write_log, write_truth_poses
 from mapfusion.se2 import Float
@@ -155,11 +156,11 @@ class StereoImport:
         known = known_from(level, reckoned, self._recording.inertial)
         if known == "odometry" and reckoned is None:
             raise InputError(f"--level odometry: {self._recording.name} has no odometry")
-        tilts = self._tilts(time_ns) if known == "imu" else None
+        tilts, counted = self._felt(time_ns) if known == "imu" else (None, None)
         usual_ns = np.median(np.diff(self._recording.time_ns))
         steps = np.diff(time_ns, prepend=time_ns[0]) / usual_ns
         front_end = FrontEnd(self.camera, self.vision)
-        levels = Levels(known, self.camera, self.T_robot_camera, reckoned, tilts)
+        levels = Levels(known, self.camera, self.T_robot_camera, reckoned, tilts, counted)
         frames = LevelFrames(self.vision, levels)
         for n, k in enumerate(rows):
             frames.add(front_end.extract(*self.rectified(k)), float(steps[n]))
@@ -174,14 +175,16 @@ class StereoImport:
             return Imported(log, truth, linked, attitude=attitude)
         return Imported(log, truth, linked, seen.covariance, attitude, int(seen.guessed.sum()))
 
-    def _tilts(self, time_ns: np.ndarray) -> tuple[Float, Float]:
+    def _felt(self, time_ns: np.ndarray) -> tuple[tuple[Float, Float], tuple[Float, Float] | None]:
+        """Tilts by the accelerometer, and turns by the gyroscopes, as `Levels` has them."""
         felt, name = self._recording.inertial, self._recording.name
         if felt is None:
             raise InputError(f"--level imu: {name} has no accelerations that are read")
         try:
-            return felt.tilts(time_ns)
+            tilts, turns = felt.tilts(time_ns), felt.turns(time_ns)
         except InputError as error:
             raise InputError(f"--level imu: {name}: {error}") from error
+        return tilts, None if turns is None else (turns, np.diff(time_ns, prepend=time_ns[0]) / NS)
 
     def _odometry(self, time_ns: np.ndarray) -> Float | None:
         """Poses (T, 4, 4) at the frames, by the recorded dead reckoning; None without it."""

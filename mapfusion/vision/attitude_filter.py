@@ -12,6 +12,7 @@ import numpy as np
 
 from mapfusion.se2 import Float
 from mapfusion.se3 import roll_pitch, tilt
+from mapfusion.vision.gyroscope import LOST_M
 from mapfusion.vision.rigid_links import RigidMotion
 
 # Standard deviation of an attitude that nothing has told yet, rad and m: anything.
@@ -19,7 +20,6 @@ _UNKNOWN = np.array([1.0, 1.0, 100.0])
 # Of the error's part that no landmark in view has in common, what the next frame keeps: tracks last
 # for some twenty frames, and what came before them tilts all that is in view alike.
 _IN_VIEW = 1 - 1 / 20
-_LOST_M = 0.1  # by how much a height may change in a step that nothing tells of
 
 
 @dataclass(frozen=True)
@@ -61,9 +61,9 @@ class AttitudeFilter:
     def move(self, motion: RigidMotion | None) -> None:
         """On to the next frame; None: it may have moved in any way."""
         if motion is None:
-            height = self.covariance[2, 2] + _LOST_M**2
+            height = self.covariance[2, 2] + LOST_M**2
             self.covariance = np.diag([*(_UNKNOWN[:2] ** 2), height])
-            self.fresh = np.diag([*(_UNKNOWN[:2] ** 2), _LOST_M**2])
+            self.fresh = np.diag([*(_UNKNOWN[:2] ** 2), LOST_M**2])
             self.carried, self._moved = np.array([0.0, 0.0, 1.0]), True
             return
         before = tilt(self.value[0], self.value[1])

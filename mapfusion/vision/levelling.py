@@ -7,6 +7,7 @@ from mapfusion.robot_log import Observations
 from mapfusion.se2 import Float
 from mapfusion.se3 import tilt
 from mapfusion.vision.attitude_filter import AttitudeFilter, Measured
+from mapfusion.vision.gyroscope import Gyroscope
 from mapfusion.vision.rigid_links import RigidMotion
 
 # Standard deviation of roll and pitch of a body on wheels, a car's on a road or a robot's on its
@@ -27,7 +28,7 @@ class Levelling:
     def __init__(self, T_robot_seen: Float | None = None, shared_rad: float = 0.0) -> None:
         self._T_robot_seen = T_robot_seen
         self._shared_rad2 = shared_rad**2
-        self._filter = AttitudeFilter()
+        self._filter, self._gyroscope = AttitudeFilter(), Gyroscope()
         self._values: list[Float] = []
         self._sigmas: list[Float] = []
         self._carried: list[Float] = []
@@ -56,14 +57,23 @@ class Levelling:
         seen = self._T_robot_seen[:3, :3]
         return seen.T @ turn @ seen
 
-    def add(self, motion: RigidMotion | None, measured: Measured) -> None:
+    def add(
+        self,
+        motion: RigidMotion | None,
+        measured: Measured,
+        counted: tuple[Float, float] | None = None,
+    ) -> None:
         """The next frame: how the links say that the camera moved, and what was measured.
 
-        Where neither tells roll and pitch, the body is level in the mean.
+        `counted` is the robot's turn since the frame before by gyroscopes, a rotation vector (3,)
+        in the robot's axes then, and the seconds since. Where nothing tells roll and pitch, the
+        body is level in the mean.
         """
         if self._values:
             if motion is not None and self._T_robot_seen is not None:
                 motion = motion.of(self._T_robot_seen)
+            if counted is not None:
+                motion = self._gyroscope.joined(*counted, motion)
             self._filter.move(motion)
         if motion is None and np.isnan(measured.value[:2]).any():
             told = np.array([0.0, 0.0, measured.value[2]])

@@ -1,5 +1,8 @@
 """What `mapfusion import` shows of a stereo recording."""
 
+from collections.abc import Sequence
+from pathlib import Path
+
 import numpy as np
 
 from experiments.run.stereo_logs import ImportedRecording
@@ -20,17 +23,16 @@ _COLUMNS = [
 ]
 
 
-def print_imported(done: ImportedRecording) -> None:
-    """The camera, a line a robot, what was dropped, and where the logs are."""
-    recording = done.recording
-    print_lines([f"{recording.name}: {len(recording)} pairs; rectified {done.camera}"])
+def print_imported(recordings: Sequence[ImportedRecording], folders: Sequence[Path]) -> None:
+    """The cameras, a line a robot, what was dropped, and where the logs are."""
+    print_lines(one.about for one in recordings)
     note = "median over the frames; linked: share of the features of the frame before"
-    print_table(_COLUMNS, [_row(one) for one in done.robots], "", note)
-    dropped = recording.dropped
+    print_table(_COLUMNS, [_row(log) for one in recordings for log in one.robots], "", note)
+    dropped = [text for one in recordings for text in one.dropped]
     print_lines(f"  dropped: {each}" for each in dropped[:_MOST_DROPPED])
     if len(dropped) > _MOST_DROPPED:
         print_lines([f"  dropped: {len(dropped) - _MOST_DROPPED} more"])
-    print_lines(map(str, done.folders))
+    print_lines(map(str, folders))
 
 
 def _row(one: Imported) -> tuple[object, ...]:

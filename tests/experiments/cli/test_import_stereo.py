@@ -31,6 +31,41 @@ def test_frames_cut_a_recording_into_robots(
         assert words in reply.out
 
 
+def test_several_recordings_and_processes_change_nothing(
+    sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two recordings by two processes; each alone, and in this process, is the same."""
+    copy = write_kitti(tmp_path / "second", drive()).rename(tmp_path / "second" / "other")
+    own = ("--vision", "tracks.min_length=2", "--odometry", "images")
+    both = ("import", "kitti", sequence, copy, "-o", tmp_path / "both", "--jobs", 2)
+    reply = command(capsys, *both, *own)
+    assert reply.code == 0, reply.err
+    for path, name in ((sequence, "07"), (copy, "other")):
+        alone = ("import", "kitti", path, "-o", tmp_path / "alone", "--jobs", 1)
+        assert command(capsys, *alone, *own).code == 0
+        assert f"{name}: 5 pairs" in reply.out
+        logs = [read_log(tmp_path / folder / name) for folder in ("both", "alone")]
+        for field in ("position_m", "covariance_m2", "descriptor", "track"):
+            first, second = (getattr(log.observations, field) for log in logs)
+            np.testing.assert_array_equal(first, second)
+        np.testing.assert_array_equal(logs[0].odometry, logs[1].odometry)
+
+
+def test_of_several_recordings_none_is_written_where_one_is_refused(
+    sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    logs = tmp_path / "logs"
+    refused = {
+        ("two robots are named 07", "--frames"): (sequence, sequence),
+        ("nothing", "no such file"): (sequence, tmp_path / "nothing"),
+        ("--odometry and --truth", "one"): (sequence, sequence, "--truth", tmp_path / "t.tum"),
+    }
+    for words, given in refused.items():
+        reply = command(capsys, "import", "kitti", *given, "-o", logs)
+        assert_refused(reply, *words)
+        assert not logs.exists()
+
+
 @pytest.mark.parametrize(
     ("given", "left_open"),
     [

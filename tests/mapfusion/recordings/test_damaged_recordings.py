@@ -70,6 +70,41 @@ DAMAGE: dict[str, tuple[str, Callable[[Path], Any], str]] = {
         lambda f: _draw(f / "image_1/000004.png", 99),
         "pair 4: right image: is 99x99 px",
     ),
+    "no day": (
+        "kitti_raw",
+        lambda f: (f.parent / "calib_cam_to_cam.txt").unlink(),
+        "calib_cam_to_cam.txt: no such file",
+    ),
+    "no raw matrix": (
+        "kitti_raw",
+        lambda f: _edit(f.parent / "calib_cam_to_cam.txt", "P_rect_01", "P_rect_09"),
+        r"has no line P_rect_01: \(12 numbers\)",
+    ),
+    "not rectified": (
+        "kitti_raw",
+        lambda f: _edit(f.parent / "calib_cam_to_cam.txt", "S_rect_00: 2.4", "S_rect_00: 2.3"),
+        "rectified ones 230x180; give the drive whose name ends in _sync",
+    ),
+    "raw time": (
+        "kitti_raw",
+        lambda f: (f / "image_00/timestamps.txt").write_text("2011-09-26 noon\n"),
+        "timestamps.txt, line 1: '2011-09-26 noon' is no time",
+    ),
+    "raw picture without a time": (
+        "kitti_raw",
+        lambda f: (f / "image_00/timestamps.txt").write_text("2011-09-26 13:02:25.9\n"),
+        "has 1 times, none for",
+    ),
+    "half a state": (
+        "kitti_raw",
+        lambda f: (f / "oxts/data/0000000003.txt").write_text("49.0 8.4\n"),
+        "0000000003.txt, line 1: has 2 columns, expected 30",
+    ),
+    "turned inside out": (
+        "kitti_raw",
+        lambda f: (f.parent / "calib_imu_to_velo.txt").write_text("R: 1 0 0 0 1 0 0 0 2\nT: 0 0 0"),
+        "calib_imu_to_velo.txt: R and T: is no rotation",
+    ),
     "no calibration": ("euroc", lambda f: (f / "mav0/cam1/sensor.yaml").unlink(), "sensor.yaml"),
     "no mount": ("euroc", lambda f: _edit(f / SENSOR, "T_BS:", "T_B:"), "T_BS"),
     "model": (

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation
 
 from mapfusion import se3
 from mapfusion.errors import InputError
@@ -18,6 +19,7 @@ from tests.mapfusion.recordings.written_layouts import write_euroc as write_pict
 from tests.mapfusion.vision.test_levelling import measured_motion
 
 GRAVITY, RATE_HZ, A_FRAME = 9.81, 200, 20  # so ten frames a second
+TURNING = (0.01, -0.02, 0.03)  # what the gyroscopes of `imu0` say, in their own axes
 T_BODY_IMU = se3.pose(se3.tilt(0.4, -0.2), [0.1, 0.0, 0.2])
 
 
@@ -82,6 +84,62 @@ def test_of_a_body_that_sways_it_is_as_sure_as_stated() -> None:
     assert rms < 0.3 * np.sqrt(np.mean(alone**2))
 
 
+@pytest.mark.parametrize("rate_hz", [50, 200])
+def test_turns_of_gyroscopes_are_the_body_s(rate_hz: int) -> None:
+    """Of one that turns about an axis of its own that turns, by the integral of its rate."""
+    frames = 10**9 + np.arange(11) * 10**8
+    sample_ns = np.arange(0, 21 * 10**8, 10**9 // rate_hz)
+    t = sample_ns / 1e9
+    R = Rotation.from_euler("ZX", np.column_stack([0.8 * t, 0.3 * np.sin(2 * t)]))
+    rate = np.column_stack([0.6 * np.cos(2 * t), np.zeros_like(t), np.full_like(t, 0.0)])
+    rate += 0.8 * R.as_matrix()[:, 2]  # the world's z, in the body's axes
+    felt = Inertial(sample_ns, at_rest(np.zeros((len(t), 2))), rate)
+    turns = felt.turns(frames)
+    assert turns is not None
+    assert np.isnan(turns[0]).all()
+    own = Rotation.from_matrix(R.as_matrix()[np.searchsorted(sample_ns, frames)])
+    true = (own[:-1].inv() * own[1:]).as_rotvec()
+    np.testing.assert_allclose(turns[1:], true, atol=30 / rate_hz**2 * 1e-2)
+
+
+def test_turns_are_unknown_where_gyroscopes_are_silent() -> None:
+    frames = np.arange(5) * 10**8
+    sample_ns = np.arange(0, 5 * 10**8, 5 * 10**6)
+    sample_ns = np.delete(sample_ns, slice(22, 36))  # 110 to 180 ms
+    felt = at_rest(np.zeros((len(sample_ns), 2)))
+    turns = Inertial(sample_ns, felt, np.zeros_like(felt)).turns(frames)
+    assert turns is not None
+    assert np.isnan(turns[:, 0]).tolist() == [True, False, True, False, False]
+    assert Inertial(sample_ns, felt).turns(frames) is None
+
+
+def test_gyroscopes_hold_a_tilt_where_pictures_show_nothing() -> None:
+    """A body that speeds up as it likes, so that its accelerometer says little; 30 frames blind."""
+    off, stated = [], []
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        n, bias = 90, rng.normal(0, 0.03, 3)
+        true = correlated(rng, n, 0.05, 5)
+        way = np.stack([0.05 * np.arange(n), np.zeros(n), 0.03 * np.arange(n)], -1)
+        bodies = se3.in_space(way, true)
+        levelling = Levelling()
+        for k in range(n):
+            motion, counted = None, None
+            if k:
+                turn = Rotation.from_matrix(se3.between(bodies[k - 1], bodies[k])[:3, :3])
+                counted = turn.as_rotvec() + 0.1 * bias + rng.normal(0, 3e-4, 3), 0.1
+                if k < 60:
+                    motion = measured_motion(rng, bodies[k - 1], bodies[k])
+            told = true[k] + rng.normal(0, 0.05, 2)
+            measured = Measured(np.array([*told, 0.0]), np.array([0.05, 0.05, 0.0]))
+            levelling.add(motion, measured, counted)
+        made = levelling.attitude
+        off.append(made.value[60:, :2] - true[60:])
+        stated.append(made.sigma[60:, :2])
+    assert 0.4 < np.mean((np.array(off) / np.array(stated)) ** 2) < 2
+    assert np.sqrt(np.mean(np.square(off))) < 0.012
+
+
 def write_felt(root: Path, acceleration: np.ndarray) -> None:
     """`imu0` of EuRoC's layout beside the pictures, of the body of `written_layouts`."""
     imu = root / "mav0" / "imu0"
@@ -91,7 +149,7 @@ def write_felt(root: Path, acceleration: np.ndarray) -> None:
     )
     stamps = START_NS + np.rint(np.linspace(-0.1, TIMES_S[-1] + 0.1, len(acceleration)) * 1e9)
     rows = [
-        ",".join([str(int(stamp)), "0", "0", "0", *map(repr, values)])
+        ",".join([str(int(stamp)), *map(repr, TURNING), *map(repr, values)])
         for stamp, values in zip(stamps, acceleration.tolist(), strict=True)
     ]
     (imu / "data.csv").write_text("\n".join(["#timestamp [ns],w_x,...", *rows, ""]))
@@ -113,6 +171,8 @@ def test_what_euroc_s_imu_felt_levels_its_pictures(euroc: Path) -> None:
     recording = read_recording("euroc", euroc, None, read_yaml)
     assert recording.inertial is not None
     np.testing.assert_allclose(recording.inertial.acceleration, shaken, atol=1e-9)
+    turning = T_body_robot.T @ T_BODY_IMU[:3, :3] @ TURNING
+    np.testing.assert_allclose(recording.inertial.rate, np.tile(turning, (400, 1)), atol=1e-12)
     one = StereoImport(recording).log_of(Cut("R", slice(None)))
     assert one.attitude is not None
     np.testing.assert_allclose(one.attitude.value[0, :2], [0.02, 0.03], atol=0.004)

@@ -1,4 +1,4 @@
-"""Three layouts of one rendered drive give one log; what is wrong with any is one line."""
+"""Four layouts of one rendered drive give one log; what is wrong with any is one line."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -53,7 +53,8 @@ def imported(name: str, folder: Path, rows: slice = slice(None), **mount: float)
 
 @pytest.fixture(scope="module")
 def logs(folders: dict[str, Path]) -> dict[str, Imported]:
-    own = {"kitti": {"z_m": 0.45}, "euroc": {}, "images": {"z_m": 0.45}}
+    low = {"z_m": 0.45}
+    own = {"kitti": low, "kitti_raw": low, "euroc": {}, "images": low}
     return {name: imported(name, folder, **own[name]) for name, folder in folders.items()}
 
 
@@ -95,9 +96,9 @@ def test_observations_lie_on_the_walls(name: str, logs: dict[str, Imported]) -> 
     assert np.median(np.abs(walls).min(axis=1)) < 0.02
 
 
-def test_one_drive_in_three_layouts_is_one_log(logs: dict[str, Imported]) -> None:
+def test_one_drive_in_four_layouts_is_one_log(logs: dict[str, Imported]) -> None:
     first = logs["kitti"].log.observations
-    for name in ("euroc", "images"):
+    for name in ("kitti_raw", "euroc", "images"):
         other = logs[name].log.observations
         np.testing.assert_allclose(other.position_m, first.position_m, atol=1e-9)
         np.testing.assert_allclose(other.covariance_m2, first.covariance_m2, atol=1e-9)

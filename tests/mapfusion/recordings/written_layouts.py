@@ -5,7 +5,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 from ruamel.yaml import YAML
+from scipy.spatial.transform import Rotation
 
+from mapfusion import se3
 from mapfusion.camera import StereoCamera
 from tests.mapfusion.vision.rendered_scene import render, wall
 
@@ -76,6 +78,64 @@ def write_kitti(root: Path, pairs: list[Pair]) -> Path:
     (root / "poses" / "07.txt").write_text("\n".join([*lines, ""]))
     (sequence / "odometry.tum").write_text(tum_lines(0, POSES))
     return sequence
+
+
+RECTIFIED, VELO_CAMERA, IMU_VELO = (
+    se3.pose(Rotation.from_euler("ZYX", angles).as_matrix(), shift)
+    for angles, shift in (
+        ((0.01, -0.005, 0.004), (0, 0, 0)),
+        ((1.5, 0.02, -1.6), (-0.004, -0.076, -0.27)),
+        ((0.015, 0.002, -0.001), (-0.81, 0.32, -0.80)),
+    )
+)
+
+
+def write_kitti_raw(root: Path, pairs: list[Pair]) -> Path:
+    """A drive in the folder of its day; returns the drive."""
+    day = root / "2011_09_26"
+    drive = day / "2011_09_26_drive_0007_sync"
+    start = np.datetime64("2011-09-26T13:02:25.964389445", "ns")
+    stamps = [start + np.timedelta64(round(1e9 * t), "ns") for t in TIMES_S[: len(pairs)]]
+    stamped = "".join(str(stamp).replace("T", " ") + "\n" for stamp in stamps)
+    for camera in (0, 1):
+        (drive / f"image_0{camera}" / "data").mkdir(parents=True)
+        (drive / f"image_0{camera}" / "timestamps.txt").write_text(stamped)
+        for k, pair in enumerate(pairs):
+            path = drive / f"image_0{camera}" / "data" / f"{k:010d}.png"
+            cv2.imwrite(str(path), pair[camera])
+    f, (cu, cv) = CAMERA.focal_px, CAMERA.center_px
+    rows = ["calib_time: 09-Jan-2012 13:57:47", f"R_rect_00: {spaced(RECTIFIED[:3, :3])}"]
+    for k in (0, 1):
+        rows.append(f"S_rect_0{k}: {CAMERA.width_px:e} {CAMERA.height_px:e}")
+        P = [[f, 0, cu, -k * f * CAMERA.baseline_m], [0, f, cv, 0], [0, 0, 1, 0]]
+        rows.append(f"P_rect_0{k}: {spaced(np.array(P))}")
+    (day / "calib_cam_to_cam.txt").write_text("\n".join([*rows, ""]))
+    for name, T in (("velo_to_cam", VELO_CAMERA), ("imu_to_velo", IMU_VELO)):
+        text = f"calib_time: 25-May-2012\nR: {spaced(T[:3, :3])}\nT: {spaced(T[:3, 3])}\n"
+        (day / f"calib_{name}.txt").write_text(text)
+    write_oxts(drive / "oxts", stamped, POSES[: len(pairs)])
+    (drive / "odometry.tum").write_text(tum_lines(int(start.astype(np.int64)), POSES))
+    return drive
+
+
+def write_oxts(oxts: Path, stamped: str, poses: np.ndarray) -> None:
+    """States of an inertial unit 2 degrees north of the equator, where lengths are 0.06 % off."""
+    (oxts / "data").mkdir(parents=True)
+    (oxts / "timestamps.txt").write_text(stamped)
+    first = np.radians(2.0)
+    scale = 6378137.0 * np.cos(first)
+    for k, pose in enumerate(poses):
+        T = matrix_of(pose) @ robot_from_left() @ RECTIFIED @ VELO_CAMERA @ IMU_VELO
+        T[:3, 3] -= (robot_from_left() @ RECTIFIED @ VELO_CAMERA @ IMU_VELO)[:3, 3]
+        latitude = np.arctan(np.sinh(T[1, 3] / scale + np.arcsinh(np.tan(first))))
+        yaw, pitch, roll = Rotation.from_matrix(T[:3, :3]).as_euler("ZYX")
+        state = [*np.degrees([latitude, T[0, 3] / scale]), 100 + T[2, 3], roll, pitch, yaw]
+        text = spaced(np.array([*state, *np.zeros(24)]))
+        (oxts / "data" / f"{k:010d}.txt").write_text(text + "\n")
+
+
+def spaced(values: np.ndarray) -> str:
+    return " ".join(map(repr, values.ravel().tolist()))
 
 
 def write_euroc(root: Path, pairs: list[Pair]) -> Path:
@@ -156,4 +216,9 @@ def write_calibration(path: Path, **changed: object) -> None:
         YAML(typ="safe", pure=True).dump(chain, file)
 
 
-WRITERS = {"kitti": write_kitti, "euroc": write_euroc, "images": write_images}
+WRITERS = {
+    "kitti": write_kitti,
+    "kitti_raw": write_kitti_raw,
+    "euroc": write_euroc,
+    "images": write_images,
+}

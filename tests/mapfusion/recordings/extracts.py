@@ -1,0 +1,36 @@
+"""Extracts of public recordings, where MAPFUSION_RECORDINGS names the folder that holds them."""
+
+import itertools
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapfusion import se2
+from mapfusion.recordings.stereo_import import Cut
+
+RECORDINGS = Path(os.environ.get("MAPFUSION_RECORDINGS", "none"))
+WHOLE = Cut("R1", slice(None))
+needs_recordings = pytest.mark.skipif(
+    not RECORDINGS.is_dir(), reason="MAPFUSION_RECORDINGS is not set"
+)
+
+
+def laid_out_as_kitti(root: Path) -> Path:
+    """`kitti_extract` laid out as KITTI publishes its sequences; returns the sequence."""
+    extract, sequence = RECORDINGS / "kitti_extract", root / "sequences" / "06"
+    sequence.mkdir(parents=True)
+    for camera, name in enumerate(("image_l", "image_r")):
+        (sequence / f"image_{camera}").symlink_to((extract / name).resolve())
+    numbers = (extract / "calib.txt").read_text().split()
+    lines = [f"P{k}: {' '.join(numbers[12 * k : 12 * k + 12])}" for k in (0, 1)]
+    (sequence / "calib.txt").write_text("\n".join(lines))
+    (sequence / "times.txt").write_text("\n".join(f"{0.1 * k:e}" for k in range(26)))
+    (sequence / "poses.txt").write_text((extract / "poses.txt").read_text())
+    return sequence
+
+
+def dead_reckoned(odometry: np.ndarray) -> np.ndarray:
+    """Poses (T, 3) from the first on."""
+    return np.array(list(itertools.accumulate(odometry, se2.compose)))
