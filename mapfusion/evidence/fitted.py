@@ -1,6 +1,6 @@
 """Coefficients of `probability.py`.
 
-Written by `python -m experiments.study.refusal.fit_probability`.
+As `python -m experiments.study.refusal.fit_probability` fits them.
 
 Of 6020 alignments, 4158 of them right, of seeds 0 to 4 of alias_copy, alias_copy_apart,
 alias_light, alias_mirror, alias_posters, alias_posters_apart, alias_rooms, alias_rooms_apart,

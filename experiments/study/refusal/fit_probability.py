@@ -35,7 +35,7 @@ _RIDGE = 1e-3
 EVERY = 2
 _TEXT = '''"""Coefficients of `probability.py`.
 
-Written by `python -m experiments.study.refusal.fit_probability`.
+As `python -m experiments.study.refusal.fit_probability` fits them.
 
 {said}
 """
