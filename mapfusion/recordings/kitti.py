@@ -34,7 +34,7 @@ _DIGITS = 6  # of a picture's name
 
 @dataclass(frozen=True)
 class KittiSettings:
-    """How KITTI sequences are read.
+    """How KITTI sequences and raw drives are read.
 
     Attributes:
         cameras: the grey pair (0 and 1) or that in colour (2 and 3).

@@ -13,17 +13,15 @@ folder `DATE_drive_NNNN_sync`, and lies in the folder of its day with the calibr
 - `odometry.tum`: dead reckoning of the robot's axes, which KITTI has not; ours, optional.
 """
 
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
 from mapfusion import se3
 from mapfusion.errors import InputError
-from mapfusion.recordings.kitti import HEIGHT_M, rectified_pair
+from mapfusion.recordings.kitti import HEIGHT_M, KittiSettings, rectified_pair
 from mapfusion.recordings.lens import R_ROBOT_OPTICAL, require_rigid
-from mapfusion.recordings.mount import MountSettings, level_mount
+from mapfusion.recordings.mount import level_mount
 from mapfusion.recordings.numbered import numbered_shots
 from mapfusion.recordings.stereo_recording import ReadYaml, StereoRecording, paired
 from mapfusion.recordings.text_tables import numbers, require_increasing, rows_of
@@ -36,20 +34,7 @@ _OXTS_NUMBERS = 30  # a line; the first six are read
 _EARTH_M = 6_378_137.0  # equatorial radius, as KITTI's own conversion takes it
 
 
-@dataclass(frozen=True)
-class KittiRawSettings:
-    """How raw drives of KITTI are read.
-
-    Attributes:
-        cameras: the grey pair (00 and 01) or that in colour (02 and 03).
-        mount: what replaces a left camera that looks level ahead 1.65 m above the road.
-    """
-
-    cameras: Literal["grey", "colour"] = "grey"
-    mount: MountSettings = field(default_factory=MountSettings)
-
-
-def read_kitti_raw(folder: Path, settings: KittiRawSettings, _: ReadYaml) -> StereoRecording:
+def read_kitti_raw(folder: Path, settings: KittiSettings, _: ReadYaml) -> StereoRecording:
     """Read a drive; pictures are loaded later.
 
     Raises:

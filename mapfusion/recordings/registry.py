@@ -64,7 +64,7 @@ IMPORTERS = {
     ),
     "kitti_raw": Importer(
         "mapfusion.recordings.kitti_raw:read_kitti_raw",
-        "KittiRawSettings",
+        "KittiSettings",
         "Drives of KITTI's raw data, rectified and synchronised",
         "2011_09_26/2011_09_26_drive_0001_sync",
         stereo=True,

@@ -1,6 +1,6 @@
 """Two bags in, a report out: what it takes, command by command.
 
-    python -m tests.benchmarks.two_bags --frames 1000 --folder /tmp/two_bags
+    python -m tests.benchmarks.two_bags --frames 1000 --folder results/two_bags
 
 Two simulated robots' drives are written as bags first, which is not counted. A bag then has
 pictures alone: the odometry is theirs. Seconds of the clock say something on a quiet machine; those

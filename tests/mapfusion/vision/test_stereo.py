@@ -180,7 +180,8 @@ def test_edges_are_rejected_and_slanted_walls_are_not(
     left, right, depth = render(slanted, CAMERA, noise=2.0, rng=rng)
     uv = detect(left, corners_of)
     u, v = np.rint(uv).astype(int).T
-    uv = uv[np.isfinite(maximum_filter(depth, 2 * tested.half_px + 1)[v, u])]  # the wall alone
+    if tested is BY_PLANE:  # at the wall's ends there are two surfaces in a window
+        uv = uv[np.isfinite(maximum_filter(depth, 2 * tested.half_px + 1)[v, u])]
     found = match(left, right, uv, CAMERA, tested).verdict
     assert np.mean(found == verdict) < 0.02
     assert np.mean(found == Verdict.MATCHED) > 0.8
