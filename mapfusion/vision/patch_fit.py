@@ -1,10 +1,17 @@
 """Where a point of an earlier picture lies in a later one: its surroundings, by least squares.
 
 A corner is found anew in each picture, and nearer to the wall another place of it is the corner.
-The surroundings of a point of a wall change by an affine map from view to view (Shi and Tomasi
-1994), and by gain and offset in brightness. The six parameters of the map and the two of brightness
-are least squares on the grey levels, Gauss-Newton with the earlier picture's derivatives, so that
-the normal matrix is built once (inverse composition, Baker and Matthews 2004).
+The surroundings of a point of a wall change by a homography from view to view, and by gain and
+offset in brightness. Around the point, x from it in the earlier picture, it is
+
+    u(x) = place + A x / (1 + h'x)      (Hartley and Zisserman 2004, section 13.1)
+
+and h follows from disparities: what a camera comes nearer to grows, and grows more at its nearer
+side. With h left out (Shi and Tomasi 1994) the place moves by half the second derivative, averaged
+over the window: a hundredth of a pixel, but always towards the robot on what it drives along. The
+six parameters of place and A and the two of brightness are least squares on the grey levels,
+Gauss-Newton with the earlier picture's derivatives, so that the normal matrix is built once
+(inverse composition, Baker and Matthews 2004).
 """
 
 import numpy as np
@@ -16,12 +23,14 @@ from mapfusion.vision.template import N_PARAMETERS, WEIGHT, WINDOW_HALF_PX, Temp
 
 _MAX_STEPS = 15
 _CONVERGED_PX = 0.005  # far below what noise lets one measure
+# Where a window's far side would shrink to a half, it is no piece of a wall that one looks at.
+_LEAST_SCALE = 0.5
 
 
 def fit_patches(
-    templates: Templates, rows: np.ndarray, after: np.ndarray, warp: Float
+    templates: Templates, rows: np.ndarray, after: np.ndarray, warp: Float, bend: Float
 ) -> np.ndarray:
-    """Move each `warp` to the affine map from around a point to a patch of a later picture.
+    """Move each `warp` to the map from around a point to a patch of a later picture.
 
     Args:
         templates: how points looked.
@@ -29,11 +38,13 @@ def fit_patches(
         after: (N, P, P) uint8 of the later picture.
         warp: (N, 2, 3), right to a few pixels; columns are d(u, v)/du, d(u, v)/dv, and where the
             point lies from the middle of `after`.
+        bend: (N, 2) h, per pixel.
 
     Returns:
         (N,) bool: False where the window leaves a patch, has too little texture, or does not fit.
     """
-    return _fit_all(templates.window, templates.factor, templates.tolerated, rows, after, warp)
+    given = (templates.window, templates.factor, templates.tolerated)
+    return _fit_all(*given, rows, after, warp, bend)
 
 
 @njit(cache=True)
@@ -44,6 +55,7 @@ def _fit_all(
     rows: np.ndarray,
     after: np.ndarray,
     warp: Float,
+    bend: Float,
 ) -> np.ndarray:
     found, shown = np.empty(len(rows), dtype=np.bool_), np.empty(after.shape[1:])
     for n in range(len(rows)):
@@ -51,17 +63,19 @@ def _fit_all(
         for v in range(after.shape[1]):
             for u in range(after.shape[2]):
                 shown[v, u] = after[n, v, u]
-        found[n] = _fit(window[i], factor[i], float(tolerated[i]), shown, warp[n])
+        found[n] = _fit(window[i], factor[i], float(tolerated[i]), shown, warp[n], bend[n])
     return found
 
 
 @njit(cache=True)
-def _fit(window: Float, factor: Float, tolerated: float, after: Float, warp: Float) -> bool:
+def _fit(
+    window: Float, factor: Float, tolerated: float, after: Float, warp: Float, bend: Float
+) -> bool:
     step = np.empty(N_PARAMETERS)
     if tolerated < 0:
         return False
     for _ in range(_MAX_STEPS):
-        square = _residuals(window, after, warp, step)
+        square = _residuals(window, after, warp, bend, step)
         if square < 0:
             return False
         solve_lower(factor, step)
@@ -75,21 +89,25 @@ def _fit(window: Float, factor: Float, tolerated: float, after: Float, warp: Flo
 
 
 @njit(cache=True)
-def _residuals(window: Float, after: Float, warp: Float, moment: Float) -> float:
+def _residuals(window: Float, after: Float, warp: Float, bend: Float, moment: Float) -> float:
     """Weighted squared differences after - before under the warp; `moment` gets J^T W r.
 
     Negative where the window leaves the patch.
     """
     half, middle = WINDOW_HALF_PX, after.shape[0] // 2
+    least = 1.0 - (abs(bend[0]) + abs(bend[1])) * half
+    if not least > _LEAST_SCALE:
+        return -1.0
     for r in range(2):
-        reach = (abs(warp[r, 0]) + abs(warp[r, 1])) * half + abs(warp[r, 2])
+        reach = (abs(warp[r, 0]) + abs(warp[r, 1])) * half / least + abs(warp[r, 2])
         if not reach + 1 <= middle:
             return -1.0
     square = m0 = m1 = m2 = m3 = m4 = m5 = m6 = m7 = 0.0
     for y in range(-half, half + 1):
         for x in range(-half, half + 1):
-            u = middle + warp[0, 2] + warp[0, 0] * x + warp[0, 1] * y
-            v = middle + warp[1, 2] + warp[1, 0] * x + warp[1, 1] * y
+            scale = 1.0 / (1.0 + bend[0] * x + bend[1] * y)
+            u = middle + warp[0, 2] + scale * (warp[0, 0] * x + warp[0, 1] * y)
+            v = middle + warp[1, 2] + scale * (warp[1, 0] * x + warp[1, 1] * y)
             pixel = window[y + half, x + half]
             level, gu, gv = pixel[0], pixel[1], pixel[2]
             residual = grey(after, u, v) - level
@@ -106,7 +124,10 @@ def _residuals(window: Float, after: Float, warp: Float, moment: Float) -> float
 
 @njit(cache=True)
 def _compose(warp: Float, step: Float) -> None:
-    """Warp after the inverse of the step's own, which moved the earlier picture."""
+    """Warp after the inverse of the step's own, which moved the earlier picture.
+
+    To first order in h: steps go to zero, and with them what that leaves out.
+    """
     a, b, c, d = 1 + step[2], step[3], step[4], 1 + step[5]
     determinant = a * d - b * c
     for r in range(2):

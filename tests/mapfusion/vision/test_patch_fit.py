@@ -43,7 +43,7 @@ def fitted(
     max_misfit: float = 0.5,
 ) -> tuple[bool, np.ndarray]:
     warp, template = start[None].copy(), Templates.of(before[None], POINT[None], noise, max_misfit)
-    found = fit_patches(template, np.zeros(1, int), after[None], warp)
+    found = fit_patches(template, np.zeros(1, int), after[None], warp, np.zeros((1, 2)))
     return bool(found[0]), warp[0]
 
 
@@ -93,7 +93,7 @@ def test_noise_moves_the_place_as_the_normal_matrix_says() -> None:
     for _ in range(300):
         pair = [grey(clean + noise * rng.standard_normal(clean.shape))[None] for _ in range(2)]
         warp, template = start[None].copy(), Templates.of(pair[0], np.zeros((1, 2)), noise, 0.5)
-        assert fit_patches(template, np.zeros(1, int), pair[1], warp)[0]
+        assert fit_patches(template, np.zeros(1, int), pair[1], warp, np.zeros((1, 2)))[0]
         errors.append(warp[0, :, 2])
     ratio = np.std(errors, axis=0) / np.sqrt(np.diag(expected)[:2])
     # bilinear values between two pixels have less noise than a pixel; 300 draws know 4 %
@@ -108,7 +108,7 @@ def test_each_is_fitted_to_its_own_template() -> None:
     templates = Templates.of(before, np.tile(POINT, (4, 1)), 2.0, 0.5)
     rows = np.array([3, 0, 2, 1, 0])
     warp = np.tile(START, (5, 1, 1))
-    found = fit_patches(templates, rows, after[rows], warp)
+    found = fit_patches(templates, rows, after[rows], warp, np.zeros((5, 2)))
     assert found.tolist() == [True, True, False, True, True]
     for row, own in zip(rows[found], warp[found], strict=True):
         np.testing.assert_array_equal(own, fitted(before[row], after[row])[1])
