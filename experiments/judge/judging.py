@@ -47,7 +47,7 @@ def load_robot(folders: RobotFolders) -> EvaluatedRobot:
             counts = f"{len(true)} rows, the log has {len(logged)} of them"
             raise InputError(f"{folders.log / file}.parquet: {counts}")
     maps = Snapshots(folders.slam, log)
-    points = landmark_truth(truth, Associations.read(folders.slam), maps)
+    points = landmark_truth(truth, Associations.read(folders.slam).at, maps)
     return EvaluatedRobot(log.robot, maps, points, PathTruth.of(truth))
 
 

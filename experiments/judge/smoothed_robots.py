@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,12 @@ from experiments.judge.map_consistency import fitted, relative_consistency
 from experiments.judge.path_errors import ate_m
 from experiments.judge.truth import landmark_truth
 from experiments.run.stages.slam import RobotFolders, final_path
-from experiments.run.stages.smooth import read_endings, read_smoothed, read_smoothed_path
-from experiments.run.stages.snapshots import Associations
+from experiments.run.stages.smooth import (
+    read_endings,
+    read_smoothed,
+    read_smoothed_path,
+    smoothed_owners,
+)
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import read_log
 from mapfusion.se2 import Float
@@ -52,7 +57,8 @@ class SmoothedRobot:
 def load_smoothed(robot: EvaluatedRobot, folders: RobotFolders, smooth: Path) -> SmoothedRobot:
     """A robot's smoothed maps joined with the truth, which is NaN where it is unknown."""
     truth, maps = truth_of(folders.log, read_log(folders.log)), read_smoothed(smooth)
-    points = landmark_truth(truth, Associations.read(folders.slam), maps)
+    owners_at = partial(smoothed_owners, smooth, folders.slam)
+    points = landmark_truth(truth, owners_at, maps)
     ending = read_endings(smooth).to_dict("records")[-1]
     paths = read_smoothed_path(smooth)
     whole = {str(name): value for name, value in ending.items()}

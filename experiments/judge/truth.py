@@ -1,13 +1,12 @@
 """The truth joined to estimates. Only the evaluation imports this; no estimator does."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 from scipy.spatial import KDTree
 
-from experiments.run.stages.snapshots import Associations
 from mapfusion import se2
 from mapfusion.align.rigid import fit_rigid
 from mapfusion.landmark_map import LandmarkMap
@@ -16,16 +15,22 @@ from mapfusion.se2 import Float
 
 
 def landmark_truth(
-    truth: RobotTruth, associations: Associations, maps: Mapping[int, LandmarkMap]
+    truth: RobotTruth, owners_at: Callable[[int, int], np.ndarray], maps: Mapping[int, LandmarkMap]
 ) -> dict[int, Float]:
     """The true world point (N, 3) of each landmark of each evaluated map; NaN where unknown.
 
     It is the median of the true points of all observations that went into the landmark.
+
+    Args:
+        truth: of the robot.
+        owners_at: by iteration and number of observations, (n,) the `source_observation` of the
+            landmark that each of the log's first observations went into then; negative for none.
+        maps: by iteration.
     """
     point_m, has_point = truth.point_world_m, np.isfinite(truth.point_world_m).all(axis=1)
     points = {}
     for iteration, landmarks in maps.items():
-        owner = associations.at(iteration, len(point_m))
+        owner = owners_at(iteration, len(point_m))
         known = has_point & (owner >= 0)
         medians = pd.DataFrame(point_m[known]).groupby(owner[known]).median()
         points[iteration] = medians.reindex(landmarks.source_observation).to_numpy(np.float64)

@@ -42,7 +42,7 @@ def calibrated(
             raise InputError(f"--output: {path} would be overwritten; name another folder")
     found = [_associations(log, settings, on_progress) for log in known]
     parameters = SmootherParameters(
-        stray_m=settings.slam.filter.stray_m, min_count=settings.slam.min_count
+        stray_m=settings.smooth.stray_m, min_count=settings.slam.min_count
     )
     calibration = calibrate(
         known,

@@ -213,9 +213,9 @@ def _smooth(
 
 
 def _smoother(scenario: Scenario) -> SmootherParameters:
-    """The filter's own noise model."""
-    settings = scenario.slam.filter
-    return SmootherParameters(settings.motion, settings.stray_m, scenario.slam.min_count)
+    """The filter's own noise model, but for the corners that the filter cannot tell apart."""
+    slam = scenario.slam
+    return SmootherParameters(slam.filter.motion, scenario.smooth.stray_m, slam.min_count)
 
 
 def _pair(scenario: Scenario, *robots: RobotStages) -> PairStages:

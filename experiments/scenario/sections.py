@@ -9,6 +9,7 @@ from mapfusion.arguments import Range, require_in_range
 from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.fuse.registry import FUSERS, REFERENCE, target_of
 from mapfusion.se2 import Float
+from mapfusion.stray import STRAY_M
 from sim.driver import DriverSettings
 from sim.floorplan import wall_shape
 from sim.odometry import OdometryNoise
@@ -193,10 +194,15 @@ class Smooth(Section):
     """The batch smoother, beside the filter.
 
     Attributes:
+        stray_m: standard deviation, along each axis, of where the point that a track is of lies
+            beside its landmark. Tracks that the filter took for one landmark and that lie farther
+            apart are parted. The filter's own (`slam.filter.stray_m`) is larger: along its path
+            they cannot be told apart.
         max_memory_gb: of its matrices, which grow with the square of the log: a robot is not
             smoothed beyond the iteration where they would take more; 0 for no robot at all.
     """
 
+    stray_m: Annotated[float, Range(0, 10, "m")] = STRAY_M
     max_memory_gb: Annotated[float, Range(0, 10_000, "GB")] = 1.0
 
 

@@ -12,7 +12,7 @@ from mapfusion.chi_square import chi_square_bound
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.looks import NO_LABEL
 from mapfusion.se2 import Float
-from mapfusion.stray import STRAY_M
+from mapfusion.stray import FILTERED_STRAY_M
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class HeightGate:
     """
 
     probability: Probability = 0.999
-    floor_m: Annotated[float, Range(0, 10, "m")] = math.sqrt(2) * STRAY_M
+    floor_m: Annotated[float, Range(0, 10, "m")] = math.sqrt(2) * FILTERED_STRAY_M
 
     def __post_init__(self) -> None:
         require_in_range(self)

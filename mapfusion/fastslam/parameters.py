@@ -8,6 +8,7 @@ from mapfusion.chi_square import chi_square_bound
 from mapfusion.fastslam.association import Association
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.fastslam.proposal import Proposal
+from mapfusion.stray import FILTERED_STRAY_M
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class FastSlamParameters:
     gate_probability: Probability = 0.9999
     descriptor_threshold: Annotated[float, Range(1e-3, 2, "1")] = 0.5
     resample_fraction: Annotated[float, Range(0, 1, "1")] = 0.5
-    stray_m: Annotated[float, Range(0, 10, "m")] = 0.004
+    stray_m: Annotated[float, Range(0, 10, "m")] = FILTERED_STRAY_M
     close_loops: bool = True
     noise_floor_m: Annotated[float, Range(0, 10, "m")] = 0.0
     log_new_landmark_density: Annotated[float, Range(-100, 100, "ln 1/m^3")] | None = None

@@ -17,9 +17,10 @@ from mapfusion.smoother.normal_equations import (
     odometry_information,
 )
 from mapfusion.smoother.odometry_levels import settled_with_levels
+from mapfusion.smoother.one_corner import parted
 from mapfusion.smoother.residuals import first_points
 from mapfusion.smoother.robust import Tails
-from mapfusion.smoother.settle import Problem, Settled, reached, settled
+from mapfusion.smoother.settle import Problem, Reached, Settled, reached, settled
 from mapfusion.smoother.sightings import Sightings, sightings_of
 from mapfusion.stray import STRAY_M
 
@@ -76,6 +77,7 @@ class Smoothed:
     """What a log says, all at once.
 
     Attributes:
+        landmark: (N,) which landmark each observation of the log is of, negative for none.
         estimate: path, landmarks and tracks' offsets.
         seen: the observations that went into them.
         weights: of observations and offsets.
@@ -86,6 +88,7 @@ class Smoothed:
             common' common.
     """
 
+    landmark: np.ndarray
     estimate: Estimate
     seen: Sightings
     weights: Weights
@@ -95,11 +98,13 @@ class Smoothed:
     common: Float
 
     @classmethod
-    def of(cls, end: Settled, steps_before: int = 0) -> "Smoothed":
-        """Where steps ended, after some of an earlier round."""
+    def of(cls, end: Settled, landmark: np.ndarray, steps_before: int = 0) -> "Smoothed":
+        """Where steps ended, after some of earlier rounds."""
         common = common_part(end.seen, end.equations, end.solution)
         n_steps, own_m2 = steps_before + end.n_steps, end.solution.own_m2
-        return cls(end.estimate, end.seen, end.weights, end.tails, n_steps, own_m2, common)
+        return cls(
+            landmark, end.estimate, end.seen, end.weights, end.tails, n_steps, own_m2, common
+        )
 
     def joint_covariance(self) -> Float:
         """(3L, 3L), dense: for small maps."""
@@ -114,6 +119,8 @@ def smooth(
 ) -> Smoothed:
     """The most probable path and landmarks.
 
+    Landmarks that were seen as several corners become several (`one_corner.py`).
+
     Args:
         log: what the robot measured.
         landmark: (N,) which landmark each observation is of, negative for none.
@@ -124,15 +131,31 @@ def smooth(
         ValueError: shapes that do not fit.
     """
     require_shape("path", path, (len(log), 3))
-    seen = sightings_of(log, landmark, parameters.min_count, stray=parameters.stray_m > 0)
-    path = between(path[0], path)
-    at = Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
-    information = parameters.odometry_information(log)
-    known = Problem(seen, log.odometry, information, parameters.stray_information)
-    blurred = replace(seen, information=seen.information / _THOUGHT_WORSE**2)
-    first = reached(known._replace(seen=blurred), at, _CLOSE)
+    information, path = parameters.odometry_information(log), between(path[0], path)
+    about = log, parameters, information
+    known, first = _first_round(*about, landmark, path)
+    path, n_steps = first.estimate.path, first.n_steps
+    parts = parted(known.seen, landmark, path, parameters.stray_m)
+    if not np.array_equal(parts, landmark):
+        known, first = _first_round(*about, parts, path)
+        n_steps += first.n_steps
     if parameters.odometry_covariance is None:
         end, _ = settled_with_levels(known, first.estimate, first.weights, first.tails)
     else:  # odometry that pictures told is used where these say nothing: they tell no level
         end = settled(known, first.estimate, weights=first.weights, tails=first.tails)
-    return Smoothed.of(end, first.n_steps)
+    return Smoothed.of(end, parts, n_steps)
+
+
+def _first_round(
+    log: RobotLog,
+    parameters: SmootherParameters,
+    information: Float,
+    landmark: np.ndarray,
+    path: Float,
+) -> tuple[Problem, Reached]:
+    """What is to be solved, and where steps end that think the observations worse."""
+    seen = sightings_of(log, landmark, parameters.min_count, stray=parameters.stray_m > 0)
+    at = Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
+    known = Problem(seen, log.odometry, information, parameters.stray_information)
+    blurred = replace(seen, information=seen.information / _THOUGHT_WORSE**2)
+    return known, reached(known._replace(seen=blurred), at, _CLOSE)

@@ -16,7 +16,6 @@ from mapfusion.viewing import viewing_of
 
 def smoothed_map(
     log: RobotLog,
-    landmark: np.ndarray,
     smoothed: Smoothed,
     rank: int = RANK,
     attitude: Attitude | None = None,
@@ -25,13 +24,12 @@ def smoothed_map(
 
     Args:
         log: what was smoothed.
-        landmark: (N,) which landmark each observation is of, as it was given to the smoother; where
-            these are rows of the log they tell what the landmarks came from.
-        smoothed: what came out.
+        smoothed: what came out. Where landmarks were named by rows of the log, these tell what
+            they came from.
         rank: shared variables that are kept.
         attitude: by which the observations were levelled; None: of a level body.
     """
-    seen = smoothed.seen
+    seen, landmark = smoothed.seen, smoothed.landmark
     if attitude is not None and seen.n_dimensions > 2:
         smoothed = _with_attitude(smoothed, attitude)
     point, joint = condensed_points(smoothed, rank)

@@ -91,7 +91,9 @@ def smooth_together(
     covariance[1:] = pose_covariances(seen, end.equations, end.solution, starts[1:])
     names = point[seen.row[seen.starts[:-1]]]
     paths = tuple(np.split(end.estimate.path, starts[1:]))
-    return SmoothedTogether(Smoothed.of(end), names, end.estimate.path[starts], covariance, paths)
+    return SmoothedTogether(
+        Smoothed.of(end, point), names, end.estimate.path[starts], covariance, paths
+    )
 
 
 def _one_log(logs: Sequence[RobotLog]) -> RobotLog:

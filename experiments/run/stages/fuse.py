@@ -22,9 +22,10 @@ from experiments.run.stages.smooth import (
     log_until,
     read_smoothed,
     read_smoothed_path,
+    smoothed_owners,
     smoother_of,
 )
-from experiments.run.stages.snapshots import Associations, Snapshots
+from experiments.run.stages.snapshots import Snapshots
 from mapfusion.aligned_landmarks import ABSENT
 from mapfusion.fuse.parameters import MergeParameters
 from mapfusion.fuse.registry import make_fuser
@@ -167,8 +168,9 @@ def _recording(
         return None
     k = max(smoothed)
     log = log_until(log, k, settings.noise_floor_m)
-    landmark = Associations.read(job.inputs[f"slam {name}"]).at(k, len(log.observations))
-    path = read_smoothed_path(job.inputs[f"smooth {name}"])[k]
+    smooth, slam = (job.inputs[f"{stage} {name}"] for stage in ("smooth", "slam"))
+    landmark = smoothed_owners(smooth, slam, k, len(log.observations))
+    path = read_smoothed_path(smooth)[k]
     smoother = smoother_of(settings.smoother, job.inputs[f"log {name}"])
     return Recording(log, landmark, path, smoother)
 

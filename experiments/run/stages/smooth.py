@@ -1,7 +1,8 @@
 """Stage: one robot's log smoothed in one batch, at each iteration that maps are fused at.
 
-It takes the filter's associations and its noise model, so what it finds differs from the filter's
-map by what a batch knows more, and by the correlations of all landmarks that come with it.
+It takes the filter's noise model and its associations, of which it parts what cannot be one corner.
+So what it finds differs from the filter's map by what a batch knows more, and by the correlations
+of all landmarks that come with it.
 """
 
 from dataclasses import dataclass, replace
@@ -26,6 +27,7 @@ from mapfusion.smoother.smooth import Smoothed, SmootherParameters, smooth
 from mapfusion.smoother.smoothed_map import smoothed_map
 from mapfusion.storage import (
     POSE_FIELDS,
+    column,
     columns,
     float_fields,
     named_columns,
@@ -39,12 +41,16 @@ from mapfusion.storage import (
 # path (else empty).
 PATH = schema("smooth.path", 1, [*fields(iteration=INT), *float_fields(POSE_FIELDS)])
 
+# Observations that are of another landmark than the filter took them for.
+PARTED = schema("smooth.parted", 1, fields(observation=INT, source_observation=INT))
+
 LABEL = "smooth the logs"
 WRITES = (
     "map_{part}.parquet",
     "map_{part}.joint.parquet",
     "map_{part}.viewing.parquet",
     "map_{part}.frames.parquet",
+    "parted_{part}.parquet",
     "path_{part}.parquet",
 )
 # Unless they are said, maps are fused at so many evenly spread iterations, the last among them.
@@ -86,8 +92,13 @@ def run(settings: SmoothSettings, job: Job) -> None:
     """Smooth the log up to one iteration; write the map with its joint covariance, and the path."""
     given = filtered_until(job, read_log(job.inputs["log"]), int(job.part), settings.noise_floor_m)
     own = replace(settings, smoother=smoother_of(settings.smoother, job.inputs["log"]))
-    landmarks, path, ended = smoothed_anew(own, *given, read_attitude(job.inputs["log"]))
+    made = smoothed_anew(own, *given, read_attitude(job.inputs["log"]))
+    landmarks, path, landmark, ended = made
     write_map(_map_path(job.output, job.part), landmarks)
+    _, filters, _ = given
+    changed = np.flatnonzero(landmark != filters)
+    rows = {"observation": changed, "source_observation": landmark[changed]}
+    write_table(_parted_path(job.output, job.part), rows, PARTED)
     rows = {"iteration": np.arange(len(path))} | named_columns(POSE_FIELDS, path)
     attributes = {name: str(value) for name, value in zip(_ENDED, ended, strict=True)}
     write_table(_path_path(job.output, job.part), rows, PATH, attributes)
@@ -120,14 +131,14 @@ def smoothed_anew(
     landmark: np.ndarray,
     path: Float,
     attitude: Attitude | None,
-) -> tuple[LandmarkMap, Float, tuple[object, ...]]:
-    """Map, path and how smoothing ended, as `_ENDED` names it."""
+) -> tuple[LandmarkMap, Float, np.ndarray, tuple[object, ...]]:
+    """Map, path, which landmark observations are of, and how smoothing ended, see `_ENDED`."""
     found = _smoothed(log, landmark, path, settings)
     if isinstance(found, str):
-        return _no_map(log), np.empty((0, 3)), (0, np.nan, np.nan, found)
+        return _no_map(log), np.empty((0, 3)), landmark, (0, np.nan, np.nan, found)
     ended = (found.n_steps, *found.tails, "")
-    made = smoothed_map(log, landmark, found, attitude=attitude)
-    return made, found.estimate.path, ended
+    made = smoothed_map(log, found, attitude=attitude)
+    return made, found.estimate.path, found.landmark, ended
 
 
 def _smoothed(
@@ -154,11 +165,15 @@ def _no_map(log: RobotLog) -> LandmarkMap:
 
 def map_files(folder: Path, iteration: int) -> list[Path]:
     """The files of the map at an iteration: the map, and what lies beside it."""
-    return [folder / name.format(part=iteration) for name in WRITES[:-1]]
+    return [folder / name.format(part=iteration) for name in WRITES[:-2]]
 
 
 def _map_path(folder: Path, part: str) -> Path:
     return folder / WRITES[0].format(part=part)
+
+
+def _parted_path(folder: Path, part: str) -> Path:
+    return folder / WRITES[-2].format(part=part)
 
 
 def _path_path(folder: Path, part: str) -> Path:
@@ -178,6 +193,21 @@ def read_smoothed_path(folder: Path) -> dict[int, Float]:
         if not attributes["not_smoothed"]:
             paths[k] = columns(table, POSE_FIELDS)
     return paths
+
+
+def smoothed_owners(smooth: Path, slam: Path, iteration: int, n_observations: int) -> np.ndarray:
+    """(n_observations,) source of the smoothed map's landmark that each is of, -1 for none.
+
+    Args:
+        smooth: this stage's folder.
+        slam: the filter's, whose associations hold where nothing was parted.
+        iteration: that has a smoothed map.
+        n_observations: of the log until then.
+    """
+    owner = Associations.read(slam).at(iteration, n_observations)
+    table, _ = read_table(_parted_path(smooth, str(iteration)), PARTED)
+    owner[column(table, "observation")] = column(table, "source_observation")
+    return owner
 
 
 def read_endings(folder: Path) -> pd.DataFrame:

@@ -50,7 +50,7 @@ def test_landmark_truth_follows_changing_associations(with_maps: tuple[int, ...]
         owner[moved] = rng.integers(-1, 8, moved.sum())
         snapshots[iteration] = owner.copy()
     maps = {iteration: map_of(snapshots[iteration]) for iteration in with_maps}
-    found = landmark_truth(RobotTruth(np.zeros((50, 3)), points), changes_of(snapshots), maps)
+    found = landmark_truth(RobotTruth(np.zeros((50, 3)), points), changes_of(snapshots).at, maps)
     for iteration in with_maps:
         owners = snapshots[iteration]
         for source, point in zip(maps[iteration].source_observation, found[iteration], strict=True):
@@ -63,7 +63,7 @@ def test_landmark_truth_follows_changing_associations(with_maps: tuple[int, ...]
 def test_landmark_truth_of_an_empty_map() -> None:
     truth = RobotTruth(np.zeros((5, 3)), np.zeros((0, 3)))
     nothing = changes_of({})
-    found = landmark_truth(truth, nothing, {3: landmark_map(np.zeros((0, 3)))})
+    found = landmark_truth(truth, nothing.at, {3: landmark_map(np.zeros((0, 3)))})
     assert found[3].shape == (0, 3)
 
 

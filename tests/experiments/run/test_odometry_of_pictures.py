@@ -74,12 +74,10 @@ def mapped_by_pictures(path: Path, log: Path, scenario: Simulation) -> Mapped:
     *_, last = run_log(one.log, parameters, np.random.default_rng(0), odometry_covariance=told)
     landmark, path_m = last.slam.best_associations(), last.slam.best_path()
     own = SmootherParameters(odometry_covariance=told)
-    found = smoothed_map(
-        one.log, landmark, smooth(one.log, landmark, path_m, own), attitude=one.attitude
-    )
-    points = np.array(
-        [np.median(truth.point_world_m[landmark == s], axis=0) for s in found.source_observation]
-    )
+    smoothed = smooth(one.log, landmark, path_m, own)
+    found = smoothed_map(one.log, smoothed, attitude=one.attitude)
+    seen_at = [truth.point_world_m[smoothed.landmark == s] for s in found.source_observation]
+    points = np.array([np.median(each, axis=0) for each in seen_at])
     return Mapped(found, points, truth.T_world_robot[0])
 
 

@@ -75,7 +75,7 @@ def test_it_is_the_smoother_on_the_log_so_far(tmp_path: Path) -> None:
     seen = owner[: len(early.observations)]
     alone = smooth(early, seen, dead_reckoned(early), SmootherParameters())
     np.testing.assert_allclose(paths[k], alone.estimate.path, atol=1e-9)
-    expected = smoothed_map(early, seen, alone)
+    expected = smoothed_map(early, alone)
     np.testing.assert_allclose(maps[k].position_m, expected.position_m, atol=1e-9)
     np.testing.assert_allclose(maps[k].covariance_m2, expected.covariance_m2, atol=1e-9)
     np.testing.assert_array_equal(maps[k].source_observation, expected.source_observation)

@@ -55,12 +55,11 @@ class LoggedTeam:
         self.recordings = [_recorded(each) for each in self.known]
         found = [smooth(r.log, r.landmark, r.path, r.parameters) for r in self.recordings]
         self.recordings = [
-            replace(own, path=each.estimate.path)
+            replace(own, path=each.estimate.path, landmark=each.landmark)
             for own, each in zip(self.recordings, found, strict=True)
         ]
         self.maps = [
-            smoothed_map(own.log, own.landmark, each)
-            for own, each in zip(self.recordings, found, strict=True)
+            smoothed_map(own.log, each) for own, each in zip(self.recordings, found, strict=True)
         ]
 
     def _known(self, T_world_robot: Float, n_frames: int, planar: bool, tracks: bool) -> Known:

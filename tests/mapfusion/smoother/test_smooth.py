@@ -8,12 +8,16 @@ from scipy.stats import chi2
 
 from mapfusion.robot_log import RobotLog
 from mapfusion.se2 import Float
+from mapfusion.smoother.normal_equations import Estimate
+from mapfusion.smoother.residuals import first_points
+from mapfusion.smoother.settle import Problem, Settled, settled
 from mapfusion.smoother.sightings import sightings_of
 from mapfusion.smoother.smooth import Smoothed, SmootherParameters, smooth
 from tests.mapfusion.smoother.white_noise_logs import (
     Known,
     dead_reckoned,
     moved_tracks,
+    scattered,
     white_noise_log,
     with_tracks,
 )
@@ -94,6 +98,19 @@ def test_a_gross_error_does_not_move_the_map() -> None:
     assert after.tails.observation < 100 < before.tails.observation
 
 
+def as_given(log: RobotLog, start: Smoothed) -> Settled:
+    """What the equations say where each track stays with the landmark that it is given to."""
+    label = log.observations.label
+    assert label is not None
+    parameters = SmootherParameters(stray_m=STRAY_M)
+    seen = sightings_of(log, label, parameters.min_count, stray=True)
+    information, path = parameters.odometry_information(log), start.estimate.path
+    problem = Problem(seen, log.odometry, information, parameters.stray_information)
+    return settled(
+        problem, Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
+    )
+
+
 def test_false_tracks_do_not_move_the_map() -> None:
     """A track of another landmark keeps its say about the path, and has none about the landmark."""
     rng = np.random.default_rng(1)
@@ -102,7 +119,7 @@ def test_false_tracks_do_not_move_the_map() -> None:
     track = known.log.observations.track
     assert track is not None
     false = rng.choice(track.max() + 1, track.max() // 30, replace=False)
-    after = smoothed(moved_tracks(known, rng, false, 0.8))
+    after = as_given(moved_tracks(known, rng, false, 0.8), before)
     truth = true_points(known, before)
     rms = [np.sqrt(np.mean((each.estimate.point_m - truth) ** 2)) for each in (before, after)]
     assert rms[1] < 1.3 * rms[0]
@@ -116,6 +133,34 @@ def test_false_tracks_do_not_move_the_map() -> None:
     assert np.median(after.weights.offset[at]) < 0.2 < np.median(after.weights.offset[tells & ~at])
     views = after.weights.observation[at[after.seen.track]]
     assert np.median(views) > 0.5
+
+
+def test_corners_taken_for_one_landmark_are_parted() -> None:
+    """Landmarks are those of the right associations, and the path comes nearer to theirs."""
+    off, off_as_given = [], []
+    for seed in (3, 4, 5):
+        rng, n = np.random.default_rng(seed), 40
+        one = scattered(rng, n, planar=False)
+        way = rng.standard_normal((n // 4, 3))
+        beside = one[: n // 4] + 10 * STRAY_M * way / np.linalg.norm(way, axis=1, keepdims=True)
+        both = np.concatenate([one, beside])
+        known = white_noise_log(rng, 160, len(both), point_m=both)
+        log = with_tracks(known, rng, STRAY_M / 10).log
+        label, parameters = log.observations.label, SmootherParameters(stray_m=STRAY_M / 10)
+        assert label is not None
+        mistaken = np.where(label < n, label, label - n)
+        start = dead_reckoned(log)
+        right, found = (smooth(log, own, start, parameters) for own in (label, mistaken))
+        two = np.isin(mistaken, label - n)
+        np.testing.assert_array_equal(found.landmark[~two], mistaken[~two])
+        _, sizes = np.unique(np.stack([label, found.landmark])[:, two], axis=1, return_counts=True)
+        assert sizes[sizes > 2].sum() > 0.95 * two.sum()  # a single sighting may be of either
+        seen = replace(log.observations, label=mistaken)
+        given = as_given(replace(log, observations=seen), right)
+        for each, apart in ((found, off), (given, off_as_given)):
+            between = (each.estimate.path - right.estimate.path)[:, :2]
+            apart.append(np.sqrt(np.mean(np.sum(between**2, axis=1))))
+    assert np.mean(off) < 0.7 * np.mean(off_as_given)
 
 
 def test_a_stray_that_is_not_modelled_makes_the_map_too_sure() -> None:

@@ -12,7 +12,7 @@ def test_planar_landmarks_have_no_height_and_are_not_unsure_of_it() -> None:
     log = white_noise_log(np.random.default_rng(0), 60, 12, planar=True).log
     assert log.observations.label is not None
     found = smooth(log, log.observations.label, dead_reckoned(log), SmootherParameters())
-    landmarks = smoothed_map(log, log.observations.label, found)
+    landmarks = smoothed_map(log, found)
     assert landmarks.joint is not None
     assert not landmarks.position_m[:, 2].any()
     assert not landmarks.covariance_m2[:, 2].any()

@@ -1,0 +1,120 @@
+"""Tracks against each other: false alarms, corners told apart, their names, what has no track."""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from mapfusion.robot_log import NO_TRACK, Observations, RobotLog
+from mapfusion.se2 import Float, rotation
+from mapfusion.smoother.one_corner import parted
+from mapfusion.smoother.sightings import sightings_of
+
+STRAY_M, SIGMA_M, N_SEEN = 0.002, 0.001, 4
+
+
+def seen_tracks(
+    rng: np.random.Generator, point_m: Float, path: Float, planar: bool = False
+) -> RobotLog:
+    """Each point (B, 3) by a track of its own, from `N_SEEN` poses one after the other."""
+    n = len(point_m)
+    frame = np.sort(np.tile(np.arange(N_SEEN), n))
+    track = np.tile(np.arange(n, dtype=np.int32), N_SEEN)
+    pose = path[frame]
+    at = point_m[track].copy()
+    at[:, :2] = np.einsum("nji,nj->ni", rotation(pose[:, 2]), at[:, :2] - pose[:, :2])
+    at += SIGMA_M * rng.standard_normal(at.shape)
+    at[:, 2] *= not planar
+    covariance = np.tile(SIGMA_M**2 * np.eye(3), (len(at), 1, 1))
+    observations = Observations(at, covariance, track=track)
+    odometry = np.zeros((N_SEEN, 3))
+    return RobotLog("R1", planar, np.arange(N_SEEN) * 0.2, odometry, frame, observations)
+
+
+def path_of(rng: np.random.Generator) -> Float:
+    path = rng.uniform(-1, 1, (N_SEEN, 3))
+    path[0] = 0
+    return path
+
+
+@pytest.mark.parametrize("planar", [False, True])
+def test_two_tracks_of_a_corner_are_parted_as_seldom_as_said(planar: bool) -> None:
+    """One pair in a thousand; of 40 000 some 40."""
+    rng, n = np.random.default_rng(0), 40_000
+    corner = rng.uniform(-3, 3, (n, 3))
+    point = np.repeat(corner, 2, axis=0) + STRAY_M * rng.standard_normal((2 * n, 3))
+    point[:, 2] *= not planar
+    path = path_of(rng)
+    log = seen_tracks(rng, point, path, planar)
+    landmark = log.observations.track // 2
+    made = parted(sightings_of(log, landmark, 1, stray=True), landmark, path, STRAY_M)
+    n_parted = len(np.unique(landmark[made != landmark]))
+    expected = 0.001 * n
+    assert abs(n_parted - expected) < 4 * np.sqrt(expected)
+
+
+def test_neighbours_are_parted_and_the_most_seen_keeps_the_name() -> None:
+    """Three corners in any order, 20 mm apart; the second has most tracks."""
+    rng, n_landmarks = np.random.default_rng(1), 50
+    which = np.array([0, 1, 1, 2, 1, 0])
+    corner = rng.uniform(-3, 3, (n_landmarks, 1, 3))
+    way = np.zeros((3, 3))
+    way[1, 2], way[2, 0] = 0.02, 0.02
+    point = (corner + way[which]).reshape(-1, 3)
+    point += STRAY_M * np.clip(rng.standard_normal(point.shape), -1.5, 1.5)
+    path = path_of(rng)
+    log = seen_tracks(rng, point, path)
+    own = log.observations.track // len(which)
+    row = np.arange(len(own))
+    first = np.array([row[own == k].min() for k in range(n_landmarks)])
+    landmark = first[own]  # named by its first observation, which is of another corner
+    made = parted(sightings_of(log, landmark, 1, stray=True), landmark, path, STRAY_M)
+    is_of = which[log.observations.track % len(which)]
+    np.testing.assert_array_equal(made == landmark, is_of == 1)
+    for k in range(n_landmarks):
+        for corner_ in (0, 2):
+            mine = np.flatnonzero((own == k) & (is_of == corner_))
+            names = np.setdiff1d(mine, landmark)
+            np.testing.assert_array_equal(made[mine], names.min())
+
+
+def test_it_takes_the_corners_that_a_slow_obvious_version_takes() -> None:
+    """Tracks strewn so widely that groups overlap."""
+    rng, size, n_landmarks = np.random.default_rng(2), 7, 60
+    point = np.repeat(rng.uniform(-3, 3, (n_landmarks, 3)), size, axis=0)
+    point += 3 * STRAY_M * rng.standard_normal(point.shape)
+    path = path_of(rng)
+    log = seen_tracks(rng, point, path)
+    track, landmark = log.observations.track, log.observations.track // size
+    made = parted(sightings_of(log, landmark, 1, stray=True), landmark, path, STRAY_M)
+    pose, told = path[log.iteration], log.observations.position_m.copy()
+    told[:, :2] = np.einsum("nij,nj->ni", rotation(pose[:, 2]), told[:, :2]) + pose[:, :2]
+    mean = np.stack([told[track == t].mean(axis=0) for t in range(len(point))])
+    S = 2 * (SIGMA_M**2 / N_SEEN + STRAY_M**2)
+    for k in range(n_landmarks):
+        left, groups = set(range(k * size, (k + 1) * size)), []
+        while left:
+            near = {
+                i: [j for j in left if np.sum((mean[i] - mean[j]) ** 2) / S <= chi2.ppf(0.999, 3)]
+                for i in sorted(left)
+            }
+            best = max(near, key=lambda i: len(near[i]))  # the first of the largest
+            groups.append(set(near[best]))
+            left -= groups[-1]
+        found = {}
+        for t in range(k * size, (k + 1) * size):
+            found.setdefault(int(made[track == t][0]), set()).add(t)
+        assert sorted(map(sorted, found.values())) == sorted(map(sorted, groups))
+
+
+def test_what_has_no_tracks_stays() -> None:
+    rng = np.random.default_rng(3)
+    path = path_of(rng)
+    log = seen_tracks(rng, rng.uniform(-3, 3, (10, 3)), path)
+    landmark = np.zeros(len(log.observations), dtype=np.int64)
+    for stray in (False, True):
+        seen = sightings_of(log, landmark, 1, stray=stray)
+        made = parted(seen, landmark, path, STRAY_M)
+        assert (len(np.unique(made)) > 1) == stray
+    log.observations.track[:] = NO_TRACK
+    seen = sightings_of(log, landmark, 1, stray=True)
+    np.testing.assert_array_equal(parted(seen, landmark, path, STRAY_M), landmark)
