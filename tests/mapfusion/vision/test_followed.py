@@ -8,6 +8,7 @@ import pytest
 from mapfusion.camera import StereoCamera
 from mapfusion.se2 import transform_points
 from mapfusion.vision.features import Features
+from mapfusion.vision.followed import bend_of
 from mapfusion.vision.frontend import FrontEnd
 from mapfusion.vision.patches import PATCH_SIDE_PX
 from mapfusion.vision.tracks import Tracker, TrackParameters
@@ -16,14 +17,20 @@ from tests.mapfusion.vision.shifted_pictures import Picture
 
 CAMERA = StereoCamera(320, 240, 288.0)
 START, END = (4.5, 3.0), (4.0, -3.0)
+BESIDE = (((8.0, -1.5), (0.5, -1.5)), ((0.5, 1.5), (8.0, 1.5)))  # on the right, and on the left
 
 
-def on_wall(pose: np.ndarray, uv: np.ndarray) -> np.ndarray:
+def on_wall(
+    pose: np.ndarray,
+    uv: np.ndarray,
+    start: tuple[float, float] = START,
+    end: tuple[float, float] = END,
+) -> np.ndarray:
     """Where rays through pixels (N, 2) meet the wall's plane."""
     eye = transform_points(pose, CAMERA.p_robot_left[None])[0]
     ray = transform_points(pose, CAMERA.back_project(uv, np.ones(len(uv)))) - eye
-    normal = np.array([END[1] - START[1], START[0] - END[0], 0.0])
-    depth = ((*START, 0.0) @ normal - eye @ normal) / (ray @ normal)
+    normal = np.array([end[1] - start[1], start[0] - end[0], 0.0])
+    depth = ((*start, 0.0) @ normal - eye @ normal) / (ray @ normal)
     return eye + depth[:, None] * ray
 
 
@@ -50,6 +57,56 @@ def test_the_point_stays_where_the_corner_strays() -> None:
     )
     assert of_point < 0.4 * of_corner
     assert of_point < 0.002
+
+
+@pytest.mark.parametrize("ends", BESIDE)
+def test_points_of_walls_beside_the_way_do_not_slide(ends: tuple[tuple[float, float], ...]) -> None:
+    """Fitted by an affine map they come 0.3 mm a frame towards the robot, all of them."""
+    slides = []
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        room = [wall(rng, *ends, texels_per_m=60.0)]
+        front_end, tracker = FrontEnd(CAMERA), Tracker(TrackParameters(), CAMERA, 0.1)
+        points = defaultdict(list)
+        for t in range(9):
+            pose = np.array([0.12 * t, 0.0, 0.0])
+            left, right, _ = render(room, CAMERA, tuple(pose), 1.0, rng)
+            tracks = tracker.update(front_end.extract(left, right))
+            for track, point in zip(
+                tracks.track_id, on_wall(pose, tracks.uv_px, *ends), strict=True
+            ):
+                points[track].append(point)
+        slides += [np.diff(np.array(seen)[:, 0]) for seen in points.values() if len(seen) > 2]
+    slide = np.concatenate(slides)
+    slide = slide[np.abs(slide) < 0.02]  # else it is another point
+    error = slide.std() / np.sqrt(len(slide))
+    assert error < 0.00005
+    assert abs(slide.mean()) < 3 * error
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_window_bends_as_the_homography_of_its_plane(seed: int) -> None:
+    """Points of a plane projected before and after driving; of the map at the point h is known."""
+    rng, f = np.random.default_rng(seed), 400.0
+    uv, d, slope = rng.uniform(-150, 150, 2), rng.uniform(5, 20), rng.uniform(-0.3, 0.3, 2)
+    base, step = 0.12, np.array([rng.uniform(-0.2, 0.2), rng.uniform(-0.05, 0.05), 0.6])
+
+    def later(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where what lies at uv + x, (N, 2), lies later, and with which disparity."""
+        disparity = d + x @ slope
+        depth = f * base / disparity
+        ray = np.column_stack([(uv + x) / f, np.ones(len(x))])
+        point = depth[:, None] * ray - step
+        return f * point[:, :2] / point[:, 2:], f * base / point[:, 2]
+
+    place, now = later(np.zeros((1, 2)))
+    small = 1e-4 * np.concatenate([np.eye(2), -np.eye(2)])
+    moved = later(small)[0]
+    A = ((moved[:2] - moved[2:]) / 2e-4).T
+    (h,) = bend_of(np.array([[d, *slope]]), now)
+    x = rng.uniform(-8, 8, (20, 2))
+    np.testing.assert_allclose(later(x)[0], place + x @ A.T / (1 + x @ h)[:, None], atol=1e-4)
+    assert np.abs(x @ h).max() > 0.01
 
 
 def test_the_disparity_is_that_of_the_point_and_not_of_the_corner() -> None:

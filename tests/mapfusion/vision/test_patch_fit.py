@@ -14,6 +14,7 @@ HALF = PATCH_SIDE_PX // 2
 POINT = np.array([0.3, -0.2])
 LINEAR = np.array([[1.15, 0.06], [-0.04, 0.9]])
 PLACE = np.array([1.1, -0.7])
+STRAIGHT = np.zeros(2)
 START = np.array([[1.1, 0.0, 0.0], [0.0, 1.0, 0.0]])  # the place a pixel off, and the map near
 
 
@@ -22,12 +23,17 @@ def grey(values: np.ndarray) -> np.ndarray:
 
 
 def before_and_after(
-    seed: int, noise: float = 0.0, gain: float = 1.0, offset: float = 0.0
+    seed: int,
+    noise: float = 0.0,
+    gain: float = 1.0,
+    offset: float = 0.0,
+    bend: np.ndarray = STRAIGHT,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What is at POINT + x in the one lies at PLACE + LINEAR x in the other."""
+    """What is at POINT + x in the one lies at PLACE + LINEAR x / (1 + h'x) in the other."""
     v, u = np.mgrid[-HALF : HALF + 1, -HALF : HALF + 1].astype(float)
     picture, rng = Picture(seed), np.random.default_rng(seed)
     back = np.linalg.inv(LINEAR) @ (np.stack([u.ravel(), v.ravel()]) - PLACE[:, None])
+    back = back / (1 - bend @ back)  # of y = x / (1 + h'x)
     u_there, v_there = back.reshape(2, *u.shape) + POINT[:, None, None]
     later = gain * picture(u_there, v_there) + offset
     images = (picture(u, v), later)
@@ -41,9 +47,10 @@ def fitted(
     start: np.ndarray = START,
     noise: float = 2.0,
     max_misfit: float = 0.5,
+    bend: np.ndarray = STRAIGHT,
 ) -> tuple[bool, np.ndarray]:
     warp, template = start[None].copy(), Templates.of(before[None], POINT[None], noise, max_misfit)
-    found = fit_patches(template, np.zeros(1, int), after[None], warp, np.zeros((1, 2)))
+    found = fit_patches(template, np.zeros(1, int), after[None], warp, bend[None])
     return bool(found[0]), warp[0]
 
 
@@ -54,6 +61,21 @@ def test_place_and_map_are_those_of_the_picture(gain: float, offset: float) -> N
         assert found
         np.testing.assert_allclose(warp[:, 2], PLACE, atol=0.02)
         np.testing.assert_allclose(warp[:, :2], LINEAR, atol=0.01)
+
+
+def test_what_bends_is_found_where_it_is() -> None:
+    """And with the bend left out always to the same side of it."""
+    bend, off, off_straight = np.array([0.008, -0.004]), [], []
+    for seed in range(10):
+        pair = before_and_after(seed, bend=bend)
+        for h, errors in ((bend, off), (STRAIGHT, off_straight)):
+            found, warp = fitted(*pair, max_misfit=2.0, bend=h)
+            assert found
+            errors.append(warp[:, 2] - PLACE)
+    np.testing.assert_allclose(off, 0, atol=0.03)
+    straight = np.mean(off_straight, axis=0)
+    assert np.linalg.norm(straight) > 0.1
+    assert np.linalg.norm(np.mean(off, axis=0)) < 0.05 * np.linalg.norm(straight)
 
 
 def test_equals_a_general_least_squares_solver() -> None:
