@@ -14,9 +14,6 @@ from numba import njit
 from mapfusion.se2 import Float
 
 _POINTS_PER_LEAF = 32  # at most; distances to neighbours in memory cost less than a box to be asked
-# Nearest points that are looked for: with fewer they have to be looked for more often, more take
-# longer to find and to put in order than they save.
-KEPT = 4
 _DEEPEST = 64  # no array has 2^64 points
 
 
@@ -125,8 +122,8 @@ def _square_to_box(box: Float, node: int, x: float, y: float, z: float) -> float
 
 @njit(cache=True)
 def put_in_order(x: float, y: float, z: float, p: Float, near: np.ndarray, square: Float) -> None:
-    """Order points `near` of p (N, 3) by how far they are, and tell it; -1 is no point."""
-    for i in range(KEPT):
+    """Order points `near` (K,) of p (N, 3) by how far they are, and tell it; -1 is no point."""
+    for i in range(len(near)):
         k, away, j = near[i], math.inf, i
         if k >= 0:
             dx, dy, dz = p[k, 0] - x, p[k, 1] - y, p[k, 2] - z
@@ -141,13 +138,14 @@ def put_in_order(x: float, y: float, z: float, p: Float, near: np.ndarray, squar
 def look_up(
     x: float, y: float, z: float, tree: BoxTree, near: np.ndarray, square: Float, todo: Todo
 ) -> None:
-    """Fill in the KEPT nearest points of the tree, nearest first, and their squared distances.
+    """Fill in the K nearest points of the tree, nearest first, and their squared distances (K,).
 
     What is in `near` already, in order, makes it shorter; -1 is no point.
     """
     _, px, py, pz, _, box, starts, ends = tree
     nodes, squares, in_leaf = todo
-    node, n_todo, inner, most = 0, 0, len(starts) // 2, square[KEPT - 1]
+    node, n_todo, inner, last = 0, 0, len(starts) // 2, len(near) - 1
+    most = square[last]
     while True:
         if node < inner:
             closer, other = 2 * node + 1, 2 * node + 2
@@ -170,16 +168,16 @@ def look_up(
             for k in range(n):
                 if in_leaf[k] < most:
                     known = False
-                    for i in range(KEPT):
+                    for i in range(len(near)):
                         known = known or near[i] == first + k
                     if known:
                         continue
-                    i = KEPT - 1
+                    i = last
                     while i > 0 and square[i - 1] > in_leaf[k]:
                         near[i], square[i] = near[i - 1], square[i - 1]
                         i -= 1
                     near[i], square[i] = first + k, in_leaf[k]
-                    most = square[KEPT - 1]
+                    most = square[last]
         while n_todo > 0 and squares[n_todo - 1] >= most:
             n_todo -= 1
         if n_todo == 0:

@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 from numba import njit
 
-from mapfusion.align.box_tree import KEPT, BoxTree, look_up, put_in_order, room_for_search
+from mapfusion.align.box_tree import BoxTree, look_up, put_in_order, room_for_search
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.method import Fit, Needs
 from mapfusion.align.pairs import Pairs
@@ -19,6 +19,9 @@ from mapfusion.planar import moved_point
 from mapfusion.se2 import Float
 
 MAX_ROUNDS = 200  # of pairing and solving
+# Points near a landmark that are kept: with fewer it has to be looked up more often, more take
+# longer to find and to put in order than they save.
+_KEPT = 4
 
 
 @dataclass(frozen=True)
@@ -96,7 +99,7 @@ def summed_square_distance(T_a_b: Float, p_b: Float, tree: BoxTree, most: float)
     It ends with the first that makes it exceed `most`.
     """
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
-    near, square, todo = np.full(KEPT, -1), np.empty(KEPT), room_for_search()
+    near, square, todo = np.full(1, -1), np.empty(1), room_for_search()
     total = 0.0
     for i in range(len(p_b)):
         x, y = moved_point(T_a_b, cos, sin, p_b[i, 0], p_b[i, 1])
@@ -124,7 +127,7 @@ def pair_and_solve(
     p, n = tree.p, len(p_b)
     T_a_b, everyone, todo = T_start.copy(), np.arange(n), room_for_search()
     nearest, matched = np.full(n, -1), np.empty((n, 3))
-    near, square = np.full((n, KEPT), -1), np.empty(KEPT)
+    near, square = np.full((n, _KEPT), -1), np.empty(_KEPT)
     looked_up, clear = np.zeros((n, 2)), np.zeros(n)  # where, and how far the last one kept was
     for rounds in range(max_rounds + 1):
         cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
@@ -137,7 +140,7 @@ def pair_and_solve(
             k = -1
             if still > 0:
                 least = still * still
-                for j in range(KEPT):
+                for j in range(_KEPT):
                     other = near[i, j]
                     dx, dy, dz = p[other, 0] - x, p[other, 1] - y, p[other, 2] - z
                     away = dx * dx + dy * dy + dz * dz
@@ -148,7 +151,7 @@ def pair_and_solve(
                 put_in_order(x, y, z, p, own, square)
                 look_up(x, y, z, tree, own, square, todo)
                 looked_up[i, 0], looked_up[i, 1] = x, y
-                clear[i] = math.sqrt(square[KEPT - 1])
+                clear[i] = math.sqrt(square[_KEPT - 1])
                 k = own[0]
             if k != nearest[i]:
                 changed, nearest[i] = True, k

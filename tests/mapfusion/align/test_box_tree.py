@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from mapfusion.align.box_tree import KEPT, BoxTree, look_up, put_in_order, room_for_search
+from mapfusion.align.box_tree import BoxTree, look_up, put_in_order, room_for_search
 from tests.mapfusion.align.test_closest import points
 
 KINDS = ["spread", "one wall", "far outlier", "one place", "two"]
@@ -10,14 +10,15 @@ KINDS = ["spread", "one wall", "far outlier", "one place", "two"]
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("begins", ["with nothing", "with others", "with the answer"])
-def test_finds_what_looking_at_all_finds(kind, begins):
+@pytest.mark.parametrize("kept", [1, 4])
+def test_finds_what_looking_at_all_finds(kind, begins, kept):
     rng = np.random.default_rng(0)
     p = points(kind, rng)
-    tree, todo, n = BoxTree.of(p), room_for_search(), min(KEPT, len(p))
+    tree, todo, n = BoxTree.of(p), room_for_search(), min(kept, len(p))
     np.testing.assert_array_equal(tree.p, p[tree.row])
-    queries = np.vstack([rng.uniform(-2, 22, (200, 3)), rng.uniform(-100, 100, (50, 3)), p[:20]])
+    queries = np.vstack([rng.uniform(-2, 22, (100, 3)), rng.uniform(-100, 100, (30, 3)), p[:20]])
     for q in queries:
-        near, square = np.full(KEPT, -1), np.empty(KEPT)
+        near, square = np.full(kept, -1), np.empty(kept)
         away = cdist(q[None], tree.p)[0]
         if begins == "with others":
             near[:n] = rng.choice(len(p), n, replace=False)
