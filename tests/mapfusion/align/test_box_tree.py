@@ -24,9 +24,9 @@ def test_finds_what_looking_at_all_finds(kind, begins, kept):
             near[:n] = rng.choice(len(p), n, replace=False)
         elif begins == "with the answer":
             near[:n] = np.argsort(away)[:n][::-1]
-        put_in_order(*q, tree.p, near, square)
+        put_in_order(q[0], q[1], q[2], tree.p, near, square)
         assert (square[1:] >= square[:-1]).all()
-        look_up(*q, tree, near, square, todo)
+        look_up(q[0], q[1], q[2], tree, near, square, todo)
         np.testing.assert_allclose(np.sqrt(square[:n]), np.sort(away)[:n], rtol=0, atol=1e-12)
         np.testing.assert_allclose(away[near[:n]], np.sqrt(square[:n]), rtol=0, atol=1e-12)
         assert len(set(near[:n])) == n
