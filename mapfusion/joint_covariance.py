@@ -76,8 +76,9 @@ def condensed(own_m2: Float, common: Float, rank: int = RANK) -> JointCovariance
     if len(common) > rank:
         n_start = min(rank + _TO_SPARE, len(common))
         start = np.linspace(0, len(common) - 1, n_start).round().astype(int)
-        basis = np.eye(len(common))[:, np.unique(start)]
-        for _ in range(_ITERATIONS):
+        # onto single rows: common' times columns of the identity
+        basis = np.linalg.qr(common @ np.ascontiguousarray(common[np.unique(start)].T))[0]
+        for _ in range(_ITERATIONS - 1):
             basis = np.linalg.qr(common @ (common.T @ basis))[0]
         within = basis.T @ common
         largest = np.linalg.eigh(within @ within.T).eigenvectors[:, ::-1][:, :rank]

@@ -137,6 +137,8 @@ def _rows_of_numbers(table: pa.Table, field: pa.Field) -> pa.Array:
             matrix[:, i] = table.column(name).cast(pa.float64()).fill_null(np.nan).to_numpy()
     elif field.name in table.column_names:
         values = table.column(field.name).combine_chunks()
+        if values.type == field.type and not values.null_count and not values.flatten().null_count:
+            return values
         if values.null_count < n:
             lengths = _call("list_value_length", values).drop_null().unique().to_pylist()
             if lengths != [width]:

@@ -24,6 +24,7 @@ from experiments.run.workers import workers
 from experiments.scenario.settings import AnyScenario
 from mapfusion.errors import DamagedFileError, InputError
 from mapfusion.fuse.registry import make_fuser
+from mapfusion.robot_log import RobotLog, read_log
 
 _JUDGED = {"errors", "fusion"}  # the other tables of pairs come from the aligners
 
@@ -72,14 +73,28 @@ class JudgedRun:
         """Where a robot's log and maps are."""
         return RobotFolders(self.store.path(robot.log), self.store.path(robot.slam))
 
+    @cached_property
+    def logs(self) -> dict[str, RobotLog]:
+        """All robots' logs by name, read once for all that is told of them."""
+        folders = {robot.name: self.robot_folders(robot) for robot in self.pipeline.robots}
+        return {name: read_log(each.log) for name, each in folders.items()}
+
     def load_robots(self) -> list[EvaluatedRobot]:
         """All robots' maps joined with the truth."""
-        return [judging.load_robot(self.robot_folders(robot)) for robot in self.pipeline.robots]
+        return [
+            judging.load_robot(self.robot_folders(robot), self.logs[robot.name])
+            for robot in self.pipeline.robots
+        ]
 
     def load_smoothed(self, robots: Sequence[EvaluatedRobot]) -> list[SmoothedRobot]:
         """What the smoother made of all robots' logs, joined with the truth."""
         return [
-            load_smoothed(robot, self.robot_folders(stages), self.store.path(stages.smooth))
+            load_smoothed(
+                robot,
+                self.robot_folders(stages),
+                self.logs[stages.name],
+                self.store.path(stages.smooth),
+            )
             for robot, stages in zip(robots, self.pipeline.robots, strict=True)
         ]
 

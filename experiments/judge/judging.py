@@ -37,9 +37,8 @@ def truth_of(folder: Path, log: RobotLog) -> RobotTruth:
     return RobotTruth(np.full((len(log), 3), np.nan), np.full((len(log.observations), 3), np.nan))
 
 
-def load_robot(folders: RobotFolders) -> EvaluatedRobot:
-    """A robot's maps joined with the truth, which is NaN where it is unknown."""
-    log = read_log(folders.log)
+def load_robot(folders: RobotFolders, log: RobotLog) -> EvaluatedRobot:
+    """A robot's maps joined with the truth beside its log, which is NaN where it is unknown."""
     truth = truth_of(folders.log, log)
     poses, points = (truth.T_world_robot, log), (truth.point_world_m, log.observations)
     for file, (true, logged) in (("truth_poses", poses), ("truth_points", points)):
@@ -53,10 +52,8 @@ def load_robot(folders: RobotFolders) -> EvaluatedRobot:
 
 def run(settings: JudgeSettings, job: Job) -> None:
     """Write the pair's `errors.parquet` and `fusion.parquet`."""
-    robots = [
-        load_robot(RobotFolders(job.inputs[f"log_{side}"], job.inputs[f"slam_{side}"]))
-        for side in "ab"
-    ]
+    folders = [RobotFolders(job.inputs[f"log_{s}"], job.inputs[f"slam_{s}"]) for s in "ab"]
+    robots = [load_robot(each, read_log(each.log)) for each in folders]
     aligned = [tables.read(job.inputs["align"] / f"{name}.parquet", name) for name in ALIGNED]
     met, radius_m = met_maps(robots, *aligned), settings.true_pair_radius_m
     errors = pd.concat([error_rows(maps, settings.judge, radius_m) for maps in met])

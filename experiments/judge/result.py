@@ -44,7 +44,6 @@ from mapfusion.align.correspondences import match
 from mapfusion.errors import InputError
 from mapfusion.fuse.registry import make_fuser
 from mapfusion.landmark_map import write_map
-from mapfusion.robot_log import read_log
 from mapfusion.se2 import Float
 from mapfusion.storage import (
     POSE_FIELDS,
@@ -235,19 +234,18 @@ def _paths(run: JudgedRun, smoothed: Sequence[SmoothedRobot]) -> pd.DataFrame:
     """Rows of the table `paths`, with the smoothed path beside its columns."""
     paths = []
     for stages, each in zip(run.pipeline.robots, smoothed, strict=True):
-        log, maps = run.robot_folders(stages)
-        poses = read_rows(maps / "poses.parquet", slam.POSES).assign(robot=each.robot.name)
-        rows = robot_paths(poses, read_log(log).odometry, each.robot.path)
+        poses = read_rows(run.store.path(stages.slam) / "poses.parquet", slam.POSES)
+        poses, log = poses.assign(robot=each.robot.name), run.logs[stages.name]
+        rows = robot_paths(poses, log.odometry, each.robot.path)
         names = [f"smoothed_{name}" for name in POSE_FIELDS]
         paths.append(rows.assign(**named_columns(names, each.last_path)))
     return pd.concat(paths, ignore_index=True)
 
 
 def _frame_times(run: JudgedRun) -> pd.DataFrame:
-    logs = {each.name: read_log(run.robot_folders(each).log) for each in run.pipeline.robots}
     parts = [
         pd.DataFrame({"robot": name, "iteration": np.arange(len(log)), "time_s": log.time_s})
-        for name, log in logs.items()
+        for name, log in run.logs.items()
     ]
     return pd.concat(parts, ignore_index=True)
 

@@ -22,7 +22,7 @@ from experiments.run.stages.smooth import (
     smoothed_owners,
 )
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.robot_log import read_log
+from mapfusion.robot_log import RobotLog
 from mapfusion.se2 import Float
 from mapfusion.storage import POSE_FIELDS, named_columns
 
@@ -54,11 +54,12 @@ class SmoothedRobot:
         return self.paths.get(len(self.filter_path) - 1, unknown)
 
 
-def load_smoothed(robot: EvaluatedRobot, folders: RobotFolders, smooth: Path) -> SmoothedRobot:
-    """A robot's smoothed maps joined with the truth, which is NaN where it is unknown."""
-    truth, maps = truth_of(folders.log, read_log(folders.log)), read_smoothed(smooth)
-    owners_at = partial(smoothed_owners, smooth, folders.slam)
-    points = landmark_truth(truth, owners_at, maps)
+def load_smoothed(
+    robot: EvaluatedRobot, folders: RobotFolders, log: RobotLog, smooth: Path
+) -> SmoothedRobot:
+    """A robot's smoothed maps joined with the truth beside its log, NaN where it is unknown."""
+    truth, maps = truth_of(folders.log, log), read_smoothed(smooth)
+    points = landmark_truth(truth, partial(smoothed_owners, smooth, folders.slam), maps)
     ending = read_endings(smooth).to_dict("records")[-1]
     paths = read_smoothed_path(smooth)
     whole = {str(name): value for name, value in ending.items()}

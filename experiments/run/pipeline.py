@@ -93,10 +93,14 @@ class Pipeline:
         return [robot for robot in self.robots if isinstance(robot, SimulatedRobotStages)]
 
     def stages(self) -> list[Stage]:
-        """All stages, each after those before it; a robot is done before the next one's images."""
+        """All stages, each after those before it; a robot is done before the next one's images.
+
+        Fused maps need one aligner only and are made in few long pieces, so they come before the
+        others' estimates: many short pieces at the end keep all processes at work until then.
+        """
         maps = (robot.smooth for robot in self.robots)
         estimates = (pair.estimates for pair in self.pairs)
-        return with_those_before([*maps, *estimates, *self.fusers.values()])
+        return with_those_before([*maps, *self.fusers.values(), *estimates])
 
 
 def lay_out(scenario: AnyScenario) -> Pipeline:

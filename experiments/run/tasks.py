@@ -59,8 +59,9 @@ def tasks_of(stages: Iterable[Stage], store: Store) -> dict[str, Task]:
     """
     tasks = {}
     for parts, group in itertools.groupby(stages, key=lambda stage: stage.parts):
-        for part, stage in itertools.product(parts, list(group)):
-            task = _task(stage, part, store)
+        folders = [(stage, store.folder(stage)) for stage in group]
+        for part, (stage, folder) in itertools.product(parts, folders):
+            task = _task(stage, part, folder, store)
             tasks[task.name] = task
     return tasks
 
@@ -74,14 +75,13 @@ def _name(stage: Stage, part: str) -> str:
     return f"{stage.name}/{stage.key}" + (f"/{part}" if part else "")
 
 
-def _task(stage: Stage, part: str, store: Store) -> Task:
+def _task(stage: Stage, part: str, folder: StageFolder, store: Store) -> Task:
     needs: list[str] = []
     for before in stage.before.values():
         if isinstance(before, Stage) and before.parts == stage.parts:
             needs.append(_name(before, part))
         else:
             needs += task_names(before)
-    folder = store.folder(stage)
     inputs = {name: store.path(before) for name, before in stage.before.items()}
     arguments = (stage.work, stage.settings, Job(inputs, folder.path, part), folder)
     outputs = folder.outputs[part]

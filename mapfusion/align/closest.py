@@ -1,4 +1,4 @@
-"""Near landmarks of a map: a grid over the plane, looked at ring by ring or about a point."""
+"""Near landmarks of a map: a grid over the plane, looked at about a point."""
 
 import math
 from typing import NamedTuple
@@ -69,43 +69,6 @@ def _sorted_into_cells(p: Float) -> Grid:
         for axis in range(p.shape[1]):
             sorted_p[k, axis] = p[i, axis]
     return Grid(sorted_p, row, start, corner_m, cell_m, np.array([nx, ny]))
-
-
-@njit(cache=True)
-def nearest_two(qx: float, qy: float, qz: float, grid: Grid) -> tuple[int, float, float]:
-    """Index into grid.p (N, 3) of the point nearest to q, its distance, and that of the next one.
-
-    The last is infinite when there is one point only.
-    """
-    p, start, corner_m, cell_m = grid.p, grid.start, grid.corner_m, grid.cell_m
-    at_x = math.floor((qx - corner_m[0]) / cell_m)
-    at_y = math.floor((qy - corner_m[1]) / cell_m)
-    nx, ny = grid.shape[0], grid.shape[1]
-    first, square1, square2 = -1, math.inf, math.inf
-    ring = max(0, -at_x, at_x - nx + 1, -at_y, at_y - ny + 1)  # the first that meets the grid
-    last = max(at_x, nx - 1 - at_x, at_y, ny - 1 - at_y)
-    while ring <= last:
-        # whatever lies in this ring or beyond is at least ring - 1 whole cells away
-        if ring > 0 and square2 <= ((ring - 1) * cell_m) ** 2:
-            break
-        for y in range(max(at_y - ring, 0), min(at_y + ring, ny - 1) + 1):
-            inner = abs(y - at_y) < ring
-            step = 2 * ring if inner else 1
-            x = at_x - ring
-            if x < 0:
-                x = at_x + ring if inner else 0
-            while x <= min(at_x + ring, nx - 1):
-                cell = y * nx + x
-                for k in range(start[cell], start[cell + 1]):
-                    dx, dy, dz = p[k, 0] - qx, p[k, 1] - qy, p[k, 2] - qz
-                    square = dx * dx + dy * dy + dz * dz
-                    if square < square1:
-                        first, square1, square2 = k, square, square1
-                    elif square < square2:
-                        square2 = square
-                x += step
-        ring += 1
-    return first, math.sqrt(square1), math.sqrt(square2)
 
 
 @njit(cache=True)

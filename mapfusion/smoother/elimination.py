@@ -17,8 +17,10 @@ from mapfusion.smoother.offsets import Reduced, without_offsets
 from mapfusion.smoother.sightings import Sightings
 from mapfusion.smoother.skyline import (
     cholesky_in_envelope,
+    entries_seen,
     solve_in_envelope,
     solve_transposed_in_envelope,
+    untouched_zeros,
 )
 
 _ITEM = np.dtype(np.float64).itemsize
@@ -94,7 +96,7 @@ def common_part(seen: Sightings, equations: NormalEquations, solution: Solution)
         np.add.at(wide, (place[rows] - first, column[seen.landmark[rows]]), coupling[rows])
         right = wide.transpose(0, 2, 1, 3).reshape(n - 3 * first, -1)
         below = solution.factor[3 * first :, 3 * first :]
-        solved = solve_in_envelope(below, right)
+        solved = solve_in_envelope(below, entries_seen(below), right)
         common[first:, :, some] = solved.reshape(-1, 3, len(some), 3)
     return common.reshape(n, -1)
 
@@ -127,16 +129,16 @@ def _beside_own(solution: Solution) -> Float:
 
 def _landmarks_first(seen: Sightings, equations: NormalEquations) -> Solution:
     n, place = len(equations.pose_block), seen.pose_place
-    S, gradient = np.zeros((3 * n, 3 * n)), np.empty((n, 3))
+    S, gradient, first = untouched_zeros(3 * n), np.empty((n, 3)), seen.first_entry
     _put_poses(S.reshape(n, 3, n, 3), place, equations)
     gradient[place] = equations.pose_gradient
     left, row = without_offsets(seen, equations), place[seen.frame]
     own = np.asarray(np.linalg.inv(_regular(seen, left.point_block)), np.float64)
     _subtract(seen.track_starts, row, equations.coupling, left.own_m2, left.pull, S, gradient)
     _subtract(seen.starts, row, left.coupling, own, left.point_gradient, S, gradient)
-    factor = cholesky_in_envelope(S[3:, 3:])
-    turned = solve_in_envelope(factor, gradient[1:].ravel())  # squared, what the step moves
-    solved = -solve_transposed_in_envelope(factor, turned)
+    factor = cholesky_in_envelope(S[3:, 3:], first)
+    turned = solve_in_envelope(factor, first, gradient[1:].ravel())  # squared, what the step moves
+    solved = -solve_transposed_in_envelope(factor, first, turned)
     way = np.zeros((n, 3))
     way[1:] = solved.reshape(-1, 3)[place[1:] - 1]
     moved = seen.sum_by_landmark(_along(left.coupling, way[seen.frame]))

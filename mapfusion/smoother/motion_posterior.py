@@ -15,7 +15,7 @@ from mapfusion.se2 import Float
 from mapfusion.smoother.elimination import chain_factor, pose_point_blocks
 from mapfusion.smoother.normal_equations import disturbance_jacobians, disturbances
 from mapfusion.smoother.settle import Settled
-from mapfusion.smoother.skyline import solve_in_envelope
+from mapfusion.smoother.skyline import entries_seen, solve_in_envelope
 
 _AT_ONCE = 128  # disturbances whose part in all poses is made as a matrix of its own
 
@@ -97,7 +97,8 @@ def _from_poses(end: Settled, before: Float, after: Float) -> Float:
         later = some > 0
         wide[began[some[later]] - first, :, each[later]] = np.swapaxes(before[some[later]], 1, 2)
         below = factor[3 * first :, 3 * first :]
-        solved = solve_in_envelope(below, wide.reshape(3 * (n - first), -1))
+        right = wide.reshape(3 * (n - first), -1)
+        solved = solve_in_envelope(below, entries_seen(below), right)
         variance[some] = np.sum(solved**2, axis=0).reshape(-1, 3)
     return variance
 

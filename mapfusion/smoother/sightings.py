@@ -8,7 +8,7 @@ import numpy as np
 from mapfusion.arguments import require_shape
 from mapfusion.robot_log import NO_TRACK, RobotLog
 from mapfusion.se2 import Float
-from mapfusion.smoother.skyline import envelope_order
+from mapfusion.smoother.skyline import envelope_order, first_entries
 
 
 @dataclass(frozen=True)
@@ -56,6 +56,16 @@ class Sightings:
         unknown = self.frame[later] - 1
         place[1:] = 1 + envelope_order(self.landmark[later], unknown, self.n_poses - 1)
         return place
+
+    @cached_property
+    def first_entry(self) -> np.ndarray:
+        """(3 (T - 1),) column of each row's first entry, of what poses have to do with each other.
+
+        Rows and columns are the unknown poses' coordinates by their places.
+        """
+        later = self.frame > 0
+        chosen = (self.landmark[later], self.frame[later] - 1, self.pose_place[1:] - 1)
+        return np.repeat(3 * first_entries(*chosen), 3)
 
     @property
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, Float, Float]:

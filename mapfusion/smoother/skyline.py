@@ -3,8 +3,12 @@
 Poses that saw no landmark in common have a zero between them. In the order of reverse Cuthill and
 McKee (1969) what is not zero lies near the diagonal, and a factor has no more than zeros before the
 first entry of each row (the envelope: George and Liu 1981, "Computer Solution of Large Sparse
-Positive Definite Systems", ch. 4). Matrices stay dense in memory, the work is done by blocks.
+Positive Definite Systems", ch. 4). Matrices stay dense, the work is done by blocks.
+
+With a matrix functions take `first` (n,), the column of each row's first entry, or one before it.
 """
+
+import mmap
 
 import numpy as np
 import scipy.linalg
@@ -40,7 +44,40 @@ def envelope_order(group: np.ndarray, member: np.ndarray, n_members: int) -> np.
     return place
 
 
-def cholesky_in_envelope(A: Float) -> Float:
+def untouched_zeros(n: int) -> Float:
+    """(n, n) zeros, of which memory holds the pages alone that something is written to.
+
+    Those of `numpy.zeros` come in huge pages: of a matrix with few entries in each row, all of it.
+    """
+    room = mmap.mmap(-1, n * n * np.dtype(np.float64).itemsize)
+    return np.frombuffer(room, np.float64).reshape(n, n)
+
+
+def first_entries(group: np.ndarray, member: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """(n,) by place: the first place that each has to do with, its own if there is none before it.
+
+    Groups and members are those of `envelope_order`, `place` (n,) is what it gave.
+    """
+    n, at = len(place), place[member]
+    first, least = np.arange(n), np.full(int(group.max(initial=-1)) + 1, n)
+    np.minimum.at(least, group, at)
+    np.minimum.at(first, at, least[group])
+    np.minimum.at(first, np.maximum(place[1:], place[:-1]), np.minimum(place[1:], place[:-1]))
+    return first
+
+
+def entries_seen(L: Float) -> np.ndarray:
+    """`first` (n,) of a factor L (n, n), or its last rows and columns, from what it holds.
+
+    Slower than what one knows of the matrix, but some rows begin later than they might.
+    """
+    first = np.empty(len(L), np.int64)
+    for rows in _blocks(len(L)):
+        first[rows] = np.argmax(L[rows].any(axis=0))
+    return first
+
+
+def cholesky_in_envelope(A: Float, first: np.ndarray) -> Float:
     """The lower Cholesky factor of A (n, n), in its place; of A the lower half is read.
 
     What lies above the diagonal blocks stays as it is.
@@ -48,7 +85,7 @@ def cholesky_in_envelope(A: Float) -> Float:
     Raises:
         LinAlgError: A is not positive definite.
     """
-    blocks, starts = _envelope(A)
+    blocks, starts = _envelope(first)
     for j, columns in enumerate(blocks):
         for i, rows in enumerate(blocks[j:], start=j):
             if starts[i] > j:
@@ -63,30 +100,33 @@ def cholesky_in_envelope(A: Float) -> Float:
     return A
 
 
-def solve_in_envelope(L: Float, right: Float) -> Float:
+def solve_in_envelope(L: Float, first: np.ndarray, right: Float) -> Float:
     """L^-1 right (n,) or (n, m) of a lower factor (n, n)."""
     x = right.copy()
-    for rows, start in zip(*_envelope(L), strict=True):
+    for rows, start in zip(*_envelope(first), strict=True):
         done = slice(start * _BLOCK, rows.start)
         x[rows] = _solved(L[rows, rows], x[rows] - L[rows, done] @ x[done])
     return x
 
 
-def solve_transposed_in_envelope(L: Float, right: Float) -> Float:
+def solve_transposed_in_envelope(L: Float, first: np.ndarray, right: Float) -> Float:
     """L'^-1 right (n,) or (n, m) of a lower factor (n, n)."""
     x = right.copy()
-    for rows, start in reversed(list(zip(*_envelope(L), strict=True))):
+    for rows, start in reversed(list(zip(*_envelope(first), strict=True))):
         x[rows] = _solved(L[rows, rows], x[rows], transposed=True)
         before = slice(start * _BLOCK, rows.start)
         x[before] -= L[rows, before].T @ x[rows]
     return x
 
 
-def _envelope(A: Float) -> tuple[list[slice], list[int]]:
+def _envelope(first: np.ndarray) -> tuple[list[slice], list[int]]:
     """The blocks of rows, and the block of columns in which the first entry of each lies."""
-    n = len(A)
-    blocks = [slice(begin, min(begin + _BLOCK, n)) for begin in range(0, n, _BLOCK)]
-    return blocks, [int(np.argmax(A[rows].any(axis=0))) // _BLOCK for rows in blocks]
+    blocks = _blocks(len(first))
+    return blocks, [int(first[rows].min()) // _BLOCK for rows in blocks]
+
+
+def _blocks(n: int) -> list[slice]:
+    return [slice(begin, min(begin + _BLOCK, n)) for begin in range(0, n, _BLOCK)]
 
 
 def _solved(L: Float, right: Float, transposed: bool = False) -> Float:

@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 import pytest
 
-from mapfusion.arguments import Range, require_in_range
+from mapfusion.arguments import Range, require_in_range, require_no_twins
 from mapfusion.errors import InputError, OutOfRangeError, did_you_mean, one_line
 
 Side = Annotated[float, Range(1, 5, "m")]
@@ -64,3 +64,16 @@ def test_an_error_is_one_short_line_whatever_was_put_in() -> None:
 def test_names_that_look_alike_are_offered() -> None:
     assert did_you_mean("ransak", ["svd", "ransac"]) == "; did you mean ransac?"
     assert did_you_mean("magic", ["svd", "ransac"]) == ""
+
+
+@pytest.mark.parametrize("named", [[0, 1, 2, 3], [0, 0, 1, 1], [0, 0, 0, 0]])
+def test_rows_are_twins_only_where_all_columns_are_the_same(named: list[int]) -> None:
+    name, points = np.array(named), np.array([[1.0, 2.0], [1.0, 3.0], [4.0, 2.0], [4.0, 3.0]])
+    require_no_twins("points", name, points)
+    twice = np.array([0, 1, 2, 3, 1])
+    with pytest.raises(ValueError, match="points: row 4 repeats row 1"):
+        require_no_twins("points", name[twice], points[twice])
+
+
+def test_rows_that_are_not_numbers_are_no_twins() -> None:
+    require_no_twins("points", np.full(3, np.nan), np.full((3, 2), np.nan))

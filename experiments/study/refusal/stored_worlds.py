@@ -62,7 +62,7 @@ class MappedWorld:
 
     def robots(self) -> list[EvaluatedRobot]:
         """All robots' maps joined with the truth."""
-        return [load_robot(folders) for folders in self.folders.values()]
+        return [load_robot(each, read_log(each.log)) for each in self.folders.values()]
 
 
 def worlds_of(words: Sequence[str], seeds: Sequence[int], results: Path) -> list[MappedWorld]:

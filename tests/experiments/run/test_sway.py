@@ -41,9 +41,10 @@ def mapped(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Mapped]:
         run = JudgedRun.of(load_scenario(path, [*shared, *own]), Store.of(root))
         robot = run.pipeline.simulated[0]
         run.execute(1, lambda *_: None, [robot.slam])
-        landmarks, points = load_robot(run.robot_folders(robot)).at(43)
         log = run.store.path(robot.log)
-        n = len(read_log(log).observations)
+        logged = read_log(log)
+        landmarks, points = load_robot(run.robot_folders(robot), logged).at(43)
+        n = len(logged.observations)
         drive = run.store.path(robot.features.before["drive"])
         found[kind] = Mapped(log, drive, fit_rmse_m(landmarks.position_m, points)[1], n)
     return found

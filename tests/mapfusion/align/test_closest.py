@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
-from scipy.spatial.distance import cdist
 
-from mapfusion.align.closest import Grid, nearest_two, runs_about
+from mapfusion.align.closest import Grid, runs_about
 
 
 def points(kind, rng):
@@ -13,26 +12,6 @@ def points(kind, rng):
         "one place": np.ones((40, 3)),
         "two": rng.uniform(0, 1, (2, 3)),
     }[kind]
-
-
-@pytest.mark.parametrize("kind", ["spread", "one wall", "far outlier", "one place", "two"])
-def test_finds_what_looking_at_all_finds(kind):
-    rng = np.random.default_rng(0)
-    p = points(kind, rng)
-    grid = Grid.of(p)
-    queries = np.vstack([rng.uniform(-2, 22, (300, 3)), rng.uniform(-100, 100, (50, 3)), p[:20]])
-    all_distances = cdist(queries, p)
-    two = np.sort(all_distances, axis=1)[:, :2]
-    for q, distances, (d1, d2) in zip(queries, all_distances, two, strict=True):
-        k, first, second = nearest_two(*q, grid)
-        assert (first, second) == pytest.approx((d1, d2), abs=1e-12)
-        assert distances[grid.row[k]] == pytest.approx(d1, abs=1e-12)
-
-
-def test_one_point_has_no_second():
-    grid = Grid.of(np.zeros((1, 3)))
-    k, first, second = nearest_two(3.0, 4.0, 0.0, grid)
-    assert (k, first, second) == (0, 5.0, np.inf)
 
 
 @pytest.mark.parametrize("kind", ["spread", "one wall", "far outlier", "one place", "two"])

@@ -7,9 +7,12 @@ import scipy.linalg
 from mapfusion.smoother import skyline
 from mapfusion.smoother.skyline import (
     cholesky_in_envelope,
+    entries_seen,
     envelope_order,
+    first_entries,
     solve_in_envelope,
     solve_transposed_in_envelope,
+    untouched_zeros,
 )
 
 
@@ -29,26 +32,49 @@ def test_factor_is_that_of_the_dense_matrix(n, n_groups):
     A = matrix_of_groups(np.random.default_rng(n), n, n_groups if n > 2 else 0)
     given = A.copy()
     given[np.triu_indices(n, skyline._BLOCK)] = 0  # only the lower half is read
-    found = np.tril(cholesky_in_envelope(given))
+    found = np.tril(cholesky_in_envelope(given, entries_seen(given)))
     np.testing.assert_allclose(found, scipy.linalg.cholesky(A, lower=True), atol=1e-12)
-    right = np.random.default_rng(0).normal(size=(n, 7))
+    right, first = np.random.default_rng(0).normal(size=(n, 7)), entries_seen(found)
     for some in (right, right[:, 0]):
-        np.testing.assert_allclose(found @ solve_in_envelope(found, some), some, atol=1e-12)
-        back = solve_transposed_in_envelope(found, some)
+        np.testing.assert_allclose(found @ solve_in_envelope(found, first, some), some, atol=1e-12)
+        back = solve_transposed_in_envelope(found, first, some)
         np.testing.assert_allclose(found.T @ back, some, atol=1e-12)
 
 
 def test_rows_that_are_zero_for_long_stay_so():
     A = 2 * np.eye(400)
     A[399, 250] = A[250, 399] = 1.0
-    assert not np.tril(cholesky_in_envelope(A), -1)[:, :250].any()
+    assert not np.tril(cholesky_in_envelope(A, entries_seen(A)), -1)[:, :250].any()
+
+
+@pytest.mark.parametrize("n_groups", [0, 1, 60])
+def test_first_entries_are_those_of_what_has_to_do_with_each_other(n_groups):
+    rng, n = np.random.default_rng(n_groups), 150
+    group, member = np.repeat(np.arange(n_groups), 3), rng.integers(0, n, 3 * n_groups)
+    place = envelope_order(group, member, n)
+    A = np.eye(n) + np.eye(n, k=1) + np.eye(n, k=-1)
+    for each in range(n_groups):
+        own = member[group == each]
+        A[np.ix_(own, own)] = 1
+    ordered = np.empty_like(A)
+    ordered[np.ix_(place, place)] = A
+    first = first_entries(group, member, place)
+    np.testing.assert_array_equal(first, np.argmax(ordered != 0, axis=1))
+
+
+def test_zeros_can_be_written_to():
+    zeros = untouched_zeros(100)
+    assert zeros.shape == (100, 100)
+    assert not zeros.any()
+    zeros[3, 4] = 1
+    assert zeros.sum() == 1
 
 
 def test_a_matrix_that_is_not_positive_definite_is_refused():
     A = np.eye(200)
     A[150, 150] = -1
     with pytest.raises(np.linalg.LinAlgError):
-        cholesky_in_envelope(A)
+        cholesky_in_envelope(A, entries_seen(A))
 
 
 def test_order_brings_those_together_that_have_to_do_with_each_other():
