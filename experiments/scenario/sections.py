@@ -195,7 +195,8 @@ class Smooth(Section):
 
     Attributes:
         stray_m: standard deviation, along each axis, of where the point that a track is of lies
-            beside its landmark. Tracks that the filter took for one landmark and that lie farther
+            beside its landmark, as usual cameras see it; of coarse ones, whose pixels show more of
+            a wall, it is larger. Tracks that the filter took for one landmark and that lie farther
             apart are parted. The filter's own (`slam.filter.stray_m`) is larger: along its path
             they cannot be told apart.
         max_memory_gb: of its matrices, which grow with the square of the log: a robot is not

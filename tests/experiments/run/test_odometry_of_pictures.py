@@ -51,7 +51,9 @@ class Mapped(NamedTuple):
 def mapped(tmp_path_factory: pytest.TempPathFactory) -> list[Mapped]:
     root = tmp_path_factory.mktemp("pictures")
     (root / "tiny.yaml").write_text(TINY, encoding="utf-8")
-    scenario = load_scenario(root / "tiny.yaml", ["render.renderer=raycast"])
+    # of this camera a pixel is four usual ones, and a corner's tracks lie 5 mm apart and not 2
+    settings = ["render.renderer=raycast", "smooth.stray_m=0.004"]
+    scenario = load_scenario(root / "tiny.yaml", settings)
     assert isinstance(scenario, Simulation)
     run = JudgedRun.of(scenario, Store.of(root))
     robots = run.pipeline.simulated
@@ -73,7 +75,7 @@ def mapped_by_pictures(path: Path, log: Path, scenario: Simulation) -> Mapped:
     assert told is not None
     *_, last = run_log(one.log, parameters, np.random.default_rng(0), odometry_covariance=told)
     landmark, path_m = last.slam.best_associations(), last.slam.best_path()
-    own = SmootherParameters(odometry_covariance=told)
+    own = SmootherParameters(stray_m=scenario.smooth.stray_m, odometry_covariance=told)
     smoothed = smooth(one.log, landmark, path_m, own)
     found = smoothed_map(one.log, smoothed, attitude=one.attitude)
     seen_at = [truth.point_world_m[smoothed.landmark == s] for s in found.source_observation]

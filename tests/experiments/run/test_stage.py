@@ -17,7 +17,7 @@ from experiments.run import stage as stage_module
 from experiments.run.code_version import imported_sources
 from experiments.run.job import Job
 from experiments.run.pipeline import lay_out
-from experiments.run.stage import RecordedLog, Stage
+from experiments.run.stage import RecordedLog, Stage, with_those_before
 from experiments.run.store import Store
 from experiments.scenario.loading import load_scenario, scenario_of
 from experiments.scenario.settings import Simulation
@@ -61,8 +61,6 @@ TOLD = {
     "slam": "slam",
     "slam.filter.motion": "slam smooth fuse",
     "slam.filter.noise_floor_m": "slam smooth fuse",
-    "slam.filter.stray_m": "slam",
-    "slam.filter.close_loops": "slam",
     "slam.min_count": "slam smooth fuse",
     "smooth": "smooth",
     "smooth.stray_m": "smooth fuse",
@@ -98,23 +96,15 @@ NO_OTHER_VALUE = {
     # names that there are
     *(f"fuse.fusers.{i}" for i in range(len(FUSERS))),
 }
-WORDS = (
-    "motion",
-    "informed",
-    "label",
-    "descriptor",
-    "solved",
-    "ransac",
-    "svd",
-    "other",
-    "raycast",
-    "pixels",
-    "drop",
+WORDS = tuple(
+    "motion informed label descriptor solved ransac svd other raycast pixels drop".split()
 )
 
 
 def stages_of(scenario: Simulation) -> list[Stage]:
-    return JudgedRun.of(scenario, Store(Path("nowhere"))).stages()
+    """In the scenario's order: done they are in another, the aligner that merges first."""
+    found = JudgedRun.of(scenario, Store(Path("nowhere"))).stages()
+    return with_those_before([*(s for s in found if s.name not in ("aligner", "fuse")), *found])
 
 
 @pytest.fixture(scope="module")

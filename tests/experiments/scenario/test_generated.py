@@ -53,21 +53,22 @@ def test_a_drawn_world_is_drawn_by_the_ray_caster_unless_another_is_named(path: 
 
 def test_pictures_without_filter_have_their_own_errors_of_disparities(path: Path) -> None:
     """By the renderer, and not where the file says it."""
-    sharp, coarse = (0.2, 6.0, 0.01), (0.7, 3.0, 0.06)
+    sharp, coarse = (0.2, 6.0, 0.01, 0.002), (0.7, 3.0, 0.06, 0.003)
     said = "vision.stereo.plane_misfit_px"
     for overrides, expected in (
         ([], sharp),
         (["vision.stereo.half_px=7"], sharp),
         (["render.renderer=tiny"], coarse),
         (["render.renderer=egl"], coarse),
-        (["render.renderer=tiny", f"{said}=0.3"], (0.3, 3.0, 0.06)),
-        ([f"{said}=0.4"], (0.4, 6.0, 0.01)),
+        (["render.renderer=tiny", f"{said}=0.3"], (0.3, 3.0, 0.06, 0.003)),
+        (["render.renderer=tiny", "smooth.stray_m=0.005"], (0.7, 3.0, 0.06, 0.005)),
+        ([f"{said}=0.4"], (0.4, 6.0, 0.01, 0.002)),
     ):
         scenario = load_scenario(path, overrides)
         assert isinstance(scenario, Simulation)
         stereo = scenario.vision.stereo
         found = stereo.plane_misfit_px, stereo.residual_correlation_px, stereo.sigma_floor_px
-        assert found == expected, overrides
+        assert (*found, scenario.smooth.stray_m) == expected, overrides
 
 
 def test_the_resolved_scenario_is_a_scenario_with_the_same_keys(path: Path, tmp_path: Path) -> None:
