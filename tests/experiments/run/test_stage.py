@@ -97,7 +97,19 @@ NO_OTHER_VALUE = {
     *(f"fuse.fusers.{i}" for i in range(len(FUSERS))),
 }
 WORDS = tuple(
-    "motion informed label descriptor solved ransac svd other raycast pixels drop".split()
+    [
+        "motion",
+        "informed",
+        "label",
+        "descriptor",
+        "solved",
+        "ransac",
+        "svd",
+        "other",
+        "raycast",
+        "pixels",
+        "drop",
+    ]
 )
 
 
