@@ -96,21 +96,8 @@ NO_OTHER_VALUE = {
     # names that there are
     *(f"fuse.fusers.{i}" for i in range(len(FUSERS))),
 }
-WORDS = tuple(
-    [
-        "motion",
-        "informed",
-        "label",
-        "descriptor",
-        "solved",
-        "ransac",
-        "svd",
-        "other",
-        "raycast",
-        "pixels",
-        "drop",
-    ]
-)
+WORDS = ("motion", "informed", "label", "descriptor", "solved", "ransac", "svd")
+WORDS += ("other", "raycast", "pixels", "drop")
 
 
 def stages_of(scenario: Simulation) -> list[Stage]:
