@@ -113,8 +113,8 @@ def bend_of(first_px: Float, disparity_px: Float) -> Float:
 
     A point of disparity d has depth f B / d, and by t nearer, d / d' = 1 - t d / (f B) of it. In
     the picture it is divided by that, which is linear in the image as d is, so that over its value
-    at the point it is 1 + h'x with h = -(d' / d - 1) grad d / d. What turning bends is left out: a
-    tenth of that.
+    at the point it is 1 + h'x with h = -(d' / d - 1) grad d / d. What turning bends, at most its
+    angle over the focal length, is left out: no rotation is known yet, and it is far less.
 
     Args:
         first_px: (N, 3) disparity d and its slopes in the earlier picture.

@@ -8,10 +8,10 @@ offset in brightness. Around the point, x from it in the earlier picture, it is
 
 and h follows from disparities: what a camera comes nearer to grows, and grows more at its nearer
 side. With h left out (Shi and Tomasi 1994) the place moves by half the second derivative, averaged
-over the window: a hundredth of a pixel, but always towards the robot on what it drives along. The
-six parameters of place and A and the two of brightness are least squares on the grey levels,
-Gauss-Newton with the earlier picture's derivatives, so that the normal matrix is built once
-(inverse composition, Baker and Matthews 2004).
+over the window: little, but on walls along the way always towards the robot. The six parameters of
+place and A and the two of brightness are least squares on the grey levels, Gauss-Newton with the
+earlier picture's derivatives, so that the normal matrix is built once (inverse composition, Baker
+and Matthews 2004).
 """
 
 import numpy as np
