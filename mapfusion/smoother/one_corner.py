@@ -26,8 +26,8 @@ _SINGULAR = 1e-12  # pivot, as a share of its diagonal element, that is rounding
 def parted(seen: Sightings, landmark: np.ndarray, path: Float, stray_m: float) -> np.ndarray:
     """(N,) which landmark each observation is of, where those of several corners are several.
 
-    The corner with the most observations keeps the landmark's number. Others are named after the
-    first of their own that names no other landmark.
+    The corner that holds the observation which a landmark is numbered after keeps the number, else
+    that with the most. Others are named after the first of their own that names no other landmark.
 
     Args:
         seen: what the landmarks were seen by.
@@ -48,7 +48,9 @@ def parted(seen: Sightings, landmark: np.ndarray, path: Float, stray_m: float) -
     for own in np.flatnonzero(np.maximum.reduceat(corner, first[:-1])):
         track = np.repeat(corner[first[own] : first[own + 1]], counts[first[own] : first[own + 1]])
         rows = seen.row[seen.starts[own] : seen.starts[own + 1]]
-        for k in range(1, track.max() + 1):
+        home = track[rows == landmark[rows[0]]]
+        keeps = home[0] if len(home) else 0
+        for k in np.setdiff1d(track, keeps):
             mine = rows[track == k]
             free = [row for row in mine.tolist() if row not in names]
             made[mine] = min(free, default=-1)

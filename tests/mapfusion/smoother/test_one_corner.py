@@ -52,10 +52,11 @@ def test_two_tracks_of_a_corner_are_parted_as_seldom_as_said(planar: bool) -> No
     assert abs(n_parted - expected) < 4 * np.sqrt(expected)
 
 
-def test_neighbours_are_parted_and_the_most_seen_keeps_the_name() -> None:
-    """Three corners in any order, 20 mm apart; the second has most tracks."""
+@pytest.mark.parametrize("by_row", [True, False])
+def test_neighbours_are_parted_and_the_one_named_keeps_the_name(by_row: bool) -> None:
+    """Three corners in any order, 20 mm apart; the second has most tracks, the third the name."""
     rng, n_landmarks = np.random.default_rng(1), 50
-    which = np.array([0, 1, 1, 2, 1, 0])
+    which = np.array([2, 1, 1, 0, 1, 0])
     corner = rng.uniform(-3, 3, (n_landmarks, 1, 3))
     way = np.zeros((3, 3))
     way[1, 2], way[2, 0] = 0.02, 0.02
@@ -66,15 +67,28 @@ def test_neighbours_are_parted_and_the_most_seen_keeps_the_name() -> None:
     own = log.observations.track // len(which)
     row = np.arange(len(own))
     first = np.array([row[own == k].min() for k in range(n_landmarks)])
-    landmark = first[own]  # named by its first observation, which is of another corner
+    # numbered after its first observation, or by what is no observation of its own
+    landmark = first[own] if by_row else own + len(own)
     made = parted(sightings_of(log, landmark, 1, stray=True), landmark, path, STRAY_M)
     is_of = which[log.observations.track % len(which)]
-    np.testing.assert_array_equal(made == landmark, is_of == 1)
+    keeps = 2 if by_row else 1
+    np.testing.assert_array_equal(made == landmark, is_of == keeps)
     for k in range(n_landmarks):
-        for corner_ in (0, 2):
+        for corner_ in {0, 1, 2} - {keeps}:
             mine = np.flatnonzero((own == k) & (is_of == corner_))
-            names = np.setdiff1d(mine, landmark)
-            np.testing.assert_array_equal(made[mine], names.min())
+            np.testing.assert_array_equal(made[mine], np.setdiff1d(mine, landmark).min())
+
+
+def test_a_name_that_is_taken_is_not_given() -> None:
+    """The parted corner's first observation is what another landmark is numbered after."""
+    rng = np.random.default_rng(4)
+    point = np.array([[2.0, 0, 0], [2.0, 0, 0], [2.0, 0, 0.1], [0, 3.0, 0]])
+    path = path_of(rng)
+    log = seen_tracks(rng, point, path)
+    track = log.observations.track
+    landmark = np.where(track == 3, 2, 0)  # row 2 is the third track's first
+    made = parted(sightings_of(log, landmark, 1, stray=True), landmark, path, STRAY_M)
+    np.testing.assert_array_equal(made, np.array([0, 0, 6, 2])[track])
 
 
 def test_it_takes_the_corners_that_a_slow_obvious_version_takes() -> None:
