@@ -10,7 +10,7 @@ from experiments.run.frames import FLOAT, INT, TEXT, fields, write_rows
 from experiments.show.export import to_markdown, write_text
 from experiments.show.figures import refusal_figures, verdict_figures
 from experiments.show.figures.drawing import save_figure
-from experiments.study.refusal.kind_rates import VERDICTS, of_any_method
+from experiments.study.refusal.kind_rates import VERDICTS, first_of_ordinary, of_any_method
 from experiments.study.refusal.refusal_rates import Rate, ordinary
 from experiments.study.refusal.reliability import Reliability
 from mapfusion.storage import schema
@@ -37,11 +37,15 @@ KINDS = schema(
 def write_kinds(folder: Path, refusals: pd.DataFrame, rows: list[dict[str, Any]]) -> Path:
     """Write rows of `kind_rates.by_kind` as the table `kinds` and, for people, `kinds.md`.
 
-    The page begins with what any method does (`kind_rates.of_any_method`).
+    The page begins with what any method does (`of_any_method`), and how early ordinary worlds are
+    come upon (`first_of_ordinary`).
     """
     write_rows(table_path(folder, "kinds"), KINDS, [_flat(row) for row in rows])
-    page, parts = folder / "kinds.md", {"Any method": of_any_method(refusals), "Each method": rows}
-    text = "# Verdicts by kind of world\n"
+    page, text = folder / "kinds.md", "# Verdicts by kind of world\n"
+    parts = {"Any method": of_any_method(refusals)}
+    if first := first_of_ordinary(refusals):
+        parts["First right answers in worlds that do not repeat themselves"] = first
+    parts["Each method"] = rows
     for title, part in parts.items():
         shown = [{name: _told(value) for name, value in row.items()} for row in part]
         text += f"\n## {title}\n\n{to_markdown(pd.DataFrame(shown))}\n"

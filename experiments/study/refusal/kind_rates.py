@@ -16,7 +16,7 @@ from experiments.judge.criteria import (
     right_refined,
 )
 from experiments.study.refusal.cases import APART, COMMON
-from experiments.study.refusal.refusal_rates import Rate, without_common_ground
+from experiments.study.refusal.refusal_rates import Rate, ordinary, without_common_ground
 
 KEPT, AMBIGUOUS, TOO_UNCERTAIN, REFUSED = "accepted", "ambiguous", "too_uncertain", "refused"
 VERDICTS = (KEPT, AMBIGUOUS, TOO_UNCERTAIN, REFUSED)
@@ -75,6 +75,24 @@ def of_any_method(refusals: pd.DataFrame) -> list[dict[str, Any]]:
         found |= {f"right_{verdict}": right["verdict"] == verdict for verdict in VERDICTS}
         rows.append({"kind": str(kind)} | {name: Rate.of(hits) for name, hits in found.items()})
     return rows
+
+
+def first_of_ordinary(refusals: pd.DataFrame) -> list[dict[str, Any]]:
+    """A row for each method: when a run's first right answer is accepted, and by chance alone.
+
+    Medians over all runs of worlds that do not repeat themselves and come to common ground, as in
+    `by_kind`; `n_runs` of them.
+    """
+    rows = as_they_came(ordinary(refusals))
+    in_one_world = rows[rows["world_a"] == rows["world_b"]]
+    ground = has_common_ground(in_one_world).groupby([in_one_world[name] for name in _RUN])
+    in_reach = in_one_world[ground.transform("any")]
+    return [
+        {"aligner": name, "n_runs": own.groupby(_RUN).ngroups}
+        | _first(own, "accepted", "")
+        | _first(own, "beats_chance", "_by_chance")
+        for name, own in in_reach.groupby("aligner", sort=False)
+    ]
 
 
 def _by_any(rows: pd.DataFrame, column: str) -> pd.Series:

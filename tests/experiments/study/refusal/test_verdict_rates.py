@@ -11,7 +11,13 @@ import pytest
 from experiments.show.figures.drawing import save_figure
 from experiments.show.figures.verdict_figures import draw_kinds, draw_reliability, draw_roc
 from experiments.show.terminal.refusal_screen import print_kinds, print_reliability
-from experiments.study.refusal.kind_rates import by_kind, of_any_method, pooled, worst
+from experiments.study.refusal.kind_rates import (
+    by_kind,
+    first_of_ordinary,
+    of_any_method,
+    pooled,
+    worst,
+)
 from experiments.study.refusal.refusal_rates import Rate
 from experiments.study.refusal.refusal_trial import crossings_of
 from experiments.study.refusal.reliability import N_BINS, judged_answers, reliability
@@ -71,6 +77,21 @@ def test_what_any_method_does_counts_once_for_two_maps() -> None:
     (row,) = of_any_method(pd.concat([table(), other]))
     told = (row["false_runs"], row["false_pairs"], row["right_accepted"], row["right_refused"])
     assert told == (Rate(1, 2), Rate(2, 5), Rate(2, 6), Rate(3, 6))
+
+
+def test_first_answers_are_of_all_ordinary_worlds_with_common_ground() -> None:
+    """Accepted at 40, 40 and, of another kind, 20; what repeats or shares nothing is left out."""
+    ordinary = table().assign(repeats=False)
+    third = ordinary[ordinary["world_a"] == "k-1"].assign(kind="l", world_a="l-1", world_b="l-1")
+    third.loc[third["iteration"] >= 20, "status"] = "accepted"
+    third["accepted"] = third["status"] == "accepted"
+    apart = third.assign(kind="m", n_common=0)
+    given = [ordinary, third, apart, table("posters")]
+    (row,) = first_of_ordinary(pd.concat(given, ignore_index=True))
+    assert (row["aligner"], row["n_runs"]) == ("ransac", 3)
+    assert (row["first_iteration"], row["first_true_pairs"]) == (40, 40)
+    assert (row["first_iteration_by_chance"], row["first_true_pairs_by_chance"]) == (20, 4)
+    assert not first_of_ordinary(table())
 
 
 def test_a_run_that_never_comes_to_it_is_later_than_all_others() -> None:
