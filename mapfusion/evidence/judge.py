@@ -182,7 +182,10 @@ class PairJudge:
             return f"{{told}}, too few beside {_named(rival)}"
         if evidence.repeats(self._bound):
             return "{told}, too few for maps that hold things twice"
-        # nothing repeats and no other motion fits: here the region that led to it counts, too
+        # Nothing repeats and no other motion fits: what is likelier right than wrong by the other
+        # regions is enough, or by few and the one that led to it.
+        if ratio < 0:
+            return "{told}; beside the one that led to it they speak against it"
         few = regions.log10_ratio(evidence.shares) < math.log10(settings.least_ratio)
         if few and regions.n_confirmed <= 1 and extent_m < evidence.region_m:
             what = f"all that agrees lies within {evidence.region_m:.2g} m"

@@ -3,8 +3,8 @@
 Of the n landmarks of a region that are looked for, k are found. If the motion is right, k is
 beta-binomial: each region has a rate of its own, since light, slant and texture differ; it is high
 where landmarks must be seen and middling where they may be. If it is wrong, a region is either the
-twin of what is there (a poster, a room that repeats), and then no different, or what chance leaves.
-What another motion lays on its like is a twin much more often than the rest, and counts apart.
+twin of what is there (a poster, a room that repeats), and then no different, or the twin covers a
+part of it, any share as well as any other, or it is what chance leaves. What another motion lays on its like is a twin much more often than the rest, and counts apart.
 
 No motion is judged that nothing led to. A wrong one was found by a twin: that this region agrees is
 no evidence for it, and no sample of how often wrong motions lay regions on their like.
@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import betaln, logsumexp
 
-from mapfusion.evidence import fitted_rates
+from mapfusion.evidence import fitted_rates, fitted_twins
 from mapfusion.se2 import Float
 
 
@@ -34,6 +34,9 @@ class BetaRate(NamedTuple):
 Rates = tuple[BetaRate, BetaRate]  # of what must be seen and of what may be
 RIGHT: Rates = (BetaRate(*fitted_rates.RIGHT[0]), BetaRate(*fitted_rates.RIGHT[1]))
 WRONG: Rates = (BetaRate(*fitted_rates.WRONG[0]), BetaRate(*fitted_rates.WRONG[1]))
+# A twin that covers a part of a region, the edge of a poster or a wall on which it hangs elsewhere:
+# what is found of it is any share of what is looked for.
+PART: Rates = (BetaRate(1.0, 1.0), BetaRate(1.0, 1.0))
 # Regions of a right alignment that are as a wrong one's: a picture that was moved, light that
 # changed, a stretch in which one of the maps drifted. It bounds what one region can say against it.
 # Of simulated worlds, in which nothing moves, the fit says a tenth of this: it is of the world, no
@@ -80,7 +83,7 @@ def log10_ratio(k: np.ndarray, n: np.ndarray, shares: TwinShares) -> Float:
     """log10 (R,) of how much likelier each region is under a right motion than under a wrong one.
 
     Under a wrong one all of a region is its like, or what another motion, too, lays on its like, or
-    nothing of it.
+    nothing of it; of what is, `fitted_twins.WHOLE` is so throughout, the rest in part.
 
     Args:
         k: (R, 2, 2) landmarks that were found: OWN and COPIED, of those that must be seen
@@ -88,13 +91,20 @@ def log10_ratio(k: np.ndarray, n: np.ndarray, shares: TwinShares) -> Float:
         n: (R, 2, 2) landmarks that are looked for.
         shares: each above 0 and below 1.
     """
-    right, chance = log_likelihood(k, n, RIGHT), log_likelihood(k, n, WRONG)
+    right, part, chance = (log_likelihood(k, n, rates) for rates in (RIGHT, PART, WRONG))
     whole = right.sum(axis=1)
     own, copied = (np.log([share, 1 - share]) for share in shares)
-    copies = np.logaddexp(copied[0] + right[:, COPIED], copied[1] + chance[:, COPIED])
-    wrong = np.logaddexp(own[0] + whole, own[1] + chance[:, OWN] + copies)
+    copies = _twin(right[:, COPIED], part[:, COPIED])
+    copies = np.logaddexp(copied[0] + copies, copied[1] + chance[:, COPIED])
+    twins = _twin(whole, part.sum(axis=1))
+    wrong = np.logaddexp(own[0] + twins, own[1] + chance[:, OWN] + copies)
     changed = np.logaddexp(np.log1p(-CHANGED) + whole, np.log(CHANGED) + wrong)
     return (changed - wrong) / np.log(10.0)
+
+
+def _twin(whole: Float, part: Float) -> Float:
+    """Natural logarithm of the likelihood of twins, from those of whole ones and of parts."""
+    return np.logaddexp(np.log(fitted_twins.WHOLE) + whole, np.log1p(-fitted_twins.WHOLE) + part)
 
 
 def log10_beside_one(log10_ratios: Float) -> float:

@@ -65,14 +65,19 @@ class Regions:
     def _all(self) -> Float:
         return self._parts.sum(axis=1)
 
-    def seen_again(self, part: int) -> tuple[int, int]:
-        """Of a part (OWN, COPIED) of regions with enough of it, the confirmed, and all.
+    def beside_best(self, part: int) -> np.ndarray:
+        """Bool (R,): regions with enough of a part (OWN, COPIED), but for that which agrees best.
 
-        But for the region that agrees best, by which the motion was found.
+        By that one a motion was found.
         """
         enough = self.expected[:, part].sum(axis=1) >= LEAST_EXPECTED
         if len(self):
             enough[np.argmax(self._all)] = False
+        return enough
+
+    def seen_again(self, part: int) -> tuple[int, int]:
+        """Of a part (OWN, COPIED) of regions `beside_best`, the confirmed, and all."""
+        enough = self.beside_best(part)
         return int(np.sum(self._parts[enough, part] >= DECISIVE)), int(np.sum(enough))
 
     def log10_ratio(self, shares: TwinShares) -> float:
