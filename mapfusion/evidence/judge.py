@@ -182,9 +182,9 @@ class PairJudge:
             return f"{{told}}, too few beside {_named(rival)}"
         if evidence.repeats(self._bound):
             return "{told}, too few for maps that hold things twice"
-        # Nothing repeats and no other motion fits: what is likelier right than wrong by the other
-        # regions is enough, or by few and the one that led to it.
-        if ratio < 0:
+        # Nothing repeats and no other motion fits: a region that contradicts is enough to doubt
+        # what is not likelier right by all but the one that led to it; else that one counts, too.
+        if ratio < 0 and regions.n_contradicted:
             return "{told}; beside the one that led to it they speak against it"
         few = regions.log10_ratio(evidence.shares) < math.log10(settings.least_ratio)
         if few and regions.n_confirmed <= 1 and extent_m < evidence.region_m:

@@ -31,12 +31,19 @@ class BetaRate(NamedTuple):
         return self.seen / (self.seen + self.missed)
 
 
+    def in_part(self) -> "BetaRate":
+        """This rate times a share that is any between 0 and 1: the beta of that mean and spread."""
+        n = self.seen + self.missed
+        mean, square = self.mean / 2, self.mean * (self.seen + 1) / (n + 1) / 3
+        total = (mean - square) / (square - mean**2)
+        return BetaRate(mean * total, (1 - mean) * total)
+
+
 Rates = tuple[BetaRate, BetaRate]  # of what must be seen and of what may be
 RIGHT: Rates = (BetaRate(*fitted_rates.RIGHT[0]), BetaRate(*fitted_rates.RIGHT[1]))
 WRONG: Rates = (BetaRate(*fitted_rates.WRONG[0]), BetaRate(*fitted_rates.WRONG[1]))
-# A twin that covers a part of a region, the edge of a poster or a wall on which it hangs elsewhere:
-# what is found of it is any share of what is looked for.
-PART: Rates = (BetaRate(1.0, 1.0), BetaRate(1.0, 1.0))
+# Of a region of which a twin covers a part: the edge of a poster, a wall that hangs elsewhere.
+PART: Rates = (RIGHT[0].in_part(), RIGHT[1].in_part())
 # Regions of a right alignment that are as a wrong one's: a picture that was moved, light that
 # changed, a stretch in which one of the maps drifted. It bounds what one region can say against it.
 # Of simulated worlds, in which nothing moves, the fit says a tenth of this: it is of the world, no

@@ -2,12 +2,15 @@
 
 import numpy as np
 import pytest
-from scipy.stats import betabinom
+from scipy.stats import beta, betabinom
 
+from mapfusion.evidence.fitted_twins import WHOLE
 from mapfusion.evidence.likelihood import (
     CHANGED,
+    PART,
     RIGHT,
     WRONG,
+    BetaRate,
     TwinShares,
     log10_against_chance,
     log10_beside_one,
@@ -32,9 +35,11 @@ def test_it_is_the_ratio_of_the_two_mixtures(shares: TwinShares) -> None:
     rng = np.random.default_rng(0)
     n = rng.integers(0, 12, (300, 2, 2))
     k = rng.binomial(n, rng.random((300, 1, 1)))
-    right, chance = pmf(k, n, RIGHT), pmf(k, n, WRONG)
-    copies = shares.copied * right[:, 1] + (1 - shares.copied) * chance[:, 1]
-    wrong = shares.own * right[:, 0] * right[:, 1] + (1 - shares.own) * chance[:, 0] * copies
+    right, part, chance = pmf(k, n, RIGHT), pmf(k, n, PART), pmf(k, n, WRONG)
+    twins = WHOLE * right[:, 1] + (1 - WHOLE) * part[:, 1]
+    copies = shares.copied * twins + (1 - shares.copied) * chance[:, 1]
+    throughout = WHOLE * right.prod(axis=1) + (1 - WHOLE) * part.prod(axis=1)
+    wrong = shares.own * throughout + (1 - shares.own) * chance[:, 0] * copies
     expected = ((1 - CHANGED) * right[:, 0] * right[:, 1] + CHANGED * wrong) / wrong
     np.testing.assert_allclose(log10_ratio(k, n, shares), np.log10(expected), rtol=1e-9)
     against = np.log10(right / chance)
@@ -42,33 +47,60 @@ def test_it_is_the_ratio_of_the_two_mixtures(shares: TwinShares) -> None:
 
 
 def test_a_region_weighs_no_more_than_twins_and_changes_allow() -> None:
-    regions = must_own(np.array([0, 1000]), np.array([1000, 1000]))
-    against, confirms = log10_ratio(*regions, TwinShares(0.2, 0.5))
-    assert against == pytest.approx(np.log10(CHANGED), abs=0.01)
-    assert confirms == pytest.approx(np.log10(0.95 / 0.2 + 0.05), abs=0.01)
+    n = np.full(1001, 1000)
+    ratios = log10_ratio(*must_own(np.arange(1001), n), TwinShares(0.2, 0.5))
+    assert ratios[0] == pytest.approx(np.log10(CHANGED), abs=0.01)
+    assert ratios.max() < np.log10((1 - CHANGED) / (0.2 * WHOLE) + CHANGED)
+    assert ratios.max() > np.log10((1 - CHANGED) / 0.2 + CHANGED)
 
 
-def test_of_a_copy_that_is_found_nothing_is_learnt_but_of_what_surrounds_it() -> None:
+@pytest.mark.parametrize("rate", RIGHT)
+def test_a_rate_in_part_has_the_mean_and_spread_of_a_rate_times_any_share(rate: BetaRate) -> None:
+    rng = np.random.default_rng(0)
+    drawn = rng.beta(*rate, 200_000) * rng.random(200_000)
+    seen, missed = rate.in_part()
+    assert seen / (seen + missed) == pytest.approx(drawn.mean(), rel=0.01)
+    assert beta.std(seen, missed) == pytest.approx(drawn.std(), rel=0.01)
+
+
+def test_half_of_a_region_speaks_for_a_twin_in_part() -> None:
+    """What is found throughout is likelier of a right motion; half of it of the edge of a twin."""
+    found = np.array([170, 100])
+    throughout, half = log10_ratio(*must_own(found, np.full(2, 200)), TwinShares(0.2, 0.2))
+    assert throughout > 0.7
+    assert half < 0
+
+
+def test_of_a_copy_that_is_found_less_is_learnt_than_of_what_surrounds_it() -> None:
     """The same picture, its surroundings found, not looked for, and missing."""
     found, expected = np.zeros((3, 2, 2), np.int64), np.zeros((3, 2, 2), np.int64)
     found[:, 1, 0] = expected[:, 1, 0] = 20
     found[0, 0, 0], expected[[0, 2], 0, 0] = 12, 12
     around, alone, bare = log10_ratio(found, expected, TwinShares(0.02, 0.9))
     assert around > 1.2
-    assert 0 < alone < 0.06
+    assert 0 < alone < np.log10(1 / WHOLE)
     assert bare < -1
 
 
-def test_where_all_is_a_twin_nothing_is_said() -> None:
-    regions = must_own(np.arange(10), np.full(10, 10))
-    np.testing.assert_allclose(log10_ratio(*regions, TwinShares(1 - 1e-12, 0.5)), 0, atol=1e-6)
+def test_where_all_is_a_twin_only_that_it_is_one_throughout_speaks_for_a_motion() -> None:
+    k, n = np.arange(11), np.full(11, 10)
+    ratios = log10_ratio(*must_own(k, n), TwinShares(1 - 1e-12, 0.5))
+    of_right = betabinom.pmf(k, 10, *RIGHT[0])
+    expected = (1 - CHANGED) * of_right / of_twin(k, 10) + CHANGED
+    np.testing.assert_allclose(ratios, np.log10(expected), rtol=1e-6)
+    assert ratios.max() < np.log10(1 / WHOLE)
+
+
+def of_twin(k: np.ndarray, n: int) -> np.ndarray:
+    """The likelihood of k of n that must be seen where they are their like."""
+    return WHOLE * betabinom.pmf(k, n, *RIGHT[0]) + (1 - WHOLE) * betabinom.pmf(k, n, *PART[0])
 
 
 def test_the_ratio_s_mean_under_wrong_motions_is_one() -> None:
     """E[right / wrong] over the wrong model is 1, whatever the numbers: a likelihood ratio."""
     n, s = 12, 0.15
     k = np.arange(n + 1)
-    wrong = s * betabinom.pmf(k, n, *RIGHT[0]) + (1 - s) * betabinom.pmf(k, n, *WRONG[0])
+    wrong = s * of_twin(k, n) + (1 - s) * betabinom.pmf(k, n, *WRONG[0])
     ratio = 10 ** log10_ratio(*must_own(k, np.full(n + 1, n)), TwinShares(s, 0.5))
     assert wrong @ ratio == pytest.approx(1.0)
 
@@ -77,9 +109,8 @@ def test_beside_the_region_that_found_it_the_mean_is_one_too() -> None:
     """The wrong model is enumerated: of two regions either, at even odds, is as if right."""
     n, s = 7, 0.15
     k = np.arange(n + 1)
-    twin = betabinom.pmf(k, n, *RIGHT[0])
-    wrong = s * twin + (1 - s) * betabinom.pmf(k, n, *WRONG[0])
-    right = (1 - CHANGED) * twin + CHANGED * wrong
+    wrong = s * of_twin(k, n) + (1 - s) * betabinom.pmf(k, n, *WRONG[0])
+    right = (1 - CHANGED) * betabinom.pmf(k, n, *RIGHT[0]) + CHANGED * wrong
     found_by_one = (np.outer(right, wrong) + np.outer(wrong, right)) / 2
     by_region = log10_ratio(*must_own(k, np.full(n + 1, n)), TwinShares(s, 0.5))
     ratio = [

@@ -6,6 +6,7 @@ import pytest
 from mapfusion import se2
 from mapfusion.evidence.copies import BETWEEN, Copies
 from mapfusion.evidence.likelihood import COPIED, OWN, TwinShares, log10_ratio
+from mapfusion.evidence.fitted_twins import WHOLE
 from mapfusion.evidence.parameters import EvidenceParameters
 from mapfusion.evidence.regions import Regions, Squares, Witness, Witnesses
 from tests.mapfusion.evidence.two_rooms import Wall, between, mapped
@@ -72,7 +73,8 @@ def test_copies_are_counted_apart_and_say_little() -> None:
     assert not marked.expected[:, OWN].any()
     assert marked.seen_again(OWN) == (0, 0)
     assert marked.seen_again(COPIED) == plain.seen_again(OWN)
-    assert 0 < marked.log10_ratio(TwinShares(0.05, 0.9)) < 0.05 * len(marked)
+    assert 0 < marked.log10_ratio(TwinShares(0.05, 0.9)) < np.log10(1 / WHOLE) * len(marked)
+    assert marked.log10_ratio(TwinShares(0.05, 0.9)) < plain.log10_ratio(TwinShares(0.05, 0.9)) / 2
 
 
 @pytest.mark.parametrize("corner", [(0.0, 0.0), (0.7, -1.3), (1.0, 2.0)])
