@@ -30,7 +30,6 @@ class BetaRate(NamedTuple):
         """The mean rate."""
         return self.seen / (self.seen + self.missed)
 
-
     def in_part(self) -> "BetaRate":
         """This rate times a share that is any between 0 and 1: the beta of that mean and spread."""
         n = self.seen + self.missed

@@ -77,7 +77,7 @@ def fit(regions: Sequence[Regions]) -> Float:
 
 
 def _likelihoods(regions: Regions, part: int) -> Float:
-    """log (3, n) of each region's counts if it is a twin throughout, in part, not at all."""
+    """Log (3, n) of each region's counts if it is a twin throughout, in part, not at all."""
     rows = regions.beside_best(part)
     k, n = regions.found[rows, part], regions.expected[rows, part]
     return np.array([log_likelihood(k, n, rates) for rates in (RIGHT, PART, WRONG)])

@@ -93,12 +93,28 @@ def test_the_best_of_more_motions_needs_more_evidence(n_others: int, status: str
     assert ("too few beside" in answer.reason) == (status == "ambiguous")
 
 
-def test_a_picture_in_two_worlds_is_contradicted_by_all_around_it() -> None:
+def walls_with_one_picture(first_x: float, last_x: float) -> tuple[Wall, Wall]:
+    """Two walls that have nothing but a picture in common."""
     first, second = Wall(16, seed=1), Wall(16, seed=8)
-    inside = (first.p[:, 0] >= 6) & (first.p[:, 0] < 8)
-    hidden = (second.p[:, 0] >= 6) & (second.p[:, 0] < 8)
+    inside = (first.p[:, 0] >= first_x) & (first.p[:, 0] < last_x)
+    hidden = (second.p[:, 0] >= first_x) & (second.p[:, 0] < last_x)
     second.p = np.concatenate([second.p[~hidden], first.p[inside]])
     second.look = np.concatenate([second.look[~hidden], first.look[inside]])
+    return first, second
+
+
+def test_what_is_missing_makes_doubt_though_nothing_repeats() -> None:
+    """A picture larger than a region, one of which led to the motion; as much is missing."""
+    first, second = walls_with_one_picture(4, 8)
+    anyhow = Judge(evidence=EvidenceParameters(least_probability=0.0))
+    said, _ = verdict(mapped(first, 4, 12, seed=4), mapped(second, 4, 12, seed=5), anyhow)
+    assert said.status is Status.AMBIGUOUS
+    assert said.n_confirmed == said.n_contradicted == 2
+    assert "beside the one that led to it they speak against it" in said.reason
+
+
+def test_a_picture_in_two_worlds_is_contradicted_by_all_around_it() -> None:
+    first, second = walls_with_one_picture(6, 8)
     said, refined = verdict(mapped(first, 2, 12, seed=4), mapped(second, 2, 12, seed=5))
     assert refined.ok
     assert said.status is Status.REFUSED

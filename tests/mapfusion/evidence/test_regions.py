@@ -5,8 +5,8 @@ import pytest
 
 from mapfusion import se2
 from mapfusion.evidence.copies import BETWEEN, Copies
-from mapfusion.evidence.likelihood import COPIED, OWN, TwinShares, log10_ratio
 from mapfusion.evidence.fitted_twins import WHOLE
+from mapfusion.evidence.likelihood import COPIED, OWN, TwinShares, log10_ratio
 from mapfusion.evidence.parameters import EvidenceParameters
 from mapfusion.evidence.regions import Regions, Squares, Witness, Witnesses
 from tests.mapfusion.evidence.two_rooms import Wall, between, mapped
