@@ -4,7 +4,8 @@ Of the n landmarks of a region that are looked for, k are found. If the motion i
 beta-binomial: each region has a rate of its own, since light, slant and texture differ; it is high
 where landmarks must be seen and middling where they may be. If it is wrong, a region is either the
 twin of what is there (a poster, a room that repeats), and then no different, or the twin covers a
-part of it, any share as well as any other, or it is what chance leaves. What another motion lays on its like is a twin much more often than the rest, and counts apart.
+part of it, any share as likely as any other, or it is what chance leaves. What another motion lays
+on its like is a twin much more often than the rest, and counts apart.
 
 No motion is judged that nothing led to. A wrong one was found by a twin: that this region agrees is
 no evidence for it, and no sample of how often wrong motions lay regions on their like.
