@@ -60,7 +60,13 @@ def calibrated(
 def filter_settings(calibration: Calibration) -> dict[str, Any]:
     """The scenario's section for corrected logs: `slam.filter.motion`."""
     motion = {name: float(f"{value:.3g}") for name, value in asdict(calibration.motion).items()}
-    wanted = {*LEVELS, "scale_error", "track_error", "lateral_slip_m_per_rad"}
+    wanted = {
+        *LEVELS,
+        "scale_error",
+        "track_error",
+        "lateral_m_per_sqrt_m",
+        "lateral_slip_m_per_rad",
+    }
     return {"slam": {"filter": {"motion": {k: v for k, v in motion.items() if k in wanted}}}}
 
 

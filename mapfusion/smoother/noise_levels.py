@@ -51,8 +51,15 @@ def pooled(of_each: Sequence[Told]) -> Told:
 
 
 def plain(motion: MotionNoise) -> MotionNoise:
-    """The noise with random walks alone: systematic errors are estimated, not covered."""
-    return replace(motion, scale_error=0, track_error=0, lateral_slip_m_per_rad=0)
+    """Random walks alone, alike along and across: systematic errors are estimated, not covered."""
+    across = motion.translation_m_per_sqrt_m
+    return replace(
+        motion,
+        scale_error=0,
+        track_error=0,
+        lateral_m_per_sqrt_m=across,
+        lateral_slip_m_per_rad=0,
+    )
 
 
 def told(
@@ -89,7 +96,8 @@ def updated(motion: MotionNoise, of_all: Told) -> MotionNoise:
         before, ratio = getattr(motion, name), found / max(known, LEAST_TOLD)
         factor = np.sqrt(np.clip(ratio, 1 / _MOST_CHANGE, _MOST_CHANGE))
         levels[name] = max(float(before * factor), _LEAST_LEVEL) if known >= LEAST_TOLD else before
-    return replace(motion, **levels)
+    across = levels["translation_m_per_sqrt_m"]
+    return replace(motion, **levels, lateral_m_per_sqrt_m=across)
 
 
 def relative_errors(of_all: Told) -> Float:

@@ -28,7 +28,9 @@ VIEW_M = (0.5, 6.0)  # ahead, and no farther to the side than ahead
 SEEN_A_FRAME = 20
 SIGMA_M, LOOKS_SIGMA = 0.05, 0.03
 FRAME_S = 0.2
-MOTION = MotionNoise(0.002, 0.0002, 0.0005, 0, 0, lateral_slip_m_per_rad=0)
+MOTION = MotionNoise(
+    0.002, 0.0002, 0.0005, 0, 0, lateral_m_per_sqrt_m=0.002, lateral_slip_m_per_rad=0
+)
 ROW_STEPS = round(ROOM_M * ROOMS_A_ROW / STEP_M)
 AISLE_STEPS = round(ROOM_M / STEP_M)
 FRAMES_A_ROW = 2 * ROW_STEPS + AISLE_STEPS + 4 * TURN_STEPS

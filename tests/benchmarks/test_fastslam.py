@@ -29,7 +29,9 @@ ROAD_M = 6.0  # landmarks stand up to half of this to the left and to the right
 VIEW_M = 6.0
 STEP_M = 0.1
 LANDMARKS_PER_M = 40.0
-MOTION = MotionNoise(0.002, 0.0002, 0.0005, 0, 0, lateral_slip_m_per_rad=0)
+MOTION = MotionNoise(
+    0.002, 0.0002, 0.0005, 0, 0, lateral_m_per_sqrt_m=0.002, lateral_slip_m_per_rad=0
+)
 MEASURED_STEPS = 300
 LONG_DRIVE_FRAMES = os.environ.get("LONG_DRIVE_FRAMES", "5000")
 MIB = 2**20

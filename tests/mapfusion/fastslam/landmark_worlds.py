@@ -11,8 +11,10 @@ from mapfusion.robot_log import Observations
 from mapfusion.se2 import compose, inverse, transform_points
 
 SIGMA_M = 0.03
-EXACT_MOTION = MotionNoise(0, 0, 0, 0, 0, lateral_slip_m_per_rad=0)
-LOOSE_MOTION = MotionNoise(0.1, 0.05, 0.1, 0, 0, lateral_slip_m_per_rad=0.03)
+EXACT_MOTION = MotionNoise(0, 0, 0, 0, 0, lateral_m_per_sqrt_m=0, lateral_slip_m_per_rad=0)
+LOOSE_MOTION = MotionNoise(
+    0.1, 0.05, 0.1, 0, 0, lateral_m_per_sqrt_m=0.1, lateral_slip_m_per_rad=0.03
+)
 
 
 @dataclass

@@ -162,7 +162,7 @@ def blind_loop(seed: int, close_loops: bool) -> FastSlam:
     Its odometry has no error but what is drawn, which grows evenly and leaves the heading alone.
     """
     rng, n = np.random.default_rng(seed), 2 * SPACING
-    motion = MotionNoise(0.05, 0, 0, 0, 0, lateral_slip_m_per_rad=0)
+    motion = MotionNoise(0.05, 0, 0, 0, 0, lateral_m_per_sqrt_m=0.05, lateral_slip_m_per_rad=0)
     settings = parameters(
         n_particles=1,
         motion=motion,

@@ -101,6 +101,7 @@ def test_millimetres_give_the_same_weights(association, planar):
             small.motion.rotation_rad_per_sqrt_rad,
             0,
             0,
+            lateral_m_per_sqrt_m=small.motion.lateral_m_per_sqrt_m * np.sqrt(scale),
             lateral_slip_m_per_rad=scale * small.motion.lateral_slip_m_per_rad,
         ),
     )
@@ -143,7 +144,13 @@ def test_localises_better_than_odometry():
         sigma = np.array([0.02, 0.01, 0.03])
         world = drive(seed, n_frames=60, per_frame=6, odometry_sigma=tuple(sigma))
         motion = MotionNoise(
-            0.02 / np.sqrt(0.15), 0, 0.03 / np.sqrt(0.1), 0, 0, lateral_slip_m_per_rad=0
+            0.02 / np.sqrt(0.15),
+            0,
+            0.03 / np.sqrt(0.1),
+            0,
+            0,
+            lateral_m_per_sqrt_m=0.02 / np.sqrt(0.15),
+            lateral_slip_m_per_rad=0,
         )
         settings = parameters(n_particles=100, motion=motion)
         slam = FastSlam(settings, np.random.default_rng(seed))
@@ -220,7 +227,7 @@ def test_landmarks_that_no_particle_has_any_more_are_forgotten():
 def test_a_long_drive_keeps_each_particles_estimates_of_what_was_seen_lately_alone():
     """One new landmark a frame, each seen in four frames; lines meet within some 300 frames."""
     rng = np.random.default_rng(0)
-    motion = MotionNoise(0.02, 0, 0.01, 0, 0, lateral_slip_m_per_rad=0)
+    motion = MotionNoise(0.02, 0, 0.01, 0, 0, lateral_m_per_sqrt_m=0.02, lateral_slip_m_per_rad=0)
     slam = FastSlam(parameters(n_particles=5, motion=motion, association="gate"), rng)
     ahead, covariance = np.array([1.0, 2.0, 3.0, 4.0]), np.tile(1e-4 * np.eye(3), (4, 1, 1))
     n_rows = []

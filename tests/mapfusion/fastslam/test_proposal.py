@@ -16,7 +16,7 @@ from mapfusion.robot_log import Observations
 from mapfusion.se2 import compose, transform_points
 from tests.mapfusion.fastslam.landmark_worlds import drive, observe, unit
 
-MOTION = MotionNoise(0.1, 0.05, 0.1, 0, 0, lateral_slip_m_per_rad=0.03)
+MOTION = MotionNoise(0.1, 0.05, 0.1, 0, 0, lateral_m_per_sqrt_m=0.1, lateral_slip_m_per_rad=0.03)
 STEP = np.array([0.3, 0.0, 0.2])
 POINTS = np.array([[1.5, 0.8, 0.3], [2.0, -0.7, 0.6], [2.5, 0.2, 1.0], [1.2, -0.2, 0.1]])
 DESCRIPTOR = unit(np.random.default_rng(9).standard_normal((4, 64)))

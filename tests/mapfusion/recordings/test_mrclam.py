@@ -150,7 +150,9 @@ def test_the_filter_finds_the_landmarks(recording: Path, tmp_path: Path):
         n_particles=20,
         proposal=Proposal.MOTION,
         association="label",
-        motion=MotionNoise(0.005, 0, 0.005, 0, 0, lateral_slip_m_per_rad=0),
+        motion=MotionNoise(
+            0.005, 0, 0.005, 0, 0, lateral_m_per_sqrt_m=0.005, lateral_slip_m_per_rad=0
+        ),
     )
     frames = list(run_log(log, settings, np.random.default_rng(0), snapshots=[len(log) - 1]))
     landmarks = frames[-1].landmarks

@@ -45,6 +45,7 @@ FILTER = FastSlamParameters(
         rotation_rad_per_sqrt_rad=0.107,
         scale_error=0,
         track_error=0,
+        lateral_m_per_sqrt_m=0.0854,
         lateral_slip_m_per_rad=0,
     ),
 )

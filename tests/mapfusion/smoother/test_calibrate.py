@@ -26,7 +26,7 @@ from mapfusion.smoother.smooth import SmootherParameters
 from tests.mapfusion.smoother.white_noise_logs import dead_reckoned, white_noise_log
 
 TRUE = np.array([0.01, -0.12, 0.1, -0.04])
-NOISE = MotionNoise(0.04, 0.05, 0.08, 0, 0, lateral_slip_m_per_rad=0)
+NOISE = MotionNoise(0.04, 0.05, 0.08, 0, 0, lateral_m_per_sqrt_m=0.04, lateral_slip_m_per_rad=0)
 RANGE_M, OBSERVED_M = 6.0, 0.03
 
 
