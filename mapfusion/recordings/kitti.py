@@ -19,7 +19,7 @@ import numpy as np
 
 from mapfusion import se3
 from mapfusion.errors import InputError
-from mapfusion.recordings.lens import R_ROBOT_OPTICAL, Lens, StereoCalibration
+from mapfusion.recordings.lens import R_ROBOT_OPTICAL, Lens, StereoCalibration, require_rigid
 from mapfusion.recordings.mount import MountSettings, level_mount
 from mapfusion.recordings.numbered import numbered_shots
 from mapfusion.recordings.stereo_recording import ReadYaml, StereoRecording, paired
@@ -124,6 +124,12 @@ def _truth(path: Path, time_ns: np.ndarray, T_robot_left: Float) -> TimedPoses:
     if len(rows) != len(time_ns):
         raise InputError(f"{path}: has {len(rows)} poses for {len(time_ns)} times")
     P = np.array(rows).reshape(-1, 3, 4)
+    T = se3.pose(P[:, :, :3], P[:, :, 3])
+    for number, each in enumerate(T, start=1):
+        try:
+            require_rigid("[R t]", each)
+        except InputError as error:
+            raise InputError(f"{path}, pose {number}: {error}") from error
     axes = se3.pose(R_ROBOT_OPTICAL, np.zeros(3))
-    T_first_left = axes @ se3.pose(P[:, :, :3], P[:, :, 3]) @ se3.inverse(axes)
+    T_first_left = axes @ T @ se3.inverse(axes)
     return TimedPoses(time_ns, T_robot_left @ T_first_left @ se3.inverse(T_robot_left))

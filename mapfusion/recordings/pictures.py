@@ -10,6 +10,7 @@ import numpy as np
 from mapfusion.errors import InputError
 
 _BITS = 8
+_SILENT = 0  # OpenCV's level of logging
 _SAMPLED = 8  # pictures whose brightest level tells how many of 16 bits a camera uses
 
 Load = Callable[[], np.ndarray]
@@ -28,12 +29,21 @@ class PictureFile:
         except OSError as error:
             reason = error.strerror or error
             raise InputError(f"{self.path}: cannot be read ({reason})") from error
-        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
+        image = _decoded(data) if len(data) else None
         if image is None:
             raise InputError(f"{self.path}: damaged or no picture")
         if image.dtype not in (np.uint8, np.uint16):
             raise InputError(f"{self.path}: holds {image.dtype}, expected 8 or 16 bits a channel")
         return image
+
+
+def _decoded(data: np.ndarray) -> np.ndarray | None:
+    """None where it is no picture, of which OpenCV would say so on the terminal, too."""
+    before = cv2.utils.logging.setLogLevel(_SILENT)
+    try:
+        return cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+    finally:
+        cv2.utils.logging.setLogLevel(before)
 
 
 def grey(image: np.ndarray) -> np.ndarray:

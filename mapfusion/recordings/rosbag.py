@@ -74,7 +74,9 @@ class _Message:
                 try:
                     return picture(message)
                 except InputError as error:
-                    raise InputError(f"{self.bag.path}: {self.topic}: {error}") from error
+                    raise InputError(
+                        f"{self.bag.path}: {self.topic} at {self.stamp_ns} ns: {error}"
+                    ) from error
         raise InputError(f"{self.bag.path}: {self.topic}: the picture of {self.stamp_ns} is gone")
 
 

@@ -24,11 +24,12 @@ from mapfusion.robot_log import TRUTH_FILES, RobotLog, write_log, write_truth_po
 from mapfusion.se2 import Float
 from mapfusion.vision.frontend import FrontEnd, FrontEndParameters
 from mapfusion.vision.observing import joined
-from mapfusion.vision.row_errors import row_errors
+from mapfusion.vision.row_errors import offsets
 
 # Windows of the row search are 17 px: what lies a row off is found there still, two rows cost
 # half of the matches.
 _MOST_ROWS_OFF = 1.0
+_MOST_COLUMNS_AHEAD = 2.0  # what is far has no disparity, but for what calibration leaves open
 _RUN = 8  # pairs that follow one another, on which tracks are tried
 _LEAST_MATCHES = 20  # corners whose median row error is worth a refusal
 _LONGEST_ODOMETRY_GAP_S = 1.0  # over which a trajectory is interpolated: wheels report often
@@ -124,20 +125,28 @@ class StereoImport:
 
     def rectified(self, k: int) -> tuple[np.ndarray, np.ndarray]:
         """The pair k of the recording, rectified; raises InputError."""
+        raw = self._recording.pair(k)
         try:
-            return self._rectification.apply(self._recording.pair(k))
+            return self._rectification.apply(raw)
         except InputError as error:
             raise InputError(f"{self._recording.name}, pair {k}: {error}") from error
 
     def _require_rows(
         self, pairs: Sequence[tuple[np.ndarray, np.ndarray]], vision: FrontEndParameters
     ) -> None:
-        off = np.concatenate([row_errors(*pair, vision.harris) for pair in pairs])
-        rows = float(np.median(np.abs(off))) if len(off) >= _LEAST_MATCHES else 0.0
+        off = np.concatenate([offsets(*pair, vision.harris) for pair in pairs])
+        if len(off) < _LEAST_MATCHES:
+            return
+        rows = float(np.median(np.abs(off[:, 1])))
         if rows > _MOST_ROWS_OFF:
             found = f"points lie {rows:.1f} rows apart in the two images (median of {len(off)})"
             remedy = "the pair is not rectified, or its calibration is another's"
             raise InputError(f"{self._recording.name}: {found}; {remedy}")
+        columns = float(np.median(off[:, 0]))
+        if columns > _MOST_COLUMNS_AHEAD:
+            found = f"points lie {columns:.1f} px farther right in the right image than in the left"
+            remedy = "are the cameras the other way round?"
+            raise InputError(f"{self._recording.name}: {found} (median of {len(off)}); {remedy}")
 
     def log_of(
         self, cut: Cut, on_progress: OnProgress = lambda *_: None, level: Level = "auto"

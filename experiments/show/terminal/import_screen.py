@@ -28,6 +28,13 @@ def print_imported(recordings: Sequence[ImportedRecording], folders: Sequence[Pa
     print_lines(one.about for one in recordings)
     note = "median over the frames; linked: share of the features of the frame before"
     print_table(_COLUMNS, [_row(log) for one in recordings for log in one.robots], "", note)
+    print_lines(
+        f"  {log.robot}: {log.guessed} motions were guessed, its map may break there; "
+        "odometry of the wheels would tell them"
+        for one in recordings
+        for log in one.robots
+        if log.guessed
+    )
     dropped = [text for one in recordings for text in one.dropped]
     print_lines(f"  dropped: {each}" for each in dropped[:_MOST_DROPPED])
     if len(dropped) > _MOST_DROPPED:

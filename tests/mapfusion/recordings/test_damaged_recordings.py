@@ -39,6 +39,11 @@ def _edit(path: Path, old: str, new: str) -> None:
     path.write_text(text.replace(old, new))
 
 
+def _swap(folder: Path) -> None:
+    for old, new in (("left", "other"), ("right", "left"), ("other", "right")):
+        (folder / old).rename(folder / new)
+
+
 # Layout, what is done to its folder, and what must be said of it.
 DAMAGE: dict[str, tuple[str, Callable[[Path], Any], str]] = {
     "no times": ("kitti", lambda f: (f / "times.txt").unlink(), "times.txt: no such file"),
@@ -59,6 +64,17 @@ DAMAGE: dict[str, tuple[str, Callable[[Path], Any], str]] = {
         "kitti",
         lambda f: (f.parents[1] / "poses/07.txt").write_text(ONE_POSE),
         "has 1 poses for 5",
+    ),
+    "no rotations": (
+        "kitti",
+        lambda f: (f.parents[1] / "poses/07.txt").write_text(ONE_POSE * 4 + "0 " * 12),
+        r"07.txt, pose 5: \[R t\]: is no rotation",
+    ),
+    "the other way round": ("images", lambda f: _swap(f), "other way round"),
+    "microseconds": (
+        "kitti",
+        lambda f: (f / "times.txt").write_text("0\n.0001\n.0002\n.0004\n.0005\n"),
+        "100000 ns apart .*another unit",
     ),
     "truncated": (
         "kitti",
