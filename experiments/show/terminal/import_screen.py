@@ -29,7 +29,7 @@ def print_imported(recordings: Sequence[ImportedRecording], folders: Sequence[Pa
     note = "median over the frames; linked: share of the features of the frame before"
     print_table(_COLUMNS, [_row(log) for one in recordings for log in one.robots], "", note)
     print_lines(
-        f"  {log.robot}: {log.guessed} motions were guessed, its map may break there; "
+        f"  {log.log.robot}: guessed motions: {log.guessed}, its map may break there; "
         "odometry of the wheels would tell them"
         for one in recordings
         for log in one.robots

@@ -163,3 +163,15 @@ def test_a_calibration_that_is_none_is_one_line(
     (tmp_path / "calibration.yaml").write_text(text)
     reply = command(capsys, "import", "images", tmp_path, "-o", tmp_path / "logs")
     assert_refused(reply, "calibration.yaml", words)
+
+
+def test_a_robot_that_drove_blind_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The camera looks at nothing from the second frame on: what it does there no link tells."""
+    pairs = drive()
+    blind = [pairs[0], *((0 * left, 0 * right) for left, right in pairs[1:])]
+    folder, own = write_kitti(tmp_path, blind), ("--odometry", "images")
+    reply = command(capsys, "import", "kitti", folder, "-o", tmp_path / "o", *own)
+    assert reply.code == 1
+    assert f"07: guessed motions: {len(pairs) - 1}, its map may break there" in reply.out
