@@ -8,6 +8,7 @@ normal variables z do to all of them: x_i = m_i + C_i' z + e_i, with e_i of cova
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from mapfusion.arguments import require_finite, require_shape
 from mapfusion.se2 import Float
@@ -88,7 +89,21 @@ def condensed(own_m2: Float, common: Float, rank: int = RANK) -> JointCovariance
     return JointCovariance(own_m2 + whole - part, by_landmark)
 
 
+@njit(cache=True)
 def _squares(common: Float, n: int) -> Float:
     """(N, 3, 3) covariance that common (R, 3N) gives each landmark."""
-    blocks = common.reshape(len(common), n, 3)
-    return np.einsum("rni,rnj->nij", blocks, blocks)
+    total = np.zeros((n, 3, 3))
+    for r in range(len(common)):
+        row = common[r]
+        for k in range(n):
+            x, y, z = row[3 * k], row[3 * k + 1], row[3 * k + 2]
+            own = total[k]
+            own[0, 0] += x * x
+            own[1, 0] += y * x
+            own[1, 1] += y * y
+            own[2, 0] += z * x
+            own[2, 1] += z * y
+            own[2, 2] += z * z
+    for own in total:
+        own[0, 1], own[0, 2], own[1, 2] = own[1, 0], own[2, 0], own[2, 1]
+    return total

@@ -81,7 +81,7 @@ def common_part(seen: Sightings, equations: NormalEquations, solution: Solution)
         return _beside_own(solution)
     coupling = without_offsets(seen, equations).coupling @ solution.own_m2[seen.landmark]
     n, n_landmarks = len(solution.factor), seen.n_landmarks
-    common = np.zeros((n // 3, 3, n_landmarks, 3))
+    common = np.zeros((n, 3 * n_landmarks))
     place = seen.pose_place[seen.frame] - 1
     unknown = np.where(seen.frame > 0, place, n // 3 - 1)
     first_seen = np.minimum.reduceat(unknown, seen.starts[:-1])
@@ -89,16 +89,45 @@ def common_part(seen: Sightings, equations: NormalEquations, solution: Solution)
     for at in range(0, n_landmarks, _AT_ONCE):
         some = order[at : at + _AT_ONCE]
         first = first_seen[some].min()  # poses before those that saw these landmarks have no part
-        column = np.full(n_landmarks, -1)
-        column[some] = np.arange(len(some))
-        rows = np.flatnonzero((column[seen.landmark] >= 0) & (seen.frame > 0))
-        wide = np.zeros((n // 3 - first, len(some), 3, 3))
-        np.add.at(wide, (place[rows] - first, column[seen.landmark[rows]]), coupling[rows])
-        right = wide.transpose(0, 2, 1, 3).reshape(n - 3 * first, -1)
+        right = np.zeros((n - 3 * first, 3 * len(some)))
+        _put_couplings(some, seen.starts, seen.frame, place - first, coupling, right)
         below = solution.factor[3 * first :, 3 * first :]
-        solved = solve_in_envelope(below, entries_seen(below), right)
-        common[first:, :, some] = solved.reshape(-1, 3, len(some), 3)
-    return common.reshape(n, -1)
+        _put_columns(
+            solve_in_envelope(below, entries_seen(below), right), some, common[3 * first :]
+        )
+    return common
+
+
+@njit(cache=True)
+def _put_couplings(
+    some: np.ndarray,
+    starts: np.ndarray,
+    frame: np.ndarray,
+    place: np.ndarray,
+    coupling: Float,
+    right: Float,
+) -> None:
+    """Add up what `some` landmarks have to do with poses: each three columns of `right`.
+
+    A landmark's observations are those from one of `starts` to the next, of a pose at three rows
+    from 3 `place` on; the first pose is no unknown.
+    """
+    for j in range(len(some)):
+        for i in range(starts[some[j]], starts[some[j] + 1]):
+            if frame[i] == 0:
+                continue
+            for r in range(3):
+                for q in range(3):
+                    right[3 * place[i] + r, 3 * j + q] += coupling[i, r, q]
+
+
+@njit(cache=True)
+def _put_columns(solved: Float, some: np.ndarray, common: Float) -> None:
+    """The three columns of each of `some` landmarks to where they are in `common`."""
+    for r in range(len(solved)):
+        for j in range(len(some)):
+            for q in range(3):
+                common[r, 3 * some[j] + q] = solved[r, 3 * j + q]
 
 
 def pose_covariances(

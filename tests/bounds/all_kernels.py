@@ -50,6 +50,9 @@ from tests.mapfusion.fastslam.test_tracked import test_each_track_s_end_widens_i
 from tests.mapfusion.smoother.test_calibrate import test_the_posterior_equals_dense_algebra
 from tests.mapfusion.smoother.test_smooth import smoothed
 from tests.mapfusion.smoother.white_noise_logs import white_noise_log, with_tracks
+from tests.mapfusion.test_joint_covariance import (
+    test_all_directions_kept_are_the_dense_covariance,
+)
 from tests.mapfusion.vision.rendered_scene import render, wall
 
 
@@ -73,6 +76,7 @@ def smoothers() -> None:
         smoothed(with_tracks(white_noise_log(rng, n_frames, n_landmarks, planar), rng, 0.05).log)
     for n_frames, n_landmarks in ((30, 12), (15, 60)):
         test_the_posterior_equals_dense_algebra(n_frames, n_landmarks)
+    test_all_directions_kept_are_the_dense_covariance()
 
 
 def alignments() -> None:
