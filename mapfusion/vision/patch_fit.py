@@ -95,6 +95,7 @@ def _residuals(window: Float, after: Float, warp: Float, bend: Float, moment: Fl
     Negative where the window leaves the patch.
     """
     half, middle = WINDOW_HALF_PX, after.shape[0] // 2
+    at_u, at_v = np.empty(2 * half + 1), np.empty(2 * half + 1)
     least = 1.0 - (abs(bend[0]) + abs(bend[1])) * half
     if not least > _LEAST_SCALE:
         return -1.0
@@ -103,14 +104,20 @@ def _residuals(window: Float, after: Float, warp: Float, bend: Float, moment: Fl
         if not reach + 1 <= middle:
             return -1.0
     square = m0 = m1 = m2 = m3 = m4 = m5 = m6 = m7 = 0.0
+    h_u, h_v = bend[0], bend[1]
+    uu, uv, u_0 = warp[0, 0], warp[0, 1], warp[0, 2]
+    vu, vv, v_0 = warp[1, 0], warp[1, 1], warp[1, 2]
     for y in range(-half, half + 1):
+        # where the row lies, apart from what is read there: several divisions at once
+        for k in range(2 * half + 1):
+            x = k - half
+            scale = 1.0 / (1.0 + h_u * x + h_v * y)
+            at_u[k] = middle + u_0 + scale * (uu * x + uv * y)
+            at_v[k] = middle + v_0 + scale * (vu * x + vv * y)
         for x in range(-half, half + 1):
-            scale = 1.0 / (1.0 + bend[0] * x + bend[1] * y)
-            u = middle + warp[0, 2] + scale * (warp[0, 0] * x + warp[0, 1] * y)
-            v = middle + warp[1, 2] + scale * (warp[1, 0] * x + warp[1, 1] * y)
             pixel = window[y + half, x + half]
             level, gu, gv = pixel[0], pixel[1], pixel[2]
-            residual = grey(after, u, v) - level
+            residual = grey(after, at_u[x + half], at_v[x + half]) - level
             weighted = WEIGHT[y + half, x + half] * residual
             square += weighted * residual
             m0, m1 = m0 + weighted * gu, m1 + weighted * gv
