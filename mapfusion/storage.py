@@ -141,7 +141,7 @@ def write_table(
     buffer = pa.BufferOutputStream()
     # measured values and pixels hardly repeat: a dictionary of them takes as long as all the rest
     repeats = [field.name for field in table_schema if not _is_measured(field.type)]
-    # what packs them a sixth smaller takes thrice as long to pack and to unpack
+    # what packs them smaller takes far longer to pack and to unpack
     options = {"compression": "lz4", "use_dictionary": repeats}
     pq.write_table(table, buffer, **options, write_page_checksum=True)
     write_sealed(path, parquet_with_seal(buffer.getvalue().to_pybytes()))
