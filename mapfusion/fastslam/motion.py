@@ -35,7 +35,8 @@ class MotionNoise:
         lateral_m_per_sqrt_m: random walk across the motion. Wheels do not roll sideways: a P3-AT's
             is 0.002 where it drives straight on a dry floor; the default leaves room for others.
         lateral_slip_m_per_rad: sideways motion in a turn that the wheels do not count. A P3-AT that
-            stops to turn slides by 0.008 on average and 0.025 at most, one that turns while it still rolls by 0.15.
+            stops to turn slides by 0.008 on average and 0.025 at most, one that turns while it
+            still rolls by 0.15.
         floor_m: added to x and y in every step, whatever the motion.
         floor_rad: added to the heading in every step, whatever the motion.
     """
