@@ -19,9 +19,7 @@ _MAX_RATIO = 0.8  # of the nearest descriptor's distance over the second's (Lowe
 def offsets(left: np.ndarray, right: np.ndarray, parameters: HarrisParameters) -> Float:
     """Columns and rows (N, 2) by which matched corners lie farther right and lower on the right.
 
-    Images are (H, W) uint8.
-
-    One false match in several is to be expected: use the median.
+    Images are (H, W) uint8. One false match in several is to be expected: use the median.
     """
     corners = [detect(image, parameters) for image in (left, right)]
     if min(map(len, corners)) < 2:
