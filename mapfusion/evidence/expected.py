@@ -10,7 +10,9 @@ from mapfusion.align.closest import Grid, runs_about
 from mapfusion.se2 import Float
 from mapfusion.viewing import Viewing
 
-LEAST_FRAMES = 3  # in which it lay in view: tracks become landmarks after as many sightings
+# In which it lay in view: a track is observed from its third frame on, and after three observations
+# its landmark is in the map (the defaults of `TrackParameters.min_length` and `min_count`).
+LEAST_FRAMES = 5
 # How a landmark that another robot saw lay in view of this one: not at all; from another distance
 # or side, from where some are found again (U-SURF's window follows the depth, but the window of one
 # picture holds other things at another distance, and the slant changes it); from about where it was
