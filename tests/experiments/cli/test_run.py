@@ -290,8 +290,8 @@ def test_run_shows_the_aligners(
     assert resolved["slam"]["filter"]["n_particles"] == 30
 
 
-# in six frames robots see less than a room, one piece of wall
-SMALL = ["align.evidence.place_m=0", "align.evidence.region_m=0.5"]
+# in six frames robots see less than a room, one piece of wall, and nothing that must be seen again
+SMALL = [f"align.evidence.{each}" for each in ("place_m=0", "region_m=0.5", "least_probability=0")]
 
 
 @pytest.mark.usefixtures("quick_save")
