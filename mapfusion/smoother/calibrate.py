@@ -26,17 +26,26 @@ from mapfusion.smoother.noise_levels import (
     told,
     updated,
 )
-from mapfusion.smoother.normal_equations import Estimate, odometry_information
-from mapfusion.smoother.odometry_error import OdometryError, sensitivity
-from mapfusion.smoother.residuals import first_points
-from mapfusion.smoother.settle import Problem, settled
+from mapfusion.smoother.normal_equations import (
+    Estimate,
+    disturbances,
+    odometry_information,
+)
+from mapfusion.smoother.odometry_error import N_CONSTANTS, OdometryError, sensitivity
+from mapfusion.smoother.residuals import first_points, squared_distances
+from mapfusion.smoother.settle import Problem, Settled, settled
 from mapfusion.smoother.sightings import Sightings, sightings_of
 from mapfusion.smoother.smooth import SmootherParameters
+from mapfusion.smoother.student import fitted_dof, student_deviance
 
 # What is known of any odometry before: standard deviations of its constants. They hold those that
 # a log says nothing about, as of a robot that never turns, and weigh nothing beside one that does.
 # Wheels are measured to a hundredth; ranges with lasting errors would claim more than that.
-_PRIOR = np.array([0.01, 0.5, 0.5, 0.3])
+_PRIOR = np.array([0.01, 0.5, 0.5, 0.3, 0.5])
+# A robot that spins while it sees nothing may have made a turn more or less than it is taken to
+# have made, and what in_place goes with that is a maximum of the likelihood of its own. So a path
+# is looked for from each of these, and within this deviation of it; the likeliest goes on.
+_IN_PLACE_STARTS, _IN_PLACE_SIGMA = (0.0, 0.4, -0.4), 0.2
 # Where smoothing starts: noise that most wheels stay below.
 _FIRST = MotionNoise(0.05, 0.1, 0.3, 0, 0, lateral_slip_m_per_rad=0)
 _CLOSE = 1e-5  # squared sigmas a coordinate that the next step of a round would move the path by
@@ -57,7 +66,7 @@ class RobotCalibration:
     Attributes:
         robot: its name.
         error: its constant errors.
-        standard_errors: (4,) theirs.
+        standard_errors: (5,) theirs.
         path: (T, 3) smoothed with them.
     """
 
@@ -97,6 +106,16 @@ class _Robot:
     path: Float
     constants: Float
     covariance: Float
+    likeliest: Float  # (5,) constants before anything is seen
+    prior: Float  # (5,) standard deviations of these
+    deviance: float = np.inf  # twice the negative log likelihood that the last round began with
+
+    @classmethod
+    def of(cls, log: RobotLog, seen: Sightings, stray_information: float, path: Float) -> "_Robot":
+        """With nothing known of the odometry but what is known of any."""
+        nothing = np.zeros(N_CONSTANTS)
+        covariance = np.diag(_PRIOR**2)
+        return cls(log, seen, stray_information, path, nothing, covariance, nothing, _PRIOR)
 
     def round(self, motion: MotionNoise) -> tuple[Told, float]:
         """Smooth, step the constants: what is told of the noise, and the step in sigmas."""
@@ -106,12 +125,13 @@ class _Robot:
         points = first_points(self.seen, self.path)
         start = Estimate(self.path, points, np.zeros((len(self.seen.strays), 3)))
         end = settled(problem, start, _CLOSE)
-        self.path = end.estimate.path
+        self.path, self.deviance = end.estimate.path, _deviance(problem, end)
         by_constants = sensitivity(self.log.odometry)[1:]
         posterior = motion_posterior(end, odometry, information, by_constants)
-        known = posterior.constants_information + np.diag(_PRIOR**-2)
+        known = posterior.constants_information + np.diag(self.prior**-2)
         self.covariance = np.asarray(np.linalg.inv(known), np.float64)
-        step = self.covariance @ (posterior.constants_gradient - self.constants / _PRIOR**2)
+        expected = (self.likeliest - self.constants) / self.prior**2
+        step = self.covariance @ (posterior.constants_gradient + expected)
         self.constants = self.constants + step
         return told(posterior, odometry, information, motion), float(np.sqrt(step @ known @ step))
 
@@ -169,6 +189,14 @@ def _change(before: MotionNoise, after: MotionNoise) -> float:
     return max(abs(getattr(after, name) / getattr(before, name) - 1) for name in LEVELS)
 
 
+def _deviance(problem: Problem, end: Settled) -> float:
+    """Of what was smoothed: of the odometry, and of the observations with the tails they have."""
+    walked = disturbances(end.estimate.path, problem.odometry)
+    squares, n = squared_distances(problem.seen, end.estimate), problem.seen.n_dimensions
+    seen = student_deviance(squares, fitted_dof(squares, n), n)
+    return seen + float(np.sum(problem.information * walked**2))
+
+
 def _begun(
     log: RobotLog,
     landmark: np.ndarray,
@@ -181,16 +209,26 @@ def _begun(
     if path is not None:
         require_shape("path", path, (len(log), 3))
         seen = sightings_of(log, landmark, parameters.min_count, stray=stray > 0)
-        return _checked(_Robot(log, seen, stray, path, np.zeros(4), np.diag(_PRIOR**2)))
-    observed = np.unique(log.iteration)
-    grown = _Robot(
-        log,
-        sightings_of(log, landmark, 1, stray=False),
-        stray,
-        IDENTITY[None],
-        np.zeros(4),
-        np.diag(_PRIOR**2),
-    )
+        return _checked(_Robot.of(log, seen, stray, path))
+    found = [_grown(log, landmark, parameters, motion, in_place) for in_place in _IN_PLACE_STARTS]
+    likeliest = min(found, key=lambda robot: robot.deviance)
+    likeliest.likeliest, likeliest.prior = np.zeros(N_CONSTANTS), _PRIOR
+    return likeliest
+
+
+def _grown(
+    log: RobotLog,
+    landmark: np.ndarray,
+    parameters: SmootherParameters,
+    motion: MotionNoise,
+    in_place: float,
+) -> _Robot:
+    """With a path that was found by smoothing more and more of the log."""
+    observed, stray = np.unique(log.iteration), parameters.stray_information
+    grown = _Robot.of(log, sightings_of(log, landmark, 1, stray=False), stray, IDENTITY[None])
+    grown.likeliest = OdometryError(in_place=in_place).constants
+    grown.prior = OdometryError(*_PRIOR[:-1], in_place=_IN_PLACE_SIGMA).constants
+    grown.constants = grown.likeliest
     n_seen = _FIRST_FRAMES
     while True:
         whole = n_seen >= len(observed)

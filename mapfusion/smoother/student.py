@@ -37,6 +37,13 @@ def student_cost(squares: Float, dof: float, n_dimensions: Float | int) -> float
     return float(np.sum((dof + n_dimensions) * np.log1p(squares / dof)))
 
 
+def student_deviance(squares: Float, dof: float, n_dimensions: Float | int) -> float:
+    """Twice the negative log likelihood, up to a constant."""
+    n = np.broadcast_to(np.asarray(n_dimensions, dtype=np.float64), len(squares))
+    normal = gammaln((dof + n) / 2) - gammaln(dof / 2) - n / 2 * np.log(dof)
+    return student_cost(squares, dof, n) - 2 * float(np.sum(normal))
+
+
 def student_bound(probability: float, dof: float, n_dimensions: int) -> float:
     """The squared Mahalanobis distance that errors stay below with this probability.
 
@@ -47,11 +54,9 @@ def student_bound(probability: float, dof: float, n_dimensions: int) -> float:
 
 def fitted_dof(squares: Float, n_dimensions: Float | int) -> float:
     """The degrees of freedom under which these squared distances (N,) are most likely."""
-    n = np.broadcast_to(np.asarray(n_dimensions, dtype=np.float64), len(squares))
-
-    def cost(log_dof: float) -> float:
-        dof = float(np.exp(log_dof))
-        normal = gammaln((dof + n) / 2) - gammaln(dof / 2) - n / 2 * log_dof
-        return student_cost(squares, dof, n) - 2 * float(np.sum(normal))
-
-    return float(np.exp(fminbound(cost, np.log(LEAST_DOF), np.log(MOST_DOF))))
+    log_dof = fminbound(
+        lambda log_dof: student_deviance(squares, float(np.exp(log_dof)), n_dimensions),
+        np.log(LEAST_DOF),
+        np.log(MOST_DOF),
+    )
+    return float(np.exp(log_dof))

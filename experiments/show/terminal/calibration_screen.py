@@ -13,9 +13,9 @@ from experiments.show.terminal.layout import columns, print_frame, print_lines
 from mapfusion.smoother.calibrate import Calibration
 from mapfusion.smoother.noise_levels import LEVELS
 
-_CONSTANTS = ("distance", "turn", "late_turn", "bias_rad_per_m")
-_TITLES = ("distance\n%", "turn\n%", "late turn\n%", "bias\nmrad/m")
-_UNITS = (100.0, 100.0, 100.0, 1000.0)
+_CONSTANTS = ("distance", "turn", "late_turn", "bias_rad_per_m", "in_place")
+_TITLES = ("distance\n%", "turn\n%", "late turn\n%", "bias\nmrad/m", "in place\n%")
+_UNITS = (100.0, 100.0, 100.0, 1000.0, 100.0)
 _SHOWN = columns("", robot="robot") | columns(">", **dict(zip(_CONSTANTS, _TITLES, strict=True)))
 
 
@@ -56,7 +56,8 @@ def print_calibration(calibration: Calibration, written: Sequence[Path]) -> None
         pd.DataFrame(rows),
         _SHOWN,
         "What the odometry has to be corrected by",
-        "late turn: share of the turn before that is only made now",
+        "late turn: share of the turn before that is only made now; in place: turns on the spot,\n"
+        "beside those while driving",
     )
     if not calibration.settled:
         n_rounds = calibration.n_rounds
