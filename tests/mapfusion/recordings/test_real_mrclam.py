@@ -38,14 +38,14 @@ FILTER = FastSlamParameters(
     n_particles=100,
     association=Association.LABEL,
     gate_probability=0.9999,
-    noise_floor_m=0.15,
+    noise_floor_m=0.2,
     motion=MotionNoise(
-        translation_m_per_sqrt_m=0.0854,
-        rotation_rad_per_sqrt_m=0.027,
+        translation_m_per_sqrt_m=0.0856,
+        rotation_rad_per_sqrt_m=0.0264,
         rotation_rad_per_sqrt_rad=0.107,
         scale_error=0,
         track_error=0,
-        lateral_m_per_sqrt_m=0.0854,
+        lateral_m_per_sqrt_m=0.0856,
         lateral_slip_m_per_rad=0,
     ),
 )
