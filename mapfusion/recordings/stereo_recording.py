@@ -20,8 +20,9 @@ ReadYaml = Callable[[Path], Mapping[str, Any]]
 # Pictures of one pair: at 1 rad/s and a focal length of 500 px, 2 ms are a pixel.
 MOST_APART_NS = 2_000_000
 # Between two pictures of one camera (median): none takes a thousand a second, so a shorter time is
-# one in another unit.
-_LEAST_STEP_NS = 1_000_000
+# one in another unit. With less than one in ten seconds nothing is seen twice by a robot that moves;
+# milliseconds that are taken for seconds are 30 of these apart and more.
+_LEAST_STEP_NS, _MOST_STEP_NS = 1_000_000, 10_000_000_000
 
 
 @dataclass(frozen=True)
@@ -87,12 +88,15 @@ def paired(
         Times (T,) of the left ones, the pairs, and what was dropped, and why.
 
     Raises:
-        InputError: there are no two pairs, or the times are too near to be a camera's.
+        InputError: there are no two pairs, or the times are too near to be a camera's, or too far
+            apart.
     """
     left_ns, right_ns = (np.array([shot.time_ns for shot in s], np.int64) for s in (left, right))
     step_ns = float(np.median(np.diff(left_ns))) if len(left) > 1 else _LEAST_STEP_NS
-    if step_ns < _LEAST_STEP_NS:
-        raise InputError(f"pictures are {step_ns:g} ns apart (median); are times in another unit?")
+    if not _LEAST_STEP_NS <= step_ns <= _MOST_STEP_NS:
+        raise InputError(
+            f"pictures are {step_ns / 1e9:g} s apart (median); are times in another unit?"
+        )
     partner, back = _nearest(left_ns, right_ns), _nearest(right_ns, left_ns)
     both = [
         (i, j)

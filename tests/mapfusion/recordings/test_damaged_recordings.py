@@ -74,7 +74,12 @@ DAMAGE: dict[str, tuple[str, Callable[[Path], Any], str]] = {
     "microseconds": (
         "kitti",
         lambda f: (f / "times.txt").write_text("0\n.0001\n.0002\n.0004\n.0005\n"),
-        "100000 ns apart .*another unit",
+        "0.0001 s apart .*another unit",
+    ),
+    "milliseconds": (
+        "kitti",
+        lambda f: (f / "times.txt").write_text("0\n100\n200\n301\n400\n"),
+        "100 s apart .*another unit",
     ),
     "truncated": (
         "kitti",
