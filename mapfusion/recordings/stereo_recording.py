@@ -20,8 +20,8 @@ ReadYaml = Callable[[Path], Mapping[str, Any]]
 # Pictures of one pair: at 1 rad/s and a focal length of 500 px, 2 ms are a pixel.
 MOST_APART_NS = 2_000_000
 # Between two pictures of one camera (median): none takes a thousand a second, so a shorter time is
-# one in another unit. With less than one in ten seconds nothing is seen twice by a robot that moves;
-# milliseconds that are taken for seconds are 30 of these apart and more.
+# one in another unit. With less than one in ten seconds a robot that moves sees nothing twice;
+# milliseconds that are taken for seconds are 30 s apart and more.
 _LEAST_STEP_NS, _MOST_STEP_NS = 1_000_000, 10_000_000_000
 
 
