@@ -3,7 +3,8 @@
 Whoever calibrates a pair of cameras and measures its mount errs once, and every observation is off
 by the same. No residual within one map shows it: a map turned about its beginning, or larger by a
 share, fits itself as well. Between the maps of two robots it does: T_a_b and what is fused by it
-are no surer than the cameras are. Simulated cameras are known exactly.
+are no surer than the cameras are. Robots whose cameras were calibrated alike err alike, and no
+number of them averages it out. Simulated cameras are known exactly.
 """
 
 import math
@@ -27,6 +28,8 @@ _MOUNT_RAD = 0.002  # of the camera's heading on its robot: what measuring a mou
 # correcting the calibration bias").
 _SCALE = 0.003
 _ATTRIBUTES = {"heading_rad": "calibration_heading_rad", "scale": "calibration_scale"}
+N_OF_CAMERA = len(_ATTRIBUTES)  # independent errors of a camera
+_CAMERA_ATTRIBUTE = "calibration_camera"
 
 
 @dataclass(frozen=True)
@@ -37,10 +40,13 @@ class CalibrationError:
         heading_rad: of the camera's heading in the robot's frame: its mount, and the middle of its
             image.
         scale: of all lengths, as a share: focal length and baseline.
+        camera: whose errors they are: robots that name the same one err alike. Empty: the robot's
+            own.
     """
 
     heading_rad: Annotated[float, Range(0, 1, "rad")] = 0.0
     scale: Annotated[float, Range(0, 1, "1")] = 0.0
+    camera: str = ""
 
     def __post_init__(self) -> None:
         require_in_range(self)
@@ -48,16 +54,20 @@ class CalibrationError:
     @property
     def is_none(self) -> bool:
         """Whether the camera is known exactly."""
-        return self == EXACT
+        return self.heading_rad == 0 and self.scale == 0
+
+    def is_of_one_camera(self, other: "CalibrationError") -> bool:
+        """Whether the other robot's errors are the same."""
+        return self.camera != "" and self.camera == other.camera
 
     def moves_m(self, position_m: Float) -> Float:
-        """How far one sigma of each error moves points (N, 3) of the robot's map: (N, 2, 3).
+        """How far one sigma of each error moves points (N, 2 or 3) of the robot's map: (N, 2, 3).
 
         In the plane: the map turns about its beginning, and grows. Heights are of the order of the
         camera's own, and roll and pitch are in the observations' covariances.
         """
         x, y = position_m[:, 0], position_m[:, 1]
-        moved = np.zeros((len(position_m), 2, 3))
+        moved = np.zeros((len(position_m), N_OF_CAMERA, 3))
         moved[:, 0, 0], moved[:, 0, 1] = -self.heading_rad * y, self.heading_rad * x
         moved[:, 1, 0], moved[:, 1, 1] = self.scale * x, self.scale * y
         return moved
@@ -66,7 +76,8 @@ class CalibrationError:
         """As files have it in their metadata; nothing of a camera that is known exactly."""
         if self.is_none:
             return {}
-        return {key: repr(float(getattr(self, name))) for name, key in _ATTRIBUTES.items()}
+        told = {key: repr(float(getattr(self, name))) for name, key in _ATTRIBUTES.items()}
+        return told | ({_CAMERA_ATTRIBUTE: self.camera} if self.camera else {})
 
 
 EXACT = CalibrationError()
@@ -76,7 +87,7 @@ def calibration_from(attributes: Mapping[str, str], where: object) -> Calibratio
     """What a file's metadata tell, EXACT where they tell nothing; raises InputError."""
     try:
         told = {name: float(attributes.get(key, "0")) for name, key in _ATTRIBUTES.items()}
-        return CalibrationError(**told)
+        return CalibrationError(**told, camera=attributes.get(_CAMERA_ATTRIBUTE, ""))
     except ValueError as error:
         keys = " and ".join(_ATTRIBUTES.values())
         raise InputError(f"{where}: {keys} in its metadata: {error}") from error

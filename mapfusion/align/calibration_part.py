@@ -12,7 +12,7 @@ def calibration_part(T_a_b: Float, pairs: Pairs, drift_sigma_m: float) -> Float:
 
     To first order: an error that moves all points of a map at once moves the least squares of
     residuals p_a - T p_b, weighed by (S_a + R S_b R^T + s_drift^2 I)^-1, by the sum of their gains.
-    Each robot has a camera of its own, so the errors of two maps are independent.
+    The errors of two maps are independent, unless both are of one camera.
 
     Args:
         T_a_b: (3,) the motion.
@@ -30,6 +30,8 @@ def calibration_part(T_a_b: Float, pairs: Pairs, drift_sigma_m: float) -> Float:
     by_a, by_b = (
         own.moves_m(p)[:, :, :2] for own, p in zip(of_maps, (pairs.p_a, pairs.p_b), strict=True)
     )
-    moved = np.concatenate([by_a, by_b @ rotation(T_a_b[2]).T], axis=1)
+    by_b = -by_b @ rotation(T_a_b[2]).T
+    alike = of_maps[0].is_of_one_camera(of_maps[1])
+    moved = by_a + by_b if alike else np.concatenate([by_a, by_b], axis=1)
     by = np.einsum("nij,nkj->ik", gain, moved)
     return by @ by.T

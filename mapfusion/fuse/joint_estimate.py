@@ -23,9 +23,10 @@ import scipy.linalg
 
 from mapfusion.align.rigid import motion_jacobian
 from mapfusion.aligned_landmarks import ABSENT
+from mapfusion.calibration_error import EXACT, N_OF_CAMERA, CalibrationError
 from mapfusion.joint_covariance import JointCovariance
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.se2 import Float, rotation_about_z, transform_points, wrap
+from mapfusion.se2 import Float, inverse, rotation_about_z, transform_points, wrap
 from mapfusion.smoother.student import MOST_DOF, fitted_dof, information_share, student_weights
 
 # The next step would move what is sought, as a whole and in squared sigmas, by no more than this.
@@ -39,20 +40,26 @@ class JointMap:
 
     Attributes:
         position_m: (N, D); D is 2 for planar maps.
-        joint: of the positions, in three dimensions.
+        joint: of the positions, in three dimensions, but for the calibration.
+        calibration: what its camera leaves open: two shared variables more, the last ones, unless
+            it is known exactly. Maps of one camera have them in common.
     """
 
     position_m: Float
     joint: JointCovariance
+    calibration: CalibrationError = EXACT
 
     def __len__(self) -> int:
         return len(self.position_m)
 
+    @property
+    def n_shared(self) -> int:
+        """R."""
+        return self.joint.rank + (0 if self.calibration.is_none else N_OF_CAMERA)
+
     @classmethod
     def of(cls, landmarks: LandmarkMap, own_sigma_m: float, n_dimensions: int) -> "JointMap":
-        """With what its camera's calibration leaves open among the shared errors.
-
-        A map without a joint covariance has no others, but more of its landmarks' own.
+        """A map without a joint covariance shares none, but has more of its landmarks' own.
 
         Args:
             landmarks: the map.
@@ -64,10 +71,7 @@ class JointMap:
             own = landmarks.covariance_m2.copy()
             own[:, [0, 1], [0, 1]] += own_sigma_m**2
             joint = JointCovariance(own, np.zeros((len(landmarks), 0, 3)))
-        if not landmarks.calibration.is_none:
-            moved = landmarks.calibration.moves_m(landmarks.position_m)
-            joint = JointCovariance(joint.own_m2, np.concatenate([joint.common_m, moved], axis=1))
-        return cls(landmarks.position_m[:, :n_dimensions], joint)
+        return cls(landmarks.position_m[:, :n_dimensions], joint, landmarks.calibration)
 
 
 class Said(NamedTuple):
@@ -113,18 +117,22 @@ class JointEstimate:
 
     def said(self, maps: Sequence[JointMap], k: int, rows: np.ndarray) -> Said:
         """What map k says of its landmarks `rows` (n,)."""
-        said = _said(maps[k], rows, self.T_first_map[k], self.shared[k])
-        return said._replace(by_unknown=_placed(said.by_unknown, _columns(maps, k), self._size))
+        arm = maps[k].position_m[rows]
+        said = _said(maps[k], rows, self.T_first_map[k], self.shared[k], arm)
+        return said._replace(by_unknown=_placed(said.by_unknown, _columns(maps)[k], self._size))
 
     @property
     def _size(self) -> int:
         return len(self.covariance)
 
 
-def _said(own_map: JointMap, rows: np.ndarray, T: Float, shared: Float) -> Said:
-    """The same with dy / d(T, z_k) alone."""
+def _said(own_map: JointMap, rows: np.ndarray, T: Float, shared: Float, arm_m: Float) -> Said:
+    """The same with dy / d(T, z_k) alone; the camera's errors move points at `arm_m` (n, D)."""
     n_dimensions = own_map.position_m.shape[1]
     common = own_map.joint.common_m[rows][:, :, :n_dimensions]
+    if not own_map.calibration.is_none:
+        moved = own_map.calibration.moves_m(arm_m)[:, :, :n_dimensions]
+        common = np.concatenate([common, moved], axis=1)
     R = rotation_about_z(T[2])[:n_dimensions, :n_dimensions]
     point = own_map.position_m[rows] + np.einsum("nri,r->ni", common, shared)
     by = np.zeros((len(rows), n_dimensions, 3 + len(shared)))
@@ -134,12 +142,19 @@ def _said(own_map: JointMap, rows: np.ndarray, T: Float, shared: Float) -> Said:
     return Said(transform_points(T, point), own, by)
 
 
-def _columns(maps: Sequence[JointMap], k: int) -> np.ndarray:
-    """Where in u motion and shared variables of map k stand; the first map's motion nowhere."""
-    ranks = [each.joint.rank for each in maps]
-    first = 3 * (len(maps) - 1) + sum(ranks[:k])
-    motion = np.arange(3 * k - 3, 3 * k) if k else np.full(3, ABSENT)
-    return np.concatenate([motion, np.arange(first, first + ranks[k])])
+def _columns(maps: Sequence[JointMap]) -> list[np.ndarray]:
+    """Where in u motion and shared variables of each map stand; the first map's motion nowhere."""
+    first, of_camera, found = 3 * (len(maps) - 1), dict[str, np.ndarray](), list[np.ndarray]()
+    for k, own in enumerate(maps):
+        motion = np.arange(3 * k - 3, 3 * k) if k else np.full(3, ABSENT)
+        name = "" if own.calibration.is_none else own.calibration.camera
+        known = of_camera.get(name, np.empty(0, np.int64))
+        shared = np.arange(first, first + own.n_shared - len(known))
+        first += len(shared)
+        found.append(np.concatenate([motion, shared, known]))
+        if name:
+            of_camera[name] = found[-1][-N_OF_CAMERA:]
+    return found
 
 
 def _placed(by: Float, columns: np.ndarray, n_unknowns: int) -> Float:
@@ -160,12 +175,13 @@ def estimate_jointly(
         parents: (C, K) rows of the maps that are one point, ABSENT for none; points of one map
             alone say nothing here.
     """
-    T, shared = np.array(T_first_map), [np.zeros(each.joint.rank) for each in maps]
-    columns = [_columns(maps, k) for k in range(len(maps))]
+    T, shared = np.array(T_first_map), [np.zeros(each.n_shared) for each in maps]
+    columns = _columns(maps)
     has = parents != ABSENT
+    rows = [parents[has[:, k], k] for k in range(len(maps))]
     weight, dof, n_steps = has.astype(np.float64), MOST_DOF, 0
     while True:
-        said = [_said(maps[k], parents[has[:, k], k], T[k], shared[k]) for k in range(len(maps))]
+        said = _all_said(maps, rows, T, shared, has, weight)
         points = _points(said, has, weight)
         A, gradient = _equations(said, has, weight, points, columns, shared)
         factor = scipy.linalg.cholesky(A, lower=True)
@@ -181,8 +197,30 @@ def estimate_jointly(
             if k:
                 T[k] += step[own[:3]]
         T[:, 2] = wrap(T[:, 2])
-        weight, dof = _reweighted(maps, T, shared, parents, weight)
+        weight, dof = _reweighted(_all_said(maps, rows, T, shared, has, weight), has, weight)
         n_steps += 1
+
+
+def _all_said(
+    maps: Sequence[JointMap],
+    rows: Sequence[np.ndarray],
+    T: Float,
+    shared: Sequence[Float],
+    has: np.ndarray,
+    weight: Float,
+) -> list[Said]:
+    """What each map says of its `rows`.
+
+    Errors of cameras move points from where all maps together see them. Moved from where the one
+    map does, they would move its noise too, and all maps shrink, since that shrinks residuals.
+    """
+    places = [own.position_m[its] for own, its in zip(maps, rows, strict=True)]
+    said = list(map(_said, maps, rows, T, shared, places))
+    if all(own.calibration.is_none for own in maps):
+        return said
+    g = _points(said, has, weight).g_m
+    arms = [transform_points(inverse(T[k]), g[has[:, k]]) for k in range(len(maps))]
+    return list(map(_said, maps, rows, T, shared, arms))
 
 
 class _Points(NamedTuple):
@@ -236,27 +274,21 @@ def _equations(
             A[np.ix_(columns[k], columns[m])] += block
             if m != k:
                 A[np.ix_(columns[m], columns[k])] += block.T
-        z = columns[k][3:]
-        A[z, z] += 1.0
-        gradient[z] += shared[k]
-    return A[:-1, :-1], gradient[:-1]
+    z = np.unique(np.concatenate([own[3:] for own in columns]))
+    A[z, z] += 1.0
+    value = np.zeros_like(gradient)
+    for own, its in zip(columns, shared, strict=True):
+        value[own[3:]] = its
+    return A[:-1, :-1], (gradient + value)[:-1]
 
 
-def _reweighted(
-    maps: Sequence[JointMap],
-    T: Float,
-    shared: Sequence[Float],
-    parents: np.ndarray,
-    weight: Float,
-) -> tuple[Float, float]:
+def _reweighted(said: Sequence[Said], has: np.ndarray, weight: Float) -> tuple[Float, float]:
     """Weights (C, K) of the Student-t, and its degrees of freedom, for what is off now.
 
     The squares are those expected about the true points (the E step of Lange et al., 1989).
     """
-    has, new = parents != ABSENT, np.zeros_like(weight)
-    said = [_said(maps[k], parents[has[:, k], k], T[k], shared[k]) for k in range(len(maps))]
-    points = _points(said, has, weight)
-    n_dimensions = maps[0].position_m.shape[1]
+    new, points = np.zeros_like(weight), _points(said, has, weight)
+    n_dimensions = points.g_m.shape[1]
     dof = fitted_dof(_disagreement(said, has), n_dimensions * (np.count_nonzero(has, axis=1) - 1))
     for k, own in enumerate(said):
         off = own.y_m - points.g_m[has[:, k]]

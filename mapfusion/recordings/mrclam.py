@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mapfusion.calibration_error import CalibrationError
 from mapfusion.errors import InputError
 from mapfusion.robot_log import (
     TRUTH_FILES,
@@ -34,6 +35,8 @@ from mapfusion.se2 import Float, between, compose, rotation, wrap
 
 _LAST_ROBOT_SUBJECT = 5
 _LARGEST = 1e12  # any number: times since 1970 are 1e9 s
+_CAMERA = "MRCLAM"  # one make of robot and camera, calibrated once, before one print of barcodes
+_MAY_BE_NONE = ("range_sigma_ratio", "range_scale_sigma")
 _MOST_FRAMES = 1_000_000  # eleven days of one a second
 
 
@@ -52,6 +55,9 @@ class MrclamSettings:
         range_sigma_ratio: the part that grows with the range: it is measured by the size of the
             barcode in the picture, which shrinks.
         bearing_sigma_rad: standard deviation of a bearing.
+        range_scale_sigma: of what all ranges of all robots are off by alike, as a share: a
+            barcode's edges that are found half a pixel outside it make fifty pixels fifty-one.
+            Odometry does not tell, since its own scale is taken from the ranges.
         longest_truth_gap_s: the truth is interpolated over gaps up to this, unknown in longer ones.
     """
 
@@ -59,11 +65,12 @@ class MrclamSettings:
     range_sigma_m: float = 0.15
     range_sigma_ratio: float = 0.08
     bearing_sigma_rad: float = 0.05
+    range_scale_sigma: float = 0.01
     longest_truth_gap_s: float = 0.1
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            positive = value > 0 or (value == 0 and name == "range_sigma_ratio")
+            positive = value > 0 or (value == 0 and name in _MAY_BE_NONE)
             if not (np.isfinite(value) and positive):
                 raise ValueError(f"{name}: is {value}, must be finite and positive")
 
@@ -142,6 +149,7 @@ def _log(
         odometry=increments,
         iteration=frame,
         observations=Observations(position, covariance, label=sighted[:, 1].astype(np.int32)),
+        calibration=CalibrationError(scale=settings.range_scale_sigma, camera=_CAMERA),
     )
 
 

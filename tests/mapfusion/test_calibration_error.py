@@ -16,6 +16,7 @@ from mapfusion.robot_log import Observations, RobotLog, read_log, write_log
 from tests.mapfusion.align.map_pairs import landmarks
 
 LEFT_OPEN = CalibrationError(0.00123456789, 0.003)
+OF_ONE_CAMERA = CalibrationError(0.0, 0.01, camera="left and right of June")
 POINTS = np.random.default_rng(0).uniform(-20, 20, (9, 3))
 
 
@@ -32,7 +33,7 @@ def a_log(calibration: CalibrationError) -> RobotLog:
     return RobotLog("R1", False, np.zeros(1), np.zeros((1, 3)), np.zeros(9, int), seen, calibration)
 
 
-@pytest.mark.parametrize("calibration", [EXACT, LEFT_OPEN])
+@pytest.mark.parametrize("calibration", [EXACT, LEFT_OPEN, OF_ONE_CAMERA])
 def test_logs_and_maps_keep_it(tmp_path: Path, calibration: CalibrationError) -> None:
     write_log(tmp_path / "R1", a_log(calibration))
     assert read_log(tmp_path / "R1").calibration == calibration

@@ -72,6 +72,7 @@ def test_of_several_recordings_none_is_written_where_one_is_refused(
         ((), lambda usual: usual.scale > 0 and usual.heading_rad > 0.002),
         (("heading_rad=0.01",), lambda own: own.heading_rad == 0.01 and own.scale > 0),
         (("heading_rad=0", "scale=0"), lambda own: own.is_none),
+        (("camera=both robots'",), lambda own: own.camera == "both robots'" and own.scale > 0),
     ],
 )
 def test_what_calibration_leaves_open_goes_with_the_log(

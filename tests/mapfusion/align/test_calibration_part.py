@@ -44,18 +44,21 @@ def spoiled(landmarks: LandmarkMap, row: int, by: CalibrationError, share: float
     return replace(landmarks, position_m=moved)
 
 
-def test_equals_solving_again_with_spoiled_maps(pair: MapPair) -> None:
+@pytest.mark.parametrize("camera", ["", "one"])
+def test_equals_solving_again_with_spoiled_maps(pair: MapPair, camera: str) -> None:
     """Each error a hundredth of its sigma; the refinement knows nothing of them."""
     share, columns = 0.01, []
+    of_both = {"map_a": replace(OF_A, camera=camera), "map_b": replace(OF_B, camera=camera)}
+    together = [["map_a", "map_b"]] if camera else [["map_a"], ["map_b"]]
     for row in (0, 1):
-        for name, by in (("map_a", OF_A), ("map_b", OF_B)):
-            there, back = (
-                refined(replace(pair, **{name: spoiled(getattr(pair, name), row, by, s)})).T_a_b
-                for s in (share, -share)
-            )
-            columns.append((there - back) / (2 * share))
+        for names in together:
+            ends = []
+            for s in (share, -share):
+                parts = {n: spoiled(getattr(pair, n), row, of_both[n], s) for n in names}
+                ends.append(refined(replace(pair, **parts)).T_a_b)
+            columns.append((ends[0] - ends[1]) / (2 * share))
     by = np.array(columns).T
-    before, after = refined(pair), refined(with_errors(pair, OF_A, OF_B))
+    before, after = refined(pair), refined(with_errors(pair, *of_both.values()))
     added = after.covariance - before.covariance
     sigma = np.sqrt(np.diag(by @ by.T))
     # which pairs are true, and s_drift, are judged anew by whoever solves again

@@ -9,11 +9,13 @@ from scipy.stats import chi2
 
 from mapfusion import se2
 from mapfusion.aligned_landmarks import ABSENT
+from mapfusion.calibration_error import CalibrationError
 from mapfusion.fuse.joint import JointFuser
 from mapfusion.fuse.joint_estimate import JointMap, estimate_jointly
 from mapfusion.fuse.kalman_drift import KalmanDrift
 from mapfusion.fuse.parameters import MergeParameters
 from mapfusion.fused_map import FusedMap
+from mapfusion.landmark_map import LandmarkMap
 from mapfusion.merge import merge
 from mapfusion.smoother.student import information_share
 from tests.mapfusion.fuse.drawn_maps import BENT_M, DrawnTeam
@@ -112,6 +114,53 @@ def test_errors_obey_the_joint_covariance() -> None:
     assert 0.93 < np.mean(inside) < 0.98
     low, high = chi2.ppf([1e-3, 1 - 1e-3], 3 * len(motions)) / (3 * len(motions))
     assert low < np.mean(motions) / 3 < high
+
+
+LEFT_OPEN = CalibrationError(0.002, 0.005)
+
+
+def _through_cameras(team: DrawnTeam, seed: int, camera: str) -> list[LandmarkMap]:
+    """The maps, moved by drawn errors of cameras; with a name all have the same."""
+    rng = np.random.default_rng(seed)
+    z = rng.normal(size=(len(team.maps), 2))
+    z = z[[0] * len(z)] if camera else z
+    moved = [
+        own.position_m + np.einsum("r,nri->ni", its, LEFT_OPEN.moves_m(team.truth(k)))
+        for k, (own, its) in enumerate(zip(team.maps, z, strict=True))
+    ]
+    known = replace(LEFT_OPEN, camera=camera)
+    return [
+        replace(own, position_m=p, calibration=known)
+        for own, p in zip(team.maps, moved, strict=True)
+    ]
+
+
+@pytest.mark.parametrize("camera", ["", "one"])
+def test_errors_obey_what_cameras_leave_open(camera: str) -> None:
+    squares = []
+    for seed in range(30):
+        team = DrawnTeam(OPPOSITE, seed)
+        maps = _through_cameras(team, seed, camera)
+        fused = merge(maps, team.pairs, MergeParameters(), JointFuser()).fused[0]
+        e = _errors(team, fused)
+        known = np.isfinite(e).all(axis=1)
+        joint = fused.landmarks[known].joint
+        assert joint is not None
+        off = e[known].ravel()
+        squares.append(off @ np.linalg.solve(joint.dense_m2(), off) / known.sum() / 3)
+    assert 0.9 < np.mean(squares) < 1.1
+
+
+@pytest.mark.parametrize("camera", ["", "one"])
+def test_noise_does_not_shrink_maps_whose_scale_is_open(camera: str) -> None:
+    """Residuals of smaller maps are smaller: the mean of all scales, which nothing tells, stays."""
+    team = DrawnTeam([slice(0, 300), slice(0, 300)], 0)
+    known = CalibrationError(scale=0.01, camera=camera)
+    maps = [JointMap.of(replace(own, calibration=known), 0.0, 3) for own in team.maps]
+    start = np.array([np.zeros(3), se2.between(*team.T_world_map)])
+    found = estimate_jointly(maps, start, np.tile(np.arange(300)[:, None], 2))
+    scales = np.array([z[-1] for z in found.shared])
+    assert abs(scales.mean()) < 0.3  # sigmas; the noise of 600 points would have them at -8
 
 
 def test_landmarks_that_one_robot_alone_has_seen_are_straightened_too() -> None:

@@ -132,6 +132,15 @@ def test_covariance_is_the_spread_of_the_noise(recording: Path, tmp_path: Path):
         assert np.all(covariance[2] == 0)
 
 
+def test_all_ranges_of_all_robots_may_be_off_alike(recording: Path, tmp_path: Path):
+    logs = import_mrclam(recording, tmp_path / "usual")
+    first, second = (read_log(path).calibration for path in logs[:2])
+    assert first.scale == MrclamSettings().range_scale_sigma > 0
+    assert first.is_of_one_camera(second)
+    known = import_mrclam(recording, tmp_path / "known", MrclamSettings(range_scale_sigma=0))
+    assert read_log(known[0]).calibration.is_none
+
+
 def test_truth_does_not_reach_the_log(recording: Path, tmp_path: Path):
     first = read_log(import_mrclam(recording, tmp_path / "a")[0])
     truth = recording / "Robot1_Groundtruth.dat"
