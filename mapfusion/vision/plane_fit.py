@@ -8,11 +8,10 @@ from numba import njit
 
 from mapfusion.symmetric import cholesky, solve_lower, solve_upper
 
-_MAX_STEPS = 8
-_CONVERGED_PX = 0.005  # far below what noise lets one measure
+_MAX_STEPS = 20  # a few on rich texture; where it is poor, slopes take long
+_CONVERGED_PX = 0.005  # anywhere in the window; far below what noise lets one measure
 # Noise adds half its variance to the mean square of slopes, which promise that much more than they
-# keep: the variance grows by the square (errors in variables, Fuller 1987, section 1.1). So much of
-# it is taken for texture at least.
+# keep (errors in variables, Fuller 1987, section 1.1). So much of it is taken for texture at least.
 _LEAST_TEXTURE = 0.25
 _SINGULAR = 1e-9  # pivot, as a share of its diagonal element, that is rounding error
 
@@ -97,12 +96,13 @@ def _fit_plane(
     """Move `plane` (3,) to the least squares and return the variance at the offset.
 
     Gauss-Newton steps after Lucas and Kanade (1981). The derivatives are those of the left image,
-    so the normal matrix is built once (inverse composition, Baker and Matthews 2004).
+    so the normal matrix is built once (inverse composition, Baker and Matthews 2004). What noise
+    adds to it shortens the steps, most where texture is poor, and moves nothing of where they end.
     """
     u, v = pixel[0], pixel[1]
     count = (2 * half + 1) ** 2
-    normal, factor, row = np.zeros((4, 4)), np.empty((4, 4)), np.empty(4)
-    _normal_matrix(left, u, v, half, normal)
+    seen, factor = np.zeros((4, 4)), np.empty((4, 4))
+    _normal_matrix(left, u, v, half, seen)
     step = np.empty(4)
     variance_grey = 2 * noise**2
     for _ in range(_MAX_STEPS):
@@ -114,7 +114,7 @@ def _fit_plane(
             return np.nan
         square = _residuals(left, right, u, v, half, plane, step)
         prior = variance_grey / slope_sigma**2
-        factor[:] = normal
+        factor[:] = seen
         factor[2, 2] += prior
         factor[3, 3] += prior
         step[2] -= prior * plane[1]
@@ -126,17 +126,51 @@ def _fit_plane(
         solve_upper(factor, step)
         plane += step[1:]
         variance_grey = max(square - count * step[0] ** 2, 0.0) / (count - 4)
-        if abs(step[1]) < _CONVERGED_PX:
+        if abs(step[1]) + half * (abs(step[2]) + abs(step[3])) < _CONVERGED_PX:
             break
-    row[0], row[1], row[2], row[3] = 0.0, 1.0, offset[0], offset[1]
-    step[:] = row
+    prior = variance_grey / slope_sigma**2
+    _without_noise(seen, half, noise, factor)
+    for i in range(1, 4):  # the moments' covariance
+        seen[i, i] = (seen[i, i] + factor[i, i]) / 2
+    factor[2, 2] += prior
+    factor[3, 3] += prior
+    if not cholesky(factor, _SINGULAR):
+        plane[:] = np.nan
+        return np.nan
+    step[0], step[1], step[2], step[3] = 0.0, 1.0, offset[0], offset[1]
     solve_lower(factor, step)
     solve_upper(factor, step)
-    kept = max(1 - count * noise**2 / 2 / normal[1, 1], _LEAST_TEXTURE)
-    variance = _counted(variance_grey, noise, alike_px) / kept**2 * np.dot(row, step)
+    variance = _counted(variance_grey, noise, alike_px) * _square(seen, prior, step)
     if row_sigma > 0:
         variance += (row_sigma * _by_row(left, u, v, half, step)) ** 2
     return variance
+
+
+@njit(cache=True)
+def _square(moments: np.ndarray, prior: float, weight: np.ndarray) -> float:
+    """Of an estimate w' J^T r: w' (M + prior) w, in variances of the grey levels.
+
+    With N the matrix that is seen and N_0 the same less what noise adds, w = (N_0 + prior)^-1 row.
+    The moments J^T r have the covariance M = (N_0 + N) / 2: noise of slopes times that of the right
+    picture; times that of the left one, which it is itself, neighbours cancel. Slopes that the
+    prior holds back are off by what it says.
+    """
+    square = prior * (weight[2] ** 2 + weight[3] ** 2)
+    for i in range(4):
+        square += weight[i] ** 2 * moments[i, i]
+        for j in range(i):
+            square += 2 * weight[i] * weight[j] * moments[i, j]
+    return square
+
+
+@njit(cache=True)
+def _without_noise(seen: np.ndarray, half: int, noise: float, normal: np.ndarray) -> None:
+    """J^T J (4, 4) less what the noise of slopes has added to their squares."""
+    normal[:] = seen
+    added = noise**2 / 2 * (2 * half + 1) ** 2
+    for i in range(1, 4):
+        normal[i, i] -= min(added, (1 - _LEAST_TEXTURE) * seen[i, i])
+        added = noise**2 / 2 * (2 * half + 1) ** 2 * half * (half + 1) / 3  # mean of x^2
 
 
 @njit(cache=True)

@@ -48,8 +48,8 @@ class StereoParameters:
         max_round_trip_px: allowed difference between the search there and the search back.
         max_jump_px: how far the refinement may move from the search's whole pixel.
         nearest_plane_m: distance h of the optical centre from the nearest plane that is to be
-            matched well. Disparity slopes by at most B / h on it: the standard deviation of the
-            prior on a and b.
+            matched well: the floor's, below the camera. Disparity slopes by at most B / h on it:
+            the standard deviation of the prior on a and b.
         noise_grey: noise of one image, grey levels; what residuals are held against.
         silhouette_half_px: half side of the window of the silhouette test.
         max_misfit_px: a half window may differ from the plane by noise and by what this error in
@@ -74,7 +74,7 @@ class StereoParameters:
     max_ambiguity: Annotated[float, Range(1e-3, 1, "1")] = 0.7
     max_round_trip_px: Annotated[int, Range(0, 100, "px")] = 1
     max_jump_px: Annotated[float, Range(0.01, 100, "px")] = 1.5
-    nearest_plane_m: Annotated[float, Range(0.01, 1000, "m")] = 1.0
+    nearest_plane_m: Annotated[float, Range(0.01, 1000, "m")] = 0.45
     noise_grey: Annotated[float, Range(0, 255, "grey levels")] = 2.0
     silhouette_half_px: Annotated[int, Range(2, 100, "px")] = 12
     max_misfit_px: Annotated[float, Range(1e-3, 100, "px")] = 1.0

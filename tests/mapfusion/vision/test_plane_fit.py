@@ -40,21 +40,37 @@ def normal_matrix(left: np.ndarray, u: int, v: int, half: int) -> np.ndarray:
     return J.T @ J
 
 
+def test_slopes_settle_where_noise_is_half_of_the_texture() -> None:
+    """Steps are too short by half then: d stands still long before the slopes do."""
+    left, right = pair(9.0, 0.0, 0.1, noise=14.0)
+    pixel = np.rint(grid(step=20)).astype(np.int64)
+    start = np.rint(9.0 + 0.1 * pixel[:, 1])
+    plane, _ = fit_planes(left, right, pixel, np.zeros(pixel.shape), start, 8, 1.0, 14.0, 1.0, 0.0)
+    assert np.nanmedian(plane[:, 2]) == pytest.approx(0.1, rel=0.03)
+
+
 def test_variance_is_that_of_the_disparity_at_the_corner() -> None:
     """d + a x + b y is less certain than d, by what the window's texture says of a and b."""
-    left, right = pair(9.3, 0.02, -0.01, noise=4.0)
+    noise = 4.0
+    left, right = pair(9.3, 0.02, -0.01, noise)
     pixel = np.rint(grid(step=60)).astype(np.int64)
     start, half = np.rint(9.3 + pixel @ [0.02, -0.01]), 6
     offset = np.random.default_rng(0).uniform(-6, 6, pixel.shape)
     fits = (
-        fit_planes(left, right, pixel, o, start, half, 1e6, 4.0, 1.0, 0.0)
+        fit_planes(left, right, pixel, o, start, half, 1e6, noise, 1.0, 0.0)
         for o in (offset, 0 * offset)
     )
     (_, there), (_, here) = fits
+    x = np.arange(-half, half + 1)
+    squares = np.array([0, len(x) ** 2, len(x) * np.sum(x**2), len(x) * np.sum(x**2)])
     for n, (u, v) in enumerate(pixel):
-        inverse = np.linalg.inv(normal_matrix(left, u, v, half))
+        seen = normal_matrix(left, u, v, half)
+        added = np.diag(squares) * noise**2 / 2
+        inverse = np.linalg.inv(seen - added)
+        covariance = inverse @ (seen - added / 2) @ inverse
         row = np.array([0, 1, *offset[n]])
-        assert there[n] / here[n] == pytest.approx(row @ inverse @ row / inverse[1, 1], rel=1e-6)
+        told = row @ covariance @ row / covariance[1, 1]
+        assert there[n] / here[n] == pytest.approx(told, rel=1e-6)
 
 
 def test_the_prior_pulls_the_slopes_towards_zero() -> None:
