@@ -16,8 +16,9 @@ from mapfusion.camera import StereoCamera
 from mapfusion.chi_square import chi_square_bound
 from mapfusion.se2 import Float
 from mapfusion.vision.harris import HarrisParameters, detect
-from mapfusion.vision.plane_fit import fit_planes, half_squares
+from mapfusion.vision.plane_fit import fit_planes
 from mapfusion.vision.row_search import search_rows
+from mapfusion.vision.silhouette_test import half_squares
 from mapfusion.vision.stereo import StereoParameters
 from mapfusion.vision.verdict import Verdict
 

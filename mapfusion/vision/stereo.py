@@ -28,9 +28,10 @@ from mapfusion.arguments import (
 from mapfusion.camera import StereoCamera
 from mapfusion.chi_square import chi_square_bound
 from mapfusion.se2 import Float
-from mapfusion.vision.plane_fit import disagrees, fit_planes
+from mapfusion.vision.plane_fit import fit_planes
 from mapfusion.vision.plane_test import FURTHER_TERMS, plane_scores
 from mapfusion.vision.row_search import search_rows
+from mapfusion.vision.silhouette_test import disagrees
 from mapfusion.vision.verdict import Verdict
 
 _MAX_HALF_PX = 90  # (2 * 90 + 1)^2 squared grey levels still fit a 32-bit sum

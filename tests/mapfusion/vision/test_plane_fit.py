@@ -5,7 +5,8 @@ import pytest
 from scipy.ndimage import map_coordinates
 from scipy.optimize import least_squares
 
-from mapfusion.vision.plane_fit import disagrees, fit_planes
+from mapfusion.vision.plane_fit import fit_planes
+from mapfusion.vision.silhouette_test import disagrees
 from tests.mapfusion.vision.shifted_pictures import grid, pair
 
 
