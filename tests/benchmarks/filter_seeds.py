@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.judge.truth import PathTruth
+from experiments.methods.threads import single_threaded
 from experiments.run.stages.smooth import log_until, smoother_of
 from experiments.scenario.loading import load_scenario
 from mapfusion.attitude import read_attitude
@@ -63,7 +64,7 @@ def main() -> None:
     asked = parser.parse_args()
     logs = sorted(path for path in asked.logs.resolve().iterdir() if path.is_dir())
     runs = [(asked.scenario, log, seed) for log in logs for seed in range(asked.seeds)]
-    with ProcessPoolExecutor(asked.jobs) as pool:
+    with ProcessPoolExecutor(asked.jobs, initializer=single_threaded) as pool:
         off = np.array(list(pool.map(off_m, runs))).reshape(len(logs), asked.seeds, 2)
     filtered, smoothed = off[:, :, 0], off[:, 0, 1]
     spread = filtered.max(axis=1) / filtered.min(axis=1)
