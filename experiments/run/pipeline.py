@@ -207,7 +207,7 @@ def _smooth(
         smooth,
         scenario.smooth,
         own={
-            "smoother": _smoother(scenario),
+            "smoother": smoother_parameters(scenario),
             "iterations": iterations,
             "noise_floor_m": settings.noise_floor_m,
         },
@@ -216,7 +216,7 @@ def _smooth(
     )
 
 
-def _smoother(scenario: Scenario) -> SmootherParameters:
+def smoother_parameters(scenario: Scenario) -> SmootherParameters:
     """The filter's own noise model, but for the corners that the filter cannot tell apart."""
     slam = scenario.slam
     return SmootherParameters(slam.filter.motion, scenario.smooth.stray_m, slam.min_count)
@@ -264,7 +264,7 @@ def _fusers(
         before[f"match {both}"] = pair.match
         before[f"aligner {both}"] = pair.aligners[scenario.merge.aligner]
     own = {"robots": tuple(robot.name for robot in robots), "iterations": tuple(iterations)}
-    own |= {"smoother": _smoother(scenario), "noise_floor_m": scenario.slam.filter.noise_floor_m}
+    own |= {"smoother": smoother_parameters(scenario), "noise_floor_m": scenario.slam.filter.noise_floor_m}
     stages = {}
     for name in scenario.fuse.fusers:
         target = target_of(name)

@@ -17,6 +17,7 @@ import numpy as np
 
 from experiments.judge.truth import PathTruth
 from experiments.methods.threads import single_threaded
+from experiments.run.pipeline import smoother_parameters
 from experiments.run.stages.smooth import log_until, smoother_of
 from experiments.scenario.loading import load_scenario
 from mapfusion.attitude import read_attitude
@@ -24,7 +25,7 @@ from mapfusion.fastslam.run import run_log
 from mapfusion.odometry_covariance import read_odometry_covariance
 from mapfusion.robot_log import read_log, read_truth
 from mapfusion.se2 import Float
-from mapfusion.smoother.smooth import SmootherParameters, smooth
+from mapfusion.smoother.smooth import smooth
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -41,8 +42,8 @@ def off_m(asked: tuple[str, Path, int]) -> tuple[float, float]:
     if seed:
         return rmse_m(path, truth), np.nan
     noisy = log_until(log, end, slam.filter.noise_floor_m)
-    settings = SmootherParameters(slam.filter.motion, scenario.smooth.stray_m, slam.min_count)
-    smoothed = smooth(noisy, last.slam.best_associations(), path, smoother_of(settings, folder))
+    settings = smoother_of(smoother_parameters(scenario), folder)
+    smoothed = smooth(noisy, last.slam.best_associations(), path, settings)
     return rmse_m(path, truth), rmse_m(smoothed.estimate.path, truth)
 
 

@@ -16,6 +16,7 @@ _ZOOM_MARGIN = 1.25
 _RECENT_ITERATIONS = 50
 _GRID_COLUMNS = 6  # holds one, two or three panels of one width
 _LOWER_ROW_IN = 2.6
+_HEADROOM = 1.35  # of the spread over time, for the legend above all peaks
 _PLANE = ["x_m", "y_m"]
 Moments = tuple[str, int, int]  # a robot, and a wide and a tight iteration of it: A and B
 
@@ -109,9 +110,8 @@ def _draw_timeline(axes: Axes, data: ResultTables, spread: pd.DataFrame) -> None
         style = {"color": data.colours[str(robot)], "linewidth": 0.8, "label": robot}
         axes.plot(rows["iteration"], rows["spread_m"], **style)
     axes.set(xlabel="FastSLAM iteration k", ylabel="spread of the particles (m)")
-    axes.set_ylim(bottom=0)
-    axes.margins(y=0.15)
-    axes.legend(loc="best")
+    axes.set_ylim(0, _HEADROOM * spread["spread_m"].max())
+    axes.legend(loc="upper center", ncols=_MAX_ROBOTS)
     axes.set_title("spread over time")
 
 
@@ -147,7 +147,7 @@ def _draw_zooms(
         plan.label_plan(axes, robot)
         # much in new territory, little on known ground
         grown = n_landmarks[k] - n_landmarks[max(0, k - _RECENT_ITERATIONS)]
-        title = f"{name}: k = {k}, spread {spread_m[k]:.3f} m\n"
+        title = f"{name}: k = {k}, spread {1e3 * spread_m[k]:.1f} mm\n"
         # the panels are narrow, and the last one ends at the page's edge
         title += f"+{grown} landmarks in {_RECENT_ITERATIONS} iterations"
         axes.set_title(title, fontsize=6.5)
