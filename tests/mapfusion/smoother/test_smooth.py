@@ -23,6 +23,7 @@ from tests.mapfusion.smoother.white_noise_logs import (
 )
 
 STRAY_M = 0.05
+GAUGE = 3  # rigid motions of the plane, in which a relative map is not known
 
 
 def smoothed(log: RobotLog, stray_m: float = STRAY_M) -> Smoothed:
@@ -49,8 +50,11 @@ def without_gauge(found: Smoothed, error: Float) -> tuple[Float, Float]:
 
 @pytest.mark.parametrize("tracks", [False, True])
 def test_errors_obey_the_joint_covariance(tracks: bool) -> None:
-    """The squared distance of all landmarks at once is chi-square distributed."""
-    total, dof, marginal = 0.0, 0, list[float]()
+    """The squared distance of all landmarks at once is chi-square distributed.
+
+    In the frame of the first pose; and with the gauge removed, each landmark's own too.
+    """
+    total, dof, relative, marginal = 0.0, 0, list[float](), list[float]()
     for seed in range(15):
         rng = np.random.default_rng(seed)
         known = white_noise_log(rng, 120, 40)
@@ -60,11 +64,14 @@ def test_errors_obey_the_joint_covariance(tracks: bool) -> None:
         total += error @ np.linalg.solve(found.joint_covariance(), error)
         dof += len(error)
         error, covariance = without_gauge(found, error)
+        variance, direction = np.linalg.eigh(covariance)
+        relative.extend((direction.T @ error)[GAUGE:] ** 2 / variance[GAUGE:])
         for i in range(0, len(error), 3):
             own = covariance[i : i + 3, i : i + 3]
             marginal.append(error[i : i + 3] @ np.linalg.solve(own, error[i : i + 3]))
     low, high = chi2.ppf([0.001, 0.999], dof)
     assert low < total < high
+    assert np.mean(relative) == pytest.approx(1, abs=0.1)
     assert np.mean(marginal) / 3 == pytest.approx(1, abs=0.15)
     assert 0.93 <= np.mean(np.array(marginal) < chi2.ppf(0.95, 3)) <= 0.97
 
