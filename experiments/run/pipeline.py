@@ -264,7 +264,8 @@ def _fusers(
         before[f"match {both}"] = pair.match
         before[f"aligner {both}"] = pair.aligners[scenario.merge.aligner]
     own = {"robots": tuple(robot.name for robot in robots), "iterations": tuple(iterations)}
-    own |= {"smoother": smoother_parameters(scenario), "noise_floor_m": scenario.slam.filter.noise_floor_m}
+    own |= {"smoother": smoother_parameters(scenario)}
+    own |= {"noise_floor_m": scenario.slam.filter.noise_floor_m}
     stages = {}
     for name in scenario.fuse.fusers:
         target = target_of(name)
