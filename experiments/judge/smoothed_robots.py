@@ -86,7 +86,7 @@ def smoother_rows(smoothed: Sequence[SmoothedRobot]) -> list[dict[str, Any]]:
 def _row(smoothed: SmoothedRobot) -> dict[str, Any]:
     robot, last = smoothed.robot, len(smoothed.filter_path) - 1
     path_m, filter_m = (
-        _path_rmse_m(path, robot.path.T_map_robot)
+        path_rmse_m(path, robot.path.T_map_robot)
         for path in (smoothed.last_path, smoothed.filter_path)
     )
     row = {"robot": robot.name, "path_rmse_m": path_m, "filter_path_rmse_m": filter_m}
@@ -104,7 +104,7 @@ def _row(smoothed: SmoothedRobot) -> dict[str, Any]:
     return row | {name: getattr(consistency, name) for name in names}
 
 
-def _path_rmse_m(path: Float, truth: Float) -> float:
+def path_rmse_m(path: Float, truth: Float) -> float:
     """RMS distance of the positions both know, from the same start; NaN where there is none."""
     known = np.isfinite(path).all(axis=1) & np.isfinite(truth).all(axis=1)
     if not known.any():

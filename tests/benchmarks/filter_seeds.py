@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from experiments.judge.smoothed_robots import path_rmse_m
 from experiments.judge.truth import PathTruth
 from experiments.methods.threads import single_threaded
 from experiments.run.pipeline import smoother_parameters
@@ -24,7 +25,6 @@ from mapfusion.attitude import read_attitude
 from mapfusion.fastslam.run import run_log
 from mapfusion.odometry_covariance import read_odometry_covariance
 from mapfusion.robot_log import read_log, read_truth
-from mapfusion.se2 import Float
 from mapfusion.smoother.smooth import smooth
 
 REPOSITORY = Path(__file__).parents[2]
@@ -40,15 +40,11 @@ def off_m(asked: tuple[str, Path, int]) -> tuple[float, float]:
     *_, last = run_log(log, slam.filter, rng, [end], slam.min_count, *told)
     truth, path = PathTruth.of(read_truth(folder)).T_map_robot, last.slam.best_path()
     if seed:
-        return rmse_m(path, truth), np.nan
+        return path_rmse_m(path, truth), np.nan
     noisy = log_until(log, end, slam.filter.noise_floor_m)
     settings = smoother_of(smoother_parameters(scenario), folder)
     smoothed = smooth(noisy, last.slam.best_associations(), path, settings)
-    return rmse_m(path, truth), rmse_m(smoothed.estimate.path, truth)
-
-
-def rmse_m(path: Float, truth: Float) -> float:
-    return float(np.sqrt(np.nanmean(np.sum((path - truth)[:, :2] ** 2, axis=1))))
+    return path_rmse_m(path, truth), path_rmse_m(smoothed.estimate.path, truth)
 
 
 def say(line: str) -> None:

@@ -16,7 +16,7 @@ _ZOOM_MARGIN = 1.25
 _RECENT_ITERATIONS = 50
 _GRID_COLUMNS = 6  # holds one, two or three panels of one width
 _LOWER_ROW_IN = 2.6
-_HEADROOM = 1.35  # of the spread over time, for the legend above all peaks
+_HEADROOM = 0.5  # above the spread over time, as a share of it, for the legend
 _PLANE = ["x_m", "y_m"]
 Moments = tuple[str, int, int]  # a robot, and a wide and a tight iteration of it: A and B
 
@@ -110,8 +110,9 @@ def _draw_timeline(axes: Axes, data: ResultTables, spread: pd.DataFrame) -> None
         style = {"color": data.colours[str(robot)], "linewidth": 0.8, "label": robot}
         axes.plot(rows["iteration"], rows["spread_m"], **style)
     axes.set(xlabel="FastSLAM iteration k", ylabel="spread of the particles (m)")
-    axes.set_ylim(0, _HEADROOM * spread["spread_m"].max())
-    axes.legend(loc="upper center", ncols=_MAX_ROBOTS)
+    axes.margins(y=_HEADROOM)
+    axes.set_ylim(bottom=0)
+    axes.legend(loc="upper right")
     axes.set_title("spread over time")
 
 
