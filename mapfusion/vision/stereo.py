@@ -9,8 +9,10 @@
    which more counts as what exceeds the sensor's noise.
 3. Each half of a larger window (left, right, upper, lower) must agree with that plane, or the
    corner sits on a silhouette, where two surfaces meet in the image and nothing in the world.
-4. What is left must not show that the disparity steps, breaks or bends (`plane_test.py`): where
-   wall and floor meet or another surface begins beside, the plane lies off in every picture alike.
+4. The larger window must not show that the disparity steps, breaks or bends (`plane_test.py`):
+   where wall and floor meet or another surface begins beside, the plane lies off in every picture
+   alike. Of a surface beside, the window of the fit holds a strip that biases the plane and is too
+   narrow to be told from noise.
 """
 
 from dataclasses import dataclass
@@ -52,7 +54,8 @@ class StereoParameters:
             matched well: the floor's, below the camera. Disparity slopes by at most B / h on it:
             the standard deviation of the prior on a and b.
         noise_grey: noise of one image, grey levels; what residuals are held against.
-        silhouette_half_px: half side of the window of the silhouette test.
+        silhouette_half_px: half side of the window of the silhouette test and of the test for one
+            plane.
         max_misfit_px: a half window may differ from the plane by noise and by what this error in
             disparity would explain,
         max_rows_px: and by what rows that are so far off would.
@@ -231,7 +234,7 @@ def _bent(
     The score of noise is chi-square times its variance: 2 n^2, and what a deviation from the plane
     and rows that are off add to it, by the slopes of the grey levels.
     """
-    scores = plane_scores(left, right, pixel, plane, parameters.half_px)
+    scores = plane_scores(left, right, pixel, plane, parameters.silhouette_half_px)
     beyond = scores[:, 1:] @ [parameters.plane_misfit_px**2, parameters.max_rows_px**2]
     bound = chi_square_bound(parameters.plane_probability, FURTHER_TERMS)
     return scores[:, 0] > bound * (2 * parameters.noise_grey**2 + beyond)

@@ -12,7 +12,7 @@ from mapfusion.vision.row_search import search_rows
 from mapfusion.vision.stereo import StereoParameters, match
 from mapfusion.vision.verdict import Verdict
 from tests.mapfusion.vision.rendered_scene import Plane, render, wall
-from tests.mapfusion.vision.shifted_pictures import CAMERA, grid, pair
+from tests.mapfusion.vision.shifted_pictures import CAMERA, Picture, grid, pair
 
 PARAMETERS = StereoParameters(min_depth_m=0.9, max_depth_m=12.0)
 
@@ -181,10 +181,28 @@ def test_edges_are_rejected_and_slanted_walls_are_not(
     uv = detect(left, corners_of)
     u, v = np.rint(uv).astype(int).T
     if tested is BY_PLANE:  # at the wall's ends there are two surfaces in a window
-        uv = uv[np.isfinite(maximum_filter(depth, 2 * tested.half_px + 1)[v, u])]
+        uv = uv[np.isfinite(maximum_filter(depth, 2 * tested.silhouette_half_px + 1)[v, u])]
     found = match(left, right, uv, CAMERA, tested).verdict
     assert np.mean(found == verdict) < 0.02
     assert np.mean(found == Verdict.MATCHED) > 0.8
+
+
+def test_a_narrow_strip_of_another_surface_is_told() -> None:
+    """Two columns of the fit's window show another surface, half a pixel nearer."""
+    corners = np.stack(np.meshgrid(np.arange(60.0, 280, 50), np.arange(30.0, 215, 25)), -1)
+    u, v = np.meshgrid(np.arange(CAMERA.width_px), np.arange(CAMERA.height_px))
+    beside = (u - 60) % 50
+    step = 0.5 * ((beside > PARAMETERS.half_px - 2) & (beside < 25))
+    tested, verdict = replace(BY_PLANE, noise_grey=2.0), []
+    for seed in range(6):
+        picture, rng = Picture(seed), np.random.default_rng(seed)
+        images = [picture(u, v), np.roll(picture(u + step, v), -8, 1)]
+        left, right = (
+            np.clip(np.rint(k + 2 * rng.standard_normal(k.shape)), 0, 255).astype(np.uint8)
+            for k in images
+        )
+        verdict.append(match(left, right, corners.reshape(-1, 2), CAMERA, tested).verdict)
+    assert np.mean(np.array(verdict) == Verdict.BENT) > 0.9
 
 
 def test_planes_are_bent_at_the_stated_rate() -> None:
