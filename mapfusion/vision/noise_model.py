@@ -90,7 +90,8 @@ def limits_for(stereo: StereoParameters, noise: NoiseModel, probability: float) 
     A half's square is a sum over so many independent parts as squares of the length over which
     residuals are alike fit into it; the correlation of a window is 1 - r^2 / (2 s^2), with s^2 the
     variance of its grey levels: the limit is what this share of the windows' textures allow. The
-    test for bent surfaces tolerates what a half does, and refuses few that the halves let pass.
+    test for bent surfaces tolerates what a half does, and refuses few that the halves let pass; its
+    window is the fit's, as real surfaces are planes over short distances at best.
     """
     alike = max(stereo.residual_correlation_px, 1.0)
     side = 2 * stereo.silhouette_half_px + 1
@@ -105,6 +106,7 @@ def limits_for(stereo: StereoParameters, noise: NoiseModel, probability: float) 
         noise_grey=noise.noise_grey,
         max_misfit_px=max(wide * noise.misfit_px, 1e-3),
         max_rows_px=wide * noise.rows_px,
+        plane_half_px=stereo.half_px,
         plane_misfit_px=wide * noise.misfit_px,
         row_sigma_px=noise.rows_px,
         min_correlation=min(max(correlation, _SEARCH[0]), stereo.min_correlation),

@@ -9,9 +9,9 @@
    which more counts as what exceeds the sensor's noise.
 3. Each half of a larger window (left, right, upper, lower) must agree with that plane, or the
    corner sits on a silhouette, where two surfaces meet in the image and nothing in the world.
-4. The larger window must not show that the disparity steps, breaks or bends (`plane_test.py`):
-   where wall and floor meet or another surface begins beside, the plane lies off in every picture
-   alike. Of a surface beside, the window of the fit holds a strip that biases the plane and is too
+4. Nor must a larger window show that the disparity steps, breaks or bends (`plane_test.py`): where
+   wall and floor meet or another surface begins beside, the plane lies off in every picture alike.
+   Of a surface beside, the window of the fit may hold a strip that biases the plane and is too
    narrow to be told from noise.
 """
 
@@ -54,11 +54,12 @@ class StereoParameters:
             matched well: the floor's, below the camera. Disparity slopes by at most B / h on it:
             the standard deviation of the prior on a and b.
         noise_grey: noise of one image, grey levels; what residuals are held against.
-        silhouette_half_px: half side of the window of the silhouette test and of the test for one
-            plane.
+        silhouette_half_px: half side of the window of the silhouette test.
         max_misfit_px: a half window may differ from the plane by noise and by what this error in
             disparity would explain,
         max_rows_px: and by what rows that are so far off would.
+        plane_half_px: half side of the window of the test for one plane: where walls are planes, as
+            simulated ones are, a larger one than the fit's.
         plane_probability: of windows of one plane, the share that is to pass the test for further
             terms of the disparity,
         plane_misfit_px: where noise, rows as above and this deviation of disparities from a plane
@@ -83,6 +84,7 @@ class StereoParameters:
     silhouette_half_px: Annotated[int, Range(2, 100, "px")] = 12
     max_misfit_px: Annotated[float, Range(1e-3, 100, "px")] = 1.0
     max_rows_px: Annotated[float, Range(0, 100, "px")] = 0.0
+    plane_half_px: Annotated[int, Range(2, 100, "px")] = 12
     plane_probability: Annotated[float, Range(0, 1, "1")] = 0.999
     plane_misfit_px: Annotated[float, Range(0, 100, "px")] = 0.2
     row_sigma_px: Annotated[float, Range(0, 100, "px")] = 0.0
@@ -93,6 +95,7 @@ class StereoParameters:
         require_in_range(self)
         require_at_least(self.min_depth_m, self, "max_depth_m")
         require_at_least(self.half_px, self, "silhouette_half_px")
+        require_at_least(self.half_px, self, "plane_half_px")
 
 
 @dataclass(frozen=True)
@@ -234,7 +237,7 @@ def _bent(
     The score of noise is chi-square times its variance: 2 n^2, and what a deviation from the plane
     and rows that are off add to it, by the slopes of the grey levels.
     """
-    scores = plane_scores(left, right, pixel, plane, parameters.silhouette_half_px)
+    scores = plane_scores(left, right, pixel, plane, parameters.plane_half_px)
     beyond = scores[:, 1:] @ [parameters.plane_misfit_px**2, parameters.max_rows_px**2]
     bound = chi_square_bound(parameters.plane_probability, FURTHER_TERMS)
     return scores[:, 0] > bound * (2 * parameters.noise_grey**2 + beyond)

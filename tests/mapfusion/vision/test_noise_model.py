@@ -60,5 +60,6 @@ def test_a_surer_limit_is_a_wider_one() -> None:
     assert wide.max_misfit_px > narrow.max_misfit_px > noise.misfit_px
     assert wide.plane_misfit_px > narrow.plane_misfit_px > noise.misfit_px
     assert wide.max_rows_px > narrow.max_rows_px > noise.rows_px
+    assert wide.plane_half_px == STEREO.half_px
     assert wide.min_correlation < narrow.min_correlation <= STEREO.min_correlation
     assert narrow.row_sigma_px == noise.rows_px

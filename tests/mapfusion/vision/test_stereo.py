@@ -181,7 +181,7 @@ def test_edges_are_rejected_and_slanted_walls_are_not(
     uv = detect(left, corners_of)
     u, v = np.rint(uv).astype(int).T
     if tested is BY_PLANE:  # at the wall's ends there are two surfaces in a window
-        uv = uv[np.isfinite(maximum_filter(depth, 2 * tested.silhouette_half_px + 1)[v, u])]
+        uv = uv[np.isfinite(maximum_filter(depth, 2 * tested.plane_half_px + 1)[v, u])]
     found = match(left, right, uv, CAMERA, tested).verdict
     assert np.mean(found == verdict) < 0.02
     assert np.mean(found == Verdict.MATCHED) > 0.8
@@ -243,7 +243,7 @@ def test_every_pixel_of_the_image_may_be_asked_for() -> None:
     u, v = np.meshgrid(np.arange(-3, 323, 2.0), np.arange(-3, 243, 7.0))
     uv = np.stack([u.ravel(), v.ravel()], -1)
     for half in (8, 15):
-        parameters = replace(PARAMETERS, half_px=half, silhouette_half_px=half)
+        parameters = replace(PARAMETERS, half_px=half, silhouette_half_px=half, plane_half_px=half)
         matches = match(left, right, uv, CAMERA, parameters)
         margin = np.minimum(uv, [319, 239] - uv).min(1)
         assert not np.any(matches.verdict[margin < half - 1] == Verdict.MATCHED)
@@ -277,6 +277,7 @@ def test_wrong_arguments_are_named(name: str, change: dict) -> None:
         ("half_px", 91),
         ("min_correlation", 1.5),
         ("silhouette_half_px", 3),
+        ("plane_half_px", 3),
         ("sigma_floor_px", -0.1),
         ("plane_probability", 1.1),
         ("plane_misfit_px", -0.1),
