@@ -174,7 +174,7 @@ class Bound(Section):
 # Errors in pictures that PyBullet samples without a filter: edges are staircases, a wall that is
 # seen straight on locks onto its texels (4 mm; two or three to a pixel at usual distances): all of
 # a window then matches the better the more it is off. With these, standard deviations hold against
-# rendered depth, and of true planes as many are refused as is said.
+# rendered depth, and most windows of one plane pass, though fewer than of white noise would.
 _UNFILTERED = {"plane_misfit_px": 0.7, "residual_correlation_px": 3.0, "sigma_floor_px": 0.06}
 # Corners, too, settle on texels.
 _UNFILTERED_STRAY_M = 0.003
