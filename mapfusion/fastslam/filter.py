@@ -212,12 +212,16 @@ class FastSlam:
         Poses (M, 3), and (M,) log of eq. 3's density over the density they were drawn from.
         """
         settings = self.parameters
+        empty = self._maps.n_slots == 0
         # a robot that stands still is where it was, and without observations there is no news
-        informed = settings.proposal is Proposal.INFORMED and len(observations) and sigma.any()
-        if not informed:
+        seeing = len(observations) and sigma.any() and not empty
+        if not (settings.proposal is Proposal.INFORMED and seeing):
             moved = motion_by_odometry(self._poses[self._best], 0.0, sigma)
             self._bends.went_on(moved @ moved.T)
-            poses = sample_motion(self._poses, odometry, sigma, self._rng)
+            # Before the first landmark no draw is better than another, nor ever will be: whichever
+            # particle is left would have turned the map by its own error beside the odometry's.
+            disturbed = np.zeros(3) if empty else sigma
+            poses = sample_motion(self._poses, odometry, disturbed, self._rng)
             return poses, np.zeros(settings.n_particles)
         predicted = compose(self._poses, odometry)
         seen = sightings(predicted, observations.position_m, noise, self._planar)

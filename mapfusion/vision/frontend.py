@@ -33,7 +33,7 @@ class FrontEndParameters:
     usurf: USurfParameters = field(default_factory=USurfParameters)
     tracks: TrackParameters = field(default_factory=TrackParameters)
     sigma_uv_px: Annotated[float, Range(1e-3, 100, "px")] = 0.08
-    max_depth_m: Annotated[float, Range(0.1, 1000, "m")] = 8.0
+    max_depth_m: Annotated[float, Range(0.1, 1000, "m")] = 12.0
     max_sigma_depth_m: Annotated[float, Range(1e-4, 1000, "m")] = 0.4
 
     def __post_init__(self) -> None:

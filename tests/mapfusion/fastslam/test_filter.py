@@ -17,6 +17,10 @@ from tests.mapfusion.fastslam.landmark_worlds import (
     parameters,
 )
 
+ONE_LANDMARK = Observations(
+    np.array([[4.0, 0.5, 0.3]]), 1e-4 * np.eye(3)[None], np.eye(1, 64, dtype=np.float32)
+)
+
 
 def test_with_exact_odometry_the_map_is_the_least_squares_solution():
     world = drive(11, odometry_sigma=(0, 0, 0))
@@ -164,8 +168,21 @@ def test_localises_better_than_odometry():
     assert np.std(errors) < 0.5 * np.std(odometry_errors)
 
 
+@pytest.mark.parametrize("proposal", ["motion", "informed"])
+def test_no_particle_is_drawn_before_there_is_a_landmark(proposal):
+    # Nothing that is seen later can tell which of the draws was right: each would turn the map.
+    slam = FastSlam(parameters(proposal=proposal), np.random.default_rng(0))
+    motion, pose = np.array([0.1, 0.02, 0.3]), np.zeros(3)
+    for frame in (nothing(), nothing(), ONE_LANDMARK):
+        pose = compose(pose, motion)
+        np.testing.assert_allclose(slam.step(motion, frame).cloud - pose, 0.0, atol=1e-12)
+    cloud = slam.step(motion, nothing()).cloud
+    assert len(np.unique(cloud[:, 2])) == len(cloud)
+
+
 def test_headings_wrap():
     slam = FastSlam(parameters(n_particles=3), np.random.default_rng(0))
+    slam.step(np.zeros(3), ONE_LANDMARK)
     for _ in range(40):
         result = slam.step(np.array([0.0, 0.0, 0.5]), nothing())
         assert np.all(np.abs(result.cloud[:, 2]) <= np.pi)

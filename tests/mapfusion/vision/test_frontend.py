@@ -125,7 +125,7 @@ def test_a_metric_window_matches_better_across_distances(room: list[Plane]) -> N
 
 
 def test_far_and_uncertain_points_are_not_observed() -> None:
-    disparity = CAMERA.focal_px * CAMERA.baseline_m / np.array([2.0, 7.9, 8.1, 5.0, 5.0])
+    disparity = CAMERA.focal_px * CAMERA.baseline_m / np.array([2.0, 11.9, 12.1, 5.0, 5.0])
     sigma_depth = np.array([0.1, 0.1, 0.1, 0.39, 0.41])
     depth = CAMERA.focal_px * CAMERA.baseline_m / disparity
     descriptor = np.eye(5, 64, dtype=np.float32)
