@@ -25,6 +25,7 @@ from mapfusion.fuse.parameters import MergeParameters
 from mapfusion.fused_map import FusedMap
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.looks import NO_LABEL
+from mapfusion.one_thread import one_blas_thread
 from mapfusion.se2 import Float
 from mapfusion.smoother.student import student_bound
 
@@ -42,6 +43,7 @@ class JointFuser:
 
     smoothed = True
 
+    @one_blas_thread
     def fuse(self, component: Component, parameters: MergeParameters) -> FusedMap:
         """Fuse the component's members."""
         n_dimensions = 2 if component.planar else 3

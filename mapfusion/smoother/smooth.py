@@ -7,6 +7,7 @@ import numpy as np
 
 from mapfusion.arguments import Range, require_in_range, require_shape
 from mapfusion.fastslam.motion import MotionNoise
+from mapfusion.one_thread import one_blas_thread
 from mapfusion.robot_log import RobotLog
 from mapfusion.se2 import Float, between
 from mapfusion.smoother.elimination import common_part
@@ -114,6 +115,7 @@ class Smoothed:
         return joint
 
 
+@one_blas_thread
 def smooth(
     log: RobotLog, landmark: np.ndarray, path: Float, parameters: SmootherParameters
 ) -> Smoothed:
