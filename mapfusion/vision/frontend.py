@@ -24,7 +24,9 @@ class FrontEndParameters:
     Attributes:
         harris, stereo, usurf, tracks: of the parts.
         sigma_uv_px: standard deviation of the place of a track's point in an image, each axis.
-        max_depth_m: points farther away are tracked but not observed,
+        max_depth_m: points farther away are tracked but not observed: about as far as a room is
+            long, since a robot that looks along it has nothing else to tell its heading by; what
+            is farther away makes maps less certain and hardly tells more,
         max_sigma_depth_m: nor are points whose depth has a larger standard deviation.
     """
 
