@@ -14,43 +14,15 @@ import numpy as np
 
 from mapfusion.se2 import Float
 from mapfusion.smoother.motion_posterior import disturbance_variances
-from mapfusion.smoother.normal_equations import Estimate, Weights, disturbances
-from mapfusion.smoother.robust import NO_TAILS, Tails
-from mapfusion.smoother.settle import Problem, Settled, settled
+from mapfusion.smoother.normal_equations import disturbances
+from mapfusion.smoother.settle import Problem, Settled
 
 # Disturbances that have to be told before a level is taken from them: a standard deviation is then
 # known to a tenth of itself, 1 / sqrt(2 n). Of fewer, covariances would be as uncertain as levels.
 _LEAST_TOLD = 50.0
-# Rounds end where none of the standard deviations changes by more than this share.
-_SETTLED = 0.05
-_MOST_ROUNDS = 10
-# Until then the next step may move the path by so much, in squared sigmas a coordinate.
-_CLOSE = 1e-3
 
 
-def settled_with_levels(
-    problem: Problem, at: Estimate, weights: Weights | None = None, tails: Tails = NO_TAILS
-) -> tuple[Settled, Float]:
-    """Where steps end under the levels (3,) that the observations tell, for the rest as `settled`.
-
-    A level that too little is told of stays 1.
-    """
-    levels, n_steps = np.ones(3), 0
-    for _ in range(_MOST_ROUNDS):
-        end = settled(_with(problem, levels), at, _CLOSE, weights, tails)
-        at, weights, tails, n_steps = end.estimate, end.weights, end.tails, n_steps + end.n_steps
-        before, levels = levels, told_levels(problem, end, levels)
-        if np.abs(np.log(levels / before)).max() < 2 * _SETTLED:
-            break
-    end = settled(_with(problem, levels), at, weights=weights, tails=tails)
-    return end._replace(n_steps=n_steps + end.n_steps), levels
-
-
-def _with(problem: Problem, levels: Float) -> Problem:
-    return problem._replace(information=problem.information / levels)
-
-
-def told_levels(problem: Problem, end: Settled, levels: Float) -> Float:
+def told_odometry_levels(problem: Problem, end: Settled, levels: Float) -> Float:
     """(3,) q of the variances along, across and in the heading.
 
     Args:

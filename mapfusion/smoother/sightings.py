@@ -1,6 +1,6 @@
 """A log as the smoother takes it: observations ordered by landmark and by track."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -77,6 +77,13 @@ class Sightings:
             self.position_m,
             self.information,
         )
+
+    def on_level(self, level: float) -> "Sightings":
+        """With stated covariances of observations on tracks that stray multiplied by `level`."""
+        if level == 1:
+            return self
+        share = np.where(self.strays[self.track], 1 / level, 1.0)
+        return replace(self, information=self.information * share[:, None, None])
 
     @property
     def landmark(self) -> np.ndarray:

@@ -11,13 +11,13 @@ from mapfusion.one_thread import one_blas_thread
 from mapfusion.robot_log import RobotLog
 from mapfusion.se2 import Float, between
 from mapfusion.smoother.elimination import common_part
+from mapfusion.smoother.levels import settled_with_levels
 from mapfusion.smoother.normal_equations import (
     Estimate,
     Weights,
     information_of,
     odometry_information,
 )
-from mapfusion.smoother.odometry_levels import settled_with_levels
 from mapfusion.smoother.one_corner import parted
 from mapfusion.smoother.residuals import first_points
 from mapfusion.smoother.robust import Tails

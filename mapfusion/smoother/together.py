@@ -13,8 +13,8 @@ import numpy as np
 from mapfusion.robot_log import NO_TRACK, Observations, RobotLog
 from mapfusion.se2 import IDENTITY, Float, between, compose
 from mapfusion.smoother.elimination import matrix_bytes, pose_covariances
+from mapfusion.smoother.levels import settled_with_levels
 from mapfusion.smoother.normal_equations import Estimate
-from mapfusion.smoother.odometry_levels import settled_with_levels
 from mapfusion.smoother.recording import Recording
 from mapfusion.smoother.residuals import first_points
 from mapfusion.smoother.settle import Problem, settled

@@ -1,0 +1,45 @@
+"""How far off a log's observations are beside what they state, along their tracks.
+
+A sensor states its errors for any texture and any distance, and with what lasts while a track does.
+What lasts is in the tracks' offsets here; the rest differs from one sighting to the next, and the
+log tells how much it is. Of squared Mahalanobis distances s of the observations from where they
+should be, each of n coordinates, with the weights w that gross ones lose, the level q is
+
+    q = sum of w s / sum of (n - c),
+
+c what of an observation's coordinates went into its track's point: the same that tells the levels
+of the odometry (MacKay 1992; `odometry_levels.py`). Without tracks nobody can tell what lasts from
+what does not, and what is stated holds.
+"""
+
+import numpy as np
+
+from mapfusion.smoother.residuals import squared_distances
+from mapfusion.smoother.settle import Settled
+from mapfusion.smoother.student import fitted_dof, student_weights
+
+# Coordinates that have to be told before a level is taken from them; see `odometry_levels.py`.
+_LEAST_TOLD = 50.0
+
+
+def told_observation_level(end: Settled, level: float) -> float:
+    """q of the stated covariances of observations on tracks that stray.
+
+    What is gross is so beside what is *stated*: tails that are fitted to the level's own residuals
+    would take each other's part, a smaller level for heavier tails.
+
+    Args:
+        end: where steps ended.
+        level: that the stated covariances were multiplied by.
+    """
+    seen, n = end.seen, end.seen.n_dimensions
+    rows = seen.strays[seen.track]
+    if not rows.any():
+        return 1.0
+    square = squared_distances(seen, end.estimate)[rows]
+    expected = squared_distances(seen, end.estimate, end.solution.track_m2)[rows]
+    known = np.sum(n - np.minimum(end.weights.observation[rows] * (expected - square), n))
+    if known < _LEAST_TOLD:
+        return 1.0
+    weights = student_weights(level * expected, fitted_dof(level * expected, n), n)
+    return float(level * np.sum(weights * square) / known)
