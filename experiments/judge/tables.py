@@ -67,11 +67,12 @@ _COLUMNS = {
     # landmarks after the best rigid fit without the gross ones, which are counted; their
     # consistency with the gauge removed. filter_: of FastSLAM's last map and final path. The
     # degrees of freedom are of the Student-t's that observations and tracks' offsets were found to
-    # be of. not_smoothed: why there is nothing (else empty).
+    # be of; observation_level is the factor on the observations' stated covariances that the log
+    # told. not_smoothed: why there is nothing (else empty).
     "smoother": """robot n_landmarks path_rmse_m filter_path_rmse_m filter_over_smoother
         landmark_rmse_m gross_share filter_landmark_rmse_m filter_gross_share
         nees_per_dof marginal_nees_per_dof coverage_95
-        n_steps observation_dof offset_dof not_smoothed""",
+        n_steps observation_dof offset_dof observation_level not_smoothed""",
     # The smoothed path, in the robot's own frame, up to each iteration that maps are fused at.
     "smoothed_paths": "robot iteration frame x_m y_m theta_rad",
     # Particles at the kept iterations, in the robot's own frame.

@@ -66,6 +66,4 @@ def _told(problem: Problem, end: Settled, levels: Levels) -> Levels:
 
 def _with(problem: Problem, levels: Levels) -> Problem:
     information = problem.information / levels.odometry
-    return problem._replace(
-        seen=problem.seen.on_level(levels.observation), information=information
-    )
+    return problem._replace(seen=problem.seen.on_level(levels.observation), information=information)

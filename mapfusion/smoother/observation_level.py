@@ -23,10 +23,10 @@ _LEAST_TOLD = 50.0
 
 
 def told_observation_level(end: Settled, level: float) -> float:
-    """q of the stated covariances of observations on tracks that stray.
+    """Q of the stated covariances of observations on tracks that stray.
 
-    What is gross is so beside what is *stated*: tails that are fitted to the level's own residuals
-    would take each other's part, a smaller level for heavier tails.
+    What is gross is so beside what is stated, or found if that is more: tails that are fitted on
+    ever smaller levels grow heavier with each, and call gross what any sensor does at times.
 
     Args:
         end: where steps ended.
@@ -41,5 +41,6 @@ def told_observation_level(end: Settled, level: float) -> float:
     known = np.sum(n - np.minimum(end.weights.observation[rows] * (expected - square), n))
     if known < _LEAST_TOLD:
         return 1.0
-    weights = student_weights(level * expected, fitted_dof(level * expected, n), n)
+    beside = min(level, 1.0) * expected
+    weights = student_weights(beside, fitted_dof(beside, n), n)
     return float(level * np.sum(weights * square) / known)

@@ -11,7 +11,7 @@ from mapfusion.one_thread import one_blas_thread
 from mapfusion.robot_log import RobotLog
 from mapfusion.se2 import Float, between
 from mapfusion.smoother.elimination import common_part
-from mapfusion.smoother.levels import settled_with_levels
+from mapfusion.smoother.levels import AS_STATED, Levels, settled_with_levels
 from mapfusion.smoother.normal_equations import (
     Estimate,
     Weights,
@@ -83,6 +83,8 @@ class Smoothed:
         seen: the observations that went into them.
         weights: of observations and offsets.
         tails: of their Student-t's.
+        observation_level: factor on the stated covariances of observations on tracks, as the log
+            tells it.
         n_steps: Gauss-Newton steps that were taken.
         own_m2: (L, 3, 3), see `common`.
         common: (R, 3L) the landmarks' joint covariance is block diagonal of `own_m2` plus
@@ -94,18 +96,20 @@ class Smoothed:
     seen: Sightings
     weights: Weights
     tails: Tails
+    observation_level: float
     n_steps: int
     own_m2: Float
     common: Float
 
     @classmethod
-    def of(cls, end: Settled, landmark: np.ndarray, steps_before: int = 0) -> "Smoothed":
-        """Where steps ended, after some of earlier rounds."""
+    def of(
+        cls, end: Settled, landmark: np.ndarray, levels: Levels = AS_STATED, steps_before: int = 0
+    ) -> "Smoothed":
+        """Where steps ended under some levels, after some of earlier rounds."""
         common = common_part(end.seen, end.equations, end.solution)
+        found = (end.estimate, end.seen, end.weights, end.tails, levels.observation)
         n_steps, own_m2 = steps_before + end.n_steps, end.solution.own_m2
-        return cls(
-            landmark, end.estimate, end.seen, end.weights, end.tails, n_steps, own_m2, common
-        )
+        return cls(landmark, *found, n_steps, own_m2, common)
 
     def joint_covariance(self) -> Float:
         """(3L, 3L), dense: for small maps."""
@@ -142,10 +146,12 @@ def smooth(
         known, first = _first_round(*about, parts, path)
         n_steps += first.n_steps
     if parameters.odometry_covariance is None:
-        end, _ = settled_with_levels(known, first.estimate, first.weights, first.tails)
+        start = first.estimate, first.weights, first.tails
+        end, levels = settled_with_levels(known, *start)
     else:  # odometry that pictures told is used where these say nothing: they tell no level
         end = settled(known, first.estimate, weights=first.weights, tails=first.tails)
-    return Smoothed.of(end, parts, n_steps)
+        levels = AS_STATED
+    return Smoothed.of(end, parts, levels, n_steps)
 
 
 def _first_round(

@@ -37,9 +37,10 @@ from mapfusion.storage import (
 )
 
 # Its attributes tell how smoothing ended: `n_steps`, the degrees of freedom of the Student-t's of
-# observations and offsets (`observation_dof`, `offset_dof`), and `not_smoothed`, why there is no
-# path (else empty).
-PATH = schema("smooth.path", 1, [*fields(iteration=INT), *float_fields(POSE_FIELDS)])
+# observations and offsets (`observation_dof`, `offset_dof`), the factor on the observations' stated
+# covariances that the log told (`observation_level`), and `not_smoothed`, why there is no path
+# (else empty).
+PATH = schema("smooth.path", 2, [*fields(iteration=INT), *float_fields(POSE_FIELDS)])
 
 # Observations that are of another landmark than the filter took them for.
 PARTED = schema("smooth.parted", 1, fields(observation=INT, source_observation=INT))
@@ -56,7 +57,7 @@ WRITES = (
 # Unless they are said, maps are fused at so many evenly spread iterations, the last among them.
 _FUSED_ITERATIONS = 5
 _GB = 1e9
-_ENDED = ("n_steps", "observation_dof", "offset_dof", "not_smoothed")
+_ENDED = ("n_steps", "observation_dof", "offset_dof", "observation_level", "not_smoothed")
 
 
 @dataclass(frozen=True)
@@ -135,8 +136,8 @@ def smoothed_anew(
     """Map, path, which landmark observations are of, and how smoothing ended, see `_ENDED`."""
     found = _smoothed(log, landmark, path, settings)
     if isinstance(found, str):
-        return _no_map(log), np.empty((0, 3)), landmark, (0, np.nan, np.nan, found)
-    ended = (found.n_steps, *found.tails, "")
+        return _no_map(log), np.empty((0, 3)), landmark, (0, np.nan, np.nan, np.nan, found)
+    ended = (found.n_steps, *found.tails, found.observation_level, "")
     made = smoothed_map(log, found, attitude=attitude)
     return made, found.estimate.path, found.landmark, ended
 
@@ -213,12 +214,12 @@ def smoothed_owners(smooth: Path, slam: Path, iteration: int, n_observations: in
 def read_endings(folder: Path) -> pd.DataFrame:
     """How smoothing ended, one row an iteration.
 
-    Columns: iteration, n_steps, observation_dof, offset_dof, not_smoothed.
+    Columns: iteration, n_steps, observation_dof, offset_dof, observation_level, not_smoothed.
     """
     ends = {k: read_table(_path_path(folder, str(k)), PATH)[1] for k in _iterations(folder)}
     rows = pd.DataFrame([{name: end[name] for name in _ENDED} for end in ends.values()])
-    kinds = {"n_steps": int, "observation_dof": float, "offset_dof": float}
-    return rows.astype(kinds).assign(iteration=list(ends))
+    kinds = dict.fromkeys(_ENDED[1:-1], float)
+    return rows.astype({"n_steps": int} | kinds).assign(iteration=list(ends))
 
 
 def _iterations(folder: Path) -> list[int]:

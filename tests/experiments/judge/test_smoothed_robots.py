@@ -9,7 +9,13 @@ from tests.helpers.made_up_maps import ITERATION, landmark_map, robot
 
 POINTS = np.random.default_rng(0).uniform(-4, 4, (30, 3))
 WORLD = np.array([1.0, 2.0, 0.5])
-ENDING = {"n_steps": 4, "observation_dof": 9.0, "offset_dof": 5.0, "not_smoothed": ""}
+ENDING = {
+    "n_steps": 4,
+    "observation_dof": 9.0,
+    "offset_dof": 5.0,
+    "observation_level": 1.0,
+    "not_smoothed": "",
+}
 
 
 def smoothed_robot() -> SmoothedRobot:

@@ -6,8 +6,8 @@ import numpy as np
 
 from mapfusion.robot_log import RobotLog
 from mapfusion.se2 import Float, rotation
+from mapfusion.smoother.levels import settled_with_levels
 from mapfusion.smoother.normal_equations import Estimate, odometry_information
-from mapfusion.smoother.odometry_levels import settled_with_levels
 from mapfusion.smoother.residuals import first_points
 from mapfusion.smoother.settle import Problem
 from mapfusion.smoother.sightings import sightings_of
@@ -34,7 +34,7 @@ def levels_of(log: RobotLog) -> Float:
     seen = sightings_of(log, label, 1, stray=False)
     information = odometry_information(log.odometry, NOISE) / STATED**2
     at = Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
-    return settled_with_levels(Problem(seen, log.odometry, information, 0), at)[1]
+    return settled_with_levels(Problem(seen, log.odometry, information, 0), at)[1].odometry
 
 
 def test_levels_are_those_of_the_noise() -> None:
@@ -49,7 +49,7 @@ def test_levels_are_those_of_the_noise() -> None:
 def test_a_log_that_tells_nothing_stays_as_stated() -> None:
     """Landmarks seen once each: whatever the odometry did, nothing contradicts it."""
     rng = np.random.default_rng(1)
-    log = seen_well(white_noise_log(rng, 40, 40), rng)
+    log = seen_well(white_noise_log(rng, 80, 40), rng)
     label = np.arange(len(log.observations), dtype=np.int32)
     log = replace(log, observations=replace(log.observations, label=label))
     np.testing.assert_allclose(levels_of(log), 1.0)

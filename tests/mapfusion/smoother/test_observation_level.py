@@ -1,0 +1,83 @@
+"""The level of the observations' noise against noise that is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mapfusion.robot_log import RobotLog
+from mapfusion.smoother.levels import settled_with_levels
+from mapfusion.smoother.normal_equations import Estimate, odometry_information
+from mapfusion.smoother.residuals import first_points
+from mapfusion.smoother.settle import Problem
+from mapfusion.smoother.sightings import sightings_of
+from tests.mapfusion.smoother.white_noise_logs import (
+    NOISE,
+    dead_reckoned,
+    moved_tracks,
+    white_noise_log,
+    with_tracks,
+)
+
+STRAY_M = 0.05
+
+
+def level_of(log: RobotLog, stray_m: float = STRAY_M) -> float:
+    label, path = log.observations.label, dead_reckoned(log)
+    assert label is not None
+    seen = sightings_of(log, label, 1, stray=True)
+    information = odometry_information(log.odometry, NOISE)
+    at = Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
+    problem = Problem(seen, log.odometry, information, stray_m**-2)
+    return settled_with_levels(problem, at)[1].observation
+
+
+def stated(log: RobotLog, factor: float) -> RobotLog:
+    """The log with covariances that are so many times the true ones."""
+    seen = log.observations
+    return replace(log, observations=replace(seen, covariance_m2=factor * seen.covariance_m2))
+
+
+def tracked_log(seed: int) -> RobotLog:
+    rng = np.random.default_rng(seed)
+    return with_tracks(white_noise_log(rng, 120, 40), rng, STRAY_M).log
+
+
+@pytest.mark.parametrize("factor", [0.3, 1.0, 4.0])
+def test_the_level_is_that_of_the_noise(factor: float) -> None:
+    """To 3 standard deviations of a variance of the 2500 coordinates that three logs tell."""
+    found = [level_of(stated(tracked_log(seed), factor)) for seed in range(3)]
+    assert np.mean(found) * factor == pytest.approx(1, abs=3 * np.sqrt(2 / 2500))
+
+
+def test_what_lasts_along_a_track_is_not_in_it() -> None:
+    """However far tracks lie from their landmarks: the level is of what differs along them."""
+    rng = np.random.default_rng(1)
+    known = with_tracks(white_noise_log(rng, 120, 40), rng, STRAY_M)
+    track = known.log.observations.track
+    assert track is not None
+    far = moved_tracks(known, rng, np.arange(track.max() + 1), 0.3)
+    assert level_of(far, 0.3) == pytest.approx(level_of(known.log), rel=0.05)
+
+
+def test_gross_observations_are_not_in_it() -> None:
+    log, rng = tracked_log(2), np.random.default_rng(0)
+    wrong = log.observations.position_m.copy()
+    rows = rng.choice(len(wrong), len(wrong) // 50, replace=False)
+    wrong[rows, :2] += rng.uniform(1, 3, (len(rows), 2))
+    gross = replace(log, observations=replace(log.observations, position_m=wrong))
+    assert level_of(gross) == pytest.approx(level_of(log), rel=0.3)
+
+
+def test_without_tracks_what_is_stated_holds() -> None:
+    log = stated(tracked_log(3), 4.0)
+    seen = replace(log.observations, track=None)
+    assert level_of(replace(log, observations=seen)) == 1.0
+
+
+def test_a_log_that_tells_nothing_stays_as_stated() -> None:
+    """Each track is of one observation: nothing is there to differ along it."""
+    log = stated(tracked_log(4), 4.0)
+    alone = np.arange(len(log.observations), dtype=np.int32)
+    seen = replace(log.observations, track=alone, label=alone)
+    assert level_of(replace(log, observations=seen)) == 1.0
