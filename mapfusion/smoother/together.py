@@ -13,7 +13,7 @@ import numpy as np
 from mapfusion.robot_log import NO_TRACK, Observations, RobotLog
 from mapfusion.se2 import IDENTITY, Float, between, compose
 from mapfusion.smoother.elimination import matrix_bytes, pose_covariances
-from mapfusion.smoother.levels import settled_with_levels
+from mapfusion.smoother.levels import AS_STATED, settled_with_levels
 from mapfusion.smoother.normal_equations import Estimate
 from mapfusion.smoother.recording import Recording
 from mapfusion.smoother.residuals import first_points
@@ -86,13 +86,16 @@ def smooth_together(
     problem = Problem(seen, log.odometry, np.concatenate(information)[:-1], stray_information)
     start = Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
     own_odometry = all(each.parameters.odometry_covariance is None for each in recordings)
-    end = settled_with_levels(problem, start)[0] if own_odometry else settled(problem, start)
+    if own_odometry:
+        end, levels = settled_with_levels(problem, start)
+    else:
+        end, levels = settled(problem, start), AS_STATED
     covariance = np.zeros((len(starts), 3, 3))
     covariance[1:] = pose_covariances(seen, end.equations, end.solution, starts[1:])
     names = point[seen.row[seen.starts[:-1]]]
     paths = tuple(np.split(end.estimate.path, starts[1:]))
     return SmoothedTogether(
-        Smoothed.of(end, point), names, end.estimate.path[starts], covariance, paths
+        Smoothed.of(end, point, levels), names, end.estimate.path[starts], covariance, paths
     )
 
 

@@ -44,7 +44,10 @@ def _n_strays(known: Known) -> int:
 
 
 class Twin:
-    """All poses but the first, all points and all offsets in one dense least-squares problem."""
+    """All poses but the first, all points and all offsets in one dense least-squares problem.
+
+    Weights and the observations' level are those that were found.
+    """
 
     def __init__(self, team: LoggedTeam, found: SmoothedTogether, dimensions: int) -> None:
         self.d, smoothed = dimensions, found.smoothed
@@ -53,8 +56,9 @@ class Twin:
         position = np.concatenate([log.observations.position_m for log in logs])[seen.row]
         covariance = np.concatenate([log.observations.covariance_m2 for log in logs])[seen.row]
         self.position = position[:, : self.d]
-        scaled = covariance[:, : self.d, : self.d] / self.weights.observation[:, None, None]
-        self.root = np.linalg.inv(np.linalg.cholesky(scaled))
+        level = np.where(self.strays[seen.track], smoothed.observation_level, 1.0)
+        scaled = (level / self.weights.observation)[:, None, None] * covariance
+        self.root = np.linalg.inv(np.linalg.cholesky(scaled[:, : self.d, : self.d]))
         self.ends = np.cumsum([len(log) for log in logs])
         self.odometry = [log.odometry for log in logs]
         at = smoothed.estimate
