@@ -14,16 +14,14 @@ what does not, and what is stated holds.
 
 import numpy as np
 
+from mapfusion.smoother.odometry_levels import LEAST_TOLD
 from mapfusion.smoother.residuals import squared_distances
 from mapfusion.smoother.settle import Settled
 from mapfusion.smoother.student import fitted_dof, student_weights
 
-# Coordinates that have to be told before a level is taken from them; see `odometry_levels.py`.
-_LEAST_TOLD = 50.0
-
 
 def told_observation_level(end: Settled, level: float) -> float:
-    """Q of the stated covariances of observations on tracks that stray.
+    """The level q of the stated covariances of observations on tracks that stray.
 
     What is gross is so beside what is stated, or found if that is more: tails that are fitted on
     ever smaller levels grow heavier with each, and call gross what any sensor does at times.
@@ -31,6 +29,9 @@ def told_observation_level(end: Settled, level: float) -> float:
     Args:
         end: where steps ended.
         level: that the stated covariances were multiplied by.
+
+    Returns:
+        q; 1 where fewer than `LEAST_TOLD` coordinates are told.
     """
     seen, n = end.seen, end.seen.n_dimensions
     rows = seen.strays[seen.track]
@@ -39,7 +40,7 @@ def told_observation_level(end: Settled, level: float) -> float:
     square = squared_distances(seen, end.estimate)[rows]
     expected = squared_distances(seen, end.estimate, end.solution.track_m2)[rows]
     known = np.sum(n - np.minimum(end.weights.observation[rows] * (expected - square), n))
-    if known < _LEAST_TOLD:
+    if known < LEAST_TOLD:
         return 1.0
     beside = min(level, 1.0) * expected
     weights = student_weights(beside, fitted_dof(beside, n), n)

@@ -19,7 +19,7 @@ from mapfusion.smoother.settle import Problem, Settled
 
 # Disturbances that have to be told before a level is taken from them: a standard deviation is then
 # known to a tenth of itself, 1 / sqrt(2 n). Of fewer, covariances would be as uncertain as levels.
-_LEAST_TOLD = 50.0
+LEAST_TOLD = 50.0
 
 
 def told_odometry_levels(problem: Problem, end: Settled, levels: Float) -> Float:
@@ -34,4 +34,4 @@ def told_odometry_levels(problem: Problem, end: Settled, levels: Float) -> Float
     untold = disturbance_variances(end) * problem.information / levels
     said = problem.information > 0  # nothing is, of the way from one robot's log to another's
     known = np.sum(np.where(said, np.clip(1 - untold, 0, 1), 0), axis=0)
-    return np.where(known < _LEAST_TOLD, 1.0, found / np.maximum(known, _LEAST_TOLD))
+    return np.where(known < LEAST_TOLD, 1.0, found / np.maximum(known, LEAST_TOLD))

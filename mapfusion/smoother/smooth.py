@@ -80,7 +80,7 @@ class Smoothed:
     Attributes:
         landmark: (N,) which landmark each observation of the log is of, negative for none.
         estimate: path, landmarks and tracks' offsets.
-        seen: the observations that went into them.
+        seen: the observations that went into them, their information on this level.
         weights: of observations and offsets.
         tails: of their Student-t's.
         observation_level: factor on the stated covariances of observations on tracks, as the log
