@@ -10,9 +10,9 @@ import typer
 
 from experiments.cli import options
 from mapfusion.errors import InputError
-from mapfusion.recordings.levels import Level
 from mapfusion.recordings.registry import (
     IMPORTERS,
+    Level,
     import_recording,
     robot_name,
     settings_class,

@@ -1,17 +1,23 @@
-"""Where compiled kernels are kept: one folder for each state of the source.
+"""Where compiled kernels are kept: a folder for each module, as it and all it imports stand.
 
-Numba notices a change in a kernel's own file, not in a kernel that it calls from another file; a
-folder named after all of the source cannot hand out an outdated one.
+Numba by itself notices a change in a kernel's own file, not in a kernel that it calls from another
+file. A folder named after the source of both cannot hand out an outdated kernel, and a change to
+one module leaves alone what is compiled of those that do not import it.
 """
 
+import functools
 import os
 import shutil
+from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
-from experiments.run.code_version import source_hash
+from experiments.run.code_version import PACKAGES, SOURCE_ROOT, imported_sources, source_hash
 
-KERNELS = ("mapfusion", "sim/raycast", "sim/exposure.py")  # where there are any
-_VERSIONS_KEPT = 4  # a few megabytes each; going back and forth between branches stays fast
+_VERSIONS_KEPT = 4  # of a module; going back and forth between branches stays fast
+_HASH_DIGITS = 16
+# What is not ours, a plug-in's kernels, goes where Numba would put it.
+_LOCATORS = ("UserProvidedCacheLocator", "InTreeCacheLocator", "UserWideCacheLocator")
 
 
 def use_kernel_cache() -> None:
@@ -23,13 +29,71 @@ def use_kernel_cache() -> None:
         return
     cache_home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     root = cache_home / "mapfusion" / "kernels"
-    folder = root / source_hash(KERNELS)[:16]
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        os.utime(folder)
+        root.mkdir(parents=True, exist_ok=True)
+        _remove_outdated(root)
     except OSError:  # a home that cannot be written to: Numba finds a place of its own
         return
-    os.environ["NUMBA_CACHE_DIR"] = str(folder)
-    versions = sorted(root.iterdir(), key=lambda path: path.stat().st_mtime, reverse=True)
-    for outdated in versions[_VERSIONS_KEPT:]:
-        shutil.rmtree(outdated, ignore_errors=True)
+    os.environ["NUMBA_CACHE_DIR"] = str(root)
+    ours = f"{__name__}.{KernelLocator.__name__}"
+    os.environ.setdefault("NUMBA_CACHE_LOCATOR_CLASSES", ",".join((ours, *_LOCATORS)))
+
+
+def _remove_outdated(root: Path) -> None:
+    seen = Counter[str]()
+    for folder in sorted(root.iterdir(), key=lambda path: path.stat().st_mtime, reverse=True):
+        module, _, _ = folder.name.rpartition("-")
+        seen[module] += 1
+        if seen[module] > _VERSIONS_KEPT:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+class KernelLocator:
+    """Tells Numba where the kernels of one of our modules are kept (its cache locators' protocol).
+
+    Numba makes one for each kernel, by the name in `NUMBA_CACHE_LOCATOR_CLASSES`.
+    """
+
+    def __init__(self, folder: Path, line: int) -> None:
+        self._folder, self._line = folder, line
+
+    @classmethod
+    def from_function(cls, py_func: Callable[..., object], py_file: str) -> "KernelLocator | None":
+        """That of a kernel in a file; none where it is not ours or cannot be kept."""
+        root, path = os.environ.get("NUMBA_CACHE_DIR"), Path(py_file)
+        if not root or not any(path.is_relative_to(SOURCE_ROOT / package) for package in PACKAGES):
+            return None
+        try:
+            return cls(_used(kernel_folder(Path(root), path)), py_func.__code__.co_firstlineno)
+        except OSError:
+            return None
+
+    def get_cache_path(self) -> str:
+        """The folder."""
+        return str(self._folder)
+
+    def ensure_cache_path(self) -> None:
+        """Make the folder where it was removed since."""
+        self._folder.mkdir(parents=True, exist_ok=True)
+
+    def get_source_stamp(self) -> str:
+        """What is in it is of one version of the source, which its name tells."""
+        return self._folder.name
+
+    def get_disambiguator(self) -> str:
+        """Tells kernels of one name in one file apart."""
+        return str(self._line)
+
+
+@functools.cache
+def kernel_folder(root: Path, path: Path) -> Path:
+    """Where below `root` the kernels of a file of ours are kept, as the source stands."""
+    module = ".".join(path.relative_to(SOURCE_ROOT).with_suffix("").parts)
+    return root / f"{module}-{source_hash(imported_sources(module))[:_HASH_DIGITS]}"
+
+
+@functools.cache
+def _used(folder: Path) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    os.utime(folder)
+    return folder

@@ -36,3 +36,10 @@ def test_the_citation_is_of_this_version() -> None:
 def test_the_shell_completes_commands() -> None:
     told = asked(COMP_WORDS="mapfusion sce", COMP_CWORD="1", _MAPFUSION_COMPLETE="complete_bash")
     assert told.split() == ["scenarios"]
+
+
+def test_help_needs_no_library_that_computes() -> None:
+    slow = "('numpy', 'numba', 'scipy', 'pandas', 'cv2', 'matplotlib', 'pydantic')"
+    code = f"import sys, experiments.cli.main; print([m for m in {slow} if m in sys.modules])"
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert told.stdout.strip() == "[]"

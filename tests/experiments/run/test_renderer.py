@@ -7,8 +7,6 @@ import pytest
 
 from experiments.judge.judged_run import JudgedRun
 from experiments.judge.result import provenance
-from experiments.run.code_version import SOURCE_ROOT
-from experiments.run.kernel_cache import KERNELS
 from experiments.run.store import Store
 from experiments.scenario.loading import load_scenario
 from sim import renderer
@@ -74,14 +72,3 @@ def test_the_ray_caster_s_camera_stays_below_the_walls_upper_edge(
     reply = command(capsys, "run", tiny_path, "--set", "render.renderer=raycast", *arguments)
     assert_refused(reply, "render.renderer", "upper edge (0.6 m)", "camera.mount_z_m is 0.8")
     load_scenario(tiny_path, arguments[1::2])  # tiny looks over them
-
-
-def test_kernels_of_the_ray_caster_are_told_apart_by_their_source() -> None:
-    compiled = [
-        path
-        for path in SOURCE_ROOT.glob("sim/**/*.py")
-        if "from numba" in path.read_text(encoding="utf-8")
-    ]
-    assert len(compiled) > 5
-    for path in compiled:
-        assert any(path.is_relative_to(SOURCE_ROOT / part) for part in KERNELS)
