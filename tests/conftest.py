@@ -9,10 +9,14 @@ from hypothesis import HealthCheck, settings
 from xdist.scheduler import LoadFileScheduling
 
 from experiments.methods.threads import single_threaded
+from experiments.run.kernel_cache import use_kernel_cache
 
 # No test may depend on how fast the machine is; by default an example may take 0.2 s.
 settings.register_profile("any_speed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any_speed")
+
+# Tests, commands and the processes that they start share the kernels that any of them compiled.
+use_kernel_cache()
 
 # Threads that wait for one another in small products take many times as long on a busy machine.
 single_threaded()

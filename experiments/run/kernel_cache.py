@@ -41,11 +41,18 @@ def use_kernel_cache() -> None:
 
 def _remove_outdated(root: Path) -> None:
     seen = Counter[str]()
-    for folder in sorted(root.iterdir(), key=lambda path: path.stat().st_mtime, reverse=True):
+    for folder in sorted(root.iterdir(), key=_last_used, reverse=True):
         module, _, _ = folder.name.rpartition("-")
         seen[module] += 1
         if seen[module] > _VERSIONS_KEPT:
             shutil.rmtree(folder, ignore_errors=True)
+
+
+def _last_used(folder: Path) -> float:
+    try:
+        return folder.stat().st_mtime
+    except OSError:  # another command has just removed it
+        return 0.0
 
 
 class KernelLocator:

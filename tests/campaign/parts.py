@@ -1,12 +1,13 @@
 """The parts of the campaign: how much each must have tried, and what does it."""
 
-import os
 import time
 import traceback
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
+
+from experiments.run.kernel_cache import use_kernel_cache
 
 ROOM = 1.1  # of what the bar asks for: shares may fall short of theirs
 
@@ -74,7 +75,7 @@ PARTS = {
 
 def one_share(name: str, seed: str, folder: Path) -> tuple[Found, float]:
     """A piece of a part, and the seconds that it took."""
-    os.environ["NUMBA_CACHE_DIR"] = ""  # kernels are shared with the tests
+    use_kernel_cache()  # shared with the tests
     started = time.monotonic()
     folder.mkdir(parents=True)
     try:

@@ -1,6 +1,5 @@
 import io
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -16,14 +15,6 @@ from experiments.scenario.settings import Scenario, Simulation
 from experiments.show.figures import drawing
 from tests.helpers.shared_folder import shared_folder
 from tests.helpers.tiny_scenario import TINY, TRIO
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _kernels_beside_the_source() -> Iterator[None]:
-    # Set but empty: commands, and processes they start, share the kernels that tests compiled.
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("NUMBA_CACHE_DIR", "")
-        yield
 
 
 @pytest.fixture(scope="session")

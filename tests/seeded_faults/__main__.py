@@ -8,7 +8,6 @@ some minutes, most of it compilation.
 """
 
 import argparse
-import functools
 import os
 import shutil
 import subprocess
@@ -18,13 +17,12 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-import grimp
-
 from experiments.run.code_version import PACKAGES
 from tests.seeded_faults.faults import ROOT, Fault, all_faults
 
 _COPIED = (*PACKAGES, "tests", "scenarios", "pyproject.toml", "README.md", "CONTRIBUTING.md")
 _TIME_LIMIT_S = 1800  # a fault may make a loop endless
+_NOT_TOLD = {"NUMBA_CACHE_DIR", "NUMBA_CACHE_LOCATOR_CLASSES"}  # kernels are the copy's own
 _PASSED, _FAILED = 0, 1  # pytest's exit codes; others are no verdict
 
 
@@ -38,37 +36,16 @@ def copy_source(folder: Path) -> None:
             shutil.copy2(source, folder / name)
 
 
-def forget_kernels(folder: Path, file: str) -> None:
-    """Delete compiled kernels of the file and of all modules that import it, directly or not.
-
-    Numba keeps a kernel as long as its own file is unchanged, whatever it calls. Of a file without
-    a kernel no other can have taken anything but constants.
-    """
-    if "njit" not in (folder / file).read_text(encoding="utf-8"):
-        return
-    module = ".".join(Path(file).with_suffix("").parts).removesuffix(".__init__")
-    reached = {module, *_imports().find_downstream_modules(module)}
-    stems = {name.rpartition(".")[2] for name in reached}
-    for cached in (folder / "kernels").rglob("*.nb[ci]"):
-        if cached.name.partition(".")[0] in stems:
-            cached.unlink()
-
-
-@functools.cache
-def _imports() -> grimp.ImportGraph:
-    return grimp.build_graph(*PACKAGES, cache_dir=None)
-
-
 def run_tests(folder: Path, tests: Sequence[str]) -> tuple[int, str]:
     """Exit code and last lines of pytest in the copy."""
     command = [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", *tests]
-    own = {"PYTHONPATH": str(folder), "NUMBA_CACHE_DIR": str(folder / "kernels")}
+    own = {"PYTHONPATH": str(folder), "XDG_CACHE_HOME": str(folder / "cache")}
     own |= {"PYTHONDONTWRITEBYTECODE": "1"}
     try:
         ended = subprocess.run(
             command,
             cwd=folder,
-            env=os.environ | own,
+            env={name: value for name, value in os.environ.items() if name not in _NOT_TOLD} | own,
             capture_output=True,
             text=True,
             timeout=_TIME_LIMIT_S,
@@ -87,13 +64,11 @@ def verdict(folder: Path, fault: Fault, sound: set[tuple[str, ...]]) -> str:
         sound.add(fault.tests)
     path = folder / fault.file
     original = path.read_text(encoding="utf-8")
-    forget_kernels(folder, fault.file)
     try:
         path.write_text(fault.applied(original), encoding="utf-8")
         code, said = run_tests(folder, fault.tests)
     finally:
         path.write_text(original, encoding="utf-8")
-        forget_kernels(folder, fault.file)
     if code == _PASSED:
         return "NOT CAUGHT"
     return "caught" if code == _FAILED else f"CANNOT RUN ({code}): {said}"
