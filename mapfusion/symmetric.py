@@ -18,6 +18,17 @@ def cofactors(
 
 
 @njit(cache=True)
+def copy_lower(matrix: Float, copy: Float) -> None:
+    """Put the lower half of a matrix into another, which Numba's `copy[:] = matrix` would, too.
+
+    That compiles what says in words how shapes differ, which takes seconds.
+    """
+    for i in range(len(matrix)):
+        for j in range(i + 1):
+            copy[i, j] = matrix[i, j]
+
+
+@njit(cache=True)
 def cholesky(matrix: Float, singular: float) -> bool:
     """Lower factor of a symmetric matrix in place, of which the lower half is read.
 

@@ -15,6 +15,7 @@ from experiments.judge.known_truth import why_no_truth
 from experiments.judge.smoothed_robots import SmoothedRobot, load_smoothed
 from experiments.run.memory import require_memory
 from experiments.run.pipeline import PairStages, Pipeline, RobotStages, lay_out
+from experiments.run.rehearsal import rehearsals
 from experiments.run.stage import Stage
 from experiments.run.stages.fuse import read_fusions
 from experiments.run.stages.slam import RobotFolders
@@ -133,9 +134,10 @@ class JudgedRun:
         require_memory(self.pipeline, jobs)
         wanted = only or self.stages()
         left = unfinished(self.tasks, [name for stage in wanted for name in task_names(stage)])
+        first = rehearsals(self.scenario, left) if jobs > 1 else []
         try:
             with workers(jobs) as pool:
-                run_tasks(left, pool, on_progress)
+                run_tasks([*first, *left], pool, on_progress)
         except DamagedFileError:  # `mending` wants to know which
             raise
         except InputError as error:

@@ -8,7 +8,7 @@ import math
 import numpy as np
 from numba import njit
 
-from mapfusion.symmetric import cholesky, solve_lower, solve_upper
+from mapfusion.symmetric import cholesky, copy_lower, solve_lower, solve_upper
 
 _MAX_STEPS = 20  # a few on rich texture; where it is poor, slopes take long
 _CONVERGED_PX = 0.005  # anywhere in the window; far below what noise lets one measure
@@ -150,7 +150,7 @@ def _settle(
             return np.nan
         square = _residuals(left, right, u, v, half, plane, step)
         prior = variance_grey / slope_sigma**2
-        factor[:] = seen
+        copy_lower(seen, factor)
         factor[2, 2] += prior
         factor[3, 3] += prior
         step[2] -= prior * plane[1]
@@ -186,8 +186,8 @@ def _square(moments: np.ndarray, prior: float, weight: np.ndarray) -> float:
 
 @njit(cache=True)
 def _without_noise(seen: np.ndarray, half: int, noise: float, normal: np.ndarray) -> None:
-    """J^T J (4, 4) less what the noise of slopes has added to their squares."""
-    normal[:] = seen
+    """J^T J (4, 4), its lower half, less what the noise of slopes has added to their squares."""
+    copy_lower(seen, normal)
     added = noise**2 / 2 * (2 * half + 1) ** 2
     for i in range(1, 4):
         normal[i, i] -= min(added, (1 - _LEAST_TEXTURE) * seen[i, i])

@@ -15,7 +15,7 @@ from numba import njit
 from mapfusion.chi_square import chi_square_bound
 from mapfusion.se2 import Float
 from mapfusion.se3 import inverse
-from mapfusion.symmetric import cholesky, cofactors, solve_lower, solve_upper
+from mapfusion.symmetric import cholesky, cofactors, copy_lower, solve_lower, solve_upper
 
 MIN_LINKS = 4  # three links determine a motion; one slip among four is the first that shows
 # Added to the noise: from a tolerance beside which all points are equally certain to none.
@@ -130,7 +130,7 @@ def _narrow(
                 _differences(T[b], p_before, p_after, lever, residual)
                 _information(T[b], variance, S_before, S_after, information)
                 _normal_equations(lever, residual, information, agree[b], normal[b], step)
-                factor[:] = normal[b]
+                copy_lower(normal[b], factor)
                 if cholesky(factor, 0.0):
                     solve_lower(factor, step)
                     solve_upper(factor, step)
