@@ -93,14 +93,20 @@ class Pipeline:
         return [robot for robot in self.robots if isinstance(robot, SimulatedRobotStages)]
 
     def stages(self) -> list[Stage]:
-        """All stages, each after those before it; a robot is done before the next one's images.
+        """All stages, each after those before it; in the order in which they keep processes busy.
 
-        Fused maps need one aligner only and are made in few long pieces, so they come before the
-        others' estimates: many short pieces at the end keep all processes at work until then.
+        What is made in one piece (a robot's tracks, its filter) is made for all robots at a time,
+        and not for the last one while others wait. Fused maps need one aligner only and are made in
+        few long pieces, so they come before the others' estimates: many short pieces at the end
+        keep all processes at work until then.
         """
-        maps = (robot.smooth for robot in self.robots)
+        images = [robot.features for robot in self.simulated]
+        logs = [robot.log for robot in self.simulated]
+        filters = [robot.slam for robot in self.robots]
+        maps = [robot.smooth for robot in self.robots]
         estimates = (pair.estimates for pair in self.pairs)
-        return with_those_before([*maps, *self.fusers.values(), *estimates])
+        in_order = [*images, *logs, *filters, *maps, *self.fusers.values(), *estimates]
+        return with_those_before(in_order)
 
 
 def lay_out(scenario: AnyScenario) -> Pipeline:
