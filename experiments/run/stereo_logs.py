@@ -12,7 +12,7 @@ from experiments.scenario.suite import settings_of
 from experiments.scenario.yaml_input import read_calibration
 from mapfusion.calibration_error import CalibrationError
 from mapfusion.errors import InputError
-from mapfusion.recordings.levels import Level
+from mapfusion.recordings.level import Level
 from mapfusion.recordings.registry import read_recording
 from mapfusion.recordings.stereo_import import (
     Cut,

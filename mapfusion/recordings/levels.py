@@ -1,20 +1,17 @@
 """Where a recording knows the attitude of its robot from, frame by frame."""
 
-from typing import Literal
-
 import numpy as np
 
 from mapfusion.camera import StereoCamera
 from mapfusion.recordings.floor import floor_of
 from mapfusion.recordings.inertial import SHARED_RAD, Inertial
+from mapfusion.recordings.level import Level
 from mapfusion.recordings.mount import levelled
 from mapfusion.robot_log import Observations
 from mapfusion.se2 import Float
 from mapfusion.se3 import roll_pitch
 from mapfusion.vision.attitude_filter import Measured
 from mapfusion.vision.features import Features
-
-Level = Literal["auto", "mount", "pictures", "floor", "imu", "odometry"]
 
 # Standard deviations of a first frame's roll, pitch (rad) and height (m): a car on its springs
 # stands within half a degree of the road, and its height is the map's.

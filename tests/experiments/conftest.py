@@ -10,6 +10,7 @@ from PIL import Image
 from experiments.judge.judged_run import JudgedRun
 from experiments.judge.result import run_scenario
 from experiments.methods.threads import single_threaded
+from experiments.run import workers
 from experiments.run.store import Store
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import Scenario, Simulation
@@ -23,6 +24,14 @@ def _kernels_beside_the_source() -> Iterator[None]:
     # Set but empty: commands, and processes they start, share the kernels that tests compiled.
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("NUMBA_CACHE_DIR", "")
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _no_server_is_forked_from_here() -> Iterator[None]:
+    """Unlike a command, this process has begun to work, and what tests replace would stay so."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(workers, "make_ready", lambda jobs: None)
         yield
 
 
