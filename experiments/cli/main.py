@@ -1,5 +1,6 @@
 """The command `mapfusion`: its list of commands, and what becomes of their failures."""
 
+import gc
 import sys
 import warnings
 from typing import Annotated, Any
@@ -19,6 +20,9 @@ from experiments.cli.options import (
 )
 from mapfusion.errors import InputError, one_line
 
+# Objects made before Python looks for cycles among them, 700 by default: most are made by imports
+# and in drawing, and stay.
+_MADE_BETWEEN_COLLECTIONS = 50_000
 REPLACED = {
     "aligners": "scenarios --aligners",
     "schema": "scenarios --schema",
@@ -71,6 +75,7 @@ def main() -> None:
     from experiments.run.defects import saved_defect
     from experiments.run.kernel_cache import use_kernel_cache
 
+    gc.set_threshold(_MADE_BETWEEN_COLLECTIONS)
     unsealed = _tell_warnings()
     try:
         use_kernel_cache()

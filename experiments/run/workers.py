@@ -43,6 +43,7 @@ def make_ready(jobs: int) -> None:
     To be called by a command that has imported what they need, and has begun nothing yet. Only the
     first call counts.
     """
+    gc.freeze()  # what is imported stays: nobody is to look through it for garbage
     server: Any = forkserver._forkserver
     if jobs == 1 or not _FORKED or server._forkserver_pid is not None:
         return
@@ -70,7 +71,6 @@ def make_ready(jobs: int) -> None:
 def _serve(listener: int, ended: int) -> NoReturn:
     """Fork workers until the end of this process's parent and of all workers."""
     try:
-        gc.freeze()  # workers share what is there: none of them is to look through it
         forkserver.main(listener, ended, [])
     finally:
         os._exit(0)

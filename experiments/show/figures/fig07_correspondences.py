@@ -137,7 +137,8 @@ def _fill_page(figure: Figure, axes: Axes3D, legend: Legend) -> None:
 
 def _extent_px(axes: Axes3D, canvas: FigureCanvasAgg) -> Bbox:
     """Where the box and its labels are drawn."""
-    canvas.draw()  # only then is it known how it is projected
+    axes.apply_aspect()
+    axes.M = axes.get_proj()  # by which labels are placed: else only drawing tells it
     corners = np.array(list(product(axes.get_xlim(), axes.get_ylim(), axes.get_zlim())))
     x, y, _ = proj_transform(corners[:, 0], corners[:, 1], corners[:, 2], axes.get_proj())
     box = Bbox.null()

@@ -241,7 +241,8 @@ def of_pair(rows: pd.DataFrame, pair: Pair) -> pd.DataFrame:
 
 def positions_and_covariances(rows: pd.DataFrame) -> tuple[Float, Float]:
     """Positions (N, 3) and covariances (N, 3, 3) of rows with the columns of a map."""
-    return points_from(pa.Table.from_pandas(rows[POSITION_FIELDS + COVARIANCE_FIELDS]))
+    columns = rows[POSITION_FIELDS + COVARIANCE_FIELDS]
+    return points_from(pa.table({name: columns[name].to_numpy() for name in columns}))
 
 
 def json_object(text: str, where: Path) -> dict[str, Any]:
