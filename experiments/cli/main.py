@@ -1,6 +1,7 @@
 """The command `mapfusion`: its list of commands, and what becomes of their failures."""
 
 import gc
+import os
 import sys
 import warnings
 from typing import Annotated, Any
@@ -76,6 +77,9 @@ def main() -> None:
     from experiments.run.kernel_cache import use_kernel_cache
 
     gc.set_threshold(_MADE_BETWEEN_COLLECTIONS)
+    # Work is bound to one thread anyway, and those that BLAS starts when it is imported wait in a
+    # loop. To be said before that.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     unsealed = _tell_warnings()
     try:
         use_kernel_cache()

@@ -41,15 +41,16 @@ def run(
     # What draws takes time to import: a scenario is refused before.
     from experiments.judge.nothing_merged import nothing_merged
     from experiments.judge.result import run_scenario
-    from experiments.run.workers import make_ready
-    from experiments.show.figures.drawing import draw_all
+    from experiments.run.workers import make_ready, workers
+    from experiments.show.figures.drawing import Drawing
     from experiments.show.terminal import layout, run_screen
 
     make_ready(jobs)
     for loaded in checked:
-        with layout.progress() as show:
-            folder = run_scenario(loaded, results, jobs, show, fresh, output)
-            drawn = draw_all(folder, jobs, partial(show, _DRAWING))
+        with layout.progress() as show, workers(jobs) as pool:
+            drawing = Drawing(pool)
+            folder = run_scenario(loaded, results, jobs, show, fresh, output, drawing.written)
+            drawn = drawing.finish(folder, partial(show, _DRAWING))
         run_screen.print_result(folder, drawn.skipped)
         if nothing := nothing_merged(folder):
             options.complain(f"warning: {nothing.text}")

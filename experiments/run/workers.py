@@ -52,8 +52,9 @@ def make_ready(jobs: int) -> None:
     from numba.core.registry import cpu_target
 
     # What Numba does before its first kernel, which takes it tenths of a second in each process.
-    cpu_target.typing_context.refresh()
-    cpu_target.target_context.refresh()
+    contexts: Any = cpu_target
+    contexts.typing_context.refresh()
+    contexts.target_context.refresh()
     sys.stdout.flush()  # else each process would write what is left there
     sys.stderr.flush()
     with held_back_interrupts(), socket.socket(socket.AF_UNIX) as listener:

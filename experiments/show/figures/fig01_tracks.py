@@ -20,6 +20,7 @@ from experiments.show.figures.style import PAGE_WIDTH_IN
 from mapfusion.errors import InputError
 from mapfusion.sealed import read_sealed
 
+READS = ("robots", "tracks")
 _MAX_FRAMES, _TRAIL_FRAMES = 4, 5
 _KEY_FRAME = re.compile(r"(?P<robot>.+)_(?P<iteration>\d+)\.png")
 

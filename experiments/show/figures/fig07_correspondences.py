@@ -18,6 +18,8 @@ from experiments.show.figures.result_tables import NothingToDraw, Pair, ResultTa
 from experiments.show.figures.style import BLACK, GRAY, PAGE_WIDTH_IN
 from mapfusion.se2 import Float
 
+READS = ("correspondences", "errors", "estimates", "landmarks", "robots", "true_pairs")
+
 # Strays must not shrink the picture: beyond this share on each side, widened by some of the extent.
 _STRAY_SHARE, _STRAY_MARGIN = 0.005, 0.05
 _GAP = 0.15  # between the two maps, as a share of the first one's width
