@@ -10,6 +10,7 @@ first line of OBJ.
 import hashlib
 import re
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 
 from mapfusion.errors import DamagedFileError, UnsealedWarning
@@ -22,10 +23,19 @@ _PARQUET_TAIL = 8  # bytes: the length of the footer, and the magic number
 _told: list[Path] = []  # the file that was said to carry no digest, once a process
 
 
+def _seals(data: bytes) -> Iterator[re.Match[bytes]]:
+    """Where a file's bytes look like a seal, the last first: large files have it near their end."""
+    at = len(data)
+    while (at := data.rfind(SEAL.encode(), 0, at)) >= 0:
+        if match := _SEAL.match(data, at):
+            yield match
+
+
 def seal(data: bytes) -> bytes:
     """Fill in the digest of a file's bytes, which hold an empty seal."""
-    *_, at = (m.start(1) for m in _SEAL.finditer(data) if m[1] == NO_DIGEST.encode())
-    return data[:at] + hashlib.sha256(data).hexdigest().encode() + data[at + len(NO_DIGEST) :]
+    at = next(match.start(1) for match in _seals(data) if match[1] == NO_DIGEST.encode())
+    view, digest = memoryview(data), hashlib.sha256(data).hexdigest().encode()
+    return b"".join((view[:at], digest, view[at + len(digest) :]))
 
 
 def is_intact(data: bytes) -> bool | None:
@@ -34,7 +44,7 @@ def is_intact(data: bytes) -> bool | None:
     One seal that fits is enough: a text in a table may look like one.
     """
     found = None
-    for match in _SEAL.finditer(data):
+    for match in _seals(data):
         at = match.start(1)
         digest = hashlib.sha256(memoryview(data)[:at])
         digest.update(NO_DIGEST.encode())
@@ -68,7 +78,7 @@ def read_sealed(path: Path, what: str, only_ours: bool = False) -> bytes:
 
 def tell_unsealed(path: Path, data: bytes) -> None:
     """Warn, once a process, that a file which could be read is of unknown soundness."""
-    if not _told and _SEAL.search(data) is None:
+    if not _told and next(_seals(data), None) is None:
         _told.append(path)
         why = "made by another program or an earlier version, so damage to it may go unseen"
         text = f"{path}: carries no digest ({why}); said of the first such file alone"
@@ -80,7 +90,8 @@ def say_again() -> None:
     _told.clear()
 
 
-def parquet_with_seal(data: bytes) -> bytes:
+def parquet_with_seal(data: bytes | memoryview) -> bytes:
     """A Parquet file with an empty seal in front of its footer, which points at nothing behind."""
-    footer = _PARQUET_TAIL + int.from_bytes(data[-_PARQUET_TAIL:][:4], "little")
-    return data[:-footer] + LINE + data[-footer:]
+    view = memoryview(data)
+    footer = _PARQUET_TAIL + int.from_bytes(view[-_PARQUET_TAIL:][:4], "little")
+    return b"".join((view[:-footer], LINE, view[-footer:]))

@@ -10,9 +10,9 @@ import typer
 
 from experiments.cli import options
 from mapfusion.errors import InputError
+from mapfusion.recordings.level import Level
 from mapfusion.recordings.registry import (
     IMPORTERS,
-    Level,
     import_recording,
     robot_name,
     settings_class,
@@ -102,6 +102,7 @@ def _stereo_command(format_name: str) -> Callable[..., None]:
         **chosen: str | None,
     ) -> None:
         from experiments.run.stereo_logs import Source, import_stereo, vision_of
+        from experiments.run.workers import make_ready
         from experiments.scenario.loading import made_settings
         from experiments.show.terminal.import_screen import print_imported
         from experiments.show.terminal.layout import progress
@@ -115,6 +116,7 @@ def _stereo_command(format_name: str) -> Callable[..., None]:
         sources = [
             Source(format_name, folder, settings, odometry, truth, *given) for folder in folders
         ]
+        make_ready(jobs)
         with progress() as show:
             done, written = import_stereo(
                 sources, output, lambda one: _cuts(robot_name(one.name), frames or ()), jobs, show

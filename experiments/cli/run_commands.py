@@ -11,7 +11,6 @@ from mapfusion.errors import InputError
 
 app = typer.Typer()
 _DRAWING = "draw the figures"
-NEEDED = ("experiments.judge.result", "experiments.show.figures.drawing")  # by worker processes
 
 
 @app.command(rich_help_panel=options.RUN)
@@ -33,25 +32,25 @@ def run(
     Finished stages are reused; an interrupted run goes on where it was.
     """
     from experiments.judge.expectations import load_checked
-    from experiments.run.workers import make_ready
     from experiments.scenario.suite import scenarios_of
 
     checked = [load_checked(path, overrides, seed) for path in scenarios_of(scenarios)]
     if output is not None and len(checked) > 1:
         several = f"is one folder for {len(checked)} runs; give --results"
         raise InputError(f"--output {output}: {several}")
-    # What draws takes seconds to import: a scenario is refused before.
-    if jobs > 1:
-        make_ready(NEEDED)
+    # What draws takes time to import: a scenario is refused before.
     from experiments.judge.nothing_merged import nothing_merged
     from experiments.judge.result import run_scenario
-    from experiments.show.figures.drawing import draw_all
+    from experiments.run.workers import make_ready, workers
+    from experiments.show.figures.drawing import Drawing
     from experiments.show.terminal import layout, run_screen
 
+    make_ready(jobs)
     for loaded in checked:
-        with layout.progress() as show:
-            folder = run_scenario(loaded, results, jobs, show, fresh, output)
-            drawn = draw_all(folder, jobs, partial(show, _DRAWING))
+        with layout.progress() as show, workers(jobs) as pool:
+            drawing = Drawing(pool)
+            folder = run_scenario(loaded, results, jobs, show, fresh, output, drawing.written)
+            drawn = drawing.finish(folder, partial(show, _DRAWING))
         run_screen.print_result(folder, drawn.skipped)
         if nothing := nothing_merged(folder):
             options.complain(f"warning: {nothing.text}")
@@ -72,12 +71,14 @@ def report(
 ) -> None:
     """Show a result in one HTML file that works offline: `mapfusion report results/quick-0`."""
     from experiments.judge.result import require_result
+    from experiments.run.workers import make_ready
     from experiments.show.figures.drawing import draw_all
     from experiments.show.report.document import write_report
     from experiments.show.terminal import layout
 
     if figures:
         require_result(result)
+        make_ready(jobs)
         with layout.progress() as show:
             drawn = draw_all(result, jobs, partial(show, _DRAWING))
         layout.print_paths(result / "figures", *drawn)
@@ -141,7 +142,9 @@ def check(
 
     def run_one(scenario: AnyScenario) -> Path:
         from experiments.judge.result import run_scenario  # as in `run`
+        from experiments.run.workers import make_ready
 
+        make_ready(jobs)
         with layout.progress() as show:
             return run_scenario(scenario, results, jobs, show, fresh)
 

@@ -29,10 +29,12 @@ def record(
     from experiments.judge import user_files as single
     from experiments.judge.expectations import load_checked
     from experiments.judge.written_drives import write_drives
+    from experiments.run.workers import make_ready
     from experiments.scenario.suite import one_scenario
     from experiments.show.terminal.layout import print_paths, progress
 
     loaded = load_checked(one_scenario(scenario), overrides, seed)
+    make_ready(jobs)
     with progress() as show:
         if kind == "log":
             paths = single.record(loaded, output, results, jobs, show)

@@ -41,6 +41,7 @@ def refusal(
     """
     import numpy as np
 
+    from experiments.run.workers import make_ready
     from experiments.scenario.seeds import parse_seeds
     from experiments.show.refusal_files import draw_refusals, write_kinds
     from experiments.show.terminal import layout, refusal_screen
@@ -49,6 +50,7 @@ def refusal(
     from experiments.study.refusal.reliability import judged_answers, reliability
     from experiments.study.refusal.stored_worlds import worlds_of
 
+    make_ready(jobs)
     mapped, drawn = worlds_of(worlds, parse_seeds(seeds), results), PairsDrawn(pairs, every)
     with layout.progress() as show:
         false_alarms = refusal_trial.run(mapped, output, drawn, jobs, show)

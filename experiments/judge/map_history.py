@@ -5,36 +5,45 @@ at them in plan.
 """
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from experiments.judge.errors import MetMaps
 from experiments.judge.fused_landmarks import PAPERS, FusedTeam, MergeSettings
-from experiments.judge.judging import JudgeSettings
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.merge import merge
 from mapfusion.storage import point_columns
 
 
-def history_tables(team: FusedTeam, settings: JudgeSettings) -> dict[str, pd.DataFrame]:
-    """The tables `map_history`, `true_pairs` and `fused_history`."""
+def map_history_rows(team: FusedTeam) -> pd.DataFrame:
+    """Rows of the table `map_history`."""
     maps = [
         _plan_rows(landmarks).assign(robot=robot.name, iteration=k)
         for robot in team.robots
         for k, landmarks in robot.maps.items()
     ]
-    true_pairs, fused = [], []
-    for met in team.met:
-        bits = np.packbits(met.is_true(settings.true_pair_radius_m)).tobytes()
-        true_pairs.append(met.names | {"n_correspondences": len(met.offered), "true_pair": bits})
-        fused.append(_joined_rows(met, settings.merge))
-    return {
-        "map_history": pd.concat(maps, ignore_index=True),
-        "true_pairs": pd.DataFrame(true_pairs),
-        "fused_history": pd.concat(fused, ignore_index=True) if fused else pd.DataFrame(),
-    }
+    return pd.concat(maps, ignore_index=True)
+
+
+def true_pair_rows(team: FusedTeam, radius_m: float) -> list[dict[str, Any]]:
+    """Rows of the table `true_pairs`."""
+    return [
+        met.names
+        | {
+            "n_correspondences": len(met.offered),
+            "true_pair": np.packbits(met.is_true(radius_m)).tobytes(),
+        }
+        for met in team.met
+    ]
+
+
+def fused_history_rows(team: FusedTeam, settings: MergeSettings) -> pd.DataFrame:
+    """Rows of the table `fused_history`."""
+    fused = [_joined_rows(met, settings) for met in team.met]
+    return pd.concat(fused, ignore_index=True) if fused else pd.DataFrame()
 
 
 def _plan_rows(landmarks: LandmarkMap) -> pd.DataFrame:

@@ -9,7 +9,7 @@ import platform
 import shutil
 from collections.abc import Callable, Collection, Sequence
 from datetime import UTC, datetime
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,11 @@ from experiments.judge.fuser_coverage import coverage_rows
 from experiments.judge.judged_fusers import JudgedFusion, fuser_rows
 from experiments.judge.judged_run import JudgedRun
 from experiments.judge.judging import ALIGNED
-from experiments.judge.map_history import history_tables
+from experiments.judge.map_history import (
+    fused_history_rows,
+    map_history_rows,
+    true_pair_rows,
+)
 from experiments.judge.path_errors import path_statistics_rows, robot_paths
 from experiments.judge.smoothed_robots import SmoothedRobot, smoothed_path_rows, smoother_rows
 from experiments.judge.team_figures import team_pair_rows, team_rows
@@ -56,6 +60,7 @@ from sim.floorplan import Wall
 from sim.renderer import renderer_name
 
 RESULT_SCHEMA_VERSION = 1
+OnWritten = Callable[[Path, str], None]
 _SUBFOLDERS = ("tables", "maps", "keyframes", "figures")
 _LABEL = "write the tables"
 _FACE_DECIMALS = 6  # a micrometre: what is beyond is rounding
@@ -76,10 +81,11 @@ def run_scenario(
     on_progress: OnProgress,
     fresh: bool = False,
     output: Path | None = None,
+    on_written: OnWritten = lambda folder, part: None,
 ) -> Path:
     """Run a scenario and write its result, to `RESULTS/NAME-SEED` by default; returns the folder.
 
-    The store is that of `results`.
+    The store is that of `results`. `on_written` is told (folder, part) as `write_result` has it.
     """
     run = JudgedRun.of(scenario, Store.of(results))
     folder = output or results / f"{scenario.name}-{scenario.seed}"
@@ -93,25 +99,36 @@ def run_scenario(
     def make() -> None:
         run.execute(jobs, on_progress)
         on_progress(_LABEL, 0, 1)
-        write_result(run, folder)
+        write_result(run, folder, on_written)
         on_progress(_LABEL, 1, 1)
 
     mending(run.store, make)
     return folder
 
 
-def write_result(run: JudgedRun, folder: Path) -> None:
-    """Collect a finished plan's tables, maps and images in a result folder."""
+def write_result(
+    run: JudgedRun, folder: Path, on_written: OnWritten = lambda folder, part: None
+) -> None:
+    """Collect a finished plan's tables, maps and images in a result folder.
+
+    `on_written` is told (folder, part) of each table, and of `scenario`, when it is there. World
+    and images are there before the first of them.
+    """
     team = run.load_team()
     measure_aligners(run, team.robots)
-    rows = all_tables(run, team) | history_tables(team, run.settings)
-    if run.no_truth:
-        rows["true_pairs"] = pd.DataFrame()
-    rows |= {"aligner_timings": run.pair_table("aligner_timings"), "tracks": _tracks(run)}
-    for name, table in rows.items():
-        tables.write(tables.table_path(folder, name), name, table)
     for outdated in ("maps", "keyframes"):  # of robots or frames that are no longer there
         shutil.rmtree(folder / outdated, ignore_errors=True)
+    _write_images(run, folder)
+    write_json(folder / "world.json", _world(run.scenario, team.robots))
+    own = {
+        "aligner_timings": lambda: run.pair_table("aligner_timings"),
+        "tracks": lambda: _tracks(run),
+    }
+    for name, make in (own | _makers(run, team) | _history(run, team)).items():
+        tables.write(tables.table_path(folder, name), name, make())
+        on_written(folder, name)
+    write_json(folder / "scenario.json", run.scenario.resolved())
+    on_written(folder, "scenario")
     for robot in team.robots:
         write_map(folder / "maps" / f"{robot.name}.parquet", robot.at(team.iteration)[0])
     for robot in run.pipeline.robots:
@@ -121,9 +138,6 @@ def write_result(run: JudgedRun, folder: Path) -> None:
         for k, fused in enumerate(read_fused_maps(run.store.path(fuser)), start=1):
             name = "fused.parquet" if k == 1 else f"fused.{k}.parquet"
             write_map(folder / "maps" / name, fused)
-    _write_images(run, folder)
-    write_json(folder / "scenario.json", run.scenario.resolved())
-    write_json(folder / "world.json", _world(run.scenario, team.robots))
     write_json(folder / "provenance.json", provenance(run))
 
 
@@ -174,46 +188,76 @@ def all_tables(
 
     Of `only` those, if it is given: a sweep of short runs spends its time on the others.
     """
-    settings, smoothed = run.settings, run.load_smoothed(team.robots)
-    paths, fusions = _paths(run, smoothed), run.load_fusions(team.robots, smoothed)
+    makers = _makers(run, team).items()
+    return {name: tables.framed(name, make()) for name, make in makers if name in only}
+
+
+def _makers(run: JudgedRun, team: FusedTeam) -> dict[str, Callable[[], Any]]:
+    """What makes these tables, by their names: first those that figures wait for."""
+    settings = run.settings
+
+    @cache
+    def smoothed() -> list[SmoothedRobot]:
+        return run.load_smoothed(team.robots)
+
+    @cache
+    def paths() -> pd.DataFrame:
+        return _paths(run, smoothed())
+
+    @cache
+    def fusions() -> list[JudgedFusion]:
+        return run.load_fusions(team.robots, smoothed())
+
     makers: dict[str, Callable[[], Any]] = {
-        "paths": lambda: paths,
-        "robots": lambda: paths,
-        "frame_times": lambda: _frame_times(run),
-        "smoother": lambda: smoother_rows(smoothed),
-        "smoothed_paths": lambda: smoothed_path_rows(smoothed),
-        "clouds": lambda: _clouds(run),
+        name: partial(run.pair_table, name) for name in ("errors", *ALIGNED, "fusion")
+    }
+    makers |= {
         "landmarks": lambda: pd.concat(
             [fused_landmarks.landmark_rows(r, *r.at(team.iteration)) for r in team.robots],
             ignore_index=True,
         ),
+        "paths": paths,
+        "robots": paths,
+        "clouds": lambda: _clouds(run),
+        "smoothed_paths": lambda: smoothed_path_rows(smoothed()),
         "fused": lambda: fused_landmarks.fused_rows(team),
-        "fused_map": lambda: _fused_map_rows(run, fusions),
-        "team_edges": lambda: fused_landmarks.team_edge_rows(team),
         "fused_motions": lambda: fused_landmarks.fused_motion_rows(team),
+        "fused_map": lambda: _fused_map_rows(run, fusions()),
+    }
+    judged: dict[str, Callable[[], Any]] = {
+        "fusers": lambda: fuser_rows(fusions()),
+        "fuser_coverage": lambda: coverage_rows(fusions()),
+        "path_statistics": lambda: path_statistics_rows(paths()),
+        "team": lambda: team_rows(team, paths(), _placed_by_smoothed(run, fusions())),
+        "team_pairs": lambda: team_pair_rows(
+            team, run.pair_table("errors"), settings.merge.aligner
+        ),
+        "map_fits": lambda: fused_landmarks.map_fit_rows(team),
+        "landmark_nees": lambda: fused_landmarks.landmark_nees_rows(
+            team, settings.true_pair_radius_m
+        ),
+    }
+    makers |= dict.fromkeys(judged, list) if run.no_truth else judged
+    return makers | {
+        "frame_times": lambda: _frame_times(run),
+        "smoother": lambda: smoother_rows(smoothed()),
+        "team_edges": lambda: fused_landmarks.team_edge_rows(team),
         "timings": lambda: [
             {"stage": stage.name, "name": f"{stage.key}:{name}", "elapsed_s": seconds}
             for stage in run.folders()
             for name, seconds in stage.figures().items()
         ],
     }
-    judged: dict[str, Callable[[], Any]] = {
-        "path_statistics": lambda: path_statistics_rows(paths),
-        "team": lambda: team_rows(team, paths, _placed_by_smoothed(run, fusions)),
-        "team_pairs": lambda: team_pair_rows(
-            team, run.pair_table("errors"), settings.merge.aligner
-        ),
-        "map_fits": lambda: fused_landmarks.map_fit_rows(team),
-        "fusers": lambda: fuser_rows(fusions),
-        "fuser_coverage": lambda: coverage_rows(fusions),
-        "landmark_nees": lambda: fused_landmarks.landmark_nees_rows(
-            team, settings.true_pair_radius_m
-        ),
-    }
-    makers |= dict.fromkeys(judged, list) if run.no_truth else judged
-    for name in (*ALIGNED, "errors", "fusion"):
-        makers[name] = partial(run.pair_table, name)
-    return {name: tables.framed(name, make()) for name, make in makers.items() if name in only}
+
+
+def _history(run: JudgedRun, team: FusedTeam) -> dict[str, Callable[[], Any]]:
+    """What makes the tables of all evaluated maps, by their names."""
+    no_truth = {"true_pairs": list} if run.no_truth else {}
+    return {
+        "true_pairs": lambda: true_pair_rows(team, run.settings.true_pair_radius_m),
+        "map_history": lambda: map_history_rows(team),
+        "fused_history": lambda: fused_history_rows(team, run.settings.merge),
+    } | no_truth
 
 
 def _fused_map_rows(run: JudgedRun, fusions: Sequence[JudgedFusion]) -> pd.DataFrame:

@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import pandas as pd
 from scipy.spatial import KDTree
 
 from mapfusion import se2
@@ -32,9 +31,28 @@ def landmark_truth(
     for iteration, landmarks in maps.items():
         owner = owners_at(iteration, len(point_m))
         known = has_point & (owner >= 0)
-        medians = pd.DataFrame(point_m[known]).groupby(owner[known]).median()
-        points[iteration] = medians.reindex(landmarks.source_observation).to_numpy(np.float64)
+        found, median_m = _medians(owner[known], point_m[known])
+        wanted = landmarks.source_observation
+        at = np.searchsorted(found, wanted)
+        is_found = at < len(found)
+        is_found[is_found] = found[at[is_found]] == wanted[is_found]
+        points[iteration] = np.full((len(wanted), 3), np.nan)
+        points[iteration][is_found] = median_m[at[is_found]]
     return points
+
+
+def _medians(group: np.ndarray, values: Float) -> tuple[np.ndarray, Float]:
+    """The groups there are (G,), sorted, and by column the median (G, D) of each one's values.
+
+    Args:
+        group: (N,) of each row.
+        values: (N, D), finite.
+    """
+    found, counts = np.unique(group, return_counts=True)
+    first = np.cumsum(counts) - counts
+    lower, upper = first + (counts - 1) // 2, first + counts // 2
+    ranked = [column[np.lexsort((column, group))] for column in values.T]
+    return found, np.stack([(column[lower] + column[upper]) / 2 for column in ranked], axis=1)
 
 
 def true_pairs(

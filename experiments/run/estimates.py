@@ -55,7 +55,8 @@ def unpacked(bits: bytes, n: int) -> np.ndarray:
 
 def covariances_of(rows: pd.DataFrame) -> Float:
     """(n, 3, 3) of motions, from the columns COVARIANCE that hold their upper halves."""
-    return covariances_from(pa.Table.from_pandas(rows[list(COVARIANCE)]), COVARIANCE)
+    columns = {name: rows[name].to_numpy(dtype=np.float64) for name in COVARIANCE}
+    return covariances_from(pa.table(columns), COVARIANCE)
 
 
 def alignment_of(row: Mapping[Any, Any], n_correspondences: int) -> Alignment:

@@ -35,7 +35,7 @@ def write_rows(
 def read_rows(path: Path, table_schema: pa.Schema) -> pd.DataFrame:
     """Read a table of that schema; raises InputError that names the file."""
     table, _ = read_table(path, table_schema)
-    return table.to_pandas()
+    return table.to_pandas(use_threads=False)
 
 
 def records(rows: pd.DataFrame) -> list[dict[str, Any]]:

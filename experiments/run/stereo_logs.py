@@ -12,7 +12,8 @@ from experiments.scenario.suite import settings_of
 from experiments.scenario.yaml_input import read_calibration
 from mapfusion.calibration_error import CalibrationError
 from mapfusion.errors import InputError
-from mapfusion.recordings.registry import Level, read_recording
+from mapfusion.recordings.level import Level
+from mapfusion.recordings.registry import read_recording
 from mapfusion.recordings.stereo_import import (
     Cut,
     Imported,

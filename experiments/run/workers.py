@@ -2,21 +2,27 @@
 
 Where Python can do so safely, they are forked from a server: a process that has imported what they
 need, once for all of them, and has done nothing else. OpenCV's and Numba's threads do not survive a
-fork, so neither the command itself is forked nor anything that has begun to work.
+fork, so nothing is forked that has begun to work. A command that has imported all it needs forks
+the server from itself, with `make_ready`; else the server imports it all anew.
 """
 
 import functools
+import gc
 import multiprocessing
 import os
+import socket
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import connection, forkserver
-from typing import Any
+from multiprocessing.connection import (
+    arbitrary_address,  # pyright: ignore[reportAttributeAccessIssue]  # of which it is not told
+)
+from typing import Any, NoReturn
 
 from experiments.methods.threads import single_threaded
 from experiments.run.interrupts import held_back_interrupts
@@ -31,15 +37,55 @@ _FORKED = sys.platform == "linux"
 _OURS = ("experiments.", "mapfusion.", "sim.")
 
 
-def make_ready(modules: Iterable[str] = ()) -> None:
-    """Begin to import what worker processes will need, while this one does something else.
+def make_ready(jobs: int) -> None:
+    """Fork the server from this process, if there are to be workers.
 
-    By default these are our modules that are imported here. Only the first call counts.
+    To be called by a command that has imported what they need, and has begun nothing yet. Only the
+    first call counts.
     """
-    if not _FORKED:
+    gc.freeze()  # what is imported stays: nobody is to look through it for garbage
+    server: Any = forkserver._forkserver
+    if jobs == 1 or not _FORKED or server._forkserver_pid is not None:
         return
+    if threading.active_count() > 1:  # one of them may hold a lock, which nobody would open
+        return
+    from numba.core.registry import cpu_target
+
+    # What Numba does before its first kernel, which takes it tenths of a second in each process.
+    contexts: Any = cpu_target
+    contexts.typing_context.refresh()
+    contexts.target_context.refresh()
+    sys.stdout.flush()  # else each process would write what is left there
+    sys.stderr.flush()
+    with held_back_interrupts(), socket.socket(socket.AF_UNIX) as listener:
+        # as `ensure_running` does, but for starting Python anew
+        address = arbitrary_address("AF_UNIX")
+        listener.bind(address)
+        os.chmod(address, 0o600)
+        listener.listen()
+        ended, alive = os.pipe()
+        process = os.fork()
+        if process == 0:
+            os.close(alive)
+            _serve(listener.fileno(), ended)
+        os.close(ended)
+    server._forkserver_address = address
+    server._forkserver_alive_fd = alive
+    server._forkserver_pid = process
+
+
+def _serve(listener: int, ended: int) -> NoReturn:
+    """Fork workers until the end of this process's parent and of all workers."""
+    try:
+        forkserver.main(listener, ended, [])
+    finally:
+        os._exit(0)
+
+
+def _ensure_server() -> None:
+    """Unless there is a server, start one that imports our modules that are imported here."""
     multiprocessing.set_forkserver_preload(
-        list(modules) or [name for name in list(sys.modules) if name.startswith(_OURS)]
+        [name for name in list(sys.modules) if name.startswith(_OURS)]
     )
     with held_back_interrupts():
         forkserver.ensure_running()
@@ -114,7 +160,8 @@ def workers(jobs: int) -> Iterator[Workers]:
     if jobs == 1:
         yield Workers(1, None)
         return
-    make_ready()
+    if _FORKED:
+        _ensure_server()
     context = multiprocessing.get_context("forkserver" if _FORKED else "spawn")
     pool = ProcessPoolExecutor(jobs, context, initializer=_start_worker)
     try:

@@ -5,8 +5,8 @@ import numpy as np
 from mapfusion.camera import StereoCamera
 from mapfusion.recordings.floor import floor_of
 from mapfusion.recordings.inertial import SHARED_RAD, Inertial
+from mapfusion.recordings.level import Level
 from mapfusion.recordings.mount import levelled
-from mapfusion.recordings.registry import Level
 from mapfusion.robot_log import Observations
 from mapfusion.se2 import Float
 from mapfusion.se3 import roll_pitch

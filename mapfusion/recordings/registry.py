@@ -5,16 +5,13 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from mapfusion.errors import InputError
 
 if TYPE_CHECKING:
     from mapfusion.recordings.stereo_drive import StereoDrive
     from mapfusion.recordings.stereo_recording import ReadYaml, StereoRecording
-
-# Where a recording of pictures knows its robot's attitude from, see `levels.py`.
-Level = Literal["auto", "mount", "pictures", "floor", "imu", "odometry"]
 
 _LONGEST_NAME = 40  # of a robot: names become parts of file names
 

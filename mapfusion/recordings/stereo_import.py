@@ -13,11 +13,11 @@ from mapfusion.camera import StereoCamera
 from mapfusion.errors import InputError
 from mapfusion.odometry_covariance import write_odometry_covariance
 from mapfusion.recordings.derived_vision import derived_vision, measured_vision
+from mapfusion.recordings.level import Level
 from mapfusion.recordings.level_frames import LevelFrames
 from mapfusion.recordings.levels import Levels, known_from
 from mapfusion.recordings.pictures import sampled
 from mapfusion.recordings.rectify import Rectification
-from mapfusion.recordings.registry import Level
 from mapfusion.recordings.stereo_recording import StereoRecording
 from mapfusion.recordings.text_tables import NS
 from mapfusion.recordings.visual_odometry import visual_odometry

@@ -146,9 +146,13 @@ class KilledCommand:
         return self.process.poll() is not None
 
     def workers(self) -> list[int]:
-        """Process ids of the workers: spawned by the command, or forked by its fork server."""
-        started = {pid: _read(Path(f"/proc/{pid}/cmdline")) for pid in _children(self.process.pid)}
-        servers = [pid for pid, line in started.items() if b"forkserver" in line]
+        """Process ids of the workers: spawned by the command, or forked by its fork server.
+
+        The server was started by the command, or forked from it.
+        """
+        own = _command_line(self.process.pid)
+        started = {pid: _command_line(pid) for pid in _children(self.process.pid)}
+        servers = [pid for pid, line in started.items() if line == own or b"forkserver" in line]
         spawned = [pid for pid, line in started.items() if b"spawn_main" in line]
         return [*spawned, *(pid for server in servers for pid in _children(server))]
 
@@ -186,6 +190,10 @@ def _send(pid: int, number: int) -> None:
 def _children(pid: int) -> list[int]:
     threads = Path(f"/proc/{pid}/task").glob("*/children")
     return [int(child) for path in threads for child in _read(path).split()]
+
+
+def _command_line(pid: int) -> bytes:
+    return _read(Path(f"/proc/{pid}/cmdline"))
 
 
 def _read(path: Path) -> bytes:

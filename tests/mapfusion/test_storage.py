@@ -8,12 +8,13 @@ import pandas as pd
 import pyarrow as pa
 import pytest
 
-from mapfusion.errors import InputError
+from mapfusion.errors import DamagedFileError, InputError
 from mapfusion.storage import (
     column,
     point_columns,
     point_fields,
     points_from,
+    read_parquet,
     read_table,
     remove_abandoned,
     require_writable,
@@ -47,6 +48,16 @@ def test_round_trip(tmp_path):
     np.testing.assert_array_equal(column(table, "weight_kg"), COLUMNS["weight_kg"])
     np.testing.assert_array_equal(column(table, "code"), COLUMNS["code"])
     assert list(pd.read_parquet(path).columns) == list(COLUMNS)
+
+
+def test_of_some_columns_each_is_read_in_the_order_asked_for(tmp_path):
+    path = tmp_path / "things.parquet"
+    write_table(path, COLUMNS, THINGS)
+    some = read_parquet(path, "table of things", ["code", "name"])
+    assert some.column_names == ["code", "name"]
+    np.testing.assert_array_equal(column(some, "code"), COLUMNS["code"])
+    with pytest.raises(DamagedFileError, match=r"things.parquet.*colour"):
+        read_parquet(path, "table of things", ["name", "colour"])
 
 
 def test_rows_of_bytes_come_back_as_bytes(tmp_path):

@@ -12,13 +12,14 @@ import matplotlib
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from experiments.run.workers import workers
+from experiments.run.workers import Workers, workers
 from experiments.show.figures.result_tables import NothingToDraw, ResultTables
 from experiments.show.figures.style import house_style
 from mapfusion.sealed import LINE
 from mapfusion.storage import write_sealed, write_whole
 
-# Each is a module `figNN_NAME` with a function `draw`; its docstring is the caption.
+# Each is a module `figNN_NAME` with a function `draw`; its docstring is the caption, and `READS`
+# names what it takes of a result: tables, and `scenario`.
 _MODULES = iter_modules([str(Path(__file__).parent)])
 FIGURES = tuple(sorted(each.name for each in _MODULES if re.match(r"fig\d\d_", each.name)))
 # An SVG's are of the parts that are drawn as pixels, which make up most of the file.
@@ -34,25 +35,55 @@ class Drawn(NamedTuple):
     skipped: list[str]
 
 
+class Drawing:
+    """The figures of one result, each drawn by a pool as soon as all that it reads is written."""
+
+    def __init__(self, pool: Workers) -> None:
+        self._pool = pool
+        self._written: set[str] = set()
+        self._begun: set[str] = set()
+
+    def written(self, result: Path, part: str) -> None:
+        """A part of a result is there: a table, or `scenario`."""
+        self._written.add(part)
+        for name in FIGURES:
+            if name not in self._begun and self._written.issuperset(_module(name).READS):
+                self._begin(name, result)
+
+    def _begin(self, name: str, result: Path) -> None:
+        self._begun.add(name)
+        self._pool.submit(
+            name, draw_figure, ResultTables(result, written=_module(name).READS), name
+        )
+
+    def finish(self, result: Path, on_progress: Callable[[int, int], None] | None = None) -> Drawn:
+        """Draw those too of which nobody said that what they read is written.
+
+        `on_progress` is told (figures done, figures in all) after each. Returns what was drawn in
+        the order of the figures; raises InputError where a table is missing or damaged.
+        """
+        for name in FIGURES:
+            if name not in self._begun:
+                self._begin(name, result)
+        outcomes: dict[str, Drawn] = {}
+        for name, outcome in self._pool.completed():
+            outcomes[name] = outcome
+            if on_progress is not None:
+                on_progress(len(outcomes), len(FIGURES))
+        drawn = [outcomes[name] for name in FIGURES]
+        files = [file for each in drawn for file in each.files]
+        return Drawn(files, [line for each in drawn for line in each.skipped])
+
+
 def draw_all(
     result: Path, jobs: int = 2, on_progress: Callable[[int, int], None] | None = None
 ) -> Drawn:
     """Draw all figures of a result folder into `RESULT/figures/`, in `jobs` processes.
 
-    `on_progress` is told (figures done, figures in all) after each. Returns what was drawn in the
-    order of the figures; raises InputError where a table is missing or damaged.
+    Else as `Drawing.finish`.
     """
-    outcomes: dict[str, Drawn] = {}
     with workers(jobs) as pool:
-        for name in FIGURES:
-            pool.submit(name, draw_figure, ResultTables(result), name)
-        for name, outcome in pool.completed():
-            outcomes[name] = outcome
-            if on_progress is not None:
-                on_progress(len(outcomes), len(FIGURES))
-    drawn = [outcomes[name] for name in FIGURES]
-    files = [file for each in drawn for file in each.files]
-    return Drawn(files, [line for each in drawn for line in each.skipped])
+        return Drawing(pool).finish(result, on_progress)
 
 
 def draw_figure(data: ResultTables, name: str, folder: Path | None = None) -> Drawn:
@@ -60,14 +91,17 @@ def draw_figure(data: ResultTables, name: str, folder: Path | None = None) -> Dr
 
     Old pictures of it are removed where there is nothing to draw.
     """
-    module = importlib.import_module(f"experiments.show.figures.{name}")
     folder = folder or data.folder / "figures"
     try:
-        return Drawn(save_figure(folder, name, module.draw, data), [])
+        return Drawn(save_figure(folder, name, _module(name).draw, data), [])
     except NothingToDraw as reason:
         for kind in _DPI:
             (folder / f"{name}.{kind}").unlink(missing_ok=True)
         return Drawn([], [f"{name}: {reason}"])
+
+
+def _module(name: str) -> Any:
+    return importlib.import_module(f"experiments.show.figures.{name}")
 
 
 def save_figure(folder: Path, name: str, draw: Callable[..., Figure], *data: Any) -> list[Path]:

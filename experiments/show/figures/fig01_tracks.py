@@ -20,6 +20,7 @@ from experiments.show.figures.style import PAGE_WIDTH_IN
 from mapfusion.errors import InputError
 from mapfusion.sealed import read_sealed
 
+READS = ("robots", "tracks")
 _MAX_FRAMES, _TRAIL_FRAMES = 4, 5
 _KEY_FRAME = re.compile(r"(?P<robot>.+)_(?P<iteration>\d+)\.png")
 
@@ -78,10 +79,14 @@ def _show_image(axes: Axes, path: Path) -> None:
 
 def _add_tracks(axes: Axes, tracks: pd.DataFrame, iteration: int, colours: dict[str, Any]) -> None:
     now = tracks[tracks["iteration"] == iteration]
+    if now.empty:
+        return
     since = tracks["iteration"].between(iteration - _TRAIL_FRAMES, iteration)
-    recent = tracks[tracks["track"].isin(now["track"]) & since].groupby("track")
-    trails = [rows[["u_px", "v_px"]].to_numpy() for _, rows in recent]
-    lengths = recent["length"].last().to_numpy(np.float64)
+    recent = tracks[tracks["track"].isin(now["track"]) & since].sort_values("track", kind="stable")
+    track = recent["track"].to_numpy()
+    ends = np.flatnonzero(np.append(track[1:] != track[:-1], True))
+    trails = np.split(recent[["u_px", "v_px"]].to_numpy(), ends[:-1] + 1)
+    lengths = recent["length"].to_numpy(np.float64)[ends]
     lines = LineCollection(trails, array=lengths, linewidths=1.2, zorder=2, **colours)
     axes.add_collection(lines, autolim=False)
     rim = {"s": 14, "edgecolors": "white", "linewidths": 0.5, "zorder": 3}

@@ -9,6 +9,8 @@ from experiments.show.figures.result_tables import NothingToDraw, ResultTables
 from experiments.show.figures.style import BLACK, GRAY, PAGE_WIDTH_IN
 from mapfusion.se2 import Float
 
+READS = ("clouds", "landmarks", "paths", "robots", "scenario", "smoothed_paths")
+
 
 def draw(data: ResultTables) -> Figure:
     """Landmarks with their ellipses, paths of best particle and smoother, the last particles."""

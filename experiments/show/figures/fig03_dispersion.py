@@ -11,6 +11,7 @@ from experiments.show.figures import floor_plan as plan
 from experiments.show.figures.result_tables import NothingToDraw, ResultTables
 from experiments.show.figures.style import BLACK, GRAY, PAGE_WIDTH_IN
 
+READS = ("clouds", "paths", "robots")
 _MAX_ROBOTS = 3
 _ZOOM_MARGIN = 1.25
 _RECENT_ITERATIONS = 50

@@ -6,6 +6,7 @@ from experiments.show.figures.error_curves import draw_error_curves
 from experiments.show.figures.result_tables import ResultTables
 from experiments.show.figures.style import plain_numbers
 
+READS = ("errors", "estimates")
 _FLOOR_M = 1e-4  # a tenth of a millimetre: anything below is exact for a robot
 
 

@@ -7,6 +7,8 @@ from experiments.show.figures.error_curves import draw_error_curves
 from experiments.show.figures.result_tables import ResultTables
 from experiments.show.figures.style import plain_numbers
 
+READS = ("errors", "estimates")
+
 # The axis is linear up to here and logarithmic beyond: good alignments err by a few thousandths of
 # a radian, bad ones by tenths or more, and both must be legible.
 _LINEAR_RAD = 0.01

@@ -10,6 +10,8 @@ from experiments.show.figures.result_tables import NothingToDraw, ResultTables
 from experiments.show.figures.style import PAGE_WIDTH_IN, aligner_legend, plain_numbers
 from experiments.study.statistics.error_bands import TIME_GROUPS, time_bands
 
+READS = ("aligner_timings", "errors", "estimates")
+
 # The line that guides the eye joins the points of one run while they are few, else medians of
 # groups of them.
 _MAX_JOINED = 16

@@ -18,6 +18,8 @@ from experiments.show.figures.result_tables import NothingToDraw, Pair, ResultTa
 from experiments.show.figures.style import BLACK, GRAY, PAGE_WIDTH_IN
 from mapfusion.se2 import Float
 
+READS = ("correspondences", "errors", "estimates", "landmarks", "robots", "true_pairs")
+
 # Strays must not shrink the picture: beyond this share on each side, widened by some of the extent.
 _STRAY_SHARE, _STRAY_MARGIN = 0.005, 0.05
 _GAP = 0.15  # between the two maps, as a share of the first one's width
@@ -137,7 +139,8 @@ def _fill_page(figure: Figure, axes: Axes3D, legend: Legend) -> None:
 
 def _extent_px(axes: Axes3D, canvas: FigureCanvasAgg) -> Bbox:
     """Where the box and its labels are drawn."""
-    canvas.draw()  # only then is it known how it is projected
+    axes.apply_aspect()
+    axes.M = axes.get_proj()  # by which labels are placed: else only drawing tells it
     corners = np.array(list(product(axes.get_xlim(), axes.get_ylim(), axes.get_zlim())))
     x, y, _ = proj_transform(corners[:, 0], corners[:, 1], corners[:, 2], axes.get_proj())
     box = Bbox.null()

@@ -10,6 +10,7 @@ from matplotlib.patheffects import withStroke
 from experiments.show.figures import floor_plan as plan
 from experiments.show.figures.result_tables import FusedPairs, NothingToDraw, ResultTables
 
+READS = ("fused", "fused_motions", "landmarks", "robots")
 _MAX_ELONGATION = 3.0  # beyond, an ellipse is a needle in print
 _MIN_SEPARATION = 0.25  # of the parents, in semi-major axes: nearer, their labels collide
 _MARGIN = 1.15

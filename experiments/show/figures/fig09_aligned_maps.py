@@ -14,6 +14,7 @@ from experiments.show.figures.result_tables import FusedPairs, ResultTables
 from experiments.show.figures.style import BLACK, GRAY, PAGE_WIDTH_IN
 from mapfusion.se2 import Float
 
+READS = ("fused", "fused_motions", "landmarks", "robots")
 _ZOOM_LANDMARKS = 5  # what a panel of that size shows without clutter
 _ZOOM_MARGIN = 1.1  # of the side
 _MAX_CANDIDATES = 500  # squares to choose from; each is held against all landmarks

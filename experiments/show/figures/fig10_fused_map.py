@@ -7,6 +7,7 @@ from experiments.show.figures.result_tables import NothingToDraw, ResultTables
 from experiments.show.figures.style import FUSED_COLOUR, PAGE_WIDTH_IN
 from mapfusion.storage import POSITION_FIELDS
 
+READS = ("fused", "fused_map", "fused_motions", "robots")
 _ROBOT_MARKERS = ("*", "^", "v", "x", "d")
 
 

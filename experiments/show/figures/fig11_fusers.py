@@ -17,6 +17,8 @@ from experiments.show.figures.style import (
     plain_numbers,
 )
 
+READS = ("fusers",)
+
 # Panels: title, the column drawn with markers, and that drawn beside it as a thin line.
 _ERRORS = (
     ("in the frame of the first robot", "landmark_rmse_m", ""),

@@ -16,6 +16,7 @@ from experiments.show.figures.style import (
     fuser_styles,
 )
 
+READS = ("fuser_coverage",)
 _PANELS = {
     "coverage": "each map after its best rigid fit",
     "frame_coverage": "each map in its own frame",

@@ -1,7 +1,7 @@
 """What a result folder holds, read when a figure asks for it."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from functools import cached_property
 from itertools import cycle
 from pathlib import Path
@@ -48,17 +48,26 @@ class ResultTables:
     `world.json` (the walls, known in simulation alone) and the key frames may be absent.
     """
 
-    def __init__(self, folder: Path, of_runs: Mapping[str, pd.DataFrame] | None = None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        of_runs: Mapping[str, pd.DataFrame] | None = None,
+        written: Collection[str] | None = None,
+    ) -> None:
         """Read from a result folder, or show rows `of_runs`, tables by name with a `run_id`.
 
-        Of runs, `errors` has one row per run where a result has one per repetition.
+        Of runs, `errors` has one row per run where a result has one per repetition. Of a folder
+        that is being written, only what is `written` yet may be asked for: tables by name, and
+        `scenario`.
         """
         self.folder = folder
+        self._written = written
         self.several_runs = of_runs is not None
         self._tables = dict(of_runs or {})
 
     def table(self, name: str) -> pd.DataFrame:
         """The table of that name (see experiments.judge.tables)."""
+        self._require_written(name)
         if name not in self._tables:
             self._tables[name] = read(table_path(self.folder, name), name)
         if self._tables[name].columns.empty:
@@ -67,7 +76,12 @@ class ResultTables:
 
     def has(self, name: str) -> bool:
         """Whether there is a table of that name; older results lack some."""
+        self._require_written(name)
         return name in self._tables or table_path(self.folder, name).is_file()
+
+    def _require_written(self, name: str) -> None:
+        if self._written is not None and name not in self._written:
+            raise LookupError(f"{name}: may be that of an earlier run")
 
     def rows(self, name: str) -> pd.DataFrame:
         """The table of that name; without rows where there is none."""
@@ -76,6 +90,7 @@ class ResultTables:
     @cached_property
     def scenario(self) -> dict[str, Any]:
         """The resolved scenario."""
+        self._require_written("scenario")
         return read_scenario(self.folder / "scenario.json")
 
     @cached_property
@@ -241,7 +256,8 @@ def of_pair(rows: pd.DataFrame, pair: Pair) -> pd.DataFrame:
 
 def positions_and_covariances(rows: pd.DataFrame) -> tuple[Float, Float]:
     """Positions (N, 3) and covariances (N, 3, 3) of rows with the columns of a map."""
-    return points_from(pa.Table.from_pandas(rows[POSITION_FIELDS + COVARIANCE_FIELDS]))
+    columns = rows[POSITION_FIELDS + COVARIANCE_FIELDS]
+    return points_from(pa.table({name: columns[name].to_numpy() for name in columns}))
 
 
 def json_object(text: str, where: Path) -> dict[str, Any]:

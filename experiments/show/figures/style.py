@@ -38,6 +38,7 @@ _RC: dict[str, Any] = {
     "lines.markersize": 3.5,
     "axes.grid": True,
     "axes.axisbelow": True,
+    "axes.titley": 1.0,  # else each drawing looks for what may be in the way: nothing is up there
     "grid.alpha": 0.35,
     "grid.linewidth": 0.4,
     "figure.constrained_layout.use": True,

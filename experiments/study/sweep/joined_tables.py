@@ -266,7 +266,7 @@ def _write(path: Path, table_schema: pa.Schema, parts: Iterable[pa.Table]) -> No
                 group, n_rows = [], 0
         if group:
             writer.write_table(pa.concat_tables(group).combine_chunks())
-    write_sealed(path, parquet_with_seal(buffer.getvalue().to_pybytes()))
+    write_sealed(path, parquet_with_seal(memoryview(buffer.getvalue())))
 
 
 def _fitted(rows: pa.Table, table_schema: pa.Schema) -> pa.Table:

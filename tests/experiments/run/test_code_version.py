@@ -1,5 +1,7 @@
 """Every way to write an import is followed; other people's modules are not."""
 
+import ast
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -8,7 +10,7 @@ from experiments.run import code_version
 
 FILES = {
     "ours/__init__.py": "",
-    "ours/start.py": "import numpy\nfrom ours import by_package, nested\n",
+    "ours/start.py": "import numpy\nfrom ours import by_package, nested, spelled\n",
     "ours/by_package.py": "def late():\n    import ours.by_name\n",
     "ours/by_name.py": "from ours.by_module import number as renamed\n",
     "ours/nested.py": """
@@ -26,6 +28,22 @@ class Late:
         case 1:
             import ours.by_case
 """,
+    "ours/spelled.py": """import os; import ours.by_semicolon
+if os: from ours import (  # not (only) this
+    by_comment as one,  # ours.unused)
+    by_bracket)
+else: from . import unused
+from ours \\
+    .kit import name, \\
+    other
+import numpy as np, ours.by_comma as last
+""",
+    "ours/by_semicolon.py": "",
+    "ours/by_comment.py": "",
+    "ours/by_bracket.py": "",
+    "ours/by_comma.py": "",
+    "ours/kit/__init__.py": "",
+    "ours/kit/other.py": "",
     "ours/by_handler.py": "",
     "ours/by_case.py": "",
     "ours/by_module.py": "from ours import start  # a circle\nnumber = 1\n",
@@ -34,22 +52,68 @@ class Late:
 }
 
 
+@pytest.fixture(autouse=True)
+def _nothing_read_yet() -> Iterator[None]:
+    """The caches hold what a process has read; files change in a test alone."""
+    _forget()
+    yield
+    _forget()
+
+
+def _forget() -> None:
+    for name in dir(code_version):
+        clear = getattr(getattr(code_version, name), "cache_clear", None)
+        if clear is not None:
+            clear()
+
+
 def test_every_import_of_ours_is_followed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, text in FILES.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text)
     (tmp_path / "numpy.py").write_text("")  # beside ours, as where packages are installed
-    monkeypatch.setattr(code_version, "SOURCE_ROOT", tmp_path)
-    monkeypatch.setattr(code_version, "PACKAGES", ("ours",))
-    code_version.imported_sources.cache_clear()
-    found = code_version.imported_sources("ours.start")
-    assert set(found) == set(FILES) - {"ours/unused.py", "ours/__init__.py"}
-    deep = tmp_path / "ours" / "kit" / "within" / "deep.py"
+    deep = tmp_path / "ours" / "whole" / "within" / "deep.py"
     deep.parent.mkdir(parents=True)
     deep.write_text("from ours import unused\n")
-    (tmp_path / "ours" / "kit" / "__init__.py").touch()
-    whole = {"ours/kit/__init__.py", "ours/kit/within/deep.py", "ours/unused.py", "ours/robot.urdf"}
-    assert set(code_version.imported_sources("ours.kit")) == whole
+    (tmp_path / "ours" / "whole" / "__init__.py").touch()
+    monkeypatch.setattr(code_version, "SOURCE_ROOT", tmp_path)
+    monkeypatch.setattr(code_version, "PACKAGES", ("ours",))
+    found = code_version.imported_sources("ours.start")
+    assert set(found) == set(FILES) - {"ours/unused.py", "ours/__init__.py"}
+    expected = {"ours/unused.py", "ours/robot.urdf"}
+    expected |= {f"ours/whole/{name}" for name in ("__init__.py", "within/deep.py")}
+    assert set(code_version.imported_sources("ours.whole")) == expected
+
+
+def test_statements_are_found_as_python_finds_them() -> None:
+    for package in code_version.PACKAGES:
+        for path in (code_version.SOURCE_ROOT / package).rglob("*.py"):
+            name = path.relative_to(code_version.SOURCE_ROOT).as_posix()
+            if name not in code_version._FINDS_BY_NAME:
+                found = code_version.imports_of(code_version.SOURCE_ROOT, name)
+                assert set(found) == _parsed_imports(path), name
+
+
+def _parsed_imports(path: Path) -> set[str]:
+    """Files of ours that a file imports, by Python's own parser."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_bytes())):
+        if isinstance(node, ast.Import):
+            found.update(*(_candidates(alias.name)[:1] for alias in node.names))
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            for alias in node.names:
+                inside, whole = (
+                    _candidates(m) for m in (f"{node.module}.{alias.name}", node.module)
+                )
+                found.update((inside or whole)[:1])
+    return found
+
+
+def _candidates(module: str) -> list[str]:
+    path = module.replace(".", "/")
+    files = (f"{path}.py", f"{path}/__init__.py")
+    ours = module.split(".")[0] in code_version.PACKAGES
+    return [file for file in files if ours and (code_version.SOURCE_ROOT / file).is_file()]
 
 
 @pytest.mark.parametrize(
@@ -73,7 +137,7 @@ def test_the_hash_is_of_all_source_and_of_nothing_else(
         (tmp_path / name).write_text("1")
 
     def found() -> str:
-        code_version.source_hash.cache_clear()
+        _forget()
         return code_version.source_hash(("ours", "single.py"))
 
     before = found()
@@ -85,4 +149,3 @@ def test_the_hash_is_of_all_source_and_of_nothing_else(
     if matters and file != "single.py":
         (tmp_path / file).rename(tmp_path / "ours" / f"moved{Path(file).suffix}")
         assert found() not in (before, changed)
-    code_version.source_hash.cache_clear()

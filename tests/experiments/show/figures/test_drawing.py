@@ -4,6 +4,7 @@ import hashlib
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import matplotlib.image
@@ -13,7 +14,7 @@ import pytest
 
 from experiments.judge import tables
 from experiments.show.figures import drawing, fig02_two_maps, fig11_fusers, fig12_coverage
-from experiments.show.figures.drawing import FIGURES, draw_all, draw_figure
+from experiments.show.figures.drawing import FIGURES, Drawing, draw_all, draw_figure
 from experiments.show.figures.fig03_dispersion import choose_moments, spread_over_time
 from experiments.show.figures.result_tables import ResultTables
 from experiments.show.figures.style import aligner_styles, house_style
@@ -168,6 +169,41 @@ def test_damaged_key_frame_is_an_error_that_names_the_file(trio_copy: Path) -> N
     next((trio_copy / "keyframes").glob("R1_*")).write_bytes(b"no picture")
     with pytest.raises(InputError, match=r"R1_\d{5}\.png: not a readable PNG image"):
         draw_figure(ResultTables(trio_copy), "fig01_tracks")
+
+
+class _Asked:
+    """A pool that only keeps what it is asked for."""
+
+    def __init__(self) -> None:
+        self.tags: list[str] = []
+
+    def submit(self, tag: str, *_: object) -> None:
+        self.tags.append(tag)
+
+
+def test_a_figure_is_begun_once_all_that_it_reads_is_written(tmp_path: Path) -> None:
+    pool: Any = _Asked()
+    drawing = Drawing(pool)
+    begun = []
+    for part in ("tracks", "fusers", "paths", "robots", "clouds", "robots", "scenario"):
+        drawing.written(tmp_path, part)
+        begun.append(list(pool.tags))
+    with_fusers = ["fig11_fusers"]
+    with_robots = [*with_fusers, "fig01_tracks"]
+    with_clouds = [*with_robots, "fig03_dispersion"]
+    assert begun == [[], with_fusers, with_fusers, with_robots, *[with_clouds] * 3]
+
+
+def test_what_is_not_written_yet_is_not_read(trio_result: Path) -> None:
+    data = ResultTables(trio_result, written=("robots",))
+    assert len(data.robots) == 3
+    for ask in (
+        lambda: data.table("paths"),
+        lambda: data.has("smoothed_paths"),
+        lambda: data.scenario,
+    ):
+        with pytest.raises(LookupError, match="earlier run"):
+            ask()
 
 
 def test_workers_draw_the_same_pictures(trio_copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
