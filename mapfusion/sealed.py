@@ -23,19 +23,27 @@ _PARQUET_TAIL = 8  # bytes: the length of the footer, and the magic number
 _told: list[Path] = []  # the file that was said to carry no digest, once a process
 
 
-def _seals(data: bytes) -> Iterator[re.Match[bytes]]:
-    """Where a file's bytes look like a seal, the last first: large files have it near their end."""
-    at = len(data)
-    while (at := data.rfind(SEAL.encode(), 0, at)) >= 0:
-        if match := _SEAL.match(data, at):
-            yield match
-
-
 def seal(data: bytes) -> bytes:
     """Fill in the digest of a file's bytes, which hold an empty seal."""
-    at = next(match.start(1) for match in _seals(data) if match[1] == NO_DIGEST.encode())
-    view, digest = memoryview(data), hashlib.sha256(data).hexdigest().encode()
-    return b"".join((view[:at], digest, view[at + len(digest) :]))
+    return b"".join(sealed_pieces(data))
+
+
+def sealed_pieces(data: bytes) -> tuple[memoryview, bytes, memoryview]:
+    """The same as what comes before the digest, the digest, and what comes after."""
+    empty, view = NO_DIGEST.encode(), memoryview(data)
+    at = next(at for at in _digests(data) if view[at : at + len(empty)] == empty)
+    return view[:at], hashlib.sha256(data).hexdigest().encode(), view[at + len(empty) :]
+
+
+def _digests(data: bytes) -> Iterator[int]:
+    """Where digests begin, from the last to the first: tables and pictures have theirs at the end.
+
+    To look for a text from the end is also much faster than what a pattern's search is.
+    """
+    name, end = SEAL.encode(), len(data)
+    while (end := data.rfind(name, 0, end)) >= 0:
+        if match := _SEAL.match(data, end):
+            yield match.start(1)
 
 
 def is_intact(data: bytes) -> bool | None:
@@ -44,12 +52,11 @@ def is_intact(data: bytes) -> bool | None:
     One seal that fits is enough: a text in a table may look like one.
     """
     found = None
-    for match in _seals(data):
-        at = match.start(1)
+    for at in _digests(data):
         digest = hashlib.sha256(memoryview(data)[:at])
         digest.update(NO_DIGEST.encode())
         digest.update(memoryview(data)[at + len(NO_DIGEST) :])
-        if digest.hexdigest().encode() == match[1]:
+        if digest.hexdigest().encode() == data[at : at + len(NO_DIGEST)]:
             return True
         found = False
     return found
@@ -78,7 +85,7 @@ def read_sealed(path: Path, what: str, only_ours: bool = False) -> bytes:
 
 def tell_unsealed(path: Path, data: bytes) -> None:
     """Warn, once a process, that a file which could be read is of unknown soundness."""
-    if not _told and next(_seals(data), None) is None:
+    if not _told and next(_digests(data), None) is None:
         _told.append(path)
         why = "made by another program or an earlier version, so damage to it may go unseen"
         text = f"{path}: carries no digest ({why}); said of the first such file alone"

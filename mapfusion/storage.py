@@ -16,7 +16,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from mapfusion.errors import DamagedFileError, InputError
-from mapfusion.sealed import NO_DIGEST, SEAL, parquet_with_seal, read_sealed, seal, tell_unsealed
+from mapfusion.sealed import (
+    NO_DIGEST,
+    SEAL,
+    parquet_with_seal,
+    read_sealed,
+    sealed_pieces,
+    tell_unsealed,
+)
 
 _KIND = b"mapfusion.kind"
 _VERSION = b"mapfusion.schema_version"
@@ -57,8 +64,13 @@ def temporary_prefix(name: str) -> str:
 
 def write_sealed(path: Path, data: bytes) -> None:
     """Fill in the empty seal that a file's bytes hold, and write them whole."""
-    sealed = seal(data)
-    write_whole(path, lambda temporary: temporary.write_bytes(sealed))
+    pieces = sealed_pieces(data)
+
+    def write(temporary: Path) -> None:
+        with temporary.open("wb") as file:
+            file.writelines(pieces)
+
+    write_whole(path, write)
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
@@ -141,10 +153,20 @@ def write_table(
     buffer = pa.BufferOutputStream()
     # measured values and pixels hardly repeat: a dictionary of them takes as long as all the rest
     repeats = [field.name for field in table_schema if not _is_measured(field.type)]
-    # what packs them smaller takes far longer to pack and to unpack
-    options = {"compression": "lz4", "use_dictionary": repeats}
+    # what packs them smaller takes far longer to pack and to unpack, and nothing packs pixels
+    packed = {
+        _leaf(field): "none" if pa.types.is_fixed_size_binary(field.type) else "lz4"
+        for field in table_schema
+    }
+    options = {"compression": packed, "use_dictionary": repeats}
     pq.write_table(table, buffer, **options, write_page_checksum=True)
     write_sealed(path, parquet_with_seal(memoryview(buffer.getvalue())))
+
+
+def _leaf(field: pa.Field) -> str:
+    """What Parquet calls the column that holds a field's values."""
+    is_list = pa.types.is_fixed_size_list(field.type)
+    return f"{field.name}.list.element" if is_list else field.name
 
 
 def _is_measured(kind: pa.DataType) -> bool:
@@ -229,7 +251,8 @@ def text_attributes(path: Path, table: pa.Table) -> dict[str, str]:
 
 def column(table: pa.Table, name: str) -> np.ndarray:
     """One column as an array: (N,), or (N, k) for fixed-size lists, and for k bytes each."""
-    values = table.column(name).combine_chunks()
+    chunked = table.column(name)
+    values = chunked.chunk(0) if chunked.num_chunks == 1 else chunked.combine_chunks()
     if pa.types.is_fixed_size_binary(values.type):
         k, buffer = values.type.byte_width, values.buffers()[1]
         return np.frombuffer(buffer, np.uint8)[k * values.offset :][: k * len(values)].reshape(

@@ -12,7 +12,9 @@ from mapfusion.se2 import Float
 
 _SOBEL_APERTURE_PX = 3
 _SOBEL_GAIN = 2.0  # OpenCV divides its Sobel sum, 8 times the slope per pixel, by 4
-_BAND_PX = 64  # rows of which the response is reckoned at a time
+_SOBEL_SUM = 4.0  # what it divides by
+_OUR_BLOCK_PX = 3
+_ONE = np.uintp(1)  # indices without a sign, which a kernel need not wrap around
 
 
 @dataclass(frozen=True)
@@ -77,16 +79,58 @@ def detect(image: np.ndarray, parameters: HarrisParameters) -> Float:
 
 
 def harris_response(image: np.ndarray, parameters: HarrisParameters) -> np.ndarray:
-    """Response (H, W) float32, band by band: what is needed on the way then stays in the cache."""
-    margin = parameters.block_px + _SOBEL_APERTURE_PX
+    """Response (H, W) float32: values of OpenCV's `cornerHarris`, sooner for the usual block."""
+    block, aperture, k = parameters.block_px, _SOBEL_APERTURE_PX, parameters.k
+    if block != _OUR_BLOCK_PX:
+        return cv2.cornerHarris(image, block, aperture, k)
+    scale = 1 / (_SOBEL_SUM * block * 255)
+    slope_u = cv2.Sobel(image, cv2.CV_32F, 1, 0, ksize=aperture, scale=scale)
+    slope_v = cv2.Sobel(image, cv2.CV_32F, 0, 1, ksize=aperture, scale=scale)
     response = np.empty(image.shape, dtype=np.float32)
-    for top in range(0, len(image), _BAND_PX):
-        low, bottom = max(top - margin, 0), min(top + _BAND_PX, len(image))
-        band = cv2.cornerHarris(
-            image[low : bottom + margin], parameters.block_px, _SOBEL_APERTURE_PX, parameters.k
-        )
-        response[top:bottom] = band[top - low : bottom - low]
+    _respond(slope_u, slope_v, np.float32(k), response)
     return response
+
+
+@njit(cache=True)
+def _respond(slope_u: np.ndarray, slope_v: np.ndarray, k: np.float32, response: np.ndarray) -> None:
+    """Fill in det M - k (trace M)^2, M the sum over 3 x 3 pixels of products of slopes (H, W).
+
+    Sums are in double precision, products and what follows in single, as OpenCV has them; beyond
+    the border the image is mirrored.
+    """
+    height, width = slope_u.shape
+    sums = np.empty((3, width + 2))
+    for v in range(height):
+        above, below = v - 1 if v > 0 else 1, v + 1 if v < height - 1 else height - 2
+        _sum_products(slope_u, slope_v, above, v, below, sums)
+        for c in range(3):
+            sums[c, 0], sums[c, width + 1] = sums[c, 2], sums[c, width - 1]
+        _combine(sums, k, response, v)
+
+
+@njit(cache=True)
+def _sum_products(
+    slope_u: np.ndarray, slope_v: np.ndarray, above: int, v: int, below: int, sums: Float
+) -> None:
+    """Fill in the sums (3, W + 2) of uu, uv and vv over three rows, but for the outermost."""
+    for i in range(slope_u.shape[1]):
+        a, b, c = slope_u[above, i], slope_u[v, i], slope_u[below, i]
+        d, e, f = slope_v[above, i], slope_v[v, i], slope_v[below, i]
+        k = np.uintp(i + 1)
+        sums[0, k] = np.float64(a * a) + np.float64(b * b) + np.float64(c * c)
+        sums[1, k] = np.float64(a * d) + np.float64(b * e) + np.float64(c * f)
+        sums[2, k] = np.float64(d * d) + np.float64(e * e) + np.float64(f * f)
+
+
+@njit(cache=True)
+def _combine(sums: Float, k: np.float32, response: np.ndarray, v: int) -> None:
+    for i in range(response.shape[1]):
+        before, here, after = np.uintp(i), np.uintp(i + 1), np.uintp(i + 2)
+        a = np.float32(sums[0, before] + sums[0, here] + sums[0, after])
+        b = np.float32(sums[1, before] + sums[1, here] + sums[1, after])
+        c = np.float32(sums[2, before] + sums[2, here] + sums[2, after])
+        trace = a + c
+        response[v, i] = (a * c - b * b) - k * (trace * trace)
 
 
 def _strongest(response: np.ndarray, parameters: HarrisParameters) -> np.ndarray:
@@ -111,22 +155,45 @@ def _strongest(response: np.ndarray, parameters: HarrisParameters) -> np.ndarray
 @njit(cache=True)
 def local_maxima(response: np.ndarray, border: int, least: np.float32) -> np.ndarray:
     """Pixels (N, 2) int64, row by row, above `least` that no neighbour's response exceeds."""
-    height, width = response.shape[0], response.shape[1]
+    height, width = response.shape
     found = np.empty(((height - 2 * border) * (width - 2 * border), 2), dtype=np.int64)
-    count = 0
+    # the mark of column u, and so many at once as a number has bytes
+    highest, is_peak = np.empty(width, np.float32), np.zeros(-(-width // 8) * 8, np.uint8)
+    marks, count = is_peak.view(np.uint64), 0
     for v in range(border, height - border):
-        for u in range(border, width - border):
-            here = response[v, u]
-            if not here > least:
+        _mark_peaks(response, v, border, least, highest, is_peak)
+        for k in range(len(marks)):
+            if marks[k] == 0:
                 continue
-            most = here
-            for y in range(v - 1, v + 2):
-                for x in range(u - 1, u + 2):
-                    most = max(most, response[y, x])
-            if most == here:
-                found[count, 0], found[count, 1] = u, v
-                count += 1
+            for u in range(8 * k, 8 * k + 8):
+                if is_peak[u]:
+                    found[count, 0], found[count, 1] = u, v
+                    count += 1
     return found[:count].copy()
+
+
+@njit(cache=True)
+def _mark_peaks(
+    response: np.ndarray,
+    v: int,
+    border: int,
+    least: np.float32,
+    highest: np.ndarray,
+    is_peak: np.ndarray,
+) -> None:
+    """Mark the maxima of row v; `highest` is room for what is highest in three rows."""
+    for u in range(response.shape[1]):
+        a, b, c = response[v - 1, u], response[v, u], response[v + 1, u]
+        most = a if a > b else b
+        highest[u] = c if c > most else most
+    begin = np.uintp(border)
+    for i in range(response.shape[1] - 2 * border):
+        u = begin + np.uintp(i)
+        a, b, c = highest[u - _ONE], highest[u], highest[u + _ONE]
+        most = a if a > b else b
+        most = c if c > most else most
+        here = response[v, u]
+        is_peak[u] = np.uint8(here == most) & np.uint8(here > least)
 
 
 @njit(cache=True)

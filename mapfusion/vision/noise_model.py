@@ -18,9 +18,9 @@ from mapfusion.se2 import Float
 from mapfusion.vision.harris import HarrisParameters, detect
 from mapfusion.vision.plane_fit import fit_planes
 from mapfusion.vision.row_search import search_rows
-from mapfusion.vision.silhouette_test import half_squares
 from mapfusion.vision.stereo import StereoParameters
 from mapfusion.vision.verdict import Verdict
+from mapfusion.vision.window_sums import window_sums
 
 _ROUNDS = 30  # of reweighting, far beyond where it stands still
 _LOUD = 1.5  # halves whose square is off by more than this share of the model count less
@@ -134,7 +134,8 @@ def _windows(
     )
     fine = np.abs(plane[:, 0] - start) <= stereo.max_jump_px  # NaN is not
     pixel, plane = pixel[fine], plane[fine]
-    squares = half_squares(left, right, pixel, plane, stereo.silhouette_half_px)
+    half = (stereo.silhouette_half_px, stereo.plane_half_px)
+    squares, _ = window_sums(left, right, pixel, plane, *half)
     whole = squares[:, 2] + squares[:, 3]
     slopes = whole[:, 2:] / np.maximum(whole[:, :1], 1.0)
     return squares, np.column_stack([_variance(left, pixel, stereo.half_px), slopes])

@@ -19,12 +19,22 @@ from numba import njit
 
 from mapfusion.se2 import Float
 from mapfusion.symmetric import solve_lower, solve_upper
-from mapfusion.vision.template import N_PARAMETERS, WEIGHT, WINDOW_HALF_PX, Templates, grey
+from mapfusion.vision.template import (
+    LEVEL,
+    N_PARAMETERS,
+    SLOPE_U,
+    SLOPE_V,
+    WEIGHT,
+    WINDOW_HALF_PX,
+    Templates,
+)
 
 _MAX_STEPS = 15
 _CONVERGED_PX = 0.005  # far below what noise lets one measure
 # Where a window's far side would shrink to a half, it is no piece of a wall that one looks at.
 _LEAST_SCALE = 0.5
+_ONE = np.uintp(1)  # indices without a sign, which a kernel need not wrap around
+_BYTE, _HALF, _LOW = np.uint32(8), np.uint32(16), np.uint32(0xFF)
 
 
 def fit_patches(
@@ -57,73 +67,124 @@ def _fit_all(
     warp: Float,
     bend: Float,
 ) -> np.ndarray:
-    found, shown = np.empty(len(rows), dtype=np.bool_), np.empty(after.shape[1:])
+    found, area = np.empty(len(rows), dtype=np.bool_), len(WEIGHT)
+    cell, share, residual = np.empty(area, np.uint32), np.empty((2, area)), np.empty(area)
     for n in range(len(rows)):
         i = rows[n]
-        for v in range(after.shape[1]):
-            for u in range(after.shape[2]):
-                shown[v, u] = after[n, v, u]
-        found[n] = _fit(window[i], factor[i], float(tolerated[i]), shown, warp[n], bend[n])
+        found[n] = False
+        if tolerated[i] >= 0:
+            square = _settle(window, i, factor[i], after, n, warp, bend, cell, share, residual)
+            found[n] = 0 <= square <= tolerated[i]
     return found
 
 
 @njit(cache=True)
-def _fit(
-    window: Float, factor: Float, tolerated: float, after: Float, warp: Float, bend: Float
-) -> bool:
+def _settle(
+    window: Float,
+    i: int,
+    factor: Float,
+    after: np.ndarray,
+    n: int,
+    warp: Float,
+    bend: Float,
+    cell: np.ndarray,
+    share: Float,
+    residual: Float,
+) -> float:
+    """Move warp n until it stays; the weighted sum of squared residuals, negative if it does not.
+
+    `cell`, `share` and `residual` are room for what is needed on the way.
+    """
     step = np.empty(N_PARAMETERS)
-    if tolerated < 0:
-        return False
     for _ in range(_MAX_STEPS):
-        square = _residuals(window, after, warp, bend, step)
-        if square < 0:
-            return False
+        if not _stays_inside(after.shape[1] // 2, warp, bend, n):
+            return -1.0
+        _find_places(after.shape[1], warp, bend, n, cell, share)
+        _look_up(after, n, cell)
+        _compare(window, i, cell, share, residual)
+        square = _moments(window, i, residual, step)
         solve_lower(factor, step)
-        for i in range(N_PARAMETERS):
-            square -= step[i] ** 2  # what the step explains: all of gain and offset
+        for k in range(N_PARAMETERS):
+            square -= step[k] ** 2  # what the step explains: all of gain and offset
         solve_upper(factor, step)
-        _compose(warp, step)
+        _compose(warp[n], step)
         if abs(step[0]) < _CONVERGED_PX and abs(step[1]) < _CONVERGED_PX:
-            return square <= tolerated
-    return False
+            return max(square, 0.0)
+    return -1.0
 
 
 @njit(cache=True)
-def _residuals(window: Float, after: Float, warp: Float, bend: Float, moment: Float) -> float:
-    """Weighted squared differences after - before under the warp; `moment` gets J^T W r.
-
-    Negative where the window leaves the patch.
-    """
-    half, middle = WINDOW_HALF_PX, after.shape[0] // 2
-    at_u, at_v = np.empty(2 * half + 1), np.empty(2 * half + 1)
-    least = 1.0 - (abs(bend[0]) + abs(bend[1])) * half
+def _stays_inside(middle: int, warp: Float, bend: Float, n: int) -> bool:
+    """Whether all of a window lies on a patch."""
+    least = 1.0 - (abs(bend[n, 0]) + abs(bend[n, 1])) * WINDOW_HALF_PX
     if not least > _LEAST_SCALE:
-        return -1.0
+        return False
     for r in range(2):
-        reach = (abs(warp[r, 0]) + abs(warp[r, 1])) * half / least + abs(warp[r, 2])
-        if not reach + 1 <= middle:
-            return -1.0
-    square = m0 = m1 = m2 = m3 = m4 = m5 = m6 = m7 = 0.0
-    h_u, h_v = bend[0], bend[1]
-    uu, uv, u_0 = warp[0, 0], warp[0, 1], warp[0, 2]
-    vu, vv, v_0 = warp[1, 0], warp[1, 1], warp[1, 2]
+        across = (abs(warp[n, r, 0]) + abs(warp[n, r, 1])) * WINDOW_HALF_PX
+        if not across / least + abs(warp[n, r, 2]) + 1 <= middle:
+            return False
+    return True
+
+
+@njit(cache=True, error_model="numpy")  # to ask whether it divides by zero takes longer than that
+def _find_places(
+    side: int, warp: Float, bend: Float, n: int, cell: np.ndarray, share: Float
+) -> None:
+    """Which pixel of a patch is before each of the window's, and shares of the way to the next."""
+    half, middle, h_u, h_v = WINDOW_HALF_PX, side // 2, bend[n, 0], bend[n, 1]
+    uu, uv, u_0 = warp[n, 0, 0], warp[n, 0, 1], warp[n, 0, 2]
+    vu, vv, v_0 = warp[n, 1, 0], warp[n, 1, 1], warp[n, 1, 2]
     for y in range(-half, half + 1):
-        # where the row lies, apart from what is read there: several divisions at once
+        first = np.uintp((y + half) * (2 * half + 1))
         for k in range(2 * half + 1):
             x = k - half
             scale = 1.0 / (1.0 + h_u * x + h_v * y)
-            at_u[k] = middle + u_0 + scale * (uu * x + uv * y)
-            at_v[k] = middle + v_0 + scale * (vu * x + vv * y)
-        for x in range(-half, half + 1):
-            pixel = window[y + half, x + half]
-            level, gu, gv = pixel[0], pixel[1], pixel[2]
-            residual = grey(after, at_u[x + half], at_v[x + half]) - level
-            weighted = WEIGHT[y + half, x + half] * residual
-            square += weighted * residual
+            at_u = middle + u_0 + scale * (uu * x + uv * y)
+            at_v = middle + v_0 + scale * (vu * x + vv * y)
+            column, row = np.int32(at_u), np.int32(at_v)
+            cell[first + np.uintp(k)] = row * np.int32(side) + column
+            share[0, first + np.uintp(k)] = at_u - float(column)
+            share[1, first + np.uintp(k)] = at_v - float(row)
+
+
+@njit(cache=True)
+def _look_up(after: np.ndarray, n: int, cell: np.ndarray) -> None:
+    """Replace pixels by the grey levels there, to the right and below, the bytes of one number."""
+    side = np.uintp(after.shape[2])
+    patch = after[n].ravel()
+    for k in range(len(cell)):
+        at = np.uintp(cell[k])
+        upper = np.uint32(patch[at]) | np.uint32(patch[at + _ONE]) << _BYTE
+        lower = np.uint32(patch[at + side]) | np.uint32(patch[at + side + _ONE]) << _BYTE
+        cell[k] = upper | lower << _HALF
+
+
+@njit(cache=True)
+def _compare(window: Float, i: int, cell: np.ndarray, share: Float, residual: Float) -> None:
+    """Fill in after - before; between pixels grey levels are bilinear."""
+    for k in range(len(cell)):
+        a, b, levels = share[0, k], share[1, k], cell[k]
+        p, q = float(levels & _LOW), float((levels >> _BYTE) & _LOW)
+        r, s = float((levels >> _HALF) & _LOW), float(levels >> (_HALF + _BYTE))
+        upper, lower = (1 - a) * p + a * q, (1 - a) * r + a * s
+        residual[k] = (1 - b) * upper + b * lower - window[i, LEVEL, k]
+
+
+@njit(cache=True)
+def _moments(window: Float, i: int, residual: Float, moment: Float) -> float:
+    """Weighted sum of squared residuals; `moment` gets J^T W r."""
+    square = m0 = m1 = m2 = m3 = m4 = m5 = m6 = m7 = 0.0
+    for y in range(-WINDOW_HALF_PX, WINDOW_HALF_PX + 1):
+        middle = (y + WINDOW_HALF_PX) * (2 * WINDOW_HALF_PX + 1) + WINDOW_HALF_PX
+        for x in range(-WINDOW_HALF_PX, WINDOW_HALF_PX + 1):
+            k = np.uintp(middle + x)
+            gu, gv, off = window[i, SLOPE_U, k], window[i, SLOPE_V, k], residual[k]
+            weighted = WEIGHT[k] * off
+            square += weighted * off
             m0, m1 = m0 + weighted * gu, m1 + weighted * gv
             m2, m3 = m2 + weighted * (gu * x), m3 + weighted * (gu * y)
             m4, m5 = m4 + weighted * (gv * x), m5 + weighted * (gv * y)
-            m6, m7 = m6 + weighted, m7 + weighted * level
+            m6, m7 = m6 + weighted, m7 + weighted * window[i, LEVEL, k]
     moment[0], moment[1], moment[2], moment[3] = m0, m1, m2, m3
     moment[4], moment[5], moment[6], moment[7] = m4, m5, m6, m7
     return square

@@ -1,14 +1,13 @@
-"""Sub-pixel disparity by least squares on grey levels, for windows that show a piece of a plane.
-
-The disparity of a plane is linear in the image: d(x, y) = d + a x + b y around the window's centre.
-"""
+"""Sub-pixel disparity by least squares on grey levels, for windows that show a piece of a plane."""
 
 import math
 
 import numpy as np
 from numba import njit
 
+from mapfusion.se2 import Float
 from mapfusion.symmetric import cholesky, copy_lower, solve_lower, solve_upper
+from mapfusion.vision.window import FIELDS, RESIDUAL, ROOM, SLOPE, fill_left, fill_residuals
 
 _MAX_STEPS = 20  # a few on rich texture; where it is poor, slopes take long
 _CONVERGED_PX = 0.005  # anywhere in the window; far below what noise lets one measure
@@ -53,58 +52,64 @@ def fit_planes(
     """
     plane = np.zeros((len(pixel), 3))
     variance = np.empty(len(pixel))
+    area = (2 * half + 1) ** 2
+    window, room, share = (
+        np.empty((FIELDS, area)),
+        np.empty((ROOM, area), np.uint32),
+        np.empty(area),
+    )
     for n in range(len(pixel)):
         plane[n, 0] = start[n]
         variance[n] = _fit_plane(
             left,
             right,
-            pixel[n],
+            pixel[n, 0],
+            pixel[n, 1],
             offset[n],
             half,
             slope_sigma,
             noise,
             alike_px,
             row_sigma,
-            plane[n],
+            window,
+            room,
+            share,
+            plane,
+            n,
         )
     return plane, variance
-
-
-@njit(cache=True)
-def grey_at(image: np.ndarray, x: float, y: int) -> float:
-    """Grey level between columns by the cubic of Catmull and Rom, for 1 <= x < width - 2."""
-    k = int(x)
-    t = x - k
-    p0, p1 = float(image[y, k - 1]), float(image[y, k])
-    p2, p3 = float(image[y, k + 1]), float(image[y, k + 2])
-    return p1 + 0.5 * t * (
-        p2 - p0 + t * (2 * p0 - 5 * p1 + 4 * p2 - p3 + t * (3 * (p1 - p2) + p3 - p0))
-    )
 
 
 @njit(cache=True)
 def _fit_plane(
     left: np.ndarray,
     right: np.ndarray,
-    pixel: np.ndarray,
+    u: int,
+    v: int,
     offset: np.ndarray,
     half: int,
     slope_sigma: float,
     noise: float,
     alike_px: float,
     row_sigma: float,
+    window: Float,
+    room: np.ndarray,
+    share: Float,
     plane: np.ndarray,
+    n: int,
 ) -> float:
-    """Move `plane` (3,) to the least squares and return the variance at the offset.
+    """Move row n of `plane` to the least squares and return the variance at the offset.
 
     Gauss-Newton steps after Lucas and Kanade (1981). The derivatives are those of the left image,
     so the normal matrix is built once (inverse composition, Baker and Matthews 2004). What noise
     adds to it shortens the steps, most where texture is poor, and moves nothing of where they end.
     """
-    u, v = pixel[0], pixel[1]
     seen, factor, step = np.zeros((4, 4)), np.empty((4, 4)), np.empty(4)
-    _normal_matrix(left, u, v, half, seen)
-    variance_grey = _settle(left, right, u, v, half, seen, slope_sigma, noise, plane)
+    fill_left(left, u, v, half, window)
+    _normal_matrix(window, half, seen)
+    variance_grey = _settle(
+        right, u, v, half, seen, slope_sigma, noise, window, room, share, plane, n
+    )
     if math.isnan(variance_grey):
         return np.nan
     _without_noise(seen, half, noise, factor)
@@ -114,7 +119,7 @@ def _fit_plane(
     factor[2, 2] += prior
     factor[3, 3] += prior
     if not cholesky(factor, _SINGULAR):
-        plane[:] = np.nan
+        _give_up(plane, n)
         return np.nan
     step[0], step[1], step[2], step[3] = 0.0, 1.0, offset[0], offset[1]
     solve_lower(factor, step)
@@ -127,7 +132,6 @@ def _fit_plane(
 
 @njit(cache=True)
 def _settle(
-    left: np.ndarray,
     right: np.ndarray,
     u: int,
     v: int,
@@ -135,36 +139,48 @@ def _settle(
     seen: np.ndarray,
     slope_sigma: float,
     noise: float,
+    window: Float,
+    room: np.ndarray,
+    share: Float,
     plane: np.ndarray,
+    n: int,
 ) -> float:
     """Take steps until plane moves nowhere in the window; the residuals' variance, or NaN."""
     count = (2 * half + 1) ** 2
     factor, step = np.empty((4, 4)), np.empty(4)
     variance_grey = 2 * noise**2
     for _ in range(_MAX_STEPS):
-        first = u - half - plane[0] + plane[1] * half
-        last = u + half - plane[0] - plane[1] * half
-        lean = abs(plane[2]) * half
+        first = u - half - plane[n, 0] + plane[n, 1] * half
+        last = u + half - plane[n, 0] - plane[n, 1] * half
+        lean = abs(plane[n, 2]) * half
         if not (first - lean >= 1 and last + lean < right.shape[1] - 2 and first < last):
-            plane[:] = np.nan
+            _give_up(plane, n)
             return np.nan
-        square = _residuals(left, right, u, v, half, plane, step)
+        fill_residuals(right, u, v, half, plane, n, window, room, share)
+        square = _moments(window, half, step)
         prior = variance_grey / slope_sigma**2
         copy_lower(seen, factor)
         factor[2, 2] += prior
         factor[3, 3] += prior
-        step[2] -= prior * plane[1]
-        step[3] -= prior * plane[2]
+        step[2] -= prior * plane[n, 1]
+        step[3] -= prior * plane[n, 2]
         if not cholesky(factor, _SINGULAR):
-            plane[:] = np.nan
+            _give_up(plane, n)
             return np.nan
         solve_lower(factor, step)
         solve_upper(factor, step)
-        plane += step[1:]
+        for i in range(3):
+            plane[n, i] += step[i + 1]
         variance_grey = max(square - count * step[0] ** 2, 0.0) / (count - 4)
         if abs(step[1]) + half * (abs(step[2]) + abs(step[3])) < _CONVERGED_PX:
             break
     return variance_grey
+
+
+@njit(cache=True)
+def _give_up(plane: np.ndarray, n: int) -> None:
+    for i in range(3):
+        plane[n, i] = np.nan
 
 
 @njit(cache=True)
@@ -195,16 +211,29 @@ def _without_noise(seen: np.ndarray, half: int, noise: float, normal: np.ndarray
 
 
 @njit(cache=True)
-def _normal_matrix(left: np.ndarray, u: int, v: int, half: int, normal: np.ndarray) -> None:
-    """Add up the lower half of J^T J, of the offset in brightness, d, a and b."""
-    row = np.empty(4)
-    for y in range(v - half, v + half + 1):
+def _normal_matrix(window: Float, half: int, normal: np.ndarray) -> None:
+    """Add up the lower half of J^T J, of the offset in brightness, d, a and b.
+
+    Slopes are multiples of a half, so that in whatever order the sums are exact.
+    """
+    for y in range(-half, half + 1):
+        g0 = g1 = s0 = s1 = s2 = 0.0
+        middle = (y + half) * (2 * half + 1) + half
         for x in range(-half, half + 1):
-            slope = 0.5 * (float(left[y, u + x + 1]) - float(left[y, u + x - 1]))
-            row[0], row[1], row[2], row[3] = 1.0, slope, slope * x, slope * (y - v)
-            for i in range(4):
-                for j in range(i + 1):
-                    normal[i, j] += row[i] * row[j]
+            g = window[SLOPE, middle + x]
+            gx = g * x
+            g0, g1 = g0 + g, g1 + gx
+            s0, s1, s2 = s0 + g * g, s1 + g * gx, s2 + gx * gx
+        normal[0, 0] += 2 * half + 1
+        normal[1, 0] += g0
+        normal[2, 0] += g1
+        normal[3, 0] += g0 * y
+        normal[1, 1] += s0
+        normal[2, 1] += s1
+        normal[2, 2] += s2
+        normal[3, 1] += s0 * y
+        normal[3, 2] += s1 * y
+        normal[3, 3] += s0 * y * y
 
 
 @njit(cache=True)
@@ -233,26 +262,15 @@ def _counted(variance_grey: float, noise: float, alike_px: float) -> float:
 
 
 @njit(cache=True)
-def _residuals(
-    left: np.ndarray,
-    right: np.ndarray,
-    u: int,
-    v: int,
-    half: int,
-    plane: np.ndarray,
-    moment: np.ndarray,
-) -> float:
-    """Sum of the squared differences right - left under `plane`; `moment` gets J^T r."""
-    square = 0.0
-    moment[:] = 0.0
+def _moments(window: Float, half: int, moment: np.ndarray) -> float:
+    """Sum of the squared residuals; `moment` gets J^T r."""
+    square = m0 = m1 = m2 = m3 = 0.0
     for y in range(-half, half + 1):
-        start = u - plane[0] - plane[2] * y
+        middle = (y + half) * (2 * half + 1) + half
         for x in range(-half, half + 1):
-            residual = grey_at(right, start + x - plane[1] * x, v + y) - float(left[v + y, u + x])
-            slope = 0.5 * (float(left[v + y, u + x + 1]) - float(left[v + y, u + x - 1]))
-            square += residual * residual
-            moment[0] += residual
-            moment[1] += slope * residual
-            moment[2] += slope * x * residual
-            moment[3] += slope * y * residual
+            r, g = window[RESIDUAL, np.uintp(middle + x)], window[SLOPE, np.uintp(middle + x)]
+            square += r * r
+            m0, m1 = m0 + r, m1 + g * r
+            m2, m3 = m2 + g * x * r, m3 + g * y * r
+    moment[0], moment[1], moment[2], moment[3] = m0, m1, m2, m3
     return square

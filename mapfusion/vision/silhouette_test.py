@@ -6,96 +6,44 @@ Where two surfaces meet in the image and nothing in the world, one half is not o
 import numpy as np
 from numba import njit
 
-from mapfusion.vision.plane_fit import grey_at
+from mapfusion.se2 import Float
+
+_COUNT, _OFF, _SLOPE_2, _DOWN_2, _OFF_2 = 0, 3, 5, 6, 7  # of a part of a window, see `window_sums`
 
 
-@njit(cache=True)
-def disagrees(
-    left: np.ndarray,
-    right: np.ndarray,
-    pixel: np.ndarray,
-    plane: np.ndarray,
-    half: int,
-    noise: float,
-    max_misfit: float,
-    max_rows: float,
-) -> np.ndarray:
-    """Whether any half (left, right, upper, lower) of each window does not fit the plane.
+def disagrees(squares: Float, noise: float, max_misfit: float, max_rows: float) -> np.ndarray:
+    """Whether any half (left, right, upper, lower) of each window does not fit the plane (N,) bool.
 
     An error e in disparity changes the grey level by g e, g its slope along u, and rows that are
     off by f change it by h f, h its slope along v. So a half fits when
     sum r^2 <= n 2 noise^2 + max_misfit^2 sum g^2 + max_rows^2 sum h^2.
 
     Args:
-        left: (H, W) uint8.
-        right: (H, W) uint8.
-        pixel: (N, 2) int64 centres of the windows; what leaves an image is not looked at.
-        plane: (N, 3) from `fit_planes`.
-        half: half side of the window, pixels.
+        squares: (N, 4, 4) from `window_sums`.
         noise: standard deviation of one image's grey levels.
         max_misfit: e, pixels.
         max_rows: f, pixels.
-
-    Returns:
-        (N,) bool.
     """
-    verdict = np.empty(len(pixel), dtype=np.bool_)
-    square = np.empty((4, 4))
-    for n in range(len(pixel)):
-        _halves(left, right, pixel[n], plane[n], half, square)
-        verdict[n] = False
-        for k in range(4):
-            tolerated = square[k, 0] * 2 * noise**2 + max_misfit**2 * square[k, 2]
-            if square[k, 1] > tolerated + max_rows**2 * square[k, 3]:
-                verdict[n] = True
-    return verdict
+    tolerated = squares[..., [0, 2, 3]] @ [2 * noise**2, max_misfit**2, max_rows**2]
+    return np.any(squares[..., 1] > tolerated, axis=1)
 
 
 @njit(cache=True)
-def half_squares(
-    left: np.ndarray, right: np.ndarray, pixel: np.ndarray, plane: np.ndarray, half: int
-) -> np.ndarray:
-    """What `disagrees` looks at, of each half of each window (N, 4, 4).
-
-    In the last axis: pixels, sum of squared residuals, of squared slopes along u and along v.
-    """
-    squares = np.empty((len(pixel), 4, 4))
-    for n in range(len(pixel)):
-        _halves(left, right, pixel[n], plane[n], half, squares[n])
-    return squares
-
-
-@njit(cache=True)
-def _halves(
-    left: np.ndarray,
-    right: np.ndarray,
-    pixel: np.ndarray,
-    plane: np.ndarray,
-    half: int,
-    squares: np.ndarray,
-) -> None:
-    """Fill in (4, 4), see `half_squares`; residuals without the window's offset in brightness."""
-    height, width = left.shape
-    u, v = pixel[0], pixel[1]
-    residuals = np.zeros(4)  # their sums: left, right, upper, lower
-    squares[:] = 0.0
-    for y in range(max(-half, -v), min(half, height - 1 - v) + 1):
-        above, below = max(v + y - 1, 0), min(v + y + 1, height - 1)
-        for x in range(max(-half, 1 - u), min(half, width - 2 - u) + 1):
-            at = u + x - plane[0] - plane[1] * x - plane[2] * y
-            if not 1 <= at < width - 2:
-                continue
-            residual = grey_at(right, at, v + y) - float(left[v + y, u + x])
-            slope = 0.5 * (float(left[v + y, u + x + 1]) - float(left[v + y, u + x - 1]))
-            down = (float(left[below, u + x]) - float(left[above, u + x])) / (below - above)
-            for k in range(4):
-                if (x < 0, x > 0, y < 0, y > 0)[k]:
-                    residuals[k] += residual
-                    squares[k, 0] += 1
-                    squares[k, 1] += residual**2
-                    squares[k, 2] += slope**2
-                    squares[k, 3] += down**2
-    count = squares[2, 0] + squares[3, 0]
-    offset = (residuals[2] + residuals[3]) / count if count > 0 else 0.0  # in brightness
+def fill_in_halves(parts: Float, squares: Float, n: int) -> None:
+    """Fill in the halves (4, 4) of window n, see `window_sums`; residuals less their own mean."""
+    count = off = 0.0
+    for side in range(3):
+        count += parts[0, side, _COUNT] + parts[2, side, _COUNT]
+        off += parts[0, side, _OFF] + parts[2, side, _OFF]
+    offset = off / count if count > 0 else 0.0  # in brightness
     for k in range(4):
-        squares[k, 1] += squares[k, 0] * offset**2 - 2 * offset * residuals[k]
+        pixels = residuals = square = slopes = downs = 0.0
+        for i in range(3):
+            part, side = (i, k * 2) if k < 2 else ((k - 2) * 2, i)
+            pixels += parts[part, side, _COUNT]
+            residuals += parts[part, side, _OFF]
+            square += parts[part, side, _OFF_2]
+            slopes += parts[part, side, _SLOPE_2]
+            downs += parts[part, side, _DOWN_2]
+        squares[n, k, 0], squares[n, k, 2], squares[n, k, 3] = pixels, slopes, downs
+        squares[n, k, 1] = square + pixels * offset**2 - 2 * offset * residuals

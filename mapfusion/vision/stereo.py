@@ -31,10 +31,11 @@ from mapfusion.camera import StereoCamera
 from mapfusion.chi_square import chi_square_bound
 from mapfusion.se2 import Float
 from mapfusion.vision.plane_fit import fit_planes
-from mapfusion.vision.plane_test import FURTHER_TERMS, plane_scores
+from mapfusion.vision.plane_test import FURTHER_TERMS
 from mapfusion.vision.row_search import search_rows
 from mapfusion.vision.silhouette_test import disagrees
 from mapfusion.vision.verdict import Verdict
+from mapfusion.vision.window_sums import window_sums
 
 _MAX_HALF_PX = 90  # (2 * 90 + 1)^2 squared grey levels still fit a 32-bit sum
 
@@ -158,19 +159,11 @@ def match(
 
     rows, plane = rows[~lost], plane[~lost]
     slope[rows] = plane[:, 1:]
-    bad = disagrees(
-        left,
-        right,
-        pixel[rows],
-        plane,
-        parameters.silhouette_half_px,
-        parameters.noise_grey,
-        parameters.max_misfit_px,
-        parameters.max_rows_px,
-    )
-    verdict[rows[bad]] = Verdict.SILHOUETTE
-    rows, plane = rows[~bad], plane[~bad]
-    verdict[rows[_bent(left, right, pixel[rows], plane, parameters)]] = Verdict.BENT
+    half = (parameters.silhouette_half_px, parameters.plane_half_px)
+    squares, scores = window_sums(left, right, pixel[rows], plane, *half)
+    tolerated = (parameters.noise_grey, parameters.max_misfit_px, parameters.max_rows_px)
+    verdict[rows[_bent(scores, parameters)]] = Verdict.BENT
+    verdict[rows[disagrees(squares, *tolerated)]] = Verdict.SILHOUETTE
 
     unmatched = verdict != Verdict.MATCHED
     disparity[unmatched] = sigma[unmatched] = slope[unmatched] = np.nan
@@ -225,19 +218,12 @@ def _refine(
     return plane, disparity, np.sqrt(variance + parameters.sigma_floor_px**2)
 
 
-def _bent(
-    left: np.ndarray,
-    right: np.ndarray,
-    pixel: np.ndarray,
-    plane: Float,
-    parameters: StereoParameters,
-) -> np.ndarray:
-    """Whether windows show more than one plane or a bent surface (N,) bool.
+def _bent(scores: Float, parameters: StereoParameters) -> np.ndarray:
+    """Whether windows with scores (N, 3) show more than one plane or a bent surface (N,) bool.
 
     The score of noise is chi-square times its variance: 2 n^2, and what a deviation from the plane
     and rows that are off add to it, by the slopes of the grey levels.
     """
-    scores = plane_scores(left, right, pixel, plane, parameters.plane_half_px)
     beyond = scores[:, 1:] @ [parameters.plane_misfit_px**2, parameters.max_rows_px**2]
     bound = chi_square_bound(parameters.plane_probability, FURTHER_TERMS)
     return scores[:, 0] > bound * (2 * parameters.noise_grey**2 + beyond)

@@ -19,7 +19,7 @@ _SIDE_PX = 2 * WINDOW_HALF_PX + 1
 _WINDOW_SIGMA_PX = 6.0  # of the Gaussian by which its pixels count
 _SINGULAR = 1e-9  # pivot, as a share of its diagonal element, that is rounding error
 N_PARAMETERS = 8  # shift u and v, their derivatives by u and v, offset and gain in brightness
-_NEXT = np.uintp(1)  # indices without a sign, which a kernel need not wrap around
+LEVEL, SLOPE_U, SLOPE_V = range(3)  # of a window's pixels
 NO_FIT = -1.0  # tolerated of a window that leaves its patch, or that has too little texture
 
 
@@ -28,7 +28,7 @@ class Templates:
     """Windows around N points of earlier pictures.
 
     Attributes:
-        window: (N, W, W, 3) grey level and its slopes along u and v.
+        window: (N, 3, W * W) grey levels, row by row, and their slopes along u and v.
         factor: (N, 8, 8) of the normal matrix, its lower half.
         tolerated: (N,) weighted sum of squared residuals that still is the same, or NO_FIT.
     """
@@ -41,7 +41,7 @@ class Templates:
     def room(cls, n: int) -> "Templates":
         """For n of them, not filled in."""
         factor = np.empty((n, N_PARAMETERS, N_PARAMETERS))
-        return cls(np.empty((n, _SIDE_PX, _SIDE_PX, 3)), factor, np.empty(n))
+        return cls(np.empty((n, 3, _SIDE_PX**2)), factor, np.empty(n))
 
     @classmethod
     def of(cls, patch: np.ndarray, point: Float, noise: float, max_misfit: float) -> "Templates":
@@ -72,7 +72,7 @@ def _weights() -> Float:
     return by_distance * by_distance[:, None]
 
 
-WEIGHT = _weights()  # (W, W), what the window's pixels count
+WEIGHT = _weights().ravel()  # (W * W,), what the window's pixels count
 WEIGHT.setflags(write=False)
 
 
@@ -86,59 +86,74 @@ def _prepare(
     factor: Float,
     tolerated: Float,
 ) -> None:
-    rows = np.empty((_SIDE_PX, _SIDE_PX, N_PARAMETERS))
+    shown = np.empty((_SIDE_PX + 2) ** 2)
     for n in range(len(patch)):
         tolerated[n] = NO_FIT
-        if _take_window(patch[n], point[n], window[n], rows):
-            sum_of_squares = _normal_matrix(rows, factor[n], variance, square_misfit)
-            if cholesky(factor[n], _SINGULAR):
-                tolerated[n] = sum_of_squares
+        middle, reach = patch.shape[1] // 2, max(abs(point[n, 0]), abs(point[n, 1]))
+        if reach + WINDOW_HALF_PX + 2 > middle:
+            continue
+        _read_grid(patch, n, middle + point[n, 0], middle + point[n, 1], shown)
+        _fill_window(shown, window, n)
+        sum_of_squares = _normal_matrix(window, n, factor, variance, square_misfit)
+        if cholesky(factor[n], _SINGULAR):
+            tolerated[n] = sum_of_squares
 
 
 @njit(cache=True)
-def _take_window(patch: np.ndarray, point: Float, window: Float, rows: Float) -> bool:
-    """Grey levels on the grid around the point, and their derivatives by the parameters."""
-    half, middle = WINDOW_HALF_PX, patch.shape[0] // 2
-    if max(abs(point[0]), abs(point[1])) + half + 2 > middle:
-        return False
-    for y in range(-half, half + 1):
-        for x in range(-half, half + 1):
-            u, v = middle + point[0] + x, middle + point[1] + y
-            own, row = window[y + half, x + half], rows[y + half, x + half]
-            level = grey(patch, u, v)
-            gu = 0.5 * (grey(patch, u + 1, v) - grey(patch, u - 1, v))
-            gv = 0.5 * (grey(patch, u, v + 1) - grey(patch, u, v - 1))
-            own[0], own[1], own[2] = level, gu, gv
-            row[0], row[1] = gu, gv
-            row[2], row[3], row[4], row[5] = gu * x, gu * y, gv * x, gv * y
-            row[6], row[7] = 1.0, level
-    return True
+def _read_grid(patch: np.ndarray, n: int, u: float, v: float, shown: Float) -> None:
+    """Fill in grey levels between pixels, bilinear: of a window around (u, v) and one pixel more.
 
-
-@njit(cache=True)
-def grey(image: np.ndarray, u: float, v: float) -> float:
-    """Grey level between pixels, bilinear."""
-    i, j = np.uintp(int(u)), np.uintp(int(v))
+    All have the same shares of the pixels around them, since u and v have no more digits than
+    their sums with whole numbers.
+    """
+    half, side = WINDOW_HALF_PX + 1, _SIDE_PX + 2
+    i, j = np.uintp(int(u) - half), np.uintp(int(v) - half)
     a, b = u - int(u), v - int(v)
-    upper = (1 - a) * image[j, i] + a * image[j, i + _NEXT]
-    lower = (1 - a) * image[j + _NEXT, i] + a * image[j + _NEXT, i + _NEXT]
-    return (1 - b) * upper + b * lower
+    for y in range(side):
+        row, below = j + np.uintp(y), j + np.uintp(y + 1)
+        for x in range(side):
+            k, after = i + np.uintp(x), i + np.uintp(x + 1)
+            upper = (1 - a) * patch[n, row, k] + a * patch[n, row, after]
+            lower = (1 - a) * patch[n, below, k] + a * patch[n, below, after]
+            shown[np.uintp(y * side + x)] = (1 - b) * upper + b * lower
 
 
 @njit(cache=True)
-def _normal_matrix(rows: Float, normal: Float, variance: float, square_misfit: float) -> float:
-    """Fills its lower half; returns which weighted sum of squared residuals is tolerated.
+def _fill_window(shown: Float, window: Float, n: int) -> None:
+    """Fill in window n's grey levels and their slopes from those of a grid around it."""
+    wide = np.uintp(_SIDE_PX + 2)
+    one = np.uintp(1)
+    for y in range(_SIDE_PX):
+        for x in range(_SIDE_PX):
+            k, at = np.uintp(y * _SIDE_PX + x), np.uintp(y + 1) * wide + np.uintp(x + 1)
+            window[n, LEVEL, k] = shown[at]
+            window[n, SLOPE_U, k] = 0.5 * (shown[at + one] - shown[at - one])
+            window[n, SLOPE_V, k] = 0.5 * (shown[at + wide] - shown[at - wide])
+
+
+@njit(cache=True)
+def _normal_matrix(
+    window: Float, n: int, normal: Float, variance: float, square_misfit: float
+) -> float:
+    """Fills in matrix n of `normal`; returns which weighted sum of squared residuals is tolerated.
 
     An error e of the place along some direction changes a grey level by g e, g its slope along it.
     """
-    tolerated = 0.0
-    normal[:] = 0.0
-    for y in range(_SIDE_PX):
-        for x in range(_SIDE_PX):
-            row, weight = rows[y, x], WEIGHT[y, x]
-            square_slope = 0.5 * (row[0] * row[0] + row[1] * row[1])  # the mean over directions
+    tolerated, row, k = 0.0, np.empty(N_PARAMETERS), 0
+    for i in range(N_PARAMETERS):
+        for j in range(N_PARAMETERS):
+            normal[n, i, j] = 0.0
+    for y in range(-WINDOW_HALF_PX, WINDOW_HALF_PX + 1):
+        for x in range(-WINDOW_HALF_PX, WINDOW_HALF_PX + 1):
+            gu, gv, weight = window[n, SLOPE_U, k], window[n, SLOPE_V, k], WEIGHT[k]
+            row[0], row[1] = gu, gv
+            row[2], row[3], row[4], row[5] = gu * x, gu * y, gv * x, gv * y
+            row[6], row[7] = 1.0, window[n, LEVEL, k]
+            square_slope = 0.5 * (gu * gu + gv * gv)  # the mean over directions
             tolerated += weight * (variance + square_misfit * square_slope)
             for i in range(N_PARAMETERS):
-                for j in range(i + 1):
-                    normal[i, j] += weight * row[i] * row[j]
+                weighted = weight * row[i]
+                for j in range(N_PARAMETERS):
+                    normal[n, i, j] += weighted * row[j]
+            k += 1
     return tolerated

@@ -16,8 +16,8 @@ from mapfusion.se3 import in_space
 from mapfusion.vision.frontend import FrontEnd, FrontEndParameters
 from mapfusion.vision.harris import HarrisParameters
 from mapfusion.vision.noise_model import measured_noise
-from mapfusion.vision.plane_test import plane_scores
 from mapfusion.vision.tracks import Tracker, TrackParameters
+from mapfusion.vision.window_sums import window_sums
 from sim.exposure import expose
 from sim.floorplan import FloorPlan, Wall
 from sim.radiometry import RadiometricNoise
@@ -124,7 +124,7 @@ def front_end() -> None:
         tracker.update(FrontEnd(camera, off_rows).extract(left, right))
         measured_noise([(left, right)], camera, few.harris, few.stereo)
         ends = np.array([[0, 0], [79, 0], [0, 59], [79, 59]])
-        plane_scores(left, right, ends, np.tile([2.5, 0.1, -0.1], (4, 1)), 8)
+        window_sums(left, right, ends, np.tile([2.5, 0.1, -0.1], (4, 1)), 8, 6)
 
 
 def call_all() -> None:

@@ -6,6 +6,7 @@ import sys
 import numpy as np
 import pandas as pd
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from mapfusion.errors import DamagedFileError, InputError
@@ -68,6 +69,17 @@ def test_rows_of_bytes_come_back_as_bytes(tmp_path):
         table, _ = read_table(tmp_path / "b.parquet", things)
         np.testing.assert_array_equal(column(table, "patch"), written)
         np.testing.assert_array_equal(column(table.slice(2), "patch"), written[2:])
+
+
+def test_all_but_bytes_is_packed(tmp_path):
+    """Lists as well, of which Parquet knows the values' column by another name."""
+    kinds = {"x": pa.float64(), "looks": pa.list_(pa.float32(), 64), "bytes": pa.binary(4)}
+    fields = schema("test.kinds", 1, [pa.field(*item) for item in kinds.items()])
+    nothing = {"x": np.zeros(9), "looks": np.full((9, 64), np.nan), "bytes": np.zeros((9, 4))}
+    write_table(tmp_path / "k.parquet", nothing, fields)
+    group = pq.read_metadata(tmp_path / "k.parquet").row_group(0)
+    packed = {(own := group.column(i)).path_in_schema: own.compression for i in range(3)}
+    assert packed == {"x": "LZ4", "looks.list.element": "LZ4", "bytes": "UNCOMPRESSED"}
 
 
 def test_empty_table_keeps_its_types(tmp_path):

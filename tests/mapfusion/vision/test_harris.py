@@ -148,14 +148,14 @@ def test_wrong_parameters_are_named(name: str, value: float) -> None:
 
 
 @pytest.mark.parametrize("block_px", [1, 3, 8])
-def test_the_response_of_bands_is_that_of_the_whole_image(block_px: int) -> None:
+def test_the_response_is_opencv_s(block_px: int) -> None:
     image = cv2.GaussianBlur(
         np.random.default_rng(5).integers(0, 256, (150, 90), dtype=np.uint8), (0, 0), 1.5
     )
     parameters = HarrisParameters(block_px=block_px)
     whole = cv2.cornerHarris(image, block_px, 3, parameters.k)
-    bands = harris_response(image, parameters)
-    np.testing.assert_allclose(bands, whole, rtol=0, atol=1e-6 * np.abs(whole).max())
+    own = harris_response(image, parameters)
+    np.testing.assert_allclose(own, whole, rtol=0, atol=1e-6 * np.abs(whole).max())
 
 
 def test_maxima_are_pixels_that_dilation_leaves_as_they_are() -> None:

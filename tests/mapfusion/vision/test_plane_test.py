@@ -5,11 +5,19 @@ import pytest
 from scipy.stats import binom, chi2, kstest, ncx2
 
 from mapfusion.vision.plane_fit import fit_planes
-from mapfusion.vision.plane_test import FURTHER_TERMS, plane_scores
+from mapfusion.vision.plane_test import FURTHER_TERMS
+from mapfusion.vision.window_sums import window_sums
 from tests.mapfusion.vision.shifted_pictures import Picture, pair
 
 HALF, NOISE, D = 8, 2.0, 8
 VARIANCE = 2 * (NOISE**2 + 1 / 12)  # of residuals: two pictures, in whole grey levels
+
+
+def plane_scores(
+    left: np.ndarray, right: np.ndarray, pixel: np.ndarray, plane: np.ndarray
+) -> np.ndarray:
+    """Scores and mean squared slopes (N, 3) of windows; halves are of larger ones."""
+    return window_sums(left, right, pixel, plane, HALF + 3, HALF)[1]
 
 
 def apart(half: int = HALF) -> np.ndarray:
@@ -48,7 +56,7 @@ def test_the_score_is_what_further_terms_explain(pictures: str) -> None:
         right = np.where(np.arange(320) % 50 < 25, right, np.roll(right, 1, 1))
     inner = np.random.default_rng(0).integers((20, 10), (305, 230), (60, 2))
     pixel = np.vstack([inner, [(100, 3), (317, 100), (150, 238), (12, 80)]])
-    scores = plane_scores(left, right, pixel, np.tile([D, 0.0, 0.0], (len(pixel), 1)), HALF)
+    scores = plane_scores(left, right, pixel, np.tile([D, 0.0, 0.0], (len(pixel), 1)))
     expected = []
     for u, v in pixel.tolist():
         known, beyond, (_, _, x, y) = (k.T for k in columns(left, u, v))
@@ -61,7 +69,7 @@ def test_the_score_is_what_further_terms_explain(pictures: str) -> None:
 def test_slopes_are_those_of_the_grey_levels() -> None:
     left, right = pair(D)
     u, v = 100, 100
-    found = plane_scores(left, right, np.array([[u, v]]), np.array([[D, 0.0, 0.0]]), HALF)[0]
+    found = plane_scores(left, right, np.array([[u, v]]), np.array([[D, 0.0, 0.0]]))[0]
     down, along = np.gradient(left.astype(float))
     window = (slice(v - HALF, v + HALF + 1), slice(u - HALF, u + HALF + 1))
     expected = [np.mean(slope[window] ** 2) for slope in (along, down)]
@@ -74,7 +82,7 @@ def test_planes_are_refused_at_the_stated_rate() -> None:
     for seed in range(6):
         images = pair(D, noise=NOISE, seed=seed)
         plane, _ = fit_planes(*images, pixel, nothing, start, HALF, 0.3, NOISE, 1.0, 0.0)
-        found.append(plane_scores(*images, pixel, plane, HALF)[:, 0])
+        found.append(plane_scores(*images, pixel, plane)[:, 0])
     score = np.concatenate(found) / VARIANCE
     assert kstest(score, chi2(FURTHER_TERMS).cdf).pvalue > 0.01
     for share in (0.1, 0.001):
@@ -88,7 +96,7 @@ def test_how_bright_a_picture_is_does_not_count() -> None:
     left, right = pair(D, noise=NOISE)
     pixel, right = apart(), right // 2 * 2
     plane = np.tile([D + 0.3, 0.01, 0.0], (len(pixel), 1))
-    scores, half = (plane_scores(left, k, pixel, plane, HALF) for k in (right, right // 2 + 30))
+    scores, half = (plane_scores(left, k, pixel, plane) for k in (right, right // 2 + 30))
     np.testing.assert_allclose(half[:, 0], scores[:, 0] / 4, rtol=2e-3)
     np.testing.assert_array_equal(half[:, 1:], scores[:, 1:])
 
@@ -111,7 +119,7 @@ def test_steps_are_found_as_often_as_their_size_says(step_px: float) -> None:
             for k in clean
         )
         plane = np.tile([D, 0.0, 0.0], (len(pixel), 1))
-        score.append(plane_scores(left, right, pixel, plane, HALF)[:, 0] / VARIANCE)
+        score.append(plane_scores(left, right, pixel, plane)[:, 0] / VARIANCE)
         for a, b in pixel.tolist():
             known, beyond, (_, _, x, y) = (k.T for k in columns(clean[0], a, b))
             change = clean[1][y, x - D] - clean[0][y, x]
@@ -127,7 +135,7 @@ def test_windows_without_texture_hold_nothing_against_a_plane() -> None:
     flat = np.full((40, 60), 90, np.uint8)
     stripes = np.tile((np.arange(60) % 7 * 30).astype(np.uint8), (40, 1))
     pixel, plane = np.array([[30, 20]]), np.zeros((1, 3))
-    assert plane_scores(flat, flat, pixel, plane, HALF)[0].tolist() == [0, 0, 0]
-    assert plane_scores(stripes, stripes, pixel, plane, HALF)[0, 0] == 0
+    assert plane_scores(flat, flat, pixel, plane)[0].tolist() == [0, 0, 0]
+    assert plane_scores(stripes, stripes, pixel, plane)[0, 0] == 0
     brighter = flat + np.random.default_rng(0).integers(0, 9, flat.shape).astype(np.uint8)
-    assert plane_scores(flat, brighter, pixel, plane, HALF)[0, 0] == 0
+    assert plane_scores(flat, brighter, pixel, plane)[0, 0] == 0
