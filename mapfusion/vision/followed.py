@@ -56,7 +56,7 @@ class Followed:
         self.first_px[rows] = _plane(features, rows, features.disparity_px[rows])
         if self.templates is not None and features.patch is not None:
             fresh = likeness.templates(features.patch[rows], uv - np.rint(uv))
-            self.templates.put(rows, fresh, slice(None))
+            self.templates.put(rows, fresh, np.arange(len(rows)))
 
 
 def followed(
@@ -102,7 +102,7 @@ def followed(
     new.uv_px[kept], new.disparity_px[kept] = uv[fits], disparity[fits]
     new.warp[kept], new.first_px[kept] = warp[fits, :, :2], first[fits]
     new.templates.put(kept, points.templates, old[fits])
-    new.templates.put(rows[again[fits[again]]], nearer, fits[again])
+    new.templates.put(rows[again[fits[again]]], nearer, np.flatnonzero(fits[again]))
     found = np.zeros(len(after), dtype=bool)
     found[kept] = True
     return new, found

@@ -6,6 +6,8 @@ from numba import njit
 from mapfusion.vision.verdict import Verdict
 
 _PEAK_HALF_WIDTH_PX = 2  # rivals are looked for beyond the slopes of the best peak
+_CROSS, _SUM, _SQUARE = range(3)  # of candidates: sums of products; of columns: of greys, squares
+_AT_ONCE = 32  # candidates that vectors take at once: up to a multiple all cost the same
 
 
 @njit(cache=True)
@@ -27,7 +29,8 @@ def search_rows(
     Returns disparities (N,), meaningful where the verdict is MATCHED, and verdicts (N,) int8.
     """
     height, width = left.shape
-    scores = np.empty(width)
+    scores, room = np.empty(width), np.zeros((3, width + _AT_ONCE), dtype=np.int32)
+    strip = np.zeros(width + _AT_ONCE, dtype=np.uint8)
     disparity = np.zeros(len(pixel), dtype=np.int64)
     verdict = np.empty(len(pixel), dtype=np.int8)
     for n in range(len(pixel)):
@@ -38,12 +41,25 @@ def search_rows(
             verdict[n] = Verdict.OUTSIDE
             continue
         found, verdict[n] = _search(
-            left, right, u, v, first, last, half, min_correlation, max_ambiguity, scores
+            left,
+            right,
+            u,
+            v,
+            first,
+            last,
+            half,
+            min_correlation,
+            max_ambiguity,
+            scores,
+            strip,
+            room,
         )
         if verdict[n] != Verdict.MATCHED:
             continue
         back_first, back_last = found + min_disparity, min(found + max_disparity, width - half - 1)
-        back, _ = _search(right, left, found, v, back_first, back_last, half, -1.0, 1.0, scores)
+        back, _ = _search(
+            right, left, found, v, back_first, back_last, half, -1.0, 1.0, scores, strip, room
+        )
         if abs(back - u) > max_round_trip:
             verdict[n] = Verdict.ONE_SIDED
             continue
@@ -63,11 +79,13 @@ def _search(
     min_correlation: float,
     max_ambiguity: float,
     scores: np.ndarray,
+    strip: np.ndarray,
+    room: np.ndarray,
 ) -> tuple[int, int]:
     """Column of `other` in first..last that looks most like (u, v) of `image`, and a verdict."""
     if last < first:
         return u, Verdict.OUTSIDE
-    if not _correlate(image, other, u, v, first, last, half, scores):
+    if not _correlate(image, other, u, v, first, last, half, scores, strip, room):
         return u, Verdict.FLAT
     best = 0
     for k in range(1, last - first + 1):
@@ -94,45 +112,85 @@ def _correlate(
     last: int,
     half: int,
     scores: np.ndarray,
+    strip: np.ndarray,
+    room: np.ndarray,
 ) -> bool:
     """Fill `scores` with the correlation at columns first..last; False when the window is flat.
 
     Whole numbers throughout, and the candidates in the inner loop: that is what vectorises.
     """
     side = 2 * half + 1
-    area = side * side
-    candidates = last - first + 1
-    cross = np.zeros(candidates, dtype=np.int32)
-    column_sum = np.zeros(candidates + 2 * half, dtype=np.int32)
-    column_square = np.zeros(candidates + 2 * half, dtype=np.int32)
+    area, candidates = side * side, last - first + 1
+    padded = -(-candidates // _AT_ONCE) * _AT_ONCE
+    _clear(room, padded + 2 * half)
     total, total_square = np.int64(0), np.int64(0)
     for y in range(v - half, v + half + 1):
-        strip = other[y, first - half : last + half + 1]
-        for k in range(candidates + 2 * half):
-            grey = np.int32(strip[k])
-            column_sum[k] += grey
-            column_square[k] += grey * grey
-        for j in range(side):
-            grey = np.int32(image[y, u - half + j])
+        _take_strip(other, y, first - half, candidates + 2 * half, strip, room)
+        _add_products(image, y, u - half, half, strip, padded, room)
+        for x in range(u - half, u + half + 1):
+            grey = np.int64(image[y, x])
             total += grey
             total_square += grey * grey
-            for k in range(candidates):
-                cross[k] += grey * np.int32(strip[k + j])
     spread = area * total_square - total * total
     if spread == 0:
         return False
     strip_total, strip_square = np.int64(0), np.int64(0)
     for k in range(side - 1):
-        strip_total += column_sum[k]
-        strip_square += column_square[k]
+        strip_total += room[_SUM, k]
+        strip_square += room[_SQUARE, k]
     for k in range(candidates):
-        strip_total += column_sum[k + side - 1]
-        strip_square += column_square[k + side - 1]
+        strip_total += room[_SUM, k + side - 1]
+        strip_square += room[_SQUARE, k + side - 1]
         strip_spread = area * strip_square - strip_total * strip_total
-        covariance = area * np.int64(cross[k]) - total * strip_total
+        covariance = area * np.int64(room[_CROSS, k]) - total * strip_total
         scores[k] = (
             covariance / np.sqrt(float(spread) * float(strip_spread)) if strip_spread > 0 else -1.0
         )
-        strip_total -= column_sum[k]
-        strip_square -= column_square[k]
+        strip_total -= room[_SUM, k]
+        strip_square -= room[_SQUARE, k]
     return True
+
+
+@njit(cache=True)
+def _clear(room: np.ndarray, count: int) -> None:
+    for i in range(len(room)):
+        for k in range(count):
+            room[i, k] = 0
+
+
+@njit(cache=True)
+def _take_strip(
+    other: np.ndarray, y: int, begin: int, count: int, strip: np.ndarray, room: np.ndarray
+) -> None:
+    """Copy part of a row, and add it to the columns' sums and sums of squares."""
+    at = np.uintp(begin)
+    for k in range(count):
+        grey = other[y, at + np.uintp(k)]
+        strip[k] = grey
+        room[_SUM, k] += np.int32(grey)
+        room[_SQUARE, k] += np.int32(grey) * np.int32(grey)
+
+
+@njit(cache=True)
+def _add_products(
+    image: np.ndarray,
+    y: int,
+    begin: int,
+    half: int,
+    strip: np.ndarray,
+    count: int,
+    room: np.ndarray,
+) -> None:
+    """Add a row of the window times the strip, from each of `count` candidates on.
+
+    The window's row is odd: its first column, then two at once, which halves the way to memory.
+    """
+    here = np.int32(image[y, begin])
+    for k in range(count):
+        room[_CROSS, k] += here * np.int32(strip[k])
+    for j in range(1, 2 * half, 2):
+        here, after = np.int32(image[y, begin + j]), np.int32(image[y, begin + j + 1])
+        first, second = np.uintp(j), np.uintp(j + 1)
+        for k in range(count):
+            products = here * np.int32(strip[first + np.uintp(k)])
+            room[_CROSS, k] += products + after * np.int32(strip[second + np.uintp(k)])

@@ -59,11 +59,21 @@ class Templates:
         _prepare(patch, point, variance, square_misfit, made.window, made.factor, made.tolerated)
         return made
 
-    def put(self, rows: np.ndarray, others: "Templates", theirs: np.ndarray | slice) -> None:
-        """Replace, in place, rows by some of others."""
-        self.window[rows] = others.window[theirs]
-        self.factor[rows] = others.factor[theirs]
+    def put(self, rows: np.ndarray, others: "Templates", theirs: np.ndarray) -> None:
+        """Replace, in place, rows (K,) by some of others, their rows (K,)."""
+        _copy(others.window, theirs, self.window, rows)
+        _copy(others.factor, theirs, self.factor, rows)
         self.tolerated[rows] = others.tolerated[theirs]
+
+
+@njit(cache=True)
+def _copy(source: Float, theirs: np.ndarray, target: Float, rows: np.ndarray) -> None:
+    """Copy rows (..., K, L) of one array to rows of another, with no copy in between."""
+    for n in range(len(rows)):
+        i, k = np.uintp(theirs[n]), np.uintp(rows[n])
+        for m in range(source.shape[1]):
+            for p in range(source.shape[2]):
+                target[k, m, p] = source[i, m, p]
 
 
 def _weights() -> Float:

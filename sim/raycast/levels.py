@@ -27,6 +27,8 @@ FIRST_AND_THIRD = np.uint32(0x00FF00FF)  # bytes of a cell
 BYTE, HALF, LOW_HALF = np.uint32(8), np.uint32(16), np.uint32(0xFFFF)
 
 Way = tuple[float, float, float]
+Line = tuple[float, float, float, float]  # x, y and their steps from pixel to pixel
+Size = tuple[int, int]  # of a copy of the picture: rows and columns
 
 
 @njit(cache=True)
@@ -99,21 +101,59 @@ def fill(
         picture: (H, W) uint8, changed.
     """
     plan, way = footprints(camera, level), ways(camera, level)
-    room, sums = np.empty((4, PIECE), np.int32), np.empty(PIECE, np.uint32)
-    for first in range(0, camera.width_px, PIECE):
-        last = min(first + PIECE, camera.width_px)
-        for n in range(np.max(open_rows[first:last])):
-            v = n if is_above else camera.height_px - 1 - n
-            begin = first
-            while begin < last:
-                end = begin
-                while end < last and n < open_rows[end]:
-                    end += 1
-                if begin < end:
-                    _sum_pixels(camera, level, way, plan, v, begin, end - begin, room, sums)
-                    samples = max(plan[v, 0] * plan[v, 1], 1)
-                    _show(sums, samples, v, begin, end - begin, picture)
-                begin = end + 1
+    shape, firsts, cells = level.shape, level.first, level.cells
+    place, cell = np.empty((3, PIECE), np.int32), np.empty(PIECE, np.uint32)
+    sums, most = np.empty(PIECE, np.uint32), _most_open(open_rows)
+    rise = (camera.eye_z_m - level.height_m) * camera.focal_px
+    for i in range(len(most)):
+        first, last = i * PIECE, min((i + 1) * PIECE, camera.width_px)
+        for row in range(most[i]):
+            v = row if is_above else camera.height_px - 1 - row
+            n, across, k = plan[v, 0], plan[v, 1], plan[v, 2]
+            size, corner = (shape[k, 0], shape[k, 1]), int(firsts[k])
+            end = first
+            while end < last:
+                begin = _next(open_rows, row, end, last, True)
+                end = _next(open_rows, row, begin, last, False)
+                count = end - begin
+                _start(sums, count, SUM_UNIT * int(BACKGROUND) if n == 0 else 0)
+                for side in range(across):
+                    u = begin + (0.0 if across == 1 else side / 2 - 0.25)
+                    for s in range(n if count else 0):
+                        z = rise / (v - 0.5 + (s + 0.5) / n - camera.center_v)
+                        line = _line(way, u, z, size)
+                        lowest = _lowest_cell(line, count, size)
+                        if lowest < 0:
+                            _add_at_the_edge(cells, corner, line, size, count, sums)
+                        else:
+                            _walk(line, lowest, size[1] + 1, count, place)
+                            _look_up(cells, corner + lowest, place, count, cell)
+                            _add_between(cell, place, count, sums)
+                _show(sums, max(n * across, 1), v, begin, count, picture)
+
+
+@njit(cache=True)
+def _most_open(open_rows: np.ndarray) -> np.ndarray:
+    """The most open rows of each `PIECE` columns."""
+    most = np.zeros(-(-len(open_rows) // PIECE), dtype=np.int64)
+    for j in range(len(open_rows)):
+        most[j // PIECE] = max(most[j // PIECE], open_rows[j])
+    return most
+
+
+@njit(cache=True)
+def _next(open_rows: np.ndarray, row: int, begin: int, end: int, is_open: bool) -> int:
+    """The first column from `begin` on that is open, or is not, in a row; else `end`."""
+    for j in range(begin, end):
+        if (row < open_rows[j]) == is_open:
+            return j
+    return end
+
+
+@njit(cache=True)
+def _start(sums: np.ndarray, count: int, value: int) -> None:
+    for i in range(count):
+        sums[i] = value
 
 
 @njit(cache=True)
@@ -121,83 +161,72 @@ def _show(
     sums: np.ndarray, samples: int, v: int, begin: int, count: int, picture: np.ndarray
 ) -> None:
     """Draw means of samples, rounded, into a row's pixels from `begin` on."""
-    scale, shown = np.float32(1 / (SUM_UNIT * samples)), picture[v, begin:]
+    scale, at = np.float32(1 / (SUM_UNIT * samples)), np.uintp(begin)
     for i in range(count):
-        shown[i] = np.uint8(np.int32(scale * np.float32(sums[i]) + np.float32(0.5)))
+        shown = np.int32(scale * np.float32(sums[i]) + np.float32(0.5))
+        picture[v, at + np.uintp(i)] = np.uint8(shown)
 
 
 @njit(cache=True)
-def _sum_pixels(
-    camera: Pinhole,
-    level: Level,
-    way: tuple[Way, Way],
-    plan: np.ndarray,
-    v: int,
-    begin: int,
-    count: int,
-    room: np.ndarray,
-    sums: np.ndarray,
-) -> None:
-    """Fill the first `count` of `sums` with the samples of a row's pixels from `begin` on."""
-    n, across, k = plan[v, 0], plan[v, 1], plan[v, 2]
-    for i in range(count):
-        sums[i] = SUM_UNIT * int(BACKGROUND) if n == 0 else 0
-    height, width = level.shape[k, 0], level.shape[k, 1]
-    (right_0, right_z, right_zu), (up_0, up_z, up_zu) = way
-    rise = (camera.eye_z_m - level.height_m) * camera.focal_px
-    for side in range(across):
-        u = begin + (0.0 if across == 1 else side / 2 - 0.25)
-        for s in range(n):
-            z = rise / (v - 0.5 + (s + 0.5) / n - camera.center_v)
-            # cells lie between the middles of texels
-            x = (right_0 + (right_z + right_zu * u) * z) * width + 0.5
-            y = (up_0 + (up_z + up_zu * u) * z) * height + 0.5
-            x_step, y_step = right_zu * z * width, up_zu * z * height
-            x_last, y_last = x + (count - 1) * x_step, y + (count - 1) * y_step
-            left, right = min(x, x_last), max(x, x_last)
-            low, high = min(y, y_last), max(y, y_last)
-            inside = left >= 0.5 and right < width + 0.5 and low >= 0.5 and high < height + 0.5
-            if inside and max(right - left, high - low) < MOST_CELLS:
-                _add_samples(level, k, x, y, x_step, y_step, int(left), int(low), count, room, sums)
-            else:
-                for i in range(count):
-                    sums[i] += _at_the_edge(level, k, x + i * x_step, y + i * y_step)
+def _line(way: tuple[Way, Way], u: float, z: float, size: Size) -> Line:
+    """Where a row's pixels lie on a copy of the picture, in cells, from the one at `u` on.
 
-
-@njit(cache=True)
-def _add_samples(
-    level: Level,
-    k: int,
-    x: float,
-    y: float,
-    x_step: float,
-    y_step: float,
-    column: int,
-    row: int,
-    count: int,
-    room: np.ndarray,
-    sums: np.ndarray,
-) -> None:
-    """Add samples of copy k on a line to the first `count` of `sums`.
-
-    Places are in cells, none to the left of `column` or below `row`. Each loop does one thing:
-    those that only look up and those that only reckon run in the processor's vectors, one that
-    does both does not.
+    Cells lie between the middles of texels.
     """
-    wide = level.shape[k, 1] + 1
-    corner = np.uint64(level.first[k] + row * wide + column)
-    at_x, at_y, place, cell = room[0], room[1], room[2], room[3].view(np.uint32)
-    first_x, step_x = np.int32((x - column) * PLACE_UNIT), np.int32(x_step * PLACE_UNIT)
-    first_y, step_y = np.int32((y - row) * PLACE_UNIT), np.int32(y_step * PLACE_UNIT)
+    (right_0, right_z, right_zu), (up_0, up_z, up_zu) = way
+    height, width = size
+    x = (right_0 + (right_z + right_zu * u) * z) * width + 0.5
+    y = (up_0 + (up_z + up_zu * u) * z) * height + 0.5
+    return x, y, right_zu * z * width, up_zu * z * height
+
+
+@njit(cache=True)
+def _lowest_cell(line: Line, count: int, size: Size) -> int:
+    """The cell that none of a line's is to the left of or below; -1: near the edge, or too far."""
+    x, y, x_step, y_step = line
+    height, width = size
+    x_last, y_last = x + (count - 1) * x_step, y + (count - 1) * y_step
+    left, right = min(x, x_last), max(x, x_last)
+    low, high = min(y, y_last), max(y, y_last)
+    inside = left >= 0.5 and right < width + 0.5 and low >= 0.5 and high < height + 0.5
+    if not inside or max(right - left, high - low) >= MOST_CELLS:
+        return -1
+    return int(low) * (width + 1) + int(left)
+
+
+# Of the loops that follow each does one thing: those that only look up and those that only reckon
+# run in the processor's vectors, one that does both does not. They are functions of their own,
+# whose arrays need not be held on to: that takes longer than such a loop.
+
+
+@njit(cache=True)
+def _walk(line: Line, lowest: int, wide: int, count: int, place: np.ndarray) -> None:
+    """Fill in places: along x and y from the lowest cell, and in cells from it."""
+    x, y, x_step, y_step = line
+    first_x, first_y = x - lowest % wide, y - lowest // wide
+    from_x, step_x = np.int32(first_x * PLACE_UNIT), np.int32(x_step * PLACE_UNIT)
+    from_y, step_y = np.int32(first_y * PLACE_UNIT), np.int32(y_step * PLACE_UNIT)
+    across = np.int32(wide)
     for i in range(count):
-        at_x[i] = first_x + np.int32(step_x * np.int32(i))
-        at_y[i] = first_y + np.int32(step_y * np.int32(i))
+        at_x = np.int32(from_x + np.int32(step_x * np.int32(i)))
+        at_y = np.int32(from_y + np.int32(step_y * np.int32(i)))
+        place[0, i], place[1, i] = at_x, at_y
+        place[2, i] = np.int32((at_y >> PLACE_BITS) * across) + (at_x >> PLACE_BITS)
+
+
+@njit(cache=True)
+def _look_up(
+    cells: np.ndarray, lowest: int, place: np.ndarray, count: int, cell: np.ndarray
+) -> None:
+    corner = np.uint64(lowest)
     for i in range(count):
-        place[i] = np.int32((at_y[i] >> PLACE_BITS) * np.int32(wide)) + (at_x[i] >> PLACE_BITS)
+        cell[i] = cells[corner + np.uint64(place[2, i])]
+
+
+@njit(cache=True)
+def _add_between(cell: np.ndarray, place: np.ndarray, count: int, sums: np.ndarray) -> None:
     for i in range(count):
-        cell[i] = level.cells[corner + np.uint64(place[i])]
-    for i in range(count):
-        sums[i] += _between(cell[i], np.uint32(at_x[i]), np.uint32(at_y[i]))
+        sums[i] += _between(cell[i], np.uint32(place[0, i]), np.uint32(place[1, i]))
 
 
 @njit(cache=True, inline="always")
@@ -212,14 +241,20 @@ def _between(cell: np.uint32, x: np.uint32, y: np.uint32) -> np.uint32:
 
 
 @njit(cache=True)
-def _at_the_edge(level: Level, k: int, x: float, y: float) -> np.uint32:
-    """A sample anywhere; beside the picture there is nothing."""
-    height, width = level.shape[k, 0], level.shape[k, 1]
-    inside = 0.5 <= x < width + 0.5 and 0.5 <= y < height + 0.5
-    column, row = int(x) if inside else 0, int(y) if inside else 0
-    cell = np.uint32(level.cells[level.first[k] + row * (width + 1) + column])
-    part_x, part_y = np.uint32((x - column) * PLACE_UNIT), np.uint32((y - row) * PLACE_UNIT)
-    return _between(cell, part_x, part_y) if inside else np.uint32(SUM_UNIT * int(BACKGROUND))
+def _add_at_the_edge(
+    cells: np.ndarray, corner: int, line: Line, size: Size, count: int, sums: np.ndarray
+) -> None:
+    """Add samples anywhere; beside the picture there is nothing."""
+    height, width = size
+    for i in range(count):
+        x, y = line[0] + i * line[2], line[1] + i * line[3]
+        if 0.5 <= x < width + 0.5 and 0.5 <= y < height + 0.5:
+            column, row = int(x), int(y)
+            cell = np.uint32(cells[corner + row * (width + 1) + column])
+            part_x, part_y = np.uint32((x - column) * PLACE_UNIT), np.uint32((y - row) * PLACE_UNIT)
+            sums[i] += _between(cell, part_x, part_y)
+        else:
+            sums[i] += np.uint32(SUM_UNIT * int(BACKGROUND))
 
 
 @njit(cache=True)

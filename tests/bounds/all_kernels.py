@@ -18,6 +18,7 @@ from mapfusion.vision.harris import HarrisParameters
 from mapfusion.vision.noise_model import measured_noise
 from mapfusion.vision.tracks import Tracker, TrackParameters
 from mapfusion.vision.window_sums import window_sums
+from sim.depth_image import depth_at
 from sim.exposure import expose
 from sim.floorplan import FloorPlan, Wall
 from sim.radiometry import RadiometricNoise
@@ -105,7 +106,8 @@ def pictures(folder: Path) -> None:
     write_faces(folder, FloorPlan((corner,)), np.random.default_rng(0))
     others = np.array([[1.4, 0.0, 0.5], [0.4, 0.3, 1.0]])
     camera = StereoCamera(160, 120, 144.0)
-    RayCaster(folder, camera).depth_m(np.zeros(3), 0.0, others)
+    depth_m = RayCaster(folder, camera).depth_m(np.zeros(3), 0.0, others)
+    depth_at(depth_m, np.array([[-1.0, -1.0], [200.0, 200.0], [80.5, 60.5]]))
     RayCaster(folder, camera).depth_m(in_space(np.zeros(3), [0.1, -0.1]), 0.0, others)
     for sampling in ("footprint", "middle"):
         picture = RayCaster(folder, camera, sampling).grey(np.zeros(3), 0.0, others)
