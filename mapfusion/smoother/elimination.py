@@ -12,8 +12,9 @@ import scipy.linalg
 from numba import njit
 
 from mapfusion.se2 import Float
+from mapfusion.smoother.landmark_elimination import moved_points, subtract_points
 from mapfusion.smoother.normal_equations import Estimate, NormalEquations
-from mapfusion.smoother.offsets import Reduced, without_offsets
+from mapfusion.smoother.offsets import known_points, without_offsets
 from mapfusion.smoother.sightings import Sightings
 from mapfusion.smoother.skyline import (
     cholesky_in_envelope,
@@ -158,22 +159,19 @@ def _beside_own(solution: Solution) -> Float:
 
 def _landmarks_first(seen: Sightings, equations: NormalEquations) -> Solution:
     n, place = len(equations.pose_block), seen.pose_place
-    S, gradient, first = untouched_zeros(3 * n), np.empty((n, 3)), seen.first_entry
+    S, gradient, first = untouched_zeros(3 * n), np.empty((n, 3)), seen.order.first_entry
     _put_poses(S.reshape(n, 3, n, 3), place, equations)
     gradient[place] = equations.pose_gradient
-    left, row = without_offsets(seen, equations), place[seen.frame]
-    own = np.asarray(np.linalg.inv(_regular(seen, left.point_block)), np.float64)
-    _subtract(seen.track_starts, row, equations.coupling, left.own_m2, left.pull, S, gradient)
-    _subtract(seen.starts, row, left.coupling, own, left.point_gradient, S, gradient)
+    left = without_offsets(seen, equations)
+    subtract_points(seen, equations, left, S, gradient)
     factor = cholesky_in_envelope(S[3:, 3:], first)
     turned = solve_in_envelope(factor, first, gradient[1:].ravel())  # squared, what the step moves
     solved = -solve_transposed_in_envelope(factor, first, turned)
     way = np.zeros((n, 3))
     way[1:] = solved.reshape(-1, 3)[place[1:] - 1]
-    moved = seen.sum_by_landmark(_along(left.coupling, way[seen.frame]))
-    points = -np.einsum("lij,lj->li", own, left.point_gradient + moved)
-    step = Estimate(way, points, _offsets(seen, equations, left, way, points))
-    return _solution(seen, left, step, own, factor, float(turned @ turned))
+    step = Estimate(way, *moved_points(seen, equations, left, way))
+    known = left.landmark_m2, *known_points(seen, left)
+    return Solution(step, float(turned @ turned), *known, factor, landmarks_first=True)
 
 
 def _put_poses(blocks: Float, place: np.ndarray, equations: NormalEquations) -> None:
@@ -184,58 +182,6 @@ def _put_poses(blocks: Float, place: np.ndarray, equations: NormalEquations) -> 
         (after > before)[:, None, None], equations.link, np.swapaxes(equations.link, 1, 2)
     )
     blocks[np.maximum(after, before), :, np.minimum(after, before), :] = link
-
-
-def _along(coupling: Float, way: Float) -> Float:
-    """Coupling' way, (N, 3), by observation."""
-    return np.einsum("nij,ni->nj", coupling, way)
-
-
-def _offsets(
-    seen: Sightings, equations: NormalEquations, left: Reduced, way: Float, points: Float
-) -> Float:
-    """The step (B, 3) of the offsets that belongs to one of path and landmarks."""
-    moved = seen.sum_by_track(_along(equations.coupling, way[seen.frame]))
-    pulled = np.einsum("tij,tj->ti", equations.track_block, points[seen.landmark_of_track])
-    return -np.einsum("tij,tj->ti", left.own_m2, left.pull + moved + pulled)
-
-
-@njit(cache=True)
-def _subtract(
-    starts: np.ndarray,
-    frame: np.ndarray,
-    coupling: Float,
-    own: Float,
-    point_gradient: Float,
-    S: Float,
-    gradient: Float,
-) -> None:
-    """Coupling A^-1 coupling' of each point, between all frames that saw it; the lower half.
-
-    Points are tracks' offsets or landmarks, each with the rows from one of `starts` to the next;
-    `frame` is the place of each row's pose.
-    Those that are not known to any extent (own covariance 0) have nothing to be subtracted.
-    """
-    gain = np.empty((3, 3))
-    for j in range(len(starts) - 1):
-        b = point_gradient[j]
-        for i in range(starts[j], starts[j + 1]):
-            row, H = 3 * frame[i], coupling[i]
-            for r in range(3):
-                for q in range(3):
-                    gain[r, q] = (
-                        H[r, 0] * own[j, 0, q] + H[r, 1] * own[j, 1, q] + H[r, 2] * own[j, 2, q]
-                    )
-                gradient[frame[i], r] -= gain[r, 0] * b[0] + gain[r, 1] * b[1] + gain[r, 2] * b[2]
-            for k in range(starts[j], i + 1):
-                column, G = 3 * frame[k], coupling[k]
-                for r in range(3):
-                    for q in range(3):
-                        value = gain[r, 0] * G[q, 0] + gain[r, 1] * G[q, 1] + gain[r, 2] * G[q, 2]
-                        if column <= row:
-                            S[row + r, column + q] -= value
-                        if column >= row and k != i:  # rows are not in the order of places
-                            S[column + q, row + r] -= value
 
 
 def _poses_first(seen: Sightings, equations: NormalEquations) -> Solution:
@@ -251,10 +197,10 @@ def _poses_first(seen: Sightings, equations: NormalEquations) -> Solution:
     offsets[seen.strays] = points[:n_offsets].reshape(-1, 3)
     step = Estimate(way, points[n_offsets:].reshape(-1, 3), offsets)
     left = without_offsets(seen, equations)
-    own = np.asarray(np.linalg.inv(_regular(seen, left.point_block)), np.float64)
+    known = left.landmark_m2, *known_points(seen, left)
     last = step.point_m.ravel()
     moved = float(np.sum((factor[-last.size :, -last.size :].T @ last) ** 2))
-    return _solution(seen, left, step, own, factor, moved, landmarks_first=False)
+    return Solution(step, moved, *known, factor, landmarks_first=False)
 
 
 def pose_point_blocks(seen: Sightings, equations: NormalEquations) -> tuple[Float, Float, Float]:
@@ -302,20 +248,3 @@ def _regular(seen: Sightings, point_block: Float) -> Float:
     regular = point_block.copy()
     regular[:, 2, 2] = 1.0
     return regular
-
-
-def _solution(
-    seen: Sightings,
-    left: Reduced,
-    step: Estimate,
-    own_m2: Float,
-    factor: Float,
-    moved: float,
-    landmarks_first: bool = True,
-) -> Solution:
-    """With the landmarks' and the tracks' own covariances."""
-    of_landmark, kept = own_m2[seen.landmark_of_track], left.kept
-    follows = np.eye(3) - kept  # -db / dl
-    offset_m2 = left.own_m2 + follows @ of_landmark @ np.swapaxes(follows, 1, 2)
-    track_m2 = left.own_m2 + kept @ of_landmark @ np.swapaxes(kept, 1, 2)
-    return Solution(step, moved, own_m2, offset_m2, track_m2, factor, landmarks_first)

@@ -11,7 +11,8 @@ With a matrix functions take `first` (n,), the column of each row's first entry,
 import mmap
 
 import numpy as np
-import scipy.linalg
+from scipy.linalg.blas import dtrsm
+from scipy.linalg.lapack import dpotrf
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
@@ -92,11 +93,13 @@ def cholesky_in_envelope(A: Float, first: np.ndarray) -> Float:
                 continue
             done = slice(max(starts[i], starts[j]) * _BLOCK, columns.start)
             A[rows, columns] -= A[rows, done] @ A[columns, done].T
-            own = A[columns, columns]
             if i == j:
-                own[:] = scipy.linalg.cholesky(own, lower=True, check_finite=False)
-            else:
-                A[rows, columns] = _solved(own, A[rows, columns].T).T
+                own, failed = dpotrf(A[columns, columns], lower=1)
+                if failed:
+                    raise np.linalg.LinAlgError("the matrix is not positive definite")
+                A[columns, columns] = own
+            else:  # what is transposed lies in memory as LAPACK wants it
+                A[rows, columns] = dtrsm(1.0, own, A[rows, columns].T, lower=1).T
     return A
 
 
@@ -130,5 +133,4 @@ def _blocks(n: int) -> list[slice]:
 
 
 def _solved(L: Float, right: Float, transposed: bool = False) -> Float:
-    trans = int(transposed)
-    return scipy.linalg.solve_triangular(L, right, trans, lower=True, check_finite=False)
+    return dtrsm(1.0, L, right, lower=1, trans_a=int(transposed)).reshape(right.shape)

@@ -1,0 +1,156 @@
+"""What is left of the poses once offsets and landmarks are eliminated, and the step that follows.
+
+With H_i an observation's block of pose and point, G_t the covariance of its track's offset if path
+and landmark were known, K_t = 1 - G_t S_t, and A the covariance of its landmark if the path were
+known, observations i, k of tracks t, u of one landmark take from what their poses have in common
+
+    H_i (K_t A K_u' + G_t if t = u) H_k'.
+"""
+
+import numpy as np
+from numba import njit
+
+from mapfusion.se2 import Float
+from mapfusion.smoother.blocks import put_product
+from mapfusion.smoother.normal_equations import NormalEquations
+from mapfusion.smoother.offsets import Reduced
+from mapfusion.smoother.sightings import Sightings
+
+
+def subtract_points(
+    seen: Sightings, equations: NormalEquations, left: Reduced, S: Float, gradient: Float
+) -> None:
+    """Take what goes by offsets and landmarks from what is between poses.
+
+    Args:
+        seen: the observations.
+        equations: all of them.
+        left: once the offsets are eliminated.
+        S: (3T, 3T) of the poses by `pose_place`; the lower half, and the blocks on the diagonal.
+        gradient: (T, 3) theirs, by `pose_place`.
+    """
+    place = seen.pose_place[seen.frame]
+    _subtract(seen.by_landmark, place, equations.coupling, left, S, gradient)
+
+
+@njit(cache=True)
+def _subtract(
+    rows: tuple[np.ndarray, np.ndarray, np.ndarray],
+    place: np.ndarray,
+    coupling: Float,
+    left: Reduced,
+    S: Float,
+    gradient: Float,
+) -> None:
+    starts, first_track, track_starts = rows
+    A, G, kept = left.landmark_m2, left.own_m2, left.kept
+    by_landmark, by_track = np.empty((3, 3)), np.empty((3, 3))  # H K A, and H (K A K' + G)
+    for j in range(len(starts) - 1):
+        for t in range(first_track[j], first_track[j + 1]):
+            for i in range(track_starts[t], track_starts[t + 1]):
+                put_product(left.coupling[i], A[j], by_landmark)
+                put_product(coupling[i], G[t], by_track)
+                _subtract_pull(by_landmark, left.point_gradient[j], gradient[place[i]])
+                _subtract_pull(by_track, left.pull[t], gradient[place[i]])
+                _add_product(by_landmark, kept[t], by_track)
+                _subtract_rows(by_landmark, starts[j], track_starts[t], i, place, left.coupling, S)
+                _subtract_rows(by_track, track_starts[t], i, i, place, coupling, S)
+                _subtract_own(by_track, coupling[i], 3 * place[i], S)
+
+
+@njit(cache=True)
+def _subtract_pull(X: Float, pull: Float, gradient: Float) -> None:
+    for r in range(3):
+        gradient[r] -= X[r, 0] * pull[0] + X[r, 1] * pull[1] + X[r, 2] * pull[2]
+
+
+@njit(cache=True)
+def _add_product(A: Float, B: Float, total: Float) -> None:
+    for r in range(3):
+        for q in range(3):
+            total[r, q] += A[r, 0] * B[0, q] + A[r, 1] * B[1, q] + A[r, 2] * B[2, q]
+
+
+@njit(cache=True)
+def _subtract_rows(
+    X: Float, begin: int, end: int, i: int, place: np.ndarray, coupling: Float, S: Float
+) -> None:
+    """X coupling' between the pose of observation i and those of the rows `begin` to `end`."""
+    x00, x01, x02 = X[0, 0], X[0, 1], X[0, 2]  # `S` may not be where `X` is, no compiler knows
+    x10, x11, x12 = X[1, 0], X[1, 1], X[1, 2]
+    x20, x21, x22 = X[2, 0], X[2, 1], X[2, 2]
+    row = 3 * place[i]
+    for k in range(begin, end):
+        column = 3 * place[k]
+        for q in range(3):
+            a, b, c = coupling[k, q, 0], coupling[k, q, 1], coupling[k, q, 2]
+            v0 = x00 * a + x01 * b + x02 * c
+            v1 = x10 * a + x11 * b + x12 * c
+            v2 = x20 * a + x21 * b + x22 * c
+            if column <= row:
+                S[row, column + q] -= v0
+                S[row + 1, column + q] -= v1
+                S[row + 2, column + q] -= v2
+            if column >= row:  # rows are not in the order of places, and one pose may have several
+                S[column + q, row] -= v0
+                S[column + q, row + 1] -= v1
+                S[column + q, row + 2] -= v2
+
+
+@njit(cache=True)
+def _subtract_own(X: Float, H: Float, row: int, S: Float) -> None:
+    for r in range(3):
+        for q in range(3):
+            S[row + r, row + q] -= X[r, 0] * H[q, 0] + X[r, 1] * H[q, 1] + X[r, 2] * H[q, 2]
+
+
+def moved_points(
+    seen: Sightings, equations: NormalEquations, left: Reduced, way: Float
+) -> tuple[Float, Float]:
+    """The step of landmarks (L, 3) and offsets (B, 3) that belongs to one (T, 3) of the path."""
+    points, offsets = np.empty((seen.n_landmarks, 3)), np.empty((len(seen.strays), 3))
+    _put_moved(seen.by_landmark, seen.frame, equations, left, way, points, offsets)
+    return points, offsets
+
+
+@njit(cache=True)
+def _put_moved(
+    rows: tuple[np.ndarray, np.ndarray, np.ndarray],
+    frame: np.ndarray,
+    equations: NormalEquations,
+    left: Reduced,
+    way: Float,
+    points: Float,
+    offsets: Float,
+) -> None:
+    starts, first_track, track_starts = rows
+    pulled = np.empty(3)
+    for j in range(len(starts) - 1):
+        for q in range(3):
+            pulled[q] = left.point_gradient[j, q]
+        _add_along(left.coupling, frame, starts[j], starts[j + 1], way, pulled)
+        _put_negative(left.landmark_m2[j], pulled, points[j])
+        x, y, z = points[j]
+        for t in range(first_track[j], first_track[j + 1]):
+            S = equations.track_block[t]
+            for q in range(3):
+                pulled[q] = left.pull[t, q] + S[q, 0] * x + S[q, 1] * y + S[q, 2] * z
+            _add_along(equations.coupling, frame, track_starts[t], track_starts[t + 1], way, pulled)
+            _put_negative(left.own_m2[t], pulled, offsets[t])
+
+
+@njit(cache=True)
+def _add_along(
+    coupling: Float, frame: np.ndarray, begin: int, end: int, way: Float, total: Float
+) -> None:
+    """Add coupling' way of the observations from one row to another."""
+    for i in range(begin, end):
+        H, x, y, turned = coupling[i], way[frame[i], 0], way[frame[i], 1], way[frame[i], 2]
+        for q in range(3):
+            total[q] += H[0, q] * x + H[1, q] * y + H[2, q] * turned
+
+
+@njit(cache=True)
+def _put_negative(A: Float, x: Float, product: Float) -> None:
+    for r in range(3):
+        product[r] = -(A[r, 0] * x[0] + A[r, 1] * x[1] + A[r, 2] * x[2])
