@@ -14,6 +14,20 @@ def put_product(A: Float, B: Float, product: Float) -> None:
 
 
 @njit(cache=True)
+def put_along(A: Float, x: Float, product: Float) -> None:
+    """A x."""
+    for r in range(3):
+        product[r] = A[r, 0] * x[0] + A[r, 1] * x[1] + A[r, 2] * x[2]
+
+
+@njit(cache=True)
+def add_along(A: Float, x: Float, total: Float) -> None:
+    """Add A x."""
+    for r in range(3):
+        total[r] += A[r, 0] * x[0] + A[r, 1] * x[1] + A[r, 2] * x[2]
+
+
+@njit(cache=True)
 def put_inverse(A: Float, inverse: Float) -> bool:
     """Inverse of a symmetric positive definite A = L D L', of which the lower half is read.
 

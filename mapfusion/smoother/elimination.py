@@ -12,9 +12,9 @@ import scipy.linalg
 from numba import njit
 
 from mapfusion.se2 import Float
-from mapfusion.smoother.landmark_elimination import moved_points, subtract_points
-from mapfusion.smoother.normal_equations import Estimate, NormalEquations
-from mapfusion.smoother.offsets import known_points, without_offsets
+from mapfusion.smoother.landmark_elimination import along_way, left_couplings, subtract_points
+from mapfusion.smoother.normal_equations import Estimate, NormalEquations, Weights, point_equations
+from mapfusion.smoother.offsets import Points, known_points, moved_points, without_offsets
 from mapfusion.smoother.sightings import Sightings
 from mapfusion.smoother.skyline import (
     cholesky_in_envelope,
@@ -59,6 +59,17 @@ def solve(seen: Sightings, equations: NormalEquations) -> Solution:
     return (_landmarks_first if first else _poses_first)(seen, equations)
 
 
+def solve_points(
+    seen: Sightings, at: Estimate, weights: Weights, stray_information: float
+) -> tuple[Estimate, Points]:
+    """The step of landmarks and offsets that is left on a path, and what is known of them there."""
+    equations = point_equations(seen, at, weights, stray_information)
+    left = without_offsets(seen, equations)
+    still = np.zeros_like(equations.track_gradient)
+    moved = moved_points(seen, equations, left, still)
+    return Estimate(np.zeros_like(at.path), *moved), known_points(seen, left)
+
+
 def matrix_bytes(seen: Sightings, n_poses: int) -> int:
     """Memory that the dense matrices take at most, in bytes: grows as the square of the log."""
     if _is_landmarks_first(seen, n_poses):  # the last factor, then a system or the common part
@@ -80,7 +91,7 @@ def common_part(seen: Sightings, equations: NormalEquations, solution: Solution)
     """(R, 3L) Y: the landmarks' joint covariance is block diagonal of `own_m2` plus Y' Y."""
     if not solution.landmarks_first:
         return _beside_own(solution)
-    coupling = without_offsets(seen, equations).coupling @ solution.own_m2[seen.landmark]
+    coupling = _coupling_left(seen, equations) @ solution.own_m2[seen.landmark]
     n, n_landmarks = len(solution.factor), seen.n_landmarks
     common = np.zeros((n, 3 * n_landmarks))
     place = seen.pose_place[seen.frame] - 1
@@ -162,14 +173,15 @@ def _landmarks_first(seen: Sightings, equations: NormalEquations) -> Solution:
     S, gradient, first = untouched_zeros(3 * n), np.empty((n, 3)), seen.order.first_entry
     _put_poses(S.reshape(n, 3, n, 3), place, equations)
     gradient[place] = equations.pose_gradient
-    left = without_offsets(seen, equations)
+    left = without_offsets(seen, equations.points)
     subtract_points(seen, equations, left, S, gradient)
     factor = cholesky_in_envelope(S[3:, 3:], first)
     turned = solve_in_envelope(factor, first, gradient[1:].ravel())  # squared, what the step moves
     solved = -solve_transposed_in_envelope(factor, first, turned)
     way = np.zeros((n, 3))
     way[1:] = solved.reshape(-1, 3)[place[1:] - 1]
-    step = Estimate(way, *moved_points(seen, equations, left, way))
+    along = along_way(seen, equations.coupling, way)
+    step = Estimate(way, *moved_points(seen, equations.points, left, along))
     known = left.landmark_m2, *known_points(seen, left)
     return Solution(step, float(turned @ turned), *known, factor, landmarks_first=True)
 
@@ -184,6 +196,11 @@ def _put_poses(blocks: Float, place: np.ndarray, equations: NormalEquations) -> 
     blocks[np.maximum(after, before), :, np.minimum(after, before), :] = link
 
 
+def _coupling_left(seen: Sightings, equations: NormalEquations) -> Float:
+    left = without_offsets(seen, equations.points)
+    return left_couplings(seen, equations.coupling, left)
+
+
 def _poses_first(seen: Sightings, equations: NormalEquations) -> Solution:
     n_poses, n_offsets = len(equations.pose_block), 3 * np.count_nonzero(seen.strays)
     B, K, gradient = pose_point_blocks(seen, equations)
@@ -196,7 +213,7 @@ def _poses_first(seen: Sightings, equations: NormalEquations) -> Solution:
     way[1:] = -(solved[:, -1] + solved[:, :-1] @ points).reshape(-1, 3)
     offsets[seen.strays] = points[:n_offsets].reshape(-1, 3)
     step = Estimate(way, points[n_offsets:].reshape(-1, 3), offsets)
-    left = without_offsets(seen, equations)
+    left = without_offsets(seen, equations.points)
     known = left.landmark_m2, *known_points(seen, left)
     last = step.point_m.ravel()
     moved = float(np.sum((factor[-last.size :, -last.size :].T @ last) ** 2))
@@ -211,15 +228,19 @@ def pose_point_blocks(seen: Sightings, equations: NormalEquations) -> tuple[Floa
     wide, K = np.zeros((n_poses, n_points, 3, 3)), np.zeros((n_points, n_points, 3, 3))
     np.add.at(wide, (seen.frame[row], stray[seen.track[row]]), equations.coupling[row])
     np.add.at(wide, (seen.frame, n + seen.landmark), equations.coupling)
-    S, each, landmark = equations.track_block, np.arange(n_points), n + seen.landmark_of_track
+    S, each, landmark = (
+        equations.points.track_block,
+        np.arange(n_points),
+        n + seen.landmark_of_track,
+    )
     own = np.concatenate([S[strays], _regular(seen, seen.sum_tracks(S))])
-    own[:n] += equations.offset_information[strays, None, None] * np.eye(3)
+    own[:n] += equations.points.offset_information[strays, None, None] * np.eye(3)
     K[each, each] = own
     K[landmark[strays], each[:n]] = S[strays]
     K[each[:n], landmark[strays]] = S[strays]
     gradient = [
-        (equations.track_gradient + equations.offset_gradient)[strays],
-        seen.sum_tracks(equations.track_gradient),
+        (equations.points.track_gradient + equations.points.offset_gradient)[strays],
+        seen.sum_tracks(equations.points.track_gradient),
     ]
     as_matrix = wide.transpose(0, 2, 1, 3).reshape(3 * n_poses, 3 * n_points)[3:]
     K = K.transpose(0, 2, 1, 3).reshape(3 * n_points, 3 * n_points)

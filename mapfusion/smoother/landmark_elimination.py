@@ -29,31 +29,32 @@ def subtract_points(
         S: (3T, 3T) of the poses by `pose_place`; the lower half, and the blocks on the diagonal.
         gradient: (T, 3) theirs, by `pose_place`.
     """
-    place = seen.pose_place[seen.frame]
-    _subtract(seen.by_landmark, place, equations.coupling, left, S, gradient)
+    place, coupling = seen.pose_place[seen.frame], equations.coupling
+    couplings = coupling, left_couplings(seen, coupling, left)
+    _subtract(seen.by_landmark, place, couplings, left, S, gradient)
 
 
 @njit(cache=True)
 def _subtract(
     rows: tuple[np.ndarray, np.ndarray, np.ndarray],
     place: np.ndarray,
-    coupling: Float,
+    couplings: tuple[Float, Float],
     left: Reduced,
     S: Float,
     gradient: Float,
 ) -> None:
-    starts, first_track, track_starts = rows
+    (starts, first_track, track_starts), (coupling, coupling_left) = rows, couplings
     A, G, kept = left.landmark_m2, left.own_m2, left.kept
     by_landmark, by_track = np.empty((3, 3)), np.empty((3, 3))  # H K A, and H (K A K' + G)
     for j in range(len(starts) - 1):
         for t in range(first_track[j], first_track[j + 1]):
             for i in range(track_starts[t], track_starts[t + 1]):
-                put_product(left.coupling[i], A[j], by_landmark)
+                put_product(coupling_left[i], A[j], by_landmark)
                 put_product(coupling[i], G[t], by_track)
                 _subtract_pull(by_landmark, left.point_gradient[j], gradient[place[i]])
                 _subtract_pull(by_track, left.pull[t], gradient[place[i]])
                 _add_product(by_landmark, kept[t], by_track)
-                _subtract_rows(by_landmark, starts[j], track_starts[t], i, place, left.coupling, S)
+                _subtract_rows(by_landmark, starts[j], track_starts[t], i, place, coupling_left, S)
                 _subtract_rows(by_track, track_starts[t], i, i, place, coupling, S)
                 _subtract_own(by_track, coupling[i], 3 * place[i], S)
 
@@ -104,53 +105,33 @@ def _subtract_own(X: Float, H: Float, row: int, S: Float) -> None:
             S[row + r, row + q] -= X[r, 0] * H[q, 0] + X[r, 1] * H[q, 1] + X[r, 2] * H[q, 2]
 
 
-def moved_points(
-    seen: Sightings, equations: NormalEquations, left: Reduced, way: Float
-) -> tuple[Float, Float]:
-    """The step of landmarks (L, 3) and offsets (B, 3) that belongs to one (T, 3) of the path."""
-    points, offsets = np.empty((seen.n_landmarks, 3)), np.empty((len(seen.strays), 3))
-    _put_moved(seen.by_landmark, seen.frame, equations, left, way, points, offsets)
-    return points, offsets
+def left_couplings(seen: Sightings, coupling: Float, left: Reduced) -> Float:
+    """(N, 3, 3) a pose's block with a landmark once offsets are eliminated, by observation."""
+    made = np.empty_like(coupling)
+    _put_left(seen.track_starts, coupling, left.kept, made)
+    return made
 
 
 @njit(cache=True)
-def _put_moved(
-    rows: tuple[np.ndarray, np.ndarray, np.ndarray],
-    frame: np.ndarray,
-    equations: NormalEquations,
-    left: Reduced,
-    way: Float,
-    points: Float,
-    offsets: Float,
+def _put_left(track_starts: np.ndarray, coupling: Float, kept: Float, made: Float) -> None:
+    for t in range(len(kept)):
+        for i in range(track_starts[t], track_starts[t + 1]):
+            put_product(coupling[i], kept[t], made[i])
+
+
+def along_way(seen: Sightings, coupling: Float, way: Float) -> Float:
+    """(B, 3) sum of coupling' way over the observations of each track; `way` (T, 3) by frame."""
+    total = np.zeros((len(seen.strays), 3))
+    _add_along_way(seen.track_starts, seen.frame, coupling, way, total)
+    return total
+
+
+@njit(cache=True)
+def _add_along_way(
+    track_starts: np.ndarray, frame: np.ndarray, coupling: Float, way: Float, total: Float
 ) -> None:
-    starts, first_track, track_starts = rows
-    pulled = np.empty(3)
-    for j in range(len(starts) - 1):
-        for q in range(3):
-            pulled[q] = left.point_gradient[j, q]
-        _add_along(left.coupling, frame, starts[j], starts[j + 1], way, pulled)
-        _put_negative(left.landmark_m2[j], pulled, points[j])
-        x, y, z = points[j]
-        for t in range(first_track[j], first_track[j + 1]):
-            S = equations.track_block[t]
+    for t in range(len(total)):
+        for i in range(track_starts[t], track_starts[t + 1]):
+            H, x, y, turned = coupling[i], way[frame[i], 0], way[frame[i], 1], way[frame[i], 2]
             for q in range(3):
-                pulled[q] = left.pull[t, q] + S[q, 0] * x + S[q, 1] * y + S[q, 2] * z
-            _add_along(equations.coupling, frame, track_starts[t], track_starts[t + 1], way, pulled)
-            _put_negative(left.own_m2[t], pulled, offsets[t])
-
-
-@njit(cache=True)
-def _add_along(
-    coupling: Float, frame: np.ndarray, begin: int, end: int, way: Float, total: Float
-) -> None:
-    """Add coupling' way of the observations from one row to another."""
-    for i in range(begin, end):
-        H, x, y, turned = coupling[i], way[frame[i], 0], way[frame[i], 1], way[frame[i], 2]
-        for q in range(3):
-            total[q] += H[0, q] * x + H[1, q] * y + H[2, q] * turned
-
-
-@njit(cache=True)
-def _put_negative(A: Float, x: Float, product: Float) -> None:
-    for r in range(3):
-        product[r] = -(A[r, 0] * x[0] + A[r, 1] * x[1] + A[r, 2] * x[2])
+                total[t, q] += H[0, q] * x + H[1, q] * y + H[2, q] * turned

@@ -12,14 +12,17 @@ from mapfusion.se2 import Float
 from mapfusion.smoother.normal_equations import Estimate, Weights
 from mapfusion.smoother.observation_level import told_observation_level
 from mapfusion.smoother.odometry_levels import told_odometry_levels
-from mapfusion.smoother.robust import NO_TAILS, Tails
-from mapfusion.smoother.settle import Problem, Settled, settled
+from mapfusion.smoother.robust import NO_TAILS, Tails, unweighted
+from mapfusion.smoother.settle import CONVERGED, Problem, Settled, finished, solved, stepped
 
-# Rounds end where none of the standard deviations changes by more than this share.
-_SETTLED = 0.05
-_MOST_ROUNDS = 10
-# Until then the next step may move the path by so much, in squared sigmas a coordinate.
+# The odometry's levels are told anew until no standard deviation changes by more than this share, but
+# no more often than so many times: of motions that are hardly told they may come and go.
+_SETTLED, _MOST_TOLD = 0.05, 4
+# Each time the next step may move the path by so much, in squared sigmas a coordinate.
 _CLOSE = 1e-3
+# The last step changes the observations' variances by no more than this share.
+_FOLLOWED = 2e-3
+_MOST_STEPS = 100
 
 
 class Levels(NamedTuple):
@@ -45,23 +48,27 @@ AS_STATED = Levels(np.ones(3), 1.0)
 def settled_with_levels(
     problem: Problem, at: Estimate, weights: Weights | None = None, tails: Tails = NO_TAILS
 ) -> tuple[Settled, Levels]:
-    """Where steps end under the levels that the log tells, for the rest as `settled`."""
-    levels, n_steps = AS_STATED, 0
-    for _ in range(_MOST_ROUNDS):
-        end = settled(_with(problem, levels), at, _CLOSE, weights, tails)
-        at, weights, tails, n_steps = end.estimate, end.weights, end.tails, n_steps + end.n_steps
-        before, levels = levels, _told(problem, end, levels)
-        if levels.differ(before) < 2 * _SETTLED:
-            break
-    end = settled(_with(problem, levels), at, weights=weights, tails=tails)
-    return end._replace(n_steps=n_steps + end.n_steps), levels
+    """Where steps end under the levels that the log tells, for the rest as `settled`.
 
-
-def _told(problem: Problem, end: Settled, levels: Levels) -> Levels:
-    return Levels(
-        told_odometry_levels(problem, end, levels.odometry),
-        told_observation_level(end, levels.observation),
-    )
+    The observations' costs little to tell and follows each step, as the tails do; the odometry's is
+    told where steps are close to their end, and they go on from there.
+    """
+    levels, n_steps, n_told, known = AS_STATED, 0, 0, False
+    weights = unweighted(problem.seen) if weights is None else weights
+    while True:
+        under = _with(problem, levels)
+        end = solved(under, at, weights, tails, n_steps)
+        further = levels._replace(observation=told_observation_level(end, levels.observation))
+        ends = known and end.is_within(CONVERGED) and further.differ(levels) < _FOLLOWED
+        if ends or n_steps == _MOST_STEPS:
+            return finished(under, end), levels
+        if not known and end.is_within(_CLOSE):
+            odometry, n_told = told_odometry_levels(problem, end, levels.odometry), n_told + 1
+            further = further._replace(odometry=odometry)
+            known = further.differ(levels) < 2 * _SETTLED or n_told == _MOST_TOLD
+        levels = further
+        at, weights, tails = stepped(under, end, _with(problem, levels).seen)
+        n_steps += 1
 
 
 def _with(problem: Problem, levels: Levels) -> Problem:

@@ -17,8 +17,8 @@ import numpy as np
 from numba import njit
 
 from mapfusion.se2 import Float
-from mapfusion.smoother.blocks import put_inverse, put_product
-from mapfusion.smoother.normal_equations import NormalEquations
+from mapfusion.smoother.blocks import add_along, put_along, put_inverse, put_product
+from mapfusion.smoother.normal_equations import PointEquations
 from mapfusion.smoother.sightings import Sightings
 
 
@@ -30,7 +30,6 @@ class Reduced(NamedTuple):
         pull: (B, 3) the gradient of each offset.
         kept: (B, 3, 3) 1 - G S, the share of a landmark's motion that its track's point takes part
             in.
-        coupling: (N, 3, 3) a pose's block with a landmark, by observation.
         point_gradient: (L, 3).
         landmark_m2: (L, 3, 3) covariance of each landmark if the path were known; in planar data,
             which say nothing of z, that has a variance of 1 of its own.
@@ -39,12 +38,11 @@ class Reduced(NamedTuple):
     own_m2: Float
     pull: Float
     kept: Float
-    coupling: Float
     point_gradient: Float
     landmark_m2: Float
 
 
-def without_offsets(seen: Sightings, equations: NormalEquations) -> Reduced:
+def without_offsets(seen: Sightings, equations: PointEquations) -> Reduced:
     """Eliminate the offsets; the blocks between poses are left to do, with `own_m2` and `pull`.
 
     Raises:
@@ -55,7 +53,6 @@ def without_offsets(seen: Sightings, equations: NormalEquations) -> Reduced:
         np.zeros((n_tracks, 3, 3)),
         equations.track_gradient + equations.offset_gradient,
         np.zeros((n_tracks, 3, 3)),
-        np.empty((len(seen), 3, 3)),
         np.zeros((n_landmarks, 3)),
         np.empty((n_landmarks, 3, 3)),
     )
@@ -70,11 +67,11 @@ def _reduce(
     rows: tuple[np.ndarray, np.ndarray, np.ndarray],
     strays: np.ndarray,
     planar: bool,
-    equations: NormalEquations,
+    equations: PointEquations,
     left: Reduced,
 ) -> bool:
     """Put what is left; False where some block is singular."""
-    _, first_track, track_starts = rows
+    _, first_track, _ = rows
     block, known = np.empty((3, 3)), np.empty((3, 3))
     for j in range(len(first_track) - 1):
         for r in range(3):
@@ -97,8 +94,6 @@ def _reduce(
                 for r in range(3):
                     K[r, r] = 1.0
             _add_track(S, K, equations.track_gradient[t], left, j, t, block)
-            for i in range(track_starts[t], track_starts[t + 1]):
-                put_product(equations.coupling[i], K, left.coupling[i])
         if planar:
             block[2, 2] = 1.0
         if not put_inverse(block, left.landmark_m2[j]):
@@ -119,6 +114,49 @@ def _add_track(
         left.point_gradient[j, r] += gradient[r] - (S[r, 0] * x + S[r, 1] * y + S[r, 2] * z)
         for q in range(3):
             block[r, q] += S[r, 0] * K[0, q] + S[r, 1] * K[1, q] + S[r, 2] * K[2, q]
+
+
+def moved_points(
+    seen: Sightings, equations: PointEquations, left: Reduced, along: Float
+) -> tuple[Float, Float]:
+    """The step of landmarks (L, 3) and offsets (B, 3).
+
+    Args:
+        seen: the observations.
+        equations: theirs.
+        left: once the offsets are eliminated.
+        along: (B, 3) what the step of the path asks of each track, sum of coupling' dx.
+    """
+    points, offsets = np.empty((seen.n_landmarks, 3)), np.empty((len(seen.strays), 3))
+    _put_moved(seen.first_track, equations.track_block, left, along, points, offsets)
+    return points, offsets
+
+
+@njit(cache=True)
+def _put_moved(
+    first_track: np.ndarray,
+    block: Float,
+    left: Reduced,
+    along: Float,
+    points: Float,
+    offsets: Float,
+) -> None:
+    asked, moved = np.empty(3), np.empty(3)
+    for j in range(len(first_track) - 1):
+        for q in range(3):
+            asked[q] = left.point_gradient[j, q]
+        for t in range(first_track[j], first_track[j + 1]):
+            add_along(left.kept[t], along[t], asked)  # it is symmetric
+        put_along(left.landmark_m2[j], asked, moved)
+        for q in range(3):
+            points[j, q] = -moved[q]
+        for t in range(first_track[j], first_track[j + 1]):
+            for q in range(3):
+                asked[q] = left.pull[t, q] + along[t, q]
+            add_along(block[t], points[j], asked)
+            put_along(left.own_m2[t], asked, moved)
+            for q in range(3):
+                offsets[t, q] = -moved[q]
 
 
 class Points(NamedTuple):

@@ -21,14 +21,14 @@ from mapfusion.smoother.normal_equations import (
 from mapfusion.smoother.one_corner import parted
 from mapfusion.smoother.residuals import first_points
 from mapfusion.smoother.robust import Tails
-from mapfusion.smoother.settle import Problem, Reached, Settled, reached, settled
+from mapfusion.smoother.settle import Problem, Settled, settled
 from mapfusion.smoother.sightings import Sightings, sightings_of
 from mapfusion.stray import STRAY_M
 
 # Factor on the observations' standard deviations in a first round (graduated non-convexity): where
 # the path to start from is far off, most observations look gross and lose the weight to mend it.
 # It need not end closer than this, in squared sigmas a coordinate, to where the next one goes on.
-_THOUGHT_WORSE, _CLOSE = 4.0, 1e-2
+_THOUGHT_WORSE, _CLOSE = 4.0, 3e-2
 # Of a motion that nothing but observations tells: what a robot does between frames is less.
 _UNTOLD_M, _UNTOLD_RAD = 10.0, 1.0
 _LEAST_SEEN = 3  # observations that fix a pose, with one to spare
@@ -160,10 +160,10 @@ def _first_round(
     information: Float,
     landmark: np.ndarray,
     path: Float,
-) -> tuple[Problem, Reached]:
+) -> tuple[Problem, Settled]:
     """What is to be solved, and where steps end that think the observations worse."""
     seen = sightings_of(log, landmark, parameters.min_count, stray=parameters.stray_m > 0)
     at = Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
     known = Problem(seen, log.odometry, information, parameters.stray_information)
     blurred = replace(seen, information=seen.information / _THOUGHT_WORSE**2)
-    return known, reached(known._replace(seen=blurred), at, _CLOSE)
+    return known, settled(known._replace(seen=blurred), at, _CLOSE)
