@@ -9,16 +9,16 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
-from numba import njit
 
+from mapfusion.joint_covariance import KnownErrors, SharedErrors
 from mapfusion.se2 import Float
-from mapfusion.smoother.landmark_elimination import along_way, left_couplings, subtract_points
+from mapfusion.smoother.landmark_elimination import along_way, subtract_points
 from mapfusion.smoother.normal_equations import Estimate, NormalEquations, Weights, point_equations
 from mapfusion.smoother.offsets import Points, known_points, moved_points, without_offsets
+from mapfusion.smoother.path_errors import PathErrors
 from mapfusion.smoother.sightings import Sightings
 from mapfusion.smoother.skyline import (
     cholesky_in_envelope,
-    entries_seen,
     solve_in_envelope,
     solve_transposed_in_envelope,
     untouched_zeros,
@@ -26,7 +26,6 @@ from mapfusion.smoother.skyline import (
 
 _ITEM = np.dtype(np.float64).itemsize
 _COPIES = 3  # of a matrix that are there at once: as it is made, in LAPACK's order, and solved
-_AT_ONCE = 256  # landmarks whose part in all poses is made as a matrix of its own
 _BAND = 5  # below the diagonal of a chain of poses of three coordinates
 
 
@@ -87,59 +86,17 @@ def _n_points(seen: Sightings) -> int:
     return seen.n_landmarks + int(np.count_nonzero(seen.strays))
 
 
+def shared_errors(seen: Sightings, equations: NormalEquations, solution: Solution) -> SharedErrors:
+    """Y (R, 3L): the landmarks' joint covariance is block diagonal of `own_m2` plus Y' Y."""
+    if solution.landmarks_first:
+        return PathErrors.of(seen, equations, solution.own_m2, solution.factor)
+    return KnownErrors(_beside_own(solution))
+
+
 def common_part(seen: Sightings, equations: NormalEquations, solution: Solution) -> Float:
-    """(R, 3L) Y: the landmarks' joint covariance is block diagonal of `own_m2` plus Y' Y."""
-    if not solution.landmarks_first:
-        return _beside_own(solution)
-    coupling = _coupling_left(seen, equations) @ solution.own_m2[seen.landmark]
-    n, n_landmarks = len(solution.factor), seen.n_landmarks
-    common = np.zeros((n, 3 * n_landmarks))
-    place = seen.pose_place[seen.frame] - 1
-    unknown = np.where(seen.frame > 0, place, n // 3 - 1)
-    first_seen = np.minimum.reduceat(unknown, seen.starts[:-1])
-    order = np.argsort(first_seen, kind="stable")
-    for at in range(0, n_landmarks, _AT_ONCE):
-        some = order[at : at + _AT_ONCE]
-        first = first_seen[some].min()  # poses before those that saw these landmarks have no part
-        right = np.zeros((n - 3 * first, 3 * len(some)))
-        _put_couplings(some, seen.starts, seen.frame, place - first, coupling, right)
-        below = solution.factor[3 * first :, 3 * first :]
-        _put_columns(
-            solve_in_envelope(below, entries_seen(below), right), some, common[3 * first :]
-        )
-    return common
-
-
-@njit(cache=True)
-def _put_couplings(
-    some: np.ndarray,
-    starts: np.ndarray,
-    frame: np.ndarray,
-    place: np.ndarray,
-    coupling: Float,
-    right: Float,
-) -> None:
-    """Add up what `some` landmarks have to do with poses: each three columns of `right`.
-
-    A landmark's observations are those from one of `starts` to the next, of a pose at three rows
-    from 3 `place` on; the first pose is no unknown.
-    """
-    for j in range(len(some)):
-        for i in range(starts[some[j]], starts[some[j] + 1]):
-            if frame[i] == 0:
-                continue
-            for r in range(3):
-                for q in range(3):
-                    right[3 * place[i] + r, 3 * j + q] += coupling[i, r, q]
-
-
-@njit(cache=True)
-def _put_columns(solved: Float, some: np.ndarray, common: Float) -> None:
-    """The three columns of each of `some` landmarks to where they are in `common`."""
-    for r in range(len(solved)):
-        for j in range(len(some)):
-            for q in range(3):
-                common[r, 3 * some[j] + q] = solved[r, 3 * j + q]
+    """(R, 3L) Y of `shared_errors`, dense."""
+    errors = shared_errors(seen, equations, solution)
+    return errors.spread(np.eye(len(errors))).T
 
 
 def pose_covariances(
@@ -194,11 +151,6 @@ def _put_poses(blocks: Float, place: np.ndarray, equations: NormalEquations) -> 
         (after > before)[:, None, None], equations.link, np.swapaxes(equations.link, 1, 2)
     )
     blocks[np.maximum(after, before), :, np.minimum(after, before), :] = link
-
-
-def _coupling_left(seen: Sightings, equations: NormalEquations) -> Float:
-    left = without_offsets(seen, equations.points)
-    return left_couplings(seen, equations.coupling, left)
 
 
 def _poses_first(seen: Sightings, equations: NormalEquations) -> Solution:

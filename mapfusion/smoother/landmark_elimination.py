@@ -59,6 +59,25 @@ def _subtract(
                 _subtract_own(by_track, coupling[i], 3 * place[i], S)
 
 
+def subtract_gram(seen: Sightings, moved: Float, S: Float) -> None:
+    """Take moved_i moved_k' of any two observations of a landmark from what is between their poses.
+
+    Args:
+        seen: the observations.
+        moved: (N, 3, 3) of each.
+        S: (3T, 3T) by `pose_place`; the lower half, and the blocks on the diagonal.
+    """
+    _subtract_gram(seen.starts, seen.pose_place[seen.frame], moved, S)
+
+
+@njit(cache=True)
+def _subtract_gram(starts: np.ndarray, place: np.ndarray, moved: Float, S: Float) -> None:
+    for j in range(len(starts) - 1):
+        for i in range(starts[j], starts[j + 1]):
+            _subtract_rows(moved[i], starts[j], i, i, place, moved, S)
+            _subtract_own(moved[i], moved[i], 3 * place[i], S)
+
+
 @njit(cache=True)
 def _subtract_pull(X: Float, pull: Float, gradient: Float) -> None:
     for r in range(3):

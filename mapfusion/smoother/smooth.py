@@ -7,10 +7,11 @@ import numpy as np
 
 from mapfusion.arguments import Range, require_in_range, require_shape
 from mapfusion.fastslam.motion import MotionNoise
+from mapfusion.joint_covariance import SharedErrors
 from mapfusion.one_thread import one_blas_thread
 from mapfusion.robot_log import RobotLog
 from mapfusion.se2 import Float, between
-from mapfusion.smoother.elimination import common_part
+from mapfusion.smoother.elimination import shared_errors
 from mapfusion.smoother.levels import AS_STATED, Levels, settled_with_levels
 from mapfusion.smoother.normal_equations import (
     Estimate,
@@ -87,8 +88,7 @@ class Smoothed:
             tells it.
         n_steps: Gauss-Newton steps that were taken.
         own_m2: (L, 3, 3), see `common`.
-        common: (R, 3L) the landmarks' joint covariance is block diagonal of `own_m2` plus
-            common' common.
+        common: Y (R, 3L): the landmarks' joint covariance is block diagonal of `own_m2` plus Y' Y.
     """
 
     landmark: np.ndarray
@@ -99,21 +99,22 @@ class Smoothed:
     observation_level: float
     n_steps: int
     own_m2: Float
-    common: Float
+    common: SharedErrors
 
     @classmethod
     def of(
         cls, end: Settled, landmark: np.ndarray, levels: Levels = AS_STATED, steps_before: int = 0
     ) -> "Smoothed":
         """Where steps ended under some levels, after some of earlier rounds."""
-        common = common_part(end.seen, end.equations, end.solution)
+        common = shared_errors(end.seen, end.equations, end.solution)
         found = (end.estimate, end.seen, end.weights, end.tails, levels.observation)
         n_steps, own_m2 = steps_before + end.n_steps, end.solution.own_m2
         return cls(landmark, *found, n_steps, own_m2, common)
 
     def joint_covariance(self) -> Float:
         """(3L, 3L), dense: for small maps."""
-        joint, n = self.common.T @ self.common, len(self.own_m2)
+        common, n = self.common.spread(np.eye(len(self.common))), len(self.own_m2)
+        joint = common @ common.T
         each = np.arange(n)
         joint.reshape(n, 3, n, 3)[each, :, each, :] += self.own_m2
         return joint
