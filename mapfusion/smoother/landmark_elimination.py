@@ -11,7 +11,6 @@ import numpy as np
 from numba import njit
 
 from mapfusion.se2 import Float
-from mapfusion.smoother.blocks import put_product
 from mapfusion.smoother.normal_equations import NormalEquations
 from mapfusion.smoother.offsets import Reduced
 from mapfusion.smoother.sightings import Sightings
@@ -44,19 +43,55 @@ def _subtract(
     gradient: Float,
 ) -> None:
     (starts, first_track, track_starts), (coupling, coupling_left) = rows, couplings
-    A, G, kept = left.landmark_m2, left.own_m2, left.kept
     by_landmark, by_track = np.empty((3, 3)), np.empty((3, 3))  # H K A, and H (K A K' + G)
     for j in range(len(starts) - 1):
         for t in range(first_track[j], first_track[j + 1]):
             for i in range(track_starts[t], track_starts[t + 1]):
-                put_product(coupling_left[i], A[j], by_landmark)
-                put_product(coupling[i], G[t], by_track)
-                _subtract_pull(by_landmark, left.point_gradient[j], gradient[place[i]])
-                _subtract_pull(by_track, left.pull[t], gradient[place[i]])
-                _add_product(by_landmark, kept[t], by_track)
+                _put_gains(left, j, t, coupling, coupling_left, i, by_landmark, by_track)
+                _subtract_pull(left, j, t, by_landmark, by_track, gradient, place[i])
+                _add_product(by_landmark, left.kept, t, by_track)
                 _subtract_rows(by_landmark, starts[j], track_starts[t], i, place, coupling_left, S)
                 _subtract_rows(by_track, track_starts[t], i, i, place, coupling, S)
-                _subtract_own(by_track, coupling[i], 3 * place[i], S)
+                _subtract_own(by_track, coupling, i, 3 * place[i], S)
+
+
+# Kernels take arrays and rows of them: views of rows are counted, which takes longer than the sums.
+@njit(cache=True)
+def _put_gains(
+    left: Reduced,
+    j: int,
+    t: int,
+    coupling: Float,
+    coupling_left: Float,
+    i: int,
+    by_landmark: Float,
+    by_track: Float,
+) -> None:
+    A, G = left.landmark_m2, left.own_m2
+    for r in range(3):
+        x, y, z = coupling_left[i, r, 0], coupling_left[i, r, 1], coupling_left[i, r, 2]
+        for q in range(3):
+            by_landmark[r, q] = x * A[j, 0, q] + y * A[j, 1, q] + z * A[j, 2, q]
+        x, y, z = coupling[i, r, 0], coupling[i, r, 1], coupling[i, r, 2]
+        for q in range(3):
+            by_track[r, q] = x * G[t, 0, q] + y * G[t, 1, q] + z * G[t, 2, q]
+
+
+@njit(cache=True)
+def _subtract_pull(
+    left: Reduced, j: int, t: int, X: Float, Y: Float, gradient: Float, row: int
+) -> None:
+    b, pull = left.point_gradient, left.pull
+    for r in range(3):
+        gradient[row, r] -= X[r, 0] * b[j, 0] + X[r, 1] * b[j, 1] + X[r, 2] * b[j, 2]
+        gradient[row, r] -= Y[r, 0] * pull[t, 0] + Y[r, 1] * pull[t, 1] + Y[r, 2] * pull[t, 2]
+
+
+@njit(cache=True)
+def _add_product(A: Float, B: Float, t: int, total: Float) -> None:
+    for r in range(3):
+        for q in range(3):
+            total[r, q] += A[r, 0] * B[t, 0, q] + A[r, 1] * B[t, 1, q] + A[r, 2] * B[t, 2, q]
 
 
 def subtract_gram(seen: Sightings, moved: Float, S: Float) -> None:
@@ -72,23 +107,14 @@ def subtract_gram(seen: Sightings, moved: Float, S: Float) -> None:
 
 @njit(cache=True)
 def _subtract_gram(starts: np.ndarray, place: np.ndarray, moved: Float, S: Float) -> None:
+    own = np.empty((3, 3))
     for j in range(len(starts) - 1):
         for i in range(starts[j], starts[j + 1]):
-            _subtract_rows(moved[i], starts[j], i, i, place, moved, S)
-            _subtract_own(moved[i], moved[i], 3 * place[i], S)
-
-
-@njit(cache=True)
-def _subtract_pull(X: Float, pull: Float, gradient: Float) -> None:
-    for r in range(3):
-        gradient[r] -= X[r, 0] * pull[0] + X[r, 1] * pull[1] + X[r, 2] * pull[2]
-
-
-@njit(cache=True)
-def _add_product(A: Float, B: Float, total: Float) -> None:
-    for r in range(3):
-        for q in range(3):
-            total[r, q] += A[r, 0] * B[0, q] + A[r, 1] * B[1, q] + A[r, 2] * B[2, q]
+            for r in range(3):
+                for q in range(3):
+                    own[r, q] = moved[i, r, q]
+            _subtract_rows(own, starts[j], i, i, place, moved, S)
+            _subtract_own(own, moved, i, 3 * place[i], S)
 
 
 @njit(cache=True)
@@ -118,10 +144,11 @@ def _subtract_rows(
 
 
 @njit(cache=True)
-def _subtract_own(X: Float, H: Float, row: int, S: Float) -> None:
-    for r in range(3):
-        for q in range(3):
-            S[row + r, row + q] -= X[r, 0] * H[q, 0] + X[r, 1] * H[q, 1] + X[r, 2] * H[q, 2]
+def _subtract_own(X: Float, coupling: Float, i: int, row: int, S: Float) -> None:
+    for q in range(3):
+        a, b, c = coupling[i, q, 0], coupling[i, q, 1], coupling[i, q, 2]
+        for r in range(3):
+            S[row + r, row + q] -= X[r, 0] * a + X[r, 1] * b + X[r, 2] * c
 
 
 def left_couplings(seen: Sightings, coupling: Float, left: Reduced) -> Float:
@@ -135,7 +162,10 @@ def left_couplings(seen: Sightings, coupling: Float, left: Reduced) -> Float:
 def _put_left(track_starts: np.ndarray, coupling: Float, kept: Float, made: Float) -> None:
     for t in range(len(kept)):
         for i in range(track_starts[t], track_starts[t + 1]):
-            put_product(coupling[i], kept[t], made[i])
+            for r in range(3):
+                x, y, z = coupling[i, r, 0], coupling[i, r, 1], coupling[i, r, 2]
+                for q in range(3):
+                    made[i, r, q] = x * kept[t, 0, q] + y * kept[t, 1, q] + z * kept[t, 2, q]
 
 
 def along_way(seen: Sightings, coupling: Float, way: Float) -> Float:
@@ -151,6 +181,7 @@ def _add_along_way(
 ) -> None:
     for t in range(len(total)):
         for i in range(track_starts[t], track_starts[t + 1]):
-            H, x, y, turned = coupling[i], way[frame[i], 0], way[frame[i], 1], way[frame[i], 2]
+            x, y, turned = way[frame[i], 0], way[frame[i], 1], way[frame[i], 2]
             for q in range(3):
-                total[t, q] += H[0, q] * x + H[1, q] * y + H[2, q] * turned
+                total[t, q] += coupling[i, 0, q] * x + coupling[i, 1, q] * y
+                total[t, q] += coupling[i, 2, q] * turned

@@ -45,10 +45,11 @@ def reweighted(
     seen: Sightings,
     at: Estimate,
     weights: Weights,
+    tails: Tails,
     known: Points,
     stray_information: float,
 ) -> tuple[Weights, Tails]:
-    """New weights and tails, given what is known of points under the weights so far.
+    """New weights and tails, given those so far and what is known of points under them.
 
     Of observations the squares are those expected about the true points (the E step of Lange et
     al.). Offsets have a Student-t in as many dimensions as they are known in, else those of
@@ -58,7 +59,10 @@ def reweighted(
     squares = squared_distances(seen, at, known.track_m2)
     of_offset = offset_squares(seen, at, stray_information)
     dimensions = known_dimensions(seen, known.offset_m2, weights.offset * stray_information)
-    tails = Tails(fitted_dof(squares, n), fitted_dof(of_offset, dimensions))
+    tails = Tails(
+        fitted_dof(squares, n, tails.observation),
+        fitted_dof(of_offset, dimensions, tails.offset),
+    )
     new.observation[:] = student_weights(squares, tails.observation, n)
     new.offset[seen.strays] = student_weights(of_offset, tails.offset, dimensions)
     return new, tails

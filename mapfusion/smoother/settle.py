@@ -129,7 +129,7 @@ def stepped(
     for _ in range(_FOLLOWING):
         step, known = solve_points(seen, at, weights, stray_information)
         at = Estimate(at.path, at.point_m + step.point_m, at.offset_m + step.offset_m)
-        weights, tails = reweighted(seen, at, weights, known, stray_information)
+        weights, tails = reweighted(seen, at, weights, tails, known, stray_information)
     return at, weights, tails
 
 

@@ -21,6 +21,7 @@ from mapfusion.se2 import Float
 # Rows and columns that are taken at once: enough for products of matrices to be at their speed, few
 # enough to follow the envelope.
 _BLOCK = 48
+_ALL_AT_ONCE = 2**27  # bytes of a matrix that is not worth sparing memory for
 
 
 def envelope_order(group: np.ndarray, member: np.ndarray, n_members: int) -> np.ndarray:
@@ -52,12 +53,15 @@ def _work(first: np.ndarray) -> int:
 
 
 def untouched_zeros(n: int) -> Float:
-    """(n, n) zeros, of which memory holds the pages alone that something is written to.
+    """(n, n) zeros; of a large matrix memory holds the pages alone that something is written to.
 
-    Those of `numpy.zeros` come in huge pages: of a matrix with few entries in each row, all of it.
+    Those of `numpy.zeros` come in huge pages, or are written to once more: of a matrix with few
+    entries in each row, all of it. That is faster where there is room for it.
     """
-    room = mmap.mmap(-1, n * n * np.dtype(np.float64).itemsize)
-    return np.frombuffer(room, np.float64).reshape(n, n)
+    size = n * n * np.dtype(np.float64).itemsize
+    if size <= _ALL_AT_ONCE:
+        return np.zeros((n, n))
+    return np.frombuffer(mmap.mmap(-1, size), np.float64).reshape(n, n)
 
 
 def first_entries(group: np.ndarray, member: np.ndarray, place: np.ndarray) -> np.ndarray:

@@ -18,6 +18,8 @@ LEAST_DOF, MOST_DOF = 0.5, 1e4
 # Degrees of freedom are found to this share of themselves: far closer than any number of errors
 # tells them.
 _FOUND_TO = 1e-6
+# What they change by from step to step is less than this share, but for the first few.
+_NEAR = 0.1
 
 
 def student_weights(squares: Float, dof: float, n_dimensions: Float | int) -> Float:
@@ -64,15 +66,24 @@ def student_slope(squares: Float, dof: float, n_dimensions: Float | int) -> floa
     return float(np.sum(each) - share * np.sum(of_normal))
 
 
-def fitted_dof(squares: Float, n_dimensions: Float | int) -> float:
-    """The degrees of freedom under which these squared distances (N,) are most likely."""
+def fitted_dof(squares: Float, n_dimensions: Float | int, near: float = MOST_DOF) -> float:
+    """The degrees of freedom under which these squared distances (N,) are most likely.
+
+    Args:
+        squares: theirs.
+        n_dimensions: one for all, or (N,).
+        near: where they are looked for first.
+    """
 
     def slope(log_dof: float) -> float:
         return student_slope(squares, float(np.exp(log_dof)), n_dimensions)
 
     low, high = float(np.log(LEAST_DOF)), float(np.log(MOST_DOF))
-    if slope(high) <= 0:
-        return MOST_DOF
-    if slope(low) >= 0:
-        return LEAST_DOF
-    return float(np.exp(brentq(slope, low, high, xtol=_FOUND_TO)))
+    before, after = np.log(near) - _NEAR, np.log(near) + _NEAR
+    if not (low < before and after < high and slope(before) < 0 < slope(after)):
+        if slope(high) <= 0:
+            return MOST_DOF
+        if slope(low) >= 0:
+            return LEAST_DOF
+        before, after = low, high
+    return float(np.exp(brentq(slope, before, after, xtol=_FOUND_TO)))
