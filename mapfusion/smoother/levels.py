@@ -15,8 +15,8 @@ from mapfusion.smoother.odometry_levels import told_odometry_levels
 from mapfusion.smoother.robust import NO_TAILS, Tails, unweighted
 from mapfusion.smoother.settle import CONVERGED, Problem, Settled, finished, solved, stepped
 
-# The odometry's levels are told anew until no standard deviation changes by more than this share, but
-# no more often than so many times: of motions that are hardly told they may come and go.
+# The odometry's levels are told anew until no standard deviation changes by more than this share,
+# but no more often than so many times: of motions that are hardly told they may come and go.
 _SETTLED, _MOST_TOLD = 0.05, 4
 # Each time the next step may move the path by so much, in squared sigmas a coordinate.
 _CLOSE = 1e-3
