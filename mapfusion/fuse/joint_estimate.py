@@ -159,9 +159,9 @@ class JointEstimate:
         These are the columns of a `factor` (U, U) of the unknowns' covariance.
         """
         columns = self.unknowns(maps, k)
-        known, n = columns != ABSENT, len(said.y_m)
-        by = said.by_unknown[:, :, known].reshape(-1, np.count_nonzero(known))
-        return (by @ factor[columns[known]]).reshape(n, -1, len(factor))
+        known = columns != ABSENT
+        by = said.by_unknown[:, :, known].reshape(said.y_m.size, np.count_nonzero(known))
+        return (by @ factor[columns[known]]).reshape(*said.y_m.shape, len(factor))
 
 
 def _said(own: _Rows, T: Float, shared: Float, arm_m: Float) -> Said:

@@ -96,7 +96,7 @@ class JointlyFused:
         weight[: len(estimate.weight)] = estimate.weight
         information = np.zeros((n, n_dimensions, n_dimensions))
         total, moved = np.zeros((n, n_dimensions)), np.zeros((n, n_dimensions, n_unknowns))
-        factor = np.linalg.cholesky(estimate.covariance)
+        factor = np.asarray(np.linalg.cholesky(estimate.covariance), np.float64)
         for k in range(len(self.maps)):
             rows = np.flatnonzero(has[:, k])
             said = estimate.said(self.maps, k, self.points[rows, k])

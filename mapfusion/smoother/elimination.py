@@ -139,8 +139,9 @@ def _landmarks_first(seen: Sightings, equations: NormalEquations) -> Solution:
     way[1:] = solved.reshape(-1, 3)[place[1:] - 1]
     along = along_way(seen, equations.coupling, way)
     step = Estimate(way, *moved_points(seen, equations.points, left, along))
-    known = left.landmark_m2, *known_points(seen, left)
-    return Solution(step, float(turned @ turned), *known, factor, landmarks_first=True)
+    moved, known = float(turned @ turned), known_points(seen, left)
+    own = left.landmark_m2, known.offset_m2, known.track_m2
+    return Solution(step, moved, *own, factor, landmarks_first=True)
 
 
 def _put_poses(blocks: Float, place: np.ndarray, equations: NormalEquations) -> None:
@@ -166,10 +167,11 @@ def _poses_first(seen: Sightings, equations: NormalEquations) -> Solution:
     offsets[seen.strays] = points[:n_offsets].reshape(-1, 3)
     step = Estimate(way, points[n_offsets:].reshape(-1, 3), offsets)
     left = without_offsets(seen, equations.points)
-    known = left.landmark_m2, *known_points(seen, left)
+    known = known_points(seen, left)
+    own = left.landmark_m2, known.offset_m2, known.track_m2
     last = step.point_m.ravel()
     moved = float(np.sum((factor[-last.size :, -last.size :].T @ last) ** 2))
-    return Solution(step, moved, *known, factor, landmarks_first=False)
+    return Solution(step, moved, *own, factor, landmarks_first=False)
 
 
 def pose_point_blocks(seen: Sightings, equations: NormalEquations) -> tuple[Float, Float, Float]:

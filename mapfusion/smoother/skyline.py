@@ -12,7 +12,7 @@ With a matrix functions take `first` (n,), the column of each row's first entry,
 import mmap
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf, dtrtri
+from scipy.linalg import get_lapack_funcs
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
@@ -22,6 +22,8 @@ from mapfusion.se2 import Float
 # enough to follow the envelope.
 _BLOCK = 48
 _ALL_AT_ONCE = 2**27  # bytes of a matrix that is not worth sparing memory for
+# LAPACK's own, without what SciPy looks at first: blocks are many and small.
+_cholesky, _inverted = get_lapack_funcs(("potrf", "trtri"), dtype=np.float64)
 
 
 def envelope_order(group: np.ndarray, member: np.ndarray, n_members: int) -> np.ndarray:
@@ -106,7 +108,7 @@ def cholesky_in_envelope(A: Float, first: np.ndarray) -> Float:
             if done.start < done.stop:
                 left = left - A[rows, done] @ A[columns, done].T
             if i == j:
-                A[rows, columns], failed = dpotrf(left, lower=1)
+                A[rows, columns], failed = _cholesky(left, lower=1)
                 if failed:
                     raise np.linalg.LinAlgError("the matrix is not positive definite")
                 inverse = _inverse(A[rows, columns])
@@ -191,4 +193,4 @@ def _blocks(n: int) -> list[slice]:
 
 def _inverse(L: Float) -> Float:
     """Of a lower block: many products with it are faster than as many times solving."""
-    return dtrtri(L, lower=1)[0]
+    return _inverted(L, lower=1)[0]

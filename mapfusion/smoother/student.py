@@ -7,7 +7,7 @@ are one. Lange, Little, Taylor (1989), "Robust statistical modeling using the t 
 """
 
 import numpy as np
-from scipy.optimize import brentq
+from scipy.optimize import root_scalar
 from scipy.special import fdtri, gammaln, psi
 
 from mapfusion.se2 import Float
@@ -86,4 +86,5 @@ def fitted_dof(squares: Float, n_dimensions: Float | int, near: float = MOST_DOF
         if slope(low) >= 0:
             return LEAST_DOF
         before, after = low, high
-    return float(np.exp(brentq(slope, before, after, xtol=_FOUND_TO)))
+    found = root_scalar(slope, bracket=(before, after), method="brentq", xtol=_FOUND_TO)
+    return float(np.exp(found.root))
