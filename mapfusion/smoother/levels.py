@@ -15,9 +15,9 @@ from mapfusion.smoother.odometry_levels import told_odometry_levels
 from mapfusion.smoother.robust import NO_TAILS, Tails, unweighted
 from mapfusion.smoother.settle import CONVERGED, Problem, Settled, finished, solved, stepped
 
-# The odometry's levels are told anew until no standard deviation changes by more than this share,
-# but no more often than so many times: of motions that are hardly told they may come and go.
-_SETTLED, _MOST_TOLD = 0.05, 4
+# The odometry's levels are told anew until no standard deviation is off by more than this share
+# from what it was once before: those of motions that are hardly told may come and go.
+_SETTLED = 0.05
 # Each time the next step may move the path by so much, in squared sigmas a coordinate.
 _CLOSE = 1e-3
 # The last step changes the observations' variances by no more than this share.
@@ -36,11 +36,6 @@ class Levels(NamedTuple):
     odometry: Float
     observation: float
 
-    def differ(self, other: "Levels") -> float:
-        """The most that a logarithm of them differs by."""
-        ratio = np.append(self.odometry / other.odometry, self.observation / other.observation)
-        return float(np.abs(np.log(ratio)).max())
-
 
 AS_STATED = Levels(np.ones(3), 1.0)
 
@@ -53,22 +48,28 @@ def settled_with_levels(
     The observations' costs little to tell and follows each step, as the tails do; the odometry's is
     told where steps are close to their end, and they go on from there.
     """
-    levels, n_steps, n_told, known = AS_STATED, 0, 0, False
+    levels, n_steps, told, known = AS_STATED, 0, [AS_STATED.odometry], False
     weights = unweighted(problem.seen) if weights is None else weights
     while True:
         under = _with(problem, levels)
         end = solved(under, at, weights, tails, n_steps)
-        further = levels._replace(observation=told_observation_level(end, levels.observation))
-        ends = known and end.is_within(CONVERGED) and further.differ(levels) < _FOLLOWED
-        if ends or n_steps == _MOST_STEPS:
+        observation = told_observation_level(end, levels.observation)
+        follows = _differ(observation, levels.observation) < _FOLLOWED
+        if n_steps == _MOST_STEPS or (known and follows and end.is_within(CONVERGED)):
             return finished(under, end), levels
+        odometry = levels.odometry
         if not known and end.is_within(_CLOSE):
-            odometry, n_told = told_odometry_levels(problem, end, levels.odometry), n_told + 1
-            further = further._replace(odometry=odometry)
-            known = further.differ(levels) < 2 * _SETTLED or n_told == _MOST_TOLD
-        levels = further
+            odometry = told_odometry_levels(problem, end, odometry)
+            known = any(_differ(odometry, each) < 2 * _SETTLED for each in told)
+            told.append(odometry)
+        levels = Levels(odometry, observation)
         at, weights, tails = stepped(under, end, _with(problem, levels).seen)
         n_steps += 1
+
+
+def _differ(levels: Float | float, others: Float | float) -> float:
+    """The most that a logarithm of them differs by."""
+    return float(np.max(np.abs(np.log(levels / others))))
 
 
 def _with(problem: Problem, levels: Levels) -> Problem:

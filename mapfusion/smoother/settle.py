@@ -118,14 +118,21 @@ def solved(
 def stepped(
     problem: Problem, end: Settled, seen: Sightings | None = None
 ) -> tuple[Estimate, Weights, Tails]:
-    """After the next step, and new weights.
+    """After the next step, and weights that follow it; of the observations `seen` from then on."""
+    after = problem if seen is None else problem._replace(seen=seen)
+    return followed(after, _further(problem, end), end.weights, end.tails)
 
-    Weights and the points that they hold follow each other some way on the path that was found: a
-    point whose observations contradict each other is slow to make up its mind, and it costs little
-    to let it while the path waits.
+
+def followed(
+    problem: Problem, at: Estimate, weights: Weights | None = None, tails: Tails = NO_TAILS
+) -> tuple[Estimate, Weights, Tails]:
+    """Weights and the points that they hold follow each other some way on a path.
+
+    A point whose observations contradict each other is slow to make up its mind, and it costs
+    little to let it while the path waits. All weights are ones by default.
     """
-    at, weights, tails = _further(problem, end), end.weights, end.tails
-    seen, stray_information = end.seen if seen is None else seen, problem.stray_information
+    seen, _, _, stray_information = problem
+    weights = unweighted(seen) if weights is None else weights
     for _ in range(_FOLLOWING):
         step, known = solve_points(seen, at, weights, stray_information)
         at = Estimate(at.path, at.point_m + step.point_m, at.offset_m + step.offset_m)

@@ -21,7 +21,8 @@ from mapfusion.se2 import Float
 # Rows and columns that are taken at once: enough for products of matrices to be at their speed, few
 # enough to follow the envelope.
 _BLOCK = 48
-_ALL_AT_ONCE = 2**27  # bytes of a matrix that is not worth sparing memory for
+# Bytes of a matrix whose memory the C library keeps for the next one, all of whose pages are there.
+_ALL_AT_ONCE = 2**25
 # LAPACK's own, without what SciPy looks at first: blocks are many and small.
 _cholesky, _inverted = get_lapack_funcs(("potrf", "trtri"), dtype=np.float64)
 

@@ -22,7 +22,7 @@ from mapfusion.smoother.normal_equations import (
 from mapfusion.smoother.one_corner import parted
 from mapfusion.smoother.residuals import first_points
 from mapfusion.smoother.robust import Tails
-from mapfusion.smoother.settle import Problem, Settled, settled
+from mapfusion.smoother.settle import Problem, Settled, finished, followed, settled
 from mapfusion.smoother.sightings import Sightings, sightings_of
 from mapfusion.stray import STRAY_M
 
@@ -139,32 +139,30 @@ def smooth(
     """
     require_shape("path", path, (len(log), 3))
     information, path = parameters.odometry_information(log), between(path[0], path)
-    about = log, parameters, information
-    known, first = _first_round(*about, landmark, path)
-    path, n_steps = first.estimate.path, first.n_steps
+    known = _problem(log, landmark, parameters, information)
+    worse = replace(known.seen, information=known.seen.information / _THOUGHT_WORSE**2)
+    blurred = known._replace(seen=worse)
+    first = finished(blurred, settled(blurred, _start(known, path), _CLOSE))
+    start, path = (first.estimate, first.weights, first.tails), first.estimate.path
     parts = parted(known.seen, landmark, path, parameters.stray_m)
     if not np.array_equal(parts, landmark):
-        known, first = _first_round(*about, parts, path)
-        n_steps += first.n_steps
+        known = _problem(log, parts, parameters, information)
+        start = followed(known, _start(known, path))
     if parameters.odometry_covariance is None:
-        start = first.estimate, first.weights, first.tails
         end, levels = settled_with_levels(known, *start)
     else:  # odometry that pictures told is used where these say nothing: they tell no level
-        end = settled(known, first.estimate, weights=first.weights, tails=first.tails)
-        levels = AS_STATED
-    return Smoothed.of(end, parts, levels, n_steps)
+        at, weights, tails = start
+        end, levels = settled(known, at, weights=weights, tails=tails), AS_STATED
+    return Smoothed.of(end, parts, levels, first.n_steps)
 
 
-def _first_round(
-    log: RobotLog,
-    parameters: SmootherParameters,
-    information: Float,
-    landmark: np.ndarray,
-    path: Float,
-) -> tuple[Problem, Settled]:
-    """What is to be solved, and where steps end that think the observations worse."""
+def _problem(
+    log: RobotLog, landmark: np.ndarray, parameters: SmootherParameters, information: Float
+) -> Problem:
     seen = sightings_of(log, landmark, parameters.min_count, stray=parameters.stray_m > 0)
-    at = Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
-    known = Problem(seen, log.odometry, information, parameters.stray_information)
-    blurred = replace(seen, information=seen.information / _THOUGHT_WORSE**2)
-    return known, settled(known._replace(seen=blurred), at, _CLOSE)
+    return Problem(seen, log.odometry, information, parameters.stray_information)
+
+
+def _start(problem: Problem, path: Float) -> Estimate:
+    seen = problem.seen
+    return Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
