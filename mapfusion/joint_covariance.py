@@ -6,6 +6,7 @@ normal variables z do to all of them: x_i = m_i + C_i' z + e_i, with e_i of cova
 """
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numba import njit
@@ -65,28 +66,80 @@ class JointCovariance:
         return joint
 
 
-def condensed(own_m2: Float, common: Float, rank: int = RANK) -> JointCovariance:
+class SharedErrors(Protocol):
+    """Y (R, 3N): what R independent, standard normal variables do to N landmarks."""
+
+    def __len__(self) -> int:
+        """R."""
+        ...
+
+    def rows_by_all(self, rows: np.ndarray) -> Float:
+        """(R, r) columns of Y Y', those of `rows` (r,)."""
+        ...
+
+    def gram(self, columns: Float) -> Float:
+        """Y Y' times columns (R, c)."""
+        ...
+
+    def spread(self, columns: Float) -> Float:
+        """(3N, c) Y' times columns (R, c)."""
+        ...
+
+    def squares(self) -> Float:
+        """(N, 3, 3) blocks of Y' Y, each landmark's with itself."""
+        ...
+
+
+@dataclass(frozen=True)
+class KnownErrors:
+    """Y as it is."""
+
+    common: Float
+
+    def __len__(self) -> int:
+        return len(self.common)
+
+    def rows_by_all(self, rows: np.ndarray) -> Float:
+        """(R, r) columns of Y Y', those of `rows` (r,)."""
+        return self.common @ np.ascontiguousarray(self.common[rows].T)
+
+    def gram(self, columns: Float) -> Float:
+        """Y Y' times columns (R, c)."""
+        return self.common @ self.spread(columns)
+
+    def spread(self, columns: Float) -> Float:
+        """(3N, c) Y' times columns (R, c)."""
+        return self.common.T @ columns
+
+    def squares(self) -> Float:
+        """(N, 3, 3) blocks of Y' Y, each landmark's with itself."""
+        return _squares(self.common, self.common.shape[1] // 3)
+
+
+def condensed(own_m2: Float, common: Float | SharedErrors, rank: int = RANK) -> JointCovariance:
     """A joint covariance of own (N, 3, 3) and common (R, 3N), by its largest `rank` directions.
 
     Marginal covariances stay as they are: what is left out is counted as the landmarks' own.
     Subspace iteration (Halko, Martinsson, Tropp 2011, alg. 4.4), from rows of `common`, which are
     of frames, evenly spread over the path.
     """
+    if isinstance(common, np.ndarray):
+        common = KnownErrors(common)
     n = len(own_m2)
-    kept = common
     if len(common) > rank:
         n_start = min(rank + _TO_SPARE, len(common))
-        start = np.linspace(0, len(common) - 1, n_start).round().astype(int)
+        rows = np.linspace(0, len(common) - 1, n_start).round().astype(int)
         # onto single rows: common' times columns of the identity
-        basis = np.linalg.qr(common @ np.ascontiguousarray(common[np.unique(start)].T))[0]
+        basis = np.linalg.qr(common.rows_by_all(np.unique(rows)))[0]
         for _ in range(_ITERATIONS - 1):
-            basis = np.linalg.qr(common @ (common.T @ basis))[0]
-        within = basis.T @ common
+            basis = np.linalg.qr(common.gram(basis))[0]
+        within = common.spread(basis).T
         largest = np.linalg.eigh(within @ within.T).eigenvectors[:, ::-1][:, :rank]
         kept = largest.T @ within
+    else:
+        kept = common.spread(np.eye(len(common))).T
     by_landmark = np.ascontiguousarray(kept.reshape(len(kept), n, 3).transpose(1, 0, 2))
-    whole, part = _squares(common, n), _squares(kept, n)
-    return JointCovariance(own_m2 + whole - part, by_landmark)
+    return JointCovariance(own_m2 + common.squares() - _squares(kept, n), by_landmark)
 
 
 @njit(cache=True)

@@ -38,10 +38,11 @@ class SamePoint:
         """
         known_i, known_j = _of_one_label(a.label, b.label)
         i, j = self._neighbours(a, b)
+        inside = self._inside(a, b, i, j)
+        i, j = i[inside], j[inside]
         labelled = (a.label[i] != NO_LABEL) & (b.label[j] != NO_LABEL)
         unlike = np.linalg.norm(a.descriptor[i] - b.descriptor[j], axis=1)
-        near = unlike <= self.max_descriptor_distance  # False for NaN
-        passes = ~labelled & near & self._inside(a, b, i, j)
+        passes = ~labelled & (unlike <= self.max_descriptor_distance)  # False for NaN
         return (
             np.concatenate([known_i, i[passes]]),
             np.concatenate([known_j, j[passes]]),

@@ -116,10 +116,9 @@ class _Placed(NamedTuple):
 
 
 def _placed(maps: Sequence[JointMap], estimate: JointEstimate) -> list[_Placed]:
-    factor = np.linalg.cholesky(estimate.covariance)
+    factor = np.asarray(np.linalg.cholesky(estimate.covariance), np.float64)
     said = [estimate.said(maps, k, np.arange(len(own))) for k, own in enumerate(maps)]
-    # one product of matrices, where one a landmark would be slow
-    shared = [np.tensordot(own.by_unknown, factor, axes=1) for own in said]
+    shared = [estimate.moved_m(maps, k, own, factor) for k, own in enumerate(said)]
     return [_Placed(own.y_m, own.own_m2, moved) for own, moved in zip(said, shared, strict=True)]
 
 

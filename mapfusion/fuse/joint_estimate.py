@@ -80,12 +80,41 @@ class Said(NamedTuple):
     Attributes:
         y_m: (n, D) where they are, in the common frame.
         own_m2: (n, D, D) covariance of their own errors, there.
-        by_unknown: (n, D, U) dy / du.
+        information: (n, D, D) its inverse.
+        by_unknown: (n, D, U_k) dy / du by the unknowns that it depends on.
     """
 
     y_m: Float
     own_m2: Float
+    information: Float
     by_unknown: Float
+
+
+class _Rows(NamedTuple):
+    """Some of a map's landmarks as they enter each step.
+
+    Attributes:
+        position_m: (n, D).
+        own_m2: (n, D, D).
+        information: (n, D, D) its inverse.
+        moved_m: (n, D, R) how far one sigma of each shared variable moves them, but for the camera.
+        calibration: the camera's.
+    """
+
+    position_m: Float
+    own_m2: Float
+    information: Float
+    moved_m: Float
+    calibration: CalibrationError
+
+    @classmethod
+    def of(cls, own_map: JointMap, rows: np.ndarray) -> "_Rows":
+        position = own_map.position_m[rows]
+        d, joint = position.shape[1], own_map.joint
+        own = joint.own_m2[rows][:, :d, :d]
+        moved = np.swapaxes(joint.common_m[rows][:, :, :d], 1, 2)
+        information = np.asarray(np.linalg.inv(own), np.float64)
+        return cls(position, own, information, np.ascontiguousarray(moved), own_map.calibration)
 
 
 @dataclass(frozen=True)
@@ -116,30 +145,40 @@ class JointEstimate:
         return found
 
     def said(self, maps: Sequence[JointMap], k: int, rows: np.ndarray) -> Said:
-        """What map k says of its landmarks `rows` (n,)."""
-        arm = maps[k].position_m[rows]
-        said = _said(maps[k], rows, self.T_first_map[k], self.shared[k], arm)
-        return said._replace(by_unknown=_placed(said.by_unknown, _columns(maps)[k], self._size))
+        """What map k says of its landmarks `rows` (n,), by its own unknowns: see `unknowns`."""
+        own = _Rows.of(maps[k], rows)
+        return _said(own, self.T_first_map[k], self.shared[k], own.position_m)
 
-    @property
-    def _size(self) -> int:
-        return len(self.covariance)
+    def unknowns(self, maps: Sequence[JointMap], k: int) -> np.ndarray:
+        """(U_k,) where those that map k depends on stand among all, ABSENT for none."""
+        return _columns(maps)[k]
+
+    def moved_m(self, maps: Sequence[JointMap], k: int, said: Said, factor: Float) -> Float:
+        """(n, D, U) how far a sigma of each independent variable moves what map k says.
+
+        These are the columns of a `factor` (U, U) of the unknowns' covariance.
+        """
+        columns = self.unknowns(maps, k)
+        known = columns != ABSENT
+        by = said.by_unknown[:, :, known].reshape(said.y_m.size, np.count_nonzero(known))
+        return (by @ factor[columns[known]]).reshape(*said.y_m.shape, len(factor))
 
 
-def _said(own_map: JointMap, rows: np.ndarray, T: Float, shared: Float, arm_m: Float) -> Said:
-    """The same with dy / d(T, z_k) alone; the camera's errors move points at `arm_m` (n, D)."""
-    n_dimensions = own_map.position_m.shape[1]
-    common = own_map.joint.common_m[rows][:, :, :n_dimensions]
-    if not own_map.calibration.is_none:
-        moved = own_map.calibration.moves_m(arm_m)[:, :, :n_dimensions]
-        common = np.concatenate([common, moved], axis=1)
-    R = rotation_about_z(T[2])[:n_dimensions, :n_dimensions]
-    point = own_map.position_m[rows] + np.einsum("nri,r->ni", common, shared)
-    by = np.zeros((len(rows), n_dimensions, 3 + len(shared)))
-    by[:, :2, :3] = motion_jacobian(T, point)
-    by[:, :, 3:] = R @ np.swapaxes(common, 1, 2)
-    own = R @ own_map.joint.own_m2[rows][:, :n_dimensions, :n_dimensions] @ R.T
-    return Said(transform_points(T, point), own, by)
+def _said(own: _Rows, T: Float, shared: Float, arm_m: Float) -> Said:
+    """The camera's errors move points at `arm_m` (n, D)."""
+    (n, d), moved = own.position_m.shape, own.moved_m
+    if not own.calibration.is_none:
+        by_camera = own.calibration.moves_m(arm_m)[:, :, :d]
+        moved = np.concatenate([moved, np.swapaxes(by_camera, 1, 2)], axis=2)
+    R = rotation_about_z(T[2])[:d, :d]
+    point = own.position_m + moved @ shared
+    by = np.empty((n, d, 3 + len(shared)))
+    by[:, :2, :3], by[:, 2:, :3] = motion_jacobian(T, point), 0.0
+    for axis in range(2):  # faster than as many small products as landmarks
+        by[:, axis, 3:] = R[axis, 0] * moved[:, 0] + R[axis, 1] * moved[:, 1]
+    by[:, 2:, 3:] = moved[:, 2:]
+    turned = R @ own.own_m2 @ R.T, R @ own.information @ R.T
+    return Said(transform_points(T, point), *turned, by)
 
 
 def _columns(maps: Sequence[JointMap]) -> list[np.ndarray]:
@@ -157,13 +196,6 @@ def _columns(maps: Sequence[JointMap]) -> list[np.ndarray]:
     return found
 
 
-def _placed(by: Float, columns: np.ndarray, n_unknowns: int) -> Float:
-    """Derivatives (n, D, U_k) among those by all unknowns."""
-    placed = np.zeros((*by.shape[:2], n_unknowns))
-    placed[:, :, columns[columns != ABSENT]] = by[:, :, columns != ABSENT]
-    return placed
-
-
 def estimate_jointly(
     maps: Sequence[JointMap], T_first_map: Float, parents: np.ndarray
 ) -> JointEstimate:
@@ -178,10 +210,10 @@ def estimate_jointly(
     T, shared = np.array(T_first_map), [np.zeros(each.n_shared) for each in maps]
     columns = _columns(maps)
     has = parents != ABSENT
-    rows = [parents[has[:, k], k] for k in range(len(maps))]
+    rows = [_Rows.of(own, parents[has[:, k], k]) for k, own in enumerate(maps)]
     weight, dof, n_steps = has.astype(np.float64), MOST_DOF, 0
+    said = _all_said(rows, T, shared, has, weight)
     while True:
-        said = _all_said(maps, rows, T, shared, has, weight)
         points = _points(said, has, weight)
         A, gradient = _equations(said, has, weight, points, columns, shared)
         factor = scipy.linalg.cholesky(A, lower=True)
@@ -197,30 +229,27 @@ def estimate_jointly(
             if k:
                 T[k] += step[own[:3]]
         T[:, 2] = wrap(T[:, 2])
-        weight, dof = _reweighted(_all_said(maps, rows, T, shared, has, weight), has, weight)
+        said = _all_said(rows, T, shared, has, weight)
+        weight, dof = _reweighted(said, has, weight, dof)
+        if not all(own.calibration.is_none for own in maps):
+            said = _all_said(rows, T, shared, has, weight)  # from where points are seen now
         n_steps += 1
 
 
 def _all_said(
-    maps: Sequence[JointMap],
-    rows: Sequence[np.ndarray],
-    T: Float,
-    shared: Sequence[Float],
-    has: np.ndarray,
-    weight: Float,
+    rows: Sequence[_Rows], T: Float, shared: Sequence[Float], has: np.ndarray, weight: Float
 ) -> list[Said]:
     """What each map says of its `rows`.
 
     Errors of cameras move points from where all maps together see them. Moved from where the one
     map does, they would move its noise too, and all maps shrink, since that shrinks residuals.
     """
-    places = [own.position_m[its] for own, its in zip(maps, rows, strict=True)]
-    said = list(map(_said, maps, rows, T, shared, places))
-    if all(own.calibration.is_none for own in maps):
+    said = [_said(*each, each[0].position_m) for each in zip(rows, T, shared, strict=True)]
+    if all(own.calibration.is_none for own in rows):
         return said
     g = _points(said, has, weight).g_m
-    arms = [transform_points(inverse(T[k]), g[has[:, k]]) for k in range(len(maps))]
-    return list(map(_said, maps, rows, T, shared, arms))
+    arms = [transform_points(inverse(T[k]), g[has[:, k]]) for k in range(len(rows))]
+    return list(map(_said, rows, T, shared, arms))
 
 
 class _Points(NamedTuple):
@@ -232,7 +261,7 @@ class _Points(NamedTuple):
 
 def weighted_information(said: Said, weight: Float) -> Float:
     """W (n, D, D)."""
-    return weight[:, None, None] * np.linalg.inv(said.own_m2)
+    return weight[:, None, None] * said.information
 
 
 def _points(said: Sequence[Said], has: np.ndarray, weight: Float) -> _Points:
@@ -261,7 +290,8 @@ def _equations(
     W = [weighted_information(own, weight[has[:, k], k]) for k, own in enumerate(said)]
     for k, own in enumerate(said):
         off = own.y_m - points.g_m[has[:, k]]
-        gradient[columns[k]] += np.einsum("ndu,nde,ne->u", own.by_unknown, W[k], off, optimize=True)
+        pulled = (W[k] @ off[:, :, None]).ravel()
+        gradient[columns[k]] += own.by_unknown.reshape(-1, len(columns[k])).T @ pulled
         for m, other in enumerate(said[: k + 1]):
             both = has[:, k] & has[:, m]
             here, there = both[has[:, k]], both[has[:, m]]
@@ -282,18 +312,24 @@ def _equations(
     return A[:-1, :-1], (gradient + value)[:-1]
 
 
-def _reweighted(said: Sequence[Said], has: np.ndarray, weight: Float) -> tuple[Float, float]:
+def _reweighted(
+    said: Sequence[Said], has: np.ndarray, weight: Float, dof: float
+) -> tuple[Float, float]:
     """Weights (C, K) of the Student-t, and its degrees of freedom, for what is off now.
+
+    Those so far are near the new ones.
 
     The squares are those expected about the true points (the E step of Lange et al., 1989).
     """
     new, points = np.zeros_like(weight), _points(said, has, weight)
     n_dimensions = points.g_m.shape[1]
-    dof = fitted_dof(_disagreement(said, has), n_dimensions * (np.count_nonzero(has, axis=1) - 1))
+    dof = fitted_dof(
+        _disagreement(said, has), n_dimensions * (np.count_nonzero(has, axis=1) - 1), dof
+    )
     for k, own in enumerate(said):
         off = own.y_m - points.g_m[has[:, k]]
         spread = off[:, :, None] * off[:, None, :] + points.covariance_m2[has[:, k]]
-        squares = np.einsum("nij,nij->n", np.linalg.inv(own.own_m2), spread)
+        squares = np.einsum("nij,nij->n", own.information, spread)
         new[has[:, k], k] = student_weights(squares, dof, n_dimensions)
     return new, dof
 
@@ -306,5 +342,5 @@ def _disagreement(said: Sequence[Said], has: np.ndarray) -> Float:
     points, total = _points(said, has, has.astype(np.float64)), np.zeros(len(has))
     for k, own in enumerate(said):
         off = own.y_m - points.g_m[has[:, k]]
-        total[has[:, k]] += np.einsum("ni,nij,nj->n", off, np.linalg.inv(own.own_m2), off)
+        total[has[:, k]] += np.einsum("ni,nij,nj->n", off, own.information, off)
     return total

@@ -95,20 +95,19 @@ class JointlyFused:
         weight = has.astype(np.float64)
         weight[: len(estimate.weight)] = estimate.weight
         information = np.zeros((n, n_dimensions, n_dimensions))
-        total, by = np.zeros((n, n_dimensions)), np.zeros((n, n_dimensions, n_unknowns))
+        total, moved = np.zeros((n, n_dimensions)), np.zeros((n, n_dimensions, n_unknowns))
+        factor = np.asarray(np.linalg.cholesky(estimate.covariance), np.float64)
         for k in range(len(self.maps)):
             rows = np.flatnonzero(has[:, k])
             said = estimate.said(self.maps, k, self.points[rows, k])
             W = weighted_information(said, weight[rows, k])
             information[rows] += W
             total[rows] += np.einsum("nij,nj->ni", W, said.y_m)
-            by[rows] += W @ said.by_unknown
+            moved[rows] += W @ estimate.moved_m(self.maps, k, said, factor)
         own, position = np.zeros((n, 3, 3)), np.zeros((n, 3))
         V = np.linalg.inv(information)
         own[:, :n_dimensions, :n_dimensions] = V
         position[:, :n_dimensions] = np.einsum("nij,nj->ni", V, total)
         shared = np.zeros((n_unknowns, n, 3))
-        shared[:, :, :n_dimensions] = (V @ by @ np.linalg.cholesky(estimate.covariance)).transpose(
-            2, 0, 1
-        )
+        shared[:, :, :n_dimensions] = (V @ moved).transpose(2, 0, 1)
         return position, condensed(own, shared.reshape(n_unknowns, 3 * n))

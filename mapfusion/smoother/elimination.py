@@ -9,15 +9,16 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
-from numba import njit
 
+from mapfusion.joint_covariance import KnownErrors, SharedErrors
 from mapfusion.se2 import Float
-from mapfusion.smoother.normal_equations import Estimate, NormalEquations
-from mapfusion.smoother.offsets import Reduced, without_offsets
+from mapfusion.smoother.landmark_elimination import along_way, subtract_points
+from mapfusion.smoother.normal_equations import Estimate, NormalEquations, Weights, point_equations
+from mapfusion.smoother.offsets import Points, known_points, moved_points, without_offsets
+from mapfusion.smoother.path_errors import PathErrors
 from mapfusion.smoother.sightings import Sightings
 from mapfusion.smoother.skyline import (
     cholesky_in_envelope,
-    entries_seen,
     solve_in_envelope,
     solve_transposed_in_envelope,
     untouched_zeros,
@@ -25,7 +26,6 @@ from mapfusion.smoother.skyline import (
 
 _ITEM = np.dtype(np.float64).itemsize
 _COPIES = 3  # of a matrix that are there at once: as it is made, in LAPACK's order, and solved
-_AT_ONCE = 256  # landmarks whose part in all poses is made as a matrix of its own
 _BAND = 5  # below the diagonal of a chain of poses of three coordinates
 
 
@@ -58,6 +58,17 @@ def solve(seen: Sightings, equations: NormalEquations) -> Solution:
     return (_landmarks_first if first else _poses_first)(seen, equations)
 
 
+def solve_points(
+    seen: Sightings, at: Estimate, weights: Weights, stray_information: float
+) -> tuple[Estimate, Points]:
+    """The step of landmarks and offsets that is left on a path, and what is known of them there."""
+    equations = point_equations(seen, at, weights, stray_information)
+    left = without_offsets(seen, equations)
+    still = np.zeros_like(equations.track_gradient)
+    moved = moved_points(seen, equations, left, still)
+    return Estimate(np.zeros_like(at.path), *moved), known_points(seen, left)
+
+
 def matrix_bytes(seen: Sightings, n_poses: int) -> int:
     """Memory that the dense matrices take at most, in bytes: grows as the square of the log."""
     if _is_landmarks_first(seen, n_poses):  # the last factor, then a system or the common part
@@ -75,59 +86,17 @@ def _n_points(seen: Sightings) -> int:
     return seen.n_landmarks + int(np.count_nonzero(seen.strays))
 
 
+def shared_errors(seen: Sightings, equations: NormalEquations, solution: Solution) -> SharedErrors:
+    """Y (R, 3L): the landmarks' joint covariance is block diagonal of `own_m2` plus Y' Y."""
+    if solution.landmarks_first:
+        return PathErrors.of(seen, equations, solution.own_m2, solution.factor)
+    return KnownErrors(_beside_own(solution))
+
+
 def common_part(seen: Sightings, equations: NormalEquations, solution: Solution) -> Float:
-    """(R, 3L) Y: the landmarks' joint covariance is block diagonal of `own_m2` plus Y' Y."""
-    if not solution.landmarks_first:
-        return _beside_own(solution)
-    coupling = without_offsets(seen, equations).coupling @ solution.own_m2[seen.landmark]
-    n, n_landmarks = len(solution.factor), seen.n_landmarks
-    common = np.zeros((n, 3 * n_landmarks))
-    place = seen.pose_place[seen.frame] - 1
-    unknown = np.where(seen.frame > 0, place, n // 3 - 1)
-    first_seen = np.minimum.reduceat(unknown, seen.starts[:-1])
-    order = np.argsort(first_seen, kind="stable")
-    for at in range(0, n_landmarks, _AT_ONCE):
-        some = order[at : at + _AT_ONCE]
-        first = first_seen[some].min()  # poses before those that saw these landmarks have no part
-        right = np.zeros((n - 3 * first, 3 * len(some)))
-        _put_couplings(some, seen.starts, seen.frame, place - first, coupling, right)
-        below = solution.factor[3 * first :, 3 * first :]
-        _put_columns(
-            solve_in_envelope(below, entries_seen(below), right), some, common[3 * first :]
-        )
-    return common
-
-
-@njit(cache=True)
-def _put_couplings(
-    some: np.ndarray,
-    starts: np.ndarray,
-    frame: np.ndarray,
-    place: np.ndarray,
-    coupling: Float,
-    right: Float,
-) -> None:
-    """Add up what `some` landmarks have to do with poses: each three columns of `right`.
-
-    A landmark's observations are those from one of `starts` to the next, of a pose at three rows
-    from 3 `place` on; the first pose is no unknown.
-    """
-    for j in range(len(some)):
-        for i in range(starts[some[j]], starts[some[j] + 1]):
-            if frame[i] == 0:
-                continue
-            for r in range(3):
-                for q in range(3):
-                    right[3 * place[i] + r, 3 * j + q] += coupling[i, r, q]
-
-
-@njit(cache=True)
-def _put_columns(solved: Float, some: np.ndarray, common: Float) -> None:
-    """The three columns of each of `some` landmarks to where they are in `common`."""
-    for r in range(len(solved)):
-        for j in range(len(some)):
-            for q in range(3):
-                common[r, 3 * some[j] + q] = solved[r, 3 * j + q]
+    """(R, 3L) Y of `shared_errors`, dense."""
+    errors = shared_errors(seen, equations, solution)
+    return errors.spread(np.eye(len(errors))).T
 
 
 def pose_covariances(
@@ -158,22 +127,21 @@ def _beside_own(solution: Solution) -> Float:
 
 def _landmarks_first(seen: Sightings, equations: NormalEquations) -> Solution:
     n, place = len(equations.pose_block), seen.pose_place
-    S, gradient, first = untouched_zeros(3 * n), np.empty((n, 3)), seen.first_entry
+    S, gradient, first = untouched_zeros(3 * n), np.empty((n, 3)), seen.order.first_entry
     _put_poses(S.reshape(n, 3, n, 3), place, equations)
     gradient[place] = equations.pose_gradient
-    left, row = without_offsets(seen, equations), place[seen.frame]
-    own = np.asarray(np.linalg.inv(_regular(seen, left.point_block)), np.float64)
-    _subtract(seen.track_starts, row, equations.coupling, left.own_m2, left.pull, S, gradient)
-    _subtract(seen.starts, row, left.coupling, own, left.point_gradient, S, gradient)
+    left = without_offsets(seen, equations.points)
+    subtract_points(seen, equations, left, S, gradient)
     factor = cholesky_in_envelope(S[3:, 3:], first)
     turned = solve_in_envelope(factor, first, gradient[1:].ravel())  # squared, what the step moves
     solved = -solve_transposed_in_envelope(factor, first, turned)
     way = np.zeros((n, 3))
     way[1:] = solved.reshape(-1, 3)[place[1:] - 1]
-    moved = seen.sum_by_landmark(_along(left.coupling, way[seen.frame]))
-    points = -np.einsum("lij,lj->li", own, left.point_gradient + moved)
-    step = Estimate(way, points, _offsets(seen, equations, left, way, points))
-    return _solution(seen, left, step, own, factor, float(turned @ turned))
+    along = along_way(seen, equations.coupling, way)
+    step = Estimate(way, *moved_points(seen, equations.points, left, along))
+    moved, known = float(turned @ turned), known_points(seen, left)
+    own = left.landmark_m2, known.offset_m2, known.track_m2
+    return Solution(step, moved, *own, factor, landmarks_first=True)
 
 
 def _put_poses(blocks: Float, place: np.ndarray, equations: NormalEquations) -> None:
@@ -184,58 +152,6 @@ def _put_poses(blocks: Float, place: np.ndarray, equations: NormalEquations) -> 
         (after > before)[:, None, None], equations.link, np.swapaxes(equations.link, 1, 2)
     )
     blocks[np.maximum(after, before), :, np.minimum(after, before), :] = link
-
-
-def _along(coupling: Float, way: Float) -> Float:
-    """Coupling' way, (N, 3), by observation."""
-    return np.einsum("nij,ni->nj", coupling, way)
-
-
-def _offsets(
-    seen: Sightings, equations: NormalEquations, left: Reduced, way: Float, points: Float
-) -> Float:
-    """The step (B, 3) of the offsets that belongs to one of path and landmarks."""
-    moved = seen.sum_by_track(_along(equations.coupling, way[seen.frame]))
-    pulled = np.einsum("tij,tj->ti", equations.track_block, points[seen.landmark_of_track])
-    return -np.einsum("tij,tj->ti", left.own_m2, left.pull + moved + pulled)
-
-
-@njit(cache=True)
-def _subtract(
-    starts: np.ndarray,
-    frame: np.ndarray,
-    coupling: Float,
-    own: Float,
-    point_gradient: Float,
-    S: Float,
-    gradient: Float,
-) -> None:
-    """Coupling A^-1 coupling' of each point, between all frames that saw it; the lower half.
-
-    Points are tracks' offsets or landmarks, each with the rows from one of `starts` to the next;
-    `frame` is the place of each row's pose.
-    Those that are not known to any extent (own covariance 0) have nothing to be subtracted.
-    """
-    gain = np.empty((3, 3))
-    for j in range(len(starts) - 1):
-        b = point_gradient[j]
-        for i in range(starts[j], starts[j + 1]):
-            row, H = 3 * frame[i], coupling[i]
-            for r in range(3):
-                for q in range(3):
-                    gain[r, q] = (
-                        H[r, 0] * own[j, 0, q] + H[r, 1] * own[j, 1, q] + H[r, 2] * own[j, 2, q]
-                    )
-                gradient[frame[i], r] -= gain[r, 0] * b[0] + gain[r, 1] * b[1] + gain[r, 2] * b[2]
-            for k in range(starts[j], i + 1):
-                column, G = 3 * frame[k], coupling[k]
-                for r in range(3):
-                    for q in range(3):
-                        value = gain[r, 0] * G[q, 0] + gain[r, 1] * G[q, 1] + gain[r, 2] * G[q, 2]
-                        if column <= row:
-                            S[row + r, column + q] -= value
-                        if column >= row and k != i:  # rows are not in the order of places
-                            S[column + q, row + r] -= value
 
 
 def _poses_first(seen: Sightings, equations: NormalEquations) -> Solution:
@@ -250,11 +166,12 @@ def _poses_first(seen: Sightings, equations: NormalEquations) -> Solution:
     way[1:] = -(solved[:, -1] + solved[:, :-1] @ points).reshape(-1, 3)
     offsets[seen.strays] = points[:n_offsets].reshape(-1, 3)
     step = Estimate(way, points[n_offsets:].reshape(-1, 3), offsets)
-    left = without_offsets(seen, equations)
-    own = np.asarray(np.linalg.inv(_regular(seen, left.point_block)), np.float64)
+    left = without_offsets(seen, equations.points)
+    known = known_points(seen, left)
+    own = left.landmark_m2, known.offset_m2, known.track_m2
     last = step.point_m.ravel()
     moved = float(np.sum((factor[-last.size :, -last.size :].T @ last) ** 2))
-    return _solution(seen, left, step, own, factor, moved, landmarks_first=False)
+    return Solution(step, moved, *own, factor, landmarks_first=False)
 
 
 def pose_point_blocks(seen: Sightings, equations: NormalEquations) -> tuple[Float, Float, Float]:
@@ -265,15 +182,19 @@ def pose_point_blocks(seen: Sightings, equations: NormalEquations) -> tuple[Floa
     wide, K = np.zeros((n_poses, n_points, 3, 3)), np.zeros((n_points, n_points, 3, 3))
     np.add.at(wide, (seen.frame[row], stray[seen.track[row]]), equations.coupling[row])
     np.add.at(wide, (seen.frame, n + seen.landmark), equations.coupling)
-    S, each, landmark = equations.track_block, np.arange(n_points), n + seen.landmark_of_track
+    S, each, landmark = (
+        equations.points.track_block,
+        np.arange(n_points),
+        n + seen.landmark_of_track,
+    )
     own = np.concatenate([S[strays], _regular(seen, seen.sum_tracks(S))])
-    own[:n] += equations.offset_information[strays, None, None] * np.eye(3)
+    own[:n] += equations.points.offset_information[strays, None, None] * np.eye(3)
     K[each, each] = own
     K[landmark[strays], each[:n]] = S[strays]
     K[each[:n], landmark[strays]] = S[strays]
     gradient = [
-        (equations.track_gradient + equations.offset_gradient)[strays],
-        seen.sum_tracks(equations.track_gradient),
+        (equations.points.track_gradient + equations.points.offset_gradient)[strays],
+        seen.sum_tracks(equations.points.track_gradient),
     ]
     as_matrix = wide.transpose(0, 2, 1, 3).reshape(3 * n_poses, 3 * n_points)[3:]
     K = K.transpose(0, 2, 1, 3).reshape(3 * n_points, 3 * n_points)
@@ -302,20 +223,3 @@ def _regular(seen: Sightings, point_block: Float) -> Float:
     regular = point_block.copy()
     regular[:, 2, 2] = 1.0
     return regular
-
-
-def _solution(
-    seen: Sightings,
-    left: Reduced,
-    step: Estimate,
-    own_m2: Float,
-    factor: Float,
-    moved: float,
-    landmarks_first: bool = True,
-) -> Solution:
-    """With the landmarks' and the tracks' own covariances."""
-    of_landmark, kept = own_m2[seen.landmark_of_track], left.kept
-    follows = np.eye(3) - kept  # -db / dl
-    offset_m2 = left.own_m2 + follows @ of_landmark @ np.swapaxes(follows, 1, 2)
-    track_m2 = left.own_m2 + kept @ of_landmark @ np.swapaxes(kept, 1, 2)
-    return Solution(step, moved, own_m2, offset_m2, track_m2, factor, landmarks_first)

@@ -12,14 +12,17 @@ from mapfusion.se2 import Float
 from mapfusion.smoother.normal_equations import Estimate, Weights
 from mapfusion.smoother.observation_level import told_observation_level
 from mapfusion.smoother.odometry_levels import told_odometry_levels
-from mapfusion.smoother.robust import NO_TAILS, Tails
-from mapfusion.smoother.settle import Problem, Settled, settled
+from mapfusion.smoother.robust import NO_TAILS, Tails, unweighted
+from mapfusion.smoother.settle import CONVERGED, Problem, Settled, finished, solved, stepped
 
-# Rounds end where none of the standard deviations changes by more than this share.
+# The odometry's levels are told anew until no standard deviation is off by more than this share
+# from what it was once before: those of motions that are hardly told may come and go.
 _SETTLED = 0.05
-_MOST_ROUNDS = 10
-# Until then the next step may move the path by so much, in squared sigmas a coordinate.
+# Each time the next step may move the path by so much, in squared sigmas a coordinate.
 _CLOSE = 1e-3
+# The last step changes the observations' variances by no more than this share.
+_FOLLOWED = 2e-3
+_MOST_STEPS = 100
 
 
 class Levels(NamedTuple):
@@ -33,11 +36,6 @@ class Levels(NamedTuple):
     odometry: Float
     observation: float
 
-    def differ(self, other: "Levels") -> float:
-        """The most that a logarithm of them differs by."""
-        ratio = np.append(self.odometry / other.odometry, self.observation / other.observation)
-        return float(np.abs(np.log(ratio)).max())
-
 
 AS_STATED = Levels(np.ones(3), 1.0)
 
@@ -45,23 +43,33 @@ AS_STATED = Levels(np.ones(3), 1.0)
 def settled_with_levels(
     problem: Problem, at: Estimate, weights: Weights | None = None, tails: Tails = NO_TAILS
 ) -> tuple[Settled, Levels]:
-    """Where steps end under the levels that the log tells, for the rest as `settled`."""
-    levels, n_steps = AS_STATED, 0
-    for _ in range(_MOST_ROUNDS):
-        end = settled(_with(problem, levels), at, _CLOSE, weights, tails)
-        at, weights, tails, n_steps = end.estimate, end.weights, end.tails, n_steps + end.n_steps
-        before, levels = levels, _told(problem, end, levels)
-        if levels.differ(before) < 2 * _SETTLED:
-            break
-    end = settled(_with(problem, levels), at, weights=weights, tails=tails)
-    return end._replace(n_steps=n_steps + end.n_steps), levels
+    """Where steps end under the levels that the log tells, for the rest as `settled`.
+
+    The observations' costs little to tell and follows each step, as the tails do; the odometry's is
+    told where steps are close to their end, and they go on from there.
+    """
+    levels, n_steps, told, known = AS_STATED, 0, [AS_STATED.odometry], False
+    weights = unweighted(problem.seen) if weights is None else weights
+    while True:
+        under = _with(problem, levels)
+        end = solved(under, at, weights, tails, n_steps)
+        observation = told_observation_level(end, levels.observation)
+        follows = _differ(observation, levels.observation) < _FOLLOWED
+        if n_steps == _MOST_STEPS or (known and follows and end.is_within(CONVERGED)):
+            return finished(under, end), levels
+        odometry = levels.odometry
+        if not known and end.is_within(_CLOSE):
+            odometry = told_odometry_levels(problem, end, odometry)
+            known = any(_differ(odometry, each) < 2 * _SETTLED for each in told)
+            told.append(odometry)
+        levels = Levels(odometry, observation)
+        at, weights, tails = stepped(under, end, _with(problem, levels).seen)
+        n_steps += 1
 
 
-def _told(problem: Problem, end: Settled, levels: Levels) -> Levels:
-    return Levels(
-        told_odometry_levels(problem, end, levels.odometry),
-        told_observation_level(end, levels.observation),
-    )
+def _differ(levels: Float | float, others: Float | float) -> float:
+    """The most that a logarithm of them differs by."""
+    return float(np.max(np.abs(np.log(levels / others))))
 
 
 def _with(problem: Problem, levels: Levels) -> Problem:

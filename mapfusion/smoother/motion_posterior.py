@@ -15,9 +15,7 @@ from mapfusion.se2 import Float
 from mapfusion.smoother.elimination import chain_factor, pose_point_blocks
 from mapfusion.smoother.normal_equations import disturbance_jacobians, disturbances
 from mapfusion.smoother.settle import Settled
-from mapfusion.smoother.skyline import entries_seen, solve_in_envelope
-
-_AT_ONCE = 128  # disturbances whose part in all poses is made as a matrix of its own
+from mapfusion.smoother.skyline import inverse_in_envelope
 
 
 class MotionPosterior(NamedTuple):
@@ -83,24 +81,13 @@ def disturbance_variances(end: Settled) -> Float:
 
 
 def _from_poses(end: Settled, before: Float, after: Float) -> Float:
-    """From the factor L of the poses' information, in their order: squares of L^-1 D'."""
-    n, factor = len(after), end.solution.factor
-    place = end.seen.pose_place[1:] - 1
-    began = np.concatenate([place[:1], place[:-1]])  # the first pose is no unknown
-    first_place = np.minimum(place, began)
-    variance, order = np.empty((n, 3)), np.argsort(first_place, kind="stable")
-    for at in range(0, n, _AT_ONCE):
-        some = order[at : at + _AT_ONCE]
-        first, each = first_place[some[0]], np.arange(len(some))
-        wide = np.zeros((n - first, 3, len(some), 3))
-        wide[place[some] - first, :, each] = np.swapaxes(after[some], 1, 2)
-        later = some > 0
-        wide[began[some[later]] - first, :, each[later]] = np.swapaxes(before[some[later]], 1, 2)
-        below = factor[3 * first :, 3 * first :]
-        right = wide.reshape(3 * (n - first), -1)
-        solved = solve_in_envelope(below, entries_seen(below), right)
-        variance[some] = np.sum(solved**2, axis=0).reshape(-1, 3)
-    return variance
+    """From the inverse of the poses' information, in their order."""
+    order = end.seen.order
+    Z = inverse_in_envelope(end.solution.factor, order.first_entry)
+    n, place = len(after), order.place[1:] - 1
+    blocks = Z.reshape(n, 3, n, 3)
+    own, link = blocks[place, :, place], blocks[place[:-1], :, place[1:]]
+    return _of_differences(before, after, own, link)
 
 
 def _difference(before: Float, after: Float, of_poses: Float) -> Float:

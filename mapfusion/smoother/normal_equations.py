@@ -47,6 +47,32 @@ class Weights(NamedTuple):
     offset: Float
 
 
+class Shares(NamedTuple):
+    """What of the weighted information of all observations, and of all offsets, counts as such."""
+
+    observation: float
+    offset: float
+
+
+WHOLE = Shares(1.0, 1.0)
+
+
+class PointEquations(NamedTuple):
+    """Of B tracks on a path that is known.
+
+    Attributes:
+        track_block: (B, 3, 3).
+        track_gradient: (B, 3).
+        offset_information: (B,) P_t, the same along each axis.
+        offset_gradient: (B, 3) P_t b_t.
+    """
+
+    track_block: Float
+    track_gradient: Float
+    offset_information: Float
+    offset_gradient: Float
+
+
 class NormalEquations(NamedTuple):
     """Of T poses, L landmarks and B tracks, by blocks.
 
@@ -54,21 +80,15 @@ class NormalEquations(NamedTuple):
         pose_block: (T, 3, 3).
         link: (T - 1, 3, 3) each pose's block with the pose before it.
         pose_gradient: (T, 3).
-        track_block: (B, 3, 3).
-        track_gradient: (B, 3).
-        offset_information: (B,) P_t, the same along each axis.
-        offset_gradient: (B, 3) P_t b_t.
         coupling: (N, 3, 3) a pose's block with a landmark, by observation.
+        points: the rest.
     """
 
     pose_block: Float
     link: Float
     pose_gradient: Float
-    track_block: Float
-    track_gradient: Float
-    offset_information: Float
-    offset_gradient: Float
     coupling: Float
+    points: PointEquations
 
 
 def odometry_information(odometry: Float, noise: MotionNoise) -> Float:
@@ -113,6 +133,7 @@ def normal_equations(
     stray_information: float,
     odometry: Float,
     information: Float,
+    shares: Shares = WHOLE,
 ) -> NormalEquations:
     """The equations of the next step.
 
@@ -123,22 +144,37 @@ def normal_equations(
         stray_information: of an offset along each axis, in 1/m^2.
         odometry: (T, 3) increments.
         information: (T - 1, 3) theirs.
+        shares: of observations and offsets in the matrix; the gradient is of all of it.
     """
-    n_poses, n_tracks = len(at.path), len(at.offset_m)
-    of_offset = weights.offset * stray_information
+    n_poses = len(at.path)
     made = NormalEquations(
         np.zeros((n_poses, 3, 3)),
         np.zeros((n_poses - 1, 3, 3)),
         np.zeros((n_poses, 3)),
-        np.zeros((n_tracks, 3, 3)),
-        np.zeros((n_tracks, 3)),
-        of_offset,
-        of_offset[:, None] * at.offset_m,
         np.empty((len(seen), 3, 3)),
+        _no_observations(at, weights, stray_information, shares),
     )
-    _add_observations(seen.arrays, at, turns(at.path), weights.observation, made)
+    factors = weights.observation, shares.observation
+    _add_observations(seen.arrays, at, turns(at.path), *factors, made)
     _add_odometry(at.path, odometry, information, made)
     return made
+
+
+def point_equations(
+    seen: Sightings, at: Estimate, weights: Weights, stray_information: float
+) -> PointEquations:
+    """Those of the points alone, the path staying as it is; arguments of `normal_equations`."""
+    made = _no_observations(at, weights, stray_information, WHOLE)
+    _add_to_points(seen.arrays, at, turns(at.path), weights.observation, made)
+    return made
+
+
+def _no_observations(
+    at: Estimate, weights: Weights, stray_information: float, shares: Shares
+) -> PointEquations:
+    n, of_offset = len(at.offset_m), weights.offset * stray_information
+    nothing = np.zeros((n, 3, 3)), np.zeros((n, 3))
+    return PointEquations(*nothing, shares.offset * of_offset, of_offset[:, None] * at.offset_m)
 
 
 def _add_odometry(path: Float, odometry: Float, information: Float, made: NormalEquations) -> None:
@@ -158,58 +194,81 @@ def _add_observations(
     at: Estimate,
     turn: Float,
     weight: Float,
+    share: float,
     made: NormalEquations,
 ) -> None:
     starts, owner, frame, position, information = seen
-    W, e, J = np.empty((3, 3)), np.empty(3), np.zeros((3, 3))
-    half, R = np.empty((3, 3)), np.zeros((3, 3))
+    path, W, e = at.path, np.empty((3, 3)), np.empty(3)
+    coupling, pose_block, pose_gradient = made.coupling, made.pose_block, made.pose_gradient
     for t in range(len(starts) - 1):
-        point = at.point_m[owner[t]] + at.offset_m[t]
-        A, b = made.track_block[t], made.track_gradient[t]
+        x = at.point_m[owner[t], 0] + at.offset_m[t, 0]
+        y = at.point_m[owner[t], 1] + at.offset_m[t, 1]
+        z = at.point_m[owner[t], 2] + at.offset_m[t, 2]
         for i in range(starts[t], starts[t + 1]):
             k = frame[i]
-            _put_rotation(turn[k], R)
-            _put_in_map_frame(R, information[i], weight[i], half, W)
-            _put_residual(at.path[k], point, R, position[i], e, J)
-            H, block = made.coupling[i], made.pose_block[k]
+            a, b = y - path[k, 1], path[k, 0] - x  # the lever: of de/dx the last column
+            _put_in_map_frame(turn[k], information[i], weight[i], W)
+            _put_residual(path[k], x, y, z, turn[k], position[i], e)
+            _add_to_track(W, e, share, made.points, t)
+            for q in range(3):
+                coupling[i, 0, q] = -share * W[0, q]
+                coupling[i, 1, q] = -share * W[1, q]
+                coupling[i, 2, q] = share * (a * W[0, q] + b * W[1, q])
             for r in range(3):
-                for q in range(3):
-                    A[r, q] += W[r, q]
-                    H[r, q] = J[0, r] * W[0, q] + J[1, r] * W[1, q] + J[2, r] * W[2, q]
-            for r in range(3):
-                b[r] += W[r, 0] * e[0] + W[r, 1] * e[1] + W[r, 2] * e[2]
-                made.pose_gradient[k, r] += H[r, 0] * e[0] + H[r, 1] * e[1] + H[r, 2] * e[2]
-                for q in range(3):
-                    block[r, q] += H[r, 0] * J[0, q] + H[r, 1] * J[1, q] + H[r, 2] * J[2, q]
+                to_x, to_y, to_z = coupling[i, r, 0], coupling[i, r, 1], coupling[i, r, 2]
+                pose_gradient[k, r] += (to_x * e[0] + to_y * e[1] + to_z * e[2]) / share
+                pose_block[k, r, 0] -= to_x
+                pose_block[k, r, 1] -= to_y
+                pose_block[k, r, 2] += to_x * a + to_y * b
 
 
 @njit(cache=True)
-def _put_rotation(turn: Float, R: Float) -> None:
-    c, s = turn
-    R[0, 0], R[0, 1], R[1, 0], R[1, 1], R[2, 2] = c, -s, s, c, 1.0
+def _add_to_points(
+    seen: tuple[np.ndarray, np.ndarray, np.ndarray, Float, Float],
+    at: Estimate,
+    turn: Float,
+    weight: Float,
+    made: PointEquations,
+) -> None:
+    starts, owner, frame, position, information = seen
+    W, e = np.empty((3, 3)), np.empty(3)
+    for t in range(len(starts) - 1):
+        x = at.point_m[owner[t], 0] + at.offset_m[t, 0]
+        y = at.point_m[owner[t], 1] + at.offset_m[t, 1]
+        z = at.point_m[owner[t], 2] + at.offset_m[t, 2]
+        for i in range(starts[t], starts[t + 1]):
+            k = frame[i]
+            _put_in_map_frame(turn[k], information[i], weight[i], W)
+            _put_residual(at.path[k], x, y, z, turn[k], position[i], e)
+            _add_to_track(W, e, 1.0, made, t)
 
 
 @njit(cache=True)
-def _put_in_map_frame(R: Float, information: Float, weight: float, half: Float, W: Float) -> None:
+def _add_to_track(W: Float, e: Float, share: float, made: PointEquations, t: int) -> None:
+    for r in range(3):
+        made.track_gradient[t, r] += W[r, 0] * e[0] + W[r, 1] * e[1] + W[r, 2] * e[2]
+        for q in range(3):
+            made.track_block[t, r, q] += share * W[r, q]
+
+
+@njit(cache=True)
+def _put_in_map_frame(turn: Float, information: Float, weight: float, W: Float) -> None:
     """The information of an observation, in the map frame: weight R information R'."""
-    for r in range(3):
-        for q in range(3):
-            half[r, q] = (
-                R[r, 0] * information[0, q]
-                + R[r, 1] * information[1, q]
-                + R[r, 2] * information[2, q]
-            )
-    for r in range(3):
-        for q in range(3):
-            W[r, q] = weight * (half[r, 0] * R[q, 0] + half[r, 1] * R[q, 1] + half[r, 2] * R[q, 2])
+    c, s = turn[0], turn[1]
+    along, across, mixed = information[0, 0], information[1, 1], information[0, 1]
+    W[0, 0] = weight * (c * c * along - 2 * c * s * mixed + s * s * across)
+    W[1, 1] = weight * (s * s * along + 2 * c * s * mixed + c * c * across)
+    W[0, 1] = W[1, 0] = weight * (c * s * (along - across) + (c * c - s * s) * mixed)
+    W[0, 2] = W[2, 0] = weight * (c * information[0, 2] - s * information[1, 2])
+    W[1, 2] = W[2, 1] = weight * (s * information[0, 2] + c * information[1, 2])
+    W[2, 2] = weight * information[2, 2]
 
 
 @njit(cache=True)
-def _put_residual(pose: Float, point: Float, R: Float, seen_at: Float, e: Float, J: Float) -> None:
-    """The residual e of one observation in the map frame, and de/dx."""
-    for r in range(3):
-        e[r] = point[r] - R[r, 0] * seen_at[0] - R[r, 1] * seen_at[1] - R[r, 2] * seen_at[2]
-    e[0] -= pose[0]
-    e[1] -= pose[1]
-    J[0, 0] = J[1, 1] = -1.0
-    J[0, 2], J[1, 2] = point[1] - pose[1], pose[0] - point[0]
+def _put_residual(
+    pose: Float, x: float, y: float, z: float, turn: Float, seen_at: Float, e: Float
+) -> None:
+    """The residual of one observation of (x, y, z), in the map frame."""
+    e[0] = x - pose[0] - (turn[0] * seen_at[0] - turn[1] * seen_at[1])
+    e[1] = y - pose[1] - (turn[1] * seen_at[0] + turn[0] * seen_at[1])
+    e[2] = z - seen_at[2]

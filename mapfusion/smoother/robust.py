@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapfusion.smoother.elimination import Solution
-from mapfusion.smoother.normal_equations import Estimate, Weights
+from mapfusion.smoother.normal_equations import Estimate, Shares, Weights
+from mapfusion.smoother.offsets import Points
 from mapfusion.smoother.residuals import known_dimensions, offset_squares, squared_distances
 from mapfusion.smoother.sightings import Sightings
 from mapfusion.smoother.student import (
@@ -31,13 +31,9 @@ class Tails(NamedTuple):
 NO_TAILS = Tails(MOST_DOF, MOST_DOF)
 
 
-def informative(seen: Sightings, weights: Weights, tails: Tails) -> Weights:
-    """The weights' parts that are information, for the covariances of what was estimated."""
-    n = seen.n_dimensions
-    return Weights(
-        weights.observation * information_share(tails.observation, n),
-        weights.offset * information_share(tails.offset, n),
-    )
+def informative(tails: Tails, n_dimensions: int) -> Shares:
+    """What of the weighted information is there in truth."""
+    return Shares(*(float(information_share(dof, n_dimensions)) for dof in tails))
 
 
 def unweighted(seen: Sightings) -> Weights:
@@ -49,20 +45,24 @@ def reweighted(
     seen: Sightings,
     at: Estimate,
     weights: Weights,
-    solution: Solution,
+    tails: Tails,
+    known: Points,
     stray_information: float,
 ) -> tuple[Weights, Tails]:
-    """New weights and tails, given the covariances that came from the weights so far.
+    """New weights and tails, given those so far and what is known of points under them.
 
     Of observations the squares are those expected about the true points (the E step of Lange et
     al.). Offsets have a Student-t in as many dimensions as they are known in, else those of
     landmarks with a single track, which look perfectly average, would hide the tails of the rest.
     """
     n, new = seen.n_dimensions, unweighted(seen)
-    squares = squared_distances(seen, at, solution.track_m2)
+    squares = squared_distances(seen, at, known.track_m2)
     of_offset = offset_squares(seen, at, stray_information)
-    known = known_dimensions(seen, solution.offset_m2, weights.offset * stray_information)
-    tails = Tails(fitted_dof(squares, n), fitted_dof(of_offset, known))
+    dimensions = known_dimensions(seen, known.offset_m2, weights.offset * stray_information)
+    tails = Tails(
+        fitted_dof(squares, n, tails.observation),
+        fitted_dof(of_offset, dimensions, tails.offset),
+    )
     new.observation[:] = student_weights(squares, tails.observation, n)
-    new.offset[seen.strays] = student_weights(of_offset, tails.offset, known)
+    new.offset[seen.strays] = student_weights(of_offset, tails.offset, dimensions)
     return new, tails

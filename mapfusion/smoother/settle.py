@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mapfusion.se2 import Float, wrap
-from mapfusion.smoother.elimination import Solution, solve
+from mapfusion.smoother.elimination import Solution, solve, solve_points
 from mapfusion.smoother.normal_equations import (
     Estimate,
     NormalEquations,
@@ -17,11 +17,12 @@ from mapfusion.smoother.residuals import squared_distances
 from mapfusion.smoother.robust import NO_TAILS, Tails, informative, reweighted, unweighted
 from mapfusion.smoother.sightings import Sightings
 
-# The next step would move the poses by no more than this, in squared sigmas a coordinate: the third
-# of a hundredth of a sigma. A step costs as the cube of the log, and there is little left to win:
+# The last step moves the poses by no more than this, in squared sigmas a coordinate: the third of a
+# hundredth of a sigma. A step costs as the cube of the log, and there is little left to win:
 # single landmarks, whose tracks contradict each other, may go on changing their minds for long.
-_CONVERGED = 1e-5
-_MOST_STEPS = 50
+CONVERGED = 1e-5
+MOST_STEPS = 50
+_FOLLOWING = 2  # times that weights and points follow each other after a step
 _MOST_HALVINGS = 12
 
 
@@ -48,17 +49,18 @@ class Problem(NamedTuple):
         return float(walked + seen + self.stray_information * offsets)
 
 
-class Reached(NamedTuple):
-    """Where steps ended, how many they were, and the weights and tails there."""
-
-    estimate: Estimate
-    weights: Weights
-    tails: Tails
-    n_steps: int
-
-
 class Settled(NamedTuple):
-    """The same of observations, with the equations of the covariances there and their solution."""
+    """Where steps ended, how many they were, and what is known there.
+
+    Attributes:
+        seen: the observations.
+        estimate: where steps ended.
+        weights: of observations and offsets.
+        tails: of their Student-t's.
+        n_steps: that were taken.
+        equations: of the next step, whose matrix is the inverse of the covariance.
+        solution: theirs.
+    """
 
     seen: Sightings
     estimate: Estimate
@@ -68,55 +70,84 @@ class Settled(NamedTuple):
     equations: NormalEquations
     solution: Solution
 
+    def is_within(self, least_move: float) -> bool:
+        """Whether the next step would move the poses by less, in squared sigmas a coordinate."""
+        return self.solution.moved < least_move * self.estimate.path.size
+
 
 def settled(
     problem: Problem,
     at: Estimate,
-    least_move: float = _CONVERGED,
+    least_move: float = CONVERGED,
     weights: Weights | None = None,
     tails: Tails = NO_TAILS,
 ) -> Settled:
-    """Where steps end, as `reached`, and what is known of it."""
-    seen, odometry, information, stray_information = problem
-    end = reached(problem, at, least_move, weights, tails)
-    known = informative(seen, end.weights, end.tails)
-    equations = normal_equations(
-        seen, end.estimate, known, stray_information, odometry, information
-    )
-    return Settled(seen, *end, equations, solve(seen, equations))
-
-
-def reached(
-    problem: Problem,
-    at: Estimate,
-    least_move: float = _CONVERGED,
-    weights: Weights | None = None,
-    tails: Tails = NO_TAILS,
-) -> Reached:
-    """Take steps from an estimate until the next would move the poses by less than `least_move`.
+    """Take steps from an estimate until one moves the poses by less than `least_move`.
 
     It is in squared sigmas a coordinate. Weights and tails to begin with are those of an earlier
     round; all ones by default.
     """
+    weights = unweighted(problem.seen) if weights is None else weights
+    end = solved(problem, at, weights, tails)
+    while end.n_steps < MOST_STEPS and not end.is_within(least_move):
+        end = solved(problem, *stepped(problem, end), end.n_steps + 1)
+    return end
+
+
+def finished(problem: Problem, end: Settled) -> Settled:
+    """With the last step taken, which is known and small; weights stay as they are."""
+    return end._replace(estimate=_further(problem, end), n_steps=end.n_steps + 1)
+
+
+def solved(
+    problem: Problem, at: Estimate, weights: Weights, tails: Tails, n_steps: int = 0
+) -> Settled:
+    """The next step from an estimate, and what is known there.
+
+    The step is that of Fisher's scoring: the slope of the weighted squares over the information
+    that is there in truth, which is less than theirs (`information_share`). So the covariance is of
+    the same equations, and steps go as far as weights that follow them will.
+    """
     seen, odometry, information, stray_information = problem
-    weights, n_steps = unweighted(seen) if weights is None else weights, 0
-    while True:
-        equations = normal_equations(seen, at, weights, stray_information, odometry, information)
-        solution = solve(seen, equations)
-        if n_steps == _MOST_STEPS or solution.moved < least_move * at.path.size:
-            return Reached(at, weights, tails, n_steps)
-        at = _stepped(problem, weights, at, solution.step)
-        weights, tails = reweighted(seen, at, weights, solution, stray_information)
-        n_steps += 1
+    shares = informative(tails, seen.n_dimensions)
+    given = weights, stray_information, odometry, information, shares
+    equations = normal_equations(seen, at, *given)
+    return Settled(seen, at, weights, tails, n_steps, equations, solve(seen, equations))
 
 
-def _stepped(problem: Problem, weights: Weights, at: Estimate, step: Estimate) -> Estimate:
+def stepped(
+    problem: Problem, end: Settled, seen: Sightings | None = None
+) -> tuple[Estimate, Weights, Tails]:
+    """After the next step, and weights that follow it; of the observations `seen` from then on."""
+    after = problem if seen is None else problem._replace(seen=seen)
+    return followed(after, _further(problem, end), end.weights, end.tails)
+
+
+def followed(
+    problem: Problem, at: Estimate, weights: Weights | None = None, tails: Tails = NO_TAILS
+) -> tuple[Estimate, Weights, Tails]:
+    """Weights and the points that they hold follow each other some way on a path.
+
+    A point whose observations contradict each other is slow to make up its mind, and it costs
+    little to let it while the path waits. All weights are ones by default.
+    """
+    seen, _, _, stray_information = problem
+    weights = unweighted(seen) if weights is None else weights
+    for _ in range(_FOLLOWING):
+        step, known = solve_points(seen, at, weights, stray_information)
+        at = Estimate(at.path, at.point_m + step.point_m, at.offset_m + step.offset_m)
+        weights, tails = reweighted(seen, at, weights, tails, known, stray_information)
+    return at, weights, tails
+
+
+def _further(problem: Problem, end: Settled) -> Estimate:
     """The step, or as much of it as lowers the cost: half, a quarter, ...
 
     It is the cost under the weights that the step is of (a generalised M step: Dempster, Laird and
     Rubin 1977). The likelihood of the Student-t's about the *fitted* points has its least
     elsewhere: it would stop steps that weights from expected squares still ask for.
     """
+    at, weights, step = end.estimate, end.weights, end.solution.step
     before, share = problem.cost(at, weights), 1.0
     for _ in range(_MOST_HALVINGS):
         further = Estimate(*(old + share * new for old, new in zip(at, step, strict=True)))

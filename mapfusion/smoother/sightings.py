@@ -12,6 +12,39 @@ from mapfusion.smoother.skyline import envelope_order, first_entries
 
 
 @dataclass(frozen=True)
+class PoseOrder:
+    """In what order the poses of T frames are solved for, by the landmarks that they saw.
+
+    Attributes:
+        landmark: (N,) of each observation.
+        frame: (N,) that each was made in.
+        n_poses: T.
+    """
+
+    landmark: np.ndarray
+    frame: np.ndarray
+    n_poses: int
+
+    @cached_property
+    def place(self) -> np.ndarray:
+        """(T,) of each pose; the first, which is known, comes first."""
+        place, later = np.zeros(self.n_poses, dtype=np.int64), self.frame > 0
+        unknown = self.frame[later] - 1
+        place[1:] = 1 + envelope_order(self.landmark[later], unknown, self.n_poses - 1)
+        return place
+
+    @cached_property
+    def first_entry(self) -> np.ndarray:
+        """(3 (T - 1),) column of each row's first entry, of what poses have to do with each other.
+
+        Rows and columns are the unknown poses' coordinates by their places.
+        """
+        later = self.frame > 0
+        chosen = (self.landmark[later], self.frame[later] - 1, self.place[1:] - 1)
+        return np.repeat(3 * first_entries(*chosen), 3)
+
+
+@dataclass(frozen=True)
 class Sightings:
     """N observations of L landmarks from T poses, ordered by landmark, track and frame.
 
@@ -28,7 +61,7 @@ class Sightings:
         information: (N, 3, 3) inverse of the stated covariances, in 1/m^2; zero in z if planar.
         row: (N,) row in the log.
         n_dimensions: 3, or 2 if planar.
-        n_poses: T.
+        order: of the poses; it is the same whatever the information is.
     """
 
     starts: np.ndarray
@@ -39,7 +72,7 @@ class Sightings:
     information: Float
     row: np.ndarray
     n_dimensions: int
-    n_poses: int
+    order: PoseOrder
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -49,23 +82,20 @@ class Sightings:
         """L."""
         return len(self.starts) - 1
 
-    @cached_property
+    @property
     def pose_place(self) -> np.ndarray:
         """(T,) order in which poses are solved for; the first, which is known, comes first."""
-        place, later = np.zeros(self.n_poses, dtype=np.int64), self.frame > 0
-        unknown = self.frame[later] - 1
-        place[1:] = 1 + envelope_order(self.landmark[later], unknown, self.n_poses - 1)
-        return place
+        return self.order.place
 
     @cached_property
-    def first_entry(self) -> np.ndarray:
-        """(3 (T - 1),) column of each row's first entry, of what poses have to do with each other.
+    def first_track(self) -> np.ndarray:
+        """(L + 1,) track of each landmark's first observation."""
+        return np.searchsorted(self.track_starts, self.starts)
 
-        Rows and columns are the unknown poses' coordinates by their places.
-        """
-        later = self.frame > 0
-        chosen = (self.landmark[later], self.frame[later] - 1, self.pose_place[1:] - 1)
-        return np.repeat(3 * first_entries(*chosen), 3)
+    @property
+    def by_landmark(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What kernels take: by landmark its first row and its first track, by track its rows."""
+        return self.starts, self.first_track, self.track_starts
 
     @property
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, Float, Float]:
@@ -85,17 +115,17 @@ class Sightings:
         share = np.where(self.strays[self.track], 1 / level, 1.0)
         return replace(self, information=self.information * share[:, None, None])
 
-    @property
+    @cached_property
     def landmark(self) -> np.ndarray:
         """(N,) the landmark of each observation: 0, 1, ..."""
         return np.repeat(np.arange(self.n_landmarks), np.diff(self.starts))
 
-    @property
+    @cached_property
     def track(self) -> np.ndarray:
         """(N,) the track of each observation: 0, 1, ..."""
         return np.repeat(np.arange(len(self.strays)), np.diff(self.track_starts))
 
-    @property
+    @cached_property
     def landmark_of_track(self) -> np.ndarray:
         """(B,)."""
         return self.landmark[self.track_starts[:-1]]
@@ -110,7 +140,7 @@ class Sightings:
 
     def sum_tracks(self, values: Float) -> Float:
         """(L, ...) sums of values (B, ...) over the tracks of each landmark."""
-        return _sums(values, np.searchsorted(self.track_starts, self.starts))
+        return _sums(values, self.first_track)
 
 
 def _sums(values: Float, starts: np.ndarray) -> Float:
@@ -151,4 +181,5 @@ def sightings_of(log: RobotLog, landmark: np.ndarray, min_count: int, *, stray: 
     if log.planar:
         position[:, 2] = 0.0
     frame = log.iteration[row].astype(np.int64)
-    return Sightings(starts, track_starts, strays, frame, position, information, row, n, len(log))
+    order = PoseOrder(np.repeat(np.arange(len(starts) - 1), np.diff(starts)), frame, len(log))
+    return Sightings(starts, track_starts, strays, frame, position, information, row, n, order)

@@ -1,7 +1,8 @@
 """Cholesky factor of a matrix that is mostly zero, its rows ordered so that it stays so.
 
 Poses that saw no landmark in common have a zero between them. In the order of reverse Cuthill and
-McKee (1969) what is not zero lies near the diagonal, and a factor has no more than zeros before the
+McKee (1969), or in that of time while nothing was seen again, what is not zero lies near the
+diagonal, and a factor has no more than zeros before the
 first entry of each row (the envelope: George and Liu 1981, "Computer Solution of Large Sparse
 Positive Definite Systems", ch. 4). Matrices stay dense, the work is done by blocks.
 
@@ -11,15 +12,19 @@ With a matrix functions take `first` (n,), the column of each row's first entry,
 import mmap
 
 import numpy as np
-import scipy.linalg
+from scipy.linalg import get_lapack_funcs
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from mapfusion.se2 import Float
 
-# Rows and columns that are taken at once: enough for LAPACK to be at its speed, few enough to
-# follow the envelope.
-_BLOCK = 96
+# Rows and columns that are taken at once: enough for products of matrices to be at their speed, few
+# enough to follow the envelope.
+_BLOCK = 48
+# Bytes of a matrix whose memory the C library keeps for the next one, all of whose pages are there.
+_ALL_AT_ONCE = 2**25
+# LAPACK's own, without what SciPy looks at first: blocks are many and small.
+_cholesky, _inverted = get_lapack_funcs(("potrf", "trtri"), dtype=np.float64)
 
 
 def envelope_order(group: np.ndarray, member: np.ndarray, n_members: int) -> np.ndarray:
@@ -34,23 +39,32 @@ def envelope_order(group: np.ndarray, member: np.ndarray, n_members: int) -> np.
         return np.arange(n_members)
     chain = np.arange(n_members - 1)
     n_groups = int(group.max(initial=-1)) + 1
-    group = np.concatenate([group, n_groups + chain, n_groups + chain])
-    member = np.concatenate([member, chain, chain + 1])
+    groups = np.concatenate([group, n_groups + chain, n_groups + chain])
+    members = np.concatenate([member, chain, chain + 1])
     shape = (n_members, n_groups + len(chain))
-    has = csr_matrix((np.ones(len(group), np.float32), (member, group)), shape=shape)
+    has = csr_matrix((np.ones(len(groups), np.float32), (members, groups)), shape=shape)
     order = reverse_cuthill_mckee((has @ has.T).tocsr(), symmetric_mode=True)
     place = np.empty(n_members, dtype=np.int64)
     place[order] = np.arange(n_members)
-    return place
+    orders = place, np.arange(n_members)
+    return min(orders, key=lambda each: _work(first_entries(group, member, each)))
+
+
+def _work(first: np.ndarray) -> int:
+    """What a factor costs: the squares of its rows' lengths."""
+    return int(np.sum((np.arange(len(first)) - first) ** 2))
 
 
 def untouched_zeros(n: int) -> Float:
-    """(n, n) zeros, of which memory holds the pages alone that something is written to.
+    """(n, n) zeros; of a large matrix memory holds the pages alone that something is written to.
 
-    Those of `numpy.zeros` come in huge pages: of a matrix with few entries in each row, all of it.
+    Those of `numpy.zeros` come in huge pages, or are written to once more: of a matrix with few
+    entries in each row, all of it. That is faster where there is room for it.
     """
-    room = mmap.mmap(-1, n * n * np.dtype(np.float64).itemsize)
-    return np.frombuffer(room, np.float64).reshape(n, n)
+    size = n * n * np.dtype(np.float64).itemsize
+    if size <= _ALL_AT_ONCE:
+        return np.zeros((n, n))
+    return np.frombuffer(mmap.mmap(-1, size), np.float64).reshape(n, n)
 
 
 def first_entries(group: np.ndarray, member: np.ndarray, place: np.ndarray) -> np.ndarray:
@@ -91,12 +105,16 @@ def cholesky_in_envelope(A: Float, first: np.ndarray) -> Float:
             if starts[i] > j:
                 continue
             done = slice(max(starts[i], starts[j]) * _BLOCK, columns.start)
-            A[rows, columns] -= A[rows, done] @ A[columns, done].T
-            own = A[columns, columns]
+            left = A[rows, columns]
+            if done.start < done.stop:
+                left = left - A[rows, done] @ A[columns, done].T
             if i == j:
-                own[:] = scipy.linalg.cholesky(own, lower=True, check_finite=False)
+                A[rows, columns], failed = _cholesky(left, lower=1)
+                if failed:
+                    raise np.linalg.LinAlgError("the matrix is not positive definite")
+                inverse = _inverse(A[rows, columns])
             else:
-                A[rows, columns] = _solved(own, A[rows, columns].T).T
+                A[rows, columns] = left @ inverse.T
     return A
 
 
@@ -105,7 +123,7 @@ def solve_in_envelope(L: Float, first: np.ndarray, right: Float) -> Float:
     x = right.copy()
     for rows, start in zip(*_envelope(first), strict=True):
         done = slice(start * _BLOCK, rows.start)
-        x[rows] = _solved(L[rows, rows], x[rows] - L[rows, done] @ x[done])
+        x[rows] = _inverse(L[rows, rows]) @ (x[rows] - L[rows, done] @ x[done])
     return x
 
 
@@ -113,10 +131,55 @@ def solve_transposed_in_envelope(L: Float, first: np.ndarray, right: Float) -> F
     """L'^-1 right (n,) or (n, m) of a lower factor (n, n)."""
     x = right.copy()
     for rows, start in reversed(list(zip(*_envelope(first), strict=True))):
-        x[rows] = _solved(L[rows, rows], x[rows], transposed=True)
+        x[rows] = _inverse(L[rows, rows]).T @ x[rows]
         before = slice(start * _BLOCK, rows.start)
         x[before] -= L[rows, before].T @ x[rows]
     return x
+
+
+def multiply_in_envelope(A: Float, first: np.ndarray, right: Float) -> Float:
+    """A right (n, m) of a symmetric A (n, n), of which the lower half is read."""
+    product = np.zeros_like(right)
+    for rows, start in zip(*_envelope(first), strict=True):
+        before = slice(start * _BLOCK, rows.start)
+        product[rows] += A[rows, before] @ right[before]
+        product[before] += A[rows, before].T @ right[rows]
+        lower = np.tril(A[rows, rows])
+        product[rows] += (lower + np.tril(lower, -1).T) @ right[rows]
+    return product
+
+
+def inverse_in_envelope(L: Float, first: np.ndarray) -> Float:
+    """(n, n) the inverse of L L' where the factor L (n, n) has its envelope, or its mirror image.
+
+    From the last block of columns on (Takahashi et al. 1973); elsewhere it is anything.
+    """
+    blocks, starts = _envelope(first)
+    Z = untouched_zeros(len(L))
+    for j, columns in reversed(list(enumerate(blocks))):
+        inverse = _inverse(L[columns, columns])
+        own, runs = inverse.T @ inverse, _runs(blocks, starts, j)
+        follows = [L[rows, columns] @ inverse for rows in runs]
+        for rows, its in zip(runs, follows, strict=True):
+            with_it = [Z[rows, other] @ that for other, that in zip(runs, follows, strict=True)]
+            Z[rows, columns] = -sum(with_it)
+            Z[columns, rows] = Z[rows, columns].T
+            own -= its.T @ Z[rows, columns]
+        Z[columns, columns] = own
+    return Z
+
+
+def _runs(blocks: list[slice], starts: list[int], j: int) -> list[slice]:
+    """The rows below block j of columns that reach it; those of neighbouring blocks are one."""
+    runs = list[slice]()
+    for rows, start in zip(blocks[j + 1 :], starts[j + 1 :], strict=True):
+        if start > j:
+            continue
+        if runs and runs[-1].stop == rows.start:
+            runs[-1] = slice(runs[-1].start, rows.stop)
+        else:
+            runs.append(rows)
+    return runs
 
 
 def _envelope(first: np.ndarray) -> tuple[list[slice], list[int]]:
@@ -129,6 +192,6 @@ def _blocks(n: int) -> list[slice]:
     return [slice(begin, min(begin + _BLOCK, n)) for begin in range(0, n, _BLOCK)]
 
 
-def _solved(L: Float, right: Float, transposed: bool = False) -> Float:
-    trans = int(transposed)
-    return scipy.linalg.solve_triangular(L, right, trans, lower=True, check_finite=False)
+def _inverse(L: Float) -> Float:
+    """Of a lower block: many products with it are faster than as many times solving."""
+    return _inverted(L, lower=1)[0]

@@ -7,10 +7,11 @@ import numpy as np
 
 from mapfusion.arguments import Range, require_in_range, require_shape
 from mapfusion.fastslam.motion import MotionNoise
+from mapfusion.joint_covariance import SharedErrors
 from mapfusion.one_thread import one_blas_thread
 from mapfusion.robot_log import RobotLog
 from mapfusion.se2 import Float, between
-from mapfusion.smoother.elimination import common_part
+from mapfusion.smoother.elimination import shared_errors
 from mapfusion.smoother.levels import AS_STATED, Levels, settled_with_levels
 from mapfusion.smoother.normal_equations import (
     Estimate,
@@ -21,14 +22,14 @@ from mapfusion.smoother.normal_equations import (
 from mapfusion.smoother.one_corner import parted
 from mapfusion.smoother.residuals import first_points
 from mapfusion.smoother.robust import Tails
-from mapfusion.smoother.settle import Problem, Reached, Settled, reached, settled
+from mapfusion.smoother.settle import Problem, Settled, finished, followed, settled
 from mapfusion.smoother.sightings import Sightings, sightings_of
 from mapfusion.stray import STRAY_M
 
 # Factor on the observations' standard deviations in a first round (graduated non-convexity): where
 # the path to start from is far off, most observations look gross and lose the weight to mend it.
 # It need not end closer than this, in squared sigmas a coordinate, to where the next one goes on.
-_THOUGHT_WORSE, _CLOSE = 4.0, 1e-2
+_THOUGHT_WORSE, _CLOSE = 4.0, 3e-2
 # Of a motion that nothing but observations tells: what a robot does between frames is less.
 _UNTOLD_M, _UNTOLD_RAD = 10.0, 1.0
 _LEAST_SEEN = 3  # observations that fix a pose, with one to spare
@@ -87,8 +88,7 @@ class Smoothed:
             tells it.
         n_steps: Gauss-Newton steps that were taken.
         own_m2: (L, 3, 3), see `common`.
-        common: (R, 3L) the landmarks' joint covariance is block diagonal of `own_m2` plus
-            common' common.
+        common: Y (R, 3L): the landmarks' joint covariance is block diagonal of `own_m2` plus Y' Y.
     """
 
     landmark: np.ndarray
@@ -99,21 +99,22 @@ class Smoothed:
     observation_level: float
     n_steps: int
     own_m2: Float
-    common: Float
+    common: SharedErrors
 
     @classmethod
     def of(
         cls, end: Settled, landmark: np.ndarray, levels: Levels = AS_STATED, steps_before: int = 0
     ) -> "Smoothed":
         """Where steps ended under some levels, after some of earlier rounds."""
-        common = common_part(end.seen, end.equations, end.solution)
+        common = shared_errors(end.seen, end.equations, end.solution)
         found = (end.estimate, end.seen, end.weights, end.tails, levels.observation)
         n_steps, own_m2 = steps_before + end.n_steps, end.solution.own_m2
         return cls(landmark, *found, n_steps, own_m2, common)
 
     def joint_covariance(self) -> Float:
         """(3L, 3L), dense: for small maps."""
-        joint, n = self.common.T @ self.common, len(self.own_m2)
+        common, n = self.common.spread(np.eye(len(self.common))), len(self.own_m2)
+        joint = common @ common.T
         each = np.arange(n)
         joint.reshape(n, 3, n, 3)[each, :, each, :] += self.own_m2
         return joint
@@ -138,32 +139,30 @@ def smooth(
     """
     require_shape("path", path, (len(log), 3))
     information, path = parameters.odometry_information(log), between(path[0], path)
-    about = log, parameters, information
-    known, first = _first_round(*about, landmark, path)
-    path, n_steps = first.estimate.path, first.n_steps
+    known = _problem(log, landmark, parameters, information)
+    worse = replace(known.seen, information=known.seen.information / _THOUGHT_WORSE**2)
+    blurred = known._replace(seen=worse)
+    first = finished(blurred, settled(blurred, _start(known, path), _CLOSE))
+    start, path = (first.estimate, first.weights, first.tails), first.estimate.path
     parts = parted(known.seen, landmark, path, parameters.stray_m)
     if not np.array_equal(parts, landmark):
-        known, first = _first_round(*about, parts, path)
-        n_steps += first.n_steps
+        known = _problem(log, parts, parameters, information)
+        start = followed(known, _start(known, path))
     if parameters.odometry_covariance is None:
-        start = first.estimate, first.weights, first.tails
         end, levels = settled_with_levels(known, *start)
     else:  # odometry that pictures told is used where these say nothing: they tell no level
-        end = settled(known, first.estimate, weights=first.weights, tails=first.tails)
-        levels = AS_STATED
-    return Smoothed.of(end, parts, levels, n_steps)
+        at, weights, tails = start
+        end, levels = settled(known, at, weights=weights, tails=tails), AS_STATED
+    return Smoothed.of(end, parts, levels, first.n_steps)
 
 
-def _first_round(
-    log: RobotLog,
-    parameters: SmootherParameters,
-    information: Float,
-    landmark: np.ndarray,
-    path: Float,
-) -> tuple[Problem, Reached]:
-    """What is to be solved, and where steps end that think the observations worse."""
+def _problem(
+    log: RobotLog, landmark: np.ndarray, parameters: SmootherParameters, information: Float
+) -> Problem:
     seen = sightings_of(log, landmark, parameters.min_count, stray=parameters.stray_m > 0)
-    at = Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
-    known = Problem(seen, log.odometry, information, parameters.stray_information)
-    blurred = replace(seen, information=seen.information / _THOUGHT_WORSE**2)
-    return known, reached(known._replace(seen=blurred), at, _CLOSE)
+    return Problem(seen, log.odometry, information, parameters.stray_information)
+
+
+def _start(problem: Problem, path: Float) -> Estimate:
+    seen = problem.seen
+    return Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))

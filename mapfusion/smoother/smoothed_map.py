@@ -6,7 +6,7 @@ import numpy as np
 
 from mapfusion.attitude import Attitude
 from mapfusion.attitude_drift import shared_heights
-from mapfusion.joint_covariance import RANK, JointCovariance, condensed
+from mapfusion.joint_covariance import RANK, JointCovariance, KnownErrors, condensed
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import RobotLog
 from mapfusion.se2 import Float
@@ -57,4 +57,6 @@ def _with_attitude(smoothed: Smoothed, attitude: Attitude) -> Smoothed:
     lifted = shared_heights(attitude, estimate.path, seen.frame, seen.landmark, estimate.point_m)
     moved = np.zeros((*lifted.shape, 3))
     moved[..., 2] = lifted
-    return replace(smoothed, common=np.vstack([smoothed.common, moved.reshape(len(moved), -1)]))
+    by_path = smoothed.common.spread(np.eye(len(smoothed.common))).T
+    both = np.vstack([by_path, moved.reshape(len(moved), -1)])
+    return replace(smoothed, common=KnownErrors(both))

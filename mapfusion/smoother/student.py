@@ -7,14 +7,19 @@ are one. Lange, Little, Taylor (1989), "Robust statistical modeling using the t 
 """
 
 import numpy as np
-from scipy.optimize import fminbound
-from scipy.special import fdtri, gammaln
+from scipy.optimize import root_scalar
+from scipy.special import fdtri, gammaln, psi
 
 from mapfusion.se2 import Float
 
 # Tails heavier than the first give (a Cauchy's are at 1) are no sensor's; above the second nobody
 # can tell it from a Gaussian.
 LEAST_DOF, MOST_DOF = 0.5, 1e4
+# Degrees of freedom are found to this share of themselves: far closer than any number of errors
+# tells them.
+_FOUND_TO = 1e-6
+# What they change by from step to step is less than this share, but for the first few.
+_NEAR = 0.1
 
 
 def student_weights(squares: Float, dof: float, n_dimensions: Float | int) -> Float:
@@ -52,11 +57,34 @@ def student_bound(probability: float, dof: float, n_dimensions: int) -> float:
     return n_dimensions * float(fdtri(n_dimensions, dof, probability))
 
 
-def fitted_dof(squares: Float, n_dimensions: Float | int) -> float:
-    """The degrees of freedom under which these squared distances (N,) are most likely."""
-    log_dof = fminbound(
-        lambda log_dof: student_deviance(squares, float(np.exp(log_dof)), n_dimensions),
-        np.log(LEAST_DOF),
-        np.log(MOST_DOF),
-    )
-    return float(np.exp(log_dof))
+def student_slope(squares: Float, dof: float, n_dimensions: Float | int) -> float:
+    """How `student_deviance` changes with the logarithm of the degrees of freedom."""
+    n, dims = len(squares), np.asarray(n_dimensions, dtype=np.float64)
+    each = dof * np.log1p(squares / dof) - (dof + dims) * squares / (dof + squares)
+    of_normal = dof * (psi((dof + dims) / 2) - psi(dof / 2)) - dims
+    share = 1 if of_normal.ndim else n  # the same for all where all have the same dimensions
+    return float(np.sum(each) - share * np.sum(of_normal))
+
+
+def fitted_dof(squares: Float, n_dimensions: Float | int, near: float = MOST_DOF) -> float:
+    """The degrees of freedom under which these squared distances (N,) are most likely.
+
+    Args:
+        squares: theirs.
+        n_dimensions: one for all, or (N,).
+        near: where they are looked for first.
+    """
+
+    def slope(log_dof: float) -> float:
+        return student_slope(squares, float(np.exp(log_dof)), n_dimensions)
+
+    low, high = float(np.log(LEAST_DOF)), float(np.log(MOST_DOF))
+    before, after = np.log(near) - _NEAR, np.log(near) + _NEAR
+    if not (low < before and after < high and slope(before) < 0 < slope(after)):
+        if slope(high) <= 0:
+            return MOST_DOF
+        if slope(low) >= 0:
+            return LEAST_DOF
+        before, after = low, high
+    found = root_scalar(slope, bracket=(before, after), method="brentq", xtol=_FOUND_TO)
+    return float(np.exp(found.root))

@@ -9,12 +9,22 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from mapfusion.joint_covariance import KnownErrors, condensed
 from mapfusion.robot_log import RobotLog
 from mapfusion.se2 import Float, between, rotation, wrap
-from mapfusion.smoother.elimination import Solution, _landmarks_first, _poses_first, common_part
+from mapfusion.smoother.blocks import put_inverse
+from mapfusion.smoother.elimination import (
+    Solution,
+    _landmarks_first,
+    _poses_first,
+    common_part,
+    shared_errors,
+    solve_points,
+)
 from mapfusion.smoother.normal_equations import (
     Estimate,
     NormalEquations,
+    Shares,
     Weights,
     normal_equations,
     odometry_information,
@@ -144,3 +154,91 @@ def dense_covariance(common: Float, own_m2: Float, d: int) -> Float:
     joint.reshape(len(own_m2), 3, len(own_m2), 3)[each, :, each, :] += own_m2
     kept = (3 * each[:, None] + np.arange(d)).ravel()
     return joint[np.ix_(kept, kept)]
+
+
+@pytest.mark.parametrize("planar", [False, True])
+@pytest.mark.parametrize("tracks", [False, True])
+def test_errors_of_the_path_are_those_of_their_large_matrix(planar: bool, tracks: bool) -> None:
+    """What is asked of Y without it, against Y as landmarks' covariances say that it is."""
+    log, seen, weights, _, _ = solved_densely(planar, tracks)
+    information = odometry_information(log.odometry, NOISE)
+    path = dead_reckoned(log)
+    at = Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
+    equations = normal_equations(seen, at, weights, STRAY_M**-2, log.odometry, information)
+    solution = _landmarks_first(seen, equations)
+    errors = shared_errors(seen, equations, solution)
+    Y = common_part(seen, equations, solution)
+    n = 3 * (len(log) - 1)
+    assert len(errors) == len(Y) == n
+    gram = Y @ Y.T
+    columns = np.random.default_rng(0).standard_normal((n, 4))
+    scale = np.abs(gram).max()
+    np.testing.assert_allclose(errors.gram(columns), gram @ columns, atol=1e-9 * scale)
+    rows = np.array([2, 0, n - 1])
+    np.testing.assert_allclose(errors.rows_by_all(rows), gram[:, rows], atol=1e-9 * scale)
+    squares = KnownErrors(Y).squares()
+    np.testing.assert_allclose(errors.squares(), squares, rtol=0, atol=1e-9 * squares.max())
+    by_both = [condensed(solution.own_m2, known, rank=6) for known in (errors, KnownErrors(Y))]
+    for one, other in zip(*((each.own_m2, each.marginal_m2) for each in by_both), strict=True):
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-6 * squares.max())
+
+
+@pytest.mark.parametrize("planar", [False, True])
+def test_points_on_a_path_that_stays_equal_the_dense_twin(planar: bool) -> None:
+    log, seen, weights, _, _ = solved_densely(planar, tracks=True)
+    path, d = dead_reckoned(log), seen.n_dimensions
+    at = Estimate(path, first_points(seen, path), np.full((len(seen.strays), 3), 0.01))
+    at.offset_m[~seen.strays] = at.offset_m[:, d:] = 0.0
+    step, known = solve_points(seen, at, weights, STRAY_M**-2)
+    n, x = 3 * (len(log) - 1), dense_unknowns(seen, at)
+
+    def residuals(points: Float) -> Float:
+        return dense_residuals(log, seen, weights, np.concatenate([x[:n], points]))
+
+    twin = least_squares(residuals, x[n:], xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    moved = Estimate(path, at.point_m + step.point_m, at.offset_m + step.offset_m)
+    np.testing.assert_allclose(dense_unknowns(seen, moved)[n:], twin.x, atol=1e-8)
+    assert not step.path.any()
+    covariance = np.linalg.inv(twin.jac.T @ twin.jac)
+    n_points, strays = d * seen.n_landmarks, np.flatnonzero(seen.strays)
+    for k, track in enumerate(strays):
+        own = d * seen.landmark_of_track[track] + np.arange(d)
+        its = n_points + d * k + np.arange(d)
+        of_offset = covariance[np.ix_(its, its)]
+        both = covariance[np.ix_(own, own)] + of_offset
+        both = both + covariance[np.ix_(own, its)] + covariance[np.ix_(its, own)]
+        for found, dense in ((known.offset_m2, of_offset), (known.track_m2, both)):
+            np.testing.assert_allclose(found[track, :d, :d], dense, rtol=1e-4, atol=1e-9)
+
+
+def test_shares_are_of_the_matrix_alone() -> None:
+    """As if all weights were less, but for the gradient."""
+    log, seen, weights, _, _ = solved_densely(planar=False, tracks=True)
+    path, information = dead_reckoned(log), odometry_information(log.odometry, NOISE)
+    at = Estimate(path, first_points(seen, path), np.full((len(seen.strays), 3), 0.01))
+    given = STRAY_M**-2, log.odometry, information
+    less = Weights(0.8 * weights.observation, 0.6 * weights.offset)
+    shared = normal_equations(seen, at, weights, *given, Shares(0.8, 0.6))
+    whole = normal_equations(seen, at, weights, *given)
+    scaled = normal_equations(seen, at, less, *given)
+    for name in ("pose_block", "link", "coupling"):
+        np.testing.assert_allclose(getattr(shared, name), getattr(scaled, name), rtol=1e-12)
+    for name in ("track_block", "offset_information"):
+        found, expected = getattr(shared.points, name), getattr(scaled.points, name)
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
+    scale = np.abs(whole.pose_gradient).max()
+    np.testing.assert_allclose(shared.pose_gradient, whole.pose_gradient, atol=1e-12 * scale)
+    for name in ("track_gradient", "offset_gradient"):
+        found, expected = getattr(shared.points, name), getattr(whole.points, name)
+        np.testing.assert_allclose(found, expected, atol=1e-12 * np.abs(expected).max())
+
+
+def test_blocks_are_inverted() -> None:
+    rng, inverse = np.random.default_rng(0), np.empty((3, 3))
+    for _ in range(20):
+        root = rng.standard_normal((3, 3)) * 10.0 ** rng.uniform(-1, 1, 3)
+        assert put_inverse(root @ root.T, inverse)
+        expected = np.linalg.inv(root @ root.T)
+        np.testing.assert_allclose(inverse, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
+    for singular in (np.diag([1.0, 0.0, 1.0]), np.diag([1.0, 1.0, -1.0]), np.full((3, 3), np.nan)):
+        assert not put_inverse(singular, inverse)

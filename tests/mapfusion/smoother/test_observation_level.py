@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 
 from mapfusion.robot_log import RobotLog
-from mapfusion.smoother.levels import settled_with_levels
+from mapfusion.se2 import Float
+from mapfusion.smoother import levels
+from mapfusion.smoother.elimination import pose_covariances
+from mapfusion.smoother.levels import Levels, settled_with_levels
 from mapfusion.smoother.normal_equations import Estimate, odometry_information
 from mapfusion.smoother.residuals import first_points
-from mapfusion.smoother.settle import Problem
+from mapfusion.smoother.settle import Problem, Settled
 from mapfusion.smoother.sightings import sightings_of
 from tests.mapfusion.smoother.white_noise_logs import (
     NOISE,
@@ -22,14 +25,18 @@ from tests.mapfusion.smoother.white_noise_logs import (
 STRAY_M = 0.05
 
 
-def level_of(log: RobotLog, stray_m: float = STRAY_M) -> float:
-    label, path = log.observations.label, dead_reckoned(log)
+def settled_from(log: RobotLog, path: Float, stray_m: float = STRAY_M) -> tuple[Settled, Levels]:
+    label = log.observations.label
     assert label is not None
     seen = sightings_of(log, label, 1, stray=True)
     information = odometry_information(log.odometry, NOISE)
     at = Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
     problem = Problem(seen, log.odometry, information, stray_m**-2)
-    return settled_with_levels(problem, at)[1].observation
+    return settled_with_levels(problem, at)
+
+
+def level_of(log: RobotLog, stray_m: float = STRAY_M) -> float:
+    return settled_from(log, dead_reckoned(log), stray_m)[1].observation
 
 
 def stated(log: RobotLog, factor: float) -> RobotLog:
@@ -81,3 +88,25 @@ def test_a_log_that_tells_nothing_stays_as_stated() -> None:
     alone = np.arange(len(log.observations), dtype=np.int32)
     seen = replace(log.observations, track=alone, label=alone)
     assert level_of(replace(log, observations=seen)) == 1.0
+
+
+def test_steps_end_where_more_of_them_would(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wherever they begin: levels to less than their errors, poses to a hundredth of theirs."""
+    log = stated(tracked_log(0), 4.0)
+    reckoned = dead_reckoned(log)
+    found, told = settled_from(log, reckoned)
+    for name, value in (("CONVERGED", 1e-12), ("_CLOSE", 1e-8), ("_SETTLED", 1e-6)):
+        monkeypatch.setattr(levels, name, value)
+    monkeypatch.setattr(levels, "_FOLLOWED", 1e-8)
+    end, at_end = settled_from(log, reckoned)
+    monkeypatch.undo()
+    again, told_again = settled_from(log, end.estimate.path)
+    frames = np.arange(1, len(log))
+    covariance = pose_covariances(end.seen, end.equations, end.solution, frames)
+    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    for each, its in ((found, told), (again, told_again)):
+        assert its.observation == pytest.approx(at_end.observation, rel=2e-3)
+        np.testing.assert_allclose(its.odometry, at_end.odometry, rtol=0.1)
+        off = (each.estimate.path - end.estimate.path)[1:] / sigma
+        assert np.sqrt(np.mean(off**2)) < 0.01
+        assert each.n_steps < end.n_steps

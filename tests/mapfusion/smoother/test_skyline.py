@@ -10,6 +10,8 @@ from mapfusion.smoother.skyline import (
     entries_seen,
     envelope_order,
     first_entries,
+    inverse_in_envelope,
+    multiply_in_envelope,
     solve_in_envelope,
     solve_transposed_in_envelope,
     untouched_zeros,
@@ -41,6 +43,21 @@ def test_factor_is_that_of_the_dense_matrix(n, n_groups):
         np.testing.assert_allclose(found.T @ back, some, atol=1e-12)
 
 
+@pytest.mark.parametrize("n", [1, 47, 48, 49, 300])
+@pytest.mark.parametrize("n_groups", [0, 40, 3000])
+def test_product_and_inverse_are_those_of_the_dense_matrix(n, n_groups):
+    A = matrix_of_groups(np.random.default_rng(n), n, n_groups if n > 2 else 0)
+    A[-1, 0] = A[0, -1] = 0.5 * A[0, -1] + 0.5 * (n > 2)  # far apart, rows between reach neither
+    first, right = entries_seen(np.tril(A)), np.random.default_rng(0).normal(size=(n, 5))
+    lower = np.tril(A) + np.triu(np.full_like(A, np.nan), 1)  # the lower half is read
+    np.testing.assert_allclose(multiply_in_envelope(lower, first, right), A @ right, atol=1e-12)
+    inverse, dense = inverse_in_envelope(np.linalg.cholesky(A), first), np.linalg.inv(A)
+    rows, columns = np.indices(A.shape)
+    within = (columns <= rows) & (columns >= first[rows])
+    np.testing.assert_allclose(inverse[within], dense[within], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(inverse.T[within], dense[within], rtol=0, atol=1e-12)
+
+
 def test_rows_that_are_zero_for_long_stay_so():
     A = 2 * np.eye(400)
     A[399, 250] = A[250, 399] = 1.0
@@ -62,7 +79,9 @@ def test_first_entries_are_those_of_what_has_to_do_with_each_other(n_groups):
     np.testing.assert_array_equal(first, np.argmax(ordered != 0, axis=1))
 
 
-def test_zeros_can_be_written_to():
+@pytest.mark.parametrize("all_at_once", [0, 2**20])
+def test_zeros_can_be_written_to(monkeypatch, all_at_once):
+    monkeypatch.setattr(skyline, "_ALL_AT_ONCE", all_at_once)
     zeros = untouched_zeros(100)
     assert zeros.shape == (100, 100)
     assert not zeros.any()
@@ -86,6 +105,16 @@ def test_order_brings_those_together_that_have_to_do_with_each_other():
     assert sorted(place) == pose.tolist()
     apart = np.abs(place[:, None] - place)[np.abs(pose[:, None] - pose) == n]
     assert apart.max() <= 6  # 100 in the order in which they were driven
+
+
+def test_where_rows_are_no_longer_so_the_order_of_time_stays():
+    """Each pose has to do with half of the others, and the last with the first: folded in the
+    middle, as neighbours of neighbours would have it, rows are twice as long."""
+    n, reach = 60, 30
+    first = np.arange(n - reach + 1)
+    member = np.concatenate([(first[:, None] + np.arange(reach)).ravel(), [0, n - 1]])
+    group = np.concatenate([np.repeat(first, reach), [len(first)] * 2])
+    np.testing.assert_array_equal(envelope_order(group, member, n), np.arange(n))
 
 
 @pytest.mark.parametrize("n_members", [0, 1, 2])

@@ -2,13 +2,17 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize_scalar
 
 from mapfusion.smoother.student import (
+    LEAST_DOF,
     MOST_DOF,
     fitted_dof,
     information_share,
     student_bound,
     student_cost,
+    student_deviance,
+    student_slope,
     student_weights,
 )
 
@@ -59,3 +63,40 @@ def test_estimates_are_as_far_off_as_the_information_says(dof: float) -> None:
         at = np.sum(weight * drawn, axis=1, keepdims=True) / np.sum(weight, axis=1, keepdims=True)
     information = information_share(dof, 2) * np.sum(weight, axis=1).mean()
     assert np.mean(at**2) * information == pytest.approx(1, abs=0.06)
+
+
+def drawn_squares(dof: float, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Squared distances, and in how many dimensions each is: a third of them in none."""
+    rng = np.random.default_rng(5)
+    dimensions = rng.uniform(0, 3, n) * (rng.uniform(size=n) > 1 / 3)
+    return rng.chisquare(dimensions + 1e-9) / (rng.chisquare(dof, n) / dof), dimensions
+
+
+@pytest.mark.parametrize("dof", [0.7, 6.0, 900.0])
+def test_slope_is_that_of_the_deviance(dof: float) -> None:
+    squares, dimensions = drawn_squares(4.0, 500)
+    for n in (3, dimensions):
+        about = [student_deviance(squares, dof * np.exp(h), n) for h in (-1e-4, 1e-4)]
+        slope = (about[1] - about[0]) / 2e-4
+        assert student_slope(squares, dof, n) == pytest.approx(slope, rel=1e-5, abs=1e-4)
+
+
+@pytest.mark.parametrize("dof", [0.1, 2.0, 8.0, 60.0, 1e9])
+def test_fitted_are_the_likeliest(dof: float) -> None:
+    """Against a search of the deviance itself, and wherever they are looked for first."""
+    squares, dimensions = drawn_squares(dof, 3000)
+    for n in (3, dimensions):
+        bounds = (np.log(LEAST_DOF), np.log(MOST_DOF))
+
+        def deviance(log_dof: float, n: int | np.ndarray = n) -> float:
+            return student_deviance(squares, float(np.exp(log_dof)), n)
+
+        twin = minimize_scalar(deviance, bounds=bounds, method="bounded", options={"xatol": 1e-7})
+        found = fitted_dof(squares, n)
+        assert found == pytest.approx(np.exp(twin.x), rel=1e-4)
+        for near in (found, 1.05 * found, 0.5, 7.0):
+            assert fitted_dof(squares, n, near) == pytest.approx(found, rel=1e-5)
+
+
+def test_nothing_tells_no_tails() -> None:
+    assert fitted_dof(np.empty(0), np.empty(0)) == MOST_DOF

@@ -1,0 +1,56 @@
+"""Blocks of three by three in kernels."""
+
+from numba import njit
+
+from mapfusion.se2 import Float
+
+
+@njit(cache=True)
+def put_product(A: Float, B: Float, product: Float) -> None:
+    """A B."""
+    for r in range(3):
+        for q in range(3):
+            product[r, q] = A[r, 0] * B[0, q] + A[r, 1] * B[1, q] + A[r, 2] * B[2, q]
+
+
+@njit(cache=True)
+def put_along(A: Float, x: Float, product: Float) -> None:
+    """A x."""
+    for r in range(3):
+        product[r] = A[r, 0] * x[0] + A[r, 1] * x[1] + A[r, 2] * x[2]
+
+
+@njit(cache=True)
+def add_along(A: Float, x: Float, total: Float) -> None:
+    """Add A x."""
+    for r in range(3):
+        total[r] += A[r, 0] * x[0] + A[r, 1] * x[1] + A[r, 2] * x[2]
+
+
+@njit(cache=True)
+def put_inverse(A: Float, inverse: Float) -> bool:
+    """Inverse of a symmetric positive definite A = L D L', of which the lower half is read.
+
+    Returns:
+        False when A is not positive definite.
+    """
+    d0 = A[0, 0]
+    if not d0 > 0:
+        return False
+    l10, l20 = A[1, 0] / d0, A[2, 0] / d0
+    d1 = A[1, 1] - l10 * A[1, 0]
+    if not d1 > 0:
+        return False
+    rest = A[2, 1] - l20 * A[1, 0]
+    l21 = rest / d1
+    d2 = A[2, 2] - l20 * A[2, 0] - l21 * rest
+    if not d2 > 0:
+        return False
+    m20 = l10 * l21 - l20  # of L^-1, whose other entries are -l10 and -l21
+    inverse[2, 2] = 1 / d2
+    inverse[1, 2] = inverse[2, 1] = -l21 / d2
+    inverse[0, 2] = inverse[2, 0] = m20 / d2
+    inverse[1, 1] = 1 / d1 + l21 * l21 / d2
+    inverse[0, 1] = inverse[1, 0] = -l10 / d1 - m20 * l21 / d2
+    inverse[0, 0] = 1 / d0 + l10 * l10 / d1 + m20 * m20 / d2
+    return True

@@ -1,0 +1,153 @@
+"""What the errors of the path do to all landmarks, without the large matrix that says so.
+
+With L the factor of the poses' information, C the poses' blocks with the landmarks and A the
+landmarks' covariances if the path were known, the landmarks' joint covariance is A beside Y' Y with
+Y = L^-1 C A. It has as many columns as there are coordinates of landmarks; C A has few entries.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numba import njit
+
+from mapfusion.se2 import Float
+from mapfusion.smoother.landmark_elimination import left_couplings, subtract_gram
+from mapfusion.smoother.normal_equations import NormalEquations
+from mapfusion.smoother.offsets import without_offsets
+from mapfusion.smoother.sightings import Sightings
+from mapfusion.smoother.skyline import (
+    inverse_in_envelope,
+    multiply_in_envelope,
+    solve_in_envelope,
+    solve_transposed_in_envelope,
+    untouched_zeros,
+)
+
+
+@dataclass(frozen=True)
+class PathErrors:
+    """Y (R, 3L), of the R coordinates of the unknown poses in their order.
+
+    Attributes:
+        seen: the observations.
+        factor: (R, R) L.
+        moved: (N, 3, 3) entries of C A, by observation.
+    """
+
+    seen: Sightings
+    factor: Float
+    moved: Float
+
+    @classmethod
+    def of(
+        cls, seen: Sightings, equations: NormalEquations, own_m2: Float, factor: Float
+    ) -> "PathErrors":
+        """Of equations that are solved, the landmarks first: with their `own_m2` and the factor."""
+        left = without_offsets(seen, equations.points)
+        coupling = left_couplings(seen, equations.coupling, left)
+        return cls(seen, factor, coupling @ own_m2[seen.landmark])
+
+    def __len__(self) -> int:
+        return len(self.factor)
+
+    def rows_by_all(self, rows: np.ndarray) -> Float:
+        """(R, r) columns of Y Y', those of `rows` (r,)."""
+        chosen = np.zeros((len(self), len(rows)))
+        chosen[rows, np.arange(len(rows))] = 1.0
+        return self.gram(chosen)
+
+    def gram(self, columns: Float) -> Float:
+        """Y Y' times columns (R, c)."""
+        negative = multiply_in_envelope(self._less_gram, self._first, self._of_poses(columns))
+        return -solve_in_envelope(self.factor, self._first, negative)
+
+    def spread(self, columns: Float) -> Float:
+        """(3L, c) Y' times columns (R, c)."""
+        total = np.zeros((3 * self.seen.n_landmarks, columns.shape[1]))
+        of_poses = self._of_poses(columns)
+        _add_spread(self.seen.starts, self._place, self.moved, of_poses, total)
+        return total
+
+    def squares(self) -> Float:
+        """(L, 3, 3) blocks of Y' Y, each landmark's with itself."""
+        total = np.zeros((self.seen.n_landmarks, 3, 3))
+        covariance = inverse_in_envelope(self.factor, self._first)
+        _add_squares(self.seen.starts, self._place, self.moved, covariance, total)
+        return total + np.swapaxes(total, 1, 2)
+
+    @property
+    def _first(self) -> np.ndarray:
+        return self.seen.order.first_entry
+
+    @property
+    def _place(self) -> np.ndarray:
+        """(N,) of each observation's pose among those that are unknown; -1 for the first pose."""
+        return self.seen.pose_place[self.seen.frame] - 1
+
+    @cached_property
+    def _less_gram(self) -> Float:
+        """-C A A C'."""
+        S = untouched_zeros(len(self) + 3)
+        subtract_gram(self.seen, self.moved, S)
+        return S[3:, 3:]
+
+    def _of_poses(self, columns: Float) -> Float:
+        return solve_transposed_in_envelope(self.factor, self._first, columns)
+
+
+@njit(cache=True)
+def _add_spread(
+    starts: np.ndarray, place: np.ndarray, moved: Float, of_poses: Float, total: Float
+) -> None:
+    """Add moved' times what is of each observation's pose to its landmark's rows."""
+    n = of_poses.shape[1]
+    for j in range(len(starts) - 1):
+        for i in range(starts[j], starts[j + 1]):
+            row = 3 * place[i]
+            if row < 0:
+                continue
+            for q in range(3):
+                a, b, c = moved[i, 0, q], moved[i, 1, q], moved[i, 2, q]
+                for k in range(n):
+                    total[3 * j + q, k] += (
+                        a * of_poses[row, k] + b * of_poses[row + 1, k] + c * of_poses[row + 2, k]
+                    )
+
+
+@njit(cache=True)
+def _add_squares(
+    starts: np.ndarray, place: np.ndarray, moved: Float, covariance: Float, total: Float
+) -> None:
+    """Of each landmark what, with its transpose, is moved' covariance moved of all that saw it."""
+    of_pose = np.empty((3, 3))
+    for j in range(len(starts) - 1):
+        for i in range(starts[j], starts[j + 1]):
+            if place[i] < 0:
+                continue
+            for r in range(3):
+                for q in range(3):
+                    of_pose[r, q] = 0.0
+            for k in range(starts[j], i):
+                if place[k] >= 0:
+                    _add_part(covariance, 3 * place[i], 3 * place[k], 1.0, moved[k], of_pose)
+            _add_part(covariance, 3 * place[i], 3 * place[i], 0.5, moved[i], of_pose)
+            for r in range(3):
+                for q in range(3):
+                    total[j, r, q] += (
+                        moved[i, 0, r] * of_pose[0, q]
+                        + moved[i, 1, r] * of_pose[1, q]
+                        + moved[i, 2, r] * of_pose[2, q]
+                    )
+
+
+@njit(cache=True)
+def _add_part(
+    covariance: Float, row: int, column: int, share: float, moved: Float, total: Float
+) -> None:
+    for r in range(3):
+        a = share * covariance[row + r, column]
+        b = share * covariance[row + r, column + 1]
+        c = share * covariance[row + r, column + 2]
+        for q in range(3):
+            total[r, q] += a * moved[0, q] + b * moved[1, q] + c * moved[2, q]
