@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from experiments.judge.judged_run import JudgedRun
-from experiments.judge.result import all_tables, renderer
+from experiments.judge.result import renderer
+from experiments.judge.table_makers import all_tables
 from experiments.run.memory import require_memory
 from experiments.run.store import Store
 from experiments.run.tasks import Task, task_names, unfinished

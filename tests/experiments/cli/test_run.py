@@ -102,21 +102,9 @@ def test_nothing_of_an_earlier_run_is_left(
     outdated = [result / "maps" / "R3.parquet", result / "keyframes" / "R1_00099.png"]
     for path in outdated:
         path.write_bytes(b"of an earlier run")
-    earlier = {path: path.stat().st_mtime_ns for path in result.rglob("*.*")}
-    told: list[str] = []
-
-    def written(folder: Path, part: str) -> None:
-        path = folder / "scenario.json" if part == "scenario" else tables.table_path(folder, part)
-        assert path.stat().st_mtime_ns > earlier[path]
-        assert (folder / "world.json").stat().st_mtime_ns > earlier[folder / "world.json"]
-        assert len(list((folder / "keyframes").iterdir())) == 4
-        told.append(part)
-
-    run_scenario(load_scenario(tiny_path), tmp_path, 1, quietly, on_written=written)
+    run_scenario(load_scenario(tiny_path), tmp_path, 1, quietly)
     assert not any(path.exists() for path in outdated)
     assert len(list((result / "keyframes").iterdir())) == 4
-    files = {path.stem for path in (result / "tables").iterdir()}
-    assert sorted(told) == sorted({"scenario"} | files)
 
 
 def test_ctrl_c_before_the_command_starts(
