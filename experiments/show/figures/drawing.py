@@ -3,19 +3,16 @@
 import importlib
 import io
 import re
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from pkgutil import iter_modules
 from typing import Any, NamedTuple
 
 import matplotlib
-import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from experiments.run.workers import Workers, workers
-from experiments.show.figures.png import png_bytes
 from experiments.show.figures.result_tables import NothingToDraw, ResultTables
 from experiments.show.figures.style import house_style
 from mapfusion.sealed import LINE
@@ -27,6 +24,8 @@ _MODULES = iter_modules([str(Path(__file__).parent)])
 FIGURES = tuple(sorted(each.name for each in _MODULES if re.match(r"fig\d\d_", each.name)))
 # An SVG's are of the parts that are drawn as pixels, which make up most of the file.
 _DPI = {"png": 200, "svg": 150}
+# No date: the same tables give the same bytes. PNG are packed faster than by default, and larger.
+_SAVED = {"png": {"pil_kwargs": {"compress_level": 2}}, "svg": {"metadata": {"Date": None}}}
 
 
 class Drawn(NamedTuple):
@@ -124,29 +123,16 @@ def save_figure(folder: Path, name: str, draw: Callable[..., Figure], *data: Any
 
 
 def _lay_out(figure: Figure) -> None:
-    """Place what a figure holds as for PNG, at its resolution, for all formats."""
+    """Place what a figure holds as for the first format, at its resolution, for all of them."""
     engine = figure.get_layout_engine()
     if engine is not None:
         FigureCanvasAgg(figure)
-        with _resolution(figure):
-            engine.execute(figure)
+        own, figure.dpi = figure.dpi, next(iter(_DPI.values()))
+        engine.execute(figure)
+        figure.dpi = own
 
 
 def _picture(figure: Figure, kind: str) -> bytes:
-    if kind == "png":
-        canvas = FigureCanvasAgg(figure)
-        with _resolution(figure):
-            canvas.draw()
-            return png_bytes(np.asarray(canvas.buffer_rgba())[..., :3], figure.dpi)
     stream = io.BytesIO()
-    # No date: the same tables give the same bytes.
-    figure.savefig(stream, format=kind, dpi=_DPI[kind], metadata={"Date": None})
+    figure.savefig(stream, format=kind, dpi=_DPI[kind], **_SAVED[kind])
     return stream.getvalue()
-
-
-@contextmanager
-def _resolution(figure: Figure) -> Iterator[None]:
-    """Let a figure have the pixels of PNG for the length of a `with` block."""
-    own, figure.dpi = figure.dpi, _DPI["png"]
-    yield
-    figure.dpi = own
