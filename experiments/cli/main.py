@@ -1,6 +1,5 @@
 """The command `mapfusion`: its list of commands, and what becomes of their failures."""
 
-import atexit
 import gc
 import os
 import sys
@@ -78,7 +77,6 @@ def main() -> None:
     from experiments.run.kernel_cache import use_kernel_cache
 
     gc.set_threshold(_MADE_BETWEEN_COLLECTIONS)
-    atexit.register(gc.freeze)  # else Python looks for cycles among all modules as it ends
     # Work is bound to one thread anyway, and those that BLAS starts when it is imported wait in a
     # loop. To be said before that.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -1,5 +1,3 @@
-import atexit
-import gc
 import io
 import shutil
 from collections.abc import Iterator
@@ -27,7 +25,6 @@ def _no_server_is_forked_from_here() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(workers, "make_ready", lambda jobs: None)
         yield
-    atexit.unregister(gc.freeze)  # what commands asked for
 
 
 @pytest.fixture(scope="session")
