@@ -220,8 +220,11 @@ def estimate_jointly(
         step = -scipy.linalg.cho_solve((factor, True), gradient)
         moved = float(np.sum((factor.T @ step) ** 2))
         if n_steps == _MOST_STEPS or moved < _CONVERGED:
-            weight *= information_share(dof, maps[0].position_m.shape[1])
-            A, _ = _equations(said, has, weight, _points(said, has, weight), columns, shared)
+            share = float(information_share(dof, maps[0].position_m.shape[1]))
+            weight *= share
+            A *= share
+            z = _shared(columns)
+            A[z, z] += 1.0 - share  # what was known of them before is all there
             covariance = scipy.linalg.inv(A)
             return JointEstimate(T, tuple(shared), covariance, weight, dof)
         for k, own in enumerate(columns):
@@ -292,24 +295,29 @@ def _equations(
         off = own.y_m - points.g_m[has[:, k]]
         pulled = (W[k] @ off[:, :, None]).ravel()
         gradient[columns[k]] += own.by_unknown.reshape(-1, len(columns[k])).T @ pulled
-        for m, other in enumerate(said[: k + 1]):
+        by, its = own.by_unknown, columns[k]
+        between = W[k] - W[k] @ points.covariance_m2[has[:, k]] @ W[k]
+        A[np.ix_(its, its)] += by.reshape(-1, len(its)).T @ (between @ by).reshape(-1, len(its))
+        for m, other in enumerate(said[:k]):
             both = has[:, k] & has[:, m]
             here, there = both[has[:, k]], both[has[:, m]]
             between = -W[k][here] @ points.covariance_m2[both] @ W[m][there]
-            if m == k:
-                between += W[k]
-            left = own.by_unknown[here].reshape(-1, len(columns[k]))
+            left = by[here].reshape(-1, len(its))
             right = between @ other.by_unknown[there]
             block = left.T @ right.reshape(-1, len(columns[m]))
-            A[np.ix_(columns[k], columns[m])] += block
-            if m != k:
-                A[np.ix_(columns[m], columns[k])] += block.T
-    z = np.unique(np.concatenate([own[3:] for own in columns]))
+            A[np.ix_(its, columns[m])] += block
+            A[np.ix_(columns[m], its)] += block.T
+    z = _shared(columns)
     A[z, z] += 1.0
     value = np.zeros_like(gradient)
     for own, its in zip(columns, shared, strict=True):
         value[own[3:]] = its
     return A[:-1, :-1], (gradient + value)[:-1]
+
+
+def _shared(columns: Sequence[np.ndarray]) -> np.ndarray:
+    """Where in u the shared variables of all maps stand."""
+    return np.unique(np.concatenate([own[3:] for own in columns]))
 
 
 def _reweighted(
