@@ -7,7 +7,8 @@ import numpy as np
 
 from mapfusion.aligned_landmarks import ABSENT, AlignedLandmarks
 from mapfusion.fuse.component import Component
-from mapfusion.fuse.joint_estimate import JointEstimate, JointMap, weighted_information
+from mapfusion.fuse.joint_estimate import JointEstimate
+from mapfusion.fuse.joint_map import JointMap, weighted_information
 from mapfusion.fuse.parameters import MergeParameters
 from mapfusion.fused_map import FusedMap
 from mapfusion.joint_covariance import JointCovariance, condensed
