@@ -18,7 +18,8 @@ from mapfusion.align.pairs import MIN_PAIRS
 from mapfusion.aligned_landmarks import ABSENT
 from mapfusion.fuse.clusters import Pair, joined
 from mapfusion.fuse.component import Component
-from mapfusion.fuse.joint_estimate import JointEstimate, JointMap, estimate_jointly
+from mapfusion.fuse.joint_estimate import JointEstimate, estimate_jointly
+from mapfusion.fuse.joint_map import JointMap
 from mapfusion.fuse.jointly_fused import JointlyFused
 from mapfusion.fuse.kalman_drift import KalmanDrift
 from mapfusion.fuse.parameters import MergeParameters

@@ -21,100 +21,15 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
-from mapfusion.align.rigid import motion_jacobian
 from mapfusion.aligned_landmarks import ABSENT
-from mapfusion.calibration_error import EXACT, N_OF_CAMERA, CalibrationError
-from mapfusion.joint_covariance import JointCovariance
-from mapfusion.landmark_map import LandmarkMap
-from mapfusion.se2 import Float, inverse, rotation_about_z, transform_points, wrap
+from mapfusion.calibration_error import N_OF_CAMERA
+from mapfusion.fuse.joint_map import JointMap, MapRows, Said, said_of, weighted_information
+from mapfusion.se2 import Float, inverse, transform_points, wrap
 from mapfusion.smoother.student import MOST_DOF, fitted_dof, information_share, student_weights
 
 # The next step would move what is sought, as a whole and in squared sigmas, by no more than this.
 _CONVERGED = 1e-3
 _MOST_STEPS = 50
-
-
-@dataclass(frozen=True)
-class JointMap:
-    """N landmarks of a map as they enter.
-
-    Attributes:
-        position_m: (N, D); D is 2 for planar maps.
-        joint: of the positions, in three dimensions, but for the calibration.
-        calibration: what its camera leaves open: two shared variables more, the last ones, unless
-            it is known exactly. Maps of one camera have them in common.
-    """
-
-    position_m: Float
-    joint: JointCovariance
-    calibration: CalibrationError = EXACT
-
-    def __len__(self) -> int:
-        return len(self.position_m)
-
-    @property
-    def n_shared(self) -> int:
-        """R."""
-        return self.joint.rank + (0 if self.calibration.is_none else N_OF_CAMERA)
-
-    @classmethod
-    def of(cls, landmarks: LandmarkMap, own_sigma_m: float, n_dimensions: int) -> "JointMap":
-        """A map without a joint covariance shares none, but has more of its landmarks' own.
-
-        Args:
-            landmarks: the map.
-            own_sigma_m: that is added in the plane where a map has no joint covariance: s_drift.
-            n_dimensions: 2 or 3.
-        """
-        joint = landmarks.joint
-        if joint is None:
-            own = landmarks.covariance_m2.copy()
-            own[:, [0, 1], [0, 1]] += own_sigma_m**2
-            joint = JointCovariance(own, np.zeros((len(landmarks), 0, 3)))
-        return cls(landmarks.position_m[:, :n_dimensions], joint, landmarks.calibration)
-
-
-class Said(NamedTuple):
-    """What a map says of some landmarks, at a guess of the unknowns.
-
-    Attributes:
-        y_m: (n, D) where they are, in the common frame.
-        own_m2: (n, D, D) covariance of their own errors, there.
-        information: (n, D, D) its inverse.
-        by_unknown: (n, D, U_k) dy / du by the unknowns that it depends on.
-    """
-
-    y_m: Float
-    own_m2: Float
-    information: Float
-    by_unknown: Float
-
-
-class _Rows(NamedTuple):
-    """Some of a map's landmarks as they enter each step.
-
-    Attributes:
-        position_m: (n, D).
-        own_m2: (n, D, D).
-        information: (n, D, D) its inverse.
-        moved_m: (n, D, R) how far one sigma of each shared variable moves them, but for the camera.
-        calibration: the camera's.
-    """
-
-    position_m: Float
-    own_m2: Float
-    information: Float
-    moved_m: Float
-    calibration: CalibrationError
-
-    @classmethod
-    def of(cls, own_map: JointMap, rows: np.ndarray) -> "_Rows":
-        position = own_map.position_m[rows]
-        d, joint = position.shape[1], own_map.joint
-        own = joint.own_m2[rows][:, :d, :d]
-        moved = np.swapaxes(joint.common_m[rows][:, :, :d], 1, 2)
-        information = np.asarray(np.linalg.inv(own), np.float64)
-        return cls(position, own, information, np.ascontiguousarray(moved), own_map.calibration)
 
 
 @dataclass(frozen=True)
@@ -146,8 +61,8 @@ class JointEstimate:
 
     def said(self, maps: Sequence[JointMap], k: int, rows: np.ndarray) -> Said:
         """What map k says of its landmarks `rows` (n,), by its own unknowns: see `unknowns`."""
-        own = _Rows.of(maps[k], rows)
-        return _said(own, self.T_first_map[k], self.shared[k], own.position_m)
+        own = MapRows.of(maps[k], rows)
+        return said_of(own, self.T_first_map[k], self.shared[k], own.position_m)
 
     def unknowns(self, maps: Sequence[JointMap], k: int) -> np.ndarray:
         """(U_k,) where those that map k depends on stand among all, ABSENT for none."""
@@ -162,23 +77,6 @@ class JointEstimate:
         known = columns != ABSENT
         by = said.by_unknown[:, :, known].reshape(said.y_m.size, np.count_nonzero(known))
         return (by @ factor[columns[known]]).reshape(*said.y_m.shape, len(factor))
-
-
-def _said(own: _Rows, T: Float, shared: Float, arm_m: Float) -> Said:
-    """The camera's errors move points at `arm_m` (n, D)."""
-    (n, d), moved = own.position_m.shape, own.moved_m
-    if not own.calibration.is_none:
-        by_camera = own.calibration.moves_m(arm_m)[:, :, :d]
-        moved = np.concatenate([moved, np.swapaxes(by_camera, 1, 2)], axis=2)
-    R = rotation_about_z(T[2])[:d, :d]
-    point = own.position_m + moved @ shared
-    by = np.empty((n, d, 3 + len(shared)))
-    by[:, :2, :3], by[:, 2:, :3] = motion_jacobian(T, point), 0.0
-    for axis in range(2):  # faster than as many small products as landmarks
-        by[:, axis, 3:] = R[axis, 0] * moved[:, 0] + R[axis, 1] * moved[:, 1]
-    by[:, 2:, 3:] = moved[:, 2:]
-    turned = R @ own.own_m2 @ R.T, R @ own.information @ R.T
-    return Said(transform_points(T, point), *turned, by)
 
 
 def _columns(maps: Sequence[JointMap]) -> list[np.ndarray]:
@@ -210,7 +108,7 @@ def estimate_jointly(
     T, shared = np.array(T_first_map), [np.zeros(each.n_shared) for each in maps]
     columns = _columns(maps)
     has = parents != ABSENT
-    rows = [_Rows.of(own, parents[has[:, k], k]) for k, own in enumerate(maps)]
+    rows = [MapRows.of(own, parents[has[:, k], k]) for k, own in enumerate(maps)]
     weight, dof, n_steps = has.astype(np.float64), MOST_DOF, 0
     said = _all_said(rows, T, shared, has, weight)
     while True:
@@ -220,8 +118,11 @@ def estimate_jointly(
         step = -scipy.linalg.cho_solve((factor, True), gradient)
         moved = float(np.sum((factor.T @ step) ** 2))
         if n_steps == _MOST_STEPS or moved < _CONVERGED:
-            weight *= information_share(dof, maps[0].position_m.shape[1])
-            A, _ = _equations(said, has, weight, _points(said, has, weight), columns, shared)
+            share = float(information_share(dof, maps[0].position_m.shape[1]))
+            weight *= share
+            A *= share
+            z = _shared(columns)
+            A[z, z] += 1.0 - share  # what was known of them before is all there
             covariance = scipy.linalg.inv(A)
             return JointEstimate(T, tuple(shared), covariance, weight, dof)
         for k, own in enumerate(columns):
@@ -237,19 +138,19 @@ def estimate_jointly(
 
 
 def _all_said(
-    rows: Sequence[_Rows], T: Float, shared: Sequence[Float], has: np.ndarray, weight: Float
+    rows: Sequence[MapRows], T: Float, shared: Sequence[Float], has: np.ndarray, weight: Float
 ) -> list[Said]:
     """What each map says of its `rows`.
 
     Errors of cameras move points from where all maps together see them. Moved from where the one
     map does, they would move its noise too, and all maps shrink, since that shrinks residuals.
     """
-    said = [_said(*each, each[0].position_m) for each in zip(rows, T, shared, strict=True)]
+    said = [said_of(*each, each[0].position_m) for each in zip(rows, T, shared, strict=True)]
     if all(own.calibration.is_none for own in rows):
         return said
     g = _points(said, has, weight).g_m
     arms = [transform_points(inverse(T[k]), g[has[:, k]]) for k in range(len(rows))]
-    return list(map(_said, rows, T, shared, arms))
+    return list(map(said_of, rows, T, shared, arms))
 
 
 class _Points(NamedTuple):
@@ -257,11 +158,6 @@ class _Points(NamedTuple):
 
     g_m: Float
     covariance_m2: Float
-
-
-def weighted_information(said: Said, weight: Float) -> Float:
-    """W (n, D, D)."""
-    return weight[:, None, None] * said.information
 
 
 def _points(said: Sequence[Said], has: np.ndarray, weight: Float) -> _Points:
@@ -292,24 +188,29 @@ def _equations(
         off = own.y_m - points.g_m[has[:, k]]
         pulled = (W[k] @ off[:, :, None]).ravel()
         gradient[columns[k]] += own.by_unknown.reshape(-1, len(columns[k])).T @ pulled
-        for m, other in enumerate(said[: k + 1]):
+        by, its = own.by_unknown, columns[k]
+        between = W[k] - W[k] @ points.covariance_m2[has[:, k]] @ W[k]
+        A[np.ix_(its, its)] += by.reshape(-1, len(its)).T @ (between @ by).reshape(-1, len(its))
+        for m, other in enumerate(said[:k]):
             both = has[:, k] & has[:, m]
             here, there = both[has[:, k]], both[has[:, m]]
             between = -W[k][here] @ points.covariance_m2[both] @ W[m][there]
-            if m == k:
-                between += W[k]
-            left = own.by_unknown[here].reshape(-1, len(columns[k]))
+            left = by[here].reshape(-1, len(its))
             right = between @ other.by_unknown[there]
             block = left.T @ right.reshape(-1, len(columns[m]))
-            A[np.ix_(columns[k], columns[m])] += block
-            if m != k:
-                A[np.ix_(columns[m], columns[k])] += block.T
-    z = np.unique(np.concatenate([own[3:] for own in columns]))
+            A[np.ix_(its, columns[m])] += block
+            A[np.ix_(columns[m], its)] += block.T
+    z = _shared(columns)
     A[z, z] += 1.0
     value = np.zeros_like(gradient)
     for own, its in zip(columns, shared, strict=True):
         value[own[3:]] = its
     return A[:-1, :-1], (gradient + value)[:-1]
+
+
+def _shared(columns: Sequence[np.ndarray]) -> np.ndarray:
+    """Where in u the shared variables of all maps stand."""
+    return np.unique(np.concatenate([own[3:] for own in columns]))
 
 
 def _reweighted(

@@ -7,7 +7,8 @@ import numpy as np
 
 from mapfusion.aligned_landmarks import ABSENT, AlignedLandmarks
 from mapfusion.fuse.component import Component
-from mapfusion.fuse.joint_estimate import JointEstimate, JointMap, weighted_information
+from mapfusion.fuse.joint_estimate import JointEstimate
+from mapfusion.fuse.joint_map import JointMap, weighted_information
 from mapfusion.fuse.parameters import MergeParameters
 from mapfusion.fused_map import FusedMap
 from mapfusion.joint_covariance import JointCovariance, condensed
@@ -94,20 +95,25 @@ class JointlyFused:
         n_dimensions, n_unknowns = self.maps[0].position_m.shape[1], len(estimate.covariance)
         weight = has.astype(np.float64)
         weight[: len(estimate.weight)] = estimate.weight
-        information = np.zeros((n, n_dimensions, n_dimensions))
-        total, moved = np.zeros((n, n_dimensions)), np.zeros((n, n_dimensions, n_unknowns))
         factor = np.asarray(np.linalg.cholesky(estimate.covariance), np.float64)
-        for k in range(len(self.maps)):
-            rows = np.flatnonzero(has[:, k])
-            said = estimate.said(self.maps, k, self.points[rows, k])
-            W = weighted_information(said, weight[rows, k])
-            information[rows] += W
-            total[rows] += np.einsum("nij,nj->ni", W, said.y_m)
-            moved[rows] += W @ estimate.moved_m(self.maps, k, said, factor)
-        own, position = np.zeros((n, 3, 3)), np.zeros((n, 3))
+        rows = [np.flatnonzero(has[:, k]) for k in range(len(self.maps))]
+        said = [estimate.said(self.maps, k, self.points[own, k]) for k, own in enumerate(rows)]
+        W = [
+            weighted_information(each, weight[own, k])
+            for k, (own, each) in enumerate(zip(rows, said, strict=True))
+        ]
+        information = np.zeros((n, n_dimensions, n_dimensions))
+        for own, its in zip(rows, W, strict=True):
+            information[own] += its
         V = np.linalg.inv(information)
-        own[:, :n_dimensions, :n_dimensions] = V
-        position[:, :n_dimensions] = np.einsum("nij,nj->ni", V, total)
+        total, moved = np.zeros((n, n_dimensions)), np.zeros((n, n_dimensions, n_unknowns))
+        for k, (own, each, its) in enumerate(zip(rows, said, W, strict=True)):
+            gain = V[own] @ its
+            total[own] += np.einsum("nij,nj->ni", gain, each.y_m)
+            moved[own] += gain @ estimate.moved_m(self.maps, k, each, factor)
+        covariance, position = np.zeros((n, 3, 3)), np.zeros((n, 3))
+        covariance[:, :n_dimensions, :n_dimensions] = V
+        position[:, :n_dimensions] = total
         shared = np.zeros((n_unknowns, n, 3))
-        shared[:, :, :n_dimensions] = (V @ moved).transpose(2, 0, 1)
-        return position, condensed(own, shared.reshape(n_unknowns, 3 * n))
+        shared[:, :, :n_dimensions] = moved.transpose(2, 0, 1)
+        return position, condensed(covariance, shared.reshape(n_unknowns, 3 * n))

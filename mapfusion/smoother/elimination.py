@@ -71,7 +71,7 @@ def solve_points(
 
 def matrix_bytes(seen: Sightings, n_poses: int) -> int:
     """Memory that the dense matrices take at most, in bytes: grows as the square of the log."""
-    if _is_landmarks_first(seen, n_poses):  # the last factor, then a system or the common part
+    if _is_landmarks_first(seen, n_poses):  # the last factor, then a system or what is shared
         n, n_landmarks = 3 * n_poses, 3 * seen.n_landmarks
         return _ITEM * n * (2 * n + max(n, n_landmarks))
     n = 3 * _n_points(seen)
@@ -91,12 +91,6 @@ def shared_errors(seen: Sightings, equations: NormalEquations, solution: Solutio
     if solution.landmarks_first:
         return PathErrors.of(seen, equations, solution.own_m2, solution.factor)
     return KnownErrors(_beside_own(solution))
-
-
-def common_part(seen: Sightings, equations: NormalEquations, solution: Solution) -> Float:
-    """(R, 3L) Y of `shared_errors`, dense."""
-    errors = shared_errors(seen, equations, solution)
-    return errors.spread(np.eye(len(errors))).T
 
 
 def pose_covariances(

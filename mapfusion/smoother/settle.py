@@ -21,7 +21,7 @@ from mapfusion.smoother.sightings import Sightings
 # hundredth of a sigma. A step costs as the cube of the log, and there is little left to win:
 # single landmarks, whose tracks contradict each other, may go on changing their minds for long.
 CONVERGED = 1e-5
-MOST_STEPS = 50
+_MOST_STEPS = 50
 _FOLLOWING = 2  # times that weights and points follow each other after a step
 _MOST_HALVINGS = 12
 
@@ -89,7 +89,7 @@ def settled(
     """
     weights = unweighted(problem.seen) if weights is None else weights
     end = solved(problem, at, weights, tails)
-    while end.n_steps < MOST_STEPS and not end.is_within(least_move):
+    while end.n_steps < _MOST_STEPS and not end.is_within(least_move):
         end = solved(problem, *stepped(problem, end), end.n_steps + 1)
     return end
 

@@ -80,17 +80,6 @@ def first_entries(group: np.ndarray, member: np.ndarray, place: np.ndarray) -> n
     return first
 
 
-def entries_seen(L: Float) -> np.ndarray:
-    """`first` (n,) of a factor L (n, n), or its last rows and columns, from what it holds.
-
-    Slower than what one knows of the matrix, but some rows begin later than they might.
-    """
-    first = np.empty(len(L), np.int64)
-    for rows in _blocks(len(L)):
-        first[rows] = np.argmax(L[rows].any(axis=0))
-    return first
-
-
 def cholesky_in_envelope(A: Float, first: np.ndarray) -> Float:
     """The lower Cholesky factor of A (n, n), in its place; of A the lower half is read.
 

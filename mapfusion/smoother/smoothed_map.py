@@ -8,6 +8,7 @@ from mapfusion.attitude import Attitude
 from mapfusion.attitude_drift import shared_heights
 from mapfusion.joint_covariance import RANK, JointCovariance, KnownErrors, condensed
 from mapfusion.landmark_map import LandmarkMap
+from mapfusion.one_thread import one_blas_thread
 from mapfusion.robot_log import RobotLog
 from mapfusion.se2 import Float
 from mapfusion.smoother.smooth import Smoothed
@@ -41,6 +42,7 @@ def smoothed_map(
     return LandmarkMap(point, joint.marginal_m2, *about, joint, viewing, log.calibration)
 
 
+@one_blas_thread
 def condensed_points(smoothed: Smoothed, rank: int = RANK) -> tuple[Float, JointCovariance]:
     """Landmarks (L, 3) and what is kept of their joint covariance; of planar ones z is known."""
     point = smoothed.estimate.point_m.copy()

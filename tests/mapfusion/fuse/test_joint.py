@@ -11,7 +11,8 @@ from mapfusion import se2
 from mapfusion.aligned_landmarks import ABSENT
 from mapfusion.calibration_error import CalibrationError
 from mapfusion.fuse.joint import JointFuser
-from mapfusion.fuse.joint_estimate import JointMap, estimate_jointly
+from mapfusion.fuse.joint_estimate import estimate_jointly
+from mapfusion.fuse.joint_map import JointMap
 from mapfusion.fuse.kalman_drift import KalmanDrift
 from mapfusion.fuse.parameters import MergeParameters
 from mapfusion.fused_map import FusedMap

@@ -17,7 +17,6 @@ from mapfusion.smoother.elimination import (
     Solution,
     _landmarks_first,
     _poses_first,
-    common_part,
     shared_errors,
     solve_points,
 )
@@ -40,6 +39,12 @@ from tests.mapfusion.smoother.white_noise_logs import (
 
 STRAY_M = 0.05
 Eliminate = Callable[[Sightings, NormalEquations], Solution]
+
+
+def common_part(seen: Sightings, equations: NormalEquations, solution: Solution) -> Float:
+    """(R, 3L) Y of what landmarks share, dense."""
+    errors = shared_errors(seen, equations, solution)
+    return errors.spread(np.eye(len(errors))).T
 
 
 def dense_residuals(log: RobotLog, seen: Sightings, weights: Weights, x: Float) -> Float:

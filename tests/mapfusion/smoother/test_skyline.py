@@ -7,7 +7,6 @@ import scipy.linalg
 from mapfusion.smoother import skyline
 from mapfusion.smoother.skyline import (
     cholesky_in_envelope,
-    entries_seen,
     envelope_order,
     first_entries,
     inverse_in_envelope,
@@ -16,6 +15,11 @@ from mapfusion.smoother.skyline import (
     solve_transposed_in_envelope,
     untouched_zeros,
 )
+
+
+def entries_seen(A: np.ndarray) -> np.ndarray:
+    """(n,) the column of each row's first entry."""
+    return np.argmax(A != 0, axis=1)
 
 
 def matrix_of_groups(rng: np.random.Generator, n: int, n_groups: int) -> np.ndarray:
