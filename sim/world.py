@@ -28,6 +28,12 @@ CORNERS = "corners.npy"  # of all faces, beside their meshes and textures
 OUT_OF_SIGHT_M = -100.0  # below the floor, where what must not be seen waits
 
 GL_ROW_TEXELS = 4  # OpenGL's default row alignment
+# Of what takes hardly more room than the smallest this is written and read soonest.
+QUICKLY = (
+    *(cv2.IMWRITE_PNG_COMPRESSION, 1),
+    *(cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP),
+    *(cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE),
+)
 
 # Who collides with whom (bit masks): wheels with the ground alone.
 GROUND, WHEEL, BODY = 1, 2, 4
@@ -223,7 +229,7 @@ def write_faces(
             seen[face.look] = painted
         shown = np.ascontiguousarray(painted[:, ::-1]) if face.mirrored else painted
         picture = cv2.cvtColor(shown, cv2.COLOR_RGB2BGR)
-        encoded = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
+        encoded = cv2.imencode(".png", picture, QUICKLY)[1].tobytes()
         # whole: another run may be painting, or looking at, the same walls
         write_sealed(path, encoded + LINE)
         write_sealed(mesh, b"# " + LINE + _mesh(face).encode("ascii"))
