@@ -24,6 +24,7 @@ from multiprocessing.connection import (
 )
 from typing import Any, NoReturn
 
+from experiments.methods.aligner_calls import end_children
 from experiments.methods.threads import single_threaded
 from experiments.run.interrupts import held_back_interrupts
 from mapfusion.errors import InputError, UnsealedWarning
@@ -49,6 +50,7 @@ def make_ready(jobs: int) -> None:
         return
     if threading.active_count() > 1:  # one of them may hold a lock, which nobody would open
         return
+    end_children()  # of plug-ins that were looked at: they would be nobody's and everybody's
     from numba.core.registry import cpu_target
 
     # What Numba does before its first kernel, which takes it tenths of a second in each process.
