@@ -14,6 +14,7 @@ _SOBEL_APERTURE_PX = 3
 _SOBEL_GAIN = 2.0  # OpenCV divides its Sobel sum, 8 times the slope per pixel, by 4
 _SOBEL_SUM = 4.0  # what it divides by
 _OUR_BLOCK_PX = 3
+_LEAST_SIDE_PX = 2  # what an image needs to be mirrored at its border
 _ONE = np.uintp(1)  # indices without a sign, which a kernel need not wrap around
 
 
@@ -81,7 +82,7 @@ def detect(image: np.ndarray, parameters: HarrisParameters) -> Float:
 def harris_response(image: np.ndarray, parameters: HarrisParameters) -> np.ndarray:
     """Response (H, W) float32: values of OpenCV's `cornerHarris`, sooner for the usual block."""
     block, aperture, k = parameters.block_px, _SOBEL_APERTURE_PX, parameters.k
-    if block != _OUR_BLOCK_PX:
+    if block != _OUR_BLOCK_PX or min(image.shape) < _LEAST_SIDE_PX:
         return cv2.cornerHarris(image, block, aperture, k)
     scale = 1 / (_SOBEL_SUM * block * 255)
     slope_u = cv2.Sobel(image, cv2.CV_32F, 1, 0, ksize=aperture, scale=scale)

@@ -158,6 +158,15 @@ def test_the_response_is_opencv_s(block_px: int) -> None:
     np.testing.assert_allclose(own, whole, rtol=0, atol=1e-6 * np.abs(whole).max())
 
 
+@pytest.mark.parametrize("shape", [(1, 40), (40, 1), (2, 40), (40, 2), (1, 1), (2, 2)])
+def test_so_it_is_of_images_that_are_all_border(shape: tuple[int, int]) -> None:
+    image = np.random.default_rng(5).integers(0, 256, shape, dtype=np.uint8)
+    parameters = HarrisParameters(block_px=3)
+    whole = cv2.cornerHarris(image, 3, 3, parameters.k)
+    own = harris_response(image, parameters)
+    np.testing.assert_allclose(own, whole, rtol=0, atol=1e-6 * np.abs(whole).max())
+
+
 def test_maxima_are_pixels_that_dilation_leaves_as_they_are() -> None:
     response = np.random.default_rng(6).integers(0, 9, (40, 50)).astype(np.float32)  # with plateaus
     inner = (slice(3, -3), slice(3, -3))
