@@ -13,6 +13,7 @@ from experiments.judge.judged_fusers import GivenMap, JudgedFusion
 from experiments.judge.judging import ALIGNED, JudgeSettings
 from experiments.judge.known_truth import why_no_truth
 from experiments.judge.smoothed_robots import SmoothedRobot, load_smoothed
+from experiments.run.head_start import with_head_start
 from experiments.run.memory import require_memory
 from experiments.run.pipeline import PairStages, Pipeline, RobotStages, lay_out
 from experiments.run.rehearsal import rehearsals
@@ -134,10 +135,12 @@ class JudgedRun:
         require_memory(self.pipeline, jobs)
         wanted = only or self.stages()
         left = unfinished(self.tasks, [name for stage in wanted for name in task_names(stage)])
-        first = rehearsals(self.scenario, left) if jobs > 1 else []
+        if jobs > 1:
+            left = with_head_start(self.pipeline, self.store, left)
+            left = [*rehearsals(self.scenario, left), *left]
         try:
             with workers(jobs) as pool:
-                run_tasks([*first, *left], pool, on_progress)
+                run_tasks(left, pool, on_progress)
         except DamagedFileError:  # `mending` wants to know which
             raise
         except InputError as error:

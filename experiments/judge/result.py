@@ -22,6 +22,7 @@ from experiments.judge.truth import common_landmarks
 from experiments.methods.aligner_calls import callable_aligner
 from experiments.methods.catalogue import find_method
 from experiments.run.code_version import library_versions
+from experiments.run.head_start import head_start
 from experiments.run.stages.fuse import read_fused_maps
 from experiments.run.stages.smooth import read_smoothed
 from experiments.run.store import Store, mending
@@ -74,8 +75,9 @@ def run_scenario(
         require_writable(place)
     remove_abandoned(folder)
     if fresh:
-        for stage_folder in run.folders():
-            stage_folder.discard()
+        head = head_start(run.pipeline)
+        for stage in [*run.stages(), *([head] if head else [])]:
+            run.store.folder(stage).discard()
 
     def make() -> None:
         run.execute(jobs, on_progress)
