@@ -14,6 +14,7 @@ from mapfusion.align.degeneracy import why_one_place
 from mapfusion.align.drift import drift_step
 from mapfusion.align.leverage import is_unlike_the_others, most_leverage, why_one_pair
 from mapfusion.align.mahalanobis_gate import PlanarPairs
+from mapfusion.align.near_pairs import farthest_m, leaves_margin, rows_in_reach, those_of
 from mapfusion.align.pairs import MIN_PAIRS, Pairs, undetermined
 from mapfusion.align.result import Alignment, Status
 from mapfusion.arguments import Range, require_in_range, require_shape
@@ -274,31 +275,43 @@ def maximise_likelihood(
         landmark (m), T_a_b (3,), its covariance (3, 3), s_drift^2, each pair's probability of being
         true (N,).
     """
-    n, p_b = len(pairs.p_a), pairs.p_b
-    T_a_b = T_start.copy()
-    e, S = np.empty((n, 2)), np.empty((n, 2, 2))
-    inside, truth = np.zeros(n, np.bool_), np.zeros(n)
+    T_a_b, farthest = T_start.copy(), farthest_m(pairs.p_b)
+    everywhere, truth_of_all = np.zeros(len(pairs.p_a), np.bool_), np.zeros(len(pairs.p_a))
+    rows, near, T_near = np.zeros(0, np.int64), pairs, T_start.copy()
+    p_b, e, S = near.p_b, np.empty((0, 2)), np.empty((0, 2, 2))
+    inside, truth = np.zeros(0, np.bool_), np.zeros(0)
     widest = (gate_m / _GATE_SIGMAS) ** 2
     variance, share = widest, 0.5
     step_share, last_change = 1.0, 0.0
     covariance, step = np.full((3, 3), np.nan), np.empty(3)
-    moved = math.inf
+    moved, determined = math.inf, True
     judged = weighed = variance
     normal, at = np.zeros((3, 3)), np.empty(3)
     for rounds in range(max_rounds):
-        residuals_under(T_a_b, pairs, e, S)
+        if rounds == 0 or leaves_margin(T_a_b, T_near, gate_m, farthest):
+            for k in range(len(rows)):
+                everywhere[rows[k]] = inside[k]
+            rows = rows_in_reach(T_a_b, pairs, gate_m, everywhere)
+            near, T_near = those_of(pairs, rows), T_a_b.copy()
+            p_b, e, S = near.p_b, np.empty((len(rows), 2)), np.empty((len(rows), 2, 2))
+            inside, truth = np.empty(len(rows), np.bool_), np.zeros(len(rows))
+            for k in range(len(rows)):
+                inside[k] = everywhere[rows[k]]
+        residuals_under(T_a_b, near, e, S)
         if rounds < _SETTLING_ROUNDS:
-            for i in range(n):
-                inside[i] = e[i, 0] * e[i, 0] + e[i, 1] * e[i, 1] <= gate_m * gate_m
+            for k in range(len(rows)):
+                inside[k] = e[k, 0] * e[k, 0] + e[k, 1] * e[k, 1] <= gate_m * gate_m
         at[:] = T_a_b
         weighed, judged = variance, max(variance, least_drift_m * least_drift_m)
         truth_probabilities(e, S, judged, share, gate_m, inside, truth)
         total = np.sum(truth)
-        if total < 1.0:
-            return False, moved, T_a_b, covariance, variance, truth
+        determined = not total < 1.0
+        if not determined:
+            break
         normal, right = normal_equations(T_a_b, p_b, e, S, variance, truth)
-        if not invert(normal, covariance):
-            return False, moved, T_a_b, covariance, variance, truth
+        determined = invert(normal, covariance)
+        if not determined:
+            break
         for k in range(3):
             step[k] = (
                 covariance[k, 0] * right[0]
@@ -318,5 +331,9 @@ def maximise_likelihood(
             T_a_b[k] += step[k]
         if moved <= _TOLERANCE_M:
             break
-    normal -= missing_information(at, p_b, e, S, weighed, judged, truth)
-    return invert(normal, covariance), moved, T_a_b, covariance, variance, truth
+    if determined:
+        normal -= missing_information(at, p_b, e, S, weighed, judged, truth)
+        determined = invert(normal, covariance)
+    for k in range(len(rows)):
+        truth_of_all[rows[k]] = truth[k]
+    return determined, moved, T_a_b, covariance, variance, truth_of_all

@@ -47,18 +47,25 @@ def of_others(copies: Sequence[Copies], own: int) -> Copies:
 
 
 @njit(cache=True)
-def laid_on_like(found: np.ndarray, near: Grid) -> np.ndarray:
-    """Which landmarks (N,) lie where enough of those about them are `found` (N,) elsewhere."""
+def about_each(counted: np.ndarray, near: Grid) -> np.ndarray:
+    """How many of the landmarks about each (N,) are `counted` (N,), itself among them."""
     p, row_of = near.p, near.row
-    laid = np.zeros(len(found), np.bool_)
+    n = np.zeros(len(counted), np.int64)
     runs = np.empty((near.shape[1], 2), np.int64)
     for k in range(len(p)):
-        n, hits = 0, 0
+        if not counted[row_of[k]]:
+            continue
         for run in range(runs_about(p[k, 0], p[k, 1], _PLACE_M, near, runs)):
             for m in range(runs[run, 0], runs[run, 1]):
                 dx, dy = p[m, 0] - p[k, 0], p[m, 1] - p[k, 1]
-                if dx * dx + dy * dy <= _PLACE_M * _PLACE_M:
-                    n += 1
-                    hits += found[row_of[m]]
-        laid[row_of[k]] = hits >= _LEAST and hits >= _LEAST_SHARE * n
-    return laid
+                n[row_of[m]] += dx * dx + dy * dy <= _PLACE_M * _PLACE_M
+    return n
+
+
+def laid_on_like(found: np.ndarray, crowd: np.ndarray, near: Grid) -> np.ndarray:
+    """Which landmarks (N,) lie where enough of those about them are `found` (N,) elsewhere.
+
+    Of `crowd` (N,) is how many there are about each.
+    """
+    hits = about_each(found, near)
+    return (hits >= _LEAST) & (hits >= _LEAST_SHARE * crowd)

@@ -9,6 +9,9 @@ from numba import njit
 from mapfusion.align.closest import Grid, runs_about
 from mapfusion.se2 import Float
 
+# Of a descriptor's dimensions, those after which it is asked whether the distance is too large yet.
+_AT_A_TIME = 8
+
 
 class Looks(NamedTuple):
     """N landmarks by place and look, for the kernel.
@@ -67,7 +70,7 @@ def has(p: Float, rows: np.ndarray, own: Looks, other: Looks, gates: Gates) -> n
                 dz = z_own[i] - z_other[j]
                 if most < math.inf and dz * dz > most * (z2_own[i] + z2_other[j] + floor_m2):
                     continue
-                if _square_apart(look_own[i], look_other[j]) <= unlike2:
+                if _alike(look_own, i, look_other, j, unlike2):
                     found[m] = True
                     break
             if found[m]:
@@ -76,9 +79,12 @@ def has(p: Float, rows: np.ndarray, own: Looks, other: Looks, gates: Gates) -> n
 
 
 @njit(cache=True)
-def _square_apart(first: np.ndarray, second: np.ndarray) -> float:
-    """Squared distance of two descriptors (D,)."""
+def _alike(own: np.ndarray, i: int, other: np.ndarray, j: int, most: float) -> bool:
+    """Whether descriptors i and j of (N, D) are no more than so much apart, squared."""
     square = 0.0
-    for d in range(len(first)):
-        square += (first[d] - second[d]) ** 2
-    return square
+    for first in range(0, own.shape[1], _AT_A_TIME):
+        for d in range(first, min(first + _AT_A_TIME, own.shape[1])):
+            square += (own[i, d] - other[j, d]) ** 2
+        if square > most:
+            return False
+    return square <= most

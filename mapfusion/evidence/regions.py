@@ -8,7 +8,7 @@ import numpy as np
 
 from mapfusion.align.closest import Grid
 from mapfusion.align.correspondences import HeightGate
-from mapfusion.evidence.copies import BETWEEN, Copies, laid_on_like
+from mapfusion.evidence.copies import BETWEEN, Copies, about_each, laid_on_like
 from mapfusion.evidence.expected import MUST, UNSEEN, Seen, Watch, how_seen
 from mapfusion.evidence.found import Gates, Looks, has
 from mapfusion.evidence.likelihood import (
@@ -146,6 +146,11 @@ class Witness:
         near = Grid.of(position[:, :2])
         self.looks = Looks(near, position[:, 2].copy(), z_m2, np.ascontiguousarray(descriptor))
 
+    @cached_property
+    def crowd(self) -> np.ndarray:
+        """(N,) landmarks about each."""
+        return about_each(np.ones(len(self.landmarks), np.bool_), self.looks.near)
+
     def seen_from(self, T: Float) -> Seen:
         """Its landmarks as another robot would find them, T from its frame to that one's."""
         viewing, p = self._viewing, self.landmarks.position_m.copy()
@@ -211,7 +216,7 @@ class Witnesses:
         p = own.landmarks.position_m.copy()
         p[:, :2] = transform_points(T, p[:, :2])
         found = has(p, np.arange(len(p)), own.looks, other.looks, self._gates)
-        return laid_on_like(found, own.looks.near)
+        return laid_on_like(found, own.crowd, own.looks.near)
 
     def _asked(
         self, own: Witness, other: Witness, T: Float, copied: np.ndarray

@@ -65,6 +65,28 @@ def test_kernel_equals_its_twin(rounds):
         np.testing.assert_allclose(ours, theirs, rtol=1e-7, atol=1e-10)
 
 
+def test_pairs_that_come_within_the_gate_on_the_way_count():
+    """From a start so turned that most of them begin far beyond the gate."""
+    rng = np.random.default_rng(13)
+    pair, maps = offered(rng, 200, 0.7, 0.05)
+    pairs = Pairs(*maps)
+    middle = pairs.p_b[:, :2].mean(axis=0)[None]
+    start = pair.T_a_b + np.array([0.0, 0.0, 0.15])
+    away = se2.transform_points(pair.T_a_b, middle) - se2.transform_points(start, middle)
+    start[:2] += away[0]
+    off = np.hypot(*residuals(start, pairs.p_a, pairs.p_b).T)
+    assert np.mean(off < 0.7) < 0.5
+    solved, _, T, covariance, variance, truth = maximise_likelihood(
+        pairs.in_plan(), start, 0.5, 0.1, 60
+    )
+    assert solved
+    assert error(T, pair.T_a_b)[0] < 0.05
+    for ours, theirs in zip(
+        (T, covariance, variance, truth), slow_iterate(pairs, start, 0.5, 0.1, 60), strict=True
+    ):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-9)
+
+
 @pytest.mark.parametrize("seed", [12, 192, 0])
 def test_few_pairs_far_surer_than_the_rest_do_not_swing_it(seed):
     """With whole steps of s_drift seeds 12 and 192 go to and fro between two answers for ever."""

@@ -3,7 +3,7 @@
 import numpy as np
 
 from mapfusion.align.closest import Grid
-from mapfusion.evidence.copies import BETWEEN, Copies, laid_on_like, of_others
+from mapfusion.evidence.copies import BETWEEN, Copies, about_each, laid_on_like, of_others
 from mapfusion.evidence.parameters import EvidenceParameters
 from mapfusion.evidence.regions import Witness, Witnesses
 from tests.mapfusion.evidence.two_rooms import Wall, between, mapped
@@ -16,7 +16,9 @@ def test_equals_the_slow_twin() -> None:
     near = np.linalg.norm(p[:, None] - p, axis=2) <= 0.5
     hits = near @ found.astype(int)
     expected = (hits >= 5) & (hits >= 0.3 * near.sum(axis=1))
-    laid = laid_on_like(found, Grid.of(p))
+    grid, every = Grid.of(p), np.ones(len(p), np.bool_)
+    np.testing.assert_array_equal(about_each(found, grid), hits)
+    laid = laid_on_like(found, about_each(every, grid), grid)
     np.testing.assert_array_equal(laid, expected)
     assert 20 < laid.sum() < 300
 

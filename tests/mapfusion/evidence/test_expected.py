@@ -4,10 +4,12 @@ import inspect
 import math
 
 import numpy as np
+import pytest
 
 from mapfusion.evidence.expected import LEAST_FRAMES, MAY, MUST, UNSEEN, Seen, Watch, how_seen
 from mapfusion.evidence.regions import Witness
 from mapfusion.fastslam.run import run_log
+from mapfusion.viewing import BEARINGS, RANGES, FieldOfView, Viewing
 from mapfusion.vision.tracks import TrackParameters
 from tests.mapfusion.evidence.two_rooms import Wall, between, mapped
 
@@ -17,7 +19,7 @@ def slowly(seen: Seen, watch: Watch) -> list[int]:
     how = []
     for p, direction, before in zip(*seen, strict=True):
         alike, frames = 0, 0
-        for t, (x, y) in enumerate(watch.places.p):
+        for t, (x, y) in enumerate(watch.place):
             theta = watch.heading[t, 2]
             sight = np.array([p[0] - x, p[1] - y])
             range_m = float(np.linalg.norm(sight))
@@ -50,6 +52,29 @@ def test_equals_the_slow_twin_on_any_places() -> None:
     seen = Seen(places, direction, rng.uniform(1.5, 7, n))
     how = how_seen(seen, witness.watch)
     assert how.tolist() == slowly(seen, witness.watch)
+    assert np.bincount(how, minlength=3).min() > 50
+
+
+@pytest.mark.parametrize("half_view_rad", [0.4, 2.0])
+def test_equals_the_slow_twin_on_a_path_that_winds(half_view_rad: float) -> None:
+    """Stretches of frames in which the robot turns, and a last one that is shorter."""
+    rng = np.random.default_rng(1)
+    n_frames, n = 100 * LEAST_FRAMES + 3, 3000
+    theta = np.cumsum(rng.normal(0, 0.2, n_frames))
+    steps = 0.1 * np.stack([np.cos(theta), np.sin(theta)], axis=1)
+    path = np.column_stack([np.cumsum(steps, axis=0), theta])
+    heights = np.tile([0.1, 1.2], (RANGES, 1))
+    field = FieldOfView(np.array([-1.0, 0.9]) * half_view_rad, np.array([0.5, 6.0]), heights)
+    reach = rng.uniform(0, 6, (n_frames, BEARINGS)).astype(np.float32)
+    nothing = np.zeros(0)
+    watch = Watch.of(Viewing(nothing, nothing, nothing.astype(np.int32), path, reach, field))
+    angle, at = rng.uniform(-np.pi, np.pi, n), path[rng.integers(0, n_frames, n), :2]
+    direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    distance = rng.uniform(0.5, 6, n)
+    places = np.column_stack([at + distance[:, None] * direction, rng.uniform(0, 1.4, n)])
+    seen = Seen(places, direction, distance)
+    how = how_seen(seen, watch)
+    assert how.tolist() == slowly(seen, watch)
     assert np.bincount(how, minlength=3).min() > 50
 
 
