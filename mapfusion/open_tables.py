@@ -130,21 +130,22 @@ def _call(name: str, values: pa.Array) -> pa.Array:
 def _rows_of_numbers(table: pa.Table, field: pa.Field) -> pa.Array:
     """A column of lists, (N, k) of NaN where there is none; also of columns NAME_0, NAME_1, ..."""
     width, n = field.type.list_size, table.num_rows
-    matrix = np.full((n, width), np.nan)
     apart = [f"{field.name}_{i}" for i in range(width)]
-    if set(apart) <= set(table.column_names):
-        for i, name in enumerate(apart):
-            matrix[:, i] = table.column(name).cast(pa.float64()).fill_null(np.nan).to_numpy()
-    elif field.name in table.column_names:
+    is_apart, values = set(apart) <= set(table.column_names), None
+    if not is_apart and field.name in table.column_names:
         values = table.column(field.name).combine_chunks()
         if values.type == field.type and not values.null_count and not values.flatten().null_count:
             return values
-        if values.null_count < n:
-            lengths = _call("list_value_length", values).drop_null().unique().to_pylist()
-            if lengths != [width]:
-                raise pa.ArrowInvalid(f"lists of {sorted(lengths)} numbers")
-            there = ~values.is_null().to_numpy(zero_copy_only=False)
-            flat = _call("list_flatten", values).cast(pa.float64()).fill_null(np.nan)
-            matrix[there] = flat.to_numpy(zero_copy_only=False).reshape(-1, width)
+    matrix = np.full((n, width), np.nan)
+    if is_apart:
+        for i, name in enumerate(apart):
+            matrix[:, i] = table.column(name).cast(pa.float64()).fill_null(np.nan).to_numpy()
+    elif values is not None and values.null_count < n:
+        lengths = _call("list_value_length", values).drop_null().unique().to_pylist()
+        if lengths != [width]:
+            raise pa.ArrowInvalid(f"lists of {sorted(lengths)} numbers")
+        there = ~values.is_null().to_numpy(zero_copy_only=False)
+        flat = _call("list_flatten", values).cast(pa.float64()).fill_null(np.nan)
+        matrix[there] = flat.to_numpy(zero_copy_only=False).reshape(-1, width)
     flat = pa.array(matrix.ravel().astype(field.type.value_type.to_pandas_dtype()))
     return pa.FixedSizeListArray.from_arrays(flat, type=field.type)

@@ -1,5 +1,6 @@
 """Which landmarks in one frame may be the same point of the world."""
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,9 +68,10 @@ class SamePoint:
             np.trace(x.covariance_m2[:, :2, :2], axis1=1, axis2=2) + x.drift_m2 for x in (a, b)
         )
         radius = np.sqrt(self._bound() * (widest_a + widest_b.max()))
-        found = KDTree(b.position_m[:, :2]).query_ball_point(a.position_m[:, :2], radius)
+        tree, places = KDTree(b.position_m[:, :2]), a.position_m[:, :2]
+        found = tree.query_ball_point(places, radius, return_sorted=True)
         lengths = [len(rows) for rows in found]
-        rows = np.concatenate([np.sort(rows) for rows in found]).astype(np.int64)
+        rows = np.fromiter(itertools.chain.from_iterable(found), np.int64, sum(lengths))
         return np.repeat(np.arange(len(a)), lengths), rows
 
     def _inside(

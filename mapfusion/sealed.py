@@ -62,6 +62,11 @@ def is_intact(data: bytes) -> bool | None:
     return found
 
 
+def carries_seal(data: bytes) -> bool:
+    """Whether a file's bytes carry a seal, fitting or not."""
+    return next(_digests(data), None) is not None
+
+
 def read_sealed(path: Path, what: str, only_ours: bool = False) -> bytes:
     """A file's bytes, checked before anybody looks at them.
 
@@ -85,7 +90,7 @@ def read_sealed(path: Path, what: str, only_ours: bool = False) -> bytes:
 
 def tell_unsealed(path: Path, data: bytes) -> None:
     """Warn, once a process, that a file which could be read is of unknown soundness."""
-    if not _told and next(_digests(data), None) is None:
+    if not _told and not carries_seal(data):
         _told.append(path)
         why = "made by another program or an earlier version, so damage to it may go unseen"
         text = f"{path}: carries no digest ({why}); said of the first such file alone"

@@ -117,10 +117,12 @@ def viewing_of(
         np.bincount(row, values, n).astype(np.float64)
         for values in (np.cos(direction), np.sin(direction), range_m)
     )
-    reach = np.zeros((len(path), BEARINGS), dtype=np.float32)
-    np.maximum.at(reach, (frame, part_of(bearing, field)), range_m.astype(np.float32))
-    mean_m = distance / np.maximum(count, 1)
-    return Viewing(np.arctan2(sin, cos), mean_m, count.astype(np.int32), path, reach, field)
+    reach = np.zeros(len(path) * BEARINGS, dtype=np.float32)
+    # with one index NumPy takes a short way that it does not know with two
+    cell = frame.astype(np.int64) * BEARINGS + part_of(bearing, field)
+    np.maximum.at(reach, cell, range_m.astype(np.float32))
+    reach_m, mean_m = reach.reshape(-1, BEARINGS), distance / np.maximum(count, 1)
+    return Viewing(np.arctan2(sin, cos), mean_m, count.astype(np.int32), path, reach_m, field)
 
 
 def part_of(bearing_rad: Float, field: FieldOfView) -> np.ndarray:
@@ -135,11 +137,24 @@ def _field_of_view(bearing_rad: Float, range_m: Float, height_m: Float) -> Field
     heights = np.tile([1.0, 0.0], (RANGES, 1))
     if not len(range_m):
         return FieldOfView(np.zeros(2), np.zeros(2), heights)
-    ends = (_STRAY, 1 - _STRAY)
-    nearest, farthest = np.quantile(range_m, ends)
+    nearest, farthest = _ends(range_m)
     step = np.floor(range_m / max(farthest, 1e-9) * RANGES).astype(np.int64)
     for k in range(RANGES):
         own = height_m[step == k]
         if len(own) >= _LEAST_SIGHTINGS:
-            heights[k] = np.quantile(own, ends)
-    return FieldOfView(np.quantile(bearing_rad, ends), np.array([nearest, farthest]), heights)
+            heights[k] = _ends(own)
+    return FieldOfView(_ends(bearing_rad), np.array([nearest, farthest]), heights)
+
+
+def _ends(values: Float) -> Float:
+    """The quantiles (2,) between which all values (n,) but the stray ones lie, n at least 1.
+
+    As `np.quantile` has them, which takes several times as long as to sort.
+    """
+    ranked = np.sort(values)
+    place = np.array([_STRAY, 1 - _STRAY]) * (len(ranked) - 1)
+    below = place.astype(np.int64)
+    low, high = ranked[below], ranked[np.minimum(below + 1, len(ranked) - 1)]
+    share = place - below
+    # from the nearer of the two
+    return np.where(share < 0.5, low + (high - low) * share, high - (high - low) * (1 - share))

@@ -16,6 +16,7 @@ from experiments.run.estimates import (
     evidence_of,
 )
 from experiments.run.frames import records
+from experiments.run.stage_tables import MOTION
 from mapfusion import se2
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.oracle import Oracle
@@ -105,13 +106,20 @@ def met_maps(
     return met
 
 
-def alignment_nees(T_estimate: Float, covariance: Float, T_true: Float) -> float:
-    """Squared Mahalanobis distance of an alignment (3,) to the truth; 3 degrees of freedom."""
+def alignment_nees(T_estimate: Float, covariance: Float, T_true: Float) -> Float:
+    """Squared Mahalanobis distances (...) of alignments to the truth; 3 degrees of freedom.
+
+    Args:
+        T_estimate: (..., 3).
+        covariance: (..., 3, 3) of these; NaN, and so the distance, where there is none.
+        T_true: (3,).
+    """
     error = T_estimate - T_true
-    error[2] = se2.wrap(error[2])
-    if not np.isfinite(covariance).all() or not np.isfinite(error).all():
-        return np.nan
-    return float(squared_mahalanobis(error, covariance))
+    error[..., 2] = se2.wrap(error[..., 2])
+    known = np.isfinite(covariance).all(axis=(-2, -1)) & np.isfinite(error).all(axis=-1)
+    nees = np.full(known.shape, np.nan)
+    nees[known] = squared_mahalanobis(error[known], covariance[known])
+    return nees
 
 
 def error_rows(met: MetMaps, judge: Judge, radius_m: float) -> pd.DataFrame:
@@ -121,29 +129,33 @@ def error_rows(met: MetMaps, judge: Judge, radius_m: float) -> pd.DataFrame:
     evidence = evidence_of(met.rivals, met.maps, judge.evidence)
     row = met.names | {"aligner": ORACLE, "repetition": 0}
     row |= estimate_row(len(pairs), oracle, oracle, judge.on(pairs, evidence).judge(oracle))
-    all_rows = [row, *records(met.estimates)]
-    rows, alignments = pd.DataFrame(all_rows), [alignment_of(each, len(pairs)) for each in all_rows]
+    rows = [row, *records(met.estimates)]
+    alignments = [alignment_of(each, len(pairs)) for each in rows]
     T_true = se2.between(met.a.path.T_world_map, met.b.path.T_world_map)
     T_refined = np.array([alignment.T_a_b for alignment in alignments])
     inlier = np.array([alignment.inlier for alignment in alignments])
-    error_m, error_rad = _motion_errors(rows[["tx_m", "ty_m", "theta_rad"]].to_numpy(), T_true)
+    covariance = np.array([alignment.covariance for alignment in alignments])
+    T_estimated = np.array([[each[name] for name in MOTION] for each in rows])
+    error_m, error_rad = _motion_errors(T_estimated, T_true)
     refined_m, refined_rad = _motion_errors(T_refined, T_true)
     oracle_m, oracle_rad = _motion_errors(T_refined, oracle.T_a_b)
     n_inliers, n_hits = inlier.sum(axis=1), (inlier & is_true).sum(axis=1)
-    return rows.assign(
-        translation_error_m=error_m,
-        rotation_error_rad=error_rad,
-        refined_translation_error_m=refined_m,
-        refined_rotation_error_rad=refined_rad,
-        oracle_distance_m=oracle_m,
-        oracle_distance_rad=np.abs(oracle_rad),
-        n_true=is_true.sum(),
-        n_common=common_landmarks(*met.points_world_m, radius_m),
-        n_inliers=n_inliers,
-        precision=n_hits / np.where(n_inliers, n_inliers, np.nan),
-        recall=n_hits / (is_true.sum() or np.nan),
-        alignment_nees=[alignment_nees(x.T_a_b, x.covariance, T_true) for x in alignments],
-    )
+    errors = {
+        "translation_error_m": error_m,
+        "rotation_error_rad": error_rad,
+        "refined_translation_error_m": refined_m,
+        "refined_rotation_error_rad": refined_rad,
+        "oracle_distance_m": oracle_m,
+        "oracle_distance_rad": np.abs(oracle_rad),
+        "n_true": is_true.sum(),
+        "n_common": common_landmarks(*met.points_world_m, radius_m),
+        "n_inliers": n_inliers,
+        "precision": n_hits / np.where(n_inliers, n_inliers, np.nan),
+        "recall": n_hits / (is_true.sum() or np.nan),
+        "alignment_nees": alignment_nees(T_refined, covariance, T_true),
+    }
+    # all columns at once: pandas takes as long to add one as to make a frame
+    return pd.DataFrame({name: [each[name] for each in rows] for name in row} | errors)
 
 
 def _motion_errors(T: Float, T_right: Float) -> tuple[Float, Float]:

@@ -23,21 +23,26 @@ def landmark_truth(
     Args:
         truth: of the robot.
         owners_at: by iteration and number of observations, (n,) the `source_observation` of the
-            landmark that each of the log's first observations went into then; negative for none.
+            landmark that each of the log's first observations went into then; -1 for none.
         maps: by iteration.
     """
     point_m, has_point = truth.point_world_m, np.isfinite(truth.point_world_m).all(axis=1)
-    points = {}
+    n = len(point_m)
+    # Both by `source_observation`, their last row, which is that of -1, of none. From one map to
+    # the next few landmarks gain or lose an observation: the medians of all others stay.
+    median_m, points = np.full((n + 1, 3), np.nan), {}
+    before = np.full(n, -1)
     for iteration, landmarks in maps.items():
-        owner = owners_at(iteration, len(point_m))
-        known = has_point & (owner >= 0)
-        found, median_m = _medians(owner[known], point_m[known])
-        wanted = landmarks.source_observation
-        at = np.searchsorted(found, wanted)
-        is_found = at < len(found)
-        is_found[is_found] = found[at[is_found]] == wanted[is_found]
-        points[iteration] = np.full((len(wanted), 3), np.nan)
-        points[iteration][is_found] = median_m[at[is_found]]
+        owner = owners_at(iteration, n)
+        changed, anew = np.flatnonzero(owner != before), np.zeros(n + 1, dtype=bool)
+        anew[before[changed]] = anew[owner[changed]] = True
+        anew[-1] = False
+        median_m[anew] = np.nan
+        counts = np.flatnonzero(anew[owner] & has_point)
+        found, found_m = _medians(owner[counts], point_m[counts])
+        median_m[found] = found_m
+        points[iteration] = median_m[landmarks.source_observation]
+        before = owner
     return points
 
 

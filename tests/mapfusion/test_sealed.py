@@ -70,6 +70,17 @@ def test_pages_carry_checksums_and_others_can_read_and_write_the_table_again(tab
         pq.read_table(pa.BufferReader(bytes(data)), page_checksum_verification=True)
 
 
+def test_without_a_digest_the_checksums_of_pages_tell_of_damage(table, tmp_path):
+    path = tmp_path / "of_others.parquet"
+    pq.write_table(pq.read_table(table), path, write_page_checksum=True, compression="none")
+    data, column = bytearray(path.read_bytes()), pq.read_metadata(path).row_group(0).column(0)
+    begin = column.dictionary_page_offset or column.data_page_offset
+    data[begin + column.total_compressed_size - 1] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(DamagedFileError, match="CRC"):
+        read_parquet(path, "table")
+
+
 def test_what_only_looks_like_a_seal_does_no_harm(tmp_path):
     path = tmp_path / "x.json"
     text = f'{sealed.SEAL}": "{"5" * 64}'

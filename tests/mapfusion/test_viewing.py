@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from mapfusion.viewing import BEARINGS, Viewing, part_of
+from mapfusion.robot_log import Observations, RobotLog
+from mapfusion.viewing import BEARINGS, RANGES, Viewing, part_of, viewing_of
 from tests.mapfusion.evidence.two_rooms import FARTHEST_M, HALF_VIEW_RAD, Wall, mapped
 
 
@@ -39,6 +40,30 @@ def test_it_reaches_as_far_as_landmarks_were_seen() -> None:
     np.testing.assert_allclose(viewing.reach_m[seen], expected[seen], atol=0.15)
     assert seen.mean() > 0.4
     assert viewing.field.range_m == pytest.approx([3.0, 3.0 / np.cos(HALF_VIEW_RAD)], abs=0.05)
+
+
+@pytest.mark.parametrize("n", [1, 2, 7, 200, 3001])
+def test_a_field_of_view_ends_at_quantiles(n: int) -> None:
+    """Of range, bearing, and height at each step of range, by NumPy's own, to the last bit."""
+    rng, stray = np.random.default_rng(n), (0.005, 1 - 0.005)
+    position = rng.normal(size=(n, 3)) * [3, 2, 0.5] + [9, 0, 0]
+    observations = Observations(position, np.tile(np.eye(3), (n, 1, 1)))
+    log = RobotLog("R", False, np.zeros(1), np.zeros((1, 3)), np.zeros(n, int), observations)
+    none = np.empty(0, dtype=np.int64)
+    field = viewing_of(log, np.full(n, -1), np.zeros((1, 3)), none).field
+    bearing = np.arctan2(position[:, 1], position[:, 0])
+    np.testing.assert_array_equal(field.bearing_rad, np.quantile(bearing, stray))
+    range_m = np.hypot(position[:, 0], position[:, 1])
+    np.testing.assert_array_equal(field.range_m, np.quantile(range_m, stray))
+    step, told = field.range_m[1] / RANGES, 0
+    for k, ends in enumerate(field.height_m):
+        own = position[(k * step <= range_m) & (range_m < (k + 1) * step), 2]
+        if len(own) < 20:
+            assert ends[0] > ends[1]
+        else:
+            np.testing.assert_array_equal(ends, np.quantile(own, stray))
+            told += 1
+    assert told >= (3 if n > 1000 else 0)
 
 
 def test_bearings_beyond_the_field_of_view_are_in_its_last_parts() -> None:

@@ -11,10 +11,18 @@ import matplotlib.image
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.figure import Figure
+from PIL import Image
 
 from experiments.judge import tables
 from experiments.show.figures import drawing, fig02_two_maps, fig11_fusers, fig12_coverage
-from experiments.show.figures.drawing import FIGURES, Drawing, draw_all, draw_figure
+from experiments.show.figures.drawing import (
+    FIGURES,
+    Drawing,
+    draw_all,
+    draw_figure,
+    save_figure,
+)
 from experiments.show.figures.fig03_dispersion import choose_moments, spread_over_time
 from experiments.show.figures.result_tables import ResultTables
 from experiments.show.figures.style import aligner_styles, house_style
@@ -57,6 +65,24 @@ def test_pictures_are_the_same_byte_for_byte(name: str, trio_result: Path, tmp_p
             files = draw_figure(ResultTables(folder), name).files
         digests.append([hashlib.sha256(file.read_bytes()).hexdigest() for file in files])
     assert digests[0] == digests[1]
+
+
+def test_a_png_is_what_matplotlib_saves_and_knows_its_resolution(tmp_path: Path) -> None:
+    def draw() -> Figure:
+        figure = Figure(figsize=(3, 2), facecolor="#FFE8C0")
+        axes = figure.subplots()
+        axes.plot([0, 1, 3], [2, 1, 5], color="#D55E00", label="a line")
+        axes.imshow(np.linspace(0, 1, 12).reshape(3, 4))
+        axes.legend()
+        return figure
+
+    png, _ = save_figure(tmp_path, "ours", draw)
+    with house_style():
+        draw().savefig(tmp_path / "theirs.png", dpi=200)
+    with Image.open(png) as ours, Image.open(tmp_path / "theirs.png") as theirs:
+        assert ours.size == (600, 400)
+        np.testing.assert_array_equal(ours.convert("RGB"), theirs.convert("RGB"))
+        assert ours.info["dpi"] == pytest.approx((200, 200), abs=0.01)
 
 
 def test_users_settings_come_back() -> None:
