@@ -57,10 +57,9 @@ def settled_with_levels(
     told where steps are close to their end, and they go on from there.
     """
     levels, n_steps, told, known = AS_STATED, 0, [AS_STATED.odometry], False
-    nearby: Float | None = None
+    under, nearby = problem, None
     weights = unweighted(problem.seen) if weights is None else weights
     while True:
-        under = _with(problem, levels)
         end = solved(under, at, weights, tails, n_steps, nearby)
         observation = told_observation_level(end, levels.observation)
         follows = _differ(observation, levels.observation) < _FOLLOWED
@@ -73,8 +72,9 @@ def settled_with_levels(
             known = any(_differ(odometry, each) < 2 * _SETTLED for each in told)
             told.append(odometry)
         levels = Levels(odometry, observation)
-        at, weights, tails = stepped(under, end, _with(problem, levels).seen)
-        n_steps, nearby = n_steps + 1, end.nearby
+        after = _with(problem, levels)
+        at, weights, tails = stepped(under, end, after.seen)
+        under, n_steps, nearby = after, n_steps + 1, end.nearby
 
 
 def _differ(levels: Float | float, others: Float | float) -> float:

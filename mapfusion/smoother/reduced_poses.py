@@ -15,12 +15,7 @@ from mapfusion.smoother.landmark_elimination import along_points, along_way, sub
 from mapfusion.smoother.normal_equations import NormalEquations
 from mapfusion.smoother.offsets import Reduced, moved_points
 from mapfusion.smoother.sightings import Sightings
-from mapfusion.smoother.skyline import (
-    cholesky_in_envelope,
-    solve_in_envelope,
-    solve_transposed_in_envelope,
-    untouched_zeros,
-)
+from mapfusion.smoother.skyline import Factor, factor_in_envelope, untouched_zeros
 
 # What a step may be off by, as a share of it, both in sigmas: what the last ones, of hundredths of
 # a sigma, leave of it is nothing, and they mend what those before left.
@@ -59,8 +54,8 @@ class ReducedPoses:
         still = self.left._replace(pull=gained, point_gradient=unpulled)
         return self._with_points(product, still, along)
 
-    def factor(self) -> Float:
-        """Lower Cholesky factor (3 (T - 1), 3 (T - 1)) of the matrix, in the poses' order.
+    def factor(self) -> Factor:
+        """Of the matrix without the first pose, the others in their order.
 
         Raises:
             LinAlgError: the matrix is not positive definite.
@@ -69,18 +64,18 @@ class ReducedPoses:
         S = untouched_zeros(3 * n)
         _put_poses(S.reshape(n, 3, n, 3), self.seen.pose_place, self.equations)
         subtract_points(self.seen, self.equations, self.left, S)
-        return cholesky_in_envelope(S[3:, 3:], self.seen.order.first_entry)
+        return factor_in_envelope(S[3:, 3:], self.seen.order.first_entry)
 
-    def solved(self, factor: Float, right: Float) -> Float:
+    def solved(self, factor: Factor, right: Float) -> Float:
         """(T, 3) what a matrix with this factor turns into `right` (T, 3)."""
-        place, first = self.seen.pose_place[1:] - 1, self.seen.order.first_entry
+        place = self.seen.pose_place[1:] - 1
         ordered, found = np.empty((len(place), 3)), np.zeros_like(right)
         ordered[place] = right[1:]
-        turned = solve_in_envelope(factor, first, ordered.ravel())
-        found[1:] = solve_transposed_in_envelope(factor, first, turned).reshape(-1, 3)[place]
+        solved = factor.solve_transposed(factor.solve(ordered.ravel()))
+        found[1:] = solved.reshape(-1, 3)[place]
         return found
 
-    def solved_nearby(self, factor: Float, right: Float) -> Float | None:
+    def solved_nearby(self, factor: Factor, right: Float) -> Float | None:
         """(T, 3) what the matrix turns into `right` (T, 3), by a factor that is nearly its own.
 
         None where that is too far off.

@@ -16,6 +16,7 @@ from mapfusion.smoother.normal_equations import (
 from mapfusion.smoother.residuals import squared_distances
 from mapfusion.smoother.robust import NO_TAILS, Tails, informative, reweighted, unweighted
 from mapfusion.smoother.sightings import Sightings
+from mapfusion.smoother.skyline import Factor
 
 # The last step moves the poses by no more than this, in squared sigmas a coordinate: the third of a
 # hundredth of a sigma. A step costs as the cube of the log, and there is little left to win:
@@ -70,7 +71,7 @@ class Settled(NamedTuple):
     n_steps: int
     equations: NormalEquations
     solution: Solution
-    nearby: Float | None
+    nearby: Factor | None
 
     def is_within(self, least_move: float) -> bool:
         """Whether the next step would move the poses by less, in squared sigmas a coordinate."""
@@ -113,7 +114,7 @@ def solved(
     weights: Weights,
     tails: Tails,
     n_steps: int = 0,
-    nearby: Float | None = None,
+    nearby: Factor | None = None,
 ) -> Settled:
     """The next step from an estimate, and what is known there; `nearby` is of a step before.
 
