@@ -127,18 +127,27 @@ def _call(name: str, values: pa.Array) -> pa.Array:
     return pc.call_function(name, [values])
 
 
+def _is_as_it_should_be(table: pa.Table, field: pa.Field) -> bool:
+    """Whether a table has a column of lists of the field's type, each number of them."""
+    if field.name not in table.column_names:
+        return False
+    values = table.column(field.name).combine_chunks()
+    return values.type == field.type and not values.null_count and not values.flatten().null_count
+
+
 def _rows_of_numbers(table: pa.Table, field: pa.Field) -> pa.Array:
     """A column of lists, (N, k) of NaN where there is none; also of columns NAME_0, NAME_1, ..."""
     width, n = field.type.list_size, table.num_rows
-    matrix = np.full((n, width), np.nan)
     apart = [f"{field.name}_{i}" for i in range(width)]
-    if set(apart) <= set(table.column_names):
+    are_apart = set(apart) <= set(table.column_names)
+    if not are_apart and _is_as_it_should_be(table, field):
+        return table.column(field.name).combine_chunks()
+    matrix = np.full((n, width), np.nan)
+    if are_apart:
         for i, name in enumerate(apart):
             matrix[:, i] = table.column(name).cast(pa.float64()).fill_null(np.nan).to_numpy()
     elif field.name in table.column_names:
         values = table.column(field.name).combine_chunks()
-        if values.type == field.type and not values.null_count and not values.flatten().null_count:
-            return values
         if values.null_count < n:
             lengths = _call("list_value_length", values).drop_null().unique().to_pylist()
             if lengths != [width]:

@@ -46,6 +46,11 @@ def _digests(data: bytes) -> Iterator[int]:
             yield match.start(1)
 
 
+def is_sealed(data: bytes) -> bool:
+    """Whether a file's bytes carry a seal."""
+    return next(_digests(data), None) is not None
+
+
 def is_intact(data: bytes) -> bool | None:
     """Whether a file's bytes are those that were sealed; None where they carry no seal.
 
@@ -85,7 +90,7 @@ def read_sealed(path: Path, what: str, only_ours: bool = False) -> bytes:
 
 def tell_unsealed(path: Path, data: bytes) -> None:
     """Warn, once a process, that a file which could be read is of unknown soundness."""
-    if not _told and next(_digests(data), None) is None:
+    if not _told and not is_sealed(data):
         _told.append(path)
         why = "made by another program or an earlier version, so damage to it may go unseen"
         text = f"{path}: carries no digest ({why}); said of the first such file alone"
