@@ -12,17 +12,13 @@ import scipy.linalg
 
 from mapfusion.joint_covariance import KnownErrors, SharedErrors
 from mapfusion.se2 import Float
-from mapfusion.smoother.landmark_elimination import along_way, subtract_points
+from mapfusion.smoother.landmark_elimination import along_way
 from mapfusion.smoother.normal_equations import Estimate, NormalEquations, Weights, point_equations
 from mapfusion.smoother.offsets import Points, known_points, moved_points, without_offsets
 from mapfusion.smoother.path_errors import PathErrors
+from mapfusion.smoother.reduced_poses import ReducedPoses
 from mapfusion.smoother.sightings import Sightings
-from mapfusion.smoother.skyline import (
-    cholesky_in_envelope,
-    solve_in_envelope,
-    solve_transposed_in_envelope,
-    untouched_zeros,
-)
+from mapfusion.smoother.skyline import Factor, factor_in_envelope
 
 _ITEM = np.dtype(np.float64).itemsize
 _COPIES = 3  # of a matrix that are there at once: as it is made, in LAPACK's order, and solved
@@ -38,7 +34,8 @@ class Solution(NamedTuple):
         own_m2: (L, 3, 3) covariance of each landmark if the path were known.
         offset_m2: (B, 3, 3) of each track's offset, likewise.
         track_m2: (B, 3, 3) of each track's point, likewise.
-        factor: lower Cholesky factor of the information of what was eliminated last.
+        factor: Cholesky factor of the information of what was eliminated last; None where
+            that of a step before was enough (`own_factor`).
         landmarks_first: whether these are the poses, in the order of `pose_place` (else the offsets
             and, after them, landmarks).
     """
@@ -48,14 +45,28 @@ class Solution(NamedTuple):
     own_m2: Float
     offset_m2: Float
     track_m2: Float
-    factor: Float
+    factor: Factor | None
     landmarks_first: bool
 
 
-def solve(seen: Sightings, equations: NormalEquations) -> Solution:
-    """The step that solves the equations."""
-    first = _is_landmarks_first(seen, len(equations.pose_block))
-    return (_landmarks_first if first else _poses_first)(seen, equations)
+def solve(seen: Sightings, equations: NormalEquations, nearby: Factor | None = None) -> Solution:
+    """The step that solves the equations; by the factor of a step before, if that is near enough.
+
+    Args:
+        seen: the observations.
+        equations: what they say.
+        nearby: factor that was found for the same observations at a step before.
+    """
+    if _is_landmarks_first(seen, len(equations.pose_block)):
+        return _landmarks_first(seen, equations, nearby)
+    return _poses_first(seen, equations)
+
+
+def own_factor(seen: Sightings, equations: NormalEquations, solution: Solution) -> Factor:
+    """The factor of the equations themselves; of a step that another one was enough for, anew."""
+    if solution.factor is not None:
+        return solution.factor
+    return ReducedPoses(seen, equations, without_offsets(seen, equations.points)).factor()
 
 
 def solve_points(
@@ -88,9 +99,10 @@ def _n_points(seen: Sightings) -> int:
 
 def shared_errors(seen: Sightings, equations: NormalEquations, solution: Solution) -> SharedErrors:
     """Y (R, 3L): the landmarks' joint covariance is block diagonal of `own_m2` plus Y' Y."""
+    factor = own_factor(seen, equations, solution)
     if solution.landmarks_first:
-        return PathErrors.of(seen, equations, solution.own_m2, solution.factor)
-    return KnownErrors(_beside_own(solution))
+        return PathErrors.of(seen, equations, solution.own_m2, factor)
+    return KnownErrors(_beside_own(solution.own_m2, factor.lower))
 
 
 def pose_covariances(
@@ -105,47 +117,35 @@ def pose_covariances(
     if not solution.landmarks_first:  # the errors of the path if all points were known, and theirs
         solved = scipy.linalg.cho_solve_banded((chain_factor(equations), True), right)
         right, alone = pose_point_blocks(seen, equations)[0].T @ solved, right.T @ solved
-    root = scipy.linalg.solve_triangular(solution.factor, right, lower=True, check_finite=False)
+    root = own_factor(seen, equations, solution).solve(right)
     return (root.T @ root + alone).reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
 
 
-def _beside_own(solution: Solution) -> Float:
+def _beside_own(own_m2: Float, lower: Float) -> Float:
     """Y (3L, 3L) from the landmarks' information: what the path's errors add to `own_m2`."""
-    n, each = len(solution.own_m2), np.arange(len(solution.own_m2))
-    factor = solution.factor[-3 * n :, -3 * n :]  # the last rows are that of what is left
-    joint = scipy.linalg.cho_solve((factor, True), np.eye(3 * n), check_finite=False)
-    joint.reshape(n, 3, n, 3)[each, :, each, :] -= solution.own_m2
+    n, each = len(own_m2), np.arange(len(own_m2))
+    lower = lower[-3 * n :, -3 * n :]  # the last rows are that of what is left
+    joint = scipy.linalg.cho_solve((lower, True), np.eye(3 * n), check_finite=False)
+    joint.reshape(n, 3, n, 3)[each, :, each, :] -= own_m2
     variance, direction = np.linalg.eigh(joint)
     return (np.sqrt(np.maximum(variance, 0.0)) * direction).T[::-1]
 
 
-def _landmarks_first(seen: Sightings, equations: NormalEquations) -> Solution:
-    n, place = len(equations.pose_block), seen.pose_place
-    S, gradient, first = untouched_zeros(3 * n), np.empty((n, 3)), seen.order.first_entry
-    _put_poses(S.reshape(n, 3, n, 3), place, equations)
-    gradient[place] = equations.pose_gradient
+def _landmarks_first(
+    seen: Sightings, equations: NormalEquations, nearby: Factor | None = None
+) -> Solution:
     left = without_offsets(seen, equations.points)
-    subtract_points(seen, equations, left, S, gradient)
-    factor = cholesky_in_envelope(S[3:, 3:], first)
-    turned = solve_in_envelope(factor, first, gradient[1:].ravel())  # squared, what the step moves
-    solved = -solve_transposed_in_envelope(factor, first, turned)
-    way = np.zeros((n, 3))
-    way[1:] = solved.reshape(-1, 3)[place[1:] - 1]
+    poses, factor = ReducedPoses(seen, equations, left), None
+    gradient = poses.gradient()
+    way = None if nearby is None else poses.solved_nearby(nearby, -gradient)
+    if way is None:
+        factor = poses.factor()
+        way = poses.solved(factor, -gradient)
     along = along_way(seen, equations.coupling, way)
     step = Estimate(way, *moved_points(seen, equations.points, left, along))
-    moved, known = float(turned @ turned), known_points(seen, left)
+    moved, known = -float(np.vdot(gradient, way)), known_points(seen, left)
     own = left.landmark_m2, known.offset_m2, known.track_m2
     return Solution(step, moved, *own, factor, landmarks_first=True)
-
-
-def _put_poses(blocks: Float, place: np.ndarray, equations: NormalEquations) -> None:
-    """What odometry and the poses' own observations say, into blocks (T, 3, T, 3) by `place`."""
-    blocks[place, :, place, :] = equations.pose_block
-    after, before = place[1:], place[:-1]
-    link = np.where(
-        (after > before)[:, None, None], equations.link, np.swapaxes(equations.link, 1, 2)
-    )
-    blocks[np.maximum(after, before), :, np.minimum(after, before), :] = link
 
 
 def _poses_first(seen: Sightings, equations: NormalEquations) -> Solution:
@@ -154,8 +154,8 @@ def _poses_first(seen: Sightings, equations: NormalEquations) -> Solution:
     chain = chain_factor(equations)
     right = np.column_stack([B, equations.pose_gradient[1:].ravel()])
     solved = scipy.linalg.cho_solve_banded((chain, True), right, check_finite=False)
-    factor = scipy.linalg.cholesky(K - B.T @ solved[:, :-1], lower=True, check_finite=False)
-    points = -scipy.linalg.cho_solve((factor, True), gradient - B.T @ solved[:, -1])
+    factor = factor_in_envelope(K - B.T @ solved[:, :-1], np.zeros(len(K), dtype=np.int64))
+    points = -factor.solve_transposed(factor.solve(gradient - B.T @ solved[:, -1]))
     way, offsets = np.zeros((n_poses, 3)), np.zeros((len(seen.strays), 3))
     way[1:] = -(solved[:, -1] + solved[:, :-1] @ points).reshape(-1, 3)
     offsets[seen.strays] = points[:n_offsets].reshape(-1, 3)
@@ -164,7 +164,7 @@ def _poses_first(seen: Sightings, equations: NormalEquations) -> Solution:
     known = known_points(seen, left)
     own = left.landmark_m2, known.offset_m2, known.track_m2
     last = step.point_m.ravel()
-    moved = float(np.sum((factor[-last.size :, -last.size :].T @ last) ** 2))
+    moved = float(np.sum((np.tril(factor.lower[-last.size :, -last.size :]).T @ last) ** 2))
     return Solution(step, moved, *own, factor, landmarks_first=False)
 
 

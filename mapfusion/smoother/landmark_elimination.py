@@ -16,9 +16,7 @@ from mapfusion.smoother.offsets import Reduced
 from mapfusion.smoother.sightings import Sightings
 
 
-def subtract_points(
-    seen: Sightings, equations: NormalEquations, left: Reduced, S: Float, gradient: Float
-) -> None:
+def subtract_points(seen: Sightings, equations: NormalEquations, left: Reduced, S: Float) -> None:
     """Take what goes by offsets and landmarks from what is between poses.
 
     Args:
@@ -26,11 +24,10 @@ def subtract_points(
         equations: all of them.
         left: once the offsets are eliminated.
         S: (3T, 3T) of the poses by `pose_place`; the lower half, and the blocks on the diagonal.
-        gradient: (T, 3) theirs, by `pose_place`.
     """
     place, coupling = seen.pose_place[seen.frame], equations.coupling
     couplings = coupling, left_couplings(seen, coupling, left)
-    _subtract(seen.by_landmark, place, couplings, left, S, gradient)
+    _subtract(seen.by_landmark, place, couplings, left, S)
 
 
 @njit(cache=True)
@@ -40,7 +37,6 @@ def _subtract(
     couplings: tuple[Float, Float],
     left: Reduced,
     S: Float,
-    gradient: Float,
 ) -> None:
     (starts, first_track, track_starts), (coupling, coupling_left) = rows, couplings
     by_landmark, by_track = np.empty((3, 3)), np.empty((3, 3))  # H K A, and H (K A K' + G)
@@ -48,7 +44,6 @@ def _subtract(
         for t in range(first_track[j], first_track[j + 1]):
             for i in range(track_starts[t], track_starts[t + 1]):
                 _put_gains(left, j, t, coupling, coupling_left, i, by_landmark, by_track)
-                _subtract_pull(left, j, t, by_landmark, by_track, gradient, place[i])
                 _add_product(by_landmark, left.kept, t, by_track)
                 _subtract_rows(by_landmark, starts[j], track_starts[t], i, place, coupling_left, S)
                 _subtract_rows(by_track, track_starts[t], i, i, place, coupling, S)
@@ -75,16 +70,6 @@ def _put_gains(
         x, y, z = coupling[i, r, 0], coupling[i, r, 1], coupling[i, r, 2]
         for q in range(3):
             by_track[r, q] = x * G[t, 0, q] + y * G[t, 1, q] + z * G[t, 2, q]
-
-
-@njit(cache=True)
-def _subtract_pull(
-    left: Reduced, j: int, t: int, X: Float, Y: Float, gradient: Float, row: int
-) -> None:
-    b, pull = left.point_gradient, left.pull
-    for r in range(3):
-        gradient[row, r] -= X[r, 0] * b[j, 0] + X[r, 1] * b[j, 1] + X[r, 2] * b[j, 2]
-        gradient[row, r] -= Y[r, 0] * pull[t, 0] + Y[r, 1] * pull[t, 1] + Y[r, 2] * pull[t, 2]
 
 
 @njit(cache=True)
@@ -185,3 +170,39 @@ def _add_along_way(
             for q in range(3):
                 total[t, q] += coupling[i, 0, q] * x + coupling[i, 1, q] * y
                 total[t, q] += coupling[i, 2, q] * turned
+
+
+def along_points(seen: Sightings, coupling: Float, point: Float, offset: Float) -> Float:
+    """(T, 3) sum of coupling (point + offset) over the observations of each frame.
+
+    Args:
+        seen: the observations.
+        coupling: (N, 3, 3) of each.
+        point: (L, 3) way of each landmark.
+        offset: (B, 3) way of each track's offset.
+    """
+    total = np.zeros((seen.order.n_poses, 3))
+    _add_along_points(
+        seen.track_starts, seen.landmark_of_track, seen.frame, coupling, point, offset, total
+    )
+    return total
+
+
+@njit(cache=True)
+def _add_along_points(
+    track_starts: np.ndarray,
+    owner: np.ndarray,
+    frame: np.ndarray,
+    coupling: Float,
+    point: Float,
+    offset: Float,
+    total: Float,
+) -> None:
+    for t in range(len(owner)):
+        j = owner[t]
+        x, y, z = point[j, 0] + offset[t, 0], point[j, 1] + offset[t, 1], point[j, 2] + offset[t, 2]
+        for i in range(track_starts[t], track_starts[t + 1]):
+            for r in range(3):
+                total[frame[i], r] += (
+                    coupling[i, r, 0] * x + coupling[i, r, 1] * y + coupling[i, r, 2] * z
+                )

@@ -13,7 +13,15 @@ from mapfusion.smoother.normal_equations import Estimate, Weights
 from mapfusion.smoother.observation_level import told_observation_level
 from mapfusion.smoother.odometry_levels import told_odometry_levels
 from mapfusion.smoother.robust import NO_TAILS, Tails, unweighted
-from mapfusion.smoother.settle import CONVERGED, Problem, Settled, finished, solved, stepped
+from mapfusion.smoother.settle import (
+    CONVERGED,
+    Problem,
+    Settled,
+    factored,
+    finished,
+    solved,
+    stepped,
+)
 
 # The odometry's levels are told anew until no standard deviation is off by more than this share
 # from what it was once before: those of motions that are hardly told may come and go.
@@ -49,22 +57,24 @@ def settled_with_levels(
     told where steps are close to their end, and they go on from there.
     """
     levels, n_steps, told, known = AS_STATED, 0, [AS_STATED.odometry], False
+    under, nearby = problem, None
     weights = unweighted(problem.seen) if weights is None else weights
     while True:
-        under = _with(problem, levels)
-        end = solved(under, at, weights, tails, n_steps)
+        end = solved(under, at, weights, tails, n_steps, nearby)
         observation = told_observation_level(end, levels.observation)
         follows = _differ(observation, levels.observation) < _FOLLOWED
         if n_steps == _MOST_STEPS or (known and follows and end.is_within(CONVERGED)):
             return finished(under, end), levels
         odometry = levels.odometry
         if not known and end.is_within(_CLOSE):
+            end = factored(end)
             odometry = told_odometry_levels(problem, end, odometry)
             known = any(_differ(odometry, each) < 2 * _SETTLED for each in told)
             told.append(odometry)
         levels = Levels(odometry, observation)
-        at, weights, tails = stepped(under, end, _with(problem, levels).seen)
-        n_steps += 1
+        after = _with(problem, levels)
+        at, weights, tails = stepped(under, end, after.seen)
+        under, n_steps, nearby = after, n_steps + 1, end.nearby
 
 
 def _differ(levels: Float | float, others: Float | float) -> float:

@@ -12,10 +12,9 @@ import scipy.linalg
 from numba import njit
 
 from mapfusion.se2 import Float
-from mapfusion.smoother.elimination import chain_factor, pose_point_blocks
+from mapfusion.smoother.elimination import chain_factor, own_factor, pose_point_blocks
 from mapfusion.smoother.normal_equations import disturbance_jacobians, disturbances
 from mapfusion.smoother.settle import Settled
-from mapfusion.smoother.skyline import inverse_in_envelope
 
 
 class MotionPosterior(NamedTuple):
@@ -82,9 +81,9 @@ def disturbance_variances(end: Settled) -> Float:
 
 def _from_poses(end: Settled, before: Float, after: Float) -> Float:
     """From the inverse of the poses' information, in their order."""
-    order = end.seen.order
-    Z = inverse_in_envelope(end.solution.factor, order.first_entry)
-    n, place = len(after), order.place[1:] - 1
+    factor = own_factor(end.seen, end.equations, end.solution)
+    Z = factor.inverse()
+    n, place = len(after), end.seen.pose_place[1:] - 1
     blocks = Z.reshape(n, 3, n, 3)
     own, link = blocks[place, :, place], blocks[place[:-1], :, place[1:]]
     return _of_differences(before, after, own, link)

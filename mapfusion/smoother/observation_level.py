@@ -15,7 +15,7 @@ what does not, and what is stated holds.
 import numpy as np
 
 from mapfusion.smoother.odometry_levels import LEAST_TOLD
-from mapfusion.smoother.residuals import squared_distances
+from mapfusion.smoother.residuals import squared_distances, squares_of_points
 from mapfusion.smoother.settle import Settled
 from mapfusion.smoother.student import fitted_dof, student_weights
 
@@ -38,10 +38,10 @@ def told_observation_level(end: Settled, level: float) -> float:
     if not rows.any():
         return 1.0
     square = squared_distances(seen, end.estimate)[rows]
-    expected = squared_distances(seen, end.estimate, end.solution.track_m2)[rows]
-    known = np.sum(n - np.minimum(end.weights.observation[rows] * (expected - square), n))
+    of_point = squares_of_points(seen, end.estimate.path, end.solution.track_m2)[rows]
+    known = np.sum(n - np.minimum(end.weights.observation[rows] * of_point, n))
     if known < LEAST_TOLD:
         return 1.0
-    beside = min(level, 1.0) * expected
+    beside = min(level, 1.0) * (square + of_point)
     weights = student_weights(beside, fitted_dof(beside, n), n)
     return float(level * np.sum(weights * square) / known)

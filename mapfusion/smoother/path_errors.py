@@ -16,13 +16,7 @@ from mapfusion.smoother.landmark_elimination import left_couplings, subtract_gra
 from mapfusion.smoother.normal_equations import NormalEquations
 from mapfusion.smoother.offsets import without_offsets
 from mapfusion.smoother.sightings import Sightings
-from mapfusion.smoother.skyline import (
-    inverse_in_envelope,
-    multiply_in_envelope,
-    solve_in_envelope,
-    solve_transposed_in_envelope,
-    untouched_zeros,
-)
+from mapfusion.smoother.skyline import Factor, multiply_in_envelope, untouched_zeros
 
 
 @dataclass(frozen=True)
@@ -31,17 +25,17 @@ class PathErrors:
 
     Attributes:
         seen: the observations.
-        factor: (R, R) L.
+        factor: L.
         moved: (N, 3, 3) entries of C A, by observation.
     """
 
     seen: Sightings
-    factor: Float
+    factor: Factor
     moved: Float
 
     @classmethod
     def of(
-        cls, seen: Sightings, equations: NormalEquations, own_m2: Float, factor: Float
+        cls, seen: Sightings, equations: NormalEquations, own_m2: Float, factor: Factor
     ) -> "PathErrors":
         """Of equations that are solved, the landmarks first: with their `own_m2` and the factor."""
         left = without_offsets(seen, equations.points)
@@ -59,26 +53,24 @@ class PathErrors:
 
     def gram(self, columns: Float) -> Float:
         """Y Y' times columns (R, c)."""
-        negative = multiply_in_envelope(self._less_gram, self._first, self._of_poses(columns))
-        return -solve_in_envelope(self.factor, self._first, negative)
+        negative = multiply_in_envelope(
+            self._less_gram, self.factor.first, self.factor.solve_transposed(columns)
+        )
+        return -self.factor.solve(negative)
 
     def spread(self, columns: Float) -> Float:
         """(3L, c) Y' times columns (R, c)."""
         total = np.zeros((3 * self.seen.n_landmarks, columns.shape[1]))
-        of_poses = self._of_poses(columns)
+        of_poses = self.factor.solve_transposed(columns)
         _add_spread(self.seen.starts, self._place, self.moved, of_poses, total)
         return total
 
     def squares(self) -> Float:
         """(L, 3, 3) blocks of Y' Y, each landmark's with itself."""
         total = np.zeros((self.seen.n_landmarks, 3, 3))
-        covariance = inverse_in_envelope(self.factor, self._first)
+        covariance = self.factor.inverse()
         _add_squares(self.seen.starts, self._place, self.moved, covariance, total)
         return total + np.swapaxes(total, 1, 2)
-
-    @property
-    def _first(self) -> np.ndarray:
-        return self.seen.order.first_entry
 
     @property
     def _place(self) -> np.ndarray:
@@ -91,9 +83,6 @@ class PathErrors:
         S = untouched_zeros(len(self) + 3)
         subtract_gram(self.seen, self.moved, S)
         return S[3:, 3:]
-
-    def _of_poses(self, columns: Float) -> Float:
-        return solve_transposed_in_envelope(self.factor, self._first, columns)
 
 
 @njit(cache=True)

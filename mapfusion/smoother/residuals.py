@@ -16,70 +16,79 @@ def first_points(seen: Sightings, path: Float) -> Float:
     return seen.sum_by_landmark(position) / np.diff(seen.starts)[:, None]
 
 
-def squared_distances(seen: Sightings, at: Estimate, covariance_m2: Float | None = None) -> Float:
-    """(N,) squared Mahalanobis distances of the observations from where they should be.
+def squared_distances(seen: Sightings, at: Estimate) -> Float:
+    """(N,) squared Mahalanobis distances of the observations from where they should be."""
+    squares = np.empty(len(seen))
+    _put_squares(seen.arrays, at, turns(at.path), squares)
+    return squares
 
-    With the covariances (B, 3, 3) of the tracks' points these are expected ones, as they are about
-    the true points: those about points that were fitted to the same observations are smaller.
+
+def squares_of_points(seen: Sightings, path: Float, covariance_m2: Float) -> Float:
+    """(N,) what squared distances are expected to be more by, about the tracks' true points.
+
+    Those about points that were fitted to the same observations are smaller.
+
+    Args:
+        seen: the observations.
+        path: (T, 3).
+        covariance_m2: (B, 3, 3) of the tracks' points.
     """
     squares = np.empty(len(seen))
-    turn = turns(at.path)
-    if covariance_m2 is None:
-        _squared_distances(seen.arrays, at, turn, squares)
-    else:
-        _expected_squares(seen.arrays, at, turn, covariance_m2, squares)
+    _put_traces(seen.arrays, turns(path), covariance_m2, squares)
     return squares
 
 
 @njit(cache=True)
-def _squared_distances(
+def _put_squares(
     seen: tuple[np.ndarray, np.ndarray, np.ndarray, Float, Float],
     at: Estimate,
     turn: Float,
     squares: Float,
 ) -> None:
     """In the robot's frame, where the information is: r' W r with r = R'(l + b - p) - z."""
-    starts, owner, frame, position, information = seen
+    starts, owner, frame, position, W = seen
     for t in range(len(starts) - 1):
-        point = at.point_m[owner[t]] + at.offset_m[t]
+        j = owner[t]
+        x = at.point_m[j, 0] + at.offset_m[t, 0]
+        y = at.point_m[j, 1] + at.offset_m[t, 1]
+        z = at.point_m[j, 2] + at.offset_m[t, 2]
         for i in range(starts[t], starts[t + 1]):
-            c, s, W = turn[frame[i], 0], turn[frame[i], 1], information[i]
-            x, y = point[0] - at.path[frame[i], 0], point[1] - at.path[frame[i], 1]
-            r0 = c * x + s * y - position[i, 0]
-            r1 = c * y - s * x - position[i, 1]
-            r2 = point[2] - position[i, 2]
+            k = frame[i]
+            c, s, along, across = turn[k, 0], turn[k, 1], x - at.path[k, 0], y - at.path[k, 1]
+            r0 = c * along + s * across - position[i, 0]
+            r1 = c * across - s * along - position[i, 1]
+            r2 = z - position[i, 2]
             squares[i] = (
-                r0 * (W[0, 0] * r0 + 2 * W[0, 1] * r1)
-                + r1 * (W[1, 1] * r1 + 2 * W[1, 2] * r2)
-                + r2 * (W[2, 2] * r2 + 2 * W[0, 2] * r0)
+                r0 * (W[i, 0, 0] * r0 + 2 * W[i, 0, 1] * r1)
+                + r1 * (W[i, 1, 1] * r1 + 2 * W[i, 1, 2] * r2)
+                + r2 * (W[i, 2, 2] * r2 + 2 * W[i, 0, 2] * r0)
             )
 
 
 @njit(cache=True)
-def _expected_squares(
+def _put_traces(
     seen: tuple[np.ndarray, np.ndarray, np.ndarray, Float, Float],
-    at: Estimate,
     turn: Float,
     covariance_m2: Float,
     squares: Float,
 ) -> None:
-    """The same and the trace of W R' C R: what the uncertainty of the track's point adds."""
-    _squared_distances(seen, at, turn, squares)
-    starts, _, frame, _, information = seen
+    """The trace of W R' C R."""
+    starts, _, frame, _, W = seen
     for t in range(len(starts) - 1):
-        C = covariance_m2[t]
+        xx, xy, xz = covariance_m2[t, 0, 0], covariance_m2[t, 0, 1], covariance_m2[t, 0, 2]
+        yy, yz, zz = covariance_m2[t, 1, 1], covariance_m2[t, 1, 2], covariance_m2[t, 2, 2]
         for i in range(starts[t], starts[t + 1]):
-            c, s, W = turn[frame[i], 0], turn[frame[i], 1], information[i]
-            along = c * c * C[0, 0] + 2 * c * s * C[0, 1] + s * s * C[1, 1]
-            across = s * s * C[0, 0] - 2 * c * s * C[0, 1] + c * c * C[1, 1]
-            mixed = c * s * (C[1, 1] - C[0, 0]) + (c * c - s * s) * C[0, 1]
-            squares[i] += (
-                W[0, 0] * along
-                + W[1, 1] * across
-                + W[2, 2] * C[2, 2]
-                + 2 * W[0, 1] * mixed
-                + 2 * W[0, 2] * (c * C[0, 2] + s * C[1, 2])
-                + 2 * W[1, 2] * (c * C[1, 2] - s * C[0, 2])
+            c, s = turn[frame[i], 0], turn[frame[i], 1]
+            along = c * c * xx + 2 * c * s * xy + s * s * yy
+            across = s * s * xx - 2 * c * s * xy + c * c * yy
+            mixed = c * s * (yy - xx) + (c * c - s * s) * xy
+            squares[i] = (
+                W[i, 0, 0] * along
+                + W[i, 1, 1] * across
+                + W[i, 2, 2] * zz
+                + 2 * W[i, 0, 1] * mixed
+                + 2 * W[i, 0, 2] * (c * xz + s * yz)
+                + 2 * W[i, 1, 2] * (c * yz - s * xz)
             )
 
 

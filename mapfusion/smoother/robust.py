@@ -11,7 +11,12 @@ import numpy as np
 
 from mapfusion.smoother.normal_equations import Estimate, Shares, Weights
 from mapfusion.smoother.offsets import Points
-from mapfusion.smoother.residuals import known_dimensions, offset_squares, squared_distances
+from mapfusion.smoother.residuals import (
+    known_dimensions,
+    offset_squares,
+    squared_distances,
+    squares_of_points,
+)
 from mapfusion.smoother.sightings import Sightings
 from mapfusion.smoother.student import (
     MOST_DOF,
@@ -56,7 +61,8 @@ def reweighted(
     landmarks with a single track, which look perfectly average, would hide the tails of the rest.
     """
     n, new = seen.n_dimensions, unweighted(seen)
-    squares = squared_distances(seen, at, known.track_m2)
+    squares = squared_distances(seen, at)
+    squares += squares_of_points(seen, at.path, known.track_m2)
     of_offset = offset_squares(seen, at, stray_information)
     dimensions = known_dimensions(seen, known.offset_m2, weights.offset * stray_information)
     tails = Tails(

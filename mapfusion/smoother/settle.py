@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mapfusion.se2 import Float, wrap
-from mapfusion.smoother.elimination import Solution, solve, solve_points
+from mapfusion.smoother.elimination import Solution, own_factor, solve, solve_points
 from mapfusion.smoother.normal_equations import (
     Estimate,
     NormalEquations,
@@ -16,6 +16,7 @@ from mapfusion.smoother.normal_equations import (
 from mapfusion.smoother.residuals import squared_distances
 from mapfusion.smoother.robust import NO_TAILS, Tails, informative, reweighted, unweighted
 from mapfusion.smoother.sightings import Sightings
+from mapfusion.smoother.skyline import Factor
 
 # The last step moves the poses by no more than this, in squared sigmas a coordinate: the third of a
 # hundredth of a sigma. A step costs as the cube of the log, and there is little left to win:
@@ -60,6 +61,7 @@ class Settled(NamedTuple):
         n_steps: that were taken.
         equations: of the next step, whose matrix is the inverse of the covariance.
         solution: theirs.
+        nearby: the last factor that was found on the way.
     """
 
     seen: Sightings
@@ -69,6 +71,7 @@ class Settled(NamedTuple):
     n_steps: int
     equations: NormalEquations
     solution: Solution
+    nearby: Factor | None
 
     def is_within(self, least_move: float) -> bool:
         """Whether the next step would move the poses by less, in squared sigmas a coordinate."""
@@ -90,7 +93,7 @@ def settled(
     weights = unweighted(problem.seen) if weights is None else weights
     end = solved(problem, at, weights, tails)
     while end.n_steps < _MOST_STEPS and not end.is_within(least_move):
-        end = solved(problem, *stepped(problem, end), end.n_steps + 1)
+        end = solved(problem, *stepped(problem, end), end.n_steps + 1, end.nearby)
     return end
 
 
@@ -99,10 +102,21 @@ def finished(problem: Problem, end: Settled) -> Settled:
     return end._replace(estimate=_further(problem, end), n_steps=end.n_steps + 1)
 
 
+def factored(end: Settled) -> Settled:
+    """With the factor of its own equations, that covariances are made of."""
+    factor = own_factor(end.seen, end.equations, end.solution)
+    return end._replace(solution=end.solution._replace(factor=factor), nearby=factor)
+
+
 def solved(
-    problem: Problem, at: Estimate, weights: Weights, tails: Tails, n_steps: int = 0
+    problem: Problem,
+    at: Estimate,
+    weights: Weights,
+    tails: Tails,
+    n_steps: int = 0,
+    nearby: Factor | None = None,
 ) -> Settled:
-    """The next step from an estimate, and what is known there.
+    """The next step from an estimate, and what is known there; `nearby` is of a step before.
 
     The step is that of Fisher's scoring: the slope of the weighted squares over the information
     that is there in truth, which is less than theirs (`information_share`). So the covariance is of
@@ -112,7 +126,9 @@ def solved(
     shares = informative(tails, seen.n_dimensions)
     given = weights, stray_information, odometry, information, shares
     equations = normal_equations(seen, at, *given)
-    return Settled(seen, at, weights, tails, n_steps, equations, solve(seen, equations))
+    solution = solve(seen, equations, nearby)
+    factor = nearby if solution.factor is None else solution.factor
+    return Settled(seen, at, weights, tails, n_steps, equations, solution, factor)
 
 
 def stepped(

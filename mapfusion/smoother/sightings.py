@@ -4,10 +4,12 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numba import njit
 
 from mapfusion.arguments import require_shape
 from mapfusion.robot_log import NO_TRACK, RobotLog
 from mapfusion.se2 import Float
+from mapfusion.smoother.blocks import put_inverse
 from mapfusion.smoother.skyline import envelope_order, first_entries
 
 
@@ -161,6 +163,7 @@ def sightings_of(log: RobotLog, landmark: np.ndarray, min_count: int, *, stray: 
 
     Raises:
         ValueError: `landmark` is not of the log's length.
+        LinAlgError: an observation's covariance is singular.
     """
     require_shape("landmark", landmark, (len(log.observations),))
     names, inverse, count = np.unique(landmark, return_inverse=True, return_counts=True)
@@ -173,13 +176,36 @@ def sightings_of(log: RobotLog, landmark: np.ndarray, min_count: int, *, stray: 
     another |= np.diff(track[row], prepend=NO_TRACK) != 0
     first = np.flatnonzero(another)
     strays, track_starts = track[row[first]] != NO_TRACK, np.append(first, len(row))
-    information = np.zeros((len(row), 3, 3))
     n = 2 if log.planar else 3
-    covariance = log.observations.covariance_m2[row, :n, :n]
-    information[:, :n, :n] = np.linalg.inv(covariance)
+    information = _inverses(log.observations.covariance_m2[row], n)
     position = np.ascontiguousarray(log.observations.position_m[row], dtype=np.float64)
     if log.planar:
         position[:, 2] = 0.0
     frame = log.iteration[row].astype(np.int64)
     order = PoseOrder(np.repeat(np.arange(len(starts) - 1), np.diff(starts)), frame, len(log))
     return Sightings(starts, track_starts, strays, frame, position, information, row, n, order)
+
+
+def _inverses(covariance_m2: Float, n_dimensions: int) -> Float:
+    """(N, 3, 3) inverses of covariances (N, 3, 3); zero in z where there are two dimensions."""
+    inverses = np.zeros((len(covariance_m2), 3, 3))
+    if not _put_inverses(covariance_m2, n_dimensions == 2, inverses):
+        raise np.linalg.LinAlgError("an observation's covariance is singular")
+    return inverses
+
+
+@njit(cache=True)
+def _put_inverses(covariance: Float, planar: bool, inverses: Float) -> bool:
+    known = np.empty((3, 3))
+    for i in range(len(covariance)):
+        for r in range(3):
+            for q in range(3):
+                known[r, q] = covariance[i, r, q]
+        if planar:
+            known[2, 0] = known[2, 1] = 0.0
+            known[2, 2] = 1.0
+        if not put_inverse(known, inverses[i]):
+            return False
+        if planar:
+            inverses[i, 2, 2] = 0.0
+    return True

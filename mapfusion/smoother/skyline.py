@@ -10,6 +10,7 @@ With a matrix functions take `first` (n,), the column of each row's first entry,
 """
 
 import mmap
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import get_lapack_funcs
@@ -80,15 +81,70 @@ def first_entries(group: np.ndarray, member: np.ndarray, place: np.ndarray) -> n
     return first
 
 
-def cholesky_in_envelope(A: Float, first: np.ndarray) -> Float:
-    """The lower Cholesky factor of A (n, n), in its place; of A the lower half is read.
+@dataclass(frozen=True)
+class Factor:
+    """The lower Cholesky factor L of a matrix (n, n).
 
-    What lies above the diagonal blocks stays as it is.
+    Attributes:
+        lower: (n, n) L; what lies above the diagonal blocks means nothing.
+        first: (n,) of the matrix.
+        inverses: of the blocks of L on the diagonal.
+    """
+
+    lower: Float
+    first: np.ndarray
+    inverses: tuple[Float, ...]
+
+    def __len__(self) -> int:
+        return len(self.lower)
+
+    def solve(self, right: Float) -> Float:
+        """L^-1 right (n,) or (n, m)."""
+        x = right.copy()
+        for rows, start, inverse in zip(*_envelope(self.first), self.inverses, strict=True):
+            done = slice(start * _BLOCK, rows.start)
+            x[rows] = inverse @ (x[rows] - self.lower[rows, done] @ x[done])
+        return x
+
+    def solve_transposed(self, right: Float) -> Float:
+        """L'^-1 right (n,) or (n, m)."""
+        x = right.copy()
+        parts = zip(*_envelope(self.first), self.inverses, strict=True)
+        for rows, start, inverse in reversed(list(parts)):
+            x[rows] = inverse.T @ x[rows]
+            before = slice(start * _BLOCK, rows.start)
+            x[before] -= self.lower[rows, before].T @ x[rows]
+        return x
+
+    def inverse(self) -> Float:
+        """(n, n) the inverse of L L' where L has its envelope, or its mirror image.
+
+        From the last block of columns on (Takahashi et al. 1973); elsewhere it is anything.
+        """
+        blocks, starts = _envelope(self.first)
+        Z = untouched_zeros(len(self))
+        for j, (columns, inverse) in reversed(
+            list(enumerate(zip(blocks, self.inverses, strict=True)))
+        ):
+            own, runs = inverse.T @ inverse, _runs(blocks, starts, j)
+            follows = [self.lower[rows, columns] @ inverse for rows in runs]
+            for rows, its in zip(runs, follows, strict=True):
+                with_it = [Z[rows, other] @ that for other, that in zip(runs, follows, strict=True)]
+                Z[rows, columns] = -sum(with_it)
+                Z[columns, rows] = Z[rows, columns].T
+                own -= its.T @ Z[rows, columns]
+            Z[columns, columns] = own
+        return Z
+
+
+def factor_in_envelope(A: Float, first: np.ndarray) -> Factor:
+    """The Cholesky factor of A (n, n), in its place; of A the lower half is read.
 
     Raises:
         LinAlgError: A is not positive definite.
     """
     blocks, starts = _envelope(first)
+    inverses = list[Float]()
     for j, columns in enumerate(blocks):
         for i, rows in enumerate(blocks[j:], start=j):
             if starts[i] > j:
@@ -101,29 +157,11 @@ def cholesky_in_envelope(A: Float, first: np.ndarray) -> Float:
                 A[rows, columns], failed = _cholesky(left, lower=1)
                 if failed:
                     raise np.linalg.LinAlgError("the matrix is not positive definite")
-                inverse = _inverse(A[rows, columns])
+                # many products with it are faster than as many times solving
+                inverses.append(_inverted(A[rows, columns], lower=1)[0])
             else:
-                A[rows, columns] = left @ inverse.T
-    return A
-
-
-def solve_in_envelope(L: Float, first: np.ndarray, right: Float) -> Float:
-    """L^-1 right (n,) or (n, m) of a lower factor (n, n)."""
-    x = right.copy()
-    for rows, start in zip(*_envelope(first), strict=True):
-        done = slice(start * _BLOCK, rows.start)
-        x[rows] = _inverse(L[rows, rows]) @ (x[rows] - L[rows, done] @ x[done])
-    return x
-
-
-def solve_transposed_in_envelope(L: Float, first: np.ndarray, right: Float) -> Float:
-    """L'^-1 right (n,) or (n, m) of a lower factor (n, n)."""
-    x = right.copy()
-    for rows, start in reversed(list(zip(*_envelope(first), strict=True))):
-        x[rows] = _inverse(L[rows, rows]).T @ x[rows]
-        before = slice(start * _BLOCK, rows.start)
-        x[before] -= L[rows, before].T @ x[rows]
-    return x
+                A[rows, columns] = left @ inverses[j].T
+    return Factor(A, first, tuple(inverses))
 
 
 def multiply_in_envelope(A: Float, first: np.ndarray, right: Float) -> Float:
@@ -136,26 +174,6 @@ def multiply_in_envelope(A: Float, first: np.ndarray, right: Float) -> Float:
         lower = np.tril(A[rows, rows])
         product[rows] += (lower + np.tril(lower, -1).T) @ right[rows]
     return product
-
-
-def inverse_in_envelope(L: Float, first: np.ndarray) -> Float:
-    """(n, n) the inverse of L L' where the factor L (n, n) has its envelope, or its mirror image.
-
-    From the last block of columns on (Takahashi et al. 1973); elsewhere it is anything.
-    """
-    blocks, starts = _envelope(first)
-    Z = untouched_zeros(len(L))
-    for j, columns in reversed(list(enumerate(blocks))):
-        inverse = _inverse(L[columns, columns])
-        own, runs = inverse.T @ inverse, _runs(blocks, starts, j)
-        follows = [L[rows, columns] @ inverse for rows in runs]
-        for rows, its in zip(runs, follows, strict=True):
-            with_it = [Z[rows, other] @ that for other, that in zip(runs, follows, strict=True)]
-            Z[rows, columns] = -sum(with_it)
-            Z[columns, rows] = Z[rows, columns].T
-            own -= its.T @ Z[rows, columns]
-        Z[columns, columns] = own
-    return Z
 
 
 def _runs(blocks: list[slice], starts: list[int], j: int) -> list[slice]:
@@ -179,8 +197,3 @@ def _envelope(first: np.ndarray) -> tuple[list[slice], list[int]]:
 
 def _blocks(n: int) -> list[slice]:
     return [slice(begin, min(begin + _BLOCK, n)) for begin in range(0, n, _BLOCK)]
-
-
-def _inverse(L: Float) -> Float:
-    """Of a lower block: many products with it are faster than as many times solving."""
-    return _inverted(L, lower=1)[0]

@@ -21,6 +21,9 @@ _FOUND_TO = 1e-6
 # What they change by from step to step is less than this share, but for the first few.
 _NEAR = 0.1
 
+# Numbers that are multiplied before a logarithm is taken of them.
+_MULTIPLIED = 8
+
 
 def student_weights(squares: Float, dof: float, n_dimensions: Float | int) -> Float:
     """Weights (N,) of errors at these squared Mahalanobis distances (N,), in n dimensions each."""
@@ -60,10 +63,21 @@ def student_bound(probability: float, dof: float, n_dimensions: int) -> float:
 def student_slope(squares: Float, dof: float, n_dimensions: Float | int) -> float:
     """How `student_deviance` changes with the logarithm of the degrees of freedom."""
     n, dims = len(squares), np.asarray(n_dimensions, dtype=np.float64)
-    each = dof * np.log1p(squares / dof) - (dof + dims) * squares / (dof + squares)
+    beside = squares * (1 / dof)
+    beside += 1
+    of_tails = dof * _sum_of_logs(beside)
+    np.reciprocal(beside, out=beside)
+    of_weights = np.sum((dof + dims) * (1 - beside))
     of_normal = dof * (psi((dof + dims) / 2) - psi(dof / 2)) - dims
     share = 1 if of_normal.ndim else n  # the same for all where all have the same dimensions
-    return float(np.sum(each) - share * np.sum(of_normal))
+    return float(of_tails - of_weights - share * np.sum(of_normal))
+
+
+def _sum_of_logs(values: Float) -> float:
+    """Of values (N,) from 1 to 10^38: logarithms of products, which take less time than those."""
+    n = len(values) // _MULTIPLIED * _MULTIPLIED
+    products = np.multiply.reduce(values[:n].reshape(_MULTIPLIED, -1), axis=0)
+    return float(np.sum(np.log(products)) + np.sum(np.log(values[n:])))
 
 
 def fitted_dof(squares: Float, n_dimensions: Float | int, near: float = MOST_DOF) -> float:

@@ -17,7 +17,7 @@ from mapfusion.smoother.levels import AS_STATED, settled_with_levels
 from mapfusion.smoother.normal_equations import Estimate
 from mapfusion.smoother.recording import Recording
 from mapfusion.smoother.residuals import first_points
-from mapfusion.smoother.settle import Problem, settled
+from mapfusion.smoother.settle import Problem, factored, settled
 from mapfusion.smoother.sightings import sightings_of
 from mapfusion.smoother.smooth import Smoothed
 
@@ -90,7 +90,7 @@ def smooth_together(
         end, levels = settled_with_levels(problem, start)
     else:
         end, levels = settled(problem, start), AS_STATED
-    covariance = np.zeros((len(starts), 3, 3))
+    end, covariance = factored(end), np.zeros((len(starts), 3, 3))
     covariance[1:] = pose_covariances(seen, end.equations, end.solution, starts[1:])
     names = point[seen.row[seen.starts[:-1]]]
     paths = tuple(np.split(end.estimate.path, starts[1:]))

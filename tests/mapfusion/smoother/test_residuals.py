@@ -5,7 +5,7 @@ import pytest
 
 from mapfusion.se2 import rotation
 from mapfusion.smoother.normal_equations import Estimate
-from mapfusion.smoother.residuals import first_points, squared_distances
+from mapfusion.smoother.residuals import first_points, squared_distances, squares_of_points
 from mapfusion.smoother.sightings import sightings_of
 from tests.mapfusion.smoother.white_noise_logs import white_noise_log, with_tracks
 
@@ -23,7 +23,9 @@ def test_squares_are_those_of_the_rotated_residuals(planar: bool, about_true_poi
     at = Estimate(known.path, first_points(seen, known.path), rng.normal(0, 0.05, (n_tracks, 3)))
     root = rng.normal(0, 0.03, (n_tracks, 3, 3))
     covariance = root @ np.swapaxes(root, 1, 2) if about_true_points else None
-    found = squared_distances(seen, at, covariance)
+    found = squared_distances(seen, at)
+    if covariance is not None:
+        found = found + squares_of_points(seen, at.path, covariance)
     for i in range(len(seen)):
         t = seen.track[i]
         R = rotation(at.path[seen.frame[i], 2])

@@ -6,13 +6,10 @@ import scipy.linalg
 
 from mapfusion.smoother import skyline
 from mapfusion.smoother.skyline import (
-    cholesky_in_envelope,
     envelope_order,
+    factor_in_envelope,
     first_entries,
-    inverse_in_envelope,
     multiply_in_envelope,
-    solve_in_envelope,
-    solve_transposed_in_envelope,
     untouched_zeros,
 )
 
@@ -38,13 +35,13 @@ def test_factor_is_that_of_the_dense_matrix(n, n_groups):
     A = matrix_of_groups(np.random.default_rng(n), n, n_groups if n > 2 else 0)
     given = A.copy()
     given[np.triu_indices(n, skyline._BLOCK)] = 0  # only the lower half is read
-    found = np.tril(cholesky_in_envelope(given, entries_seen(given)))
+    factor = factor_in_envelope(given, entries_seen(given))
+    found = np.tril(factor.lower)
     np.testing.assert_allclose(found, scipy.linalg.cholesky(A, lower=True), atol=1e-12)
-    right, first = np.random.default_rng(0).normal(size=(n, 7)), entries_seen(found)
+    right = np.random.default_rng(0).normal(size=(n, 7))
     for some in (right, right[:, 0]):
-        np.testing.assert_allclose(found @ solve_in_envelope(found, first, some), some, atol=1e-12)
-        back = solve_transposed_in_envelope(found, first, some)
-        np.testing.assert_allclose(found.T @ back, some, atol=1e-12)
+        np.testing.assert_allclose(found @ factor.solve(some), some, atol=1e-12)
+        np.testing.assert_allclose(found.T @ factor.solve_transposed(some), some, atol=1e-12)
 
 
 @pytest.mark.parametrize("n", [1, 47, 48, 49, 300])
@@ -55,7 +52,7 @@ def test_product_and_inverse_are_those_of_the_dense_matrix(n, n_groups):
     first, right = entries_seen(np.tril(A)), np.random.default_rng(0).normal(size=(n, 5))
     lower = np.tril(A) + np.triu(np.full_like(A, np.nan), 1)  # the lower half is read
     np.testing.assert_allclose(multiply_in_envelope(lower, first, right), A @ right, atol=1e-12)
-    inverse, dense = inverse_in_envelope(np.linalg.cholesky(A), first), np.linalg.inv(A)
+    inverse, dense = factor_in_envelope(A.copy(), first).inverse(), np.linalg.inv(A)
     rows, columns = np.indices(A.shape)
     within = (columns <= rows) & (columns >= first[rows])
     np.testing.assert_allclose(inverse[within], dense[within], rtol=0, atol=1e-12)
@@ -65,7 +62,7 @@ def test_product_and_inverse_are_those_of_the_dense_matrix(n, n_groups):
 def test_rows_that_are_zero_for_long_stay_so():
     A = 2 * np.eye(400)
     A[399, 250] = A[250, 399] = 1.0
-    assert not np.tril(cholesky_in_envelope(A, entries_seen(A)), -1)[:, :250].any()
+    assert not np.tril(factor_in_envelope(A, entries_seen(A)).lower, -1)[:, :250].any()
 
 
 @pytest.mark.parametrize("n_groups", [0, 1, 60])
@@ -97,7 +94,7 @@ def test_a_matrix_that_is_not_positive_definite_is_refused():
     A = np.eye(200)
     A[150, 150] = -1
     with pytest.raises(np.linalg.LinAlgError):
-        cholesky_in_envelope(A, entries_seen(A))
+        factor_in_envelope(A, entries_seen(A))
 
 
 def test_order_brings_those_together_that_have_to_do_with_each_other():

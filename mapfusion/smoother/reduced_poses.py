@@ -1,0 +1,102 @@
+"""What is left of the equations of the poses once offsets and landmarks are eliminated.
+
+Its matrix is large and has a factor; a product with it needs neither: it goes from the poses to the
+points that they saw, and back. From one step to the next the matrix changes little, so that with
+the factor of a step before a few products solve for a step.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapfusion.se2 import Float
+from mapfusion.smoother.conjugate_gradients import solved_by_products
+from mapfusion.smoother.landmark_elimination import along_points, along_way, subtract_points
+from mapfusion.smoother.normal_equations import NormalEquations
+from mapfusion.smoother.offsets import Reduced, moved_points
+from mapfusion.smoother.sightings import Sightings
+from mapfusion.smoother.skyline import Factor, factor_in_envelope, untouched_zeros
+
+# What a step may be off by, as a share of it, both in sigmas: what the last ones, of hundredths of
+# a sigma, leave of it is nothing, and they mend what those before left.
+_OFF = 1e-4
+# A factor of its own costs as much as this many products and more.
+_MOST_PRODUCTS = 15
+
+
+@dataclass(frozen=True)
+class ReducedPoses:
+    """The equations of T poses, of which the first is known: its rows are zero.
+
+    Attributes:
+        seen: the observations.
+        equations: all of them.
+        left: once the offsets are eliminated.
+    """
+
+    seen: Sightings
+    equations: NormalEquations
+    left: Reduced
+
+    def gradient(self) -> Float:
+        """(T, 3)."""
+        still = np.zeros_like(self.equations.points.track_gradient)
+        return self._with_points(self.equations.pose_gradient, self.left, still)
+
+    def times(self, way: Float) -> Float:
+        """(T, 3) the matrix times a way (T, 3) of the poses."""
+        link, gained = self.equations.link, np.zeros_like(self.left.pull)
+        product = np.einsum("kij,kj->ki", self.equations.pose_block, way)
+        product[1:] += np.einsum("kij,kj->ki", link, way[:-1])
+        product[:-1] += np.einsum("kji,kj->ki", link, way[1:])
+        along = along_way(self.seen, self.equations.coupling, way)
+        unpulled = np.zeros_like(self.left.point_gradient)
+        still = self.left._replace(pull=gained, point_gradient=unpulled)
+        return self._with_points(product, still, along)
+
+    def factor(self) -> Factor:
+        """Of the matrix without the first pose, the others in their order.
+
+        Raises:
+            LinAlgError: the matrix is not positive definite.
+        """
+        n = len(self.equations.pose_block)
+        S = untouched_zeros(3 * n)
+        _put_poses(S.reshape(n, 3, n, 3), self.seen.pose_place, self.equations)
+        subtract_points(self.seen, self.equations, self.left, S)
+        return factor_in_envelope(S[3:, 3:], self.seen.order.first_entry)
+
+    def solved(self, factor: Factor, right: Float) -> Float:
+        """(T, 3) what a matrix with this factor turns into `right` (T, 3)."""
+        place = self.seen.pose_place[1:] - 1
+        ordered, found = np.empty((len(place), 3)), np.zeros_like(right)
+        ordered[place] = right[1:]
+        solved = factor.solve_transposed(factor.solve(ordered.ravel()))
+        found[1:] = solved.reshape(-1, 3)[place]
+        return found
+
+    def solved_nearby(self, factor: Factor, right: Float) -> Float | None:
+        """(T, 3) what the matrix turns into `right` (T, 3), by a factor that is nearly its own.
+
+        None where that is too far off.
+        """
+        return solved_by_products(
+            self.times, lambda rest: self.solved(factor, rest), right, _OFF, _MOST_PRODUCTS
+        )
+
+    def _with_points(self, of_poses: Float, left: Reduced, along: Float) -> Float:
+        """With what points add that follow the poses."""
+        moved = moved_points(self.seen, self.equations.points, left, along)
+        total = of_poses + along_points(self.seen, self.equations.coupling, *moved)
+        total[0] = 0.0
+        return total
+
+
+def _put_poses(blocks: Float, place: np.ndarray, equations: NormalEquations) -> None:
+    """What odometry and the poses' own observations say, into blocks (T, 3, T, 3) by `place`."""
+    blocks[place, :, place, :] = equations.pose_block
+    after, before = place[1:], place[:-1]
+    link = np.where(
+        (after > before)[:, None, None], equations.link, np.swapaxes(equations.link, 1, 2)
+    )
+    blocks[np.maximum(after, before), :, np.minimum(after, before), :] = link
