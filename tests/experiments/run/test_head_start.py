@@ -1,6 +1,5 @@
 """The first pictures wait for a drive of the first frames alone, and are the same."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +19,10 @@ from sim.trajectory import read_trajectory
 
 def long(scenario: Simulation, frames: int, renderer: str = "raycast") -> Simulation:
     """The scenario, driven for so many frames, by bodies that sway."""
-    sway = replace(scenario.drive.body_sway, sigma_rad=0.02)
-    driven = scenario.drive.model_copy(update={"frames": frames, "body_sway": sway})
-    drawn = replace(scenario.render, renderer=renderer)
-    return scenario.model_copy(update={"drive": driven, "render": drawn})
+    settings = scenario.resolved()
+    settings["drive"] |= {"frames": frames, "body_sway": {"sigma_rad": 0.02}}
+    settings["render"]["renderer"] = renderer
+    return Simulation.model_validate(settings)
 
 
 def test_robots_begin_as_they_do_on_the_whole_way(tiny: Simulation, tmp_path: Path) -> None:
@@ -53,7 +52,7 @@ def test_first_pictures_wait_for_their_own_drive(
     head, left = head_start(run.pipeline), list(run.tasks.values())
     assert head is not None
     tasks = {task.name: task for task in with_head_start(run.pipeline, run.store, left)}
-    assert list(tasks)[0] == f"drive/{head.key}"
+    assert next(iter(tasks)) == f"drive/{head.key}"
     assert list(tasks)[1:] == [task.name for task in left]
     whole = {name for name in tasks if name.startswith("drive/")} - {f"drive/{head.key}"}
     for robot in run.pipeline.simulated:
