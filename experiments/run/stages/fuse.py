@@ -266,7 +266,8 @@ def _fused(
     last: LandmarkMap,
 ) -> FusedMap:
     place, n = {name: k for k, name in enumerate(robots)}, len(robots)
-    points = points_from(pa.Table.from_pandas(landmarks[POSITION_FIELDS + COVARIANCE_FIELDS]))
+    numbers = landmarks[POSITION_FIELDS + COVARIANCE_FIELDS]
+    points = points_from(pa.Table.from_pandas(numbers, nthreads=1))  # else it starts many
     origin = np.full(len(landmarks), ABSENT, dtype=np.int64)
     count = landmarks["count"].to_numpy(np.int32)
     made = LandmarkMap(*points, count, origin, planar=last.planar, name=last.name)

@@ -66,6 +66,12 @@ def test_a_broken_file_is_named(folder: Path) -> None:
         scenarios_of(["ci"], folder)
 
 
+def test_a_name_is_that_of_the_file_and_of_all_that_say_so(folder: Path) -> None:
+    (folder / "d.yaml").write_text(WORLD.format(name="a", tags=""))
+    (folder / "e.yaml").write_text("- 1")  # which has nothing to do with it
+    assert scenarios_of(["a"], folder) == [folder / "a.yaml", folder / "d.yaml"]
+
+
 def test_the_listing_shows_names_as_they_are(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
