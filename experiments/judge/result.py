@@ -17,7 +17,7 @@ import numpy as np
 from experiments.judge import tables
 from experiments.judge.errors import EvaluatedRobot
 from experiments.judge.judged_run import JudgedRun
-from experiments.judge.table_makers import history_makers, makers
+from experiments.judge.table_makers import history_makers, in_order, makers
 from experiments.judge.truth import common_landmarks
 from experiments.methods.aligner_calls import callable_aligner
 from experiments.methods.catalogue import find_method
@@ -103,7 +103,7 @@ def write_result(
         shutil.rmtree(folder / outdated, ignore_errors=True)
     _write_images(run, folder)
     write_json(folder / "world.json", _world(run.scenario, team.robots))
-    for name, make in (makers(run, team) | history_makers(run, team)).items():
+    for name, make in in_order(makers(run, team) | history_makers(run, team)).items():
         tables.write(tables.table_path(folder, name), name, make())
         on_written(folder, name)
     write_json(folder / "scenario.json", run.scenario.resolved())

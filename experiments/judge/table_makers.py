@@ -1,6 +1,6 @@
 """What makes the tables of a finished run."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import cache, partial
 from typing import Any
 
@@ -24,6 +24,11 @@ from mapfusion.se2 import Float
 from mapfusion.storage import POSE_FIELDS, named_columns
 
 Maker = Callable[[], Any]
+# Written after all others, in this order: what takes long to make, and last what no figure reads.
+_LATE = (
+    *("fused_map", "fusers", "fuser_coverage"),
+    *("map_history", "fused_history", "path_statistics", "timings"),
+)
 
 
 def all_tables(
@@ -37,8 +42,14 @@ def all_tables(
     return {name: tables.framed(name, make()) for name, make in made_by if name in only}
 
 
+def in_order(made: Mapping[str, Maker]) -> dict[str, Maker]:
+    """The same in the order to write them in: figures are drawn meanwhile, from what is there."""
+    late = {name: place for place, name in enumerate(_LATE, start=1)}
+    return {name: made[name] for name in sorted(made, key=lambda name: late.get(name, 0))}
+
+
 def makers(run: JudgedRun, team: FusedTeam) -> dict[str, Maker]:
-    """What makes these tables, by their names: first those that figures wait for."""
+    """What makes these tables, by their names."""
     settings = run.settings
 
     @cache
