@@ -27,18 +27,23 @@ _ABSENT = 1e9
 
 
 def nearest_both_ways(
-    map_a: LandmarkMap, map_b: LandmarkMap, height_bound: float, floor_m2: float
+    map_a: LandmarkMap,
+    map_b: LandmarkMap,
+    height_bound: float,
+    floor_m2: float,
+    elsewhere_m: float = 0.0,
 ) -> tuple[np.ndarray, Float, np.ndarray]:
     """Nearest b of each a, its squared distance (infinite: none fits), and nearest a of each b.
 
     Two fit when the squared difference of their heights is at most `height_bound`, infinite for
     planar maps, times its variance, in which `floor_m2` is what landmarks' own variances leave out.
+    Nor do they fit that lie nearer to each other than `elsewhere_m`, of a map beside itself.
     """
     a, b = _Side.of(map_a, _ABSENT, 0.0), _Side.of(map_b, -_ABSENT, floor_m2)
     for rows in a.blocks(height_bound):
         columns = b.of_heights(*a.interval(rows, height_bound), height_bound)
         product = a.descriptor[rows] @ b.descriptor[columns].T
-        _take_nearer(product, rows, columns, a, b, height_bound)
+        _take_nearer(product, rows, columns, a, b, height_bound, elsewhere_m)
     return a.nearest, a.distance2, b.nearest
 
 
@@ -47,6 +52,7 @@ class _Side(NamedTuple):
 
     descriptor: np.ndarray  # (N, D)
     square: np.ndarray  # (N,) squared norms of the descriptors
+    place_m: Float  # (N, 2) in the plane
     z_m: Float  # (N,)
     variance_m2: Float  # (N,) of the heights
     nearest: np.ndarray  # (N,)
@@ -60,6 +66,7 @@ class _Side(NamedTuple):
         return cls(
             descriptor,
             np.einsum("ij,ij->i", descriptor, descriptor),
+            landmarks.position_m[:, :2].copy(),
             landmarks.position_m[:, 2].copy(),
             landmarks.covariance_m2[:, 2, 2] + floor_m2,
             np.full(n, -1),
@@ -146,11 +153,13 @@ def _take_nearer(
     a: _Side,
     b: _Side,
     height_bound: float,
+    elsewhere_m: float,
 ) -> None:
     """Update the nearest both ways from scalar products of descriptors.
 
     `product` (n, m) is of some `rows` of map a with some `columns` of map b, `height_bound` the
-    most for the squared difference of heights over its variance. Of equally near ones the first row
+    most for the squared difference of heights over its variance; pairs nearer than `elsewhere_m`
+    are none. Of equally near ones the first row
     of its map counts. All are compared coarsely, by pieces that double, since few are nearer than
     the nearest of many; those that pass are compared as exactly as they were given.
     """
@@ -175,6 +184,8 @@ def _take_nearer(
                     c = w * WORD + trailing_zeros(word)
                     word &= word - np.uint64(1)
                     j = columns[c]
+                    if _apart_by_less(a.place_m, i, b.place_m, j, elsewhere_m):
+                        continue
                     dz = a.z_m[i] - b.z_m[j]
                     if dz * dz > height_bound * (a.variance_m2[i] + b.variance_m2[j]):
                         continue
@@ -183,6 +194,13 @@ def _take_nearer(
                     _take(b, j, i, distance2)
                     best[c] = b.distance2[j]
             first, end = end, 2 * end
+
+
+@njit(cache=True)
+def _apart_by_less(p: Float, i: int, q: Float, j: int, distance_m: float) -> bool:
+    """Whether point i of (N, 2) and point j of others are less than a distance apart."""
+    dx, dy = p[i, 0] - q[j, 0], p[i, 1] - q[j, 1]
+    return dx * dx + dy * dy < distance_m * distance_m
 
 
 @njit(cache=True)

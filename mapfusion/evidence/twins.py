@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 
 from mapfusion.align.correspondences import Correspondences, HeightGate
+from mapfusion.align.nearest_descriptors import nearest_both_ways
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.se2 import Float
 
@@ -13,7 +14,6 @@ from mapfusion.se2 import Float
 # and one point may be in a map twice.
 _ELSEWHERE_M = 1.0
 _UNLIKE = 0.6  # of descriptors, at the most: as landmarks of two maps are paired
-_BLOCK_ROWS = 256  # of the matrix of all products, held at once: 2.5 MB at 5000 landmarks
 
 
 def twins(landmarks: LandmarkMap) -> Correspondences:
@@ -27,45 +27,12 @@ def twins(landmarks: LandmarkMap) -> Correspondences:
         return Correspondences(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
     height = HeightGate()
     bound = math.inf if landmarks.planar else height.bound
-    position = np.ascontiguousarray(landmarks.position_m)
-    variance = landmarks.covariance_m2[:, 2, 2] + height.floor_m**2 / 2
-    descriptor = np.nan_to_num(landmarks.descriptor.astype(np.float32), nan=0.0)
-    square = np.einsum("ij,ij->i", descriptor, descriptor)
-    square[np.isnan(landmarks.descriptor).any(axis=1)] = np.inf
-    nearest, distance2 = np.full(n, -1), np.full(n, np.inf, dtype=np.float32)
-    for first in range(0, n, _BLOCK_ROWS):
-        product = descriptor[first : first + _BLOCK_ROWS] @ descriptor.T
-        _nearest_elsewhere(product, first, square, position, variance, bound, nearest, distance2)
+    gates = bound, height.floor_m**2, _ELSEWHERE_M
+    nearest, distance2, _ = nearest_both_ways(landmarks, landmarks, *gates)
     rows = np.arange(n)
-    unlike = np.sqrt(np.maximum(distance2, 0.0, dtype=np.float64))
+    unlike = np.sqrt(np.maximum(distance2, 0.0))
     kept = (nearest >= 0) & (nearest[nearest] == rows) & (unlike <= _UNLIKE)
     return Correspondences(rows[kept], nearest[kept], unlike[kept])
-
-
-@njit(cache=True)
-def _nearest_elsewhere(
-    product: np.ndarray,
-    first: int,
-    square: np.ndarray,
-    position: Float,
-    variance_m2: Float,
-    height_bound: float,
-    nearest: np.ndarray,
-    distance2: np.ndarray,
-) -> None:
-    """The most alike of the landmarks elsewhere, for rows from `first` on with products (n, N)."""
-    for k in range(len(product)):
-        i = first + k
-        for j in range(len(square)):
-            unlike2 = square[i] + square[j] - 2 * product[k, j]
-            if not unlike2 < distance2[i]:
-                continue
-            dx, dy = position[i, 0] - position[j, 0], position[i, 1] - position[j, 1]
-            dz = position[i, 2] - position[j, 2]
-            if dx * dx + dy * dy < _ELSEWHERE_M * _ELSEWHERE_M:
-                continue
-            if dz * dz <= height_bound * (variance_m2[i] + variance_m2[j]):
-                nearest[i], distance2[i] = j, unlike2
 
 
 @njit(cache=True)
