@@ -24,7 +24,11 @@ from mapfusion.symmetric import cholesky, solve_lower, solve_upper
 # Gauss-Newton steps; the turn of a frame is off by 0.1 rad at most, which the second step makes
 # 0.005 and the third nothing.
 _ROUNDS = 3
-_PAIR = 11  # numbers kept of a pair, see _gather_pairs
+# Particles that are taken together, a number of each in a row: many enough that arithmetic on rows
+# is worth its start, few enough that what they see stays near the processor.
+_LANES = 32
+_PAIR = 11  # rows kept of a pair, see _gather_pairs
+_AT, _SYSTEM = 8, 9  # rows of where it is linearised, and of the system there, see _put_linearised
 
 
 class Proposal(StrEnum):
@@ -48,17 +52,19 @@ def widened(
 
 @njit(cache=True, error_model="numpy")
 def _widen(point: Float, covariance: Float, pose: Float, turn: float, sigma: Float) -> None:
+    a, b, w = sigma[0] ** 2, sigma[1] ** 2, sigma[2] ** 2
+    by_odometry = np.empty((len(pose), 3))
     for m in range(len(pose)):
         # the disturbance is added in the frame that the robot had before the motion
         cos, sin = np.cos(pose[m, 2] - turn), np.sin(pose[m, 2] - turn)
-        a, b, w = sigma[0] ** 2, sigma[1] ** 2, sigma[2] ** 2
-        xx, yy = cos * cos * a + sin * sin * b, sin * sin * a + cos * cos * b
-        xy = cos * sin * (a - b)
-        for k in range(len(point)):
+        by_odometry[m, 0], by_odometry[m, 1] = cos * cos * a + sin * sin * b, cos * sin * (a - b)
+        by_odometry[m, 2] = sin * sin * a + cos * cos * b
+    for k in range(len(point)):
+        for m in range(len(pose)):
             dx, dy = point[k, m, 0] - pose[m, 0], point[k, m, 1] - pose[m, 1]
-            covariance[k, m, 0] += xx + w * dy * dy
-            covariance[k, m, 1] += xy - w * dx * dy
-            covariance[k, m, 3] += yy + w * dx * dx
+            covariance[k, m, 0] += by_odometry[m, 0] + w * dy * dy
+            covariance[k, m, 1] += by_odometry[m, 1] - w * dx * dy
+            covariance[k, m, 3] += by_odometry[m, 2] + w * dx * dx
 
 
 @njit(cache=True, error_model="numpy")
@@ -83,28 +89,43 @@ def informed_disturbance(
     """
     eta = np.zeros(T_map_predicted.shape)
     log_ratio = np.empty(len(eta))
-    pairs = np.empty((len(chosen), _PAIR))
-    root, right, pull = np.empty((3, 3)), np.empty(3), np.empty(3)
-    for m in range(len(eta)):
-        n_pairs = _gather_pairs(slots, chosen, predicted, T_map_predicted, planar, m, pairs)
-        before = T_map_predicted[m, 2] - turn
-        for _ in range(_ROUNDS):
-            _normal_equations(pairs[:n_pairs], before, sigma, gate, eta[m], root, right)
-            cholesky(root, 0.0)
-            solve_lower(root, right)
-            solve_upper(root, right)
-            for i in range(3):
-                eta[m, i] += right[i]
-        # the precision is root root^T, so root^-T times a standard normal has its inverse
-        for i in range(3):
-            pull[i] = standard_normal[m, i]
-        solve_upper(root, pull)
-        for i in range(3):
-            eta[m, i] += pull[i]
-        prior = eta[m, 0] ** 2 + eta[m, 1] ** 2 + eta[m, 2] ** 2
-        drawn = standard_normal[m, 0] ** 2 + standard_normal[m, 1] ** 2 + standard_normal[m, 2] ** 2
-        log_ratio[m] = 0.5 * (drawn - prior) - np.log(root[0, 0] * root[1, 1] * root[2, 2])
+    pairs = np.empty((len(chosen), _PAIR * _LANES))
+    at, system = np.zeros(_AT * _LANES), np.zeros(_SYSTEM * _LANES)
+    root, right = np.empty((3, 3)), np.empty(3)
+    for first in range(0, len(eta), _LANES):
+        end = min(first + _LANES, len(eta))
+        n_pairs = _gather_pairs(
+            slots, chosen, predicted, T_map_predicted, planar, first, end, pairs
+        )
+        for step in range(_ROUNDS):
+            for m in range(first, end):
+                before = T_map_predicted[m, 2] - turn
+                _put_linearised(before, sigma, eta[m], m - first, at, system)
+            _add_pairs(pairs[:n_pairs], sigma[2], gate, at, system)
+            for m in range(first, end):
+                _take_system(system, m - first, root, right)
+                cholesky(root, 0.0)
+                solve_lower(root, right)
+                solve_upper(root, right)
+                for i in range(3):
+                    eta[m, i] += right[i]
+                if step == _ROUNDS - 1:
+                    log_ratio[m] = _draw(root, standard_normal[m], right, eta[m])
     return eta, log_ratio
+
+
+@njit(cache=True, error_model="numpy")
+def _draw(root: Float, standard_normal: Float, pull: Float, eta: Float) -> float:
+    """Draw about eta (3,), in place; the log of the density before over that of the draw."""
+    # the precision is root root^T, so root^-T times a standard normal has its inverse
+    for i in range(3):
+        pull[i] = standard_normal[i]
+    solve_upper(root, pull)
+    for i in range(3):
+        eta[i] += pull[i]
+    prior = eta[0] ** 2 + eta[1] ** 2 + eta[2] ** 2
+    drawn = standard_normal[0] ** 2 + standard_normal[1] ** 2 + standard_normal[2] ** 2
+    return 0.5 * (drawn - prior) - np.log(root[0, 0] * root[1, 1] * root[2, 2])
 
 
 @njit(cache=True, error_model="numpy")
@@ -114,62 +135,100 @@ def _gather_pairs(
     predicted: Sightings,
     pose: Float,
     planar: bool,
-    m: int,
+    first: int,
+    end: int,
     pairs: Float,
 ) -> int:
     """Fill rows of innovation (3), inverse of Z (6) and arm from robot to point (2); their number.
 
-    What does not change from step to step; Z with the noise turned by the predicted heading.
+    What does not change from step to step; Z with the noise turned by the predicted heading. Of a
+    row each number is there for the particles from `first` to `end`, zero for those without a pair,
+    to which it adds nothing.
     """
-    n = 0
+    n, point = 0, predicted.point_m
     for k in range(len(chosen)):
-        s = chosen[k, m]
-        if s < 0:
-            continue
-        point, row, r = predicted.point_m[k], pairs[n], int(slots.row[s])
-        difference, inverse, _ = innovation(predicted, k, slots.own, r, m, planar)
-        row[0], row[1], row[2] = difference
-        row[3], row[4], row[5], row[6], row[7], row[8] = inverse
-        row[9], row[10] = point[m, 0] - pose[m, 0], point[m, 1] - pose[m, 1]
-        n += 1
+        row, is_any = pairs[n], False
+        for m in range(first, end):
+            s, lane = chosen[k, m], m - first
+            if s < 0:
+                for i in range(_PAIR):
+                    row[i * _LANES + lane] = 0.0
+                continue
+            is_any, r = True, int(slots.row[s])
+            difference, inverse, _ = innovation(predicted, k, slots.own, r, m, planar)
+            row[lane], row[_LANES + lane], row[2 * _LANES + lane] = difference
+            row[3 * _LANES + lane], row[4 * _LANES + lane] = inverse[0], inverse[1]
+            row[5 * _LANES + lane], row[6 * _LANES + lane] = inverse[2], inverse[3]
+            row[7 * _LANES + lane], row[8 * _LANES + lane] = inverse[4], inverse[5]
+            row[9 * _LANES + lane] = point[k, m, 0] - pose[m, 0]
+            row[10 * _LANES + lane] = point[k, m, 1] - pose[m, 1]
+        n += is_any
+    for row in pairs[:n]:
+        for lane in range(end - first, _LANES):
+            for i in range(_PAIR):
+                row[i * _LANES + lane] = 0.0
     return n
 
 
 @njit(cache=True, error_model="numpy")
-def _normal_equations(
-    pairs: Float, before: float, sigma: Float, gate: float, eta: Float, normal: Float, right: Float
+def _put_linearised(
+    before: float, sigma: Float, eta: Float, lane: int, at: Float, system: Float
 ) -> None:
-    """Fill the precision (3, 3) of eta and the gradient (3,) of the log density at eta."""
+    """Where a particle is linearised at, and its system before anything is seen."""
     ax, ay = sigma[0] * np.cos(before), sigma[0] * np.sin(before)  # d(x, y) / d eta_0
     bx, by = -sigma[1] * np.sin(before), sigma[1] * np.cos(before)  # d(x, y) / d eta_1
-    cos, sin = np.cos(sigma[2] * eta[2]), np.sin(sigma[2] * eta[2])
-    shift_x, shift_y = ax * eta[0] + bx * eta[1], ay * eta[0] + by * eta[1]
-    n00 = n11 = n22 = 1.0
-    n10 = n20 = n21 = 0.0
-    r0, r1, r2 = -eta[0], -eta[1], -eta[2]
+    at[lane], at[_LANES + lane] = ax, ay
+    at[2 * _LANES + lane], at[3 * _LANES + lane] = bx, by
+    at[4 * _LANES + lane] = np.cos(sigma[2] * eta[2])
+    at[5 * _LANES + lane] = np.sin(sigma[2] * eta[2])
+    at[6 * _LANES + lane] = ax * eta[0] + bx * eta[1]
+    at[7 * _LANES + lane] = ay * eta[0] + by * eta[1]
+    for i in range(3):
+        system[i * _LANES + lane] = -eta[i]
+        system[(3 + i) * _LANES + lane] = 1.0
+        system[(6 + i) * _LANES + lane] = 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def _take_system(system: Float, lane: int, normal: Float, right: Float) -> None:
+    """A particle's precision (3, 3) of eta, its lower half, and the gradient (3,)."""
+    for i in range(3):
+        right[i] = system[i * _LANES + lane]
+        normal[i, i] = system[(3 + i) * _LANES + lane]
+    normal[1, 0], normal[2, 0] = system[6 * _LANES + lane], system[7 * _LANES + lane]
+    normal[2, 1] = system[8 * _LANES + lane]
+
+
+# One loop over all lanes, which a processor takes several at a time, without a call, a branch, or
+# an array of two dimensions in it: with these each is taken alone.
+@njit(cache=True, error_model="numpy")
+def _add_pairs(pairs: Float, sigma_turn: float, gate: float, at: Float, system: Float) -> None:
+    """Add what pairs say to the gradients of the log density at eta, and to the precisions."""
     for n in range(len(pairs)):
-        dz, ixx, ixy, ixz = pairs[n, 2], pairs[n, 3], pairs[n, 4], pairs[n, 5]
-        iyy, iyz, izz = pairs[n, 6], pairs[n, 7], pairs[n, 8]
-        rx, ry = pairs[n, 9], pairs[n, 10]
-        # eta moves the point from where it was predicted
-        tx, ty = cos * rx - sin * ry, sin * rx + cos * ry
-        dx = pairs[n, 0] + (shift_x + tx - rx)
-        dy = pairs[n, 1] + (shift_y + ty - ry)
-        distance = quadratic_form((dx, dy, dz), (ixx, ixy, ixz, iyy, iyz, izz))
-        weight = 1.0 / (1.0 + distance / gate)
-        cx, cy = -sigma[2] * ty, sigma[2] * tx  # d(point) / d eta_2
-        wx = weight * (ixx * dx + ixy * dy + ixz * dz)
-        wy = weight * (ixy * dx + iyy * dy + iyz * dz)
-        r0 -= ax * wx + ay * wy
-        r1 -= bx * wx + by * wy
-        r2 -= cx * wx + cy * wy
-        axx, axy, ayy = weight * ixx, weight * ixy, weight * iyy
-        n00 += ax * ax * axx + 2 * ax * ay * axy + ay * ay * ayy
-        n11 += bx * bx * axx + 2 * bx * by * axy + by * by * ayy
-        n22 += cx * cx * axx + 2 * cx * cy * axy + cy * cy * ayy
-        n10 += ax * bx * axx + (ax * by + ay * bx) * axy + ay * by * ayy
-        n20 += ax * cx * axx + (ax * cy + ay * cx) * axy + ay * cy * ayy
-        n21 += bx * cx * axx + (bx * cy + by * cx) * axy + by * cy * ayy
-    normal[0, 0], normal[1, 1], normal[2, 2] = n00, n11, n22
-    normal[1, 0], normal[2, 0], normal[2, 1] = n10, n20, n21
-    right[0], right[1], right[2] = r0, r1, r2
+        pair = pairs[n]
+        for m in range(_LANES):
+            ax, ay, bx, by = at[m], at[_LANES + m], at[2 * _LANES + m], at[3 * _LANES + m]
+            cos, sin = at[4 * _LANES + m], at[5 * _LANES + m]
+            dz, ixx, ixy = pair[2 * _LANES + m], pair[3 * _LANES + m], pair[4 * _LANES + m]
+            ixz, iyy = pair[5 * _LANES + m], pair[6 * _LANES + m]
+            iyz, izz = pair[7 * _LANES + m], pair[8 * _LANES + m]
+            rx, ry = pair[9 * _LANES + m], pair[10 * _LANES + m]
+            # eta moves the point from where it was predicted
+            tx, ty = cos * rx - sin * ry, sin * rx + cos * ry
+            dx = pair[m] + (at[6 * _LANES + m] + tx - rx)
+            dy = pair[_LANES + m] + (at[7 * _LANES + m] + ty - ry)
+            distance = quadratic_form((dx, dy, dz), (ixx, ixy, ixz, iyy, iyz, izz))
+            weight = 1.0 / (1.0 + distance / gate)
+            cx, cy = -sigma_turn * ty, sigma_turn * tx  # d(point) / d eta_2
+            wx = weight * (ixx * dx + ixy * dy + ixz * dz)
+            wy = weight * (ixy * dx + iyy * dy + iyz * dz)
+            system[m] -= ax * wx + ay * wy
+            system[_LANES + m] -= bx * wx + by * wy
+            system[2 * _LANES + m] -= cx * wx + cy * wy
+            axx, axy, ayy = weight * ixx, weight * ixy, weight * iyy
+            system[3 * _LANES + m] += ax * ax * axx + 2 * ax * ay * axy + ay * ay * ayy
+            system[4 * _LANES + m] += bx * bx * axx + 2 * bx * by * axy + by * by * ayy
+            system[5 * _LANES + m] += cx * cx * axx + 2 * cx * cy * axy + cy * cy * ayy
+            system[6 * _LANES + m] += ax * bx * axx + (ax * by + ay * bx) * axy + ay * by * ayy
+            system[7 * _LANES + m] += ax * cx * axx + (ax * cy + ay * cx) * axy + ay * cy * ayy
+            system[8 * _LANES + m] += bx * cx * axx + (bx * cy + by * cx) * axy + by * cy * ayy

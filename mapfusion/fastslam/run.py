@@ -30,14 +30,20 @@ class Frame:
     Attributes:
         iteration: of the log.
         result: of the step.
-        landmarks: the best map with its viewing evidence, at the iterations that were asked for.
-        slam: the filter itself, as it is after this step (for `best_path`, `best_associations`).
+        slam: the filter itself, as it is after this step.
+        landmarks: the best map, at the iterations that were asked for; None at others, as what
+            follows.
+        path: (iteration + 1, 3) that it was made along.
+        associations: (n,) source of the landmark that each observation so far went into, -1 for
+            none.
     """
 
     iteration: int
     result: StepResult
-    landmarks: LandmarkMap | None
     slam: FastSlam
+    landmarks: LandmarkMap | None = None
+    path: Float | None = None
+    associations: np.ndarray | None = None
 
 
 def run_log(
@@ -48,6 +54,7 @@ def run_log(
     min_count: int = 3,
     odometry_covariance: Float | None = None,
     attitude: Attitude | None = None,
+    viewing: bool = True,
 ) -> Iterator[Frame]:
     """Filter a log frame by frame.
 
@@ -61,6 +68,7 @@ def run_log(
             place of the motion noise, of which only the floor is added. How much both share is not
             known, so each counts half (covariance intersection).
         attitude: by which the log's observations were levelled; None: of a level body.
+        viewing: whether maps come with their viewing evidence, which is of the whole log so far.
 
     Yields:
         One `Frame` for each row of the log's frames.
@@ -83,16 +91,17 @@ def run_log(
             sigma = parameters.motion.with_floor(own)
             frame = replace(frame, covariance_m2=frame.covariance_m2 / _HALF)
         result = slam.step(odometry, frame, sigma)
-        landmarks = None
-        if iteration in wanted:
-            landmarks = replace(
-                slam.best_map(min_count), name=log.robot, calibration=log.calibration
-            )
-            seen = slam.best_associations(), slam.best_path(), landmarks.source_observation
-            landmarks = replace(landmarks, viewing=viewing_of(log, *seen))
-            if attitude is not None and not log.planar:
-                landmarks = _with_attitude(landmarks, log, *seen[:2], attitude)
-        yield Frame(iteration, result, landmarks, slam)
+        if iteration not in wanted:
+            yield Frame(iteration, result, slam)
+            continue
+        landmarks = replace(slam.best_map(min_count), name=log.robot, calibration=log.calibration)
+        seen = slam.best_associations(), slam.best_path()
+        if viewing:
+            found = viewing_of(log, *seen, landmarks.source_observation)
+            landmarks = replace(landmarks, viewing=found)
+        if attitude is not None and not log.planar:
+            landmarks = _with_attitude(landmarks, log, *seen, attitude)
+        yield Frame(iteration, result, slam, landmarks, seen[1], seen[0])
 
 
 def build_map(

@@ -1,14 +1,14 @@
 """Stage: one robot's FastSLAM over its log, with its map at each evaluated iteration."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import pandas as pd
 import pyarrow as pa
 
-from experiments.run.frames import BOOL, FLOAT, INT, fields, read_rows, write_rows
+from experiments.run.frames import BOOL, FLOAT, INT, fields, read_rows
 from experiments.run.job import Job
 from experiments.scenario.randomness import generator
 from mapfusion.attitude import read_attitude
@@ -18,7 +18,15 @@ from mapfusion.fastslam.run import run_log
 from mapfusion.odometry_covariance import read_odometry_covariance
 from mapfusion.robot_log import read_log
 from mapfusion.se2 import Float
-from mapfusion.storage import POSE_FIELDS, float_fields, point_columns, point_fields, schema
+from mapfusion.storage import (
+    POSE_FIELDS,
+    float_fields,
+    named_columns,
+    point_columns,
+    point_fields,
+    schema,
+    write_table,
+)
 
 _ONLINE, _FINAL = ([f"{path}_{name}" for name in POSE_FIELDS] for path in ("online", "final"))
 _ITERATION = fields(iteration=INT)
@@ -73,39 +81,64 @@ def run(settings: SlamSettings, job: Job) -> None:
     """Run the filter over a log and write maps, poses, associations and particle clouds."""
     log = read_log(job.inputs["log"])
     last = len(log) - 1
-    maps, associations, steps, clouds, paths = [], [], [], [], []
+    steps = list[dict[str, float]]()
+    maps, associations, clouds, paths = _Rows(), _Rows(), _Rows(), _Rows()
     counted = np.empty(0, dtype=np.int64)
     iterations = evaluated_iterations(len(log), settings.every)
     rng = generator(settings.seed, "slam", log.robot)
     told = read_odometry_covariance(job.inputs["log"]), read_attitude(job.inputs["log"])
-    for frame in run_log(log, settings.filter, rng, iterations, settings.min_count, *told):
+    filtered = run_log(
+        log, settings.filter, rng, iterations, settings.min_count, *told, viewing=False
+    )
+    for frame in filtered:
         k, result = frame.iteration, frame.result
         steps.append(_step(result))
         if k % settings.clouds_every == 0 or k == last:
-            cloud = pd.DataFrame(result.cloud, columns=pd.Index(POSE_FIELDS))
-            cloud = cloud.assign(iteration=k, log_weight=result.log_weights)
-            clouds.append(cloud.rename_axis("particle").reset_index())
+            cloud = {"particle": np.arange(len(result.cloud)), "log_weight": result.log_weights}
+            clouds.add(named_columns(POSE_FIELDS, result.cloud) | cloud, iteration=k)
         if frame.landmarks is not None:
+            assert frame.path is not None
+            assert frame.associations is not None
             seen, origin = frame.landmarks, frame.landmarks.source_observation
             points = point_columns(seen.position_m, seen.covariance_m2)
-            points |= {"count": seen.count, "source_observation": origin}
-            maps.append(pd.DataFrame(points).assign(iteration=k))
-            counts_for = frame.slam.best_associations()
+            maps.add(points | {"count": seen.count, "source_observation": origin}, iteration=k)
+            counts_for = frame.associations
             new = np.full(len(counts_for) - len(counted), -1)
             changed = np.flatnonzero(counts_for != np.concatenate([counted, new]))
             columns = {"observation": changed, "source_observation": counts_for[changed]}
-            associations.append(pd.DataFrame(columns).assign(from_iteration=k))
-            counted = counts_for
-            path = pd.DataFrame(frame.slam.best_path()[: k + 1], columns=pd.Index(POSE_FIELDS))
-            paths.append(path.rename_axis("iteration").reset_index().assign(evaluated=k))
-    poses = pd.DataFrame(steps).rename_axis("iteration").reset_index()
-    poses[_FINAL] = paths[-1][POSE_FIELDS].to_numpy()
+            associations.add(columns, from_iteration=k)
+            counted, path = counts_for, frame.path
+            rows = {"iteration": np.arange(len(path))} | named_columns(POSE_FIELDS, path)
+            paths.add(rows, evaluated=k)
+    poses = {name: np.array([step[name] for step in steps]) for name in steps[0]}
+    poses |= {"iteration": np.arange(len(steps))} | named_columns(_FINAL, path)
     # An empty map has no row: the list tells that its iteration was evaluated all the same.
     evaluated = {"iterations": ",".join(map(str, iterations))}
-    tables = (*map(pd.concat, (maps, associations)), poses, *map(pd.concat, (clouds, paths)))
+    tables = (maps.columns, associations.columns, poses, clouds.columns, paths.columns)
     schemas = (SNAPSHOTS, ASSOCIATIONS, POSES, CLOUDS, PATHS)
-    for file, table_schema, rows in zip(WRITES, schemas, tables, strict=True):
-        write_rows(job.output / file, table_schema, rows, evaluated)
+    for file, table_schema, columns in zip(WRITES, schemas, tables, strict=True):
+        write_table(job.output / file, columns, table_schema, evaluated)
+
+
+class _Rows:
+    """Rows of a table, a part of them at a time."""
+
+    def __init__(self) -> None:
+        self._parts = list[Mapping[str, np.ndarray]]()
+
+    def add(self, columns: Mapping[str, np.ndarray], **same: int) -> None:
+        """Further rows, by column, and what is the same in all of them."""
+        n = len(next(iter(columns.values())))
+        self._parts.append(
+            dict(columns) | {name: np.full(n, value) for name, value in same.items()}
+        )
+
+    @property
+    def columns(self) -> dict[str, np.ndarray]:
+        """All rows, by column."""
+        return {
+            name: np.concatenate([part[name] for part in self._parts]) for name in self._parts[0]
+        }
 
 
 def _step(result: StepResult) -> dict[str, float]:

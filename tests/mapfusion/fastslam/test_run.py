@@ -40,7 +40,19 @@ def test_a_log_is_its_frames_one_after_the_other():
         result = slam.step(log.odometry[frame.iteration], log.observations[rows])
         np.testing.assert_array_equal(frame.result.cloud, result.cloud)
         assert (frame.landmarks is not None) == (frame.iteration in (5, 11))
+        if frame.landmarks is None:
+            assert frame.path is None
+            assert frame.associations is None
+            continue
+        assert frame.landmarks.viewing is not None
+        np.testing.assert_array_equal(frame.path, slam.best_path())
+        np.testing.assert_array_equal(frame.associations, slam.best_associations())
     assert frame.iteration == 11
+    bare = run_log(log, SETTINGS, np.random.default_rng(1), [11], 1, viewing=False)
+    *_, last = bare
+    assert last.landmarks is not None
+    assert last.landmarks.viewing is None
+    np.testing.assert_array_equal(last.landmarks.position_m, frame.landmarks.position_m)
     built = build_map(log, SETTINGS, np.random.default_rng(1), min_count=1)
     assert built.name == "R1"
     np.testing.assert_array_equal(built.position_m, slam.best_map(min_count=1).position_m)
