@@ -14,7 +14,6 @@ from mapfusion.align.method import Fit, Needs
 from mapfusion.align.pairs import Pairs
 from mapfusion.align.rigid import fit_rigid
 from mapfusion.arguments import Range, require_in_range
-from mapfusion.landmark_map import LandmarkMap
 from mapfusion.planar import moved_point
 from mapfusion.se2 import Float
 
@@ -22,6 +21,8 @@ MAX_ROUNDS = 200  # of pairing and solving
 # Points near a landmark that are kept: with fewer it has to be looked up more often, more take
 # longer to find and to put in order than they save.
 _KEPT = 4
+_CHANGES, _REPEATS = -2, -1  # how a descent ended, where it met no other one
+_NO_ROUNDS = np.empty(0, np.int64)
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class Icp:
     def find(self, pairs: Pairs, rng: np.random.Generator) -> Fit:
         """T_a_b of the last pairing."""
         start = draw_motion(pairs, np.arange(len(pairs)), rng)
-        return ClosestPoints(pairs.map_a, pairs.map_b).descend(start, pairs, self.max_rounds)
+        return ClosestPoints.of(pairs).descend(start, self.max_rounds)
 
 
 def draw_motion(pairs: Pairs, rows: np.ndarray, rng: np.random.Generator) -> Float:
@@ -56,13 +57,27 @@ def draw_motion(pairs: Pairs, rows: np.ndarray, rng: np.random.Generator) -> Flo
 
 
 class ClosestPoints:
-    """Pairs each landmark of map b with the nearest of map a (planar maps: in the plane)."""
+    """Pairs each landmark of map b with the nearest of map a (planar maps: in the plane).
 
-    def __init__(self, map_a: LandmarkMap, map_b: LandmarkMap) -> None:
-        upright = np.array([1.0, 1.0, 0.0 if map_a.planar or map_b.planar else 1.0])
-        self._tree = BoxTree.of(map_a.position_m * upright)
-        self._maps = map_a, map_b
-        self._p_b = map_b.position_m * upright
+    Descents that come to the same motion go on as one: what was met on the way is kept, and a
+    descent that meets it again ends where that one did.
+    """
+
+    def __init__(self, pairs: Pairs) -> None:
+        upright = np.array([1.0, 1.0, 0.0 if pairs.planar else 1.0])
+        self._pairs = pairs
+        self._tree = BoxTree.of(pairs.map_a.position_m * upright)
+        self._p_b = pairs.map_b.position_m * upright
+        self._ends: list[Fit] = []
+        # T_a_b of each round that led to one of them, which one, and after how many more
+        self._met, self._end, self._to_go = np.empty((0, 3)), _NO_ROUNDS, _NO_ROUNDS
+
+    @classmethod
+    def of(cls, pairs: Pairs) -> "ClosestPoints":
+        """Those of the last call with these pairs, if there was one."""
+        if cls not in pairs.kept:
+            pairs.kept[cls] = cls(pairs)
+        return pairs.kept[cls]
 
     def cost_m2(self, T_a_b: Float, most_m2: float = math.inf) -> float:
         """Summed squared distance of map b's landmarks under T_a_b to their nearest in map a.
@@ -80,15 +95,34 @@ class ClosestPoints:
                 nearest, least_m2 = T_a_b, cost_m2
         return nearest
 
-    def descend(self, T_a_b: Float, pairs: Pairs, max_rounds: int) -> Fit:
+    def descend(self, T_a_b: Float, max_rounds: int) -> Fit:
         """Pair and solve from T_a_b on until the pairing repeats; fitted to the last pairing."""
-        T_a_b, nearest, repeats = pair_and_solve(T_a_b, max_rounds, self._p_b, self._tree)
-        index_a, index_b = self._tree.row[nearest], np.arange(len(nearest))
+        way, nearest, met = pair_and_solve(
+            T_a_b, max_rounds, self._p_b, self._tree, self._met, self._to_go
+        )
+        if met == _CHANGES:
+            return self._fit(
+                way[-1].copy(), nearest, f"pairs still changed after {max_rounds} rounds"
+            )
+        if met == _REPEATS:
+            new, end, further = way, len(self._ends), 0
+            self._ends.append(self._fit(way[-1].copy(), nearest))
+        else:
+            new, end, further = way[:-1], self._end[met], self._to_go[met]
+        to_go = further + len(way) - 1 - np.arange(len(new))
+        self._met = np.concatenate([self._met, new])
+        self._end = np.concatenate([self._end, np.full(len(new), end)])
+        self._to_go = np.concatenate([self._to_go, to_go])
+        return self._ends[end]
+
+    def _fit(self, T_a_b: Float, nearest: np.ndarray, refusal: str = "") -> Fit:
+        pairs, index_a, index_b = self._pairs, self._tree.row[nearest], np.arange(len(nearest))
+        every = Correspondences(index_a, index_b, np.zeros(len(nearest)))
         return Fit(
             T_a_b,
             index_a[pairs.index_b] == pairs.index_a,
-            fitted=Pairs(*self._maps, Correspondences(index_a, index_b, np.zeros(len(nearest)))),
-            refusal="" if repeats else f"pairs still changed after {max_rounds} rounds",
+            fitted=Pairs(pairs.map_a, pairs.map_b, every),
+            refusal=refusal,
         )
 
 
@@ -113,23 +147,38 @@ def summed_square_distance(T_a_b: Float, p_b: Float, tree: BoxTree, most: float)
 
 @njit(cache=True)
 def pair_and_solve(
-    T_start: Float, max_rounds: int, p_b: Float, tree: BoxTree
-) -> tuple[Float, np.ndarray, bool]:
+    T_start: Float,
+    max_rounds: int,
+    p_b: Float,
+    tree: BoxTree,
+    met: Float,
+    to_go: np.ndarray,
+) -> tuple[Float, np.ndarray, int]:
     """Pair p_b (N, 3) with the nearest points of a tree and solve, until no pair changes.
 
     Of each landmark a few that were near where it was looked up are kept. No other point is nearer
     than the last of them was, less how far it has moved since (triangle inequality): while one of
     them is, it is not looked up again.
 
+    All that follows, follows from the motion: at one of `met` (M, 3), from which `to_go` (M,) more
+    rounds lead to an end, there is nothing left to do.
+
     Returns:
-        T_a_b (3,), index into the tree's points of each one's nearest (N,), whether it repeats.
+        T_a_b of each round (R, 3), index into the tree's points of each one's nearest (N,), and the
+        row of `met` that it came to; if to none, whether it repeats.
     """
     p, n = tree.p, len(p_b)
     T_a_b, everyone, todo = T_start.copy(), np.arange(n), room_for_search()
     nearest, matched = np.full(n, -1), np.empty((n, 3))
     near, square = np.full((n, _KEPT), -1), np.empty(_KEPT)
     looked_up, clear = np.zeros((n, 2)), np.zeros(n)  # where, and how far the last one kept was
+    way = np.empty((max_rounds + 1, 3))
     for rounds in range(max_rounds + 1):
+        way[rounds, 0], way[rounds, 1], way[rounds, 2] = T_a_b[0], T_a_b[1], T_a_b[2]
+        row = _row_of(T_a_b, met)
+        # one round more than that if it came there by other pairs
+        if row >= 0 and rounds + to_go[row] < max_rounds:
+            return way[: rounds + 1], nearest, row
         cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
         changed = False
         for i in range(n):
@@ -158,7 +207,16 @@ def pair_and_solve(
                 for axis in range(3):
                     matched[i, axis] = p[k, axis]
         if not changed:
-            return T_a_b, nearest, True
+            return way[: rounds + 1], nearest, _REPEATS
         if rounds < max_rounds:
             T_a_b[0], T_a_b[1], T_a_b[2] = fit_rigid(matched, p_b, everyone)
-    return T_a_b, nearest, False
+    return way, nearest, _CHANGES
+
+
+@njit(cache=True)
+def _row_of(T_a_b: Float, met: Float) -> int:
+    """Where a motion (3,) is among (M, 3), to the last bit; -1: nowhere."""
+    for row in range(len(met)):
+        if met[row, 2] == T_a_b[2] and met[row, 0] == T_a_b[0] and met[row, 1] == T_a_b[1]:
+            return row
+    return -1

@@ -40,6 +40,6 @@ class ImpIcp:
         # equal distances (labels) are all as good as the last one taken
         last = np.sort(pairs.distance)[max(int(self.best_share * len(pairs)), 2) - 1]
         best = np.flatnonzero(pairs.distance <= last)
-        closest = ClosestPoints(pairs.map_a, pairs.map_b)
+        closest = ClosestPoints.of(pairs)
         starts = [draw_motion(pairs, best, rng) for _ in range(self.sets)]
-        return closest.descend(closest.nearest_of(starts), pairs, self.max_rounds)
+        return closest.descend(closest.nearest_of(starts), self.max_rounds)

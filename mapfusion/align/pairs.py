@@ -3,6 +3,7 @@
 import time
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -41,6 +42,11 @@ class Pairs:
 
     def __getitem__(self, rows: np.ndarray) -> "Pairs":
         return Pairs(self.map_a, self.map_b, self.correspondences[rows])
+
+    @cached_property
+    def kept(self) -> dict[type, Any]:
+        """What methods keep of the maps between their calls with these pairs, each by its type."""
+        return {}
 
     @property
     def index_a(self) -> np.ndarray:

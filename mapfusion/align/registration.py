@@ -68,7 +68,13 @@ class MethodAligner:
             ValueError: an index of the correspondences lies outside its map.
         """
         started_s = time.perf_counter()
-        pairs = Pairs(map_a, map_b, correspondences)
+        return self._align(Pairs(map_a, map_b, correspondences), rng, started_s)
+
+    def align_again(self, pairs: Pairs, rng: np.random.Generator) -> Alignment:
+        """The same of pairs that it was given before: the method may have kept what helps it."""
+        return self._align(pairs, rng, time.perf_counter())
+
+    def _align(self, pairs: Pairs, rng: np.random.Generator, started_s: float) -> Alignment:
         rows = np.arange(len(pairs))
         height = getattr(self.method, "height", None)
         if isinstance(height, HeightGate):
@@ -219,13 +225,18 @@ class PairRegistration:
 
     def register(self, rng: np.random.Generator) -> Registered:
         """Estimate once more; refine and judge the estimate unless it was there before."""
-        pairs = self._pairs
-        estimated = self._aligner.align(pairs.map_a, pairs.map_b, pairs.correspondences, rng)
+        estimated = self._estimated(rng)
         known = (estimated.T_a_b.tobytes(), estimated.status, estimated.reason)
         if known not in self._completed:
             refined = self._refined(estimated)
             self._completed[known] = refined, self._judged(refined)
         return Registered(estimated, *self._completed[known])
+
+    def _estimated(self, rng: np.random.Generator) -> Alignment:
+        pairs = self._pairs
+        if isinstance(self._aligner, MethodAligner):
+            return self._aligner.align_again(pairs, rng)
+        return self._aligner.align(pairs.map_a, pairs.map_b, pairs.correspondences, rng)
 
     def _refined(self, estimated: Alignment) -> Alignment:
         if estimated.status in NOT_RUN:

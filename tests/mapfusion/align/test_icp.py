@@ -3,6 +3,7 @@ import pytest
 from scipy.spatial.distance import cdist
 
 from mapfusion import se2
+from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.icp import ClosestPoints, Icp
 from mapfusion.align.impicp import ImpIcp
 from mapfusion.align.pairs import Pairs
@@ -11,6 +12,10 @@ from mapfusion.align.registry import make_aligner
 from mapfusion.align.result import Status
 from mapfusion.align.rigid import fit_rigid
 from tests.mapfusion.align.map_pairs import error, given_pairs, landmarks
+
+
+def closest_points(pair):
+    return ClosestPoints(Pairs(pair.map_a, pair.map_b, pair.correspondences))
 
 
 def slow_icp(p_a, p_b, T, max_rounds):
@@ -34,25 +39,56 @@ def slow_icp(p_a, p_b, T, max_rounds):
 def test_kernel_equals_its_twin(offset_m, max_rounds):
     pair = given_pairs(np.random.default_rng(0), 300, 0.7, 0.05)
     start = pair.T_a_b + np.array([offset_m, -offset_m, 0.1 * offset_m])
-    closest = ClosestPoints(pair.map_a, pair.map_b)
-    pairs = Pairs(pair.map_a, pair.map_b, pair.correspondences)
-    found = closest.descend(start, pairs, max_rounds)
+    closest = closest_points(pair)
+    found = closest.descend(start, max_rounds)
     T, nearest, repeats = slow_icp(pair.map_a.position_m, pair.map_b.position_m, start, max_rounds)
     np.testing.assert_allclose(found.T_a_b, T, atol=1e-9)
     np.testing.assert_array_equal(found.inlier, nearest == np.arange(300))
     assert ("still changed" in found.refusal) == (not repeats)
 
 
+@pytest.mark.parametrize("max_rounds", [3, 6, 200])
+def test_descents_that_meet_end_as_each_does_by_itself(max_rounds):
+    pair, rng = given_pairs(np.random.default_rng(5), 200, 0.7, 0.02), np.random.default_rng(6)
+    together = closest_points(pair)
+    alone = [pair.T_a_b + rng.normal(0, [0.3, 0.3, 0.03]) for _ in range(40)]
+    ends = [together.descend(T, max_rounds) for T in alone]
+    met = len(ends) - len({id(end) for end in ends})
+    assert met > 10 or max_rounds == 3
+    for T, end in zip(alone, ends, strict=True):
+        other = closest_points(pair).descend(T, max_rounds)
+        np.testing.assert_array_equal(end.T_a_b, other.T_a_b)
+        np.testing.assert_array_equal(end.inlier, other.inlier)
+        assert end.refusal == other.refusal
+        assert end.fitted is not None
+        assert other.fitted is not None
+        np.testing.assert_array_equal(end.fitted.index_a, other.fitted.index_a)
+
+
+def test_a_motion_met_before_ends_as_it_did():
+    """From anywhere on the way of another descent, as long as rounds are left to get there."""
+    pair = given_pairs(np.random.default_rng(0), 300, 0.7, 0.05)
+    closest, start = closest_points(pair), pair.T_a_b + np.array([0.5, -0.5, 0.05])
+    first = closest.descend(start, 200)
+    way = closest._met.copy()
+    assert len(way) > 5
+    for T, left in zip(way, range(len(way) - 1, 0, -1), strict=False):
+        assert closest.descend(T, 200) is first
+        few = closest.descend(T, left - 1)
+        assert "still changed" in few.refusal
+    assert len(closest._met) == len(way)
+
+
 def test_cost_is_the_summed_square_distance():
     pair = given_pairs(np.random.default_rng(1), 80, 0.5, 0.05)
-    cost = ClosestPoints(pair.map_a, pair.map_b).cost_m2(pair.T_a_b)
+    cost = closest_points(pair).cost_m2(pair.T_a_b)
     moved = se2.transform_points(pair.T_a_b, pair.map_b.position_m)
     assert cost == pytest.approx(np.sum(cdist(moved, pair.map_a.position_m).min(axis=1) ** 2))
 
 
 def test_of_several_starts_the_first_with_the_least_cost_is_taken():
     pair, rng = given_pairs(np.random.default_rng(1), 80, 0.5, 0.05), np.random.default_rng(2)
-    closest = ClosestPoints(pair.map_a, pair.map_b)
+    closest = closest_points(pair)
     for _ in range(20):
         starts = list(pair.T_a_b + rng.normal(0, 0.5, (4, 3)))
         starts.insert(2, starts[int(np.argmin([closest.cost_m2(T) for T in starts]))].copy())
@@ -62,7 +98,7 @@ def test_of_several_starts_the_first_with_the_least_cost_is_taken():
 
 def test_cost_is_not_summed_up_beyond_what_is_asked():
     pair = given_pairs(np.random.default_rng(1), 80, 0.5, 0.05)
-    closest = ClosestPoints(pair.map_a, pair.map_b)
+    closest = closest_points(pair)
     cost = closest.cost_m2(pair.T_a_b)
     assert closest.cost_m2(pair.T_a_b, cost) == cost
     assert cost / 2 < closest.cost_m2(pair.T_a_b, cost / 2) < cost
@@ -72,7 +108,9 @@ def test_planar_maps_ignore_heights():
     rng = np.random.default_rng(2)
     p = rng.uniform(0, 10, (50, 3))
     other = np.column_stack([p[:, :2], rng.uniform(0, 10, 50)])
-    closest = ClosestPoints(landmarks(p, planar=True), landmarks(other, planar=True))
+    maps = landmarks(p, planar=True), landmarks(other, planar=True)
+    nobody = np.empty(0, np.int64)
+    closest = ClosestPoints(Pairs(*maps, Correspondences(nobody, nobody, np.empty(0))))
     assert closest.cost_m2(np.zeros(3)) == pytest.approx(0, abs=1e-20)
 
 
