@@ -20,13 +20,14 @@ from experiments.run.rehearsal import rehearsals
 from experiments.run.stage import Stage
 from experiments.run.stages.fuse import read_fusions
 from experiments.run.stages.slam import RobotFolders
+from experiments.run.stages.snapshots import stored_log
 from experiments.run.store import StageFolder, Store
 from experiments.run.tasks import OnProgress, Task, run_tasks, task_names, tasks_of, unfinished
 from experiments.run.workers import workers
 from experiments.scenario.settings import AnyScenario
 from mapfusion.errors import DamagedFileError, InputError
 from mapfusion.fuse.registry import make_fuser
-from mapfusion.robot_log import RobotLog, read_log
+from mapfusion.robot_log import RobotLog
 
 _JUDGED = {"errors", "fusion"}  # the other tables of pairs come from the aligners
 
@@ -77,16 +78,13 @@ class JudgedRun:
 
     @cached_property
     def logs(self) -> dict[str, RobotLog]:
-        """All robots' logs by name, read once for all that is told of them."""
+        """All robots' logs by name."""
         folders = {robot.name: self.robot_folders(robot) for robot in self.pipeline.robots}
-        return {name: read_log(each.log) for name, each in folders.items()}
+        return {name: stored_log(each) for name, each in folders.items()}
 
     def load_robots(self) -> list[EvaluatedRobot]:
         """All robots' maps joined with the truth."""
-        return [
-            judging.load_robot(self.robot_folders(robot), self.logs[robot.name])
-            for robot in self.pipeline.robots
-        ]
+        return [judging.load_robot(self.robot_folders(robot)) for robot in self.pipeline.robots]
 
     def load_smoothed(self, robots: Sequence[EvaluatedRobot]) -> list[SmoothedRobot]:
         """What the smoother made of all robots' logs, joined with the truth."""

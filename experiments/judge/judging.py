@@ -1,5 +1,6 @@
 """Stage: one robot pair's estimates against the truth, and whether fusing the pair was worth it."""
 
+import functools
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,11 +12,11 @@ from experiments.judge.errors import EvaluatedRobot, error_rows, met_maps
 from experiments.judge.fused_landmarks import MergeSettings, fusion_rows
 from experiments.judge.truth import PathTruth, landmark_truth
 from experiments.run.job import Job
-from experiments.run.stages.slam import RobotFolders
-from experiments.run.stages.snapshots import Associations, Snapshots
+from experiments.run.stages.slam import RobotFolders, folders_of_both
+from experiments.run.stages.snapshots import ROBOTS_KEPT, stored_log, stored_maps
 from mapfusion.errors import InputError
 from mapfusion.evidence.judge import Judge
-from mapfusion.robot_log import TRUTH_FILES, RobotLog, RobotTruth, read_log, read_truth
+from mapfusion.robot_log import TRUTH_FILES, RobotLog, RobotTruth, read_truth
 
 WRITES = ("errors.parquet", "fusion.parquet")
 ALIGNED = ("estimates", "correspondences", "rivals")  # tables of the align stage, per pair of maps
@@ -37,23 +38,27 @@ def truth_of(folder: Path, log: RobotLog) -> RobotTruth:
     return RobotTruth(np.full((len(log), 3), np.nan), np.full((len(log.observations), 3), np.nan))
 
 
-def load_robot(folders: RobotFolders, log: RobotLog) -> EvaluatedRobot:
-    """A robot's maps joined with the truth beside its log, which is NaN where it is unknown."""
+@functools.lru_cache(maxsize=ROBOTS_KEPT)
+def load_robot(folders: RobotFolders) -> EvaluatedRobot:
+    """A robot's maps joined with the truth beside its log, which is NaN where it is unknown.
+
+    They stay in memory as `stored_maps` do.
+    """
+    log = stored_log(folders)
     truth = truth_of(folders.log, log)
     poses, points = (truth.T_world_robot, log), (truth.point_world_m, log.observations)
     for file, (true, logged) in (("truth_poses", poses), ("truth_points", points)):
         if len(true) != len(logged):
             counts = f"{len(true)} rows, the log has {len(logged)} of them"
             raise InputError(f"{folders.log / file}.parquet: {counts}")
-    maps = Snapshots(folders.slam, log)
-    points = landmark_truth(truth, Associations.read(folders.slam).at, maps)
+    maps = stored_maps(folders)
+    points = landmark_truth(truth, maps.associations.at, maps)
     return EvaluatedRobot(log.robot, maps, points, PathTruth.of(truth))
 
 
 def run(settings: JudgeSettings, job: Job) -> None:
     """Write the pair's `errors.parquet` and `fusion.parquet`."""
-    folders = [RobotFolders(job.inputs[f"log_{s}"], job.inputs[f"slam_{s}"]) for s in "ab"]
-    robots = [load_robot(each, read_log(each.log)) for each in folders]
+    robots = [load_robot(folders) for folders in folders_of_both(job)]
     aligned = [tables.read(job.inputs["align"] / f"{name}.parquet", name) for name in ALIGNED]
     met, radius_m = met_maps(robots, *aligned), settings.true_pair_radius_m
     errors = pd.concat([error_rows(maps, settings.judge, radius_m) for maps in met])

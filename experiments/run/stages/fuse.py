@@ -18,6 +18,7 @@ from experiments.run.frames import FLOAT, INT, TEXT, fields, read_rows, write_ro
 from experiments.run.job import Job
 from experiments.run.stage_tables import CORRESPONDENCES, COVARIANCE, ESTIMATES
 from experiments.run.stages import match
+from experiments.run.stages.slam import RobotFolders
 from experiments.run.stages.smooth import (
     log_until,
     read_smoothed,
@@ -25,14 +26,14 @@ from experiments.run.stages.smooth import (
     smoothed_owners,
     smoother_of,
 )
-from experiments.run.stages.snapshots import Snapshots
+from experiments.run.stages.snapshots import stored_log, stored_maps
 from mapfusion.aligned_landmarks import ABSENT
 from mapfusion.fuse.parameters import MergeParameters
 from mapfusion.fuse.registry import make_fuser
 from mapfusion.fused_map import AlignedPair, FusedMap
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map
 from mapfusion.merge import ConnectedMaps, connect
-from mapfusion.robot_log import RobotLog, read_log
+from mapfusion.robot_log import RobotLog
 from mapfusion.smoother.recording import Recording
 from mapfusion.smoother.smooth import SmootherParameters
 from mapfusion.storage import (
@@ -146,9 +147,9 @@ def given_teams(settings: FuseSettings, job: Job) -> Iterator[tuple[int, GivenTe
 
 
 def _read_robot(job: Job, name: str, smoothed: bool) -> _Robot:
-    log = read_log(job.inputs[f"log {name}"])
+    folders = RobotFolders(job.inputs[f"log {name}"], job.inputs[f"slam {name}"])
     maps = read_smoothed(job.inputs[f"smooth {name}"]) if smoothed else {}
-    return _Robot(log, Snapshots(job.inputs[f"slam {name}"], log), maps)
+    return _Robot(stored_log(folders), stored_maps(folders), maps)
 
 
 def _at(maps: Mapping[int, LandmarkMap], iteration: int) -> LandmarkMap:

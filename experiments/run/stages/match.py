@@ -3,7 +3,6 @@
 What matching and aligning read, they read here.
 """
 
-import functools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,8 @@ from experiments.run.estimates import rival_rows
 from experiments.run.frames import read_rows, write_rows
 from experiments.run.job import Job
 from experiments.run.stage_tables import CORRESPONDENCES, RIVALS
-from experiments.run.stages.snapshots import Snapshots
+from experiments.run.stages.slam import folders_of_both
+from experiments.run.stages.snapshots import Snapshots, stored_maps
 from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.correspondences import MatchParameters, match
 from mapfusion.align.pairs import Pairs
@@ -23,7 +23,6 @@ from mapfusion.align.refine import Refinement
 from mapfusion.evidence.judge import Judge
 from mapfusion.evidence.parameters import EvidenceParameters
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.robot_log import read_log
 
 # Evaluated iterations a part: small enough that an interruption loses little and two cores end
 # at about the same time, large enough that reading the maps costs little beside aligning them.
@@ -79,15 +78,9 @@ def rivals_path(folder: Path, part: str) -> Path:
     return folder / WRITES[1].format(part=part)
 
 
-# The maps of one pair of robots stay in memory: each aligner of the pair wants the same.
-@functools.lru_cache(maxsize=2)
-def _maps(log: Path, slam: Path) -> Snapshots:
-    return Snapshots(slam, read_log(log))
-
-
 def maps_of_both(job: Job) -> list[Snapshots]:
     """All maps of the job's two robots, by iteration."""
-    return [_maps(job.inputs[f"log_{side}"], job.inputs[f"slam_{side}"]) for side in "ab"]
+    return [stored_maps(folders) for folders in folders_of_both(job)]
 
 
 def pairs_of_maps(

@@ -72,6 +72,11 @@ class RobotFolders(NamedTuple):
     slam: Path
 
 
+def folders_of_both(job: Job) -> list[RobotFolders]:
+    """Those of the two robots that a job of a pair is handed."""
+    return [RobotFolders(job.inputs[f"log_{side}"], job.inputs[f"slam_{side}"]) for side in "ab"]
+
+
 def evaluated_iterations(n_frames: int, every: int) -> list[int]:
     """Each multiple of `every` from the first on, and the last frame."""
     return sorted({*range(every, n_frames, every), n_frames - 1})

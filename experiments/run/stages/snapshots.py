@@ -1,5 +1,6 @@
 """What the SLAM stage wrote, read again: the robot's map at each evaluated iteration."""
 
+import functools
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property
@@ -7,12 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.run.stages.slam import ASSOCIATIONS, PATHS, SNAPSHOTS
+from experiments.run.stages.slam import ASSOCIATIONS, PATHS, SNAPSHOTS, RobotFolders
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.robot_log import RobotLog, with_rows
+from mapfusion.robot_log import RobotLog, read_log, with_rows
 from mapfusion.se2 import Float
 from mapfusion.storage import POSE_FIELDS, column, columns, points_from, read_table
 from mapfusion.viewing import viewing_of
+
+ROBOTS_KEPT = 4  # by a process; of a robot that drives for minutes they are tens of megabytes
 
 
 class Associations:
@@ -75,13 +78,14 @@ class Snapshots(Mapping[int, LandmarkMap]):
             landmarks = with_rows(self._landmarks, self._rows[iteration])
             log, path = self._log, self._path(iteration)
             n_seen = int(np.searchsorted(log.iteration, iteration + 1))
-            counts_for = self._associations.at(iteration, n_seen)
+            counts_for = self.associations.at(iteration, n_seen)
             viewing = viewing_of(log, counts_for, path, landmarks.source_observation)
             self._made[iteration] = replace(landmarks, viewing=viewing)
         return self._made[iteration]
 
     @cached_property
-    def _associations(self) -> Associations:
+    def associations(self) -> Associations:
+        """Which landmark each of the log's observations is of."""
         return Associations.read(self._slam)
 
     @cached_property
@@ -93,6 +97,21 @@ class Snapshots(Mapping[int, LandmarkMap]):
         """The path (iteration + 1, 3) that the map was made along."""
         evaluated, poses = self._paths
         return poses[slice(*np.searchsorted(evaluated, [iteration, iteration + 1]))]
+
+
+@functools.lru_cache(maxsize=ROBOTS_KEPT)
+def stored_log(folders: RobotFolders) -> RobotLog:
+    """A robot's log; those of a few robots stay in memory, since stage after stage wants the same.
+
+    The maps' folder is named after what the log holds: of another log it is another folder.
+    """
+    return read_log(folders.log)
+
+
+@functools.lru_cache(maxsize=ROBOTS_KEPT)
+def stored_maps(folders: RobotFolders) -> Snapshots:
+    """A robot's maps, which stay in memory likewise, with all that was made of them."""
+    return Snapshots(folders.slam, stored_log(folders))
 
 
 def _rows(iteration: np.ndarray, evaluated: str) -> dict[int, slice]:

@@ -11,14 +11,13 @@ from experiments.judge.judged_run import JudgedRun
 from experiments.judge.judging import load_robot
 from experiments.judge.result import require_result
 from experiments.run.stages.slam import RobotFolders, evaluated_iterations
-from experiments.run.stages.snapshots import Snapshots
+from experiments.run.stages.snapshots import stored_maps
 from experiments.run.store import Store
 from experiments.scenario.seeds import parse_seeds
 from experiments.scenario.settings import AnyScenario, Simulation
 from experiments.scenario.suite import scenarios_of
 from mapfusion.errors import InputError
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.robot_log import read_log
 
 
 @dataclass(frozen=True)
@@ -57,12 +56,11 @@ class MappedWorld:
 
     def maps(self, robot: str) -> Mapping[int, LandmarkMap]:
         """One robot's maps by iteration, without the truth."""
-        folders = self.folders[robot]
-        return Snapshots(folders.slam, read_log(folders.log))
+        return stored_maps(self.folders[robot])
 
     def robots(self) -> list[EvaluatedRobot]:
         """All robots' maps joined with the truth."""
-        return [load_robot(each, read_log(each.log)) for each in self.folders.values()]
+        return [load_robot(each) for each in self.folders.values()]
 
 
 def worlds_of(words: Sequence[str], seeds: Sequence[int], results: Path) -> list[MappedWorld]:

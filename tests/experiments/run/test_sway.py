@@ -43,7 +43,7 @@ def mapped(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Mapped]:
         run.execute(1, lambda *_: None, [robot.slam])
         log = run.store.path(robot.log)
         logged = read_log(log)
-        landmarks, points = load_robot(run.robot_folders(robot), logged).at(43)
+        landmarks, points = load_robot(run.robot_folders(robot)).at(43)
         n = len(logged.observations)
         drive = run.store.path(robot.features.before["drive"])
         found[kind] = Mapped(log, drive, fit_rmse_m(landmarks.position_m, points)[1], n)
