@@ -131,8 +131,8 @@ def run(settings: FuseSettings, job: Job) -> dict[str, float]:
 
 def given_teams(settings: FuseSettings, job: Job) -> Iterator[tuple[int, GivenTeam]]:
     """What there is to be fused, at each iteration."""
-    takes = make_fuser(settings.fuser).smoothed
-    robots = {name: _read_robot(job, name, takes) for name in settings.robots}
+    takes, viewing = make_fuser(settings.fuser).smoothed, bool(settings.origin)
+    robots = {name: _read_robot(job, name, takes, viewing) for name in settings.robots}
     alignments = _alignments(settings, job)
     for k in settings.iterations:
         given, recordings = [], list[Recording | None]()
@@ -145,10 +145,11 @@ def given_teams(settings: FuseSettings, job: Job) -> Iterator[tuple[int, GivenTe
         yield k, GivenTeam(maps, pairs, given, recordings)
 
 
-def _read_robot(job: Job, name: str, smoothed: bool) -> _Robot:
+def _read_robot(job: Job, name: str, smoothed: bool, viewing: bool) -> _Robot:
+    """What there is of a robot; with viewing evidence, which none of our fusers looks at, if so."""
     log = read_log(job.inputs[f"log {name}"])
     maps = read_smoothed(job.inputs[f"smooth {name}"]) if smoothed else {}
-    return _Robot(log, Snapshots(job.inputs[f"slam {name}"], log), maps)
+    return _Robot(log, Snapshots(job.inputs[f"slam {name}"], log, viewing), maps)
 
 
 def _at(maps: Mapping[int, LandmarkMap], iteration: int) -> LandmarkMap:

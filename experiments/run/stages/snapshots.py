@@ -12,7 +12,7 @@ from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import RobotLog, with_rows
 from mapfusion.se2 import Float
 from mapfusion.storage import POSE_FIELDS, column, columns, points_from, read_table
-from mapfusion.viewing import viewing_of
+from mapfusion.viewing import Viewing, viewing_of
 
 
 class Associations:
@@ -52,15 +52,18 @@ class Snapshots(Mapping[int, LandmarkMap]):
 
     These are descriptors, labels, and from where they were seen. A map is made when it is first
     asked for: most that read them want a few of them.
+
+    Args:
+        slam: the stage's folder.
+        log: what was filtered.
+        viewing: whether maps come with their viewing evidence, which is of the whole log so far.
     """
 
-    def __init__(self, slam: Path, log: RobotLog) -> None:
-        self._slam, self._log = slam, log
+    def __init__(self, slam: Path, log: RobotLog, viewing: bool = True) -> None:
+        self._slam, self._log, self._viewing = slam, log, viewing
         table, attributes = read_table(slam / "snapshots.parquet", SNAPSHOTS)
-        origin = column(table, "source_observation")
-        seen = log.observations[origin]
-        about = (column(table, "count"), origin, seen.descriptor, seen.label, log.planar, log.robot)
-        self._landmarks = LandmarkMap(*points_from(table), *about, calibration=log.calibration)
+        about = (column(table, "count"), column(table, "source_observation"))
+        self._landmarks = LandmarkMap(*points_from(table), *about)
         self._rows = _rows(column(table, "iteration"), attributes["iterations"])
         self._made: dict[int, LandmarkMap] = {}
 
@@ -72,13 +75,23 @@ class Snapshots(Mapping[int, LandmarkMap]):
 
     def __getitem__(self, iteration: int) -> LandmarkMap:
         if iteration not in self._made:
-            landmarks = with_rows(self._landmarks, self._rows[iteration])
-            log, path = self._log, self._path(iteration)
-            n_seen = int(np.searchsorted(log.iteration, iteration + 1))
-            counts_for = self._associations.at(iteration, n_seen)
-            viewing = viewing_of(log, counts_for, path, landmarks.source_observation)
-            self._made[iteration] = replace(landmarks, viewing=viewing)
+            landmarks, log = with_rows(self._landmarks, self._rows[iteration]), self._log
+            origin, seen = landmarks.source_observation, log.observations
+            self._made[iteration] = replace(
+                landmarks,
+                descriptor=None if seen.descriptor is None else seen.descriptor[origin],
+                label=None if seen.label is None else seen.label[origin],
+                planar=log.planar,
+                name=log.robot,
+                viewing=self._viewing_of(iteration, origin) if self._viewing else None,
+                calibration=log.calibration,
+            )
         return self._made[iteration]
+
+    def _viewing_of(self, iteration: int, origin: np.ndarray) -> Viewing:
+        log, path = self._log, self._path(iteration)
+        n_seen = int(np.searchsorted(log.iteration, iteration + 1))
+        return viewing_of(log, self._associations.at(iteration, n_seen), path, origin)
 
     @cached_property
     def _associations(self) -> Associations:
