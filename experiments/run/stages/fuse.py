@@ -16,6 +16,7 @@ import pyarrow as pa
 from experiments.run.estimates import alignment_of, correspondences_of, covariances_of
 from experiments.run.frames import FLOAT, INT, TEXT, fields, read_rows, write_rows
 from experiments.run.job import Job
+from experiments.run.kept_logs import kept_log
 from experiments.run.stage_tables import CORRESPONDENCES, COVARIANCE, ESTIMATES
 from experiments.run.stages import match
 from experiments.run.stages.smooth import (
@@ -32,7 +33,7 @@ from mapfusion.fuse.registry import make_fuser
 from mapfusion.fused_map import AlignedPair, FusedMap
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map
 from mapfusion.merge import ConnectedMaps, connect
-from mapfusion.robot_log import RobotLog, read_log
+from mapfusion.robot_log import RobotLog
 from mapfusion.smoother.recording import Recording
 from mapfusion.smoother.smooth import SmootherParameters
 from mapfusion.storage import (
@@ -147,7 +148,7 @@ def given_teams(settings: FuseSettings, job: Job) -> Iterator[tuple[int, GivenTe
 
 def _read_robot(job: Job, name: str, smoothed: bool, viewing: bool) -> _Robot:
     """What there is of a robot; with viewing evidence, which none of our fusers looks at, if so."""
-    log = read_log(job.inputs[f"log {name}"])
+    log = kept_log(job.inputs[f"log {name}"])
     maps = read_smoothed(job.inputs[f"smooth {name}"]) if smoothed else {}
     return _Robot(log, Snapshots(job.inputs[f"slam {name}"], log, viewing), maps)
 

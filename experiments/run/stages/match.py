@@ -14,6 +14,7 @@ import pyarrow as pa
 from experiments.run.estimates import rival_rows
 from experiments.run.frames import read_rows, write_rows
 from experiments.run.job import Job
+from experiments.run.kept_logs import kept_log
 from experiments.run.stage_tables import CORRESPONDENCES, RIVALS
 from experiments.run.stages.snapshots import Snapshots
 from mapfusion.align.acceptance import Acceptance
@@ -23,7 +24,6 @@ from mapfusion.align.refine import Refinement
 from mapfusion.evidence.judge import Judge
 from mapfusion.evidence.parameters import EvidenceParameters
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.robot_log import read_log
 
 # Evaluated iterations a part: small enough that an interruption loses little and two cores end
 # at about the same time, large enough that reading the maps costs little beside aligning them.
@@ -82,7 +82,7 @@ def rivals_path(folder: Path, part: str) -> Path:
 # The maps of one pair of robots stay in memory: each aligner of the pair wants the same.
 @functools.lru_cache(maxsize=2)
 def _maps(log: Path, slam: Path) -> Snapshots:
-    return Snapshots(slam, read_log(log))
+    return Snapshots(slam, kept_log(log))
 
 
 def maps_of_both(job: Job) -> list[Snapshots]:
