@@ -14,13 +14,13 @@ from experiments.judge.judging import ALIGNED, JudgeSettings
 from experiments.judge.known_truth import why_no_truth
 from experiments.judge.smoothed_robots import SmoothedRobot, load_smoothed
 from experiments.run.head_start import with_head_start
+from experiments.run.kept_logs import kept_log
 from experiments.run.memory import require_memory
 from experiments.run.pipeline import PairStages, Pipeline, RobotStages, lay_out
 from experiments.run.rehearsal import rehearsals
 from experiments.run.stage import Stage
 from experiments.run.stages.fuse import read_fusions
 from experiments.run.stages.slam import RobotFolders
-from experiments.run.stages.snapshots import stored_log
 from experiments.run.store import StageFolder, Store
 from experiments.run.tasks import OnProgress, Task, run_tasks, task_names, tasks_of, unfinished
 from experiments.run.workers import workers
@@ -80,7 +80,7 @@ class JudgedRun:
     def logs(self) -> dict[str, RobotLog]:
         """All robots' logs by name."""
         folders = {robot.name: self.robot_folders(robot) for robot in self.pipeline.robots}
-        return {name: stored_log(each) for name, each in folders.items()}
+        return {name: kept_log(each.log) for name, each in folders.items()}
 
     def load_robots(self) -> list[EvaluatedRobot]:
         """All robots' maps joined with the truth."""

@@ -12,8 +12,9 @@ from experiments.judge.errors import EvaluatedRobot, error_rows, met_maps
 from experiments.judge.fused_landmarks import MergeSettings, fusion_rows
 from experiments.judge.truth import PathTruth, landmark_truth
 from experiments.run.job import Job
+from experiments.run.kept_logs import kept_log
 from experiments.run.stages.slam import RobotFolders, folders_of_both
-from experiments.run.stages.snapshots import ROBOTS_KEPT, stored_log, stored_maps
+from experiments.run.stages.snapshots import ROBOTS_KEPT, stored_maps
 from mapfusion.errors import InputError
 from mapfusion.evidence.judge import Judge
 from mapfusion.robot_log import TRUTH_FILES, RobotLog, RobotTruth, read_truth
@@ -44,7 +45,7 @@ def load_robot(folders: RobotFolders) -> EvaluatedRobot:
 
     They stay in memory as `stored_maps` do.
     """
-    log = stored_log(folders)
+    log = kept_log(folders.log)
     truth = truth_of(folders.log, log)
     poses, points = (truth.T_world_robot, log), (truth.point_world_m, log.observations)
     for file, (true, logged) in (("truth_poses", poses), ("truth_points", points)):

@@ -5,9 +5,9 @@ also those move that one robot alone has seen. Maps without one are fused by wha
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations
-from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -96,7 +96,8 @@ def _inliers(component: Component) -> list[Pair]:
     return found
 
 
-class _Placed(NamedTuple):
+@dataclass(frozen=True)
+class _Placed:
     """A map's n landmarks in the common frame.
 
     Attributes:
@@ -109,11 +110,11 @@ class _Placed(NamedTuple):
     own_m2: Float
     shared_m: Float
 
-    @property
+    @cached_property
     def widest_m2(self) -> Float:
         """(n,) two landmarks' together are no less than any variance of their difference."""
-        own = np.trace(self.own_m2, axis1=1, axis2=2)
-        return own + 2 * np.sum(self.shared_m**2, axis=(1, 2))
+        own, shared = np.trace(self.own_m2, axis1=1, axis2=2), self.shared_m
+        return own + 2 * np.einsum("nij,nij->n", shared, shared)
 
 
 def _placed(maps: Sequence[JointMap], estimate: JointEstimate) -> list[_Placed]:

@@ -71,12 +71,15 @@ class JointEstimate:
     def moved_m(self, maps: Sequence[JointMap], k: int, said: Said, factor: Float) -> Float:
         """(n, D, U) how far a sigma of each independent variable moves what map k says.
 
-        These are the columns of a `factor` (U, U) of the unknowns' covariance.
+        These are the columns of a lower triangular `factor` (U, U) of the unknowns' covariance.
         """
         columns = self.unknowns(maps, k)
         known = columns != ABSENT
         by = said.by_unknown[:, :, known].reshape(said.y_m.size, np.count_nonzero(known))
-        return (by @ factor[columns[known]]).reshape(*said.y_m.shape, len(factor))
+        n = 1 + int(columns.max(initial=ABSENT))  # what comes after them in the factor is zero
+        moved = np.zeros((said.y_m.size, len(factor)))
+        np.matmul(by, factor[columns[known], :n], out=moved[:, :n])
+        return moved.reshape(*said.y_m.shape, len(factor))
 
 
 def _columns(maps: Sequence[JointMap]) -> list[np.ndarray]:

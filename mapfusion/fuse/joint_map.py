@@ -106,12 +106,10 @@ def said_of(own: MapRows, T: Float, shared: Float, arm_m: Float) -> Said:
         by_camera = own.calibration.moves_m(arm_m)[:, :, :d]
         moved = np.concatenate([moved, np.swapaxes(by_camera, 1, 2)], axis=2)
     R = rotation_about_z(T[2])[:d, :d]
-    point = own.position_m + moved @ shared
+    point = own.position_m + (moved.reshape(n * d, len(shared)) @ shared).reshape(n, d)
     by = np.empty((n, d, 3 + len(shared)))
     by[:, :2, :3], by[:, 2:, :3] = motion_jacobian(T, point), 0.0
-    for axis in range(2):  # faster than as many small products as landmarks
-        by[:, axis, 3:] = R[axis, 0] * moved[:, 0] + R[axis, 1] * moved[:, 1]
-    by[:, 2:, 3:] = moved[:, 2:]
+    np.matmul(R, moved, out=by[:, :, 3:])
     turned = R @ own.own_m2 @ R.T, R @ own.information @ R.T
     return Said(transform_points(T, point), *turned, by)
 

@@ -5,26 +5,20 @@ from numba import njit
 from mapfusion.se2 import Float
 
 
+# Of tables of blocks they take all and a row: views of rows are counted, which takes longer than
+# the sums.
 @njit(cache=True)
-def put_product(A: Float, B: Float, product: Float) -> None:
-    """A B."""
+def put_along(A: Float, row: int, x: Float, product: Float) -> None:
+    """A[row] x."""
     for r in range(3):
-        for q in range(3):
-            product[r, q] = A[r, 0] * B[0, q] + A[r, 1] * B[1, q] + A[r, 2] * B[2, q]
-
-
-@njit(cache=True)
-def put_along(A: Float, x: Float, product: Float) -> None:
-    """A x."""
-    for r in range(3):
-        product[r] = A[r, 0] * x[0] + A[r, 1] * x[1] + A[r, 2] * x[2]
+        product[r] = A[row, r, 0] * x[0] + A[row, r, 1] * x[1] + A[row, r, 2] * x[2]
 
 
 @njit(cache=True)
-def add_along(A: Float, x: Float, total: Float) -> None:
-    """Add A x."""
+def add_along(A: Float, row: int, x: Float, total: Float) -> None:
+    """Add A[row] x."""
     for r in range(3):
-        total[r] += A[r, 0] * x[0] + A[r, 1] * x[1] + A[r, 2] * x[2]
+        total[r] += A[row, r, 0] * x[0] + A[row, r, 1] * x[1] + A[row, r, 2] * x[2]
 
 
 @njit(cache=True)

@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 
 from mapfusion.se2 import Float
-from mapfusion.smoother.blocks import add_along, put_along, put_inverse, put_product
+from mapfusion.smoother.blocks import add_along, put_along, put_inverse
 from mapfusion.smoother.normal_equations import PointEquations
 from mapfusion.smoother.sightings import Sightings
 
@@ -72,48 +72,50 @@ def _reduce(
 ) -> bool:
     """Put what is left; False where some block is singular."""
     _, first_track, _ = rows
-    block, known = np.empty((3, 3)), np.empty((3, 3))
+    block, known, inverse = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    S, P, G, K = equations.track_block, equations.offset_information, left.own_m2, left.kept
     for j in range(len(first_track) - 1):
         for r in range(3):
             for q in range(3):
                 block[r, q] = 0.0
         for t in range(first_track[j], first_track[j + 1]):
-            S, K = equations.track_block[t], left.kept[t]
             if strays[t]:
-                G, P = left.own_m2[t], equations.offset_information[t]
                 for r in range(3):
                     for q in range(3):
-                        known[r, q] = S[r, q]
-                    known[r, r] += P
-                if not put_inverse(known, G):
+                        known[r, q] = S[t, r, q]
+                    known[r, r] += P[t]
+                if not put_inverse(known, inverse):
                     return False
                 for r in range(3):
                     for q in range(3):
-                        K[r, q] = P * G[r, q]
+                        G[t, r, q], K[t, r, q] = inverse[r, q], P[t] * inverse[r, q]
             else:
                 for r in range(3):
-                    K[r, r] = 1.0
-            _add_track(S, K, equations.track_gradient[t], left, j, t, block)
+                    K[t, r, r] = 1.0
+            _add_track(equations, left, j, t, block)
         if planar:
             block[2, 2] = 1.0
-        if not put_inverse(block, left.landmark_m2[j]):
+        if not put_inverse(block, inverse):
             return False
+        for r in range(3):
+            for q in range(3):
+                left.landmark_m2[j, r, q] = inverse[r, q]
     return True
 
 
 @njit(cache=True)
-def _add_track(
-    S: Float, K: Float, gradient: Float, left: Reduced, j: int, t: int, block: Float
-) -> None:
+def _add_track(equations: PointEquations, left: Reduced, j: int, t: int, block: Float) -> None:
     """Add what is left of a track to its landmark's block and gradient."""
-    G, pull = left.own_m2[t], left.pull[t]
-    x = G[0, 0] * pull[0] + G[0, 1] * pull[1] + G[0, 2] * pull[2]
-    y = G[1, 0] * pull[0] + G[1, 1] * pull[1] + G[1, 2] * pull[2]
-    z = G[2, 0] * pull[0] + G[2, 1] * pull[1] + G[2, 2] * pull[2]
+    S, gradient, G, K = equations.track_block, equations.track_gradient, left.own_m2, left.kept
+    a, b, c = left.pull[t, 0], left.pull[t, 1], left.pull[t, 2]
+    x = G[t, 0, 0] * a + G[t, 0, 1] * b + G[t, 0, 2] * c
+    y = G[t, 1, 0] * a + G[t, 1, 1] * b + G[t, 1, 2] * c
+    z = G[t, 2, 0] * a + G[t, 2, 1] * b + G[t, 2, 2] * c
     for r in range(3):
-        left.point_gradient[j, r] += gradient[r] - (S[r, 0] * x + S[r, 1] * y + S[r, 2] * z)
+        a, b, c = S[t, r, 0], S[t, r, 1], S[t, r, 2]
+        left.point_gradient[j, r] += gradient[t, r] - (a * x + b * y + c * z)
         for q in range(3):
-            block[r, q] += S[r, 0] * K[0, q] + S[r, 1] * K[1, q] + S[r, 2] * K[2, q]
+            block[r, q] += a * K[t, 0, q] + b * K[t, 1, q] + c * K[t, 2, q]
 
 
 def moved_points(
@@ -141,20 +143,22 @@ def _put_moved(
     points: Float,
     offsets: Float,
 ) -> None:
-    asked, moved = np.empty(3), np.empty(3)
+    asked, way, moved = np.empty(3), np.empty(3), np.empty(3)
     for j in range(len(first_track) - 1):
         for q in range(3):
             asked[q] = left.point_gradient[j, q]
         for t in range(first_track[j], first_track[j + 1]):
-            add_along(left.kept[t], along[t], asked)  # it is symmetric
-        put_along(left.landmark_m2[j], asked, moved)
+            for q in range(3):
+                way[q] = along[t, q]
+            add_along(left.kept, t, way, asked)  # it is symmetric
+        put_along(left.landmark_m2, j, asked, moved)
         for q in range(3):
-            points[j, q] = -moved[q]
+            points[j, q] = way[q] = -moved[q]
         for t in range(first_track[j], first_track[j + 1]):
             for q in range(3):
                 asked[q] = left.pull[t, q] + along[t, q]
-            add_along(block[t], points[j], asked)
-            put_along(left.own_m2[t], asked, moved)
+            add_along(block, t, way, asked)
+            put_along(left.own_m2, t, asked, moved)
             for q in range(3):
                 offsets[t, q] = -moved[q]
 
@@ -180,16 +184,29 @@ def known_points(seen: Sightings, left: Reduced) -> Points:
 
 @njit(cache=True)
 def _put_known(landmark: np.ndarray, left: Reduced, made: Points) -> None:
-    follows, half, spread = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    keeps, follows, half = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for t in range(len(landmark)):
-        A, G, K = left.landmark_m2[landmark[t]], left.own_m2[t], left.kept[t]
         for r in range(3):
             for q in range(3):
-                follows[r, q] = -K[r, q]  # -db / dl
+                keeps[r, q] = left.kept[t, r, q]
+                follows[r, q] = -keeps[r, q]  # -db / dl
             follows[r, r] += 1.0
-        for of_landmark, covariance in ((follows, made.offset_m2[t]), (K, made.track_m2[t])):
-            put_product(of_landmark, A, half)
-            put_product(half, of_landmark, spread)  # it is symmetric
-            for r in range(3):
-                for q in range(3):
-                    covariance[r, q] = G[r, q] + spread[r, q]
+        _put_sum(follows, landmark[t], left, t, half, made.offset_m2)
+        _put_sum(keeps, landmark[t], left, t, half, made.track_m2)
+
+
+@njit(cache=True)
+def _put_sum(
+    of_landmark: Float, j: int, left: Reduced, t: int, half: Float, covariance_m2: Float
+) -> None:
+    """What is known of a track, and what its landmark's covariance does by a symmetric matrix."""
+    A, G = left.landmark_m2, left.own_m2
+    for r in range(3):
+        x, y, z = of_landmark[r, 0], of_landmark[r, 1], of_landmark[r, 2]
+        for q in range(3):
+            half[r, q] = x * A[j, 0, q] + y * A[j, 1, q] + z * A[j, 2, q]
+    for r in range(3):
+        x, y, z = half[r, 0], half[r, 1], half[r, 2]
+        for q in range(3):
+            moved = x * of_landmark[0, q] + y * of_landmark[1, q] + z * of_landmark[2, q]
+            covariance_m2[t, r, q] = G[t, r, q] + moved

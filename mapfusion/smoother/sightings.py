@@ -196,7 +196,8 @@ def _inverses(covariance_m2: Float, n_dimensions: int) -> Float:
 
 @njit(cache=True)
 def _put_inverses(covariance: Float, planar: bool, inverses: Float) -> bool:
-    known = np.empty((3, 3))
+    n = 2 if planar else 3
+    known, inverse = np.empty((3, 3)), np.empty((3, 3))
     for i in range(len(covariance)):
         for r in range(3):
             for q in range(3):
@@ -204,8 +205,9 @@ def _put_inverses(covariance: Float, planar: bool, inverses: Float) -> bool:
         if planar:
             known[2, 0] = known[2, 1] = 0.0
             known[2, 2] = 1.0
-        if not put_inverse(known, inverses[i]):
+        if not put_inverse(known, inverse):
             return False
-        if planar:
-            inverses[i, 2, 2] = 0.0
+        for r in range(n):
+            for q in range(n):
+                inverses[i, r, q] = inverse[r, q]
     return True

@@ -6,6 +6,8 @@ themselves, say how many there are: of Gaussian residuals they grow without limi
 are one. Lange, Little, Taylor (1989), "Robust statistical modeling using the t distribution".
 """
 
+import functools
+
 import numpy as np
 from scipy.optimize import root_scalar
 from scipy.special import fdtri, gammaln, psi
@@ -89,6 +91,7 @@ def fitted_dof(squares: Float, n_dimensions: Float | int, near: float = MOST_DOF
         near: where they are looked for first.
     """
 
+    @functools.cache  # the search looks at both ends again
     def slope(log_dof: float) -> float:
         return student_slope(squares, float(np.exp(log_dof)), n_dimensions)
 

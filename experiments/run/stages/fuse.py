@@ -16,6 +16,7 @@ import pyarrow as pa
 from experiments.run.estimates import alignment_of, correspondences_of, covariances_of
 from experiments.run.frames import FLOAT, INT, TEXT, fields, read_rows, write_rows
 from experiments.run.job import Job
+from experiments.run.kept_logs import kept_log
 from experiments.run.stage_tables import CORRESPONDENCES, COVARIANCE, ESTIMATES
 from experiments.run.stages import match
 from experiments.run.stages.slam import RobotFolders
@@ -26,7 +27,7 @@ from experiments.run.stages.smooth import (
     smoothed_owners,
     smoother_of,
 )
-from experiments.run.stages.snapshots import stored_log, stored_maps
+from experiments.run.stages.snapshots import stored_maps
 from mapfusion.aligned_landmarks import ABSENT
 from mapfusion.fuse.parameters import MergeParameters
 from mapfusion.fuse.registry import make_fuser
@@ -132,8 +133,8 @@ def run(settings: FuseSettings, job: Job) -> dict[str, float]:
 
 def given_teams(settings: FuseSettings, job: Job) -> Iterator[tuple[int, GivenTeam]]:
     """What there is to be fused, at each iteration."""
-    takes = make_fuser(settings.fuser).smoothed
-    robots = {name: _read_robot(job, name, takes) for name in settings.robots}
+    takes, viewing = make_fuser(settings.fuser).smoothed, bool(settings.origin)
+    robots = {name: _read_robot(job, name, takes, viewing) for name in settings.robots}
     alignments = _alignments(settings, job)
     for k in settings.iterations:
         given, recordings = [], list[Recording | None]()
@@ -146,10 +147,11 @@ def given_teams(settings: FuseSettings, job: Job) -> Iterator[tuple[int, GivenTe
         yield k, GivenTeam(maps, pairs, given, recordings)
 
 
-def _read_robot(job: Job, name: str, smoothed: bool) -> _Robot:
+def _read_robot(job: Job, name: str, smoothed: bool, viewing: bool) -> _Robot:
+    """What there is of a robot; with viewing evidence, which none of our fusers looks at, if so."""
     folders = RobotFolders(job.inputs[f"log {name}"], job.inputs[f"slam {name}"])
     maps = read_smoothed(job.inputs[f"smooth {name}"]) if smoothed else {}
-    return _Robot(stored_log(folders), stored_maps(folders), maps)
+    return _Robot(kept_log(folders.log), stored_maps(folders, viewing), maps)
 
 
 def _at(maps: Mapping[int, LandmarkMap], iteration: int) -> LandmarkMap:
@@ -267,8 +269,7 @@ def _fused(
     last: LandmarkMap,
 ) -> FusedMap:
     place, n = {name: k for k, name in enumerate(robots)}, len(robots)
-    numbers = landmarks[POSITION_FIELDS + COVARIANCE_FIELDS]
-    points = points_from(pa.Table.from_pandas(numbers, nthreads=1))  # else it starts many
+    points = points_from(pa.Table.from_pandas(landmarks[POSITION_FIELDS + COVARIANCE_FIELDS]))
     origin = np.full(len(landmarks), ABSENT, dtype=np.int64)
     count = landmarks["count"].to_numpy(np.int32)
     made = LandmarkMap(*points, count, origin, planar=last.planar, name=last.name)

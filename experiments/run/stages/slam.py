@@ -10,13 +10,13 @@ import pyarrow as pa
 
 from experiments.run.frames import BOOL, FLOAT, INT, fields, read_rows
 from experiments.run.job import Job
+from experiments.run.kept_logs import kept_log
 from experiments.scenario.randomness import generator
 from mapfusion.attitude import read_attitude
 from mapfusion.fastslam.filter import StepResult
 from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.fastslam.run import run_log
 from mapfusion.odometry_covariance import read_odometry_covariance
-from mapfusion.robot_log import read_log
 from mapfusion.se2 import Float
 from mapfusion.storage import (
     POSE_FIELDS,
@@ -84,7 +84,7 @@ def evaluated_iterations(n_frames: int, every: int) -> list[int]:
 
 def run(settings: SlamSettings, job: Job) -> None:
     """Run the filter over a log and write maps, poses, associations and particle clouds."""
-    log = read_log(job.inputs["log"])
+    log = kept_log(job.inputs["log"])
     last = len(log) - 1
     steps = list[dict[str, float]]()
     maps, associations, clouds, paths = _Rows(), _Rows(), _Rows(), _Rows()

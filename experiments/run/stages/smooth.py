@@ -13,8 +13,9 @@ import pandas as pd
 
 from experiments.run.frames import INT, fields
 from experiments.run.job import Job
-from experiments.run.stages.slam import RobotFolders, evaluated_iterations, final_path
-from experiments.run.stages.snapshots import Associations, stored_log
+from experiments.run.kept_logs import kept_log
+from experiments.run.stages.slam import evaluated_iterations, final_path
+from experiments.run.stages.snapshots import Associations
 from mapfusion.attitude import Attitude, read_attitude
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map
 from mapfusion.log_part import first_frames
@@ -91,8 +92,7 @@ def parts(iterations: tuple[int, ...]) -> tuple[str, ...]:
 
 def run(settings: SmoothSettings, job: Job) -> None:
     """Smooth the log up to one iteration; write the map with its joint covariance, and the path."""
-    log = stored_log(RobotFolders(job.inputs["log"], job.inputs["slam"]))
-    given = filtered_until(job, log, int(job.part), settings.noise_floor_m)
+    given = filtered_until(job, kept_log(job.inputs["log"]), int(job.part), settings.noise_floor_m)
     own = replace(settings, smoother=smoother_of(settings.smoother, job.inputs["log"]))
     made = smoothed_anew(own, *given, read_attitude(job.inputs["log"]))
     landmarks, path, landmark, ended = made

@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
+from experiments.run.kept_logs import kept_log
 from experiments.run.stages.slam import ASSOCIATIONS, PATHS, SNAPSHOTS, RobotFolders
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.robot_log import RobotLog, read_log, with_rows
+from mapfusion.robot_log import RobotLog, with_rows
 from mapfusion.se2 import Float
 from mapfusion.storage import POSE_FIELDS, column, columns, points_from, read_table
-from mapfusion.viewing import viewing_of
+from mapfusion.viewing import Viewing, viewing_of
 
 ROBOTS_KEPT = 4  # by a process; of a robot that drives for minutes they are tens of megabytes
 
@@ -55,15 +56,18 @@ class Snapshots(Mapping[int, LandmarkMap]):
 
     These are descriptors, labels, and from where they were seen. A map is made when it is first
     asked for: most that read them want a few of them.
+
+    Args:
+        slam: the stage's folder.
+        log: what was filtered.
+        viewing: whether maps come with their viewing evidence, which is of the whole log so far.
     """
 
-    def __init__(self, slam: Path, log: RobotLog) -> None:
-        self._slam, self._log = slam, log
+    def __init__(self, slam: Path, log: RobotLog, viewing: bool = True) -> None:
+        self._slam, self._log, self._viewing = slam, log, viewing
         table, attributes = read_table(slam / "snapshots.parquet", SNAPSHOTS)
-        origin = column(table, "source_observation")
-        seen = log.observations[origin]
-        about = (column(table, "count"), origin, seen.descriptor, seen.label, log.planar, log.robot)
-        self._landmarks = LandmarkMap(*points_from(table), *about, calibration=log.calibration)
+        about = (column(table, "count"), column(table, "source_observation"))
+        self._landmarks = LandmarkMap(*points_from(table), *about)
         self._rows = _rows(column(table, "iteration"), attributes["iterations"])
         self._made: dict[int, LandmarkMap] = {}
 
@@ -75,13 +79,23 @@ class Snapshots(Mapping[int, LandmarkMap]):
 
     def __getitem__(self, iteration: int) -> LandmarkMap:
         if iteration not in self._made:
-            landmarks = with_rows(self._landmarks, self._rows[iteration])
-            log, path = self._log, self._path(iteration)
-            n_seen = int(np.searchsorted(log.iteration, iteration + 1))
-            counts_for = self.associations.at(iteration, n_seen)
-            viewing = viewing_of(log, counts_for, path, landmarks.source_observation)
-            self._made[iteration] = replace(landmarks, viewing=viewing)
+            landmarks, log = with_rows(self._landmarks, self._rows[iteration]), self._log
+            origin, seen = landmarks.source_observation, log.observations
+            self._made[iteration] = replace(
+                landmarks,
+                descriptor=None if seen.descriptor is None else seen.descriptor[origin],
+                label=None if seen.label is None else seen.label[origin],
+                planar=log.planar,
+                name=log.robot,
+                viewing=self._viewing_of(iteration, origin) if self._viewing else None,
+                calibration=log.calibration,
+            )
         return self._made[iteration]
+
+    def _viewing_of(self, iteration: int, origin: np.ndarray) -> Viewing:
+        log, path = self._log, self._path(iteration)
+        n_seen = int(np.searchsorted(log.iteration, iteration + 1))
+        return viewing_of(log, self.associations.at(iteration, n_seen), path, origin)
 
     @cached_property
     def associations(self) -> Associations:
@@ -100,18 +114,13 @@ class Snapshots(Mapping[int, LandmarkMap]):
 
 
 @functools.lru_cache(maxsize=ROBOTS_KEPT)
-def stored_log(folders: RobotFolders) -> RobotLog:
-    """A robot's log; those of a few robots stay in memory, since stage after stage wants the same.
+def stored_maps(folders: RobotFolders, viewing: bool = True) -> Snapshots:
+    """A robot's maps, with or without viewing evidence.
 
-    The maps' folder is named after what the log holds: of another log it is another folder.
+    Those of a few robots stay in memory with all that was made of them, since stage after stage
+    wants the same. Their folder is named after what the log holds: of another log it is another.
     """
-    return read_log(folders.log)
-
-
-@functools.lru_cache(maxsize=ROBOTS_KEPT)
-def stored_maps(folders: RobotFolders) -> Snapshots:
-    """A robot's maps, which stay in memory likewise, with all that was made of them."""
-    return Snapshots(folders.slam, stored_log(folders))
+    return Snapshots(folders.slam, kept_log(folders.log), viewing)
 
 
 def _rows(iteration: np.ndarray, evaluated: str) -> dict[int, slice]:

@@ -9,6 +9,7 @@ import pytest
 
 from experiments.run.frames import write_rows
 from experiments.run.job import Job
+from experiments.run.kept_logs import kept_log
 from experiments.run.stages.slam import ASSOCIATIONS, POSES
 from experiments.run.stages.smooth import (
     SmoothSettings,
@@ -24,7 +25,7 @@ from experiments.run.stages.smooth import (
 )
 from experiments.run.stages.snapshots import Associations
 from mapfusion.odometry_covariance import write_odometry_covariance
-from mapfusion.robot_log import RobotLog, write_log
+from mapfusion.robot_log import RobotLog, read_log, write_log
 from mapfusion.smoother.smooth import SmootherParameters, smooth
 from mapfusion.smoother.smoothed_map import smoothed_map
 from mapfusion.storage import POSE_FIELDS
@@ -61,6 +62,19 @@ def smoothed_at(
     settings = SmoothSettings(SmootherParameters(), 0.0, iterations, max_memory_gb)
     for part in parts(iterations):
         run(settings, Job(inputs, folder, part))
+
+
+def test_the_log_that_is_kept_stays_as_it_was(tmp_path: Path) -> None:
+    log = white_noise_log(np.random.default_rng(0), N_FRAMES, 25).log
+    inputs = filtered(tmp_path, log, owners(log))
+    kept = kept_log(inputs["log"])
+    smoothed_at(inputs, tmp_path / "out", N_FRAMES - 1)
+    assert kept_log(inputs["log"]) is kept
+    read = read_log(inputs["log"])
+    for values, others in ((kept, read), (kept.observations, read.observations)):
+        for name, value in vars(others).items():
+            if isinstance(value, np.ndarray):
+                np.testing.assert_array_equal(getattr(values, name), value)
 
 
 def test_it_is_the_smoother_on_the_log_so_far(tmp_path: Path) -> None:
