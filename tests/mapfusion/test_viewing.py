@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mapfusion.viewing import BEARINGS, Viewing, part_of
+from mapfusion.viewing import BEARINGS, Viewing, _ends, part_of
 from tests.mapfusion.evidence.two_rooms import FARTHEST_M, HALF_VIEW_RAD, Wall, mapped
 
 
@@ -39,6 +39,21 @@ def test_it_reaches_as_far_as_landmarks_were_seen() -> None:
     np.testing.assert_allclose(viewing.reach_m[seen], expected[seen], atol=0.15)
     assert seen.mean() > 0.4
     assert viewing.field.range_m == pytest.approx([3.0, 3.0 / np.cos(HALF_VIEW_RAD)], abs=0.05)
+
+
+def test_ends_are_numpy_s_quantiles_bit_for_bit() -> None:
+    rng = np.random.default_rng(0)
+    for n in (20, 999, 1000, 1001, 4321, 50_000):
+        for values in (rng.normal(size=n), np.sort(rng.random(n)), rng.integers(0, 9, n) / 7):
+            expected = np.quantile(values, [0.005, 0.995])
+            np.testing.assert_array_equal(_ends(values), expected)
+
+
+def test_ends_that_the_sample_does_not_show_are_looked_for_among_all() -> None:
+    values = np.where(np.arange(4800) % 16 == 0, np.arange(4800) / 1e4, 1.0)
+    values[::16] *= np.where(np.arange(300) < 150, -1, 1)
+    for few in (values, values - 1, -values):
+        np.testing.assert_array_equal(_ends(few), np.quantile(few, [0.005, 0.995]))
 
 
 def test_bearings_beyond_the_field_of_view_are_in_its_last_parts() -> None:

@@ -12,7 +12,7 @@ from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import RobotLog, with_rows
 from mapfusion.se2 import Float
 from mapfusion.storage import POSE_FIELDS, column, columns, points_from, read_table
-from mapfusion.viewing import viewing_of
+from mapfusion.viewing import Sightings
 
 
 class Associations:
@@ -76,9 +76,14 @@ class Snapshots(Mapping[int, LandmarkMap]):
             log, path = self._log, self._path(iteration)
             n_seen = int(np.searchsorted(log.iteration, iteration + 1))
             counts_for = self._associations.at(iteration, n_seen)
-            viewing = viewing_of(log, counts_for, path, landmarks.source_observation)
+            source = landmarks.source_observation
+            viewing = self._sightings.viewing(counts_for, path, source)
             self._made[iteration] = replace(landmarks, viewing=viewing)
         return self._made[iteration]
+
+    @cached_property
+    def _sightings(self) -> Sightings:
+        return Sightings.of(self._log)
 
     @cached_property
     def _associations(self) -> Associations:
