@@ -305,9 +305,9 @@ def covariance_columns(names: Sequence[str], covariance_m2: np.ndarray) -> dict[
 
 def covariances_from(table: pa.Table, names: Sequence[str]) -> np.ndarray:
     """The inverse of `covariance_columns`."""
-    upper = columns(table, names)
-    covariance = np.empty((len(upper), 3, 3))
-    covariance[:, _UPPER[0], _UPPER[1]] = covariance[:, _UPPER[1], _UPPER[0]] = upper
+    covariance = np.empty((table.num_rows, 3, 3))
+    for name, i, j in zip(names, *_UPPER, strict=True):
+        covariance[:, i, j] = covariance[:, j, i] = column(table, name)
     return covariance
 
 

@@ -5,6 +5,7 @@ lay in the field of view of several frames, and nothing nearer hid it.
 """
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -88,6 +89,50 @@ class Viewing:
         return replace(self, **both)
 
 
+class SightLines(NamedTuple):
+    """The n sightings of a log, from which the viewing evidence of its maps is made.
+
+    Attributes:
+        frame: (n,) ascending.
+        bearing_rad, range_m, height_m: (n,) in the robot's frame, the range in the plane.
+    """
+
+    frame: np.ndarray
+    bearing_rad: Float
+    range_m: Float
+    height_m: Float
+
+    @classmethod
+    def of(cls, log: RobotLog, n: int | None = None) -> "SightLines":
+        """Of a log, all of them or the first n."""
+        frame, (x, y, z) = log.iteration[:n], log.observations.position_m[:n].T
+        return cls(frame, np.arctan2(y, x), np.hypot(x, y), z.copy())
+
+    def viewing(self, landmark: np.ndarray, path: Float, source_observation: np.ndarray) -> Viewing:
+        """The viewing evidence of a map made of them, by the arguments of `viewing_of`."""
+        n_seen = min(int(np.searchsorted(self.frame, len(path))), len(landmark))
+        bearing, range_m, height = (part[:n_seen] for part in self[1:])
+        field = _field_of_view(bearing, range_m, height)
+        n = len(source_observation)
+        owner, row_of = landmark[:n_seen], np.full(len(self.frame) + 1, -1, dtype=np.int64)
+        row_of[source_observation] = np.arange(n)
+        row = np.where(owner >= 0, row_of[owner], -1)
+        used = np.flatnonzero(row >= 0)
+        row, frame, bearing, range_m = row[used], self.frame[used], bearing[used], range_m[used]
+        count = np.bincount(row, minlength=n)
+        direction = bearing + path[frame, 2]
+        cos, sin, distance = (
+            np.bincount(row, values, n).astype(np.float64)
+            for values in (np.cos(direction), np.sin(direction), range_m)
+        )
+        reach = np.zeros(len(path) * BEARINGS, dtype=np.float32)
+        at = frame.astype(np.int64) * BEARINGS + part_of(bearing, field)
+        np.maximum.at(reach, at, range_m.astype(np.float32))
+        mean_m, n_views = distance / np.maximum(count, 1), count.astype(np.int32)
+        ways = path, reach.reshape(len(path), BEARINGS), field
+        return Viewing(np.arctan2(sin, cos), mean_m, n_views, *ways)
+
+
 def viewing_of(
     log: RobotLog, landmark: np.ndarray, path: Float, source_observation: np.ndarray
 ) -> Viewing:
@@ -100,29 +145,8 @@ def viewing_of(
         path: (T, 3) poses of the first T frames, in the map's frame.
         source_observation: (N,) of the map's landmarks.
     """
-    n_seen = min(int(np.searchsorted(log.iteration, len(path))), len(landmark))
-    frame, p = log.iteration[:n_seen], log.observations.position_m[:n_seen]
-    bearing, range_m = np.arctan2(p[:, 1], p[:, 0]), np.hypot(p[:, 0], p[:, 1])
-    field = _field_of_view(bearing, range_m, p[:, 2])
-    row_of = np.full(len(log.observations) + 1, -1, dtype=np.int64)
-    row_of[source_observation] = np.arange(len(source_observation))
-    owner = landmark[:n_seen]
-    row = np.where(owner >= 0, row_of[owner], -1)
-    used = row >= 0
-    row, frame, bearing, range_m = row[used], frame[used], bearing[used], range_m[used]
-    n = len(source_observation)
-    count = np.bincount(row, minlength=n)
-    direction = bearing + path[frame, 2]
-    cos, sin, distance = (
-        np.bincount(row, values, n).astype(np.float64)
-        for values in (np.cos(direction), np.sin(direction), range_m)
-    )
-    reach = np.zeros(len(path) * BEARINGS, dtype=np.float32)
-    # with one index NumPy takes a short way that it does not know with two
-    cell = frame.astype(np.int64) * BEARINGS + part_of(bearing, field)
-    np.maximum.at(reach, cell, range_m.astype(np.float32))
-    reach_m, mean_m = reach.reshape(-1, BEARINGS), distance / np.maximum(count, 1)
-    return Viewing(np.arctan2(sin, cos), mean_m, count.astype(np.int32), path, reach_m, field)
+    n_seen = int(np.searchsorted(log.iteration, len(path)))
+    return SightLines.of(log, n_seen).viewing(landmark, path, source_observation)
 
 
 def part_of(bearing_rad: Float, field: FieldOfView) -> np.ndarray:
@@ -138,9 +162,12 @@ def _field_of_view(bearing_rad: Float, range_m: Float, height_m: Float) -> Field
     if not len(range_m):
         return FieldOfView(np.zeros(2), np.zeros(2), heights)
     nearest, farthest = _ends(range_m)
-    step = np.floor(range_m / max(farthest, 1e-9) * RANGES).astype(np.int64)
+    # the last step is of what is farther, as long as a byte holds it
+    step = np.minimum(np.floor(range_m / max(farthest, 1e-9) * RANGES), RANGES).astype(np.int8)
+    by_step = height_m[np.argsort(step, kind="stable")]
+    starts = np.concatenate([[0], np.cumsum(np.bincount(step, minlength=RANGES))])
     for k in range(RANGES):
-        own = height_m[step == k]
+        own = by_step[starts[k] : starts[k + 1]]
         if len(own) >= _LEAST_SIGHTINGS:
             heights[k] = _ends(own)
     return FieldOfView(_ends(bearing_rad), np.array([nearest, farthest]), heights)

@@ -301,7 +301,8 @@ def maximise_likelihood(
         if rounds < _SETTLING_ROUNDS:
             for k in range(len(rows)):
                 inside[k] = e[k, 0] * e[k, 0] + e[k, 1] * e[k, 1] <= gate_m * gate_m
-        at[:] = T_a_b
+        for k in range(3):
+            at[k] = T_a_b[k]
         weighed, judged = variance, max(variance, least_drift_m * least_drift_m)
         truth_probabilities(e, S, judged, share, gate_m, inside, truth)
         total = np.sum(truth)

@@ -9,7 +9,7 @@ import numpy as np
 from mapfusion.align.closest import Grid
 from mapfusion.align.correspondences import HeightGate
 from mapfusion.evidence.copies import BETWEEN, Copies, about_each, laid_on_like
-from mapfusion.evidence.expected import MUST, UNSEEN, Seen, Watch, how_seen
+from mapfusion.evidence.expected import MUST, UNSEEN, Seen, how_seen
 from mapfusion.evidence.found import Gates, Looks, has
 from mapfusion.evidence.likelihood import (
     DECISIVE,
@@ -19,6 +19,7 @@ from mapfusion.evidence.likelihood import (
     log10_ratio,
 )
 from mapfusion.evidence.parameters import EvidenceParameters
+from mapfusion.evidence.watch import Watch
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.se2 import Float, inverse, transform_points
 

@@ -14,7 +14,7 @@ from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import RobotLog, with_rows
 from mapfusion.se2 import Float
 from mapfusion.storage import POSE_FIELDS, column, columns, points_from, read_table
-from mapfusion.viewing import Viewing, viewing_of
+from mapfusion.viewing import SightLines, Viewing
 
 ROBOTS_KEPT = 4  # by a process; of a robot that drives for minutes they are tens of megabytes
 
@@ -95,7 +95,11 @@ class Snapshots(Mapping[int, LandmarkMap]):
     def _viewing_of(self, iteration: int, origin: np.ndarray) -> Viewing:
         log, path = self._log, self._path(iteration)
         n_seen = int(np.searchsorted(log.iteration, iteration + 1))
-        return viewing_of(log, self.associations.at(iteration, n_seen), path, origin)
+        return self._sight_lines.viewing(self.associations.at(iteration, n_seen), path, origin)
+
+    @cached_property
+    def _sight_lines(self) -> SightLines:
+        return SightLines.of(self._log)
 
     @cached_property
     def associations(self) -> Associations:

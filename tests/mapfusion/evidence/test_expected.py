@@ -6,35 +6,35 @@ import math
 import numpy as np
 import pytest
 
-from mapfusion.evidence.expected import LEAST_FRAMES, MAY, MUST, UNSEEN, Seen, Watch, how_seen
+from mapfusion.evidence.expected import LEAST_FRAMES, MAY, MUST, UNSEEN, Seen, how_seen
 from mapfusion.evidence.regions import Witness
+from mapfusion.evidence.watch import Watch
 from mapfusion.fastslam.run import run_log
 from mapfusion.viewing import BEARINGS, RANGES, FieldOfView, Viewing
 from mapfusion.vision.tracks import TrackParameters
 from tests.mapfusion.evidence.two_rooms import Wall, between, mapped
 
 
-def slowly(seen: Seen, watch: Watch) -> list[int]:
+def slowly(seen: Seen, viewing: Viewing) -> list[int]:
     """How each lay in view, pose by pose, from angles alone."""
-    how = []
+    how, field = [], viewing.field
     for p, direction, before in zip(*seen, strict=True):
         alike, frames = 0, 0
-        for t, (x, y) in enumerate(watch.place):
-            theta = watch.heading[t, 2]
+        for t, (x, y, theta) in enumerate(viewing.pose):
             sight = np.array([p[0] - x, p[1] - y])
             range_m = float(np.linalg.norm(sight))
             if not before / 2 <= range_m <= 2 * before or range_m == 0:
                 continue
             slant = math.acos(np.clip(sight @ direction / range_m, -1, 1))
             bearing = math.remainder(math.atan2(sight[1], sight[0]) - theta, 2 * math.pi)
-            low, high = watch.bearing_rad
+            low, high = field.bearing_rad
             if slant > math.radians(45) or not low <= bearing <= high:
                 continue
-            if not watch.range_m[0] <= range_m <= watch.range_m[1]:
+            if not field.range_m[0] <= range_m <= field.range_m[1]:
                 continue
-            lowest, highest = watch.height_m[min(int(8 * range_m / watch.range_m[1]), 7)]
+            lowest, highest = field.height_m[min(int(8 * range_m / field.range_m[1]), 7)]
             part = min(int(16 * (bearing - low) / (high - low)), 15)
-            unhidden = range_m <= watch.reach_m[t, part] + 0.3
+            unhidden = range_m <= viewing.reach_m[t, part] + 0.3
             if lowest <= p[2] <= highest and unhidden:
                 near = before / 1.4 <= range_m <= 1.4 * before
                 alike, frames = alike + (near and slant <= math.radians(30)), frames + 1
@@ -45,13 +45,14 @@ def slowly(seen: Seen, watch: Watch) -> list[int]:
 
 def test_equals_the_slow_twin_on_any_places() -> None:
     rng = np.random.default_rng(0)
-    witness = Witness(mapped(Wall(8, seed=1), 1, 6, seed=2))
+    landmarks = mapped(Wall(8, seed=1), 1, 6, seed=2)
+    assert landmarks.viewing is not None
     n, angle = 8000, rng.uniform(-0.8, 0.8, 8000)
     places = np.stack([rng.uniform(1, 4, n), rng.uniform(-6, 2, n), rng.uniform(0, 1.3, n)], axis=1)
     direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     seen = Seen(places, direction, rng.uniform(1.5, 7, n))
-    how = how_seen(seen, witness.watch)
-    assert how.tolist() == slowly(seen, witness.watch)
+    how = how_seen(seen, Watch.of(landmarks.viewing))
+    assert how.tolist() == slowly(seen, landmarks.viewing)
     assert np.bincount(how, minlength=3).min() > 50
 
 
@@ -67,15 +68,42 @@ def test_equals_the_slow_twin_on_a_path_that_winds(half_view_rad: float) -> None
     field = FieldOfView(np.array([-1.0, 0.9]) * half_view_rad, np.array([0.5, 6.0]), heights)
     reach = rng.uniform(0, 6, (n_frames, BEARINGS)).astype(np.float32)
     nothing = np.zeros(0)
-    watch = Watch.of(Viewing(nothing, nothing, nothing.astype(np.int32), path, reach, field))
+    viewing = Viewing(nothing, nothing, nothing.astype(np.int32), path, reach, field)
     angle, at = rng.uniform(-np.pi, np.pi, n), path[rng.integers(0, n_frames, n), :2]
     direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     distance = rng.uniform(0.5, 6, n)
     places = np.column_stack([at + distance[:, None] * direction, rng.uniform(0, 1.4, n)])
     seen = Seen(places, direction, distance)
-    how = how_seen(seen, watch)
-    assert how.tolist() == slowly(seen, watch)
+    how = how_seen(seen, Watch.of(viewing))
+    assert how.tolist() == slowly(seen, viewing)
     assert np.bincount(how, minlength=3).min() > 50
+
+
+@pytest.mark.parametrize("half_view_rad", [0.4, 2.0])
+def test_what_is_straight_behind_is_not_in_view(half_view_rad: float) -> None:
+    """Of a robot that turns once, so that its frames are not told all at once to look elsewhere."""
+    n_frames, one = LEAST_FRAMES + 1, np.ones(1)
+    path = np.zeros((n_frames, 3))
+    path[0, 2] = 3.1
+    field = FieldOfView(
+        np.array([-1.0, 0.9]) * half_view_rad,
+        np.array([0.5, 6.0]),
+        np.tile([0.0, 1.0], (RANGES, 1)),
+    )
+    reach = np.full((n_frames, BEARINGS), 5.0, np.float32)
+    ways = one, one, np.ones(1, np.int32), path, reach, field
+    for x, how in ((2.0, MUST), (-2.0, UNSEEN)):
+        seen = Seen(np.array([[x, 0.0, 0.5]]), np.array([[np.sign(x), 0.0]]), 2 * one)
+        assert how_seen(seen, Watch.of(Viewing(*ways))).tolist() == [how]
+
+
+def test_where_nothing_was_seen_nothing_is_in_view() -> None:
+    nowhere = FieldOfView(np.zeros(2), np.zeros(2), np.tile([1.0, 0.0], (RANGES, 1)))
+    one, path = np.ones(1), np.zeros((9, 3))
+    reach = np.zeros((9, BEARINGS), np.float32)
+    viewing = Viewing(one, one, np.ones(1, np.int32), path, reach, nowhere)
+    seen = Seen(np.array([[0.2, 0.0, 0.5]]), np.array([[1.0, 0.0]]), 0.2 * one)
+    assert how_seen(seen, Watch.of(viewing)).tolist() == [UNSEEN]
 
 
 def test_what_must_be_seen_was_in_view_for_as_long_as_a_landmark_takes() -> None:
