@@ -60,6 +60,18 @@ def test_landmark_truth_follows_changing_associations(with_maps: tuple[int, ...]
             np.testing.assert_array_equal(point, expected)
 
 
+def test_landmark_truth_forgets_an_observation_that_went_elsewhere() -> None:
+    """To no landmark at all: none gains one."""
+    points = np.array([[0.0, 0, 0], [1, 2, 3], [8, 9, 7]])
+    owners = {10: np.array([0, 0, 0]), 20: np.array([0, 0, -1]), 30: np.array([-1, -1, -1])}
+    maps = dict.fromkeys(owners, map_of(owners[10]))
+    truth = RobotTruth(np.zeros((40, 3)), points)
+    found = landmark_truth(truth, changes_of(owners).at, maps)
+    np.testing.assert_array_equal(found[10], [[1, 2, 3]])
+    np.testing.assert_array_equal(found[20], [[0.5, 1, 1.5]])
+    np.testing.assert_array_equal(found[30], [[np.nan] * 3])
+
+
 def test_landmark_truth_of_more_landmarks_than_16_bits_count() -> None:
     n = 2**16 + 100
     points = np.random.default_rng(0).normal(size=(n, 3))
