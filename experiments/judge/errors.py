@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -61,7 +61,7 @@ class MetMaps:
     maps: tuple[LandmarkMap, LandmarkMap]
     points_world_m: tuple[Float, Float]
     offered: Correspondences
-    estimates: pd.DataFrame
+    estimates: Sequence[Mapping[str, Any]]  # rows of the table of that name
     rivals: pd.DataFrame
 
     @property
@@ -79,8 +79,8 @@ class MetMaps:
 
         The two are the `a`th and the `b`th of those that are merged.
         """
-        chosen = (self.estimates["aligner"] == aligner) & (self.estimates["repetition"] == 0)
-        row = self.estimates[chosen].iloc[0].to_dict()
+        ours = (row for row in self.estimates if row["aligner"] == aligner)
+        row = next(row for row in ours if row["repetition"] == 0)
         alignment = alignment_of(row, len(self.offered))
         return AlignedPair(a, b, alignment, self.offered, row["log10_false_alarms"])
 
@@ -94,9 +94,12 @@ def met_maps(
     """All pairs and iterations of the tables of these names, in their order."""
     by_name = {robot.name: robot for robot in robots}
     offered, rival = (dict(iter(rows.groupby(_MEETING))) for rows in (correspondences, rivals))
+    said: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
+    for row in records(estimates):  # a group of a frame takes as long as all of these
+        said.setdefault((row["robot_a"], row["robot_b"], row["iteration"]), []).append(row)
     met = []
-    for key, rows in estimates.groupby(_MEETING, sort=False):
-        name_a, name_b, iteration = cast("tuple[str, str, int]", key)
+    for key, rows in said.items():
+        name_a, name_b, iteration = key
         a, b = by_name[name_a], by_name[name_b]
         (map_a, points_a), (map_b, points_b) = a.at(iteration), b.at(iteration)
         pairs = correspondences_of(offered.get(key, correspondences.iloc[:0]))
@@ -129,7 +132,7 @@ def error_rows(met: MetMaps, judge: Judge, radius_m: float) -> pd.DataFrame:
     evidence = evidence_of(met.rivals, met.maps, judge.evidence)
     row = met.names | {"aligner": ORACLE, "repetition": 0}
     row |= estimate_row(len(pairs), oracle, oracle, judge.on(pairs, evidence).judge(oracle))
-    rows = [row, *records(met.estimates)]
+    rows = [row, *met.estimates]
     alignments = [alignment_of(each, len(pairs)) for each in rows]
     T_true = se2.between(met.a.path.T_world_map, met.b.path.T_world_map)
     T_refined = np.array([alignment.T_a_b for alignment in alignments])

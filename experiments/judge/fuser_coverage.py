@@ -37,9 +37,8 @@ def coverage_rows(fusions: Sequence[JudgedFusion]) -> list[dict[str, Any]]:
     for kind, given in _given(at_end).items():
         rows += _rows(given, at_end[0], {"map": kind, "fuser": ""})
     for fusion in at_end:
-        landmarks, fit = fusion.fusion.landmarks, fusion.fit
-        both = relative_consistency(landmarks, fit), consistency_in_frame(landmarks, fit)
-        rows += _rows([both], fusion, {"map": FUSED, "fuser": fusion.fuser})
+        named = {"map": FUSED, "fuser": fusion.fuser}
+        rows += _rows([fusion.consistency], fusion, named)
     return rows
 
 

@@ -16,6 +16,7 @@ import pandas as pd
 from experiments.judge.errors import EvaluatedRobot, alignment_nees
 from experiments.judge.fused_landmarks import FusedTeam
 from experiments.judge.map_consistency import (
+    Consistency,
     FittedMap,
     consistency_in_frame,
     fitted,
@@ -93,12 +94,17 @@ class JudgedFusion:
         frame = self.given[self.fusion.members[0]].robot
         return fitted(self.fusion.landmarks, frame.in_map_frame(self.team().truth_of(self.fusion)))
 
+    @cached_property
+    def consistency(self) -> tuple[Consistency, Consistency]:
+        """Of the fused map after the best rigid fit, and in its frame."""
+        landmarks, fit = self.fusion.landmarks, self.fit
+        return relative_consistency(landmarks, fit), consistency_in_frame(landmarks, fit)
+
     def row(self) -> dict[str, Any]:
         """Its row of the table `fusers`."""
         landmarks, fit = self.fusion.landmarks, self.fit
         lengths = np.linalg.norm(fit.error_m[~fit.gross], axis=1)
-        relative = relative_consistency(landmarks, fit)
-        in_frame = consistency_in_frame(landmarks, fit)
+        relative, in_frame = self.consistency
         return {
             "fuser": self.fuser,
             "iteration": self.iteration,

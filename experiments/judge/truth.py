@@ -53,11 +53,17 @@ def _medians(group: np.ndarray, values: Float) -> tuple[np.ndarray, Float]:
         group: (N,) of each row.
         values: (N, D), finite.
     """
-    found, counts = np.unique(group, return_counts=True)
+    found, place, counts = np.unique(group, return_inverse=True, return_counts=True)
+    if len(found) <= 1 + np.iinfo(np.uint16).max:
+        place = place.astype(np.uint16)  # such numbers NumPy sorts digit by digit, far sooner
     first = np.cumsum(counts) - counts
     lower, upper = first + (counts - 1) // 2, first + counts // 2
-    ranked = [column[np.lexsort((column, group))] for column in values.T]
-    return found, np.stack([(column[lower] + column[upper]) / 2 for column in ranked], axis=1)
+    medians = np.empty((len(found), values.shape[1]))
+    for k, column in enumerate(values.T):
+        by_value = np.argsort(column)
+        ranked = column[by_value[np.argsort(place[by_value], kind="stable")]]
+        medians[:, k] = (ranked[lower] + ranked[upper]) / 2
+    return found, medians
 
 
 def true_pairs(

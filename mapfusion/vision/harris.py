@@ -15,6 +15,7 @@ _SOBEL_GAIN = 2.0  # OpenCV divides its Sobel sum, 8 times the slope per pixel, 
 _SOBEL_SUM = 4.0  # what it divides by
 _OUR_BLOCK_PX = 3
 _LEAST_SIDE_PX = 2  # what an image needs to be mirrored at its border
+_BITS, _ALL_BITS = np.uint64(32), np.uint32(0xFFFFFFFF)  # of a response
 _ONE = np.uintp(1)  # indices without a sign, which a kernel need not wrap around
 
 
@@ -138,7 +139,7 @@ def _strongest(response: np.ndarray, parameters: HarrisParameters) -> np.ndarray
     """Pixels (N, 2) int64 of the corners to keep, strongest first."""
     maxima = local_maxima(response, parameters.border_px, np.float32(parameters.min_response))
     u, v = maxima.T
-    candidates = maxima[np.argsort(-response[v, u], kind="stable")]
+    candidates = maxima[descending(response[v, u])]
     height, width = response.shape
     cells = -(-height // parameters.cell_px) * -(-width // parameters.cell_px)
     kept = _spread(
@@ -151,6 +152,17 @@ def _strongest(response: np.ndarray, parameters: HarrisParameters) -> np.ndarray
         parameters.max_corners,
     )
     return candidates[kept]
+
+
+def descending(values: np.ndarray) -> np.ndarray:
+    """Rows of values (N,) float32 above zero from the highest on, equal ones in their own order.
+
+    The bits of such numbers grow as they do. With the row behind them no two keys are the same, so
+    that what sorts fastest, and leaves equals in any order, can sort them.
+    """
+    rows = np.arange(len(values), dtype=np.uint64)
+    keys = (_ALL_BITS - values.view(np.uint32)).astype(np.uint64) << _BITS | rows
+    return (np.sort(keys) & np.uint64(_ALL_BITS)).astype(np.int64)
 
 
 @njit(cache=True)

@@ -145,25 +145,43 @@ def _fill_window(shown: Float, window: Float, n: int) -> None:
 def _normal_matrix(
     window: Float, n: int, normal: Float, variance: float, square_misfit: float
 ) -> float:
-    """Fills in matrix n of `normal`; returns which weighted sum of squared residuals is tolerated.
+    """Fills in the lower half of matrix n of `normal`; returns which sum of squares is tolerated.
 
-    An error e of the place along some direction changes a grey level by g e, g its slope along it.
+    That is weighted, of residuals: an error e of the place along some direction changes a grey
+    level by g e, g its slope along it.
+    Entries are added up by names of their own, one for each: so they stay in registers.
     """
-    tolerated, row, k = 0.0, np.empty(N_PARAMETERS), 0
-    for i in range(N_PARAMETERS):
-        for j in range(N_PARAMETERS):
-            normal[n, i, j] = 0.0
+    tolerated, k = 0.0, np.uintp(0)
+    n00 = n10 = n11 = n20 = n21 = n22 = n30 = n31 = n32 = n33 = 0.0
+    n40 = n41 = n42 = n43 = n44 = n50 = n51 = n52 = n53 = n54 = n55 = 0.0
+    n60 = n61 = n62 = n63 = n64 = n65 = n66 = 0.0
+    n70 = n71 = n72 = n73 = n74 = n75 = n76 = n77 = 0.0
     for y in range(-WINDOW_HALF_PX, WINDOW_HALF_PX + 1):
         for x in range(-WINDOW_HALF_PX, WINDOW_HALF_PX + 1):
-            gu, gv, weight = window[n, SLOPE_U, k], window[n, SLOPE_V, k], WEIGHT[k]
-            row[0], row[1] = gu, gv
-            row[2], row[3], row[4], row[5] = gu * x, gu * y, gv * x, gv * y
-            row[6], row[7] = 1.0, window[n, LEVEL, k]
-            square_slope = 0.5 * (gu * gu + gv * gv)  # the mean over directions
-            tolerated += weight * (variance + square_misfit * square_slope)
-            for i in range(N_PARAMETERS):
-                weighted = weight * row[i]
-                for j in range(N_PARAMETERS):
-                    normal[n, i, j] += weighted * row[j]
-            k += 1
+            g0, g1 = window[n, SLOPE_U, k], window[n, SLOPE_V, k]
+            g2, g3, g4, g5 = g0 * x, g0 * y, g1 * x, g1 * y
+            g7, w = window[n, LEVEL, k], WEIGHT[k]
+            square_slope = 0.5 * (g0 * g0 + g1 * g1)  # the mean over directions
+            tolerated += w * (variance + square_misfit * square_slope)
+            w0, w1, w2, w3 = w * g0, w * g1, w * g2, w * g3
+            w4, w5, w7 = w * g4, w * g5, w * g7
+            n00, n10, n11 = n00 + w0 * g0, n10 + w1 * g0, n11 + w1 * g1
+            n20, n21, n22 = n20 + w2 * g0, n21 + w2 * g1, n22 + w2 * g2
+            n30, n31, n32, n33 = n30 + w3 * g0, n31 + w3 * g1, n32 + w3 * g2, n33 + w3 * g3
+            n40, n41, n42, n43 = n40 + w4 * g0, n41 + w4 * g1, n42 + w4 * g2, n43 + w4 * g3
+            n44, n50, n51, n52 = n44 + w4 * g4, n50 + w5 * g0, n51 + w5 * g1, n52 + w5 * g2
+            n53, n54, n55 = n53 + w5 * g3, n54 + w5 * g4, n55 + w5 * g5
+            n60, n61, n62, n63 = n60 + w * g0, n61 + w * g1, n62 + w * g2, n63 + w * g3
+            n64, n65, n66 = n64 + w * g4, n65 + w * g5, n66 + w
+            n70, n71, n72, n73 = n70 + w7 * g0, n71 + w7 * g1, n72 + w7 * g2, n73 + w7 * g3
+            n74, n75, n76, n77 = n74 + w7 * g4, n75 + w7 * g5, n76 + w7, n77 + w7 * g7
+            k += np.uintp(1)
+    entries = (
+        *(n00, n10, n11, n20, n21, n22, n30, n31, n32, n33),
+        *(n40, n41, n42, n43, n44, n50, n51, n52, n53, n54, n55),
+        *(n60, n61, n62, n63, n64, n65, n66, n70, n71, n72, n73, n74, n75, n76, n77),
+    )
+    for i in range(N_PARAMETERS):
+        for j in range(i + 1):
+            normal[n, i, j] = entries[i * (i + 1) // 2 + j]
     return tolerated

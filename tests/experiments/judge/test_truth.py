@@ -60,6 +60,33 @@ def test_landmark_truth_follows_changing_associations(with_maps: tuple[int, ...]
             np.testing.assert_array_equal(point, expected)
 
 
+def test_landmark_truth_forgets_an_observation_that_went_elsewhere() -> None:
+    """To no landmark at all: none gains one."""
+    points = np.array([[0.0, 0, 0], [1, 2, 3], [8, 9, 7]])
+    owners = {10: np.array([0, 0, 0]), 20: np.array([0, 0, -1]), 30: np.array([-1, -1, -1])}
+    maps = dict.fromkeys(owners, map_of(owners[10]))
+    truth = RobotTruth(np.zeros((40, 3)), points)
+    found = landmark_truth(truth, changes_of(owners).at, maps)
+    np.testing.assert_array_equal(found[10], [[1, 2, 3]])
+    np.testing.assert_array_equal(found[20], [[0.5, 1, 1.5]])
+    np.testing.assert_array_equal(found[30], [[np.nan] * 3])
+
+
+def test_landmark_truth_of_more_landmarks_than_16_bits_count() -> None:
+    n = 2**16 + 100
+    points = np.random.default_rng(0).normal(size=(n, 3))
+    owner = np.arange(n)
+    owner[1::2] -= 1  # two observations each, but for the last hundred
+    owner[-100:] = np.arange(n - 100, n)
+    alone = map_of(np.arange(n))
+    truth = RobotTruth(np.zeros((1, 3)), points)
+    each = landmark_truth(truth, lambda iteration, count: np.arange(n)[:count], {0: alone})
+    np.testing.assert_array_equal(each[0], points)
+    both = landmark_truth(truth, lambda iteration, count: owner[:count], {0: map_of(owner)})
+    middle = (points[:-100:2] + points[1:-100:2]) / 2
+    np.testing.assert_array_equal(both[0], np.concatenate([middle, points[-100:]]))
+
+
 def test_landmark_truth_of_an_empty_map() -> None:
     truth = RobotTruth(np.zeros((5, 3)), np.zeros((0, 3)))
     nothing = changes_of({})

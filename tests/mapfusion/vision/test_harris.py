@@ -7,6 +7,7 @@ import pytest
 from mapfusion.vision.harris import (
     HarrisParameters,
     _spread,
+    descending,
     detect,
     harris_response,
     local_maxima,
@@ -98,6 +99,16 @@ def test_choice_equals_its_obvious_twin(seed: int) -> None:
     candidates = rng.permutation(np.argwhere(rng.random((60, 70)) < 0.1))[:, ::-1]
     found = _spread(np.ascontiguousarray(candidates), 60, 70, 5, 20, 4, 37)
     assert found.tolist() == spread_twin(candidates, 5, 20, 4, 37)
+
+
+def test_equal_responses_keep_their_order() -> None:
+    """Against NumPy's stable sort, of numbers of all sizes, many of them twice or more."""
+    rng = np.random.default_rng(8)
+    values = np.exp(rng.uniform(-80, 80, 4000)).astype(np.float32)
+    values = values[rng.integers(0, 1500, 4000)]
+    values[:2] = np.finfo(np.float32).tiny, np.finfo(np.float32).max
+    np.testing.assert_array_equal(descending(values), np.argsort(-values, kind="stable"))
+    assert len(descending(values[:0])) == 0
 
 
 def test_strongest_come_first_and_follow_the_image() -> None:
