@@ -28,6 +28,7 @@ from mapfusion.landmark_map import LandmarkMap
 from mapfusion.looks import NO_LABEL
 from mapfusion.one_thread import one_blas_thread
 from mapfusion.se2 import Float
+from mapfusion.smoother.blocks import inverses
 from mapfusion.smoother.student import student_bound
 
 # What is one point is judged anew with each estimate, until nothing changes or for so many rounds.
@@ -169,7 +170,7 @@ def _inside(a: _Placed, b: _Placed, i: np.ndarray, j: np.ndarray, bound: float) 
     shared = a.shared_m[i] - b.shared_m[j]
     S = a.own_m2[i] + b.own_m2[j] + shared @ np.swapaxes(shared, 1, 2)
     off = a.position_m[i] - b.position_m[j]
-    return np.einsum("ni,ni->n", off, np.linalg.solve(S, off[:, :, None])[:, :, 0]) <= bound
+    return np.einsum("ni,nij,nj->n", off, inverses(S), off) <= bound
 
 
 def _of_one_label(a: LandmarkMap, b: LandmarkMap) -> tuple[np.ndarray, np.ndarray]:
