@@ -89,7 +89,7 @@ def informed_disturbance(
     """
     eta = np.zeros(T_map_predicted.shape)
     log_ratio = np.empty(len(eta))
-    pairs = np.empty((len(chosen), _PAIR * _LANES))
+    pairs = np.zeros((len(chosen), _PAIR * _LANES))
     at, system = np.zeros(_AT * _LANES), np.zeros(_SYSTEM * _LANES)
     root, right = np.empty((3, 3)), np.empty(3)
     for first in range(0, len(eta), _LANES):
@@ -163,10 +163,6 @@ def _gather_pairs(
             row[9 * _LANES + lane] = point[k, m, 0] - pose[m, 0]
             row[10 * _LANES + lane] = point[k, m, 1] - pose[m, 1]
         n += is_any
-    for row in pairs[:n]:
-        for lane in range(end - first, _LANES):
-            for i in range(_PAIR):
-                row[i * _LANES + lane] = 0.0
     return n
 
 

@@ -28,10 +28,14 @@ from mapfusion.landmark_map import LandmarkMap
 from mapfusion.looks import NO_LABEL
 from mapfusion.one_thread import one_blas_thread
 from mapfusion.se2 import Float
+from mapfusion.smoother.blocks import inverses
 from mapfusion.smoother.student import student_bound
 
 # What is one point is judged anew with each estimate, until nothing changes or for so many rounds.
 _MOST_ROUNDS = 5
+# Of landmarks' variances that are looked for with one radius: fewer take more searches, more find
+# more that is out of reach.
+_OCTAVES = 3
 # Heavier tails have no variance: they are of false pairs, not of landmarks.
 _LEAST_DOF = 2.0
 
@@ -166,7 +170,7 @@ def _inside(a: _Placed, b: _Placed, i: np.ndarray, j: np.ndarray, bound: float) 
     shared = a.shared_m[i] - b.shared_m[j]
     S = a.own_m2[i] + b.own_m2[j] + shared @ np.swapaxes(shared, 1, 2)
     off = a.position_m[i] - b.position_m[j]
-    return np.einsum("ni,ni->n", off, np.linalg.solve(S, off[:, :, None])[:, :, 0]) <= bound
+    return np.einsum("ni,nij,nj->n", off, inverses(S), off) <= bound
 
 
 def _of_one_label(a: LandmarkMap, b: LandmarkMap) -> tuple[np.ndarray, np.ndarray]:
@@ -191,12 +195,13 @@ def _alike(
 
 
 def _near(a: _Placed, b: _Placed, bound: float) -> tuple[np.ndarray, np.ndarray]:
-    """All pairs of landmarks whose difference a gate could hold, and some more.
+    """All pairs of landmarks whose difference a gate could hold.
 
-    Landmarks of the one map are taken by how uncertain they are, a factor of two at a time: few
-    that are far and uncertain would make the gates of all others wide.
+    Landmarks of the one map are taken by how uncertain they are, some octaves at a time: few that
+    are far and uncertain would make the gates of all others wide.
     """
-    wide_a, octave = a.widest_m2, np.ceil(np.log2(b.widest_m2))
+    wide_a, wide_b = a.widest_m2, b.widest_m2
+    octave = _OCTAVES * np.ceil(np.log2(wide_b) / _OCTAVES)
     rows_a, rows_b = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     for each in np.unique(octave):
         rows = np.flatnonzero(octave == each)
@@ -205,4 +210,7 @@ def _near(a: _Placed, b: _Placed, bound: float) -> tuple[np.ndarray, np.ndarray]
         found = tree.query_ball_point(a.position_m, radius_m, return_sorted=True)
         rows_a.append(np.repeat(np.arange(len(wide_a)), [len(own) for own in found]))
         rows_b.append(rows[np.concatenate([*found, []]).astype(np.int64)])
-    return np.concatenate(rows_a), np.concatenate(rows_b)
+    i, j = np.concatenate(rows_a), np.concatenate(rows_b)
+    off = a.position_m[i] - b.position_m[j]
+    near = np.einsum("ni,ni->n", off, off) <= bound * (wide_a[i] + wide_b[j])
+    return i[near], j[near]

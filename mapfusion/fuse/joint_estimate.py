@@ -25,6 +25,7 @@ from mapfusion.aligned_landmarks import ABSENT
 from mapfusion.calibration_error import N_OF_CAMERA
 from mapfusion.fuse.joint_map import JointMap, MapRows, Said, said_of, weighted_information
 from mapfusion.se2 import Float, inverse, transform_points, wrap
+from mapfusion.smoother.blocks import inverses
 from mapfusion.smoother.student import MOST_DOF, fitted_dof, information_share, student_weights
 
 # The next step would move what is sought, as a whole and in squared sigmas, by no more than this.
@@ -171,7 +172,7 @@ def _points(said: Sequence[Said], has: np.ndarray, weight: Float) -> _Points:
         W = weighted_information(own, weight[has[:, k], k])
         information[has[:, k]] += W
         total[has[:, k]] += np.einsum("nij,nj->ni", W, own.y_m)
-    V = np.asarray(np.linalg.inv(information), np.float64)
+    V = inverses(information)
     return _Points(np.einsum("nij,nj->ni", V, total), V)
 
 

@@ -10,6 +10,7 @@ from mapfusion.calibration_error import EXACT, N_OF_CAMERA, CalibrationError
 from mapfusion.joint_covariance import JointCovariance
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.se2 import Float, rotation_about_z, transform_points
+from mapfusion.smoother.blocks import inverses
 
 
 @dataclass(frozen=True)
@@ -92,8 +93,7 @@ class MapRows(NamedTuple):
         d, joint = position.shape[1], own_map.joint
         own = joint.own_m2[rows][:, :d, :d]
         moved = np.swapaxes(joint.common_m[rows][:, :, :d], 1, 2)
-        information = np.asarray(np.linalg.inv(own), np.float64)
-        return cls(position, own, information, np.ascontiguousarray(moved), own_map.calibration)
+        return cls(position, own, inverses(own), np.ascontiguousarray(moved), own_map.calibration)
 
 
 def said_of(own: MapRows, T: Float, shared: Float, arm_m: Float) -> Said:

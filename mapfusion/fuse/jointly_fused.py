@@ -15,6 +15,7 @@ from mapfusion.joint_covariance import JointCovariance, condensed
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.looks import DESCRIPTOR_LENGTH, NO_LABEL
 from mapfusion.se2 import IDENTITY, Float
+from mapfusion.smoother.blocks import inverses
 
 _SOURCE_UNKNOWN = -1  # a fused landmark comes from no single observation
 
@@ -105,7 +106,7 @@ class JointlyFused:
         information = np.zeros((n, n_dimensions, n_dimensions))
         for own, its in zip(rows, W, strict=True):
             information[own] += its
-        V = np.linalg.inv(information)
+        V = inverses(information)
         total, moved = np.zeros((n, n_dimensions)), np.zeros((n, n_dimensions, n_unknowns))
         for k, (own, each, its) in enumerate(zip(rows, said, W, strict=True)):
             gain = V[own] @ its

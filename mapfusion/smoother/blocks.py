@@ -1,5 +1,6 @@
 """Blocks of three by three in kernels."""
 
+import numpy as np
 from numba import njit
 
 from mapfusion.se2 import Float
@@ -47,4 +48,32 @@ def put_inverse(A: Float, inverse: Float) -> bool:
     inverse[1, 1] = 1 / d1 + l21 * l21 / d2
     inverse[0, 1] = inverse[1, 0] = -l10 / d1 - m20 * l21 / d2
     inverse[0, 0] = 1 / d0 + l10 * l10 / d1 + m20 * m20 / d2
+    return True
+
+
+def inverses(blocks: Float) -> Float:
+    """(N, D, D) inverses of symmetric positive definite blocks (N, D, D), D two or three.
+
+    Raises:
+        LinAlgError: one is not positive definite.
+    """
+    found = np.empty(blocks.shape)
+    if not _put_inverses(np.ascontiguousarray(blocks), found):
+        raise np.linalg.LinAlgError("a block is not positive definite")
+    return found
+
+
+@njit(cache=True)
+def _put_inverses(blocks: Float, inverses: Float) -> bool:
+    n, d = blocks.shape[0], blocks.shape[1]
+    block, inverse = np.eye(3), np.empty((3, 3))
+    for i in range(n):
+        for r in range(d):
+            for q in range(d):
+                block[r, q] = blocks[i, r, q]
+        if not put_inverse(block, inverse):
+            return False
+        for r in range(d):
+            for q in range(d):
+                inverses[i, r, q] = inverse[r, q]
     return True

@@ -68,21 +68,32 @@ class ReducedPoses:
 
     def solved(self, factor: Factor, right: Float) -> Float:
         """(T, 3) what a matrix with this factor turns into `right` (T, 3)."""
-        place = self.seen.pose_place[1:] - 1
-        ordered, found = np.empty((len(place), 3)), np.zeros_like(right)
-        ordered[place] = right[1:]
-        solved = factor.solve_transposed(factor.solve(ordered.ravel()))
-        found[1:] = solved.reshape(-1, 3)[place]
-        return found
+        solved = factor.solve_transposed(factor.solve(self._ordered(right)))
+        return self._by_frame(solved)
 
     def solved_nearby(self, factor: Factor, right: Float) -> Float | None:
         """(T, 3) what the matrix turns into `right` (T, 3), by a factor that is nearly its own.
 
         None where that is too far off.
         """
-        return solved_by_products(
-            self.times, lambda rest: self.solved(factor, rest), right, _OFF, _MOST_PRODUCTS
-        )
+
+        def roughly(rest: Float) -> Float:
+            return self._by_frame(factor.solve_both_roughly(self._ordered(rest)))
+
+        return solved_by_products(self.times, roughly, right, _OFF, _MOST_PRODUCTS)
+
+    def _ordered(self, of_poses: Float) -> Float:
+        """(3 (T - 1),) values (T, 3) of the unknown poses, in their order."""
+        ordered = np.empty((len(of_poses) - 1, 3))
+        ordered[self.seen.pose_place[1:] - 1] = of_poses[1:]
+        return ordered.ravel()
+
+    def _by_frame(self, ordered: Float) -> Float:
+        """(T, 3) the same by frame; zero for the first pose."""
+        place = self.seen.pose_place
+        found = np.zeros((len(place), 3))
+        found[1:] = ordered.reshape(-1, 3)[place[1:] - 1]
+        return found
 
     def _with_points(self, of_poses: Float, left: Reduced, along: Float) -> Float:
         """With what points add that follow the poses."""

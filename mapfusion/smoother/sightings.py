@@ -4,12 +4,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numba import njit
 
 from mapfusion.arguments import require_shape
 from mapfusion.robot_log import NO_TRACK, RobotLog
 from mapfusion.se2 import Float
-from mapfusion.smoother.blocks import put_inverse
+from mapfusion.smoother.blocks import inverses
 from mapfusion.smoother.skyline import envelope_order, first_entries
 
 
@@ -163,7 +162,7 @@ def sightings_of(log: RobotLog, landmark: np.ndarray, min_count: int, *, stray: 
 
     Raises:
         ValueError: `landmark` is not of the log's length.
-        LinAlgError: an observation's covariance is singular.
+        LinAlgError: an observation's covariance is not positive definite.
     """
     require_shape("landmark", landmark, (len(log.observations),))
     names, inverse, count = np.unique(landmark, return_inverse=True, return_counts=True)
@@ -177,37 +176,11 @@ def sightings_of(log: RobotLog, landmark: np.ndarray, min_count: int, *, stray: 
     first = np.flatnonzero(another)
     strays, track_starts = track[row[first]] != NO_TRACK, np.append(first, len(row))
     n = 2 if log.planar else 3
-    information = _inverses(log.observations.covariance_m2[row], n)
+    information = np.zeros((len(row), 3, 3))
+    information[:, :n, :n] = inverses(log.observations.covariance_m2[row, :n, :n])
     position = np.ascontiguousarray(log.observations.position_m[row], dtype=np.float64)
     if log.planar:
         position[:, 2] = 0.0
     frame = log.iteration[row].astype(np.int64)
     order = PoseOrder(np.repeat(np.arange(len(starts) - 1), np.diff(starts)), frame, len(log))
     return Sightings(starts, track_starts, strays, frame, position, information, row, n, order)
-
-
-def _inverses(covariance_m2: Float, n_dimensions: int) -> Float:
-    """(N, 3, 3) inverses of covariances (N, 3, 3); zero in z where there are two dimensions."""
-    inverses = np.zeros((len(covariance_m2), 3, 3))
-    if not _put_inverses(covariance_m2, n_dimensions == 2, inverses):
-        raise np.linalg.LinAlgError("an observation's covariance is singular")
-    return inverses
-
-
-@njit(cache=True)
-def _put_inverses(covariance: Float, planar: bool, inverses: Float) -> bool:
-    n = 2 if planar else 3
-    known, inverse = np.empty((3, 3)), np.empty((3, 3))
-    for i in range(len(covariance)):
-        for r in range(3):
-            for q in range(3):
-                known[r, q] = covariance[i, r, q]
-        if planar:
-            known[2, 0] = known[2, 1] = 0.0
-            known[2, 2] = 1.0
-        if not put_inverse(known, inverse):
-            return False
-        for r in range(n):
-            for q in range(n):
-                inverses[i, r, q] = inverse[r, q]
-    return True

@@ -11,6 +11,7 @@ With a matrix functions take `first` (n,), the column of each row's first entry,
 
 import mmap
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import get_lapack_funcs
@@ -115,6 +116,26 @@ class Factor:
             before = slice(start * _BLOCK, rows.start)
             x[before] -= self.lower[rows, before].T @ x[rows]
         return x
+
+    def solve_both_roughly(self, right: Float) -> Float:
+        """(L L')^-1 right (n,), in single precision: half as much to be read from memory."""
+        x = right.astype(np.float32)
+        for rows, before, L, inverse in self._single:
+            x[rows] = inverse @ (x[rows] - L @ x[before])
+        for rows, before, L, inverse in reversed(self._single):
+            x[rows] = inverse.T @ x[rows]
+            x[before] -= L.T @ x[rows]
+        return x.astype(np.float64)
+
+    @cached_property
+    def _single(self) -> list[tuple[slice, slice, np.ndarray, np.ndarray]]:
+        """Of each block of rows the columns before it, L there, and the inverse of its own."""
+        found = []
+        for rows, start, inverse in zip(*_envelope(self.first), self.inverses, strict=True):
+            before = slice(start * _BLOCK, rows.start)
+            L = self.lower[rows, before].astype(np.float32)
+            found.append((rows, before, L, inverse.astype(np.float32)))
+        return found
 
     def inverse(self) -> Float:
         """(n, n) the inverse of L L' where L has its envelope, or its mirror image.

@@ -117,6 +117,53 @@ def test_a_false_pair_does_not_take_the_pose_along() -> None:
     np.testing.assert_allclose(0.05 * eta[0], pose, atol=0.003)
 
 
+def many_particles(n: int, n_points: int) -> tuple[Slots, Sightings, np.ndarray, np.ndarray]:
+    """Landmarks, sightings, poses, and what each particle takes for what; some for nothing."""
+    rng = np.random.default_rng(8)
+    points = rng.uniform((1, -2, 0), (4, 2, 1), (n_points, 3))
+    pose = rng.normal(0, 0.03, (n, 3))
+    covariance = np.tile(1e-3 * np.diag([4.0, 1.0, 2.0]), (n_points, 1, 1))
+    seen = sightings(pose, points, covariance, False)
+    slots = slots_of(points, 1e-4, n)
+    slots.own.mean_m[:n_points] += rng.normal(0, 0.02, (n_points, n, 3))
+    chosen = np.where(rng.uniform(size=(n_points, n)) < 0.7, np.arange(n_points)[:, None], -1)
+    return slots, seen, pose, chosen
+
+
+@pytest.mark.parametrize("n", [1, 31, 32, 33, 70])
+def test_a_particle_is_drawn_as_if_it_were_alone(n: int) -> None:
+    """However many are taken together: by steps that are written down once more here."""
+    slots, seen, pose, chosen = many_particles(n, 9)
+    sigma, gate, turn = np.array([0.1, 0.05, 0.08]), 21.0, 0.1
+    normal = np.random.default_rng(9).standard_normal((n, 3))
+    found, ratio = informed_disturbance(slots, chosen, seen, pose, turn, sigma, gate, False, normal)
+    for m in range(n):
+        eta, before = np.zeros(3), pose[m, 2] - turn
+        axes = np.array([[np.cos(before), -np.sin(before)], [np.sin(before), np.cos(before)]])
+        for _ in range(3):
+            A, pull = np.eye(3), -eta
+            angle = sigma[2] * eta[2]
+            R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+            for k in np.flatnonzero(chosen[:, m] >= 0):
+                W = full(slots.own.covariance_m2[k, m]) + full(seen.covariance_m2[k, m])
+                W = np.linalg.inv(W)
+                arm = seen.point_m[k, m, :2] - pose[m, :2]
+                off = seen.point_m[k, m] - slots.own.mean_m[k, m]
+                off[:2] += axes @ (sigma[:2] * eta[:2]) + R @ arm - arm
+                J = np.zeros((3, 3))
+                J[:2, :2] = axes * sigma[:2]
+                J[:2, 2] = sigma[2] * np.array([-(R @ arm)[1], (R @ arm)[0]])
+                weight = 1 / (1 + off @ W @ off / gate)
+                A += weight * J.T @ W @ J
+                pull -= weight * J.T @ W @ off
+            eta = eta + np.linalg.solve(A, pull)
+        root = np.linalg.cholesky(A)
+        eta = eta + np.linalg.solve(root.T, normal[m])
+        np.testing.assert_allclose(found[m], eta, atol=1e-9)
+        told = 0.5 * (normal[m] @ normal[m] - eta @ eta) - np.log(np.diag(root).prod())
+        assert ratio[m] == pytest.approx(told, abs=1e-8)
+
+
 def test_widened_covariances_are_those_of_disturbed_sightings() -> None:
     rng = np.random.default_rng(7)
     odometry, sigma = np.array([0.2, 0.0, 0.5]), np.array([0.02, 0.05, 0.03])
@@ -153,13 +200,13 @@ def test_standing_still_and_blind_frames_are_as_with_eq_3() -> None:
 START = np.array([[0.5, 0.2, 0.4]])  # a predicted pose, reached without turning
 
 
-def slots_of(mean_m: np.ndarray, variance_m2: float) -> Slots:
-    """Landmarks (S, 3) of one particle, equally certain in all directions."""
-    slots, n = ParticleMaps(1, 21.0).slots, len(mean_m)
+def slots_of(mean_m: np.ndarray, variance_m2: float, n_particles: int = 1) -> Slots:
+    """Landmarks (S, 3), the same in all particles, equally certain in all directions."""
+    slots, n = ParticleMaps(n_particles, 21.0).slots, len(mean_m)
     slots.row[:n] = np.arange(n)
-    slots.own.mean_m[:n, 0] = mean_m
-    slots.own.covariance_m2[:n, 0] = np.array([1, 0, 0, 1, 0, 1]) * variance_m2
-    slots.own.count[:n, 0] = 1
+    slots.own.mean_m[:n] = mean_m[:, None]
+    slots.own.covariance_m2[:n] = np.array([1, 0, 0, 1, 0, 1]) * variance_m2
+    slots.own.count[:n] = 1
     return slots
 
 

@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 from mapfusion.joint_covariance import KnownErrors, condensed
 from mapfusion.robot_log import RobotLog
 from mapfusion.se2 import Float, between, rotation, wrap
-from mapfusion.smoother.blocks import put_inverse
+from mapfusion.smoother.blocks import inverses, put_inverse
 from mapfusion.smoother.elimination import (
     Solution,
     _landmarks_first,
@@ -288,5 +288,12 @@ def test_blocks_are_inverted() -> None:
         assert put_inverse(root @ root.T, inverse)
         expected = np.linalg.inv(root @ root.T)
         np.testing.assert_allclose(inverse, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
+    roots = rng.standard_normal((7, 3, 3))
+    blocks = roots @ np.swapaxes(roots, 1, 2) + np.eye(3)
+    for d in (2, 3):
+        expected = np.linalg.inv(blocks[:, :d, :d])
+        np.testing.assert_allclose(inverses(blocks[:, :d, :d]), expected, atol=1e-12)
+    with pytest.raises(np.linalg.LinAlgError):
+        inverses(np.stack([np.eye(3), -np.eye(3)]))
     for singular in (np.diag([1.0, 0.0, 1.0]), np.diag([1.0, 1.0, -1.0]), np.full((3, 3), np.nan)):
         assert not put_inverse(singular, inverse)
