@@ -188,6 +188,8 @@ def settle_at_best_scale(
         log = log_likelihood(T, pairs, variances_m2[level], count / (n + 1), area)
         if log > best:
             best, best_level = log, level
-            T_a_b[:] = T
-            inside[:] = marks
+            for k in range(3):
+                T_a_b[k] = T[k]
+            for i in range(n):
+                inside[i] = marks[i]
     return best, best_level

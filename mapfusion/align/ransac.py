@@ -184,9 +184,11 @@ def most_supported(
         if count < 2:  # the motion moved away from its own support
             continue
         if count > best_count or (count == best_count and cost < best_cost):
-            best_T[:] = T_a_b
+            for k in range(3):
+                best_T[k] = T_a_b[k]
             best_count, best_cost = count, cost
-            best_rows[:count] = rows[:count]
+            for k in range(count):
+                best_rows[k] = rows[k]
             hit = count * (count - 1) / (n * (n - 1))
             needed = min(needed, log_miss / math.log1p(-hit)) if hit < 1 else 0.0
     return draws, best_T, best_rows[:best_count].copy()

@@ -93,7 +93,8 @@ def least_truncated_squares(
         count = settle(T_a_b, pairs, variance_m2, bound, inside)
         count, score = mark_supporters(T_a_b, pairs, mean, variance_m2, bound, inside)
         if count >= 2 and score > best_score:
-            best_T[:] = T_a_b
+            for k in range(3):
+                best_T[k] = T_a_b[k]
             best_score = score
             hit = count * (count - 1) / (n * (n - 1))
             needed = min(needed, log_miss / math.log1p(-hit)) if hit < 1 else 0.0

@@ -152,10 +152,15 @@ class Witness:
         """(N,) landmarks about each."""
         return about_each(np.ones(len(self.landmarks), np.bool_), self.looks.near)
 
+    def laid_by(self, T: Float) -> Float:
+        """Its landmarks (N, 3) where a motion of the plane lays them."""
+        p = self.landmarks.position_m.copy()
+        p[:, :2] = transform_points(T, p[:, :2])
+        return p
+
     def seen_from(self, T: Float) -> Seen:
         """Its landmarks as another robot would find them, T from its frame to that one's."""
-        viewing, p = self._viewing, self.landmarks.position_m.copy()
-        p[:, :2] = transform_points(T, p[:, :2])
+        viewing, p = self._viewing, self.laid_by(T)
         angle = viewing.direction_rad + T[2]
         direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
         distance = np.where(viewing.n_views > 0, viewing.distance_m, 0.0)
@@ -172,6 +177,9 @@ class Witnesses:
         bound = np.inf if planar else height.bound
         unlike = parameters.max_descriptor_distance
         self._gates = Gates(parameters.gate_m, bound, height.floor_m**2, unlike)
+        # which of a's or b's landmarks (N,) the other has under a motion: copies ask for all, and
+        # regions, after them, for some of the same
+        self._found: dict[tuple[bool, bytes], np.ndarray] = {}
 
     @cached_property
     def _of(self) -> dict[str, "Witnesses"]:
@@ -214,9 +222,9 @@ class Witnesses:
         return none._replace(**{f"in_{of}": in_a | in_b})
 
     def _laid(self, own: Witness, other: Witness, T: Float) -> np.ndarray:
-        p = own.landmarks.position_m.copy()
-        p[:, :2] = transform_points(T, p[:, :2])
+        p = own.laid_by(T)
         found = has(p, np.arange(len(p)), own.looks, other.looks, self._gates)
+        self._found[own is self.a, T.tobytes()] = found
         return laid_on_like(found, own.crowd, own.looks.near)
 
     def _asked(
@@ -229,5 +237,9 @@ class Witnesses:
         seen = own.seen_from(T)
         how = how_seen(seen, other.watch)
         rows = np.flatnonzero(how != UNSEEN)
-        found = has(seen.p, rows, own.looks, other.looks, self._gates)
+        known = self._found.get((own is self.a, T.tobytes()))
+        if known is None:
+            found = has(seen.p, rows, own.looks, other.looks, self._gates)
+        else:
+            found = known[rows]
         return _Asked(rows, how[rows], found, copied[rows]), seen.p

@@ -47,6 +47,20 @@ def test_a_motion_along_the_wall_is_contradicted_everywhere() -> None:
     assert found.log10_ratio(SHARES) < -3
 
 
+@pytest.mark.parametrize("of", [BETWEEN, "a"])
+def test_what_was_found_for_copies_gives_the_same_regions(of: str) -> None:
+    none = Copies.none(len(A.landmarks), len(B.landmarks))
+    fresh, asked = (Witnesses(A, B, PARAMETERS) for _ in range(2))
+    motions = T_A_B, T_A_B + np.array([0.0, 0.4, 0.0])
+    for T in motions:
+        asked.copies(of, T)
+    for T in motions:
+        expected, again = (each.regions(of, T, SQUARES, none) for each in (fresh, asked))
+        np.testing.assert_array_equal(again.found, expected.found)
+        np.testing.assert_array_equal(again.expected, expected.expected)
+        assert len(expected) >= 3
+
+
 def test_where_nothing_must_be_seen_nothing_is_said() -> None:
     found = regions(T_A_B + np.array([0.0, 40.0, 0.0]))
     assert len(found) == 0
