@@ -146,7 +146,8 @@ def colour(
     counted from 1, in `number`. `uncoloured` and `same` (W,) are work space. Returns how many.
     """
     words = len(candidates)
-    uncoloured[:] = candidates
+    for w in range(words):  # a slice would take long to compile, with the wording of its error
+        uncoloured[w] = candidates[w]
     count, k = 0, 0
     while True:
         k += 1
