@@ -38,6 +38,11 @@ def read_rows(path: Path, table_schema: pa.Schema) -> pd.DataFrame:
     return table.to_pandas(use_threads=False)
 
 
+def at_iteration(rows: pd.DataFrame, iteration: int) -> pd.DataFrame:
+    """The rows of one iteration, of a table that is ordered by it."""
+    return rows.iloc[slice(*rows["iteration"].searchsorted([iteration, iteration + 1]))]
+
+
 def records(rows: pd.DataFrame) -> list[dict[str, Any]]:
     """The rows by column; pandas' own takes ten times as long for a few rows of many columns."""
     names = rows.columns.tolist()

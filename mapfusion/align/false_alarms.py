@@ -58,15 +58,28 @@ def _mark_thinned(p_a: Float, p_b: Float, patch_m: float, near_a: Grid) -> np.nd
     kept = np.zeros(len(p_a), np.bool_)
     runs = np.empty((near_a.shape[1], 2), np.int64)
     for i in range(len(p_a)):
-        free = True
-        for run in range(runs_about(p_a[i, 0], p_a[i, 1], patch_m, near_a, runs)):
-            for k in range(runs[run, 0], runs[run, 1]):
-                j = near_a.row[k]
-                if not (kept[j] and apart_by_less(p_a, i, j, patch_m)):
-                    continue
-                free = free and not apart_by_less(p_b, i, j, patch_m)
-        kept[i] = free
+        n_runs = runs_about(p_a[i, 0], p_a[i, 1], patch_m, near_a, runs)
+        kept[i] = not _has_neighbour(i, p_a, p_b, patch_m, near_a.row, runs[:n_runs], kept)
     return kept
+
+
+@njit(cache=True)
+def _has_neighbour(
+    i: int,
+    p_a: Float,
+    p_b: Float,
+    patch_m: float,
+    row_of: np.ndarray,
+    runs: np.ndarray,
+    kept: np.ndarray,
+) -> bool:
+    """Whether a kept pair in some ranges (R, 2) of the grid is a neighbour of pair i."""
+    for run in range(len(runs)):
+        for k in range(runs[run, 0], runs[run, 1]):
+            j = row_of[k]
+            if kept[j] and apart_by_less(p_a, i, j, patch_m) and apart_by_less(p_b, i, j, patch_m):
+                return True
+    return False
 
 
 @njit(cache=True)

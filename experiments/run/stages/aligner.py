@@ -8,7 +8,7 @@ from typing import Any
 
 from experiments.methods.aligner_calls import callable_aligner
 from experiments.run.estimates import correspondences_of, estimate_row, evidence_of
-from experiments.run.frames import read_rows, write_rows
+from experiments.run.frames import at_iteration, read_rows, write_rows
 from experiments.run.job import Job
 from experiments.run.stage_tables import CORRESPONDENCES, ESTIMATES, RIVALS
 from experiments.run.stages import match
@@ -48,8 +48,8 @@ def run(settings: AlignerSettings, job: Job) -> None:
     registration = Registration(aligner, settings.refinement, judge)
     rows = []
     for k, map_a, map_b in match.pairs_of_maps(job, settings.iterations):
-        pairs = correspondences_of(offered[offered["iteration"] == k])
-        evidence = evidence_of(rivals[rivals["iteration"] == k], (map_a, map_b), settings.evidence)
+        pairs = correspondences_of(at_iteration(offered, k))
+        evidence = evidence_of(at_iteration(rivals, k), (map_a, map_b), settings.evidence)
         on_pair = registration.on(map_a, map_b, pairs, evidence)
         for repetition in range(settings.repetitions if registration.randomised else 1):
             names = {"robot_a": map_a.name, "robot_b": map_b.name, "iteration": k}

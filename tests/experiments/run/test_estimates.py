@@ -4,6 +4,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.run.estimates import evidence_of, rival_rows
+from experiments.run.frames import at_iteration
 from mapfusion.align.correspondences import match
 from mapfusion.align.pairs import Pairs
 from mapfusion.evidence.judge import Judge
@@ -23,3 +24,10 @@ def test_evidence_comes_back_from_the_rows_of_rivals() -> None:
     assert len(again.motions) == len(found.motions)
     for one, two in zip(again.motions, found.motions, strict=True):
         np.testing.assert_equal(vars(one), vars(two))
+
+
+def test_rows_of_an_iteration_are_those_that_say_so() -> None:
+    rows = pd.DataFrame({"iteration": [0, 0, 25, 50, 50, 50], "value": range(6)})
+    for iteration in (-1, 0, 25, 30, 50, 75):
+        expected = rows[rows["iteration"] == iteration]
+        pd.testing.assert_frame_equal(at_iteration(rows, iteration), expected)
