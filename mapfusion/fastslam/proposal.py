@@ -17,16 +17,13 @@ import numpy as np
 from numba import njit
 
 from mapfusion.fastslam.sensor import Sightings, innovation, quadratic_form
-from mapfusion.fastslam.slots import Slots
+from mapfusion.fastslam.slots import LANES, Slots
 from mapfusion.se2 import Float
 from mapfusion.symmetric import cholesky, solve_lower, solve_upper
 
 # Gauss-Newton steps; the turn of a frame is off by 0.1 rad at most, which the second step makes
 # 0.005 and the third nothing.
 _ROUNDS = 3
-# Particles that are taken together, a number of each in a row: many enough that arithmetic on rows
-# is worth its start, few enough that what they see stays near the processor.
-_LANES = 32
 _PAIR = 11  # rows kept of a pair, see _gather_pairs
 _AT, _SYSTEM = 8, 9  # rows of where it is linearised, and of the system there, see _put_linearised
 
@@ -89,11 +86,11 @@ def informed_disturbance(
     """
     eta = np.zeros(T_map_predicted.shape)
     log_ratio = np.empty(len(eta))
-    pairs = np.zeros((len(chosen), _PAIR * _LANES))
-    at, system = np.zeros(_AT * _LANES), np.zeros(_SYSTEM * _LANES)
+    pairs = np.zeros((len(chosen), _PAIR * LANES))
+    at, system = np.zeros(_AT * LANES), np.zeros(_SYSTEM * LANES)
     root, right = np.empty((3, 3)), np.empty(3)
-    for first in range(0, len(eta), _LANES):
-        end = min(first + _LANES, len(eta))
+    for first in range(0, len(eta), LANES):
+        end = min(first + LANES, len(eta))
         n_pairs = _gather_pairs(
             slots, chosen, predicted, T_map_predicted, planar, first, end, pairs
         )
@@ -152,16 +149,16 @@ def _gather_pairs(
             s, lane = chosen[k, m], m - first
             if s < 0:
                 for i in range(_PAIR):
-                    row[i * _LANES + lane] = 0.0
+                    row[i * LANES + lane] = 0.0
                 continue
             is_any, r = True, int(slots.row[s])
             difference, inverse, _ = innovation(predicted, k, slots.own, r, m, planar)
-            row[lane], row[_LANES + lane], row[2 * _LANES + lane] = difference
-            row[3 * _LANES + lane], row[4 * _LANES + lane] = inverse[0], inverse[1]
-            row[5 * _LANES + lane], row[6 * _LANES + lane] = inverse[2], inverse[3]
-            row[7 * _LANES + lane], row[8 * _LANES + lane] = inverse[4], inverse[5]
-            row[9 * _LANES + lane] = point[k, m, 0] - pose[m, 0]
-            row[10 * _LANES + lane] = point[k, m, 1] - pose[m, 1]
+            row[lane], row[LANES + lane], row[2 * LANES + lane] = difference
+            row[3 * LANES + lane], row[4 * LANES + lane] = inverse[0], inverse[1]
+            row[5 * LANES + lane], row[6 * LANES + lane] = inverse[2], inverse[3]
+            row[7 * LANES + lane], row[8 * LANES + lane] = inverse[4], inverse[5]
+            row[9 * LANES + lane] = point[k, m, 0] - pose[m, 0]
+            row[10 * LANES + lane] = point[k, m, 1] - pose[m, 1]
         n += is_any
     return n
 
@@ -173,26 +170,26 @@ def _put_linearised(
     """Where a particle is linearised at, and its system before anything is seen."""
     ax, ay = sigma[0] * np.cos(before), sigma[0] * np.sin(before)  # d(x, y) / d eta_0
     bx, by = -sigma[1] * np.sin(before), sigma[1] * np.cos(before)  # d(x, y) / d eta_1
-    at[lane], at[_LANES + lane] = ax, ay
-    at[2 * _LANES + lane], at[3 * _LANES + lane] = bx, by
-    at[4 * _LANES + lane] = np.cos(sigma[2] * eta[2])
-    at[5 * _LANES + lane] = np.sin(sigma[2] * eta[2])
-    at[6 * _LANES + lane] = ax * eta[0] + bx * eta[1]
-    at[7 * _LANES + lane] = ay * eta[0] + by * eta[1]
+    at[lane], at[LANES + lane] = ax, ay
+    at[2 * LANES + lane], at[3 * LANES + lane] = bx, by
+    at[4 * LANES + lane] = np.cos(sigma[2] * eta[2])
+    at[5 * LANES + lane] = np.sin(sigma[2] * eta[2])
+    at[6 * LANES + lane] = ax * eta[0] + bx * eta[1]
+    at[7 * LANES + lane] = ay * eta[0] + by * eta[1]
     for i in range(3):
-        system[i * _LANES + lane] = -eta[i]
-        system[(3 + i) * _LANES + lane] = 1.0
-        system[(6 + i) * _LANES + lane] = 0.0
+        system[i * LANES + lane] = -eta[i]
+        system[(3 + i) * LANES + lane] = 1.0
+        system[(6 + i) * LANES + lane] = 0.0
 
 
 @njit(cache=True, error_model="numpy")
 def _take_system(system: Float, lane: int, normal: Float, right: Float) -> None:
     """A particle's precision (3, 3) of eta, its lower half, and the gradient (3,)."""
     for i in range(3):
-        right[i] = system[i * _LANES + lane]
-        normal[i, i] = system[(3 + i) * _LANES + lane]
-    normal[1, 0], normal[2, 0] = system[6 * _LANES + lane], system[7 * _LANES + lane]
-    normal[2, 1] = system[8 * _LANES + lane]
+        right[i] = system[i * LANES + lane]
+        normal[i, i] = system[(3 + i) * LANES + lane]
+    normal[1, 0], normal[2, 0] = system[6 * LANES + lane], system[7 * LANES + lane]
+    normal[2, 1] = system[8 * LANES + lane]
 
 
 # One loop over all lanes, which a processor takes several at a time, without a call, a branch, or
@@ -202,29 +199,29 @@ def _add_pairs(pairs: Float, sigma_turn: float, gate: float, at: Float, system: 
     """Add what pairs say to the gradients of the log density at eta, and to the precisions."""
     for n in range(len(pairs)):
         pair = pairs[n]
-        for m in range(_LANES):
-            ax, ay, bx, by = at[m], at[_LANES + m], at[2 * _LANES + m], at[3 * _LANES + m]
-            cos, sin = at[4 * _LANES + m], at[5 * _LANES + m]
-            dz, ixx, ixy = pair[2 * _LANES + m], pair[3 * _LANES + m], pair[4 * _LANES + m]
-            ixz, iyy = pair[5 * _LANES + m], pair[6 * _LANES + m]
-            iyz, izz = pair[7 * _LANES + m], pair[8 * _LANES + m]
-            rx, ry = pair[9 * _LANES + m], pair[10 * _LANES + m]
+        for m in range(LANES):
+            ax, ay, bx, by = at[m], at[LANES + m], at[2 * LANES + m], at[3 * LANES + m]
+            cos, sin = at[4 * LANES + m], at[5 * LANES + m]
+            dz, ixx, ixy = pair[2 * LANES + m], pair[3 * LANES + m], pair[4 * LANES + m]
+            ixz, iyy = pair[5 * LANES + m], pair[6 * LANES + m]
+            iyz, izz = pair[7 * LANES + m], pair[8 * LANES + m]
+            rx, ry = pair[9 * LANES + m], pair[10 * LANES + m]
             # eta moves the point from where it was predicted
             tx, ty = cos * rx - sin * ry, sin * rx + cos * ry
-            dx = pair[m] + (at[6 * _LANES + m] + tx - rx)
-            dy = pair[_LANES + m] + (at[7 * _LANES + m] + ty - ry)
+            dx = pair[m] + (at[6 * LANES + m] + tx - rx)
+            dy = pair[LANES + m] + (at[7 * LANES + m] + ty - ry)
             distance = quadratic_form((dx, dy, dz), (ixx, ixy, ixz, iyy, iyz, izz))
             weight = 1.0 / (1.0 + distance / gate)
             cx, cy = -sigma_turn * ty, sigma_turn * tx  # d(point) / d eta_2
             wx = weight * (ixx * dx + ixy * dy + ixz * dz)
             wy = weight * (ixy * dx + iyy * dy + iyz * dz)
             system[m] -= ax * wx + ay * wy
-            system[_LANES + m] -= bx * wx + by * wy
-            system[2 * _LANES + m] -= cx * wx + cy * wy
+            system[LANES + m] -= bx * wx + by * wy
+            system[2 * LANES + m] -= cx * wx + cy * wy
             axx, axy, ayy = weight * ixx, weight * ixy, weight * iyy
-            system[3 * _LANES + m] += ax * ax * axx + 2 * ax * ay * axy + ay * ay * ayy
-            system[4 * _LANES + m] += bx * bx * axx + 2 * bx * by * axy + by * by * ayy
-            system[5 * _LANES + m] += cx * cx * axx + 2 * cx * cy * axy + cy * cy * ayy
-            system[6 * _LANES + m] += ax * bx * axx + (ax * by + ay * bx) * axy + ay * by * ayy
-            system[7 * _LANES + m] += ax * cx * axx + (ax * cy + ay * cx) * axy + ay * cy * ayy
-            system[8 * _LANES + m] += bx * cx * axx + (bx * cy + by * cx) * axy + by * cy * ayy
+            system[3 * LANES + m] += ax * ax * axx + 2 * ax * ay * axy + ay * ay * ayy
+            system[4 * LANES + m] += bx * bx * axx + 2 * bx * by * axy + by * by * ayy
+            system[5 * LANES + m] += cx * cx * axx + 2 * cx * cy * axy + cy * cy * ayy
+            system[6 * LANES + m] += ax * bx * axx + (ax * by + ay * bx) * axy + ay * by * ayy
+            system[7 * LANES + m] += ax * cx * axx + (ax * cy + ay * cx) * axy + ay * cy * ayy
+            system[8 * LANES + m] += bx * cx * axx + (bx * cy + by * cx) * axy + by * cy * ayy

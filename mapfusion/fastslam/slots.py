@@ -18,6 +18,10 @@ NOWHERE = (np.inf, np.inf, -np.inf, -np.inf)  # a box that touches none
 # Slots that share a box: a search looks at all blocks, and at the slots of those that touch. Slots
 # of like age lie near each other, so with this many a search among 10^6 costs little beside a step.
 BLOCK = 64
+# Particles that kernels take together, a number of each in a row: many enough that arithmetic on
+# rows is worth its start, few enough that what they see stays near the processor. The usual number
+# of particles is a multiple.
+LANES = 40
 
 
 class Estimates(NamedTuple):

@@ -11,7 +11,7 @@ from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.fastslam.particles import ParticleMaps
 from mapfusion.fastslam.proposal import Proposal, informed_disturbance, widened
 from mapfusion.fastslam.sensor import Sightings, sightings
-from mapfusion.fastslam.slots import Slots
+from mapfusion.fastslam.slots import LANES, Slots
 from mapfusion.robot_log import Observations
 from mapfusion.se2 import compose, transform_points
 from tests.mapfusion.fastslam.landmark_worlds import drive, observe, unit
@@ -130,7 +130,7 @@ def many_particles(n: int, n_points: int) -> tuple[Slots, Sightings, np.ndarray,
     return slots, seen, pose, chosen
 
 
-@pytest.mark.parametrize("n", [1, 31, 32, 33, 70])
+@pytest.mark.parametrize("n", [1, LANES - 1, LANES, LANES + 1, 2 * LANES + 5])
 def test_a_particle_is_drawn_as_if_it_were_alone(n: int) -> None:
     """However many are taken together: by steps that are written down once more here."""
     slots, seen, pose, chosen = many_particles(n, 9)
