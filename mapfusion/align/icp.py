@@ -186,15 +186,7 @@ def pair_and_solve(
             z = p_b[i, 2]
             dx, dy = x - looked_up[i, 0], y - looked_up[i, 1]
             still = clear[i] - math.sqrt(dx * dx + dy * dy)
-            k = -1
-            if still > 0:
-                least = still * still
-                for j in range(_KEPT):
-                    other = near[i, j]
-                    dx, dy, dz = p[other, 0] - x, p[other, 1] - y, p[other, 2] - z
-                    away = dx * dx + dy * dy + dz * dz
-                    if away < least:
-                        k, least = other, away
+            k = _nearest_within(still, x, y, z, p, near, i) if still > 0 else -1
             if k < 0:
                 own = near[i]
                 put_in_order(x, y, z, p, own, square)
@@ -211,6 +203,21 @@ def pair_and_solve(
         if rounds < max_rounds:
             T_a_b[0], T_a_b[1], T_a_b[2] = fit_rigid(matched, p_b, everyone)
     return way, nearest, _CHANGES
+
+
+@njit(cache=True)
+def _nearest_within(
+    reach: float, x: float, y: float, z: float, p: Float, near: np.ndarray, i: int
+) -> int:
+    """Which of the points near[i] (K,) of p (N, 3) is nearest, if less than `reach` away; -1."""
+    k, least = -1, reach * reach
+    for j in range(_KEPT):
+        other = near[i, j]
+        dx, dy, dz = p[other, 0] - x, p[other, 1] - y, p[other, 2] - z
+        away = dx * dx + dy * dy + dz * dz
+        if away < least:
+            k, least = other, away
+    return k
 
 
 @njit(cache=True)

@@ -265,6 +265,27 @@ def _farthest_moved(T_a_b: Float, step: Float, p_b: Float, truth: Float) -> floa
 
 
 @njit(cache=True)
+def _put(rows: np.ndarray, values: np.ndarray, into: np.ndarray) -> None:
+    """Values (n,) into rows (n,) of an array."""
+    for k in range(len(rows)):
+        into[rows[k]] = values[k]
+
+
+@njit(cache=True)
+def _put_product(matrix: Float, vector: Float, product: Float) -> None:
+    """Matrix (3, 3) times vector (3,)."""
+    for k in range(3):
+        product[k] = matrix[k, 0] * vector[0] + matrix[k, 1] * vector[1] + matrix[k, 2] * vector[2]
+
+
+@njit(cache=True)
+def _mark_within(gate_m: float, e: Float, inside: np.ndarray) -> None:
+    """Which residuals (n, 2) are no longer than a gate, into (n,)."""
+    for k in range(len(e)):
+        inside[k] = e[k, 0] * e[k, 0] + e[k, 1] * e[k, 1] <= gate_m * gate_m
+
+
+@njit(cache=True)
 def maximise_likelihood(
     pairs: PlanarPairs, T_start: Float, gate_m: float, least_drift_m: float, max_rounds: int
 ) -> tuple[bool, float, Float, np.ndarray, float, Float]:
@@ -281,28 +302,21 @@ def maximise_likelihood(
     p_b, e, S = near.p_b, np.empty((0, 2)), np.empty((0, 2, 2))
     inside, truth = np.zeros(0, np.bool_), np.zeros(0)
     widest = (gate_m / _GATE_SIGMAS) ** 2
-    variance, share = widest, 0.5
-    step_share, last_change = 1.0, 0.0
+    variance, share, step_share, last_change = widest, 0.5, 1.0, 0.0
     covariance, step = np.full((3, 3), np.nan), np.empty(3)
     moved, determined = math.inf, True
-    judged = weighed = variance
-    normal, at = np.zeros((3, 3)), np.empty(3)
+    judged, weighed, normal, at = variance, variance, np.zeros((3, 3)), np.empty(3)
     for rounds in range(max_rounds):
         if rounds == 0 or leaves_margin(T_a_b, T_near, gate_m, farthest):
-            for k in range(len(rows)):
-                everywhere[rows[k]] = inside[k]
+            _put(rows, inside, everywhere)
             rows = rows_in_reach(T_a_b, pairs, gate_m, everywhere)
             near, T_near = those_of(pairs, rows), T_a_b.copy()
             p_b, e, S = near.p_b, np.empty((len(rows), 2)), np.empty((len(rows), 2, 2))
-            inside, truth = np.empty(len(rows), np.bool_), np.zeros(len(rows))
-            for k in range(len(rows)):
-                inside[k] = everywhere[rows[k]]
+            inside, truth = everywhere[rows], np.zeros(len(rows))
         residuals_under(T_a_b, near, e, S)
         if rounds < _SETTLING_ROUNDS:
-            for k in range(len(rows)):
-                inside[k] = e[k, 0] * e[k, 0] + e[k, 1] * e[k, 1] <= gate_m * gate_m
-        for k in range(3):
-            at[k] = T_a_b[k]
+            _mark_within(gate_m, e, inside)
+        at = T_a_b.copy()
         weighed, judged = variance, max(variance, least_drift_m * least_drift_m)
         truth_probabilities(e, S, judged, share, gate_m, inside, truth)
         total = np.sum(truth)
@@ -313,12 +327,7 @@ def maximise_likelihood(
         determined = invert(normal, covariance)
         if not determined:
             break
-        for k in range(3):
-            step[k] = (
-                covariance[k, 0] * right[0]
-                + covariance[k, 1] * right[1]
-                + covariance[k, 2] * right[2]
-            )
+        _put_product(covariance, right, step)
         share = total / (np.sum(inside) + _PRIOR_FALSE)
         change = min(drift_step(e, S, truth, variance, gate_m), widest) - variance
         # few pairs far surer than the rest can throw it from one side to the other
@@ -335,6 +344,5 @@ def maximise_likelihood(
     if determined:
         normal -= missing_information(at, p_b, e, S, weighed, judged, truth)
         determined = invert(normal, covariance)
-    for k in range(len(rows)):
-        truth_of_all[rows[k]] = truth[k]
+    _put(rows, truth, truth_of_all)
     return determined, moved, T_a_b, covariance, variance, truth_of_all
