@@ -79,8 +79,9 @@ def rivals_path(folder: Path, part: str) -> Path:
     return folder / WRITES[1].format(part=part)
 
 
-# The maps of one pair of robots stay in memory: each aligner of the pair wants the same.
-@functools.lru_cache(maxsize=2)
+# The maps of a pair of robots stay in memory, since each aligner of the pair wants the same, and
+# those of a third: three robots' pairs, which are gone through twice, are then read once.
+@functools.lru_cache(maxsize=3)
 def _maps(log: Path, slam: Path) -> Snapshots:
     return Snapshots(slam, read_log(log))
 
