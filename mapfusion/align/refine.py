@@ -255,13 +255,13 @@ def invert(matrix: Float, inverse: Float) -> bool:
 def _farthest_moved(T_a_b: Float, step: Float, p_b: Float, truth: Float) -> float:
     """How far a step (3,) moves the landmark that it moves farthest, in m."""
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
-    moved = 0.0
+    square = 0.0
     for i in range(len(truth)):
         if truth[i] > 0:
             jx, jy = lever(cos, sin, p_b, i)
             dx, dy = step[0] + jx * step[2], step[1] + jy * step[2]
-            moved = max(moved, math.sqrt(dx * dx + dy * dy))
-    return moved
+            square = max(square, dx * dx + dy * dy)
+    return math.sqrt(square)
 
 
 @njit(cache=True)

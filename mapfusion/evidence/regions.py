@@ -1,6 +1,6 @@
 """The regions that two maps must share under a motion, and how much of each is in both."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
@@ -38,6 +38,9 @@ class Regions:
 
     found: np.ndarray
     expected: np.ndarray
+    _evidence: dict[TwinShares, float] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     def __len__(self) -> int:
         return len(self.found)
@@ -87,7 +90,10 @@ class Regions:
 
     def log10_evidence(self, shares: TwinShares) -> float:
         """The same, if wrong then found by one of them, which is no evidence; 0 of none."""
-        return log10_beside_one(log10_ratio(self.found, self.expected, shares))
+        if shares not in self._evidence:  # a verdict rests on it in several places
+            ratios = log10_ratio(self.found, self.expected, shares)
+            self._evidence[shares] = log10_beside_one(ratios)
+        return self._evidence[shares]
 
 
 class Squares(NamedTuple):
