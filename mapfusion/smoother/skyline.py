@@ -150,10 +150,12 @@ class Factor:
             own, runs = inverse.T @ inverse, _runs(blocks, starts, j)
             follows = [self.lower[rows, columns] @ inverse for rows in runs]
             for rows, its in zip(runs, follows, strict=True):
-                with_it = [Z[rows, other] @ that for other, that in zip(runs, follows, strict=True)]
-                Z[rows, columns] = -sum(with_it)
-                Z[columns, rows] = Z[rows, columns].T
-                own -= its.T @ Z[rows, columns]
+                with_it = Z[rows, runs[0]] @ follows[0]
+                for other, that in zip(runs[1:], follows[1:], strict=True):
+                    with_it += Z[rows, other] @ that
+                Z[rows, columns] = np.negative(with_it, out=with_it)
+                Z[columns, rows] = with_it.T
+                own -= its.T @ with_it
             Z[columns, columns] = own
         return Z
 
