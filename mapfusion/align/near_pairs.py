@@ -5,6 +5,7 @@ the motion has not gone farther than a margin.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -15,6 +16,45 @@ from mapfusion.se2 import Float
 
 _MARGIN = 0.25  # of a gate; a motion that has found its pairs goes less far
 _ROUNDING = 1e-6  # of a gate, more than rounding may move a point by
+
+
+class NearPairs(NamedTuple):
+    """n pairs in reach of a gate, and room for what is worked out of each.
+
+    Attributes:
+        rows: (n,) among all pairs.
+        pairs: themselves.
+        e: (n, 2) residuals.
+        S: (n, 2, 2) their covariances.
+        inside: (n,) bool, whether they lie within the gate.
+        truth: (n,) probabilities of being true; 0 at first.
+    """
+
+    rows: np.ndarray
+    pairs: PlanarPairs
+    e: Float
+    S: Float
+    inside: np.ndarray
+    truth: Float
+
+
+@njit(cache=True)
+def near_pairs(T_a_b: Float, pairs: PlanarPairs, gate_m: float, inside: np.ndarray) -> NearPairs:
+    """The pairs in reach under a motion, and those `inside` (N,) already, which stay so."""
+    rows = rows_in_reach(T_a_b, pairs, gate_m, inside)
+    n = len(rows)
+    room = np.empty((n, 2)), np.empty((n, 2, 2)), np.empty(n, np.bool_), np.zeros(n)
+    near = NearPairs(rows, those_of(pairs, rows), room[0], room[1], room[2], room[3])
+    for k in range(n):
+        near.inside[k] = inside[rows[k]]
+    return near
+
+
+@njit(cache=True)
+def at_rows(values: np.ndarray, rows: np.ndarray, among: np.ndarray) -> None:
+    """Put values (n,) at rows (n,) of others (N,)."""
+    for k in range(len(rows)):
+        among[rows[k]] = values[k]
 
 
 @njit(cache=True)

@@ -14,7 +14,7 @@ from mapfusion.align.degeneracy import why_one_place
 from mapfusion.align.drift import drift_step
 from mapfusion.align.leverage import is_unlike_the_others, most_leverage, why_one_pair
 from mapfusion.align.mahalanobis_gate import PlanarPairs
-from mapfusion.align.near_pairs import farthest_m, leaves_margin, rows_in_reach, those_of
+from mapfusion.align.near_pairs import at_rows, farthest_m, leaves_margin, near_pairs
 from mapfusion.align.pairs import MIN_PAIRS, Pairs, undetermined
 from mapfusion.align.result import Alignment, Status
 from mapfusion.arguments import Range, require_in_range, require_shape
@@ -265,27 +265,6 @@ def _farthest_moved(T_a_b: Float, step: Float, p_b: Float, truth: Float) -> floa
 
 
 @njit(cache=True)
-def _put(rows: np.ndarray, values: np.ndarray, into: np.ndarray) -> None:
-    """Values (n,) into rows (n,) of an array."""
-    for k in range(len(rows)):
-        into[rows[k]] = values[k]
-
-
-@njit(cache=True)
-def _put_product(matrix: Float, vector: Float, product: Float) -> None:
-    """Matrix (3, 3) times vector (3,)."""
-    for k in range(3):
-        product[k] = matrix[k, 0] * vector[0] + matrix[k, 1] * vector[1] + matrix[k, 2] * vector[2]
-
-
-@njit(cache=True)
-def _mark_within(gate_m: float, e: Float, inside: np.ndarray) -> None:
-    """Which residuals (n, 2) are no longer than a gate, into (n,)."""
-    for k in range(len(e)):
-        inside[k] = e[k, 0] * e[k, 0] + e[k, 1] * e[k, 1] <= gate_m * gate_m
-
-
-@njit(cache=True)
 def maximise_likelihood(
     pairs: PlanarPairs, T_start: Float, gate_m: float, least_drift_m: float, max_rounds: int
 ) -> tuple[bool, float, Float, np.ndarray, float, Float]:
@@ -296,38 +275,31 @@ def maximise_likelihood(
         landmark (m), T_a_b (3,), its covariance (3, 3), s_drift^2, each pair's probability of being
         true (N,).
     """
-    T_a_b, farthest = T_start.copy(), farthest_m(pairs.p_b)
-    everywhere, truth_of_all = np.zeros(len(pairs.p_a), np.bool_), np.zeros(len(pairs.p_a))
-    rows, near, T_near = np.zeros(0, np.int64), pairs, T_start.copy()
-    p_b, e, S = near.p_b, np.empty((0, 2)), np.empty((0, 2, 2))
-    inside, truth = np.zeros(0, np.bool_), np.zeros(0)
+    n, farthest = len(pairs.p_a), farthest_m(pairs.p_b)
+    T_a_b, T_near = T_start.copy(), T_start.copy()
+    inside_of_all, truth_of_all = np.zeros(n, np.bool_), np.zeros(n)
+    near = near_pairs(T_a_b, pairs, gate_m, inside_of_all)
     widest = (gate_m / _GATE_SIGMAS) ** 2
-    variance, share, step_share, last_change = widest, 0.5, 1.0, 0.0
+    variance, share = widest, 0.5
+    step_share, last_change = 1.0, 0.0
     covariance, step = np.full((3, 3), np.nan), np.empty(3)
     moved, determined = math.inf, True
     judged, weighed, normal, at = variance, variance, np.zeros((3, 3)), np.empty(3)
     for rounds in range(max_rounds):
-        if rounds == 0 or leaves_margin(T_a_b, T_near, gate_m, farthest):
-            _put(rows, inside, everywhere)
-            rows = rows_in_reach(T_a_b, pairs, gate_m, everywhere)
-            near, T_near = those_of(pairs, rows), T_a_b.copy()
-            p_b, e, S = near.p_b, np.empty((len(rows), 2)), np.empty((len(rows), 2, 2))
-            inside, truth = everywhere[rows], np.zeros(len(rows))
-        residuals_under(T_a_b, near, e, S)
+        if leaves_margin(T_a_b, T_near, gate_m, farthest):
+            at_rows(near.inside, near.rows, inside_of_all)
+            near, T_near = near_pairs(T_a_b, pairs, gate_m, inside_of_all), T_a_b.copy()
+        _, some, e, S, inside, truth = near
+        residuals_under(T_a_b, some, e, S)
         if rounds < _SETTLING_ROUNDS:
-            _mark_within(gate_m, e, inside)
-        at = T_a_b.copy()
+            _mark_inside(e, gate_m, inside)
         weighed, judged = variance, max(variance, least_drift_m * least_drift_m)
         truth_probabilities(e, S, judged, share, gate_m, inside, truth)
         total = np.sum(truth)
-        determined = not total < 1.0
+        normal, right = normal_equations(T_a_b, some.p_b, e, S, variance, truth)
+        determined = not total < 1.0 and invert(normal, covariance)
         if not determined:
             break
-        normal, right = normal_equations(T_a_b, p_b, e, S, variance, truth)
-        determined = invert(normal, covariance)
-        if not determined:
-            break
-        _put_product(covariance, right, step)
         share = total / (np.sum(inside) + _PRIOR_FALSE)
         change = min(drift_step(e, S, truth, variance, gate_m), widest) - variance
         # few pairs far surer than the rest can throw it from one side to the other
@@ -336,13 +308,31 @@ def maximise_likelihood(
             step_share /= 2
         variance += step_share * change
         last_change = change
-        moved = _farthest_moved(T_a_b, step, p_b, truth)
+        _times(covariance, right, step)
+        moved = _farthest_moved(T_a_b, step, some.p_b, truth)
         for k in range(3):
+            at[k] = T_a_b[k]
             T_a_b[k] += step[k]
         if moved <= _TOLERANCE_M:
             break
     if determined:
-        normal -= missing_information(at, p_b, e, S, weighed, judged, truth)
+        _, some, e, S, _, truth = near
+        missing = missing_information(at, some.p_b, e, S, weighed, judged, truth)
+        normal -= missing
         determined = invert(normal, covariance)
-    _put(rows, truth, truth_of_all)
+    at_rows(near.truth, near.rows, truth_of_all)
     return determined, moved, T_a_b, covariance, variance, truth_of_all
+
+
+@njit(cache=True)
+def _mark_inside(e: Float, gate_m: float, inside: np.ndarray) -> None:
+    """Mark which residuals (n, 2) lie within the gate."""
+    for i in range(len(e)):
+        inside[i] = e[i, 0] * e[i, 0] + e[i, 1] * e[i, 1] <= gate_m * gate_m
+
+
+@njit(cache=True)
+def _times(matrix: Float, vector: Float, product: Float) -> None:
+    """Fill the product (3,) of a matrix (3, 3) and a vector (3,)."""
+    for k in range(3):
+        product[k] = matrix[k, 0] * vector[0] + matrix[k, 1] * vector[1] + matrix[k, 2] * vector[2]
