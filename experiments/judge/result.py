@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from experiments.judge import tables
 from experiments.judge.errors import EvaluatedRobot
@@ -22,6 +23,7 @@ from experiments.judge.truth import common_landmarks
 from experiments.methods.aligner_calls import callable_aligner
 from experiments.methods.catalogue import find_method
 from experiments.run.code_version import library_versions
+from experiments.run.estimates import correspondences_of
 from experiments.run.head_start import head_start
 from experiments.run.stages.fuse import read_fused_maps
 from experiments.run.stages.smooth import read_smoothed
@@ -30,7 +32,6 @@ from experiments.run.store_files import link_or_copy
 from experiments.run.tasks import OnProgress
 from experiments.scenario.randomness import generator
 from experiments.scenario.settings import AnyScenario, Simulation
-from mapfusion.align.correspondences import match
 from mapfusion.errors import InputError
 from mapfusion.landmark_map import write_map
 from mapfusion.storage import (
@@ -130,11 +131,16 @@ def measure_aligners(run: JudgedRun, robots: Sequence[EvaluatedRobot]) -> None:
         path = run.store.path(pair.estimates) / "aligner_timings.parquet"
         if not path.is_file():
             remove_abandoned(path.parent)
-            rows = _time_pair(run.scenario, by_name[pair.a.name], by_name[pair.b.name])
+            offered = tables.read(path.with_name("correspondences.parquet"), "correspondences")
+            robots_of = by_name[pair.a.name], by_name[pair.b.name]
+            rows = _time_pair(run.scenario, *robots_of, offered)
             tables.write(path, "aligner_timings", rows)
 
 
-def _time_pair(scenario: AnyScenario, a: EvaluatedRobot, b: EvaluatedRobot) -> list[dict[str, Any]]:
+def _time_pair(
+    scenario: AnyScenario, a: EvaluatedRobot, b: EvaluatedRobot, offered: pd.DataFrame
+) -> list[dict[str, Any]]:
+    """Rows of a pair of robots, to which `offered` are the correspondences at all iterations."""
     settings, iterations = scenario.evaluate, np.array(sorted({*a.maps, *b.maps}))
     spread = np.linspace(0, len(iterations) - 1, settings.timing_points)
     repeats = range(_WARM_UP_RUNS + settings.timing_repeats)
@@ -145,7 +151,7 @@ def _time_pair(scenario: AnyScenario, a: EvaluatedRobot, b: EvaluatedRobot) -> l
     rows = []
     for iteration in iterations[np.unique(spread.round().astype(int))].tolist():
         (map_a, points_a), (map_b, points_b) = a.at(iteration), b.at(iteration)
-        pairs = match(map_a, map_b, scenario.align.match)
+        pairs = correspondences_of(offered[offered["iteration"] == iteration])
         known = np.isfinite(points_a).any() and np.isfinite(points_b).any()
         n_common = common_landmarks(points_a, points_b, settings.true_pair_radius_m)
         n_common = n_common if known else tables.UNKNOWN

@@ -6,10 +6,9 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from experiments.judge import result
+from experiments.judge import result, tables
 from experiments.judge.errors import EvaluatedRobot
 from experiments.judge.truth import PathTruth
-from mapfusion.align.correspondences import MatchParameters
 from tests.helpers.made_up_maps import landmark_map
 
 COMPILING_S = 50.0
@@ -42,10 +41,14 @@ def test_compilation_does_not_count_and_first_and_last_maps_do(
     monkeypatch.setattr(result, "callable_aligner", lambda *_: clock)
     evaluate = SimpleNamespace(timing_points=3, timing_repeats=11, true_pair_radius_m=0.1)
     entry = SimpleNamespace(name="icp", method="icp", parameters={}, time_limit_s=1.0)
-    align = SimpleNamespace(aligners=[entry], match=MatchParameters())
+    align = SimpleNamespace(aligners=[entry])
     scenario = cast(Any, SimpleNamespace(seed=0, evaluate=evaluate, align=align))
-    rows = result._time_pair(scenario, grown("R1", range(5, 50, 5)), grown("R2", range(5, 30, 5)))
+    pair = {"robot_a": "R1", "robot_b": "R2", "iteration": 25, "index_a": 3, "index_b": 3}
+    offered = tables.framed("correspondences", [pair | {"descriptor_distance": 0.1}])
+    robots = grown("R1", range(5, 50, 5)), grown("R2", range(5, 30, 5))
+    rows = result._time_pair(scenario, *robots, offered)
     assert [row["iteration"] for row in rows] == [5, 25, 45]
+    assert [row["n_correspondences"] for row in rows] == [0, 1, 0]
     assert [row["n_common"] for row in rows] == [5, 25, 25]  # R2's log ended at 25
     assert clock.asked == [5] * 12 + [25] * 12 + [45] * 12
     for row in rows:
