@@ -8,19 +8,16 @@ from typing import Annotated, ClassVar
 import numpy as np
 from numba import njit
 
-from mapfusion.align.box_tree import BoxTree, look_up, put_in_order, room_for_search
+from mapfusion.align.box_tree import BoxTree
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.method import Fit, Needs
+from mapfusion.align.nearest_points import GROUP, Groups, look_up_group, room_for_groups
 from mapfusion.align.pairs import Pairs
 from mapfusion.align.rigid import fit_rigid
 from mapfusion.arguments import Range, require_in_range
-from mapfusion.planar import moved_point
 from mapfusion.se2 import Float
 
 MAX_ROUNDS = 200  # of pairing and solving
-# Points near a landmark that are kept: with fewer it has to be looked up more often, more take
-# longer to find and to put in order than they save.
-_KEPT = 4
 _CHANGES, _REPEATS = -2, -1  # how a descent ended, where it met no other one
 _NO_ROUNDS = np.empty(0, np.int64)
 
@@ -68,6 +65,7 @@ class ClosestPoints:
         self._pairs = pairs
         self._tree = BoxTree.of(pairs.map_a.position_m * upright)
         self._p_b = pairs.map_b.position_m * upright
+        self._groups = Groups.of(self._p_b)
         self._ends: list[Fit] = []
         # T_a_b of each round that led to one of them, which one, and after how many more
         self._met, self._end, self._to_go = np.empty((0, 3)), _NO_ROUNDS, _NO_ROUNDS
@@ -84,7 +82,7 @@ class ClosestPoints:
 
         Beyond `most_m2` it is not summed up: what comes back is more than that.
         """
-        return summed_square_distance(T_a_b, self._p_b, self._tree, most_m2)
+        return summed_square_distance(T_a_b, self._groups, self._tree, most_m2)
 
     def nearest_of(self, starts: Sequence[Float]) -> Float:
         """The first of the motions with the least cost."""
@@ -98,7 +96,7 @@ class ClosestPoints:
     def descend(self, T_a_b: Float, max_rounds: int) -> Fit:
         """Pair and solve from T_a_b on until the pairing repeats; fitted to the last pairing."""
         way, nearest, met = pair_and_solve(
-            T_a_b, max_rounds, self._p_b, self._tree, self._met, self._to_go
+            T_a_b, max_rounds, self._p_b, self._groups, self._tree, self._met, self._to_go
         )
         if met == _CHANGES:
             return self._fit(
@@ -127,19 +125,17 @@ class ClosestPoints:
 
 
 @njit(cache=True)
-def summed_square_distance(T_a_b: Float, p_b: Float, tree: BoxTree, most: float) -> float:
-    """Sum over p_b (N, 3) of the squared distance under T_a_b to the nearest point of the tree.
+def summed_square_distance(T_a_b: Float, groups: Groups, tree: BoxTree, most: float) -> float:
+    """Sum over all points of the squared distance under T_a_b to the nearest point of the tree.
 
-    It ends with the first that makes it exceed `most`.
+    It ends with the first group that makes it exceed `most`.
     """
-    cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
-    near, square, todo = np.full(1, -1), np.empty(1), room_for_search()
+    room, nobody = room_for_groups(), np.full(len(groups.row), -1)
     total = 0.0
-    for i in range(len(p_b)):
-        x, y = moved_point(T_a_b, cos, sin, p_b[i, 0], p_b[i, 1])
-        put_in_order(x, y, p_b[i, 2], tree.p, near, square)  # that of the one before
-        look_up(x, y, p_b[i, 2], tree, near, square, todo)
-        total += square[0]
+    for first in range(0, groups.n, GROUP):
+        look_up_group(T_a_b, first, groups, tree, nobody, room)
+        for q in range(min(GROUP, groups.n - first)):
+            total += room.square[q]
         if total > most:
             break
     return total
@@ -150,15 +146,12 @@ def pair_and_solve(
     T_start: Float,
     max_rounds: int,
     p_b: Float,
+    groups: Groups,
     tree: BoxTree,
     met: Float,
     to_go: np.ndarray,
 ) -> tuple[Float, np.ndarray, int]:
-    """Pair p_b (N, 3) with the nearest points of a tree and solve, until no pair changes.
-
-    Of each landmark a few that were near where it was looked up are kept. No other point is nearer
-    than the last of them was, less how far it has moved since (triangle inequality): while one of
-    them is, it is not looked up again.
+    """Pair p_b (N, 3), in groups, with the nearest of a tree and solve, until no pair changes.
 
     All that follows, follows from the motion: at one of `met` (M, 3), from which `to_go` (M,) more
     rounds lead to an end, there is nothing left to do.
@@ -168,10 +161,9 @@ def pair_and_solve(
         row of `met` that it came to; if to none, whether it repeats.
     """
     p, n = tree.p, len(p_b)
-    T_a_b, everyone, todo = T_start.copy(), np.arange(n), room_for_search()
-    nearest, matched = np.full(n, -1), np.empty((n, 3))
-    near, square = np.full((n, _KEPT), -1), np.empty(_KEPT)
-    looked_up, clear = np.zeros((n, 2)), np.zeros(n)  # where, and how far the last one kept was
+    T_a_b, everyone, room = T_start.copy(), np.arange(n), room_for_groups()
+    row_of, found = groups.row, room.nearest
+    nearest, in_group, matched = np.full(n, -1), np.full(len(row_of), -1), np.empty((n, 3))
     way = np.empty((max_rounds + 1, 3))
     for rounds in range(max_rounds + 1):
         way[rounds, 0], way[rounds, 1], way[rounds, 2] = T_a_b[0], T_a_b[1], T_a_b[2]
@@ -179,45 +171,20 @@ def pair_and_solve(
         # one round more than that if it came there by other pairs
         if row >= 0 and rounds + to_go[row] < max_rounds:
             return way[: rounds + 1], nearest, row
-        cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
         changed = False
-        for i in range(n):
-            x, y = moved_point(T_a_b, cos, sin, p_b[i, 0], p_b[i, 1])
-            z = p_b[i, 2]
-            dx, dy = x - looked_up[i, 0], y - looked_up[i, 1]
-            still = clear[i] - math.sqrt(dx * dx + dy * dy)
-            k = _nearest_within(still, x, y, z, p, near, i) if still > 0 else -1
-            if k < 0:
-                own = near[i]
-                put_in_order(x, y, z, p, own, square)
-                look_up(x, y, z, tree, own, square, todo)
-                looked_up[i, 0], looked_up[i, 1] = x, y
-                clear[i] = math.sqrt(square[_KEPT - 1])
-                k = own[0]
-            if k != nearest[i]:
-                changed, nearest[i] = True, k
-                for axis in range(3):
-                    matched[i, axis] = p[k, axis]
+        for first in range(0, len(in_group), GROUP):
+            look_up_group(T_a_b, first, groups, tree, in_group, room)
+            for q in range(GROUP):
+                i, k = first + q, int(found[q])
+                if k != in_group[i]:
+                    changed, in_group[i], nearest[row_of[i]] = True, k, k
+                    for axis in range(3):
+                        matched[row_of[i], axis] = p[k, axis]
         if not changed:
             return way[: rounds + 1], nearest, _REPEATS
         if rounds < max_rounds:
             T_a_b[0], T_a_b[1], T_a_b[2] = fit_rigid(matched, p_b, everyone)
     return way, nearest, _CHANGES
-
-
-@njit(cache=True)
-def _nearest_within(
-    reach: float, x: float, y: float, z: float, p: Float, near: np.ndarray, i: int
-) -> int:
-    """Which of the points near[i] (K,) of p (N, 3) is nearest, if less than `reach` away; -1."""
-    k, least = -1, reach * reach
-    for j in range(_KEPT):
-        other = near[i, j]
-        dx, dy, dz = p[other, 0] - x, p[other, 1] - y, p[other, 2] - z
-        away = dx * dx + dy * dy + dz * dz
-        if away < least:
-            k, least = other, away
-    return k
 
 
 @njit(cache=True)

@@ -31,10 +31,10 @@ from tests.experiments.study.refusal.test_refusal import (
 from tests.mapfusion.align.map_pairs import given_pairs
 from tests.mapfusion.align.test_box_tree import (
     test_each_box_holds_its_points_and_halves_those_of_the_one_above,
-    test_finds_what_looking_at_all_finds,
 )
 from tests.mapfusion.align.test_correspondences import two_maps
 from tests.mapfusion.align.test_max_clique import on_bits, random_graph
+from tests.mapfusion.align.test_nearest_points import test_finds_what_looking_at_all_finds
 from tests.mapfusion.evidence.test_judge import (
     test_a_picture_that_hangs_twice_leaves_two_places,
     test_what_was_found_before_gives_the_same_verdict,
@@ -95,7 +95,7 @@ def alignments() -> None:
     first, second, _ = two_maps(np.random.default_rng(0), 40)
     match(first, second)
     test_each_box_holds_its_points_and_halves_those_of_the_one_above("spread")
-    test_finds_what_looking_at_all_finds("spread", "with others", 4)
+    test_finds_what_looking_at_all_finds("spread", "with others", 75)
     test_what_was_found_before_gives_the_same_verdict()
     test_a_picture_that_hangs_twice_leaves_two_places()
     larger_clique(on_bits(random_graph(0, 130, 0.3)), everyone(130), 0, 1000)
