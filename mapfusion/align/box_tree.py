@@ -56,9 +56,7 @@ def _boxes_about(p: Float) -> BoxTree:
     for node in range(n_nodes):
         widest, extent = 0, -math.inf
         for axis in range(3):
-            low, high = math.inf, -math.inf
-            for k in range(first[node], end[node]):
-                low, high = min(low, p[row[k], axis]), max(high, p[row[k], axis])
+            low, high = span(p, row, first[node], end[node], axis)
             box[node, axis], box[node, 3 + axis] = low, high
             if high - low > extent:
                 widest, extent = axis, high - low
@@ -70,6 +68,15 @@ def _boxes_about(p: Float) -> BoxTree:
     in_order = p[row]
     x, y, z = in_order[:, 0].copy(), in_order[:, 1].copy(), in_order[:, 2].copy()
     return BoxTree(in_order, x, y, z, row, box, first, end)
+
+
+@njit(cache=True)
+def span(p: Float, row: np.ndarray, first: int, end: int, axis: int) -> tuple[float, float]:
+    """The least and the greatest coordinate of the points row[first:end] of p (N, D)."""
+    low, high = math.inf, -math.inf
+    for k in range(first, end):
+        low, high = min(low, p[row[k], axis]), max(high, p[row[k], axis])
+    return low, high
 
 
 @njit(cache=True)

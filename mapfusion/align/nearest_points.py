@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from mapfusion.align.box_tree import BoxTree, halve
+from mapfusion.align.box_tree import BoxTree, halve, span
 from mapfusion.planar import moved_point
 from mapfusion.se2 import Float
 
@@ -72,12 +72,8 @@ def room_for_groups() -> Room:
 @njit(cache=True)
 def _in_groups(p: Float) -> np.ndarray:
     """Rows of p (N, 3) such that each GROUP of them lie near each other."""
-    row, begins, ends, n_todo = (
-        np.arange(len(p)),
-        np.zeros(_DEEPEST, np.int64),
-        np.zeros(64, np.int64),
-        1,
-    )
+    row, n_todo = np.arange(len(p)), 1
+    begins, ends = np.zeros(_DEEPEST, np.int64), np.zeros(_DEEPEST, np.int64)
     ends[0] = len(p)
     while n_todo > 0:
         n_todo -= 1
@@ -86,9 +82,7 @@ def _in_groups(p: Float) -> np.ndarray:
             continue
         widest, extent = 0, -math.inf
         for axis in range(3):
-            low, high = math.inf, -math.inf
-            for k in range(first, end):
-                low, high = min(low, p[row[k], axis]), max(high, p[row[k], axis])
+            low, high = span(p, row, first, end, axis)
             if high - low > extent:
                 widest, extent = axis, high - low
         middle = first + max((end - first) // (2 * GROUP), 1) * GROUP
