@@ -51,6 +51,8 @@ class Source:
         left_out = {"NUMBA_CACHE_DIR", "NUMBA_CACHE_LOCATOR_CLASSES", "PYTHONPATH"}
         environment = {name: value for name, value in os.environ.items() if name not in left_out}
         environment["XDG_CACHE_HOME"] = str(self.cache)
+        # Python tells versions of a module apart by size and whole seconds; tests are faster
+        environment["PYTHONDONTWRITEBYTECODE"] = "1"
         asked = partial(subprocess.run, [sys.executable, "-c", CALL], cwd=self._root)
         told = asked(env=environment, capture_output=True, text=True, check=True)
         return json.loads(told.stdout)
