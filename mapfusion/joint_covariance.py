@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numba import njit
 
 from mapfusion.arguments import require_finite, require_shape
+from mapfusion.kernels import kernel
 from mapfusion.se2 import Float
 
 # Of the shared variables that a log gives, three a frame, as many are kept: their variances fall
@@ -142,7 +142,7 @@ def condensed(own_m2: Float, common: Float | SharedErrors, rank: int = RANK) -> 
     return JointCovariance(own_m2 + common.squares() - _squares(kept, n), by_landmark)
 
 
-@njit(cache=True)
+@kernel
 def _squares(common: Float, n: int) -> Float:
     """(N, 3, 3) covariance that common (R, 3N) gives each landmark."""
     total = np.zeros((n, 3, 3))

@@ -1,8 +1,8 @@
 """Depth between the pixels of a depth image."""
 
 import numpy as np
-from numba import njit
 
+from mapfusion.kernels import kernel
 from mapfusion.se2 import Float
 
 SAME_SURFACE = 0.02  # neighbouring pixels whose depths differ by more belong to two surfaces
@@ -20,7 +20,7 @@ def depth_at(depth_m: np.ndarray, uv_px: Float) -> Float:
     return found
 
 
-@njit(cache=True, error_model="numpy")  # one over a depth of zero is infinite
+@kernel(error_model="numpy")  # one over a depth of zero is infinite
 def _read(depth_m: np.ndarray, uv: Float, found: Float) -> None:
     height, width = depth_m.shape
     for n in range(len(uv)):

@@ -9,9 +9,9 @@ pixels are rounded.
 import functools
 
 import numpy as np
-from numba import njit
 from scipy.special import ndtri
 
+from mapfusion.kernels import kernel
 from sim.radiometry import RadiometricNoise
 
 VALUES = 2**16
@@ -41,7 +41,7 @@ def draw_bits(n: int, rng: np.random.Generator) -> np.ndarray:
     return words.astype("<u8", copy=False).view("<u2")[:n]
 
 
-@njit(cache=True)
+@kernel
 def _exposed(
     gray: np.ndarray, levels: np.ndarray, bits: np.ndarray, deviations: np.ndarray
 ) -> np.ndarray:

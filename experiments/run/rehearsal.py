@@ -139,7 +139,7 @@ def _made_up_log(robot: str, start: Float) -> RobotLog:
 
 def _with_kernels() -> list[Path]:
     files = (path for package in PACKAGES for path in (SOURCE_ROOT / package).rglob("*.py"))
-    return [path for path in files if b"@njit" in path.read_bytes()]
+    return [path for path in files if b"from mapfusion.kernels" in path.read_bytes()]
 
 
 def _is_in(path: Path, folders: Iterable[str]) -> bool:

@@ -4,8 +4,10 @@ from collections.abc import Callable
 from typing import Any, cast
 
 import numpy as np
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
+
+from mapfusion.kernels import kernel, kernel_part
 
 WORD = 64
 
@@ -40,7 +42,7 @@ trailing_zeros = cast(Callable[[Any], int], _trailing_zeros)
 ones = cast(Callable[[Any], int], _ones)
 
 
-@njit(cache=True)
+@kernel
 def count_common(first: np.ndarray, second: np.ndarray) -> int:
     """Size of the intersection of two sets (W,) uint64."""
     count = 0
@@ -49,7 +51,7 @@ def count_common(first: np.ndarray, second: np.ndarray) -> int:
     return count
 
 
-@njit(cache=True)
+@kernel
 def packed(eights: np.ndarray, w: int) -> np.uint64:
     """Word w of a set whose members are bytes of 1, the others 0; `eights` are eight bytes each."""
     word = np.uint64(0)
@@ -58,7 +60,7 @@ def packed(eights: np.ndarray, w: int) -> np.uint64:
     return word
 
 
-@njit(cache=True)
+@kernel_part
 def transpose(square: np.ndarray) -> None:
     """Exchange rows and columns of 64 words: halves of halves change places (Warren 2012, 7-3)."""
     size, low = WORD // 2, np.uint64(0xFFFFFFFF)
@@ -73,7 +75,7 @@ def transpose(square: np.ndarray) -> None:
         low ^= low << np.uint64(size)
 
 
-@njit(cache=True)
+@kernel
 def mirror(graph: np.ndarray) -> None:
     """Make a graph (N, W) symmetric of which only the edges to later vertices are there."""
     n, words = graph.shape

@@ -9,8 +9,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from mapfusion.kernels import kernel
 from mapfusion.se2 import Float
 
 _POINTS_PER_LEAF = 16  # at most; a box to be asked costs as much as some points of a leaf
@@ -44,7 +44,7 @@ class BoxTree(NamedTuple):
         return _boxes_about(np.ascontiguousarray(p))
 
 
-@njit(cache=True)
+@kernel
 def _boxes_about(p: Float) -> BoxTree:
     n, n_leaves = len(p), 1
     while n > n_leaves * _POINTS_PER_LEAF:
@@ -70,7 +70,7 @@ def _boxes_about(p: Float) -> BoxTree:
     return BoxTree(in_order, x, y, z, row, box, first, end)
 
 
-@njit(cache=True)
+@kernel
 def span(p: Float, row: np.ndarray, first: int, end: int, axis: int) -> tuple[float, float]:
     """The least and the greatest coordinate of the points row[first:end] of p (N, D)."""
     low, high = math.inf, -math.inf
@@ -79,7 +79,7 @@ def span(p: Float, row: np.ndarray, first: int, end: int, axis: int) -> tuple[fl
     return low, high
 
 
-@njit(cache=True)
+@kernel
 def halve(x: Float, row: np.ndarray, first: int, end: int, middle: int) -> None:
     """Put row[first:end] so that x of none before `middle` is larger than x of any from there on.
 

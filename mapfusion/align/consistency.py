@@ -8,10 +8,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from mapfusion.align.bits import WORD, mirror, packed, trailing_zeros
 from mapfusion.align.mahalanobis_gate import PlanarPairs
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float
 
 # What single precision may add to the difference of two distances: coordinates of at most 1, read
@@ -23,7 +23,7 @@ _SHARE = 1 / 16
 _LEAST_EXTENT_M = 1e-6  # of a map: all its landmarks in one place must not divide by zero
 
 
-@njit(cache=True)
+@kernel
 def largest_variances(S: Float) -> Float:
     """Larger eigenvalue (N,) of covariances (N, 2, 2): the variance in the worst direction."""
     largest = np.empty(len(S))
@@ -48,7 +48,7 @@ class _Coarse(NamedTuple):
     most: np.ndarray
 
 
-@njit(cache=True)
+@kernel_part
 def _coarse(pairs: PlanarPairs, variance_m2: float, bound: float) -> _Coarse:
     """The pairs under their landmarks' worst variances, so that rounding loses none."""
     p_a, p_b, S_a, S_b = pairs
@@ -76,7 +76,7 @@ def _coarse(pairs: PlanarPairs, variance_m2: float, bound: float) -> _Coarse:
     return coarse
 
 
-@njit(cache=True)
+@kernel_part
 def _mark_near(
     ax: np.ndarray,
     ay: np.ndarray,
@@ -100,14 +100,14 @@ def _mark_near(
         near[j] = (p - q) * (p - q) <= m * (p + q + (p + q) - m)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _variance_along(dx: float, dy: float, square: float, xx: float, xy: float, yy: float) -> float:
     """Variance along the line (dx, dy) of this squared length; 0 where there is no line."""
     along = dx * dx * xx + 2 * dx * dy * xy + dy * dy * yy
     return along / square if square > 0 else 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _needed(one: tuple[float, ...], other: tuple[float, ...], bound: float) -> float:
     """`drift_needed` of two correspondences, each a row of `in_rows`."""
     ax, ay, bx, by = other[0] - one[0], other[1] - one[1], other[2] - one[2], other[3] - one[3]
@@ -118,7 +118,7 @@ def _needed(one: tuple[float, ...], other: tuple[float, ...], bound: float) -> f
     return (difference * difference / bound - v) / 2
 
 
-@njit(cache=True)
+@kernel
 def in_rows(pairs: PlanarPairs) -> Float:
     """The pairs (N, 10): p_a, p_b, and xx, xy, yy of S_a and of S_b; a row is read as one piece."""
     p_a, p_b, S_a, S_b = pairs
@@ -130,13 +130,13 @@ def in_rows(pairs: PlanarPairs) -> Float:
     return rows
 
 
-@njit(cache=True)
+@kernel
 def _numbers(rows: Float, i: int) -> tuple[float, ...]:
     r = rows[i]
     return r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9]
 
 
-@njit(cache=True)
+@kernel_part
 def drift_needed(rows: Float, i: int, j: int, bound: float) -> float:
     """s_drift^2 from which on correspondences i and j of `in_rows` agree; negative: even without.
 
@@ -146,7 +146,7 @@ def drift_needed(rows: Float, i: int, j: int, bound: float) -> float:
     return _needed(_numbers(rows, i), _numbers(rows, j), bound)
 
 
-@njit(cache=True)
+@kernel_part
 def _agreeing(
     near: np.uint64,
     first: int,
@@ -169,7 +169,7 @@ def _agreeing(
     return low, high
 
 
-@njit(cache=True)
+@kernel
 def consistency(pairs: PlanarPairs, scales_m2: tuple[float, float], bound: float) -> np.ndarray:
     """Graphs of consistent correspondences, for a small and a large s_drift.
 

@@ -1,10 +1,10 @@
 """Whether the landmarks of pairs can determine a motion of the plane."""
 
 import numpy as np
-from numba import njit
 
 from mapfusion.align.pairs import Pairs
 from mapfusion.chi_square import chi_square_bound
+from mapfusion.kernels import kernel
 from mapfusion.se2 import Float
 
 # probability that points without extent pass for a shape by their noise alone
@@ -29,7 +29,7 @@ def lacks_extent(p: Float, covariance_m2: Float, drift_m2: float, dimensions: in
     return bool(spread[2 - dimensions] <= most)
 
 
-@njit(cache=True)
+@kernel
 def _moments(p: Float, covariance_m2: Float) -> tuple[Float, Float, float]:
     """In plan: scatter about the mean (2, 2), mean covariance (2, 2), largest coordinate."""
     n = len(p)

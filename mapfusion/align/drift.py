@@ -7,8 +7,8 @@ maps the residuals of true pairs have the covariance S_a + R S_b R^T + s_drift^2
 import math
 
 import numpy as np
-from numba import njit
 
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float
 
 # Below this nothing is measured: it only keeps the weights of noise-free data finite.
@@ -20,7 +20,7 @@ _BEYOND = 41.0
 _MOTION_PARAMETERS = 3
 
 
-@njit(cache=True)
+@kernel
 def _scoring(
     residual_m: Float, covariance_m2: Float, weight: Float, variance_m2: float, gate_m: float
 ) -> float:
@@ -53,7 +53,7 @@ def _scoring(
     return score / information
 
 
-@njit(cache=True)
+@kernel_part
 def drift_step(
     residual_m: Float, covariance_m2: Float, weight: Float, variance_m2: float, gate_m: float
 ) -> float:
@@ -62,7 +62,7 @@ def drift_step(
     return max(variance_m2 + step, DRIFT_FLOOR_M * DRIFT_FLOOR_M)
 
 
-@njit(cache=True)
+@kernel
 def _climb(residual_m: Float, covariance_m2: Float, variance_m2: float, gate_m: float) -> float:
     """s_drift^2 (at least the floor) where Fisher scoring takes no step.
 

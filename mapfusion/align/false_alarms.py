@@ -7,11 +7,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from mapfusion.align.closest import Grid, runs_about
 from mapfusion.align.pairs import MIN_PAIRS
 from mapfusion.align.rigid import fit_rigid
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.planar import moved_point
 from mapfusion.se2 import Float
 
@@ -53,7 +53,7 @@ def thin(p_a: Float, p_b: Float, patch_m: float) -> np.ndarray:
     return np.flatnonzero(_mark_thinned(p_a, p_b, patch_m, Grid.of(p_a)))
 
 
-@njit(cache=True)
+@kernel
 def _mark_thinned(p_a: Float, p_b: Float, patch_m: float, near_a: Grid) -> np.ndarray:
     kept = np.zeros(len(p_a), np.bool_)
     runs = np.empty((near_a.shape[1], 2), np.int64)
@@ -63,7 +63,7 @@ def _mark_thinned(p_a: Float, p_b: Float, patch_m: float, near_a: Grid) -> np.nd
     return kept
 
 
-@njit(cache=True)
+@kernel_part
 def _has_neighbour(
     i: int,
     p_a: Float,
@@ -82,7 +82,7 @@ def _has_neighbour(
     return False
 
 
-@njit(cache=True)
+@kernel
 def apart_by_less(p: Float, i: int, j: int, distance_m: float) -> bool:
     """Whether points i and j of (N, D) are less than a distance apart."""
     if abs(p[i, 0] - p[j, 0]) >= distance_m:  # most are already told apart by this
@@ -93,7 +93,7 @@ def apart_by_less(p: Float, i: int, j: int, distance_m: float) -> bool:
     return square < distance_m * distance_m
 
 
-@njit(cache=True)
+@kernel
 def log10_tail(k: int, n: int, p: float) -> float:
     """log10 of the probability of k or more successes in n trials; 0 up to the mean.
 
@@ -115,7 +115,7 @@ def log10_tail(k: int, n: int, p: float) -> float:
     return min((first + math.log(total)) / math.log(10.0), 0.0)
 
 
-@njit(cache=True)
+@kernel
 def moved_points(T_a_b: Float, p_b: Float) -> Float:
     """T p_b (n, 2)."""
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
@@ -125,7 +125,7 @@ def moved_points(T_a_b: Float, p_b: Float) -> Float:
     return moved
 
 
-@njit(cache=True)
+@kernel
 def residuals_m(T_a_b: Float, p_a: Float, p_b: Float) -> Float:
     """Distances (n,) in the plane between p_a and T p_b."""
     moved = moved_points(T_a_b, p_b)
@@ -135,7 +135,7 @@ def residuals_m(T_a_b: Float, p_a: Float, p_b: Float) -> Float:
     return distance
 
 
-@njit(cache=True)
+@kernel_part
 def nearest_first(distance: Float, n: int, gate_m: float) -> np.ndarray:
     """Rows (k,) among the first n whose distance (N,) is within the gate.
 
@@ -162,7 +162,7 @@ def nearest_first(distance: Float, n: int, gate_m: float) -> np.ndarray:
     return rows[:k]
 
 
-@njit(cache=True)
+@kernel_part
 def minimal_motion(p_a: Float, p_b: Float, supporters: np.ndarray, T_a_b: Float) -> Float:
     """The motion (3,) of two pairs nearest to T_a_b: least displacement of the supporters (RMS).
 
@@ -192,14 +192,14 @@ def minimal_motion(p_a: Float, p_b: Float, supporters: np.ndarray, T_a_b: Float)
     return found
 
 
-@njit(cache=True)
+@kernel_part
 def same_height(heights: Float, i: int, j: int) -> bool:
     """Whether landmark a of pair i and landmark b of pair j can have one height."""
     dz = heights[i, 0] - heights[j, 1]
     return dz * dz <= heights[i, 2] + heights[j, 3]
 
 
-@njit(cache=True)
+@kernel
 def possible_repairings(heights: Float) -> np.ndarray:
     """How many (i, j), i not j, can have one height, both among the first m + 1 pairs: (N,)."""
     counts = np.zeros(len(heights), np.int64)
@@ -216,7 +216,7 @@ def possible_repairings(heights: Float) -> np.ndarray:
     return counts
 
 
-@njit(cache=True)
+@kernel_part
 def agreeing_repairings(
     T_a_b: Float, pairs: IndependentPairs, gates_m: Float, first: int
 ) -> np.ndarray:
@@ -248,7 +248,7 @@ def agreeing_repairings(
     return agreeing
 
 
-@njit(cache=True)
+@kernel_part
 def chance_of_agreeing(agreeing: np.ndarray, possible: np.ndarray) -> Float:
     """The larger p (G,) of the selection's and all pairs', from counts (2, G) and (2,).
 
@@ -262,7 +262,7 @@ def chance_of_agreeing(agreeing: np.ndarray, possible: np.ndarray) -> Float:
     return p
 
 
-@njit(cache=True)
+@kernel
 def fewest_false_alarms(
     pairs: IndependentPairs, T_a_b: Float, gates_m: Float
 ) -> tuple[float, float, int, int]:

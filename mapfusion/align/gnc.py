@@ -5,13 +5,13 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numba import njit
 
 from mapfusion.align.consensus import Consensus
 from mapfusion.align.mahalanobis_gate import PlanarPairs, mean_variances
 from mapfusion.align.method import Fit, Undetermined
 from mapfusion.align.pairs import Pairs
 from mapfusion.align.rigid import fit_weighted
+from mapfusion.kernels import kernel
 from mapfusion.planar import residual
 from mapfusion.se2 import Float
 
@@ -38,7 +38,7 @@ class Gnc(Consensus):
         return self.settled(anneal(planar, mean_m2, self.bound)[0], pairs, planar)
 
 
-@njit(cache=True)
+@kernel
 def anneal(pairs: PlanarPairs, mean_m2: Float, bound: float) -> tuple[Float, Float]:
     """Alternate closed-form fits and weights while the cost goes from convex to truncated.
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 import numpy as np
-from numba import njit
 
 from mapfusion.align.box_tree import BoxTree
 from mapfusion.align.correspondences import Correspondences
@@ -15,6 +14,7 @@ from mapfusion.align.nearest_points import GROUP, Groups, look_up_group, room_fo
 from mapfusion.align.pairs import Pairs
 from mapfusion.align.rigid import fit_rigid
 from mapfusion.arguments import Range, require_in_range
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float
 
 MAX_ROUNDS = 200  # of pairing and solving
@@ -124,7 +124,7 @@ class ClosestPoints:
         )
 
 
-@njit(cache=True)
+@kernel
 def summed_square_distance(T_a_b: Float, groups: Groups, tree: BoxTree, most: float) -> float:
     """Sum over all points of the squared distance under T_a_b to the nearest point of the tree.
 
@@ -141,7 +141,7 @@ def summed_square_distance(T_a_b: Float, groups: Groups, tree: BoxTree, most: fl
     return total
 
 
-@njit(cache=True)
+@kernel
 def pair_and_solve(
     T_start: Float,
     max_rounds: int,
@@ -187,7 +187,7 @@ def pair_and_solve(
     return way, nearest, _CHANGES
 
 
-@njit(cache=True)
+@kernel_part
 def _row_of(T_a_b: Float, met: Float) -> int:
     """Where a motion (3,) is among (M, 3), to the last bit; -1: nowhere."""
     for row in range(len(met)):

@@ -7,9 +7,9 @@ is small because the motion follows it.
 import math
 
 import numpy as np
-from numba import njit
 
 from mapfusion.align.mahalanobis_gate import PlanarPairs, residual_covariance
+from mapfusion.kernels import kernel
 from mapfusion.planar import lever, residual
 from mapfusion.se2 import Float, transform_points
 
@@ -60,7 +60,7 @@ def why_one_pair(
     return f"rests on one correspondence: without it landmarks move by {moved_m:.2g} m"
 
 
-@njit(cache=True)
+@kernel
 def most_leverage(
     T_a_b: Float, pairs: PlanarPairs, variance_m2: float, truth: Float, covariance: Float
 ) -> int:

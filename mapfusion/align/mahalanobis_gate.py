@@ -9,9 +9,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from mapfusion.align.rigid import fit_weighted
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.planar import add_turned, residual
 from mapfusion.se2 import Float
 
@@ -35,7 +35,7 @@ class PlanarPairs(NamedTuple):
     S_b: Float
 
 
-@njit(cache=True)
+@kernel
 def mean_variances(pairs: PlanarPairs, variance_m2: float) -> Float:
     """Half the trace of C (N,): the residuals' variance per axis, the same for every theta."""
     S_a, S_b = pairs.S_a, pairs.S_b
@@ -46,7 +46,7 @@ def mean_variances(pairs: PlanarPairs, variance_m2: float) -> Float:
     return mean
 
 
-@njit(cache=True)
+@kernel
 def residual_covariance(
     cos: float, sin: float, S_a: Float, S_b: Float, i: int, variance_m2: float
 ) -> tuple[float, float, float]:
@@ -57,14 +57,14 @@ def residual_covariance(
     return xx + variance_m2, xy, yy + variance_m2
 
 
-@njit(cache=True)
+@kernel
 def _square_and_det(ex: float, ey: float, xx: float, xy: float, yy: float) -> tuple[float, float]:
     """e^T C^-1 e and |C| of one residual."""
     det = xx * yy - xy * xy
     return (yy * ex * ex - 2 * xy * ex * ey + xx * ey * ey) / det, det
 
 
-@njit(cache=True)
+@kernel
 def mark_supporters(
     T_a_b: Float,
     pairs: PlanarPairs,
@@ -96,7 +96,7 @@ def mark_supporters(
     return count, score
 
 
-@njit(cache=True)
+@kernel_part
 def log_likelihood(
     T_a_b: Float, pairs: PlanarPairs, variance_m2: float, share: float, area_m2: float
 ) -> float:
@@ -123,7 +123,7 @@ def log_likelihood(
     return log + math.log(product)
 
 
-@njit(cache=True)
+@kernel
 def settle(
     T_a_b: Float, pairs: PlanarPairs, variance_m2: float, bound: float, inside: np.ndarray
 ) -> int:
@@ -149,7 +149,7 @@ def settle(
     return count
 
 
-@njit(cache=True)
+@kernel
 def spread_area_m2(p: Float) -> float:
     """Area of the rectangle over which points (N, 2) with this spread would be uniform."""
     n = len(p)
@@ -165,7 +165,7 @@ def spread_area_m2(p: Float) -> float:
     return 12 * math.sqrt(max(xx * yy - xy * xy, 0.0))  # a side L has the variance L^2 / 12
 
 
-@njit(cache=True)
+@kernel
 def settle_at_best_scale(
     T_a_b: Float, pairs: PlanarPairs, variances_m2: Float, bound: float, inside: np.ndarray
 ) -> tuple[float, int]:

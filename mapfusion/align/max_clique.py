@@ -6,12 +6,12 @@ steps is that of Rossi et al. 2015, PMC).
 """
 
 import numpy as np
-from numba import njit
 
 from mapfusion.align.bits import WORD, count_common, trailing_zeros
+from mapfusion.kernels import kernel, kernel_part
 
 
-@njit(cache=True)
+@kernel_part
 def degrees(graph: np.ndarray) -> np.ndarray:
     """Number of neighbours (N,) of each vertex of a graph (N, W)."""
     degree = np.empty(len(graph), np.int64)
@@ -20,13 +20,13 @@ def degrees(graph: np.ndarray) -> np.ndarray:
     return degree
 
 
-@njit(cache=True)
+@kernel
 def has(bits: np.ndarray, v: int) -> bool:
     """Whether v is in a set (W,)."""
     return (bits[v // WORD] >> np.uint64(v % WORD)) & np.uint64(1) != 0
 
 
-@njit(cache=True)
+@kernel
 def members(bits: np.ndarray, into: np.ndarray) -> int:
     """Write the numbers of a set (W,) into `into`, ascending; returns how many there are."""
     count = 0
@@ -39,7 +39,7 @@ def members(bits: np.ndarray, into: np.ndarray) -> int:
     return count
 
 
-@njit(cache=True)
+@kernel
 def most_first(degree: np.ndarray) -> np.ndarray:
     """Vertices by descending degree (N,), those of one degree in their order (a counting sort).
 
@@ -59,7 +59,7 @@ def most_first(degree: np.ndarray) -> np.ndarray:
     return order
 
 
-@njit(cache=True)
+@kernel
 def everyone(n: int) -> np.ndarray:
     """The set (W,) of all numbers below n."""
     bits = np.zeros((n + WORD - 1) // WORD, np.uint64)
@@ -68,7 +68,7 @@ def everyone(n: int) -> np.ndarray:
     return bits
 
 
-@njit(cache=True)
+@kernel
 def keep_core(graph: np.ndarray, chosen: np.ndarray, least: int, rows: np.ndarray) -> int:
     """Take away from `chosen` (W,) until all that remain have `least` neighbours among them.
 
@@ -89,13 +89,13 @@ def keep_core(graph: np.ndarray, chosen: np.ndarray, least: int, rows: np.ndarra
     return n if n > least else 0
 
 
-@njit(cache=True)
+@kernel
 def may_hold(graph: np.ndarray, among: np.ndarray, size: int) -> bool:
     """Whether some vertices (W,) have neighbours enough for a clique of more than `size`."""
     return keep_core(graph, among.copy(), size, np.empty(len(graph), np.int64)) > 0
 
 
-@njit(cache=True)
+@kernel
 def greedy_clique(graph: np.ndarray, starts: int) -> np.ndarray:
     """A large clique: from each of the vertices of most neighbours, add the next of most that fits.
 
@@ -129,7 +129,7 @@ def greedy_clique(graph: np.ndarray, starts: int) -> np.ndarray:
     return best[:size_of_best].copy()
 
 
-@njit(cache=True)
+@kernel
 def colour(
     graph: np.ndarray,
     candidates: np.ndarray,
@@ -170,7 +170,7 @@ def colour(
                     count += 1
 
 
-@njit(cache=True)
+@kernel_part
 def _branch_and_bound(graph: np.ndarray, at_least: int, budget: int) -> tuple[np.ndarray, int]:
     """Maximum clique (K,) of a small graph (n, W) if larger than `at_least`, else empty.
 
@@ -217,7 +217,7 @@ def _branch_and_bound(graph: np.ndarray, at_least: int, budget: int) -> tuple[np
     return best, budget
 
 
-@njit(cache=True)
+@kernel_part
 def _subgraph(graph: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """The graph (n, ceil(n / 64)) of some vertices (n,), numbered 0 to n - 1."""
     n = len(rows)
@@ -229,7 +229,7 @@ def _subgraph(graph: np.ndarray, rows: np.ndarray) -> np.ndarray:
     return small
 
 
-@njit(cache=True)
+@kernel
 def larger_clique(
     graph: np.ndarray, among: np.ndarray, at_least: int, budget: int
 ) -> tuple[np.ndarray, bool]:

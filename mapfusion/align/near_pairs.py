@@ -8,9 +8,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from mapfusion.align.mahalanobis_gate import PlanarPairs
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.planar import residual
 from mapfusion.se2 import Float
 
@@ -38,7 +38,7 @@ class NearPairs(NamedTuple):
     truth: Float
 
 
-@njit(cache=True)
+@kernel
 def near_pairs(T_a_b: Float, pairs: PlanarPairs, gate_m: float, inside: np.ndarray) -> NearPairs:
     """The pairs in reach under a motion, and those `inside` (N,) already, which stay so."""
     rows = rows_in_reach(T_a_b, pairs, gate_m, inside)
@@ -50,14 +50,14 @@ def near_pairs(T_a_b: Float, pairs: PlanarPairs, gate_m: float, inside: np.ndarr
     return near
 
 
-@njit(cache=True)
+@kernel
 def at_rows(values: np.ndarray, rows: np.ndarray, among: np.ndarray) -> None:
     """Put values (n,) at rows (n,) of others (N,)."""
     for k in range(len(rows)):
         among[rows[k]] = values[k]
 
 
-@njit(cache=True)
+@kernel_part
 def rows_in_reach(T_a_b: Float, pairs: PlanarPairs, gate_m: float, also: np.ndarray) -> np.ndarray:
     """Rows (n,) of pairs that lie within the gate or its margin, and of those marked (N,)."""
     p_a, p_b = pairs.p_a, pairs.p_b
@@ -71,7 +71,7 @@ def rows_in_reach(T_a_b: Float, pairs: PlanarPairs, gate_m: float, also: np.ndar
     return rows[:n]
 
 
-@njit(cache=True)
+@kernel_part
 def those_of(pairs: PlanarPairs, rows: np.ndarray) -> PlanarPairs:
     """Some of the pairs, by their rows (n,)."""
     p_a, p_b, S_a, S_b = pairs
@@ -86,7 +86,7 @@ def those_of(pairs: PlanarPairs, rows: np.ndarray) -> PlanarPairs:
     return some
 
 
-@njit(cache=True)
+@kernel
 def farthest_m(p: Float) -> float:
     """Distance from the origin of the farthest of points (N, 2)."""
     square = 0.0
@@ -95,7 +95,7 @@ def farthest_m(p: Float) -> float:
     return math.sqrt(square)
 
 
-@njit(cache=True)
+@kernel_part
 def leaves_margin(T_a_b: Float, before: Float, gate_m: float, farthest_m: float) -> bool:
     """Whether two motions may lay a point no farther off than that apart by more than the margin.
 

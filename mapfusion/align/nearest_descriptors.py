@@ -8,9 +8,9 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from mapfusion.align.bits import WORD, packed, trailing_zeros
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.se2 import Float
 
@@ -105,7 +105,7 @@ class _Coarse(NamedTuple):
     most: np.ndarray  # what each adds to the most that the squared difference of heights may be
 
 
-@njit(cache=True)
+@kernel
 def _coarse(side: _Side, rows: np.ndarray, height_bound: float) -> _Coarse:
     """Some landmarks (n,) in single precision, with what its rounding needs."""
     n = len(rows)
@@ -124,7 +124,7 @@ def _coarse(side: _Side, rows: np.ndarray, height_bound: float) -> _Coarse:
     return _Coarse(square, best, z, most)
 
 
-@njit(cache=True)
+@kernel_part
 def _mark_nearer(
     product: np.ndarray,
     square: np.ndarray,
@@ -145,7 +145,7 @@ def _mark_nearer(
         near[k] = (distance2 <= max(best[k], best0)) & (dz * dz <= most[k] + most0)
 
 
-@njit(cache=True)
+@kernel
 def _take_nearer(
     product: np.ndarray,
     rows: np.ndarray,
@@ -196,14 +196,14 @@ def _take_nearer(
             first, end = end, 2 * end
 
 
-@njit(cache=True)
+@kernel_part
 def _apart_by_less(p: Float, i: int, q: Float, j: int, distance_m: float) -> bool:
     """Whether point i of (N, 2) and point j of others are less than a distance apart."""
     dx, dy = p[i, 0] - q[j, 0], p[i, 1] - q[j, 1]
     return dx * dx + dy * dy < distance_m * distance_m
 
 
-@njit(cache=True)
+@kernel
 def _take(side: _Side, i: int, j: int, distance2: float) -> None:
     """Take j for the nearest of i if it is; of equally near ones the first."""
     known = side.distance2[i]

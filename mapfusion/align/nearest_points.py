@@ -9,9 +9,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from mapfusion.align.box_tree import BoxTree, halve, span
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.planar import moved_point
 from mapfusion.se2 import Float
 
@@ -62,14 +62,14 @@ class Room(NamedTuple):
     away: Float
 
 
-@njit(cache=True)
+@kernel
 def room_for_groups() -> Room:
     """One for any number of groups, one after the other."""
     x, y, z, nearest = np.empty(GROUP), np.empty(GROUP), np.empty(GROUP), np.empty(GROUP)
     return Room(x, y, z, nearest, np.empty(GROUP), np.empty(_DEEPEST, np.int64), np.empty(_DEEPEST))
 
 
-@njit(cache=True)
+@kernel
 def _in_groups(p: Float) -> np.ndarray:
     """Rows of p (N, 3) such that each GROUP of them lie near each other."""
     row, n_todo = np.arange(len(p)), 1
@@ -93,7 +93,7 @@ def _in_groups(p: Float) -> np.ndarray:
     return row
 
 
-@njit(cache=True)
+@kernel
 def look_up_group(
     T_a_b: Float, first: int, groups: Groups, tree: BoxTree, nearest: np.ndarray, room: Room
 ) -> None:
@@ -123,7 +123,7 @@ def look_up_group(
     _descend(tree, room)
 
 
-@njit(cache=True, inline="always")
+@kernel_part
 def _largest(values: Float) -> float:
     largest = values[0]
     for q in range(1, GROUP):
@@ -131,13 +131,13 @@ def _largest(values: Float) -> float:
     return largest
 
 
-@njit(cache=True, inline="always")
+@kernel_part
 def _between(low: float, high: float, box_low: float, box_high: float) -> float:
     """How far two intervals are apart."""
     return max(box_low - high, low - box_high, 0.0)
 
 
-@njit(cache=True)
+@kernel_part
 def _descend(tree: BoxTree, room: Room) -> None:
     """Go down the tree with a group, to the nearest boxes first."""
     _, px, py, pz, _, box, starts, ends = tree
@@ -179,7 +179,7 @@ def _descend(tree: BoxTree, room: Room) -> None:
         node = nodes[n_todo]
 
 
-@njit(cache=True, inline="always")
+@kernel_part
 def _compare(
     k: int,
     px: float,

@@ -6,11 +6,11 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from mapfusion.align.correspondences import Correspondences, HeightGate
 from mapfusion.align.mahalanobis_gate import PlanarPairs
 from mapfusion.align.result import Alignment, degenerate
+from mapfusion.kernels import kernel
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.se2 import Float
 
@@ -119,7 +119,7 @@ class Pairs:
         )
 
 
-@njit(cache=True)
+@kernel
 def _in_plan(p_a: Float, p_b: Float, covariance_a: Float, covariance_b: Float) -> PlanarPairs:
     n = len(p_a)
     plan = PlanarPairs(np.empty((n, 2)), np.empty((n, 2)), np.empty((n, 2, 2)), np.empty((n, 2, 2)))

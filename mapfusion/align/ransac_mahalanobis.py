@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 import numpy as np
-from numba import njit
 
 from mapfusion.align.consensus import Consensus
 from mapfusion.align.consistency import drift_needed, in_rows
@@ -16,6 +15,7 @@ from mapfusion.align.ransac import draw_pair
 from mapfusion.align.rigid import fit_two
 from mapfusion.arguments import Probability, Range
 from mapfusion.chi_square import chi_square_bound
+from mapfusion.kernels import kernel
 from mapfusion.se2 import Float
 
 
@@ -56,7 +56,7 @@ class RansacMahalanobis(Consensus):
         return self.settled(T_a_b, pairs, planar)
 
 
-@njit(cache=True)
+@kernel
 def least_truncated_squares(
     pairs: PlanarPairs,
     variance_m2: float,

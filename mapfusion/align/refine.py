@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
-from numba import njit
 
 from mapfusion.align.calibration_part import calibration_part
 from mapfusion.align.correspondences import HeightGate
@@ -18,6 +17,7 @@ from mapfusion.align.near_pairs import at_rows, farthest_m, leaves_margin, near_
 from mapfusion.align.pairs import MIN_PAIRS, Pairs, undetermined
 from mapfusion.align.result import Alignment, Status
 from mapfusion.arguments import Range, require_in_range, require_shape
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.planar import add_turned, lever, residual
 from mapfusion.se2 import Float, transform_points, wrap
 from mapfusion.symmetric import cofactors
@@ -133,7 +133,7 @@ class Refinement:
         return max(self.gate_m, _GATE_SIGMAS**2 * math.sqrt(np.mean(np.sum(off**2, axis=1))))
 
 
-@njit(cache=True)
+@kernel_part
 def residuals_under(T_a_b: Float, pairs: PlanarPairs, e: Float, S: Float) -> None:
     """Fill e = p_a - T p_b (N, 2) and S = S_a + R S_b R^T (N, 2, 2)."""
     p_a, p_b, S_a, S_b = pairs
@@ -146,7 +146,7 @@ def residuals_under(T_a_b: Float, pairs: PlanarPairs, e: Float, S: Float) -> Non
         S[i, 0, 1] = S[i, 1, 0] = S_a[i, 0, 1] + turned_xy
 
 
-@njit(cache=True)
+@kernel_part
 def truth_probabilities(
     e: Float,
     S: Float,
@@ -170,7 +170,7 @@ def truth_probabilities(
             truth[i] = true_density / (true_density + false_density)
 
 
-@njit(cache=True)
+@kernel_part
 def normal_equations(
     T_a_b: Float, p_b: Float, e: Float, S: Float, variance_m2: float, truth: Float
 ) -> tuple[Float, Float]:
@@ -199,7 +199,7 @@ def normal_equations(
     return normal, right
 
 
-@njit(cache=True)
+@kernel_part
 def missing_information(
     T_a_b: Float,
     p_b: Float,
@@ -236,7 +236,7 @@ def missing_information(
     return missing
 
 
-@njit(cache=True)
+@kernel
 def invert(matrix: Float, inverse: Float) -> bool:
     """Fill the inverse (3, 3) of a symmetric matrix; False unless positive definite."""
     a, d, f = matrix[0, 0], matrix[1, 1], matrix[2, 2]
@@ -251,7 +251,7 @@ def invert(matrix: Float, inverse: Float) -> bool:
     return True
 
 
-@njit(cache=True)
+@kernel_part
 def _farthest_moved(T_a_b: Float, step: Float, p_b: Float, truth: Float) -> float:
     """How far a step (3,) moves the landmark that it moves farthest, in m."""
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
@@ -264,7 +264,7 @@ def _farthest_moved(T_a_b: Float, step: Float, p_b: Float, truth: Float) -> floa
     return math.sqrt(square)
 
 
-@njit(cache=True)
+@kernel
 def maximise_likelihood(
     pairs: PlanarPairs, T_start: Float, gate_m: float, least_drift_m: float, max_rounds: int
 ) -> tuple[bool, float, Float, np.ndarray, float, Float]:
@@ -324,14 +324,14 @@ def maximise_likelihood(
     return determined, moved, T_a_b, covariance, variance, truth_of_all
 
 
-@njit(cache=True)
+@kernel_part
 def _mark_inside(e: Float, gate_m: float, inside: np.ndarray) -> None:
     """Mark which residuals (n, 2) lie within the gate."""
     for i in range(len(e)):
         inside[i] = e[i, 0] * e[i, 0] + e[i, 1] * e[i, 1] <= gate_m * gate_m
 
 
-@njit(cache=True)
+@kernel_part
 def _times(matrix: Float, vector: Float, product: Float) -> None:
     """Fill the product (3,) of a matrix (3, 3) and a vector (3,)."""
     for k in range(3):

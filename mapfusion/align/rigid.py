@@ -3,13 +3,13 @@
 import math
 
 import numpy as np
-from numba import njit
 
+from mapfusion.kernels import kernel
 from mapfusion.planar import add_turned, lever, residual
 from mapfusion.se2 import Float, rotation
 
 
-@njit(cache=True)
+@kernel
 def _fit_rows(
     p_a: Float, p_b: Float, rows: np.ndarray, weight: Float
 ) -> tuple[float, float, float]:
@@ -38,7 +38,7 @@ def _fit_rows(
     return ax - cos * bx + sin * by, ay - sin * bx - cos * by, theta
 
 
-@njit(cache=True)
+@kernel
 def fit_rigid(p_a: Float, p_b: Float, rows: np.ndarray) -> tuple[float, float, float]:
     """tx, ty, theta that minimise the summed squared distance in the plane of p_a to T p_b.
 
@@ -47,13 +47,13 @@ def fit_rigid(p_a: Float, p_b: Float, rows: np.ndarray) -> tuple[float, float, f
     return _fit_rows(p_a, p_b, rows, np.ones(len(rows)))
 
 
-@njit(cache=True)
+@kernel
 def fit_weighted(p_a: Float, p_b: Float, weight: Float, T_a_b: Float) -> None:
     """Fill T_a_b (3,) that minimises the sum of weight (N,) times |p_a - T p_b|^2."""
     T_a_b[0], T_a_b[1], T_a_b[2] = _fit_rows(p_a, p_b, np.arange(len(weight)), weight)
 
 
-@njit(cache=True)
+@kernel
 def fit_two(p_a: Float, p_b: Float, i: int, j: int, T_a_b: Float) -> float:
     """Fill T_a_b (3,) with the motion of pairs i and j; returns the shorter of their distances."""
     ax, ay = p_a[j, 0] - p_a[i, 0], p_a[j, 1] - p_a[i, 1]
@@ -67,7 +67,7 @@ def fit_two(p_a: Float, p_b: Float, i: int, j: int, T_a_b: Float) -> float:
     return math.sqrt(min(ax * ax + ay * ay, bx * bx + by * by))
 
 
-@njit(cache=True)
+@kernel
 def residuals(T_a_b: Float, p_a: Float, p_b: Float) -> Float:
     """p_a - T_a_b p_b in the plane (N, 2)."""
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
@@ -77,7 +77,7 @@ def residuals(T_a_b: Float, p_a: Float, p_b: Float) -> Float:
     return found
 
 
-@njit(cache=True)
+@kernel
 def residual_covariances(T_a_b: Float, covariance_a: Float, covariance_b: Float) -> Float:
     """S_a + R S_b R^T in the plane (N, 2, 2): what the landmarks' own noise makes of a residual."""
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
@@ -103,7 +103,7 @@ def least_squares_gain(T_a_b: Float, p_b: Float, weight: Float | None = None) ->
     return _gain(T_a_b, p_b, given, inverse)
 
 
-@njit(cache=True)
+@kernel
 def _normal_matrix(T_a_b: Float, p_b: Float, weight: Float) -> Float:
     """Sum of weight J'J (3, 3), J the `motion_jacobian` of a point."""
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
@@ -117,7 +117,7 @@ def _normal_matrix(T_a_b: Float, p_b: Float, weight: Float) -> Float:
     return np.array([[total, 0.0, x], [0.0, total, y], [x, y, square]])
 
 
-@njit(cache=True)
+@kernel
 def _gain(T_a_b: Float, p_b: Float, weight: Float, inverse: Float) -> Float:
     """Weight times the normal matrix' inverse (3, 3) times J' (N, 3, 2)."""
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
@@ -130,7 +130,7 @@ def _gain(T_a_b: Float, p_b: Float, weight: Float, inverse: Float) -> Float:
     return gain
 
 
-@njit(cache=True)
+@kernel
 def motion_covariance(gain: Float, covariance_m2: Float) -> Float:
     """Covariance (3, 3) of a motion from its gains (N, 3, 2) and independent residuals' (N, 2, 2).
 

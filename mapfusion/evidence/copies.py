@@ -4,9 +4,9 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from mapfusion.align.closest import Grid, runs_about
+from mapfusion.kernels import kernel
 
 # A place is that of a landmark, as far about it as the smallest posters are wide (half a metre):
 # neighbouring corners of one picture.
@@ -46,7 +46,7 @@ def of_others(copies: Sequence[Copies], own: int) -> Copies:
     return first.joined(each for k, each in enumerate(copies) if k != own)
 
 
-@njit(cache=True)
+@kernel
 def about_each(counted: np.ndarray, near: Grid) -> np.ndarray:
     """How many of the landmarks about each (N,) are `counted` (N,), itself among them."""
     p, row_of = near.p, near.row

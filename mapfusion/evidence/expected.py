@@ -4,10 +4,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from mapfusion.align.bits import WORD, ones, packed, trailing_zeros
 from mapfusion.evidence.watch import BEHIND_M, CELLS, ROUNDING, STRETCH, Parts, Poses, Watch
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float
 
 # In which it lay in view: a track is observed from its third frame on, and after three observations
@@ -52,7 +52,7 @@ class Seen(NamedTuple):
     distance_m: Float
 
 
-@njit(cache=True)
+@kernel
 def how_seen(seen: Seen, watch: Watch) -> np.ndarray:
     """UNSEEN, MAY or MUST (N,) of each landmark: LEAST_FRAMES frames or more had it in view so."""
     p, direction, distance_m = seen
@@ -94,7 +94,7 @@ def how_seen(seen: Seen, watch: Watch) -> np.ndarray:
     return how
 
 
-@njit(cache=True)
+@kernel_part
 def _mark_possible(
     own: tuple[float, float, float, float, float, float],
     x: Float,
@@ -128,7 +128,7 @@ def _mark_possible(
         )
 
 
-@njit(cache=True)
+@kernel_part
 def _look(
     sight: tuple[float, float, float, float, float],
     c: int,
@@ -180,7 +180,7 @@ def _look(
         said[k] = may * ((1 << _MAY_BIT) + (alike << _ALIKE_BIT) + (unsure << _UNSURE_BIT))
 
 
-@njit(cache=True)
+@kernel_part
 def _is_in_view(
     sight: tuple[float, float, float, float, float],
     c: int,

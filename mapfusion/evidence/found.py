@@ -4,9 +4,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from mapfusion.align.closest import Grid, runs_about
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float
 
 # Of a descriptor's dimensions, those after which it is asked whether the distance is too large yet.
@@ -46,7 +46,7 @@ class Gates(NamedTuple):
     unlike: float
 
 
-@njit(cache=True)
+@kernel
 def has(p: Float, rows: np.ndarray, own: Looks, other: Looks, gates: Gates) -> np.ndarray:
     """Bool (n,): whether `other` has some `rows` (n,) of `own`, whose places are p (N, 3) there.
 
@@ -78,7 +78,7 @@ def has(p: Float, rows: np.ndarray, own: Looks, other: Looks, gates: Gates) -> n
     return found
 
 
-@njit(cache=True)
+@kernel_part
 def _alike(own: np.ndarray, i: int, other: np.ndarray, j: int, most: float) -> bool:
     """Whether descriptors i and j of (N, D) are no more than so much apart, squared."""
     square = 0.0

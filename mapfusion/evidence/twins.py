@@ -3,10 +3,10 @@
 import math
 
 import numpy as np
-from numba import njit
 
 from mapfusion.align.correspondences import Correspondences, HeightGate
 from mapfusion.align.nearest_descriptors import nearest_both_ways
+from mapfusion.kernels import kernel
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.se2 import Float
 
@@ -35,7 +35,7 @@ def twins(landmarks: LandmarkMap) -> Correspondences:
     return Correspondences(rows[kept], nearest[kept], unlike[kept])
 
 
-@njit(cache=True)
+@kernel
 def largest_patch_m(p: Float, reach_m: float, least: int) -> float:
     """The longest side of the largest patch of points (n, 2), 0 of none.
 

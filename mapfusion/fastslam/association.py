@@ -8,13 +8,13 @@ from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from mapfusion.fastslam.boxes import touches
 from mapfusion.fastslam.particles import ParticleMaps
 from mapfusion.fastslam.sensor import Sightings, innovation, quadratic_form
 from mapfusion.fastslam.slots import Estimates, Slots
 from mapfusion.fastslam.update import DROPPED, NEW
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float
 
 _PART = 16  # entries of a descriptor that are compared at a time
@@ -35,7 +35,7 @@ class Pairs(NamedTuple):
     slot: np.ndarray  # (P,)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def boxes_of(seen: Sightings, gate: float) -> Float:
     """Boxes (K, 4) of observations and their gates over all particles."""
     boxes = np.empty((len(seen.point_m), 4))
@@ -95,7 +95,7 @@ def pairs_of_labels(
     return Pairs(known, slot[known]), first & (slot < 0)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _touching(
     slots: Slots, names: np.ndarray, boxes: Float, descriptor: np.ndarray, threshold: np.float32
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -114,7 +114,7 @@ def _touching(
     return observation[:n], slot[:n], distance[:n]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part(error_model="numpy")
 def _unlikeness(
     descriptor: np.ndarray, k: int, known: np.ndarray, s: int, threshold: np.float32
 ) -> np.float32:
@@ -167,13 +167,13 @@ def choose(
     return chosen, used[taken.any(axis=1)]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _distance(seen: Sightings, k: int, own: Estimates, r: int, m: int, planar: bool) -> float:
     difference, inverse, _ = innovation(seen, k, own, r, m, planar)
     return quadratic_form(difference, inverse)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _take_in_order(
     slots: Slots,
     pairs: Pairs,
@@ -195,7 +195,7 @@ def _take_in_order(
                 taken[j, m] = True
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part(error_model="numpy")
 def _sort_inside(distance: Float, gate: float, order: np.ndarray) -> int:
     """Write the pairs inside the gate into `order`, nearest first, the first on a tie; how many.
 
@@ -213,7 +213,7 @@ def _sort_inside(distance: Float, gate: float, order: np.ndarray) -> int:
     return n
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _take_nearest(
     slots: Slots,
     pairs: Pairs,
@@ -240,7 +240,7 @@ def _take_nearest(
                 taken[j, m] = True
 
 
-@njit(cache=True)
+@kernel
 def sources(slots: Slots, chosen: np.ndarray, first_source: int) -> np.ndarray:
     """(K, M) int32 source of the landmark that each observation went into, -1 if it was dropped.
 

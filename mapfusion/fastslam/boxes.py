@@ -1,13 +1,13 @@
 """Where landmarks may be matched: boxes around their means and gates, and a search among them."""
 
 import numpy as np
-from numba import njit
 
 from mapfusion.fastslam.slots import BLOCK, COMMON, Slots
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float
 
 
-@njit(cache=True)
+@kernel
 def bound(slots: Slots, which: np.ndarray, gate: float) -> None:
     """Write the boxes of slots that are up to date, and of their blocks."""
     for s in which:
@@ -40,7 +40,7 @@ def bound(slots: Slots, which: np.ndarray, gate: float) -> None:
             bound_block(slots, last)
 
 
-@njit(cache=True)
+@kernel_part
 def bend_box(slots: Slots, s: int, motion: Float) -> None:
     """Put a box around what is in it after a motion (3,) of the plane."""
     box = slots.box_m[s]
@@ -53,7 +53,7 @@ def bend_box(slots: Slots, s: int, motion: Float) -> None:
     box[0], box[1], box[2], box[3] = x - wide_x, y - wide_y, x + wide_x, y + wide_y
 
 
-@njit(cache=True)
+@kernel
 def bound_block(slots: Slots, block: int) -> None:
     """Write the box of a block around those of its slots."""
     around = slots.block_box_m[block]
@@ -65,7 +65,7 @@ def bound_block(slots: Slots, block: int) -> None:
         around[3] = max(around[3], slots.box_m[s, 3])
 
 
-@njit(cache=True)
+@kernel
 def touches(boxes: Float, i: int, box: Float) -> bool:
     """Whether row i of boxes (N, 4) and a box (4,) have a point in common."""
     x = (boxes[i, 0] <= box[2]) & (boxes[i, 2] >= box[0])
@@ -73,7 +73,7 @@ def touches(boxes: Float, i: int, box: Float) -> bool:
     return x & y
 
 
-@njit(cache=True)
+@kernel
 def near(slots: Slots, box: Float) -> np.ndarray:
     """Slots, ascending, whose boxes touch a box (4,)."""
     blocks = np.empty(len(slots.block_box_m), dtype=np.int64)

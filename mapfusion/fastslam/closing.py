@@ -3,12 +3,12 @@
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from mapfusion.fastslam.bends import SPACING, Bends
 from mapfusion.fastslam.sensor import Sightings, innovation, quadratic_form
 from mapfusion.fastslam.slots import Slots
 from mapfusion.fastslam.update import NEW
+from mapfusion.kernels import kernel
 from mapfusion.se2 import Float
 from mapfusion.symmetric import cholesky, solve_lower, solve_upper
 
@@ -87,7 +87,7 @@ def close_loops(
     return drift
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _pose_in_view(
     slots: Slots, frame: Seen, rows: np.ndarray, by_odometry: Float
 ) -> tuple[Float, Float]:
@@ -123,7 +123,7 @@ def _pose_in_view(
     return motion, covariance
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _add_evidence(
     slots: Slots, frame: Seen, rows: np.ndarray, motion: Float, information: Float, pull: Float
 ) -> None:

@@ -5,7 +5,8 @@ they were written, and are read through the ancestors since.
 """
 
 import numpy as np
-from numba import njit
+
+from mapfusion.kernels import kernel
 
 # Generations that are remembered. Every landmark is written at least once in this many resamplings
 # (see `particles.py`); a longer memory costs each resampling more, a shorter one makes that
@@ -30,7 +31,7 @@ class Genealogy:
     # `ancestors[g % MEMORY, m]` is the ancestor in generation g of the present particle m.
 
 
-@njit(cache=True)
+@kernel
 def _compose(table: np.ndarray, ancestors: np.ndarray, newest: int, shared: int) -> int:
     """Follow a resampling, in the generations where it makes a difference; the new `shared`."""
     n_particles = table.shape[1]

@@ -7,7 +7,6 @@ once the particles' lines have met, and a step costs what is in view.
 """
 
 import numpy as np
-from numba import njit
 
 from mapfusion.fastslam.boxes import bend_box, bound, bound_block, near
 from mapfusion.fastslam.genealogy import MEMORY, Genealogy
@@ -24,6 +23,7 @@ from mapfusion.fastslam.slots import (
     with_room,
 )
 from mapfusion.fastslam.update import NEW
+from mapfusion.kernels import kernel
 from mapfusion.robot_log import Observations
 from mapfusion.se2 import Float
 
@@ -191,7 +191,7 @@ class _Pool:
         self._free.extend(numbers.tolist())
 
 
-@njit(cache=True)
+@kernel
 def _bend(slots: Slots, which: np.ndarray, T_map_bent: Float) -> None:
     for s in which:
         motion = T_map_bent[s]
@@ -209,7 +209,7 @@ def _bend(slots: Slots, which: np.ndarray, T_map_bent: Float) -> None:
         bound_block(slots, block)
 
 
-@njit(cache=True)
+@kernel
 def _inherit(slots: Slots, which: np.ndarray, ancestors: np.ndarray, generation: int) -> np.ndarray:
     own, common = slots.own, slots.common
     n_particles = own.count.shape[1]
@@ -240,7 +240,7 @@ def _inherit(slots: Slots, which: np.ndarray, ancestors: np.ndarray, generation:
     return alive
 
 
-@njit(cache=True)
+@kernel
 def _settle(slots: Slots, which: np.ndarray) -> np.ndarray:
     """Note what is common to all particles; for each slot whether all is."""
     own = slots.own
@@ -260,7 +260,7 @@ def _settle(slots: Slots, which: np.ndarray) -> np.ndarray:
     return same
 
 
-@njit(cache=True)
+@kernel
 def _initialise(
     slots: Slots,
     created: np.ndarray,

@@ -14,10 +14,10 @@ sigma * eta, and eta is standard normal before anything is seen.
 from enum import StrEnum
 
 import numpy as np
-from numba import njit
 
 from mapfusion.fastslam.sensor import Sightings, innovation, quadratic_form
 from mapfusion.fastslam.slots import LANES, Slots
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float
 from mapfusion.symmetric import cholesky, solve_lower, solve_upper
 
@@ -47,7 +47,7 @@ def widened(
     return Sightings(predicted.point_m, covariance)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _widen(point: Float, covariance: Float, pose: Float, turn: float, sigma: Float) -> None:
     a, b, w = sigma[0] ** 2, sigma[1] ** 2, sigma[2] ** 2
     by_odometry = np.empty((len(pose), 3))
@@ -64,7 +64,7 @@ def _widen(point: Float, covariance: Float, pose: Float, turn: float, sigma: Flo
             covariance[k, m, 3] += by_odometry[m, 2] + w * dx * dx
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def informed_disturbance(
     slots: Slots,
     chosen: np.ndarray,
@@ -111,7 +111,7 @@ def informed_disturbance(
     return eta, log_ratio
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part(error_model="numpy")
 def _draw(root: Float, standard_normal: Float, pull: Float, eta: Float) -> float:
     """Draw about eta (3,), in place; the log of the density before over that of the draw."""
     # the precision is root root^T, so root^-T times a standard normal has its inverse
@@ -125,7 +125,7 @@ def _draw(root: Float, standard_normal: Float, pull: Float, eta: Float) -> float
     return 0.5 * (drawn - prior) - np.log(root[0, 0] * root[1, 1] * root[2, 2])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part(error_model="numpy")
 def _gather_pairs(
     slots: Slots,
     chosen: np.ndarray,
@@ -163,7 +163,7 @@ def _gather_pairs(
     return n
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part(error_model="numpy")
 def _put_linearised(
     before: float, sigma: Float, eta: Float, lane: int, at: Float, system: Float
 ) -> None:
@@ -182,7 +182,7 @@ def _put_linearised(
         system[(6 + i) * LANES + lane] = 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part(error_model="numpy")
 def _take_system(system: Float, lane: int, normal: Float, right: Float) -> None:
     """A particle's precision (3, 3) of eta, its lower half, and the gradient (3,)."""
     for i in range(3):
@@ -194,7 +194,7 @@ def _take_system(system: Float, lane: int, normal: Float, right: Float) -> None:
 
 # One loop over all lanes, which a processor takes several at a time, without a call, a branch, or
 # an array of two dimensions in it: with these each is taken alone.
-@njit(cache=True, error_model="numpy")
+@kernel_part(error_model="numpy")
 def _add_pairs(pairs: Float, sigma_turn: float, gate: float, at: Float, system: Float) -> None:
     """Add what pairs say to the gradients of the log density at eta, and to the precisions."""
     for n in range(len(pairs)):

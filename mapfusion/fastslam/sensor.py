@@ -11,9 +11,9 @@ Symmetric matrices are their six upper entries: xx, xy, xz, yy, yz, zz.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from mapfusion.fastslam.slots import Estimates
+from mapfusion.kernels import kernel
 from mapfusion.planar import add_turned
 from mapfusion.se2 import Float
 from mapfusion.symmetric import cofactors
@@ -40,7 +40,7 @@ def sightings(
     return seen
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _turn_into_map(
     T_map_robot: Float, position: Float, covariance: Float, planar: bool, seen: Sightings
 ) -> None:
@@ -65,7 +65,7 @@ def _turn_into_map(
 
 # Division is NumPy's in the filter's kernels (`error_model`): a check for zero at each one keeps
 # LLVM from inlining what divides. No Z is singular: a frame with a singular R_t is refused.
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def inverse_and_determinant(
     xx: float, xy: float, xz: float, yy: float, yz: float, zz: float
 ) -> tuple[Upper, float]:
@@ -75,7 +75,7 @@ def inverse_and_determinant(
     return (f * axx, f * axy, f * axz, f * ayy, f * ayz, f * azz), determinant
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def innovation(
     seen: Sightings, k: int, own: Estimates, r: int, m: int, planar: bool
 ) -> tuple[Vector, Upper, float]:
@@ -100,7 +100,7 @@ def innovation(
     return difference, inverse, determinant
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def quadratic_form(difference: Vector, inverse: Upper) -> float:
     """Squared Mahalanobis distance: d^T Z^-1 d."""
     dx, dy, dz = difference

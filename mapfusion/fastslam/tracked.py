@@ -5,9 +5,9 @@ about the one is less so about the other, and about the point that the next trac
 """
 
 import numpy as np
-from numba import njit
 
 from mapfusion.fastslam.slots import FREE, Slots
+from mapfusion.kernels import kernel
 
 
 class Tracked:
@@ -43,7 +43,7 @@ class Tracked:
         self._source = slots.source[self._slot]
 
 
-@njit(cache=True)
+@kernel
 def _distinct(chosen: np.ndarray) -> np.ndarray:
     """Rows and slots (n, 2) of `chosen` (K, M), each once: most particles choose the same slot."""
     pairs = np.empty((chosen.size, 2), dtype=np.int64)

@@ -1,10 +1,10 @@
 """The Kalman filter of one landmark in one particle, and its weight (eq. 4-10)."""
 
 import numpy as np
-from numba import njit
 
 from mapfusion.fastslam.sensor import Sightings, inverse_and_determinant, quadratic_form
 from mapfusion.fastslam.slots import LANES, Estimates, Slots
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float
 
 NEW = -1  # the particle has no such landmark yet
@@ -14,7 +14,7 @@ DROPPED = -2  # the observation is used for nothing
 _MEAN, _OFF, _SIGMA, _NOISE, _ROWS = 2, 5, 8, 14, 20
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def update_landmarks(
     slots: Slots, chosen: np.ndarray, seen: Sightings, log_new: Float, planar: bool
 ) -> Float:
@@ -42,7 +42,7 @@ def update_landmarks(
     return log_likelihood
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part(error_model="numpy")
 def _gather(
     slots: Slots,
     chosen: np.ndarray,
@@ -68,7 +68,7 @@ def _gather(
             rows[(_NOISE + i) * LANES + lane] = noise[k, m, i]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part(error_model="numpy")
 def _put_back(own: Estimates, r: int, m: int, lane: int, rows: Float) -> None:
     for i in range(3):
         own.mean_m[r, m, i] = rows[(_MEAN + i) * LANES + lane]
@@ -77,7 +77,7 @@ def _put_back(own: Estimates, r: int, m: int, lane: int, rows: Float) -> None:
     own.count[r, m] += 1
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part(error_model="numpy")
 def _correct(rows: Float, planar: bool) -> None:
     """Equations 7 to 9 with G = I, and the squared distance and |Z|, in all lanes.
 

@@ -1,28 +1,28 @@
 """Blocks of three by three in kernels."""
 
 import numpy as np
-from numba import njit
 
+from mapfusion.kernels import kernel
 from mapfusion.se2 import Float
 
 
 # Of tables of blocks they take all and a row: views of rows are counted, which takes longer than
 # the sums.
-@njit(cache=True)
+@kernel
 def put_along(A: Float, row: int, x: Float, product: Float) -> None:
     """A[row] x."""
     for r in range(3):
         product[r] = A[row, r, 0] * x[0] + A[row, r, 1] * x[1] + A[row, r, 2] * x[2]
 
 
-@njit(cache=True)
+@kernel
 def add_along(A: Float, row: int, x: Float, total: Float) -> None:
     """Add A[row] x."""
     for r in range(3):
         total[r] += A[row, r, 0] * x[0] + A[row, r, 1] * x[1] + A[row, r, 2] * x[2]
 
 
-@njit(cache=True)
+@kernel
 def put_inverse(A: Float, inverse: Float) -> bool:
     """Inverse of a symmetric positive definite A = L D L', of which the lower half is read.
 
@@ -63,7 +63,7 @@ def inverses(blocks: Float) -> Float:
     return found
 
 
-@njit(cache=True)
+@kernel
 def _put_inverses(blocks: Float, inverses: Float) -> bool:
     n, d = blocks.shape[0], blocks.shape[1]
     block, inverse = np.eye(3), np.empty((3, 3))

@@ -8,8 +8,8 @@ known, observations i, k of tracks t, u of one landmark take from what their pos
 """
 
 import numpy as np
-from numba import njit
 
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float
 from mapfusion.smoother.normal_equations import NormalEquations
 from mapfusion.smoother.offsets import Reduced
@@ -30,7 +30,7 @@ def subtract_points(seen: Sightings, equations: NormalEquations, left: Reduced, 
     _subtract(seen.by_landmark, place, couplings, left, S)
 
 
-@njit(cache=True)
+@kernel
 def _subtract(
     rows: tuple[np.ndarray, np.ndarray, np.ndarray],
     place: np.ndarray,
@@ -51,7 +51,7 @@ def _subtract(
 
 
 # Kernels take arrays and rows of them: views of rows are counted, which takes longer than the sums.
-@njit(cache=True)
+@kernel_part
 def _put_gains(
     left: Reduced,
     j: int,
@@ -72,7 +72,7 @@ def _put_gains(
             by_track[r, q] = x * G[t, 0, q] + y * G[t, 1, q] + z * G[t, 2, q]
 
 
-@njit(cache=True)
+@kernel_part
 def _add_product(A: Float, B: Float, t: int, total: Float) -> None:
     for r in range(3):
         for q in range(3):
@@ -90,7 +90,7 @@ def subtract_gram(seen: Sightings, moved: Float, S: Float) -> None:
     _subtract_gram(seen.starts, seen.pose_place[seen.frame], moved, S)
 
 
-@njit(cache=True)
+@kernel
 def _subtract_gram(starts: np.ndarray, place: np.ndarray, moved: Float, S: Float) -> None:
     own = np.empty((3, 3))
     for j in range(len(starts) - 1):
@@ -102,7 +102,7 @@ def _subtract_gram(starts: np.ndarray, place: np.ndarray, moved: Float, S: Float
             _subtract_own(own, moved, i, 3 * place[i], S)
 
 
-@njit(cache=True)
+@kernel
 def _subtract_rows(
     X: Float, begin: int, end: int, i: int, place: np.ndarray, coupling: Float, S: Float
 ) -> None:
@@ -128,7 +128,7 @@ def _subtract_rows(
                 S[column + q, row + 2] -= v2
 
 
-@njit(cache=True)
+@kernel
 def _subtract_own(X: Float, coupling: Float, i: int, row: int, S: Float) -> None:
     for q in range(3):
         a, b, c = coupling[i, q, 0], coupling[i, q, 1], coupling[i, q, 2]
@@ -143,7 +143,7 @@ def left_couplings(seen: Sightings, coupling: Float, left: Reduced) -> Float:
     return made
 
 
-@njit(cache=True)
+@kernel
 def _put_left(track_starts: np.ndarray, coupling: Float, kept: Float, made: Float) -> None:
     for t in range(len(kept)):
         for i in range(track_starts[t], track_starts[t + 1]):
@@ -160,7 +160,7 @@ def along_way(seen: Sightings, coupling: Float, way: Float) -> Float:
     return total
 
 
-@njit(cache=True)
+@kernel
 def _add_along_way(
     track_starts: np.ndarray, frame: np.ndarray, coupling: Float, way: Float, total: Float
 ) -> None:
@@ -188,7 +188,7 @@ def along_points(seen: Sightings, coupling: Float, point: Float, offset: Float) 
     return total
 
 
-@njit(cache=True)
+@kernel
 def _add_along_points(
     track_starts: np.ndarray,
     owner: np.ndarray,

@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
-from numba import njit
 
+from mapfusion.kernels import kernel
 from mapfusion.se2 import Float
 from mapfusion.smoother.elimination import chain_factor, own_factor, pose_point_blocks
 from mapfusion.smoother.normal_equations import disturbance_jacobians, disturbances
@@ -125,7 +125,7 @@ def _chain_covariances(factor: Float, n: int) -> tuple[Float, Float]:
     return own, link
 
 
-@njit(cache=True)
+@kernel
 def _selected_inverse(diagonal: Float, below: Float, own: Float, link: Float) -> None:
     """The blocks of the inverse on and beside the diagonal (Takahashi et al. 1973)."""
     for k in range(len(diagonal) - 1, -1, -1):

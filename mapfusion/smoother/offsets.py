@@ -14,8 +14,8 @@ landmark. A track that does not stray has G = 0. As P is the same along each axi
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float
 from mapfusion.smoother.blocks import add_along, put_along, put_inverse
 from mapfusion.smoother.normal_equations import PointEquations
@@ -62,7 +62,7 @@ def without_offsets(seen: Sightings, equations: PointEquations) -> Reduced:
     return left
 
 
-@njit(cache=True)
+@kernel
 def _reduce(
     rows: tuple[np.ndarray, np.ndarray, np.ndarray],
     strays: np.ndarray,
@@ -103,7 +103,7 @@ def _reduce(
     return True
 
 
-@njit(cache=True)
+@kernel_part
 def _add_track(equations: PointEquations, left: Reduced, j: int, t: int, block: Float) -> None:
     """Add what is left of a track to its landmark's block and gradient."""
     S, gradient, G, K = equations.track_block, equations.track_gradient, left.own_m2, left.kept
@@ -134,7 +134,7 @@ def moved_points(
     return points, offsets
 
 
-@njit(cache=True)
+@kernel
 def _put_moved(
     first_track: np.ndarray,
     block: Float,
@@ -182,7 +182,7 @@ def known_points(seen: Sightings, left: Reduced) -> Points:
     return made
 
 
-@njit(cache=True)
+@kernel
 def _put_known(landmark: np.ndarray, left: Reduced, made: Points) -> None:
     keeps, follows, half = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for t in range(len(landmark)):
@@ -195,7 +195,7 @@ def _put_known(landmark: np.ndarray, left: Reduced, made: Points) -> None:
         _put_sum(keeps, landmark[t], left, t, half, made.track_m2)
 
 
-@njit(cache=True)
+@kernel
 def _put_sum(
     of_landmark: Float, j: int, left: Reduced, t: int, half: Float, covariance_m2: Float
 ) -> None:

@@ -11,9 +11,9 @@ so what it is off by draws them together and not apart. A landmark becomes as ma
 """
 
 import numpy as np
-from numba import njit
 
 from mapfusion.chi_square import chi_square_bound
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float, rotation
 from mapfusion.smoother.sightings import Sightings
 from mapfusion.symmetric import cholesky, solve_lower
@@ -71,7 +71,7 @@ def _track_points(seen: Sightings, path: Float) -> tuple[Float, Float]:
     return np.einsum("tij,tj->ti", covariance, weighted), covariance
 
 
-@njit(cache=True)
+@kernel
 def _corners(
     first: np.ndarray, counts: np.ndarray, point: Float, covariance: Float, bound: float
 ) -> np.ndarray:
@@ -110,7 +110,7 @@ def _corners(
     return corner
 
 
-@njit(cache=True)
+@kernel_part
 def _square(S: Float, off: Float) -> float:
     """Squared Mahalanobis distance; destroys both."""
     if not cholesky(S, _SINGULAR):

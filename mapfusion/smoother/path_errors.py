@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numba import njit
 
+from mapfusion.kernels import kernel
 from mapfusion.se2 import Float
 from mapfusion.smoother.landmark_elimination import left_couplings, subtract_gram
 from mapfusion.smoother.normal_equations import NormalEquations
@@ -85,7 +85,7 @@ class PathErrors:
         return S[3:, 3:]
 
 
-@njit(cache=True)
+@kernel
 def _add_spread(
     starts: np.ndarray, place: np.ndarray, moved: Float, of_poses: Float, total: Float
 ) -> None:
@@ -104,7 +104,7 @@ def _add_spread(
                     )
 
 
-@njit(cache=True)
+@kernel
 def _add_squares(
     starts: np.ndarray, place: np.ndarray, moved: Float, covariance: Float, total: Float
 ) -> None:
@@ -130,7 +130,7 @@ def _add_squares(
                     )
 
 
-@njit(cache=True)
+@kernel
 def _add_part(
     covariance: Float, row: int, column: int, share: float, moved: Float, total: Float
 ) -> None:

@@ -1,8 +1,8 @@
 """How far observations lie from where path and landmarks say."""
 
 import numpy as np
-from numba import njit
 
+from mapfusion.kernels import kernel
 from mapfusion.se2 import Float, rotation
 from mapfusion.smoother.normal_equations import Estimate, turns
 from mapfusion.smoother.sightings import Sightings
@@ -38,7 +38,7 @@ def squares_of_points(seen: Sightings, path: Float, covariance_m2: Float) -> Flo
     return squares
 
 
-@njit(cache=True)
+@kernel
 def _put_squares(
     seen: tuple[np.ndarray, np.ndarray, np.ndarray, Float, Float],
     at: Estimate,
@@ -65,7 +65,7 @@ def _put_squares(
             )
 
 
-@njit(cache=True)
+@kernel
 def _put_traces(
     seen: tuple[np.ndarray, np.ndarray, np.ndarray, Float, Float],
     turn: Float,

@@ -5,9 +5,9 @@ from typing import Annotated
 
 import cv2
 import numpy as np
-from numba import njit
 
 from mapfusion.arguments import Range, require_in_range
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float
 
 _SOBEL_APERTURE_PX = 3
@@ -93,7 +93,7 @@ def harris_response(image: np.ndarray, parameters: HarrisParameters) -> np.ndarr
     return response
 
 
-@njit(cache=True)
+@kernel
 def _respond(slope_u: np.ndarray, slope_v: np.ndarray, k: np.float32, response: np.ndarray) -> None:
     """Fill in det M - k (trace M)^2, M the sum over 3 x 3 pixels of products of slopes (H, W).
 
@@ -110,7 +110,7 @@ def _respond(slope_u: np.ndarray, slope_v: np.ndarray, k: np.float32, response: 
         _combine(sums, k, response, v)
 
 
-@njit(cache=True)
+@kernel_part
 def _sum_products(
     slope_u: np.ndarray, slope_v: np.ndarray, above: int, v: int, below: int, sums: Float
 ) -> None:
@@ -124,7 +124,7 @@ def _sum_products(
         sums[2, k] = np.float64(d * d) + np.float64(e * e) + np.float64(f * f)
 
 
-@njit(cache=True)
+@kernel_part
 def _combine(sums: Float, k: np.float32, response: np.ndarray, v: int) -> None:
     for i in range(response.shape[1]):
         before, here, after = np.uintp(i), np.uintp(i + 1), np.uintp(i + 2)
@@ -165,7 +165,7 @@ def descending(values: np.ndarray) -> np.ndarray:
     return (np.sort(keys) & np.uint64(_ALL_BITS)).astype(np.int64)
 
 
-@njit(cache=True)
+@kernel
 def local_maxima(response: np.ndarray, border: int, least: np.float32) -> np.ndarray:
     """Pixels (N, 2) int64, row by row, above `least` that no neighbour's response exceeds."""
     height, width = response.shape
@@ -185,7 +185,7 @@ def local_maxima(response: np.ndarray, border: int, least: np.float32) -> np.nda
     return found[:count].copy()
 
 
-@njit(cache=True)
+@kernel_part
 def _mark_peaks(
     response: np.ndarray,
     v: int,
@@ -209,7 +209,7 @@ def _mark_peaks(
         is_peak[u] = np.uint8(here == most) & np.uint8(here > least)
 
 
-@njit(cache=True)
+@kernel
 def _spread(
     candidates: np.ndarray,
     height: int,

@@ -15,8 +15,8 @@ and Matthews 2004).
 """
 
 import numpy as np
-from numba import njit
 
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float
 from mapfusion.symmetric import solve_lower, solve_upper
 from mapfusion.vision.template import (
@@ -57,7 +57,7 @@ def fit_patches(
     return _fit_all(*given, rows, after, warp, bend)
 
 
-@njit(cache=True)
+@kernel
 def _fit_all(
     window: Float,
     factor: Float,
@@ -78,7 +78,7 @@ def _fit_all(
     return found
 
 
-@njit(cache=True)
+@kernel_part
 def _settle(
     window: Float,
     i: int,
@@ -113,7 +113,7 @@ def _settle(
     return -1.0
 
 
-@njit(cache=True)
+@kernel_part
 def _stays_inside(middle: int, warp: Float, bend: Float, n: int) -> bool:
     """Whether all of a window lies on a patch."""
     least = 1.0 - (abs(bend[n, 0]) + abs(bend[n, 1])) * WINDOW_HALF_PX
@@ -126,7 +126,7 @@ def _stays_inside(middle: int, warp: Float, bend: Float, n: int) -> bool:
     return True
 
 
-@njit(cache=True, error_model="numpy")  # to ask whether it divides by zero takes longer than that
+@kernel(error_model="numpy")  # to ask whether it divides by zero takes longer than that
 def _find_places(
     side: int, warp: Float, bend: Float, n: int, cell: np.ndarray, share: Float
 ) -> None:
@@ -147,7 +147,7 @@ def _find_places(
             share[1, first + np.uintp(k)] = at_v - float(row)
 
 
-@njit(cache=True)
+@kernel_part
 def _look_up(after: np.ndarray, n: int, cell: np.ndarray) -> None:
     """Replace pixels by the grey levels there, to the right and below, the bytes of one number."""
     side = np.uintp(after.shape[2])
@@ -159,7 +159,7 @@ def _look_up(after: np.ndarray, n: int, cell: np.ndarray) -> None:
         cell[k] = upper | lower << _HALF
 
 
-@njit(cache=True)
+@kernel_part
 def _compare(window: Float, i: int, cell: np.ndarray, share: Float, residual: Float) -> None:
     """Fill in after - before; between pixels grey levels are bilinear."""
     for k in range(len(cell)):
@@ -170,7 +170,7 @@ def _compare(window: Float, i: int, cell: np.ndarray, share: Float, residual: Fl
         residual[k] = (1 - b) * upper + b * lower - window[i, LEVEL, k]
 
 
-@njit(cache=True)
+@kernel_part
 def _moments(window: Float, i: int, residual: Float, moment: Float) -> float:
     """Weighted sum of squared residuals; `moment` gets J^T W r."""
     square = m0 = m1 = m2 = m3 = m4 = m5 = m6 = m7 = 0.0
@@ -190,7 +190,7 @@ def _moments(window: Float, i: int, residual: Float, moment: Float) -> float:
     return square
 
 
-@njit(cache=True)
+@kernel_part
 def _compose(warp: Float, step: Float) -> None:
     """Warp after the inverse of the step's own, which moved the earlier picture.
 

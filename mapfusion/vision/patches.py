@@ -1,8 +1,8 @@
 """Cut-outs of pictures around corners, by which tracks follow them."""
 
 import numpy as np
-from numba import njit
 
+from mapfusion.kernels import kernel
 from mapfusion.se2 import Float
 
 _PATCH_HALF_PX = 17  # room for a fit's window when what it shows has grown by half
@@ -16,7 +16,7 @@ def cut_patches(image: np.ndarray, uv_px: Float) -> np.ndarray:
     return patch
 
 
-@njit(cache=True)
+@kernel
 def _cut(image: np.ndarray, pixel: np.ndarray, patch: np.ndarray) -> None:
     bottom, right = image.shape[0] - 1, image.shape[1] - 1
     for n in range(len(pixel)):

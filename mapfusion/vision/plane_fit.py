@@ -3,8 +3,8 @@
 import math
 
 import numpy as np
-from numba import njit
 
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float
 from mapfusion.symmetric import cholesky, copy_lower, solve_lower, solve_upper
 from mapfusion.vision.window import FIELDS, RESIDUAL, ROOM, SLOPE, fill_left, fill_residuals
@@ -17,7 +17,7 @@ _LEAST_TEXTURE = 0.25
 _SINGULAR = 1e-9  # pivot, as a share of its diagonal element, that is rounding error
 
 
-@njit(cache=True)
+@kernel
 def fit_planes(
     left: np.ndarray,
     right: np.ndarray,
@@ -80,7 +80,7 @@ def fit_planes(
     return plane, variance
 
 
-@njit(cache=True)
+@kernel_part
 def _fit_plane(
     left: np.ndarray,
     right: np.ndarray,
@@ -130,7 +130,7 @@ def _fit_plane(
     return variance
 
 
-@njit(cache=True)
+@kernel_part
 def _settle(
     right: np.ndarray,
     u: int,
@@ -177,13 +177,13 @@ def _settle(
     return variance_grey
 
 
-@njit(cache=True)
+@kernel
 def _give_up(plane: np.ndarray, n: int) -> None:
     for i in range(3):
         plane[n, i] = np.nan
 
 
-@njit(cache=True)
+@kernel_part
 def _square(moments: np.ndarray, prior: float, weight: np.ndarray) -> float:
     """Of an estimate w' J^T r: w' (M + prior) w, in variances of the grey levels.
 
@@ -200,7 +200,7 @@ def _square(moments: np.ndarray, prior: float, weight: np.ndarray) -> float:
     return square
 
 
-@njit(cache=True)
+@kernel_part
 def _without_noise(seen: np.ndarray, half: int, noise: float, normal: np.ndarray) -> None:
     """J^T J (4, 4), its lower half, less what the noise of slopes has added to their squares."""
     copy_lower(seen, normal)
@@ -210,7 +210,7 @@ def _without_noise(seen: np.ndarray, half: int, noise: float, normal: np.ndarray
         added = noise**2 / 2 * (2 * half + 1) ** 2 * half * (half + 1) / 3  # mean of x^2
 
 
-@njit(cache=True)
+@kernel_part
 def _normal_matrix(window: Float, half: int, normal: np.ndarray) -> None:
     """Add up the lower half of J^T J, of the offset in brightness, d, a and b.
 
@@ -236,7 +236,7 @@ def _normal_matrix(window: Float, half: int, normal: np.ndarray) -> None:
         normal[3, 3] += s0 * y * y
 
 
-@njit(cache=True)
+@kernel_part
 def _by_row(left: np.ndarray, u: int, v: int, half: int, weight: np.ndarray) -> float:
     """How much an estimate changes when the right window is one row off.
 
@@ -254,14 +254,14 @@ def _by_row(left: np.ndarray, u: int, v: int, half: int, weight: np.ndarray) -> 
     return change
 
 
-@njit(cache=True)
+@kernel_part
 def _counted(variance_grey: float, noise: float, alike_px: float) -> float:
     """Variance of residuals as if all were independent: noise is, what exceeds it is not."""
     independent = min(variance_grey, 2 * noise**2)
     return independent + alike_px**2 * (variance_grey - independent)
 
 
-@njit(cache=True)
+@kernel_part
 def _moments(window: Float, half: int, moment: np.ndarray) -> float:
     """Sum of the squared residuals; `moment` gets J^T r."""
     square = m0 = m1 = m2 = m3 = 0.0

@@ -7,8 +7,8 @@ levels. The score test (Rao 1948; Breusch and Pagan 1980) asks for all of them w
 """
 
 import numpy as np
-from numba import njit
 
+from mapfusion.kernels import kernel_part
 from mapfusion.se2 import Float
 from mapfusion.symmetric import cholesky, solve_lower
 
@@ -32,7 +32,7 @@ SQUARES = 9  # of the sums of a row the first of g^2
 SUMS = 14  # of a row: g times 1, L and r, each with x^0 to x^2, and g^2 with x^0 to x^4
 
 
-@njit(cache=True)
+@kernel_part
 def score(grid: Float, whole: Float, normal: Float, moment: Float) -> float:
     """What a window holds against one plane.
 
@@ -62,7 +62,7 @@ def score(grid: Float, whole: Float, normal: Float, moment: Float) -> float:
     return against
 
 
-@njit(cache=True)
+@kernel_part
 def _fold(grid: Float) -> None:
     """From sums (3, 5, 3, SUMS) by the side of y and of x to sums with signs, in place.
 
@@ -83,7 +83,7 @@ def _fold(grid: Float) -> None:
                 grid[i, q, 2, k] = beyond + below
 
 
-@njit(cache=True)
+@kernel_part
 def _fill_in(grid: Float, normal: Float, moment: Float) -> None:
     """The entries of the disparities' terms: of a product signs and powers add up."""
     for i in range(len(_TERMS)):

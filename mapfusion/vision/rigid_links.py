@@ -10,9 +10,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from mapfusion.chi_square import chi_square_bound
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float
 from mapfusion.se3 import inverse
 from mapfusion.symmetric import cholesky, cofactors, copy_lower, solve_lower, solve_upper
@@ -102,7 +102,7 @@ def starts(p_before_m: Float) -> np.ndarray:
     return np.not_equal(part, np.array([-1, *range(_PARTS)])[:, None])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _narrow(
     start: np.ndarray,
     agree: np.ndarray,
@@ -142,7 +142,7 @@ def _narrow(
                 agree[b, j] = square[b, j] <= gate and (i >= _ALL_AFTER or start[b, j])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part(error_model="numpy")
 def _differences(T: Float, p_before: Float, p_after: Float, lever: Float, residual: Float) -> None:
     """Before minus after (N, 3) under a motion, and the turned points (N, 3), which are levers."""
     for j in range(len(residual)):
@@ -152,7 +152,7 @@ def _differences(T: Float, p_before: Float, p_after: Float, lever: Float, residu
             residual[j, k] = p_before[j, k] - lever[j, k] - T[k, 3]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part(error_model="numpy")
 def _information(
     T: Float, variance: float, S_before: Float, S_after: Float, information: Float
 ) -> None:
@@ -181,7 +181,7 @@ def _information(
         own[3], own[4], own[5] = scale * ayy, scale * ayz, scale * azz
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part(error_model="numpy")
 def _normal_equations(
     lever: Float, residual: Float, information: Float, used: np.ndarray, normal: Float, right: Float
 ) -> None:
@@ -231,7 +231,7 @@ def _normal_equations(
         normal[r, r] *= 1 + _OPEN
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part(error_model="numpy")
 def _move(T: Float, step: Float) -> None:
     """Shift, and turn about the origin's axes by the step's rotation vector (Rodrigues)."""
     x, y, z = step[3], step[4], step[5]
@@ -250,7 +250,7 @@ def _move(T: Float, step: Float) -> None:
         T[k, 3] += step[k]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel_part(error_model="numpy")
 def _square(lever: Float, residual: Float, information: Float, step: Float) -> float:
     """Squared distance of a link's points, in standard deviations, after the step."""
     xx, xy, xz = information[0], information[1], information[2]

@@ -1,8 +1,8 @@
 """Where in its row of the right image a window of the left one is found, in whole pixels."""
 
 import numpy as np
-from numba import njit
 
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.vision.verdict import Verdict
 
 _PEAK_HALF_WIDTH_PX = 2  # rivals are looked for beyond the slopes of the best peak
@@ -10,7 +10,7 @@ _CROSS, _SUM, _SQUARE = range(3)  # of candidates: sums of products; of columns:
 _AT_ONCE = 32  # candidates that vectors take at once: up to a multiple all cost the same
 
 
-@njit(cache=True)
+@kernel
 def search_rows(
     left: np.ndarray,
     right: np.ndarray,
@@ -67,7 +67,7 @@ def search_rows(
     return disparity, verdict
 
 
-@njit(cache=True)
+@kernel
 def _search(
     image: np.ndarray,
     other: np.ndarray,
@@ -102,7 +102,7 @@ def _search(
     return first + best, Verdict.MATCHED
 
 
-@njit(cache=True)
+@kernel_part
 def _correlate(
     image: np.ndarray,
     other: np.ndarray,
@@ -151,14 +151,14 @@ def _correlate(
     return True
 
 
-@njit(cache=True)
+@kernel_part
 def _clear(room: np.ndarray, count: int) -> None:
     for i in range(len(room)):
         for k in range(count):
             room[i, k] = 0
 
 
-@njit(cache=True)
+@kernel_part
 def _take_strip(
     other: np.ndarray, y: int, begin: int, count: int, strip: np.ndarray, room: np.ndarray
 ) -> None:
@@ -171,7 +171,7 @@ def _take_strip(
         room[_SQUARE, k] += np.int32(grey) * np.int32(grey)
 
 
-@njit(cache=True)
+@kernel_part
 def _add_products(
     image: np.ndarray,
     y: int,

@@ -4,8 +4,8 @@ Where two surfaces meet in the image and nothing in the world, one half is not o
 """
 
 import numpy as np
-from numba import njit
 
+from mapfusion.kernels import kernel_part
 from mapfusion.se2 import Float
 
 _COUNT, _OFF, _SLOPE_2, _DOWN_2, _OFF_2 = 0, 3, 5, 6, 7  # of a part of a window, see `window_sums`
@@ -28,7 +28,7 @@ def disagrees(squares: Float, noise: float, max_misfit: float, max_rows: float) 
     return np.any(squares[..., 1] > tolerated, axis=1)
 
 
-@njit(cache=True)
+@kernel_part
 def fill_in_halves(parts: Float, squares: Float, n: int) -> None:
     """Fill in the halves (4, 4) of window n, see `window_sums`; residuals less their own mean."""
     count = off = 0.0

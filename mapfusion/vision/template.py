@@ -8,8 +8,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float
 from mapfusion.symmetric import cholesky
 
@@ -66,7 +66,7 @@ class Templates:
         self.tolerated[rows] = others.tolerated[theirs]
 
 
-@njit(cache=True)
+@kernel
 def _copy(source: Float, theirs: np.ndarray, target: Float, rows: np.ndarray) -> None:
     """Copy rows (..., K, L) of one array to rows of another, with no copy in between."""
     for n in range(len(rows)):
@@ -86,7 +86,7 @@ WEIGHT = _weights().ravel()  # (W * W,), what the window's pixels count
 WEIGHT.setflags(write=False)
 
 
-@njit(cache=True)
+@kernel
 def _prepare(
     patch: np.ndarray,
     point: Float,
@@ -109,7 +109,7 @@ def _prepare(
             tolerated[n] = sum_of_squares
 
 
-@njit(cache=True)
+@kernel_part
 def _read_grid(patch: np.ndarray, n: int, u: float, v: float, shown: Float) -> None:
     """Fill in grey levels between pixels, bilinear: of a window around (u, v) and one pixel more.
 
@@ -128,7 +128,7 @@ def _read_grid(patch: np.ndarray, n: int, u: float, v: float, shown: Float) -> N
             shown[np.uintp(y * side + x)] = (1 - b) * upper + b * lower
 
 
-@njit(cache=True)
+@kernel_part
 def _fill_window(shown: Float, window: Float, n: int) -> None:
     """Fill in window n's grey levels and their slopes from those of a grid around it."""
     wide = np.uintp(_SIDE_PX + 2)
@@ -141,7 +141,7 @@ def _fill_window(shown: Float, window: Float, n: int) -> None:
             window[n, SLOPE_V, k] = 0.5 * (shown[at + wide] - shown[at - wide])
 
 
-@njit(cache=True)
+@kernel_part
 def _normal_matrix(
     window: Float, n: int, normal: Float, variance: float, square_misfit: float
 ) -> float:

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
-from numba import njit
 
 from mapfusion.arguments import Probability, Range, require_in_range
 from mapfusion.camera import StereoCamera
+from mapfusion.kernels import kernel
 from mapfusion.se2 import Float
 from mapfusion.vision.features import Features
 from mapfusion.vision.followed import Followed, Likeness, followed
@@ -180,7 +180,7 @@ def link(
     )
 
 
-@njit(cache=True)
+@kernel
 def _link(
     previous_uv: np.ndarray,
     previous_disparity: np.ndarray,

@@ -16,7 +16,6 @@ from typing import Annotated, Literal
 
 import cv2
 import numpy as np
-from numba import njit
 
 from mapfusion.arguments import (
     Range,
@@ -25,6 +24,7 @@ from mapfusion.arguments import (
     require_in_range,
     require_shape,
 )
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float
 
 CELLS = 4
@@ -113,7 +113,7 @@ def describe(image: np.ndarray, uv_px: Float, scale_px: Float) -> np.ndarray:
     return descriptor
 
 
-@njit(cache=True)
+@kernel
 def _describe(
     integral: np.ndarray, uv: np.ndarray, scale: np.ndarray, weights: np.ndarray, out: np.ndarray
 ) -> None:
@@ -141,7 +141,7 @@ def _describe(
             out[n, k] *= factor
 
 
-@njit(cache=True)
+@kernel_part
 def _read_nodes(
     integral: np.ndarray,
     u: float,
@@ -171,7 +171,7 @@ def _read_nodes(
             node[i, j] = top + below * (low - top)
 
 
-@njit(cache=True)
+@kernel_part
 def _sum_cell_row(node: np.ndarray, weights: np.ndarray, first: int, sums: np.ndarray) -> None:
     """Column sums (4, 20) of weighted dx, dy, |dx|, |dy| over the five rows of one row of cells."""
     sums[:] = 0.0

@@ -8,8 +8,8 @@ not. And each goes over a whole window: handing over its arrays takes as long as
 """
 
 import numpy as np
-from numba import njit
 
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float
 
 # Of a window's pixels, row by row (4, S * S) with S = 2 half + 1: grey levels of the left picture,
@@ -24,14 +24,14 @@ _ONE = np.uintp(1)  # indices without a sign, which a kernel need not wrap aroun
 _BYTE, _LOW = np.uint32(8), np.uint32(0xFF)
 
 
-@njit(cache=True)
+@kernel
 def parts_inside(image: np.ndarray, u: int, v: int, half: int) -> tuple[int, int, int, int]:
     """First and last row and column, from (u, v), of a window's part with a column to spare."""
     height, width = image.shape
     return max(-half, -v), min(half, height - 1 - v), max(-half, 1 - u), min(half, width - 2 - u)
 
 
-@njit(cache=True)
+@kernel
 def fill_left(left: np.ndarray, u: int, v: int, half: int, window: Float) -> None:
     """Fill in the left picture's grey levels around (u, v), and their slopes along u."""
     side = 2 * half + 1
@@ -45,7 +45,7 @@ def fill_left(left: np.ndarray, u: int, v: int, half: int, window: Float) -> Non
             window[LEVEL, m], window[SLOPE, m] = left[row, k + _ONE], 0.5 * slope
 
 
-@njit(cache=True)
+@kernel_part
 def fill_down(left: np.ndarray, u: int, v: int, half: int, window: Float) -> None:
     """Fill in the slopes along v; at the border that to the row inside."""
     side = 2 * half + 1
@@ -60,7 +60,7 @@ def fill_down(left: np.ndarray, u: int, v: int, half: int, window: Float) -> Non
             window[DOWN, at + np.uintp(i)] = share * down
 
 
-@njit(cache=True)
+@kernel
 def fill_residuals(
     right: np.ndarray,
     u: int,
@@ -90,7 +90,7 @@ def fill_residuals(
     _compare(window, room, share)
 
 
-@njit(cache=True)
+@kernel_part
 def _find_columns(
     right: np.ndarray,
     u: int,
@@ -114,7 +114,7 @@ def _find_columns(
             share[at + np.uintp(i)] = place - float(column + np.int32(1))
 
 
-@njit(cache=True)
+@kernel_part
 def _look_up(right: np.ndarray, u: int, v: int, half: int, room: np.ndarray) -> None:
     side = 2 * half + 1
     for y in range(-half, half + 1):
@@ -129,7 +129,7 @@ def _look_up(right: np.ndarray, u: int, v: int, half: int, room: np.ndarray) -> 
             room[_LEVELS, m] = levels
 
 
-@njit(cache=True)
+@kernel_part
 def _compare(window: Float, room: np.ndarray, share: Float) -> None:
     for i in range(len(share)):
         levels, t = room[_LEVELS, i], share[i]

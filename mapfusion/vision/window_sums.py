@@ -5,8 +5,8 @@ silhouette's test (`silhouette_test.py`) and the test for one plane (`plane_test
 """
 
 import numpy as np
-from numba import njit
 
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float
 from mapfusion.vision.plane_test import COLUMNS, SQUARES, SUMS, score
 from mapfusion.vision.silhouette_test import fill_in_halves
@@ -28,7 +28,7 @@ from mapfusion.vision.window import (
 _PARTS = 8
 
 
-@njit(cache=True)
+@kernel
 def window_sums(
     left: np.ndarray,
     right: np.ndarray,
@@ -84,7 +84,7 @@ def window_sums(
     return squares, scores
 
 
-@njit(cache=True)
+@kernel_part
 def _find_ends(
     right: np.ndarray, u: int, v: int, half: int, plane: Float, n: int, ends: np.ndarray
 ) -> None:
@@ -105,7 +105,7 @@ def _find_ends(
         ends[y + half, 0], ends[y + half, 1] = first, last
 
 
-@njit(cache=True)
+@kernel
 def _add_up(
     window: Float, ends: np.ndarray, half: int, own: int, shade: float, grid: Float, parts: Float
 ) -> None:
@@ -139,7 +139,7 @@ def _add_up(
             power *= y
 
 
-@njit(cache=True)
+@kernel_part
 def _clear(grid: Float, parts: Float) -> None:
     for part in range(3):
         for side in range(3):
@@ -150,7 +150,7 @@ def _clear(grid: Float, parts: Float) -> None:
                     grid[part, q, side, k] = 0.0
 
 
-@njit(cache=True)
+@kernel_part
 def _sum_up(
     window: Float,
     middle: int,

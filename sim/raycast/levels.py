@@ -7,8 +7,8 @@ large as it is wide (Heckbert 1989, section 3; McCormack et al. 1999, Feline).
 """
 
 import numpy as np
-from numba import njit
 
+from mapfusion.kernels import kernel, kernel_part
 from sim.raycast.plan import Pinhole
 from sim.raycast.scene import Level
 
@@ -31,7 +31,7 @@ Line = tuple[float, float, float, float]  # x, y and their steps from pixel to p
 Size = tuple[int, int]  # of a copy of the picture: rows and columns
 
 
-@njit(cache=True)
+@kernel
 def row_depth_m(camera: Pinhole, height_m: float, v: float) -> float:
     """Depth at which a ray through row `v` meets a level plane; infinity if it does not."""
     down = (v - camera.center_v) / camera.focal_px
@@ -39,7 +39,7 @@ def row_depth_m(camera: Pinhole, height_m: float, v: float) -> float:
     return drop / down if drop * down > 0 else np.inf
 
 
-@njit(cache=True)
+@kernel_part
 def footprints(camera: Pinhole, level: Level) -> np.ndarray:
     """How each row is sampled (H, 3) int64: samples along, samples across, copy of the picture."""
     plan = np.zeros((camera.height_px, 3), dtype=np.int64)
@@ -59,7 +59,7 @@ def footprints(camera: Pinhole, level: Level) -> np.ndarray:
     return plan
 
 
-@njit(cache=True)
+@kernel
 def ways(camera: Pinhole, level: Level) -> tuple[Way, Way]:
     """How rays go over a picture: right = a + (b + c u) Z, and up likewise, both 0 to 1 on it."""
     cos, sin = np.cos(camera.theta), np.sin(camera.theta)
@@ -81,7 +81,7 @@ def ways(camera: Pinhole, level: Level) -> tuple[Way, Way]:
     )
 
 
-@njit(cache=True)
+@kernel
 def fill(
     camera: Pinhole,
     level: Level,
@@ -132,7 +132,7 @@ def fill(
                 _show(sums, max(n * across, 1), v, begin, count, picture)
 
 
-@njit(cache=True)
+@kernel_part
 def _most_open(open_rows: np.ndarray) -> np.ndarray:
     """The most open rows of each `PIECE` columns."""
     most = np.zeros(-(-len(open_rows) // PIECE), dtype=np.int64)
@@ -141,7 +141,7 @@ def _most_open(open_rows: np.ndarray) -> np.ndarray:
     return most
 
 
-@njit(cache=True)
+@kernel
 def _next(open_rows: np.ndarray, row: int, begin: int, end: int, is_open: bool) -> int:
     """The first column from `begin` on that is open, or is not, in a row; else `end`."""
     for j in range(begin, end):
@@ -150,13 +150,13 @@ def _next(open_rows: np.ndarray, row: int, begin: int, end: int, is_open: bool) 
     return end
 
 
-@njit(cache=True)
+@kernel_part
 def _start(sums: np.ndarray, count: int, value: int) -> None:
     for i in range(count):
         sums[i] = value
 
 
-@njit(cache=True)
+@kernel_part
 def _show(
     sums: np.ndarray, samples: int, v: int, begin: int, count: int, picture: np.ndarray
 ) -> None:
@@ -167,7 +167,7 @@ def _show(
         picture[v, at + np.uintp(i)] = np.uint8(shown)
 
 
-@njit(cache=True)
+@kernel_part
 def _line(way: tuple[Way, Way], u: float, z: float, size: Size) -> Line:
     """Where a row's pixels lie on a copy of the picture, in cells, from the one at `u` on.
 
@@ -180,7 +180,7 @@ def _line(way: tuple[Way, Way], u: float, z: float, size: Size) -> Line:
     return x, y, right_zu * z * width, up_zu * z * height
 
 
-@njit(cache=True)
+@kernel_part
 def _lowest_cell(line: Line, count: int, size: Size) -> int:
     """The cell that none of a line's is to the left of or below; -1: near the edge, or too far."""
     x, y, x_step, y_step = line
@@ -199,7 +199,7 @@ def _lowest_cell(line: Line, count: int, size: Size) -> int:
 # whose arrays need not be held on to: that takes longer than such a loop.
 
 
-@njit(cache=True)
+@kernel_part
 def _walk(line: Line, lowest: int, wide: int, count: int, place: np.ndarray) -> None:
     """Fill in places: along x and y from the lowest cell, and in cells from it."""
     x, y, x_step, y_step = line
@@ -214,7 +214,7 @@ def _walk(line: Line, lowest: int, wide: int, count: int, place: np.ndarray) -> 
         place[2, i] = np.int32((at_y >> PLACE_BITS) * across) + (at_x >> PLACE_BITS)
 
 
-@njit(cache=True)
+@kernel_part
 def _look_up(
     cells: np.ndarray, lowest: int, place: np.ndarray, count: int, cell: np.ndarray
 ) -> None:
@@ -223,13 +223,13 @@ def _look_up(
         cell[i] = cells[corner + np.uint64(place[2, i])]
 
 
-@njit(cache=True)
+@kernel_part
 def _add_between(cell: np.ndarray, place: np.ndarray, count: int, sums: np.ndarray) -> None:
     for i in range(count):
         sums[i] += _between(cell[i], np.uint32(place[0, i]), np.uint32(place[1, i]))
 
 
-@njit(cache=True, inline="always")
+@kernel_part
 def _between(cell: np.uint32, x: np.uint32, y: np.uint32) -> np.uint32:
     """What lies between a cell's corners, the bytes of one number, in 2^-16 grey levels."""
     right, up = (x >> TO_SHARE) & LOW_SHARE, (y >> TO_SHARE) & LOW_SHARE
@@ -240,7 +240,7 @@ def _between(cell: np.uint32, x: np.uint32, y: np.uint32) -> np.uint32:
     return np.uint32(np.uint32(lower * (WHOLE_SHARE - up)) + np.uint32(upper * up))
 
 
-@njit(cache=True)
+@kernel_part
 def _add_at_the_edge(
     cells: np.ndarray, corner: int, line: Line, size: Size, count: int, sums: np.ndarray
 ) -> None:
@@ -257,7 +257,7 @@ def _add_at_the_edge(
             sums[i] += np.uint32(SUM_UNIT * int(BACKGROUND))
 
 
-@njit(cache=True)
+@kernel_part
 def texel(level: Level, right: float, up: float) -> float:
     """The texel that a point of the picture lies on; the background beside it."""
     if not (0 <= right < 1 and 0 <= up < 1):

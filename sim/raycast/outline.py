@@ -5,12 +5,12 @@ sums from the left are the covered shares (Levien 2016, font-rs; the same as Fre
 """
 
 import numpy as np
-from numba import njit
 
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float
 
 
-@njit(cache=True)
+@kernel
 def hull(points: Float) -> Float:
     """Corners (K, 2) of the convex hull of points (N, 2), in one sense (Andrew 1979)."""
     order, n = _from_left(points), len(points)
@@ -27,7 +27,7 @@ def hull(points: Float) -> Float:
     return chain[:k].copy()
 
 
-@njit(cache=True)
+@kernel_part
 def _from_left(points: Float) -> np.ndarray:
     """The order (N,) of points (N, 2) by u, and by v where upright edges share u; N is small."""
     order = np.empty(len(points), dtype=np.int64)
@@ -41,12 +41,12 @@ def _from_left(points: Float) -> np.ndarray:
     return order
 
 
-@njit(cache=True)
+@kernel_part
 def _turn(a: Float, b: Float, c: Float) -> float:
     return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 
-@njit(cache=True)
+@kernel_part
 def clip(polygon: Float, width: float, height: float) -> Float:
     """A convex polygon (K, 2) inside a rectangle from (0, 0) on; (0, 2) beside it.
 
@@ -71,7 +71,7 @@ def clip(polygon: Float, width: float, height: float) -> Float:
     return polygon
 
 
-@njit(cache=True)
+@kernel_part
 def coverage(polygon: Float, height: int, width: int) -> Float:
     """Covered shares (height, width) of the unit squares that a polygon (K, 2) lies on.
 
@@ -89,7 +89,7 @@ def coverage(polygon: Float, height: int, width: int) -> Float:
     return covered
 
 
-@njit(cache=True)
+@kernel_part
 def _add_edge(start: Float, end: Float, change: Float) -> None:
     """Add one edge's changes of covered area, row by row."""
     if start[1] == end[1]:

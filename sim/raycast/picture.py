@@ -1,8 +1,8 @@
 """Whole pictures: each pixel the mean of its footprint, or the texel that its middle hits."""
 
 import numpy as np
-from numba import njit
 
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float
 from sim.raycast.levels import BACKGROUND, Way, fill, row_depth_m, texel, ways
 from sim.raycast.plan import NONE, Pinhole, nearest, project, strips
@@ -52,7 +52,7 @@ def depths(
     return depth_m
 
 
-@njit(cache=True)
+@kernel
 def _still_depths(camera: Pinhole, walls: Walls, floor: Level, ceiling: Level) -> np.ndarray:
     """Depth (H, W) of what stands still."""
     seen = project(camera, walls)
@@ -89,7 +89,7 @@ def sampled(
     return picture
 
 
-@njit(cache=True)
+@kernel
 def _still_texels(camera: Pinhole, walls: Walls, floor: Level, ceiling: Level) -> np.ndarray:
     """Texels (H, W) uint8 of what stands still."""
     seen = project(camera, walls)
@@ -117,13 +117,13 @@ def _still_texels(camera: Pinhole, walls: Walls, floor: Level, ceiling: Level) -
     return picture
 
 
-@njit(cache=True)
+@kernel
 def _along(way: Way, u: float, z: float) -> float:
     """Where on a level's picture a column's ray is at a depth, see `ways`."""
     return way[0] + (way[1] + way[2] * u) * z
 
 
-@njit(cache=True)
+@kernel_part
 def _wall_texel(walls: Walls, i: int, right: int, up: int) -> float:
     n = walls.size[i, 1] + 1
     here = walls.first[i] + right * n + up

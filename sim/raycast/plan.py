@@ -9,8 +9,8 @@ upper envelope of straight segments over u, and its breaks lie at segments' ends
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float
 from sim.raycast.scene import Walls
 
@@ -47,7 +47,7 @@ class Pinhole(NamedTuple):
     near_m: float
 
 
-@njit(cache=True)
+@kernel
 def project(camera: Pinhole, walls: Walls) -> Float:
     """Faces (F, 7) in the picture: from u, to u, w0, w1, t0, t1, t2: w = w0 + w1 u.
 
@@ -86,7 +86,7 @@ def project(camera: Pinhole, walls: Walls) -> Float:
     return seen
 
 
-@njit(cache=True)
+@kernel
 def nearest(seen: Float, at_u: Float) -> np.ndarray:
     """The nearest face (N,) at each of the ascending, evenly spaced coordinates (N,), or NONE."""
     found = np.full(len(at_u), NONE, dtype=np.int64)
@@ -104,7 +104,7 @@ def nearest(seen: Float, at_u: Float) -> np.ndarray:
     return found
 
 
-@njit(cache=True)
+@kernel
 def strips(camera: Pinhole, seen: Float) -> tuple[np.ndarray, Float, np.ndarray]:
     """What is seen in each pixel column, from left to right.
 
@@ -138,7 +138,7 @@ def strips(camera: Pinhole, seen: Float) -> tuple[np.ndarray, Float, np.ndarray]
     return face, until, count
 
 
-@njit(cache=True)
+@kernel_part
 def _envelope(seen: Float, low: float, high: float, face: np.ndarray, until: Float) -> int:
     """Fill in the faces seen between two coordinates, and where each ends; returns how many."""
     breaks = _breaks(seen, low, high)
@@ -162,7 +162,7 @@ def _envelope(seen: Float, low: float, high: float, face: np.ndarray, until: Flo
     return count
 
 
-@njit(cache=True)
+@kernel_part
 def _breaks(seen: Float, low: float, high: float) -> Float:
     """Where faces begin and end between two coordinates, and these, from left to right."""
     breaks = np.empty(2 * len(seen) + 2)
@@ -181,7 +181,7 @@ def _breaks(seen: Float, low: float, high: float) -> Float:
     return breaks[:n]
 
 
-@njit(cache=True)
+@kernel_part
 def _first(seen: Float, at: float, stop: float) -> int:
     """The nearest face just right of `at`, among those that reach from there to `stop`."""
     u = at + 1e-7 * (stop - at)
@@ -194,7 +194,7 @@ def _first(seen: Float, at: float, stop: float) -> int:
     return best
 
 
-@njit(cache=True)
+@kernel_part
 def _overtaken(seen: Float, now: int, at: float, stop: float) -> tuple[float, int]:
     """Where another face comes before the face `now`, and which; `stop` and `now` if none does."""
     after, follower = stop, now

@@ -5,8 +5,8 @@ floor to the ceiling, so whether a wall hides a solid is decided column by colum
 """
 
 import numpy as np
-from numba import njit
 
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float
 from sim.raycast.outline import clip, coverage, hull
 from sim.raycast.plan import NONE, Pinhole
@@ -21,7 +21,7 @@ from sim.raycast.windows import (
 )
 
 
-@njit(cache=True)
+@kernel
 def depth_of(solids: Solids, i: int, eye: Float, ray: Float, near_m: float) -> float:
     """Depth at which a ray (3,), one metre of depth long, enters a solid; infinity if it does not.
 
@@ -41,7 +41,7 @@ def depth_of(solids: Solids, i: int, eye: Float, ray: Float, near_m: float) -> f
     return enter if enter < leave else np.inf
 
 
-@njit(cache=True)
+@kernel
 def cast(
     camera: Pinhole, solids: Solids, poses: Float, grey: Float, depth_m: np.ndarray,
     picture: np.ndarray,
@@ -71,7 +71,7 @@ def cast(
                             picture[v, u] = grey[i]
 
 
-@njit(cache=True)
+@kernel_part
 def _nearness(
     camera: Pinhole, solids: Solids, i: int, eye: Float, axes: Float, outline: Float,
     v: int, left: int, nearness: Float,
@@ -108,7 +108,7 @@ def _nearness(
             inside[u] = min(inside[u], at_left - aside / f * u)
 
 
-@njit(cache=True)
+@kernel_part
 def _between(outline: Float, v: float) -> tuple[float, float]:
     """Where a convex outline (K, 2) begins and ends in row v; infinities where it does not."""
     begin, end = np.inf, -np.inf
@@ -120,7 +120,7 @@ def _between(outline: Float, v: float) -> tuple[float, float]:
     return begin, end
 
 
-@njit(cache=True)
+@kernel
 def draw(
     camera: Pinhole, seen: Float, face: np.ndarray, until: Float, count: np.ndarray,
     solids: Solids, poses: Float, grey: Float, picture: np.ndarray,
@@ -171,7 +171,7 @@ def draw(
             picture[v, j] = np.uint8(shown[v - above, j - first] + 0.5)
 
 
-@njit(cache=True)
+@kernel_part
 def _covered(
     camera: Pinhole, solids: Solids, i: int, pose: Float, corners: Float,
     top: int, bottom: int, left: int, right: int,
@@ -195,7 +195,7 @@ def _covered(
     return covered
 
 
-@njit(cache=True)
+@kernel_part
 def _depth_in_column(camera: Pinhole, solids: Solids, i: int, pose: Float, j: int) -> float:
     """Depth of a solid's box where column j meets it in plan, or of its corner nearest to that."""
     eye, axes = in_robot(camera, pose)
@@ -220,7 +220,7 @@ def _depth_in_column(camera: Pinhole, solids: Solids, i: int, pose: Float, j: in
     return best_m
 
 
-@njit(cache=True)
+@kernel_part
 def _open_share(
     seen: Float, face: np.ndarray, until: Float, count: np.ndarray, j: int, at_m: float
 ) -> float:

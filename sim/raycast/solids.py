@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull
 
+from mapfusion.kernels import kernel_part
 from mapfusion.se2 import Float
 
 MARGIN_M = 0.001  # by which PyBullet shows cylinders too large
@@ -131,7 +131,7 @@ def _rotation(rpy: ArrayLike) -> Float:
     return about_z @ about_y @ about_x
 
 
-@njit(cache=True)
+@kernel_part
 def front_to_back(solids: Solids, eye_m: Float) -> np.ndarray:
     """An order (S,) in which none hides one before it, seen from a point (3,) of their frame.
 
@@ -157,7 +157,7 @@ def front_to_back(solids: Solids, eye_m: Float) -> np.ndarray:
     return order
 
 
-@njit(cache=True)
+@kernel_part
 def _unhidden(solids: Solids, i: int, j: int, eye_m: Float) -> bool:
     """Whether solid j can hide nothing of solid i."""
     for axis in range(3):

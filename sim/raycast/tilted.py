@@ -11,10 +11,10 @@ from typing import Self
 
 import cv2
 import numpy as np
-from numba import njit
 
 from mapfusion.camera import StereoCamera
 from mapfusion.errors import InputError
+from mapfusion.kernels import kernel
 from mapfusion.se2 import Float
 from sim.depth_image import SAME_SURFACE
 from sim.raycast.plan import Pinhole
@@ -90,7 +90,7 @@ class TiltedView:
         return _depths(level, self.to_level, height, width)
 
 
-@njit(cache=True)
+@kernel
 def _depths(level: np.ndarray, to_level: Float, height: int, width: int) -> np.ndarray:
     """As `sim.depth_image.depth_at` at each pixel's place in the level image, tilted again."""
     depth_m = np.empty((height, width), dtype=np.float32)

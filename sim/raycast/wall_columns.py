@@ -9,8 +9,8 @@ themselves: to hold on to them while it calls others would take as long as a loo
 """
 
 import numpy as np
-from numba import njit
 
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float
 from sim.raycast.plan import NONE, Pinhole
 from sim.raycast.scene import Walls
@@ -24,7 +24,7 @@ COVERED = np.float32(1 - 1e-6)  # shares are kept in single precision
 LEAST_TEXELS = 1e-6  # of a strip at a wall's end: sums still tell them apart
 
 
-@njit(cache=True)
+@kernel
 def open_rows(
     camera: Pinhole, walls: Walls, seen: Float, face: np.ndarray, until: Float, count: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -59,14 +59,14 @@ def open_rows(
     return above, below
 
 
-@njit(cache=True, inline="always")
+@kernel_part
 def _edges(camera: Pinhole, height_m: float, w: float) -> tuple[float, float]:
     """Where a wall's upper and lower edge lie in v, at inverse depth w."""
     top = camera.center_v - (height_m - camera.eye_z_m) * camera.focal_px * w
     return top, camera.center_v + camera.eye_z_m * camera.focal_px * w
 
 
-@njit(cache=True)
+@kernel
 def draw_walls(
     camera: Pinhole,
     walls: Walls,
@@ -118,7 +118,7 @@ def draw_walls(
         _show(total, covered, shown, first, last, j, picture)
 
 
-@njit(cache=True)
+@kernel_part
 def _most_rows(size: np.ndarray) -> int:
     most = 0
     for i in range(len(size)):
@@ -126,19 +126,19 @@ def _most_rows(size: np.ndarray) -> int:
     return most
 
 
-@njit(cache=True)
+@kernel_part
 def _clear(total: np.ndarray, covered: np.ndarray) -> None:
     for v in range(len(total)):
         total[v], covered[v] = 0.0, 0.0
 
 
-@njit(cache=True)
+@kernel_part
 def _round(total: np.ndarray, shown: np.ndarray) -> None:
     for v in range(len(total)):
         shown[v] = np.uint8(np.int32(total[v] + np.float32(0.5)))
 
 
-@njit(cache=True)
+@kernel_part
 def _show(
     total: np.ndarray,
     covered: np.ndarray,
@@ -156,7 +156,7 @@ def _show(
             picture[v, j] = shown[v]
 
 
-@njit(cache=True)
+@kernel_part
 def _cuts(camera: Pinhole, height_m: float, seen: Float, i: int, low: float, high: float) -> int:
     """Into how many strips one of face i is cut."""
     slope = seen[i, 3]
@@ -167,7 +167,7 @@ def _cuts(camera: Pinhole, height_m: float, seen: Float, i: int, low: float, hig
     return min(int(crossed / STEEPEST_ROWS) + 1, MOST_CUTS)
 
 
-@njit(cache=True)
+@kernel_part
 def _rows(
     camera: Pinhole,
     height_m: float,
@@ -183,7 +183,7 @@ def _rows(
     return top, bottom, size[i, 1] / (height_m * camera.focal_px * w)
 
 
-@njit(cache=True)
+@kernel_part
 def _texels(
     seen: Float, i: int, low: float, high: float, width_m: Float, size: np.ndarray
 ) -> tuple[float, float]:
@@ -196,7 +196,7 @@ def _texels(
     return begin, min(max(end * per_m, begin + LEAST_TEXELS), n)
 
 
-@njit(cache=True)
+@kernel_part
 def _cover(
     covered: np.ndarray, share: float, top: float, bottom: float, first: int, last: int
 ) -> None:
@@ -207,7 +207,7 @@ def _cover(
     covered[last] -= share * max(last + 0.5 - bottom, 0.0)
 
 
-@njit(cache=True)
+@kernel_part
 def _add_columns(
     table: np.ndarray,
     first: int,
@@ -237,7 +237,7 @@ def _add_columns(
         sums[r] = np.float32(whole) + (b * np.float32(gained) - a * np.float32(lost))
 
 
-@njit(cache=True)
+@kernel_part
 def _find_rows(
     q: float, texels: float, n: int, edges: int, row: np.ndarray, share: np.ndarray
 ) -> None:
@@ -252,7 +252,7 @@ def _find_rows(
         share[v] = at - np.float32(row[v])
 
 
-@njit(cache=True)
+@kernel_part
 def _look_up(
     sums: np.ndarray, row: np.ndarray, edges: int, below: np.ndarray, more: np.ndarray
 ) -> None:
@@ -262,13 +262,13 @@ def _look_up(
         more[v] = sums[k + np.uint64(1)]
 
 
-@njit(cache=True)
+@kernel_part
 def _interpolate(below: np.ndarray, more: np.ndarray, share: np.ndarray, edges: int) -> None:
     for v in range(edges):
         below[v] += share[v] * (more[v] - below[v])
 
 
-@njit(cache=True)
+@kernel_part
 def _add_means(below: np.ndarray, scale: float, first: int, last: int, total: np.ndarray) -> None:
     """Add means over footprints, from the sums below the edges between them."""
     start, weight = np.uint64(first), np.float32(scale)

@@ -1,14 +1,14 @@
 """Where the other robots are in a picture: their places before the camera, and their windows."""
 
 import numpy as np
-from numba import njit
 
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float
 from sim.raycast.plan import Pinhole
 from sim.raycast.solids import Solids
 
 
-@njit(cache=True)
+@kernel
 def in_robot(camera: Pinhole, pose: Float) -> tuple[Float, Float]:
     """The eye (3,) in a robot's frame, and the camera's axes (3, 3) there: ahead, left, up."""
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
@@ -26,7 +26,7 @@ def by_distance(camera: Pinhole, poses: Float) -> Float:
     return poses[np.argsort(np.sum(apart**2, axis=1), kind="stable")]
 
 
-@njit(cache=True)
+@kernel
 def pixel_ray(camera: Pinhole, axes: Float, v: int, u: int, ray: Float) -> None:
     """Fill in the ray (3,) through a pixel's middle, one metre of depth long."""
     left, up = (camera.center_u - u) / camera.focal_px, (camera.center_v - v) / camera.focal_px
@@ -34,7 +34,7 @@ def pixel_ray(camera: Pinhole, axes: Float, v: int, u: int, ray: Float) -> None:
         ray[k] = axes[0, k] + left * axes[1, k] + up * axes[2, k]
 
 
-@njit(cache=True)
+@kernel
 def _in_camera(camera: Pinhole, solids: Solids, i: int, pose: Float) -> Float:
     """A solid's corners (K, 3) ahead, to the left and above the eye, metres."""
     eye, axes = in_robot(camera, pose)
@@ -47,7 +47,7 @@ def _in_camera(camera: Pinhole, solids: Solids, i: int, pose: Float) -> Float:
     return placed
 
 
-@njit(cache=True)
+@kernel
 def _project(camera: Pinhole, ahead: float, left: float, up: float, seen: Float) -> None:
     """Fill in u, v and depth (3,) of a point."""
     seen[0] = camera.center_u - camera.focal_px * left / ahead if ahead > 0 else np.nan
@@ -55,7 +55,7 @@ def _project(camera: Pinhole, ahead: float, left: float, up: float, seen: Float)
     seen[2] = ahead
 
 
-@njit(cache=True)
+@kernel
 def project_corners(camera: Pinhole, solids: Solids, i: int, pose: Float) -> Float:
     """A solid's corners (K, 3) in the picture: u, v and depth along the axis in metres."""
     seen = _in_camera(camera, solids, i, pose)
@@ -64,7 +64,7 @@ def project_corners(camera: Pinhole, solids: Solids, i: int, pose: Float) -> Flo
     return seen
 
 
-@njit(cache=True)
+@kernel_part
 def _project_before_lens(camera: Pinhole, solids: Solids, i: int, pose: Float) -> Float:
     """The same (M, 3) of what is left of a solid that the plane through the lens cuts.
 
@@ -87,7 +87,7 @@ def _project_before_lens(camera: Pinhole, solids: Solids, i: int, pose: Float) -
     return seen[:m]
 
 
-@njit(cache=True)
+@kernel
 def window(
     camera: Pinhole, solids: Solids, i: int, pose: Float, corners: Float
 ) -> tuple[int, int, int, int]:
@@ -103,7 +103,7 @@ def window(
     return int(top), int(bottom), int(left), int(right)
 
 
-@njit(cache=True)
+@kernel_part
 def all_windows(camera: Pinhole, solids: Solids, poses: Float) -> tuple[int, int, int, int]:
     """First and last row and column that any robot may show in."""
     above, below, first, last = camera.height_px, -1, camera.width_px, -1
@@ -117,7 +117,7 @@ def all_windows(camera: Pinhole, solids: Solids, poses: Float) -> tuple[int, int
     return above, below, first, last
 
 
-@njit(cache=True)
+@kernel
 def extremes(corners: Float) -> tuple[Float, Float]:
     """The least (3,) and the largest (3,) of corners (K, 3) in each coordinate."""
     first, last = corners[0].copy(), corners[0].copy()

@@ -6,11 +6,11 @@ that two correspondences determine is judged, which is more than any estimator t
 
 import numpy as np
 import pandas as pd
-from numba import njit
 
 from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.false_alarms import IndependentPairs, fewest_false_alarms, independent_pairs
 from mapfusion.align.rigid import fit_rigid
+from mapfusion.kernels import kernel
 from mapfusion.se2 import Float
 
 N_PAIRS_OF_MAPS = 5000
@@ -44,7 +44,7 @@ def calibrate(acceptance: Acceptance, rng: np.random.Generator, n_pairs: int) ->
     return pd.DataFrame(columns)
 
 
-@njit(cache=True)
+@kernel
 def accepted_motions(pairs: IndependentPairs, gates_m: Float, bounds_log10: Float) -> np.ndarray:
     """How many motions of two of the pairs have an NFA up to each bound (S,)."""
     p_a, p_b = pairs.p_a, pairs.p_b

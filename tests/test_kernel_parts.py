@@ -1,0 +1,66 @@
+"""Parts of kernels: they are put into few places, all of which divide by zero as they do."""
+
+import ast
+from collections import defaultdict
+
+import pytest
+
+from experiments.run.code_version import PACKAGES, SOURCE_ROOT
+
+_MOST_COPIED = 20  # statements; more of them take longer to compile than a kernel apart
+
+Named = tuple[str, str]  # a module and a function
+
+TREES = {
+    ".".join(path.relative_to(SOURCE_ROOT).with_suffix("").parts): ast.parse(path.read_bytes())
+    for package in PACKAGES
+    for path in sorted((SOURCE_ROOT / package).rglob("*.py"))
+}
+FUNCTIONS: dict[Named, ast.FunctionDef] = {
+    (module, node.name): node
+    for module, tree in TREES.items()
+    for node in tree.body
+    if isinstance(node, ast.FunctionDef)
+}
+
+
+def decorator(node: ast.FunctionDef) -> tuple[str, str]:
+    """The name of its only decorator and what that is given; empty where there is none."""
+    name, _, options = "".join(ast.unparse(each) for each in node.decorator_list).partition("(")
+    return name, options
+
+
+def found_uses() -> dict[Named, list[ast.FunctionDef]]:
+    """By function, the functions that name it, once for each time that they do."""
+    uses = defaultdict[Named, list[ast.FunctionDef]](list)
+    for module, tree in TREES.items():
+        meant = {name: (home, name) for home, name in FUNCTIONS if home == module}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and node.module:
+                meant |= {one.name: (node.module, one.name) for one in node.names}
+        for caller in (node for node in tree.body if isinstance(node, ast.FunctionDef)):
+            for node in ast.walk(caller):
+                if isinstance(node, ast.Name) and node.id in meant:
+                    uses[meant[node.id]].append(caller)
+    return uses
+
+
+USES = found_uses()
+PARTS = [named for named, node in FUNCTIONS.items() if decorator(node)[0] == "kernel_part"]
+
+
+def test_parts_are_found() -> None:
+    assert len(PARTS) > 100
+
+
+@pytest.mark.parametrize("part", PARTS, ids=".".join)
+def test_a_part_is_called_by_kernels_alone_that_divide_as_it_does(part: Named) -> None:
+    _, options = decorator(FUNCTIONS[part])
+    callers = {decorator(caller) for caller in USES[part]}
+    assert callers
+    assert callers <= {("kernel", options), ("kernel_part", options)}
+
+
+@pytest.mark.parametrize("part", PARTS, ids=".".join)
+def test_a_part_that_is_called_at_several_places_is_short(part: Named) -> None:
+    assert (len(USES[part]) - 1) * len(FUNCTIONS[part].body) <= _MOST_COPIED
