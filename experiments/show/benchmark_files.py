@@ -153,7 +153,7 @@ def _lay_out(panels: np.ndarray, shares: list[float]) -> None:
     panels[0, 0].set_ylim(-3, 103)
     for axes in panels[1:].flat:
         axes.set_yscale("log")
-        axes.yaxis.set_major_formatter(style.plain_numbers())
+        style.write_plainly(axes.yaxis)
     drawn = [line.get_ydata() for axes in panels[1] for line in axes.get_lines()]
     ratios = np.concatenate([*drawn, _RATIO_RANGE])
     panels[1, 0].set_yticks(_RATIO_TICKS)

@@ -4,7 +4,7 @@ from matplotlib.figure import Figure
 
 from experiments.show.figures.error_curves import draw_error_curves
 from experiments.show.figures.result_tables import ResultTables
-from experiments.show.figures.style import plain_numbers
+from experiments.show.figures.style import write_plainly
 
 READS = ("errors", "estimates")
 _FLOOR_M = 1e-4  # a tenth of a millimetre: anything below is exact for a robot
@@ -15,6 +15,6 @@ def draw(data: ResultTables) -> Figure:
     figure, drawn = draw_error_curves(data, "translation_error_m", "translation error (m)")
     axes = figure.axes[0]
     axes.set_yscale("log", nonpositive="clip")
-    axes.yaxis.set_major_formatter(plain_numbers())
+    write_plainly(axes.yaxis)
     axes.set_ylim(max(drawn.min(), _FLOOR_M) / 1.3, max(drawn.max(), 2 * _FLOOR_M) * 1.3)
     return figure

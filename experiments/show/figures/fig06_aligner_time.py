@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from experiments.judge.criteria import ORACLE
 from experiments.judge.tables import UNKNOWN
 from experiments.show.figures.result_tables import NothingToDraw, ResultTables
-from experiments.show.figures.style import PAGE_WIDTH_IN, aligner_legend, plain_numbers
+from experiments.show.figures.style import PAGE_WIDTH_IN, aligner_legend, write_plainly
 from experiments.study.statistics.error_bands import TIME_GROUPS, time_bands
 
 READS = ("aligner_timings", "errors", "estimates")
@@ -40,7 +40,7 @@ def draw(data: ResultTables) -> Figure:
         if not axes.lines:
             axes.text(0.5, 0.5, "no truth: unknown", ha="center", transform=axes.transAxes)
         axes.set(xlabel=label, yscale="log")
-        axes.yaxis.set_major_formatter(plain_numbers())
+        write_plainly(axes.yaxis)
     panels[0].set_ylabel("time of one alignment (s)")
     shown = [(n, label) for n, label in data.labels.items() if n in timed or label != n]
     aligner_legend(figure, {label: data.styles[name] for name, label in shown}, columns=5)

@@ -31,7 +31,7 @@ def draw_curves(axes: Axes, refusals: pd.DataFrame, score: str) -> None:
     axes.set_xlabel("false merges: no common ground (left edge: none)")
     axes.set_ylabel(f"missed merges: {MERGEABLE_PAIRS}+ true pairs (bottom: none)")
     for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_formatter(style.plain_numbers())
+        style.write_plainly(axis)
 
 
 def draw_support(axes: Axes, refusals: pd.DataFrame) -> None:

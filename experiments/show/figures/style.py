@@ -7,9 +7,10 @@ from typing import Any
 
 import matplotlib.style
 from matplotlib.artist import Artist
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, LogFormatter
 
 from experiments.judge.criteria import ORACLE
 from experiments.judge.fuser_coverage import FILTERED, SMOOTHED
@@ -82,9 +83,26 @@ ROBOT_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
 FUSED_COLOUR = BLACK
 
 
+class _Between(LogFormatter):
+    """Between powers of ten: numbers where Matplotlib writes some, on axes with few powers."""
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        return _plain(x) if super().__call__(x, pos) else ""
+
+
 def plain_numbers() -> FuncFormatter:
     """Ticks of logarithmic axes as people read them: 0.01, 0.1, 1, 10."""
-    return FuncFormatter(lambda value, _: f"{value:g}".replace("-", "−"))
+    return FuncFormatter(lambda value, _: _plain(value))
+
+
+def write_plainly(axis: Axis) -> None:
+    """Give a logarithmic axis plain numbers, also between the powers of ten."""
+    axis.set_major_formatter(plain_numbers())
+    axis.set_minor_formatter(_Between())
+
+
+def _plain(value: float) -> str:
+    return f"{value:g}".replace("-", "−")
 
 
 def house_style() -> AbstractContextManager[None]:
