@@ -66,7 +66,7 @@ class ClosestPoints:
         self._tree = BoxTree.of(pairs.map_a.position_m * upright)
         self._p_b = pairs.map_b.position_m * upright
         self._groups = Groups.of(self._p_b)
-        self._ends: list[Fit] = []
+        self._ends: list[tuple[Float, np.ndarray]] = []  # T_a_b and what was nearest of each
         # T_a_b of each round that led to one of them, which one, and after how many more
         self._met, self._end, self._to_go = np.empty((0, 3)), _NO_ROUNDS, _NO_ROUNDS
 
@@ -104,14 +104,14 @@ class ClosestPoints:
             )
         if met == _REPEATS:
             new, end, further = way, len(self._ends), 0
-            self._ends.append(self._fit(way[-1].copy(), nearest))
+            self._ends.append((way[-1].copy(), nearest))
         else:
             new, end, further = way[:-1], self._end[met], self._to_go[met]
         to_go = further + len(way) - 1 - np.arange(len(new))
         self._met = np.concatenate([self._met, new])
         self._end = np.concatenate([self._end, np.full(len(new), end)])
         self._to_go = np.concatenate([self._to_go, to_go])
-        return self._ends[end]
+        return self._fit(*self._ends[end])
 
     def _fit(self, T_a_b: Float, nearest: np.ndarray, refusal: str = "") -> Fit:
         pairs, index_a, index_b = self._pairs, self._tree.row[nearest], np.arange(len(nearest))

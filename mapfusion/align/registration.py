@@ -1,7 +1,7 @@
 """Registration: estimate with a method, refine by least squares, judge."""
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -75,15 +75,45 @@ class MethodAligner:
         return self._align(pairs, rng, time.perf_counter())
 
     def _align(self, pairs: Pairs, rng: np.random.Generator, started_s: float) -> Alignment:
-        rows = np.arange(len(pairs))
         height = getattr(self.method, "height", None)
-        if isinstance(height, HeightGate):
-            rows = pairs.of_one_height(height)
         needs = getattr(self.method, "needs", None) or Needs()
-        given = pairs if len(rows) == len(pairs) else pairs[rows]
-        reason = _why_not_called(needs, pairs, given)
-        found = Undetermined(reason) if reason else self.method.find(given, rng)
-        return alignment_of_fit(found, pairs, rows, started_s)
+        offer = _Offer.of(pairs, height if isinstance(height, HeightGate) else None, needs)
+        if offer.too_little:
+            return undetermined(offer.too_little, len(pairs), started_s)
+        found = self.method.find(offer.given, rng)
+        if isinstance(found, Undetermined):
+            return undetermined(found.reason, len(pairs), started_s)
+        answer = offer.answers.get(content := _content(found))
+        if answer is None:
+            answer = alignment_of_fit(found, pairs, offer.rows, started_s)
+            offer.answers[content] = answer
+        return replace(answer, elapsed_s=time.perf_counter() - started_s)
+
+
+class _Offer(NamedTuple):
+    """What a method is given of the pairs of two maps.
+
+    Attributes:
+        rows: (n,) of all pairs.
+        given: those.
+        too_little: why they are less than the method needs; empty when they are not.
+        answers: that fits of them made, by their content.
+    """
+
+    rows: np.ndarray
+    given: Pairs
+    too_little: str
+    answers: dict[tuple, Alignment]
+
+    @classmethod
+    def of(cls, pairs: Pairs, height: HeightGate | None, needs: Needs) -> "_Offer":
+        """That of the last call with these pairs, of the same gate and needs, if there was one."""
+        offers: dict[tuple, _Offer] = pairs.kept.setdefault(cls, {})
+        if (height, needs) not in offers:
+            rows = np.arange(len(pairs)) if height is None else pairs.of_one_height(height)
+            given = pairs if len(rows) == len(pairs) else pairs[rows]
+            offers[height, needs] = cls(rows, given, _why_not_called(needs, pairs, given), {})
+        return offers[height, needs]
 
 
 def _why_not_called(needs: Needs, pairs: Pairs, given: Pairs) -> str:
@@ -93,6 +123,15 @@ def _why_not_called(needs: Needs, pairs: Pairs, given: Pairs) -> str:
         n, least = len(given), needs.pairs
         reason = f"the heights of {n} correspondences agree, at least {least} are needed"
     return reason or needs.why_without_extent(given)
+
+
+def _content(fit: Fit) -> tuple:
+    """All that a fit says; two of the same content are the same answer."""
+    fitted = None if fit.fitted is None else fit.fitted.correspondences
+    indices = (None, None) if fitted is None else (fitted.index_a, fitted.index_b)
+    arrays = (fit.T_a_b, fit.inlier, fit.weight, fit.gain, *indices)
+    told = (None if array is None else np.asarray(array).tobytes() for array in arrays)
+    return (*told, fit.gate_m, fit.refusal)
 
 
 def alignment_of_fit(
@@ -192,7 +231,10 @@ class Registration:
         Raises:
             ValueError: an index of the correspondences lies outside its map.
         """
-        return PairRegistration(self, Pairs(map_a, map_b, correspondences), evidence)
+        pairs = Pairs(map_a, map_b, correspondences)
+        return PairRegistration(
+            self.method, Completion(pairs, self.refinement, self.judge, evidence)
+        )
 
     def register(
         self,
@@ -209,41 +251,66 @@ class Registration:
         return self.on(map_a, map_b, correspondences).register(rng)
 
 
-class PairRegistration:
-    """A `Registration` on one pair of maps; equal estimates are refined and judged once."""
+class Completion:
+    """What follows an estimate on a pair of maps, whoever made it: it is refined and judged.
+
+    Equal estimates are refined once, and what becomes the same by that is judged once.
+    """
 
     def __init__(
-        self, registration: Registration, pairs: Pairs, evidence: PairEvidence | None
+        self,
+        pairs: Pairs,
+        refinement: Refinement,
+        judge: Judge | None,
+        evidence: PairEvidence | None = None,
     ) -> None:
-        self._registration = registration
-        self._aligner = as_aligner(registration.method)
-        self._pairs = pairs
-        self.judge: PairJudge | None = None
-        if registration.judge is not None:
-            self.judge = registration.judge.on(pairs, evidence)
-        self._completed: dict[object, tuple[Alignment, Verdict]] = {}
+        """For some correspondences; the others as `Registration` and its `on` have them."""
+        self.pairs, self._refinement = pairs, refinement
+        self.judge: PairJudge | None = judge.on(pairs, evidence) if judge is not None else None
+        self._refined: dict[tuple, Alignment] = {}
+        self._judged: dict[tuple, Verdict] = {}
 
-    def register(self, rng: np.random.Generator) -> Registered:
-        """Estimate once more; refine and judge the estimate unless it was there before."""
-        estimated = self._estimated(rng)
-        known = (estimated.T_a_b.tobytes(), estimated.status, estimated.reason)
-        if known not in self._completed:
-            refined = self._refined(estimated)
-            self._completed[known] = refined, self._judged(refined)
-        return Registered(estimated, *self._completed[known])
+    def of(self, estimated: Alignment) -> tuple[Alignment, Verdict]:
+        """An estimate refined, and the verdict on that."""
+        refined = estimated
+        if estimated.status not in NOT_RUN:
+            known = (estimated.T_a_b.tobytes(), estimated.status, estimated.reason)
+            if known not in self._refined:
+                self._refined[known] = self._refinement.refine(self.pairs, estimated.T_a_b)
+            refined = self._refined[known]
+        arrays = (array.tobytes() for array in (refined.T_a_b, refined.covariance, refined.inlier))
+        known = (*arrays, refined.drift_sigma_m, refined.status, refined.reason)
+        if known not in self._judged:
+            self._judged[known] = self._judge(refined)
+        return refined, self._judged[known]
 
-    def _estimated(self, rng: np.random.Generator) -> Alignment:
-        pairs = self._pairs
-        if isinstance(self._aligner, MethodAligner):
-            return self._aligner.align_again(pairs, rng)
-        return self._aligner.align(pairs.map_a, pairs.map_b, pairs.correspondences, rng)
-
-    def _refined(self, estimated: Alignment) -> Alignment:
-        if estimated.status in NOT_RUN:
-            return estimated
-        return self._registration.refinement.refine(self._pairs, estimated.T_a_b)
-
-    def _judged(self, refined: Alignment) -> Verdict:
+    def _judge(self, refined: Alignment) -> Verdict:
         if self.judge is None:
             return Verdict(refined.status, np.nan, refined.reason)
         return self.judge.judge(refined)
+
+
+class PairRegistration:
+    """A method on one pair of maps, and the completion of what it estimates.
+
+    Several methods on the same pair may share the completion.
+    """
+
+    def __init__(self, method: Method | Aligner, completion: Completion) -> None:
+        self._aligner, self._completion = as_aligner(method), completion
+
+    @property
+    def judge(self) -> PairJudge | None:
+        """Who gives the verdict; None where whatever the refinement does is accepted."""
+        return self._completion.judge
+
+    def register(self, rng: np.random.Generator) -> Registered:
+        """Estimate once more, and complete it."""
+        estimated = self._estimated(rng)
+        return Registered(estimated, *self._completion.of(estimated))
+
+    def _estimated(self, rng: np.random.Generator) -> Alignment:
+        pairs = self._completion.pairs
+        if isinstance(self._aligner, MethodAligner):
+            return self._aligner.align_again(pairs, rng)
+        return self._aligner.align(pairs.map_a, pairs.map_b, pairs.correspondences, rng)

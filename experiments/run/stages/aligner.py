@@ -3,7 +3,10 @@
 Each aligner apart, so a run in which one has changed takes all others' estimates as they are.
 """
 
+import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from experiments.methods.aligner_calls import callable_aligner
@@ -14,12 +17,14 @@ from experiments.run.stage_tables import CORRESPONDENCES, ESTIMATES, RIVALS
 from experiments.run.stages import match
 from experiments.scenario.randomness import generator
 from mapfusion.align.acceptance import Acceptance
+from mapfusion.align.pairs import Pairs
 from mapfusion.align.refine import Refinement
-from mapfusion.align.registration import Registration
+from mapfusion.align.registration import Completion, PairRegistration
 from mapfusion.evidence.judge import Judge
 from mapfusion.evidence.parameters import EvidenceParameters
 
 LABEL, WRITES = match.LABEL, match.WRITES[:1]
+_BATCHES_KEPT = 4  # by a process; three robots have three pairs
 
 
 @dataclass(frozen=True)
@@ -41,19 +46,35 @@ class AlignerSettings:
 
 def run(settings: AlignerSettings, job: Job) -> None:
     """Let the aligner estimate at one batch of iterations, on what the match stage offers."""
-    offered = read_rows(match.batch_path(job.inputs["match"], job.part), CORRESPONDENCES)
-    rivals = read_rows(match.rivals_path(job.inputs["match"], job.part), RIVALS)
     aligner = callable_aligner(settings.method, settings.parameters, settings.time_limit_s)
     judge = Judge(settings.acceptance, settings.evidence, settings.refinement)
-    registration = Registration(aligner, settings.refinement, judge)
+    inputs = tuple(job.inputs.items())
     rows = []
-    for k, map_a, map_b in match.pairs_of_maps(job, settings.iterations):
-        pairs = correspondences_of(at_iteration(offered, k))
-        evidence = evidence_of(at_iteration(rivals, k), (map_a, map_b), settings.evidence)
-        on_pair = registration.on(map_a, map_b, pairs, evidence)
-        for repetition in range(settings.repetitions if registration.randomised else 1):
-            names = {"robot_a": map_a.name, "robot_b": map_b.name, "iteration": k}
+    for k, completion in _completions(inputs, job.part, judge, settings.iterations):
+        pairs, on_pair = completion.pairs, PairRegistration(aligner, completion)
+        for repetition in range(settings.repetitions if aligner.randomised else 1):
+            names = {"robot_a": pairs.map_a.name, "robot_b": pairs.map_b.name, "iteration": k}
             names |= {"aligner": settings.name, "repetition": repetition}
             done = on_pair.register(generator(settings.seed, "align", *names.values()))
             rows.append(names | estimate_row(len(pairs), *done))
     write_rows(match.batch_path(job.output, job.part), ESTIMATES, rows)
+
+
+@functools.lru_cache(maxsize=_BATCHES_KEPT)
+def _completions(
+    inputs: tuple[tuple[str, Path], ...], part: str, judge: Judge, iterations: tuple[int, ...]
+) -> Sequence[tuple[int, Completion]]:
+    """Iterations of a batch, and what completes an estimate there, whichever aligner made it.
+
+    One aligner's task follows on another's, so the last ones stay in memory. What is in a folder
+    follows from its name.
+    """
+    job = Job(dict(inputs), Path(), part)
+    offered = read_rows(match.batch_path(job.inputs["match"], part), CORRESPONDENCES)
+    rivals = read_rows(match.rivals_path(job.inputs["match"], part), RIVALS)
+    completions = []
+    for k, map_a, map_b in match.pairs_of_maps(job, iterations):
+        pairs = Pairs(map_a, map_b, correspondences_of(at_iteration(offered, k)))
+        evidence = evidence_of(at_iteration(rivals, k), (map_a, map_b), judge.evidence)
+        completions.append((k, Completion(pairs, judge.refinement, judge, evidence)))
+    return completions

@@ -11,7 +11,7 @@ from mapfusion.align.method import Fit, Needs, Undetermined, supported
 from mapfusion.align.pairs import Pairs
 from mapfusion.align.ransac import Ransac
 from mapfusion.align.refine import Refinement
-from mapfusion.align.registration import Registration, as_aligner
+from mapfusion.align.registration import Completion, PairRegistration, Registration, as_aligner
 from mapfusion.align.registry import ALIGNERS, make_aligner
 from mapfusion.align.result import Alignment, Status, without_answer
 from mapfusion.align.rigid import (
@@ -49,6 +49,21 @@ class WholeAnswers:
     def align(self, map_a, map_b, correspondences, rng):
         del map_a, map_b, correspondences, rng
         return self.answer
+
+
+@dataclass
+class CountedJudge:
+    """Keeps what it was asked to judge."""
+
+    asked: list = field(default_factory=list)
+
+    def on(self, pairs, known):
+        self.ready = Judge().on(pairs, known)
+        return self
+
+    def judge(self, alignment):
+        self.asked.append(alignment)
+        return self.ready.judge(alignment)
 
 
 @dataclass
@@ -240,6 +255,97 @@ def test_equal_estimates_are_refined_once():
     assert [d.estimated.reason for d in done[3:5]] == ["a", "b"]
     again = Registration(Answers(fits)).register(*maps_of(pair), rng)
     assert_same(again.refined, done[0].refined)
+
+
+def test_methods_on_one_pair_share_what_completes_their_estimates():
+    pair = given_pairs(np.random.default_rng(8), 60, 0.8, 0.02)
+    methods = [make_aligner(name) for name in ("ransac", "icp", "impicp", "clique", "gnc")] * 2
+    refinement, judge = CountedRefinement(), CountedJudge()
+    completion = Completion(Pairs(*maps_of(pair)), refinement, judge)
+    motions, refined = set(), set()
+    for k, method in enumerate(methods):
+        rng, same_rng = np.random.default_rng(k), np.random.default_rng(k)
+        done = PairRegistration(method, completion).register(rng)
+        alone = Registration(method).register(*maps_of(pair), same_rng)
+        assert_same(done.estimated, alone.estimated)
+        assert_same(done.refined, alone.refined)
+        assert done.verdict == alone.verdict
+        motions.add((done.estimated.T_a_b.tobytes(), done.estimated.reason))
+        refined.add((done.refined.T_a_b.tobytes(), done.refined.covariance.tobytes()))
+    assert len(refinement.calls) == len(motions) < len(methods)
+    assert len(judge.asked) == len(refined) < len(methods)
+
+
+def test_what_becomes_the_same_is_judged_once_and_what_differs_by_itself():
+    pair = given_pairs(np.random.default_rng(8), 60, 1.0, 0.02)
+    motions = [pair.T_a_b + np.array([k * 0.01, 0, 0]) for k in range(6)]
+    fits = [Fit(T, np.ones(60, bool)) for T in motions]
+    method, refinement, judge = Answers(fits), CountedRefinement(), CountedJudge()
+    completion = Completion(Pairs(*maps_of(pair)), refinement, judge)
+    answer, _ = completion.of(as_aligner(method).align(*maps_of(pair), None))
+    refinement.refine = lambda pairs, T_a_b: answer  # all to one place
+    n = len(judge.asked)
+    for _ in motions:
+        rng = np.random.default_rng(0)
+        assert PairRegistration(method, completion).register(rng).refined is answer
+    assert len(judge.asked) == n == 1
+    for changed in (
+        {"T_a_b": answer.T_a_b + 1e-12},
+        {"covariance": answer.covariance * 2},
+        {"inlier": ~answer.inlier},
+        {"drift_sigma_m": 1.0},
+        {"status": Status.REFUSED, "reason": "unsure"},
+    ):
+        other = replace(answer, **changed)
+        refinement.refine = lambda pairs, T_a_b, other=other: other
+        completion.of(replace(answer, T_a_b=answer.T_a_b + len(judge.asked)))
+        assert judge.asked[-1] is other
+
+
+def test_equal_fits_are_one_answer_and_others_are_not():
+    """Whatever a fit says counts: else a fit would be given the covariance of another."""
+    pair = given_pairs(np.random.default_rng(9), 40, 1.0, 0.05)
+    pairs, everyone, rng = Pairs(*maps_of(pair)), np.ones(40, bool), np.random.default_rng(0)
+    first = Fit(pair.T_a_b, everyone)
+    gain = least_squares_gain(pair.T_a_b, pairs.p_b, np.linspace(2, 1, 40))
+    fits = [
+        first,
+        Fit(pair.T_a_b.copy(), everyone.copy()),
+        replace(first, T_a_b=pair.T_a_b + np.array([0.1, 0, 0])),
+        replace(first, inlier=np.arange(40) < 30),
+        replace(first, weight=np.linspace(1, 2, 40)),
+        replace(first, gain=gain),
+        replace(first, fitted=pairs[np.arange(20)]),
+        replace(first, gate_m=0.1),
+        replace(first, refusal="unsure"),
+    ]
+    aligner = as_aligner(Answers(fits))
+    again = [aligner.align_again(pairs, rng) for _ in fits]
+    for fit, found in zip(fits, again, strict=True):
+        assert_same(found, as_aligner(Answers([fit])).align(*maps_of(pair), rng))
+    covariances = [found.covariance.tobytes() for found in again]
+    assert covariances[0] == covariances[1]
+    assert len(set(covariances[1:-1])) == len(fits) - 2
+    assert again[0].covariance is again[1].covariance
+    assert again[0].elapsed_s != again[1].elapsed_s
+
+
+def test_the_height_gate_and_needs_of_each_method_are_its_own():
+    """Of the same pairs one method is given all, another those of one height, a third none."""
+    pair = given_pairs(np.random.default_rng(3), 50, 1.0, 0.01)
+    raised = replace(pair.map_b, position_m=pair.map_b.position_m + np.array([0, 0, 5.0]))
+    pairs, everyone = Pairs(pair.map_a, raised, pair.correspondences), np.ones(50, bool)
+    rng, plain = np.random.default_rng(0), Answers([Fit(pair.T_a_b, everyone)])
+    assert as_aligner(plain).align_again(pairs, rng).ok
+    gated = Answers([Fit(pair.T_a_b, everyone)])
+    gated.height = HeightGate()
+    assert "heights of 0" in as_aligner(gated).align_again(pairs, rng).reason
+    assert not gated.given
+    wants = Answers([Fit(pair.T_a_b, everyone)])
+    wants.needs = Needs(51)
+    assert "51 are needed" in as_aligner(wants).align_again(pairs, rng).reason
+    assert as_aligner(plain).align_again(pairs, rng).ok
+    assert [len(given) for given in plain.given] == [50, 50]
 
 
 def test_index_outside_its_map_is_named():
