@@ -103,18 +103,20 @@ def fill(
     plan, way = footprints(camera, level), ways(camera, level)
     shape, firsts, cells = level.shape, level.first, level.cells
     place, cell = np.empty((3, PIECE), np.int32), np.empty(PIECE, np.uint32)
-    sums, most = np.empty(PIECE, np.uint32), _most_open(open_rows)
+    sums, bounds = np.empty(PIECE, np.uint32), _least_and_most(open_rows)
     rise = (camera.eye_z_m - level.height_m) * camera.focal_px
-    for i in range(len(most)):
+    for i in range(len(bounds)):
         first, last = i * PIECE, min((i + 1) * PIECE, camera.width_px)
-        for row in range(most[i]):
+        for row in range(bounds[i, 1]):
             v = row if is_above else camera.height_px - 1 - row
             n, across, k = plan[v, 0], plan[v, 1], plan[v, 2]
             size, corner = (shape[k, 0], shape[k, 1]), int(firsts[k])
             end = first
             while end < last:
-                begin = _next(open_rows, row, end, last, True)
-                end = _next(open_rows, row, begin, last, False)
+                begin, end = end, last
+                if row >= bounds[i, 0]:
+                    begin = _next(open_rows, row, begin, last, True)
+                    end = _next(open_rows, row, begin, last, False)
                 count = end - begin
                 _start(sums, count, SUM_UNIT * int(BACKGROUND) if n == 0 else 0)
                 for side in range(across):
@@ -133,12 +135,16 @@ def fill(
 
 
 @kernel_part
-def _most_open(open_rows: np.ndarray) -> np.ndarray:
-    """The most open rows of each `PIECE` columns."""
-    most = np.zeros(-(-len(open_rows) // PIECE), dtype=np.int64)
+def _least_and_most(open_rows: np.ndarray) -> np.ndarray:
+    """The least and the most open rows of each `PIECE` columns (N, 2)."""
+    bounds = np.zeros((-(-len(open_rows) // PIECE), 2), dtype=np.int64)
+    for i in range(len(bounds)):
+        bounds[i, 0] = open_rows[i * PIECE]
     for j in range(len(open_rows)):
-        most[j // PIECE] = max(most[j // PIECE], open_rows[j])
-    return most
+        i = j // PIECE
+        bounds[i, 0] = min(bounds[i, 0], open_rows[j])
+        bounds[i, 1] = max(bounds[i, 1], open_rows[j])
+    return bounds
 
 
 @kernel

@@ -1,5 +1,6 @@
 """Whole pictures: each pixel the mean of its footprint, or the texel that its middle hits."""
 
+import cv2
 import numpy as np
 
 from mapfusion.kernels import kernel, kernel_part
@@ -34,7 +35,10 @@ def filtered(
     picture = np.empty((camera.height_px, camera.width_px), dtype=np.uint8)
     fill(camera, ceiling, True, above, picture)
     fill(camera, floor, False, below, picture)
-    draw_walls(camera, walls, seen, face, until, count, picture)
+    # walls are drawn by columns, which in a picture lie far apart in memory
+    columns = cv2.transpose(picture)
+    draw_walls(camera, walls, seen, face, until, count, columns)
+    picture = cv2.transpose(columns)
     if len(poses):
         in_order = by_distance(camera, poses)
         draw(camera, seen, face, until, count, solids, in_order, grey, picture)

@@ -74,22 +74,25 @@ def draw_walls(
     face: np.ndarray,
     until: Float,
     count: np.ndarray,
-    picture: np.ndarray,
+    columns: np.ndarray,
 ) -> None:
-    """Draw walls over a picture (H, W) uint8 of what is behind them; arguments as above."""
+    """Draw walls over what is behind them; arguments as above.
+
+    The picture's columns (W, H) uint8 are changed, each one after the other in memory.
+    """
     height, height_m, width_m, size = camera.height_px, walls.height_m, walls.width_m, walls.size
     begins, table = walls.first, walls.sums
     # of a strip: sums of its texels up to each row of texels; of the edges between pixels: the row
     # of texels that they lie in, the share of it below them, sums up to that row and from it to the
-    # next; of pixels: grey levels times covered share, that share, and grey levels
+    # next; of pixels: grey levels times covered share, and that share
     sums = np.empty(_most_rows(size) + 1, dtype=np.float32)
     row, share = np.empty(height + 1, dtype=np.int32), np.empty(height + 1, dtype=np.float32)
     below = np.empty(height + 1, dtype=np.float32)
     more = np.empty(height + 1, dtype=np.float32)
     total, covered = np.empty(height, dtype=np.float32), np.empty(height, dtype=np.float32)
-    shown = np.empty(height, dtype=np.uint8)
     for j in range(camera.width_px):
         low, first, last = j - 0.5, height - 1, 0
+        lowest_top, highest_bottom = 0, height - 1
         _clear(total, covered)
         for s in range(count[j]):
             i, high = face[j, s], until[j, s]
@@ -113,9 +116,14 @@ def draw_walls(
                 _add_means(below, (b - a) / ((end - begin) * step), upper, lower, total)
                 _cover(covered, b - a, top, bottom, upper, lower)
                 first, last = min(first, upper), max(last, lower)
+                lowest_top, highest_bottom = max(lowest_top, upper), min(highest_bottom, lower)
             low = high
-        _round(total, shown)
-        _show(total, covered, shown, first, last, j, picture)
+        # rows between the edges of all strips are covered alike; if wholly, nothing shines through
+        begin, end = lowest_top + 1, highest_bottom
+        if begin >= end or covered[begin] < COVERED:
+            begin = end = last + 1
+        _round(total, begin, end, j, columns)
+        _blend(total, covered, first, begin, end, last, j, columns)
 
 
 @kernel_part
@@ -133,27 +141,36 @@ def _clear(total: np.ndarray, covered: np.ndarray) -> None:
 
 
 @kernel_part
-def _round(total: np.ndarray, shown: np.ndarray) -> None:
-    for v in range(len(total)):
-        shown[v] = np.uint8(np.int32(total[v] + np.float32(0.5)))
+def _round(total: np.ndarray, begin: int, end: int, j: int, columns: np.ndarray) -> None:
+    """Draw a column's rows from `begin` to before `end`, which walls cover."""
+    start = np.uintp(begin)
+    for i in range(end - begin):
+        v = start + np.uintp(i)
+        columns[j, v] = np.uint8(np.int32(total[v] + np.float32(0.5)))
 
 
 @kernel_part
-def _show(
+def _blend(
     total: np.ndarray,
     covered: np.ndarray,
-    shown: np.ndarray,
     first: int,
+    begin: int,
+    end: int,
     last: int,
     j: int,
-    picture: np.ndarray,
+    columns: np.ndarray,
 ) -> None:
-    """Draw a column's rows from `first` to `last` over what is there."""
-    for v in range(first, last + 1):
+    """Draw its other rows, from `first` to `last`, over what is there."""
+    v = first
+    while v <= last:
+        if v == begin:
+            v = end
+            continue
         if covered[v] < COVERED:
-            picture[v, j] = np.uint8(total[v] + (1 - covered[v]) * picture[v, j] + 0.5)
+            columns[j, v] = np.uint8(total[v] + (1 - covered[v]) * columns[j, v] + 0.5)
         else:
-            picture[v, j] = shown[v]
+            columns[j, v] = np.uint8(np.int32(total[v] + np.float32(0.5)))
+        v += 1
 
 
 @kernel_part
@@ -201,8 +218,9 @@ def _cover(
     covered: np.ndarray, share: float, top: float, bottom: float, first: int, last: int
 ) -> None:
     """Add a strip's share to what is covered of pixels, less of those that its edges cross."""
-    for v in range(first, last + 1):
-        covered[v] += np.float32(share)
+    begin, whole = np.uintp(first), np.float32(share)
+    for i in range(last + 1 - first):
+        covered[begin + np.uintp(i)] += whole
     covered[first] -= share * max(top - (first - 0.5), 0.0)
     covered[last] -= share * max(last + 0.5 - bottom, 0.0)
 
