@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 import scipy.linalg
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from mapfusion.smoother import skyline
 from mapfusion.smoother.skyline import (
@@ -111,14 +113,40 @@ def test_order_brings_those_together_that_have_to_do_with_each_other():
     assert apart.max() <= 6  # 100 in the order in which they were driven
 
 
-def test_where_rows_are_no_longer_so_the_order_of_time_stays():
-    """Each pose has to do with half of the others, and the last with the first: folded in the
-    middle, as neighbours of neighbours would have it, rows are twice as long."""
-    n, reach = 60, 30
+def windows(n: int, reach: int) -> tuple[np.ndarray, np.ndarray]:
+    """Groups and members of a drive that sees each thing for `reach` poses and never again."""
     first = np.arange(n - reach + 1)
-    member = np.concatenate([(first[:, None] + np.arange(reach)).ravel(), [0, n - 1]])
-    group = np.concatenate([np.repeat(first, reach), [len(first)] * 2])
-    np.testing.assert_array_equal(envelope_order(group, member, n), np.arange(n))
+    return np.repeat(first, reach), (first[:, None] + np.arange(reach)).ravel()
+
+
+def lengths(group: np.ndarray, member: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """(n,) of the rows of a factor."""
+    return np.arange(len(place)) - first_entries(group, member, place)
+
+
+@pytest.mark.parametrize("reach", [2, 10, 30])
+def test_while_nothing_is_seen_again_the_order_of_time_stays(reach):
+    group, member = windows(60, reach)
+    np.testing.assert_array_equal(envelope_order(group, member, 60), np.arange(60))
+
+
+def test_a_factor_costs_less_than_in_other_orders():
+    """Of drives that come back to five places, each at some other time; costs beside the least."""
+    n, costs = 300, []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        group, member = windows(n, 8)
+        again = rng.integers(0, n - 20, (5, 2))[:, :, None] + np.arange(20)
+        groups = group.max() + 1 + np.tile(np.arange(100).reshape(5, 1, 20), (1, 2, 1))
+        group = np.concatenate([group, groups.ravel()])
+        member = np.concatenate([member, again.ravel()])
+        has = csr_matrix((np.ones(len(group)), (member, group)))
+        by_degree = reverse_cuthill_mckee((has @ has.T).tocsr(), symmetric_mode=True).argsort()
+        orders = envelope_order(group, member, n), by_degree, np.arange(n)
+        found, *others = (np.sum(lengths(group, member, each) ** 2) for each in orders)
+        costs.append(found / min(others))
+    assert max(costs) <= 1
+    assert np.mean(costs) < 0.8
 
 
 @pytest.mark.parametrize("n_members", [0, 1, 2])
