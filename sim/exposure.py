@@ -32,7 +32,13 @@ def expose(gray: np.ndarray, noise: RadiometricNoise, rng: np.random.Generator) 
     light = 255.0 ** (1 - noise.gamma) * np.arange(256.0) ** noise.gamma
     levels = (gain * light + offset).astype(np.float32)
     bits = draw_bits(gray.size, rng).reshape(gray.shape)
-    return _exposed(gray, levels, bits, np.float32(noise.sigma_gray) * normal_values())
+    return _exposed(gray, levels, bits, _deviations(noise.sigma_gray))
+
+
+@functools.lru_cache(maxsize=1)
+def _deviations(sigma_gray: float) -> np.ndarray:
+    """Equally likely deviations (VALUES,) float32 of a pixel's grey level."""
+    return np.float32(sigma_gray) * normal_values()
 
 
 def draw_bits(n: int, rng: np.random.Generator) -> np.ndarray:

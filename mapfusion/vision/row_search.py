@@ -127,10 +127,9 @@ def _correlate(
     for y in range(v - half, v + half + 1):
         _take_strip(other, y, first - half, candidates + 2 * half, strip, room)
         _add_products(image, y, u - half, half, strip, padded, room)
-        for x in range(u - half, u + half + 1):
-            grey = np.int64(image[y, x])
-            total += grey
-            total_square += grey * grey
+        row_total, row_square = _add_up(image, y, u - half, side)
+        total += row_total
+        total_square += row_square
     spread = area * total_square - total * total
     if spread == 0:
         return False
@@ -149,6 +148,17 @@ def _correlate(
         strip_total -= room[_SUM, k]
         strip_square -= room[_SQUARE, k]
     return True
+
+
+@kernel_part
+def _add_up(image: np.ndarray, y: int, begin: int, count: int) -> tuple[np.int32, np.int32]:
+    """Sum and sum of squares of part of a row."""
+    total, total_square, at = np.int32(0), np.int32(0), np.uintp(begin)
+    for k in range(count):
+        grey = np.int32(image[y, at + np.uintp(k)])
+        total = np.int32(total + grey)
+        total_square = np.int32(total_square + grey * grey)
+    return total, total_square
 
 
 @kernel_part

@@ -19,6 +19,7 @@ from sim.raycast.plan import Pinhole
 from sim.raycast.scene import REFUSED, Scene, read_scene
 from sim.raycast.solids import read_solids
 from sim.raycast.tilted import TiltedView
+from sim.raycast.windows import within_view
 from sim.stereo_head import NEAR_M, StereoFrame, camera_pose
 
 Sampling = Literal["footprint", "middle"]
@@ -45,6 +46,7 @@ class RayCaster:
         self._channels: list[Scene] = []
         self._solids = read_solids(URDF)
         rgb = self._solids.rgb.astype(np.uint8)[None]
+        self._reach_m = float(np.linalg.norm(self._solids.corners_m[:, :, :2], axis=2).max())
         self._grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)[0].astype(np.float64)
 
     def stereo(
@@ -60,10 +62,12 @@ class RayCaster:
         It is at a pose (3,), or (4, 4) where its body tilts; raises InputError where it looks from
         above the walls, or too far up or down.
         """
-        half_m = self._camera.baseline_m / 2
-        left, right = (self.grey(T_world_robot, y_m, others) for y_m in (half_m, -half_m))
-        depth_m = self.depth_m(T_world_robot, half_m, others)
-        rgb = self.rgb(T_world_robot, half_m, others) if colour else None
+        half_m, poses = self._camera.baseline_m / 2, _poses(others)
+        view = self._view(T_world_robot, half_m)
+        left = self._draw(self._scene, view, poses, self._grey)
+        right = self.grey(T_world_robot, -half_m, poses)
+        depth_m = self._depth_m(view, poses)
+        rgb = self.rgb(T_world_robot, half_m, poses) if colour else None
         return StereoFrame(expose(left, noise, rng), expose(right, noise, rng), depth_m, rgb)
 
     def grey(self, T_world_robot: ArrayLike, y_m: float, others: ArrayLike) -> np.ndarray:
@@ -74,37 +78,37 @@ class RayCaster:
             y_m: of the optical centre, to the left of the robot's axis.
             others: (R, 3) poses of the robots that may be seen.
         """
-        return self._draw(self._scene, T_world_robot, y_m, others, self._grey)
+        view = self._view(T_world_robot, y_m)
+        return self._draw(self._scene, view, _poses(others), self._grey)
 
     def rgb(self, T_world_robot: ArrayLike, y_m: float, others: ArrayLike) -> np.ndarray:
         """The same in colour (H, W, 3) uint8; three times the work and the memory."""
         if not self._channels:
             self._channels = [read_scene(self._faces, channel) for channel in range(3)]
-        colours = self._solids.rgb.T
+        colours, view, poses = self._solids.rgb.T, self._view(T_world_robot, y_m), _poses(others)
         drawn = [
-            self._draw(scene, T_world_robot, y_m, others, colour.copy())
+            self._draw(scene, view, poses, colour.copy())
             for scene, colour in zip(self._channels, colours, strict=True)
         ]
         return np.stack(drawn, -1)
 
     def depth_m(self, T_world_robot: ArrayLike, y_m: float, others: ArrayLike) -> np.ndarray:
         """Depth (H, W) float32 along the optical axis behind each pixel's middle; NaN: nothing."""
-        scene, view = self._scene, self._view(T_world_robot, y_m)
-        camera = view if isinstance(view, Pinhole) else view.level
-        found = depths(
-            camera, scene.walls, scene.floor, scene.ceiling, self._solids, _poses(others)
-        )
+        return self._depth_m(self._view(T_world_robot, y_m), _poses(others))
+
+    def _depth_m(self, view: Pinhole | TiltedView, poses: Float) -> np.ndarray:
+        scene, camera = self._scene, view if isinstance(view, Pinhole) else view.level
+        shown = within_view(camera, self._reach_m, poses)
+        found = depths(camera, scene.walls, scene.floor, scene.ceiling, self._solids, shown)
         return found if isinstance(view, Pinhole) else view.depth_m(found)
 
     def _draw(
-        self, scene: Scene, T_world_robot: ArrayLike, y_m: float, others: ArrayLike, grey: Float
+        self, scene: Scene, view: Pinhole | TiltedView, poses: Float, grey: Float
     ) -> np.ndarray:
         kernel = filtered if self._sampling == "footprint" else sampled
-        view = self._view(T_world_robot, y_m)
         camera = view if isinstance(view, Pinhole) else view.level
-        drawn = kernel(
-            camera, scene.walls, scene.floor, scene.ceiling, self._solids, _poses(others), grey
-        )
+        shown = within_view(camera, self._reach_m, poses)
+        drawn = kernel(camera, scene.walls, scene.floor, scene.ceiling, self._solids, shown, grey)
         return drawn if isinstance(view, Pinhole) else view.picture(drawn)
 
     def _view(self, T_world_robot: ArrayLike, y_m: float) -> Pinhole | TiltedView:

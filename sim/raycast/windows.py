@@ -1,5 +1,7 @@
 """Where the other robots are in a picture: their places before the camera, and their windows."""
 
+import math
+
 import numpy as np
 
 from mapfusion.kernels import kernel, kernel_part
@@ -22,8 +24,23 @@ def in_robot(camera: Pinhole, pose: Float) -> tuple[Float, Float]:
 
 def by_distance(camera: Pinhole, poses: Float) -> Float:
     """The poses (R, 3) from the nearest to the farthest."""
-    apart = poses[:, :2] - [camera.eye_x_m, camera.eye_y_m]
-    return poses[np.argsort(np.sum(apart**2, axis=1), kind="stable")]
+    x, y = poses[:, 0] - camera.eye_x_m, poses[:, 1] - camera.eye_y_m
+    return poses[np.argsort(x * x + y * y, kind="stable")]
+
+
+def within_view(camera: Pinhole, reach_m: float, poses: Float) -> Float:
+    """Those of the poses (R, 3) at which robots may show, were there no walls.
+
+    No part of them is farther than `reach_m` from where they stand, in plan. What shows lies
+    between two lines from the eye, ahead of it.
+    """
+    cos, sin = math.cos(camera.theta), math.sin(camera.theta)
+    x, y = poses[:, 0] - camera.eye_x_m, poses[:, 1] - camera.eye_y_m
+    ahead, aside = cos * x + sin * y, np.abs(cos * y - sin * x)
+    # half a pixel from the last one's middle is its edge, the other half is to spare
+    widest = max(camera.center_u, camera.width_px - 1 - camera.center_u) + 1
+    beside = aside - ahead * (widest / camera.focal_px)
+    return poses[(ahead > -reach_m) & (beside <= reach_m * math.hypot(1, widest / camera.focal_px))]
 
 
 @kernel

@@ -7,7 +7,7 @@ from sim.p3at import URDF
 from sim.raycast.plan import Pinhole
 from sim.raycast.robots import depth_of
 from sim.raycast.solids import read_solids
-from sim.raycast.windows import in_robot, pixel_ray, project_corners, window
+from sim.raycast.windows import in_robot, pixel_ray, project_corners, window, within_view
 from sim.stereo_head import NEAR_M
 
 # A wide lens low above the floor, which has something of a robot beside it in view.
@@ -50,3 +50,22 @@ def test_what_stands_beside_the_lens_has_no_window() -> None:
         if corners[:, 2].min() <= NEAR_M:
             top, bottom, left, right = window(narrow, SOLIDS, i, beside, corners)
             assert top > bottom or left > right
+
+
+def test_robots_that_have_a_window_are_within_view_and_others_mostly_not() -> None:
+    rng = np.random.default_rng(3)
+    camera = CAMERA._replace(center_u=30.0, eye_x_m=1.0, eye_y_m=-2.0, theta=2.5)
+    poses = rng.uniform([-3, -6, -np.pi], [5, 2, np.pi], (300, 3))
+    reach_m = float(np.hypot(*SOLIDS.corners_m[..., :2].reshape(-1, 2).T).max())
+    within = {tuple(pose) for pose in within_view(camera, reach_m, poses)}
+    beside = 0
+    for pose in poses:
+        shows = False
+        for i in range(len(SOLIDS.n_corners)):
+            corners = project_corners(camera, SOLIDS, i, pose)
+            top, bottom, left, right = window(camera, SOLIDS, i, pose, corners)
+            shows |= top <= bottom and left <= right
+        assert tuple(pose) in within or not shows
+        beside += tuple(pose) in within and not shows
+    assert 0 < len(within) < len(poses)
+    assert beside < 0.15 * len(within)
