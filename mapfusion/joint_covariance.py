@@ -28,7 +28,7 @@ _DEPENDENT = 1e-6
 # all iterations.
 _FEW = 2 * _ITERATIONS * (RANK + _TO_SPARE)
 
-_cholesky = scipy.linalg.get_lapack_funcs("potrf", dtype=np.float64)
+(_cholesky,) = scipy.linalg.get_lapack_funcs(("potrf",), dtype=np.float64)
 
 
 @dataclass(frozen=True)
