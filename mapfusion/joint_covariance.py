@@ -6,9 +6,11 @@ normal variables z do to all of them: x_i = m_i + C_i' z + e_i, with e_i of cova
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
+import scipy.linalg
 
 from mapfusion.arguments import require_finite, require_shape
 from mapfusion.kernels import kernel
@@ -20,6 +22,13 @@ RANK = 100
 # The subspace of the largest variances is found by iteration, with so many directions to spare; at
 # each what is not wanted shrinks by the ratio of its variance to the wanted ones.
 _TO_SPARE, _ITERATIONS = 20, 3
+# Sine of a direction's angle to those before it, below which products of both tell nothing of it.
+_DEPENDENT = 1e-6
+# Of so many rows all products of Y Y' cost no more than those with some columns by way of Y' do in
+# all iterations.
+_FEW = 2 * _ITERATIONS * (RANK + _TO_SPARE)
+
+(_cholesky,) = scipy.linalg.get_lapack_funcs(("potrf",), dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -99,12 +108,21 @@ class KnownErrors:
     def __len__(self) -> int:
         return len(self.common)
 
+    @cached_property
+    def _by_all(self) -> Float:
+        """(R, R) Y Y'."""
+        return self.common @ self.common.T
+
     def rows_by_all(self, rows: np.ndarray) -> Float:
         """(R, r) columns of Y Y', those of `rows` (r,)."""
+        if len(self) <= _FEW:
+            return self._by_all[:, rows]
         return self.common @ np.ascontiguousarray(self.common[rows].T)
 
     def gram(self, columns: Float) -> Float:
         """Y Y' times columns (R, c)."""
+        if len(self) <= _FEW:
+            return self._by_all @ columns
         return self.common @ self.spread(columns)
 
     def spread(self, columns: Float) -> Float:
@@ -130,9 +148,9 @@ def condensed(own_m2: Float, common: Float | SharedErrors, rank: int = RANK) -> 
         n_start = min(rank + _TO_SPARE, len(common))
         rows = np.linspace(0, len(common) - 1, n_start).round().astype(int)
         # onto single rows: common' times columns of the identity
-        basis = np.linalg.qr(common.rows_by_all(np.unique(rows)))[0]
+        basis = _orthonormal(common.rows_by_all(np.unique(rows)))
         for _ in range(_ITERATIONS - 1):
-            basis = np.linalg.qr(common.gram(basis))[0]
+            basis = _orthonormal(common.gram(basis))
         within = common.spread(basis).T
         largest = np.linalg.eigh(within @ within.T).eigenvectors[:, ::-1][:, :rank]
         kept = largest.T @ within
@@ -140,6 +158,23 @@ def condensed(own_m2: Float, common: Float | SharedErrors, rank: int = RANK) -> 
         kept = common.spread(np.eye(len(common))).T
     by_landmark = np.ascontiguousarray(kept.reshape(len(kept), n, 3).transpose(1, 0, 2))
     return JointCovariance(own_m2 + common.squares() - _squares(kept, n), by_landmark)
+
+
+def _orthonormal(columns: Float) -> Float:
+    """(n, m) columns that span the same, by the Cholesky factor of their products.
+
+    That leaves them orthonormal but for the square of their condition, and a second time but for
+    rounding (Yamamoto et al. 2015, "Roundoff error analysis of the CholeskyQR2 algorithm"): tall
+    ones take a fifth of what reflections take. Those that are too near to each other take these.
+    """
+    length = np.linalg.norm(columns, axis=0)
+    basis = columns / np.where(length > 0, length, 1.0)
+    for _ in range(2):
+        factor, failed = _cholesky(basis.T @ basis, lower=1)
+        if failed or not np.diagonal(factor).min() > _DEPENDENT:
+            return np.linalg.qr(columns)[0]
+        basis = scipy.linalg.solve_triangular(factor, basis.T, lower=True, check_finite=False).T
+    return basis
 
 
 @kernel

@@ -18,7 +18,7 @@ from mapfusion.smoother.offsets import Points, known_points, moved_points, witho
 from mapfusion.smoother.path_errors import PathErrors
 from mapfusion.smoother.reduced_poses import ReducedPoses
 from mapfusion.smoother.sightings import Sightings
-from mapfusion.smoother.skyline import Factor, factor_in_envelope
+from mapfusion.smoother.skyline import Envelope, Factor, factor_in_envelope
 
 _ITEM = np.dtype(np.float64).itemsize
 _COPIES = 3  # of a matrix that are there at once: as it is made, in LAPACK's order, and solved
@@ -102,7 +102,7 @@ def shared_errors(seen: Sightings, equations: NormalEquations, solution: Solutio
     factor = own_factor(seen, equations, solution)
     if solution.landmarks_first:
         return PathErrors.of(seen, equations, solution.own_m2, factor)
-    return KnownErrors(_beside_own(solution.own_m2, factor.lower))
+    return KnownErrors(_beside_own(solution.own_m2, factor.dense()))
 
 
 def pose_covariances(
@@ -154,7 +154,8 @@ def _poses_first(seen: Sightings, equations: NormalEquations) -> Solution:
     chain = chain_factor(equations)
     right = np.column_stack([B, equations.pose_gradient[1:].ravel()])
     solved = scipy.linalg.cho_solve_banded((chain, True), right, check_finite=False)
-    factor = factor_in_envelope(K - B.T @ solved[:, :-1], np.zeros(len(K), dtype=np.int64))
+    whole = Envelope(np.zeros(len(K), dtype=np.int64))
+    factor = factor_in_envelope(whole.of(K - B.T @ solved[:, :-1]), whole)
     points = -factor.solve_transposed(factor.solve(gradient - B.T @ solved[:, -1]))
     way, offsets = np.zeros((n_poses, 3)), np.zeros((len(seen.strays), 3))
     way[1:] = -(solved[:, -1] + solved[:, :-1] @ points).reshape(-1, 3)
@@ -164,7 +165,7 @@ def _poses_first(seen: Sightings, equations: NormalEquations) -> Solution:
     known = known_points(seen, left)
     own = left.landmark_m2, known.offset_m2, known.track_m2
     last = step.point_m.ravel()
-    moved = float(np.sum((np.tril(factor.lower[-last.size :, -last.size :]).T @ last) ** 2))
+    moved = float(np.sum((factor.dense()[-last.size :, -last.size :].T @ last) ** 2))
     return Solution(step, moved, *own, factor, landmarks_first=False)
 
 

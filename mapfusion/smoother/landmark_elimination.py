@@ -23,11 +23,11 @@ def subtract_points(seen: Sightings, equations: NormalEquations, left: Reduced, 
         seen: the observations.
         equations: all of them.
         left: once the offsets are eliminated.
-        S: (3T, 3T) of the poses by `pose_place`; the lower half, and the blocks on the diagonal.
+        S: entries of what is between the unknown poses, in `seen.order.envelope`.
     """
-    place, coupling = seen.pose_place[seen.frame], equations.coupling
+    coupling, offset = equations.coupling, seen.order.envelope.offset
     couplings = coupling, left_couplings(seen, coupling, left)
-    _subtract(seen.by_landmark, place, couplings, left, S)
+    _subtract(seen.by_landmark, seen.unknown_place, couplings, left, offset, S)
 
 
 @kernel
@@ -36,18 +36,22 @@ def _subtract(
     place: np.ndarray,
     couplings: tuple[Float, Float],
     left: Reduced,
+    offset: np.ndarray,
     S: Float,
 ) -> None:
     (starts, first_track, track_starts), (coupling, coupling_left) = rows, couplings
     by_landmark, by_track = np.empty((3, 3)), np.empty((3, 3))  # H K A, and H (K A K' + G)
     for j in range(len(starts) - 1):
         for t in range(first_track[j], first_track[j + 1]):
-            for i in range(track_starts[t], track_starts[t + 1]):
+            own = track_starts[t]
+            for i in range(own, track_starts[t + 1]):
+                if place[i] < 0:
+                    continue
                 _put_gains(left, j, t, coupling, coupling_left, i, by_landmark, by_track)
                 _add_product(by_landmark, left.kept, t, by_track)
-                _subtract_rows(by_landmark, starts[j], track_starts[t], i, place, coupling_left, S)
-                _subtract_rows(by_track, track_starts[t], i, i, place, coupling, S)
-                _subtract_own(by_track, coupling, i, 3 * place[i], S)
+                _subtract_rows(by_landmark, starts[j], own, i, place, coupling_left, offset, S)
+                _subtract_rows(by_track, own, i, i, place, coupling, offset, S)
+                _subtract_own(by_track, coupling, i, 3 * place[i], offset, S)
 
 
 # Kernels take arrays and rows of them: views of rows are counted, which takes longer than the sums.
@@ -85,55 +89,73 @@ def subtract_gram(seen: Sightings, moved: Float, S: Float) -> None:
     Args:
         seen: the observations.
         moved: (N, 3, 3) of each.
-        S: (3T, 3T) by `pose_place`; the lower half, and the blocks on the diagonal.
+        S: entries of what is between the unknown poses, in `seen.order.envelope`.
     """
-    _subtract_gram(seen.starts, seen.pose_place[seen.frame], moved, S)
+    _subtract_gram(seen.starts, seen.unknown_place, moved, seen.order.envelope.offset, S)
 
 
 @kernel
-def _subtract_gram(starts: np.ndarray, place: np.ndarray, moved: Float, S: Float) -> None:
+def _subtract_gram(
+    starts: np.ndarray, place: np.ndarray, moved: Float, offset: np.ndarray, S: Float
+) -> None:
     own = np.empty((3, 3))
     for j in range(len(starts) - 1):
         for i in range(starts[j], starts[j + 1]):
+            if place[i] < 0:
+                continue
             for r in range(3):
                 for q in range(3):
                     own[r, q] = moved[i, r, q]
-            _subtract_rows(own, starts[j], i, i, place, moved, S)
-            _subtract_own(own, moved, i, 3 * place[i], S)
+            _subtract_rows(own, starts[j], i, i, place, moved, offset, S)
+            _subtract_own(own, moved, i, 3 * place[i], offset, S)
 
 
 @kernel
 def _subtract_rows(
-    X: Float, begin: int, end: int, i: int, place: np.ndarray, coupling: Float, S: Float
+    X: Float,
+    begin: int,
+    end: int,
+    i: int,
+    place: np.ndarray,
+    coupling: Float,
+    offset: np.ndarray,
+    S: Float,
 ) -> None:
     """X coupling' between the pose of observation i and those of the rows `begin` to `end`."""
     x00, x01, x02 = X[0, 0], X[0, 1], X[0, 2]  # `S` may not be where `X` is, no compiler knows
     x10, x11, x12 = X[1, 0], X[1, 1], X[1, 2]
     x20, x21, x22 = X[2, 0], X[2, 1], X[2, 2]
     row = 3 * place[i]
+    at0, at1, at2 = offset[row], offset[row + 1], offset[row + 2]
     for k in range(begin, end):
         column = 3 * place[k]
+        if column < 0:
+            continue
         for q in range(3):
             a, b, c = coupling[k, q, 0], coupling[k, q, 1], coupling[k, q, 2]
             v0 = x00 * a + x01 * b + x02 * c
             v1 = x10 * a + x11 * b + x12 * c
             v2 = x20 * a + x21 * b + x22 * c
             if column <= row:
-                S[row, column + q] -= v0
-                S[row + 1, column + q] -= v1
-                S[row + 2, column + q] -= v2
+                S[at0 + column + q] -= v0
+                S[at1 + column + q] -= v1
+                S[at2 + column + q] -= v2
             if column >= row:  # rows are not in the order of places, and one pose may have several
-                S[column + q, row] -= v0
-                S[column + q, row + 1] -= v1
-                S[column + q, row + 2] -= v2
+                at = offset[column + q] + row
+                S[at] -= v0
+                S[at + 1] -= v1
+                S[at + 2] -= v2
 
 
 @kernel
-def _subtract_own(X: Float, coupling: Float, i: int, row: int, S: Float) -> None:
+def _subtract_own(
+    X: Float, coupling: Float, i: int, row: int, offset: np.ndarray, S: Float
+) -> None:
     for q in range(3):
         a, b, c = coupling[i, q, 0], coupling[i, q, 1], coupling[i, q, 2]
         for r in range(3):
-            S[row + r, row + q] -= X[r, 0] * a + X[r, 1] * b + X[r, 2] * c
+            at = offset[row + r] + row + q
+            S[at] -= X[r, 0] * a + X[r, 1] * b + X[r, 2] * c
 
 
 def left_couplings(seen: Sightings, coupling: Float, left: Reduced) -> Float:

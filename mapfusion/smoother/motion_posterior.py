@@ -82,10 +82,9 @@ def disturbance_variances(end: Settled) -> Float:
 def _from_poses(end: Settled, before: Float, after: Float) -> Float:
     """From the inverse of the poses' information, in their order."""
     factor = own_factor(end.seen, end.equations, end.solution)
-    Z = factor.inverse()
-    n, place = len(after), end.seen.pose_place[1:] - 1
-    blocks = Z.reshape(n, 3, n, 3)
-    own, link = blocks[place, :, place], blocks[place[:-1], :, place[1:]]
+    Z, between = factor.inverse(), factor.envelope.between
+    place = end.seen.pose_place[1:] - 1
+    own, link = between(Z, place, place), between(Z, place[:-1], place[1:])
     return _of_differences(before, after, own, link)
 
 

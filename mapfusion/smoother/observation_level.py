@@ -43,5 +43,5 @@ def told_observation_level(end: Settled, level: float) -> float:
     if known < LEAST_TOLD:
         return 1.0
     beside = min(level, 1.0) * (square + of_point)
-    weights = student_weights(beside, fitted_dof(beside, n), n)
+    weights = student_weights(beside, fitted_dof(beside, n, end.tails.observation), n)
     return float(level * np.sum(weights * square) / known)

@@ -10,13 +10,13 @@ from functools import cached_property
 
 import numpy as np
 
-from mapfusion.kernels import kernel
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float
 from mapfusion.smoother.landmark_elimination import left_couplings, subtract_gram
 from mapfusion.smoother.normal_equations import NormalEquations
 from mapfusion.smoother.offsets import without_offsets
 from mapfusion.smoother.sightings import Sightings
-from mapfusion.smoother.skyline import Factor, multiply_in_envelope, untouched_zeros
+from mapfusion.smoother.skyline import Factor, multiply_in_envelope
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class PathErrors:
     def gram(self, columns: Float) -> Float:
         """Y Y' times columns (R, c)."""
         negative = multiply_in_envelope(
-            self._less_gram, self.factor.first, self.factor.solve_transposed(columns)
+            self._less_gram, self.factor.envelope, self.factor.solve_transposed(columns)
         )
         return -self.factor.solve(negative)
 
@@ -62,27 +62,23 @@ class PathErrors:
         """(3L, c) Y' times columns (R, c)."""
         total = np.zeros((3 * self.seen.n_landmarks, columns.shape[1]))
         of_poses = self.factor.solve_transposed(columns)
-        _add_spread(self.seen.starts, self._place, self.moved, of_poses, total)
+        _add_spread(self.seen.starts, self.seen.unknown_place, self.moved, of_poses, total)
         return total
 
     def squares(self) -> Float:
         """(L, 3, 3) blocks of Y' Y, each landmark's with itself."""
         total = np.zeros((self.seen.n_landmarks, 3, 3))
-        covariance = self.factor.inverse()
-        _add_squares(self.seen.starts, self._place, self.moved, covariance, total)
+        covariance, offset = self.factor.inverse(), self.factor.envelope.offset
+        place = self.seen.unknown_place
+        _add_squares(self.seen.starts, place, self.moved, offset, covariance, total)
         return total + np.swapaxes(total, 1, 2)
-
-    @property
-    def _place(self) -> np.ndarray:
-        """(N,) of each observation's pose among those that are unknown; -1 for the first pose."""
-        return self.seen.pose_place[self.seen.frame] - 1
 
     @cached_property
     def _less_gram(self) -> Float:
-        """-C A A C'."""
-        S = untouched_zeros(len(self) + 3)
+        """-C A A C', its entries."""
+        S = self.factor.envelope.zeros()
         subtract_gram(self.seen, self.moved, S)
-        return S[3:, 3:]
+        return S
 
 
 @kernel
@@ -106,9 +102,14 @@ def _add_spread(
 
 @kernel
 def _add_squares(
-    starts: np.ndarray, place: np.ndarray, moved: Float, covariance: Float, total: Float
+    starts: np.ndarray,
+    place: np.ndarray,
+    moved: Float,
+    offset: np.ndarray,
+    Z: Float,
+    total: Float,
 ) -> None:
-    """Of each landmark what, with its transpose, is moved' covariance moved of all that saw it."""
+    """Of each landmark what, with its transpose, is moved' Z moved of all that saw it."""
     of_pose = np.empty((3, 3))
     for j in range(len(starts) - 1):
         for i in range(starts[j], starts[j + 1]):
@@ -117,10 +118,10 @@ def _add_squares(
             for r in range(3):
                 for q in range(3):
                     of_pose[r, q] = 0.0
-            for k in range(starts[j], i):
+            for k in range(starts[j], i + 1):
                 if place[k] >= 0:
-                    _add_part(covariance, 3 * place[i], 3 * place[k], 1.0, moved[k], of_pose)
-            _add_part(covariance, 3 * place[i], 3 * place[i], 0.5, moved[i], of_pose)
+                    share = 0.5 if k == i else 1.0
+                    _add_part(Z, offset, 3 * place[i], 3 * place[k], share, moved, k, of_pose)
             for r in range(3):
                 for q in range(3):
                     total[j, r, q] += (
@@ -130,13 +131,27 @@ def _add_squares(
                     )
 
 
-@kernel
+@kernel_part
 def _add_part(
-    covariance: Float, row: int, column: int, share: float, moved: Float, total: Float
+    Z: Float,
+    offset: np.ndarray,
+    row: int,
+    column: int,
+    share: float,
+    moved: Float,
+    k: int,
+    total: Float,
 ) -> None:
-    for r in range(3):
-        a = share * covariance[row + r, column]
-        b = share * covariance[row + r, column + 1]
-        c = share * covariance[row + r, column + 2]
-        for q in range(3):
-            total[r, q] += a * moved[0, q] + b * moved[1, q] + c * moved[2, q]
+    """Add a share of the poses' covariance times what moves observation k's landmark."""
+    above = row < column  # its mirror image is stored
+    down, across = (column, row) if above else (row, column)
+    at0, at1, at2 = offset[down] + across, offset[down + 1] + across, offset[down + 2] + across
+    for q in range(3):
+        x, y, z = share * moved[k, 0, q], share * moved[k, 1, q], share * moved[k, 2, q]
+        if above:
+            for r in range(3):
+                total[r, q] += Z[at0 + r] * x + Z[at1 + r] * y + Z[at2 + r] * z
+        else:
+            total[0, q] += Z[at0] * x + Z[at0 + 1] * y + Z[at0 + 2] * z
+            total[1, q] += Z[at1] * x + Z[at1 + 1] * y + Z[at1 + 2] * z
+            total[2, q] += Z[at2] * x + Z[at2 + 1] * y + Z[at2 + 2] * z

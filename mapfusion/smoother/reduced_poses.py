@@ -15,7 +15,7 @@ from mapfusion.smoother.landmark_elimination import along_points, along_way, sub
 from mapfusion.smoother.normal_equations import NormalEquations
 from mapfusion.smoother.offsets import Reduced, moved_points
 from mapfusion.smoother.sightings import Sightings
-from mapfusion.smoother.skyline import Factor, factor_in_envelope, untouched_zeros
+from mapfusion.smoother.skyline import Envelope, Factor, factor_in_envelope
 
 # What a step may be off by, as a share of it, both in sigmas: what the last ones, of hundredths of
 # a sigma, leave of it is nothing, and they mend what those before left.
@@ -60,11 +60,11 @@ class ReducedPoses:
         Raises:
             LinAlgError: the matrix is not positive definite.
         """
-        n = len(self.equations.pose_block)
-        S = untouched_zeros(3 * n)
-        _put_poses(S.reshape(n, 3, n, 3), self.seen.pose_place, self.equations)
+        envelope = self.seen.order.envelope
+        S = envelope.zeros()
+        _put_poses(S, envelope, self.seen.pose_place[1:] - 1, self.equations)
         subtract_points(self.seen, self.equations, self.left, S)
-        return factor_in_envelope(S[3:, 3:], self.seen.order.first_entry)
+        return factor_in_envelope(S, envelope)
 
     def solved(self, factor: Factor, right: Float) -> Float:
         """(T, 3) what a matrix with this factor turns into `right` (T, 3)."""
@@ -103,11 +103,9 @@ class ReducedPoses:
         return total
 
 
-def _put_poses(blocks: Float, place: np.ndarray, equations: NormalEquations) -> None:
-    """What odometry and the poses' own observations say, into blocks (T, 3, T, 3) by `place`."""
-    blocks[place, :, place, :] = equations.pose_block
-    after, before = place[1:], place[:-1]
-    link = np.where(
-        (after > before)[:, None, None], equations.link, np.swapaxes(equations.link, 1, 2)
-    )
-    blocks[np.maximum(after, before), :, np.minimum(after, before), :] = link
+def _put_poses(S: Float, envelope: Envelope, place: np.ndarray, equations: NormalEquations) -> None:
+    """What odometry and the poses' own observations say, by the `place` of each unknown pose."""
+    S[envelope.where(place, place)] = equations.pose_block[1:]
+    after, before, link = place[1:], place[:-1], equations.link[1:]
+    link = np.where((after > before)[:, None, None], link, np.swapaxes(link, 1, 2))
+    S[envelope.where(np.maximum(after, before), np.minimum(after, before))] = link

@@ -9,7 +9,8 @@ from mapfusion.arguments import require_shape
 from mapfusion.robot_log import NO_TRACK, RobotLog
 from mapfusion.se2 import Float
 from mapfusion.smoother.blocks import inverses
-from mapfusion.smoother.skyline import envelope_order, first_entries
+from mapfusion.smoother.envelope_order import envelope_order, first_entries
+from mapfusion.smoother.skyline import Envelope
 
 
 @dataclass(frozen=True)
@@ -35,14 +36,11 @@ class PoseOrder:
         return place
 
     @cached_property
-    def first_entry(self) -> np.ndarray:
-        """(3 (T - 1),) column of each row's first entry, of what poses have to do with each other.
-
-        Rows and columns are the unknown poses' coordinates by their places.
-        """
+    def envelope(self) -> Envelope:
+        """Of what is between the unknown poses, three rows of each by their places."""
         later = self.frame > 0
         chosen = (self.landmark[later], self.frame[later] - 1, self.place[1:] - 1)
-        return np.repeat(3 * first_entries(*chosen), 3)
+        return Envelope(np.repeat(3 * first_entries(*chosen), 3))
 
 
 @dataclass(frozen=True)
@@ -87,6 +85,11 @@ class Sightings:
     def pose_place(self) -> np.ndarray:
         """(T,) order in which poses are solved for; the first, which is known, comes first."""
         return self.order.place
+
+    @cached_property
+    def unknown_place(self) -> np.ndarray:
+        """(N,) of each observation's pose among those that are unknown; -1 for the first pose."""
+        return self.pose_place[self.frame] - 1
 
     @cached_property
     def first_track(self) -> np.ndarray:

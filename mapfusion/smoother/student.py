@@ -7,6 +7,7 @@ are one. Lange, Little, Taylor (1989), "Robust statistical modeling using the t 
 """
 
 import functools
+from collections.abc import Callable
 
 import numpy as np
 from scipy.optimize import root_scalar
@@ -20,8 +21,9 @@ LEAST_DOF, MOST_DOF = 0.5, 1e4
 # Degrees of freedom are found to this share of themselves: far closer than any number of errors
 # tells them.
 _FOUND_TO = 1e-6
-# What they change by from step to step is less than this share, but for the first few.
-_NEAR = 0.1
+# Beside where they were before they are looked for by secants: the first is of a place this share
+# aside, about what they change by from step to step.
+_ASIDE, _MOST_SECANTS = 0.01, 6
 
 # Numbers that are multiplied before a logarithm is taken of them.
 _MULTIPLIED = 8
@@ -91,17 +93,42 @@ def fitted_dof(squares: Float, n_dimensions: Float | int, near: float = MOST_DOF
         near: where they are looked for first.
     """
 
-    @functools.cache  # the search looks at both ends again
+    @functools.cache  # searches look at their ends again
     def slope(log_dof: float) -> float:
         return student_slope(squares, float(np.exp(log_dof)), n_dimensions)
 
     low, high = float(np.log(LEAST_DOF)), float(np.log(MOST_DOF))
-    before, after = np.log(near) - _NEAR, np.log(near) + _NEAR
-    if not (low < before and after < high and slope(before) < 0 < slope(after)):
-        if slope(high) <= 0:
-            return MOST_DOF
-        if slope(low) >= 0:
-            return LEAST_DOF
-        before, after = low, high
-    found = root_scalar(slope, bracket=(before, after), method="brentq", xtol=_FOUND_TO)
+    if near < MOST_DOF:
+        found = _root_nearby(slope, float(np.log(near)), low, high)
+        if found is not None:
+            return float(np.exp(found))
+    if slope(high) <= 0:
+        return MOST_DOF
+    if slope(low) >= 0:
+        return LEAST_DOF
+    found = root_scalar(slope, bracket=(low, high), method="brentq", xtol=_FOUND_TO)
     return float(np.exp(found.root))
+
+
+def _root_nearby(
+    slope: Callable[[float], float], start: float, low: float, high: float
+) -> float | None:
+    """Where a slope rises through zero, by secants from `start`; None where they do not lead there.
+
+    A secant's end is off by about the product of how far off the two places were that it is of.
+    """
+    before, slope_before = start, slope(start)
+    at, off_before = before + np.copysign(_ASIDE, -slope_before), 1.0
+    for _ in range(_MOST_SECANTS):
+        slope_at = slope(at)
+        rise = (slope_at - slope_before) / (at - before)
+        if not rise > 0:
+            return None
+        before, slope_before, off = at, slope_at, -slope_at / rise
+        at = at + off
+        if not (low < at < high and abs(off) < 1):
+            return None
+        if abs(off * off_before) < _FOUND_TO:
+            return float(at)
+        off_before = off
+    return None

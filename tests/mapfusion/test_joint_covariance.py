@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from mapfusion import joint_covariance
 from mapfusion.joint_covariance import JointCovariance, condensed
 
 
@@ -30,7 +31,11 @@ def test_all_directions_kept_are_the_dense_covariance() -> None:
 
 
 @pytest.mark.parametrize("rank", [5, 20])
-def test_what_is_left_out_is_the_smallest_and_goes_to_the_landmarks_own(rank: int) -> None:
+@pytest.mark.parametrize("few", [0, 720])
+def test_what_is_left_out_is_the_smallest_and_goes_to_the_landmarks_own(
+    monkeypatch: pytest.MonkeyPatch, rank: int, few: int
+) -> None:
+    monkeypatch.setattr(joint_covariance, "_FEW", few)
     variances = np.geomspace(1, 1e-6, 60)
     own, common = _parts(np.random.default_rng(1), 40, variances)
     joint, whole = condensed(own, common, rank), _dense(own, common)
@@ -42,6 +47,17 @@ def test_what_is_left_out_is_the_smallest_and_goes_to_the_landmarks_own(rank: in
     off = np.linalg.norm(common.T @ common - stacked.T @ stacked, ord=2)
     assert off == pytest.approx(variances[rank], rel=1e-3)
     assert np.all(np.linalg.eigvalsh(joint.own_m2 - own) > -1e-12)
+
+
+@pytest.mark.parametrize("near", [1.0, 1e-3, 1e-5, 1e-9, 0.0])
+def test_columns_become_orthonormal_however_near_to_each_other(near: float) -> None:
+    rng = np.random.default_rng(3)
+    columns = rng.normal(size=(200, 1)) + near * rng.normal(size=(200, 12))
+    columns *= np.geomspace(1, 1e-9, 12)
+    basis = joint_covariance._orthonormal(columns)
+    np.testing.assert_allclose(basis.T @ basis, np.eye(12), rtol=0, atol=1e-12)
+    left = columns - basis @ (basis.T @ columns)
+    assert np.all(np.linalg.norm(left, axis=0) < 1e-12 * np.linalg.norm(columns, axis=0))
 
 
 def test_rows_are_those_of_the_dense_covariance() -> None:

@@ -207,7 +207,7 @@ def test_a_step_by_the_factor_of_another_is_the_same(planar: bool, tracks: bool)
     assert found.factor is None
     assert own.factor is not None
     off = (found.step.path - own.step.path)[seen.pose_place.argsort()][1:].ravel()
-    lower = np.tril(own.factor.lower)
+    lower = own.factor.dense()
     assert np.linalg.norm(lower.T @ off) < 2e-4 * np.sqrt(own.moved)
     assert found.moved == pytest.approx(own.moved, rel=1e-6)
     for one, another in zip(found.step, own.step, strict=True):
@@ -225,7 +225,8 @@ def test_a_factor_that_is_too_far_off_is_not_used(planar: bool) -> None:
     equations = normal_equations(seen, at, weights, STRAY_M**-2, log.odometry, information)
     own = _landmarks_first(seen, equations)
     assert own.factor is not None
-    far = factor_in_envelope(np.diag(np.logspace(-6, 6, len(own.factor))), own.factor.first)
+    envelope, wide = own.factor.envelope, np.diag(np.logspace(-6, 6, len(own.factor)))
+    far = factor_in_envelope(envelope.of(wide), envelope)
     found = _landmarks_first(seen, equations, far)
     assert found.factor is not None
     np.testing.assert_array_equal(found.step.path, own.step.path)

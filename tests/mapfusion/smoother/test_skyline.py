@@ -7,18 +7,29 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from mapfusion.smoother import skyline
-from mapfusion.smoother.skyline import (
-    envelope_order,
-    factor_in_envelope,
-    first_entries,
-    multiply_in_envelope,
-    untouched_zeros,
-)
+from mapfusion.smoother.envelope_order import envelope_order, first_entries
+from mapfusion.smoother.skyline import Envelope, Factor, factor_in_envelope, multiply_in_envelope
 
 
-def entries_seen(A: np.ndarray) -> np.ndarray:
-    """(n,) the column of each row's first entry."""
-    return np.argmax(A != 0, axis=1)
+def entries_seen(A: np.ndarray) -> Envelope:
+    """By the column of each row's first entry."""
+    return Envelope(np.argmax(A != 0, axis=1))
+
+
+def factor_of(A: np.ndarray) -> Factor:
+    """Of the lower half of a matrix in its own envelope."""
+    envelope = entries_seen(A)
+    return factor_in_envelope(envelope.of(A), envelope)
+
+
+def stored(envelope: Envelope, entries: np.ndarray) -> np.ndarray:
+    """(n, n) the lower half by its entries one by one, zero where there are none."""
+    n = len(envelope)
+    found = np.zeros((n, n))
+    for row in range(n):
+        for column in range(envelope.first[row], row + 1):
+            found[row, column] = entries[envelope.offset[row] + column]
+    return found
 
 
 def matrix_of_groups(rng: np.random.Generator, n: int, n_groups: int) -> np.ndarray:
@@ -37,8 +48,11 @@ def test_factor_is_that_of_the_dense_matrix(n, n_groups):
     A = matrix_of_groups(np.random.default_rng(n), n, n_groups if n > 2 else 0)
     given = A.copy()
     given[np.triu_indices(n, skyline._BLOCK)] = 0  # only the lower half is read
-    factor = factor_in_envelope(given, entries_seen(given))
-    found = np.tril(factor.lower)
+    factor = factor_of(given)
+    found = factor.dense()
+    np.testing.assert_array_equal(
+        stored(factor.envelope, factor.lower)[found != 0], found[found != 0]
+    )
     np.testing.assert_allclose(found, scipy.linalg.cholesky(A, lower=True), atol=1e-12)
     right = np.random.default_rng(0).normal(size=(n, 7))
     for some in (right, right[:, 0]):
@@ -54,20 +68,32 @@ def test_factor_is_that_of_the_dense_matrix(n, n_groups):
 def test_product_and_inverse_are_those_of_the_dense_matrix(n, n_groups):
     A = matrix_of_groups(np.random.default_rng(n), n, n_groups if n > 2 else 0)
     A[-1, 0] = A[0, -1] = 0.5 * A[0, -1] + 0.5 * (n > 2)  # far apart, rows between reach neither
-    first, right = entries_seen(np.tril(A)), np.random.default_rng(0).normal(size=(n, 5))
+    envelope, right = entries_seen(np.tril(A)), np.random.default_rng(0).normal(size=(n, 5))
     lower = np.tril(A) + np.triu(np.full_like(A, np.nan), 1)  # the lower half is read
-    np.testing.assert_allclose(multiply_in_envelope(lower, first, right), A @ right, atol=1e-12)
-    inverse, dense = factor_in_envelope(A.copy(), first).inverse(), np.linalg.inv(A)
+    product = multiply_in_envelope(envelope.of(lower), envelope, right)
+    np.testing.assert_allclose(product, A @ right, atol=1e-12)
+    inverse = stored(envelope, factor_in_envelope(envelope.of(A), envelope).inverse())
     rows, columns = np.indices(A.shape)
-    within = (columns <= rows) & (columns >= first[rows])
-    np.testing.assert_allclose(inverse[within], dense[within], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(inverse.T[within], dense[within], rtol=0, atol=1e-12)
+    within = (columns <= rows) & (columns >= envelope.first[rows])
+    np.testing.assert_allclose(inverse[within], np.linalg.inv(A)[within], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("n_groups", [40, 3000])
+def test_blocks_of_three_are_found(n_groups):
+    n, rng = 100, np.random.default_rng(0)
+    A = np.kron(matrix_of_groups(rng, n, n_groups), np.ones((3, 3)))
+    A *= 1 + rng.random(A.shape)
+    A = np.tril(A) + np.tril(A, -1).T
+    envelope = Envelope(np.argmax(A != 0, axis=1))
+    rows, columns = np.nonzero(A[::3, ::3])
+    found = envelope.between(envelope.of(A), rows, columns)
+    np.testing.assert_array_equal(found, A.reshape(n, 3, n, 3)[rows, :, columns])
 
 
 def test_rows_that_are_zero_for_long_stay_so():
     A = 2 * np.eye(400)
     A[399, 250] = A[250, 399] = 1.0
-    assert not np.tril(factor_in_envelope(A, entries_seen(A)).lower, -1)[:, :250].any()
+    assert not np.tril(factor_of(A).dense(), -1)[:, :250].any()
 
 
 @pytest.mark.parametrize("n_groups", [0, 1, 60])
@@ -85,21 +111,11 @@ def test_first_entries_are_those_of_what_has_to_do_with_each_other(n_groups):
     np.testing.assert_array_equal(first, np.argmax(ordered != 0, axis=1))
 
 
-@pytest.mark.parametrize("all_at_once", [0, 2**20])
-def test_zeros_can_be_written_to(monkeypatch, all_at_once):
-    monkeypatch.setattr(skyline, "_ALL_AT_ONCE", all_at_once)
-    zeros = untouched_zeros(100)
-    assert zeros.shape == (100, 100)
-    assert not zeros.any()
-    zeros[3, 4] = 1
-    assert zeros.sum() == 1
-
-
 def test_a_matrix_that_is_not_positive_definite_is_refused():
     A = np.eye(200)
     A[150, 150] = -1
     with pytest.raises(np.linalg.LinAlgError):
-        factor_in_envelope(A, entries_seen(A))
+        factor_of(A)
 
 
 def test_order_brings_those_together_that_have_to_do_with_each_other():
