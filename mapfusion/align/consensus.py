@@ -49,7 +49,17 @@ class Consensus:
         return np.unique(np.maximum(self.drift_sigma_m * _SCALES, DRIFT_FLOOR_M) ** 2)
 
     def settled(self, T_a_b: Float, pairs: Pairs, planar: PlanarPairs) -> Fit | Undetermined:
-        """T_a_b (3,) fitted to its support at the likeliest s_drift; NaN when there is none."""
+        """T_a_b (3,) fitted to its support at the likeliest s_drift; NaN when there is none.
+
+        What was settled of these pairs before is not settled again: repetitions find the same.
+        """
+        fits: dict[tuple, Fit | Undetermined] = pairs.kept.setdefault(Consensus, {})
+        key = self, T_a_b.tobytes()
+        if key not in fits:
+            fits[key] = self._settle(T_a_b, pairs, planar)
+        return fits[key]
+
+    def _settle(self, T_a_b: Float, pairs: Pairs, planar: PlanarPairs) -> Fit | Undetermined:
         inlier, level = np.zeros(len(pairs), dtype=bool), -1
         if np.all(np.isfinite(T_a_b)):
             _, level = settle_at_best_scale(T_a_b, planar, self.variances_m2, self.bound, inlier)

@@ -102,7 +102,11 @@ class Pairs:
         )
 
     def in_plan(self) -> PlanarPairs:
-        """The pairs without their heights, for the kernels."""
+        """The pairs without their heights, for the kernels, which do not change them."""
+        return self._plan
+
+    @cached_property
+    def _plan(self) -> PlanarPairs:
         return _in_plan(self.p_a, self.p_b, self.covariance_a, self.covariance_b)
 
     def of_one_height(self, gate: HeightGate) -> np.ndarray:

@@ -45,27 +45,40 @@ class Judge:
     evidence: EvidenceParameters = field(default_factory=EvidenceParameters)
     refinement: Refinement = field(default_factory=Refinement)
 
-    def on(self, pairs: Pairs, known: PairEvidence | None = None) -> "PairJudge":
+    def on(
+        self,
+        pairs: Pairs,
+        known: PairEvidence | None = None,
+        witnesses: tuple[Witness, Witness] | None = None,
+    ) -> "PairJudge":
         """Made ready for any number of alignments of two maps.
 
         Args:
             pairs: their correspondences.
             known: what was found for them before; sought where it is needed if None.
+            witnesses: both maps made ready, and perhaps asked about other pairs before; they are
+                made ready where it is needed if None.
         """
-        return PairJudge(self, pairs, known)
+        return PairJudge(self, pairs, known, witnesses)
 
 
 class PairJudge:
     """A `Judge` on two maps."""
 
-    def __init__(self, judge: Judge, pairs: Pairs, known: PairEvidence | None) -> None:
-        self._judge, self._pairs, self._known = judge, pairs, known
+    def __init__(
+        self,
+        judge: Judge,
+        pairs: Pairs,
+        known: PairEvidence | None,
+        witnesses: tuple[Witness, Witness] | None,
+    ) -> None:
+        self._judge, self._pairs, self._known, self._ready = judge, pairs, known, witnesses
         self._chance = judge.acceptance.on(pairs)
         self._bound = math.log10(judge.acceptance.false_alarms)
 
     @cached_property
     def _witnesses(self) -> Witnesses:
-        a, b = Witness(self._pairs.map_a), Witness(self._pairs.map_b)
+        a, b = self._ready or (Witness(self._pairs.map_a), Witness(self._pairs.map_b))
         return Witnesses(a, b, self._judge.evidence)
 
     @cached_property

@@ -11,7 +11,7 @@ from mapfusion.align.refine import Refinement
 from mapfusion.evidence.copies import BETWEEN, Copies, of_others
 from mapfusion.evidence.likelihood import COPIED, OWN, TwinShares
 from mapfusion.evidence.parameters import EvidenceParameters
-from mapfusion.evidence.regions import Regions, Squares, Witnesses
+from mapfusion.evidence.regions import Regions, Squares, Witness, Witnesses
 from mapfusion.evidence.rivals import Supported, distinct_motions, self_motions
 from mapfusion.evidence.twins import largest_patch_m
 from mapfusion.landmark_map import LandmarkMap
@@ -112,7 +112,7 @@ def find_evidence(
     region_m, onto_self = parameters.region_m, []
     supporters = [pairs.p_a[each.inlier] for each in between]
     for side, own in zip("ab", (witnesses.a, witnesses.b), strict=True):
-        alike, motions = self_motions(own.landmarks, N_SELF_MOTIONS, acceptance, refinement)
+        alike, motions = _onto_itself(own, acceptance, refinement)
         onto_self += [(side, motion) for motion in motions]
         supporters += [alike.p_a[each.inlier] for each in motions]
         region_m = max(region_m, _largest_twin_m(alike, motions, acceptance))
@@ -130,6 +130,16 @@ def find_evidence(
         for (of, each), r, copies in zip(kinds, regions, laid, strict=True)
     ]
     return PairEvidence(tuple(found), shares, region_m)
+
+
+def _onto_itself(
+    own: Witness, acceptance: Acceptance, refinement: Refinement
+) -> tuple[Pairs, list[Supported]]:
+    """The twins of a map and its motions onto itself, found once."""
+    key = self_motions, acceptance, refinement
+    if key not in own.kept:
+        own.kept[key] = self_motions(own.landmarks, N_SELF_MOTIONS, acceptance, refinement)
+    return own.kept[key]
 
 
 def _largest_twin_m(alike: Pairs, motions: list[Supported], acceptance: Acceptance) -> float:

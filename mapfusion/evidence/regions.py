@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -152,6 +152,8 @@ class Witness:
         z_m2 = landmarks.covariance_m2[:, 2, 2].copy()
         near = Grid.of(position[:, :2])
         self.looks = Looks(near, position[:, 2].copy(), z_m2, np.ascontiguousarray(descriptor))
+        # what was found of this map alone, by what was asked: several pairs have the same map
+        self.kept: dict[tuple, Any] = {}
 
     @cached_property
     def crowd(self) -> np.ndarray:
@@ -184,16 +186,23 @@ class Witnesses:
         unlike = parameters.max_descriptor_distance
         self._gates = Gates(parameters.gate_m, bound, height.floor_m**2, unlike)
         # which of a's or b's landmarks (N,) the other has under a motion: copies ask for all, and
-        # regions, after them, for some of the same
+        # regions, after them, for some of the same; and how the other saw them
         self._found: dict[tuple[bool, bytes], np.ndarray] = {}
+        self._how: dict[tuple[bool, bytes], np.ndarray] = {}
+
+    @classmethod
+    def beside_itself(cls, own: Witness, parameters: EvidenceParameters) -> "Witnesses":
+        """A map that may be asked about motions onto itself, with what it was asked before."""
+        key = cls, parameters
+        if key not in own.kept:
+            own.kept[key] = cls(own, own, parameters)
+        return own.kept[key]
 
     @cached_property
     def _of(self) -> dict[str, "Witnesses"]:
         """These, and each map beside itself, by what motions are of."""
-        own = {
-            side: Witnesses(w, w, self._parameters) for side, w in (("a", self.a), ("b", self.b))
-        }
-        return {BETWEEN: self, **own}
+        a, b = (self.beside_itself(own, self._parameters) for own in (self.a, self.b))
+        return {BETWEEN: self, "a": a, "b": b}
 
     def regions(self, of: str, T: Float, squares: Squares, copies: Copies) -> Regions:
         """What must have been seen under a motion, and is there, in squares of frame a.
@@ -228,10 +237,12 @@ class Witnesses:
         return none._replace(**{f"in_{of}": in_a | in_b})
 
     def _laid(self, own: Witness, other: Witness, T: Float) -> np.ndarray:
-        p = own.laid_by(T)
-        found = has(p, np.arange(len(p)), own.looks, other.looks, self._gates)
-        self._found[own is self.a, T.tobytes()] = found
-        return laid_on_like(found, own.crowd, own.looks.near)
+        key = own is self.a, T.tobytes()
+        if key not in self._found:
+            p = own.laid_by(T)
+            found = has(p, np.arange(len(p)), own.looks, other.looks, self._gates)
+            self._found[key] = found
+        return laid_on_like(self._found[key], own.crowd, own.looks.near)
 
     def _asked(
         self, own: Witness, other: Witness, T: Float, copied: np.ndarray
@@ -240,12 +251,16 @@ class Witnesses:
 
         T (3,) maps own's frame into that of the other.
         """
-        seen = own.seen_from(T)
-        how = how_seen(seen, other.watch)
+        key = own is self.a, T.tobytes()
+        if key in self._how:
+            p = own.laid_by(T)
+        else:
+            seen = own.seen_from(T)
+            self._how[key], p = how_seen(seen, other.watch), seen.p
+        how, known = self._how[key], self._found.get(key)
         rows = np.flatnonzero(how != UNSEEN)
-        known = self._found.get((own is self.a, T.tobytes()))
         if known is None:
-            found = has(seen.p, rows, own.looks, other.looks, self._gates)
+            found = has(p, rows, own.looks, other.looks, self._gates)
         else:
             found = known[rows]
-        return _Asked(rows, how[rows], found, copied[rows]), seen.p
+        return _Asked(rows, how[rows], found, copied[rows]), p

@@ -24,7 +24,7 @@ from mapfusion.evidence.judge import Judge
 from mapfusion.evidence.parameters import EvidenceParameters
 
 LABEL, WRITES = match.LABEL, match.WRITES[:1]
-_BATCHES_KEPT = 4  # by a process; three robots have three pairs
+_BATCHES_KEPT = 2  # by a process: that of the aligners that go on, and of those that begin
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 What matching and aligning read, they read here.
 """
 
+import functools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,14 +15,16 @@ from experiments.run.estimates import rival_rows
 from experiments.run.frames import read_rows, write_rows
 from experiments.run.job import Job
 from experiments.run.stage_tables import CORRESPONDENCES, RIVALS
-from experiments.run.stages.slam import folders_of_both
-from experiments.run.stages.snapshots import Snapshots, stored_maps
+from experiments.run.stages.slam import RobotFolders, folders_of_both
+from experiments.run.stages.snapshots import ROBOTS_KEPT, Snapshots, stored_maps
 from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.correspondences import MatchParameters, match
 from mapfusion.align.pairs import Pairs
 from mapfusion.align.refine import Refinement
 from mapfusion.evidence.judge import Judge
+from mapfusion.evidence.pair_evidence import why_not_sought
 from mapfusion.evidence.parameters import EvidenceParameters
+from mapfusion.evidence.regions import Witness
 from mapfusion.landmark_map import LandmarkMap
 
 # Evaluated iterations a part: small enough that an interruption loses little and two cores end
@@ -49,12 +52,22 @@ def run(settings: MatchSettings, job: Job) -> None:
     for k, map_a, map_b in pairs_of_maps(job, settings.iterations):
         pairs = match(map_a, map_b, settings.match)
         names = {"robot_a": map_a.name, "robot_b": map_b.name, "iteration": k}
-        if evidence := judge.on(Pairs(map_a, map_b, pairs)).evidence:
+        witnesses = None
+        if not why_not_sought(map_a, map_b):
+            a, b = folders_of_both(job)
+            witnesses = _witness(a, k), _witness(b, k)
+        if evidence := judge.on(Pairs(map_a, map_b, pairs), witnesses=witnesses).evidence:
             rivals += rival_rows(names, evidence)
         columns = names | {"index_a": pairs.index_a, "index_b": pairs.index_b}
         made.append(pd.DataFrame(columns | {"descriptor_distance": pairs.distance}))
     write_rows(batch_path(job.output, job.part), CORRESPONDENCES, pd.concat(made))
     write_rows(rivals_path(job.output, job.part), RIVALS, rivals)
+
+
+@functools.lru_cache(maxsize=ROBOTS_KEPT * _ITERATIONS_PER_BATCH)
+def _witness(folders: RobotFolders, iteration: int) -> Witness:
+    """A robot's map, with what it was asked: it is in as many pairs as there are other robots."""
+    return Witness(map_at(stored_maps(folders), iteration))
 
 
 def batches(iterations: tuple[int, ...]) -> tuple[str, ...]:

@@ -16,6 +16,7 @@ from mapfusion.align.clique import Clique, CliqueSearch
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.gnc import Gnc
 from mapfusion.align.mahalanobis_gate import settle
+from mapfusion.align.method import Fit
 from mapfusion.align.oracle import Oracle
 from mapfusion.align.pairs import Pairs
 from mapfusion.align.ransac_mahalanobis import RansacMahalanobis, least_truncated_squares
@@ -300,3 +301,22 @@ def test_a_sharp_landmark_is_held_to_more_than_a_blurred_one():
 def test_wrong_parameters_are_named(aligner, name, value):
     with pytest.raises(ValueError, match=name):
         aligner(**{name: value})
+
+
+def test_what_was_settled_before_of_the_same_pairs_is_settled_so_again():
+    """Whatever the seed; but with other parameters by itself."""
+    pair = given_pairs(np.random.default_rng(3), 80, 0.6, 0.05)
+    maps = pair.map_a, pair.map_b, pair.correspondences
+    pairs, methods = Pairs(*maps), [RansacMahalanobis(), RansacMahalanobis(probability=0.9)]
+    methods.append(RansacMahalanobis(drift_sigma_m=0.3))
+    settled = {}
+    for seed in range(5):
+        for method in methods:
+            found = method.find(pairs, np.random.default_rng(seed))
+            alone = method.find(Pairs(*maps), np.random.default_rng(seed))
+            assert isinstance(found, Fit)
+            assert isinstance(alone, Fit)
+            for name in ("T_a_b", "inlier", "weight"):
+                np.testing.assert_array_equal(getattr(found, name), getattr(alone, name))
+            settled[id(found)] = found
+    assert len(methods) <= len(settled) < 5 * len(methods)

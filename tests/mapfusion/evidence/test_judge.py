@@ -1,20 +1,25 @@
 """The verdict: walls that are common, that hang twice, that fool, and what is too uncertain."""
 
+import itertools
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 
-from mapfusion.align.acceptance import Verdict
+from mapfusion.align.acceptance import Acceptance, Verdict
 from mapfusion.align.clique import Clique
 from mapfusion.align.correspondences import match
+from mapfusion.align.pairs import Pairs
 from mapfusion.align.registration import Registration
 from mapfusion.align.result import Alignment, Status
+from mapfusion.evidence import pair_evidence
 from mapfusion.evidence.copies import BETWEEN, Copies
 from mapfusion.evidence.judge import Judge
 from mapfusion.evidence.pair_evidence import RivalMotion
 from mapfusion.evidence.parameters import EvidenceParameters
+from mapfusion.evidence.regions import Witness
+from mapfusion.evidence.rivals import self_motions
 from mapfusion.landmark_map import LandmarkMap
 from tests.mapfusion.evidence.two_rooms import Wall, between, mapped
 
@@ -172,6 +177,38 @@ def test_what_was_found_before_gives_the_same_verdict() -> None:
     known = registration.on(A, B, pairs, sought.judge.evidence)
     both = [each.register(np.random.default_rng(0)).verdict for each in (sought, known)]
     assert both[0] == both[1]
+
+
+def test_a_map_in_several_pairs_is_asked_once_and_says_the_same(monkeypatch) -> None:
+    """Each as `a` and as `b`: what it holds twice, and what of that must be seen, is its own."""
+    wall = Wall(20, seed=1, copies=[(2, 2, 12), (5, 1.5, 16)])
+    ends = (1, 11), (4, 16), (7, 19)
+    maps = [mapped(wall, *each, seed=k, name=f"R{k}") for k, each in enumerate(ends)]
+    ready, asked = [Witness(each) for each in maps], []
+
+    def counted(landmarks: LandmarkMap, *settings):
+        asked.append(landmarks.name)
+        return self_motions(landmarks, *settings)
+
+    monkeypatch.setattr(pair_evidence, "self_motions", counted)
+    for _ in range(2):
+        for a, b in itertools.permutations(range(3), 2):
+            pairs = Pairs(maps[a], maps[b], match(maps[a], maps[b]))
+            found = JUDGE.on(pairs, witnesses=(ready[a], ready[b])).evidence
+            n, fresh = len(asked), JUDGE.on(pairs).evidence
+            assert len(asked) == n + 2
+            del asked[n:]
+            assert found is not None
+            assert fresh is not None
+            assert (found.shares, found.region_m) == (fresh.shares, fresh.region_m)
+            assert any(each.of != BETWEEN and each.n_regions for each in found.motions)
+            for own, other in zip(found.motions, fresh.motions, strict=True):
+                np.testing.assert_equal(asdict(own), asdict(other))
+    assert sorted(asked) == ["R0", "R1", "R2"]
+    other = replace(JUDGE, acceptance=Acceptance(patch_m=0.5))
+    changed = other.on(pairs, witnesses=(ready[a], ready[b])).evidence
+    assert changed is not None
+    assert len(asked) == 5
 
 
 def test_the_sigma_is_of_landmarks_wherever_the_origins_are() -> None:

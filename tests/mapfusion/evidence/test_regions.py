@@ -50,7 +50,8 @@ def test_a_motion_along_the_wall_is_contradicted_everywhere() -> None:
 @pytest.mark.parametrize("of", [BETWEEN, "a"])
 def test_what_was_found_for_copies_gives_the_same_regions(of: str) -> None:
     none = Copies.none(len(A.landmarks), len(B.landmarks))
-    fresh, asked = (Witnesses(A, B, PARAMETERS) for _ in range(2))
+    maps = A.landmarks, B.landmarks
+    fresh, asked = (Witnesses(*map(Witness, maps), PARAMETERS) for _ in range(2))
     motions = T_A_B, T_A_B + np.array([0.0, 0.4, 0.0])
     for T in motions:
         asked.copies(of, T)
