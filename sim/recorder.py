@@ -103,34 +103,24 @@ class FrameSource:
         return self._drawn.stereo(poses[own], others, noise, rng, colour)
 
 
-def truth_points(
+def truth_behind(
     camera: StereoCamera, depth_m: np.ndarray, uv_px: ArrayLike, T_world_robot: ArrayLike
-) -> Float:
-    """World points (N, 3) behind pixels (N, 2) of the left image; NaN where nothing is.
+) -> tuple[Float, Float]:
+    """World points behind pixels (N, 2) of the left image, and how they move with the pixel.
 
-    The robot is at a pose (3,), or (4, 4) where its body tilts.
     Between pixels of one surface the inverse depth is interpolated (it is linear in the image for a
     plane); at the edge of a surface the nearest pixel's depth counts.
-    """
-    uv = np.asarray(uv_px, dtype=np.float64).reshape(-1, 2)
-    p_robot = camera.back_project(uv, depth_at(depth_m, uv))
-    return _in_world(T_world_robot, p_robot)
 
+    Args:
+        camera: of the image.
+        depth_m: (H, W) along the optical axis.
+        uv_px: pixels.
+        T_world_robot: the robot's pose (3,), or (4, 4) where its body tilts.
 
-def _in_world(T_world_robot: ArrayLike, p_robot: Float) -> Float:
-    T = np.asarray(T_world_robot, dtype=np.float64)
-    if T.shape == (4, 4):
-        return p_robot @ T[:3, :3].T + T[:3, 3]
-    return transform_points(T, p_robot)
-
-
-def truth_slopes(
-    camera: StereoCamera, depth_m: np.ndarray, uv_px: ArrayLike, T_world_robot: ArrayLike
-) -> Float:
-    """Derivatives (N, 3, 2) of `truth_points` by the pixel, on the surface that is seen there.
-
-    The difference to the next pixel, or to the one before where that is another surface's; 0 where
-    both are.
+    Returns:
+        Points (N, 3), NaN where nothing is, and their derivatives (N, 3, 2) by the pixel on the
+        surface that is seen there: the difference to the next pixel, or to the one before where
+        that is another surface's; 0 where both are.
     """
     uv = np.asarray(uv_px, dtype=np.float64).reshape(-1, 2)
     steps = np.array([[0, 0], [-1, 0], [1, 0], [0, -1], [0, 1]], dtype=np.float64)
@@ -138,10 +128,16 @@ def truth_slopes(
     depth = depth_at(depth_m, there)
     point = _in_world(T_world_robot, camera.back_project(there, depth)).reshape(5, -1, 3)
     depth = depth.reshape(5, -1)
-    same = np.abs(depth - depth[0]) <= SAME_SURFACE * depth[0]
-    slope = np.zeros((len(uv), 3, 2))
-    for step, own, moved in zip(steps[1:], same[1:], point[1:], strict=True):
-        # the next pixel comes last, so it counts where both are on the surface
-        axis = int(step[0] == 0)
-        slope[own, :, axis] = step[axis] * (moved - point[0])[own]
-    return slope
+    same = (np.abs(depth - depth[0]) <= SAME_SURFACE * depth[0])[:, :, None]
+    slope = np.empty((len(uv), 3, 2))
+    for axis, (before, after) in enumerate(((1, 2), (3, 4))):
+        back = np.where(same[before], -(point[before] - point[0]), 0.0)
+        slope[:, :, axis] = np.where(same[after], point[after] - point[0], back)
+    return point[0], slope
+
+
+def _in_world(T_world_robot: ArrayLike, p_robot: Float) -> Float:
+    T = np.asarray(T_world_robot, dtype=np.float64)
+    if T.shape == (4, 4):
+        return p_robot @ T[:3, :3].T + T[:3, 3]
+    return transform_points(T, p_robot)

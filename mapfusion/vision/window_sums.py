@@ -132,9 +132,9 @@ def _add_up(
             _sum_up(window, middle, begin, end, shade, row, side, parts, part)
         power = 1.0
         for q in range(5):
-            # what is not squared is asked for with y^2 at most
+            # what is not squared is asked for with y^2 at most, squares with x^k y^(4 - k)
             for side in range(3):
-                for k in range(0 if q <= 2 else SQUARES, SUMS):
+                for k in range(0 if q <= 2 else SQUARES, SUMS - q):
                     grid[part, q, side, k] += power * row[side, k]
             power *= y
 

@@ -124,12 +124,13 @@ def fill(
                     for s in range(n if count else 0):
                         z = rise / (v - 0.5 + (s + 0.5) / n - camera.center_v)
                         line = _line(way, u, z, size)
-                        lowest = _lowest_cell(line, count, size)
+                        lowest, leftmost = _lowest_cell(line, count, size)
                         if lowest < 0:
                             _add_at_the_edge(cells, corner, line, size, count, sums)
                         else:
-                            _walk(line, lowest, size[1] + 1, count, place)
-                            _look_up(cells, corner + lowest, place, count, cell)
+                            wide = size[1] + 1
+                            _walk(line, lowest, leftmost, wide, count, place)
+                            _look_up(cells, corner + lowest * wide + leftmost, place, count, cell)
                             _add_between(cell, place, count, sums)
                 _show(sums, max(n * across, 1), v, begin, count, picture)
 
@@ -187,8 +188,11 @@ def _line(way: tuple[Way, Way], u: float, z: float, size: Size) -> Line:
 
 
 @kernel_part
-def _lowest_cell(line: Line, count: int, size: Size) -> int:
-    """The cell that none of a line's is to the left of or below; -1: near the edge, or too far."""
+def _lowest_cell(line: Line, count: int, size: Size) -> tuple[int, int]:
+    """Row and column that none of a line's cells is below or to the left of.
+
+    -1: near the edge, or too far.
+    """
     x, y, x_step, y_step = line
     height, width = size
     x_last, y_last = x + (count - 1) * x_step, y + (count - 1) * y_step
@@ -196,8 +200,8 @@ def _lowest_cell(line: Line, count: int, size: Size) -> int:
     low, high = min(y, y_last), max(y, y_last)
     inside = left >= 0.5 and right < width + 0.5 and low >= 0.5 and high < height + 0.5
     if not inside or max(right - left, high - low) >= MOST_CELLS:
-        return -1
-    return int(low) * (width + 1) + int(left)
+        return -1, -1
+    return int(low), int(left)
 
 
 # Of the loops that follow each does one thing: those that only look up and those that only reckon
@@ -206,10 +210,10 @@ def _lowest_cell(line: Line, count: int, size: Size) -> int:
 
 
 @kernel_part
-def _walk(line: Line, lowest: int, wide: int, count: int, place: np.ndarray) -> None:
+def _walk(line: Line, lowest: int, leftmost: int, wide: int, count: int, place: np.ndarray) -> None:
     """Fill in places: along x and y from the lowest cell, and in cells from it."""
     x, y, x_step, y_step = line
-    first_x, first_y = x - lowest % wide, y - lowest // wide
+    first_x, first_y = x - leftmost, y - lowest
     from_x, step_x = np.int32(first_x * PLACE_UNIT), np.int32(x_step * PLACE_UNIT)
     from_y, step_y = np.int32(first_y * PLACE_UNIT), np.int32(y_step * PLACE_UNIT)
     across = np.int32(wide)

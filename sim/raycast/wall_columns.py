@@ -3,9 +3,9 @@
 A level camera sees an upright wall's strip at one depth, so its footprints are rectangles on the
 wall, side by side up the column. Sums of all texels left of and below a corner (Crow 1984) give the
 exact mean over each: first the difference of two columns of sums, then that of two of its rows.
-Each loop does one thing: those that only look up and those that only reckon run in the processor's
-vectors, one that does both does not. And each is a function of its own that is given its arrays by
-themselves: to hold on to them while it calls others would take as long as a loop.
+Loops that only reckon run in the processor's vectors, one that looks up as well does not: so what
+can be reckoned beforehand has a loop of its own. And each is a function of its own that is given
+its arrays by themselves: to hold on to them while it calls others would take as long as a loop.
 """
 
 import numpy as np
@@ -83,12 +83,11 @@ def draw_walls(
     height, height_m, width_m, size = camera.height_px, walls.height_m, walls.width_m, walls.size
     begins, table = walls.first, walls.sums
     # of a strip: sums of its texels up to each row of texels; of the edges between pixels: the row
-    # of texels that they lie in, the share of it below them, sums up to that row and from it to the
-    # next; of pixels: grey levels times covered share, and that share
+    # of texels that they lie in, the share of it below them, sums up to them; of pixels: grey
+    # levels times covered share, and that share
     sums = np.empty(_most_rows(size) + 1, dtype=np.float32)
     row, share = np.empty(height + 1, dtype=np.int32), np.empty(height + 1, dtype=np.float32)
     below = np.empty(height + 1, dtype=np.float32)
-    more = np.empty(height + 1, dtype=np.float32)
     total, covered = np.empty(height, dtype=np.float32), np.empty(height, dtype=np.float32)
     for j in range(camera.width_px):
         low, first, last = j - 0.5, height - 1, 0
@@ -111,8 +110,7 @@ def draw_walls(
                 rows, edges = top_row - bottom_row, lower + 2 - upper
                 _add_columns(table, begins[i], size, i, begin, end, bottom_row, top_row, sums)
                 _find_rows(highest_q - bottom_row, step, rows, edges, row, share)
-                _look_up(sums, row, edges, below, more)
-                _interpolate(below, more, share, edges)
+                _interpolate(sums, row, share, edges, below)
                 _add_means(below, (b - a) / ((end - begin) * step), upper, lower, total)
                 _cover(covered, b - a, top, bottom, upper, lower)
                 first, last = min(first, upper), max(last, lower)
@@ -271,19 +269,14 @@ def _find_rows(
 
 
 @kernel_part
-def _look_up(
-    sums: np.ndarray, row: np.ndarray, edges: int, below: np.ndarray, more: np.ndarray
+def _interpolate(
+    sums: np.ndarray, row: np.ndarray, share: np.ndarray, edges: int, below: np.ndarray
 ) -> None:
+    """Fill in the sums below edges."""
     for v in range(edges):
         k = np.uint64(row[v])
-        below[v] = sums[k]
-        more[v] = sums[k + np.uint64(1)]
-
-
-@kernel_part
-def _interpolate(below: np.ndarray, more: np.ndarray, share: np.ndarray, edges: int) -> None:
-    for v in range(edges):
-        below[v] += share[v] * (more[v] - below[v])
+        lower = sums[k]
+        below[v] = lower + share[v] * (sums[k + np.uint64(1)] - lower)
 
 
 @kernel_part

@@ -15,7 +15,7 @@ from mapfusion.se2 import transform_points
 from mapfusion.se3 import in_space
 from sim.p3at import LENGTH_M
 from sim.radiometry import RadiometricNoise
-from sim.recorder import FrameSource, truth_points, truth_slopes
+from sim.recorder import FrameSource, truth_behind
 from sim.renderer import Renderer
 from sim.stereo_head import StereoFrame
 
@@ -98,7 +98,7 @@ def test_truth_points_lie_on_what_is_seen(source: FrameSource) -> None:
     frame = source.render(POSES, "a", NOISE, np.random.default_rng(0))
     rng = np.random.default_rng(2)
     uv = rng.uniform([90, 1], [140, 100], (200, 2))  # above b: the wall at y = 3.95, sub-pixel
-    points = truth_points(CAMERA, frame.depth_m, uv, POSES[0])
+    points, _ = truth_behind(CAMERA, frame.depth_m, uv, POSES[0])
     np.testing.assert_allclose(points[:, 1], 3.95, atol=1e-4)
     # seen from the left camera, the points fall on their pixels again
     x, y, z = points.T
@@ -114,7 +114,7 @@ def test_truth_on_a_slanted_plane_interpolates_the_inverse_depth() -> None:
     v, u = np.mgrid[:240, :320]
     depth = (1 / (0.2 + 0.0005 * u + 0.0002 * v)).astype(np.float32)
     uv = np.random.default_rng(3).uniform([0, 0], [319, 239], (500, 2))
-    points = truth_points(CAMERA, depth, uv, np.zeros(3))
+    points, _ = truth_behind(CAMERA, depth, uv, np.zeros(3))
     expected = 1 / (0.2 + 0.0005 * uv[:, 0] + 0.0002 * uv[:, 1])
     np.testing.assert_allclose(points[:, 0] - CAMERA.mount_x_m, expected, atol=2e-6)
 
@@ -124,7 +124,7 @@ def test_at_an_edge_the_nearest_pixel_counts() -> None:
     depth[:, 100:] = 5.0
     depth[:, 200:] = np.nan
     uv = np.array([[99.4, 50.0], [99.6, 50.0], [199.4, 50.0], [199.6, 50.0], [319.0, 239.0]])
-    points = truth_points(CAMERA, depth, uv, np.zeros(3))
+    points, _ = truth_behind(CAMERA, depth, uv, np.zeros(3))
     np.testing.assert_allclose(
         points[:, 0] - CAMERA.mount_x_m, [2, 5, 5, np.nan, np.nan], atol=1e-6
     )
@@ -138,7 +138,7 @@ def test_truth_follows_the_pixel_on_its_own_surface() -> None:
     uv = np.random.default_rng(3).uniform([3, 3], [316, 236], (500, 2))
     uv = np.concatenate([uv, [[149.0, 100.0], [150.0, 100.0]]])  # at the step, on either side
     pose = np.array([1.0, 2.0, 0.7])
-    slope = truth_slopes(CAMERA, depth, uv, pose)
+    _, slope = truth_behind(CAMERA, depth, uv, pose)
     for own, left in zip(planes, (uv[:, 0] < 149.01, uv[:, 0] > 149.99), strict=True):
         for axis, step in enumerate(0.01 * np.eye(2)):
             there, here = (
@@ -148,12 +148,12 @@ def test_truth_follows_the_pixel_on_its_own_surface() -> None:
             along = (transform_points(pose, there) - transform_points(pose, here)) / 0.02
             np.testing.assert_allclose(slope[left, :, axis], along, atol=3e-4)
     gone = np.where(u < 150, planes[0], np.nan).astype(np.float32)
-    assert np.all(truth_slopes(CAMERA, gone, np.array([[200.0, 50.0]]), pose) == 0)
+    assert np.all(truth_behind(CAMERA, gone, np.array([[200.0, 50.0]]), pose)[1] == 0)
 
 
 def test_no_pixels_no_points() -> None:
     depth = np.ones((240, 320), dtype=np.float32)
-    assert truth_points(CAMERA, depth, np.zeros((0, 2)), np.zeros(3)).shape == (0, 3)
+    assert truth_behind(CAMERA, depth, np.zeros((0, 2)), np.zeros(3))[0].shape == (0, 3)
 
 
 def test_a_body_that_tilts_sees_the_same_room(source: FrameSource) -> None:
@@ -162,14 +162,14 @@ def test_a_body_that_tilts_sees_the_same_room(source: FrameSource) -> None:
     frame = source.render(tilted, "a", NOISE, np.random.default_rng(0))
     rng = np.random.default_rng(2)
     uv = rng.uniform([30, 3], [290, 236], (2000, 2))
-    points = truth_points(CAMERA, frame.depth_m, uv, tilted[0])
+    points, _ = truth_behind(CAMERA, frame.depth_m, uv, tilted[0])
     # not on b, nor on an edge, where the nearest pixel counts
     inside = np.all(np.abs(points[:, :2] - POSES[1, :2]) > 0.4, axis=1)
     surfaces = np.array([[0.05, 4.95], [0.05, 3.95], [0.0, 2.5]])
     off = np.abs(points[inside, :, None] - surfaces)
     assert np.quantile(off.min(axis=(1, 2)), 0.95) < 2e-3
-    slope = truth_slopes(CAMERA, frame.depth_m, uv, tilted[0])
-    there = truth_points(CAMERA, frame.depth_m, uv + np.array([0.3, 0.0]), tilted[0])
+    _, slope = truth_behind(CAMERA, frame.depth_m, uv, tilted[0])
+    there, _ = truth_behind(CAMERA, frame.depth_m, uv + np.array([0.3, 0.0]), tilted[0])
     near = np.linalg.norm(there - points - 0.3 * slope[:, :, 0], axis=1)
     assert np.quantile(near, 0.9) < 1e-3
 

@@ -37,7 +37,7 @@ from mapfusion.vision.features import Features
 from mapfusion.vision.frontend import FrontEnd, FrontEndParameters
 from mapfusion.vision.patches import PATCH_SIDE_PX
 from sim.radiometry import RadiometricNoise
-from sim.recorder import FrameSource, truth_points, truth_slopes
+from sim.recorder import FrameSource, truth_behind
 from sim.renderer import Renderer
 from sim.stereo_head import StereoFrame
 from sim.trajectory import read_trajectory
@@ -119,9 +119,8 @@ def run(settings: FeatureSettings, job: Job) -> dict[str, float]:
         found = front_end.extract(frame.left, frame.right)
         own_pose = poses[trajectory.index(robot)]
         features.append(found)
-        seen = (settings.camera, frame.depth_m, found.uv_px, own_pose)
-        slopes = truth_slopes(*seen).reshape(-1, len(_POINT_SLOPE))
-        truth.append(np.concatenate([truth_points(*seen), slopes], axis=1))
+        points, slopes = truth_behind(settings.camera, frame.depth_m, found.uv_px, own_pose)
+        truth.append(np.concatenate([points, slopes.reshape(-1, len(_POINT_SLOPE))], axis=1))
         if 0 <= iteration - settings.images_at < settings.images:
             encoded = cv2.imencode(".png", frame.left)[1].tobytes()
             write_sealed(job.output / f"image_{iteration:06d}.png", encoded + LINE)
