@@ -264,9 +264,6 @@ def sources(slots: Slots, chosen: np.ndarray, first_source: int) -> np.ndarray:
             s = chosen[k, m]
             if s != last:
                 last = s
-                if s == NEW:
-                    its = first_source + k
-                else:
-                    its = -1 if s == DROPPED else slots.source[s]
+                its = -1 if s == DROPPED else first_source + k if s == NEW else slots.source[s]
             source[k, m] = its
     return source
