@@ -155,7 +155,7 @@ def choose(
     Returns:
         (K, M) int64 slot, NEW or DROPPED; and the slots that were chosen, ascending.
     """
-    used, place = np.unique(pairs.slot, return_inverse=True)
+    used, place = _distinct(pairs.slot)
     alive = maps.bring_up_to_date(used)
     if not alive.all():
         pairs, place = Pairs(*(values[alive[place]] for values in pairs)), place[alive[place]]
@@ -165,6 +165,17 @@ def choose(
     take = _take_nearest if nearest else _take_in_order
     take(maps.slots, pairs, place, taken, seen, gate, planar, chosen)
     return chosen, used[taken.any(axis=1)]
+
+
+def _distinct(slot: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """As `np.unique` with the inverse; that takes three times as long of some hundred."""
+    order = np.argsort(slot)
+    ordered = slot[order]
+    first = np.ones(len(slot), dtype=bool)
+    np.not_equal(ordered[1:], ordered[:-1], out=first[1:])
+    place = np.empty(len(slot), dtype=np.int64)
+    place[order] = np.cumsum(first) - 1
+    return ordered[first], place
 
 
 @kernel(error_model="numpy")
@@ -248,10 +259,11 @@ def sources(slots: Slots, chosen: np.ndarray, first_source: int) -> np.ndarray:
     """
     source = np.empty(chosen.shape, dtype=np.int32)
     for k in range(chosen.shape[0]):
+        last, its = DROPPED, -1  # most particles choose as the one before
         for m in range(chosen.shape[1]):
             s = chosen[k, m]
-            if s == NEW:
-                source[k, m] = first_source + k
-            else:
-                source[k, m] = -1 if s == DROPPED else slots.source[s]
+            if s != last:
+                last = s
+                its = -1 if s == DROPPED else first_source + k if s == NEW else slots.source[s]
+            source[k, m] = its
     return source

@@ -74,6 +74,8 @@ def close_loops(
     motion, covariance = _pose_in_view(slots, frame, rows[~back], by_odometry)
     drift = n_free / max(len(frame.chosen), 1) * covariance
     rows, last = rows[back], last[back]
+    if len(rows) < _LEAST:
+        return drift
     group_of = last // SPACING  # what went out of view at about the same time
     groups, size = np.unique(group_of, return_counts=True)
     own = [group_of == group for group in groups[size >= _LEAST]]

@@ -23,10 +23,11 @@ from mapfusion.fastslam.slots import (
     with_room,
 )
 from mapfusion.fastslam.update import NEW
-from mapfusion.kernels import kernel
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.robot_log import Observations
 from mapfusion.se2 import Float
 
+_ALONG_AXES = np.array([0, 3, 5])  # of the upper entries of a covariance
 _FIRST_SLOTS, _FIRST_ROWS = 4 * BLOCK, 64
 # In so many resamplings all rows are visited once, wherever their landmarks lie. Two visits of a
 # row are then less than twice this apart, which is what the genealogy remembers.
@@ -85,8 +86,8 @@ class ParticleMaps:
         """Add to the covariances of these slots' landmarks, along each axis."""
         which = which[self.bring_up_to_date(which)]
         with np.errstate(invalid="ignore"):  # what particles without the landmark have there
-            for axis in (0, 3, 5):
-                self.slots.own.covariance_m2[self.slots.row[which], :, axis] += variance_m2
+            own = self.slots.own.covariance_m2
+            own[self.slots.row[which, None], :, _ALONG_AXES] += variance_m2
         self.moved(which)
 
     def bend(self, T_map_bent: Float) -> None:
@@ -231,13 +232,26 @@ def _inherit(slots: Slots, which: np.ndarray, ancestors: np.ndarray, generation:
             for m in range(n_particles):
                 copy_estimate(common, s, 0, own, r, m)
         else:
-            for m in range(n_particles):
-                copy_estimate(own, r, m, old, 0, m)
+            _copy_row(own, r, old)
             for m in range(n_particles):
                 parent = ancestors[written % len(ancestors), m]
                 copy_estimate(old, 0, parent, own, r, m)
                 alive[i] |= own.count[r, m] > 0
     return alive
+
+
+@kernel_part
+def _copy_row(own: Estimates, r: int, old: Estimates) -> None:
+    """All particles' estimates, number by number: a processor takes several at a time."""
+    n_particles = own.count.shape[1]
+    means, covariances = own.mean_m[r].reshape(-1), own.covariance_m2[r].reshape(-1)
+    old_means, old_covariances = old.mean_m.reshape(-1), old.covariance_m2.reshape(-1)
+    for k in range(3 * n_particles):
+        old_means[k] = means[k]
+    for k in range(6 * n_particles):
+        old_covariances[k] = covariances[k]
+    for m in range(n_particles):
+        old.count[0, m] = own.count[r, m]
 
 
 @kernel

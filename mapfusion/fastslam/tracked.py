@@ -18,7 +18,12 @@ class Tracked:
 
     def ended(self, track: np.ndarray | None, slots: Slots) -> np.ndarray:
         """Slots (n,) of tracks that go on in none of this frame's observations (K,); once each."""
-        over = np.isin(self._track, [] if track is None else track, invert=True)
+        if track is not None and len(track):
+            known = np.sort(track)
+            place = np.minimum(np.searchsorted(known, self._track), len(known) - 1)
+            over = known[place] != self._track
+        else:
+            over = np.ones(len(self._track), dtype=bool)
         # A landmark that no particle has any more is gone, and its slot may be another's by now.
         over &= slots.generation[self._slot] != FREE
         over &= slots.source[self._slot] == self._source
