@@ -8,12 +8,13 @@ import numpy as np
 
 from mapfusion.align.acceptance import Verdict
 from mapfusion.align.calibration_part import calibration_part
+from mapfusion.align.completion import Completion
 from mapfusion.align.correspondences import Correspondences, HeightGate
 from mapfusion.align.drift import estimate_drift_m
 from mapfusion.align.method import Fit, Method, Needs, Undetermined
 from mapfusion.align.pairs import MIN_PAIRS, Pairs, undetermined, why_too_few
 from mapfusion.align.refine import Refinement
-from mapfusion.align.result import NOT_RUN, Alignment, Status
+from mapfusion.align.result import Alignment, Status
 from mapfusion.align.rigid import (
     least_squares_gain,
     motion_covariance,
@@ -249,45 +250,6 @@ class Registration:
             ValueError: an index of the correspondences lies outside its map.
         """
         return self.on(map_a, map_b, correspondences).register(rng)
-
-
-class Completion:
-    """What follows an estimate on a pair of maps, whoever made it: it is refined and judged.
-
-    Equal estimates are refined once, and what becomes the same by that is judged once.
-    """
-
-    def __init__(
-        self,
-        pairs: Pairs,
-        refinement: Refinement,
-        judge: Judge | None,
-        evidence: PairEvidence | None = None,
-    ) -> None:
-        """For some correspondences; the others as `Registration` and its `on` have them."""
-        self.pairs, self._refinement = pairs, refinement
-        self.judge: PairJudge | None = judge.on(pairs, evidence) if judge is not None else None
-        self._refined: dict[tuple, Alignment] = {}
-        self._judged: dict[tuple, Verdict] = {}
-
-    def of(self, estimated: Alignment) -> tuple[Alignment, Verdict]:
-        """An estimate refined, and the verdict on that."""
-        refined = estimated
-        if estimated.status not in NOT_RUN:
-            known = (estimated.T_a_b.tobytes(), estimated.status, estimated.reason)
-            if known not in self._refined:
-                self._refined[known] = self._refinement.refine(self.pairs, estimated.T_a_b)
-            refined = self._refined[known]
-        arrays = (array.tobytes() for array in (refined.T_a_b, refined.covariance, refined.inlier))
-        known = (*arrays, refined.drift_sigma_m, refined.status, refined.reason)
-        if known not in self._judged:
-            self._judged[known] = self._judge(refined)
-        return refined, self._judged[known]
-
-    def _judge(self, refined: Alignment) -> Verdict:
-        if self.judge is None:
-            return Verdict(refined.status, np.nan, refined.reason)
-        return self.judge.judge(refined)
 
 
 class PairRegistration:

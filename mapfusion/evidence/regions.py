@@ -259,8 +259,7 @@ class Witnesses:
             self._how[key], p = how_seen(seen, other.watch), seen.p
         how, known = self._how[key], self._found.get(key)
         rows = np.flatnonzero(how != UNSEEN)
-        if known is None:
+        found = known[rows] if known is not None else None
+        if found is None:
             found = has(p, rows, own.looks, other.looks, self._gates)
-        else:
-            found = known[rows]
         return _Asked(rows, how[rows], found, copied[rows]), p

@@ -17,9 +17,10 @@ from experiments.run.stage_tables import CORRESPONDENCES, ESTIMATES, RIVALS
 from experiments.run.stages import match
 from experiments.scenario.randomness import generator
 from mapfusion.align.acceptance import Acceptance
+from mapfusion.align.completion import Completion
 from mapfusion.align.pairs import Pairs
 from mapfusion.align.refine import Refinement
-from mapfusion.align.registration import Completion, PairRegistration
+from mapfusion.align.registration import PairRegistration
 from mapfusion.evidence.judge import Judge
 from mapfusion.evidence.parameters import EvidenceParameters
 
