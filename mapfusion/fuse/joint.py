@@ -7,7 +7,7 @@ also those move that one robot alone has seen. Maps without one are fused by wha
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import combinations
+from itertools import chain, combinations
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -209,7 +209,7 @@ def _near(a: _Placed, b: _Placed, bound: float) -> tuple[np.ndarray, np.ndarray]
         tree = KDTree(b.position_m[rows])
         found = tree.query_ball_point(a.position_m, radius_m, return_sorted=True)
         rows_a.append(np.repeat(np.arange(len(wide_a)), [len(own) for own in found]))
-        rows_b.append(rows[np.concatenate([*found, []]).astype(np.int64)])
+        rows_b.append(rows[np.fromiter(chain.from_iterable(found), np.int64)])
     i, j = np.concatenate(rows_a), np.concatenate(rows_b)
     off = a.position_m[i] - b.position_m[j]
     near = np.einsum("ni,ni->n", off, off) <= bound * (wide_a[i] + wide_b[j])

@@ -58,13 +58,13 @@ class Envelope:
         Those of a block on the diagonal are stored all.
         """
         first_column = np.repeat(np.array(self.starts, np.int64) * _BLOCK, self._sizes)
-        end = np.repeat([rows.stop for rows in self.blocks], self._sizes)
+        end = np.repeat(np.array([rows.stop for rows in self.blocks], np.int64), self._sizes)
         stored = np.concatenate([[0], np.cumsum(end - first_column)])
         return stored - np.append(first_column, 0)
 
     @cached_property
-    def _sizes(self) -> list[int]:
-        return [rows.stop - rows.start for rows in self.blocks]
+    def _sizes(self) -> np.ndarray:
+        return np.array([rows.stop - rows.start for rows in self.blocks], np.int64)
 
     def zeros(self) -> Float:
         """Entries (E,) as they are stored, all zero."""

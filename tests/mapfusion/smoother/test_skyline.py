@@ -90,6 +90,14 @@ def test_blocks_of_three_are_found(n_groups):
     np.testing.assert_array_equal(found, A.reshape(n, 3, n, 3)[rows, :, columns])
 
 
+def test_nothing_has_a_factor():
+    nothing = Envelope(np.empty(0, dtype=np.int64))
+    factor = factor_in_envelope(nothing.of(np.empty((0, 0))), nothing)
+    assert factor.dense().shape == (0, 0)
+    assert factor.solve_transposed(factor.solve(np.empty(0))).shape == (0,)
+    assert factor.inverse().size == 0
+
+
 def test_rows_that_are_zero_for_long_stay_so():
     A = 2 * np.eye(400)
     A[399, 250] = A[250, 399] = 1.0
