@@ -9,7 +9,6 @@ import numpy as np
 from mapfusion.arguments import Range, require_in_range
 from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float
-from mapfusion.vision.blur import smoothed
 
 _SOBEL_APERTURE_PX = 3
 _SOBEL_GAIN = 2.0  # OpenCV divides its Sobel sum, 8 times the slope per pixel, by 4
@@ -73,7 +72,8 @@ def detect(image: np.ndarray, parameters: HarrisParameters) -> Float:
         raise ValueError(f"image: is {image.dtype} {image.shape}, expected uint8 (H, W)")
     if min(image.shape) <= 2 * parameters.border_px:
         return np.zeros((0, 2))
-    response = harris_response(smoothed(image, parameters.smoothing_px), parameters)
+    smooth = cv2.GaussianBlur(image, (0, 0), parameters.smoothing_px)
+    response = harris_response(smooth, parameters)
     pixels = _strongest(response, parameters)
     if len(pixels) == 0:
         return np.zeros((0, 2))
