@@ -93,17 +93,18 @@ def align(path_a: Path, path_b: Path, settings: Scenario) -> list[dict[str, Any]
     """Every aligner's estimate, its refinement and the verdict on it, as rows.
 
     Each is called twice, with the same random numbers, and the second call is timed: the first
-    compiles kernels and starts processes.
+    compiles kernels and starts processes. Nothing of the first is kept for the second.
     """
     map_a, map_b = read_map(path_a), read_map(path_b)
     pairs = match(map_a, map_b, settings.align.match)
     evidence = settings.align.judge.on(Pairs(map_a, map_b, pairs)).evidence
     rows = []
     for entry in settings.align.aligners:
-        registration = _registration(entry, settings.align).on(map_a, map_b, pairs, evidence)
-        done = registration.register(generator(settings.seed, "align", entry.name))
+        registration = _registration(entry, settings.align)
+        given = map_a, map_b, pairs, evidence
+        done = registration.on(*given).register(generator(settings.seed, "align", entry.name))
         if done.estimated.status not in NOT_RUN:
-            done = registration.register(generator(settings.seed, "align", entry.name))
+            done = registration.on(*given).register(generator(settings.seed, "align", entry.name))
         row = {"aligner": entry.name, "elapsed_s": done.estimated.elapsed_s}
         row |= {"n_inliers": int(done.refined.inlier.sum())} | estimate_row(len(pairs), *done)
         rows.append(row)

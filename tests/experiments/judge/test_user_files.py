@@ -6,8 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.judge.user_files import merge
+from experiments.judge.user_files import align, merge
 from experiments.scenario.loading import default_settings
+from mapfusion.align.icp import Icp
+from mapfusion.align.pairs import Pairs
 from mapfusion.landmark_map import write_map
 from tests.mapfusion.robots_of_one_world import Robots
 from tests.mapfusion.same_fusion import assert_same_points
@@ -35,3 +37,19 @@ def test_the_order_of_the_files_changes_nothing_but_the_frame(paths: list[Path])
         order = orders[place]
         two = merge([paths[k] for k in order], settings).fused[0]
         assert_same_points(one, two, order, WITHIN)
+
+
+def test_a_call_that_is_timed_finds_nothing_of_the_one_before(
+    paths: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found, given = Icp.find, list[Pairs]()
+
+    def find(method: Icp, pairs: Pairs, rng: np.random.Generator) -> object:
+        given.append(pairs)  # which keep what helps a later call on the same
+        return found(method, pairs, rng)
+
+    monkeypatch.setattr(Icp, "find", find)
+    rows = align(paths[0], paths[1], default_settings([], 0))
+    assert {row["aligner"] for row in rows} >= {"icp", "ransac"}
+    first, timed = given
+    assert first is not timed
