@@ -20,13 +20,16 @@ from experiments.run.pipeline import PairStages, Pipeline, RobotStages, lay_out
 from experiments.run.rehearsal import rehearsals
 from experiments.run.stage import Stage
 from experiments.run.stages.fuse import read_fusions
+from experiments.run.stages.match import map_at
 from experiments.run.stages.slam import RobotFolders
+from experiments.run.stages.snapshots import stored_maps
 from experiments.run.store import StageFolder, Store
 from experiments.run.tasks import OnProgress, Task, run_tasks, task_names, tasks_of, unfinished
 from experiments.run.workers import workers
 from experiments.scenario.settings import AnyScenario
 from mapfusion.errors import DamagedFileError, InputError
 from mapfusion.fuse.registry import make_fuser
+from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import RobotLog
 
 _JUDGED = {"errors", "fusion"}  # the other tables of pairs come from the aligners
@@ -83,8 +86,14 @@ class JudgedRun:
         return {name: kept_log(each.log) for name, each in folders.items()}
 
     def load_robots(self) -> list[EvaluatedRobot]:
-        """All robots' maps joined with the truth."""
-        return [judging.load_robot(self.robot_folders(robot)) for robot in self.pipeline.robots]
+        """All robots' maps joined with the truth, without viewing evidence: no table reads it."""
+        folders = map(self.robot_folders, self.pipeline.robots)
+        return [judging.load_robot(each, viewing=False) for each in folders]
+
+    def last_maps(self, iteration: int) -> dict[str, LandmarkMap]:
+        """All robots' maps at an iteration as they were stored, by name."""
+        folders = {robot.name: self.robot_folders(robot) for robot in self.pipeline.robots}
+        return {name: map_at(stored_maps(each), iteration) for name, each in folders.items()}
 
     def load_smoothed(self, robots: Sequence[EvaluatedRobot]) -> list[SmoothedRobot]:
         """What the smoother made of all robots' logs, joined with the truth."""

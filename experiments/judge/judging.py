@@ -40,10 +40,10 @@ def truth_of(folder: Path, log: RobotLog) -> RobotTruth:
 
 
 @functools.lru_cache(maxsize=ROBOTS_KEPT)
-def load_robot(folders: RobotFolders) -> EvaluatedRobot:
+def load_robot(folders: RobotFolders, viewing: bool = True) -> EvaluatedRobot:
     """A robot's maps joined with the truth beside its log, which is NaN where it is unknown.
 
-    They stay in memory as `stored_maps` do.
+    They stay in memory as `stored_maps` do, with or without viewing evidence.
     """
     log = kept_log(folders.log)
     truth = truth_of(folders.log, log)
@@ -52,7 +52,7 @@ def load_robot(folders: RobotFolders) -> EvaluatedRobot:
         if len(true) != len(logged):
             counts = f"{len(true)} rows, the log has {len(logged)} of them"
             raise InputError(f"{folders.log / file}.parquet: {counts}")
-    maps = stored_maps(folders)
+    maps = stored_maps(folders, viewing)
     points = landmark_truth(truth, maps.associations.at, maps)
     return EvaluatedRobot(log.robot, maps, points, PathTruth.of(truth))
 

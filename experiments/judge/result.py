@@ -109,8 +109,8 @@ def write_result(
         on_written(folder, name)
     write_json(folder / "scenario.json", run.scenario.resolved())
     on_written(folder, "scenario")
-    for robot in team.robots:
-        write_map(folder / "maps" / f"{robot.name}.parquet", robot.at(team.iteration)[0])
+    for name, landmarks in run.last_maps(team.iteration).items():
+        write_map(folder / "maps" / f"{name}.parquet", landmarks)
     for robot in run.pipeline.robots:
         if smoothed := read_smoothed(run.store.path(robot.smooth)).get(robot.n_frames - 1):
             write_map(folder / "maps" / f"{robot.name}.smoothed.parquet", smoothed)

@@ -15,10 +15,10 @@ from experiments.run.store import Store
 from experiments.run.tasks import Task, task_names, tasks_of
 from experiments.scenario.settings import Simulation
 
-# Of all frames: as many as the ray caster and the front end, which take five times as long for one
+# Of all frames: as many as the ray caster and the front end, which take four times as long for one
 # as the drive does, are done with when the drive is over. Of slower renderers' pictures one chunk
 # of each robot takes longer than the drive.
-_SHARE = 1 / 8
+_SHARE = 1 / 6
 
 
 def head_start(pipeline: Pipeline) -> Stage | None:

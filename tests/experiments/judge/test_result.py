@@ -1,11 +1,17 @@
-"""Whoever is told that a part of a result is written finds it there."""
+"""What a result holds, and when: whoever is told that a part is written finds it there."""
 
 import shutil
 from pathlib import Path
 
+import numpy as np
+
 from experiments.judge import tables
+from experiments.judge.judged_run import JudgedRun
 from experiments.judge.result import run_scenario
+from experiments.run.stages.snapshots import stored_maps
+from experiments.run.store import Store
 from experiments.scenario.settings import Simulation
+from mapfusion.landmark_map import read_map
 
 
 def test_each_part_is_there_when_it_is_told(
@@ -30,3 +36,16 @@ def test_each_part_is_there_when_it_is_told(
     run_scenario(tiny, tmp_path, 1, lambda *_: None, on_written=written)
     files = [path.stem for path in (result / "tables").iterdir()]
     assert sorted(told) == sorted(["scenario", *files])
+
+
+def test_maps_of_a_result_tell_from_where_their_landmarks_were_seen(
+    tiny: Simulation, tiny_results: Path
+) -> None:
+    run = JudgedRun.of(tiny, Store.of(tiny_results))
+    for robot in run.pipeline.robots:
+        stored = stored_maps(run.robot_folders(robot))[robot.n_frames - 1].viewing
+        told = read_map(tiny_results / "tiny-3" / "maps" / f"{robot.name}.parquet").viewing
+        assert stored is not None
+        assert told is not None
+        np.testing.assert_array_equal(told.n_views, stored.n_views)
+        np.testing.assert_array_equal(told.pose, stored.pose)

@@ -44,7 +44,7 @@ def test_robots_begin_as_they_do_on_the_whole_way(tiny: Simulation, tmp_path: Pa
     np.testing.assert_array_equal(few.time_s, all_frames.time_s[: len(few)])
 
 
-@pytest.mark.parametrize(("renderer", "n_early"), [("raycast", 3), ("tiny", 1)])
+@pytest.mark.parametrize(("renderer", "n_early"), [("raycast", 4), ("tiny", 1)])
 def test_first_pictures_wait_for_their_own_drive(
     tiny: Simulation, tmp_path: Path, renderer: str, n_early: int
 ) -> None:
