@@ -236,7 +236,8 @@ def _pair(scenario: Scenario, *robots: RobotStages) -> PairStages:
     parts = match.batches(iterations)
     maps = {"log_a": a.log, "slam_a": a.slam, "log_b": b.log, "slam_b": b.slam}
     own = {"iterations": iterations}
-    matched = _stage(match, scenario.align, own=own, before=maps, parts=parts)
+    # a robot's maps are in several pairs, and what is matched of two goes to all aligners
+    matched = _stage(match, scenario.align, own=own, before=maps, parts=parts, shares=match.LABEL)
     estimates: dict[str, Stage] = {}
     for entry in scenario.align.aligners:
         method = find_method(entry.method)
@@ -250,6 +251,8 @@ def _pair(scenario: Scenario, *robots: RobotStages) -> PairStages:
             before=maps | {"match": matched},
             parts=parts,
             loads=(module,),
+            # fusing does not wait for the others
+            shares="" if entry.name == scenario.merge.aligner else f"estimates on {matched.key}",
         )
     named = {f"aligner {i}": stage for i, stage in enumerate(estimates.values())}
     joined = _stage(align, own={"batches": parts}, before={"match": matched} | named)

@@ -40,6 +40,8 @@ class Stage:
         parts: made apart from each other, in any order; each needs all of the stages before it,
             but of one with the same parts its own counterpart alone.
         loads: modules that it finds by name, which no import shows.
+        shares: a name for what it reads or makes ready in memory; stages of one name have it in
+            common, part by part. It has no say in what they make.
     """
 
     name: str
@@ -50,6 +52,7 @@ class Stage:
     before: Mapping[str, "Stage | RecordedLog"] = field(default_factory=dict)
     parts: tuple[str, ...] = WHOLE
     loads: tuple[str, ...] = ()
+    shares: str = ""
 
     @cached_property
     def sources(self) -> tuple[str, ...]:

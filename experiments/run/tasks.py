@@ -31,6 +31,8 @@ class Task:
         arguments: all can be pickled.
         outputs: files that are there once it is done; without any it is never taken for done.
         needs: names of the tasks that must be done before.
+        shares: a name for what it keeps in memory; tasks of one name are given to one process, as
+            far as they are ready together. Empty for none.
     """
 
     name: str
@@ -39,6 +41,7 @@ class Task:
     arguments: tuple[Any, ...]
     outputs: tuple[Path, ...]
     needs: tuple[str, ...] = ()
+    shares: str = ""
 
     @property
     def finished(self) -> bool:
@@ -85,7 +88,8 @@ def _task(stage: Stage, part: str, folder: StageFolder, store: Store) -> Task:
     inputs = {name: store.path(before) for name, before in stage.before.items()}
     arguments = (stage.work, stage.settings, Job(inputs, folder.path, part), folder)
     outputs = folder.outputs[part]
-    return Task(_name(stage, part), stage.label, _perform, arguments, outputs, tuple(needs))
+    shares = f"{stage.shares}/{part}" if stage.shares else ""
+    return Task(_name(stage, part), stage.label, _perform, arguments, outputs, tuple(needs), shares)
 
 
 def _perform(work: Callable[..., Any], settings: Any, job: Job, folder: StageFolder) -> None:
@@ -121,14 +125,29 @@ def run_tasks(tasks: Sequence[Task], pool: Workers, on_progress: OnProgress) -> 
         on_progress(label, 0, total[label])
 
     def hand_out() -> None:
-        ready = (task for task in waiting if undone.isdisjoint(task.needs))
-        for task in list(itertools.islice(ready, pool.room)):
-            waiting.remove(task)
-            pool.submit(task, task.run)
+        while pool.room and (batch := _first_ready(waiting, undone)):
+            for task in batch:
+                waiting.remove(task)
+            pool.submit(batch, _run_each, batch)
 
     hand_out()
-    for task, _ in pool.completed():
-        undone.remove(task.name)
-        done[task.label] += 1
-        on_progress(task.label, done[task.label], total[task.label])
+    for batch, _ in pool.completed():
+        for task in batch:
+            undone.remove(task.name)
+            done[task.label] += 1
+            on_progress(task.label, done[task.label], total[task.label])
         hand_out()
+
+
+def _first_ready(waiting: Sequence[Task], undone: set[str]) -> tuple[Task, ...]:
+    """The first task that waits for none of those undone, and all ready ones that share with it."""
+    ready = (task for task in waiting if undone.isdisjoint(task.needs))
+    first = next(ready, None)
+    if first is None:
+        return ()
+    return first, *(task for task in ready if first.shares and task.shares == first.shares)
+
+
+def _run_each(tasks: Sequence[Task]) -> None:
+    for task in tasks:
+        task.run()

@@ -117,13 +117,17 @@ class Snapshots(Mapping[int, LandmarkMap]):
         return poses[slice(*np.searchsorted(evaluated, [iteration, iteration + 1]))]
 
 
-@functools.lru_cache(maxsize=ROBOTS_KEPT)
 def stored_maps(folders: RobotFolders, viewing: bool = True) -> Snapshots:
     """A robot's maps, with or without viewing evidence.
 
     Those of a few robots stay in memory with all that was made of them, since stage after stage
     wants the same. Their folder is named after what the log holds: of another log it is another.
     """
+    return _stored_maps(folders, viewing)
+
+
+@functools.lru_cache(maxsize=ROBOTS_KEPT)
+def _stored_maps(folders: RobotFolders, viewing: bool) -> Snapshots:
     return Snapshots(folders.slam, kept_log(folders.log), viewing)
 
 

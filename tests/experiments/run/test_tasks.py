@@ -1,7 +1,9 @@
 """Tasks: what is left to do, in which order, and the same whatever the pool."""
 
+import os
 import random
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -104,3 +106,27 @@ def test_one_process_keeps_the_order_of_the_plan(tmp_path: Path) -> None:
     with workers(1) as pool:
         run_tasks(list(tasks(tmp_path, needs).values()), pool, lambda *_: None)
     assert journal(tmp_path) == ["w", "r1", "s1", "r2", "s2"]
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_tasks_that_share_are_done_by_one_process_as_far_as_they_are_ready(
+    tmp_path: Path, jobs: int
+) -> None:
+    names = {"a1": (), "b1": (), "a2": (), "b2": (), "w": (), "a3": ("w",)}
+    made = [
+        replace(task, function=_append_process, shares=task.name[0] if task.name != "w" else "")
+        for task in tasks(tmp_path, names).values()
+    ]
+    with workers(jobs) as pool:
+        run_tasks(made, pool, lambda *_: None)
+    ran = journal(tmp_path)
+    assert sorted(name.split("@")[0] for name in ran) == sorted(names)
+    by = dict(name.split("@") for name in ran)
+    assert by["a1"] == by["a2"]
+    assert by["b1"] == by["b2"]
+    if jobs == 1:
+        assert [name.split("@")[0] for name in ran] == ["a1", "a2", "b1", "b2", "w", "a3"]
+
+
+def _append_process(journal: Path, name: str, output: Path) -> None:
+    _append(journal, f"{name}@{os.getpid()}", output)
