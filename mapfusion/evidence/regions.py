@@ -259,7 +259,6 @@ class Witnesses:
             self._how[key], p = how_seen(seen, other.watch), seen.p
         how, known = self._how[key], self._found.get(key)
         rows = np.flatnonzero(how != UNSEEN)
-        found = known[rows] if known is not None else None
-        if found is None:
-            found = has(p, rows, own.looks, other.looks, self._gates)
+        looks = own.looks, other.looks
+        found = has(p, rows, *looks, self._gates) if known is None else known[rows]
         return _Asked(rows, how[rows], found, copied[rows]), p
