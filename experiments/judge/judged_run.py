@@ -126,6 +126,17 @@ class JudgedRun:
         met = met_maps(robots, *map(self.pair_table, ALIGNED))
         return FusedTeam.of(robots, met, self.settings.merge)
 
+    @cached_property
+    def team(self) -> FusedTeam:
+        """What `load_team` gives; it stays in memory."""
+        return self.load_team()
+
+    def _team_task(self) -> Task:
+        read = [robot.slam for robot in self.pipeline.robots]
+        read += [pair.estimates for pair in self.pipeline.pairs]
+        needs = tuple(name for stage in read for name in task_names(stage))
+        return Task("team", "load the maps", lambda: self.team, (), (), needs)
+
     def pair_table(self, name: str) -> pd.DataFrame:
         """A table of robot pairs, of all pairs."""
         made = self.judgements if name in _JUDGED else [p.estimates for p in self.pipeline.pairs]
@@ -134,6 +145,8 @@ class JudgedRun:
 
     def execute(self, jobs: int, on_progress: OnProgress, only: Sequence[Stage] = ()) -> None:
         """Do what is not in the store yet, in `jobs` processes; of `only` these stages, if any.
+
+        Of all stages `team` is loaded beside the last tasks.
 
         Raises:
             InputError: something that was given cannot be used, or this machine has too little
@@ -147,7 +160,7 @@ class JudgedRun:
             left = [*rehearsals(self.scenario, left), *left]
         try:
             with workers(jobs) as pool:
-                run_tasks(left, pool, on_progress)
+                run_tasks(left, pool, on_progress, None if only else self._team_task())
         except DamagedFileError:  # `mending` wants to know which
             raise
         except InputError as error:

@@ -98,7 +98,7 @@ def write_result(
     `on_written` is told (folder, part) of each table, and of `scenario`, when it is there. World
     and images are there before the first of them.
     """
-    team = run.load_team()
+    team = run.team
     measure_aligners(run, team.robots)
     for outdated in ("maps", "keyframes"):  # of robots or frames that are no longer there
         shutil.rmtree(folder / outdated, ignore_errors=True)

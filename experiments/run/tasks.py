@@ -113,11 +113,17 @@ def unfinished(tasks: dict[str, Task], goals: Iterable[str]) -> list[Task]:
     return left[::-1]
 
 
-def run_tasks(tasks: Sequence[Task], pool: Workers, on_progress: OnProgress) -> None:
+def run_tasks(
+    tasks: Sequence[Task],
+    pool: Workers,
+    on_progress: OnProgress,
+    meanwhile: Task | None = None,
+) -> None:
     """Run tasks in a pool, earlier ones first where there is a choice.
 
     What a task needs beyond these is done already. `on_progress` is told (label, tasks done, tasks
-    in all).
+    in all). `meanwhile` is run by this process once what it needs is done and no task waits, while
+    the pool works on the last ones; where there are no tasks it is not run.
     """
     waiting, undone = list(tasks), {task.name for task in tasks}
     total, done = Counter(task.label for task in tasks), Counter[str]()
@@ -137,6 +143,9 @@ def run_tasks(tasks: Sequence[Task], pool: Workers, on_progress: OnProgress) -> 
             done[task.label] += 1
             on_progress(task.label, done[task.label], total[task.label])
         hand_out()
+        if meanwhile and not waiting and undone.isdisjoint(meanwhile.needs):
+            meanwhile.run()
+            meanwhile = None
 
 
 def _first_ready(waiting: Sequence[Task], undone: set[str]) -> tuple[Task, ...]:

@@ -2,6 +2,7 @@
 
 import os
 import random
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -38,6 +39,8 @@ def journal(folder: Path) -> list[str]:
     return path.read_text().split() if path.exists() else []
 
 
+_GIVE_UP_S = 60.0  # on a busy machine
+_LONGER_S = 0.5
 DIAMOND = {"a1": (), "a2": ("a1",), "a3": ("a1",), "b": ("a2", "a3"), "c": ("b",), "d": ()}
 
 
@@ -126,6 +129,36 @@ def test_tasks_that_share_are_done_by_one_process_as_far_as_they_are_ready(
     assert by["b1"] == by["b2"]
     if jobs == 1:
         assert [name.split("@")[0] for name in ran] == ["a1", "a2", "b1", "b2", "w", "a3"]
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_this_process_does_its_part_beside_the_last_task_when_what_it_needs_is_done(
+    tmp_path: Path, jobs: int
+) -> None:
+    """The last task waits for it, and it for the second one, which takes longer than the first."""
+    made = tasks(tmp_path, {"first": (), "second": (), "last": ()})
+    for name, before in {"second": "first", "last": "own"}.items():
+        arguments = (*made[name].arguments, tmp_path / before)
+        made[name] = replace(made[name], function=_append_after, arguments=arguments)
+    own = tasks(tmp_path, {"own": ("second",)})["own"]
+    with workers(jobs) as pool:
+        run_tasks(list(made.values()), pool, lambda *_: None, own)
+    assert journal(tmp_path) == ["first", "second", "own", "last"]
+
+
+def _append_after(journal: Path, name: str, output: Path, other: Path) -> None:
+    give_up = time.monotonic() + _GIVE_UP_S
+    while not other.exists() and time.monotonic() < give_up:
+        time.sleep(0.01)
+    time.sleep(_LONGER_S)
+    _append(journal, name, output)
+
+
+def test_this_process_does_nothing_where_no_task_is_left(tmp_path: Path) -> None:
+    """What it would load is loaded by whoever wants it."""
+    with workers(1) as pool:
+        run_tasks([], pool, lambda *_: None, tasks(tmp_path, {"own": ()})["own"])
+    assert journal(tmp_path) == []
 
 
 def _append_process(journal: Path, name: str, output: Path) -> None:
