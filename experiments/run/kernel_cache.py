@@ -64,8 +64,9 @@ class KernelLocator:
     Numba makes one for each kernel, by the name in `NUMBA_CACHE_LOCATOR_CLASSES`.
     """
 
-    def __init__(self, folder: Path, line: int) -> None:
+    def __init__(self, folder: Path, path: str, line: int) -> None:
         self._folder, self._line = folder, line
+        self._py_file = path  # where Numba's warning points to, of a kernel that cannot be kept
 
     @classmethod
     def from_function(cls, py_func: Callable[..., object], py_file: str) -> "KernelLocator | None":
@@ -74,9 +75,10 @@ class KernelLocator:
         if not root or not any(path.is_relative_to(SOURCE_ROOT / package) for package in PACKAGES):
             return None
         try:
-            return cls(_used(kernel_folder(Path(root), path)), py_func.__code__.co_firstlineno)
+            folder = _used(kernel_folder(Path(root), path))
         except OSError:
             return None
+        return cls(folder, py_file, py_func.__code__.co_firstlineno)
 
     def get_cache_path(self) -> str:
         """The folder."""

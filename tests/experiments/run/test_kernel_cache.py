@@ -92,3 +92,11 @@ def test_of_a_module_few_versions_are_kept(source: Source) -> None:
     # the last call leaves one more than it found
     assert sum(name.startswith("mapfusion.caller-") for name in kept) == 5
     assert sum(name.startswith("mapfusion.apart-") for name in kept) == 1
+
+
+def test_a_kernel_that_numba_cannot_keep_is_compiled_each_time(source: Source) -> None:
+    """It has a large global array, of which the code holds nothing but the place in memory."""
+    large = "import numpy as np\nTABLE = np.ones(1_000_000)\n"
+    source.write("apart", large + KERNELS["apart"].replace("3 * x", "3 * x * TABLE[x]"))
+    for _ in range(2):
+        assert source.called() == {"caller": [22, True], "apart": [30, False]}
