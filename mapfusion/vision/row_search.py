@@ -7,7 +7,7 @@ from mapfusion.vision.verdict import Verdict
 
 _PEAK_HALF_WIDTH_PX = 2  # rivals are looked for beyond the slopes of the best peak
 _CROSS, _SUM, _SQUARE = range(3)  # of candidates: sums of products; of columns: of greys, squares
-_AT_ONCE = 32  # candidates that vectors take at once: up to a multiple all cost the same
+_AT_ONCE = 8  # candidates that a vector takes: up to a multiple all cost the same
 
 
 @kernel
