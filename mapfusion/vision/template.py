@@ -23,14 +23,14 @@ LEVEL, SLOPE_U, SLOPE_V = range(3)  # of a window's pixels
 NO_FIT = -1.0  # tolerated of a window that leaves its patch, or that has too little texture
 
 
-@dataclass(frozen=True)
+@dataclass
 class Templates:
-    """Windows around N points of earlier pictures.
+    """Windows around points of earlier pictures: K rows, of which some are in use.
 
     Attributes:
-        window: (N, 3, W * W) grey levels, row by row, and their slopes along u and v.
-        factor: (N, 8, 8) of the normal matrix, its lower half.
-        tolerated: (N,) weighted sum of squared residuals that still is the same, or NO_FIT.
+        window: (K, 3, W * W) grey levels, row by row, and their slopes along u and v.
+        factor: (K, 8, 8) of the normal matrix, its lower half.
+        tolerated: (K,) weighted sum of squared residuals that still is the same, or NO_FIT.
     """
 
     window: Float
@@ -45,35 +45,37 @@ class Templates:
 
     @classmethod
     def of(cls, patch: np.ndarray, point: Float, noise: float, max_misfit: float) -> "Templates":
-        """What points look like.
+        """Those of N points, in their order; arguments as `fill` has them."""
+        made = cls.room(len(patch))
+        made.fill(np.arange(len(patch)), patch, point, noise, max_misfit)
+        return made
+
+    def unused(self, used: np.ndarray, n: int) -> np.ndarray:
+        """Rows (n,) beside those in use (U,); there will be twice the room where that is short."""
+        if len(used) + n > len(self.tolerated):
+            larger = Templates.room(2 * (len(used) + n))
+            for name, values in vars(self).items():
+                getattr(larger, name)[: len(values)] = values
+            self.window, self.factor, self.tolerated = vars(larger).values()
+        is_free = np.ones(len(self.tolerated), dtype=bool)
+        is_free[used] = False
+        return np.flatnonzero(is_free)[:n]
+
+    def fill(
+        self, rows: np.ndarray, patch: np.ndarray, point: Float, noise: float, max_misfit: float
+    ) -> None:
+        """Put what points look like into some rows.
 
         Args:
+            rows: (N,).
             patch: (N, P, P) uint8 of pictures.
             point: (N, 2) in them, u and v from their middles.
             noise: standard deviation of one picture's grey levels.
             max_misfit: what is found may differ by noise and by what this error of its place would
                 explain, pixels.
         """
-        made = cls.room(len(patch))
-        variance, square_misfit = 2 * noise**2, max_misfit**2
-        _prepare(patch, point, variance, square_misfit, made.window, made.factor, made.tolerated)
-        return made
-
-    def put(self, rows: np.ndarray, others: "Templates", theirs: np.ndarray) -> None:
-        """Replace, in place, rows (K,) by some of others, their rows (K,)."""
-        _copy(others.window, theirs, self.window, rows)
-        _copy(others.factor, theirs, self.factor, rows)
-        self.tolerated[rows] = others.tolerated[theirs]
-
-
-@kernel
-def _copy(source: Float, theirs: np.ndarray, target: Float, rows: np.ndarray) -> None:
-    """Copy rows (..., K, L) of one array to rows of another, with no copy in between."""
-    for n in range(len(rows)):
-        i, k = np.uintp(theirs[n]), np.uintp(rows[n])
-        for m in range(source.shape[1]):
-            for p in range(source.shape[2]):
-                target[k, m, p] = source[i, m, p]
+        given = (patch, point, 2 * noise**2, max_misfit**2, rows)
+        _prepare(*given, self.window, self.factor, self.tolerated)
 
 
 def _weights() -> Float:
@@ -92,21 +94,23 @@ def _prepare(
     point: Float,
     variance: float,
     square_misfit: float,
+    rows: np.ndarray,
     window: Float,
     factor: Float,
     tolerated: Float,
 ) -> None:
     shown = np.empty((_SIDE_PX + 2) ** 2)
-    for n in range(len(patch)):
-        tolerated[n] = NO_FIT
+    for n in range(len(rows)):
+        i = rows[n]
+        tolerated[i] = NO_FIT
         middle, reach = patch.shape[1] // 2, max(abs(point[n, 0]), abs(point[n, 1]))
         if reach + WINDOW_HALF_PX + 2 > middle:
             continue
         _read_grid(patch, n, middle + point[n, 0], middle + point[n, 1], shown)
-        _fill_window(shown, window, n)
-        sum_of_squares = _normal_matrix(window, n, factor, variance, square_misfit)
-        if cholesky(factor[n], _SINGULAR):
-            tolerated[n] = sum_of_squares
+        _fill_window(shown, window, i)
+        sum_of_squares = _normal_matrix(window, i, factor, variance, square_misfit)
+        if cholesky(factor[i], _SINGULAR):
+            tolerated[i] = sum_of_squares
 
 
 @kernel_part

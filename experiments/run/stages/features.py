@@ -4,6 +4,7 @@ Frames do not depend on each other, so they are made in parallel, in chunks; a c
 never made again. Images are kept for a few frames only (for figure 1).
 """
 
+import itertools
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -169,6 +170,7 @@ def read_features(folder: Path, n_frames: int) -> Iterator[tuple[Features, TrueP
         true_table, _ = read_table(truth_path, TRUTH)
         point = columns(true_table, POSITION_FIELDS)
         slope = columns(true_table, _POINT_SLOPE).reshape(-1, 3, 2)
-        for k in _chunk(part, n_frames):
-            rows = slice(*np.searchsorted(column(table, "iteration"), [k, k + 1]))
+        frames = _chunk(part, n_frames)
+        ends = np.searchsorted(column(table, "iteration"), [*frames, frames.stop]).tolist()
+        for rows in itertools.starmap(slice, itertools.pairwise(ends)):
             yield with_rows(found, rows), TruePoints(point[rows], slope[rows])
