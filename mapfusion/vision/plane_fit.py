@@ -7,13 +7,14 @@ import numpy as np
 from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float
 from mapfusion.symmetric import cholesky, copy_lower, solve_lower, solve_upper
-from mapfusion.vision.window import FIELDS, RESIDUAL, ROOM, SLOPE, fill_left, fill_residuals
+from mapfusion.vision.window import FIELDS, RESIDUAL, ROOM, SLOPE, WIDE, fill_left, fill_residuals
 
 _MAX_STEPS = 20  # a few on rich texture; where it is poor, slopes take long
 _CONVERGED_PX = 0.005  # anywhere in the window; far below what noise lets one measure
 # Noise adds half its variance to the mean square of slopes, which promise that much more than they
 # keep (errors in variables, Fuller 1987, section 1.1). So much of it is taken for texture at least.
 _LEAST_TEXTURE = 0.25
+_AT = tuple(np.uintp(k) * WIDE for k in range(4))  # sums down columns, see there
 _SINGULAR = 1e-9  # pivot, as a share of its diagonal element, that is rounding error
 
 
@@ -39,7 +40,7 @@ def fit_planes(
             pixel to spare.
         offset: (N, 2) from the centres to the points whose variance is wanted.
         start: (N,) disparities right to a pixel or two.
-        half: half side of the window, pixels.
+        half: half side of the window, `MOST_HALF_PX` at most.
         slope_sigma: standard deviation of the prior on a and b, around zero.
         noise: standard deviation of one image's grey levels.
         alike_px: what residuals hold beyond noise is alike over so many pixels each way.
@@ -148,6 +149,7 @@ def _settle(
     """Take steps until plane moves nowhere in the window; the residuals' variance, or NaN."""
     count = (2 * half + 1) ** 2
     factor, step = np.empty((4, 4)), np.empty(4)
+    down = np.empty(len(_AT) * WIDE)
     variance_grey = 2 * noise**2
     for _ in range(_MAX_STEPS):
         first = u - half - plane[n, 0] + plane[n, 1] * half
@@ -157,7 +159,7 @@ def _settle(
             _give_up(plane, n)
             return np.nan
         fill_residuals(right, u, v, half, plane, n, window, room, share)
-        square = _moments(window, half, step)
+        square = _moments(window, half, down, step)
         prior = variance_grey / slope_sigma**2
         copy_lower(seen, factor)
         factor[2, 2] += prior
@@ -262,15 +264,30 @@ def _counted(variance_grey: float, noise: float, alike_px: float) -> float:
 
 
 @kernel_part
-def _moments(window: Float, half: int, moment: np.ndarray) -> float:
-    """Sum of the squared residuals; `moment` gets J^T r."""
+def _moments(window: Float, half: int, down: Float, moment: np.ndarray) -> float:
+    """Sum of the squared residuals; `moment` gets J^T r.
+
+    Sums are taken down the columns first, into `down`: so loops run in vectors.
+    """
+    side = 2 * half + 1
+    for i in range(side):
+        m = np.uintp(i)
+        down[m] = down[m + _AT[1]] = down[m + _AT[2]] = down[m + _AT[3]] = 0.0
+    for row in range(side):
+        y, at = float(row - half), np.uintp(row * side)
+        for i in range(side):
+            m, k = np.uintp(i), at + np.uintp(i)
+            r = window[RESIDUAL, k]
+            along = window[SLOPE, k] * r
+            down[m] += r * r
+            down[m + _AT[1]] += r
+            down[m + _AT[2]] += along
+            down[m + _AT[3]] += along * y
     square = m0 = m1 = m2 = m3 = 0.0
-    for y in range(-half, half + 1):
-        middle = (y + half) * (2 * half + 1) + half
-        for x in range(-half, half + 1):
-            r, g = window[RESIDUAL, np.uintp(middle + x)], window[SLOPE, np.uintp(middle + x)]
-            square += r * r
-            m0, m1 = m0 + r, m1 + g * r
-            m2, m3 = m2 + g * x * r, m3 + g * y * r
+    for i in range(side):
+        m = np.uintp(i)
+        along = down[m + _AT[2]]
+        square, m0, m1 = square + down[m], m0 + down[m + _AT[1]], m1 + along
+        m2, m3 = m2 + along * (i - half), m3 + down[m + _AT[3]]
     moment[0], moment[1], moment[2], moment[3] = m0, m1, m2, m3
     return square

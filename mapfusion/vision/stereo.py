@@ -35,7 +35,7 @@ from mapfusion.vision.plane_test import FURTHER_TERMS
 from mapfusion.vision.row_search import search_rows
 from mapfusion.vision.silhouette_test import disagrees
 from mapfusion.vision.verdict import Verdict
-from mapfusion.vision.window_moments import MOST_HALF_PX
+from mapfusion.vision.window import MOST_HALF_PX
 from mapfusion.vision.window_sums import window_sums
 
 _MAX_HALF_PX = 90  # (2 * 90 + 1)^2 squared grey levels still fit a 32-bit sum

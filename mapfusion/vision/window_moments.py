@@ -10,7 +10,6 @@ import numpy as np
 
 from mapfusion.se2 import Float
 
-MOST_HALF_PX = 100  # half side of the largest window
 # Products that are summed down the columns: with L the grey levels of the left picture, g and h
 # their slopes along u and v, r = right - left. Those of g also times y and its square, g^2 times
 # all powers up to the fourth.

@@ -18,6 +18,7 @@ from mapfusion.vision.window import (
     RESIDUAL,
     ROOM,
     SLOPE,
+    WIDE,
     fill_down,
     fill_left,
     fill_residuals,
@@ -26,7 +27,6 @@ from mapfusion.vision.window import (
 from mapfusion.vision.window_moments import (
     GG,
     HH,
-    MOST_HALF_PX,
     N_PRODUCTS,
     ONE,
     SIDES,
@@ -39,13 +39,9 @@ _ASKED = (plane_test.ASKED, silhouette_test.ASKED, (moment(ONE), moment(GG), mom
 _SUMS, _place = np.unique([m for asked in _ASKED for m in asked], axis=0, return_inverse=True)
 _DOWN_SUMS, _FROM = np.unique(_SUMS[:, :2], axis=0, return_inverse=True)
 _OF_PLANE, _OF_HALVES, _OF_SLOPES = np.split(_place, np.cumsum([len(a) for a in _ASKED[:-1]]))
-# Sums of one product have room for the widest window, in whole vectors: so it is known how far
-# those of two products lie apart when loops over them are compiled, and that these may run in the
-# processor's vectors.
-_AT_ONCE = 8
-_WIDE = np.uintp(-(-(2 * MOST_HALF_PX + 1) // _AT_ONCE) * _AT_ONCE)
-_AT = tuple(np.uintp(k) * _WIDE for k in range(N_PRODUCTS))
-_PART = np.uintp(N_PRODUCTS) * _WIDE
+# Where sums of each product begin, and those of the rows of the next part.
+_AT = tuple(np.uintp(k) * WIDE for k in range(N_PRODUCTS))
+_PART = np.uintp(N_PRODUCTS) * WIDE
 _INSIDE = FIELDS  # of a window's pixels, after its other fields: 1 in both pictures, else 0
 
 
@@ -94,7 +90,7 @@ def _look_at_all(
     half = max(silhouette_half, plane_half)
     area = (2 * half + 1) ** 2
     window, share = np.empty((FIELDS + 1, area)), np.empty(area)
-    room, down = np.empty((ROOM, area), np.uint32), np.empty(3 * N_PRODUCTS * _WIDE)
+    room, down = np.empty((ROOM, area), np.uint32), np.empty(3 * N_PRODUCTS * WIDE)
     column, sums = np.empty(2 * half + 1), np.empty(len(_SUMS))
     normal, moments = np.empty((COLUMNS, COLUMNS)), np.empty(COLUMNS)
     for n in range(len(pixel)):
@@ -153,15 +149,15 @@ def _sum_down(window: Float, half: int, own: int, shade: float, down: Float) -> 
         half: of the window.
         own: of what is looked at.
         shade: what grey levels are counted from.
-        down: (3 * N_PRODUCTS * _WIDE,), changed: of the rows above the middle, of that in it and of
+        down: (3 * N_PRODUCTS * WIDE,), changed: of the rows above the middle, of that in it and of
             those below the sums of each product.
     """
     for k in range(3 * N_PRODUCTS):
-        first = np.uintp(k) * _WIDE
+        first = np.uintp(k) * WIDE
         for i in range(2 * own + 1):
             down[first + np.uintp(i)] = 0.0
     for y in range(-own, own + 1):
-        part = np.uintp((1 + (y > 0) - (y < 0)) * N_PRODUCTS) * _WIDE
+        part = np.uintp((1 + (y > 0) - (y < 0)) * N_PRODUCTS) * WIDE
         at, q = np.uintp((y + half) * (2 * half + 1) + half - own), float(y)
         for i in range(2 * own + 1):
             m, k = part + np.uintp(i), at + np.uintp(i)
@@ -200,7 +196,7 @@ def _sum_along(down: Float, half: int, own: int, weight: Float, column: Float, s
             last = _FROM[n]
             product, t = np.uintp(_DOWN_SUMS[last, 0]), _DOWN_SUMS[last, 1]
             above, at, below = SIDES[t, 0], SIDES[t, 1], SIDES[t, 2]
-            m = product * _WIDE
+            m = product * WIDE
             for i in range(2 * own + 1):
                 k = m + np.uintp(i)
                 column[i] = above * down[k] + at * down[k + _PART] + below * down[k + _PART + _PART]
