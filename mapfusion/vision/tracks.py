@@ -185,7 +185,8 @@ def link(
     on shift and disparity allow over so many steps, and the distance is within its limit.
     """
     steps = min(steps, _LONGEST_PAUSE)
-    return _link(
+    forward, backward = np.full(len(previous), _NO_MATCH), np.full(len(current), _NO_MATCH)
+    _link(
         previous.uv_px,
         previous.disparity_px,
         previous.descriptor,
@@ -196,7 +197,12 @@ def link(
         steps * parameters.max_shift_v_px,
         parameters.max_disparity_ratio**steps,
         parameters.max_descriptor_distance**2,
+        forward,
+        np.full(len(previous), np.inf),
+        backward,
+        np.full(len(current), np.inf),
     )
+    return backward
 
 
 @kernel
@@ -211,14 +217,15 @@ def _link(
     max_shift_v: float,
     max_ratio: float,
     max_squared: float,
-) -> np.ndarray:
-    n_previous, n = len(previous_uv), len(uv)
-    forward = np.full(n_previous, _NO_MATCH)
-    forward_squared = np.full(n_previous, np.inf)
-    backward = np.full(n, _NO_MATCH)
-    backward_squared = np.full(n, np.inf)
+    forward: np.ndarray,
+    forward_squared: Float,
+    backward: np.ndarray,
+    backward_squared: Float,
+) -> None:
+    """Fill in the links of both frames' features, which are none yet, and squared distances."""
+    n = len(uv)
     for i in range(n):
-        for j in range(n_previous):
+        for j in range(len(previous_uv)):
             if abs(uv[i, 0] - previous_uv[j, 0]) > max_shift_u:
                 continue
             if abs(uv[i, 1] - previous_uv[j, 1]) > max_shift_v:
@@ -238,4 +245,3 @@ def _link(
         j = backward[i]
         if j != _NO_MATCH and (forward[j] != i or backward_squared[i] > max_squared):
             backward[i] = _NO_MATCH
-    return backward
