@@ -57,8 +57,11 @@ def fit_patches(
     Returns:
         (N,) bool: False where the window leaves a patch, has too little texture, or does not fit.
     """
-    given = (templates.window, templates.factor, templates.tolerated)
-    return _fit_all(*given, rows, after, warp, bend)
+    given = (templates.window, templates.factor, templates.tolerated, rows, after, warp, bend)
+    found, area = np.zeros(len(rows), dtype=np.bool_), len(WEIGHT)
+    cell, share, residual = np.empty(area, np.uint32), np.empty((2, area)), np.empty(area)
+    _fit_all(*given, cell, share, residual, np.empty(len(_AT) * _WIDE), found)
+    return found
 
 
 @kernel
@@ -70,19 +73,20 @@ def _fit_all(
     after: np.ndarray,
     warp: Float,
     bend: Float,
-) -> np.ndarray:
-    found, area = np.empty(len(rows), dtype=np.bool_), len(WEIGHT)
-    cell, share, residual = np.empty(area, np.uint32), np.empty((2, area)), np.empty(area)
-    down = np.empty(len(_AT) * _WIDE)
+    cell: np.ndarray,
+    share: Float,
+    residual: Float,
+    down: Float,
+    found: np.ndarray,
+) -> None:
+    """Move warps and mark what is found; from `cell` to `down` it is room on the way."""
     for n in range(len(rows)):
         i = rows[n]
-        found[n] = False
         if tolerated[i] >= 0:
             square = _settle(
                 window, i, factor[i], after, n, warp, bend, cell, share, residual, down
             )
             found[n] = 0 <= square <= tolerated[i]
-    return found
 
 
 @kernel_part
