@@ -25,6 +25,7 @@ from mapfusion.vision.template import (
     SLOPE_U,
     SLOPE_V,
     WEIGHT,
+    WIDE,
     WINDOW_HALF_PX,
     Templates,
 )
@@ -34,10 +35,8 @@ _CONVERGED_PX = 0.005  # far below what noise lets one measure
 # Where a window's far side would shrink to a half, it is no piece of a wall that one looks at.
 _LEAST_SCALE = 0.5
 _ONE = np.uintp(1)  # indices without a sign, which a kernel need not wrap around
-# Sums of one product down a window's columns have whole vectors of room, and lie as far from those
-# of the next as is known when loops over them are compiled.
-_SIDE_PX, _WIDE = 2 * WINDOW_HALF_PX + 1, 24
-_AT = tuple(np.uintp(k * _WIDE) for k in range(7))
+_SIDE_PX = 2 * WINDOW_HALF_PX + 1
+_AT = tuple(np.uintp(k * WIDE) for k in range(7))  # where sums of each product begin
 _BYTE, _HALF, _LOW = np.uint32(8), np.uint32(16), np.uint32(0xFF)
 
 
@@ -60,7 +59,7 @@ def fit_patches(
     given = (templates.window, templates.factor, templates.tolerated, rows, after, warp, bend)
     found, area = np.zeros(len(rows), dtype=np.bool_), len(WEIGHT)
     cell, share, residual = np.empty(area, np.uint32), np.empty((2, area)), np.empty(area)
-    _fit_all(*given, cell, share, residual, np.empty(len(_AT) * _WIDE), found)
+    _fit_all(*given, cell, share, residual, np.empty(len(_AT) * WIDE), found)
     return found
 
 
