@@ -7,7 +7,7 @@ import numpy as np
 
 from mapfusion.arguments import Range, require_in_range
 from mapfusion.camera import StereoCamera
-from mapfusion.robot_log import Observations
+from mapfusion.se2 import Float
 from mapfusion.vision.features import Features
 from mapfusion.vision.harris import HarrisParameters, detect
 from mapfusion.vision.patches import cut_patches
@@ -73,39 +73,22 @@ class FrontEnd:
 
 
 def observable(
-    camera: StereoCamera, features: Features, keep: np.ndarray, parameters: FrontEndParameters
+    camera: StereoCamera,
+    disparity_px: Float,
+    sigma_px: Float,
+    keep: np.ndarray,
+    parameters: FrontEndParameters,
 ) -> np.ndarray:
-    """Rows of the features marked in `keep` (N,) bool that are near and certain enough.
+    """Rows of the disparities (N,) marked in `keep` (N,) bool that are near and certain enough.
+
+    `sigma_px` (N,) are their standard deviations.
 
     Raises:
-        ValueError: `keep` has another length than `features`.
+        ValueError: `keep` has another length than the disparities.
     """
-    if keep.shape != (len(features),):
-        raise ValueError(f"keep: shape is {keep.shape}, expected ({len(features)},)")
-    depth = camera.focal_px * camera.baseline_m / features.disparity_px
-    sigma_depth = depth * features.sigma_disparity_px / features.disparity_px
+    if keep.shape != disparity_px.shape:
+        raise ValueError(f"keep: shape is {keep.shape}, expected {disparity_px.shape}")
+    depth = camera.focal_px * camera.baseline_m / disparity_px
+    sigma_depth = depth * sigma_px / disparity_px
     near = (depth <= parameters.max_depth_m) & (sigma_depth <= parameters.max_sigma_depth_m)
-    return np.nonzero(keep & near)[0]
-
-
-def observe(
-    camera: StereoCamera, features: Features, keep: np.ndarray, parameters: FrontEndParameters
-) -> Observations:
-    """Observations of the `observable` features.
-
-    Their covariance is R_t of eq. 6, from the stereo geometry.
-
-    Raises:
-        ValueError: `keep` has another length than `features`.
-    """
-    rows = observable(camera, features, keep, parameters)
-    position, covariance = camera.triangulate(
-        features.uv_px[rows],
-        features.disparity_px[rows],
-        parameters.sigma_uv_px,
-        features.sigma_disparity_px[rows],
-    )
-    uvd = np.column_stack([features.uv_px[rows], features.disparity_px[rows]])
-    return Observations(
-        position, covariance, features.descriptor[rows], uvd_px=uvd.astype(np.float32)
-    )
+    return np.flatnonzero(keep & near)

@@ -142,16 +142,17 @@ def _strongest(response: np.ndarray, parameters: HarrisParameters) -> np.ndarray
     candidates = maxima[descending(response[v, u])]
     height, width = response.shape
     cells = -(-height // parameters.cell_px) * -(-width // parameters.cell_px)
-    kept = _spread(
-        candidates,
-        height,
-        width,
-        parameters.min_distance_px,
-        parameters.cell_px,
-        -(-parameters.max_corners // cells),
-        parameters.max_corners,
-    )
-    return candidates[kept]
+    share = -(-parameters.max_corners // cells)
+    return candidates[
+        spread(
+            candidates,
+            response.shape,
+            parameters.min_distance_px,
+            parameters.cell_px,
+            share,
+            parameters.max_corners,
+        )
+    ]
 
 
 def descending(values: np.ndarray) -> np.ndarray:
@@ -165,15 +166,29 @@ def descending(values: np.ndarray) -> np.ndarray:
     return (np.sort(keys) & np.uint64(_ALL_BITS)).astype(np.int64)
 
 
-@kernel
 def local_maxima(response: np.ndarray, border: int, least: np.float32) -> np.ndarray:
     """Pixels (N, 2) int64, row by row, above `least` that no neighbour's response exceeds."""
     height, width = response.shape
     found = np.empty(((height - 2 * border) * (width - 2 * border), 2), dtype=np.int64)
-    # the mark of column u, and so many at once as a number has bytes
+    # the mark of each column, and so many at once as a number has bytes
     highest, is_peak = np.empty(width, np.float32), np.zeros(-(-width // 8) * 8, np.uint8)
-    marks, count = is_peak.view(np.uint64), 0
-    for v in range(border, height - border):
+    marks = is_peak.view(np.uint64)
+    return found[: _list_maxima(response, border, least, highest, is_peak, marks, found)]
+
+
+@kernel
+def _list_maxima(
+    response: np.ndarray,
+    border: int,
+    least: np.float32,
+    highest: np.ndarray,
+    is_peak: np.ndarray,
+    marks: np.ndarray,
+    found: np.ndarray,
+) -> int:
+    """Fill in the first rows of `found`, and tell how many."""
+    count = 0
+    for v in range(border, response.shape[0] - border):
         _mark_peaks(response, v, border, least, highest, is_peak)
         for k in range(len(marks)):
             if marks[k] == 0:
@@ -182,7 +197,7 @@ def local_maxima(response: np.ndarray, border: int, least: np.float32) -> np.nda
                 if is_peak[u]:
                     found[count, 0], found[count, 1] = u, v
                     count += 1
-    return found[:count].copy()
+    return count
 
 
 @kernel_part
@@ -209,30 +224,45 @@ def _mark_peaks(
         is_peak[u] = np.uint8(here == most) & np.uint8(here > least)
 
 
-@kernel
-def _spread(
+def spread(
     candidates: np.ndarray,
-    height: int,
-    width: int,
+    size: tuple[int, ...],
     min_distance: int,
     cell: int,
     per_cell: int,
     most: int,
 ) -> np.ndarray:
-    """Rows of candidates (N, 2), sorted by strength, that a greedy choice keeps.
+    """Which candidates (N, 2) of an image, sorted by strength, a greedy choice keeps (N,) bool.
 
     A first pass fills each cell up to its share, a second hands what poor cells left over to the
     strongest remaining. No two are nearer than `min_distance`.
     """
-    blocked = np.zeros((height, width), dtype=np.uint8)
-    filled = np.zeros((height // cell + 1, width // cell + 1), dtype=np.int64)
-    taken = np.zeros(len(candidates), dtype=np.bool_)
-    count = 0
+    taken, blocked = np.zeros(len(candidates), dtype=np.bool_), np.zeros(size, dtype=np.uint8)
+    filled = np.zeros((size[0] // cell + 1, size[1] // cell + 1), dtype=np.int64)
+    _choose(candidates, min_distance, cell, per_cell, most, blocked, filled, taken)
+    return taken
+
+
+# What kernels of this file need room for is made by their callers: that is not compiled.
+
+
+@kernel
+def _choose(
+    candidates: np.ndarray,
+    min_distance: int,
+    cell: int,
+    per_cell: int,
+    most: int,
+    blocked: np.ndarray,
+    filled: np.ndarray,
+    taken: np.ndarray,
+) -> None:
+    count, (height, width) = 0, blocked.shape
     for share in (per_cell, most):
         for n in range(len(candidates)):
             u, v = candidates[n, 0], candidates[n, 1]
             if count == most:
-                return np.nonzero(taken)[0]
+                return
             if taken[n] or blocked[v, u] or filled[v // cell, u // cell] >= share:
                 continue
             taken[n] = True
@@ -240,9 +270,8 @@ def _spread(
             filled[v // cell, u // cell] += 1
             for y in range(max(v - min_distance + 1, 0), min(v + min_distance, height)):
                 for x in range(max(u - min_distance + 1, 0), min(u + min_distance, width)):
-                    if (x - u) ** 2 + (y - v) ** 2 < min_distance**2:
+                    if (x - u) * (x - u) + (y - v) * (y - v) < min_distance * min_distance:
                         blocked[y, x] = 1
-    return np.nonzero(taken)[0]
 
 
 def _peak(response: np.ndarray, pixels: np.ndarray) -> Float:

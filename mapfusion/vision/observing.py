@@ -1,7 +1,7 @@
 """Observations of a log, frame by frame: features that tracks have followed for long enough."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from mapfusion.camera import StereoCamera
 from mapfusion.robot_log import Observations
 from mapfusion.se2 import Float
 from mapfusion.vision.features import Features
-from mapfusion.vision.frontend import FrontEndParameters, observable, observe
+from mapfusion.vision.frontend import FrontEndParameters, observable
 from mapfusion.vision.tracks import Tracker, Tracks
 
 
@@ -52,12 +52,18 @@ class Observer:
     ) -> ObservedFrame:
         """The next frame's observations; other arguments as `Tracker.update` has them."""
         tracks = self.tracker.update(found, steps, R_after_before)
-        lasting = self.tracker.landmarks(tracks)
-        own = replace(found, uv_px=tracks.uv_px, disparity_px=tracks.disparity_px)
-        rows = observable(self.camera, own, lasting, self.vision)
-        observations = observe(self.camera, own, lasting, self.vision)
-        track = tracks.track_id[rows]
-        return ObservedFrame(tracks, rows, replace(observations, track=track))
+        given = (tracks.disparity_px, found.sigma_disparity_px, self.tracker.landmarks(tracks))
+        rows = observable(self.camera, *given, self.vision)
+        position, covariance = (values[rows] for values in self.tracker.points_m)
+        uvd = np.column_stack([tracks.uv_px[rows], tracks.disparity_px[rows]]).astype(np.float32)
+        observations = Observations(
+            position,
+            covariance,
+            found.descriptor[rows],
+            uvd_px=uvd,
+            track=tracks.track_id[rows],
+        )
+        return ObservedFrame(tracks, rows, observations)
 
 
 def joined(frames: Sequence[Observations]) -> tuple[np.ndarray, Observations]:

@@ -25,6 +25,7 @@ from mapfusion.vision.template import (
     SLOPE_U,
     SLOPE_V,
     WEIGHT,
+    WIDE,
     WINDOW_HALF_PX,
     Templates,
 )
@@ -34,6 +35,8 @@ _CONVERGED_PX = 0.005  # far below what noise lets one measure
 # Where a window's far side would shrink to a half, it is no piece of a wall that one looks at.
 _LEAST_SCALE = 0.5
 _ONE = np.uintp(1)  # indices without a sign, which a kernel need not wrap around
+_SIDE_PX = 2 * WINDOW_HALF_PX + 1
+_AT = tuple(np.uintp(k * WIDE) for k in range(7))  # where sums of each product begin
 _BYTE, _HALF, _LOW = np.uint32(8), np.uint32(16), np.uint32(0xFF)
 
 
@@ -53,8 +56,11 @@ def fit_patches(
     Returns:
         (N,) bool: False where the window leaves a patch, has too little texture, or does not fit.
     """
-    given = (templates.window, templates.factor, templates.tolerated)
-    return _fit_all(*given, rows, after, warp, bend)
+    given = (templates.window, templates.factor, templates.tolerated, rows, after, warp, bend)
+    found, area = np.zeros(len(rows), dtype=np.bool_), len(WEIGHT)
+    cell, share, residual = np.empty(area, np.uint32), np.empty((2, area)), np.empty(area)
+    _fit_all(*given, cell, share, residual, np.empty(len(_AT) * WIDE), found)
+    return found
 
 
 @kernel
@@ -66,16 +72,20 @@ def _fit_all(
     after: np.ndarray,
     warp: Float,
     bend: Float,
-) -> np.ndarray:
-    found, area = np.empty(len(rows), dtype=np.bool_), len(WEIGHT)
-    cell, share, residual = np.empty(area, np.uint32), np.empty((2, area)), np.empty(area)
+    cell: np.ndarray,
+    share: Float,
+    residual: Float,
+    down: Float,
+    found: np.ndarray,
+) -> None:
+    """Move warps and mark what is found; from `cell` to `down` it is room on the way."""
     for n in range(len(rows)):
         i = rows[n]
-        found[n] = False
         if tolerated[i] >= 0:
-            square = _settle(window, i, factor[i], after, n, warp, bend, cell, share, residual)
+            square = _settle(
+                window, i, factor[i], after, n, warp, bend, cell, share, residual, down
+            )
             found[n] = 0 <= square <= tolerated[i]
-    return found
 
 
 @kernel_part
@@ -90,10 +100,11 @@ def _settle(
     cell: np.ndarray,
     share: Float,
     residual: Float,
+    down: Float,
 ) -> float:
     """Move warp n until it stays; the weighted sum of squared residuals, negative if it does not.
 
-    `cell`, `share` and `residual` are room for what is needed on the way.
+    `cell`, `share`, `residual` and `down` are room for what is needed on the way.
     """
     step = np.empty(N_PARAMETERS)
     for _ in range(_MAX_STEPS):
@@ -102,7 +113,7 @@ def _settle(
         _find_places(after.shape[1], warp, bend, n, cell, share)
         _look_up(after, n, cell)
         _compare(window, i, cell, share, residual)
-        square = _moments(window, i, residual, step)
+        square = _moments(window, i, residual, down, step)
         solve_lower(factor, step)
         for k in range(N_PARAMETERS):
             square -= step[k] ** 2  # what the step explains: all of gain and offset
@@ -171,20 +182,35 @@ def _compare(window: Float, i: int, cell: np.ndarray, share: Float, residual: Fl
 
 
 @kernel_part
-def _moments(window: Float, i: int, residual: Float, moment: Float) -> float:
-    """Weighted sum of squared residuals; `moment` gets J^T W r."""
-    square = m0 = m1 = m2 = m3 = m4 = m5 = m6 = m7 = 0.0
-    for y in range(-WINDOW_HALF_PX, WINDOW_HALF_PX + 1):
-        middle = (y + WINDOW_HALF_PX) * (2 * WINDOW_HALF_PX + 1) + WINDOW_HALF_PX
-        for x in range(-WINDOW_HALF_PX, WINDOW_HALF_PX + 1):
-            k = np.uintp(middle + x)
+def _moments(window: Float, i: int, residual: Float, down: Float, moment: Float) -> float:
+    """Weighted sum of squared residuals; `moment` gets J^T W r.
+
+    Sums are taken down the columns first, into `down`: so loops run in vectors.
+    """
+    for k in range(len(down)):
+        down[k] = 0.0
+    for row in range(_SIDE_PX):
+        y, at = float(row - WINDOW_HALF_PX), np.uintp(row * _SIDE_PX)
+        for x in range(_SIDE_PX):
+            m, k = np.uintp(x), at + np.uintp(x)
             gu, gv, off = window[i, SLOPE_U, k], window[i, SLOPE_V, k], residual[k]
             weighted = WEIGHT[k] * off
-            square += weighted * off
-            m0, m1 = m0 + weighted * gu, m1 + weighted * gv
-            m2, m3 = m2 + weighted * (gu * x), m3 + weighted * (gu * y)
-            m4, m5 = m4 + weighted * (gv * x), m5 + weighted * (gv * y)
-            m6, m7 = m6 + weighted, m7 + weighted * window[i, LEVEL, k]
+            along_u, along_v = weighted * gu, weighted * gv
+            down[m] += weighted * off
+            down[m + _AT[1]] += along_u
+            down[m + _AT[2]] += along_v
+            down[m + _AT[3]] += along_u * y
+            down[m + _AT[4]] += along_v * y
+            down[m + _AT[5]] += weighted
+            down[m + _AT[6]] += weighted * window[i, LEVEL, k]
+    square = m0 = m1 = m2 = m3 = m4 = m5 = m6 = m7 = 0.0
+    for k in range(_SIDE_PX):
+        m, x = np.uintp(k), float(k - WINDOW_HALF_PX)
+        along_u, along_v = down[m + _AT[1]], down[m + _AT[2]]
+        square, m0, m1 = square + down[m], m0 + along_u, m1 + along_v
+        m2, m3 = m2 + along_u * x, m3 + down[m + _AT[3]]
+        m4, m5 = m4 + along_v * x, m5 + down[m + _AT[4]]
+        m6, m7 = m6 + down[m + _AT[5]], m7 + down[m + _AT[6]]
     moment[0], moment[1], moment[2], moment[3] = m0, m1, m2, m3
     moment[4], moment[5], moment[6], moment[7] = m4, m5, m6, m7
     return square

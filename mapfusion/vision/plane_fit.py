@@ -7,17 +7,17 @@ import numpy as np
 from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float
 from mapfusion.symmetric import cholesky, copy_lower, solve_lower, solve_upper
-from mapfusion.vision.window import FIELDS, RESIDUAL, ROOM, SLOPE, fill_left, fill_residuals
+from mapfusion.vision.window import FIELDS, RESIDUAL, ROOM, SLOPE, WIDE, fill_left, fill_residuals
 
 _MAX_STEPS = 20  # a few on rich texture; where it is poor, slopes take long
 _CONVERGED_PX = 0.005  # anywhere in the window; far below what noise lets one measure
 # Noise adds half its variance to the mean square of slopes, which promise that much more than they
 # keep (errors in variables, Fuller 1987, section 1.1). So much of it is taken for texture at least.
 _LEAST_TEXTURE = 0.25
+_AT = tuple(np.uintp(k) * WIDE for k in range(4))  # sums down columns, see there
 _SINGULAR = 1e-9  # pivot, as a share of its diagonal element, that is rounding error
 
 
-@kernel
 def fit_planes(
     left: np.ndarray,
     right: np.ndarray,
@@ -39,7 +39,7 @@ def fit_planes(
             pixel to spare.
         offset: (N, 2) from the centres to the points whose variance is wanted.
         start: (N,) disparities right to a pixel or two.
-        half: half side of the window, pixels.
+        half: half side of the window, `MOST_HALF_PX` at most.
         slope_sigma: standard deviation of the prior on a and b, around zero.
         noise: standard deviation of one image's grey levels.
         alike_px: what residuals hold beyond noise is alike over so many pixels each way.
@@ -50,8 +50,34 @@ def fit_planes(
         Planes (N, 3) of d, a, b, and the variances (N,) of d + a x + b y at the offsets; NaN where
         the fit left the image or the texture is too poor.
     """
-    plane = np.zeros((len(pixel), 3))
-    variance = np.empty(len(pixel))
+    plane, variance = np.zeros((len(pixel), 3)), np.empty(len(pixel))
+    weight = np.empty((len(pixel), 4))
+    plane[:, 0] = start
+    pictures, noises = (left, right, pixel, offset), (slope_sigma, noise, alike_px)
+    _fit_all(*pictures, half, *noises, plane, variance, weight)
+    if row_sigma > 0:
+        _add_rows(left, pixel, half, row_sigma, weight, variance)
+    return plane, variance
+
+
+@kernel
+def _fit_all(
+    left: np.ndarray,
+    right: np.ndarray,
+    pixel: np.ndarray,
+    offset: np.ndarray,
+    half: int,
+    slope_sigma: float,
+    noise: float,
+    alike_px: float,
+    plane: Float,
+    variance: Float,
+    weight: Float,
+) -> None:
+    """Fit planes (N, 3), which hold the starts; fill in variances (N,) without that of rows.
+
+    And how each estimate follows from the moments J^T r: its `weight` (N, 4).
+    """
     area = (2 * half + 1) ** 2
     window, room, share = (
         np.empty((FIELDS, area)),
@@ -59,25 +85,23 @@ def fit_planes(
         np.empty(area),
     )
     for n in range(len(pixel)):
-        plane[n, 0] = start[n]
         variance[n] = _fit_plane(
             left,
             right,
             pixel[n, 0],
             pixel[n, 1],
-            offset[n],
+            offset,
             half,
             slope_sigma,
             noise,
             alike_px,
-            row_sigma,
             window,
             room,
             share,
             plane,
+            weight,
             n,
         )
-    return plane, variance
 
 
 @kernel_part
@@ -91,11 +115,11 @@ def _fit_plane(
     slope_sigma: float,
     noise: float,
     alike_px: float,
-    row_sigma: float,
     window: Float,
     room: np.ndarray,
     share: Float,
     plane: np.ndarray,
+    weight: Float,
     n: int,
 ) -> float:
     """Move row n of `plane` to the least squares and return the variance at the offset.
@@ -121,13 +145,12 @@ def _fit_plane(
     if not cholesky(factor, _SINGULAR):
         _give_up(plane, n)
         return np.nan
-    step[0], step[1], step[2], step[3] = 0.0, 1.0, offset[0], offset[1]
+    step[0], step[1], step[2], step[3] = 0.0, 1.0, offset[n, 0], offset[n, 1]
     solve_lower(factor, step)
     solve_upper(factor, step)
-    variance = _counted(variance_grey, noise, alike_px) * _square(seen, prior, step)
-    if row_sigma > 0:
-        variance += (row_sigma * _by_row(left, u, v, half, step)) ** 2
-    return variance
+    for i in range(4):
+        weight[n, i] = step[i]
+    return _counted(variance_grey, noise, alike_px) * _square(seen, prior, step)
 
 
 @kernel_part
@@ -148,6 +171,7 @@ def _settle(
     """Take steps until plane moves nowhere in the window; the residuals' variance, or NaN."""
     count = (2 * half + 1) ** 2
     factor, step = np.empty((4, 4)), np.empty(4)
+    down = np.empty(len(_AT) * WIDE)
     variance_grey = 2 * noise**2
     for _ in range(_MAX_STEPS):
         first = u - half - plane[n, 0] + plane[n, 1] * half
@@ -157,7 +181,7 @@ def _settle(
             _give_up(plane, n)
             return np.nan
         fill_residuals(right, u, v, half, plane, n, window, room, share)
-        square = _moments(window, half, step)
+        square = _moments(window, half, down, step)
         prior = variance_grey / slope_sigma**2
         copy_lower(seen, factor)
         factor[2, 2] += prior
@@ -236,22 +260,25 @@ def _normal_matrix(window: Float, half: int, normal: np.ndarray) -> None:
         normal[3, 3] += s0 * y * y
 
 
-@kernel_part
-def _by_row(left: np.ndarray, u: int, v: int, half: int, weight: np.ndarray) -> float:
-    """How much an estimate changes when the right window is one row off.
+@kernel
+def _add_rows(
+    left: np.ndarray, pixel: np.ndarray, half: int, row_sigma: float, weight: Float, variance: Float
+) -> None:
+    """Add to variances (N,) what estimates change by when the right windows' rows are off.
 
-    `weight` (4,) is how it follows from the moments J^T r; such a shift makes r the slope along v.
+    That makes residuals the slope along v, and of these follows, by `weight`, the change.
     """
-    change = 0.0
-    for y in range(v - half, v + half + 1):
-        # the window's own rows where the next one lies outside the image
-        above, below = max(y - 1, 0), min(y + 1, left.shape[0] - 1)
-        for x in range(-half, half + 1):
-            slope = 0.5 * (float(left[y, u + x + 1]) - float(left[y, u + x - 1]))
-            down = (float(left[below, u + x]) - float(left[above, u + x])) / (below - above)
-            along = weight[1] + weight[2] * x + weight[3] * (y - v)
-            change += (weight[0] + slope * along) * down
-    return change
+    for n in range(len(pixel)):
+        u, v, change = pixel[n, 0], pixel[n, 1], 0.0
+        for y in range(v - half, v + half + 1):
+            # the window's own rows where the next one lies outside the image
+            above, below = max(y - 1, 0), min(y + 1, left.shape[0] - 1)
+            for x in range(-half, half + 1):
+                slope = 0.5 * (float(left[y, u + x + 1]) - float(left[y, u + x - 1]))
+                down = (float(left[below, u + x]) - float(left[above, u + x])) / (below - above)
+                along = weight[n, 1] + weight[n, 2] * x + weight[n, 3] * (y - v)
+                change += (weight[n, 0] + slope * along) * down
+        variance[n] += (row_sigma * change) ** 2
 
 
 @kernel_part
@@ -262,15 +289,30 @@ def _counted(variance_grey: float, noise: float, alike_px: float) -> float:
 
 
 @kernel_part
-def _moments(window: Float, half: int, moment: np.ndarray) -> float:
-    """Sum of the squared residuals; `moment` gets J^T r."""
+def _moments(window: Float, half: int, down: Float, moment: np.ndarray) -> float:
+    """Sum of the squared residuals; `moment` gets J^T r.
+
+    Sums are taken down the columns first, into `down`: so loops run in vectors.
+    """
+    side = 2 * half + 1
+    for i in range(side):
+        m = np.uintp(i)
+        down[m] = down[m + _AT[1]] = down[m + _AT[2]] = down[m + _AT[3]] = 0.0
+    for row in range(side):
+        y, at = float(row - half), np.uintp(row * side)
+        for i in range(side):
+            m, k = np.uintp(i), at + np.uintp(i)
+            r = window[RESIDUAL, k]
+            along = window[SLOPE, k] * r
+            down[m] += r * r
+            down[m + _AT[1]] += r
+            down[m + _AT[2]] += along
+            down[m + _AT[3]] += along * y
     square = m0 = m1 = m2 = m3 = 0.0
-    for y in range(-half, half + 1):
-        middle = (y + half) * (2 * half + 1) + half
-        for x in range(-half, half + 1):
-            r, g = window[RESIDUAL, np.uintp(middle + x)], window[SLOPE, np.uintp(middle + x)]
-            square += r * r
-            m0, m1 = m0 + r, m1 + g * r
-            m2, m3 = m2 + g * x * r, m3 + g * y * r
+    for i in range(side):
+        m = np.uintp(i)
+        along = down[m + _AT[2]]
+        square, m0, m1 = square + down[m], m0 + down[m + _AT[1]], m1 + along
+        m2, m3 = m2 + along * (i - half), m3 + down[m + _AT[3]]
     moment[0], moment[1], moment[2], moment[3] = m0, m1, m2, m3
     return square

@@ -81,7 +81,8 @@ def rigid_links(
         return np.ones(n, dtype=bool), None
     gate = chi_square_bound(probability, 3)
     start = starts(p_before_m)
-    agree, T = start.copy(), np.tile(np.eye(4), (len(start), 1, 1))
+    agree, T = start.copy(), np.zeros((len(start), 4, 4))
+    T[:, range(4), range(4)] = 1.0
     square, normal = np.empty((len(start), n)), np.empty((len(start), _SIZE, _SIZE))
     points = (p_before_m, covariance_before_m2, p_after_m, covariance_after_m2)
     _narrow(start, agree, *points, gate, T, square, normal)
@@ -97,8 +98,10 @@ def rigid_links(
 
 def starts(p_before_m: Float) -> np.ndarray:
     """Links (4, N) bool that each start uses: all, and without a third by distance."""
-    by_distance = np.argsort(np.argsort(np.linalg.norm(p_before_m, axis=1), kind="stable"))
-    part = by_distance * _PARTS // len(p_before_m)
+    n = len(p_before_m)
+    by_distance = np.argsort(np.linalg.norm(p_before_m, axis=1), kind="stable")
+    part = np.empty(n, dtype=np.int64)
+    part[by_distance] = np.arange(n) * _PARTS // n
     return np.not_equal(part, np.array([-1, *range(_PARTS)])[:, None])
 
 

@@ -7,10 +7,9 @@ from mapfusion.vision.verdict import Verdict
 
 _PEAK_HALF_WIDTH_PX = 2  # rivals are looked for beyond the slopes of the best peak
 _CROSS, _SUM, _SQUARE = range(3)  # of candidates: sums of products; of columns: of greys, squares
-_AT_ONCE = 32  # candidates that vectors take at once: up to a multiple all cost the same
+_AT_ONCE = 8  # candidates that a vector takes: up to a multiple all cost the same
 
 
-@kernel
 def search_rows(
     left: np.ndarray,
     right: np.ndarray,
@@ -28,11 +27,34 @@ def search_rows(
     below `max_ambiguity` of the best rival's, start and end differ by `max_round_trip` at most.
     Returns disparities (N,), meaningful where the verdict is MATCHED, and verdicts (N,) int8.
     """
-    height, width = left.shape
-    scores, room = np.empty(width), np.zeros((3, width + _AT_ONCE), dtype=np.int32)
+    width = left.shape[1]
+    disparity, verdict = np.zeros(len(pixel), dtype=np.int64), np.empty(len(pixel), dtype=np.int8)
+    room = np.zeros((3, width + _AT_ONCE), dtype=np.int32)
     strip = np.zeros(width + _AT_ONCE, dtype=np.uint8)
-    disparity = np.zeros(len(pixel), dtype=np.int64)
-    verdict = np.empty(len(pixel), dtype=np.int8)
+    limits = (min_disparity, max_disparity, half, min_correlation, max_ambiguity, max_round_trip)
+    _search_all(left, right, pixel, *limits, np.empty(width), strip, room, disparity, verdict)
+    return disparity, verdict
+
+
+@kernel
+def _search_all(
+    left: np.ndarray,
+    right: np.ndarray,
+    pixel: np.ndarray,
+    min_disparity: int,
+    max_disparity: int,
+    half: int,
+    min_correlation: float,
+    max_ambiguity: float,
+    max_round_trip: int,
+    scores: np.ndarray,
+    strip: np.ndarray,
+    room: np.ndarray,
+    disparity: np.ndarray,
+    verdict: np.ndarray,
+) -> None:
+    """Fill in disparities and verdicts; the three before are room for what is on the way."""
+    height, width = left.shape
     for n in range(len(pixel)):
         u, v = pixel[n, 0], pixel[n, 1]
         first, last = max(u - max_disparity, half), u - min_disparity
@@ -64,7 +86,6 @@ def search_rows(
             verdict[n] = Verdict.ONE_SIDED
             continue
         disparity[n] = u - found
-    return disparity, verdict
 
 
 @kernel

@@ -7,8 +7,25 @@ import numpy as np
 
 from mapfusion.kernels import kernel_part
 from mapfusion.se2 import Float
+from mapfusion.vision.window_moments import (
+    ABOVE,
+    ALL,
+    BELOW,
+    GG,
+    HH,
+    LEFT,
+    ONE,
+    RIGHT,
+    RR,
+    R,
+    moment,
+)
 
-_COUNT, _OFF, _SLOPE_2, _DOWN_2, _OFF_2 = 0, 3, 5, 6, 7  # of a part of a window, see `window_sums`
+_OF_A_HALF = (ONE, R, RR, GG, HH)
+_EACH = len(_OF_A_HALF)
+# How columns and rows of the left half, the right, the upper and the lower one count.
+_HALVES = ((LEFT, ALL), (RIGHT, ALL), (ALL, ABOVE), (ALL, BELOW))
+ASKED = tuple(moment(product, s=s, t=t) for s, t in _HALVES for product in _OF_A_HALF)
 
 
 def disagrees(squares: Float, noise: float, max_misfit: float, max_rows: float) -> np.ndarray:
@@ -29,21 +46,18 @@ def disagrees(squares: Float, noise: float, max_misfit: float, max_rows: float) 
 
 
 @kernel_part
-def fill_in_halves(parts: Float, squares: Float, n: int) -> None:
-    """Fill in the halves (4, 4) of window n, see `window_sums`; residuals less their own mean."""
-    count = off = 0.0
-    for side in range(3):
-        count += parts[0, side, _COUNT] + parts[2, side, _COUNT]
-        off += parts[0, side, _OFF] + parts[2, side, _OFF]
+def fill_in_halves(sums: Float, place: np.ndarray, squares: Float, n: int) -> None:
+    """Fill in the halves (4, 4) of window n, see `window_sums`; residuals less their own mean.
+
+    `place` is that of the sums that are `ASKED` for.
+    """
+    first, second = 2 * _EACH, 3 * _EACH  # the upper half and the lower one
+    count = sums[place[first]] + sums[place[second]]
+    off = sums[place[first + 1]] + sums[place[second + 1]]
     offset = off / count if count > 0 else 0.0  # in brightness
     for k in range(4):
-        pixels = residuals = square = slopes = downs = 0.0
-        for i in range(3):
-            part, side = (i, k * 2) if k < 2 else ((k - 2) * 2, i)
-            pixels += parts[part, side, _COUNT]
-            residuals += parts[part, side, _OFF]
-            square += parts[part, side, _OFF_2]
-            slopes += parts[part, side, _SLOPE_2]
-            downs += parts[part, side, _DOWN_2]
-        squares[n, k, 0], squares[n, k, 2], squares[n, k, 3] = pixels, slopes, downs
+        at = k * _EACH
+        pixels, residuals, square = sums[place[at]], sums[place[at + 1]], sums[place[at + 2]]
+        squares[n, k, 0] = pixels
         squares[n, k, 1] = square + pixels * offset**2 - 2 * offset * residuals
+        squares[n, k, 2], squares[n, k, 3] = sums[place[at + 3]], sums[place[at + 4]]

@@ -35,6 +35,7 @@ from mapfusion.vision.plane_test import FURTHER_TERMS
 from mapfusion.vision.row_search import search_rows
 from mapfusion.vision.silhouette_test import disagrees
 from mapfusion.vision.verdict import Verdict
+from mapfusion.vision.window import MOST_HALF_PX
 from mapfusion.vision.window_sums import window_sums
 
 _MAX_HALF_PX = 90  # (2 * 90 + 1)^2 squared grey levels still fit a 32-bit sum
@@ -82,10 +83,10 @@ class StereoParameters:
     max_jump_px: Annotated[float, Range(0.01, 100, "px")] = 1.5
     nearest_plane_m: Annotated[float, Range(0.01, 1000, "m")] = 0.45
     noise_grey: Annotated[float, Range(0, 255, "grey levels")] = 2.0
-    silhouette_half_px: Annotated[int, Range(2, 100, "px")] = 12
+    silhouette_half_px: Annotated[int, Range(2, MOST_HALF_PX, "px")] = 12
     max_misfit_px: Annotated[float, Range(1e-3, 100, "px")] = 1.0
     max_rows_px: Annotated[float, Range(0, 100, "px")] = 0.0
-    plane_half_px: Annotated[int, Range(2, 100, "px")] = 12
+    plane_half_px: Annotated[int, Range(2, MOST_HALF_PX, "px")] = 12
     plane_probability: Annotated[float, Range(0, 1, "1")] = 0.999
     plane_misfit_px: Annotated[float, Range(0, 100, "px")] = 0.2
     row_sigma_px: Annotated[float, Range(0, 100, "px")] = 0.0

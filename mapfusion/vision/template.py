@@ -5,6 +5,7 @@ not once a view: grey levels, their slopes, and the Cholesky factor of the norma
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,14 +24,14 @@ LEVEL, SLOPE_U, SLOPE_V = range(3)  # of a window's pixels
 NO_FIT = -1.0  # tolerated of a window that leaves its patch, or that has too little texture
 
 
-@dataclass(frozen=True)
+@dataclass
 class Templates:
-    """Windows around N points of earlier pictures.
+    """Windows around points of earlier pictures: K rows, of which some are in use.
 
     Attributes:
-        window: (N, 3, W * W) grey levels, row by row, and their slopes along u and v.
-        factor: (N, 8, 8) of the normal matrix, its lower half.
-        tolerated: (N,) weighted sum of squared residuals that still is the same, or NO_FIT.
+        window: (K, 3, W * W) grey levels, row by row, and their slopes along u and v.
+        factor: (K, 8, 8) of the normal matrix, its lower half.
+        tolerated: (K,) weighted sum of squared residuals that still is the same, or NO_FIT.
     """
 
     window: Float
@@ -45,35 +46,37 @@ class Templates:
 
     @classmethod
     def of(cls, patch: np.ndarray, point: Float, noise: float, max_misfit: float) -> "Templates":
-        """What points look like.
+        """Those of N points, in their order; arguments as `fill` has them."""
+        made = cls.room(len(patch))
+        made.fill(np.arange(len(patch)), patch, point, noise, max_misfit)
+        return made
+
+    def unused(self, used: np.ndarray, n: int) -> np.ndarray:
+        """Rows (n,) beside those in use (U,); there will be twice the room where that is short."""
+        if len(used) + n > len(self.tolerated):
+            larger = Templates.room(2 * (len(used) + n))
+            for name, values in vars(self).items():
+                getattr(larger, name)[: len(values)] = values
+            self.window, self.factor, self.tolerated = vars(larger).values()
+        is_free = np.ones(len(self.tolerated), dtype=bool)
+        is_free[used] = False
+        return np.flatnonzero(is_free)[:n]
+
+    def fill(
+        self, rows: np.ndarray, patch: np.ndarray, point: Float, noise: float, max_misfit: float
+    ) -> None:
+        """Put what points look like into some rows.
 
         Args:
+            rows: (N,).
             patch: (N, P, P) uint8 of pictures.
             point: (N, 2) in them, u and v from their middles.
             noise: standard deviation of one picture's grey levels.
             max_misfit: what is found may differ by noise and by what this error of its place would
                 explain, pixels.
         """
-        made = cls.room(len(patch))
-        variance, square_misfit = 2 * noise**2, max_misfit**2
-        _prepare(patch, point, variance, square_misfit, made.window, made.factor, made.tolerated)
-        return made
-
-    def put(self, rows: np.ndarray, others: "Templates", theirs: np.ndarray) -> None:
-        """Replace, in place, rows (K,) by some of others, their rows (K,)."""
-        _copy(others.window, theirs, self.window, rows)
-        _copy(others.factor, theirs, self.factor, rows)
-        self.tolerated[rows] = others.tolerated[theirs]
-
-
-@kernel
-def _copy(source: Float, theirs: np.ndarray, target: Float, rows: np.ndarray) -> None:
-    """Copy rows (..., K, L) of one array to rows of another, with no copy in between."""
-    for n in range(len(rows)):
-        i, k = np.uintp(theirs[n]), np.uintp(rows[n])
-        for m in range(source.shape[1]):
-            for p in range(source.shape[2]):
-                target[k, m, p] = source[i, m, p]
+        given = (patch, point, 2 * noise**2, max_misfit**2, rows)
+        _prepare(*given, self.window, self.factor, self.tolerated)
 
 
 def _weights() -> Float:
@@ -85,6 +88,29 @@ def _weights() -> Float:
 WEIGHT = _weights().ravel()  # (W * W,), what the window's pixels count
 WEIGHT.setflags(write=False)
 
+# Sums of one product down a window's columns have whole vectors of room, and lie as far from those
+# of the next as is known when loops over them are compiled.
+WIDE = 24
+_AT = tuple(np.uintp(k * WIDE) for k in range(20))
+# Derivatives by the parameters: a factor, and what of x and y it goes with. Where the products of
+# two factors begin among the sums; those with higher powers of y follow.
+_DERIVATIVES = ("u", "v", "ux", "uy", "vx", "vy", "1", "L")
+_PRODUCTS = {"uu": 0, "uv": 3, "vv": 6, "1u": 9, "1v": 11, "Lu": 13, "Lv": 15}
+_PRODUCTS |= {"11": 17, "1L": 18, "LL": 19}
+
+
+def _entries() -> Iterator[tuple[int, int, int, int]]:
+    """Of the normal matrix' lower half: row, column, place of its sums, and the power of x."""
+    for i, one in enumerate(_DERIVATIVES):
+        for j, other in enumerate(_DERIVATIVES[: i + 1]):
+            both = one + other
+            place = _PRODUCTS["".join(sorted(one[0] + other[0]))] + both.count("y")
+            yield i, j, place, both.count("x")
+
+
+_ENTRIES = np.array([*_entries()])
+_X_POWERS = np.vander(np.arange(-WINDOW_HALF_PX, WINDOW_HALF_PX + 1.0), 3, increasing=True).T.copy()
+
 
 @kernel
 def _prepare(
@@ -92,21 +118,23 @@ def _prepare(
     point: Float,
     variance: float,
     square_misfit: float,
+    rows: np.ndarray,
     window: Float,
     factor: Float,
     tolerated: Float,
 ) -> None:
-    shown = np.empty((_SIDE_PX + 2) ** 2)
-    for n in range(len(patch)):
-        tolerated[n] = NO_FIT
+    shown, down = np.empty((_SIDE_PX + 2) ** 2), np.empty(len(_AT) * WIDE)
+    for n in range(len(rows)):
+        i = rows[n]
+        tolerated[i] = NO_FIT
         middle, reach = patch.shape[1] // 2, max(abs(point[n, 0]), abs(point[n, 1]))
         if reach + WINDOW_HALF_PX + 2 > middle:
             continue
         _read_grid(patch, n, middle + point[n, 0], middle + point[n, 1], shown)
-        _fill_window(shown, window, n)
-        sum_of_squares = _normal_matrix(window, n, factor, variance, square_misfit)
-        if cholesky(factor[n], _SINGULAR):
-            tolerated[n] = sum_of_squares
+        _fill_window(shown, window, i)
+        sum_of_squares = _normal_matrix(window, i, factor, variance, square_misfit, down)
+        if cholesky(factor[i], _SINGULAR):
+            tolerated[i] = sum_of_squares
 
 
 @kernel_part
@@ -143,45 +171,49 @@ def _fill_window(shown: Float, window: Float, n: int) -> None:
 
 @kernel_part
 def _normal_matrix(
-    window: Float, n: int, normal: Float, variance: float, square_misfit: float
+    window: Float, n: int, normal: Float, variance: float, square_misfit: float, down: Float
 ) -> float:
     """Fills in the lower half of matrix n of `normal`; returns which sum of squares is tolerated.
 
     That is weighted, of residuals: an error e of the place along some direction changes a grey
-    level by g e, g its slope along it.
-    Entries are added up by names of their own, one for each: so they stay in registers.
+    level by g e, g its slope along it, whose square is a mean over directions.
+    Sums are taken down the columns first, into `down`: so loops run in vectors.
     """
-    tolerated, k = 0.0, np.uintp(0)
-    n00 = n10 = n11 = n20 = n21 = n22 = n30 = n31 = n32 = n33 = 0.0
-    n40 = n41 = n42 = n43 = n44 = n50 = n51 = n52 = n53 = n54 = n55 = 0.0
-    n60 = n61 = n62 = n63 = n64 = n65 = n66 = 0.0
-    n70 = n71 = n72 = n73 = n74 = n75 = n76 = n77 = 0.0
-    for y in range(-WINDOW_HALF_PX, WINDOW_HALF_PX + 1):
-        for x in range(-WINDOW_HALF_PX, WINDOW_HALF_PX + 1):
-            g0, g1 = window[n, SLOPE_U, k], window[n, SLOPE_V, k]
-            g2, g3, g4, g5 = g0 * x, g0 * y, g1 * x, g1 * y
-            g7, w = window[n, LEVEL, k], WEIGHT[k]
-            square_slope = 0.5 * (g0 * g0 + g1 * g1)  # the mean over directions
-            tolerated += w * (variance + square_misfit * square_slope)
-            w0, w1, w2, w3 = w * g0, w * g1, w * g2, w * g3
-            w4, w5, w7 = w * g4, w * g5, w * g7
-            n00, n10, n11 = n00 + w0 * g0, n10 + w1 * g0, n11 + w1 * g1
-            n20, n21, n22 = n20 + w2 * g0, n21 + w2 * g1, n22 + w2 * g2
-            n30, n31, n32, n33 = n30 + w3 * g0, n31 + w3 * g1, n32 + w3 * g2, n33 + w3 * g3
-            n40, n41, n42, n43 = n40 + w4 * g0, n41 + w4 * g1, n42 + w4 * g2, n43 + w4 * g3
-            n44, n50, n51, n52 = n44 + w4 * g4, n50 + w5 * g0, n51 + w5 * g1, n52 + w5 * g2
-            n53, n54, n55 = n53 + w5 * g3, n54 + w5 * g4, n55 + w5 * g5
-            n60, n61, n62, n63 = n60 + w * g0, n61 + w * g1, n62 + w * g2, n63 + w * g3
-            n64, n65, n66 = n64 + w * g4, n65 + w * g5, n66 + w
-            n70, n71, n72, n73 = n70 + w7 * g0, n71 + w7 * g1, n72 + w7 * g2, n73 + w7 * g3
-            n74, n75, n76, n77 = n74 + w7 * g4, n75 + w7 * g5, n76 + w7, n77 + w7 * g7
-            k += np.uintp(1)
-    entries = (
-        *(n00, n10, n11, n20, n21, n22, n30, n31, n32, n33),
-        *(n40, n41, n42, n43, n44, n50, n51, n52, n53, n54, n55),
-        *(n60, n61, n62, n63, n64, n65, n66, n70, n71, n72, n73, n74, n75, n76, n77),
-    )
-    for i in range(N_PARAMETERS):
-        for j in range(i + 1):
-            normal[n, i, j] = entries[i * (i + 1) // 2 + j]
-    return tolerated
+    for k in range(len(down)):
+        down[k] = 0.0
+    for row in range(_SIDE_PX):
+        y, at = float(row - WINDOW_HALF_PX), np.uintp(row * _SIDE_PX)
+        yy = y * y
+        for x in range(_SIDE_PX):
+            m, k = np.uintp(x), at + np.uintp(x)
+            u, v, level = window[n, SLOPE_U, k], window[n, SLOPE_V, k], window[n, LEVEL, k]
+            w = WEIGHT[k]
+            wu, wv, w_level = w * u, w * v, w * level
+            uu, uv, vv, u_level, v_level = wu * u, wu * v, wv * v, wu * level, wv * level
+            down[m] += uu
+            down[m + _AT[1]] += uu * y
+            down[m + _AT[2]] += uu * yy
+            down[m + _AT[3]] += uv
+            down[m + _AT[4]] += uv * y
+            down[m + _AT[5]] += uv * yy
+            down[m + _AT[6]] += vv
+            down[m + _AT[7]] += vv * y
+            down[m + _AT[8]] += vv * yy
+            down[m + _AT[9]] += wu
+            down[m + _AT[10]] += wu * y
+            down[m + _AT[11]] += wv
+            down[m + _AT[12]] += wv * y
+            down[m + _AT[13]] += u_level
+            down[m + _AT[14]] += u_level * y
+            down[m + _AT[15]] += v_level
+            down[m + _AT[16]] += v_level * y
+            down[m + _AT[17]] += w
+            down[m + _AT[18]] += w_level
+            down[m + _AT[19]] += w_level * level
+    for e in range(len(_ENTRIES)):
+        first, power, total = np.uintp(_ENTRIES[e, 2]) * np.uintp(WIDE), _ENTRIES[e, 3], 0.0
+        for x in range(_SIDE_PX):
+            total += down[first + np.uintp(x)] * _X_POWERS[power, x]
+        normal[n, _ENTRIES[e, 0], _ENTRIES[e, 1]] = total
+    square_slopes = normal[n, 0, 0] + normal[n, 1, 1]
+    return variance * normal[n, 6, 6] + 0.5 * square_misfit * square_slopes

@@ -16,6 +16,7 @@ from mapfusion.se2 import Float
 from mapfusion.vision.features import Features
 from mapfusion.vision.followed import Followed, Likeness, followed
 from mapfusion.vision.rigid_links import RigidMotion, rigid_links
+from mapfusion.vision.template import Templates
 
 _NO_MATCH = -1
 _LONGEST_PAUSE = 50.0  # steps: after these no limit on shift or disparity is left
@@ -89,6 +90,7 @@ class Tracker:
         self._sigma_uv_px = sigma_uv_px
         self._likeness = Likeness(parameters.noise_grey, parameters.max_misfit_px)
         self._previous: tuple[Features, Followed, Tracks] | None = None
+        self._points_m = np.empty((0, 3)), np.empty((0, 3, 3))
         self._next_id = 0
 
     def update(
@@ -101,9 +103,15 @@ class Tracker:
         the robot is known to have tilted since, in its axes: limits on shifts count from there.
         """
         n = len(features)
-        source, points = np.full(n, _NO_MATCH), Followed.unseen(features)
-        track_id, length, motion = np.empty(n, np.int64), np.ones(n, np.int64), None
-        if self._previous is not None:
+        source, track_id, length = (
+            np.full(n, _NO_MATCH),
+            np.empty(n, np.int64),
+            np.ones(n, np.int64),
+        )
+        if self._previous is None:
+            points, motion = Followed.unseen(features, Templates.room(n)), None
+            self._points_m = self._triangulated(points, features, slice(None))
+        else:
             before, points_before, tracks = self._previous
             expected = before
             if R_after_before is not None:
@@ -112,9 +120,7 @@ class Tracker:
             source = link(expected, features, self.parameters, steps)
             points, found = followed(points_before, before, features, source, self._likeness)
             source[~found] = _NO_MATCH
-            rows = np.flatnonzero(found)
-            agree, motion = self._agree(points_before, before, points, features, source, rows)
-            source[rows[~agree]] = _NO_MATCH
+            motion = self._keep_rigid(points, features, source)
             linked = source != _NO_MATCH
             track_id[linked] = tracks.track_id[source[linked]]
             length[linked] += tracks.length[source[linked]]
@@ -126,24 +132,37 @@ class Tracker:
         self._previous = features, points, made
         return made
 
-    def _agree(
-        self,
-        points_before: Followed,
-        before: Features,
-        points: Followed,
-        after: Features,
-        source: np.ndarray,
-        rows: np.ndarray,
-    ) -> tuple[np.ndarray, RigidMotion | None]:
-        """Which links (those of `rows` of `after`) one motion explains, and that motion."""
-        return rigid_links(
-            *self._points(points_before, before, source[rows]),
-            *self._points(points, after, rows),
+    @property
+    def points_m(self) -> tuple[Float, Float]:
+        """Where the last frame's points lie in the robot frame (N, 3), and covariances."""
+        return self._points_m
+
+    def _keep_rigid(
+        self, points: Followed, features: Features, source: np.ndarray
+    ) -> RigidMotion | None:
+        """Cut the links that the motion which explains most does not, and tell that motion.
+
+        What was linked to nothing, or is no more, stands for its own corner.
+        """
+        rows = np.flatnonzero(source != _NO_MATCH)
+        position_before, covariance_before = (values[source[rows]] for values in self._points_m)
+        position, covariance = self._triangulated(points, features, slice(None))
+        agree, motion = rigid_links(
+            position_before,
+            covariance_before,
+            position[rows],
+            covariance[rows],
             self.parameters.rigid_probability,
         )
+        cut = rows[~agree]
+        source[cut] = _NO_MATCH
+        if len(cut):
+            position[cut], covariance[cut] = self._triangulated(features, features, cut)
+        self._points_m = position, covariance
+        return motion
 
-    def _points(
-        self, points: Followed, features: Features, rows: np.ndarray
+    def _triangulated(
+        self, points: Followed | Features, features: Features, rows: np.ndarray | slice
     ) -> tuple[Float, Float]:
         return self._camera.triangulate(
             points.uv_px[rows],
@@ -166,7 +185,8 @@ def link(
     on shift and disparity allow over so many steps, and the distance is within its limit.
     """
     steps = min(steps, _LONGEST_PAUSE)
-    return _link(
+    forward, backward = np.full(len(previous), _NO_MATCH), np.full(len(current), _NO_MATCH)
+    _link(
         previous.uv_px,
         previous.disparity_px,
         previous.descriptor,
@@ -177,7 +197,12 @@ def link(
         steps * parameters.max_shift_v_px,
         parameters.max_disparity_ratio**steps,
         parameters.max_descriptor_distance**2,
+        forward,
+        np.full(len(previous), np.inf),
+        backward,
+        np.full(len(current), np.inf),
     )
+    return backward
 
 
 @kernel
@@ -192,14 +217,15 @@ def _link(
     max_shift_v: float,
     max_ratio: float,
     max_squared: float,
-) -> np.ndarray:
-    n_previous, n = len(previous_uv), len(uv)
-    forward = np.full(n_previous, _NO_MATCH)
-    forward_squared = np.full(n_previous, np.inf)
-    backward = np.full(n, _NO_MATCH)
-    backward_squared = np.full(n, np.inf)
+    forward: np.ndarray,
+    forward_squared: Float,
+    backward: np.ndarray,
+    backward_squared: Float,
+) -> None:
+    """Fill in the links of both frames' features, which are none yet, and squared distances."""
+    n = len(uv)
     for i in range(n):
-        for j in range(n_previous):
+        for j in range(len(previous_uv)):
             if abs(uv[i, 0] - previous_uv[j, 0]) > max_shift_u:
                 continue
             if abs(uv[i, 1] - previous_uv[j, 1]) > max_shift_v:
@@ -219,4 +245,3 @@ def _link(
         j = backward[i]
         if j != _NO_MATCH and (forward[j] != i or backward_squared[i] > max_squared):
             backward[i] = _NO_MATCH
-    return backward

@@ -20,6 +20,12 @@ FIELDS = 4
 # pixel is read, and the grey levels of four columns from there on, the bytes of one number.
 _COLUMN, _LEVELS = range(2)
 ROOM = 2
+MOST_HALF_PX = 100  # half side of the largest window
+# Sums of one product down the columns of a window have room for the widest, in whole vectors: so it
+# is known how far those of two products lie apart when loops over them are compiled, and that these
+# may run in the processor's vectors.
+_AT_ONCE = 8
+WIDE = np.uintp(-(-(2 * MOST_HALF_PX + 1) // _AT_ONCE) * _AT_ONCE)
 _ONE = np.uintp(1)  # indices without a sign, which a kernel need not wrap around
 _BYTE, _LOW = np.uint32(8), np.uint32(0xFF)
 

@@ -1,14 +1,15 @@
 """What windows hold against the planes that were fitted to them, read once for both tests.
 
-Row by row, and to the left of its middle, in the middle and to the right of it: sums of what the
-silhouette's test (`silhouette_test.py`) and the test for one plane (`plane_test.py`) ask for.
+These are sums over their pixels, which the silhouette's test (`silhouette_test.py`) and the test
+for one plane (`plane_test.py`) ask for.
 """
 
 import numpy as np
 
 from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float
-from mapfusion.vision.plane_test import COLUMNS, SQUARES, SUMS, score
+from mapfusion.vision import plane_test, silhouette_test
+from mapfusion.vision.plane_test import COLUMNS, score
 from mapfusion.vision.silhouette_test import fill_in_halves
 from mapfusion.vision.window import (
     DOWN,
@@ -17,18 +18,33 @@ from mapfusion.vision.window import (
     RESIDUAL,
     ROOM,
     SLOPE,
+    WIDE,
     fill_down,
     fill_left,
     fill_residuals,
     parts_inside,
 )
+from mapfusion.vision.window_moments import (
+    GG,
+    HH,
+    N_PRODUCTS,
+    ONE,
+    SIDES,
+    column_weights,
+    moment,
+)
 
-# Sums over parts of a window: of 1, L, L^2, r and L r, of g^2, h^2 and r^2, with L the grey levels
-# of the left picture, g and h their slopes along u and v, r = right - left.
-_PARTS = 8
+_ASKED = (plane_test.ASKED, silhouette_test.ASKED, (moment(ONE), moment(GG), moment(HH)))
+# Each sum is taken once, and so are those down the columns that several go on from.
+_SUMS, _place = np.unique([m for asked in _ASKED for m in asked], axis=0, return_inverse=True)
+_DOWN_SUMS, _FROM = np.unique(_SUMS[:, :2], axis=0, return_inverse=True)
+_OF_PLANE, _OF_HALVES, _OF_SLOPES = np.split(_place, np.cumsum([len(a) for a in _ASKED[:-1]]))
+# Where sums of each product begin, and those of the rows of the next part.
+_AT = tuple(np.uintp(k) * WIDE for k in range(N_PRODUCTS))
+_PART = np.uintp(N_PRODUCTS) * WIDE
+_INSIDE = FIELDS  # of a window's pixels, after its other fields: 1 in both pictures, else 0
 
 
-@kernel
 def window_sums(
     left: np.ndarray,
     right: np.ndarray,
@@ -44,8 +60,8 @@ def window_sums(
         right: (H, W) uint8.
         pixel: (N, 2) int64 centres of the windows; what leaves an image is not looked at.
         plane: (N, 3) from `fit_planes`.
-        silhouette_half: half side of the window of the silhouette test, pixels.
-        plane_half: half side of the window of the test for one plane, pixels.
+        silhouette_half: half side of the window of the silhouette test, `MOST_HALF_PX` at most.
+        plane_half: half side of the window of the test for one plane, likewise.
 
     Returns:
         Of each half (left, right, upper, lower) of each window (N, 4, 4) the number of pixels, and
@@ -53,47 +69,59 @@ def window_sums(
         of the grey levels along u and along v. Then (N, 3): the score of the test for one plane,
         see there, and the mean squared slopes along u and along v.
     """
-    half = max(silhouette_half, plane_half)
-    area, ends = (2 * half + 1) ** 2, np.empty((2 * half + 1, 2), dtype=np.int64)
-    window, room, share = (
-        np.empty((FIELDS, area)),
-        np.empty((ROOM, area), np.uint32),
-        np.empty(area),
-    )
-    grid, parts, total = np.empty((3, 5, 3, SUMS)), np.empty((3, 3, _PARTS)), np.empty(_PARTS)
-    normal, moment = np.empty((COLUMNS, COLUMNS)), np.empty(COLUMNS)
     squares, scores = np.empty((len(pixel), 4, 4)), np.empty((len(pixel), 3))
+    weight = column_weights(max(silhouette_half, plane_half))
+    _look_at_all(left, right, pixel, plane, silhouette_half, plane_half, weight, squares, scores)
+    return squares, scores
+
+
+@kernel
+def _look_at_all(
+    left: np.ndarray,
+    right: np.ndarray,
+    pixel: np.ndarray,
+    plane: Float,
+    silhouette_half: int,
+    plane_half: int,
+    weight: Float,
+    squares: Float,
+    scores: Float,
+) -> None:
+    half = max(silhouette_half, plane_half)
+    area = (2 * half + 1) ** 2
+    window, share = np.empty((FIELDS + 1, area)), np.empty(area)
+    room, down = np.empty((ROOM, area), np.uint32), np.empty(3 * N_PRODUCTS * WIDE)
+    column, sums = np.empty(2 * half + 1), np.empty(len(_SUMS))
+    normal, moments = np.empty((COLUMNS, COLUMNS)), np.empty(COLUMNS)
     for n in range(len(pixel)):
         u, v = pixel[n, 0], pixel[n, 1]
-        _find_ends(right, u, v, half, plane, n, ends)
         fill_left(left, u, v, half, window)
         fill_down(left, u, v, half, window)
         fill_residuals(right, u, v, half, plane, n, window, room, share)
         shade = float(left[v, u])  # grey levels are counted from it: small numbers lose less
-        _add_up(window, ends, half, plane_half, shade, grid, parts)
-        for k in range(_PARTS):
-            total[k] = 0.0
-            for i in range(3):
-                total[k] += parts[i, 0, k] + parts[i, 1, k] + parts[i, 2, k]
-        count = max(total[0], 1.0)
-        scores[n, 0] = score(grid, total, normal, moment)
-        scores[n, 1], scores[n, 2] = total[5] / count, total[6] / count
-        if silhouette_half != plane_half:
-            _add_up(window, ends, half, silhouette_half, shade, grid, parts)
-        fill_in_halves(parts, squares, n)
-    return squares, scores
+        _leave_out(right, u, v, half, plane, n, shade, window)
+        for own in (plane_half, silhouette_half):
+            _sum_down(window, half, own, shade, down)
+            _sum_along(down, half, own, weight, column, sums)
+            if own == plane_half:
+                pixels = max(sums[_OF_SLOPES[0]], 1.0)
+                scores[n, 0] = score(sums, _OF_PLANE, normal, moments)
+                scores[n, 1] = sums[_OF_SLOPES[1]] / pixels
+                scores[n, 2] = sums[_OF_SLOPES[2]] / pixels
+            if own == silhouette_half:
+                fill_in_halves(sums, _OF_HALVES, squares, n)
+                break
 
 
 @kernel_part
-def _find_ends(
-    right: np.ndarray, u: int, v: int, half: int, plane: Float, n: int, ends: np.ndarray
+def _leave_out(
+    right: np.ndarray, u: int, v: int, half: int, plane: Float, n: int, shade: float, window: Float
 ) -> None:
-    """Fill in (S, 2): of each row of a window the first and the last x that lie in both pictures.
-
-    Where none does the last comes before the first.
-    """
+    """Mark which pixels of a window lie in both pictures, and let the others add nothing."""
     top, bottom, left_end, right_end = parts_inside(right, u, v, half)
     d, a, b = plane[n, 0], plane[n, 1], plane[n, 2]
+    for k in range(window.shape[1]):
+        window[_INSIDE, k] = 1.0
     for y in range(-half, half + 1):
         first, last, start = left_end, right_end, u - d - b * y
         if not top <= y <= bottom:
@@ -102,86 +130,77 @@ def _find_ends(
             first += 1
         while first <= last and not 1 <= start + last - a * last < right.shape[1] - 2:
             last -= 1
-        ends[y + half, 0], ends[y + half, 1] = first, last
+        if first == -half and last == half:
+            continue
+        middle = (y + half) * (2 * half + 1) + half
+        for x in range(-half, half + 1):
+            if not first <= x <= last:
+                window[LEVEL, middle + x] = shade
+                window[SLOPE, middle + x] = window[DOWN, middle + x] = 0.0
+                window[RESIDUAL, middle + x] = window[_INSIDE, middle + x] = 0.0
 
 
-@kernel
-def _add_up(
-    window: Float, ends: np.ndarray, half: int, own: int, shade: float, grid: Float, parts: Float
-) -> None:
-    """Sums over the pixels of a window that are up to `own` from its middle.
+@kernel_part
+def _sum_down(window: Float, half: int, own: int, shade: float, down: Float) -> None:
+    """Sums down the columns of a window that are up to `own` from its middle, as far up and down.
 
     Args:
         window: of half side `half`.
-        ends: of its rows.
         half: of the window.
         own: of what is looked at.
         shade: what grey levels are counted from.
-        grid: (3, 5, 3, SUMS), changed: of y^q (q to 4) times what `_sum_up` gives, of the rows
-            above the middle, of that in it and of those below, and likewise along rows.
-        parts: (3, 3, _PARTS), changed: of the same parts of the window.
+        down: (3 * N_PRODUCTS * WIDE,), changed: of the rows above the middle, of that in it and of
+            those below the sums of each product.
     """
-    row = np.empty((3, SUMS))
-    _clear(grid, parts)
+    for k in range(3 * N_PRODUCTS):
+        first = np.uintp(k) * WIDE
+        for i in range(2 * own + 1):
+            down[first + np.uintp(i)] = 0.0
     for y in range(-own, own + 1):
-        part, middle = 1 + (y > 0) - (y < 0), (y + half) * (2 * half + 1) + half
-        first, last = max(ends[y + half, 0], -own), min(ends[y + half, 1], own)
-        for side in range(3):
-            begin = max(first, (first, 0, 1)[side])
-            end = min(last, (-1, 0, last)[side])
-            _sum_up(window, middle, begin, end, shade, row, side, parts, part)
-        power = 1.0
-        for q in range(5):
-            # what is not squared is asked for with y^2 at most, squares with x^k y^(4 - k)
-            for side in range(3):
-                for k in range(0 if q <= 2 else SQUARES, SUMS - q):
-                    grid[part, q, side, k] += power * row[side, k]
-            power *= y
+        part = np.uintp((1 + (y > 0) - (y < 0)) * N_PRODUCTS) * WIDE
+        at, q = np.uintp((y + half) * (2 * half + 1) + half - own), float(y)
+        for i in range(2 * own + 1):
+            m, k = part + np.uintp(i), at + np.uintp(i)
+            L, g, h = window[LEVEL, k] - shade, window[SLOPE, k], window[DOWN, k]
+            r, gy = window[RESIDUAL, k], g * q
+            gyy = gy * q
+            down[m] += g * g
+            down[m + _AT[1]] += g * gy
+            down[m + _AT[2]] += gy * gy
+            down[m + _AT[3]] += gy * gyy
+            down[m + _AT[4]] += gyy * gyy
+            down[m + _AT[5]] += g
+            down[m + _AT[6]] += gy
+            down[m + _AT[7]] += gyy
+            down[m + _AT[8]] += g * L
+            down[m + _AT[9]] += gy * L
+            down[m + _AT[10]] += gyy * L
+            down[m + _AT[11]] += g * r
+            down[m + _AT[12]] += gy * r
+            down[m + _AT[13]] += gyy * r
+            down[m + _AT[14]] += L
+            down[m + _AT[15]] += L * L
+            down[m + _AT[16]] += r
+            down[m + _AT[17]] += L * r
+            down[m + _AT[18]] += h * h
+            down[m + _AT[19]] += r * r
+            down[m + _AT[20]] += window[_INSIDE, k]
 
 
 @kernel_part
-def _clear(grid: Float, parts: Float) -> None:
-    for part in range(3):
-        for side in range(3):
-            for k in range(_PARTS):
-                parts[part, side, k] = 0.0
-            for q in range(5):
-                for k in range(SUMS):
-                    grid[part, q, side, k] = 0.0
-
-
-@kernel_part
-def _sum_up(
-    window: Float,
-    middle: int,
-    begin: int,
-    end: int,
-    shade: float,
-    row: Float,
-    side: int,
-    parts: Float,
-    part: int,
-) -> None:
-    """Sums over the pixels `begin` to `end` of the row whose middle is pixel `middle`.
-
-    Fills in `row[side]`: g x^k (k to 2) times 1, L and r, and g^2 x^k (k to 4); adds to `parts`.
-    """
-    g0 = g1 = g2 = l0 = l1 = l2 = r0 = r1 = r2 = s0 = s1 = s2 = s3 = s4 = 0.0
-    own = own2 = off = own_off = down2 = off2 = 0.0
-    for x in range(begin, end + 1):
-        k = np.uintp(middle + x)
-        L, g = window[LEVEL, k] - shade, window[SLOPE, k]
-        h, r = window[DOWN, k], window[RESIDUAL, k]
-        gx = g * x
-        gxx = gx * x
-        g0, g1, g2 = g0 + g, g1 + gx, g2 + gxx
-        l0, l1, l2 = l0 + g * L, l1 + gx * L, l2 + gxx * L
-        r0, r1, r2 = r0 + g * r, r1 + gx * r, r2 + gxx * r
-        s0, s1, s2, s3, s4 = s0 + g * g, s1 + g * gx, s2 + gx * gx, s3 + gx * gxx, s4 + gxx * gxx
-        own, own2, off, own_off = own + L, own2 + L * L, off + r, own_off + L * r
-        down2, off2 = down2 + h * h, off2 + r * r
-    for k, value in enumerate((g0, g1, g2, l0, l1, l2, r0, r1, r2, s0, s1, s2, s3, s4)):
-        row[side, k] = value
-    count = float(max(end + 1 - begin, 0))
-    for k, value in enumerate((count, own, own2, off, own_off, s0, down2, off2)):
-        parts[part, side, k] += value
+def _sum_along(down: Float, half: int, own: int, weight: Float, column: Float, sums: Float) -> None:
+    """Fill in what is asked for from sums down the columns; `column` is room for those of a row."""
+    last = -1
+    for n in range(len(_SUMS)):
+        if _FROM[n] != last:
+            last = _FROM[n]
+            product, t = np.uintp(_DOWN_SUMS[last, 0]), _DOWN_SUMS[last, 1]
+            above, at, below = SIDES[t, 0], SIDES[t, 1], SIDES[t, 2]
+            m = product * WIDE
+            for i in range(2 * own + 1):
+                k = m + np.uintp(i)
+                column[i] = above * down[k] + at * down[k + _PART] + below * down[k + _PART + _PART]
+        w, total = _SUMS[n, 2], 0.0
+        for i in range(2 * own + 1):
+            total += column[i] * weight[w, np.uintp(half - own + i)]
+        sums[n] = total

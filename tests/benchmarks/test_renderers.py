@@ -143,7 +143,8 @@ def seen_on_a_leg(
         frame = source.render(np.stack([own, AWAY]), "a", RadiometricNoise(), rng, colour=False)
         features = front_end.extract(frame.left, frame.right)
         keep = tracker.landmarks(tracker.update(features))
-        kept = observable(CAMERA, features, keep, front_end.parameters)
+        given = (features.disparity_px, features.sigma_disparity_px)
+        kept = observable(CAMERA, *given, keep, front_end.parameters)
         # inverse depth is linear in the picture on a plane
         at = features.uv_px[kept, ::-1].T
         nearness = map_coordinates(1 / frame.depth_m.astype(float), at, order=1)

@@ -4,9 +4,11 @@ Frames do not depend on each other, so they are made in parallel, in chunks; a c
 never made again. Images are kept for a few frames only (for figure 1).
 """
 
+import itertools
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -46,15 +48,17 @@ from sim.trajectory import read_trajectory
 FRAMES_PER_CHUNK = 20
 
 _PIXEL = ["u_px", "v_px"]
-_ONE_EACH = ["disparity_px", "sigma_disparity_px", "descriptor"]
+_ONE_EACH = ["disparity_px", "sigma_disparity_px"]
 _SLOPE = ["disparity_per_u", "disparity_per_v"]
+_NUMBER = np.dtype("<f4")  # of a descriptor
 FEATURES = schema(
     "features",
-    2,
+    3,
     [
         pa.field("iteration", pa.int32()),
         *float_fields([*_PIXEL, "disparity_px", "sigma_disparity_px", *_SLOPE]),
-        pa.field("descriptor", pa.list_(pa.float32(), DESCRIPTOR_LENGTH)),
+        # as bytes: lists are written, and read, number by number
+        pa.field("descriptor", pa.binary(_NUMBER.itemsize * DESCRIPTOR_LENGTH)),
         pa.field("patch", pa.binary(PATCH_SIDE_PX**2)),
     ],
 )
@@ -95,6 +99,10 @@ def _chunk(part: str, n_frames: int) -> range:
 _open: dict[tuple[object, ...], FrameSource] = {}
 
 
+# The stage's tasks for one robot, and mostly those for all of them, read the same way.
+_trajectory = lru_cache(maxsize=1)(read_trajectory)
+
+
 def _world(settings: FeatureSettings, faces: Path, robots: tuple[str, ...]) -> FrameSource:
     world = (faces, settings.camera, robots, settings.renderer)
     if world not in _open:
@@ -106,7 +114,7 @@ def _world(settings: FeatureSettings, faces: Path, robots: tuple[str, ...]) -> F
 
 def run(settings: FeatureSettings, job: Job) -> dict[str, float]:
     """Render and extract the frames of one chunk; returns how long the rendering took."""
-    trajectory = read_trajectory(job.inputs["drive"] / TRAJECTORY_FILE)
+    trajectory = _trajectory(job.inputs["drive"] / TRAJECTORY_FILE)
     source = _world(settings, job.inputs["faces"], trajectory.robots)
     front_end = FrontEnd(settings.camera, settings.vision)
     robot, features, truth, rendering_s = settings.robot, [], [], 0.0
@@ -127,8 +135,9 @@ def run(settings: FeatureSettings, job: Job) -> dict[str, float]:
     truth_path, features_path = (job.output / name.format(part=job.part) for name in WRITES)
     joined = {
         name: np.concatenate([getattr(found, name) for found in features])
-        for name in ("uv_px", "slope", "patch", *_ONE_EACH)
+        for name in ("uv_px", "slope", "descriptor", "patch", *_ONE_EACH)
     }
+    joined["descriptor"] = joined["descriptor"].astype(_NUMBER, copy=False).view(np.uint8)
     joined |= named_columns(_PIXEL, joined["uv_px"]) | named_columns(_SLOPE, joined["slope"])
     joined["iteration"] = np.repeat(np.array(frames), [len(found) for found in features])
     write_table(truth_path, named_columns(TRUTH.names, np.concatenate(truth)), TRUTH)
@@ -163,12 +172,14 @@ def read_features(folder: Path, n_frames: int) -> Iterator[tuple[Features, TrueP
         found = Features(
             columns(table, _PIXEL),
             **{name: column(table, name) for name in _ONE_EACH},
+            descriptor=column(table, "descriptor").view(_NUMBER),
             slope=columns(table, _SLOPE),
             patch=column(table, "patch").reshape(-1, PATCH_SIDE_PX, PATCH_SIDE_PX),
         )
         true_table, _ = read_table(truth_path, TRUTH)
         point = columns(true_table, POSITION_FIELDS)
         slope = columns(true_table, _POINT_SLOPE).reshape(-1, 3, 2)
-        for k in _chunk(part, n_frames):
-            rows = slice(*np.searchsorted(column(table, "iteration"), [k, k + 1]))
+        frames = _chunk(part, n_frames)
+        ends = np.searchsorted(column(table, "iteration"), [*frames, frames.stop]).tolist()
+        for rows in itertools.starmap(slice, itertools.pairwise(ends)):
             yield with_rows(found, rows), TruePoints(point[rows], slope[rows])

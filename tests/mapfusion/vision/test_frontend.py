@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from mapfusion.camera import StereoCamera
+from mapfusion.robot_log import Observations
 from mapfusion.se2 import transform_points
 from mapfusion.vision.features import Features
-from mapfusion.vision.frontend import FrontEnd, FrontEndParameters, observe
+from mapfusion.vision.frontend import FrontEnd, FrontEndParameters, observable
 from mapfusion.vision.tracks import Tracker, TrackParameters
 from mapfusion.vision.usurf import USurfParameters
 from tests.mapfusion.vision.rendered_scene import Plane, render, wall
@@ -34,6 +35,18 @@ def room() -> list[Plane]:
 
 def everything(features: Features) -> np.ndarray:
     return np.ones(len(features), bool)
+
+
+def observe(
+    camera: StereoCamera, features: Features, keep: np.ndarray, parameters: FrontEndParameters
+) -> Observations:
+    """What is observed of features that no track moves."""
+    given = (features.disparity_px, features.sigma_disparity_px)
+    rows = observable(camera, *given, keep, parameters)
+    uv, disparity, sigma = (values[rows] for values in (features.uv_px, *given))
+    points = camera.triangulate(uv, disparity, parameters.sigma_uv_px, sigma)
+    uvd = np.column_stack([uv, disparity])
+    return Observations(*points, features.descriptor[rows], uvd_px=uvd)
 
 
 def test_points_lie_on_the_walls_within_their_covariance(room: list[Plane]) -> None:
@@ -81,6 +94,9 @@ def test_landmarks_come_from_tracks_of_a_moving_robot(room: list[Plane]) -> None
         left, right, _ = render(room, CAMERA, pose, 2.0, rng)
         features = front_end.extract(left, right)
         tracks = tracker.update(features)
+        own = (tracks.uv_px, tracks.disparity_px, 0.08, features.sigma_disparity_px)
+        for found, expected in zip(tracker.points_m, CAMERA.triangulate(*own), strict=True):
+            np.testing.assert_array_equal(found, expected)
         keep = tracker.landmarks(tracks)
         seen = observe(CAMERA, features, keep, parameters)
         assert len(seen) == 0 if t < 2 else len(seen) > 35

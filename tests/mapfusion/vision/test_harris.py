@@ -6,11 +6,11 @@ import pytest
 
 from mapfusion.vision.harris import (
     HarrisParameters,
-    _spread,
     descending,
     detect,
     harris_response,
     local_maxima,
+    spread,
 )
 
 
@@ -97,8 +97,8 @@ def spread_twin(
 def test_choice_equals_its_obvious_twin(seed: int) -> None:
     rng = np.random.default_rng(seed)
     candidates = rng.permutation(np.argwhere(rng.random((60, 70)) < 0.1))[:, ::-1]
-    found = _spread(np.ascontiguousarray(candidates), 60, 70, 5, 20, 4, 37)
-    assert found.tolist() == spread_twin(candidates, 5, 20, 4, 37)
+    found = spread(np.ascontiguousarray(candidates), (60, 70), 5, 20, 4, 37)
+    assert np.flatnonzero(found).tolist() == spread_twin(candidates, 5, 20, 4, 37)
 
 
 def test_equal_responses_keep_their_order() -> None:

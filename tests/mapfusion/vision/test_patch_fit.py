@@ -136,6 +136,17 @@ def test_each_is_fitted_to_its_own_template() -> None:
         np.testing.assert_array_equal(own, fitted(before[row], after[row])[1])
 
 
+def test_templates_have_room_beside_those_in_use() -> None:
+    before, _ = before_and_after(0)
+    templates = Templates.of(np.stack([before] * 3), np.tile(POINT, (3, 1)), 2.0, 0.5)
+    window = templates.window.copy()
+    assert templates.unused(np.array([0, 2]), 1).tolist() == [1]
+    more = templates.unused(np.arange(3), 4)
+    assert len(set(more.tolist()) - {0, 1, 2}) == 4
+    assert more.max() < len(templates.window) == len(templates.factor) == len(templates.tolerated)
+    np.testing.assert_array_equal(templates.window[:3], window)
+
+
 def test_what_does_not_fit_is_told() -> None:
     before, after = before_and_after(5)
     other, _ = before_and_after(6)

@@ -78,6 +78,9 @@ def test_a_feature_that_slips_begins_a_new_track() -> None:
         tracks = tracker.update(features(uvd[:, :2], descriptor, uvd[:, 2]))
     assert tracks.length.tolist() == [3] * 7 + [1] + [3] * 4
     assert tracks.track_id.tolist() == [*range(7), 12, *range(8, 12)]
+    own = camera.triangulate(tracks.uv_px, tracks.disparity_px, 0.3, 0.1)
+    for found, expected in zip(tracker.points_m, own, strict=True):
+        np.testing.assert_array_equal(found, expected)
 
 
 def link_twin(previous: Features, current: Features, parameters: TrackParameters) -> list[int]:
