@@ -32,7 +32,9 @@ def _scoring(
     the fitted motion took from the 2N numbers are made good by their share.
     S = S_a + R S_b R^T is (N, 2, 2), `weight` (N,) 0 to 1 how surely each pair is true.
     """
-    numbers = 2 * np.sum(weight)
+    numbers = 0.0
+    for i in range(len(weight)):
+        numbers += 2 * weight[i]
     share = numbers / max(numbers - _MOTION_PARAMETERS, 1.0)
     score = information = 0.0
     for i in range(len(residual_m)):

@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from mapfusion.align.mahalanobis_gate import PlanarPairs, residual_covariance
-from mapfusion.kernels import kernel
+from mapfusion.kernels import kernel_part
 from mapfusion.planar import lever, residual
 from mapfusion.se2 import Float, transform_points
 
@@ -60,7 +60,7 @@ def why_one_pair(
     return f"rests on one correspondence: without it landmarks move by {moved_m:.2g} m"
 
 
-@kernel
+@kernel_part
 def most_leverage(
     T_a_b: Float, pairs: PlanarPairs, variance_m2: float, truth: Float, covariance: Float
 ) -> int:

@@ -81,7 +81,7 @@ class Refinement:
         rows = pairs.of_one_height(self.height)
         planar = pairs[rows].in_plan()
         limits = (self._widest_m(pairs, T_a_b), self.least_drift_m, self.max_rounds)
-        solved, moved_m, T_a_b, covariance, variance, truth = maximise_likelihood(
+        solved, moved_m, T_a_b, covariance, variance, truth, left_out = maximise_likelihood(
             planar, T_a_b, *limits
         )
         if not solved:
@@ -97,9 +97,8 @@ class Refinement:
         elif np.count_nonzero(inlier) < MIN_PAIRS:
             reason = f"{np.count_nonzero(inlier)} correspondences agree, {MIN_PAIRS} are needed"
         else:
-            left_out = most_leverage(T_a_b, planar, variance, truth, covariance)
             others = PlanarPairs(*(np.delete(part, left_out, axis=0) for part in planar))
-            solved, _, T_without, sure, drift_m2, _ = maximise_likelihood(others, T_a_b, *limits)
+            solved, _, T_without, sure, drift_m2, *_ = maximise_likelihood(others, T_a_b, *limits)
             may_move_m = limits[0]
             # a known identity that the motion rests on is false only if it is unlike all others
             if pairs.by_name and solved:
@@ -155,9 +154,13 @@ def truth_probabilities(
     gate_m: float,
     inside: np.ndarray,
     truth: Float,
-) -> None:
-    """Fill the probability (N,) of being true of each pair inside the gate, 0 of the others."""
+) -> tuple[float, int]:
+    """Fill the probability (N,) of being true of each pair inside the gate, 0 of the others.
+
+    Returns their sum, and how many are inside.
+    """
     false_density = (1 - share) / (math.pi * gate_m * gate_m)
+    total, count = 0.0, 0
     for i in range(len(e)):
         truth[i] = 0.0
         if not inside[i]:
@@ -168,6 +171,9 @@ def truth_probabilities(
         true_density = share * math.exp(-square / 2) / (2 * math.pi * math.sqrt(det))
         if true_density > 0:
             truth[i] = true_density / (true_density + false_density)
+        total += truth[i]
+        count += 1
+    return total, count
 
 
 @kernel_part
@@ -200,7 +206,7 @@ def normal_equations(
 
 
 @kernel_part
-def missing_information(
+def take_missing_information(
     T_a_b: Float,
     p_b: Float,
     e: Float,
@@ -208,8 +214,9 @@ def missing_information(
     weighed_m2: float,
     judged_m2: float,
     truth: Float,
-) -> Float:
-    """What not knowing which pairs are true takes from the information (3, 3) (Louis 1982).
+    information: Float,
+) -> None:
+    """Take from the information (3, 3) what not knowing which pairs are true takes (Louis 1982).
 
     When the motion moves, so do the probabilities: d truth / de = -truth (1 - truth) C^-1 e, and a
     normal matrix with certain weights would promise too much. `weighed_m2` is s_drift^2 in the
@@ -233,7 +240,9 @@ def missing_information(
             for column in range(3):
                 product = pull[row] * turn[column] + turn[row] * pull[column]
                 missing[row, column] += share * product / 2
-    return missing
+    for row in range(3):
+        for column in range(3):
+            information[row, column] -= missing[row, column]
 
 
 @kernel
@@ -267,13 +276,13 @@ def _farthest_moved(T_a_b: Float, step: Float, p_b: Float, truth: Float) -> floa
 @kernel
 def maximise_likelihood(
     pairs: PlanarPairs, T_start: Float, gate_m: float, least_drift_m: float, max_rounds: int
-) -> tuple[bool, float, Float, np.ndarray, float, Float]:
+) -> tuple[bool, float, Float, np.ndarray, float, Float, int]:
     """Expectation maximisation for motion, s_drift and share of true pairs.
 
     Returns:
         Whether the pairs determine a motion and its covariance, how far the last step moved a
         landmark (m), T_a_b (3,), its covariance (3, 3), s_drift^2, each pair's probability of being
-        true (N,).
+        true (N,), and which one has most leverage.
     """
     n, farthest = len(pairs.p_a), farthest_m(pairs.p_b)
     T_a_b, T_near = T_start.copy(), T_start.copy()
@@ -294,13 +303,12 @@ def maximise_likelihood(
         if rounds < _SETTLING_ROUNDS:
             _mark_inside(e, gate_m, inside)
         weighed, judged = variance, max(variance, least_drift_m * least_drift_m)
-        truth_probabilities(e, S, judged, share, gate_m, inside, truth)
-        total = np.sum(truth)
+        total, count = truth_probabilities(e, S, judged, share, gate_m, inside, truth)
         normal, right = normal_equations(T_a_b, some.p_b, e, S, variance, truth)
         determined = not total < 1.0 and invert(normal, covariance)
         if not determined:
             break
-        share = total / (np.sum(inside) + _PRIOR_FALSE)
+        share = total / (count + _PRIOR_FALSE)
         change = min(drift_step(e, S, truth, variance, gate_m), widest) - variance
         # few pairs far surer than the rest can throw it from one side to the other
         turned_back = change * last_change < 0 and abs(change) > _SWINGING * abs(last_change)
@@ -317,11 +325,11 @@ def maximise_likelihood(
             break
     if determined:
         _, some, e, S, _, truth = near
-        missing = missing_information(at, some.p_b, e, S, weighed, judged, truth)
-        normal -= missing
+        take_missing_information(at, some.p_b, e, S, weighed, judged, truth, normal)
         determined = invert(normal, covariance)
     at_rows(near.truth, near.rows, truth_of_all)
-    return determined, moved, T_a_b, covariance, variance, truth_of_all
+    most = most_leverage(T_a_b, pairs, variance, truth_of_all, covariance)
+    return determined, moved, T_a_b, covariance, variance, truth_of_all, most
 
 
 @kernel_part
