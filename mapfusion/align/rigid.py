@@ -78,9 +78,12 @@ def residuals(T_a_b: Float, p_a: Float, p_b: Float) -> Float:
 def residual_covariances(T_a_b: Float, covariance_a: Float, covariance_b: Float) -> Float:
     """S_a + R S_b R^T in the plane (N, 2, 2): what the landmarks' own noise makes of a residual."""
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
-    a, b = ((S[:, 0, 0], S[:, 0, 1], S[:, 1, 1]) for S in (covariance_a, covariance_b))
+    a, b = (S.T[[0, 0, 1], [0, 1, 1]] for S in (covariance_a, covariance_b))
     xx, xy, yy = add_turned.py_func(*a, cos, sin, *b)
-    return np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
+    found = np.empty((len(xx), 2, 2))
+    found[:, 0, 0], found[:, 1, 1] = xx, yy
+    found[:, 0, 1] = found[:, 1, 0] = xy
+    return found
 
 
 def least_squares_gain(T_a_b: Float, p_b: Float, weight: Float | None = None) -> Float:
@@ -95,8 +98,8 @@ def least_squares_gain(T_a_b: Float, p_b: Float, weight: Float | None = None) ->
     normal = np.array([[total, 0.0, x], [0.0, total, y], [x, y, given @ (jx * jx + jy * jy)]])
     inverse = np.linalg.inv(normal)
     gain = np.empty((len(p_b), 3, 2))
-    gain[:, :, 0] = given[:, None] * (inverse[:, 0] + np.multiply.outer(jx, inverse[:, 2]))
-    gain[:, :, 1] = given[:, None] * (inverse[:, 1] + np.multiply.outer(jy, inverse[:, 2]))
+    for k, j in enumerate((jx, jy)):
+        gain[:, :, k] = (given * (inverse[:, k, None] + inverse[:, 2, None] * j)).T
     return gain
 
 
@@ -106,8 +109,8 @@ def motion_covariance(gain: Float, covariance_m2: Float) -> Float:
     Weights that are not the inverse covariances make it larger than the inverse of the normal
     matrix: this is the sandwich of the two.
     """
-    x, y = gain[:, :, 0].T, gain[:, :, 1].T
-    xx, xy, yy = covariance_m2[:, 0, 0], covariance_m2[:, 0, 1], covariance_m2[:, 1, 1]
+    x, y = np.ascontiguousarray(gain.T)
+    xx, xy, yy = covariance_m2.T[[0, 0, 1], [0, 1, 1]]
     total = (x * xx + y * xy) @ x.T + (x * xy + y * yy) @ y.T
     return (total + total.T) / 2  # symmetric to the last bit
 
