@@ -42,7 +42,8 @@ class BoxTree(NamedTuple):
         """Tree over points (N, 3)."""
         rows, boxes, ends = in_leaves(p, -(-len(p) // n_leaves_of(len(p), _POINTS_PER_LEAF)))
         in_order = p[rows]
-        return cls(in_order, *np.ascontiguousarray(in_order.T), rows, boxes, ends[0], ends[1])
+        x, y, z = np.ascontiguousarray(in_order.T)
+        return cls(in_order, x, y, z, rows, boxes, ends[0], ends[1])
 
 
 def n_leaves_of(n: int, size: int) -> int:

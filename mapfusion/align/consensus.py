@@ -62,7 +62,8 @@ class Consensus:
     def _settle(self, T_a_b: Float, pairs: Pairs, planar: PlanarPairs) -> Fit | Undetermined:
         inlier, level = np.zeros(len(pairs), dtype=bool), -1
         if np.all(np.isfinite(T_a_b)):
-            _, level = settle_at_best_scale(T_a_b, planar, self.variances_m2, self.bound, inlier)
+            given = planar, mean_variances(planar), self.variances_m2, self.bound
+            _, level = settle_at_best_scale(T_a_b, *given, inlier)
         return self.fit_of(T_a_b, inlier, level, pairs, planar)
 
     def fit_of(

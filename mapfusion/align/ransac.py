@@ -132,14 +132,14 @@ def refit(
     Motions are compared only after this: a raw minimal set can gain a false supporter by leaning
     towards it, with its true ones at the gate's edge.
     """
-    cost = 0.0
+    cost, none_to_beat = 0.0, np.int64(0)  # a plain 0 is a type of its own, and compiled for
     before = np.empty(len(rows), np.int64)
     for _ in range(_LOCAL_ROUNDS):
         T_a_b[0], T_a_b[1], T_a_b[2] = fit_rigid(p_a, p_b, rows[:count])
         before_count = count
         for i in range(count):
             before[i] = rows[i]
-        count, cost = list_supporters(T_a_b, p_a, p_b, gate_m, 0, rows)
+        count, cost = list_supporters(T_a_b, p_a, p_b, gate_m, none_to_beat, rows)
         same = count == before_count
         for i in range(count):
             same = same and rows[i] == before[i]

@@ -45,6 +45,8 @@ class RansacMahalanobis(Consensus):
         planar = pairs.in_plan()
         _, T_a_b = least_truncated_squares(
             planar,
+            mean_variances(planar),
+            in_rows(planar),
             self.variances_m2[-1],
             self.bound,
             chi_square_bound(self.probability, 1),
@@ -59,6 +61,8 @@ class RansacMahalanobis(Consensus):
 @kernel
 def least_truncated_squares(
     pairs: PlanarPairs,
+    own_m2: Float,
+    rows: Float,
     variance_m2: float,
     bound: float,
     agreement: float,
@@ -69,13 +73,13 @@ def least_truncated_squares(
 ) -> tuple[int, Float]:
     """Draw minimal sets until two supporters of the best motion would have come up by now.
 
+    `own_m2` are the `mean_variances` without s_drift, `rows` the pairs as `in_rows` has them,
     `bound` is the most for e^T C^-1 e of a supporter, `agreement` for the squared difference of a
     set's two lengths over its variance, `log_miss` the logarithm of the chance accepted of never
     drawing two supporters, `seed` not 0. Returns the number of draws and T_a_b (3,), NaN for none.
     """
     p_a, p_b = pairs.p_a, pairs.p_b
     n = len(p_a)
-    mean, rows = mean_variances(pairs, variance_m2), in_rows(pairs)
     best_T, T_a_b, inside = np.full(3, np.nan), np.empty(3), np.empty(n, np.bool_)
     best_score, best_raw = 0.0, 0.0
     needed, draws, state = float(max_draws), 0, seed
@@ -86,12 +90,12 @@ def least_truncated_squares(
             continue
         if fit_two(p_a, p_b, i, j, T_a_b) < min_baseline_m:
             continue
-        count, score = mark_supporters(T_a_b, pairs, mean, variance_m2, bound, inside)
+        count, score = mark_supporters(T_a_b, pairs, own_m2, variance_m2, bound, inside)
         if count < 2 or score <= best_raw:
             continue
         best_raw = score
-        count = settle(T_a_b, pairs, variance_m2, bound, inside)
-        count, score = mark_supporters(T_a_b, pairs, mean, variance_m2, bound, inside)
+        count = settle(T_a_b, pairs, own_m2, variance_m2, bound, inside)
+        count, score = mark_supporters(T_a_b, pairs, own_m2, variance_m2, bound, inside)
         if count >= 2 and score > best_score:
             for k in range(3):
                 best_T[k] = T_a_b[k]
