@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapfusion.kernels import kernel
+from mapfusion.kernels import inner_kernel, kernel
 from mapfusion.se2 import Float
 
 _WIDER = 1 + 1e-6  # than the radius asked for, so that rounding leaves out no point on its edge
@@ -71,7 +71,7 @@ def _sorted_into_cells(p: Float) -> Grid:
     return Grid(sorted_p, row, start, corner_m, cell_m, np.array([nx, ny]))
 
 
-@kernel
+@inner_kernel
 def _cells(middle: float, radius: float, corner: float, cell: float, cells: int) -> tuple[int, int]:
     """First cell that an interval meets along one axis, and one behind the last."""
     wider = radius * _WIDER
@@ -80,7 +80,7 @@ def _cells(middle: float, radius: float, corner: float, cell: float, cells: int)
     return (int(first), int(last) + 1) if first <= last else (0, 0)
 
 
-@kernel
+@inner_kernel
 def runs_about(x: float, y: float, radius_m: float, grid: Grid, runs: np.ndarray) -> int:
     """Ranges of grid.p with all points within a radius of (x, y), and others.
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from mapfusion.align.bits import WORD, mirror, packed, trailing_zeros
 from mapfusion.align.mahalanobis_gate import PlanarPairs
-from mapfusion.kernels import kernel, kernel_part
+from mapfusion.kernels import inner_kernel, kernel, kernel_part
 from mapfusion.se2 import Float
 
 # What single precision may add to the difference of two distances: coordinates of at most 1, read
@@ -94,14 +94,14 @@ def _mark_near(
         near[j] = (p - q) * (p - q) <= m * (p + q + (p + q) - m)
 
 
-@kernel(error_model="numpy")
+@inner_kernel(error_model="numpy")
 def _variance_along(dx: float, dy: float, square: float, xx: float, xy: float, yy: float) -> float:
     """Variance along the line (dx, dy) of this squared length; 0 where there is no line."""
     along = dx * dx * xx + 2 * dx * dy * xy + dy * dy * yy
     return along / square if square > 0 else 0.0
 
 
-@kernel(error_model="numpy")
+@inner_kernel(error_model="numpy")
 def _needed(one: tuple[float, ...], other: tuple[float, ...], bound: float) -> float:
     """`drift_needed` of two correspondences, each a row of `in_rows`."""
     ax, ay, bx, by = other[0] - one[0], other[1] - one[1], other[2] - one[2], other[3] - one[3]
@@ -121,7 +121,7 @@ def in_rows(pairs: PlanarPairs) -> Float:
     return rows
 
 
-@kernel
+@inner_kernel
 def _numbers(rows: Float, i: int) -> tuple[float, ...]:
     r = rows[i]
     return r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9]

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from mapfusion.kernels import kernel, kernel_part
+from mapfusion.kernels import inner_kernel, kernel, kernel_part
 from mapfusion.se2 import Float
 
 # Below this nothing is measured: it only keeps the weights of noise-free data finite.
@@ -20,7 +20,7 @@ _BEYOND = 41.0
 _MOTION_PARAMETERS = 3
 
 
-@kernel
+@inner_kernel
 def _scoring(
     residual_m: Float, covariance_m2: Float, weight: Float, variance_m2: float, gate_m: float
 ) -> float:

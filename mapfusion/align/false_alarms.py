@@ -11,7 +11,7 @@ import numpy as np
 from mapfusion.align.closest import Grid, runs_about
 from mapfusion.align.pairs import MIN_PAIRS
 from mapfusion.align.rigid import fit_rigid
-from mapfusion.kernels import kernel, kernel_part
+from mapfusion.kernels import inner_kernel, kernel, kernel_part
 from mapfusion.planar import moved_point
 from mapfusion.se2 import Float
 
@@ -82,7 +82,7 @@ def _has_neighbour(
     return False
 
 
-@kernel
+@inner_kernel
 def apart_by_less(p: Float, i: int, j: int, distance_m: float) -> bool:
     """Whether points i and j of (N, D) are less than a distance apart."""
     if abs(p[i, 0] - p[j, 0]) >= distance_m:  # most are already told apart by this

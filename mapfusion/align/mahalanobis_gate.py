@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mapfusion.align.rigid import fit_weighted
-from mapfusion.kernels import kernel, kernel_part
+from mapfusion.kernels import inner_kernel, kernel, kernel_part
 from mapfusion.planar import add_turned, residual
 from mapfusion.se2 import Float
 
@@ -41,7 +41,7 @@ def mean_variances(pairs: PlanarPairs, variance_m2: float = 0.0) -> Float:
     return (S_a[:, 0, 0] + S_a[:, 1, 1] + S_b[:, 0, 0] + S_b[:, 1, 1]) / 2 + variance_m2
 
 
-@kernel
+@inner_kernel
 def residual_covariance(
     cos: float, sin: float, S_a: Float, S_b: Float, i: int, variance_m2: float
 ) -> tuple[float, float, float]:
@@ -52,14 +52,14 @@ def residual_covariance(
     return xx + variance_m2, xy, yy + variance_m2
 
 
-@kernel
+@inner_kernel
 def _square_and_det(ex: float, ey: float, xx: float, xy: float, yy: float) -> tuple[float, float]:
     """e^T C^-1 e and |C| of one residual."""
     det = xx * yy - xy * xy
     return (yy * ex * ex - 2 * xy * ex * ey + xx * ey * ey) / det, det
 
 
-@kernel
+@inner_kernel
 def mark_supporters(
     T_a_b: Float,
     pairs: PlanarPairs,

@@ -8,7 +8,7 @@ steps is that of Rossi et al. 2015, PMC).
 import numpy as np
 
 from mapfusion.align.bits import WORD, count_common, trailing_zeros
-from mapfusion.kernels import kernel, kernel_part
+from mapfusion.kernels import inner_kernel, kernel, kernel_part
 
 
 @kernel_part
@@ -20,13 +20,13 @@ def degrees(graph: np.ndarray) -> np.ndarray:
     return degree
 
 
-@kernel
+@inner_kernel
 def has(bits: np.ndarray, v: int) -> bool:
     """Whether v is in a set (W,)."""
     return (bits[v // WORD] >> np.uint64(v % WORD)) & np.uint64(1) != 0
 
 
-@kernel
+@inner_kernel
 def members(bits: np.ndarray, into: np.ndarray) -> int:
     """Write the numbers of a set (W,) into `into`, ascending; returns how many there are."""
     count = 0
@@ -131,7 +131,7 @@ def greedy_clique(graph: np.ndarray, starts: int) -> np.ndarray:
     return best[:size_of_best].copy()
 
 
-@kernel
+@inner_kernel
 def colour(
     graph: np.ndarray,
     candidates: np.ndarray,

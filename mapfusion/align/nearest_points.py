@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mapfusion.align.box_tree import BoxTree, in_leaves
-from mapfusion.kernels import kernel, kernel_part
+from mapfusion.kernels import inner_kernel, kernel, kernel_part
 from mapfusion.planar import moved_point
 from mapfusion.se2 import Float
 
@@ -69,7 +69,7 @@ def room_for_groups() -> Room:
     return Room(x, y, z, nearest, np.empty(GROUP), np.empty(_DEEPEST, np.int64), np.empty(_DEEPEST))
 
 
-@kernel
+@inner_kernel
 def look_up_group(
     T_a_b: Float, first: int, groups: Groups, tree: BoxTree, nearest: np.ndarray, room: Room
 ) -> None:

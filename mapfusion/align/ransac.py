@@ -11,7 +11,7 @@ from mapfusion.align.method import Fit, Undetermined
 from mapfusion.align.pairs import Pairs
 from mapfusion.align.rigid import fit_rigid, fit_two
 from mapfusion.arguments import Probability, Range, require_in_range
-from mapfusion.kernels import kernel, kernel_part
+from mapfusion.kernels import inner_kernel, kernel, kernel_part
 from mapfusion.planar import residual
 from mapfusion.se2 import Float
 
@@ -62,7 +62,7 @@ class Ransac:
         return Fit(T_a_b, inlier, gate_m=self.gate_m)
 
 
-@kernel
+@inner_kernel
 def next_random(state: np.uint64) -> np.uint64:
     """Next state of a xorshift generator with 64 bits (Marsaglia 2003); state must not be 0."""
     state ^= state << np.uint64(13)
@@ -71,7 +71,7 @@ def next_random(state: np.uint64) -> np.uint64:
     return state
 
 
-@kernel
+@inner_kernel
 def draw_pair(state: np.uint64, n: int) -> tuple[np.uint64, int, int]:
     """The state after drawing two different numbers below n, and the numbers."""
     # the upper 32 bits, scaled, are uneven by n / 2^32 at most
@@ -96,7 +96,7 @@ def _two_point_motion(
     return fit_two(p_a, p_b, i, j, T_a_b) >= min_baseline_m
 
 
-@kernel
+@inner_kernel
 def list_supporters(
     T_a_b: Float, p_a: Float, p_b: Float, gate_m: float, to_beat: int, rows: np.ndarray
 ) -> tuple[int, float]:

@@ -17,7 +17,7 @@ from mapfusion.align.near_pairs import at_rows, farthest_m, leaves_margin, near_
 from mapfusion.align.pairs import MIN_PAIRS, Pairs, undetermined
 from mapfusion.align.result import Alignment, Status
 from mapfusion.arguments import Range, require_in_range, require_shape
-from mapfusion.kernels import kernel, kernel_part
+from mapfusion.kernels import inner_kernel, kernel, kernel_part
 from mapfusion.planar import add_turned, lever, residual
 from mapfusion.se2 import Float, transform_points, wrap
 from mapfusion.symmetric import cofactors
@@ -245,7 +245,7 @@ def take_missing_information(
             information[row, column] -= missing[row, column]
 
 
-@kernel
+@inner_kernel
 def invert(matrix: Float, inverse: Float) -> bool:
     """Fill the inverse (3, 3) of a symmetric matrix; False unless positive definite."""
     a, d, f = matrix[0, 0], matrix[1, 1], matrix[2, 2]

@@ -4,14 +4,14 @@ import math
 
 import numpy as np
 
-from mapfusion.kernels import kernel
+from mapfusion.kernels import inner_kernel, kernel
 from mapfusion.planar import add_turned, lever, residual
 from mapfusion.se2 import Float, rotation
 
 _ALL = slice(None)  # as the number of a pair: of all of them at once, in NumPy
 
 
-@kernel
+@inner_kernel
 def _fit_rows(
     p_a: Float, p_b: Float, rows: np.ndarray, weight: Float
 ) -> tuple[float, float, float]:
@@ -55,7 +55,7 @@ def fit_weighted(p_a: Float, p_b: Float, weight: Float, T_a_b: Float) -> None:
     T_a_b[0], T_a_b[1], T_a_b[2] = _fit_rows(p_a, p_b, np.arange(len(weight)), weight)
 
 
-@kernel
+@inner_kernel
 def fit_two(p_a: Float, p_b: Float, i: int, j: int, T_a_b: Float) -> float:
     """Fill T_a_b (3,) with the motion of pairs i and j; returns the shorter of their distances."""
     ax, ay = p_a[j, 0] - p_a[i, 0], p_a[j, 1] - p_a[i, 1]

@@ -14,7 +14,7 @@ from mapfusion.fastslam.particles import ParticleMaps
 from mapfusion.fastslam.sensor import Sightings, innovation, quadratic_form
 from mapfusion.fastslam.slots import Estimates, Slots
 from mapfusion.fastslam.update import DROPPED, NEW
-from mapfusion.kernels import kernel, kernel_part
+from mapfusion.kernels import inner_kernel, kernel, kernel_part
 from mapfusion.se2 import Float
 
 _PART = 16  # entries of a descriptor that are compared at a time
@@ -178,7 +178,7 @@ def _distinct(slot: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return ordered[first], place
 
 
-@kernel(error_model="numpy")
+@inner_kernel(error_model="numpy")
 def _distance(seen: Sightings, k: int, own: Estimates, r: int, m: int, planar: bool) -> float:
     difference, inverse, _ = innovation(seen, k, own, r, m, planar)
     return quadratic_form(difference, inverse)

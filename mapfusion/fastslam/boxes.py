@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from mapfusion.fastslam.slots import BLOCK, COMMON, Slots
-from mapfusion.kernels import kernel, kernel_part
+from mapfusion.kernels import inner_kernel, kernel, kernel_part
 from mapfusion.se2 import Float
 
 
@@ -72,7 +72,7 @@ def _bound_block(slots: Slots, block: int) -> None:
     around[block, 2], around[block, 3] = high_x, high_y
 
 
-@kernel
+@inner_kernel
 def touches(boxes: Float, i: int, box: Float) -> bool:
     """Whether row i of boxes (N, 4) and a box (4,) have a point in common."""
     x = (boxes[i, 0] <= box[2]) & (boxes[i, 2] >= box[0])

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mapfusion.fastslam.slots import Estimates
-from mapfusion.kernels import kernel
+from mapfusion.kernels import inner_kernel, kernel
 from mapfusion.planar import add_turned
 from mapfusion.se2 import Float
 from mapfusion.symmetric import cofactors
@@ -65,7 +65,7 @@ def _turn_into_map(
 
 # Division is NumPy's in the filter's kernels (`error_model`): a check for zero at each one keeps
 # LLVM from inlining what divides. No Z is singular: a frame with a singular R_t is refused.
-@kernel(error_model="numpy")
+@inner_kernel(error_model="numpy")
 def inverse_and_determinant(
     xx: float, xy: float, xz: float, yy: float, yz: float, zz: float
 ) -> tuple[Upper, float]:
@@ -75,7 +75,7 @@ def inverse_and_determinant(
     return (f * axx, f * axy, f * axz, f * ayy, f * ayz, f * azz), determinant
 
 
-@kernel(error_model="numpy")
+@inner_kernel(error_model="numpy")
 def innovation(
     seen: Sightings, k: int, own: Estimates, r: int, m: int, planar: bool
 ) -> tuple[Vector, Upper, float]:
@@ -100,7 +100,7 @@ def innovation(
     return difference, inverse, determinant
 
 
-@kernel(error_model="numpy")
+@inner_kernel(error_model="numpy")
 def quadratic_form(difference: Vector, inverse: Upper) -> float:
     """Squared Mahalanobis distance: d^T Z^-1 d."""
     dx, dy, dz = difference

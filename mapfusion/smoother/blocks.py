@@ -4,27 +4,27 @@ from typing import Any
 
 import numpy as np
 
-from mapfusion.kernels import kernel
+from mapfusion.kernels import inner_kernel
 from mapfusion.se2 import Float
 
 
 # Of tables of blocks they take all and a row: views of rows are counted, which takes longer than
 # the sums.
-@kernel
+@inner_kernel
 def put_along(A: Float, row: int, x: Float, product: Float) -> None:
     """A[row] x."""
     for r in range(3):
         product[r] = A[row, r, 0] * x[0] + A[row, r, 1] * x[1] + A[row, r, 2] * x[2]
 
 
-@kernel
+@inner_kernel
 def add_along(A: Float, row: int, x: Float, total: Float) -> None:
     """Add A[row] x."""
     for r in range(3):
         total[r] += A[row, r, 0] * x[0] + A[row, r, 1] * x[1] + A[row, r, 2] * x[2]
 
 
-@kernel
+@inner_kernel
 def put_inverse(A: Float, inverse: Float) -> bool:
     """Inverse of a symmetric positive definite A = L D L', of which the lower half is read.
 
@@ -39,7 +39,7 @@ def put_inverse(A: Float, inverse: Float) -> bool:
     return positive
 
 
-@kernel(error_model="numpy")
+@inner_kernel(error_model="numpy")
 def _inverse_entries(a00: Any, a10: Any, a11: Any, a20: Any, a21: Any, a22: Any) -> Any:
     """Whether A = L D L' is positive definite, and the lower half of its inverse, row by row.
 

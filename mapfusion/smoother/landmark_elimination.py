@@ -9,7 +9,7 @@ known, observations i, k of tracks t, u of one landmark take from what their pos
 
 import numpy as np
 
-from mapfusion.kernels import kernel, kernel_part
+from mapfusion.kernels import inner_kernel, kernel, kernel_part
 from mapfusion.se2 import Float
 from mapfusion.smoother.normal_equations import NormalEquations
 from mapfusion.smoother.offsets import Reduced
@@ -83,7 +83,7 @@ def _add_product(A: Float, B: Float, t: int, total: Float) -> None:
             total[r, q] += A[r, 0] * B[t, 0, q] + A[r, 1] * B[t, 1, q] + A[r, 2] * B[t, 2, q]
 
 
-@kernel
+@inner_kernel
 def _subtract_rows(
     X: Float,
     begin: int,

@@ -14,6 +14,7 @@ from mapfusion.align.mahalanobis_gate import (
 )
 from mapfusion.align.pairs import Pairs
 from mapfusion.align.rigid import fit_weighted
+from tests.helpers.inner_kernels import from_python
 from tests.mapfusion.align.map_pairs import blurred, error, given_pairs, stretched
 from tests.mapfusion.align.slow_twins import slow_squares
 
@@ -31,7 +32,7 @@ def test_support_equals_its_twin(case, variance):
     pairs, T_a_b = case
     planar, inside = pairs.in_plan(), np.empty(200, dtype=bool)
     own, mean = mean_variances(planar), mean_variances(planar, variance)
-    count, score = mark_supporters(T_a_b, planar, own, variance, BOUND, inside)
+    count, score = from_python(mark_supporters)(T_a_b, planar, own, variance, BOUND, inside)
     _, C, square = slow_squares(T_a_b, pairs, variance)
     np.testing.assert_allclose(mean, np.trace(C, axis1=1, axis2=2) / 2)
     np.testing.assert_array_equal(inside, square <= BOUND)
@@ -43,7 +44,7 @@ def test_gate_keeps_true_pairs_with_the_probability_stated():
     (map_a, map_b), pair = blurred(np.random.default_rng(1), 20_000, 1.0)
     planar, inside = Pairs(map_a, map_b, pair.correspondences).in_plan(), np.empty(20_000, bool)
     own = mean_variances(planar)
-    count, _ = mark_supporters(pair.T_a_b, planar, own, 1e-12, BOUND, inside)
+    count, _ = from_python(mark_supporters)(pair.T_a_b, planar, own, 1e-12, BOUND, inside)
     assert count / 20_000 == pytest.approx(0.99, abs=4 * math.sqrt(0.99 * 0.01 / 20_000))
 
 
