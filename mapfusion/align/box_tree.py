@@ -64,9 +64,8 @@ def in_leaves(p: Float, size: int) -> tuple[np.ndarray, Float, np.ndarray]:
         where to where their points are (2, M).
     """
     n_leaves = n_leaves_of(len(p), max(size, 1))
-    held = np.full(
-        (4, 1, n_leaves * max(size, 1)), np.nan
-    )  # what there are too few of is beyond all
+    # what there are too few of is beyond all others
+    held = np.full((4, 1, n_leaves * max(size, 1)), np.nan)
     held[:3, 0, : len(p)], held[3, 0, : len(p)] = p.T, np.arange(len(p))
     boxes, ranges = list[Float](), list[np.ndarray]()
     while True:

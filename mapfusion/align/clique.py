@@ -9,7 +9,7 @@ from mapfusion.align.consensus import Consensus
 from mapfusion.align.consistency import consistency, in_rows
 from mapfusion.align.mahalanobis_gate import (
     PlanarPairs,
-    mean_variances,
+    Spread,
     settle,
     settle_at_best_scale,
 )
@@ -96,7 +96,7 @@ class CliqueSearch:
 
     def __init__(self, clique: Clique, pairs: PlanarPairs) -> None:
         self._pairs, self._bound, self._variances_m2 = pairs, clique.bound, clique.variances_m2
-        self._rows, self._own_m2 = in_rows(pairs), mean_variances(pairs)
+        self._rows, self._spread = in_rows(pairs), Spread.of(pairs)
         self._scales_m2 = float(self._variances_m2[0]), float(self._variances_m2[-1])
         self._agreement = chi_square_bound(clique.agreement_probability, 1)
         self._max_nodes = clique.max_nodes
@@ -130,7 +130,7 @@ class CliqueSearch:
             return
         pairs, scales, bound = self._pairs, self._variances_m2, self._bound
         T_a_b, inside = np.array(fit_rigid(pairs.p_a, pairs.p_b, clique)), np.empty_like(self.near)
-        log, level = settle_at_best_scale(T_a_b, pairs, self._own_m2, scales, bound, inside)
+        log, level = settle_at_best_scale(T_a_b, pairs, self._spread, scales, bound, inside)
         if log > self._log:
             self.T_a_b, self.inside, self.level, self._log = T_a_b, inside, level, log
             self.near = self.support(1)
@@ -139,7 +139,7 @@ class CliqueSearch:
         """Which pairs (N,) support the likeliest motion, settled at a scale; none before."""
         inside = np.zeros(len(self._pairs.p_a), np.bool_)
         if self.level >= 0:
-            given = self._pairs, self._own_m2, self._scales_m2[scale], self._bound
+            given = self._pairs, self._spread.own_m2, self._scales_m2[scale], self._bound
             settle(self.T_a_b.copy(), *given, inside)
         return inside
 

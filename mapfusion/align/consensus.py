@@ -8,7 +8,12 @@ import numpy as np
 from mapfusion.align.correspondences import HeightGate
 from mapfusion.align.degeneracy import why_one_place
 from mapfusion.align.drift import DRIFT_FLOOR_M
-from mapfusion.align.mahalanobis_gate import PlanarPairs, mean_variances, settle_at_best_scale
+from mapfusion.align.mahalanobis_gate import (
+    PlanarPairs,
+    Spread,
+    mean_variances,
+    settle_at_best_scale,
+)
 from mapfusion.align.method import Fit, Undetermined
 from mapfusion.align.pairs import Pairs
 from mapfusion.arguments import Probability, Range, require_in_range
@@ -62,7 +67,7 @@ class Consensus:
     def _settle(self, T_a_b: Float, pairs: Pairs, planar: PlanarPairs) -> Fit | Undetermined:
         inlier, level = np.zeros(len(pairs), dtype=bool), -1
         if np.all(np.isfinite(T_a_b)):
-            given = planar, mean_variances(planar), self.variances_m2, self.bound
+            given = planar, Spread.of(planar), self.variances_m2, self.bound
             _, level = settle_at_best_scale(T_a_b, *given, inlier)
         return self.fit_of(T_a_b, inlier, level, pairs, planar)
 

@@ -149,39 +149,48 @@ def settle(
     return count
 
 
-@kernel_part
 def spread_area_m2(p: Float) -> float:
     """Area of the rectangle over which points (N, 2) with this spread would be uniform."""
-    n = len(p)
-    mx = my = xx = xy = yy = 0.0
-    for i in range(n):
-        mx += p[i, 0] / n
-        my += p[i, 1] / n
-    for i in range(n):
-        dx, dy = p[i, 0] - mx, p[i, 1] - my
-        xx += dx * dx / n
-        xy += dx * dy / n
-        yy += dy * dy / n
-    return 12 * math.sqrt(max(xx * yy - xy * xy, 0.0))  # a side L has the variance L^2 / 12
+    x, y = p.T - np.mean(p, axis=0)[:, None]
+    determinant = np.mean(x * x) * np.mean(y * y) - np.mean(x * y) ** 2
+    return 12 * math.sqrt(max(determinant, 0.0))  # a side L has the variance L^2 / 12
+
+
+class Spread(NamedTuple):
+    """What of N pairs no motion changes.
+
+    Attributes:
+        own_m2: (N,) the `mean_variances` without s_drift.
+        area_m2: over which the landmarks are spread in the map in which it is larger.
+    """
+
+    own_m2: Float
+    area_m2: float
+
+    @classmethod
+    def of(cls, pairs: PlanarPairs) -> "Spread":
+        """Of pairs, one or more."""
+        area_m2 = max(spread_area_m2(pairs.p_a), spread_area_m2(pairs.p_b))
+        return cls(mean_variances(pairs), area_m2)
 
 
 @kernel
 def settle_at_best_scale(
     T_a_b: Float,
     pairs: PlanarPairs,
-    own_m2: Float,
+    spread: Spread,
     variances_m2: Float,
     bound: float,
     inside: np.ndarray,
 ) -> tuple[float, int]:
     """Settle T_a_b at every scale, coarse to fine, and keep the likeliest.
 
-    T_a_b (3,) and inside (N,) are changed; `own_m2` are the `mean_variances` without s_drift.
-    Scales (L,) are s_drift^2, ascending. Returns the log-likelihood and the scale chosen; -1 when
-    fewer than two pairs support any.
+    T_a_b (3,) and inside (N,) are changed; `spread` is that of the pairs. Scales (L,) are
+    s_drift^2, ascending. Returns the log-likelihood and the scale chosen; -1 when fewer than two
+    pairs support any.
     """
     n = len(pairs.p_a)
-    area = max(spread_area_m2(pairs.p_a), spread_area_m2(pairs.p_b))
+    own_m2, area = spread.own_m2, spread.area_m2
     T, marks = T_a_b.copy(), np.empty(n, np.bool_)
     for i in range(n):
         inside[i] = False

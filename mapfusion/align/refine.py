@@ -291,7 +291,9 @@ def maximise_likelihood(
     widest = (gate_m / _GATE_SIGMAS) ** 2
     variance, share = widest, 0.5
     step_share, last_change = 1.0, 0.0
-    covariance, step = np.full((3, 3), np.nan), np.empty(3)
+    covariance, step = np.empty((3, 3)), np.empty(3)
+    for k in range(9):
+        covariance[k // 3, k % 3] = math.nan
     moved, determined = math.inf, True
     judged, weighed, normal, at = variance, variance, np.zeros((3, 3)), np.empty(3)
     for rounds in range(max_rounds):

@@ -99,9 +99,9 @@ def pairs_of_labels(
 def _touching(
     slots: Slots, names: np.ndarray, boxes: Float, descriptor: np.ndarray, threshold: np.float32
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    observation = np.empty(len(boxes) * len(names), dtype=np.int64)
-    slot = np.empty(len(observation), dtype=np.int64)
-    distance = np.empty(len(observation), dtype=np.float32)
+    observation = np.empty(len(boxes) * len(names), np.int64)
+    slot = np.empty(len(observation), np.int64)
+    distance = np.empty(len(observation), np.float32)
     n = 0
     for k in range(len(boxes)):
         for s in names:

@@ -83,13 +83,13 @@ def touches(boxes: Float, i: int, box: Float) -> bool:
 @kernel
 def near(slots: Slots, box: Float) -> np.ndarray:
     """Slots, ascending, whose boxes touch a box (4,)."""
-    blocks = np.empty(len(slots.block_box_m), dtype=np.int64)
+    blocks = np.empty(len(slots.block_box_m), np.int64)
     n_blocks = n = 0
     for block in range(len(blocks)):
         if touches(slots.block_box_m, block, box):
             blocks[n_blocks] = block
             n_blocks += 1
-    found = np.empty(n_blocks * BLOCK, dtype=np.int64)
+    found = np.empty(n_blocks * BLOCK, np.int64)
     for block in blocks[:n_blocks]:
         for s in range(block * BLOCK, (block + 1) * BLOCK):
             if touches(slots.box_m, s, box):

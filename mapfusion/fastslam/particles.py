@@ -212,11 +212,11 @@ def _move(means: Float, motion: Float) -> Float:
 def _inherit(slots: Slots, which: np.ndarray, ancestors: np.ndarray, generation: int) -> np.ndarray:
     own, common = slots.own, slots.common
     n_particles = own.count.shape[1]
-    alive = np.zeros(len(which), dtype=np.bool_)
+    alive = np.zeros(len(which), np.bool_)
     old = Estimates(
         np.empty((1, n_particles, 3)),
         np.empty((1, n_particles, 6)),
-        np.empty((1, n_particles), dtype=np.int32),
+        np.empty((1, n_particles), np.int32),
     )
     for i in range(len(which)):
         s = int(which[i])

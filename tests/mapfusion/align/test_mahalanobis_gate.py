@@ -5,6 +5,7 @@ import pytest
 from scipy.stats import chi2, multivariate_normal
 
 from mapfusion.align.mahalanobis_gate import (
+    Spread,
     log_likelihood,
     mark_supporters,
     mean_variances,
@@ -86,14 +87,14 @@ def test_the_scale_that_the_residuals_have_is_chosen(drift_m, level):
         planar = Pairs(pair.map_a, stretched(rng, pair.map_b, 1), pair.correspondences).in_plan()
         T, inside = pair.T_a_b.copy(), np.empty(300, dtype=bool)
         scales = np.array([0.0, 0.05, 0.1]) ** 2 + 1e-12
-        own = mean_variances(planar)
-        assert settle_at_best_scale(T, planar, own, scales, BOUND, inside)[1] == level
+        spread = Spread.of(planar)
+        assert settle_at_best_scale(T, planar, spread, scales, BOUND, inside)[1] == level
 
 
 def test_no_support_at_any_scale():
     pair = given_pairs(np.random.default_rng(3), 50, 1.0, 0.01, planar=True)
     planar = Pairs(pair.map_a, pair.map_b, pair.correspondences).in_plan()
     T, inside = pair.T_a_b + np.array([500.0, 0, 0]), np.ones(50, dtype=bool)
-    own = mean_variances(planar)
-    assert settle_at_best_scale(T, planar, own, np.array([1e-4]), BOUND, inside)[1] == -1
+    spread = Spread.of(planar)
+    assert settle_at_best_scale(T, planar, spread, np.array([1e-4]), BOUND, inside)[1] == -1
     assert not inside.any()
