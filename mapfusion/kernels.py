@@ -29,7 +29,7 @@ def inner_kernel(function: Any = None, **options: Any) -> Any:
     """
     if function is None:
         return partial(inner_kernel, **options)
-    made = njit(function, no_cpython_wrapper=True, **_OPTIONS, **options)
+    made = kernel(function, no_cpython_wrapper=True, **options)
     made.__class__ = _Inner
     return made
 

@@ -73,15 +73,17 @@ def most_leverage(
     """
     _, p_b, S_a, S_b = pairs
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+    cxx, cxy, cyy = covariance[0, 0], covariance[0, 1], covariance[1, 1]
+    cxt, cyt, ctt = covariance[0, 2], covariance[1, 2], covariance[2, 2]
     most, found = -1.0, 0
     for i in range(len(p_b)):
         xx, xy, yy = residual_covariance(cos, sin, S_a, S_b, i, variance_m2)
         jx, jy = lever(cos, sin, p_b, i)
         # J cov J': what the motion's own uncertainty makes of this point
-        txx = covariance[0, 0] + 2 * jx * covariance[0, 2] + jx * jx * covariance[2, 2]
-        tyy = covariance[1, 1] + 2 * jy * covariance[1, 2] + jy * jy * covariance[2, 2]
-        txy = covariance[0, 1] + jx * covariance[1, 2] + jy * covariance[0, 2]
-        txy += jx * jy * covariance[2, 2]
+        txx = cxx + 2 * jx * cxt + jx * jx * ctt
+        tyy = cyy + 2 * jy * cyt + jy * jy * ctt
+        txy = cxy + jx * cyt + jy * cxt
+        txy += jx * jy * ctt
         leverage = truth[i] * (txx * yy - 2 * txy * xy + tyy * xx) / (xx * yy - xy * xy)
         if leverage > most:
             most, found = leverage, i

@@ -177,32 +177,38 @@ def truth_probabilities(
 
 
 @kernel_part
-def normal_equations(
-    T_a_b: Float, p_b: Float, e: Float, S: Float, variance_m2: float, truth: Float
-) -> tuple[Float, Float]:
+def put_normal_equations(
+    T_a_b: Float,
+    p_b: Float,
+    e: Float,
+    S: Float,
+    variance_m2: float,
+    truth: Float,
+    normal: Float,
+    right: Float,
+) -> None:
     """J' W J (3, 3) and J' W e (3,) with W = truth (S + s_drift^2 I)^-1 and J = d(T p_b)/dT."""
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
-    normal = np.zeros((3, 3))
-    right = np.zeros(3)
+    nxx = nxy = nyy = nxt = nyt = ntt = rx = ry = rt = 0.0
     for i in range(len(e)):
         if truth[i] == 0:
             continue
+        ex, ey = e[i, 0], e[i, 1]
         xx, xy, yy = S[i, 0, 0] + variance_m2, S[i, 0, 1], S[i, 1, 1] + variance_m2
         scale = truth[i] / (xx * yy - xy * xy)
         wxx, wxy, wyy = scale * yy, -scale * xy, scale * xx
         jx, jy = lever(cos, sin, p_b, i)
-        wx, wy = wxx * e[i, 0] + wxy * e[i, 1], wxy * e[i, 0] + wyy * e[i, 1]
-        normal[0, 0] += wxx
-        normal[0, 1] += wxy
-        normal[1, 1] += wyy
-        normal[0, 2] += wxx * jx + wxy * jy
-        normal[1, 2] += wxy * jx + wyy * jy
-        normal[2, 2] += wxx * jx * jx + 2 * wxy * jx * jy + wyy * jy * jy
-        right[0] += wx
-        right[1] += wy
-        right[2] += jx * wx + jy * wy
-    normal[1, 0], normal[2, 0], normal[2, 1] = normal[0, 1], normal[0, 2], normal[1, 2]
-    return normal, right
+        wx, wy = wxx * ex + wxy * ey, wxy * ex + wyy * ey
+        nxx, nxy, nyy = nxx + wxx, nxy + wxy, nyy + wyy
+        nxt += wxx * jx + wxy * jy
+        nyt += wxy * jx + wyy * jy
+        ntt += wxx * jx * jx + 2 * wxy * jx * jy + wyy * jy * jy
+        rx, ry, rt = rx + wx, ry + wy, rt + (jx * wx + jy * wy)
+    right[0], right[1], right[2] = rx, ry, rt
+    normal[0, 0], normal[1, 1], normal[2, 2] = nxx, nyy, ntt
+    normal[0, 1] = normal[1, 0] = nxy
+    normal[0, 2] = normal[2, 0] = nxt
+    normal[1, 2] = normal[2, 1] = nyt
 
 
 @kernel_part
@@ -223,14 +229,14 @@ def take_missing_information(
     weights, `judged_m2` in the probabilities; e and S are those of `residuals_under`.
     """
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
-    missing = np.zeros((3, 3))
-    pull, turn = np.empty(3), np.empty(3)
+    missing, pull, turn = np.zeros((3, 3)), np.empty(3), np.empty(3)
     for i in range(len(e)):
         share = truth[i] * (1 - truth[i])
         if share == 0:
             continue
         jx, jy = lever(cos, sin, p_b, i)
-        for variance, force in ((weighed_m2, pull), (judged_m2, turn)):
+        for k in range(2):
+            variance, force = (judged_m2, turn) if k else (weighed_m2, pull)
             xx, xy, yy = S[i, 0, 0] + variance, S[i, 0, 1], S[i, 1, 1] + variance
             det = xx * yy - xy * xy
             force[0] = (yy * e[i, 0] - xy * e[i, 1]) / det
@@ -291,11 +297,11 @@ def maximise_likelihood(
     widest = (gate_m / _GATE_SIGMAS) ** 2
     variance, share = widest, 0.5
     step_share, last_change = 1.0, 0.0
-    covariance, step = np.empty((3, 3)), np.empty(3)
+    covariance, step, right = np.empty((3, 3)), np.empty(3), np.empty(3)
     for k in range(9):
         covariance[k // 3, k % 3] = math.nan
     moved, determined = math.inf, True
-    judged, weighed, normal, at = variance, variance, np.zeros((3, 3)), np.empty(3)
+    judged, weighed, normal, at = variance, variance, np.empty((3, 3)), np.empty(3)
     for rounds in range(max_rounds):
         if leaves_margin(T_a_b, T_near, gate_m, farthest):
             at_rows(near.inside, near.rows, inside_of_all)
@@ -306,7 +312,7 @@ def maximise_likelihood(
             _mark_inside(e, gate_m, inside)
         weighed, judged = variance, max(variance, least_drift_m * least_drift_m)
         total, count = truth_probabilities(e, S, judged, share, gate_m, inside, truth)
-        normal, right = normal_equations(T_a_b, some.p_b, e, S, variance, truth)
+        put_normal_equations(T_a_b, some.p_b, e, S, variance, truth, normal, right)
         determined = not total < 1.0 and invert(normal, covariance)
         if not determined:
             break
