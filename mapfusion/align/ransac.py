@@ -132,7 +132,7 @@ def refit(
     Motions are compared only after this: a raw minimal set can gain a false supporter by leaning
     towards it, with its true ones at the gate's edge.
     """
-    cost, none_to_beat = 0.0, 0 * count  # a plain 0 is a type of its own, and compiled for
+    cost, none_to_beat = 0.0, np.int64(0)  # a plain 0 is a type of its own, and compiled for
     before = np.empty(len(rows), np.int64)
     for _ in range(_LOCAL_ROUNDS):
         T_a_b[0], T_a_b[1], T_a_b[2] = fit_rigid(p_a, p_b, rows[:count])
@@ -168,7 +168,7 @@ def most_supported(
     n = len(p_a)
     best_T, T_a_b = np.full(3, np.nan), np.empty(3)
     rows, best_rows = np.empty(n, np.int64), np.empty(n, np.int64)
-    best_count, best_cost = 0, math.inf
+    best_count, best_cost = np.int64(0), math.inf  # a plain 0 is of a type of its own at first
     needed = float(max_draws)
     draws = 0
     state = seed

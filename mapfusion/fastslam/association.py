@@ -3,6 +3,7 @@
 An observation takes at most one landmark in a frame, and a landmark at most one observation.
 """
 
+import math
 from collections.abc import Mapping
 from enum import StrEnum
 from typing import NamedTuple
@@ -38,18 +39,20 @@ class Pairs(NamedTuple):
 @kernel(error_model="numpy")
 def boxes_of(seen: Sightings, gate: float) -> Float:
     """Boxes (K, 4) of observations and their gates over all particles."""
-    boxes = np.empty((len(seen.point_m), 4))
+    point, noise = seen
+    boxes = np.empty((len(point), 4))
     for k in range(len(boxes)):
-        point, noise, box = seen.point_m[k], seen.covariance_m2[k], boxes[k]
-        box[:2], box[2:] = np.inf, -np.inf
+        low_x = low_y = math.inf
+        high_x = high_y = -math.inf
         spread_x = spread_y = 0.0
-        for m in range(len(point)):
-            box[0], box[1] = min(box[0], point[m, 0]), min(box[1], point[m, 1])
-            box[2], box[3] = max(box[2], point[m, 0]), max(box[3], point[m, 1])
-            spread_x, spread_y = max(spread_x, noise[m, 0]), max(spread_y, noise[m, 3])
-        margin_x, margin_y = np.sqrt(gate * spread_x), np.sqrt(gate * spread_y)
-        box[0], box[1] = box[0] - margin_x, box[1] - margin_y
-        box[2], box[3] = box[2] + margin_x, box[3] + margin_y
+        for m in range(point.shape[1]):
+            x, y = point[k, m, 0], point[k, m, 1]
+            low_x, low_y = min(low_x, x), min(low_y, y)
+            high_x, high_y = max(high_x, x), max(high_y, y)
+            spread_x, spread_y = max(spread_x, noise[k, m, 0]), max(spread_y, noise[k, m, 3])
+        margin_x, margin_y = math.sqrt(gate * spread_x), math.sqrt(gate * spread_y)
+        boxes[k, 0], boxes[k, 1] = low_x - margin_x, low_y - margin_y
+        boxes[k, 2], boxes[k, 3] = high_x + margin_x, high_y + margin_y
     return boxes
 
 

@@ -36,15 +36,21 @@ def sightings(
     shape = (len(position_m), len(T_map_robot))
     seen = Sightings(np.empty((*shape, 3)), np.empty((*shape, 6)))
     position, covariance = np.ascontiguousarray(position_m), np.ascontiguousarray(covariance_m2)
-    _turn_into_map(T_map_robot, position, covariance, planar, seen)
+    turn = T_map_robot[:, 2]
+    _turn_into_map(T_map_robot, np.cos(turn), np.sin(turn), position, covariance, planar, seen)
     return seen
 
 
 @kernel(error_model="numpy")
 def _turn_into_map(
-    T_map_robot: Float, position: Float, covariance: Float, planar: bool, seen: Sightings
+    T_map_robot: Float,
+    cos: Float,
+    sin: Float,
+    position: Float,
+    covariance: Float,
+    planar: bool,
+    seen: Sightings,
 ) -> None:
-    cos, sin = np.cos(T_map_robot[:, 2]), np.sin(T_map_robot[:, 2])
     for k in range(len(position)):
         x, y, z = position[k, 0], position[k, 1], position[k, 2]
         xx, xy, xz = covariance[k, 0, 0], covariance[k, 0, 1], covariance[k, 0, 2]
