@@ -46,7 +46,8 @@ class Grid(NamedTuple):
         shape = (extent_m / cell_m).astype(np.int64) + 1
         column = ((x - corner_m[0]) / cell_m).astype(np.int64)
         cell = ((y - corner_m[1]) / cell_m).astype(np.int64) * shape[0] + column
-        row = np.argsort(cell, kind="stable")
+        # of short numbers NumPy sorts by digits
+        row = np.argsort(cell.astype(np.min_scalar_type(shape[0] * shape[1])), kind="stable")
         start = np.zeros(shape[0] * shape[1] + 1, np.int64)
         np.cumsum(np.bincount(cell, minlength=len(start) - 1), out=start[1:])
         return cls(p[row], row, start, corner_m, cell_m, shape)

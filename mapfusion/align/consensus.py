@@ -67,7 +67,7 @@ class Consensus:
     def _settle(self, T_a_b: Float, pairs: Pairs, planar: PlanarPairs) -> Fit | Undetermined:
         inlier, level = np.zeros(len(pairs), dtype=bool), -1
         if np.all(np.isfinite(T_a_b)):
-            given = planar, Spread.of(planar), self.variances_m2, self.bound
+            given = planar, spread_of(pairs), self.variances_m2, self.bound
             _, level = settle_at_best_scale(T_a_b, *given, inlier)
         return self.fit_of(T_a_b, inlier, level, pairs, planar)
 
@@ -85,3 +85,10 @@ class Consensus:
             return Undetermined(reason)
         weight = 1 / mean_variances(planar, variance_m2)[inlier]
         return Fit(T_a_b, inlier, weight=weight, fitted=support)
+
+
+def spread_of(pairs: Pairs) -> Spread:
+    """What no motion changes, of the last call with these pairs if there was one."""
+    if Spread not in pairs.kept:
+        pairs.kept[Spread] = Spread.of(pairs.in_plan())
+    return pairs.kept[Spread]

@@ -30,12 +30,12 @@ def lacks_extent(p: Float, covariance_m2: Float, drift_m2: float, dimensions: in
 
 def _moments(p: Float, covariance_m2: Float) -> tuple[Float, Float, float]:
     """In plan: scatter about the mean (2, 2), mean covariance (2, 2), largest coordinate."""
-    x, y = p[:, 0], p[:, 1]
-    off = np.stack([x - x[0], y - y[0]])  # far from the origin as exact as near it
-    share = np.full(len(p), 1 / len(p))
+    n, in_plan = len(p), np.ascontiguousarray(p.T[:2])
+    share = np.full(n, 1 / n)
+    off = in_plan - in_plan[:, :1]  # far from the origin as exact as near it
     off -= (off @ share)[:, None]
-    mean = (share @ covariance_m2.reshape(len(p), -1)).reshape(covariance_m2.shape[1:])
-    return off @ off.T, mean[:2, :2], max(x.max(), -x.min(), y.max(), -y.min())
+    mean = (share @ covariance_m2.reshape(n, -1)).reshape(covariance_m2.shape[1:])
+    return off @ off.T, mean[:2, :2], np.abs(in_plan).max()
 
 
 def why_one_place(pairs: Pairs, drift_m2: float = 0.0) -> str:

@@ -106,11 +106,14 @@ class Pairs:
 
     @cached_property
     def _plan(self) -> PlanarPairs:
-        points, covariances = (self.p_a, self.p_b), (self.covariance_a, self.covariance_b)
-        return PlanarPairs(
-            *(np.ascontiguousarray(p[:, :2]) for p in points),
-            *(np.ascontiguousarray(S[:, :2, :2]) for S in covariances),
-        )
+        n = len(self)
+        plan = PlanarPairs(*np.empty((2, n, 2)), *np.empty((2, n, 2, 2)))
+        for part, whole in zip(plan[:2], (self.p_a, self.p_b), strict=True):
+            part[:, 0], part[:, 1] = whole[:, 0], whole[:, 1]
+        for part, whole in zip(plan[2:], (self.covariance_a, self.covariance_b), strict=True):
+            part[:, 0, 0], part[:, 0, 1] = whole[:, 0, 0], whole[:, 0, 1]
+            part[:, 1, 0], part[:, 1, 1] = whole[:, 1, 0], whole[:, 1, 1]
+        return plan
 
     def of_one_height(self, gate: HeightGate) -> np.ndarray:
         """Rows (n,) of the pairs whose heights agree; of planar maps all."""

@@ -6,9 +6,9 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from mapfusion.align.consensus import Consensus
+from mapfusion.align.consensus import Consensus, spread_of
 from mapfusion.align.consistency import drift_needed, in_rows
-from mapfusion.align.mahalanobis_gate import PlanarPairs, mark_supporters, mean_variances, settle
+from mapfusion.align.mahalanobis_gate import PlanarPairs, mark_supporters, settle
 from mapfusion.align.method import Fit, Undetermined
 from mapfusion.align.pairs import Pairs
 from mapfusion.align.ransac import draw_pair
@@ -43,10 +43,12 @@ class RansacMahalanobis(Consensus):
     def find(self, pairs: Pairs, rng: np.random.Generator) -> Fit | Undetermined:
         """T_a_b of the best minimal set at the largest s_drift, settled on its support."""
         planar = pairs.in_plan()
+        if RansacMahalanobis not in pairs.kept:
+            pairs.kept[RansacMahalanobis] = in_rows(planar)
         _, T_a_b = least_truncated_squares(
             planar,
-            mean_variances(planar),
-            in_rows(planar),
+            spread_of(pairs).own_m2,
+            pairs.kept[RansacMahalanobis],
             self.variances_m2[-1],
             self.bound,
             chi_square_bound(self.probability, 1),
