@@ -13,7 +13,6 @@ import numpy as np
 import scipy.linalg
 
 from mapfusion.arguments import require_finite, require_shape
-from mapfusion.kernels import kernel
 from mapfusion.se2 import Float
 
 # Of the shared variables that a log gives, three a frame, as many are kept: their variances fall
@@ -64,7 +63,7 @@ class JointCovariance:
     @property
     def marginal_m2(self) -> Float:
         """(N, 3, 3) covariance of each landmark for itself."""
-        return self.own_m2 + np.swapaxes(self.common_m, 1, 2) @ self.common_m
+        return self.own_m2 + _squares(self.common_m)
 
     def dense_m2(self) -> Float:
         """(3N, 3N), for small maps."""
@@ -131,7 +130,7 @@ class KnownErrors:
 
     def squares(self) -> Float:
         """(N, 3, 3) blocks of Y' Y, each landmark's with itself."""
-        return _squares(self.common, self.common.shape[1] // 3)
+        return _squares(_by_landmark(self.common))
 
 
 def condensed(own_m2: Float, common: Float | SharedErrors, rank: int = RANK) -> JointCovariance:
@@ -143,7 +142,6 @@ def condensed(own_m2: Float, common: Float | SharedErrors, rank: int = RANK) -> 
     """
     if isinstance(common, np.ndarray):
         common = KnownErrors(common)
-    n = len(own_m2)
     if len(common) > rank:
         n_start = min(rank + _TO_SPARE, len(common))
         rows = np.linspace(0, len(common) - 1, n_start).round().astype(int)
@@ -156,8 +154,8 @@ def condensed(own_m2: Float, common: Float | SharedErrors, rank: int = RANK) -> 
         kept = largest.T @ within
     else:
         kept = common.spread(np.eye(len(common))).T
-    by_landmark = np.ascontiguousarray(kept.reshape(len(kept), n, 3).transpose(1, 0, 2))
-    return JointCovariance(own_m2 + common.squares() - _squares(kept, n), by_landmark)
+    moved = _by_landmark(kept)
+    return JointCovariance(own_m2 + common.squares() - _squares(moved), moved)
 
 
 def _orthonormal(columns: Float) -> Float:
@@ -177,21 +175,11 @@ def _orthonormal(columns: Float) -> Float:
     return basis
 
 
-@kernel
-def _squares(common: Float, n: int) -> Float:
-    """(N, 3, 3) covariance that common (R, 3N) gives each landmark."""
-    total = np.zeros((n, 3, 3))
-    for r in range(len(common)):
-        row = common[r]
-        for k in range(n):
-            x, y, z = row[3 * k], row[3 * k + 1], row[3 * k + 2]
-            own = total[k]
-            own[0, 0] += x * x
-            own[1, 0] += y * x
-            own[1, 1] += y * y
-            own[2, 0] += z * x
-            own[2, 1] += z * y
-            own[2, 2] += z * z
-    for own in total:
-        own[0, 1], own[0, 2], own[1, 2] = own[1, 0], own[2, 0], own[2, 1]
-    return total
+def _squares(by_landmark: Float) -> Float:
+    """(N, 3, 3) covariance that each landmark has of what shared variables do to it (N, R, 3)."""
+    return np.swapaxes(by_landmark, 1, 2) @ by_landmark
+
+
+def _by_landmark(common: Float) -> Float:
+    """(N, R, 3) of (R, 3N)."""
+    return np.ascontiguousarray(common.reshape(len(common), -1, 3).transpose(1, 0, 2))

@@ -2,11 +2,11 @@
 
 import math
 
-from mapfusion.kernels import kernel
+from mapfusion.kernels import inner_kernel
 from mapfusion.se2 import Float
 
 
-@kernel
+@inner_kernel
 def cofactors(
     xx: float, xy: float, xz: float, yy: float, yz: float, zz: float
 ) -> tuple[float, float, float, float, float, float, float]:
@@ -16,7 +16,7 @@ def cofactors(
     return axx, axy, axz, ayy, ayz, azz, xx * axx + xy * axy + xz * axz
 
 
-@kernel
+@inner_kernel
 def copy_lower(matrix: Float, copy: Float) -> None:
     """Put the lower half of a matrix into another, which Numba's `copy[:] = matrix` would, too.
 
@@ -27,7 +27,7 @@ def copy_lower(matrix: Float, copy: Float) -> None:
             copy[i, j] = matrix[i, j]
 
 
-@kernel
+@inner_kernel
 def cholesky(matrix: Float, singular: float) -> bool:
     """Lower factor of a symmetric matrix in place, of which the lower half is read.
 
@@ -48,7 +48,7 @@ def cholesky(matrix: Float, singular: float) -> bool:
     return True
 
 
-@kernel
+@inner_kernel
 def solve_lower(factor: Float, x: Float) -> None:
     """Solve factor y = x in place."""
     for i in range(len(x)):
@@ -57,7 +57,7 @@ def solve_lower(factor: Float, x: Float) -> None:
         x[i] /= factor[i, i]
 
 
-@kernel
+@inner_kernel
 def solve_upper(factor: Float, x: Float) -> None:
     """Solve factor^T y = x in place."""
     for i in range(len(x) - 1, -1, -1):

@@ -1,4 +1,7 @@
-"""Parts of kernels: they are put into few places, all of which divide by zero as they do."""
+"""Parts of kernels and inner kernels: who calls them.
+
+Parts are put into few places, all of which divide by zero as they do.
+"""
 
 import ast
 from collections import defaultdict
@@ -8,6 +11,8 @@ import pytest
 from experiments.run.code_version import PACKAGES, SOURCE_ROOT
 
 _MOST_COPIED = 20  # statements; more of them take longer to compile than a kernel apart
+
+KERNELS = {"kernel", "inner_kernel", "kernel_part"}  # decorators
 
 Named = tuple[str, str]  # a module and a function
 
@@ -30,14 +35,20 @@ def decorator(node: ast.FunctionDef) -> tuple[str, str]:
     return name, options
 
 
+def meant_in(module: str) -> dict[str, Named]:
+    """The functions that names stand for in a module: its own, and those it imports."""
+    meant = {name: (home, name) for home, name in FUNCTIONS if home == module}
+    for node in ast.walk(TREES[module]):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            meant |= {one.name: (node.module, one.name) for one in node.names}
+    return meant
+
+
 def found_uses() -> dict[Named, list[ast.FunctionDef]]:
     """By function, the functions that name it, once for each time that they do."""
     uses = defaultdict[Named, list[ast.FunctionDef]](list)
     for module, tree in TREES.items():
-        meant = {name: (home, name) for home, name in FUNCTIONS if home == module}
-        for node in ast.walk(tree):
-            if isinstance(node, ast.ImportFrom) and node.module:
-                meant |= {one.name: (node.module, one.name) for one in node.names}
+        meant = meant_in(module)
         for caller in (node for node in tree.body if isinstance(node, ast.FunctionDef)):
             for node in ast.walk(caller):
                 if isinstance(node, ast.Name) and node.id in meant:
@@ -58,9 +69,32 @@ def test_a_part_is_called_by_kernels_alone_that_divide_as_it_does(part: Named) -
     _, options = decorator(FUNCTIONS[part])
     callers = {decorator(caller) for caller in USES[part]}
     assert callers
-    assert callers <= {("kernel", options), ("kernel_part", options)}
+    assert callers <= {(kind, options) for kind in KERNELS}
 
 
 @pytest.mark.parametrize("part", PARTS, ids=".".join)
 def test_a_part_that_is_called_at_several_places_is_short(part: Named) -> None:
     assert (len(USES[part]) - 1) * len(FUNCTIONS[part].body) <= _MOST_COPIED
+
+
+INNER = {named for named, node in FUNCTIONS.items() if decorator(node)[0] == "inner_kernel"}
+
+
+def test_inner_kernels_are_found() -> None:
+    assert len(INNER) > 30
+
+
+@pytest.mark.parametrize("module", TREES)
+def test_an_inner_kernel_is_called_by_kernels_alone(module: str) -> None:
+    """Elsewhere it is named only for the function that it was made of (`py_func`)."""
+    meant, allowed = meant_in(module), set[ast.AST]()
+    for node in ast.walk(TREES[module]):
+        if isinstance(node, ast.FunctionDef) and decorator(node)[0] in KERNELS:
+            allowed.update(ast.walk(node))
+        if isinstance(node, ast.Attribute) and node.attr == "py_func":
+            allowed.add(node.value)
+    assert not [
+        (node.id, node.lineno)
+        for node in ast.walk(TREES[module])
+        if isinstance(node, ast.Name) and meant.get(node.id) in INNER and node not in allowed
+    ]

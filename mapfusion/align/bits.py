@@ -7,7 +7,7 @@ import numpy as np
 from numba import types
 from numba.extending import intrinsic
 
-from mapfusion.kernels import kernel, kernel_part
+from mapfusion.kernels import inner_kernel, kernel, kernel_part
 
 WORD = 64
 
@@ -42,7 +42,7 @@ trailing_zeros = cast(Callable[[Any], int], _trailing_zeros)
 ones = cast(Callable[[Any], int], _ones)
 
 
-@kernel
+@inner_kernel
 def count_common(first: np.ndarray, second: np.ndarray) -> int:
     """Size of the intersection of two sets (W,) uint64."""
     count = 0
@@ -51,7 +51,7 @@ def count_common(first: np.ndarray, second: np.ndarray) -> int:
     return count
 
 
-@kernel
+@inner_kernel
 def packed(eights: np.ndarray, w: int) -> np.uint64:
     """Word w of a set whose members are bytes of 1, the others 0; `eights` are eight bytes each."""
     word = np.uint64(0)

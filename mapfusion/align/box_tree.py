@@ -5,12 +5,10 @@ Landmarks lie on walls. A box about a piece of wall is flat, so a point that is 
 empty cells between.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 
-from mapfusion.kernels import kernel
 from mapfusion.se2 import Float
 
 _POINTS_PER_LEAF = 16  # at most; a box to be asked costs as much as some points of a leaf
@@ -19,13 +17,14 @@ _POINTS_PER_LEAF = 16  # at most; a box to be asked costs as much as some points
 class BoxTree(NamedTuple):
     """N points, in the order of the leaves, and boxes about them, for the kernels.
 
-    Node 0 holds all points; the halves of node k are nodes 2k + 1 and 2k + 2.
+    Node 0 holds all points; the halves of node k are nodes 2k + 1 and 2k + 2. The first leaves are
+    full, those behind the last point are empty.
 
     Attributes:
         p: (N, 3) the points.
         x, y, z: (N,) their coordinates, each by itself.
         row: (N,) where each was in the array given.
-        box: (M, 6) lower corner and upper corner of each node.
+        box: (M, 6) lower corner and upper corner of each node; of an empty one inf and -inf.
         first, end: (M,) first point of each node, and one behind the last.
     """
 
@@ -41,64 +40,46 @@ class BoxTree(NamedTuple):
     @classmethod
     def of(cls, p: Float) -> "BoxTree":
         """Tree over points (N, 3)."""
-        return _boxes_about(np.ascontiguousarray(p))
+        rows, boxes, ends = in_leaves(p, -(-len(p) // n_leaves_of(len(p), _POINTS_PER_LEAF)))
+        in_order = p[rows]
+        x, y, z = np.ascontiguousarray(in_order.T)
+        return cls(in_order, x, y, z, rows, boxes, ends[0], ends[1])
 
 
-@kernel
-def _boxes_about(p: Float) -> BoxTree:
-    n, n_leaves = len(p), 1
-    while n > n_leaves * _POINTS_PER_LEAF:
+def n_leaves_of(n: int, size: int) -> int:
+    """How many leaves n points take if each may hold so many: a power of two."""
+    n_leaves = 1
+    while n > n_leaves * size:
         n_leaves *= 2
-    n_nodes = 2 * n_leaves - 1
-    row, box = np.arange(n), np.empty((n_nodes, 6))
-    first, end = np.zeros(n_nodes, np.int64), np.zeros(n_nodes, np.int64)
-    end[0] = n
-    for node in range(n_nodes):
-        widest, extent = 0, -math.inf
-        for axis in range(3):
-            low, high = span(p, row, first[node], end[node], axis)
-            box[node, axis], box[node, 3 + axis] = low, high
-            if high - low > extent:
-                widest, extent = axis, high - low
-        if node < n_leaves - 1:
-            middle = (first[node] + end[node]) // 2
-            halve(p[:, widest], row, first[node], end[node], middle)
-            first[2 * node + 1], end[2 * node + 1] = first[node], middle
-            first[2 * node + 2], end[2 * node + 2] = middle, end[node]
-    in_order = p[row]
-    x, y, z = in_order[:, 0].copy(), in_order[:, 1].copy(), in_order[:, 2].copy()
-    return BoxTree(in_order, x, y, z, row, box, first, end)
+    return n_leaves
 
 
-@kernel
-def span(p: Float, row: np.ndarray, first: int, end: int, axis: int) -> tuple[float, float]:
-    """The least and the greatest coordinate of the points row[first:end] of p (N, D)."""
-    low, high = math.inf, -math.inf
-    for k in range(first, end):
-        low, high = min(low, p[row[k], axis]), max(high, p[row[k], axis])
-    return low, high
+def in_leaves(p: Float, size: int) -> tuple[np.ndarray, Float, np.ndarray]:
+    """Points (N, 3) halved along the longest side of their box until `size` are left or fewer.
 
+    The lower half is filled first, so that of all leaves with points only the last is not full.
 
-@kernel
-def halve(x: Float, row: np.ndarray, first: int, end: int, middle: int) -> None:
-    """Put row[first:end] so that x of none before `middle` is larger than x of any from there on.
-
-    Quickselect (Hoare 1961).
+    Returns:
+        (N,) rows of p, leaf by leaf; and of all nodes, the root first, the boxes (M, 6) and from
+        where to where their points are (2, M).
     """
-    low, high = first, end - 1
-    while low < high:
-        pivot, i, j = x[row[(low + high) // 2]], low, high
-        while i <= j:
-            while x[row[i]] < pivot:
-                i += 1
-            while x[row[j]] > pivot:
-                j -= 1
-            if i <= j:
-                row[i], row[j] = row[j], row[i]
-                i, j = i + 1, j - 1
-        if middle <= j:
-            high = j
-        elif middle >= i:
-            low = i
-        else:
-            return
+    n_leaves = n_leaves_of(len(p), max(size, 1))
+    # what there are too few of is beyond all others
+    held = np.full((4, 1, n_leaves * max(size, 1)), np.nan)
+    held[:3, 0, : len(p)], held[3, 0, : len(p)] = p.T, np.arange(len(p))
+    boxes, ranges = list[Float](), list[np.ndarray]()
+    while True:
+        lower, upper = np.fmin.reduce(held[:3], axis=2), np.fmax.reduce(held[:3], axis=2)
+        boxes.append(np.concatenate([lower, upper]).T)
+        n_nodes, n_held = held.shape[1:]
+        first = n_held * np.arange(n_nodes)
+        ranges.append(np.minimum([first, first + n_held], len(p)))
+        if n_nodes == n_leaves:
+            break
+        along = held[np.argmax(upper - lower, axis=0), np.arange(n_nodes)]
+        order = np.argpartition(along, n_held // 2, axis=1)
+        held = np.take_along_axis(held, order[None], axis=2).reshape(4, 2 * n_nodes, n_held // 2)
+    box, rows = np.concatenate(boxes), held[3].ravel()
+    empty = np.isnan(box[:, 0])
+    box[empty, :3], box[empty, 3:] = np.inf, -np.inf
+    return rows[~np.isnan(rows)].astype(np.int64), box, np.concatenate(ranges, axis=1)

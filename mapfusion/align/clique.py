@@ -5,11 +5,21 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from mapfusion.align.bits import WORD
 from mapfusion.align.consensus import Consensus
-from mapfusion.align.consistency import consistency
-from mapfusion.align.mahalanobis_gate import PlanarPairs, settle, settle_at_best_scale
-from mapfusion.align.max_clique import everyone, greedy_clique, larger_clique, may_hold
+from mapfusion.align.consistency import consistency, in_rows
+from mapfusion.align.mahalanobis_gate import (
+    PlanarPairs,
+    Spread,
+    settle,
+    settle_at_best_scale,
+)
+from mapfusion.align.max_clique import (
+    everyone,
+    greedy_clique,
+    larger_clique,
+    may_hold,
+    set_of,
+)
 from mapfusion.align.method import Fit, Undetermined
 from mapfusion.align.pairs import Pairs
 from mapfusion.align.rigid import fit_rigid
@@ -86,6 +96,7 @@ class CliqueSearch:
 
     def __init__(self, clique: Clique, pairs: PlanarPairs) -> None:
         self._pairs, self._bound, self._variances_m2 = pairs, clique.bound, clique.variances_m2
+        self._rows, self._spread = in_rows(pairs), Spread.of(pairs)
         self._scales_m2 = float(self._variances_m2[0]), float(self._variances_m2[-1])
         self._agreement = chi_square_bound(clique.agreement_probability, 1)
         self._max_nodes = clique.max_nodes
@@ -96,10 +107,7 @@ class CliqueSearch:
 
     def graphs(self, rows: np.ndarray) -> np.ndarray:
         """Which of some pairs (n,) agree (2, n, W): without s_drift, and with it."""
-        among = self._pairs
-        if len(rows) < len(among.p_a):
-            among = PlanarPairs(*(np.ascontiguousarray(part[rows]) for part in self._pairs))
-        return consistency(among, self._scales_m2, self._agreement)
+        return consistency(self._rows[rows], self._scales_m2, self._agreement)
 
     def offer_greedy(self, rows: np.ndarray, least: int = 2) -> np.ndarray:
         """Offer a greedy clique of some pairs (n,) at either scale, of no fewer than `least`.
@@ -122,7 +130,7 @@ class CliqueSearch:
             return
         pairs, scales, bound = self._pairs, self._variances_m2, self._bound
         T_a_b, inside = np.array(fit_rigid(pairs.p_a, pairs.p_b, clique)), np.empty_like(self.near)
-        log, level = settle_at_best_scale(T_a_b, pairs, scales, bound, inside)
+        log, level = settle_at_best_scale(T_a_b, pairs, self._spread, scales, bound, inside)
         if log > self._log:
             self.T_a_b, self.inside, self.level, self._log = T_a_b, inside, level, log
             self.near = self.support(1)
@@ -131,7 +139,8 @@ class CliqueSearch:
         """Which pairs (N,) support the likeliest motion, settled at a scale; none before."""
         inside = np.zeros(len(self._pairs.p_a), np.bool_)
         if self.level >= 0:
-            settle(self.T_a_b.copy(), self._pairs, self._scales_m2[scale], self._bound, inside)
+            given = self._pairs, self._spread.own_m2, self._scales_m2[scale], self._bound
+            settle(self.T_a_b.copy(), *given, inside)
         return inside
 
     def is_plain(self) -> bool:
@@ -149,7 +158,7 @@ class CliqueSearch:
         graphs = [self.offer_greedy(rows) for rows in parts]
         size = int(np.count_nonzero(self.near)) // (2 * len(parts))
         for rows, graph in zip(parts, graphs, strict=True):
-            others = _set_of(~self.near[rows])
+            others = set_of(~self.near[rows])
             clique, finished = larger_clique(graph[1], others, size, self._max_nodes)
             if len(clique) or not finished:
                 return False
@@ -163,13 +172,6 @@ class CliqueSearch:
         for scale, graph in enumerate(self.graphs(rows)):
             greedy = greedy_clique(graph, _GREEDY_STARTS)
             self.offer(greedy)
-            if may_hold(graph, _set_of(~self.near), int(np.count_nonzero(self.near)) // 2):
+            if may_hold(graph, set_of(~self.near), int(np.count_nonzero(self.near)) // 2):
                 at_least = max(int(np.count_nonzero(self.support(scale))), len(greedy))
                 self.offer(larger_clique(graph, everyone(len(rows)), at_least, self._max_nodes)[0])
-
-
-def _set_of(chosen: np.ndarray) -> np.ndarray:
-    """The pairs that are marked (N,) as bits of words (W,)."""
-    bits = np.zeros(-(-len(chosen) // WORD) * WORD, np.bool_)
-    bits[: len(chosen)] = chosen
-    return np.packbits(bits, bitorder="little").view("<u8")

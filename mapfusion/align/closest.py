@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapfusion.kernels import kernel
+from mapfusion.kernels import inner_kernel
 from mapfusion.se2 import Float
 
 _WIDER = 1 + 1e-6  # than the radius asked for, so that rounding leaves out no point on its edge
@@ -34,44 +34,26 @@ class Grid(NamedTuple):
     @classmethod
     def of(cls, p: Float) -> "Grid":
         """Grid over points (N, 2 or 3)."""
-        return _sorted_into_cells(np.ascontiguousarray(p))
+        n, (x, y) = len(p), np.ascontiguousarray(p[:, :2].T)
+        corner_m, extent_m, cell_m = np.zeros(2), np.zeros(2), 1.0
+        if n:
+            corner_m = np.array([x.min(), y.min()])
+            extent_m = np.array([x.max(), y.max()]) - corner_m
+        if extent_m.any():
+            # a line or a point has no area; cells as long as its share of the longer side do
+            area = extent_m[0] * extent_m[1]
+            cell_m = max(math.sqrt(area * _LANDMARKS_PER_CELL / n), float(extent_m.max()) / n)
+        shape = (extent_m / cell_m).astype(np.int64) + 1
+        column = ((x - corner_m[0]) / cell_m).astype(np.int64)
+        cell = ((y - corner_m[1]) / cell_m).astype(np.int64) * shape[0] + column
+        # of short numbers NumPy sorts by digits
+        row = np.argsort(cell.astype(np.min_scalar_type(shape[0] * shape[1])), kind="stable")
+        start = np.zeros(shape[0] * shape[1] + 1, np.int64)
+        np.cumsum(np.bincount(cell, minlength=len(start) - 1), out=start[1:])
+        return cls(p[row], row, start, corner_m, cell_m, shape)
 
 
-@kernel
-def _sorted_into_cells(p: Float) -> Grid:
-    n = len(p)
-    corner_m, extent_m = np.zeros(2), np.zeros(2)
-    for axis in range(2):
-        low, high = math.inf, -math.inf
-        for i in range(n):
-            low, high = min(low, p[i, axis]), max(high, p[i, axis])
-        if n > 0:
-            corner_m[axis], extent_m[axis] = low, high - low
-    cell_m = 1.0
-    if extent_m[0] > 0 or extent_m[1] > 0:
-        # a line or a point has no area; cells as long as its share of the longer side do
-        area = extent_m[0] * extent_m[1]
-        cell_m = max(math.sqrt(area * _LANDMARKS_PER_CELL / n), max(extent_m[0], extent_m[1]) / n)
-    nx, ny = int(extent_m[0] / cell_m) + 1, int(extent_m[1] / cell_m) + 1
-    cell, start = np.empty(n, np.int64), np.zeros(nx * ny + 1, np.int64)
-    for i in range(n):
-        x, y = int((p[i, 0] - corner_m[0]) / cell_m), int((p[i, 1] - corner_m[1]) / cell_m)
-        cell[i] = y * nx + x
-        start[cell[i] + 1] += 1
-    for k in range(nx * ny):
-        start[k + 1] += start[k]
-    next_free = start.copy()
-    sorted_p, row = np.empty_like(p), np.empty(n, np.int64)
-    for i in range(n):
-        k = next_free[cell[i]]
-        next_free[cell[i]] += 1
-        row[k] = i
-        for axis in range(p.shape[1]):
-            sorted_p[k, axis] = p[i, axis]
-    return Grid(sorted_p, row, start, corner_m, cell_m, np.array([nx, ny]))
-
-
-@kernel
+@inner_kernel
 def _cells(middle: float, radius: float, corner: float, cell: float, cells: int) -> tuple[int, int]:
     """First cell that an interval meets along one axis, and one behind the last."""
     wider = radius * _WIDER
@@ -80,7 +62,7 @@ def _cells(middle: float, radius: float, corner: float, cell: float, cells: int)
     return (int(first), int(last) + 1) if first <= last else (0, 0)
 
 
-@kernel
+@inner_kernel
 def runs_about(x: float, y: float, radius_m: float, grid: Grid, runs: np.ndarray) -> int:
     """Ranges of grid.p with all points within a radius of (x, y), and others.
 

@@ -8,7 +8,12 @@ import numpy as np
 from mapfusion.align.correspondences import HeightGate
 from mapfusion.align.degeneracy import why_one_place
 from mapfusion.align.drift import DRIFT_FLOOR_M
-from mapfusion.align.mahalanobis_gate import PlanarPairs, mean_variances, settle_at_best_scale
+from mapfusion.align.mahalanobis_gate import (
+    PlanarPairs,
+    Spread,
+    mean_variances,
+    settle_at_best_scale,
+)
 from mapfusion.align.method import Fit, Undetermined
 from mapfusion.align.pairs import Pairs
 from mapfusion.arguments import Probability, Range, require_in_range
@@ -62,7 +67,8 @@ class Consensus:
     def _settle(self, T_a_b: Float, pairs: Pairs, planar: PlanarPairs) -> Fit | Undetermined:
         inlier, level = np.zeros(len(pairs), dtype=bool), -1
         if np.all(np.isfinite(T_a_b)):
-            _, level = settle_at_best_scale(T_a_b, planar, self.variances_m2, self.bound, inlier)
+            given = planar, spread_of(pairs), self.variances_m2, self.bound
+            _, level = settle_at_best_scale(T_a_b, *given, inlier)
         return self.fit_of(T_a_b, inlier, level, pairs, planar)
 
     def fit_of(
@@ -79,3 +85,10 @@ class Consensus:
             return Undetermined(reason)
         weight = 1 / mean_variances(planar, variance_m2)[inlier]
         return Fit(T_a_b, inlier, weight=weight, fitted=support)
+
+
+def spread_of(pairs: Pairs) -> Spread:
+    """What no motion changes, of the last call with these pairs if there was one."""
+    if Spread not in pairs.kept:
+        pairs.kept[Spread] = Spread.of(pairs.in_plan())
+    return pairs.kept[Spread]

@@ -11,7 +11,7 @@ import numpy as np
 
 from mapfusion.align.bits import WORD, mirror, packed, trailing_zeros
 from mapfusion.align.mahalanobis_gate import PlanarPairs
-from mapfusion.kernels import kernel, kernel_part
+from mapfusion.kernels import inner_kernel, kernel, kernel_part
 from mapfusion.se2 import Float
 
 # What single precision may add to the difference of two distances: coordinates of at most 1, read
@@ -21,16 +21,6 @@ _ROUNDING = 16 * 2.0**-24
 # closely pays for a rounding r that is larger than it.
 _SHARE = 1 / 16
 _LEAST_EXTENT_M = 1e-6  # of a map: all its landmarks in one place must not divide by zero
-
-
-@kernel
-def largest_variances(S: Float) -> Float:
-    """Larger eigenvalue (N,) of covariances (N, 2, 2): the variance in the worst direction."""
-    largest = np.empty(len(S))
-    for i in range(len(S)):
-        xx, xy, yy = S[i, 0, 0], S[i, 0, 1], S[i, 1, 1]
-        largest[i] = (xx + yy) / 2 + math.hypot((xx - yy) / 2, xy)
-    return largest
 
 
 class _Coarse(NamedTuple):
@@ -49,16 +39,18 @@ class _Coarse(NamedTuple):
 
 
 @kernel_part
-def _coarse(pairs: PlanarPairs, variance_m2: float, bound: float) -> _Coarse:
+def _worst(xx: float, xy: float, yy: float) -> float:
+    """Larger eigenvalue of a covariance: the variance in the worst direction."""
+    return (xx + yy) / 2 + math.hypot((xx - yy) / 2, xy)
+
+
+@kernel_part
+def _coarse(rows: Float, variance_m2: float, bound: float) -> _Coarse:
     """The pairs under their landmarks' worst variances, so that rounding loses none."""
-    p_a, p_b, S_a, S_b = pairs
-    n = len(p_a)
-    extent = _LEAST_EXTENT_M
+    n, extent = len(rows), _LEAST_EXTENT_M
     for i in range(n):
-        for axis in range(2):
-            extent = max(extent, abs(p_a[i, axis] - p_a[0, axis]))
-            extent = max(extent, abs(p_b[i, axis] - p_b[0, axis]))
-    worst_a, worst_b = largest_variances(S_a), largest_variances(S_b)
+        for k in range(4):
+            extent = max(extent, abs(rows[i, k] - rows[0, k]))
     coarse = _Coarse(
         np.empty(n, np.float32),
         np.empty(n, np.float32),
@@ -67,11 +59,13 @@ def _coarse(pairs: PlanarPairs, variance_m2: float, bound: float) -> _Coarse:
         np.empty(n, np.float32),
     )
     for i in range(n):
-        coarse.ax[i] = (p_a[i, 0] - p_a[0, 0]) / extent
-        coarse.ay[i] = (p_a[i, 1] - p_a[0, 1]) / extent
-        coarse.bx[i] = (p_b[i, 0] - p_b[0, 0]) / extent
-        coarse.by[i] = (p_b[i, 1] - p_b[0, 1]) / extent
-        most = bound * (worst_a[i] + worst_b[i] + variance_m2) / (extent * extent)
+        coarse.ax[i] = (rows[i, 0] - rows[0, 0]) / extent
+        coarse.ay[i] = (rows[i, 1] - rows[0, 1]) / extent
+        coarse.bx[i] = (rows[i, 2] - rows[0, 2]) / extent
+        coarse.by[i] = (rows[i, 3] - rows[0, 3]) / extent
+        worst = _worst(rows[i, 4], rows[i, 5], rows[i, 6])
+        worst += _worst(rows[i, 7], rows[i, 8], rows[i, 9])
+        most = bound * (worst + variance_m2) / (extent * extent)
         coarse.most[i] = (1 + _SHARE) * most + (1 + 1 / _SHARE) * _ROUNDING * _ROUNDING / 2
     return coarse
 
@@ -100,14 +94,14 @@ def _mark_near(
         near[j] = (p - q) * (p - q) <= m * (p + q + (p + q) - m)
 
 
-@kernel(error_model="numpy")
+@inner_kernel(error_model="numpy")
 def _variance_along(dx: float, dy: float, square: float, xx: float, xy: float, yy: float) -> float:
     """Variance along the line (dx, dy) of this squared length; 0 where there is no line."""
     along = dx * dx * xx + 2 * dx * dy * xy + dy * dy * yy
     return along / square if square > 0 else 0.0
 
 
-@kernel(error_model="numpy")
+@inner_kernel(error_model="numpy")
 def _needed(one: tuple[float, ...], other: tuple[float, ...], bound: float) -> float:
     """`drift_needed` of two correspondences, each a row of `in_rows`."""
     ax, ay, bx, by = other[0] - one[0], other[1] - one[1], other[2] - one[2], other[3] - one[3]
@@ -118,19 +112,16 @@ def _needed(one: tuple[float, ...], other: tuple[float, ...], bound: float) -> f
     return (difference * difference / bound - v) / 2
 
 
-@kernel
 def in_rows(pairs: PlanarPairs) -> Float:
     """The pairs (N, 10): p_a, p_b, and xx, xy, yy of S_a and of S_b; a row is read as one piece."""
-    p_a, p_b, S_a, S_b = pairs
-    rows = np.empty((len(p_a), 10))
-    for i in range(len(p_a)):
-        rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3] = p_a[i, 0], p_a[i, 1], p_b[i, 0], p_b[i, 1]
-        rows[i, 4], rows[i, 5], rows[i, 6] = S_a[i, 0, 0], S_a[i, 0, 1], S_a[i, 1, 1]
-        rows[i, 7], rows[i, 8], rows[i, 9] = S_b[i, 0, 0], S_b[i, 0, 1], S_b[i, 1, 1]
+    rows = np.empty((len(pairs.p_a), 10))
+    rows[:, :2], rows[:, 2:4] = pairs.p_a, pairs.p_b
+    for k, S in ((4, pairs.S_a), (7, pairs.S_b)):
+        rows[:, k], rows[:, k + 1], rows[:, k + 2] = S[:, 0, 0], S[:, 0, 1], S[:, 1, 1]
     return rows
 
 
-@kernel
+@inner_kernel
 def _numbers(rows: Float, i: int) -> tuple[float, ...]:
     r = rows[i]
     return r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9]
@@ -170,14 +161,14 @@ def _agreeing(
 
 
 @kernel
-def consistency(pairs: PlanarPairs, scales_m2: tuple[float, float], bound: float) -> np.ndarray:
+def consistency(rows: Float, scales_m2: tuple[float, float], bound: float) -> np.ndarray:
     """Graphs of consistent correspondences, for a small and a large s_drift.
 
     Every two are first compared coarsely, under the landmarks' worst variances; only the few that
     pass are looked at along their own lines.
 
     Args:
-        pairs: N correspondences.
+        rows: N correspondences as `in_rows` has them.
         scales_m2: two s_drift^2, the smaller one first.
         bound: most for the squared difference of distances over its variance.
 
@@ -185,13 +176,12 @@ def consistency(pairs: PlanarPairs, scales_m2: tuple[float, float], bound: float
         (2, N, ceil(N / 64)) uint64: bit j of row i tells whether i and j agree; symmetric, without
         the diagonal.
     """
-    n = len(pairs.p_a)
+    n = len(rows)
     words = (n + WORD - 1) // WORD
     graphs = np.zeros((2, n, words), np.uint64)
     eights = np.zeros(words * WORD // 8, np.uint64)
     near = eights.view(np.uint8)
-    rows = in_rows(pairs)
-    ax, ay, bx, by, most = _coarse(pairs, scales_m2[1], bound)
+    ax, ay, bx, by, most = _coarse(rows, scales_m2[1], bound)
     for i in range(n - 1):
         at = ax[i], ay[i], bx[i], by[i], most[i]
         _mark_near(ax[i:], ay[i:], bx[i:], by[i:], most[i:], at, near[i:n])

@@ -4,7 +4,6 @@ import numpy as np
 
 from mapfusion.align.pairs import Pairs
 from mapfusion.chi_square import chi_square_bound
-from mapfusion.kernels import kernel
 from mapfusion.se2 import Float
 
 # probability that points without extent pass for a shape by their noise alone
@@ -29,24 +28,14 @@ def lacks_extent(p: Float, covariance_m2: Float, drift_m2: float, dimensions: in
     return bool(spread[2 - dimensions] <= most)
 
 
-@kernel
 def _moments(p: Float, covariance_m2: Float) -> tuple[Float, Float, float]:
     """In plan: scatter about the mean (2, 2), mean covariance (2, 2), largest coordinate."""
-    n = len(p)
-    middle, scatter, mean = np.zeros(2), np.zeros((2, 2)), np.zeros((2, 2))
-    largest = 0.0
-    for i in range(n):
-        for k in range(2):
-            middle[k] += (p[i, k] - p[0, k]) / n  # far from the origin as exact as near it
-            largest = max(largest, abs(p[i, k]))
-            for j in range(2):
-                mean[k, j] += covariance_m2[i, k, j] / n
-    for i in range(n):
-        for k in range(2):
-            for j in range(2):
-                off_j = p[i, j] - p[0, j] - middle[j]
-                scatter[k, j] += (p[i, k] - p[0, k] - middle[k]) * off_j
-    return scatter, mean, largest
+    n, in_plan = len(p), np.ascontiguousarray(p.T[:2])
+    share = np.full(n, 1 / n)
+    off = in_plan - in_plan[:, :1]  # far from the origin as exact as near it
+    off -= (off @ share)[:, None]
+    mean = (share @ covariance_m2.reshape(n, -1)).reshape(covariance_m2.shape[1:])
+    return off @ off.T, mean[:2, :2], np.abs(in_plan).max()
 
 
 def why_one_place(pairs: Pairs, drift_m2: float = 0.0) -> str:

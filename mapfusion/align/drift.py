@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from mapfusion.kernels import kernel, kernel_part
+from mapfusion.kernels import inner_kernel, kernel, kernel_part
 from mapfusion.se2 import Float
 
 # Below this nothing is measured: it only keeps the weights of noise-free data finite.
@@ -20,7 +20,7 @@ _BEYOND = 41.0
 _MOTION_PARAMETERS = 3
 
 
-@kernel
+@inner_kernel
 def _scoring(
     residual_m: Float, covariance_m2: Float, weight: Float, variance_m2: float, gate_m: float
 ) -> float:
@@ -32,7 +32,9 @@ def _scoring(
     the fitted motion took from the 2N numbers are made good by their share.
     S = S_a + R S_b R^T is (N, 2, 2), `weight` (N,) 0 to 1 how surely each pair is true.
     """
-    numbers = 2 * np.sum(weight)
+    numbers = 0.0
+    for i in range(len(weight)):
+        numbers += 2 * weight[i]
     share = numbers / max(numbers - _MOTION_PARAMETERS, 1.0)
     score = information = 0.0
     for i in range(len(residual_m)):

@@ -11,7 +11,7 @@ import numpy as np
 from mapfusion.align.closest import Grid, runs_about
 from mapfusion.align.pairs import MIN_PAIRS
 from mapfusion.align.rigid import fit_rigid
-from mapfusion.kernels import kernel, kernel_part
+from mapfusion.kernels import inner_kernel, kernel, kernel_part
 from mapfusion.planar import moved_point
 from mapfusion.se2 import Float
 
@@ -82,7 +82,7 @@ def _has_neighbour(
     return False
 
 
-@kernel
+@inner_kernel
 def apart_by_less(p: Float, i: int, j: int, distance_m: float) -> bool:
     """Whether points i and j of (N, D) are less than a distance apart."""
     if abs(p[i, 0] - p[j, 0]) >= distance_m:  # most are already told apart by this
@@ -115,7 +115,7 @@ def log10_tail(k: int, n: int, p: float) -> float:
     return min((first + math.log(total)) / math.log(10.0), 0.0)
 
 
-@kernel
+@kernel_part
 def moved_points(T_a_b: Float, p_b: Float) -> Float:
     """T p_b (n, 2)."""
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
@@ -170,10 +170,12 @@ def minimal_motion(p_a: Float, p_b: Float, supporters: np.ndarray, T_a_b: Float)
     """
     k = len(supporters)
     mean_x = mean_y = square = 0.0
-    for row in supporters:
+    for i in range(k):
+        row = supporters[i]
         mean_x += p_b[row, 0] / k
         mean_y += p_b[row, 1] / k
-    for row in supporters:
+    for i in range(k):
+        row = supporters[i]
         square += ((p_b[row, 0] - mean_x) ** 2 + (p_b[row, 1] - mean_y) ** 2) / k
     nearest, found = math.inf, T_a_b.copy()
     two = np.empty(2, np.int64)
@@ -249,17 +251,13 @@ def agreeing_repairings(
 
 
 @kernel_part
-def chance_of_agreeing(agreeing: np.ndarray, possible: np.ndarray) -> Float:
-    """The larger p (G,) of the selection's and all pairs', from counts (2, G) and (2,).
+def chance_of_agreeing(agreeing: np.ndarray, g: int, possible: int, of_all: int) -> float:
+    """The larger p of the selection's and all pairs', from counts (2, G) at gate g and of possible.
 
     One more than was counted, as in a test by permutations: that none of a few re-pairings agrees
     does not make p zero.
     """
-    p = np.empty(agreeing.shape[1])
-    for g in range(len(p)):
-        selected = (agreeing[0, g] + 1) / (possible[0] + 1)
-        p[g] = max(selected, (agreeing[1, g] + 1) / (possible[1] + 1))
-    return p
+    return max((agreeing[0, g] + 1) / (possible + 1), (agreeing[1, g] + 1) / (of_all + 1))
 
 
 @kernel
@@ -277,7 +275,6 @@ def fewest_false_alarms(
     while total >> selections >= _SMALLEST_SELECTION:
         selections += 1
     distance = residuals_m(T_a_b, p_a, p_b)
-    possible_here = np.empty(2, np.int64)
     best, best_gate, best_n, best_k = math.inf, 0.0, total, 0
     for s in range(selections):
         n = total >> s
@@ -285,8 +282,7 @@ def fewest_false_alarms(
         if len(supporters) < MIN_PAIRS:
             continue
         T_two = minimal_motion(p_a, p_b, supporters, T_a_b)
-        possible_here[0], possible_here[1] = possible[n - 1], possible[total - 1]
-        p = chance_of_agreeing(agreeing_repairings(T_two, pairs, gates_m, n), possible_here)
+        agreeing = agreeing_repairings(T_two, pairs, gates_m, n)
         under_two = residuals_m(T_two, p_a, p_b)
         tests = math.log10(selections * len(gates_m)) + math.log10(n * (n - 1) / 2)
         for g in range(len(gates_m)):
@@ -295,7 +291,8 @@ def fewest_false_alarms(
                 k += distance[i] <= gates_m[g] and under_two[i] <= gates_m[g]
             if k < MIN_PAIRS:
                 continue
-            log10 = tests + log10_tail(k - 2, n - 2, p[g])
+            p = chance_of_agreeing(agreeing, g, possible[n - 1], possible[total - 1])
+            log10 = tests + log10_tail(k - 2, n - 2, p)
             if log10 < best:
                 best, best_gate, best_n, best_k = log10, gates_m[g], n, k
     return best, best_gate, best_n, best_k

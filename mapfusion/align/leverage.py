@@ -9,7 +9,8 @@ import math
 import numpy as np
 
 from mapfusion.align.mahalanobis_gate import PlanarPairs, residual_covariance
-from mapfusion.kernels import kernel
+from mapfusion.align.rigid import residual_covariances
+from mapfusion.kernels import kernel_part
 from mapfusion.planar import lever, residual
 from mapfusion.se2 import Float, transform_points
 
@@ -34,10 +35,10 @@ def is_unlike_the_others(
     if m < 1:
         return False
     J = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    J[:, 2] = lever(cos, sin, p_b, left_out)
-    xx, xy, yy = residual_covariance(cos, sin, S_a, S_b, left_out, variance_m2)
-    e = np.array(residual(T_without, cos, sin, pairs.p_a, p_b, left_out))
-    D = e @ np.linalg.solve(np.array([[xx, xy], [xy, yy]]) + J @ covariance @ J.T, e)
+    J[:, 2] = lever.py_func(cos, sin, p_b, left_out)
+    (S,) = residual_covariances(T_without, S_a[left_out, None], S_b[left_out, None])
+    e = np.array(residual.py_func(T_without, cos, sin, pairs.p_a, p_b, left_out))
+    D = e @ np.linalg.solve(S + variance_m2 * np.eye(2) + J @ covariance @ J.T, e)
     return -m / 2 * math.log1p(D / m) < math.log(_CALLED_FALSE / len(p_b))
 
 
@@ -60,7 +61,7 @@ def why_one_pair(
     return f"rests on one correspondence: without it landmarks move by {moved_m:.2g} m"
 
 
-@kernel
+@kernel_part
 def most_leverage(
     T_a_b: Float, pairs: PlanarPairs, variance_m2: float, truth: Float, covariance: Float
 ) -> int:
@@ -72,15 +73,17 @@ def most_leverage(
     """
     _, p_b, S_a, S_b = pairs
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+    cxx, cxy, cyy = covariance[0, 0], covariance[0, 1], covariance[1, 1]
+    cxt, cyt, ctt = covariance[0, 2], covariance[1, 2], covariance[2, 2]
     most, found = -1.0, 0
     for i in range(len(p_b)):
         xx, xy, yy = residual_covariance(cos, sin, S_a, S_b, i, variance_m2)
         jx, jy = lever(cos, sin, p_b, i)
         # J cov J': what the motion's own uncertainty makes of this point
-        txx = covariance[0, 0] + 2 * jx * covariance[0, 2] + jx * jx * covariance[2, 2]
-        tyy = covariance[1, 1] + 2 * jy * covariance[1, 2] + jy * jy * covariance[2, 2]
-        txy = covariance[0, 1] + jx * covariance[1, 2] + jy * covariance[0, 2]
-        txy += jx * jy * covariance[2, 2]
+        txx = cxx + 2 * jx * cxt + jx * jx * ctt
+        tyy = cyy + 2 * jy * cyt + jy * jy * ctt
+        txy = cxy + jx * cyt + jy * cxt
+        txy += jx * jy * ctt
         leverage = truth[i] * (txx * yy - 2 * txy * xy + tyy * xx) / (xx * yy - xy * xy)
         if leverage > most:
             most, found = leverage, i

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mapfusion.align.rigid import fit_weighted
-from mapfusion.kernels import kernel, kernel_part
+from mapfusion.kernels import inner_kernel, kernel, kernel_part
 from mapfusion.planar import add_turned, residual
 from mapfusion.se2 import Float
 
@@ -35,18 +35,13 @@ class PlanarPairs(NamedTuple):
     S_b: Float
 
 
-@kernel
-def mean_variances(pairs: PlanarPairs, variance_m2: float) -> Float:
+def mean_variances(pairs: PlanarPairs, variance_m2: float = 0.0) -> Float:
     """Half the trace of C (N,): the residuals' variance per axis, the same for every theta."""
     S_a, S_b = pairs.S_a, pairs.S_b
-    mean = np.empty(len(S_a))
-    for i in range(len(S_a)):
-        trace = S_a[i, 0, 0] + S_a[i, 1, 1] + S_b[i, 0, 0] + S_b[i, 1, 1]
-        mean[i] = trace / 2 + variance_m2
-    return mean
+    return (S_a[:, 0, 0] + S_a[:, 1, 1] + S_b[:, 0, 0] + S_b[:, 1, 1]) / 2 + variance_m2
 
 
-@kernel
+@inner_kernel
 def residual_covariance(
     cos: float, sin: float, S_a: Float, S_b: Float, i: int, variance_m2: float
 ) -> tuple[float, float, float]:
@@ -57,25 +52,25 @@ def residual_covariance(
     return xx + variance_m2, xy, yy + variance_m2
 
 
-@kernel
+@inner_kernel
 def _square_and_det(ex: float, ey: float, xx: float, xy: float, yy: float) -> tuple[float, float]:
     """e^T C^-1 e and |C| of one residual."""
     det = xx * yy - xy * xy
     return (yy * ex * ex - 2 * xy * ex * ey + xx * ey * ey) / det, det
 
 
-@kernel
+@inner_kernel
 def mark_supporters(
     T_a_b: Float,
     pairs: PlanarPairs,
-    mean_m2: Float,
+    own_m2: Float,
     variance_m2: float,
     bound: float,
     inside: np.ndarray,
 ) -> tuple[int, float]:
     """Mark the pairs with e^T C^-1 e <= bound in `inside` (N,).
 
-    `mean_m2` are the `mean_variances` for this s_drift. Returns the number of supporters, and the
+    `own_m2` are the `mean_variances` without s_drift. Returns the number of supporters, and the
     sum of what each stays below the bound: up to a constant, minus the truncated squares of all.
     """
     p_a, p_b, S_a, S_b = pairs
@@ -85,7 +80,7 @@ def mark_supporters(
         ex, ey = residual(T_a_b, cos, sin, p_a, p_b, i)
         inside[i] = False
         # no direction's variance is above the trace, so this loses none and spares most
-        if ex * ex + ey * ey > 2 * bound * mean_m2[i]:
+        if ex * ex + ey * ey > 2 * bound * (own_m2[i] + variance_m2):
             continue
         xx, xy, yy = residual_covariance(cos, sin, S_a, S_b, i, variance_m2)
         square, _ = _square_and_det(ex, ey, xx, xy, yy)
@@ -125,63 +120,83 @@ def log_likelihood(
 
 @kernel
 def settle(
-    T_a_b: Float, pairs: PlanarPairs, variance_m2: float, bound: float, inside: np.ndarray
+    T_a_b: Float,
+    pairs: PlanarPairs,
+    own_m2: Float,
+    variance_m2: float,
+    bound: float,
+    inside: np.ndarray,
 ) -> int:
     """Fit to the support and take the support again until it repeats; T_a_b, inside are changed.
 
-    Returns the number of supporters; below two T_a_b is not fitted again.
+    `own_m2` are the `mean_variances` without s_drift. Returns the number of supporters; below two
+    T_a_b is not fitted again.
     """
-    mean = mean_variances(pairs, variance_m2)
-    inverse, weight = 1 / mean, np.empty(len(mean))
-    count, _ = mark_supporters(T_a_b, pairs, mean, variance_m2, bound, inside)
+    weight = np.empty(len(own_m2))
+    count, _ = mark_supporters(T_a_b, pairs, own_m2, variance_m2, bound, inside)
     for _ in range(_ROUNDS):
         if count < 2:
             break
-        for i in range(len(mean)):
-            weight[i] = inverse[i] if inside[i] else 0.0
+        for i in range(len(own_m2)):
+            weight[i] = 1 / (own_m2[i] + variance_m2) if inside[i] else 0.0
         fit_weighted(pairs.p_a, pairs.p_b, weight, T_a_b)
-        count, _ = mark_supporters(T_a_b, pairs, mean, variance_m2, bound, inside)
+        count, _ = mark_supporters(T_a_b, pairs, own_m2, variance_m2, bound, inside)
         changed = 0
-        for i in range(len(mean)):
+        for i in range(len(own_m2)):
             changed += inside[i] != (weight[i] > 0)
         if changed == 0:
             break
     return count
 
 
-@kernel
 def spread_area_m2(p: Float) -> float:
     """Area of the rectangle over which points (N, 2) with this spread would be uniform."""
-    n = len(p)
-    mx = my = xx = xy = yy = 0.0
-    for i in range(n):
-        mx += p[i, 0] / n
-        my += p[i, 1] / n
-    for i in range(n):
-        dx, dy = p[i, 0] - mx, p[i, 1] - my
-        xx += dx * dx / n
-        xy += dx * dy / n
-        yy += dy * dy / n
-    return 12 * math.sqrt(max(xx * yy - xy * xy, 0.0))  # a side L has the variance L^2 / 12
+    x, y = p.T - np.mean(p, axis=0)[:, None]
+    determinant = np.mean(x * x) * np.mean(y * y) - np.mean(x * y) ** 2
+    return 12 * math.sqrt(max(determinant, 0.0))  # a side L has the variance L^2 / 12
+
+
+class Spread(NamedTuple):
+    """What of N pairs no motion changes.
+
+    Attributes:
+        own_m2: (N,) the `mean_variances` without s_drift.
+        area_m2: over which the landmarks are spread in the map in which it is larger.
+    """
+
+    own_m2: Float
+    area_m2: float
+
+    @classmethod
+    def of(cls, pairs: PlanarPairs) -> "Spread":
+        """Of pairs, one or more."""
+        area_m2 = max(spread_area_m2(pairs.p_a), spread_area_m2(pairs.p_b))
+        return cls(mean_variances(pairs), area_m2)
 
 
 @kernel
 def settle_at_best_scale(
-    T_a_b: Float, pairs: PlanarPairs, variances_m2: Float, bound: float, inside: np.ndarray
+    T_a_b: Float,
+    pairs: PlanarPairs,
+    spread: Spread,
+    variances_m2: Float,
+    bound: float,
+    inside: np.ndarray,
 ) -> tuple[float, int]:
     """Settle T_a_b at every scale, coarse to fine, and keep the likeliest.
 
-    T_a_b (3,) and inside (N,) are changed.
-    Scales (L,) are s_drift^2, ascending. Returns the log-likelihood and the scale chosen; -1 when
-    fewer than two pairs support any.
+    T_a_b (3,) and inside (N,) are changed; `spread` is that of the pairs. Scales (L,) are
+    s_drift^2, ascending. Returns the log-likelihood and the scale chosen; -1 when fewer than two
+    pairs support any.
     """
     n = len(pairs.p_a)
-    area = max(spread_area_m2(pairs.p_a), spread_area_m2(pairs.p_b))
+    own_m2, area = spread.own_m2, spread.area_m2
     T, marks = T_a_b.copy(), np.empty(n, np.bool_)
-    inside[:] = False
+    for i in range(n):
+        inside[i] = False
     best, best_level = -math.inf, -1
     for level in range(len(variances_m2) - 1, -1, -1):
-        count = settle(T, pairs, variances_m2[level], bound, marks)
+        count = settle(T, pairs, own_m2, variances_m2[level], bound, marks)
         if count < 2:
             break
         # one false pair counted before any is seen keeps the share below 1

@@ -8,7 +8,7 @@ steps is that of Rossi et al. 2015, PMC).
 import numpy as np
 
 from mapfusion.align.bits import WORD, count_common, trailing_zeros
-from mapfusion.kernels import kernel, kernel_part
+from mapfusion.kernels import inner_kernel, kernel, kernel_part
 
 
 @kernel_part
@@ -20,13 +20,13 @@ def degrees(graph: np.ndarray) -> np.ndarray:
     return degree
 
 
-@kernel
+@inner_kernel
 def has(bits: np.ndarray, v: int) -> bool:
     """Whether v is in a set (W,)."""
     return (bits[v // WORD] >> np.uint64(v % WORD)) & np.uint64(1) != 0
 
 
-@kernel
+@inner_kernel
 def members(bits: np.ndarray, into: np.ndarray) -> int:
     """Write the numbers of a set (W,) into `into`, ascending; returns how many there are."""
     count = 0
@@ -59,13 +59,16 @@ def most_first(degree: np.ndarray) -> np.ndarray:
     return order
 
 
-@kernel
+def set_of(chosen: np.ndarray) -> np.ndarray:
+    """The numbers that are marked (N,) as bits of words (W,)."""
+    bits = np.zeros(-(-len(chosen) // WORD) * WORD, np.bool_)
+    bits[: len(chosen)] = chosen
+    return np.packbits(bits, bitorder="little").view("<u8")
+
+
 def everyone(n: int) -> np.ndarray:
     """The set (W,) of all numbers below n."""
-    bits = np.zeros((n + WORD - 1) // WORD, np.uint64)
-    for v in range(n):
-        bits[v // WORD] |= np.uint64(1) << np.uint64(v % WORD)
-    return bits
+    return set_of(np.ones(n, np.bool_))
 
 
 @kernel
@@ -89,7 +92,6 @@ def keep_core(graph: np.ndarray, chosen: np.ndarray, least: int, rows: np.ndarra
     return n if n > least else 0
 
 
-@kernel
 def may_hold(graph: np.ndarray, among: np.ndarray, size: int) -> bool:
     """Whether some vertices (W,) have neighbours enough for a clique of more than `size`."""
     return keep_core(graph, among.copy(), size, np.empty(len(graph), np.int64)) > 0
@@ -129,7 +131,7 @@ def greedy_clique(graph: np.ndarray, starts: int) -> np.ndarray:
     return best[:size_of_best].copy()
 
 
-@kernel
+@inner_kernel
 def colour(
     graph: np.ndarray,
     candidates: np.ndarray,

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mapfusion.align.mahalanobis_gate import PlanarPairs
-from mapfusion.kernels import kernel, kernel_part
+from mapfusion.kernels import inner_kernel, kernel, kernel_part
 from mapfusion.planar import residual
 from mapfusion.se2 import Float
 
@@ -50,7 +50,7 @@ def near_pairs(T_a_b: Float, pairs: PlanarPairs, gate_m: float, inside: np.ndarr
     return near
 
 
-@kernel
+@inner_kernel
 def at_rows(values: np.ndarray, rows: np.ndarray, among: np.ndarray) -> None:
     """Put values (n,) at rows (n,) of others (N,)."""
     for k in range(len(rows)):
@@ -86,7 +86,7 @@ def those_of(pairs: PlanarPairs, rows: np.ndarray) -> PlanarPairs:
     return some
 
 
-@kernel
+@inner_kernel
 def farthest_m(p: Float) -> float:
     """Distance from the origin of the farthest of points (N, 2)."""
     square = 0.0

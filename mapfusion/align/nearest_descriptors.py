@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mapfusion.align.bits import WORD, packed, trailing_zeros
-from mapfusion.kernels import kernel, kernel_part
+from mapfusion.kernels import inner_kernel, kernel, kernel_part
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.se2 import Float
 
@@ -203,7 +203,7 @@ def _apart_by_less(p: Float, i: int, q: Float, j: int, distance_m: float) -> boo
     return dx * dx + dy * dy < distance_m * distance_m
 
 
-@kernel
+@inner_kernel
 def _take(side: _Side, i: int, j: int, distance2: float) -> None:
     """Take j for the nearest of i if it is; of equally near ones the first."""
     known = side.distance2[i]

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapfusion.align.box_tree import BoxTree, halve, span
-from mapfusion.kernels import kernel, kernel_part
+from mapfusion.align.box_tree import BoxTree, in_leaves
+from mapfusion.kernels import inner_kernel, kernel, kernel_part
 from mapfusion.planar import moved_point
 from mapfusion.se2 import Float
 
@@ -37,7 +37,7 @@ class Groups(NamedTuple):
     @classmethod
     def of(cls, p: Float) -> "Groups":
         """Groups of points (N, 3)."""
-        row = _in_groups(np.ascontiguousarray(p))
+        row, _, _ = in_leaves(p, GROUP)
         row = np.append(row, np.full(-len(p) % GROUP, row[len(p) // GROUP * GROUP :][:1]))
         return cls(len(p), row, *np.ascontiguousarray(p[row].T))
 
@@ -69,31 +69,7 @@ def room_for_groups() -> Room:
     return Room(x, y, z, nearest, np.empty(GROUP), np.empty(_DEEPEST, np.int64), np.empty(_DEEPEST))
 
 
-@kernel
-def _in_groups(p: Float) -> np.ndarray:
-    """Rows of p (N, 3) such that each GROUP of them lie near each other."""
-    row, n_todo = np.arange(len(p)), 1
-    begins, ends = np.zeros(_DEEPEST, np.int64), np.zeros(_DEEPEST, np.int64)
-    ends[0] = len(p)
-    while n_todo > 0:
-        n_todo -= 1
-        first, end = begins[n_todo], ends[n_todo]
-        if end - first <= GROUP:
-            continue
-        widest, extent = 0, -math.inf
-        for axis in range(3):
-            low, high = span(p, row, first, end, axis)
-            if high - low > extent:
-                widest, extent = axis, high - low
-        middle = first + max((end - first) // (2 * GROUP), 1) * GROUP
-        halve(p[:, widest], row, first, end, middle)
-        begins[n_todo], ends[n_todo] = first, middle
-        begins[n_todo + 1], ends[n_todo + 1] = middle, end
-        n_todo += 2
-    return row
-
-
-@kernel
+@inner_kernel
 def look_up_group(
     T_a_b: Float, first: int, groups: Groups, tree: BoxTree, nearest: np.ndarray, room: Room
 ) -> None:

@@ -10,7 +10,6 @@ import numpy as np
 from mapfusion.align.correspondences import Correspondences, HeightGate
 from mapfusion.align.mahalanobis_gate import PlanarPairs
 from mapfusion.align.result import Alignment, degenerate
-from mapfusion.kernels import kernel
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.se2 import Float
 
@@ -107,7 +106,14 @@ class Pairs:
 
     @cached_property
     def _plan(self) -> PlanarPairs:
-        return _in_plan(self.p_a, self.p_b, self.covariance_a, self.covariance_b)
+        n = len(self)
+        plan = PlanarPairs(*np.empty((2, n, 2)), *np.empty((2, n, 2, 2)))
+        for part, whole in zip(plan[:2], (self.p_a, self.p_b), strict=True):
+            part[:, 0], part[:, 1] = whole[:, 0], whole[:, 1]
+        for part, whole in zip(plan[2:], (self.covariance_a, self.covariance_b), strict=True):
+            part[:, 0, 0], part[:, 0, 1] = whole[:, 0, 0], whole[:, 0, 1]
+            part[:, 1, 0], part[:, 1, 1] = whole[:, 1, 0], whole[:, 1, 1]
+        return plan
 
     def of_one_height(self, gate: HeightGate) -> np.ndarray:
         """Rows (n,) of the pairs whose heights agree; of planar maps all."""
@@ -121,18 +127,6 @@ class Pairs:
                 self.covariance_b[:, 2, 2],
             )
         )
-
-
-@kernel
-def _in_plan(p_a: Float, p_b: Float, covariance_a: Float, covariance_b: Float) -> PlanarPairs:
-    n = len(p_a)
-    plan = PlanarPairs(np.empty((n, 2)), np.empty((n, 2)), np.empty((n, 2, 2)), np.empty((n, 2, 2)))
-    for i in range(n):
-        for k in range(2):
-            plan.p_a[i, k], plan.p_b[i, k] = p_a[i, k], p_b[i, k]
-            for j in range(2):
-                plan.S_a[i, k, j], plan.S_b[i, k, j] = covariance_a[i, k, j], covariance_b[i, k, j]
-    return plan
 
 
 def why_too_few(map_a: LandmarkMap, map_b: LandmarkMap, n_pairs: int, needed: int) -> str:

@@ -11,7 +11,7 @@ from mapfusion.align.method import Fit, Undetermined
 from mapfusion.align.pairs import Pairs
 from mapfusion.align.rigid import fit_rigid, fit_two
 from mapfusion.arguments import Probability, Range, require_in_range
-from mapfusion.kernels import kernel, kernel_part
+from mapfusion.kernels import inner_kernel, kernel, kernel_part
 from mapfusion.planar import residual
 from mapfusion.se2 import Float
 
@@ -62,7 +62,7 @@ class Ransac:
         return Fit(T_a_b, inlier, gate_m=self.gate_m)
 
 
-@kernel
+@inner_kernel
 def next_random(state: np.uint64) -> np.uint64:
     """Next state of a xorshift generator with 64 bits (Marsaglia 2003); state must not be 0."""
     state ^= state << np.uint64(13)
@@ -71,7 +71,7 @@ def next_random(state: np.uint64) -> np.uint64:
     return state
 
 
-@kernel
+@inner_kernel
 def draw_pair(state: np.uint64, n: int) -> tuple[np.uint64, int, int]:
     """The state after drawing two different numbers below n, and the numbers."""
     # the upper 32 bits, scaled, are uneven by n / 2^32 at most
@@ -96,7 +96,7 @@ def _two_point_motion(
     return fit_two(p_a, p_b, i, j, T_a_b) >= min_baseline_m
 
 
-@kernel
+@inner_kernel
 def list_supporters(
     T_a_b: Float, p_a: Float, p_b: Float, gate_m: float, to_beat: int, rows: np.ndarray
 ) -> tuple[int, float]:
@@ -132,14 +132,14 @@ def refit(
     Motions are compared only after this: a raw minimal set can gain a false supporter by leaning
     towards it, with its true ones at the gate's edge.
     """
-    cost = 0.0
+    cost, none_to_beat = 0.0, np.int64(0)  # a plain 0 is a type of its own, and compiled for
     before = np.empty(len(rows), np.int64)
     for _ in range(_LOCAL_ROUNDS):
         T_a_b[0], T_a_b[1], T_a_b[2] = fit_rigid(p_a, p_b, rows[:count])
         before_count = count
         for i in range(count):
             before[i] = rows[i]
-        count, cost = list_supporters(T_a_b, p_a, p_b, gate_m, 0, rows)
+        count, cost = list_supporters(T_a_b, p_a, p_b, gate_m, none_to_beat, rows)
         same = count == before_count
         for i in range(count):
             same = same and rows[i] == before[i]
@@ -168,7 +168,7 @@ def most_supported(
     n = len(p_a)
     best_T, T_a_b = np.full(3, np.nan), np.empty(3)
     rows, best_rows = np.empty(n, np.int64), np.empty(n, np.int64)
-    best_count, best_cost = 0, math.inf
+    best_count, best_cost = np.int64(0), math.inf  # a plain 0 is of a type of its own at first
     needed = float(max_draws)
     draws = 0
     state = seed

@@ -6,9 +6,9 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from mapfusion.align.consensus import Consensus
+from mapfusion.align.consensus import Consensus, spread_of
 from mapfusion.align.consistency import drift_needed, in_rows
-from mapfusion.align.mahalanobis_gate import PlanarPairs, mark_supporters, mean_variances, settle
+from mapfusion.align.mahalanobis_gate import PlanarPairs, mark_supporters, settle
 from mapfusion.align.method import Fit, Undetermined
 from mapfusion.align.pairs import Pairs
 from mapfusion.align.ransac import draw_pair
@@ -43,8 +43,12 @@ class RansacMahalanobis(Consensus):
     def find(self, pairs: Pairs, rng: np.random.Generator) -> Fit | Undetermined:
         """T_a_b of the best minimal set at the largest s_drift, settled on its support."""
         planar = pairs.in_plan()
+        if RansacMahalanobis not in pairs.kept:
+            pairs.kept[RansacMahalanobis] = in_rows(planar)
         _, T_a_b = least_truncated_squares(
             planar,
+            spread_of(pairs).own_m2,
+            pairs.kept[RansacMahalanobis],
             self.variances_m2[-1],
             self.bound,
             chi_square_bound(self.probability, 1),
@@ -59,6 +63,8 @@ class RansacMahalanobis(Consensus):
 @kernel
 def least_truncated_squares(
     pairs: PlanarPairs,
+    own_m2: Float,
+    rows: Float,
     variance_m2: float,
     bound: float,
     agreement: float,
@@ -69,13 +75,13 @@ def least_truncated_squares(
 ) -> tuple[int, Float]:
     """Draw minimal sets until two supporters of the best motion would have come up by now.
 
+    `own_m2` are the `mean_variances` without s_drift, `rows` the pairs as `in_rows` has them,
     `bound` is the most for e^T C^-1 e of a supporter, `agreement` for the squared difference of a
     set's two lengths over its variance, `log_miss` the logarithm of the chance accepted of never
     drawing two supporters, `seed` not 0. Returns the number of draws and T_a_b (3,), NaN for none.
     """
     p_a, p_b = pairs.p_a, pairs.p_b
     n = len(p_a)
-    mean, rows = mean_variances(pairs, variance_m2), in_rows(pairs)
     best_T, T_a_b, inside = np.full(3, np.nan), np.empty(3), np.empty(n, np.bool_)
     best_score, best_raw = 0.0, 0.0
     needed, draws, state = float(max_draws), 0, seed
@@ -86,12 +92,12 @@ def least_truncated_squares(
             continue
         if fit_two(p_a, p_b, i, j, T_a_b) < min_baseline_m:
             continue
-        count, score = mark_supporters(T_a_b, pairs, mean, variance_m2, bound, inside)
+        count, score = mark_supporters(T_a_b, pairs, own_m2, variance_m2, bound, inside)
         if count < 2 or score <= best_raw:
             continue
         best_raw = score
-        count = settle(T_a_b, pairs, variance_m2, bound, inside)
-        count, score = mark_supporters(T_a_b, pairs, mean, variance_m2, bound, inside)
+        count = settle(T_a_b, pairs, own_m2, variance_m2, bound, inside)
+        count, score = mark_supporters(T_a_b, pairs, own_m2, variance_m2, bound, inside)
         if count >= 2 and score > best_score:
             for k in range(3):
                 best_T[k] = T_a_b[k]

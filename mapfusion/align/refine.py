@@ -17,7 +17,7 @@ from mapfusion.align.near_pairs import at_rows, farthest_m, leaves_margin, near_
 from mapfusion.align.pairs import MIN_PAIRS, Pairs, undetermined
 from mapfusion.align.result import Alignment, Status
 from mapfusion.arguments import Range, require_in_range, require_shape
-from mapfusion.kernels import kernel, kernel_part
+from mapfusion.kernels import inner_kernel, kernel, kernel_part
 from mapfusion.planar import add_turned, lever, residual
 from mapfusion.se2 import Float, transform_points, wrap
 from mapfusion.symmetric import cofactors
@@ -81,7 +81,7 @@ class Refinement:
         rows = pairs.of_one_height(self.height)
         planar = pairs[rows].in_plan()
         limits = (self._widest_m(pairs, T_a_b), self.least_drift_m, self.max_rounds)
-        solved, moved_m, T_a_b, covariance, variance, truth = maximise_likelihood(
+        solved, moved_m, T_a_b, covariance, variance, truth, left_out = maximise_likelihood(
             planar, T_a_b, *limits
         )
         if not solved:
@@ -97,9 +97,8 @@ class Refinement:
         elif np.count_nonzero(inlier) < MIN_PAIRS:
             reason = f"{np.count_nonzero(inlier)} correspondences agree, {MIN_PAIRS} are needed"
         else:
-            left_out = most_leverage(T_a_b, planar, variance, truth, covariance)
             others = PlanarPairs(*(np.delete(part, left_out, axis=0) for part in planar))
-            solved, _, T_without, sure, drift_m2, _ = maximise_likelihood(others, T_a_b, *limits)
+            solved, _, T_without, sure, drift_m2, *_ = maximise_likelihood(others, T_a_b, *limits)
             may_move_m = limits[0]
             # a known identity that the motion rests on is false only if it is unlike all others
             if pairs.by_name and solved:
@@ -155,9 +154,13 @@ def truth_probabilities(
     gate_m: float,
     inside: np.ndarray,
     truth: Float,
-) -> None:
-    """Fill the probability (N,) of being true of each pair inside the gate, 0 of the others."""
+) -> tuple[float, int]:
+    """Fill the probability (N,) of being true of each pair inside the gate, 0 of the others.
+
+    Returns their sum, and how many are inside.
+    """
     false_density = (1 - share) / (math.pi * gate_m * gate_m)
+    total, count = 0.0, 0
     for i in range(len(e)):
         truth[i] = 0.0
         if not inside[i]:
@@ -168,39 +171,48 @@ def truth_probabilities(
         true_density = share * math.exp(-square / 2) / (2 * math.pi * math.sqrt(det))
         if true_density > 0:
             truth[i] = true_density / (true_density + false_density)
+        total += truth[i]
+        count += 1
+    return total, count
 
 
 @kernel_part
-def normal_equations(
-    T_a_b: Float, p_b: Float, e: Float, S: Float, variance_m2: float, truth: Float
-) -> tuple[Float, Float]:
+def put_normal_equations(
+    T_a_b: Float,
+    p_b: Float,
+    e: Float,
+    S: Float,
+    variance_m2: float,
+    truth: Float,
+    normal: Float,
+    right: Float,
+) -> None:
     """J' W J (3, 3) and J' W e (3,) with W = truth (S + s_drift^2 I)^-1 and J = d(T p_b)/dT."""
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
-    normal = np.zeros((3, 3))
-    right = np.zeros(3)
+    nxx = nxy = nyy = nxt = nyt = ntt = rx = ry = rt = 0.0
     for i in range(len(e)):
         if truth[i] == 0:
             continue
+        ex, ey = e[i, 0], e[i, 1]
         xx, xy, yy = S[i, 0, 0] + variance_m2, S[i, 0, 1], S[i, 1, 1] + variance_m2
         scale = truth[i] / (xx * yy - xy * xy)
         wxx, wxy, wyy = scale * yy, -scale * xy, scale * xx
         jx, jy = lever(cos, sin, p_b, i)
-        wx, wy = wxx * e[i, 0] + wxy * e[i, 1], wxy * e[i, 0] + wyy * e[i, 1]
-        normal[0, 0] += wxx
-        normal[0, 1] += wxy
-        normal[1, 1] += wyy
-        normal[0, 2] += wxx * jx + wxy * jy
-        normal[1, 2] += wxy * jx + wyy * jy
-        normal[2, 2] += wxx * jx * jx + 2 * wxy * jx * jy + wyy * jy * jy
-        right[0] += wx
-        right[1] += wy
-        right[2] += jx * wx + jy * wy
-    normal[1, 0], normal[2, 0], normal[2, 1] = normal[0, 1], normal[0, 2], normal[1, 2]
-    return normal, right
+        wx, wy = wxx * ex + wxy * ey, wxy * ex + wyy * ey
+        nxx, nxy, nyy = nxx + wxx, nxy + wxy, nyy + wyy
+        nxt += wxx * jx + wxy * jy
+        nyt += wxy * jx + wyy * jy
+        ntt += wxx * jx * jx + 2 * wxy * jx * jy + wyy * jy * jy
+        rx, ry, rt = rx + wx, ry + wy, rt + (jx * wx + jy * wy)
+    right[0], right[1], right[2] = rx, ry, rt
+    normal[0, 0], normal[1, 1], normal[2, 2] = nxx, nyy, ntt
+    normal[0, 1] = normal[1, 0] = nxy
+    normal[0, 2] = normal[2, 0] = nxt
+    normal[1, 2] = normal[2, 1] = nyt
 
 
 @kernel_part
-def missing_information(
+def take_missing_information(
     T_a_b: Float,
     p_b: Float,
     e: Float,
@@ -208,22 +220,23 @@ def missing_information(
     weighed_m2: float,
     judged_m2: float,
     truth: Float,
-) -> Float:
-    """What not knowing which pairs are true takes from the information (3, 3) (Louis 1982).
+    information: Float,
+) -> None:
+    """Take from the information (3, 3) what not knowing which pairs are true takes (Louis 1982).
 
     When the motion moves, so do the probabilities: d truth / de = -truth (1 - truth) C^-1 e, and a
     normal matrix with certain weights would promise too much. `weighed_m2` is s_drift^2 in the
     weights, `judged_m2` in the probabilities; e and S are those of `residuals_under`.
     """
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
-    missing = np.zeros((3, 3))
-    pull, turn = np.empty(3), np.empty(3)
+    missing, pull, turn = np.zeros((3, 3)), np.empty(3), np.empty(3)
     for i in range(len(e)):
         share = truth[i] * (1 - truth[i])
         if share == 0:
             continue
         jx, jy = lever(cos, sin, p_b, i)
-        for variance, force in ((weighed_m2, pull), (judged_m2, turn)):
+        for k in range(2):
+            variance, force = (judged_m2, turn) if k else (weighed_m2, pull)
             xx, xy, yy = S[i, 0, 0] + variance, S[i, 0, 1], S[i, 1, 1] + variance
             det = xx * yy - xy * xy
             force[0] = (yy * e[i, 0] - xy * e[i, 1]) / det
@@ -233,10 +246,12 @@ def missing_information(
             for column in range(3):
                 product = pull[row] * turn[column] + turn[row] * pull[column]
                 missing[row, column] += share * product / 2
-    return missing
+    for row in range(3):
+        for column in range(3):
+            information[row, column] -= missing[row, column]
 
 
-@kernel
+@inner_kernel
 def invert(matrix: Float, inverse: Float) -> bool:
     """Fill the inverse (3, 3) of a symmetric matrix; False unless positive definite."""
     a, d, f = matrix[0, 0], matrix[1, 1], matrix[2, 2]
@@ -267,13 +282,13 @@ def _farthest_moved(T_a_b: Float, step: Float, p_b: Float, truth: Float) -> floa
 @kernel
 def maximise_likelihood(
     pairs: PlanarPairs, T_start: Float, gate_m: float, least_drift_m: float, max_rounds: int
-) -> tuple[bool, float, Float, np.ndarray, float, Float]:
+) -> tuple[bool, float, Float, np.ndarray, float, Float, int]:
     """Expectation maximisation for motion, s_drift and share of true pairs.
 
     Returns:
         Whether the pairs determine a motion and its covariance, how far the last step moved a
         landmark (m), T_a_b (3,), its covariance (3, 3), s_drift^2, each pair's probability of being
-        true (N,).
+        true (N,), and which one has most leverage.
     """
     n, farthest = len(pairs.p_a), farthest_m(pairs.p_b)
     T_a_b, T_near = T_start.copy(), T_start.copy()
@@ -282,9 +297,11 @@ def maximise_likelihood(
     widest = (gate_m / _GATE_SIGMAS) ** 2
     variance, share = widest, 0.5
     step_share, last_change = 1.0, 0.0
-    covariance, step = np.full((3, 3), np.nan), np.empty(3)
+    covariance, step, right = np.empty((3, 3)), np.empty(3), np.empty(3)
+    for k in range(9):
+        covariance[k // 3, k % 3] = math.nan
     moved, determined = math.inf, True
-    judged, weighed, normal, at = variance, variance, np.zeros((3, 3)), np.empty(3)
+    judged, weighed, normal, at = variance, variance, np.empty((3, 3)), np.empty(3)
     for rounds in range(max_rounds):
         if leaves_margin(T_a_b, T_near, gate_m, farthest):
             at_rows(near.inside, near.rows, inside_of_all)
@@ -294,13 +311,12 @@ def maximise_likelihood(
         if rounds < _SETTLING_ROUNDS:
             _mark_inside(e, gate_m, inside)
         weighed, judged = variance, max(variance, least_drift_m * least_drift_m)
-        truth_probabilities(e, S, judged, share, gate_m, inside, truth)
-        total = np.sum(truth)
-        normal, right = normal_equations(T_a_b, some.p_b, e, S, variance, truth)
+        total, count = truth_probabilities(e, S, judged, share, gate_m, inside, truth)
+        put_normal_equations(T_a_b, some.p_b, e, S, variance, truth, normal, right)
         determined = not total < 1.0 and invert(normal, covariance)
         if not determined:
             break
-        share = total / (np.sum(inside) + _PRIOR_FALSE)
+        share = total / (count + _PRIOR_FALSE)
         change = min(drift_step(e, S, truth, variance, gate_m), widest) - variance
         # few pairs far surer than the rest can throw it from one side to the other
         turned_back = change * last_change < 0 and abs(change) > _SWINGING * abs(last_change)
@@ -317,11 +333,11 @@ def maximise_likelihood(
             break
     if determined:
         _, some, e, S, _, truth = near
-        missing = missing_information(at, some.p_b, e, S, weighed, judged, truth)
-        normal -= missing
+        take_missing_information(at, some.p_b, e, S, weighed, judged, truth, normal)
         determined = invert(normal, covariance)
     at_rows(near.truth, near.rows, truth_of_all)
-    return determined, moved, T_a_b, covariance, variance, truth_of_all
+    most = most_leverage(T_a_b, pairs, variance, truth_of_all, covariance)
+    return determined, moved, T_a_b, covariance, variance, truth_of_all, most
 
 
 @kernel_part

@@ -4,12 +4,14 @@ import math
 
 import numpy as np
 
-from mapfusion.kernels import kernel
+from mapfusion.kernels import inner_kernel, kernel
 from mapfusion.planar import add_turned, lever, residual
 from mapfusion.se2 import Float, rotation
 
+_ALL = slice(None)  # as the number of a pair: of all of them at once, in NumPy
 
-@kernel
+
+@inner_kernel
 def _fit_rows(
     p_a: Float, p_b: Float, rows: np.ndarray, weight: Float
 ) -> tuple[float, float, float]:
@@ -53,7 +55,7 @@ def fit_weighted(p_a: Float, p_b: Float, weight: Float, T_a_b: Float) -> None:
     T_a_b[0], T_a_b[1], T_a_b[2] = _fit_rows(p_a, p_b, np.arange(len(weight)), weight)
 
 
-@kernel
+@inner_kernel
 def fit_two(p_a: Float, p_b: Float, i: int, j: int, T_a_b: Float) -> float:
     """Fill T_a_b (3,) with the motion of pairs i and j; returns the shorter of their distances."""
     ax, ay = p_a[j, 0] - p_a[i, 0], p_a[j, 1] - p_a[i, 1]
@@ -67,28 +69,20 @@ def fit_two(p_a: Float, p_b: Float, i: int, j: int, T_a_b: Float) -> float:
     return math.sqrt(min(ax * ax + ay * ay, bx * bx + by * by))
 
 
-@kernel
 def residuals(T_a_b: Float, p_a: Float, p_b: Float) -> Float:
     """p_a - T_a_b p_b in the plane (N, 2)."""
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
-    found = np.empty((len(p_a), 2))
-    for i in range(len(p_a)):
-        found[i, 0], found[i, 1] = residual(T_a_b, cos, sin, p_a, p_b, i)
-    return found
+    return np.stack(residual.py_func(T_a_b, cos, sin, p_a, p_b, _ALL), axis=1)
 
 
-@kernel
 def residual_covariances(T_a_b: Float, covariance_a: Float, covariance_b: Float) -> Float:
     """S_a + R S_b R^T in the plane (N, 2, 2): what the landmarks' own noise makes of a residual."""
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
-    found = np.empty((len(covariance_a), 2, 2))
-    for i in range(len(covariance_a)):
-        S_a, S_b = covariance_a[i], covariance_b[i]
-        xx, xy, yy = S_a[0, 0], S_a[0, 1], S_a[1, 1]
-        xx, xy, yy = add_turned(xx, xy, yy, cos, sin, S_b[0, 0], S_b[0, 1], S_b[1, 1])
-        found[i, 0, 0] = xx
-        found[i, 0, 1] = found[i, 1, 0] = xy
-        found[i, 1, 1] = yy
+    a, b = (S.T[[0, 0, 1], [0, 1, 1]] for S in (covariance_a, covariance_b))
+    xx, xy, yy = add_turned.py_func(*a, cos, sin, *b)
+    found = np.empty((len(xx), 2, 2))
+    found[:, 0, 0], found[:, 1, 1] = xx, yy
+    found[:, 0, 1] = found[:, 1, 0] = xy
     return found
 
 
@@ -99,56 +93,26 @@ def least_squares_gain(T_a_b: Float, p_b: Float, weight: Float | None = None) ->
     p_b are (N, 2 or more), not all in one place; weights (N,) are all equal by default.
     """
     given = np.ones(len(p_b)) if weight is None else weight
-    inverse: Float = np.linalg.inv(_normal_matrix(T_a_b, p_b, given)).astype(np.float64, copy=False)
-    return _gain(T_a_b, p_b, given, inverse)
-
-
-@kernel
-def _normal_matrix(T_a_b: Float, p_b: Float, weight: Float) -> Float:
-    """Sum of weight J'J (3, 3), J the `motion_jacobian` of a point."""
-    cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
-    total = x = y = square = 0.0
-    for i in range(len(p_b)):
-        jx, jy = lever(cos, sin, p_b, i)
-        total += weight[i]
-        x += weight[i] * jx
-        y += weight[i] * jy
-        square += weight[i] * (jx * jx + jy * jy)
-    return np.array([[total, 0.0, x], [0.0, total, y], [x, y, square]])
-
-
-@kernel
-def _gain(T_a_b: Float, p_b: Float, weight: Float, inverse: Float) -> Float:
-    """Weight times the normal matrix' inverse (3, 3) times J' (N, 3, 2)."""
-    cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+    jx, jy = lever.py_func(math.cos(T_a_b[2]), math.sin(T_a_b[2]), p_b, _ALL)
+    total, x, y = np.sum(given), given @ jx, given @ jy
+    normal = np.array([[total, 0.0, x], [0.0, total, y], [x, y, given @ (jx * jx + jy * jy)]])
+    inverse = np.linalg.inv(normal)
     gain = np.empty((len(p_b), 3, 2))
-    for i in range(len(p_b)):
-        jx, jy = lever(cos, sin, p_b, i)
-        for k in range(3):
-            gain[i, k, 0] = weight[i] * (inverse[k, 0] + inverse[k, 2] * jx)
-            gain[i, k, 1] = weight[i] * (inverse[k, 1] + inverse[k, 2] * jy)
+    for k, j in enumerate((jx, jy)):
+        gain[:, :, k] = (given * (inverse[:, k, None] + inverse[:, 2, None] * j)).T
     return gain
 
 
-@kernel
 def motion_covariance(gain: Float, covariance_m2: Float) -> Float:
     """Covariance (3, 3) of a motion from its gains (N, 3, 2) and independent residuals' (N, 2, 2).
 
     Weights that are not the inverse covariances make it larger than the inverse of the normal
     matrix: this is the sandwich of the two.
     """
-    total = np.zeros((3, 3))
-    for i in range(len(gain)):
-        xx, xy, yy = covariance_m2[i, 0, 0], covariance_m2[i, 0, 1], covariance_m2[i, 1, 1]
-        for k in range(3):
-            x, y = gain[i, k, 0], gain[i, k, 1]
-            along_x, along_y = x * xx + y * xy, x * xy + y * yy
-            for j in range(k + 1):
-                total[k, j] += along_x * gain[i, j, 0] + along_y * gain[i, j, 1]
-    for k in range(3):
-        for j in range(k):
-            total[j, k] = total[k, j]
-    return total
+    x, y = np.ascontiguousarray(gain.T)
+    xx, xy, yy = covariance_m2.T[[0, 0, 1], [0, 1, 1]]
+    total = (x * xx + y * xy) @ x.T + (x * xy + y * yy) @ y.T
+    return (total + total.T) / 2  # symmetric to the last bit
 
 
 def motion_jacobian(T_a_b: Float, p_b: Float) -> Float:

@@ -3,6 +3,7 @@
 An observation takes at most one landmark in a frame, and a landmark at most one observation.
 """
 
+import math
 from collections.abc import Mapping
 from enum import StrEnum
 from typing import NamedTuple
@@ -14,7 +15,7 @@ from mapfusion.fastslam.particles import ParticleMaps
 from mapfusion.fastslam.sensor import Sightings, innovation, quadratic_form
 from mapfusion.fastslam.slots import Estimates, Slots
 from mapfusion.fastslam.update import DROPPED, NEW
-from mapfusion.kernels import kernel, kernel_part
+from mapfusion.kernels import inner_kernel, kernel, kernel_part
 from mapfusion.se2 import Float
 
 _PART = 16  # entries of a descriptor that are compared at a time
@@ -38,18 +39,20 @@ class Pairs(NamedTuple):
 @kernel(error_model="numpy")
 def boxes_of(seen: Sightings, gate: float) -> Float:
     """Boxes (K, 4) of observations and their gates over all particles."""
-    boxes = np.empty((len(seen.point_m), 4))
+    point, noise = seen
+    boxes = np.empty((len(point), 4))
     for k in range(len(boxes)):
-        point, noise, box = seen.point_m[k], seen.covariance_m2[k], boxes[k]
-        box[:2], box[2:] = np.inf, -np.inf
+        low_x = low_y = math.inf
+        high_x = high_y = -math.inf
         spread_x = spread_y = 0.0
-        for m in range(len(point)):
-            box[0], box[1] = min(box[0], point[m, 0]), min(box[1], point[m, 1])
-            box[2], box[3] = max(box[2], point[m, 0]), max(box[3], point[m, 1])
-            spread_x, spread_y = max(spread_x, noise[m, 0]), max(spread_y, noise[m, 3])
-        margin_x, margin_y = np.sqrt(gate * spread_x), np.sqrt(gate * spread_y)
-        box[0], box[1] = box[0] - margin_x, box[1] - margin_y
-        box[2], box[3] = box[2] + margin_x, box[3] + margin_y
+        for m in range(point.shape[1]):
+            x, y = point[k, m, 0], point[k, m, 1]
+            low_x, low_y = min(low_x, x), min(low_y, y)
+            high_x, high_y = max(high_x, x), max(high_y, y)
+            spread_x, spread_y = max(spread_x, noise[k, m, 0]), max(spread_y, noise[k, m, 3])
+        margin_x, margin_y = math.sqrt(gate * spread_x), math.sqrt(gate * spread_y)
+        boxes[k, 0], boxes[k, 1] = low_x - margin_x, low_y - margin_y
+        boxes[k, 2], boxes[k, 3] = high_x + margin_x, high_y + margin_y
     return boxes
 
 
@@ -99,9 +102,9 @@ def pairs_of_labels(
 def _touching(
     slots: Slots, names: np.ndarray, boxes: Float, descriptor: np.ndarray, threshold: np.float32
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    observation = np.empty(len(boxes) * len(names), dtype=np.int64)
-    slot = np.empty(len(observation), dtype=np.int64)
-    distance = np.empty(len(observation), dtype=np.float32)
+    observation = np.empty(len(boxes) * len(names), np.int64)
+    slot = np.empty(len(observation), np.int64)
+    distance = np.empty(len(observation), np.float32)
     n = 0
     for k in range(len(boxes)):
         for s in names:
@@ -178,7 +181,7 @@ def _distinct(slot: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return ordered[first], place
 
 
-@kernel(error_model="numpy")
+@inner_kernel(error_model="numpy")
 def _distance(seen: Sightings, k: int, own: Estimates, r: int, m: int, planar: bool) -> float:
     difference, inverse, _ = innovation(seen, k, own, r, m, planar)
     return quadratic_form(difference, inverse)
@@ -251,19 +254,13 @@ def _take_nearest(
                 taken[j, m] = True
 
 
-@kernel
 def sources(slots: Slots, chosen: np.ndarray, first_source: int) -> np.ndarray:
     """(K, M) int32 source of the landmark that each observation went into, -1 if it was dropped.
 
     `first_source` is the running number of the first observation.
     """
-    source = np.empty(chosen.shape, dtype=np.int32)
-    for k in range(chosen.shape[0]):
-        last, its = DROPPED, -1  # most particles choose as the one before
-        for m in range(chosen.shape[1]):
-            s = chosen[k, m]
-            if s != last:
-                last = s
-                its = -1 if s == DROPPED else first_source + k if s == NEW else slots.source[s]
-            source[k, m] = its
+    source = slots.source.take(chosen, mode="wrap").astype(np.int32)
+    own = np.arange(first_source, first_source + len(chosen), dtype=np.int32)
+    np.copyto(source, own[:, None], where=chosen == NEW)
+    np.copyto(source, -1, where=chosen == DROPPED)
     return source

@@ -35,7 +35,7 @@ class Genealogy:
 def _compose(table: np.ndarray, ancestors: np.ndarray, newest: int, shared: int) -> int:
     """Follow a resampling, in the generations where it makes a difference; the new `shared`."""
     n_particles = table.shape[1]
-    old = np.empty(n_particles, dtype=table.dtype)
+    old = np.empty(n_particles, np.int32)
     for generation in range(max(shared + 1, newest - len(table) + 1), newest):
         g, is_shared = generation % len(table), True
         for m in range(n_particles):

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mapfusion.fastslam.slots import Estimates
-from mapfusion.kernels import kernel
+from mapfusion.kernels import inner_kernel, kernel
 from mapfusion.planar import add_turned
 from mapfusion.se2 import Float
 from mapfusion.symmetric import cofactors
@@ -36,15 +36,21 @@ def sightings(
     shape = (len(position_m), len(T_map_robot))
     seen = Sightings(np.empty((*shape, 3)), np.empty((*shape, 6)))
     position, covariance = np.ascontiguousarray(position_m), np.ascontiguousarray(covariance_m2)
-    _turn_into_map(T_map_robot, position, covariance, planar, seen)
+    turn = T_map_robot[:, 2]
+    _turn_into_map(T_map_robot, np.cos(turn), np.sin(turn), position, covariance, planar, seen)
     return seen
 
 
 @kernel(error_model="numpy")
 def _turn_into_map(
-    T_map_robot: Float, position: Float, covariance: Float, planar: bool, seen: Sightings
+    T_map_robot: Float,
+    cos: Float,
+    sin: Float,
+    position: Float,
+    covariance: Float,
+    planar: bool,
+    seen: Sightings,
 ) -> None:
-    cos, sin = np.cos(T_map_robot[:, 2]), np.sin(T_map_robot[:, 2])
     for k in range(len(position)):
         x, y, z = position[k, 0], position[k, 1], position[k, 2]
         xx, xy, xz = covariance[k, 0, 0], covariance[k, 0, 1], covariance[k, 0, 2]
@@ -65,7 +71,7 @@ def _turn_into_map(
 
 # Division is NumPy's in the filter's kernels (`error_model`): a check for zero at each one keeps
 # LLVM from inlining what divides. No Z is singular: a frame with a singular R_t is refused.
-@kernel(error_model="numpy")
+@inner_kernel(error_model="numpy")
 def inverse_and_determinant(
     xx: float, xy: float, xz: float, yy: float, yz: float, zz: float
 ) -> tuple[Upper, float]:
@@ -75,7 +81,7 @@ def inverse_and_determinant(
     return (f * axx, f * axy, f * axz, f * ayy, f * ayz, f * azz), determinant
 
 
-@kernel(error_model="numpy")
+@inner_kernel(error_model="numpy")
 def innovation(
     seen: Sightings, k: int, own: Estimates, r: int, m: int, planar: bool
 ) -> tuple[Vector, Upper, float]:
@@ -100,7 +106,7 @@ def innovation(
     return difference, inverse, determinant
 
 
-@kernel(error_model="numpy")
+@inner_kernel(error_model="numpy")
 def quadratic_form(difference: Vector, inverse: Upper) -> float:
     """Squared Mahalanobis distance: d^T Z^-1 d."""
     dx, dy, dz = difference

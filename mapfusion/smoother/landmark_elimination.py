@@ -9,7 +9,7 @@ known, observations i, k of tracks t, u of one landmark take from what their pos
 
 import numpy as np
 
-from mapfusion.kernels import kernel, kernel_part
+from mapfusion.kernels import inner_kernel, kernel, kernel_part
 from mapfusion.se2 import Float
 from mapfusion.smoother.normal_equations import NormalEquations
 from mapfusion.smoother.offsets import Reduced
@@ -83,34 +83,7 @@ def _add_product(A: Float, B: Float, t: int, total: Float) -> None:
             total[r, q] += A[r, 0] * B[t, 0, q] + A[r, 1] * B[t, 1, q] + A[r, 2] * B[t, 2, q]
 
 
-def subtract_gram(seen: Sightings, moved: Float, S: Float) -> None:
-    """Take moved_i moved_k' of any two observations of a landmark from what is between their poses.
-
-    Args:
-        seen: the observations.
-        moved: (N, 3, 3) of each.
-        S: entries of what is between the unknown poses, in `seen.order.envelope`.
-    """
-    _subtract_gram(seen.starts, seen.unknown_place, moved, seen.order.envelope.offset, S)
-
-
-@kernel
-def _subtract_gram(
-    starts: np.ndarray, place: np.ndarray, moved: Float, offset: np.ndarray, S: Float
-) -> None:
-    own = np.empty((3, 3))
-    for j in range(len(starts) - 1):
-        for i in range(starts[j], starts[j + 1]):
-            if place[i] < 0:
-                continue
-            for r in range(3):
-                for q in range(3):
-                    own[r, q] = moved[i, r, q]
-            _subtract_rows(own, starts[j], i, i, place, moved, offset, S)
-            _subtract_own(own, moved, i, 3 * place[i], offset, S)
-
-
-@kernel
+@inner_kernel
 def _subtract_rows(
     X: Float,
     begin: int,
@@ -147,7 +120,7 @@ def _subtract_rows(
                 S[at + 2] -= v2
 
 
-@kernel
+@kernel_part
 def _subtract_own(
     X: Float, coupling: Float, i: int, row: int, offset: np.ndarray, S: Float
 ) -> None:

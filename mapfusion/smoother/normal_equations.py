@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mapfusion.fastslam.motion import MotionNoise
-from mapfusion.kernels import kernel
+from mapfusion.kernels import inner_kernel, kernel
 from mapfusion.se2 import Float, between, rotation, wrap
 from mapfusion.smoother.sightings import Sightings
 
@@ -243,7 +243,7 @@ def _add_to_points(
             _add_to_track(W, e, 1.0, made, t)
 
 
-@kernel
+@inner_kernel
 def _add_to_track(W: Float, e: Float, share: float, made: PointEquations, t: int) -> None:
     for r in range(3):
         made.track_gradient[t, r] += W[r, 0] * e[0] + W[r, 1] * e[1] + W[r, 2] * e[2]
@@ -251,7 +251,7 @@ def _add_to_track(W: Float, e: Float, share: float, made: PointEquations, t: int
             made.track_block[t, r, q] += share * W[r, q]
 
 
-@kernel
+@inner_kernel
 def _put_in_map_frame(turn: Float, information: Float, weight: float, W: Float) -> None:
     """The information of an observation, in the map frame: weight R information R'."""
     c, s = turn[0], turn[1]
@@ -264,7 +264,7 @@ def _put_in_map_frame(turn: Float, information: Float, weight: float, W: Float) 
     W[2, 2] = weight * information[2, 2]
 
 
-@kernel
+@inner_kernel
 def _put_residual(
     pose: Float, x: float, y: float, z: float, turn: Float, seen_at: Float, e: Float
 ) -> None:

@@ -177,36 +177,30 @@ class Points(NamedTuple):
 
 def known_points(seen: Sightings, left: Reduced) -> Points:
     """What is known of offsets and tracks' points, their landmark's own covariance in it."""
-    made = Points(np.empty_like(left.own_m2), np.empty_like(left.own_m2))
+    made = np.empty((2, *left.own_m2.shape))
     _put_known(seen.landmark_of_track, left, made)
-    return made
+    return Points(made[0], made[1])
 
 
 @kernel
-def _put_known(landmark: np.ndarray, left: Reduced, made: Points) -> None:
-    keeps, follows, half = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    for t in range(len(landmark)):
-        for r in range(3):
-            for q in range(3):
-                keeps[r, q] = left.kept[t, r, q]
-                follows[r, q] = -keeps[r, q]  # -db / dl
-            follows[r, r] += 1.0
-        _put_sum(follows, landmark[t], left, t, half, made.offset_m2)
-        _put_sum(keeps, landmark[t], left, t, half, made.track_m2)
-
-
-@kernel
-def _put_sum(
-    of_landmark: Float, j: int, left: Reduced, t: int, half: Float, covariance_m2: Float
-) -> None:
+def _put_known(landmark: np.ndarray, left: Reduced, made: Float) -> None:
     """What is known of a track, and what its landmark's covariance does by a symmetric matrix."""
-    A, G = left.landmark_m2, left.own_m2
-    for r in range(3):
-        x, y, z = of_landmark[r, 0], of_landmark[r, 1], of_landmark[r, 2]
-        for q in range(3):
-            half[r, q] = x * A[j, 0, q] + y * A[j, 1, q] + z * A[j, 2, q]
-    for r in range(3):
-        x, y, z = half[r, 0], half[r, 1], half[r, 2]
-        for q in range(3):
-            moved = x * of_landmark[0, q] + y * of_landmark[1, q] + z * of_landmark[2, q]
-            covariance_m2[t, r, q] = G[t, r, q] + moved
+    A, G, kept = left.landmark_m2, left.own_m2, left.kept
+    follows, half = np.empty((3, 3)), np.empty((3, 3))
+    for which in range(2):
+        for t in range(len(landmark)):
+            j = landmark[t]
+            for r in range(3):
+                for q in range(3):
+                    follows[r, q] = kept[t, r, q]
+                    if which == 0:  # -db / dl
+                        follows[r, q] = (1.0 if r == q else 0.0) - kept[t, r, q]
+            for r in range(3):
+                x, y, z = follows[r, 0], follows[r, 1], follows[r, 2]
+                for q in range(3):
+                    half[r, q] = x * A[j, 0, q] + y * A[j, 1, q] + z * A[j, 2, q]
+            for r in range(3):
+                x, y, z = half[r, 0], half[r, 1], half[r, 2]
+                for q in range(3):
+                    moved = x * follows[0, q] + y * follows[1, q] + z * follows[2, q]
+                    made[which, t, r, q] = G[t, r, q] + moved

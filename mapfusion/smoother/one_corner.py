@@ -13,10 +13,8 @@ so what it is off by draws them together and not apart. A landmark becomes as ma
 import numpy as np
 
 from mapfusion.chi_square import chi_square_bound
-from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float, rotation
 from mapfusion.smoother.sightings import Sightings
-from mapfusion.symmetric import cholesky, solve_lower
 
 # Of two tracks of one corner so many stay together; what is parted by mistake is seen twice.
 _TOGETHER = 0.999
@@ -43,7 +41,7 @@ def parted(seen: Sightings, landmark: np.ndarray, path: Float, stray_m: float) -
     first = np.searchsorted(seen.track_starts, seen.starts)
     counts, n = np.diff(seen.track_starts), seen.n_dimensions
     bound = chi_square_bound(_TOGETHER, n)
-    corner = _corners(first, counts, point[:, :n].copy(), covariance[:, :n, :n].copy(), bound)
+    corner = _corners(first, counts, point[:, :n], covariance[:, :n, :n], bound)
     names = set(landmark.tolist())
     for own in np.flatnonzero(np.maximum.reduceat(corner, first[:-1])):
         track = np.repeat(corner[first[own] : first[own + 1]], counts[first[own] : first[own + 1]])
@@ -71,7 +69,6 @@ def _track_points(seen: Sightings, path: Float) -> tuple[Float, Float]:
     return np.einsum("tij,tj->ti", covariance, weighted), covariance
 
 
-@kernel
 def _corners(
     first: np.ndarray, counts: np.ndarray, point: Float, covariance: Float, bound: float
 ) -> np.ndarray:
@@ -80,43 +77,40 @@ def _corners(
     Again and again the track that the most observations agree with takes those tracks along.
     """
     corner = np.zeros(len(point), dtype=np.int64)
-    n = point.shape[1]
-    S, off = np.empty((n, n)), np.empty(n)
-    for own in range(len(first) - 1):
+    of = np.repeat(np.arange(len(first) - 1), np.diff(first))
+    before = np.arange(len(point)) - first[of]  # tracks of the same landmark before each
+    i, ends = np.repeat(np.arange(len(point)), before), np.cumsum(before)
+    j = np.arange(len(i)) - np.repeat(ends - before - first[of], before)
+    S, off = (np.ascontiguousarray(values.T) for values in (covariance, point))
+    S, off = S[..., i] + S[..., j], off[..., i] - off[..., j]
+    apart = np.flatnonzero(_squares(S, off) > bound)
+    of_apart = of[i[apart]]
+    for own in np.unique(of_apart):
         begin, size = first[own], first[own + 1] - first[own]
-        near = np.zeros((size, size), dtype=np.bool_)
-        for i in range(size):
-            near[i, i] = True
-            for j in range(i):
-                for r in range(n):
-                    off[r] = point[begin + i, r] - point[begin + j, r]
-                    for q in range(n):
-                        S[r, q] = covariance[begin + i, r, q] + covariance[begin + j, r, q]
-                near[i, j] = near[j, i] = _square(S, off) <= bound
-        left, k = np.ones(size, dtype=np.bool_), 0
+        here = apart[slice(*np.searchsorted(of_apart, [own, own + 1]))]
+        near, one, other = np.ones((size, size), dtype=bool), i[here] - begin, j[here] - begin
+        near[one, other] = near[other, one] = False
+        left, k = np.ones(size, dtype=bool), 0
         while left.any():
-            best, most = -1, 0
-            for i in range(size):
-                agree = 0
-                for j in range(size):
-                    if left[i] and left[j] and near[i, j]:
-                        agree += counts[begin + j]
-                if agree > most:
-                    best, most = i, agree
-            for j in range(size):
-                if left[j] and near[best, j]:
-                    corner[begin + j], left[j] = k, False
-            k += 1
+            agree = np.where(left, near @ (left * counts[begin : begin + size]), 0)
+            taken = left & near[np.argmax(agree)]
+            corner[begin : begin + size][taken] = k
+            left, k = left & ~taken, k + 1
     return corner
 
 
-@kernel_part
-def _square(S: Float, off: Float) -> float:
-    """Squared Mahalanobis distance; destroys both."""
-    if not cholesky(S, _SINGULAR):
-        return 0.0
-    solve_lower(S, off)
-    total = 0.0
-    for value in off:
-        total += value * value
-    return total
+def _squares(S: Float, off: Float) -> Float:
+    """(P,) squared Mahalanobis distances of (n, P), 0 where S (n, n, P) is singular.
+
+    By S = L D L'; both are changed.
+    """
+    total, regular = np.zeros(S.shape[-1]), np.ones(S.shape[-1], dtype=bool)
+    least = [_SINGULAR * S[k, k] for k in range(len(S))]
+    for k in range(len(S)):
+        regular &= S[k, k] > least[k]
+        pivot = np.where(regular, S[k, k], 1.0)
+        total += off[k] ** 2 / pivot
+        share = S[k + 1 :, k] / pivot
+        off[k + 1 :] -= share * off[k]
+        S[k + 1 :, k + 1 :] -= share[:, None] * S[k, k + 1 :]
+    return np.where(regular, total, 0.0)

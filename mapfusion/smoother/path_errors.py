@@ -9,14 +9,15 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float
-from mapfusion.smoother.landmark_elimination import left_couplings, subtract_gram
+from mapfusion.smoother.landmark_elimination import left_couplings
 from mapfusion.smoother.normal_equations import NormalEquations
 from mapfusion.smoother.offsets import without_offsets
 from mapfusion.smoother.sightings import Sightings
-from mapfusion.smoother.skyline import Factor, multiply_in_envelope
+from mapfusion.smoother.skyline import Factor
 
 
 @dataclass(frozen=True)
@@ -53,17 +54,11 @@ class PathErrors:
 
     def gram(self, columns: Float) -> Float:
         """Y Y' times columns (R, c)."""
-        negative = multiply_in_envelope(
-            self._less_gram, self.factor.envelope, self.factor.solve_transposed(columns)
-        )
-        return -self.factor.solve(negative)
+        return self.factor.solve(self._moving.T @ self.spread(columns))
 
     def spread(self, columns: Float) -> Float:
         """(3L, c) Y' times columns (R, c)."""
-        total = np.zeros((3 * self.seen.n_landmarks, columns.shape[1]))
-        of_poses = self.factor.solve_transposed(columns)
-        _add_spread(self.seen.starts, self.seen.unknown_place, self.moved, of_poses, total)
-        return total
+        return self._moving @ self.factor.solve_transposed(columns)
 
     def squares(self) -> Float:
         """(L, 3, 3) blocks of Y' Y, each landmark's with itself."""
@@ -74,30 +69,15 @@ class PathErrors:
         return total + np.swapaxes(total, 1, 2)
 
     @cached_property
-    def _less_gram(self) -> Float:
-        """-C A A C', its entries."""
-        S = self.factor.envelope.zeros()
-        subtract_gram(self.seen, self.moved, S)
-        return S
-
-
-@kernel
-def _add_spread(
-    starts: np.ndarray, place: np.ndarray, moved: Float, of_poses: Float, total: Float
-) -> None:
-    """Add moved' times what is of each observation's pose to its landmark's rows."""
-    n = of_poses.shape[1]
-    for j in range(len(starts) - 1):
-        for i in range(starts[j], starts[j + 1]):
-            row = 3 * place[i]
-            if row < 0:
-                continue
-            for q in range(3):
-                a, b, c = moved[i, 0, q], moved[i, 1, q], moved[i, 2, q]
-                for k in range(n):
-                    total[3 * j + q, k] += (
-                        a * of_poses[row, k] + b * of_poses[row + 1, k] + c * of_poses[row + 2, k]
-                    )
+    def _moving(self) -> csr_array:
+        """(3L, R) A C', of which each observation is a block."""
+        place, each = self.seen.unknown_place, np.arange(3)
+        known = place >= 0
+        rows = 3 * self.seen.landmark[known, None] + each
+        columns = 3 * place[known, None] + each
+        rows, columns = np.broadcast_arrays(rows[:, None, :], columns[:, :, None])
+        shape = 3 * self.seen.n_landmarks, len(self)
+        return csr_array((self.moved[known].ravel(), (rows.ravel(), columns.ravel())), shape)
 
 
 @kernel

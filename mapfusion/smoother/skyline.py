@@ -230,15 +230,3 @@ def factor_in_envelope(entries: Float, envelope: Envelope) -> Factor:
             else:
                 left[:] = left @ inverses[j].T
     return Factor(envelope, entries, tuple(inverses))
-
-
-def multiply_in_envelope(entries: Float, envelope: Envelope, right: Float) -> Float:
-    """A right (n, m) of a symmetric A (n, n) by its entries, of which the lower half is read."""
-    product = np.zeros_like(right)
-    for rows, first, panel in envelope.panels(entries):
-        before, A = slice(first, rows.start), panel[:, : rows.start - first]
-        product[rows] += A @ right[before]
-        product[before] += A.T @ right[rows]
-        lower = np.tril(panel[:, rows.start - first :])
-        product[rows] += (lower + np.tril(lower, -1).T) @ right[rows]
-    return product

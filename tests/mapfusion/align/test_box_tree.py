@@ -12,15 +12,24 @@ def test_each_box_holds_its_points_and_halves_those_of_the_one_above(kind):
     p = points(kind, np.random.default_rng(1))
     tree = BoxTree.of(p)
     np.testing.assert_array_equal(tree.p, p[tree.row])
+    np.testing.assert_array_equal(np.stack([tree.x, tree.y, tree.z], axis=1), tree.p)
     assert sorted(tree.row) == list(range(len(tree.p)))
     inner = len(tree.first) // 2
+    size = -(-len(p) // (inner + 1))
+    assert size <= 16
+    leaves = tree.end[inner:] - tree.first[inner:]
+    np.testing.assert_array_equal(leaves, np.clip(len(p) - size * np.arange(inner + 1), 0, size))
     for node, (first, end) in enumerate(zip(tree.first, tree.end, strict=True)):
         held = tree.p[first:end]
+        if len(held) == 0:
+            np.testing.assert_array_equal(tree.box[node], [np.inf] * 3 + [-np.inf] * 3)
+            continue
         np.testing.assert_array_equal(tree.box[node], [*held.min(axis=0), *held.max(axis=0)])
         if node < inner:
-            below = (2 * node + 1, 2 * node + 2)
-            assert [tree.first[k] for k in below] == [first, (first + end) // 2]
-            assert [tree.end[k] for k in below] == [(first + end) // 2, end]
+            low, high = 2 * node + 1, 2 * node + 2
+            assert tree.first[low] == first
+            assert tree.end[low] == tree.first[high]
+            assert tree.end[high] == end
             axis = np.argmax(np.ptp(held, axis=0))
-            halves = (tree.p[tree.first[k] : tree.end[k], axis] for k in below)
-            assert next(halves).max() <= next(halves).min()
+            above = tree.p[tree.first[high] : end, axis]
+            assert tree.p[first : tree.end[low], axis].max() <= above.min(initial=np.inf)

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from mapfusion.align.closest import Grid, runs_about
+from tests.helpers.inner_kernels import from_python
 
 
 def points(kind, rng):
@@ -22,7 +23,7 @@ def test_all_within_a_radius_are_in_the_runs_about_a_point(kind):
     runs = np.empty((grid.shape[1], 2), np.int64)
     queries = np.vstack([rng.uniform(-2, 22, (200, 3)), rng.uniform(-1000, 1000, (20, 3)), p[:20]])
     for q, radius in zip(queries, rng.uniform(0, 3, len(queries)), strict=True):
-        ranges = runs[: runs_about(q[0], q[1], radius, grid, runs)]
+        ranges = runs[: from_python(runs_about)(q[0], q[1], radius, grid, runs)]
         found = np.concatenate([grid.row[first:end] for first, end in ranges] + [np.zeros(0, int)])
         near = np.flatnonzero(np.hypot(*(p - q)[:, :2].T) <= radius)
         assert len(set(found)) == len(found)
@@ -34,5 +35,5 @@ def test_all_within_a_radius_are_in_the_runs_about_a_point(kind):
 def test_of_no_points_there_is_a_grid():
     grid = Grid.of(np.zeros((0, 2)))
     runs = np.empty((grid.shape[1], 2), np.int64)
-    assert runs_about(0.0, 0.0, 1.0, grid, runs) <= 1
+    assert from_python(runs_about)(0.0, 0.0, 1.0, grid, runs) <= 1
     np.testing.assert_array_equal(grid.start, 0)

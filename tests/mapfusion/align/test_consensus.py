@@ -13,9 +13,10 @@ from scipy.stats import f as f_distribution
 
 from mapfusion import se2
 from mapfusion.align.clique import Clique, CliqueSearch
+from mapfusion.align.consistency import in_rows
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.gnc import Gnc
-from mapfusion.align.mahalanobis_gate import settle
+from mapfusion.align.mahalanobis_gate import mean_variances, settle
 from mapfusion.align.method import Fit
 from mapfusion.align.oracle import Oracle
 from mapfusion.align.pairs import Pairs
@@ -162,7 +163,7 @@ def test_clique_is_the_largest_set_that_agrees():
         largest = np.array(next(s for s in sets if agree[np.ix_(s, s)].all()))
         planar = Pairs(pair.map_a, pair.map_b, pair.correspondences).in_plan()
         T, inside = np.array(fit_rigid(a, b, largest)), np.empty(14, dtype=bool)
-        settle(T, planar, 1e-12, aligner.bound, inside)
+        settle(T, planar, mean_variances(planar), 1e-12, aligner.bound, inside)
         found = estimate(aligner, pair)
         np.testing.assert_array_equal(found.inlier, inside)
         assert error(found.T_a_b, T) == pytest.approx((0, 0), abs=1e-6)
@@ -239,7 +240,7 @@ def slow_search(pairs, variance, bound, agreement, max_draws, seed):
         if np.sum(raw > 0) < 2 or np.sum(raw) <= best_raw:
             continue
         best_raw = np.sum(raw)
-        settle(T, planar, variance, bound, np.empty(n, dtype=bool))
+        settle(T, planar, mean_variances(planar), variance, bound, np.empty(n, dtype=bool))
         score = scores(T, pairs, variance, bound)
         if np.sum(score > 0) >= 2 and np.sum(score) > best_score:
             best_T, best_score, count = T, np.sum(score), np.sum(score > 0)
@@ -256,8 +257,10 @@ def test_search_equals_its_twin(seed):
     maps, pair = blurred(np.random.default_rng(seed), 50, 0.2)
     pairs = Pairs(*maps, pair.correspondences)
     bound, agreement = float(chi2.ppf(0.99, 2)), float(chi2.ppf(0.99, 1))
+    planar = pairs.in_plan()
+    given = planar, mean_variances(planar), in_rows(planar)
     draws, T = least_truncated_squares(
-        pairs.in_plan(), 0.0025, bound, agreement, 1.0, LOG_MISS, 3000, np.uint64(seed + 1)
+        *given, 0.0025, bound, agreement, 1.0, LOG_MISS, 3000, np.uint64(seed + 1)
     )
     slow_draws, slow_T = slow_search(pairs, 0.0025, bound, agreement, 3000, seed + 1)
     assert draws == slow_draws

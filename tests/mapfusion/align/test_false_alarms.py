@@ -88,7 +88,8 @@ def test_repairings_are_counted_right():
 def test_chance_is_the_larger_of_the_selections_and_of_all():
     """Counted by hand, one more than was counted: 1/5 and 3/101, 5/5 and 4/101, 1/5 and 101/101."""
     agreeing, possible = np.array([[0, 4, 0], [2, 3, 100]]), np.array([4, 100])
-    np.testing.assert_allclose(chance_of_agreeing(agreeing, possible), [0.2, 1.0, 1.0], rtol=1e-12)
+    found = [chance_of_agreeing(agreeing, g, *possible) for g in range(3)]
+    np.testing.assert_allclose(found, [0.2, 1.0, 1.0], rtol=1e-12)
 
 
 def test_minimal_motion_is_the_nearest_of_all():

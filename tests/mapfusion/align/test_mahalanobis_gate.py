@@ -5,6 +5,7 @@ import pytest
 from scipy.stats import chi2, multivariate_normal
 
 from mapfusion.align.mahalanobis_gate import (
+    Spread,
     log_likelihood,
     mark_supporters,
     mean_variances,
@@ -14,6 +15,7 @@ from mapfusion.align.mahalanobis_gate import (
 )
 from mapfusion.align.pairs import Pairs
 from mapfusion.align.rigid import fit_weighted
+from tests.helpers.inner_kernels import from_python
 from tests.mapfusion.align.map_pairs import blurred, error, given_pairs, stretched
 from tests.mapfusion.align.slow_twins import slow_squares
 
@@ -30,8 +32,8 @@ def case():
 def test_support_equals_its_twin(case, variance):
     pairs, T_a_b = case
     planar, inside = pairs.in_plan(), np.empty(200, dtype=bool)
-    mean = mean_variances(planar, variance)
-    count, score = mark_supporters(T_a_b, planar, mean, variance, BOUND, inside)
+    own, mean = mean_variances(planar), mean_variances(planar, variance)
+    count, score = from_python(mark_supporters)(T_a_b, planar, own, variance, BOUND, inside)
     _, C, square = slow_squares(T_a_b, pairs, variance)
     np.testing.assert_allclose(mean, np.trace(C, axis1=1, axis2=2) / 2)
     np.testing.assert_array_equal(inside, square <= BOUND)
@@ -42,8 +44,8 @@ def test_support_equals_its_twin(case, variance):
 def test_gate_keeps_true_pairs_with_the_probability_stated():
     (map_a, map_b), pair = blurred(np.random.default_rng(1), 20_000, 1.0)
     planar, inside = Pairs(map_a, map_b, pair.correspondences).in_plan(), np.empty(20_000, bool)
-    mean = mean_variances(planar, 1e-12)
-    count, _ = mark_supporters(pair.T_a_b, planar, mean, 1e-12, BOUND, inside)
+    own = mean_variances(planar)
+    count, _ = from_python(mark_supporters)(pair.T_a_b, planar, own, 1e-12, BOUND, inside)
     assert count / 20_000 == pytest.approx(0.99, abs=4 * math.sqrt(0.99 * 0.01 / 20_000))
 
 
@@ -59,7 +61,7 @@ def test_settled_motion_fits_its_own_support(case):
     pairs, T_a_b = case
     planar, inside = pairs.in_plan(), np.empty(200, dtype=bool)
     T = T_a_b + np.array([0.05, -0.05, 0.002])
-    count = settle(T, planar, 0.0025, BOUND, inside)
+    count = settle(T, planar, mean_variances(planar), 0.0025, BOUND, inside)
     fitted = np.empty(3)
     fit_weighted(planar.p_a, planar.p_b, inside / mean_variances(planar, 0.0025), fitted)
     assert error(T, fitted) == pytest.approx((0, 0), abs=1e-12)
@@ -85,12 +87,14 @@ def test_the_scale_that_the_residuals_have_is_chosen(drift_m, level):
         planar = Pairs(pair.map_a, stretched(rng, pair.map_b, 1), pair.correspondences).in_plan()
         T, inside = pair.T_a_b.copy(), np.empty(300, dtype=bool)
         scales = np.array([0.0, 0.05, 0.1]) ** 2 + 1e-12
-        assert settle_at_best_scale(T, planar, scales, BOUND, inside)[1] == level
+        spread = Spread.of(planar)
+        assert settle_at_best_scale(T, planar, spread, scales, BOUND, inside)[1] == level
 
 
 def test_no_support_at_any_scale():
     pair = given_pairs(np.random.default_rng(3), 50, 1.0, 0.01, planar=True)
     planar = Pairs(pair.map_a, pair.map_b, pair.correspondences).in_plan()
     T, inside = pair.T_a_b + np.array([500.0, 0, 0]), np.ones(50, dtype=bool)
-    assert settle_at_best_scale(T, planar, np.array([1e-4]), BOUND, inside)[1] == -1
+    spread = Spread.of(planar)
+    assert settle_at_best_scale(T, planar, spread, np.array([1e-4]), BOUND, inside)[1] == -1
     assert not inside.any()

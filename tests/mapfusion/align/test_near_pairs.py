@@ -5,6 +5,7 @@ import numpy as np
 from mapfusion import se2
 from mapfusion.align.mahalanobis_gate import PlanarPairs
 from mapfusion.align.near_pairs import farthest_m, leaves_margin, rows_in_reach, those_of
+from tests.helpers.inner_kernels import from_python
 
 
 def test_whatever_comes_within_the_gate_before_the_margin_is_left_is_among_the_rows() -> None:
@@ -21,7 +22,7 @@ def test_whatever_comes_within_the_gate_before_the_margin_is_left_is_among_the_r
         for part, some in zip(pairs, those_of(pairs, rows), strict=True):
             np.testing.assert_array_equal(some, part[rows])
         after = before + rng.normal(0, 1, 3) * [0.05, 0.05, 0.012]
-        if leaves_margin(after, before, gate_m, farthest_m(p_b)):
+        if leaves_margin(after, before, gate_m, from_python(farthest_m)(p_b)):
             left += 1
             continue
         inside = np.linalg.norm(p_a - se2.transform_points(after, p_b), axis=1) <= gate_m

@@ -5,6 +5,7 @@ from scipy.spatial.distance import cdist
 from mapfusion import se2
 from mapfusion.align.box_tree import BoxTree
 from mapfusion.align.nearest_points import GROUP, Groups, look_up_group, room_for_groups
+from tests.helpers.inner_kernels import from_python
 from tests.mapfusion.align.test_box_tree import KINDS
 from tests.mapfusion.align.test_closest import points
 
@@ -25,7 +26,7 @@ def test_finds_what_looking_at_all_finds(kind: str, begins: str, n: int) -> None
     elif begins == "with the answer":
         nearest[:] = away.argmin(axis=1)
     for first in range(0, len(groups.row), GROUP):
-        look_up_group(T, first, groups, tree, nearest, room)
+        from_python(look_up_group)(T, first, groups, tree, nearest, room)
         own = away[first : first + GROUP]
         np.testing.assert_allclose(np.sqrt(room.square), own.min(axis=1), rtol=0, atol=1e-10)
         found = own[np.arange(GROUP), room.nearest.astype(int)]
@@ -42,7 +43,7 @@ def test_close_groups_find_theirs_in_a_large_tree(apart_m: float) -> None:
     away = cdist(asked[groups.row], tree.p)
     for before in (np.full(1600, -1), away.argpartition(9, axis=1)[:, 9]):
         for first in range(0, 1600, GROUP):
-            look_up_group(np.zeros(3), first, groups, tree, before, room)
+            from_python(look_up_group)(np.zeros(3), first, groups, tree, before, room)
             own = away[first : first + GROUP].min(axis=1)
             np.testing.assert_allclose(np.sqrt(room.square), own, rtol=0, atol=1e-10)
 

@@ -56,7 +56,7 @@ def test_kernel_equals_its_twin(rounds):
     map_a = replace(map_a, covariance_m2=map_b.covariance_m2)
     pairs = Pairs(stretched(rng, map_a), stretched(rng, map_b), c)
     start = pair.T_a_b + np.array([0.1, -0.05, 0.005])
-    solved, _, T, covariance, variance, truth = maximise_likelihood(
+    solved, _, T, covariance, variance, truth, _ = maximise_likelihood(
         pairs.in_plan(), start, 0.5, 0.06, rounds
     )
     twin = slow_iterate(pairs, start, 0.5, 0.06, rounds)
@@ -76,7 +76,7 @@ def test_pairs_that_come_within_the_gate_on_the_way_count():
     start[:2] += away[0]
     off = np.hypot(*residuals(start, pairs.p_a, pairs.p_b).T)
     assert np.mean(off < 0.7) < 0.5
-    solved, _, T, covariance, variance, truth = maximise_likelihood(
+    solved, _, T, covariance, variance, truth, _ = maximise_likelihood(
         pairs.in_plan(), start, 0.5, 0.1, 60
     )
     assert solved
@@ -99,7 +99,7 @@ def test_few_pairs_far_surer_than_the_rest_do_not_swing_it(seed):
     p_a[:n_sure] += rng.normal(size=(n_sure, 2)) * 0.008
     S = np.eye(2) * (sigma**2 / 2)[:, None, None]
     start = T_a_b + np.array([0.05, 0.05, 0.01])
-    solved, moved_m, T, _, variance, truth = maximise_likelihood(
+    solved, moved_m, T, _, variance, truth, _ = maximise_likelihood(
         PlanarPairs(p_a, p_b, S, S), start, 0.5, 0.1, 100
     )
     assert solved

@@ -1,0 +1,13 @@
+"""Kernels that only kernels call, called by tests."""
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+from numba import njit
+
+
+@cache
+def from_python(inner: Any) -> Callable[..., Any]:
+    """The same function, compiled with what callers in Python need."""
+    return njit(inner.py_func)
