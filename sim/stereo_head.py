@@ -1,5 +1,6 @@
 """The stereo head: what a rectified pair of pinhole cameras on a robot sees of a world."""
 
+import functools
 from dataclasses import dataclass
 
 import cv2
@@ -89,9 +90,19 @@ def camera_pose(camera: StereoCamera, T_world_robot: ArrayLike, y_m: float) -> F
         T_world_robot: (3,), or (4, 4) of a body that tilts.
         y_m: of the camera, to the left of the middle of the pair.
     """
+    return body_pose(T_world_robot) @ _mounted(camera, y_m)
+
+
+def body_pose(T_world_robot: ArrayLike) -> Float:
+    """T_world_robot (4, 4) of a body at a pose (3,), or (4, 4) where it tilts."""
     T = np.asarray(T_world_robot, dtype=np.float64)
-    body = T if T.shape == (4, 4) else from_planar(T)
-    return body @ pose(camera.camera_axes, camera.p_robot_eye(y_m))
+    return T if T.shape == (4, 4) else from_planar(T)
+
+
+@functools.lru_cache(maxsize=4)
+def _mounted(camera: StereoCamera, y_m: float) -> Float:
+    """T_robot_camera (4, 4)."""
+    return pose(camera.camera_axes, camera.p_robot_eye(y_m))
 
 
 def _view_matrix(T_world_camera: Float) -> list[float]:

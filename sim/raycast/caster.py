@@ -14,13 +14,12 @@ from mapfusion.se3 import planar
 from sim.exposure import expose
 from sim.p3at import URDF
 from sim.radiometry import RadiometricNoise
-from sim.raycast.picture import depths, filtered, sampled
+from sim.raycast.picture import Sight, depths, filtered, sampled, sight
 from sim.raycast.plan import Pinhole
 from sim.raycast.scene import REFUSED, Scene, read_scene
 from sim.raycast.solids import read_solids
 from sim.raycast.tilted import TiltedView
-from sim.raycast.windows import within_view
-from sim.stereo_head import NEAR_M, StereoFrame, camera_pose
+from sim.stereo_head import NEAR_M, StereoFrame, body_pose, camera_pose
 
 Sampling = Literal["footprint", "middle"]
 
@@ -46,7 +45,6 @@ class RayCaster:
         self._channels: list[Scene] = []
         self._solids = read_solids(URDF)
         rgb = self._solids.rgb.astype(np.uint8)[None]
-        self._reach_m = float(np.linalg.norm(self._solids.corners_m[:, :, :2], axis=2).max())
         self._grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)[0].astype(np.float64)
 
     def stereo(
@@ -62,12 +60,12 @@ class RayCaster:
         It is at a pose (3,), or (4, 4) where its body tilts; raises InputError where it looks from
         above the walls, or too far up or down.
         """
-        half_m, poses = self._camera.baseline_m / 2, _poses(others)
-        view = self._view(T_world_robot, half_m)
-        left = self._draw(self._scene, view, poses, self._grey)
-        right = self.grey(T_world_robot, -half_m, poses)
-        depth_m = self._depth_m(view, poses)
-        rgb = self.rgb(T_world_robot, half_m, poses) if colour else None
+        half_m, poses, body = self._camera.baseline_m / 2, _poses(others), body_pose(T_world_robot)
+        view = self._view(body, half_m)
+        seen = self._sight(view, poses)
+        left, depth_m = self._draw(self._scene, view, seen, self._grey), self._depth_m(view, seen)
+        right = self.grey(body, -half_m, poses)
+        rgb = self.rgb(body, half_m, poses) if colour else None
         return StereoFrame(expose(left, noise, rng), expose(right, noise, rng), depth_m, rgb)
 
     def grey(self, T_world_robot: ArrayLike, y_m: float, others: ArrayLike) -> np.ndarray:
@@ -79,36 +77,38 @@ class RayCaster:
             others: (R, 3) poses of the robots that may be seen.
         """
         view = self._view(T_world_robot, y_m)
-        return self._draw(self._scene, view, _poses(others), self._grey)
+        return self._draw(self._scene, view, self._sight(view, _poses(others)), self._grey)
 
     def rgb(self, T_world_robot: ArrayLike, y_m: float, others: ArrayLike) -> np.ndarray:
         """The same in colour (H, W, 3) uint8; three times the work and the memory."""
         if not self._channels:
             self._channels = [read_scene(self._faces, channel) for channel in range(3)]
-        colours, view, poses = self._solids.rgb.T, self._view(T_world_robot, y_m), _poses(others)
+        view = self._view(T_world_robot, y_m)
+        seen, colours = self._sight(view, _poses(others)), self._solids.rgb.T
         drawn = [
-            self._draw(scene, view, poses, colour.copy())
+            self._draw(scene, view, seen, colour)
             for scene, colour in zip(self._channels, colours, strict=True)
         ]
         return np.stack(drawn, -1)
 
     def depth_m(self, T_world_robot: ArrayLike, y_m: float, others: ArrayLike) -> np.ndarray:
         """Depth (H, W) float32 along the optical axis behind each pixel's middle; NaN: nothing."""
-        return self._depth_m(self._view(T_world_robot, y_m), _poses(others))
+        view = self._view(T_world_robot, y_m)
+        return self._depth_m(view, self._sight(view, _poses(others)))
 
-    def _depth_m(self, view: Pinhole | TiltedView, poses: Float) -> np.ndarray:
-        scene, camera = self._scene, view if isinstance(view, Pinhole) else view.level
-        shown = within_view(camera, self._reach_m, poses)
-        found = depths(camera, scene.walls, scene.floor, scene.ceiling, self._solids, shown)
+    def _sight(self, view: Pinhole | TiltedView, poses: Float) -> Sight:
+        camera = view if isinstance(view, Pinhole) else view.level
+        return sight(camera, self._scene.walls, self._solids, poses)
+
+    def _depth_m(self, view: Pinhole | TiltedView, seen: Sight) -> np.ndarray:
+        found = depths(seen, self._scene, self._solids)
         return found if isinstance(view, Pinhole) else view.depth_m(found)
 
     def _draw(
-        self, scene: Scene, view: Pinhole | TiltedView, poses: Float, grey: Float
+        self, scene: Scene, view: Pinhole | TiltedView, seen: Sight, grey: Float
     ) -> np.ndarray:
-        kernel = filtered if self._sampling == "footprint" else sampled
-        camera = view if isinstance(view, Pinhole) else view.level
-        shown = within_view(camera, self._reach_m, poses)
-        drawn = kernel(camera, scene.walls, scene.floor, scene.ceiling, self._solids, shown, grey)
+        kind = filtered if self._sampling == "footprint" else sampled
+        drawn = kind(seen, scene, self._solids, grey)
         return drawn if isinstance(view, Pinhole) else view.picture(drawn)
 
     def _view(self, T_world_robot: ArrayLike, y_m: float) -> Pinhole | TiltedView:

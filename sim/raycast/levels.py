@@ -6,10 +6,15 @@ texels: it is filled with bilinear samples all along it, from the copy whose tex
 large as it is wide (Heckbert 1989, section 3; McCormack et al. 1999, Feline).
 """
 
+import functools
+import math
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mapfusion.kernels import kernel, kernel_part
-from sim.raycast.plan import Pinhole
+from mapfusion.se2 import Float
+from sim.raycast.plan import Pinhole, anywhere
 from sim.raycast.scene import Level
 
 BACKGROUND = 255.0  # grey level of what is nowhere, as PyBullet has it
@@ -31,67 +36,57 @@ Line = tuple[float, float, float, float]  # x, y and their steps from pixel to p
 Size = tuple[int, int]  # of a copy of the picture: rows and columns
 
 
-@kernel
-def row_depth_m(camera: Pinhole, height_m: float, v: float) -> float:
-    """Depth at which a ray through row `v` meets a level plane; infinity if it does not."""
-    down = (v - camera.center_v) / camera.focal_px
-    drop = camera.eye_z_m - height_m
-    return drop / down if drop * down > 0 else np.inf
+def row_depth_m(camera: Pinhole, height_m: ArrayLike, v: ArrayLike) -> Float:
+    """Depths (N,) at which rays through rows (N,) meet level planes; infinity if they do not."""
+    down = (np.asarray(v) - camera.center_v) / camera.focal_px
+    drop = camera.eye_z_m - np.asarray(height_m)
+    with np.errstate(divide="ignore"):
+        return np.where(drop * down > 0, drop / down, np.inf)
 
 
-@kernel_part
 def footprints(camera: Pinhole, level: Level) -> np.ndarray:
     """How each row is sampled (H, 3) int64: samples along, samples across, copy of the picture."""
+    per_m = float(level.shape[0, 1] / level.size_m[0])
+    return _footprints(anywhere(camera), level.height_m, per_m, len(level.first))
+
+
+@functools.lru_cache(maxsize=8)
+def _footprints(camera: Pinhole, height_m: float, per_m: float, copies: int) -> np.ndarray:
+    """The same of a picture with so many texels per metre and so many copies."""
+    edges_m = row_depth_m(camera, height_m, np.arange(camera.height_px + 1) - 0.5)
+    z = row_depth_m(camera, height_m, np.arange(camera.height_px))
+    seen = np.isfinite(edges_m[:-1]) & np.isfinite(edges_m[1:])
+    along = np.abs(edges_m[1:][seen] - edges_m[:-1][seen]) * per_m
+    across = z[seen] / camera.focal_px * per_m
+    # halved until they are at most two texels wide, as far as there are copies
+    mantissa, halvings = np.frexp(across)
+    k = np.clip(halvings - np.where(mantissa > 0.5, 1, 2), 0, copies - 1)
+    across, along = np.ldexp(across, -k), np.ldexp(along, -k)
     plan = np.zeros((camera.height_px, 3), dtype=np.int64)
-    per_m = level.shape[0, 1] / level.size_m[0]
-    for i in range(camera.height_px):
-        z = row_depth_m(camera, level.height_m, float(i))
-        inner = row_depth_m(camera, level.height_m, i - 0.5)
-        outer = row_depth_m(camera, level.height_m, i + 0.5)
-        if not (np.isfinite(inner) and np.isfinite(outer)):
-            continue
-        across, along, k = z / camera.focal_px * per_m, abs(outer - inner) * per_m, 0
-        while across > 2 and k < len(level.first) - 1:
-            across, along, k = across / 2, along / 2, k + 1
-        plan[i, 0] = min(max(np.ceil(along / STEP_TEXELS), 1), MOST_SAMPLES)
-        plan[i, 1] = 1 if across <= 1 else 2
-        plan[i, 2] = k
+    plan[seen, 0] = np.clip(np.ceil(along / STEP_TEXELS), 1, MOST_SAMPLES)
+    plan[seen, 1] = np.where(across <= 1, 1, 2)
+    plan[seen, 2] = k
     return plan
 
 
-@kernel
 def ways(camera: Pinhole, level: Level) -> tuple[Way, Way]:
     """How rays go over a picture: right = a + (b + c u) Z, and up likewise, both 0 to 1 on it."""
-    cos, sin = np.cos(camera.theta), np.sin(camera.theta)
-    x0, y0 = camera.eye_x_m - level.corner_m[0], camera.eye_y_m - level.corner_m[1]
+    cos, sin = math.cos(camera.theta), math.sin(camera.theta)
     left = camera.center_u / camera.focal_px
+    corner_x, corner_y = level.corner_m.tolist()
+    x0, y0 = camera.eye_x_m - corner_x, camera.eye_y_m - corner_y
     dx, dy = cos - left * sin, sin + left * cos
-    right, up = level.right_per_m2, level.up_per_m2
-    return (
-        (
-            right[0] * x0 + right[1] * y0,
-            right[0] * dx + right[1] * dy,
-            (right[0] * sin - right[1] * cos) / camera.focal_px,
-        ),
-        (
-            up[0] * x0 + up[1] * y0,
-            up[0] * dx + up[1] * dy,
-            (up[0] * sin - up[1] * cos) / camera.focal_px,
-        ),
-    )
+
+    def along(x: float, y: float) -> Way:
+        return x * x0 + y * y0, x * dx + y * dy, (x * sin - y * cos) / camera.focal_px
+
+    return along(*level.right_per_m2.tolist()), along(*level.up_per_m2.tolist())
 
 
-@kernel
 def fill(
-    camera: Pinhole,
-    level: Level,
-    is_above: bool,
-    open_rows: np.ndarray,
-    picture: np.ndarray,
+    camera: Pinhole, level: Level, is_above: bool, open_rows: np.ndarray, picture: np.ndarray
 ) -> None:
     """Draw floor or ceiling where walls leave pixels open on its side of the horizon.
-
-    Row by row: there the depth is one, and footprints lie side by side on a line.
 
     Args:
         camera: level.
@@ -101,28 +96,52 @@ def fill(
         picture: (H, W) uint8, changed.
     """
     plan, way = footprints(camera, level), ways(camera, level)
-    shape, firsts, cells = level.shape, level.first, level.cells
-    place, cell = np.empty((3, PIECE), np.int32), np.empty(PIECE, np.uint32)
-    sums, bounds = np.empty(PIECE, np.uint32), _least_and_most(open_rows)
     rise = (camera.eye_z_m - level.height_m) * camera.focal_px
-    for i in range(len(bounds)):
-        first, last = i * PIECE, min((i + 1) * PIECE, camera.width_px)
-        for row in range(bounds[i, 1]):
-            v = row if is_above else camera.height_px - 1 - row
+    texels = level.shape, level.first, level.cells
+    _fill(*texels, plan, way, rise, camera.center_v, is_above, open_rows, picture)
+
+
+@kernel
+def _fill(
+    shape: np.ndarray,
+    firsts: np.ndarray,
+    cells: np.ndarray,
+    plan: np.ndarray,
+    way: tuple[Way, Way],
+    rise: float,
+    center_v: float,
+    is_above: bool,
+    open_rows: np.ndarray,
+    picture: np.ndarray,
+) -> None:
+    """Row by row: there the depth is one, and footprints lie side by side on a line."""
+    height, width = picture.shape
+    place, cell = np.empty((3, PIECE), dtype=np.int32), np.empty(PIECE, dtype=np.uint32)
+    sums = np.empty(PIECE, dtype=np.uint32)
+    for first in range(0, width, PIECE):
+        last = min(first + PIECE, width)
+        least = most = open_rows[first]
+        for j in range(first, last):
+            least, most = min(least, open_rows[j]), max(most, open_rows[j])
+        for row in range(most):
+            v = row if is_above else height - 1 - row
             n, across, k = plan[v, 0], plan[v, 1], plan[v, 2]
             size, corner = (shape[k, 0], shape[k, 1]), int(firsts[k])
             end = first
             while end < last:
                 begin, end = end, last
-                if row >= bounds[i, 0]:
-                    begin = _next(open_rows, row, begin, last, True)
-                    end = _next(open_rows, row, begin, last, False)
+                if row >= least:  # the next columns that are open
+                    while begin < last and row >= open_rows[begin]:
+                        begin += 1
+                    end = begin
+                    while end < last and row < open_rows[end]:
+                        end += 1
                 count = end - begin
                 _start(sums, count, SUM_UNIT * int(BACKGROUND) if n == 0 else 0)
                 for side in range(across):
                     u = begin + (0.0 if across == 1 else side / 2 - 0.25)
                     for s in range(n if count else 0):
-                        z = rise / (v - 0.5 + (s + 0.5) / n - camera.center_v)
+                        z = rise / (v - 0.5 + (s + 0.5) / n - center_v)
                         line = _line(way, u, z, size)
                         lowest, leftmost = _lowest_cell(line, count, size)
                         if lowest < 0:
@@ -133,28 +152,6 @@ def fill(
                             _look_up(cells, corner + lowest * wide + leftmost, place, count, cell)
                             _add_between(cell, place, count, sums)
                 _show(sums, max(n * across, 1), v, begin, count, picture)
-
-
-@kernel_part
-def _least_and_most(open_rows: np.ndarray) -> np.ndarray:
-    """The least and the most open rows of each `PIECE` columns (N, 2)."""
-    bounds = np.zeros((-(-len(open_rows) // PIECE), 2), dtype=np.int64)
-    for i in range(len(bounds)):
-        bounds[i, 0] = open_rows[i * PIECE]
-    for j in range(len(open_rows)):
-        i = j // PIECE
-        bounds[i, 0] = min(bounds[i, 0], open_rows[j])
-        bounds[i, 1] = max(bounds[i, 1], open_rows[j])
-    return bounds
-
-
-@kernel
-def _next(open_rows: np.ndarray, row: int, begin: int, end: int, is_open: bool) -> int:
-    """The first column from `begin` on that is open, or is not, in a row; else `end`."""
-    for j in range(begin, end):
-        if (row < open_rows[j]) == is_open:
-            return j
-    return end
 
 
 @kernel_part
@@ -267,12 +264,12 @@ def _add_at_the_edge(
             sums[i] += np.uint32(SUM_UNIT * int(BACKGROUND))
 
 
-@kernel_part
-def texel(level: Level, right: float, up: float) -> float:
-    """The texel that a point of the picture lies on; the background beside it."""
-    if not (0 <= right < 1 and 0 <= up < 1):
-        return BACKGROUND
+def texels(level: Level, right: Float, up: Float) -> np.ndarray:
+    """The texels (...) that points of the picture lie on; the background beside it."""
+    inside = (right >= 0) & (right < 1) & (up >= 0) & (up < 1)
     height, width = level.shape[0]
     # it is the first corner of the cell to the right of its middle and above it
-    row, column = int(up * height) + 1, int(right * width) + 1
-    return float(level.cells[row * (width + 1) + column] & np.uint32(0xFF))
+    row, column = (up[inside] * height).astype(int) + 1, (right[inside] * width).astype(int) + 1
+    found = np.full(inside.shape, BACKGROUND)
+    found[inside] = level.cells[row * (width + 1) + column] & 0xFF
+    return found

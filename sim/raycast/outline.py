@@ -1,4 +1,4 @@
-"""How much of each pixel a convex outline covers, exactly.
+"""How much of each pixel convex outlines cover, exactly, and which pixels' middles lie in them.
 
 Each edge adds, to the pixels that it crosses in a row, the change of the covered area to its right;
 sums from the left are the covered shares (Levien 2016, font-rs; the same as FreeType's "cells").
@@ -9,112 +9,82 @@ import numpy as np
 from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float
 
+_LEAST_WIDTH_PX = 1e-12  # of an edge within a row, to divide by
+
 
 @kernel
-def hull(points: Float) -> Float:
-    """Corners (K, 2) of the convex hull of points (N, 2), in one sense (Andrew 1979)."""
-    order, n = _from_left(points), len(points)
-    chain, k = np.empty((2 * n + 1, 2)), 0
-    for half in range(2):
-        begin = k
-        for m in range(n):
-            p = points[order[m] if half == 0 else order[n - 1 - m]]
-            while k >= begin + 2 and _turn(chain[k - 2], chain[k - 1], p) <= 0:
-                k -= 1
-            chain[k, 0], chain[k, 1] = p[0], p[1]
-            k += 1
-        k -= 1  # the last of one half is the first of the other
-    return chain[:k].copy()
+def fill_coverage(edges: Float, covered: Float) -> None:
+    """Fill in shares (H, W), zeros before, of a window's unit squares that an outline covers.
 
-
-@kernel_part
-def _from_left(points: Float) -> np.ndarray:
-    """The order (N,) of points (N, 2) by u, and by v where upright edges share u; N is small."""
-    order = np.empty(len(points), dtype=np.int64)
-    for m in range(len(points)):
-        u, v = points[m]
-        k = m
-        while k > 0 and (points[order[k - 1], 0], points[order[k - 1], 1]) > (u, v):
-            order[k] = order[k - 1]
-            k -= 1
-        order[k] = m
-    return order
-
-
-@kernel_part
-def _turn(a: Float, b: Float, c: Float) -> float:
-    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
-
-
-@kernel_part
-def clip(polygon: Float, width: float, height: float) -> Float:
-    """A convex polygon (K, 2) inside a rectangle from (0, 0) on; (0, 2) beside it.
-
-    Sutherland and Hodgman (1974), one side after the other.
+    Its edges (E, 4) go from u and v to u and v, all in one sense around it, in any order. The
+    window's first pixel has its middle at (0, 0).
     """
-    for side in range(4):
-        axis, sign = side % 2, 1.0 if side < 2 else -1.0
-        bound = 0.0 if side < 2 else -width if axis == 0 else -height
-        kept, k = np.empty((2 * len(polygon) + 2, 2)), 0
-        for m in range(len(polygon)):
-            p, q = polygon[m], polygon[(m + 1) % len(polygon)]
-            p_in, q_in = sign * p[axis] - bound, sign * q[axis] - bound
-            if p_in >= 0:
-                kept[k, 0], kept[k, 1] = p[0], p[1]
-                k += 1
-            if p_in * q_in < 0:
-                other = 1 - axis
-                kept[k, other] = p[other] + p_in / (p_in - q_in) * (q[other] - p[other])
-                kept[k, axis] = sign * bound
-                k += 1
-        polygon = kept[:k].copy()
-    return polygon
-
-
-@kernel_part
-def coverage(polygon: Float, height: int, width: int) -> Float:
-    """Covered shares (height, width) of the unit squares that a polygon (K, 2) lies on.
-
-    Its corners lie inside of 0 to width and 0 to height.
-    """
-    change = np.zeros((height, width + 2))
-    for m in range(len(polygon)):
-        _add_edge(polygon[m], polygon[(m + 1) % len(polygon)], change)
-    covered = np.empty((height, width))
+    height, width = covered.shape
+    for k in range(len(edges)):
+        u_0, v_0, u_1, v_1 = edges[k, 0], edges[k, 1], edges[k, 2], edges[k, 3]
+        u_0, v_0, u_1, v_1 = (
+            u_0 + 0.5,
+            v_0 + 0.5,
+            u_1 + 0.5,
+            v_1 + 0.5,
+        )  # from its upper left corner
+        if v_0 == v_1:
+            continue
+        sign = 1.0 if v_0 < v_1 else -1.0
+        if v_0 > v_1:
+            u_0, v_0, u_1, v_1 = u_1, v_1, u_0, v_0
+        slope, least, most = (u_1 - u_0) / (v_1 - v_0), min(u_0, u_1), max(u_0, u_1)
+        for row in range(max(int(np.floor(v_0)), 0), min(int(np.ceil(v_1)), height)):
+            top, bottom = max(float(row), v_0), min(row + 1.0, v_1)
+            at_top = min(max(u_0 + slope * (top - v_0), least), most)
+            at_bottom = min(max(u_0 + slope * (bottom - v_0), least), most)
+            left, right = min(at_top, at_bottom), max(at_top, at_bottom)
+            # what lies left of the window counts in its first column
+            first, last = max(int(np.floor(left)), 0), max(int(np.floor(right)) + 1, 0)
+            area, before = _area(left, right, float(first)), 0.0
+            for column in range(first, min(last + 1, width)):
+                area_after = _area(left, right, column + 1.0)
+                share = sign * (bottom - top) * (area_after - area)
+                covered[row, column] += share - before
+                area, before = area_after, share
     for row in range(height):
         total = 0.0
         for column in range(width):
-            total += change[row, column]
+            total += covered[row, column]
             covered[row, column] = min(abs(total), 1.0)
-    return covered
 
 
 @kernel_part
-def _add_edge(start: Float, end: Float, change: Float) -> None:
-    """Add one edge's changes of covered area, row by row."""
-    if start[1] == end[1]:
-        return
-    sign = 1.0 if start[1] < end[1] else -1.0
-    top, bottom = (start, end) if start[1] < end[1] else (end, start)
-    slope = (bottom[0] - top[0]) / (bottom[1] - top[1])
-    least, most = min(top[0], bottom[0]), max(top[0], bottom[0])
-    for row in range(int(top[1]), min(int(np.ceil(bottom[1])), len(change))):
-        y0, y1 = max(float(row), top[1]), min(row + 1.0, bottom[1])
-        a = min(max(top[0] + slope * (y0 - top[1]), least), most)
-        b = min(max(top[0] + slope * (y1 - top[1]), least), most)
-        left, right, rise = min(a, b), max(a, b), sign * (y1 - y0)
-        first, last = int(left), int(right)
-        if first == last:
-            inside = (left + right) / 2 - first
-            change[row, first] += rise * (1 - inside)
-            change[row, first + 1] += rise * inside
+def _area(left: float, right: float, border: float) -> float:
+    """Between an edge from `left` to `right` and a border to the right of it, for a unit's rise."""
+    inside = min(max(border - left, 0.0), right - left)
+    return inside * inside / (2 * max(right - left, _LEAST_WIDTH_PX)) + max(border - right, 0.0)
+
+
+@kernel
+def fill_least(edges: Float, in_row: Float, per_column: Float, least: Float) -> None:
+    """Fill in the least of K linear functions at the pixels (H, W) whose middles an outline holds.
+
+    The outline's edges are as above. The functions have the values `in_row` (H, K) in the first
+    column, and change by `per_column` (K,).
+    """
+    height, width = least.shape
+    for row in range(height):
+        begin, stop = np.inf, -np.inf
+        for k in range(len(edges)):
+            u_0, v_0, u_1, v_1 = edges[k, 0], edges[k, 1], edges[k, 2], edges[k, 3]
+            if min(v_0, v_1) <= row <= max(v_0, v_1) and v_0 != v_1:
+                u = u_0 + (row - v_0) / (v_1 - v_0) * (u_1 - u_0)
+                begin, stop = min(begin, u), max(stop, u)
+        begin, stop = max(np.ceil(begin), 0.0), min(np.floor(stop), width - 1.0)
+        if begin > stop:
             continue
-        # area to the right of the edge up to each pixel's right border, less that up to its left
-        before = 0.0
-        for column in range(first, last + 1):
-            x0, x1 = max(left, float(column)), min(right, column + 1.0)
-            crossed = rise * (x1 - x0) / (right - left)
-            now = crossed * (column + 1 - (x0 + x1) / 2)
-            change[row, column] += now + before
-            before = crossed - now
-        change[row, last + 1] += before
+        first, last = int(begin), int(stop)
+        inside = least[row, first : last + 1]
+        for i in range(len(inside)):
+            inside[i] = np.inf
+        for k in range(len(per_column)):
+            step = per_column[k]
+            at = in_row[row, k] + step * first
+            for i in range(len(inside)):
+                inside[i] = min(inside[i], at + step * i)

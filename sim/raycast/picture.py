@@ -1,136 +1,145 @@
 """Whole pictures: each pixel the mean of its footprint, or the texel that its middle hits."""
 
+import functools
+import math
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 
-from mapfusion.kernels import kernel, kernel_part
+from mapfusion.kernels import kernel
 from mapfusion.se2 import Float
-from sim.raycast.levels import BACKGROUND, Way, fill, row_depth_m, texel, ways
-from sim.raycast.plan import NONE, Pinhole, nearest, project, strips
+from sim.raycast.levels import Way, fill, row_depth_m, texels, ways
+from sim.raycast.plan import NONE, Pinhole, Plan, anywhere, look
 from sim.raycast.robots import cast, draw
-from sim.raycast.scene import Level, Walls
+from sim.raycast.scene import Level, Scene, Walls
 from sim.raycast.solids import Solids
-from sim.raycast.wall_columns import draw_walls, open_rows
-from sim.raycast.windows import by_distance
+from sim.raycast.wall_columns import draw_walls
+from sim.raycast.windows import Body, by_distance, is_hidden, place, within_view
 
 
-def filtered(
-    camera: Pinhole, walls: Walls, floor: Level, ceiling: Level, solids: Solids, poses: Float,
-    grey: Float,
-) -> np.ndarray:  # fmt: skip
+class Sight(NamedTuple):
+    """Where things are before a camera, whatever their colours.
+
+    Attributes:
+        camera: level.
+        plan: what it sees of the walls.
+        bodies: the robots that walls do not hide, from the nearest to the farthest.
+    """
+
+    camera: Pinhole
+    plan: Plan
+    bodies: list[Body]
+
+
+def sight(camera: Pinhole, walls: Walls, solids: Solids, poses: Float) -> Sight:
+    """What a camera has before it, robots at poses (R, 3) among it."""
+    plan, bodies = look(camera, walls), list[Body]()
+    for pose in by_distance(camera, within_view(camera, solids.reach_m, poses)):
+        if not is_hidden(camera, plan, solids.reach_m, pose):
+            bodies.append(place(camera, solids, pose))
+    return Sight(camera, plan, [body for body in bodies if len(body.shown)])
+
+
+def filtered(of: Sight, scene: Scene, solids: Solids, grey: Float) -> np.ndarray:
     """Grey levels (H, W) uint8, each the mean over the pixel's footprint.
 
     Args:
-        camera: level.
-        walls: as they stand.
-        floor: below.
-        ceiling: above.
+        of: what the camera has before it.
+        scene: what stands still.
         solids: of one robot.
-        poses: (R, 3) of the robots in the world.
         grey: (S,) the solids' grey levels.
     """
-    seen = project(camera, walls)
-    face, until, count = strips(camera, seen)
-    above, below = open_rows(camera, walls, seen, face, until, count)
+    camera, plan = of.camera, of.plan
     picture = np.empty((camera.height_px, camera.width_px), dtype=np.uint8)
-    fill(camera, ceiling, True, above, picture)
-    fill(camera, floor, False, below, picture)
+    fill(camera, scene.ceiling, True, plan.above, picture)
+    fill(camera, scene.floor, False, plan.below, picture)
     # walls are drawn by columns, which in a picture lie far apart in memory
     columns = cv2.transpose(picture)
-    draw_walls(camera, walls, seen, face, until, count, columns)
+    draw_walls(camera, scene.walls, plan, columns)
     picture = cv2.transpose(columns)
-    if len(poses):
-        in_order = by_distance(camera, poses)
-        draw(camera, seen, face, until, count, solids, in_order, grey, picture)
+    if of.bodies:
+        draw(camera, plan, solids, of.bodies, grey, picture)
     return picture
 
 
-def depths(
-    camera: Pinhole, walls: Walls, floor: Level, ceiling: Level, solids: Solids, poses: Float
-) -> np.ndarray:
+def depths(of: Sight, scene: Scene, solids: Solids) -> np.ndarray:
     """Depth (H, W) float32 along the optical axis behind the pixels' middles; NaN for nothing."""
-    depth_m = _still_depths(camera, walls, floor, ceiling)
-    nothing = np.zeros((0, 0), dtype=np.uint8)
-    if len(poses):
-        cast(camera, solids, poses, np.zeros(0), depth_m, nothing)
+    depth_m = _still_depths(of, scene)
+    cast(of.camera, solids, of.bodies, np.zeros(len(solids.rgb)), depth_m)
+    if np.any(of.plan.middle == NONE):
+        depth_m[np.isinf(depth_m)] = np.nan
     return depth_m
 
 
-@kernel
-def _still_depths(camera: Pinhole, walls: Walls, floor: Level, ceiling: Level) -> np.ndarray:
-    """Depth (H, W) of what stands still."""
-    seen = project(camera, walls)
-    face = nearest(seen, np.arange(camera.width_px).astype(np.float64))
-    wall_m = np.full(camera.width_px, np.inf, dtype=np.float32)
-    for j in range(camera.width_px):
-        if face[j] != NONE:
-            wall_m[j] = 1 / (seen[face[j], 2] + seen[face[j], 3] * j)
+def _still_depths(of: Sight, scene: Scene) -> np.ndarray:
+    """Depth (H, W) of what stands still; infinity for nothing."""
+    camera, plan = of.camera, of.plan
+    levels_m = _depths_of_levels(anywhere(camera), scene.floor.height_m, scene.ceiling.height_m)
     depth_m = np.empty((camera.height_px, camera.width_px), dtype=np.float32)
-    for v in range(camera.height_px):
-        level = ceiling if v < camera.center_v else floor
-        level_m = np.float32(row_depth_m(camera, level.height_m, float(v)))
-        for j in range(camera.width_px):
-            depth_m[v, j] = min(wall_m[j], level_m)
-    for j in range(camera.width_px):  # only a column without walls shows where floors end
-        if face[j] == NONE:
-            for v in range(camera.height_px):
-                level = ceiling if v < camera.center_v else floor
-                right, up = ways(camera, level)
-                z = row_depth_m(camera, level.height_m, float(v))
-                if not (0 <= _along(right, j, z) < 1 and 0 <= _along(up, j, z) < 1):
-                    depth_m[v, j] = np.nan
+    _fill_nearer(plan.middle_m.astype(np.float32), levels_m.astype(np.float32), depth_m)
+    beside = np.flatnonzero(plan.middle == NONE)
+    if len(beside):  # only a column without walls shows where floors end
+        for level, rows in _sides(camera, scene):
+            z = levels_m[rows, None]
+            right, up = (_along(way, beside, z) for way in ways(camera, level))
+            inside = (right >= 0) & (right < 1) & (up >= 0) & (up < 1)
+            depth_m[rows, beside] = np.where(inside, z, np.inf)
     return depth_m
 
 
-def sampled(
-    camera: Pinhole, walls: Walls, floor: Level, ceiling: Level, solids: Solids, poses: Float,
-    grey: Float,
-) -> np.ndarray:  # fmt: skip
+@functools.lru_cache(maxsize=1)
+def _depths_of_levels(camera: Pinhole, floor_m: float, ceiling_m: float) -> Float:
+    """Depths (H,) of floor and ceiling at two heights, were there no walls."""
+    v = np.arange(camera.height_px)
+    height_m = np.where(v < camera.center_v, ceiling_m, floor_m)
+    return row_depth_m(camera, height_m, v)
+
+
+@kernel
+def _fill_nearer(columns_m: np.ndarray, rows_m: np.ndarray, depth_m: np.ndarray) -> None:
+    """Fill in the nearer depth (H, W) of what columns (W,) and rows (H,) show."""
+    for v in range(len(rows_m)):
+        for u in range(len(columns_m)):
+            depth_m[v, u] = min(columns_m[u], rows_m[v])
+
+
+def _sides(camera: Pinhole, scene: Scene) -> list[tuple[Level, slice]]:
+    """Ceiling and floor, and the rows on their side of the horizon."""
+    horizon = min(max(math.ceil(camera.center_v), 0), camera.height_px)
+    return [(scene.ceiling, slice(horizon)), (scene.floor, slice(horizon, camera.height_px))]
+
+
+def sampled(of: Sight, scene: Scene, solids: Solids, grey: Float) -> np.ndarray:
     """Grey levels (H, W) uint8 of what the pixels' middles hit; arguments as of `filtered`."""
-    picture = _still_texels(camera, walls, floor, ceiling)
-    if len(poses):
-        cast(camera, solids, poses, grey, _still_depths(camera, walls, floor, ceiling), picture)
+    picture = _still_texels(of, scene)
+    cast(of.camera, solids, of.bodies, grey, _still_depths(of, scene), picture)
     return picture
 
 
-@kernel
-def _still_texels(camera: Pinhole, walls: Walls, floor: Level, ceiling: Level) -> np.ndarray:
+def _still_texels(of: Sight, scene: Scene) -> np.ndarray:
     """Texels (H, W) uint8 of what stands still."""
-    seen = project(camera, walls)
-    face = nearest(seen, np.arange(camera.width_px).astype(np.float64))
+    camera, plan, walls, u = of.camera, of.plan, scene.walls, np.arange(of.camera.width_px)
+    face, wall_m = plan.middle, plan.middle_m
+    seen, size = plan.seen[face], walls.size[face]
+    levels_m = _depths_of_levels(anywhere(camera), scene.floor.height_m, scene.ceiling.height_m)
+    along = np.where(face == NONE, 0.0, (seen[:, 4] + seen[:, 5] * u) * wall_m - seen[:, 6])
+    right = np.clip(along / walls.width_m[face] * size[:, 0], 0, size[:, 0] - 1).astype(np.int64)
+    first = walls.first[face] + right * (size[:, 1] + 1)
     picture = np.empty((camera.height_px, camera.width_px), dtype=np.uint8)
-    ways_up, ways_down = ways(camera, ceiling), ways(camera, floor)
-    for j in range(camera.width_px):
-        i, wall_m, right = face[j], np.inf, 0
-        if i != NONE:
-            wall_m = 1 / (seen[i, 2] + seen[i, 3] * j)
-            along = (seen[i, 4] + seen[i, 5] * j) * wall_m - seen[i, 6]
-            right = int(along / walls.width_m[i] * walls.size[i, 0])
-            right = min(max(right, 0), walls.size[i, 0] - 1)
-        for v in range(camera.height_px):
-            level, way = (ceiling, ways_up) if v < camera.center_v else (floor, ways_down)
-            z = row_depth_m(camera, level.height_m, float(v))
-            if wall_m < z:
-                height_m = camera.eye_z_m - (v - camera.center_v) * wall_m / camera.focal_px
-                row = min(int(height_m / walls.height_m * walls.size[i, 1]), walls.size[i, 1] - 1)
-                picture[v, j] = _wall_texel(walls, i, right, row)
-            elif np.isfinite(z):
-                picture[v, j] = texel(level, _along(way[0], j, z), _along(way[1], j, z))
-            else:
-                picture[v, j] = BACKGROUND
+    for level, rows in _sides(camera, scene):
+        to_right, to_up = (_along(way, u, levels_m[rows, None]) for way in ways(camera, level))
+        picture[rows] = texels(level, to_right, to_up)
+    v, j = np.nonzero(wall_m < levels_m[:, None])
+    height_m = camera.eye_z_m - (v - camera.center_v) * wall_m[j] / camera.focal_px
+    up = (height_m / walls.height_m * size[j, 1]).astype(np.int64)
+    here = first[j] + np.minimum(up, size[j, 1] - 1)
+    there, sums = here + size[j, 1] + 1, walls.sums
+    picture[v, j] = sums[there + 1] - sums[there] - sums[here + 1] + sums[here]
     return picture
 
 
-@kernel
-def _along(way: Way, u: float, z: float) -> float:
-    """Where on a level's picture a column's ray is at a depth, see `ways`."""
-    return way[0] + (way[1] + way[2] * u) * z
-
-
-@kernel_part
-def _wall_texel(walls: Walls, i: int, right: int, up: int) -> float:
-    n = walls.size[i, 1] + 1
-    here = walls.first[i] + right * n + up
-    there = here + n
-    sums = walls.sums
-    return float(np.int32(sums[there + 1] - sums[there] - sums[here + 1] + sums[here]))
+def _along(way: Way, u: np.ndarray, z: Float) -> Float:
+    """Where on a level's picture columns' rays are at depths, see `ways`; NaN infinitely far."""
+    with np.errstate(invalid="ignore"):
+        return way[0] + (way[1] + way[2] * u) * z

@@ -15,8 +15,9 @@ from mapfusion.se2 import Float
 from sim.raycast.scene import Walls
 
 NONE = -1  # no wall
-MOST_STRIPS = 12  # of one column; what is thinner than a twelfth of a pixel is not told apart
-_THINNEST_PX = 1e-9
+_THINNEST_PX = 1e-9  # what is thinner is not told apart
+_JUST_RIGHT_PX = 1e-7  # of a place: there what begins at it is nearer than the rest, or is not
+_MOST_PIECES = 10  # for each face; an upper envelope of so many segments has fewer
 
 
 class Pinhole(NamedTuple):
@@ -47,17 +48,59 @@ class Pinhole(NamedTuple):
     near_m: float
 
 
+def anywhere(camera: Pinhole) -> Pinhole:
+    """A camera whose rows see floors as far off as those of another one do."""
+    return camera._replace(eye_x_m=0.0, eye_y_m=0.0, theta=0.0)
+
+
+class Plan(NamedTuple):
+    """What a camera sees of the walls, from left to right: N strips of one face and column each.
+
+    Column j reaches from u = j - 1/2 to j + 1/2.
+
+    Attributes:
+        seen: (F, 7) all faces, see `_project`.
+        face: (N,) int64 that is seen in a strip, or NONE.
+        low: (N,) where in u it begins.
+        high: (N,) where it ends.
+        first: (W + 1,) int64 each column's first strip, and N.
+        middle: (W,) int64 the face that each column's middle sees, or NONE.
+        middle_m: (W,) its depth there; infinity for none.
+        above: (W,) int64 how many rows from the upper edge on walls leave open, wholly or partly.
+        below: (W,) int32 the same from the lower edge on.
+    """
+
+    seen: Float
+    face: np.ndarray
+    low: Float
+    high: Float
+    first: np.ndarray
+    middle: np.ndarray
+    middle_m: Float
+    above: np.ndarray
+    below: np.ndarray
+
+
 @kernel
-def project(camera: Pinhole, walls: Walls) -> Float:
+def look(camera: Pinhole, walls: Walls) -> Plan:
+    """What a camera sees of the walls."""
+    seen = _project(camera, walls)
+    face, low, high, first, middle, middle_m = _strips(seen, camera.width_px)
+    above, below = _open_rows(camera, walls.height_m, seen, face, low, high, first)
+    return Plan(seen, face, low, high, first, middle, middle_m, above, below)
+
+
+@kernel_part
+def _project(camera: Pinhole, walls: Walls) -> Float:
     """Faces (F, 7) in the picture: from u, to u, w0, w1, t0, t1, t2: w = w0 + w1 u.
 
     t is the place along the face in metres: t = (t0 + t1 u) / w - t2. A face that is not seen,
-    being behind or turned away, has from > to.
+    being behind or turned away, is from infinity to minus infinity.
     """
     cos, sin = np.cos(camera.theta), np.sin(camera.theta)
+    f, c = camera.focal_px, camera.center_u
     seen = np.empty((len(walls.width_m), 7))
-    for i in range(len(walls.width_m)):
-        seen[i, 0], seen[i, 1] = 1.0, 0.0
+    for i in range(len(seen)):
         x, y = walls.start_m[i, 0] - camera.eye_x_m, walls.start_m[i, 1] - camera.eye_y_m
         start_z, start_y = cos * x + sin * y, cos * y - sin * x
         ahead = cos * walls.along[i, 0] + sin * walls.along[i, 1]
@@ -65,144 +108,100 @@ def project(camera: Pinhole, walls: Walls) -> Float:
         end_z, end_y = start_z + walls.width_m[i] * ahead, start_y + walls.width_m[i] * left
         # distance of the eye before the face; its front lies to the right of the way along it
         before = start_y * ahead - start_z * left
+        seen[i, 0], seen[i, 1] = np.inf, -np.inf
         if before <= 0 or max(start_z, end_z) <= camera.near_m:
             continue
-        f, c = camera.focal_px, camera.center_u
-        seen[i, 0], seen[i, 1] = -np.inf, np.inf
-        if start_z > camera.near_m:
-            seen[i, 0] = c - f * start_y / start_z
-        if end_z > camera.near_m:
-            seen[i, 1] = c - f * end_y / end_z
         # 0 = Z (y ahead - left) - before, with y = (c - u) / f
-        seen[i, 2] = (ahead * c / f - left) / before
-        seen[i, 3] = -ahead / (f * before)
-        seen[i, 4] = ahead + left * c / f
-        seen[i, 5] = -left / f
+        w_0, w_u = (ahead * c / f - left) / before, -ahead / (f * before)
+        seen[i, 2], seen[i, 3] = w_0, w_u
+        seen[i, 4], seen[i, 5] = ahead + left * c / f, -left / f
         seen[i, 6] = ahead * start_z + left * start_y
-        if start_z <= camera.near_m:  # cut where w is that of the near plane
-            seen[i, 0] = (1 / camera.near_m - seen[i, 2]) / seen[i, 3]
-        if end_z <= camera.near_m:
-            seen[i, 1] = (1 / camera.near_m - seen[i, 2]) / seen[i, 3]
+        for k, z, y in ((0, start_z, start_y), (1, end_z, end_y)):
+            if z > camera.near_m:
+                seen[i, k] = c - f * y / z
+            else:  # cut where w is that of the near plane
+                seen[i, k] = (1 / camera.near_m - w_0) / w_u
     return seen
 
 
-@kernel
-def nearest(seen: Float, at_u: Float) -> np.ndarray:
-    """The nearest face (N,) at each of the ascending, evenly spaced coordinates (N,), or NONE."""
-    found = np.full(len(at_u), NONE, dtype=np.int64)
-    w = np.zeros(len(at_u))
-    step = at_u[1] - at_u[0] if len(at_u) > 1 else 1.0
-    for i in range(len(seen)):
-        if seen[i, 0] > seen[i, 1]:
-            continue
-        low = max(np.ceil((seen[i, 0] - at_u[0]) / step), 0.0)
-        high = min(np.floor((seen[i, 1] - at_u[0]) / step), len(at_u) - 1.0)
-        for k in range(int(low), int(high) + 1):
-            w_here = seen[i, 2] + seen[i, 3] * at_u[k]
-            if w_here > w[k]:
-                w[k], found[k] = w_here, i
-    return found
+@kernel_part
+def _strips(
+    seen: Float, width_px: int
+) -> tuple[np.ndarray, Float, Float, np.ndarray, np.ndarray, Float]:
+    """What is seen in each column: `Plan`'s face, low, high, first, middle and its depth.
 
-
-@kernel
-def strips(camera: Pinhole, seen: Float) -> tuple[np.ndarray, Float, np.ndarray]:
-    """What is seen in each pixel column, from left to right.
-
-    Returns:
-        Faces (W, MOST_STRIPS), where each strip ends in u (W, MOST_STRIPS), and how many strips
-        there are (W,); column j begins at u = j - 1/2. Where no wall is the face is NONE.
+    A face is the nearest until it ends, until another one begins before it, or until another one
+    crosses it, which then is the nearest.
     """
-    width = camera.width_px
-    edges = np.arange(width + 1).astype(np.float64) - 0.5
-    at_edge = nearest(seen, edges)
-    face = np.empty((width, MOST_STRIPS), dtype=np.int64)
-    until = np.empty((width, MOST_STRIPS))
-    count = np.ones(width, dtype=np.int64)
-    split = np.zeros(width, dtype=np.bool_)
-    for j in range(width):
-        face[j, 0], until[j, 0] = at_edge[j], j + 0.5
-        split[j] = at_edge[j] != at_edge[j + 1]
-    for i in range(len(seen)):  # an end between two edges, in front of what is seen there
-        for end in range(2):
-            u = seen[i, end]
-            if seen[i, 0] > seen[i, 1] or not -0.5 < u < width - 0.5:
-                continue
-            j = int(np.floor(u + 0.5))
-            behind = at_edge[j]
-            w = seen[i, 2] + seen[i, 3] * u
-            if behind == NONE or w >= (seen[behind, 2] + seen[behind, 3] * u) * (1 - 1e-9):
-                split[j] = True
-    for j in range(width):
-        if split[j]:
-            count[j] = _envelope(seen, edges[j], edges[j + 1], face[j], until[j])
-    return face, until, count
-
-
-@kernel_part
-def _envelope(seen: Float, low: float, high: float, face: np.ndarray, until: Float) -> int:
-    """Fill in the faces seen between two coordinates, and where each ends; returns how many."""
-    breaks = _breaks(seen, low, high)
-    count = 0
-    for k in range(len(breaks) - 1):
-        at, stop = breaks[k], breaks[k + 1]
-        if stop - at < _THINNEST_PX:
-            continue
-        now = _first(seen, at, stop)
+    face = np.empty(width_px + _MOST_PIECES * (len(seen) + 1), dtype=np.int64)
+    low, high = np.empty(len(face)), np.empty(len(face))
+    first, middle = np.empty(width_px + 1, dtype=np.int64), np.empty(width_px, dtype=np.int64)
+    middle_m = np.empty(width_px)
+    first[0], column, n = 0, 0, 0
+    at, now, last = -0.5, NONE, width_px - 0.5
+    while at < last:
+        if now == NONE:
+            nearest = 0.0
+            for i in range(len(seen)):
+                w = seen[i, 2] + seen[i, 3] * (at + _JUST_RIGHT_PX)
+                if seen[i, 0] <= at < seen[i, 1] and w > nearest:
+                    now, nearest = i, w
+        stop, w_0, w_u, follower = last, 0.0, 0.0, NONE
+        if now != NONE:
+            stop, w_0, w_u = min(seen[now, 1], last), seen[now, 2], seen[now, 3]
+        for i in range(len(seen)):
+            start, more_0, more_u = seen[i, 0], seen[i, 2] - w_0, seen[i, 3] - w_u
+            if at < start < stop and more_0 + more_u * (start + _JUST_RIGHT_PX) > 0:
+                stop, follower = start, NONE
+            elif more_u > 0 and max(at, start) < -more_0 / more_u < min(stop, seen[i, 1]):
+                stop, follower = -more_0 / more_u, i
         while at < stop:
-            after, follower = _overtaken(seen, now, at, stop)
-            if count > 0 and face[count - 1] == now:
-                until[count - 1] = after
-            elif count < MOST_STRIPS:
-                face[count], until[count] = now, after
-                count += 1
-            else:
-                until[count - 1] = after
-            at, now = after, follower
-    until[count - 1] = high
-    return count
-
-
-@kernel_part
-def _breaks(seen: Float, low: float, high: float) -> Float:
-    """Where faces begin and end between two coordinates, and these, from left to right."""
-    breaks = np.empty(2 * len(seen) + 2)
-    breaks[0], breaks[1], n = low, high, 2
-    for i in range(len(seen)):
-        if seen[i, 0] > seen[i, 1] or seen[i, 1] <= low or seen[i, 0] >= high:
-            continue
-        for end in range(2):
-            u, k = seen[i, end], n
-            if low < u < high:
-                while breaks[k - 1] > u:  # few: put each where it belongs
-                    breaks[k] = breaks[k - 1]
-                    k -= 1
-                breaks[k] = u
+            end = min(stop, column + 0.5)
+            if end - at >= _THINNEST_PX and n < len(face):
+                face[n], low[n], high[n] = now, at, end
                 n += 1
-    return breaks[:n]
+            if at <= column < end:
+                middle[column], middle_m[column] = now, np.inf
+                if now != NONE:
+                    middle_m[column] = 1 / (w_0 + w_u * column)
+            if end == column + 0.5:
+                column += 1
+                first[column] = n
+            at = end
+        now = follower
+    return face[:n], low[:n], high[:n], first, middle, middle_m
 
 
 @kernel_part
-def _first(seen: Float, at: float, stop: float) -> int:
-    """The nearest face just right of `at`, among those that reach from there to `stop`."""
-    u = at + 1e-7 * (stop - at)
-    best, best_w = NONE, 0.0
-    for i in range(len(seen)):
-        if seen[i, 0] <= at and seen[i, 1] >= stop:
-            w = seen[i, 2] + seen[i, 3] * u
-            if w > best_w:
-                best, best_w = i, w
-    return best
+def _open_rows(
+    camera: Pinhole,
+    height_m: float,
+    seen: Float,
+    face: np.ndarray,
+    low: Float,
+    high: Float,
+    first: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """How many rows of each column walls leave open, see `Plan`."""
+    above = np.empty(camera.width_px, dtype=np.int64)
+    below = np.empty(camera.width_px, dtype=np.int64)
+    horizon = int(np.ceil(camera.center_v))
+    for j in range(camera.width_px):
+        w = np.inf  # where walls are farthest; nowhere they are infinitely far
+        for s in range(first[j], first[j + 1]):
+            w_0, w_u = seen[face[s], 2], seen[face[s], 3]
+            w = min(w, w_0 + w_u * low[s], w_0 + w_u * high[s]) if face[s] != NONE else 0.0
+        top = camera.center_v - (height_m - camera.eye_z_m) * camera.focal_px * w
+        bottom = camera.center_v + camera.eye_z_m * camera.focal_px * w
+        above[j] = max(0, min(int(max(np.floor(top + 0.5) + 1, 0.0)), horizon))
+        below[j] = max(0, camera.height_px - max(int(np.floor(bottom + 0.5)), horizon))
+    return above, below
 
 
-@kernel_part
-def _overtaken(seen: Float, now: int, at: float, stop: float) -> tuple[float, int]:
-    """Where another face comes before the face `now`, and which; `stop` and `now` if none does."""
-    after, follower = stop, now
-    if now == NONE:
-        return after, follower
-    for i in range(len(seen)):
-        if seen[i, 0] <= at and seen[i, 1] >= stop and seen[i, 3] > seen[now, 3]:
-            u = (seen[now, 2] - seen[i, 2]) / (seen[i, 3] - seen[now, 3])
-            if at + _THINNEST_PX < u < after - _THINNEST_PX:
-                after, follower = u, i
-    return after, follower
+def inverse_depths(plan: Plan, first: int, last: int) -> Float:
+    """Of what is seen in the middles of strips (N,) in columns from `first` to before `last`."""
+    strips = slice(plan.first[first], plan.first[last])
+    face, middle = plan.face[strips], (plan.low[strips] + plan.high[strips]) / 2
+    w = plan.seen[face, 2] + plan.seen[face, 3] * middle
+    w[face == NONE] = 0.0
+    return w

@@ -1,234 +1,159 @@
 """The other robots in a picture: flat solids, drawn from the nearest to the farthest.
 
-A picture of a convex solid is the convex hull of its corners' pictures, and walls reach from the
-floor to the ceiling, so whether a wall hides a solid is decided column by column in plan.
+A picture of a convex solid is bounded by the edges between faces that it turns to the eye and
+others, and walls reach from the floor to the ceiling, so whether a wall hides a solid is decided
+column by column in plan.
 """
 
 import numpy as np
 
-from mapfusion.kernels import kernel, kernel_part
+from mapfusion.kernels import kernel
 from mapfusion.se2 import Float
-from sim.raycast.outline import clip, coverage, hull
-from sim.raycast.plan import NONE, Pinhole
+from sim.raycast.outline import fill_coverage, fill_least
+from sim.raycast.plan import Pinhole, Plan, inverse_depths
 from sim.raycast.solids import Solids, front_to_back
-from sim.raycast.windows import (
-    all_windows,
-    extremes,
-    in_robot,
-    pixel_ray,
-    project_corners,
-    window,
-)
+from sim.raycast.windows import Body
+
+_PARALLEL = 1e-12  # of a ray's direction along an axis: it meets no plane across that
 
 
-@kernel
-def depth_of(solids: Solids, i: int, eye: Float, ray: Float, near_m: float) -> float:
-    """Depth at which a ray (3,), one metre of depth long, enters a solid; infinity if it does not.
-
-    Both in the solid's frame (Kay and Kajiya 1986: the last plane entered before the first left).
-    """
-    enter, leave = near_m, np.inf
-    for k in range(solids.n_planes[i]):
-        n = solids.planes[i, k]
-        outside = n[0] * eye[0] + n[1] * eye[1] + n[2] * eye[2] - n[3]
-        toward = n[0] * ray[0] + n[1] * ray[1] + n[2] * ray[2]
-        if toward < 0:
-            enter = max(enter, -outside / toward)
-        elif toward > 0:
-            leave = min(leave, -outside / toward)
-        elif outside > 0:
-            return np.inf
-    return enter if enter < leave else np.inf
-
-
-@kernel
 def cast(
-    camera: Pinhole, solids: Solids, poses: Float, grey: Float, depth_m: np.ndarray,
+    camera: Pinhole, solids: Solids, bodies: list[Body], grey: Float, depth_m: np.ndarray,
+    picture: np.ndarray | None = None,
+) -> None:  # fmt: skip
+    """Draw robots into pixels whose middles hit them nearer than `depth_m` (H, W).
+
+    Both `depth_m`, infinity where nothing is, and `picture` (H, W) are changed.
+    """
+    for body in bodies:
+        for i in body.shown.tolist():
+            nearness = _nearness(camera, solids, i, body)
+            top, bottom, left, right = body.windows[i].tolist()
+            _put_nearer(nearness, top, left, depth_m)
+            if picture is not None:
+                picture[top : bottom + 1, left : right + 1][nearness > 0] = grey[i]
+
+
+@kernel
+def _put_nearer(nearness: Float, top: int, left: int, depth_m: np.ndarray) -> None:
+    """Put a window's inverse depths into a picture's where they are nearer; others become 0."""
+    height, width = nearness.shape
+    for i in range(height):
+        for j in range(width):
+            if nearness[i, j] * depth_m[top + i, left + j] > 1:
+                depth_m[top + i, left + j] = 1 / nearness[i, j]
+            else:
+                nearness[i, j] = 0.0
+
+
+def _nearness(camera: Pinhole, solids: Solids, i: int, body: Body) -> Float:
+    """Inverse depth of a solid behind its window's pixels; 0 where it is not.
+
+    Inverse depth is linear in the picture on each of its planes. Its surface is the farthest of
+    those that face the eye, where a ray has not left it before (Kay and Kajiya 1986).
+    """
+    top, bottom, left, right = body.windows[i].tolist()
+    own, f = slice(*solids.first_plane[i : i + 2]), camera.focal_px
+    up = (camera.center_v - np.arange(top, bottom + 1)) / f
+
+    def least(edges: Float, faces: np.ndarray, sign: float) -> Float:
+        n, outside_m = solids.planes[own, :3][faces], body.outside_m[own][faces]
+        ahead, aside, above = -sign * (body.axes @ n.T) / outside_m
+        in_row = ahead + aside * ((camera.center_u - left) / f) + above * up[:, None]
+        found = np.zeros((len(up), right + 1 - left))
+        fill_least(edges, in_row, -aside / f, found)
+        return found
+
+    facing = body.outside_m[own] > 0
+    if not body.is_cut[i]:
+        return least(body.outline(i), facing, 1.0)
+    # of what reaches the lens no outline is known: rays through all pixels of the window
+    around = np.array(
+        [[-1.0, -1, -1, len(up)], [right + 1.0 - left, len(up), right + 1 - left, -1]]
+    )
+    nearness = np.minimum(least(around, facing, 1.0), 1 / camera.near_m)
+    leaves = -least(around, body.outside_m[own] < 0, -1.0)
+    return np.where(nearness > np.maximum(leaves, 0.0), nearness, 0.0)
+
+
+def draw(
+    camera: Pinhole, plan: Plan, solids: Solids, bodies: list[Body], grey: Float,
     picture: np.ndarray,
 ) -> None:  # fmt: skip
-    """Draw robots at poses (R, 3) into pixels whose middles hit them nearer than `depth_m` (H, W).
-
-    Both `depth_m` and `picture` (H, W) are changed; a picture of no size is left alone.
-    """
-    for r in range(len(poses)):
-        eye, axes = in_robot(camera, poses[r])
-        for i in range(len(solids.n_corners)):
-            corners = project_corners(camera, solids, i, poses[r])
-            top, bottom, left, right = window(camera, solids, i, poses[r], corners)
-            if top > bottom or left > right:
-                continue
-            wholly_before = extremes(corners)[0][2] > camera.near_m
-            outline = hull(corners[:, :2]) if wholly_before else corners[:0]
-            nearness = np.empty(right - left + 1)
-            for v in range(top, bottom + 1):
-                _nearness(camera, solids, i, eye, axes, outline, v, left, nearness)
-                for u in range(left, right + 1):
-                    w = nearness[u - left]
-                    # nothing at all is NaN, which nothing compares with
-                    if w > 0 and not w * depth_m[v, u] <= 1:
-                        depth_m[v, u] = 1 / w
-                        if picture.size:
-                            picture[v, u] = grey[i]
-
-
-@kernel_part
-def _nearness(
-    camera: Pinhole, solids: Solids, i: int, eye: Float, axes: Float, outline: Float,
-    v: int, left: int, nearness: Float,
-) -> None:  # fmt: skip
-    """Inverse depth of a solid behind the pixels of a row from `left` on; 0 where it is not.
-
-    `outline` is that of its picture; none where it reaches the lens. Inverse depth is linear in the
-    picture on each of its planes, and its surface is the farthest of those that face the eye.
-    """
-    f, up = camera.focal_px, (camera.center_v - v) / camera.focal_px
-    nearness[:] = 0.0
-    if len(outline) == 0:
-        ray = np.empty(3)
-        for u in range(len(nearness)):
-            pixel_ray(camera, axes, v, left + u, ray)
-            nearness[u] = 1 / depth_of(solids, i, eye, ray, camera.near_m)
-        return
-    begin, end = _between(outline, float(v))
-    begin = max(np.ceil(begin) - left, 0.0)
-    end = min(np.floor(end) - left, len(nearness) - 1.0)
-    if begin > end:
-        return
-    inside = nearness[int(begin) : int(end) + 1]
-    inside[:] = np.inf
-    for k in range(solids.n_planes[i]):
-        n = solids.planes[i, k]
-        outside = n[0] * eye[0] + n[1] * eye[1] + n[2] * eye[2] - n[3]
-        if outside <= 0:
-            continue
-        ahead = -(n[0] * axes[0, 0] + n[1] * axes[0, 1] + n[2] * up) / outside
-        aside = -(n[0] * axes[1, 0] + n[1] * axes[1, 1]) / outside
-        at_left = ahead + aside * (camera.center_u - left - begin) / f
-        for u in range(len(inside)):
-            inside[u] = min(inside[u], at_left - aside / f * u)
-
-
-@kernel_part
-def _between(outline: Float, v: float) -> tuple[float, float]:
-    """Where a convex outline (K, 2) begins and ends in row v; infinities where it does not."""
-    begin, end = np.inf, -np.inf
-    for k in range(len(outline)):
-        p, q = outline[k], outline[(k + 1) % len(outline)]
-        if min(p[1], q[1]) <= v <= max(p[1], q[1]) and p[1] != q[1]:
-            u = p[0] + (v - p[1]) / (q[1] - p[1]) * (q[0] - p[0])
-            begin, end = min(begin, u), max(end, u)
-    return begin, end
-
-
-@kernel
-def draw(
-    camera: Pinhole, seen: Float, face: np.ndarray, until: Float, count: np.ndarray,
-    solids: Solids, poses: Float, grey: Float, picture: np.ndarray,
-) -> None:  # fmt: skip
-    """Draw robots at poses (R, 3) over a picture (H, W), each pixel by the share they cover.
+    """Draw robots over a picture (H, W) uint8, each pixel by the share they cover.
 
     Args:
         camera: level.
-        seen: from `sim.raycast.plan.project`.
-        face: from `sim.raycast.plan.strips`.
-        until: likewise.
-        count: likewise.
+        plan: what it sees of the walls.
         solids: of one robot.
-        poses: of the robots, from the nearest to the farthest.
+        bodies: in the picture, from the nearest to the farthest.
         grey: (S,) the solids' grey levels.
-        picture: (H, W) uint8, changed.
+        picture: changed.
     """
-    above, below, first, last = all_windows(camera, solids, poses)
-    if above > below or first > last:
-        return
-    under = picture[above : below + 1, first : last + 1].astype(np.float32)
-    shown = under.copy()
-    rest = np.ones(under.shape, dtype=np.float32)
-    for r in range(len(poses)):
-        eye, _ = in_robot(camera, poses[r])
-        for i in front_to_back(solids, eye):
-            corners = project_corners(camera, solids, i, poses[r])
-            top, bottom, left, right = window(camera, solids, i, poses[r], corners)
+    bounds = np.array([body.bounds() for body in bodies])
+    (above, first), (below, last) = bounds[:, ::2].min(axis=0), bounds[:, 1::2].max(axis=0)
+    under = picture[above:below, first:last].astype(np.float32)
+    seen, rest = under.copy(), np.ones_like(under)
+    for body in bodies:
+        open_share = _open_shares(camera, plan, solids, body, first, last)
+        windows = body.windows.tolist()
+        for i in front_to_back(solids, body.eye_m):
+            top, bottom, left, right = windows[i]
             if top > bottom or left > right:
                 continue
-            open_share, most = np.zeros(right - left + 1), 0.0
-            for j in range(left, right + 1):
-                at_m = _depth_in_column(camera, solids, i, poses[r], j)
-                open_share[j - left] = _open_share(seen, face, until, count, j, at_m)
-                most = max(most, open_share[j - left])
-            if most == 0:
-                continue
-            covered = _covered(camera, solids, i, poses[r], corners, top, bottom, left, right)
-            for v in range(top, bottom + 1):
-                for j in range(left, right + 1):
-                    # what is nearer hides the others where it is, and nowhere else in a pixel
-                    left_over = rest[v - above, j - first]
-                    share = min(covered[v - top, j - left] * open_share[j - left], left_over)
-                    rest[v - above, j - first] -= share
-                    shown[v - above, j - first] += share * (grey[i] - under[v - above, j - first])
-    for v in range(above, below + 1):
-        for j in range(first, last + 1):
-            picture[v, j] = np.uint8(shown[v - above, j - first] + 0.5)
+            if body.is_cut[i]:  # by the pixels' middles
+                covered = (_nearness(camera, solids, i, body) > 0).astype(np.float64)
+            else:
+                covered = np.zeros((bottom + 1 - top, right + 1 - left))
+                fill_coverage(body.outline(i), covered)
+            is_open = open_share[i, left - first : right + 1 - first]
+            _paint(covered, is_open, grey[i], top - above, left - first, under, rest, seen)
+    picture[above:below, first:last] = (seen + 0.5).astype(np.uint8)
 
 
-@kernel_part
-def _covered(
-    camera: Pinhole, solids: Solids, i: int, pose: Float, corners: Float,
-    top: int, bottom: int, left: int, right: int,
-) -> Float:  # fmt: skip
-    """Covered shares of a window's pixels; by their middles where the solid reaches the lens."""
-    height, width = bottom - top + 1, right - left + 1
-    if extremes(corners)[0][2] > camera.near_m:
-        outline = hull(corners[:, :2])
-        for k in range(len(outline)):
-            outline[k, 0] -= left - 0.5
-            outline[k, 1] -= top - 0.5
-        polygon = clip(outline, float(width), float(height))
-        return coverage(polygon, height, width)
-    covered, ray = np.zeros((height, width)), np.empty(3)
-    eye, axes = in_robot(camera, pose)
-    for v in range(height):
-        for u in range(width):
-            pixel_ray(camera, axes, top + v, left + u, ray)
-            if depth_of(solids, i, eye, ray, camera.near_m) < np.inf:
-                covered[v, u] = 1.0
-    return covered
+@kernel
+def _paint(
+    covered: Float, open_share: Float, grey: float, top: int, left: int, under: np.ndarray,
+    rest: np.ndarray, seen: np.ndarray,
+) -> None:  # fmt: skip
+    """Draw a solid by the shares of its window's pixels (H, W) and columns (W,), see `draw`.
+
+    What is nearer hides the others where it is, and nowhere else in a pixel.
+    """
+    height, width = covered.shape
+    for i in range(height):
+        for j in range(width):
+            v, u = top + i, left + j
+            share = min(covered[i, j] * open_share[j], rest[v, u])
+            rest[v, u] -= share
+            seen[v, u] += share * (grey - under[v, u])
 
 
-@kernel_part
-def _depth_in_column(camera: Pinhole, solids: Solids, i: int, pose: Float, j: int) -> float:
-    """Depth of a solid's box where column j meets it in plan, or of its corner nearest to that."""
-    eye, axes = in_robot(camera, pose)
-    y = (camera.center_u - j) / camera.focal_px
-    low, high = solids.low_m[i], solids.high_m[i]
-    enter, leave = 0.0, np.inf
-    for axis in range(2):
-        ray = axes[0, axis] + y * axes[1, axis]
-        if abs(ray) > 1e-12:
-            a, b = (low[axis] - eye[axis]) / ray, (high[axis] - eye[axis]) / ray
-            enter, leave = max(enter, min(a, b)), min(leave, max(a, b))
-    if enter <= leave:
-        return (enter + leave) / 2
-    best, best_m = np.inf, 0.0
-    for k in range(4):
-        x = (low[0] if k < 2 else high[0]) - eye[0]
-        across = (low[1] if k % 2 else high[1]) - eye[1]
-        depth_m = axes[0, 0] * x + axes[0, 1] * across
-        off = abs(axes[1, 0] * x + axes[1, 1] * across - y * depth_m) / max(depth_m, camera.near_m)
-        if off < best:
-            best, best_m = off, depth_m
-    return best_m
-
-
-@kernel_part
-def _open_share(
-    seen: Float, face: np.ndarray, until: Float, count: np.ndarray, j: int, at_m: float
-) -> float:
-    """Share of column j in which no wall stands before a depth."""
-    share, low = 0.0, j - 0.5
-    for s in range(count[j]):
-        i, high = face[j, s], until[j, s]
-        if i == NONE or at_m * (seen[i, 2] + seen[i, 3] * (low + high) / 2) < 1:
-            share += high - low
-        low = high
-    return share
+def _open_shares(
+    camera: Pinhole, plan: Plan, solids: Solids, body: Body, first: int, last: int
+) -> Float:
+    """Shares (S, N) of columns from `first` to before `last` in which no wall hides a solid."""
+    w = inverse_depths(plan, first, last)
+    if body.farthest_m * w.max() < 1:  # in front of all walls
+        return np.ones((len(body.windows), last - first))
+    (ahead_x, ahead_y), (left_x, left_y) = body.axes[:2, :2].tolist()
+    low, high = solids.low_m[:, :2] - body.eye_m[:2], solids.high_m[:, :2] - body.eye_m[:2]
+    x = np.stack([low[:, 0], low[:, 0], high[:, 0], high[:, 0]])
+    y = np.stack([low[:, 1], high[:, 1], low[:, 1], high[:, 1]])
+    corner_m, aside_m = ahead_x * x + ahead_y * y, left_x * x + left_y * y
+    left = (camera.center_u - np.arange(first, last)) / camera.focal_px
+    # depths at which columns meet solids' boxes in plan, or of the corners nearest to them
+    enter, leave = np.zeros((len(low), 1)), np.full((len(low), 1), np.inf)
+    for axis, ray in enumerate((ahead_x + left * left_x, ahead_y + left * left_y)):
+        ray[np.abs(ray) <= _PARALLEL] = np.nan  # which counts neither as least nor as most
+        at_low, at_high = low[:, axis, None] / ray, high[:, axis, None] / ray
+        enter = np.fmax(enter, np.minimum(at_low, at_high))
+        leave = np.fmin(leave, np.maximum(at_low, at_high))
+    off = np.abs(aside_m[:, :, None] - left * corner_m[:, :, None])
+    off /= np.maximum(corner_m, camera.near_m)[:, :, None]
+    nearest_m = np.take_along_axis(corner_m.T, np.argmin(off, axis=0), axis=1)
+    depth_m = np.where(enter <= leave, (enter + leave) / 2, nearest_m)
+    begins = plan.first[first : last + 1]
+    width = (plan.high - plan.low)[begins[0] : begins[-1]]
+    share = np.where(np.repeat(depth_m, np.diff(begins), axis=1) * w < 1, width, 0.0)
+    return np.add.reduceat(share, begins[:-1] - begins[0], axis=1)

@@ -8,32 +8,44 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull
 
-from mapfusion.kernels import kernel_part
 from mapfusion.se2 import Float
 
 MARGIN_M = 0.001  # by which PyBullet shows cylinders too large
+
+_Hull = tuple[Float, np.ndarray, np.ndarray]  # planes, edges and sides, see `Solids`
 
 
 class Solids(NamedTuple):
     """One robot at rest, in its own frame: metres, the floor at z = 0.
 
+    Corners, faces and edges of all S solids one after the other; faces are triangles.
+
     Attributes:
-        corners_m: (S, K, 3) convex hulls' corners.
-        n_corners: (S,) int64, how many of them count.
-        planes: (S, P, 4) outward normals and offsets: inside, n p <= d.
-        n_planes: (S,) int64, how many of them count.
+        corners_m: (N, 3).
+        first_corner: (S + 1,) int64, where each solid's begin, and N.
+        planes: (P, 4) the faces' outward normals and offsets: inside, n p <= d.
+        first_plane: (S + 1,) likewise.
+        edges: (E, 2) int64 corners: the first face lies to the left of the way along an edge, seen
+            from outside.
+        sides: (E, 2) int64, the faces that meet there.
+        first_edge: (S + 1,) likewise.
         low_m: (S, 3) lowest corners of the boxes around them.
         high_m: (S, 3) highest.
         rgb: (S, 3) float64 colours as they show, of 255.
+        reach_m: no part is farther from where it stands, in plan.
     """
 
     corners_m: Float
-    n_corners: np.ndarray
+    first_corner: np.ndarray
     planes: Float
-    n_planes: np.ndarray
+    first_plane: np.ndarray
+    edges: np.ndarray
+    sides: np.ndarray
+    first_edge: np.ndarray
     low_m: Float
     high_m: Float
     rgb: Float
+    reach_m: float
 
 
 def read_solids(urdf: Path) -> Solids:
@@ -42,28 +54,34 @@ def read_solids(urdf: Path) -> Solids:
     colours = {m.attrib["name"]: _numbers(m.find("color"), "rgba") for m in root.iter("material")
                if m.find("color") is not None}  # fmt: skip
     places = {_named(j, "child"): _numbers(j.find("origin"), "xyz") for j in root.iter("joint")}
-    shapes = []
+    corners_m, planes, edges, sides, rgb = [], [], [], [], []
     for link in root.iter("link"):
         place = places.get(link.attrib["name"], np.zeros(3))
         for visual in link.iter("visual"):
-            rgb = np.floor(255 * colours[_named(visual, "material", "name")][:3])
-            corners_m, planes = _shape(visual)
-            planes[:, 3] += planes[:, :3] @ place
-            shapes.append((corners_m + place, planes, rgb))
-    most = [max(len(shape[part]) for shape in shapes) for part in range(2)]
-    corners_m, planes = np.zeros((len(shapes), most[0], 3)), np.zeros((len(shapes), most[1], 4))
-    for i, (own_corners, own_planes, _) in enumerate(shapes):
-        corners_m[i, : len(own_corners)] = own_corners
-        planes[i, : len(own_planes)] = own_planes
+            own_corners, hull = _shape(visual, place)
+            edges.append(hull[1] + sum(map(len, corners_m)))
+            sides.append(hull[2] + sum(map(len, planes)))
+            corners_m.append(own_corners)
+            planes.append(hull[0])
+            rgb.append(np.floor(255 * colours[_named(visual, "material", "name")][:3]))
     return Solids(
-        corners_m,
-        np.array([len(own) for own, _, _ in shapes]),
-        planes,
-        np.array([len(own) for _, own, _ in shapes]),
-        np.array([own.min(axis=0) for own, _, _ in shapes]),
-        np.array([own.max(axis=0) for own, _, _ in shapes]),
-        np.array([rgb for _, _, rgb in shapes]),
+        np.concatenate(corners_m),
+        _begins(corners_m),
+        np.concatenate(planes),
+        _begins(planes),
+        np.concatenate(edges),
+        np.concatenate(sides),
+        _begins(edges),
+        np.array([own.min(axis=0) for own in corners_m]),
+        np.array([own.max(axis=0) for own in corners_m]),
+        np.array(rgb),
+        float(np.linalg.norm(np.concatenate(corners_m)[:, :2], axis=1).max()),
     )
+
+
+def _begins(parts: list[np.ndarray]) -> np.ndarray:
+    """Where each of the parts begins, one after the other, and where the last ends."""
+    return np.cumsum([0, *(len(part) for part in parts)])
 
 
 def _numbers(element: ElementTree.Element | None, name: str) -> Float:
@@ -77,28 +95,40 @@ def _named(element: ElementTree.Element, child: str, name: str = "link") -> str:
     return found.attrib[name]
 
 
-def _shape(visual: ElementTree.Element) -> tuple[Float, Float]:
-    """Corners (K, 3) and planes (P, 4) of a box or a cylinder in its link's frame."""
+def _shape(visual: ElementTree.Element, place_m: Float) -> tuple[Float, _Hull]:
+    """Corners (K, 3) of a box or a cylinder in the robot's frame, and its faces."""
     origin, box = visual.find("origin"), visual.find("geometry/box")
-    R = _rotation(_numbers(origin, "rpy"))
     if box is not None:
-        half = _numbers(box, "size") / 2
         signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-        corners, normals, offsets = (
-            signs * half,
-            np.vstack([np.eye(3), -np.eye(3)]),
-            np.tile(half, 2),
-        )
+        corners = signs * _numbers(box, "size") / 2
     else:
         cylinder = visual.find("geometry/cylinder")
         assert cylinder is not None
         radius, half_m = float(cylinder.attrib["radius"]), float(cylinder.attrib["length"]) / 2
         corners = _bullets_cylinder(radius, half_m)
-        planes = np.unique(ConvexHull(corners).equations.round(9), axis=0)
-        normals, offsets = planes[:, :3], -planes[:, 3]
-    at = _numbers(origin, "xyz")
-    normals = normals @ R.T
-    return corners @ R.T + at, np.column_stack([normals, offsets + normals @ at])
+    planes, edges, sides = _hull(corners)
+    R, at = _rotation(_numbers(origin, "rpy")), _numbers(origin, "xyz")
+    planes[:, :3] = planes[:, :3] @ R.T
+    planes[:, 3] += planes[:, :3] @ at
+    planes[:, 3] += planes[:, :3] @ place_m
+    return corners @ R.T + at + place_m, (planes, edges, sides)
+
+
+def _hull(corners: Float) -> _Hull:
+    """Planes, edges and the faces that meet there, see `Solids`, of the corners of a solid."""
+    hull = ConvexHull(corners)
+    a, b, c = np.moveaxis(corners[hull.simplices], 1, 0)
+    normals = hull.equations[:, :3]
+    turned = np.sum(np.cross(b - a, c - a) * normals, axis=1) < 0
+    edges, sides = [], []
+    for i, (corner, beside) in enumerate(zip(hull.simplices, hull.neighbors, strict=True)):
+        for k in range(3):  # the edge across from corner k
+            if i < beside[k]:
+                way = [corner[(k + 1) % 3], corner[(k + 2) % 3]]
+                edges.append(way[::-1] if turned[i] else way)
+                sides.append([i, beside[k]])
+    planes = hull.equations.round(9) * [1, 1, 1, -1]
+    return planes, np.array(edges), np.array(sides)
 
 
 def _bullets_cylinder(radius: float, half_m: float) -> Float:
@@ -131,39 +161,19 @@ def _rotation(rpy: ArrayLike) -> Float:
     return about_z @ about_y @ about_x
 
 
-@kernel_part
-def front_to_back(solids: Solids, eye_m: Float) -> np.ndarray:
+def front_to_back(solids: Solids, eye_m: Float) -> list[int]:
     """An order (S,) in which none hides one before it, seen from a point (3,) of their frame.
 
     The boxes around them do not overlap, so between any two lies a plane along two axes; what
     is on the eye's side of it cannot be hidden by the other.
     """
-    n = len(solids.n_corners)
-    order, taken = np.empty(n, dtype=np.int64), np.zeros(n, dtype=np.bool_)
-    for place in range(n):
-        order[place] = -1
-        for i in range(n):
-            if taken[i]:
-                continue
-            first = True
-            for j in range(n):
-                if j != i and not taken[j]:
-                    first = first and _unhidden(solids, i, j, eye_m)
-            if first or order[place] < 0:
-                order[place] = i
-            if first:
-                break
-        taken[order[place]] = True
+    low, high = solids.low_m, solids.high_m
+    in_front = (high[:, None] <= low + 1e-9) & (eye_m <= low)
+    in_front |= (low[:, None] >= high - 1e-9) & (eye_m >= high)
+    unhidden = (in_front.any(axis=2) | np.eye(len(low), dtype=bool)).tolist()
+    order, left = list[int](), list(range(len(low)))
+    while left:
+        first = (i for i in left if all(unhidden[i][j] for j in left))
+        order.append(next(first, left[0]))
+        left.remove(order[-1])
     return order
-
-
-@kernel_part
-def _unhidden(solids: Solids, i: int, j: int, eye_m: Float) -> bool:
-    """Whether solid j can hide nothing of solid i."""
-    for axis in range(3):
-        low, high = solids.low_m[:, axis], solids.high_m[:, axis]
-        if high[i] <= low[j] + 1e-9 and eye_m[axis] <= low[j]:
-            return True
-        if low[i] >= high[j] - 1e-9 and eye_m[axis] >= high[j]:
-            return True
-    return False

@@ -12,7 +12,7 @@ import numpy as np
 
 from mapfusion.kernels import kernel, kernel_part
 from mapfusion.se2 import Float
-from sim.raycast.plan import NONE, Pinhole
+from sim.raycast.plan import NONE, Pinhole, Plan
 from sim.raycast.scene import Walls
 
 # A wall's level lines cross a column at a slope, which cuts a footprint's corners. A strip is cut
@@ -25,61 +25,16 @@ LEAST_TEXELS = 1e-6  # of a strip at a wall's end: sums still tell them apart
 
 
 @kernel
-def open_rows(
-    camera: Pinhole, walls: Walls, seen: Float, face: np.ndarray, until: Float, count: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """How many rows from the upper edge and from the lower one walls leave open, wholly or partly.
+def draw_walls(camera: Pinhole, walls: Walls, plan: Plan, columns: np.ndarray) -> None:
+    """Draw walls over what is behind them.
 
     Args:
         camera: level.
         walls: all faces.
-        seen: as `sim.raycast.plan.project` gives them.
-        face: as `sim.raycast.plan.strips` gives them.
-        until: likewise.
-        count: likewise.
-
-    Returns:
-        Of each column (W,) those above the horizon, and those from it on.
+        plan: what the camera sees of them.
+        columns: the picture's (W, H) uint8, changed, each one after the other in memory.
     """
-    above = np.zeros(camera.width_px, dtype=np.int32)
-    below = np.zeros(camera.width_px, dtype=np.int32)
-    horizon = int(np.ceil(camera.center_v))
-    for j in range(camera.width_px):
-        low = j - 0.5
-        for s in range(count[j]):
-            i, high = face[j, s], until[j, s]
-            # where it is farthest; nowhere it is infinitely far
-            w = min(seen[i, 2] + seen[i, 3] * low, seen[i, 2] + seen[i, 3] * high)
-            top, bottom = _edges(camera, walls.height_m, 0.0 if i == NONE else w)
-            rows = min(int(max(np.floor(top + 0.5) + 1, 0.0)), horizon)
-            above[j] = max(above[j], rows)
-            rows = camera.height_px - max(int(np.floor(bottom + 0.5)), horizon)
-            below[j] = max(below[j], rows)
-            low = high
-    return above, below
-
-
-@kernel_part
-def _edges(camera: Pinhole, height_m: float, w: float) -> tuple[float, float]:
-    """Where a wall's upper and lower edge lie in v, at inverse depth w."""
-    top = camera.center_v - (height_m - camera.eye_z_m) * camera.focal_px * w
-    return top, camera.center_v + camera.eye_z_m * camera.focal_px * w
-
-
-@kernel
-def draw_walls(
-    camera: Pinhole,
-    walls: Walls,
-    seen: Float,
-    face: np.ndarray,
-    until: Float,
-    count: np.ndarray,
-    columns: np.ndarray,
-) -> None:
-    """Draw walls over what is behind them; arguments as above.
-
-    The picture's columns (W, H) uint8 are changed, each one after the other in memory.
-    """
+    seen, face, lows, highs = plan.seen, plan.face, plan.low, plan.high
     height, height_m, width_m, size = camera.height_px, walls.height_m, walls.width_m, walls.size
     begins, table = walls.first, walls.sums
     # of a strip: sums of its texels up to each row of texels; of the edges between pixels: the row
@@ -90,11 +45,11 @@ def draw_walls(
     below = np.empty(height + 1, dtype=np.float32)
     total, covered = np.empty(height, dtype=np.float32), np.empty(height, dtype=np.float32)
     for j in range(camera.width_px):
-        low, first, last = j - 0.5, height - 1, 0
+        first, last = height - 1, 0
         lowest_top, highest_bottom = 0, height - 1
         _clear(total, covered)
-        for s in range(count[j]):
-            i, high = face[j, s], until[j, s]
+        for s in range(plan.first[j], plan.first[j + 1]):
+            i, low, high = face[s], lows[s], highs[s]
             n = 0 if i == NONE else _cuts(camera, height_m, seen, i, low, high)
             for k in range(n):
                 a, b = low + k * (high - low) / n, low + (k + 1) * (high - low) / n
@@ -115,7 +70,6 @@ def draw_walls(
                 _cover(covered, b - a, top, bottom, upper, lower)
                 first, last = min(first, upper), max(last, lower)
                 lowest_top, highest_bottom = max(lowest_top, upper), min(highest_bottom, lower)
-            low = high
         # rows between the edges of all strips are covered alike; if wholly, nothing shines through
         begin, end = lowest_top + 1, highest_bottom
         if begin >= end or covered[begin] < COVERED:
@@ -194,7 +148,8 @@ def _rows(
 ) -> tuple[float, float, float]:
     """Where a strip of face i begins and ends in v, and how many texels a row is high."""
     w = seen[i, 2] + seen[i, 3] * (low + high) / 2
-    top, bottom = _edges(camera, height_m, w)
+    top = camera.center_v - (height_m - camera.eye_z_m) * camera.focal_px * w
+    bottom = camera.center_v + camera.eye_z_m * camera.focal_px * w
     return top, bottom, size[i, 1] / (height_m * camera.focal_px * w)
 
 

@@ -7,14 +7,14 @@ import numpy as np
 from mapfusion.camera import StereoCamera
 from mapfusion.se2 import compose
 from sim.p3at import URDF
-from sim.raycast.picture import filtered
+from sim.raycast.picture import filtered, sight
 from sim.raycast.plan import Pinhole
 from sim.raycast.scene import Scene, make_scene
 from sim.raycast.solids import read_solids
 
 NOBODY = np.zeros((0, 3))
 SOLIDS = read_solids(URDF)
-GREY = np.zeros(len(SOLIDS.n_corners))
+GREY = np.zeros(len(SOLIDS.rgb))
 HEIGHT_M, TEXELS_PER_M = 2.5, 250
 
 
@@ -48,8 +48,8 @@ def slanted(distance_m: float, slant_rad: float, half_m: float) -> tuple[np.ndar
 
 def look(scene: Scene, camera: Pinhole) -> np.ndarray:
     """The filtered picture (H, W) as float64, nobody else in view."""
-    walls, floor, ceiling = scene.walls, scene.floor, scene.ceiling
-    return filtered(camera, walls, floor, ceiling, SOLIDS, NOBODY, GREY).astype(np.float64)
+    seen = sight(camera, scene.walls, SOLIDS, NOBODY)
+    return filtered(seen, scene, SOLIDS, GREY).astype(np.float64)
 
 
 def along_m(start: np.ndarray, end: np.ndarray, camera: Pinhole, u: np.ndarray) -> np.ndarray:

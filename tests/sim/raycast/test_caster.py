@@ -107,6 +107,22 @@ def test_filtered_pictures_are_tinyrenderer_s_of_four_times_the_size_averaged(fa
     assert np.mean(off_edges) < 1.0
 
 
+def test_robots_in_filtered_pictures_are_those_that_many_rays_hit(faces: Path) -> None:
+    """What a robot changes in a picture, walls before it and behind it."""
+    caster, fine, nobody = RayCaster(faces, CAMERA), finer(CAMERA, 8), np.zeros((0, 3))
+    by_rays = RayCaster(faces, fine, "middle")
+    for view in VIEWS:
+        own, robot = view[0], view[1:]
+        picture, alone = (caster.grey(own, LEFT_M, who).astype(float) for who in (robot, nobody))
+        changed, by_ray = (by_rays.grey(own, LEFT_M, who) for who in (robot, nobody))
+        true = averaged(changed.astype(float) - by_ray, 8)
+        off = np.abs(picture - alone - true)
+        where = (np.abs(true) > 1) | (np.abs(picture - alone) > 1)
+        assert where.sum() > 200
+        assert off[where].mean() < 1.5
+        assert np.mean(off[where] > 10) < 0.03
+
+
 TILTS = np.array([[0.09, -0.05], [-0.03, 0.1], [0.05, 0.05]])
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from mapfusion.camera import StereoCamera
 from sim.floorplan import FloorPlan, Wall
-from sim.raycast.plan import NONE, Pinhole, nearest, project, strips
+from sim.raycast.plan import NONE, Pinhole, look
 from sim.raycast.scene import Walls, make_scene
 from tests.sim.raycast.scenes import pinhole
 
@@ -52,28 +52,27 @@ def test_columns_middles_see_the_nearest_wall_at_its_depth(walls: Walls) -> None
     u = np.arange(float(CAMERA.width_px))
     for pose in places(60):
         camera = pinhole(CAMERA, pose)
-        seen = project(camera, walls)
-        face = nearest(seen, u)
+        plan = look(camera, walls)
         true_face, true_m = cast(walls, camera, u)
-        np.testing.assert_array_equal(face, true_face)
-        np.testing.assert_allclose(1 / (seen[face, 2] + seen[face, 3] * u), true_m, rtol=1e-9)
+        np.testing.assert_array_equal(plan.middle, true_face)
+        np.testing.assert_allclose(plan.middle_m, true_m, rtol=1e-9)
 
 
 def test_strips_are_what_rays_through_their_middles_meet(walls: Walls) -> None:
     several = 0
     for pose in places(60):
         camera = pinhole(CAMERA, pose)
-        face, until, count = strips(camera, project(camera, walls))
-        ends = [until[j, : count[j]] for j in range(CAMERA.width_px)]
-        begins = [np.r_[j - 0.5, end[:-1]] for j, end in enumerate(ends)]
-        np.testing.assert_allclose([end[-1] for end in ends], np.arange(CAMERA.width_px) + 0.5)
-        drawn = np.concatenate([face[j, : count[j]] for j in range(CAMERA.width_px)])
-        begin, end = np.concatenate(begins), np.concatenate(ends)
+        plan = look(camera, walls)
+        begin, end = plan.low, plan.high
+        edges = np.arange(CAMERA.width_px + 1) - 0.5
+        np.testing.assert_allclose(begin[plan.first[:-1]], edges[:-1], atol=1e-8)
+        np.testing.assert_allclose(end[plan.first[1:] - 1], edges[1:], atol=1e-8)
+        np.testing.assert_allclose(end[:-1], begin[1:], atol=1e-8)
         for share in (1e-3, 0.3, 0.5, 0.9, 1 - 1e-3):
             thick = end - begin > 1e-6
             true_face, _ = cast(walls, camera, (begin + share * (end - begin))[thick])
-            np.testing.assert_array_equal(drawn[thick], true_face)
-        several += np.sum(count > 1)
+            np.testing.assert_array_equal(plan.face[thick], true_face)
+        several += np.sum(np.diff(plan.first) > 1)
     assert several > 30  # corners, edges, and walls that run into each other
 
 
@@ -81,11 +80,9 @@ def test_where_no_wall_is_none_is_seen() -> None:
     corners = np.array([[[2, 0.5, 0], [2, -0.5, 0], [2, -0.5, 2.5], [2, 0.5, 2.5]]], dtype=float)
     walls = make_scene(corners, lambda _: np.zeros((4, 4), dtype=np.uint8)).walls
     camera = pinhole(StereoCamera(160, 120, 80.5, mount_x_m=0.0), np.zeros(3))
-    face, until, count = strips(camera, project(camera, walls))
-    width_px = sum(
-        np.diff(np.r_[j - 0.5, until[j, : count[j]]])[face[j, : count[j]] == 0].sum()
-        for j in range(160)
-    )
-    assert width_px == pytest.approx(80.5 / 2, abs=1e-9)
+    plan = look(camera, walls)
+    assert np.sum((plan.high - plan.low)[plan.face == 0]) == pytest.approx(80.5 / 2, abs=1e-9)
     turned = pinhole(CAMERA, np.array([4.0, 0.0, np.pi]))  # behind it: seen from its front only
-    assert np.all(strips(turned, project(turned, walls))[0][:, 0] == NONE)
+    plan = look(turned, walls)
+    assert np.all(plan.face == NONE)
+    assert np.all(np.isinf(plan.middle_m))

@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
+from mapfusion.se2 import transform_points
 from sim.p3at import URDF
 from sim.raycast.plan import Pinhole
-from sim.raycast.robots import depth_of
+from sim.raycast.robots import cast
 from sim.raycast.solids import read_solids
-from sim.raycast.windows import in_robot, pixel_ray, project_corners, window, within_view
+from sim.raycast.windows import Body, place, within_view
 from sim.stereo_head import NEAR_M
 
 # A wide lens low above the floor, which has something of a robot beside it in view.
@@ -15,24 +16,58 @@ CAMERA = Pinhole(80, 60, 30.0, 39.5, 29.5, 0.0, 0.0, 0.2, 0.0, NEAR_M)
 SOLIDS = read_solids(URDF)
 
 
-def pixels_hit(i: int, pose: np.ndarray) -> np.ndarray:
-    """Rows and columns (N, 2) of the pixels whose middles hit a solid."""
-    eye, axes = in_robot(CAMERA, pose)
-    hit, ray = np.zeros((CAMERA.height_px, CAMERA.width_px), dtype=bool), np.empty(3)
-    for v, u in np.ndindex(*hit.shape):
-        pixel_ray(CAMERA, axes, v, u, ray)
-        hit[v, u] = depth_of(SOLIDS, i, eye, ray, NEAR_M) < np.inf
-    return np.argwhere(hit)
+def depth_of(planes: np.ndarray, eye_m: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """Depths (N,) at which rays (N, 3), one metre of depth long, enter a solid; infinity if not."""
+    outside, toward = planes[:, :3] @ eye_m - planes[:, 3], rays @ planes[:, :3].T
+    at = -outside / toward
+    enter = np.where(toward < 0, at, NEAR_M).max(axis=1, initial=NEAR_M)
+    leave = np.where(toward > 0, at, np.inf).min(axis=1)
+    return np.where(enter < leave, enter, np.inf)
 
 
-@pytest.mark.parametrize("pose", [(0.1, -0.4, 0.3), (0.0, 0.45, 1.7), (0.35, -0.4, -2.0)])
+def depths_m(i: int, body: Body) -> np.ndarray:
+    """Depths (H, W) of a solid behind pixels' middles, infinity where it is not."""
+    v, u = np.mgrid[: CAMERA.height_px, : CAMERA.width_px].reshape(2, -1, 1)
+    ahead, left, up = body.axes
+    to_left, to_up = CAMERA.center_u - u, CAMERA.center_v - v
+    rays = ahead + to_left / CAMERA.focal_px * left + to_up / CAMERA.focal_px * up
+    planes = SOLIDS.planes[SOLIDS.first_plane[i] : SOLIDS.first_plane[i + 1]]
+    return depth_of(planes, body.eye_m, rays).reshape(CAMERA.height_px, CAMERA.width_px)
+
+
+def ahead_m(camera: Pinhole, i: int, pose: np.ndarray) -> np.ndarray:
+    """How far ahead of a camera a solid's corners (K,) are, of a robot at a pose."""
+    corners = SOLIDS.corners_m[SOLIDS.first_corner[i] : SOLIDS.first_corner[i + 1]]
+    x, y = transform_points(pose, corners)[:, :2].T
+    x, y = x - camera.eye_x_m, y - camera.eye_y_m
+    return np.cos(camera.theta) * x + np.sin(camera.theta) * y
+
+
+POSES = [(0.1, -0.4, 0.3), (0.0, 0.45, 1.7), (0.35, -0.4, -2.0)]
+
+
+@pytest.mark.parametrize("pose", [*POSES, (0.05, 0.0, 0.3), (1.2, 0.3, 0.4)])
+def test_depths_are_those_of_rays_through_all_pixels(pose: tuple) -> None:
+    """Of what reaches the lens and even holds it, and of what is farther off."""
+    body = place(CAMERA, SOLIDS, np.array(pose))
+    seen = np.full((CAMERA.height_px, CAMERA.width_px), np.inf)
+    cast(CAMERA, SOLIDS, [body], np.zeros(len(SOLIDS.rgb)), seen)
+    true = np.min([depths_m(i, body) for i in range(len(SOLIDS.rgb))], axis=0)
+    both = np.isfinite(seen) & np.isfinite(true)
+    assert both.sum() > 90
+    assert np.mean(np.isfinite(seen) != np.isfinite(true)) < 1e-3
+    assert np.mean(np.abs(seen[both] / true[both] - 1) > 1e-9) < 1e-3
+
+
+@pytest.mark.parametrize("pose", POSES)
 def test_the_window_holds_all_that_shows_of_what_reaches_the_lens(pose: tuple) -> None:
-    at, cut, share = np.array(pose), 0, 1.0
-    for i in range(len(SOLIDS.n_corners)):
-        corners = project_corners(CAMERA, SOLIDS, i, at)
-        hit = pixels_hit(i, at)
-        if corners[:, 2].min() <= NEAR_M and len(hit):
-            top, bottom, left, right = window(CAMERA, SOLIDS, i, at, corners)
+    body, cut, share = place(CAMERA, SOLIDS, np.array(pose)), 0, 1.0
+    for i in range(len(SOLIDS.rgb)):
+        hit = np.argwhere(depths_m(i, body) < np.inf)
+        assert body.is_cut[i] == (ahead_m(CAMERA, i, np.array(pose)).min() <= NEAR_M)
+        if body.is_cut[i] and len(hit):
+            top, bottom, left, right = body.windows[i]
+            assert i in body.shown
             assert np.all(hit.min(axis=0) >= [top, left])
             assert np.all(hit.max(axis=0) <= [bottom, right])
             cut, size = cut + 1, (bottom - top + 1) * (right - left + 1)
@@ -43,28 +78,20 @@ def test_the_window_holds_all_that_shows_of_what_reaches_the_lens(pose: tuple) -
 
 def test_what_stands_beside_the_lens_has_no_window() -> None:
     beside = np.array([0.2, -1.5, 0.0])
-    ahead = [project_corners(CAMERA, SOLIDS, i, beside) for i in range(len(SOLIDS.n_corners))]
-    assert any(c[:, 2].min() <= NEAR_M < c[:, 2].max() for c in ahead)
-    narrow = CAMERA._replace(focal_px=80.0)
-    for i, corners in enumerate(ahead):
-        if corners[:, 2].min() <= NEAR_M:
-            top, bottom, left, right = window(narrow, SOLIDS, i, beside, corners)
-            assert top > bottom or left > right
+    ahead = [ahead_m(CAMERA, i, beside) for i in range(len(SOLIDS.rgb))]
+    assert any(m.min() <= NEAR_M < m.max() for m in ahead)
+    body = place(CAMERA._replace(focal_px=80.0), SOLIDS, beside)
+    assert not np.any(body.is_cut[body.shown])
 
 
 def test_robots_that_have_a_window_are_within_view_and_others_mostly_not() -> None:
     rng = np.random.default_rng(3)
     camera = CAMERA._replace(center_u=30.0, eye_x_m=1.0, eye_y_m=-2.0, theta=2.5)
     poses = rng.uniform([-3, -6, -np.pi], [5, 2, np.pi], (300, 3))
-    reach_m = float(np.hypot(*SOLIDS.corners_m[..., :2].reshape(-1, 2).T).max())
-    within = {tuple(pose) for pose in within_view(camera, reach_m, poses)}
+    within = {tuple(pose) for pose in within_view(camera, SOLIDS.reach_m, poses)}
     beside = 0
     for pose in poses:
-        shows = False
-        for i in range(len(SOLIDS.n_corners)):
-            corners = project_corners(camera, SOLIDS, i, pose)
-            top, bottom, left, right = window(camera, SOLIDS, i, pose, corners)
-            shows |= top <= bottom and left <= right
+        shows = len(place(camera, SOLIDS, pose).shown) > 0
         assert tuple(pose) in within or not shows
         beside += tuple(pose) in within and not shows
     assert 0 < len(within) < len(poses)
