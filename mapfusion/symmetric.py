@@ -5,6 +5,8 @@ import math
 from mapfusion.kernels import inner_kernel
 from mapfusion.se2 import Float
 
+_SINGULAR = 1e-12  # determinant of a matrix scaled to a unit diagonal that is rounding error
+
 
 @inner_kernel
 def cofactors(
@@ -14,6 +16,21 @@ def cofactors(
     axx, axy, axz = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
     ayy, ayz, azz = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
     return axx, axy, axz, ayy, ayz, azz, xx * axx + xy * axy + xz * axz
+
+
+@inner_kernel
+def invert(matrix: Float, inverse: Float) -> bool:
+    """Fill the inverse (3, 3) of a symmetric matrix; False unless positive definite."""
+    a, d, f = matrix[0, 0], matrix[1, 1], matrix[2, 2]
+    axx, axy, axz, ayy, ayz, azz, det = cofactors(a, matrix[0, 1], matrix[0, 2], d, matrix[1, 2], f)
+    positive = a > 0 and azz > 0  # with det > 0 the leading minors (Sylvester)
+    if not (positive and det > _SINGULAR * a * d * f):
+        return False
+    inverse[0, 0], inverse[1, 1], inverse[2, 2] = axx / det, ayy / det, azz / det
+    inverse[0, 1] = inverse[1, 0] = axy / det
+    inverse[0, 2] = inverse[2, 0] = axz / det
+    inverse[1, 2] = inverse[2, 1] = ayz / det
+    return True
 
 
 @inner_kernel

@@ -103,3 +103,10 @@ def leaves_margin(T_a_b: Float, before: Float, gate_m: float, farthest_m: float)
     """
     dx, dy, turned = T_a_b[0] - before[0], T_a_b[1] - before[1], abs(T_a_b[2] - before[2])
     return math.sqrt(dx * dx + dy * dy) + turned * farthest_m > _MARGIN * gate_m
+
+
+@kernel_part
+def mark_inside(e: Float, gate_m: float, inside: np.ndarray) -> None:
+    """Mark which residuals (n, 2) lie within the gate."""
+    for i in range(len(e)):
+        inside[i] = e[i, 0] * e[i, 0] + e[i, 1] * e[i, 1] <= gate_m * gate_m

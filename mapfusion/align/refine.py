@@ -13,14 +13,20 @@ from mapfusion.align.degeneracy import why_one_place
 from mapfusion.align.drift import drift_step
 from mapfusion.align.leverage import is_unlike_the_others, most_leverage, why_one_pair
 from mapfusion.align.mahalanobis_gate import PlanarPairs
-from mapfusion.align.near_pairs import at_rows, farthest_m, leaves_margin, near_pairs
+from mapfusion.align.near_pairs import (
+    at_rows,
+    farthest_m,
+    leaves_margin,
+    mark_inside,
+    near_pairs,
+)
 from mapfusion.align.pairs import MIN_PAIRS, Pairs, undetermined
 from mapfusion.align.result import Alignment, Status
 from mapfusion.arguments import Range, require_in_range, require_shape
-from mapfusion.kernels import inner_kernel, kernel, kernel_part
+from mapfusion.kernels import kernel, kernel_part
 from mapfusion.planar import add_turned, lever, residual
 from mapfusion.se2 import Float, transform_points, wrap
-from mapfusion.symmetric import cofactors
+from mapfusion.symmetric import invert
 
 # A gate of three standard deviations keeps 99 % of a plane's residuals; a larger s_drift could not
 # be told from false pairs spread over the gate.
@@ -33,7 +39,6 @@ _SWINGING = 0.9  # of the last change of s_drift^2, turned back: it hardly settl
 # False pairs in the gate counted before any is seen: a share of exactly 1 could never be revised,
 # and is approached without end.
 _PRIOR_FALSE = 1.0
-_SINGULAR = 1e-12  # determinant of the normal matrix scaled to a unit diagonal
 
 
 @dataclass(frozen=True)
@@ -251,21 +256,6 @@ def take_missing_information(
             information[row, column] -= missing[row, column]
 
 
-@inner_kernel
-def invert(matrix: Float, inverse: Float) -> bool:
-    """Fill the inverse (3, 3) of a symmetric matrix; False unless positive definite."""
-    a, d, f = matrix[0, 0], matrix[1, 1], matrix[2, 2]
-    axx, axy, axz, ayy, ayz, azz, det = cofactors(a, matrix[0, 1], matrix[0, 2], d, matrix[1, 2], f)
-    positive = a > 0 and azz > 0  # with det > 0 the leading minors (Sylvester)
-    if not (positive and det > _SINGULAR * a * d * f):
-        return False
-    inverse[0, 0], inverse[1, 1], inverse[2, 2] = axx / det, ayy / det, azz / det
-    inverse[0, 1] = inverse[1, 0] = axy / det
-    inverse[0, 2] = inverse[2, 0] = axz / det
-    inverse[1, 2] = inverse[2, 1] = ayz / det
-    return True
-
-
 @kernel_part
 def _farthest_moved(T_a_b: Float, step: Float, p_b: Float, truth: Float) -> float:
     """How far a step (3,) moves the landmark that it moves farthest, in m."""
@@ -309,7 +299,7 @@ def maximise_likelihood(
         _, some, e, S, inside, truth = near
         residuals_under(T_a_b, some, e, S)
         if rounds < _SETTLING_ROUNDS:
-            _mark_inside(e, gate_m, inside)
+            mark_inside(e, gate_m, inside)
         weighed, judged = variance, max(variance, least_drift_m * least_drift_m)
         total, count = truth_probabilities(e, S, judged, share, gate_m, inside, truth)
         put_normal_equations(T_a_b, some.p_b, e, S, variance, truth, normal, right)
@@ -338,13 +328,6 @@ def maximise_likelihood(
     at_rows(near.truth, near.rows, truth_of_all)
     most = most_leverage(T_a_b, pairs, variance, truth_of_all, covariance)
     return determined, moved, T_a_b, covariance, variance, truth_of_all, most
-
-
-@kernel_part
-def _mark_inside(e: Float, gate_m: float, inside: np.ndarray) -> None:
-    """Mark which residuals (n, 2) lie within the gate."""
-    for i in range(len(e)):
-        inside[i] = e[i, 0] * e[i, 0] + e[i, 1] * e[i, 1] <= gate_m * gate_m
 
 
 @kernel_part

@@ -93,26 +93,56 @@ def least_squares_gain(T_a_b: Float, p_b: Float, weight: Float | None = None) ->
     p_b are (N, 2 or more), not all in one place; weights (N,) are all equal by default.
     """
     given = np.ones(len(p_b)) if weight is None else weight
-    jx, jy = lever.py_func(math.cos(T_a_b[2]), math.sin(T_a_b[2]), p_b, _ALL)
-    total, x, y = np.sum(given), given @ jx, given @ jy
-    normal = np.array([[total, 0.0, x], [0.0, total, y], [x, y, given @ (jx * jx + jy * jy)]])
-    inverse = np.linalg.inv(normal)
+    inverse: Float = np.linalg.inv(_normal_matrix(T_a_b, p_b, given)).astype(np.float64, copy=False)
+    return _gain(T_a_b, p_b, given, inverse)
+
+
+@kernel
+def _normal_matrix(T_a_b: Float, p_b: Float, weight: Float) -> Float:
+    """Sum of weight J'J (3, 3), J the `motion_jacobian` of a point."""
+    cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+    total = x = y = square = 0.0
+    for i in range(len(p_b)):
+        jx, jy = lever(cos, sin, p_b, i)
+        total += weight[i]
+        x += weight[i] * jx
+        y += weight[i] * jy
+        square += weight[i] * (jx * jx + jy * jy)
+    return np.array([[total, 0.0, x], [0.0, total, y], [x, y, square]])
+
+
+@kernel
+def _gain(T_a_b: Float, p_b: Float, weight: Float, inverse: Float) -> Float:
+    """Weight times the normal matrix' inverse (3, 3) times J' (N, 3, 2)."""
+    cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
     gain = np.empty((len(p_b), 3, 2))
-    for k, j in enumerate((jx, jy)):
-        gain[:, :, k] = (given * (inverse[:, k, None] + inverse[:, 2, None] * j)).T
+    for i in range(len(p_b)):
+        jx, jy = lever(cos, sin, p_b, i)
+        for k in range(3):
+            gain[i, k, 0] = weight[i] * (inverse[k, 0] + inverse[k, 2] * jx)
+            gain[i, k, 1] = weight[i] * (inverse[k, 1] + inverse[k, 2] * jy)
     return gain
 
 
+@kernel
 def motion_covariance(gain: Float, covariance_m2: Float) -> Float:
     """Covariance (3, 3) of a motion from its gains (N, 3, 2) and independent residuals' (N, 2, 2).
 
     Weights that are not the inverse covariances make it larger than the inverse of the normal
     matrix: this is the sandwich of the two.
     """
-    x, y = np.ascontiguousarray(gain.T)
-    xx, xy, yy = covariance_m2.T[[0, 0, 1], [0, 1, 1]]
-    total = (x * xx + y * xy) @ x.T + (x * xy + y * yy) @ y.T
-    return (total + total.T) / 2  # symmetric to the last bit
+    total = np.zeros((3, 3))
+    for i in range(len(gain)):
+        xx, xy, yy = covariance_m2[i, 0, 0], covariance_m2[i, 0, 1], covariance_m2[i, 1, 1]
+        for k in range(3):
+            x, y = gain[i, k, 0], gain[i, k, 1]
+            along_x, along_y = x * xx + y * xy, x * xy + y * yy
+            for j in range(k + 1):
+                total[k, j] += along_x * gain[i, j, 0] + along_y * gain[i, j, 1]
+    for k in range(3):
+        for j in range(k):
+            total[j, k] = total[k, j]
+    return total
 
 
 def motion_jacobian(T_a_b: Float, p_b: Float) -> Float:

@@ -75,7 +75,7 @@ def inverses(blocks: Float) -> Float:
     for k, (r, q) in enumerate(pairs):
         if r < dimensions:
             entries[k] = blocks[:, r, q]
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         positive, inverse = _inverse_entries.py_func(*entries)
     if not positive.all():
         raise np.linalg.LinAlgError("a block is not positive definite")
