@@ -30,7 +30,8 @@ def inner_kernel(function: Any = None, **options: Any) -> Any:
     if function is None:
         return partial(inner_kernel, **options)
     made = kernel(function, no_cpython_wrapper=True, **options)
-    made.__class__ = _Inner
+    if isinstance(made, CPUDispatcher):  # not so with NUMBA_DISABLE_JIT
+        made.__class__ = _Inner
     return made
 
 
