@@ -182,4 +182,6 @@ def _squares(by_landmark: Float) -> Float:
 
 def _by_landmark(common: Float) -> Float:
     """(N, R, 3) of (R, 3N)."""
-    return np.ascontiguousarray(common.reshape(len(common), common.shape[1] // 3, 3).transpose(1, 0, 2))
+    return np.ascontiguousarray(
+        common.reshape(len(common), common.shape[1] // 3, 3).transpose(1, 0, 2)
+    )

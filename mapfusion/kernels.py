@@ -35,6 +35,11 @@ def inner_kernel(function: Any = None, **options: Any) -> Any:
     return made
 
 
+def source_of(compiled: Callable[..., Any]) -> Callable[..., Any]:
+    """The function that a kernel was made of, which NumPy's arrays may be given to as well."""
+    return getattr(compiled, "py_func", compiled)
+
+
 # For what is called by kernels alone and at one place, or is short: its lines are put into its
 # caller before that is compiled, which is less to compile than both apart. Both have the same
 # `error_model`: once inside, a part divides by zero as its caller does. Called from Python, as

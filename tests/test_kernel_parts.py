@@ -86,13 +86,13 @@ def test_inner_kernels_are_found() -> None:
 
 @pytest.mark.parametrize("module", TREES)
 def test_an_inner_kernel_is_called_by_kernels_alone(module: str) -> None:
-    """Elsewhere it is named only for the function that it was made of (`py_func`)."""
+    """Elsewhere it is named only for the function that it was made of (`source_of`)."""
     meant, allowed = meant_in(module), set[ast.AST]()
     for node in ast.walk(TREES[module]):
         if isinstance(node, ast.FunctionDef) and decorator(node)[0] in KERNELS:
             allowed.update(ast.walk(node))
-        if isinstance(node, ast.Attribute) and node.attr == "py_func":
-            allowed.add(node.value)
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "source_of":
+            allowed.update(node.args)
     assert not [
         (node.id, node.lineno)
         for node in ast.walk(TREES[module])

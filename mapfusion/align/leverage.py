@@ -10,7 +10,7 @@ import numpy as np
 
 from mapfusion.align.mahalanobis_gate import PlanarPairs, residual_covariance
 from mapfusion.align.rigid import residual_covariances
-from mapfusion.kernels import kernel_part
+from mapfusion.kernels import kernel_part, source_of
 from mapfusion.planar import lever, residual
 from mapfusion.se2 import Float, transform_points
 
@@ -35,9 +35,9 @@ def is_unlike_the_others(
     if m < 1:
         return False
     J = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    J[:, 2] = lever.py_func(cos, sin, p_b, left_out)
+    J[:, 2] = source_of(lever)(cos, sin, p_b, left_out)
     (S,) = residual_covariances(T_without, S_a[left_out, None], S_b[left_out, None])
-    e = np.array(residual.py_func(T_without, cos, sin, pairs.p_a, p_b, left_out))
+    e = np.array(source_of(residual)(T_without, cos, sin, pairs.p_a, p_b, left_out))
     D = e @ np.linalg.solve(S + variance_m2 * np.eye(2) + J @ covariance @ J.T, e)
     return -m / 2 * math.log1p(D / m) < math.log(_CALLED_FALSE / len(p_b))
 

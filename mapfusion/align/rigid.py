@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from mapfusion.kernels import inner_kernel, kernel
+from mapfusion.kernels import inner_kernel, kernel, source_of
 from mapfusion.planar import add_turned, lever, residual
 from mapfusion.se2 import Float, rotation
 
@@ -72,14 +72,14 @@ def fit_two(p_a: Float, p_b: Float, i: int, j: int, T_a_b: Float) -> float:
 def residuals(T_a_b: Float, p_a: Float, p_b: Float) -> Float:
     """p_a - T_a_b p_b in the plane (N, 2)."""
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
-    return np.stack(residual.py_func(T_a_b, cos, sin, p_a, p_b, _ALL), axis=1)
+    return np.stack(source_of(residual)(T_a_b, cos, sin, p_a, p_b, _ALL), axis=1)
 
 
 def residual_covariances(T_a_b: Float, covariance_a: Float, covariance_b: Float) -> Float:
     """S_a + R S_b R^T in the plane (N, 2, 2): what the landmarks' own noise makes of a residual."""
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
     a, b = (S.T[[0, 0, 1], [0, 1, 1]] for S in (covariance_a, covariance_b))
-    xx, xy, yy = add_turned.py_func(*a, cos, sin, *b)
+    xx, xy, yy = source_of(add_turned)(*a, cos, sin, *b)
     found = np.empty((len(xx), 2, 2))
     found[:, 0, 0], found[:, 1, 1] = xx, yy
     found[:, 0, 1] = found[:, 1, 0] = xy

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from mapfusion.kernels import inner_kernel
+from mapfusion.kernels import inner_kernel, source_of
 from mapfusion.se2 import Float
 
 
@@ -76,7 +76,7 @@ def inverses(blocks: Float) -> Float:
         if r < dimensions:
             entries[k] = blocks[:, r, q]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        positive, inverse = _inverse_entries.py_func(*entries)
+        positive, inverse = source_of(_inverse_entries)(*entries)
     if not positive.all():
         raise np.linalg.LinAlgError("a block is not positive definite")
     found = np.empty(blocks.shape)

@@ -6,8 +6,10 @@ from typing import Any
 
 from numba import njit
 
+from mapfusion.kernels import source_of
+
 
 @cache
 def from_python(inner: Any) -> Callable[..., Any]:
     """The same function, compiled with what callers in Python need."""
-    return njit(inner.py_func)
+    return njit(source_of(inner))
