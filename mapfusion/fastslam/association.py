@@ -254,13 +254,19 @@ def _take_nearest(
                 taken[j, m] = True
 
 
+@kernel
 def sources(slots: Slots, chosen: np.ndarray, first_source: int) -> np.ndarray:
     """(K, M) int32 source of the landmark that each observation went into, -1 if it was dropped.
 
     `first_source` is the running number of the first observation.
     """
-    source = slots.source.take(chosen, mode="wrap").astype(np.int32)
-    own = np.arange(first_source, first_source + len(chosen), dtype=np.int32)
-    np.copyto(source, own[:, None], where=chosen == NEW)
-    np.copyto(source, -1, where=chosen == DROPPED)
+    source = np.empty(chosen.shape, dtype=np.int32)
+    for k in range(chosen.shape[0]):
+        last, its = DROPPED, -1  # most particles choose as the one before
+        for m in range(chosen.shape[1]):
+            s = chosen[k, m]
+            if s != last:
+                last = s
+                its = -1 if s == DROPPED else first_source + k if s == NEW else slots.source[s]
+            source[k, m] = its
     return source

@@ -7,6 +7,7 @@ about the one is less so about the other, and about the point that the next trac
 import numpy as np
 
 from mapfusion.fastslam.slots import FREE, Slots
+from mapfusion.kernels import kernel
 
 
 class Tracked:
@@ -42,9 +43,26 @@ class Tracked:
         if track is None:
             self._track = self._slot = self._source = np.empty(0, dtype=np.int64)
             return
-        first = chosen >= 0
-        first[:, 1:] &= chosen[:, 1:] != chosen[:, :-1]  # most choose as the one before
-        row, particle = np.nonzero(first)
-        self._track = track[np.concatenate([row, created[:, 0]])]
-        self._slot = np.concatenate([chosen[row, particle], created[:, 1]])
+        pairs = np.concatenate([_distinct(chosen), created])
+        self._track, self._slot = track[pairs[:, 0]], pairs[:, 1]
         self._source = slots.source[self._slot]
+
+
+@kernel
+def _distinct(chosen: np.ndarray) -> np.ndarray:
+    """Rows and slots (n, 2) of `chosen` (K, M), each once: most particles choose the same slot."""
+    pairs = np.empty((chosen.size, 2), dtype=np.int64)
+    n = 0
+    for k in range(chosen.shape[0]):
+        first = n
+        for m in range(chosen.shape[1]):
+            s = chosen[k, m]
+            if s < 0:
+                continue
+            known = False
+            for i in range(first, n):
+                known = known or pairs[i, 1] == s
+            if not known:
+                pairs[n, 0], pairs[n, 1] = k, s
+                n += 1
+    return pairs[:n].copy()
