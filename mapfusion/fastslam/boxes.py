@@ -1,7 +1,5 @@
 """Where landmarks may be matched: boxes around their means and gates, and a search among them."""
 
-import math
-
 import numpy as np
 
 from mapfusion.fastslam.slots import BLOCK, COMMON, Slots
@@ -12,64 +10,59 @@ from mapfusion.se2 import Float
 @kernel
 def bound(slots: Slots, which: np.ndarray, gate: float) -> None:
     """Write the boxes of slots that are up to date, and of their blocks."""
-    own, common, boxes = slots.own, slots.common, slots.box_m
     for s in which:
-        low_x = low_y = math.inf
-        high_x = high_y = -math.inf
-        spread_x = spread_y = 0.0
+        box, spread_x, spread_y = slots.box_m[s], 0.0, 0.0
         if slots.generation[s] == COMMON:
-            low_x = high_x = common.mean_m[s, 0, 0]
-            low_y = high_y = common.mean_m[s, 0, 1]
-            spread_x, spread_y = common.covariance_m2[s, 0, 0], common.covariance_m2[s, 0, 3]
+            box[0] = box[2] = slots.common.mean_m[s, 0, 0]
+            box[1] = box[3] = slots.common.mean_m[s, 0, 1]
+            spread_x = slots.common.covariance_m2[s, 0, 0]
+            spread_y = slots.common.covariance_m2[s, 0, 3]
         else:
+            box[:2], box[2:] = np.inf, -np.inf
             r = slots.row[s]
-            for m in range(own.count.shape[1]):
-                if own.count[r, m] == 0:
+            for m in range(slots.own.count.shape[1]):
+                if slots.own.count[r, m] == 0:
                     continue
-                x, y = own.mean_m[r, m, 0], own.mean_m[r, m, 1]
-                low_x, low_y = min(low_x, x), min(low_y, y)
-                high_x, high_y = max(high_x, x), max(high_y, y)
-                spread_x = max(spread_x, own.covariance_m2[r, m, 0])
-                spread_y = max(spread_y, own.covariance_m2[r, m, 3])
+                x, y = slots.own.mean_m[r, m, 0], slots.own.mean_m[r, m, 1]
+                box[0], box[1] = min(box[0], x), min(box[1], y)
+                box[2], box[3] = max(box[2], x), max(box[3], y)
+                spread_x = max(spread_x, slots.own.covariance_m2[r, m, 0])
+                spread_y = max(spread_y, slots.own.covariance_m2[r, m, 3])
         # Inside the gate |dx| <= sqrt(gate (Sigma_xx + R_xx)), at most the sum of both roots: one
         # is the landmark's margin, the other the observation's.
-        margin_x, margin_y = math.sqrt(gate * spread_x), math.sqrt(gate * spread_y)
-        boxes[s, 0], boxes[s, 1] = low_x - margin_x, low_y - margin_y
-        boxes[s, 2], boxes[s, 3] = high_x + margin_x, high_y + margin_y
+        margin_x, margin_y = np.sqrt(gate * spread_x), np.sqrt(gate * spread_y)
+        box[0], box[1] = box[0] - margin_x, box[1] - margin_y
+        box[2], box[3] = box[2] + margin_x, box[3] + margin_y
     last = -1
     for s in which:
         if s // BLOCK != last:
             last = s // BLOCK
-            _bound_block(slots, last)
-
-
-def bend_boxes(slots: Slots, which: np.ndarray, T_map_bent: Float) -> None:
-    """Put boxes around what is in those of slots (n,) after each slot's motion (S, 3)."""
-    shift_x, shift_y, turn = T_map_bent[which].T
-    cos, sin = np.cos(turn), np.sin(turn)
-    low_x, low_y, high_x, high_y = slots.box_m[which].T
-    x, y = 0.5 * (low_x + high_x), 0.5 * (low_y + high_y)
-    half_x, half_y = 0.5 * (high_x - low_x), 0.5 * (high_y - low_y)
-    wide_x = np.abs(cos) * half_x + np.abs(sin) * half_y
-    wide_y = np.abs(sin) * half_x + np.abs(cos) * half_y
-    x, y = cos * x - sin * y + shift_x, sin * x + cos * y + shift_y
-    slots.box_m[which] = np.stack([x - wide_x, y - wide_y, x + wide_x, y + wide_y], axis=1)
-    blocks = slots.box_m.reshape(-1, BLOCK, 4)
-    slots.block_box_m[:, :2] = blocks[:, :, :2].min(axis=1)
-    slots.block_box_m[:, 2:] = blocks[:, :, 2:].max(axis=1)
+            bound_block(slots, last)
 
 
 @kernel_part
-def _bound_block(slots: Slots, block: int) -> None:
+def bend_box(slots: Slots, s: int, motion: Float) -> None:
+    """Put a box around what is in it after a motion (3,) of the plane."""
+    box = slots.box_m[s]
+    cos, sin = np.cos(motion[2]), np.sin(motion[2])
+    x, y = 0.5 * (box[0] + box[2]), 0.5 * (box[1] + box[3])
+    half_x, half_y = 0.5 * (box[2] - box[0]), 0.5 * (box[3] - box[1])
+    wide_x = abs(cos) * half_x + abs(sin) * half_y
+    wide_y = abs(sin) * half_x + abs(cos) * half_y
+    x, y = cos * x - sin * y + motion[0], sin * x + cos * y + motion[1]
+    box[0], box[1], box[2], box[3] = x - wide_x, y - wide_y, x + wide_x, y + wide_y
+
+
+@kernel
+def bound_block(slots: Slots, block: int) -> None:
     """Write the box of a block around those of its slots."""
-    boxes, around = slots.box_m, slots.block_box_m
-    low_x = low_y = math.inf
-    high_x = high_y = -math.inf
+    around = slots.block_box_m[block]
+    around[:2], around[2:] = np.inf, -np.inf
     for s in range(block * BLOCK, (block + 1) * BLOCK):
-        low_x, low_y = min(low_x, boxes[s, 0]), min(low_y, boxes[s, 1])
-        high_x, high_y = max(high_x, boxes[s, 2]), max(high_y, boxes[s, 3])
-    around[block, 0], around[block, 1] = low_x, low_y
-    around[block, 2], around[block, 3] = high_x, high_y
+        around[0] = min(around[0], slots.box_m[s, 0])
+        around[1] = min(around[1], slots.box_m[s, 1])
+        around[2] = max(around[2], slots.box_m[s, 2])
+        around[3] = max(around[3], slots.box_m[s, 3])
 
 
 @inner_kernel

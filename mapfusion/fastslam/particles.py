@@ -8,7 +8,7 @@ once the particles' lines have met, and a step costs what is in view.
 
 import numpy as np
 
-from mapfusion.fastslam.boxes import bend_boxes, bound, near
+from mapfusion.fastslam.boxes import bend_box, bound, bound_block, near
 from mapfusion.fastslam.genealogy import MEMORY, Genealogy
 from mapfusion.fastslam.sensor import Sightings
 from mapfusion.fastslam.slots import (
@@ -95,15 +95,7 @@ class ParticleMaps:
 
         The motions are small: covariances keep their directions.
         """
-        slots = self.slots
-        common = np.flatnonzero(slots.generation == COMMON)
-        rowed = np.flatnonzero(slots.generation >= 0)
-        slots.common.mean_m[common] = _move(slots.common.mean_m[common], T_map_bent[common])
-        own, rows = slots.own.mean_m, slots.row[rowed]
-        # what particles without the landmark have there
-        with np.errstate(invalid="ignore", over="ignore"):
-            own[rows] = _move(own[rows], T_map_bent[rowed])
-        bend_boxes(slots, np.concatenate([common, rowed]), T_map_bent)
+        _bend(self.slots, np.flatnonzero(self.slots.generation != FREE), T_map_bent)
 
     def create(
         self, chosen: np.ndarray, seen: Sightings, observations: Observations, first_source: int
@@ -200,12 +192,22 @@ class _Pool:
         self._free.extend(numbers.tolist())
 
 
-def _move(means: Float, motion: Float) -> Float:
-    """Points (n, M, 3) moved each row by its motion of the plane (n, 3)."""
-    x, y, z = np.moveaxis(means, -1, 0)
-    shift_x, shift_y, turn = motion.T[..., None]
-    cos, sin = np.cos(turn), np.sin(turn)
-    return np.stack([cos * x - sin * y + shift_x, sin * x + cos * y + shift_y, z], axis=-1)
+@kernel
+def _bend(slots: Slots, which: np.ndarray, T_map_bent: Float) -> None:
+    for s in which:
+        motion = T_map_bent[s]
+        cos, sin = np.cos(motion[2]), np.sin(motion[2])
+        if slots.generation[s] == COMMON:
+            means = slots.common.mean_m[s]
+        else:
+            means = slots.own.mean_m[slots.row[s]]
+        for m in range(len(means)):
+            x, y = means[m, 0], means[m, 1]
+            means[m, 0] = cos * x - sin * y + motion[0]
+            means[m, 1] = sin * x + cos * y + motion[1]
+        bend_box(slots, s, motion)
+    for block in range(len(slots.block_box_m)):
+        bound_block(slots, block)
 
 
 @kernel
@@ -252,17 +254,27 @@ def _copy_row(own: Estimates, r: int, old: Estimates) -> None:
         old.count[0, m] = own.count[r, m]
 
 
+@kernel
 def _settle(slots: Slots, which: np.ndarray) -> np.ndarray:
     """Note what is common to all particles; for each slot whether all is."""
-    rows, x = slots.row[which], slots.own.mean_m[:, :, 0]
-    same = x[rows, 0] == x[rows, -1]  # most are told already by these
-    for common, own in zip(slots.common, slots.own, strict=True):
-        common[which, 0] = own[rows, 0]
-        values = own[rows[same]]
-        same[same] = np.all(values == values[:, :1], axis=tuple(range(1, values.ndim)))
+    own = slots.own
+    same = np.ones(len(which), dtype=np.bool_)
+    for i in range(len(which)):
+        s = int(which[i])
+        r = int(slots.row[s])
+        copy_estimate(own, r, 0, slots.common, s, 0)
+        for m in range(1, own.count.shape[1]):
+            same[i] &= own.count[r, m] == own.count[r, 0]
+            for k in range(3):
+                same[i] &= own.mean_m[r, m, k] == own.mean_m[r, 0, k]
+            for k in range(6):
+                same[i] &= own.covariance_m2[r, m, k] == own.covariance_m2[r, 0, k]
+            if not same[i]:
+                break
     return same
 
 
+@kernel
 def _initialise(
     slots: Slots,
     created: np.ndarray,
@@ -271,7 +283,13 @@ def _initialise(
     seen: Sightings,
     n_landmarks: np.ndarray,
 ) -> None:
-    own, place, new = slots.own, slots.row[created], chosen[rows] == NEW
-    own.count[place] = new
-    own.mean_m[place], own.covariance_m2[place] = seen.point_m[rows], seen.covariance_m2[rows]
-    n_landmarks += np.count_nonzero(new, axis=0)
+    own = slots.own
+    for i in range(len(created)):
+        r, k = slots.row[created[i]], rows[i]
+        for m in range(len(n_landmarks)):
+            own.count[r, m] = int(chosen[k, m] == NEW)
+            n_landmarks[m] += own.count[r, m]
+            for j in range(3):
+                own.mean_m[r, m, j] = seen.point_m[k, m, j]
+            for j in range(6):
+                own.covariance_m2[r, m, j] = seen.covariance_m2[k, m, j]

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapfusion.kernels import kernel_part
+from mapfusion.kernels import kernel
 from mapfusion.looks import DESCRIPTOR_LENGTH, NO_LABEL
 
 FREE = -1  # the generation of a slot in no use, and the slot of a row in no use
@@ -87,7 +87,7 @@ def _estimates(n: int, m: int) -> Estimates:
     return Estimates(np.empty((n, m, 3)), np.empty((n, m, 6)), np.empty((n, m), dtype=np.int32))
 
 
-@kernel_part
+@kernel
 def copy_estimate(old: Estimates, n: int, m: int, new: Estimates, i: int, j: int) -> None:
     """Write what particle m has of landmark n to another place."""
     new.count[i, j] = old.count[n, m]
