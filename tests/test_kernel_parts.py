@@ -6,9 +6,12 @@ Parts are put into few places, all of which divide by zero as they do.
 import ast
 from collections import defaultdict
 
+import numpy as np
 import pytest
 
 from experiments.run.code_version import PACKAGES, SOURCE_ROOT
+from mapfusion import planar
+from mapfusion.kernels import source_of
 
 _MOST_COPIED = 20  # statements; more of them take longer to compile than a kernel apart
 
@@ -82,6 +85,12 @@ INNER = {named for named, node in FUNCTIONS.items() if decorator(node)[0] == "in
 
 def test_inner_kernels_are_found() -> None:
     assert len(INNER) > 30
+
+
+def test_an_inner_kernel_called_from_python_says_so_and_ends_nothing() -> None:
+    with pytest.raises(TypeError, match="moved_point: only kernels can call it"):
+        planar.moved_point(np.zeros(3), 1.0, 0.0, 1.0, 1.0)
+    assert source_of(planar.moved_point)(np.ones(3), 1.0, 0.0, 1.0, 1.0) == (2.0, 2.0)
 
 
 @pytest.mark.parametrize("module", TREES)

@@ -19,6 +19,9 @@ from mapfusion.smoother.sightings import Sightings
 # Of two tracks of one corner so many stay together; what is parted by mistake is seen twice.
 _TOGETHER = 0.999
 _SINGULAR = 1e-12  # pivot, as a share of its diagonal element, that is rounding error
+# Pairs of tracks that are looked at together: some hundred bytes each. A landmark may have
+# thousands of tracks, all of whose pairs would not fit into memory.
+_PAIRS_AT_ONCE = 100_000
 
 
 def parted(seen: Sightings, landmark: np.ndarray, path: Float, stray_m: float) -> np.ndarray:
@@ -76,18 +79,12 @@ def _corners(
 
     Again and again the track that the most observations agree with takes those tracks along.
     """
-    corner = np.zeros(len(point), dtype=np.int64)
-    of = np.repeat(np.arange(len(first) - 1), np.diff(first))
-    before = np.arange(len(point)) - first[of]  # tracks of the same landmark before each
-    i, ends = np.repeat(np.arange(len(point)), before), np.cumsum(before)
-    j = np.arange(len(i)) - np.repeat(ends - before - first[of], before)
-    S, off = (np.ascontiguousarray(values.T) for values in (covariance, point))
-    S, off = S[..., i] + S[..., j], off[..., i] - off[..., j]
-    apart = np.flatnonzero(_squares(S, off) > bound)
-    of_apart = of[i[apart]]
+    corner, of = np.zeros(len(point), dtype=np.int64), _landmarks(first)
+    i, j = _apart(first, point, covariance, bound)
+    of_apart = of[i]
     for own in np.unique(of_apart):
         begin, size = first[own], first[own + 1] - first[own]
-        here = apart[slice(*np.searchsorted(of_apart, [own, own + 1]))]
+        here = slice(*np.searchsorted(of_apart, [own, own + 1]))
         near, one, other = np.ones((size, size), dtype=bool), i[here] - begin, j[here] - begin
         near[one, other] = near[other, one] = False
         left, k = np.ones(size, dtype=bool), 0
@@ -97,6 +94,27 @@ def _corners(
             corner[begin : begin + size][taken] = k
             left, k = left & ~taken, k + 1
     return corner
+
+
+def _landmarks(first: np.ndarray) -> np.ndarray:
+    """(B,) which landmark each track is of, of landmarks whose tracks begin at `first` (L + 1,)."""
+    return np.repeat(np.arange(len(first) - 1), np.diff(first))
+
+
+def _apart(first: np.ndarray, point: Float, covariance: Float, bound: float) -> np.ndarray:
+    """(2, A) the tracks of one landmark that are of two corners, in the order of the first one."""
+    begin = first[_landmarks(first)]
+    before = np.arange(len(point)) - begin  # tracks of the same landmark before each
+    part = np.cumsum(before) // _PAIRS_AT_ONCE
+    S, off = (np.ascontiguousarray(values.T) for values in (covariance, point))
+    found = []
+    for own in np.split(np.arange(len(point)), np.flatnonzero(np.diff(part)) + 1):
+        n = before[own]
+        i = np.repeat(own, n)
+        j = np.arange(len(i)) - np.repeat(np.cumsum(n) - n - begin[own], n)
+        away = _squares(S[..., i] + S[..., j], off[..., i] - off[..., j]) > bound
+        found.append(np.stack([i[away], j[away]]))
+    return np.concatenate(found, axis=1)
 
 
 def _squares(S: Float, off: Float) -> Float:

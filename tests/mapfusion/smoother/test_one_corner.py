@@ -1,11 +1,14 @@
 """Tracks against each other: false alarms, corners told apart, their names, what has no track."""
 
+import itertools
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
 from mapfusion.robot_log import NO_TRACK, Observations, RobotLog
 from mapfusion.se2 import Float, rotation
+from mapfusion.smoother import one_corner
 from mapfusion.smoother.one_corner import parted
 from mapfusion.smoother.sightings import sightings_of
 
@@ -132,3 +135,26 @@ def test_what_has_no_tracks_stays() -> None:
     log.observations.track[:] = NO_TRACK
     seen = sightings_of(log, landmark, 1, stray=True)
     np.testing.assert_array_equal(parted(seen, landmark, path, STRAY_M), landmark)
+
+
+@pytest.mark.parametrize("at_once", [1, 7, 100_000])
+def test_pairs_of_tracks_that_are_apart_are_those_of_looking_at_each(
+    monkeypatch: pytest.MonkeyPatch, at_once: int
+) -> None:
+    """However many are looked at together; a landmark's tracks with no other landmark's."""
+    monkeypatch.setattr(one_corner, "_PAIRS_AT_ONCE", at_once)
+    rng = np.random.default_rng(0)
+    first = np.array([0, 1, 9, 9, 11, 30])
+    point, root = rng.normal(size=(30, 3)), rng.normal(size=(30, 3, 3))
+    covariance = root @ np.swapaxes(root, 1, 2)
+    covariance[[12, 13]] = 0.0  # of which nothing can be said
+    apart = []
+    for begin, end in itertools.pairwise(first):
+        for i in range(begin, end):
+            for j in range(begin, i):
+                S, off = covariance[i] + covariance[j], point[i] - point[j]
+                known = np.linalg.matrix_rank(S) == 3
+                apart += [(i, j)] if known and off @ np.linalg.solve(S, off) > 0.5 else []
+    assert 20 < len(apart) < 180
+    found = one_corner._apart(first, point, covariance, 0.5)
+    np.testing.assert_array_equal(found.T, apart)
