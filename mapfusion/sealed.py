@@ -3,8 +3,8 @@
 A file of ours holds `mapfusion.sha256` and 64 hexadecimal digits: the SHA-256 of the whole file
 with these digits as zeros. Where it stands is up to the format, always where other readers pass it
 by: between the pages and the footer of Parquet (so that a table which another program reads and
-writes again keeps no stale one), as the first field of JSON, behind the end of PNG and NPY, in the
-first line of OBJ.
+writes again keeps no stale one), as the first field of JSON, behind the end of PNG, BMP and NPY, in
+the first line of OBJ.
 """
 
 import hashlib

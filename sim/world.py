@@ -25,16 +25,12 @@ from sim.textures import AS_PAINTED, Texture, paint, paint_posters
 GRAVITY_M_S2 = 9.81
 PHYSICS_HZ = 240  # PyBullet's own default; contacts and motors are tuned for it
 CORNERS = "corners.npy"  # of all faces, beside their meshes and textures
+# Each process that draws reads all pictures, and takes ten times as long for compressed ones; the
+# room they take is small beside that of the features found in them.
+PICTURE = ".bmp"
 OUT_OF_SIGHT_M = -100.0  # below the floor, where what must not be seen waits
 
 GL_ROW_TEXELS = 4  # OpenGL's default row alignment
-# Of what takes hardly more room than the smallest this is written and read soonest.
-QUICKLY = (
-    *(cv2.IMWRITE_PNG_COMPRESSION, 1),
-    *(cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP),
-    *(cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE),
-)
-
 # Who collides with whom (bit masks): wheels with the ground alone.
 GROUND, WHEEL, BODY = 1, 2, 4
 
@@ -229,7 +225,7 @@ def write_faces(
             seen[face.look] = painted
         shown = np.ascontiguousarray(painted[:, ::-1]) if face.mirrored else painted
         picture = cv2.cvtColor(shown, cv2.COLOR_RGB2BGR)
-        encoded = cv2.imencode(".png", picture, QUICKLY)[1].tobytes()
+        encoded = cv2.imencode(PICTURE, picture)[1].tobytes()
         # whole: another run may be painting, or looking at, the same walls
         write_sealed(path, encoded + LINE)
         write_sealed(mesh, b"# " + LINE + _mesh(face).encode("ascii"))
@@ -257,7 +253,7 @@ def read_corners(path: Path) -> Float:
 
 def face_files(folder: Path, i: int) -> tuple[Path, Path]:
     """A face's mesh and its picture."""
-    return folder / f"face_{i:04d}.obj", folder / f"face_{i:04d}.png"
+    return folder / f"face_{i:04d}.obj", folder / f"face_{i:04d}{PICTURE}"
 
 
 def _mesh(face: Face) -> str:

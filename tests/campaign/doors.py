@@ -32,7 +32,7 @@ from mapfusion.sealed import read_sealed
 from mapfusion.storage import write_json
 from sim.floorplan import FloorPlan, Wall
 from sim.trajectory import Trajectory, read_trajectory, write_trajectory
-from sim.world import CORNERS, read_corners, write_faces
+from sim.world import CORNERS, face_files, read_corners, write_faces
 
 
 class Door(NamedTuple):
@@ -138,7 +138,7 @@ def _of_the_store(folder: Path, rng: np.random.Generator) -> list[Door]:
     write_trajectory(drive, driven)
     corner = np.array([[0.0, 0.0], [0.4, 0.0], [0.4, 0.4]])
     write_faces(faces, FloorPlan((Wall(corner, 0.3),)), rng)
-    mesh, picture = (next(faces.glob(kind)) for kind in ("*.obj", "*.png"))
+    mesh, picture = face_files(faces, 0)
     return [
         Door(mark, made.figures),
         Door(drive, partial(read_trajectory, drive)),

@@ -9,6 +9,7 @@ from mapfusion.camera import StereoCamera
 from mapfusion.se2 import transform_points
 from sim.floorplan import Face, FloorPlan
 from sim.radiometry import RadiometricNoise
+from sim.world import face_files
 
 CAMERA = StereoCamera()
 NO_NOISE = RadiometricNoise(0, 0, 0)
@@ -30,7 +31,7 @@ def ray_cast(
     nearest = np.full(u.shape, np.inf)
     picture = np.zeros((*u.shape, 3), dtype=np.uint8)
     for i, face in enumerate(room.faces()):
-        texture = cv2.imread(str(folder / f"face_{i:04d}.png"))[::-1, :, ::-1]
+        texture = cv2.imread(str(face_files(folder, i)[1]))[::-1, :, ::-1]
         height, width = texture.shape[:2]
         distance, right, upward = hit(face, eye, ray)
         seen = (distance > 0) & (distance < nearest)

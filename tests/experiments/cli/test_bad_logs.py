@@ -79,7 +79,7 @@ def test_empty_log(tiny_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture
     ("jobs", "left_out", "where"),
     [
         (2, ("observed", "log", "slam", "align", "judge"), "features/*/features_000020.parquet"),
-        (1, ("features", "observed", "log", "slam", "align", "judge"), "faces/*/*_0001.png"),
+        (1, ("features", "observed", "log", "slam", "align", "judge"), "faces/*/*_0001.bmp"),
         (1, (), "judge/*/errors.parquet"),
         (1, (), "slam/*/done.json"),
         (1, (), "log/*/observations.parquet"),
