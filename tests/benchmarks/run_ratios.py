@@ -1,0 +1,84 @@
+"""What a run takes with the ray caster and with TinyRenderer, side by side, again and again.
+
+    python -m tests.benchmarks.run_ratios quick --repetitions 5
+    python -m tests.benchmarks.run_ratios quick --repetitions 5 --anew
+
+Seconds by the clock of `mapfusion run`, from an empty store, with as many processes as there are
+cores; the two take turns, so that a machine which is now faster and now slower is so for both. A
+run's rendering alone is what its processes spent on TinyRenderer's pictures, as if they had shared
+that out evenly and had done nothing else. With `--anew` all kernels are compiled by each run,
+without it they are there already.
+"""
+
+import argparse
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from tests.benchmarks.where_time_goes import seconds
+
+_RENDERERS = ("raycast", "tiny")
+
+
+def run_s(scenario: str, renderer: str, results: Path, kernels: Path | None) -> float:
+    """Seconds by the clock of a run from an empty store; kernels are kept in a folder of theirs."""
+    words = ("run", scenario, "--set", f"render.renderer={renderer}", "--results", str(results))
+    environment = os.environ | ({} if kernels is None else {"XDG_CACHE_HOME": str(kernels)})
+    started = time.perf_counter()
+    command = [sys.executable, "-m", "experiments", *words]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    took = time.perf_counter() - started
+    if done.returncode:
+        sys.exit(f"{' '.join(command)}\n{done.stderr}")
+    return took
+
+
+def rendering_s(results: Path) -> float:
+    """Seconds by the clock that rendering alone takes all cores, of a finished run's pictures."""
+    (result,) = (path.parent for path in results.glob("*/tables"))
+    return float(seconds([result])["rendering"]) / (os.cpu_count() or 1)
+
+
+def once(scenario: str, anew: bool) -> dict[str, float]:
+    """One run with each renderer: seconds and ratios by name."""
+    took: dict[str, float] = {}
+    for renderer in _RENDERERS:
+        with tempfile.TemporaryDirectory() as folder:
+            results, kernels = Path(folder) / "results", Path(folder) / "kernels"
+            took[f"{renderer}, s"] = run_s(scenario, renderer, results, kernels if anew else None)
+            if renderer == "tiny":
+                took["tiny's rendering alone, s"] = rendering_s(results)
+    took["raycast over tiny"] = took["raycast, s"] / took["tiny, s"]
+    took["tiny over its rendering"] = took["tiny, s"] / took["tiny's rendering alone, s"]
+    return took
+
+
+def main() -> None:
+    """Print each repetition as it ends, then medians with the least and the greatest."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scenario", help="File or name.")
+    parser.add_argument("--repetitions", type=int, default=5)
+    parser.add_argument("--anew", action="store_true", help="Compile all kernels in each run.")
+    asked = parser.parse_args()
+    done: list[dict[str, float]] = []
+    for _ in range(asked.repetitions):
+        done.append(once(asked.scenario, asked.anew))
+        say("; ".join(f"{name} {value:.4g}" for name, value in done[-1].items()))
+    say("\n| | median | least | greatest |\n|---|---|---|---|")
+    for name in done[0]:
+        values = [each[name] for each in done]
+        shown = (statistics.median(values), min(values), max(values))
+        say(f"| {name} | {' | '.join(f'{value:.3g}' for value in shown)} |")
+
+
+def say(line: str) -> None:
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()
