@@ -11,7 +11,8 @@ import numpy as np
 
 from mapfusion.se2 import Float
 
-_POINTS_PER_LEAF = 16  # at most; a box to be asked costs as much as some points of a leaf
+# At most. To ask a box costs as much as to pass over some ten points of a leaf.
+POINTS_PER_LEAF = 64
 
 
 class BoxTree(NamedTuple):
@@ -40,7 +41,7 @@ class BoxTree(NamedTuple):
     @classmethod
     def of(cls, p: Float) -> "BoxTree":
         """Tree over points (N, 3)."""
-        rows, boxes, ends = in_leaves(p, -(-len(p) // n_leaves_of(len(p), _POINTS_PER_LEAF)))
+        rows, boxes, ends = in_leaves(p, -(-len(p) // n_leaves_of(len(p), POINTS_PER_LEAF)))
         in_order = p[rows]
         x, y, z = np.ascontiguousarray(in_order.T)
         return cls(in_order, x, y, z, rows, boxes, ends[0], ends[1])

@@ -1,8 +1,9 @@
 """The nearest points of a tree, for groups of points that lie near each other.
 
 A group goes down the tree together: a box that is farther from the box about the group than each
-point from what it has found so far is nobody's. Distances of a whole group to a point of the tree
-are a few instructions, as the processor takes several numbers at once.
+point from what it has found so far is nobody's, and so is a point of a leaf. Distances of a whole
+group to a point of the tree, and of a leaf's points to the group's box, are a few instructions, as
+the processor takes several numbers at once.
 """
 
 import math
@@ -10,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapfusion.align.box_tree import BoxTree, in_leaves
+from mapfusion.align.box_tree import POINTS_PER_LEAF, BoxTree, in_leaves
 from mapfusion.kernels import inner_kernel, kernel, kernel_part
 from mapfusion.planar import moved_point
 from mapfusion.se2 import Float
@@ -51,6 +52,8 @@ class Room(NamedTuple):
         square: (GROUP,) its squared distance.
         node: nodes to be asked.
         away: their squared distances.
+        near: points of a leaf that may be somebody's nearest.
+        far: squared distances of all of the leaf's.
     """
 
     x: Float
@@ -60,13 +63,17 @@ class Room(NamedTuple):
     square: Float
     node: np.ndarray
     away: Float
+    near: np.ndarray
+    far: Float
 
 
 @kernel
 def room_for_groups() -> Room:
     """One for any number of groups, one after the other."""
     x, y, z, nearest = np.empty(GROUP), np.empty(GROUP), np.empty(GROUP), np.empty(GROUP)
-    return Room(x, y, z, nearest, np.empty(GROUP), np.empty(_DEEPEST, np.int64), np.empty(_DEEPEST))
+    node, away = np.empty(_DEEPEST, np.int64), np.empty(_DEEPEST)
+    near, far = np.empty(POINTS_PER_LEAF, np.int64), np.empty(POINTS_PER_LEAF)
+    return Room(x, y, z, nearest, np.empty(GROUP), node, away, near, far)
 
 
 @inner_kernel
@@ -83,15 +90,18 @@ def look_up_group(
         nearest: (M GROUP,) a point of the tree for each point of the groups, -1: none yet.
         room: filled in.
     """
-    x, y, z, found, square, _, _ = room
+    x, y, z, found, square, _, _, _, _ = room
     _, _, own_x, own_y, own_z = groups
     _, px, py, pz, _, _, _, _ = tree
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+    # indices without a sign, else the compiler would take one point at a time
+    begin = np.uint64(first)
     for q in range(GROUP):
-        i = first + q
+        i = begin + np.uint64(q)
         x[q], y[q] = moved_point(T_a_b, cos, sin, own_x[i], own_y[i])
         z[q] = own_z[i]
-        k = nearest[i]
+    for q in range(GROUP):
+        k = nearest[first + q]
         found[q], square[q] = k, math.inf
         if k >= 0:
             dx, dy, dz = px[k] - x[q], py[k] - y[q], pz[k] - z[q]
@@ -117,7 +127,7 @@ def _between(low: float, high: float, box_low: float, box_high: float) -> float:
 def _descend(tree: BoxTree, room: Room) -> None:
     """Go down the tree with a group, to the nearest boxes first."""
     _, px, py, pz, _, box, starts, ends = tree
-    x, y, z, found, square, nodes, aways = room
+    x, y, z, found, square, nodes, aways, near, far = room
     low_x, high_x, low_y, high_y, low_z, high_z = x[0], x[0], y[0], y[0], z[0], z[0]
     for q in range(1, GROUP):
         low_x, high_x = min(low_x, x[q]), max(high_x, x[q])
@@ -144,7 +154,18 @@ def _descend(tree: BoxTree, room: Room) -> None:
                 node = closer
                 continue
         else:
-            for k in range(starts[node], ends[node]):
+            begin, n, n_near = np.uint64(starts[node]), ends[node] - starts[node], 0
+            for c in range(n):
+                k = begin + np.uint64(c)
+                dx = _between(low_x, high_x, px[k], px[k])
+                dy = _between(low_y, high_y, py[k], py[k])
+                dz = _between(low_z, high_z, pz[k], pz[k])
+                far[c] = dx * dx + dy * dy + dz * dz
+            for c in range(n):  # all are written, those that are too far over one another
+                near[n_near] = c
+                n_near += far[c] < most
+            for c in range(n_near):
+                k = starts[node] + near[c]
                 _compare(k, px[k], py[k], pz[k], x, y, z, found, square)
             most = _largest(square)
         while n_todo > 0 and aways[n_todo - 1] >= most:

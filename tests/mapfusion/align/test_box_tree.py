@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from mapfusion.align.box_tree import BoxTree
+from mapfusion.align.box_tree import POINTS_PER_LEAF, BoxTree
 from tests.mapfusion.align.test_closest import points
 
 KINDS = ["spread", "one wall", "far outlier", "one place", "two"]
@@ -16,7 +16,7 @@ def test_each_box_holds_its_points_and_halves_those_of_the_one_above(kind):
     assert sorted(tree.row) == list(range(len(tree.p)))
     inner = len(tree.first) // 2
     size = -(-len(p) // (inner + 1))
-    assert size <= 16
+    assert size <= POINTS_PER_LEAF
     leaves = tree.end[inner:] - tree.first[inner:]
     np.testing.assert_array_equal(leaves, np.clip(len(p) - size * np.arange(inner + 1), 0, size))
     for node, (first, end) in enumerate(zip(tree.first, tree.end, strict=True)):
