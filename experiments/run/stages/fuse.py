@@ -284,9 +284,8 @@ def _fused(
     return FusedMap(made, of, T, covariance, drift, duplicates, (), fallback)
 
 
-def read_fused_maps(folder: Path) -> list[LandmarkMap]:
-    """The last maps of all components, that of the most robots first."""
+def fused_map_files(folder: Path) -> list[Path]:
+    """The files of the last maps of all components, that of the most robots first."""
     motions = read_rows(folder / WRITES[2], MOTIONS)
     of_last = motions[motions["iteration"] == motions["iteration"].max()]
-    components = range(1, 1 + int(of_last["component"].max()))
-    return [read_map(_map_path(folder, component)) for component in components]
+    return [_map_path(folder, k) for k in range(1, 1 + int(of_last["component"].max()))]
