@@ -116,9 +116,8 @@ def save_figure(folder: Path, name: str, draw: Callable[..., Figure], *data: Any
         with matplotlib.rc_context({"figure.constrained_layout.use": False}):
             figure.set_layout_engine(None)
             write_sealed(png_file, png(_pixels(figure), _DPI["png"]) + LINE)
-            vectors = io.BytesIO()
-            figure.savefig(vectors, format="svg", dpi=_DPI["svg"], metadata=_NO_DATE)
-            write_whole(svg_file, lambda path: path.write_bytes(vectors.getbuffer()))
+            vectors = _vectors(figure)
+            write_whole(svg_file, lambda path: path.write_bytes(vectors))
     return [png_file, svg_file]
 
 
@@ -135,6 +134,12 @@ def _pixels(figure: Figure) -> np.ndarray:
     with _at_pixels(figure) as canvas:
         canvas.draw()
         return np.asarray(canvas.buffer_rgba())[..., :3]
+
+
+def _vectors(figure: Figure) -> bytes:
+    stream = io.BytesIO()
+    figure.savefig(stream, format="svg", dpi=_DPI["svg"], metadata=_NO_DATE)
+    return stream.getvalue()
 
 
 @contextmanager

@@ -26,7 +26,7 @@ def png(picture: np.ndarray, dpi: float) -> bytes:
     parts = (
         (b"IHDR", struct.pack(">IIBBBBB", width, height, _BITS, _COLOUR, 0, 0, 0)),
         (b"pHYs", struct.pack(">IIB", per_metre, per_metre, _PER_METRE)),
-        (b"IDAT", zlib.compress(rows, _LEVEL)),
+        (b"IDAT", zlib.compress(rows.tobytes(), _LEVEL)),
         (b"IEND", b""),
     )
     return _SIGNATURE + b"".join(_chunk(kind, data) for kind, data in parts)
