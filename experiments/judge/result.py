@@ -7,7 +7,7 @@ robots that only each other's alignments connect), `keyframes/`, `figures/`, `sc
 
 import platform
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ import numpy as np
 from experiments.judge import tables
 from experiments.judge.errors import EvaluatedRobot
 from experiments.judge.judged_run import JudgedRun
-from experiments.judge.table_makers import history_makers, in_order, makers
+from experiments.judge.table_makers import Maker, history_makers, in_order, makers
 from experiments.methods.catalogue import find_method
 from experiments.run.code_version import library_versions
 from experiments.run.head_start import head_start
@@ -100,11 +100,17 @@ def write_result(
         shutil.rmtree(folder / outdated, ignore_errors=True)
     _write_images(run, folder)
     write_json(folder / "world.json", _world(run.scenario, team.robots))
-    for name, make in in_order(makers(run, team) | history_makers(run, team)).items():
-        tables.write(tables.table_path(folder, name), name, make())
-        on_written(folder, name)
+
+    def write_tables(made: Mapping[str, Maker]) -> None:
+        for name, make in made.items():
+            tables.write(tables.table_path(folder, name), name, make())
+            on_written(folder, name)
+
+    of_figures, others = in_order(makers(run, team) | history_makers(run, team))
+    write_tables(of_figures)
     write_json(folder / "scenario.json", run.scenario.resolved())
     on_written(folder, "scenario")
+    write_tables(others)
     _write_maps(run, folder / "maps")
     write_json(folder / "provenance.json", provenance(run))
 
