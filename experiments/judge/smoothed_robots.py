@@ -34,7 +34,7 @@ class SmoothedRobot:
     Attributes:
         robot: its filter's maps, and its true path.
         filter_path: (T, 3) the filter's whole path at the end.
-        maps: with their joint covariances.
+        maps: the last one with its joint covariance.
         points_world_m: (N, 3) true points for each map, NaN where unknown.
         paths: (k + 1, 3) up to each iteration k.
         ending: how smoothing ended at the robot's last iteration.

@@ -183,8 +183,12 @@ def _path_path(folder: Path, part: str) -> Path:
 
 
 def read_smoothed(folder: Path) -> dict[int, LandmarkMap]:
-    """The robot's smoothed map, with its joint covariance, at each iteration that has one."""
-    return {k: read_map(_map_path(folder, str(k))) for k in read_smoothed_path(folder)}
+    """The robot's smoothed map at each iteration that has one.
+
+    The last one is whole; earlier ones have neither joint covariances nor viewing evidence.
+    """
+    known = list(read_smoothed_path(folder))
+    return {k: read_map(_map_path(folder, str(k)), alone=k != known[-1]) for k in known}
 
 
 def read_smoothed_path(folder: Path) -> dict[int, Float]:
