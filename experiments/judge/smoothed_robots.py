@@ -58,7 +58,7 @@ def load_smoothed(
     robot: EvaluatedRobot, folders: RobotFolders, log: RobotLog, smooth: Path
 ) -> SmoothedRobot:
     """A robot's smoothed maps joined with the truth beside its log, NaN where it is unknown."""
-    truth, maps = truth_of(folders.log, log), read_smoothed(smooth)
+    truth, maps = truth_of(folders.log, log), read_smoothed(smooth, last_whole=True)
     points = landmark_truth(truth, partial(smoothed_owners, smooth, folders.slam), maps)
     ending = read_endings(smooth).to_dict("records")[-1]
     paths = read_smoothed_path(smooth)

@@ -182,13 +182,14 @@ def _path_path(folder: Path, part: str) -> Path:
     return folder / WRITES[-1].format(part=part)
 
 
-def read_smoothed(folder: Path) -> dict[int, LandmarkMap]:
-    """The robot's smoothed map at each iteration that has one.
+def read_smoothed(folder: Path, last_whole: bool = False) -> dict[int, LandmarkMap]:
+    """The robot's smoothed map, with its joint covariance, at each iteration that has one.
 
-    The last one is whole; earlier ones have neither joint covariances nor viewing evidence.
+    If `last_whole` only the last one has that, and viewing evidence: it is most of what is read.
     """
     known = list(read_smoothed_path(folder))
-    return {k: read_map(_map_path(folder, str(k)), alone=k != known[-1]) for k in known}
+    alone = known[:-1] if last_whole else ()
+    return {k: read_map(_map_path(folder, str(k)), alone=k in alone) for k in known}
 
 
 def read_smoothed_path(folder: Path) -> dict[int, Float]:
