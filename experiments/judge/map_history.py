@@ -75,8 +75,10 @@ def _joined(met: MetMaps, settings: MergeSettings) -> dict[str, np.ndarray]:
     As `PAPERS` fuses them, and only they are given: the second pass, which looks for what they
     missed, takes ten times as long as all the rest of this table.
     """
-    (map_a, map_b), pair = met.maps, met.aligned(settings.aligner, 0, 1)
+    pair = met.aligned(settings.aligner, 0, 1)
     pairs = met.offered[np.flatnonzero(pair.alignment.inlier & pair.alignment.ok)]
+    # all are paired already: nobody looks at their descriptors
+    map_a, map_b = (replace(own, descriptor=None) for own in met.maps)
     fused, each = map_a[pairs.index_a], np.arange(len(pairs))
     if pair.alignment.ok:
         alone = replace(
