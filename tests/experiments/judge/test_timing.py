@@ -59,16 +59,16 @@ def test_compilation_does_not_count_and_first_and_last_maps_do(
     robots = grown("R1", range(5, 50, 5)), grown("R2", range(5, 30, 5))
     timing = AlignerTiming.of(scenario, [met_at(k, *robots) for k in range(5, 50, 5)])
     # All are ready: what is compiled was compiled while nothing was timed.
-    assert [clock.asked for clock in clocks.values()] == [[45], [45]]
+    assert [clock.asked for clock in clocks.values()] == [[5, 45], [5, 45]]
     rows = timing.rows()
     assert [row["iteration"] for row in rows[::2]] == [5, 25, 45]
     assert [row["aligner"] for row in rows] == ["icp", "svd"] * 3
     assert [row["n_correspondences"] for row in rows[::2]] == [0, 1, 0]
     assert [row["n_common"] for row in rows[::2]] == [5, 25, 25]  # R2's log ended at 25
     # The first one's call before reads the maps for all.
-    assert clocks["icp"].asked[1:] == [5] * 12 + [25] * 12 + [45] * 12
-    assert clocks["svd"].asked[1:] == [5] * 11 + [25] * 11 + [45] * 11
+    assert clocks["icp"].asked[2:] == [5] * 12 + [25] * 12 + [45] * 12
+    assert clocks["svd"].asked[2:] == [5] * 11 + [25] * 11 + [45] * 11
     times = [[row[f"elapsed{end}_s"] for end in ("_low", "", "_high")] for row in rows]
     of_eleven = np.array([1.0, 5.0, 9.0])  # percentiles of 0 to 10
-    first_calls = [1, 0, 1, 0, 2, 1]
+    first_calls = [2, 1, 1, 0, 2, 1]
     np.testing.assert_allclose(times, of_eleven + np.array(first_calls)[:, None])
