@@ -130,8 +130,8 @@ def write_map(path: Path, landmarks: LandmarkMap) -> None:
     )
 
 
-def read_map(path: Path) -> LandmarkMap:
-    """Read a map, with what lies beside it; raises InputError that names the file."""
+def read_map(path: Path, alone: bool = False) -> LandmarkMap:
+    """Read a map, with what lies beside it but for `alone`; raises InputError naming the file."""
     table, attributes = read_open_table(path, LANDMARKS)
     position, covariance = points_from(table)
     planar = attributes.get("planar") == "true"
@@ -150,5 +150,7 @@ def read_map(path: Path) -> LandmarkMap:
         require_no_twins("landmarks", position, covariance.reshape(-1, 9))
     except ValueError as error:
         raise InputError(f"{path}: {error}") from error
+    if alone:
+        return found
     viewing = read_viewing(path, len(found))
     return replace(found, joint=read_joint(path, covariance), viewing=viewing)

@@ -105,8 +105,8 @@ def one_to_one(i: np.ndarray, j: np.ndarray, unlike: np.ndarray) -> tuple[np.nda
     taken_i: set[int] = set()
     taken_j: set[int] = set()
     kept = []
-    for row in np.argsort(unlike, kind="stable"):
-        at_i, at_j = int(i[row]), int(j[row])
+    rows = np.argsort(unlike, kind="stable")
+    for row, at_i, at_j in zip(rows, i[rows].tolist(), j[rows].tolist(), strict=True):
         if at_i not in taken_i and at_j not in taken_j:
             taken_i.add(at_i)
             taken_j.add(at_j)

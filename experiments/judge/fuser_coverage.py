@@ -12,12 +12,7 @@ import numpy as np
 
 from experiments.judge.errors import EvaluatedRobot
 from experiments.judge.judged_fusers import JudgedFusion
-from experiments.judge.map_consistency import (
-    Consistency,
-    consistency_in_frame,
-    fitted,
-    relative_consistency,
-)
+from experiments.judge.map_consistency import Consistency, both_consistencies, fitted
 from experiments.judge.truth import degrees_of_freedom
 from mapfusion.chi_square import chi_square_bound
 from mapfusion.landmark_map import LandmarkMap
@@ -57,7 +52,7 @@ def _given(fusions: Sequence[JudgedFusion]) -> dict[str, list[_Both]]:
 
 def _judged(robot: EvaluatedRobot, landmarks: LandmarkMap, point_world_m: Float) -> _Both:
     fit = fitted(landmarks, robot.in_map_frame(point_world_m))
-    return relative_consistency(landmarks, fit), consistency_in_frame(landmarks, fit)
+    return both_consistencies(landmarks, fit)
 
 
 def _rows(

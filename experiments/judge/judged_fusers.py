@@ -18,9 +18,8 @@ from experiments.judge.fused_landmarks import FusedTeam
 from experiments.judge.map_consistency import (
     Consistency,
     FittedMap,
-    consistency_in_frame,
+    both_consistencies,
     fitted,
-    relative_consistency,
     rmse,
 )
 from experiments.judge.smoothed_robots import SmoothedRobot
@@ -97,8 +96,7 @@ class JudgedFusion:
     @cached_property
     def consistency(self) -> tuple[Consistency, Consistency]:
         """Of the fused map after the best rigid fit, and in its frame."""
-        landmarks, fit = self.fusion.landmarks, self.fit
-        return relative_consistency(landmarks, fit), consistency_in_frame(landmarks, fit)
+        return both_consistencies(self.fusion.landmarks, self.fit)
 
     def row(self) -> dict[str, Any]:
         """Its row of the table `fusers`."""

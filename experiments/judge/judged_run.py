@@ -1,13 +1,15 @@
 """All stages of a scenario, the judgement too, with the store that keeps them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import pandas as pd
 
 from experiments.judge import judging, tables
-from experiments.judge.errors import EvaluatedRobot, met_maps
+from experiments.judge.aligner_timing import AlignerTiming
+from experiments.judge.errors import EvaluatedRobot, MetMaps, met_maps
 from experiments.judge.fused_landmarks import FusedTeam, MergeSettings
 from experiments.judge.judged_fusers import GivenMap, JudgedFusion
 from experiments.judge.judging import ALIGNED, JudgeSettings
@@ -131,11 +133,32 @@ class JudgedRun:
         """What `load_team` gives; it stays in memory."""
         return self.load_team()
 
-    def _team_task(self) -> Task:
+    @cached_property
+    def timings(self) -> dict[tuple[str, str], AlignerTiming]:
+        """The aligners made ready to be timed, by the names of a pair's robots."""
+        met: dict[tuple[str, str], list[MetMaps]] = {}
+        for each in self.team.met:
+            met.setdefault((each.a.name, each.b.name), []).append(each)
+        return {pair: AlignerTiming.of(self.scenario, maps) for pair, maps in met.items()}
+
+    def untimed(self) -> Iterator[tuple[PairStages, Path]]:
+        """The pairs on whose maps aligners are yet to be timed, and the tables this goes to."""
+        for pair in self.pipeline.pairs:
+            path = self.store.path(pair.estimates) / "aligner_timings.parquet"
+            if not path.is_file():
+                yield pair, path
+
+    def _load(self) -> None:
+        """Have in memory what is wanted when all tasks are done."""
+        _ = self.team
+        if any(self.untimed()):
+            _ = self.timings
+
+    def _load_task(self) -> Task:
         read = [robot.slam for robot in self.pipeline.robots]
         read += [pair.estimates for pair in self.pipeline.pairs]
         needs = tuple(name for stage in read for name in task_names(stage))
-        return Task("team", "load the maps", lambda: self.team, (), (), needs)
+        return Task("team", "load the maps", self._load, (), (), needs)
 
     def pair_table(self, name: str) -> pd.DataFrame:
         """A table of robot pairs, of all pairs."""
@@ -146,7 +169,7 @@ class JudgedRun:
     def execute(self, jobs: int, on_progress: OnProgress, only: Sequence[Stage] = ()) -> None:
         """Do what is not in the store yet, in `jobs` processes; of `only` these stages, if any.
 
-        Of all stages `team` is loaded beside the last tasks.
+        Of all stages `team` and `timings` are made beside the last tasks.
 
         Raises:
             InputError: something that was given cannot be used, or this machine has too little
@@ -160,7 +183,7 @@ class JudgedRun:
             left = [*rehearsals(self.scenario, left), *left]
         try:
             with workers(jobs) as pool:
-                run_tasks(left, pool, on_progress, None if only else self._team_task())
+                run_tasks(left, pool, on_progress, None if only else self._load_task())
         except DamagedFileError:  # `mending` wants to know which
             raise
         except InputError as error:

@@ -124,27 +124,35 @@ def _error(landmarks: LandmarkMap, position_m: Float, truth_m: Float) -> Float:
 
 def relative_consistency(landmarks: LandmarkMap, fit: FittedMap) -> Consistency:
     """Of the map as such: gauge removed, gross landmarks left out."""
+    return both_consistencies(landmarks, fit)[0]
+
+
+def both_consistencies(landmarks: LandmarkMap, fit: FittedMap) -> tuple[Consistency, Consistency]:
+    """The relative one, and that of the map in the frame that its truth was given in.
+
+    Both without the gross landmarks; what takes long is the same for both.
+    """
     kept = ~fit.gross
-    return _consistency(landmarks, fit.rows[kept], fit.error_m[kept], fit.truth_m[kept])
-
-
-def consistency_in_frame(landmarks: LandmarkMap, fit: FittedMap) -> Consistency:
-    """Of the map in the frame that its truth was given in, gross landmarks left out."""
-    kept = ~fit.gross
-    return _consistency(landmarks, fit.rows[kept], fit.frame_error_m[kept], None)
-
-
-def _consistency(
-    landmarks: LandmarkMap, rows: np.ndarray, error_m: Float, gauge_at_m: Float | None
-) -> Consistency:
-    """With the gauge removed, if points (n, 3) to take the rigid motions at are given."""
+    rows = fit.rows[kept]
     if len(rows) < _LEAST:
-        return UNKNOWN
+        return UNKNOWN, UNKNOWN
     d = degrees_of_freedom(landmarks)
-    joint, error = _joint_of(landmarks, rows, d), error_m[:, :d]
-    J = np.zeros((len(rows), d, 0)) if gauge_at_m is None else rigid_motions(gauge_at_m, d)
-    inverse = joint.solve(np.concatenate([error[..., None], J], axis=2))
-    J_flat, solved = J.reshape(error.size, -1), inverse.reshape(error.size, -1)
+    joint = _joint_of(landmarks, rows, d)
+    error, frame_error = fit.error_m[kept, :d], fit.frame_error_m[kept, :d]
+    J = rigid_motions(fit.truth_m[kept], d)
+    columns = [error[..., None], J, frame_error[..., None]]
+    solved = joint.solve(np.concatenate(columns, axis=2)).reshape(error.size, -1)
+    n_gauge, no_gauge = J.shape[2], J[..., :0]
+    return (
+        _consistency(joint, error, J, solved[:, : 1 + n_gauge]),
+        _consistency(joint, frame_error, no_gauge, solved[:, 1 + n_gauge :]),
+    )
+
+
+def _consistency(joint: "_LowRank", error: Float, J: Float, solved: Float) -> Consistency:
+    """Of errors (n, D) without what lies along J (n, D, k), by S^-1 of both (n D, 1 + k)."""
+    d = error.shape[1]
+    J_flat = J.reshape(error.size, -1)
     pull, stiffness = J_flat.T @ solved[:, 0], J_flat.T @ solved[:, 1:]
     nees = error.ravel() @ solved[:, 0] - pull @ np.linalg.solve(stiffness, pull)
     left, marginal = _projected(joint, error, J_flat)

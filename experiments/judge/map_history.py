@@ -4,6 +4,7 @@ The stages keep the maps whole in the store; what leaves with the result is what
 at them in plan.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,21 +12,27 @@ import numpy as np
 import pandas as pd
 
 from experiments.judge.errors import MetMaps
-from experiments.judge.fused_landmarks import PAPERS, FusedTeam, MergeSettings
+from experiments.judge.fused_landmarks import FusedTeam, MergeSettings
 from mapfusion.align.correspondences import Correspondences
+from mapfusion.aligned_landmarks import AlignedLandmarks
+from mapfusion.fuse.kalman import kalman_fused
+from mapfusion.fuse.sequential import landmarks_in_turn
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.merge import merge
+from mapfusion.merge import connect
 from mapfusion.storage import point_columns
 
 
 def map_history_rows(team: FusedTeam) -> pd.DataFrame:
     """Rows of the table `map_history`."""
     maps = [
-        _plan_rows(landmarks).assign(robot=robot.name, iteration=k)
+        (
+            {"robot": robot.name, "iteration": k},
+            {"landmark": np.arange(len(landmarks))} | _points(landmarks),
+        )
         for robot in team.robots
         for k, landmarks in robot.maps.items()
     ]
-    return pd.concat(maps, ignore_index=True)
+    return _rows(maps)
 
 
 def true_pair_rows(team: FusedTeam, radius_m: float) -> list[dict[str, Any]]:
@@ -42,23 +49,36 @@ def true_pair_rows(team: FusedTeam, radius_m: float) -> list[dict[str, Any]]:
 
 def fused_history_rows(team: FusedTeam, settings: MergeSettings) -> pd.DataFrame:
     """Rows of the table `fused_history`."""
-    fused = [_joined_rows(met, settings) for met in team.met]
-    return pd.concat(fused, ignore_index=True) if fused else pd.DataFrame()
+    return _rows([(met.names, _joined(met, settings)) for met in team.met])
 
 
-def _plan_rows(landmarks: LandmarkMap) -> pd.DataFrame:
-    columns = point_columns(landmarks.position_m, landmarks.covariance_m2)
-    return pd.DataFrame({"landmark": np.arange(len(landmarks)), **columns})
+def _rows(parts: Sequence[tuple[dict[str, Any], dict[str, np.ndarray]]]) -> pd.DataFrame:
+    """Rows of parts: what is said of all rows of a part, and columns; these are the same of all.
+
+    All in one frame at once: to make one of each part takes many times as long.
+    """
+    if not parts:
+        return pd.DataFrame()
+    said = pd.DataFrame([named for named, _ in parts])
+    n_rows = [len(next(iter(columns.values()))) for _, columns in parts]
+    joined = {name: np.concatenate([columns[name] for _, columns in parts]) for name in parts[0][1]}
+    return pd.DataFrame({name: said[name].to_numpy().repeat(n_rows) for name in said} | joined)
 
 
-def _joined_rows(met: MetMaps, settings: MergeSettings) -> pd.DataFrame:
+def _points(landmarks: LandmarkMap | AlignedLandmarks) -> dict[str, np.ndarray]:
+    return point_columns(landmarks.position_m, landmarks.covariance_m2)
+
+
+def _joined(met: MetMaps, settings: MergeSettings) -> dict[str, np.ndarray]:
     """The inliers of the merging aligner's first repetition, fused; none where it was refused.
 
-    Only they are given to the merge: its second pass, which looks for what they missed, takes ten
-    times as long as all the rest of this table.
+    As `PAPERS` fuses them, and only they are given: the second pass, which looks for what they
+    missed, takes ten times as long as all the rest of this table.
     """
-    (map_a, map_b), pair = met.maps, met.aligned(settings.aligner, 0, 1)
+    pair = met.aligned(settings.aligner, 0, 1)
     pairs = met.offered[np.flatnonzero(pair.alignment.inlier & pair.alignment.ok)]
+    # all are paired already: nobody looks at their descriptors
+    map_a, map_b = (replace(own, descriptor=None) for own in met.maps)
     fused, each = map_a[pairs.index_a], np.arange(len(pairs))
     if pair.alignment.ok:
         alone = replace(
@@ -66,7 +86,8 @@ def _joined_rows(met: MetMaps, settings: MergeSettings) -> pd.DataFrame:
             alignment=replace(pair.alignment, inlier=np.ones(len(each), dtype=bool)),
             correspondences=Correspondences(each, each, pairs.distance),
         )
-        both = [fused, map_b[pairs.index_b]]
-        fused = merge(both, [alone], settings.parameters, PAPERS).fused[0].landmarks
-    joined = {"landmark_a": pairs.index_a, "landmark_b": pairs.index_b}
-    return _plan_rows(fused).assign(**met.names, **joined)
+        both = connect([fused, map_b[pairs.index_b]], [alone], settings.parameters.team)
+        fused = landmarks_in_turn(
+            both.components[0], settings.parameters, kalman_fused, use_drift=True
+        )
+    return {"landmark_a": pairs.index_a, "landmark_b": pairs.index_b} | _points(fused)

@@ -7,38 +7,35 @@ robots that only each other's alignments connect), `keyframes/`, `figures/`, `sc
 
 import platform
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from experiments.judge import tables
 from experiments.judge.errors import EvaluatedRobot
 from experiments.judge.judged_run import JudgedRun
-from experiments.judge.table_makers import history_makers, in_order, makers
-from experiments.judge.truth import common_landmarks
-from experiments.methods.aligner_calls import callable_aligner
+from experiments.judge.table_makers import Maker, history_makers, in_order, makers
 from experiments.methods.catalogue import find_method
 from experiments.run.code_version import library_versions
-from experiments.run.estimates import correspondences_of
 from experiments.run.head_start import head_start
-from experiments.run.stages.fuse import read_fused_maps
-from experiments.run.stages.smooth import read_smoothed
+from experiments.run.stages.fuse import fused_map_files
+from experiments.run.stages.smooth import map_files, read_smoothed_path
 from experiments.run.store import Store, mending
 from experiments.run.store_files import link_or_copy
 from experiments.run.tasks import OnProgress
-from experiments.scenario.randomness import generator
 from experiments.scenario.settings import AnyScenario, Simulation
 from mapfusion.errors import InputError
+from mapfusion.joint_files import joint_path
 from mapfusion.landmark_map import write_map
 from mapfusion.storage import (
     remove_abandoned,
     require_writable,
     write_json,
 )
+from mapfusion.viewing_files import viewing_paths
 from sim.floorplan import Wall
 from sim.renderer import renderer_name
 
@@ -47,7 +44,6 @@ OnWritten = Callable[[Path, str], None]
 _SUBFOLDERS = ("tables", "maps", "keyframes", "figures")
 _LABEL = "write the tables"
 _FACE_DECIMALS = 6  # a micrometre: what is beyond is rounding
-_WARM_UP_RUNS = 1  # compilation and caches
 
 
 def require_result(result: Path) -> None:
@@ -99,71 +95,55 @@ def write_result(
     and images are there before the first of them.
     """
     team = run.team
-    measure_aligners(run, team.robots)
+    measure_aligners(run)
     for outdated in ("maps", "keyframes"):  # of robots or frames that are no longer there
         shutil.rmtree(folder / outdated, ignore_errors=True)
     _write_images(run, folder)
     write_json(folder / "world.json", _world(run.scenario, team.robots))
-    for name, make in in_order(makers(run, team) | history_makers(run, team)).items():
-        tables.write(tables.table_path(folder, name), name, make())
-        on_written(folder, name)
+
+    def write_tables(made: Mapping[str, Maker]) -> None:
+        for name, make in made.items():
+            tables.write(tables.table_path(folder, name), name, make())
+            on_written(folder, name)
+
+    of_figures, others = in_order(makers(run, team) | history_makers(run, team))
+    write_tables(of_figures)
     write_json(folder / "scenario.json", run.scenario.resolved())
     on_written(folder, "scenario")
-    for name, landmarks in run.last_maps(team.iteration).items():
-        write_map(folder / "maps" / f"{name}.parquet", landmarks)
-    for robot in run.pipeline.robots:
-        if smoothed := read_smoothed(run.store.path(robot.smooth)).get(robot.n_frames - 1):
-            write_map(folder / "maps" / f"{robot.name}.smoothed.parquet", smoothed)
-    if fuser := run.pipeline.fusers.get(run.scenario.merge.fuser):
-        for k, fused in enumerate(read_fused_maps(run.store.path(fuser)), start=1):
-            name = "fused.parquet" if k == 1 else f"fused.{k}.parquet"
-            write_map(folder / "maps" / name, fused)
+    write_tables(others)
+    _write_maps(run, folder / "maps")
     write_json(folder / "provenance.json", provenance(run))
 
 
-def measure_aligners(run: JudgedRun, robots: Sequence[EvaluatedRobot]) -> None:
+def measure_aligners(run: JudgedRun) -> None:
     """Time every aligner on each pair's maps of growing overlap; a table already there is kept.
 
     Serially, when all else is done: nothing else may be running.
     """
-    by_name = {robot.name: robot for robot in robots}
-    for pair in run.pipeline.pairs:
-        path = run.store.path(pair.estimates) / "aligner_timings.parquet"
-        if not path.is_file():
-            remove_abandoned(path.parent)
-            offered = tables.read(path.with_name("correspondences.parquet"), "correspondences")
-            robots_of = by_name[pair.a.name], by_name[pair.b.name]
-            rows = _time_pair(run.scenario, *robots_of, offered)
-            tables.write(path, "aligner_timings", rows)
+    for pair, path in run.untimed():
+        timing = run.timings[pair.a.name, pair.b.name]
+        remove_abandoned(path.parent)
+        tables.write(path, "aligner_timings", timing.rows())
 
 
-def _time_pair(
-    scenario: AnyScenario, a: EvaluatedRobot, b: EvaluatedRobot, offered: pd.DataFrame
-) -> list[dict[str, Any]]:
-    """Rows of a pair of robots, to which `offered` are the correspondences at all iterations."""
-    settings, iterations = scenario.evaluate, np.array(sorted({*a.maps, *b.maps}))
-    spread = np.linspace(0, len(iterations) - 1, settings.timing_points)
-    repeats = range(_WARM_UP_RUNS + settings.timing_repeats)
-    aligners = {
-        entry.name: callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
-        for entry in scenario.align.aligners
-    }
-    rows = []
-    for iteration in iterations[np.unique(spread.round().astype(int))].tolist():
-        (map_a, points_a), (map_b, points_b) = a.at(iteration), b.at(iteration)
-        pairs = correspondences_of(offered[offered["iteration"] == iteration])
-        known = np.isfinite(points_a).any() and np.isfinite(points_b).any()
-        n_common = common_landmarks(points_a, points_b, settings.true_pair_radius_m)
-        n_common = n_common if known else tables.UNKNOWN
-        maps = {"robot_a": a.name, "robot_b": b.name, "iteration": iteration}
-        maps |= {"n_correspondences": len(pairs), "n_common": n_common}
-        for name, aligner in aligners.items():
-            rngs = (generator(scenario.seed, "timing", name, repeat) for repeat in repeats)
-            elapsed = [aligner.align(map_a, map_b, pairs, rng).elapsed_s for rng in rngs]
-            low, median, high = np.percentile(elapsed[_WARM_UP_RUNS:], [10, 50, 90])
-            times = {"elapsed_s": median, "elapsed_low_s": low, "elapsed_high_s": high}
-            rows.append({**maps, "aligner": name, **times})
-    return rows
+def _write_maps(run: JudgedRun, folder: Path) -> None:
+    for name, landmarks in run.last_maps(run.team.iteration).items():
+        write_map(folder / f"{name}.parquet", landmarks)
+    for robot in run.pipeline.robots:
+        smooth, last = run.store.path(robot.smooth), robot.n_frames - 1
+        if last in read_smoothed_path(smooth):
+            _put_map(map_files(smooth, last)[0], folder / f"{robot.name}.smoothed.parquet")
+    if fuser := run.pipeline.fusers.get(run.scenario.merge.fuser):
+        for k, fused in enumerate(fused_map_files(run.store.path(fuser)), start=1):
+            _put_map(fused, folder / ("fused.parquet" if k == 1 else f"fused.{k}.parquet"))
+
+
+def _put_map(source: Path, target: Path) -> None:
+    """A map as it is stored, with what lies beside it."""
+    sources, targets = ((path, joint_path(path), *viewing_paths(path)) for path in (source, target))
+    for own, place in zip(sources, targets, strict=True):
+        if own.is_file():
+            link_or_copy(own, place)
 
 
 def _world(scenario: AnyScenario, robots: Sequence[EvaluatedRobot]) -> dict[str, object]:

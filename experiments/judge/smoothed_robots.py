@@ -34,7 +34,7 @@ class SmoothedRobot:
     Attributes:
         robot: its filter's maps, and its true path.
         filter_path: (T, 3) the filter's whole path at the end.
-        maps: with their joint covariances.
+        maps: the last one with its joint covariance.
         points_world_m: (N, 3) true points for each map, NaN where unknown.
         paths: (k + 1, 3) up to each iteration k.
         ending: how smoothing ended at the robot's last iteration.
@@ -58,7 +58,7 @@ def load_smoothed(
     robot: EvaluatedRobot, folders: RobotFolders, log: RobotLog, smooth: Path
 ) -> SmoothedRobot:
     """A robot's smoothed maps joined with the truth beside its log, NaN where it is unknown."""
-    truth, maps = truth_of(folders.log, log), read_smoothed(smooth)
+    truth, maps = truth_of(folders.log, log), read_smoothed(smooth, last_whole=True)
     points = landmark_truth(truth, partial(smoothed_owners, smooth, folders.slam), maps)
     ending = read_endings(smooth).to_dict("records")[-1]
     paths = read_smoothed_path(smooth)

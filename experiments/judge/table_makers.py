@@ -24,11 +24,8 @@ from mapfusion.se2 import Float
 from mapfusion.storage import POSE_FIELDS, named_columns
 
 Maker = Callable[[], Any]
-# Written after all others, in this order: what takes long to make, and last what no figure reads.
-_LATE = (
-    *("fused_map", "fusers", "fuser_coverage"),
-    *("map_history", "fused_history", "path_statistics", "timings"),
-)
+_LONG = ("fused_map", "fusers", "fuser_coverage")  # to make, of those that figures read
+_IN_NO_FIGURE = ("map_history", "fused_history", "path_statistics", "timings")
 
 
 def all_tables(
@@ -42,10 +39,14 @@ def all_tables(
     return {name: tables.framed(name, make()) for name, make in made_by if name in only}
 
 
-def in_order(made: Mapping[str, Maker]) -> dict[str, Maker]:
-    """The same in the order to write them in: figures are drawn meanwhile, from what is there."""
-    late = {name: place for place, name in enumerate(_LATE, start=1)}
-    return {name: made[name] for name in sorted(made, key=lambda name: late.get(name, 0))}
+def in_order(made: Mapping[str, Maker]) -> tuple[dict[str, Maker], dict[str, Maker]]:
+    """Those that figures read, what takes long last, and those that no figure reads.
+
+    In this order they are to be written: figures are drawn meanwhile, from what is there.
+    """
+    of_figures = (name for name in made if name not in _IN_NO_FIGURE)
+    first = {name: made[name] for name in sorted(of_figures, key=_LONG.__contains__)}
+    return first, {name: made[name] for name in _IN_NO_FIGURE}
 
 
 def makers(run: JudgedRun, team: FusedTeam) -> dict[str, Maker]:

@@ -26,6 +26,23 @@ def fused_in_turn(
         fuse_pairs: what becomes of two landmarks.
         use_drift: weigh with, and report, S + s_drift^2 I instead of the paper's S.
     """
+    fused = landmarks_in_turn(component, parameters, fuse_pairs, use_drift)
+    planar, drift = component.planar, component.drift_sigma_m
+    return FusedMap(
+        fused.landmark_map(planar, component.maps[component.members[0]].name),
+        fused.parents,
+        component.T_first_map,
+        component.motion_covariance,
+        drift if use_drift else np.where(np.isnan(drift), np.nan, 0.0),
+        parameters.same_point(planar).duplicate_share(fused),
+        component.left_out,
+    )
+
+
+def landmarks_in_turn(
+    component: Component, parameters: MergeParameters, fuse_pairs: FusePairs, use_drift: bool
+) -> AlignedLandmarks:
+    """The landmarks alone, of the same."""
     members, planar = component.by_name, component.planar
     test, drift = parameters.same_point(planar), component.drift_sigma_m
 
@@ -39,15 +56,7 @@ def fused_in_turn(
         other = moved(k)
         rows, others = _paired(fused, other, *_inliers(fused, k, component.pairs), test)
         fused = fused.joined(other, rows, others, 2 if planar else 3, fuse_pairs)
-    return FusedMap(
-        fused.landmark_map(planar, component.maps[component.members[0]].name),
-        fused.parents,
-        component.T_first_map,
-        component.motion_covariance,
-        drift if use_drift else np.where(np.isnan(drift), np.nan, 0.0),
-        test.duplicate_share(fused),
-        component.left_out,
-    )
+    return fused
 
 
 def _inliers(

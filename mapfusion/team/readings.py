@@ -129,6 +129,8 @@ class Team:
 
     def _all_loops(self, allowed: np.ndarray) -> list[np.ndarray]:
         """Alignments (rows) of each loop, the shortest first, and of these the best closed."""
+        if np.count_nonzero(allowed) < 2:  # one alone closes none
+            return []
         found: dict[tuple[int, ...], float] = {}
         for seed in np.flatnonzero(allowed):
             placement = placed(self.relations, np.array([seed]))

@@ -246,16 +246,17 @@ def read_fusions(folder: Path, robots: Sequence[str]) -> dict[int, FusedMap]:
 
     The last one is whole; earlier ones have neither descriptors nor joint covariances.
     """
-    last = read_map(_map_path(folder))
-    tables = [
+    last, place = read_map(_map_path(folder)), {name: k for k, name in enumerate(robots)}
+    tables = (
         read_rows(folder / file, table)
         for file, table in zip(WRITES[:3], (LANDMARKS, PARENTS, MOTIONS), strict=True)
-    ]
-    first = [rows[rows["component"] == 1] for rows in tables]
+    )
+    landmarks, *of_robots = (rows[rows["component"] == 1] for rows in tables)
+    parents, motions = (rows.assign(robot=rows["robot"].map(place)) for rows in of_robots)
     found = {}
-    for k in sorted(first[2]["iteration"].unique().tolist()):  # a map may have no landmarks
-        landmarks, parents, motions = (rows[rows["iteration"] == k] for rows in first)
-        found[k] = _fused(landmarks, parents, motions, robots, last)
+    for k in sorted(motions["iteration"].unique().tolist()):  # a map may have no landmarks
+        own, of, moved = (rows[rows["iteration"] == k] for rows in (landmarks, parents, motions))
+        found[k] = _fused(own, of, moved, len(robots), last)
     if found:
         found[k] = replace(found[k], landmarks=last)
     return found
@@ -265,18 +266,20 @@ def _fused(
     landmarks: pd.DataFrame,
     parents: pd.DataFrame,
     motions: pd.DataFrame,
-    robots: Sequence[str],
+    n_robots: int,
     last: LandmarkMap,
 ) -> FusedMap:
-    place, n = {name: k for k, name in enumerate(robots)}, len(robots)
-    points = points_from(pa.Table.from_pandas(landmarks[POSITION_FIELDS + COVARIANCE_FIELDS]))
+    columns = {name: landmarks[name].to_numpy() for name in POSITION_FIELDS + COVARIANCE_FIELDS}
     origin = np.full(len(landmarks), ABSENT, dtype=np.int64)
     count = landmarks["count"].to_numpy(np.int32)
-    made = LandmarkMap(*points, count, origin, planar=last.planar, name=last.name)
-    of = np.full((len(landmarks), n), ABSENT)
-    of[parents["landmark"], parents["robot"].map(place)] = parents["parent"]
-    at = motions["robot"].map(place).to_numpy()
-    T, covariance, drift = np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan), np.full(n, np.nan)
+    made = LandmarkMap(
+        *points_from(pa.table(columns)), count, origin, planar=last.planar, name=last.name
+    )
+    of = np.full((len(landmarks), n_robots), ABSENT)
+    of[parents["landmark"], parents["robot"]] = parents["parent"]
+    at = motions["robot"].to_numpy()
+    T, covariance = np.full((n_robots, 3), np.nan), np.full((n_robots, 3, 3), np.nan)
+    drift = np.full(n_robots, np.nan)
     T[at], drift[at] = motions[POSE_FIELDS], motions["drift_sigma_m"]
     covariance[at] = covariances_of(motions)
     said = motions.iloc[0]
@@ -284,9 +287,8 @@ def _fused(
     return FusedMap(made, of, T, covariance, drift, duplicates, (), fallback)
 
 
-def read_fused_maps(folder: Path) -> list[LandmarkMap]:
-    """The last maps of all components, that of the most robots first."""
+def fused_map_files(folder: Path) -> list[Path]:
+    """The files of the last maps of all components, that of the most robots first."""
     motions = read_rows(folder / WRITES[2], MOTIONS)
     of_last = motions[motions["iteration"] == motions["iteration"].max()]
-    components = range(1, 1 + int(of_last["component"].max()))
-    return [read_map(_map_path(folder, component)) for component in components]
+    return [_map_path(folder, k) for k in range(1, 1 + int(of_last["component"].max()))]

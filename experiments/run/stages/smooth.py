@@ -182,9 +182,14 @@ def _path_path(folder: Path, part: str) -> Path:
     return folder / WRITES[-1].format(part=part)
 
 
-def read_smoothed(folder: Path) -> dict[int, LandmarkMap]:
-    """The robot's smoothed map, with its joint covariance, at each iteration that has one."""
-    return {k: read_map(_map_path(folder, str(k))) for k in read_smoothed_path(folder)}
+def read_smoothed(folder: Path, last_whole: bool = False) -> dict[int, LandmarkMap]:
+    """The robot's smoothed map, with its joint covariance, at each iteration that has one.
+
+    If `last_whole` only the last one has that, and viewing evidence: it is most of what is read.
+    """
+    known = list(read_smoothed_path(folder))
+    alone = known[:-1] if last_whole else ()
+    return {k: read_map(_map_path(folder, str(k)), alone=k in alone) for k in known}
 
 
 def read_smoothed_path(folder: Path) -> dict[int, Float]:

@@ -76,11 +76,14 @@ def _with_band(bands: pd.DataFrame, columns: Sequence[str]) -> set[str]:
 
 
 def _draw_panel(axes: Axes, data: ResultTables, bands: pd.DataFrame, column: str) -> None:
+    shown = [f"{column}_low", column, f"{column}_high"]
+    curves = dict(iter(bands.sort_values("iteration").groupby("aligner")))
     for place, name in enumerate(data.aligners):
-        curve = bands[bands["aligner"] == name].sort_values("iteration").set_index("iteration")
-        ends = (curve[f"{column}_low"], curve[f"{column}_high"])
+        curve = curves.get(name, bands[:0])
+        iteration = curve["iteration"].to_numpy()
+        low, middle, high = curve[shown].to_numpy().T
         band = {"color": data.styles[name]["color"], "zorder": 1, "rasterized": True}
-        axes.fill_between(curve.index, *ends, **band, **_BAND_STYLE)
+        axes.fill_between(iteration, low, high, **band, **_BAND_STYLE)
         step = max(1, len(curve) // _MARKERS_PER_LINE)
         line = data.styles[name] | {
             "label": name,
@@ -88,4 +91,4 @@ def _draw_panel(axes: Axes, data: ResultTables, bands: pd.DataFrame, column: str
             "zorder": 3 if name == ORACLE else 2,
             "rasterized": len(curve) > _MAX_VECTOR_POINTS,
         }
-        axes.plot(curve.index, curve[column], **line)
+        axes.plot(iteration, middle, **line)

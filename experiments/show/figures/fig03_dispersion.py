@@ -96,14 +96,15 @@ def _draw_path(axes: Axes, data: ResultTables, robot: str, magnification: int) -
     path, walls = data.path_of(robot), plan.start_plan(axes, data, robot)
     axes.plot(*path.T, color=GRAY, linewidth=0.7, zorder=2)
     style = {"marker": ".", "markersize": 1.0, "color": data.colours[robot], "zorder": 3}
-    for _, rows in data.of_robot("clouds", robot).groupby("iteration"):
-        points = rows[_PLANE].to_numpy()
-        mean = points.mean(axis=0)
-        plan.add_points(axes, mean + magnification * (points - mean), **style)
+    clouds = data.of_robot("clouds", robot)  # ordered by iteration
+    ends = np.flatnonzero(np.diff(clouds["iteration"])) + 1
+    sets = np.split(clouds[_PLANE].to_numpy(), ends)
+    enlarged = [own.mean(axis=0) + magnification * (own - own.mean(axis=0)) for own in sets]
+    plan.add_points(axes, np.concatenate(enlarged), **style)
     plan.add_frame(axes, length_m=1.5)
     plan.set_view(axes, path[:0], path, *walls)
-    enlarged = f", spread x{magnification}" if magnification > 1 else ""
-    axes.set_title(f"{robot}: particles{enlarged}")
+    said = f", spread x{magnification}" if magnification > 1 else ""
+    axes.set_title(f"{robot}: particles{said}")
 
 
 def _draw_timeline(axes: Axes, data: ResultTables, spread: pd.DataFrame) -> None:

@@ -279,5 +279,5 @@ def measure_times(sweep: Sweep, failed: Collection[str], on_progress: OnProgress
 def _measured(sweep: Sweep, run: SweepRun) -> pd.DataFrame:
     judged = JudgedRun.of(run.load(), sweep.store)
     judged.execute(1, lambda *_: None)  # what is there already, but for a damaged stage
-    measure_aligners(judged, judged.load_robots())
+    measure_aligners(judged)
     return judged.pair_table(ALIGNER_TIMINGS)

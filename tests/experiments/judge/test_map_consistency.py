@@ -8,7 +8,7 @@ import scipy.linalg
 
 from experiments.judge.map_consistency import (
     GROSS_M,
-    consistency_in_frame,
+    both_consistencies,
     fitted,
     relative_consistency,
 )
@@ -84,7 +84,7 @@ def test_equals_the_dense_twin(planar: bool) -> None:
 def test_in_its_own_frame_nothing_is_projected() -> None:
     landmarks, truth = drawn_map(np.random.default_rng(1))
     error = landmarks.position_m - truth
-    found = consistency_in_frame(landmarks, fitted(landmarks, truth))
+    _, found = both_consistencies(landmarks, fitted(landmarks, truth))
     assert landmarks.joint is not None
     nees = error.ravel() @ scipy.linalg.solve(landmarks.joint.dense_m2(), error.ravel())
     assert found.nees_per_dof == pytest.approx(nees / error.size, rel=1e-9)

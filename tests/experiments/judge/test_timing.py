@@ -4,18 +4,21 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
+import pandas as pd
 import pytest
 
-from experiments.judge import result, tables
-from experiments.judge.errors import EvaluatedRobot
+from experiments.judge import aligner_timing
+from experiments.judge.aligner_timing import AlignerTiming
+from experiments.judge.errors import EvaluatedRobot, MetMaps
 from experiments.judge.truth import PathTruth
+from mapfusion.align.correspondences import Correspondences
 from tests.helpers.made_up_maps import landmark_map
 
 COMPILING_S = 50.0
 
 
 class Clockwork:
-    """An aligner whose first call on each maps takes long, as compilation does."""
+    """An aligner whose first call takes long, as compilation does."""
 
     def __init__(self) -> None:
         self.asked: list[int] = []
@@ -23,7 +26,7 @@ class Clockwork:
     def align(self, map_a: Any, map_b: Any, pairs: Any, rng: np.random.Generator) -> Any:
         self.asked.append(len(map_a))
         call = self.asked.count(len(map_a)) - 1
-        return SimpleNamespace(elapsed_s=COMPILING_S if call == 0 else float(call))
+        return SimpleNamespace(elapsed_s=COMPILING_S if len(self.asked) == 1 else float(call))
 
 
 def grown(name: str, iterations: range) -> EvaluatedRobot:
@@ -34,23 +37,38 @@ def grown(name: str, iterations: range) -> EvaluatedRobot:
     return EvaluatedRobot(name, maps, {k: points[:k] for k in iterations}, truth)
 
 
+def met_at(k: int, a: EvaluatedRobot, b: EvaluatedRobot) -> MetMaps:
+    """Maps that have met at an iteration, with a pair of landmarks offered at one of them."""
+    (map_a, points_a), (map_b, points_b) = a.at(k), b.at(k)
+    pairs = np.arange(3, 4 if k == 25 else 3)
+    offered = Correspondences(pairs, pairs, np.full(len(pairs), 0.1))
+    return MetMaps(a, b, k, (map_a, map_b), (points_a, points_b), offered, [], pd.DataFrame())
+
+
 def test_compilation_does_not_count_and_first_and_last_maps_do(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    clock = Clockwork()
-    monkeypatch.setattr(result, "callable_aligner", lambda *_: clock)
+    clocks = {"icp": Clockwork(), "svd": Clockwork()}
+    monkeypatch.setattr(aligner_timing, "callable_aligner", lambda method, *_: clocks[method])
     evaluate = SimpleNamespace(timing_points=3, timing_repeats=11, true_pair_radius_m=0.1)
-    entry = SimpleNamespace(name="icp", method="icp", parameters={}, time_limit_s=1.0)
-    align = SimpleNamespace(aligners=[entry])
+    entries = [
+        SimpleNamespace(name=name, method=name, parameters={}, time_limit_s=1.0) for name in clocks
+    ]
+    align = SimpleNamespace(aligners=entries)
     scenario = cast(Any, SimpleNamespace(seed=0, evaluate=evaluate, align=align))
-    pair = {"robot_a": "R1", "robot_b": "R2", "iteration": 25, "index_a": 3, "index_b": 3}
-    offered = tables.framed("correspondences", [pair | {"descriptor_distance": 0.1}])
     robots = grown("R1", range(5, 50, 5)), grown("R2", range(5, 30, 5))
-    rows = result._time_pair(scenario, *robots, offered)
-    assert [row["iteration"] for row in rows] == [5, 25, 45]
-    assert [row["n_correspondences"] for row in rows] == [0, 1, 0]
-    assert [row["n_common"] for row in rows] == [5, 25, 25]  # R2's log ended at 25
-    assert clock.asked == [5] * 12 + [25] * 12 + [45] * 12
-    for row in rows:
-        times = [row[f"elapsed{end}_s"] for end in ("_low", "", "_high")]
-        assert times == [2.0, 6.0, 10.0]  # of 1 to 11
+    timing = AlignerTiming.of(scenario, [met_at(k, *robots) for k in range(5, 50, 5)])
+    # All are ready: what is compiled was compiled while nothing was timed.
+    assert [clock.asked for clock in clocks.values()] == [[5, 45], [5, 45]]
+    rows = timing.rows()
+    assert [row["iteration"] for row in rows[::2]] == [5, 25, 45]
+    assert [row["aligner"] for row in rows] == ["icp", "svd"] * 3
+    assert [row["n_correspondences"] for row in rows[::2]] == [0, 1, 0]
+    assert [row["n_common"] for row in rows[::2]] == [5, 25, 25]  # R2's log ended at 25
+    # The first one's call before reads the maps for all.
+    assert clocks["icp"].asked[2:] == [5] * 12 + [25] * 12 + [45] * 12
+    assert clocks["svd"].asked[2:] == [5] * 11 + [25] * 11 + [45] * 11
+    times = [[row[f"elapsed{end}_s"] for end in ("_low", "", "_high")] for row in rows]
+    of_eleven = np.array([1.0, 5.0, 9.0])  # percentiles of 0 to 10
+    first_calls = [2, 1, 1, 0, 2, 1]
+    np.testing.assert_allclose(times, of_eleven + np.array(first_calls)[:, None])

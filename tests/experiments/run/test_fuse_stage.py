@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.run.stages.fuse import read_fused_maps, read_fusions, write_fusions
+from experiments.run.stages.fuse import fused_map_files, read_fusions, write_fusions
 from mapfusion.fuse.parameters import MergeParameters
 from mapfusion.fuse.registry import FUSERS, make_fuser
+from mapfusion.landmark_map import read_map
 from mapfusion.merge import merge
 from tests.mapfusion.fuse.drawn_maps import DrawnTeam
 
@@ -49,4 +50,5 @@ def test_what_is_written_is_read_again(fuser: str, tmp_path: Path) -> None:
         np.testing.assert_allclose(read.landmarks.covariance_m2, own.covariance_m2, atol=1e-15)
     assert found[3].landmarks.joint is None  # kept for the last alone
     assert (found[7].landmarks.joint is None) == (fused[0].landmarks.joint is None)
-    assert [len(each) for each in read_fused_maps(tmp_path)] == [len(e.landmarks) for e in fused]
+    files = fused_map_files(tmp_path)
+    assert [len(read_map(each)) for each in files] == [len(e.landmarks) for e in fused]
