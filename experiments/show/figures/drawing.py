@@ -3,19 +3,16 @@
 import importlib
 import io
 import re
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from pkgutil import iter_modules
 from typing import Any, NamedTuple
 
 import matplotlib
-import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from experiments.run.workers import Workers, workers
-from experiments.show.figures.png import png
 from experiments.show.figures.result_tables import NothingToDraw, ResultTables
 from experiments.show.figures.style import house_style
 from mapfusion.sealed import LINE
@@ -27,7 +24,8 @@ _MODULES = iter_modules([str(Path(__file__).parent)])
 FIGURES = tuple(sorted(each.name for each in _MODULES if re.match(r"fig\d\d_", each.name)))
 # An SVG's are of the parts that are drawn as pixels, which make up most of the file.
 _DPI = {"png": 200, "svg": 150}
-_NO_DATE = {"Date": None}  # the same tables give the same bytes
+# No date: the same tables give the same bytes. PNG are packed faster than by default, and larger.
+_SAVED = {"png": {"pil_kwargs": {"compress_level": 2}}, "svg": {"metadata": {"Date": None}}}
 
 
 class Drawn(NamedTuple):
@@ -108,45 +106,33 @@ def _module(name: str) -> Any:
 
 def save_figure(folder: Path, name: str, draw: Callable[..., Figure], *data: Any) -> list[Path]:
     """Write the figure `draw(*data)`, in the house style, in all formats; returns the pictures."""
-    png_file, svg_file = (folder / f"{name}.{kind}" for kind in _DPI)
+    files = [folder / f"{name}.{kind}" for kind in _DPI]
     with house_style():
         figure = draw(*data)
         _lay_out(figure)
         # Neither before nor after a format would Matplotlib draw it all once more, to lay it out.
         with matplotlib.rc_context({"figure.constrained_layout.use": False}):
             figure.set_layout_engine(None)
-            write_sealed(png_file, png(_pixels(figure), _DPI["png"]) + LINE)
-            vectors = _vectors(figure)
-            write_whole(svg_file, lambda path: path.write_bytes(vectors))
-    return [png_file, svg_file]
+            for file, kind in zip(files, _DPI, strict=True):
+                picture = _picture(figure, kind)
+                if kind == "png":
+                    write_sealed(file, picture + LINE)
+                else:
+                    write_whole(file, lambda path, picture=picture: path.write_bytes(picture))
+    return files
 
 
 def _lay_out(figure: Figure) -> None:
-    """Place what a figure holds as for pixels, at their resolution, for all formats."""
+    """Place what a figure holds as for the first format, at its resolution, for all of them."""
     engine = figure.get_layout_engine()
     if engine is not None:
-        with _at_pixels(figure):
-            engine.execute(figure)
-
-
-def _pixels(figure: Figure) -> np.ndarray:
-    """A figure (H, W, 3) uint8."""
-    with _at_pixels(figure) as canvas:
-        canvas.draw()
-        return np.asarray(canvas.buffer_rgba())[..., :3]
-
-
-def _vectors(figure: Figure) -> bytes:
-    stream = io.BytesIO()
-    figure.savefig(stream, format="svg", dpi=_DPI["svg"], metadata=_NO_DATE)
-    return stream.getvalue()
-
-
-@contextmanager
-def _at_pixels(figure: Figure) -> Iterator[FigureCanvasAgg]:
-    """A figure on a canvas of pixels, at their resolution."""
-    own, figure.dpi = figure.dpi, _DPI["png"]
-    try:
-        yield FigureCanvasAgg(figure)
-    finally:
+        FigureCanvasAgg(figure)
+        own, figure.dpi = figure.dpi, next(iter(_DPI.values()))
+        engine.execute(figure)
         figure.dpi = own
+
+
+def _picture(figure: Figure, kind: str) -> bytes:
+    stream = io.BytesIO()
+    figure.savefig(stream, format=kind, dpi=_DPI[kind], **_SAVED[kind])
+    return stream.getvalue()
