@@ -1,15 +1,14 @@
 """Drives all robots along their routes in one physical world and writes down what happened."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from mapfusion.arguments import Range, require_in_range
 from mapfusion.errors import InputError
-from mapfusion.se2 import Float, between, wrap
 from sim.floorplan import FloorPlan
 from sim.p3at import (
     OUTER_RADIUS_M,
@@ -18,8 +17,10 @@ from sim.p3at import (
     WHEEL_RADIUS_M,
     WIDTH_M,
     P3at,
+    Pose,
 )
 from sim.route import Route, check_routes, place
+from sim.solid_walls import SolidWalls
 from sim.trajectory import Trajectory
 from sim.world import PHYSICS_HZ, World
 
@@ -92,34 +93,31 @@ def drive(
     controls_per_frame = _controls_per_frame(frame_interval_s)
     with World() as world:
         ground = world.start_physics()
-        world.add_solid_walls(plan)
         robots = [P3at(world, route.T_world_start, route.tire_friction) for route in routes]
         drivers = [
             _Driver(route, robot, settings) for route, robot in zip(routes, robots, strict=True)
         ]
         names = {robot.body: route.robot for route, robot in zip(routes, robots, strict=True)}
+        walls = SolidWalls(world, plan, len(robots))
         world.step(round(SETTLING_S * PHYSICS_HZ))
         encoder_zero = np.stack([robot.wheel_angles() for robot in robots])
         poses = np.empty((len(robots), n_frames, 3))
         wheels = np.empty((len(robots), n_frames, 2))
+        now = [robot.pose() for robot in robots]
         for frame in range(n_frames):
+            poses[:, frame] = now
             for i, robot in enumerate(robots):
-                poses[i, frame] = robot.pose()
                 wheels[i, frame] = robot.wheel_angles() - encoder_zero[i]
             for control in range(controls_per_frame if frame + 1 < n_frames else 0):
                 time_s = frame * frame_interval_s + control / CONTROL_HZ
-                now = [robot.pose() for robot in robots]
                 parked = [driver.parked for driver in drivers]
                 for i, driver in enumerate(drivers):
-                    others = [
-                        _Other(now[j], j, j < i and not parked[j], drivers[j].lets_by == i)
-                        for j in range(len(drivers))
-                        if j != i
-                    ]
-                    driver.control(time_s, now[i], others)
+                    driver.control(time_s, now[i], _others(i, now, parked, drivers))
+                walls.stand_near(now)
                 world.step(STEPS_PER_CONTROL)
                 for driver in drivers:
                     driver.refuse_contact(time_s, ground, names)
+                now = [robot.pose() for robot in robots]
     time_s = np.arange(n_frames, dtype=np.float64) * frame_interval_s
     return Trajectory(tuple(route.robot for route in routes), time_s, poses, wheels)
 
@@ -133,18 +131,17 @@ def _controls_per_frame(frame_interval_s: float) -> int:
     return round(controls)
 
 
-@dataclass(frozen=True)
-class _Other:
+class _Other(NamedTuple):
     """Another robot as a driver sees it.
 
     Attributes:
-        T_world_robot: (3,).
+        T_world_robot: where it is.
         place: in the list of routes.
         goes_first: those listed first do, until they have come to their end.
         lets_by: whether it stands because this one is in its way.
     """
 
-    T_world_robot: Float
+    T_world_robot: Pose
     place: int
     goes_first: bool
     lets_by: bool
@@ -161,11 +158,21 @@ class _Other:
         return x < 2 * OUTER_RADIUS_M + STOPPING_GAP_M and abs(y) < beside_m
 
 
+def _others(
+    of: int, now: list[Pose], parked: list[bool], drivers: list["_Driver"]
+) -> Iterator[_Other]:
+    """All robots but one, as that one sees them."""
+    for i, driver in enumerate(drivers):
+        if i != of:
+            yield _Other(now[i], i, i < of and not parked[i], driver.lets_by == of)
+
+
 class _Driver:
     """Steers one robot from waypoint to waypoint by its true pose."""
 
     def __init__(self, route: Route, robot: P3at, settings: DriverSettings) -> None:
         self._route, self._robot, self._settings = route, robot, settings
+        self._waypoints_m: list[list[float]] = route.waypoints_m.tolist()
         self._target = 0
         self._done = False
         self._speed_m_s = 0.0
@@ -182,7 +189,7 @@ class _Driver:
         """Whether it has come to the end of its route."""
         return self._done
 
-    def control(self, time_s: float, pose: Float, others: list[_Other]) -> None:
+    def control(self, time_s: float, pose: Pose, others: Iterable[_Other]) -> None:
         """One step, given where all robots are."""
         settings = self._settings
         self._advance(time_s, pose)
@@ -199,12 +206,12 @@ class _Driver:
         left, right = self._speed_m_s - difference, self._speed_m_s + difference
         self._robot.drive(left / WHEEL_RADIUS_M, right / WHEEL_RADIUS_M)
 
-    def _advance(self, time_s: float, pose: Float) -> None:
+    def _advance(self, time_s: float, pose: Pose) -> None:
         """Go on to the next waypoint; refuse to go on where nothing moves."""
         distance = self._distance_m(pose)
         if not self._done and distance < self._settings.arrival_m:
             self._target += 1
-            if self._target == len(self._route.waypoints_m):
+            if self._target == len(self._waypoints_m):
                 self._done = not self._route.loop
                 self._target = 0
             self._nearest_m, self._progress_s = np.inf, time_s
@@ -216,21 +223,22 @@ class _Driver:
             raise InputError(
                 f"robot {self._route.robot}: {why} at {place(pose)} since t = "
                 f"{self._progress_s:.1f} s, on the way to waypoint {self._target + 1} "
-                f"{place(self._route.waypoints_m[self._target])}"
+                f"{place(self._waypoints_m[self._target])}"
             )
 
-    def _distance_m(self, pose: Float) -> float:
-        return math.dist(self._route.waypoints_m[self._target], pose[:2])
+    def _distance_m(self, pose: Pose) -> float:
+        return math.dist(self._waypoints_m[self._target], pose[:2])
 
-    def _wish(self, pose: Float) -> tuple[float, float]:
+    def _wish(self, pose: Pose) -> tuple[float, float]:
         """Speed and turn rate towards the waypoint.
 
         A corner is turned in place, after a stop: a skid-steered robot that turns while it still
         rolls slides sideways by 0.1 m per radian, which no encoder counts.
         """
         settings = self._settings
-        x, y = self._route.waypoints_m[self._target] - pose[:2]
-        error = float(wrap(math.atan2(y, x) - pose[2]))
+        x, y = self._waypoints_m[self._target]
+        heading = math.atan2(y - pose[1], x - pose[0])
+        error = (heading - pose[2] + math.pi) % (2 * math.pi) - math.pi
         top = settings.turn_rate_rad_s
         turn = min(max(HEADING_GAIN_PER_S * error, -top), top)
         self._turning = abs(error) > (ALIGNED_RAD if self._turning else settings.turn_in_place_rad)
@@ -238,14 +246,17 @@ class _Driver:
             return 0.0, turn if self._speed_m_s == 0 else 0.0
         return settings.speed_m_s * max(0.0, 1 - abs(error) / settings.turn_in_place_rad), turn
 
-    def _first_in_the_way(self, pose: Float, others: list[_Other]) -> int | None:
+    def _first_in_the_way(self, pose: Pose, others: Iterable[_Other]) -> int | None:
         """Another robot ahead that goes first or stands in the way."""
         for other in others:
-            if math.dist(pose[:2], other.T_world_robot[:2]) > self._looks_m:
+            along, across = other.T_world_robot[0] - pose[0], other.T_world_robot[1] - pose[1]
+            apart_m = math.hypot(along, across)
+            if apart_m > self._looks_m:
                 continue
-            x, y, _ = between(pose, other.T_world_robot)
+            cos, sin = math.cos(pose[2]), math.sin(pose[2])
+            x, y = cos * along + sin * across, cos * across - sin * along
             goes_first = other.goes_first and not other.lets_by
-            gives_way = goes_first and math.hypot(x, y) < self._settings.give_way_m
+            gives_way = goes_first and apart_m < self._settings.give_way_m
             if x > 0 and (gives_way or other.is_in_the_way(x, y)):
                 return other.place
         return None

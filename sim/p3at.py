@@ -26,6 +26,7 @@ CENTER_OF_MASS_M = 0.1735  # of the body without wheels, above the floor
 # So the wheels act as if they stood this far apart (the maker's parameter files: 0.588 m).
 SKID_TRACK_M = TRACK_M + WHEELBASE_M**2 / TRACK_M
 BODY_B, NORMAL_FORCE = 2, 9  # fields of PyBullet's contact points
+Pose = tuple[float, float, float]  # T_world_robot: x_m, y_m, theta_rad
 WHEELS = ("front_left_wheel", "rear_left_wheel", "front_right_wheel", "rear_right_wheel")
 
 
@@ -81,7 +82,7 @@ class P3at:
     def drive(self, left_rad_s: float, right_rad_s: float) -> None:
         """Set the wheel motors' speeds; their torque is limited."""
         top = TOP_WHEEL_SPEED_RAD_S
-        left, right = (min(max(speed, -top), top) for speed in (left_rad_s, right_rad_s))
+        left, right = min(max(left_rad_s, -top), top), min(max(right_rad_s, -top), top)
         self._p.setJointMotorControlArray(
             self.body,
             self._wheels,
@@ -91,14 +92,14 @@ class P3at:
             physicsClientId=self._client,
         )
 
-    def pose(self) -> Float:
-        """T_world_robot (3,) of the point on the floor below the middle of the wheels."""
+    def pose(self) -> Pose:
+        """T_world_robot of the point on the floor below the middle of the wheels."""
         position, quaternion = self._p.getBasePositionAndOrientation(
             self.body, physicsClientId=self._client
         )
         x, y, z, w = quaternion
         theta = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-        return np.array([position[0], position[1], theta])
+        return position[0], position[1], float(theta)
 
     def wheel_angles(self) -> Float:
         """Encoders: left and right (2,) in radians since the start, mean of the side's wheels."""
@@ -107,7 +108,9 @@ class P3at:
         return np.array([angles[:2].mean(), angles[2:].mean()])
 
     def touched_bodies(self) -> set[int]:
-        """Ids of all bodies that press against it."""
-        contacts = self._p.getContactPoints(bodyA=self.body, physicsClientId=self._client)
+        """Ids of all bodies that press against its body; its wheels meet nothing but the ground."""
+        contacts = self._p.getContactPoints(
+            bodyA=self.body, linkIndexA=-1, physicsClientId=self._client
+        )
         pressing = (contact for contact in contacts if contact[NORMAL_FORCE] > 0)
         return {contact[BODY_B] for contact in pressing} - {self.body}

@@ -138,21 +138,21 @@ class World:
         for _ in range(n):
             self.bullet.stepSimulation(physicsClientId=self.client)
 
-    def add_solid_walls(self, plan: FloorPlan) -> None:
-        """Collision boxes, one a wall segment."""
+    def add_solid_wall(self, start: Float, end: Float, thickness_m: float, height_m: float) -> None:
+        """A wall from `start` to `end` (2,), (2,) as a box to bump into."""
         p, client = self.bullet, self.client
-        for start, end, thickness, height in zip(*plan.segments(), strict=True):
-            along = end - start
-            half = [float(np.linalg.norm(along)) / 2, thickness / 2, height / 2]
-            shape = p.createCollisionShape(p.GEOM_BOX, halfExtents=half, physicsClientId=client)
-            wall = p.createMultiBody(
-                0,
-                shape,
-                basePosition=[*((start + end) / 2), height / 2],
-                baseOrientation=p.getQuaternionFromEuler([0, 0, np.arctan2(along[1], along[0])]),
-                physicsClientId=client,
-            )
-            p.setCollisionFilterGroupMask(wall, -1, BODY, BODY, physicsClientId=client)
+        along = end - start
+        half = [float(np.linalg.norm(along)) / 2, thickness_m / 2, height_m / 2]
+        shape = p.createCollisionShape(p.GEOM_BOX, halfExtents=half, physicsClientId=client)
+        wall = p.createMultiBody(
+            0,
+            shape,
+            basePosition=[*((start + end) / 2), height_m / 2],
+            baseOrientation=p.getQuaternionFromEuler([0, 0, np.arctan2(along[1], along[0])]),
+            useMaximalCoordinates=1,  # of other bodies that stand still each pair is looked at
+            physicsClientId=client,
+        )
+        p.setCollisionFilterGroupMask(wall, -1, BODY, BODY, physicsClientId=client)
 
     def add_painted_faces(self, folder: Path) -> Float:
         """Load the faces that `write_faces` left in `folder`, to be seen and not touched.

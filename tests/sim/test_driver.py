@@ -216,7 +216,7 @@ def test_robots_that_are_not_looked_at_are_in_nobodys_way() -> None:
         asks_all._looks_m = np.inf
         found = set()
         for _ in range(300):
-            pose, *there = rng.uniform([-2, -2, -4], [2, 2, 4], (3, 3))
+            pose, *there = map(tuple, rng.uniform([-2, -2, -4], [2, 2, 4], (3, 3)).tolist())
             flags = rng.random((2, 2)) < 0.5
             others = [_Other(T, k, *flags[k].tolist()) for k, T in enumerate(there)]
             found.add(asks_all._first_in_the_way(pose, others))
