@@ -7,7 +7,7 @@ A log is a folder of Parquet tables (each readable with plain pandas):
 - `truth_poses.parquet`, `truth_points.parquet`: optional; only the evaluation opens them.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -95,9 +95,15 @@ TRUTH_POINTS = schema(
 
 
 def with_rows(value: Arrays, rows: slice | np.ndarray) -> Arrays:
-    """The same dataclass with each of its arrays cut to some rows."""
-    arrays = {name: v[rows] for name, v in vars(value).items() if isinstance(v, np.ndarray)}
-    return replace(value, **arrays)
+    """The same dataclass with each of its arrays cut to some rows.
+
+    What was found sound is not looked at again: frames are cut out of logs one by one.
+    """
+    cut = object.__new__(type(value))
+    for field in fields(value):
+        v = getattr(value, field.name)
+        vars(cut)[field.name] = v[rows] if isinstance(v, np.ndarray) else v
+    return cut
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,8 @@
 """Harris corners (Harris and Stephens 1988), the strongest of each part of the image."""
 
+import functools
+import itertools
+import math
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -14,6 +17,7 @@ _SOBEL_APERTURE_PX = 3
 _SOBEL_GAIN = 2.0  # OpenCV divides its Sobel sum, 8 times the slope per pixel, by 4
 _SOBEL_SUM = 4.0  # what it divides by
 _OUR_BLOCK_PX = 3
+_PROBED_SIGMAS = 8  # more than OpenCV's window has to either side, and than its weights show
 _LEAST_SIDE_PX = 2  # what an image needs to be mirrored at its border
 _BITS, _ALL_BITS = np.uint64(32), np.uint32(0xFFFFFFFF)  # of a response
 _ONE = np.uintp(1)  # indices without a sign, which a kernel need not wrap around
@@ -72,12 +76,28 @@ def detect(image: np.ndarray, parameters: HarrisParameters) -> Float:
         raise ValueError(f"image: is {image.dtype} {image.shape}, expected uint8 (H, W)")
     if min(image.shape) <= 2 * parameters.border_px:
         return np.zeros((0, 2))
-    smooth = cv2.GaussianBlur(image, (0, 0), parameters.smoothing_px)
+    side = _window_px(parameters.smoothing_px)
+    smooth = cv2.GaussianBlur(image, (side, side), parameters.smoothing_px)
     response = harris_response(smooth, parameters)
     pixels = _strongest(response, parameters)
     if len(pixels) == 0:
         return np.zeros((0, 2))
     return _peak(response, pixels)
+
+
+@functools.cache
+def _window_px(sigma_px: float) -> int:
+    """Side of the smallest window that smooths as OpenCV's own does.
+
+    Its weights have eight bits, of which the outermost may have none: to add them up takes time.
+    What becomes of one bright column shows all weights.
+    """
+    line = np.zeros((1, 2 * math.ceil(_PROBED_SIGMAS * sigma_px) + 1), np.uint8)
+    line[0, line.shape[1] // 2] = 255
+    smooth = cv2.GaussianBlur(line, (0, 0), sigma_px)
+    sides = range(1, line.shape[1] + 1, 2)
+    same = (np.array_equal(cv2.GaussianBlur(line, (n, n), sigma_px), smooth) for n in sides)
+    return next(itertools.compress(sides, same))
 
 
 def harris_response(image: np.ndarray, parameters: HarrisParameters) -> np.ndarray:

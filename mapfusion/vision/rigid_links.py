@@ -88,12 +88,15 @@ def rigid_links(
     _narrow(start, agree, *points, gate, T, square, normal)
     best = int(np.argmax(agree.sum(axis=1)))
     own = agree[best]
-    if own.sum() < MIN_LINKS:
+    n_links = int(own.sum())
+    if n_links < MIN_LINKS:
         return own, None
     # The median of what has passed the gate lies a little low, by less than a part in a hundred.
-    excess = max(float(np.median(square[best][own])) / _MEDIAN_SQUARE, 1.0)
+    ranked = np.sort(square[best][own])
+    median = (ranked[(n_links - 1) // 2] + ranked[n_links // 2]) / 2
+    excess = max(median / _MEDIAN_SQUARE, 1.0)
     covariance = excess * np.linalg.inv(normal[best])
-    return own, RigidMotion(T[best], (covariance + covariance.T) / 2, int(own.sum()))
+    return own, RigidMotion(T[best], (covariance + covariance.T) / 2, n_links)
 
 
 def starts(p_before_m: Float) -> np.ndarray:

@@ -6,6 +6,7 @@ import pytest
 
 from mapfusion.vision.harris import (
     HarrisParameters,
+    _window_px,
     descending,
     detect,
     harris_response,
@@ -59,6 +60,19 @@ def test_threshold_is_a_slope_in_every_direction() -> None:
     inner = (strong & peak)[border:-border, border:-border]
     assert 0 < inner.sum() < peak[border:-border, border:-border].sum()
     assert len(detect(image, parameters)) == inner.sum()
+
+
+@pytest.mark.parametrize("sigma_px", [0.1, 0.3, 0.5, 0.8, 1.0, 1.3, 1.5, 2.0, 3.7, 10.0, 50.0])
+def test_a_picture_is_smoothed_as_over_all_of_opencvs_window(sigma_px: float) -> None:
+    image, side = (
+        np.random.default_rng(0).integers(0, 256, (90, 80), np.uint8),
+        _window_px(sigma_px),
+    )
+    np.testing.assert_array_equal(
+        cv2.GaussianBlur(image, (side, side), sigma_px), cv2.GaussianBlur(image, (0, 0), sigma_px)
+    )
+    smaller = cv2.GaussianBlur(image, (max(side - 2, 1),) * 2, sigma_px)
+    assert side == 1 or np.any(smaller != cv2.GaussianBlur(image, (0, 0), sigma_px))
 
 
 def test_corners_keep_their_distance_and_number() -> None:
