@@ -24,6 +24,7 @@ from mapfusion.smoother.settle import (
     stepped,
     stretched,
 )
+from mapfusion.smoother.sightings import Sightings
 
 # Where steps end the odometry's levels are told anew, until no standard deviation is off by more
 # than this share from what it was or was once before: those of motions that are hardly told may
@@ -67,7 +68,7 @@ def settled_with_levels(
     weights = unweighted(problem.seen) if weights is None else weights
     levels = AS_STATED._replace(observation=first_observation_level(problem, at, weights, tails))
     told, untold, known, before, n_steps = [AS_STATED.odometry], None, False, None, 0
-    under = _with(problem, levels)
+    under = _under(problem, levels, problem.seen.on_level(levels.observation))
     at, weights, tails = followed(under, at, weights, tails)
     while True:
         end = solved(under, at, weights, tails, n_steps, None if before is None else before.nearby)
@@ -85,11 +86,12 @@ def settled_with_levels(
             known = at_end and any(_are_alike(anew, each) for each in told)
             told.append(anew)
         stretch = stretched(before, end) if before and end.is_within(_CLOSE) else 1.0
-        at, weights, tails = stepped(under, end, problem.seen.on_level(observation), stretch)
+        seen = problem.seen.on_level(observation)
+        at, weights, tails = stepped(under, end, seen, stretch)
         if untold is not None:
             odometry = untold.told_levels(problem, at.path, odometry)
         levels = Levels(odometry, observation)
-        under, before, n_steps = _with(problem, levels), end, n_steps + 1
+        under, before, n_steps = _under(problem, levels, seen), end, n_steps + 1
 
 
 def _are_alike(levels: Float, others: Float) -> bool:
@@ -101,6 +103,7 @@ def _differ(levels: Float | float, others: Float | float) -> float:
     return float(np.max(np.abs(np.log(levels / others))))
 
 
-def _with(problem: Problem, levels: Levels) -> Problem:
+def _under(problem: Problem, levels: Levels, seen: Sightings) -> Problem:
+    """The problem under levels, those of the observations being in `seen`."""
     information = problem.information / levels.odometry
-    return problem._replace(seen=problem.seen.on_level(levels.observation), information=information)
+    return problem._replace(seen=seen, information=information)
