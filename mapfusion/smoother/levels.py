@@ -68,13 +68,14 @@ def settled_with_levels(
     weights = unweighted(problem.seen) if weights is None else weights
     levels = AS_STATED._replace(observation=first_observation_level(problem, at, weights, tails))
     told, untold, known, before, n_steps = [AS_STATED.odometry], None, False, None, 0
+    stretch = 1.0  # of the step before: that the one after a stretched one is short, tells no end
     under = _under(problem, levels, problem.seen.on_level(levels.observation))
     at, weights, tails = followed(under, at, weights, tails)
     while True:
         end = solved(under, at, weights, tails, n_steps, None if before is None else before.nearby)
         observation, odometry = told_observation_level(end, levels.observation), levels.odometry
         follows = _differ(observation, levels.observation) < _FOLLOWED
-        at_end = follows and end.is_within(CONVERGED)
+        at_end = follows and stretch == 1 and end.is_within(CONVERGED)
         if n_steps == _MOST_STEPS or (known and at_end):
             return finished(under, end), levels
         if at_end or (untold is None and end.is_within(_NEAR)):
