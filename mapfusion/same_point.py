@@ -78,11 +78,15 @@ class SamePoint:
         self, a: AlignedLandmarks, b: AlignedLandmarks, i: np.ndarray, j: np.ndarray
     ) -> np.ndarray:
         drift_m2 = a.drift_m2[i] + b.drift_m2[j]
-        S = a.covariance_m2[i][:, :2, :2] + b.covariance_m2[j][:, :2, :2]
-        S = S + drift_m2[:, None, None] * np.eye(2)
-        e = (a.position_m[i] - b.position_m[j])[:, :2]
-        inside = np.einsum("ni,ni->n", e, np.linalg.solve(S, e[:, :, None])[:, :, 0])
-        inside = inside <= self._bound()
+        (x_a, y_a), (x_b, y_b) = a.position_m[:, :2].T, b.position_m[:, :2].T
+        x, y = x_a[i] - x_b[j], y_a[i] - y_b[j]
+        xx, xy, yy = (
+            a.covariance_m2[:, r, q][i] + b.covariance_m2[:, r, q][j]
+            for r, q in ((0, 0), (0, 1), (1, 1))
+        )
+        xx, yy = xx + drift_m2, yy + drift_m2
+        # (x, y) S^-1 (x, y)' by the inverse of two by two, both sides times the determinant
+        inside = yy * x**2 - 2 * xy * x * y + xx * y**2 <= self._bound() * (xx * yy - xy**2)
         if self.planar:
             return inside
         return inside & self.height.agrees(

@@ -33,12 +33,15 @@ def intersected(
     Positions are (N, D), covariances (N, D, D), those returned as well.
     """
     A, B = np.linalg.inv(covariance_i), np.linalg.inv(covariance_j)
+    # det(w A + (1 - w) B) is that of B times the product of 1 + w m, one for each axis along which
+    # the two are both uncorrelated: there A is 1 + m times as much as B
+    root = np.linalg.cholesky(covariance_j)
+    more = np.linalg.eigvalsh(np.swapaxes(root, 1, 2) @ A @ root).T - 1
     low, high = np.zeros(len(A)), np.ones(len(A))
-    for _ in range(_HALVINGS):  # log det(w A + (1 - w) B) is concave in w: its slope falls
+    for _ in range(_HALVINGS):  # its logarithm is concave in w: the slope falls
         w = (low + high) / 2
-        information = B + w[:, None, None] * (A - B)
-        slope = np.trace(np.linalg.solve(information, A - B), axis1=1, axis2=2)
-        low, high = np.where(slope > 0, w, low), np.where(slope > 0, high, w)
+        rises = np.sum(more / (1 + w * more), axis=0) > 0
+        low, high = np.where(rises, w, low), np.where(rises, high, w)
     w = ((low + high) / 2)[:, None, None]
     covariance = np.linalg.inv(w * A + (1 - w) * B)
     total = np.einsum("nij,nj->ni", w * A, position_i)

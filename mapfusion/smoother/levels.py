@@ -10,8 +10,8 @@ import numpy as np
 
 from mapfusion.se2 import Float
 from mapfusion.smoother.normal_equations import Estimate, Weights
-from mapfusion.smoother.observation_level import told_observation_level
-from mapfusion.smoother.odometry_levels import told_odometry_levels
+from mapfusion.smoother.observation_level import first_observation_level, told_observation_level
+from mapfusion.smoother.odometry_levels import Untold
 from mapfusion.smoother.robust import NO_TAILS, Tails, unweighted
 from mapfusion.smoother.settle import (
     CONVERGED,
@@ -19,14 +19,21 @@ from mapfusion.smoother.settle import (
     Settled,
     factored,
     finished,
+    followed,
     solved,
     stepped,
+    stretched,
 )
+from mapfusion.smoother.sightings import Sightings
 
-# The odometry's levels are told anew until no standard deviation is off by more than this share
-# from what it was once before: those of motions that are hardly told may come and go.
+# Where steps end the odometry's levels are told anew, until no standard deviation is off by more
+# than this share from what it was or was once before: those of motions that are hardly told may
+# come and go.
 _SETTLED = 0.05
-# Each time the next step may move the path by so much, in squared sigmas a coordinate.
+# They are told first where the next step may move the path by so much, in squared sigmas a
+# coordinate: what observations leave open of it changes little by that.
+_NEAR = 1.0
+# Steps are stretched where each moves the path by less.
 _CLOSE = 1e-3
 # The last step changes the observations' variances by no more than this share.
 _FOLLOWED = 2e-3
@@ -53,28 +60,43 @@ def settled_with_levels(
 ) -> tuple[Settled, Levels]:
     """Where steps end under the levels that the log tells, for the rest as `settled`.
 
-    The observations' costs little to tell and follows each step, as the tails do; the odometry's is
-    told where steps are close to their end, and they go on from there.
+    The observations' costs little to tell and follows each step, as the tails do. The odometry's
+    takes the variances of what was found: these are told once steps are near their end, levels
+    follow each step from there on, and where steps end it shows whether they are right. The factor
+    and its inverse that this takes are those of the covariances.
     """
-    levels, n_steps, told, known = AS_STATED, 0, [AS_STATED.odometry], False
-    under, nearby = problem, None
     weights = unweighted(problem.seen) if weights is None else weights
+    levels = AS_STATED._replace(observation=first_observation_level(problem, at, weights, tails))
+    told, untold, known, before, n_steps = [AS_STATED.odometry], None, False, None, 0
+    stretch = 1.0  # of the step before: that the one after a stretched one is short, tells no end
+    under = _under(problem, levels, problem.seen.on_level(levels.observation))
+    at, weights, tails = followed(under, at, weights, tails)
     while True:
-        end = solved(under, at, weights, tails, n_steps, nearby)
-        observation = told_observation_level(end, levels.observation)
+        end = solved(under, at, weights, tails, n_steps, None if before is None else before.nearby)
+        observation, odometry = told_observation_level(end, levels.observation), levels.odometry
         follows = _differ(observation, levels.observation) < _FOLLOWED
-        if n_steps == _MOST_STEPS or (known and follows and end.is_within(CONVERGED)):
+        at_end = follows and stretch == 1 and end.is_within(CONVERGED)
+        if n_steps == _MOST_STEPS or (known and at_end):
             return finished(under, end), levels
-        odometry = levels.odometry
-        if not known and end.is_within(_CLOSE):
+        if at_end or (untold is None and end.is_within(_NEAR)):
             end = factored(end)
-            odometry = told_odometry_levels(problem, end, odometry)
-            known = any(_differ(odometry, each) < 2 * _SETTLED for each in told)
-            told.append(odometry)
+            untold = Untold.of(problem, end, odometry)
+            anew = untold.told_levels(problem, at.path, odometry)
+            if at_end and _are_alike(anew, odometry):
+                return finished(under, end), levels
+            known = at_end and any(_are_alike(anew, each) for each in told)
+            told.append(anew)
+        stretch = stretched(before, end) if before and end.is_within(_CLOSE) else 1.0
+        seen = problem.seen.on_level(observation)
+        at, weights, tails = stepped(under, end, seen, stretch)
+        if untold is not None:
+            odometry = untold.told_levels(problem, at.path, odometry)
         levels = Levels(odometry, observation)
-        after = _with(problem, levels)
-        at, weights, tails = stepped(under, end, after.seen)
-        under, n_steps, nearby = after, n_steps + 1, end.nearby
+        under, before, n_steps = _under(problem, levels, seen), end, n_steps + 1
+
+
+def _are_alike(levels: Float, others: Float) -> bool:
+    return _differ(levels, others) < 2 * _SETTLED
 
 
 def _differ(levels: Float | float, others: Float | float) -> float:
@@ -82,6 +104,7 @@ def _differ(levels: Float | float, others: Float | float) -> float:
     return float(np.max(np.abs(np.log(levels / others))))
 
 
-def _with(problem: Problem, levels: Levels) -> Problem:
+def _under(problem: Problem, levels: Levels, seen: Sightings) -> Problem:
+    """The problem under levels, those of the observations being in `seen`."""
     information = problem.information / levels.odometry
-    return problem._replace(seen=problem.seen.on_level(levels.observation), information=information)
+    return problem._replace(seen=seen, information=information)

@@ -82,7 +82,7 @@ def disturbance_variances(end: Settled) -> Float:
 def _from_poses(end: Settled, before: Float, after: Float) -> Float:
     """From the inverse of the poses' information, in their order."""
     factor = own_factor(end.seen, end.equations, end.solution)
-    Z, between = factor.inverse(), factor.envelope.between
+    Z, between = factor.inverse, factor.envelope.between
     place = end.seen.pose_place[1:] - 1
     own, link = between(Z, place, place), between(Z, place[:-1], place[1:])
     return _of_differences(before, after, own, link)

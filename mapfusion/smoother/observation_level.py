@@ -14,9 +14,14 @@ what does not, and what is stated holds.
 
 import numpy as np
 
+from mapfusion.se2 import Float
+from mapfusion.smoother.elimination import solve_points
+from mapfusion.smoother.normal_equations import Estimate, Weights
 from mapfusion.smoother.odometry_levels import LEAST_TOLD
 from mapfusion.smoother.residuals import squared_distances, squares_of_points
-from mapfusion.smoother.settle import Settled
+from mapfusion.smoother.robust import Tails
+from mapfusion.smoother.settle import Problem, Settled
+from mapfusion.smoother.sightings import Sightings
 from mapfusion.smoother.student import fitted_dof, student_weights
 
 
@@ -33,15 +38,28 @@ def told_observation_level(end: Settled, level: float) -> float:
     Returns:
         q; 1 where fewer than `LEAST_TOLD` coordinates are told.
     """
-    seen, n = end.seen, end.seen.n_dimensions
-    rows = seen.strays[seen.track]
+    return _level(end.seen, end.estimate, end.weights, end.tails, end.solution.track_m2, level)
+
+
+def first_observation_level(
+    problem: Problem, at: Estimate, weights: Weights, tails: Tails
+) -> float:
+    """The level q of what is stated, before any step from an estimate."""
+    _, known = solve_points(problem.seen, at, weights, problem.stray_information)
+    return _level(problem.seen, at, weights, tails, known.track_m2, 1.0)
+
+
+def _level(
+    seen: Sightings, at: Estimate, weights: Weights, tails: Tails, track_m2: Float, level: float
+) -> float:
+    n, rows = seen.n_dimensions, seen.strays[seen.track]
     if not rows.any():
         return 1.0
-    square = squared_distances(seen, end.estimate)[rows]
-    of_point = squares_of_points(seen, end.estimate.path, end.solution.track_m2)[rows]
-    known = np.sum(n - np.minimum(end.weights.observation[rows] * of_point, n))
+    square = squared_distances(seen, at)[rows]
+    of_point = squares_of_points(seen, at.path, track_m2)[rows]
+    known = np.sum(n - np.minimum(weights.observation[rows] * of_point, n))
     if known < LEAST_TOLD:
         return 1.0
     beside = min(level, 1.0) * (square + of_point)
-    weights = student_weights(beside, fitted_dof(beside, n, end.tails.observation), n)
-    return float(level * np.sum(weights * square) / known)
+    found = student_weights(beside, fitted_dof(beside, n, tails.observation), n)
+    return float(level * np.sum(found * square) / known)

@@ -8,7 +8,15 @@ and variances C given all observations, and v as stated, the variances are v_j q
     sum of d^2 / v_j = q_j sum of (1 - C / (v_j q_j)),
 
 the level q_j under which what was smoothed is most likely (MacKay 1992; `noise_levels.py`).
+
+The variances C take a factor of the poses' information and its inverse, the means d nothing. So
+levels follow each step with C as it was told once, or nearly: of a disturbance that observations
+tell with information J whatever the others are, the share C / v that is left untold is
+
+    u = 1 / (1 + J v q),    so that under other levels    1 / u - 1    is as many times as much.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,16 +30,37 @@ from mapfusion.smoother.settle import Problem, Settled
 LEAST_TOLD = 50.0
 
 
-def told_odometry_levels(problem: Problem, end: Settled, levels: Float) -> Float:
-    """(3,) q of the variances along, across and in the heading.
+class Untold(NamedTuple):
+    """What observations leave open of disturbances, under some levels.
 
-    Args:
-        problem: with the odometry's information as stated.
-        end: where steps ended.
+    Attributes:
+        share: (T - 1, 3) of their variances; 1 where nothing is said of them.
         levels: (3,) that the stated variances were multiplied by.
     """
-    found = np.sum(disturbances(end.estimate.path, problem.odometry) ** 2 * problem.information, 0)
-    untold = disturbance_variances(end) * problem.information / levels
-    said = problem.information > 0  # nothing is, of the way from one robot's log to another's
-    known = np.sum(np.where(said, np.clip(1 - untold, 0, 1), 0), axis=0)
-    return np.where(known < LEAST_TOLD, 1.0, found / np.maximum(known, LEAST_TOLD))
+
+    share: Float
+    levels: Float
+
+    @classmethod
+    def of(cls, problem: Problem, end: Settled, levels: Float) -> "Untold":
+        """Where steps ended under these levels, those of the problem being as stated."""
+        share = np.clip(disturbance_variances(end) * problem.information / levels, 0, 1)
+        # nothing is said of the way from one robot's log to another's
+        return cls(np.where(problem.information > 0, share, 1.0), levels)
+
+    def known(self, levels: Float) -> Float:
+        """(3,) disturbances that are told under other levels, by each axis."""
+        more = levels / self.levels
+        return np.sum(1 - self.share / (self.share + (1 - self.share) * more), axis=0)
+
+    def told_levels(self, problem: Problem, path: Float, levels: Float) -> Float:
+        """(3,) q of the variances along, across and in the heading.
+
+        Args:
+            problem: with the odometry's information as stated.
+            path: (T, 3) as it was found.
+            levels: (3,) under which it was found.
+        """
+        found = np.sum(disturbances(path, problem.odometry) ** 2 * problem.information, axis=0)
+        is_told = self.known(self.levels) >= LEAST_TOLD
+        return np.where(is_told, found / np.maximum(self.known(levels), LEAST_TOLD), 1.0)

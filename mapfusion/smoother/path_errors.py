@@ -53,8 +53,10 @@ class PathErrors:
         return self.gram(chosen)
 
     def gram(self, columns: Float) -> Float:
-        """Y Y' times columns (R, c)."""
-        return self.factor.solve(self._moving.T @ self.spread(columns))
+        """Y Y' times columns (R, c), in single precision."""
+        moving = self._moving_roughly
+        by_landmark = moving @ self.factor.solve_transposed(columns.astype(np.float32))
+        return self.factor.solve(moving.T @ by_landmark).astype(np.float64)
 
     def spread(self, columns: Float) -> Float:
         """(3L, c) Y' times columns (R, c)."""
@@ -63,7 +65,7 @@ class PathErrors:
     def squares(self) -> Float:
         """(L, 3, 3) blocks of Y' Y, each landmark's with itself."""
         total = np.zeros((self.seen.n_landmarks, 3, 3))
-        covariance, offset = self.factor.inverse(), self.factor.envelope.offset
+        covariance, offset = self.factor.inverse, self.factor.envelope.offset
         place = self.seen.unknown_place
         _add_squares(self.seen.starts, place, self.moved, offset, covariance, total)
         return total + np.swapaxes(total, 1, 2)
@@ -78,6 +80,13 @@ class PathErrors:
         rows, columns = np.broadcast_arrays(rows[:, None, :], columns[:, :, None])
         shape = 3 * self.seen.n_landmarks, len(self)
         return csr_array((self.moved[known].ravel(), (rows.ravel(), columns.ravel())), shape)
+
+    @cached_property
+    def _moving_roughly(self) -> csr_array:
+        """The same in single precision."""
+        known = self._moving
+        entries = known.data.astype(np.float32), known.indices, known.indptr
+        return csr_array(entries, known.shape)
 
 
 @kernel

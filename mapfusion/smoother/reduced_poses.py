@@ -18,8 +18,9 @@ from mapfusion.smoother.sightings import Sightings
 from mapfusion.smoother.skyline import Envelope, Factor, factor_in_envelope
 
 # What a step may be off by, as a share of it, both in sigmas: what the last ones, of hundredths of
-# a sigma, leave of it is nothing, and they mend what those before left.
-_OFF = 1e-4
+# a sigma, leave of it is nothing, and they mend what those before left. As each leaves a third and
+# more for weights that follow it, to be closer makes no step needless.
+_OFF = 1e-2
 # A factor of its own costs as much as this many products and more.
 _MOST_PRODUCTS = 15
 

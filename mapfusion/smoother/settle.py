@@ -25,6 +25,11 @@ CONVERGED = 1e-5
 _MOST_STEPS = 50
 _FOLLOWING = 2  # times that weights and points follow each other after a step
 _MOST_HALVINGS = 12
+# Steps are of one direction where the cosine of their angle is more than this. A step that is more
+# than so many times as long as the one before it does not tell where they end.
+_ONE_WAY, _LONGEST = 0.8, 0.9
+# Of the way that steps after it would go, a stretched step goes this share.
+_FURTHER = 0.5
 
 
 class Problem(NamedTuple):
@@ -72,6 +77,11 @@ class Settled(NamedTuple):
     equations: NormalEquations
     solution: Solution
     nearby: Factor | None
+
+    @property
+    def way_m(self) -> Float:
+        """(T, 2) the next step of the poses in the plane."""
+        return self.solution.step.path[:, :2]
 
     def is_within(self, least_move: float) -> bool:
         """Whether the next step would move the poses by less, in squared sigmas a coordinate."""
@@ -132,11 +142,30 @@ def solved(
 
 
 def stepped(
-    problem: Problem, end: Settled, seen: Sightings | None = None
+    problem: Problem, end: Settled, seen: Sightings | None = None, stretch: float = 1.0
 ) -> tuple[Estimate, Weights, Tails]:
-    """After the next step, and weights that follow it; of the observations `seen` from then on."""
+    """After the next step, and weights that follow it; of the observations `seen` from then on.
+
+    A step that is stretched goes where many more like it would (`stretched`).
+    """
     after = problem if seen is None else problem._replace(seen=seen)
-    return followed(after, _further(problem, end), end.weights, end.tails)
+    further = _further(problem, end) if stretch == 1 else _moved(end, stretch)
+    return followed(after, further, end.weights, end.tails)
+
+
+def stretched(before: Settled, end: Settled) -> float:
+    """How many times as far a step is to go as it says, by the step before it.
+
+    Weights follow where points go, and points weights: in the end steps are of one direction, each
+    r times as long as the one before it, and together they lead to where 1 / (1 - r) of the first
+    does (Aitken 1926). Of what that is more weights that follow the step itself go a share.
+    """
+    one, other = before.way_m, end.way_m
+    length, along = np.linalg.norm(one), np.vdot(one, other)
+    if not along > _ONE_WAY * length * np.linalg.norm(other):
+        return 1.0
+    r = float(along / length**2)
+    return 1 + _FURTHER * r / (1 - r) if r < _LONGEST else 1.0
 
 
 def followed(
@@ -163,12 +192,19 @@ def _further(problem: Problem, end: Settled) -> Estimate:
     Rubin 1977). The likelihood of the Student-t's about the *fitted* points has its least
     elsewhere: it would stop steps that weights from expected squares still ask for.
     """
-    at, weights, step = end.estimate, end.weights, end.solution.step
+    at, weights = end.estimate, end.weights
     before, share = problem.cost(at, weights), 1.0
     for _ in range(_MOST_HALVINGS):
-        further = Estimate(*(old + share * new for old, new in zip(at, step, strict=True)))
-        further.path[:, 2] = wrap(further.path[:, 2])
+        further = _moved(end, share)
         if problem.cost(further, weights) <= before:
             return further
         share /= 2
     return at
+
+
+def _moved(end: Settled, share: float) -> Estimate:
+    """By a share of the step."""
+    at, step = end.estimate, end.solution.step
+    further = Estimate(*(old + share * new for old, new in zip(at, step, strict=True)))
+    further.path[:, 2] = wrap(further.path[:, 2])
+    return further

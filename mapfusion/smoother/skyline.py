@@ -5,9 +5,9 @@ A factor has no more than zeros before the first entry of each row (the envelope
 diagonal block, and the work is done by products of parts of them.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import get_lapack_funcs
@@ -102,6 +102,15 @@ class Envelope:
         return np.where((rows < columns)[:, None, None], np.swapaxes(found, 1, 2), found)
 
 
+class _Part(NamedTuple):
+    """Of a block of rows of L the columns before it, L there, and the inverse of its own block."""
+
+    rows: slice
+    before: slice
+    lower: np.ndarray
+    inverse: np.ndarray
+
+
 @dataclass(frozen=True)
 class Factor:
     """The lower Cholesky factor L of a matrix (n, n).
@@ -126,45 +135,47 @@ class Factor:
             found[rows, first : rows.stop] = L
         return np.tril(found)
 
-    def solve(self, right: Float) -> Float:
-        """L^-1 right (n,) or (n, m)."""
+    def solve(self, right: np.ndarray) -> np.ndarray:
+        """L^-1 right (n,) or (n, m), in the precision of `right`."""
         x = right.copy()
-        for rows, before, L, inverse in self._parts():
+        for rows, before, L, inverse in self._parts(right):
             x[rows] = inverse @ (x[rows] - L @ x[before])
         return x
 
-    def solve_transposed(self, right: Float) -> Float:
-        """L'^-1 right (n,) or (n, m)."""
+    def solve_transposed(self, right: np.ndarray) -> np.ndarray:
+        """L'^-1 right (n,) or (n, m), in the precision of `right`."""
         x = right.copy()
-        for rows, before, L, inverse in reversed(list(self._parts())):
+        for rows, before, L, inverse in reversed(self._parts(right)):
             x[rows] = inverse.T @ x[rows]
             x[before] -= L.T @ x[rows]
         return x
 
     def solve_both_roughly(self, right: Float) -> Float:
         """(L L')^-1 right (n,), in single precision: half as much to be read from memory."""
-        x = right.astype(np.float32)
-        for rows, before, L, inverse in self._single:
-            x[rows] = inverse @ (x[rows] - L @ x[before])
-        for rows, before, L, inverse in reversed(self._single):
-            x[rows] = inverse.T @ x[rows]
-            x[before] -= L.T @ x[rows]
-        return x.astype(np.float64)
+        found = self.solve_transposed(self.solve(right.astype(np.float32)))
+        return found.astype(np.float64)
+
+    def _parts(self, right: np.ndarray) -> list[_Part]:
+        """In the precision of `right`."""
+        return self._single if right.dtype == np.float32 else self._double
 
     @cached_property
-    def _single(self) -> list[tuple[slice, slice, np.ndarray, np.ndarray]]:
-        single = np.float32
+    def _double(self) -> list[_Part]:
+        panels = self.envelope.panels(self.lower)
         return [
-            (rows, before, L.astype(single), inverse.astype(single))
-            for rows, before, L, inverse in self._parts()
+            _Part(rows, slice(first, rows.start), L[:, : rows.start - first], inverse)
+            for (rows, first, L), inverse in zip(panels, self.inverses, strict=True)
         ]
 
-    def _parts(self) -> Iterator[tuple[slice, slice, Float, Float]]:
-        """Of each block of rows the columns before it, L there, and the inverse of its own."""
-        panels = self.envelope.panels(self.lower)
-        for (rows, first, L), inverse in zip(panels, self.inverses, strict=True):
-            yield rows, slice(first, rows.start), L[:, : rows.start - first], inverse
+    @cached_property
+    def _single(self) -> list[_Part]:
+        single = np.float32
+        return [
+            _Part(rows, before, L.astype(single), inverse.astype(single))
+            for rows, before, L, inverse in self._double
+        ]
 
+    @cached_property
     def inverse(self) -> Float:
         """Entries of the inverse of L L'; those of the blocks on the diagonal are symmetric.
 

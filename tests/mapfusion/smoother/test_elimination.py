@@ -12,6 +12,7 @@ from scipy.optimize import least_squares
 from mapfusion.joint_covariance import KnownErrors, condensed
 from mapfusion.robot_log import RobotLog
 from mapfusion.se2 import Float, between, rotation, wrap
+from mapfusion.smoother import reduced_poses
 from mapfusion.smoother.blocks import inverses, put_inverse
 from mapfusion.smoother.elimination import (
     Solution,
@@ -181,9 +182,9 @@ def test_errors_of_the_path_are_those_of_their_large_matrix(planar: bool, tracks
     gram = Y @ Y.T
     columns = np.random.default_rng(0).standard_normal((n, 4))
     scale = np.abs(gram).max()
-    np.testing.assert_allclose(errors.gram(columns), gram @ columns, atol=1e-9 * scale)
+    np.testing.assert_allclose(errors.gram(columns), gram @ columns, atol=1e-5 * scale)
     rows = np.array([2, 0, n - 1])
-    np.testing.assert_allclose(errors.rows_by_all(rows), gram[:, rows], atol=1e-9 * scale)
+    np.testing.assert_allclose(errors.rows_by_all(rows), gram[:, rows], atol=1e-5 * scale)
     squares = KnownErrors(Y).squares()
     np.testing.assert_allclose(errors.squares(), squares, rtol=0, atol=1e-9 * squares.max())
     by_both = [condensed(solution.own_m2, known, rank=6) for known in (errors, KnownErrors(Y))]
@@ -193,8 +194,12 @@ def test_errors_of_the_path_are_those_of_their_large_matrix(planar: bool, tracks
 
 @pytest.mark.parametrize("planar", [False, True])
 @pytest.mark.parametrize("tracks", [False, True])
-def test_a_step_by_the_factor_of_another_is_the_same(planar: bool, tracks: bool) -> None:
+@pytest.mark.parametrize("share", [reduced_poses._OFF, 1e-4])
+def test_a_step_by_the_factor_of_another_is_the_same(
+    planar: bool, tracks: bool, share: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Of other weights and another path; covariances are of the equations' own factor."""
+    monkeypatch.setattr(reduced_poses, "_OFF", share)
     log, seen, weights, _, _ = solved_densely(planar, tracks)
     information, path = odometry_information(log.odometry, NOISE), dead_reckoned(log)
     at = Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
@@ -209,10 +214,10 @@ def test_a_step_by_the_factor_of_another_is_the_same(planar: bool, tracks: bool)
     assert own.factor is not None
     off = (found.step.path - own.step.path)[seen.pose_place.argsort()][1:].ravel()
     lower = own.factor.dense()
-    assert np.linalg.norm(lower.T @ off) < 2e-4 * np.sqrt(own.moved)
-    assert found.moved == pytest.approx(own.moved, rel=1e-6)
+    assert np.linalg.norm(lower.T @ off) < 2 * share * np.sqrt(own.moved)
+    assert found.moved == pytest.approx(own.moved, rel=4 * share**2)
     for one, another in zip(found.step, own.step, strict=True):
-        np.testing.assert_allclose(one, another, rtol=0, atol=1e-3 * np.abs(another).max())
+        np.testing.assert_allclose(one, another, rtol=0, atol=10 * share * np.abs(another).max())
     np.testing.assert_array_equal(own_factor(seen, equations, found).lower, own.factor.lower)
     expected = shared_errors(seen, equations, own).squares()
     np.testing.assert_array_equal(shared_errors(seen, equations, found).squares(), expected)
@@ -226,7 +231,7 @@ def test_a_factor_that_is_too_far_off_is_not_used(planar: bool) -> None:
     equations = normal_equations(seen, at, weights, STRAY_M**-2, log.odometry, information)
     own = _landmarks_first(seen, equations)
     assert own.factor is not None
-    envelope, wide = own.factor.envelope, np.diag(np.logspace(-6, 6, len(own.factor)))
+    envelope, wide = own.factor.envelope, np.diag(np.logspace(-9, 9, len(own.factor)))
     far = factor_in_envelope(envelope.of(wide), envelope)
     found = _landmarks_first(seen, equations, far)
     assert found.factor is not None

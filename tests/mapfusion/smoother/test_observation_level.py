@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from mapfusion.robot_log import RobotLog
-from mapfusion.se2 import Float
+from mapfusion.se2 import Float, rotation
 from mapfusion.smoother import levels
 from mapfusion.smoother.elimination import pose_covariances
 from mapfusion.smoother.levels import Levels, settled_with_levels
 from mapfusion.smoother.normal_equations import Estimate, odometry_information
 from mapfusion.smoother.residuals import first_points
-from mapfusion.smoother.settle import Problem, Settled
+from mapfusion.smoother.settle import Problem, Settled, followed, stretched
 from mapfusion.smoother.sightings import sightings_of
 from tests.mapfusion.smoother.white_noise_logs import (
     NOISE,
@@ -110,3 +110,52 @@ def test_steps_end_where_more_of_them_would(monkeypatch: pytest.MonkeyPatch) -> 
         off = (each.estimate.path - end.estimate.path)[1:] / sigma
         assert np.sqrt(np.mean(off**2)) < 0.01
         assert each.n_steps < end.n_steps
+
+
+@pytest.mark.parametrize("factor", [1.0, 4.0])
+def test_the_level_is_known_before_the_first_step(factor: float) -> None:
+    """From the points that observations tell along a path that is right."""
+    log = stated(tracked_log(0), factor)
+    end, _ = settled_from(log, dead_reckoned(log))
+    problem = Problem(
+        sightings_of(log, log.observations.label, 1, stray=True),
+        log.odometry,
+        odometry_information(log.odometry, NOISE),
+        STRAY_M**-2,
+    )
+    at, weights, tails = followed(problem, end.estimate)
+    first = levels.first_observation_level(problem, at, weights, tails)
+    assert first * factor == pytest.approx(1, abs=0.15)
+
+
+def test_a_step_is_stretched_by_how_much_shorter_it_is() -> None:
+    log = tracked_log(1)
+    before, _ = settled_from(log, dead_reckoned(log))
+
+    def followed_by(share: float, turn_rad: float = 0.0) -> float:
+        solution = before.solution
+        path = share * solution.step.path
+        path[:, :2] = path[:, :2] @ rotation(turn_rad)
+        step = solution.step._replace(path=path)
+        return stretched(before, before._replace(solution=solution._replace(step=step)))
+
+    assert followed_by(0.5) == pytest.approx(1.5)  # half of 1/2 + 1/4 + ... more
+    assert followed_by(0.75) == pytest.approx(2.5)
+    assert followed_by(-0.5) == followed_by(0.5, turn_rad=1.0) == followed_by(0.95) == 1.0
+
+
+def test_stretched_steps_end_where_others_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And are fewer."""
+    log = stated(tracked_log(0), 4.0)
+    rng = np.random.default_rng(0)
+    wrong = log.observations.position_m.copy()
+    rows = rng.choice(len(wrong), len(wrong) // 5, replace=False)
+    wrong[rows, :2] += rng.normal(0, 0.2, (len(rows), 2))
+    log = replace(log, observations=replace(log.observations, position_m=wrong))
+    monkeypatch.setattr(levels, "CONVERGED", 1e-10)
+    found, told = settled_from(log, dead_reckoned(log))
+    monkeypatch.setattr(levels, "stretched", lambda before, end: 1.0)
+    slow, told_slowly = settled_from(log, dead_reckoned(log))
+    assert found.n_steps < slow.n_steps
+    np.testing.assert_allclose(found.estimate.path, slow.estimate.path, rtol=0, atol=1e-5)
+    assert told.observation == pytest.approx(told_slowly.observation, rel=1e-4)

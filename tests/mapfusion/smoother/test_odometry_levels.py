@@ -3,11 +3,13 @@
 from dataclasses import replace
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from mapfusion.robot_log import RobotLog
-from mapfusion.se2 import Float, rotation
+from mapfusion.se2 import Float, compose, rotation
 from mapfusion.smoother.levels import settled_with_levels
 from mapfusion.smoother.normal_equations import Estimate, odometry_information
+from mapfusion.smoother.odometry_levels import Untold
 from mapfusion.smoother.residuals import first_points
 from mapfusion.smoother.settle import Problem
 from mapfusion.smoother.sightings import sightings_of
@@ -53,3 +55,55 @@ def test_a_log_that_tells_nothing_stays_as_stated() -> None:
     label = np.arange(len(log.observations), dtype=np.int32)
     log = replace(log, observations=replace(log.observations, label=label))
     np.testing.assert_allclose(levels_of(log), 1.0)
+
+
+def told_by_themselves(
+    rng: np.random.Generator, level: Float, n: int
+) -> tuple[Problem, Float, Float]:
+    """A problem, and disturbances (n, 3) that were measured each for itself: these, and J."""
+    odometry = np.column_stack([0.3 + 0 * np.arange(n + 1), np.zeros((n + 1, 2))])
+    stated = rng.uniform(1e-4, 1e-3, (n, 3))
+    J = rng.uniform(0.3, 3, (n, 3)) / stated
+    measured = rng.standard_normal((n, 3)) * np.sqrt(level * stated + 1 / J)
+    log = replace(white_noise_log(rng, n + 1, 1).log, odometry=odometry)
+    seen = sightings_of(log, np.full(len(log.observations), -1), 1, stray=False)
+    return Problem(seen, odometry, 1 / stated, 0), measured, J
+
+
+def path_of(odometry: Float, disturbance: Float) -> Float:
+    path = np.zeros((len(odometry), 3))
+    for k in range(1, len(path)):
+        path[k] = compose(path[k - 1], odometry[k] + disturbance[k - 1])
+    return path
+
+
+def test_levels_that_follow_steps_end_where_they_are_likeliest() -> None:
+    """Of disturbances that are told each for itself, whatever levels the variances are of."""
+    rng, true = np.random.default_rng(0), np.array([0.3, 1.0, 3.0])
+    problem, measured, J = told_by_themselves(rng, true, 600)
+    v, first = 1 / problem.information, np.array([1.0, 0.5, 1.5])
+    untold = Untold(1 / (1 + J * v * first), first)
+    levels = first
+    for _ in range(100):
+        found = measured * (levels * v) / (levels * v + 1 / J)  # means under these levels
+        path = path_of(problem.odometry, found)
+        levels = untold.told_levels(problem, path, levels)
+
+    def deviance(log_level: float, axis: int) -> float:
+        variance = np.exp(log_level) * v[:, axis] + 1 / J[:, axis]
+        return float(np.sum(np.log(variance) + measured[:, axis] ** 2 / variance))
+
+    likeliest = [minimize_scalar(deviance, (-2, 2), args=(axis,)).x for axis in range(3)]
+    np.testing.assert_allclose(levels, np.exp(likeliest), rtol=1e-4)
+    exact = np.sum(1 - 1 / (1 + J * v * levels), axis=0)
+    np.testing.assert_allclose(untold.known(levels), exact, rtol=1e-12)
+
+
+def test_axes_that_too_little_was_told_of_stay_as_stated() -> None:
+    """Whatever other levels would make of it: they would come and go."""
+    problem, measured, J = told_by_themselves(np.random.default_rng(1), np.ones(3), 60)
+    share = np.clip(1 / (1 + J / problem.information), 0, 1)
+    share[:, 1] = 0.5
+    path = path_of(problem.odometry, measured)
+    levels = Untold(share, np.ones(3)).told_levels(problem, path, np.array([1.0, 100.0, 1.0]))
+    assert levels[1] == 1.0

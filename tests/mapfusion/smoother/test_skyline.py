@@ -69,7 +69,7 @@ def test_inverse_is_that_of_the_dense_matrix(n, n_groups):
     A = matrix_of_groups(np.random.default_rng(n), n, n_groups if n > 2 else 0)
     A[-1, 0] = A[0, -1] = 0.5 * A[0, -1] + 0.5 * (n > 2)  # far apart, rows between reach neither
     envelope = entries_seen(np.tril(A))
-    inverse = stored(envelope, factor_in_envelope(envelope.of(A), envelope).inverse())
+    inverse = stored(envelope, factor_in_envelope(envelope.of(A), envelope).inverse)
     rows, columns = np.indices(A.shape)
     within = (columns <= rows) & (columns >= envelope.first[rows])
     np.testing.assert_allclose(inverse[within], np.linalg.inv(A)[within], rtol=0, atol=1e-12)
@@ -92,7 +92,7 @@ def test_nothing_has_a_factor():
     factor = factor_in_envelope(nothing.of(np.empty((0, 0))), nothing)
     assert factor.dense().shape == (0, 0)
     assert factor.solve_transposed(factor.solve(np.empty(0))).shape == (0,)
-    assert factor.inverse().size == 0
+    assert factor.inverse.size == 0
 
 
 def test_rows_that_are_zero_for_long_stay_so():
