@@ -19,7 +19,6 @@ from mapfusion.smoother.residuals import (
 )
 from mapfusion.smoother.sightings import Sightings
 from mapfusion.smoother.student import (
-    LEAST_DOF,
     MOST_DOF,
     fitted_dof,
     information_share,
@@ -38,16 +37,8 @@ NO_TAILS = Tails(MOST_DOF, MOST_DOF)
 
 
 def informative(tails: Tails, n_dimensions: int) -> Shares:
-    """What of the weighted information is there in truth.
-
-    All of it where tails are as heavy as they may be: that is of errors that are all smaller than
-    stated, not of tails, and steps by the share of such tails would go too far.
-    """
-    return Shares(*(_share(dof, n_dimensions) for dof in tails))
-
-
-def _share(dof: float, n_dimensions: int) -> float:
-    return float(information_share(dof, n_dimensions)) if dof > LEAST_DOF else 1.0
+    """What of the weighted information is there in truth."""
+    return Shares(*(float(information_share(dof, n_dimensions)) for dof in tails))
 
 
 def unweighted(seen: Sightings) -> Weights:

@@ -8,14 +8,12 @@ from scipy.stats import chi2
 
 from mapfusion.robot_log import RobotLog
 from mapfusion.se2 import Float
-from mapfusion.smoother.normal_equations import Estimate, odometry_information
+from mapfusion.smoother.normal_equations import Estimate
 from mapfusion.smoother.residuals import first_points
 from mapfusion.smoother.settle import Problem, Settled, settled
 from mapfusion.smoother.sightings import sightings_of
 from mapfusion.smoother.smooth import Smoothed, SmootherParameters, smooth
-from mapfusion.smoother.student import LEAST_DOF
 from tests.mapfusion.smoother.white_noise_logs import (
-    NOISE,
     Known,
     dead_reckoned,
     moved_tracks,
@@ -207,22 +205,3 @@ def test_heavy_tails_do_not_stop_the_steps_before_their_end() -> None:
     gross = seen.position_m + sigma_m * rng.standard_t(2.5, (n, 3))
     found = smoothed(replace(log, observations=replace(seen, position_m=gross)))
     assert found.n_steps < 40  # of 50 in each of two rounds, at most
-
-
-def test_observations_that_are_thought_far_worse_are_settled_in_few_steps() -> None:
-    """Tails as heavy as may be are of none of them: steps by their share would go too far."""
-    rng = np.random.default_rng(3)
-    log = with_tracks(white_noise_log(rng, 60, 40), rng, STRAY_M).log
-    observed, label = log.observations, log.observations.label
-    assert label is not None
-    sigma_m = np.sqrt(np.diagonal(observed.covariance_m2, axis1=1, axis2=2))
-    off = rng.normal(0, 200, (len(label), 3)) * (rng.random((len(label), 1)) < 0.1)
-    gross = observed.position_m + sigma_m * off
-    log = replace(log, observations=replace(observed, position_m=gross))
-    seen = sightings_of(log, label, 1, stray=True)
-    worse = replace(seen, information=seen.information / 100)
-    information, path = odometry_information(log.odometry, NOISE), dead_reckoned(log)
-    at = Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
-    end = settled(Problem(worse, log.odometry, information, STRAY_M**-2), at, 1e-4)
-    assert end.tails.observation == LEAST_DOF
-    assert end.n_steps <= 4
