@@ -80,7 +80,7 @@ def in_leaves(p: Float, size: int) -> tuple[np.ndarray, Float, np.ndarray]:
         along = held[np.argmax(upper - lower, axis=0), np.arange(n_nodes)]
         order = np.argpartition(along, n_held // 2, axis=1) + first[:, None]
         held = held.reshape(4, -1).take(order, axis=1).reshape(4, 2 * n_nodes, n_held // 2)
-    box, rows = np.concatenate(boxes), held[3].ravel()
+    box, rows = np.ascontiguousarray(np.concatenate(boxes)), held[3].ravel()
     empty = np.isnan(box[:, 0])
     box[empty, :3], box[empty, 3:] = np.inf, -np.inf
     return rows[~np.isnan(rows)].astype(np.int64), box, np.concatenate(ranges, axis=1)

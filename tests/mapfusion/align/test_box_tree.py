@@ -33,3 +33,10 @@ def test_each_box_holds_its_points_and_halves_those_of_the_one_above(kind):
             axis = np.argmax(np.ptp(held, axis=0))
             above = tree.p[tree.first[high] : end, axis]
             assert tree.p[first : tree.end[low], axis].max() <= above.min(initial=np.inf)
+
+
+@pytest.mark.parametrize("n", [1, POINTS_PER_LEAF, 10 * POINTS_PER_LEAF])
+def test_kernels_get_arrays_of_one_layout_from_trees_of_any_size(n: int) -> None:
+    """Of another layout they would be compiled once more."""
+    tree = BoxTree.of(np.random.default_rng(0).uniform(0, 9, (n, 3)))
+    assert all(part.flags.c_contiguous for part in tree)
