@@ -72,7 +72,7 @@ def main() -> None:
     for name in done[0]:
         values = [each[name] for each in done]
         shown = (statistics.median(values), min(values), max(values))
-        say(f"| {name} | {' | '.join(f'{value:.3g}' for value in shown)} |")
+        say(f"| {name} | {' | '.join(f'{value:.4g}' for value in shown)} |")
 
 
 def say(line: str) -> None:

@@ -113,11 +113,17 @@ def _world(settings: FeatureSettings, faces: Path, robots: tuple[str, ...]) -> F
 
 
 def run(settings: FeatureSettings, job: Job) -> dict[str, float]:
-    """Render and extract the frames of one chunk; returns how long the rendering took."""
+    """Render and extract the frames of one chunk.
+
+    Returns:
+        How long the rendering took, with the world opened for it.
+    """
     trajectory = _trajectory(job.inputs["drive"] / TRAJECTORY_FILE)
+    started = time.perf_counter()
     source = _world(settings, job.inputs["faces"], trajectory.robots)
+    rendering_s = time.perf_counter() - started
     front_end = FrontEnd(settings.camera, settings.vision)
-    robot, features, truth, rendering_s = settings.robot, [], [], 0.0
+    robot, features, truth = settings.robot, [], []
     frames = _chunk(job.part, len(trajectory))
     for iteration in frames:
         poses = trajectory.bodies(iteration)
