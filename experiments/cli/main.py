@@ -21,8 +21,9 @@ from experiments.cli.options import (
 )
 from mapfusion.errors import InputError, one_line
 
-# Objects made before Python looks for cycles among them, 700 by default: what imports make stays.
-_MADE_BY_IMPORTS = 500_000
+# Objects made before Python looks for cycles among them, 700 by default: most are made by imports
+# and in drawing, and stay.
+_MADE_BETWEEN_COLLECTIONS = 50_000
 REPLACED = {
     "aligners": "scenarios --aligners",
     "schema": "scenarios --schema",
@@ -75,7 +76,7 @@ def main() -> None:
     from experiments.run.defects import saved_defect
     from experiments.run.kernel_cache import use_kernel_cache
 
-    gc.set_threshold(_MADE_BY_IMPORTS)
+    gc.set_threshold(_MADE_BETWEEN_COLLECTIONS)
     # Work is bound to one thread anyway, and those that BLAS starts when it is imported wait in a
     # loop. To be said before that.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -32,8 +32,6 @@ from mapfusion.errors import InputError, UnsealedWarning
 # While a process works on one task, the next is there already. More of them would be begun in the
 # order they were submitted, though a later one may be what others wait for.
 TASKS_PER_PROCESS = 2
-# Objects made before Python looks for cycles among them: most are made in drawing, and stay.
-_MADE_BETWEEN_COLLECTIONS = 50_000
 
 # On other systems libraries hold threads or handles from their import on.
 _FORKED = sys.platform == "linux"
@@ -47,7 +45,6 @@ def make_ready(jobs: int) -> None:
     first call counts.
     """
     gc.freeze()  # what is imported stays: nobody is to look through it for garbage
-    gc.set_threshold(_MADE_BETWEEN_COLLECTIONS)
     server: Any = forkserver._forkserver
     if jobs == 1 or not _FORKED or server._forkserver_pid is not None:
         return
