@@ -12,29 +12,13 @@ without it they are there already.
 
 import argparse
 import os
-import statistics
-import subprocess
-import sys
 import tempfile
-import time
 from pathlib import Path
 
+from tests.benchmarks.commands import command_s, print_repeated
 from tests.benchmarks.where_time_goes import seconds
 
 _RENDERERS = ("raycast", "tiny")
-
-
-def run_s(scenario: str, renderer: str, results: Path, kernels: Path | None) -> float:
-    """Seconds by the clock of a run from an empty store; kernels are kept in a folder of theirs."""
-    words = ("run", scenario, "--set", f"render.renderer={renderer}", "--results", str(results))
-    environment = os.environ | ({} if kernels is None else {"XDG_CACHE_HOME": str(kernels)})
-    started = time.perf_counter()
-    command = [sys.executable, "-m", "experiments", *words]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    took = time.perf_counter() - started
-    if done.returncode:
-        sys.exit(f"{' '.join(command)}\n{done.stderr}")
-    return took
 
 
 def rendering_s(results: Path) -> float:
@@ -49,7 +33,10 @@ def once(scenario: str, anew: bool) -> dict[str, float]:
     for renderer in _RENDERERS:
         with tempfile.TemporaryDirectory() as folder:
             results, kernels = Path(folder) / "results", Path(folder) / "kernels"
-            took[f"{renderer}, s"] = run_s(scenario, renderer, results, kernels if anew else None)
+            words = ("run", scenario, "--set", f"render.renderer={renderer}")
+            took[f"{renderer}, s"] = command_s(
+                (*words, "--results", str(results)), kernels if anew else None
+            )
             if renderer == "tiny":
                 took["tiny's rendering alone, s"] = rendering_s(results)
     took["raycast over tiny"] = took["raycast, s"] / took["tiny, s"]
@@ -64,20 +51,7 @@ def main() -> None:
     parser.add_argument("--repetitions", type=int, default=5)
     parser.add_argument("--anew", action="store_true", help="Compile all kernels in each run.")
     asked = parser.parse_args()
-    done: list[dict[str, float]] = []
-    for _ in range(asked.repetitions):
-        done.append(once(asked.scenario, asked.anew))
-        say("; ".join(f"{name} {value:.4g}" for name, value in done[-1].items()))
-    say("\n| | median | least | greatest |\n|---|---|---|---|")
-    for name in done[0]:
-        values = [each[name] for each in done]
-        shown = (statistics.median(values), min(values), max(values))
-        say(f"| {name} | {' | '.join(f'{value:.4g}' for value in shown)} |")
-
-
-def say(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
+    print_repeated(lambda: once(asked.scenario, asked.anew), asked.repetitions)
 
 
 if __name__ == "__main__":
