@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from experiments.judge.criteria import ANSWERABLE_PAIRS, ORACLE
-from experiments.show.figures.result_tables import NothingToDraw, ResultTables, of_pair
+from experiments.show.figures.result_tables import NothingToDraw, Pair, ResultTables, of_pair
 from experiments.show.figures.style import PAGE_WIDTH_IN, PALE_GRAY, aligner_legend
 from experiments.study.statistics.error_bands import error_bands, scarce_spans
 
@@ -26,15 +26,16 @@ _MAX_VECTOR_POINTS = 200
 def draw_error_curves(data: ResultTables, quantity: str, label: str) -> tuple[Figure, np.ndarray]:
     """One row of panels per robot pair: as estimated on the left, refined on the right.
 
-    Of many pairs the first are drawn, which the label of the x axis then says. `quantity` is a
-    column of the `errors` table. Also returns all values drawn, by which the y axis that all panels
-    share is to be set.
+    Of many pairs those with the most to go by are drawn, which the label of the x axis then says.
+    `quantity` is a column of the `errors` table. Also returns all values drawn, by which the y axis
+    that all panels share is to be set.
     """
     if not data.pairs:
         raise NothingToDraw("no robot pair was aligned")
     if data.no_truth:
         raise NothingToDraw("no truth: errors are unknown")
-    pairs, errors = data.pairs[:_MOST_PAIRS], data.table("errors")
+    errors = data.table("errors")
+    pairs = _shown_pairs(data.pairs, errors)
     errors = errors[pd.MultiIndex.from_frame(errors[["robot_a", "robot_b"]]).isin(pairs)]
     bands = error_bands(errors)
     kinds = {"as estimated": quantity, "refined": f"refined_{quantity}"}
@@ -53,8 +54,8 @@ def draw_error_curves(data: ResultTables, quantity: str, label: str) -> tuple[Fi
             axes.set_title(f"{pair[0]} - {pair[1]}, {kind}")
         row[0].set_ylabel(label)
     left_out = len(data.pairs) > len(pairs)
-    note = f" (first {len(pairs)} of {len(data.pairs)} robot pairs)" if left_out else ""
-    figure.supxlabel(f"FastSLAM iteration k{note}", fontsize=8)
+    note = f"\n({len(pairs)} of {len(data.pairs)} robot pairs: those with the most true pairs)"
+    figure.supxlabel(f"FastSLAM iteration k{note if left_out else ''}", fontsize=8)
     over = f"{errors['run_id'].nunique()} runs" if data.several_runs else "repetitions"
     explained = []
     if any(len(list(scarce_spans(of_pair(errors, pair)))) for pair in pairs):
@@ -67,6 +68,15 @@ def draw_error_curves(data: ResultTables, quantity: str, label: str) -> tuple[Fi
     looks = {label: data.styles[name] for name, label in data.labels.items()}
     aligner_legend(figure, looks, 4, explained)
     return figure, drawn
+
+
+def _shown_pairs(pairs: list[Pair], errors: pd.DataFrame) -> list[Pair]:
+    """Of many robot pairs those with the most true correspondences at any iteration, in order."""
+    if len(pairs) <= _MOST_PAIRS:
+        return pairs
+    most = errors.groupby(["robot_a", "robot_b"])["n_true"].max()
+    chosen = sorted(pairs, key=lambda pair: most[pair], reverse=True)[:_MOST_PAIRS]
+    return [pair for pair in pairs if pair in chosen]
 
 
 def _with_band(bands: pd.DataFrame, columns: Sequence[str]) -> set[str]:

@@ -62,7 +62,7 @@ def _consecutive_frames(data: ResultTables) -> tuple[str, dict[int, Path]]:
             if len(run) > len(best):
                 robot, best = each, run
     if not best:
-        raise NothingToDraw("no key frames were kept (logs without images)")
+        raise NothingToDraw("no key frames were kept: no images, or none from `keep.images_at` on")
     return robot, dict(list(best.items())[-_MAX_FRAMES:])
 
 

@@ -63,5 +63,5 @@ def _draw_map(axes: Axes, data: ResultTables, robot: str, enlarged: int) -> None
     label = "particles at the end" + (f", spread x{enlarged}" if enlarged > 1 else "")
     plan.add_points(axes, middle + enlarged * (last - middle), label=label, **points)
     plan.add_frame(axes)
-    counted = plan.set_view(axes, position, path, *walls)
+    counted = plan.set_view(axes, position, path, walls)
     axes.set_title(f"{robot}: {counted}\n({data.sightings})")

@@ -102,7 +102,7 @@ def _draw_path(axes: Axes, data: ResultTables, robot: str, magnification: int) -
     enlarged = [own.mean(axis=0) + magnification * (own - own.mean(axis=0)) for own in sets]
     plan.add_points(axes, np.concatenate(enlarged), **style)
     plan.add_frame(axes, length_m=1.5)
-    plan.set_view(axes, path[:0], path, *walls)
+    plan.set_view(axes, path[:0], path, walls)
     said = f", spread x{magnification}" if magnification > 1 else ""
     axes.set_title(f"{robot}: particles{said}")
 

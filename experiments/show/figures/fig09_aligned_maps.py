@@ -31,7 +31,7 @@ def draw(data: ResultTables) -> Figure:
     for axes, rows, scale in ((overview, slice(None), 0.3), (zoom, part.whole, 1.0)):
         plan.start_plan(axes, data, data.fused_frame)
         _draw_landmarks(axes, data, pairs, rows, scale)
-    plan.set_view(overview, fused)
+    plan.set_view(overview, fused, fused[:0])
     zoom.set(xlim=(x, x + side), ylim=(y, y + side), aspect="equal")
     dashed = {"fill": False, "edgecolor": BLACK, "linestyle": "--", "zorder": 6}
     overview.add_patch(Rectangle((x, y), side, side, **dashed))

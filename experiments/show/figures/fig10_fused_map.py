@@ -32,6 +32,6 @@ def draw(data: ResultTables) -> Figure:
         if chosen.any():
             plan.add_points(axes, position[chosen], label=f"{name} ({chosen.sum()})", **style)
     plan.add_frame(axes)
-    axes.set_title(f"fused map: {plan.set_view(axes, position, *walls)}")
+    axes.set_title(f"fused map: {plan.set_view(axes, position, position[:0], walls)}")
     plan.finish_plans(figure, [axes], axes.get_legend_handles_labels()[0], 4, markerscale=1.6)
     return figure

@@ -21,6 +21,7 @@ ELLIPSE_BOUND = chi_square_bound(_LEVEL, _PLANE_DIMENSIONS)  # squared Mahalanob
 _MAGNIFICATIONS = (1, 2, 5, 10, 20, 50, 100)
 _WIDEST_SHARE = 1 / 10  # of the map's extent that the widest drawn particle set may take
 _STRAY_SHARE = 0.005  # a stray landmark tens of metres off, on each side, must not shrink the map
+_SURROUNDINGS = 1.0  # walls are shown so far around a map, as a multiple of its extent
 _MARGIN, _MIN_MARGIN_M = 0.05, 0.3  # of the view's extent
 _LABELS_WIDTH_IN, _LABELS_HEIGHT_IN = 0.55, 0.65  # what labels and titles take beside each panel
 _LEGEND_ROW_IN, _LEGEND_FRAME_IN = 0.16, 0.2
@@ -87,22 +88,33 @@ def ellipse_handle(colour: str) -> Line2D:
     return Line2D([], [], color=colour, label=f"{LEVEL_TEXT} ellipses, to scale", **style)
 
 
-def set_view(axes: Axes, landmarks_m: Float, *others_m: Float) -> str:
-    """Show all of `others_m` and the landmarks but for strays, at equal scales.
+def set_view(axes: Axes, landmarks_m: Float, path_m: Float, walls_m: Sequence[Float] = ()) -> str:
+    """Show a path, the landmarks but for strays, and the walls around both, at equal scales.
 
-    Returns in words how many landmarks there are, and how many of them are out of view.
+    A house is shown whole unless it is much larger than what was mapped of it. Returns in words how
+    many landmarks there are, and how many of them are out of view.
     """
-    core = [points[:, :2] for points in others_m if len(points)]
     plan = landmarks_m[:, :2]
+    core = [path_m[:, :2]] if len(path_m) else []
     if len(plan):
         core.append(np.quantile(plan, [_STRAY_SHARE, 1 - _STRAY_SHARE], axis=0))
-    points = np.concatenate(core) if core else np.zeros((1, 2))
-    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
+    low, high = _bounds(core or walls_m)
+    if core and len(walls_m):
+        reach = _SURROUNDINGS * float((high - low).max())
+        walls_low, walls_high = _bounds(walls_m)
+        low = np.minimum(low, np.maximum(walls_low, low - reach))
+        high = np.maximum(high, np.minimum(walls_high, high + reach))
     margin = max(_MARGIN * float((high - low).max()), _MIN_MARGIN_M)
     low, high = low - margin, high + margin
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     outside = np.any((plan < low) | (plan > high), axis=1).sum()
     return f"{len(plan)} landmarks" + (f", {outside} out of view" if outside else "")
+
+
+def _bounds(lines: Sequence[Float]) -> tuple[Float, Float]:
+    """Lowest and highest coordinates (2,) of lines (n, 2); the origin where there is none."""
+    points = np.concatenate(lines) if len(lines) else np.zeros((1, 2))
+    return np.nanmin(points, axis=0), np.nanmax(points, axis=0)
 
 
 def set_one_scale(panels: Sequence[Axes]) -> None:

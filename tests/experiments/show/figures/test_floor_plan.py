@@ -23,9 +23,23 @@ def test_strays_are_out_of_view_and_counted() -> None:
     assert axes.get_xlim() == pytest.approx((-1.5, 31.5), abs=0.1)
 
 
+def test_of_a_house_much_larger_than_its_map_the_surroundings_are_shown() -> None:
+    """A map of 10 m by 2 m in a house of 400 m: 10 m around it; and to a wall that is nearer."""
+    landmarks = np.array([[0.0, 0.0, 1.0], [10.0, 2.0, 1.0]])
+    landmarks = np.repeat(landmarks, 300, axis=0)  # no stray
+    house = [np.array([[-200.0, -3.0], [200.0, -3.0]]), np.array([[-200.0, 50.0], [200.0, 50.0]])]
+    axes = Figure().subplots()
+    assert floor_plan.set_view(axes, landmarks, np.zeros((0, 2)), house) == "600 landmarks"
+    margin = 0.05 * 30
+    assert axes.get_xlim() == pytest.approx((-10 - margin, 20 + margin))
+    assert axes.get_ylim() == pytest.approx((-3 - margin, 12 + margin))
+    floor_plan.set_view(axes, landmarks[:0], np.zeros((0, 2)), house)
+    assert axes.get_xlim() == pytest.approx((-220, 220))
+
+
 def test_nothing_to_see_has_a_view_too() -> None:
     axes = Figure().subplots()
-    assert floor_plan.set_view(axes, np.zeros((0, 3))) == "0 landmarks"
+    assert floor_plan.set_view(axes, np.zeros((0, 3)), np.zeros((0, 2))) == "0 landmarks"
     assert axes.get_xlim() == axes.get_ylim() == pytest.approx((-0.3, 0.3))
 
 
