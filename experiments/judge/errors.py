@@ -17,6 +17,7 @@ from experiments.run.estimates import (
 )
 from experiments.run.frames import records
 from experiments.run.stage_tables import MOTION
+from experiments.run.stages.match import known_at
 from mapfusion import se2
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.oracle import Oracle
@@ -40,8 +41,7 @@ class EvaluatedRobot:
 
     def at(self, iteration: int) -> tuple[LandmarkMap, Float]:
         """Map and true points at an iteration (the last ones of a log that ended earlier)."""
-        known = max((k for k in self.maps if k <= iteration), default=min(self.maps))
-        return self.maps[known], self.points_world_m[known]
+        return known_at(self.maps, iteration), known_at(self.points_world_m, iteration)
 
     def in_map_frame(self, points_world_m: Float) -> Float:
         """Points (..., 3) of the world in the frame of this robot's maps."""

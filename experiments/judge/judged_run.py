@@ -22,7 +22,7 @@ from experiments.run.pipeline import PairStages, Pipeline, RobotStages, lay_out
 from experiments.run.rehearsal import rehearsals
 from experiments.run.stage import Stage
 from experiments.run.stages.fuse import read_fusions
-from experiments.run.stages.match import map_at
+from experiments.run.stages.match import known_at
 from experiments.run.stages.slam import RobotFolders
 from experiments.run.stages.snapshots import stored_maps
 from experiments.run.store import StageFolder, Store
@@ -95,7 +95,7 @@ class JudgedRun:
     def last_maps(self, iteration: int) -> dict[str, LandmarkMap]:
         """All robots' maps at an iteration as they were stored, by name."""
         folders = {robot.name: self.robot_folders(robot) for robot in self.pipeline.robots}
-        return {name: map_at(stored_maps(each), iteration) for name, each in folders.items()}
+        return {name: known_at(stored_maps(each), iteration) for name, each in folders.items()}
 
     def load_smoothed(self, robots: Sequence[EvaluatedRobot]) -> list[SmoothedRobot]:
         """What the smoother made of all robots' logs, joined with the truth."""

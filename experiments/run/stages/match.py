@@ -7,6 +7,7 @@ import functools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import pandas as pd
 import pyarrow as pa
@@ -30,6 +31,7 @@ from mapfusion.landmark_map import LandmarkMap
 # Evaluated iterations a part: small enough that an interruption loses little and two cores end
 # at about the same time, large enough that reading the maps costs little beside aligning them.
 _ITERATIONS_PER_BATCH = 12
+_Known = TypeVar("_Known")
 LABEL = "align the maps"
 WRITES = ("batch_{part}.parquet", "rivals_{part}.parquet")
 
@@ -67,7 +69,7 @@ def run(settings: MatchSettings, job: Job) -> None:
 @functools.lru_cache(maxsize=ROBOTS_KEPT * _ITERATIONS_PER_BATCH)
 def _witness(folders: RobotFolders, iteration: int) -> Witness:
     """A robot's map, with what it was asked: it is in as many pairs as there are other robots."""
-    return Witness(map_at(stored_maps(folders), iteration))
+    return Witness(known_at(stored_maps(folders), iteration))
 
 
 def batches(iterations: tuple[int, ...]) -> tuple[str, ...]:
@@ -103,9 +105,9 @@ def pairs_of_maps(
     a, b = maps_of_both(job)
     start = int(job.part) * _ITERATIONS_PER_BATCH
     for k in iterations[start : start + _ITERATIONS_PER_BATCH]:
-        yield k, map_at(a, k), map_at(b, k)
+        yield k, known_at(a, k), known_at(b, k)
 
 
-def map_at(maps: Mapping[int, LandmarkMap], iteration: int) -> LandmarkMap:
-    """A robot's map at an iteration; a robot whose log ended earlier keeps its last map."""
-    return maps[max((k for k in maps if k <= iteration), default=min(maps))]
+def known_at(known: Mapping[int, _Known], iteration: int) -> _Known:
+    """A robot's map, or what belongs to it, at an iteration: the last of a log that ended."""
+    return known[max((k for k in known if k <= iteration), default=min(known))]

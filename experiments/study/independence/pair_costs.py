@@ -7,7 +7,7 @@ from experiments.methods.threads import single_threaded
 from experiments.run.frames import write_rows
 from experiments.run.job import Job
 from experiments.run.stages.aligner import AlignerSettings
-from experiments.run.stages.match import map_at, maps_of_both
+from experiments.run.stages.match import known_at, maps_of_both
 from experiments.scenario.randomness import generator
 from experiments.study.independence.measured_work import (
     COSTS_FILE,
@@ -39,7 +39,7 @@ def run(settings: PairCostSettings, job: Job) -> None:
     """Write what aligning costs at each iteration."""
     single_threaded()
     maps_a, maps_b = maps_of_both(job)
-    both = {k: (map_at(maps_a, k), map_at(maps_b, k)) for k in settings.iterations}
+    both = {k: (known_at(maps_a, k), known_at(maps_b, k)) for k in settings.iterations}
     _align(settings, *both[settings.iterations[-1]])  # compiles, and fills caches
     costs = [cost_row(k, ALIGNMENT, _align(settings, *maps)) for k, maps in both.items()]
     write_rows(job.output / COSTS_FILE, WORK_COSTS, [dict(row) for row in costs])

@@ -12,7 +12,7 @@ import pandas as pd
 from experiments.judge.tables import table_path
 from experiments.methods.aligner_calls import callable_aligner
 from experiments.run.frames import BOOL, FLOAT, INT, TEXT, fields, read_rows, write_rows
-from experiments.run.stages.match import map_at
+from experiments.run.stages.match import known_at
 from experiments.run.tasks import OnProgress
 from experiments.run.workers import workers
 from experiments.scenario.randomness import generator
@@ -208,7 +208,7 @@ def apart_rows(scenario: Simulation, crossing: Crossing) -> Rows:
     of_a, of_b = functools.cache(crossing.a.maps), functools.cache(crossing.b.maps)
     rows: Rows = []
     for robot_a, robot_b, iteration in crossing.meetings:
-        maps = map_at(of_a(robot_a), iteration), map_at(of_b(robot_b), iteration)
+        maps = known_at(of_a(robot_a), iteration), known_at(of_b(robot_b), iteration)
         rows += _answers(scenario, cases.apart(*maps, matching), worlds, iteration)
     if len(crossing.a.folders) < 2 or not crossing.hung:  # no partner has seen what robot a saw
         return rows
@@ -216,7 +216,7 @@ def apart_rows(scenario: Simulation, crossing: Crossing) -> Rows:
     last = min(world.iterations[-1] for world in worlds)
     first, partner, *_ = in_a.values()
     source = cases.common(first, partner, last, matching, scenario.evaluate.true_pair_radius_m)
-    others = [map_at(robot.maps, last) for robot in in_b.values()]
+    others = [known_at(robot.maps, last) for robot in in_b.values()]
     for number in range(REPEATED_PER_WORLDS):
         each, size = divmod(number, len(cases.POSTER_RADII_M))  # each robot meets each size
         rng = generator(scenario.seed, "poster", crossing.a.name, crossing.b.name, number)
