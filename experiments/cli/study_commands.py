@@ -135,6 +135,12 @@ def compare(
     second: Annotated[Path, typer.Argument(metavar="SECOND", help="And of the other version.")],
     show_all: Annotated[bool, typer.Option("--all", help="Show also what did not change.")] = False,
     output: options.OutputFolder = None,
+    apart_from: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KEY", help="Setting in which matched runs may differ; may be repeated."
+        ),
+    ] = None,
     fail_if_worse: Annotated[
         bool, typer.Option("--fail-if-worse", help="Exit code 1 if anything got worse.")
     ] = False,
@@ -147,7 +153,7 @@ def compare(
     from experiments.show.terminal.statistics_screen import print_comparison
     from experiments.study.compare import versions
 
-    found = versions.compare(first, second)
+    found = versions.compare(first, second, apart_from or ())
     if output is not None:
         write_tables(output, {"comparison": found.table})
     print_comparison(found, show_all, output)

@@ -1,10 +1,11 @@
 """Two versions on the same runs: what got better or worse, and whether that is more than noise.
 
-Only what both have counts: the same scenario, seed and settings, robot pair, iteration and aligner.
+Only what both have counts: the same scenario, seed and settings (but for those left out by name),
+robot pair, iteration and aligner.
 """
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +17,7 @@ from experiments.judge import judged_maps
 from experiments.judge.criteria import (
     ORACLE,
 )
-from experiments.judge.judged_maps import MAP_PAIR
+from experiments.judge.judged_maps import MAP_PAIR, setting_columns
 from experiments.judge.result_files import read_scenario
 from experiments.study.compare.quantities import EACH_METHOD, QUANTITIES, READ, Quantity
 from experiments.study.statistics import better
@@ -55,14 +56,21 @@ class VersionComparison(NamedTuple):
         return bool(((self.table["verdict"] == WORSE) & ~self.table["timed"]).any())
 
 
-def compare(path_a: Path, path_b: Path) -> VersionComparison:
+def compare(path_a: Path, path_b: Path, apart_from: Sequence[str] = ()) -> VersionComparison:
     """Compare the result or sweep folders of two versions.
 
+    Args:
+        path_a: of the first.
+        path_b: of the second.
+        apart_from: settings that sweeps varied, in which matched runs may differ.
+
     Raises:
-        InputError: the two have no run in common, or no table.
+        InputError: the two have no run in common, or no table; or such a setting is none that a
+            sweep varied, or tells two runs of one side apart.
     """
     a, b = find_runs(path_a), find_runs(path_b)
-    runs_a, runs_b = a.names, b.names
+    notes = _apart_from(a, b, apart_from)
+    runs_a, runs_b = (_names(*side, apart_from) for side in ((path_a, a), (path_b, b)))
     common = runs_a & runs_b
     if not common:
         raise InputError(
@@ -70,19 +78,47 @@ def compare(path_a: Path, path_b: Path) -> VersionComparison:
             f"the first has {_some(runs_a)}, the second {_some(runs_b)}"
         )
     unit = RUN if len(common) > 1 else MAPS_OF_ONE_RUN
-    rows = [_judged(*each, len(common)) for each in _all_values(a, b)]
+    rows = [_judged(*each, len(common)) for each in _all_values(a, b, apart_from)]
     if not rows:
         raise InputError(f"{path_a} and {path_b}: their common runs have no rows in common")
     table = pd.DataFrame(rows)
     table["p_holm"] = better.holm(table["p"].to_numpy())
     table["verdict"] = [_verdict(row) for row in table.to_dict("records")]
-    notes = _differing_settings(a, b)
+    notes += _differing_settings(a, b)
     for names, which in ((runs_a - runs_b, "first"), (runs_b - runs_a, "second")):
         if names:
             runs = f"{len(names)} run{'s' * (len(names) > 1)} of the {which}"
             notes.append(f"left out: {runs} that the other has not ({_some(names)})")
     notes += _notes_on(table, unit, len(common))
     return VersionComparison(table.drop(columns=_NOT_SHOWN), unit, len(common), tuple(notes))
+
+
+def _names(path: Path, runs: Runs, apart_from: Sequence[str]) -> set[str]:
+    """What the runs of one side are matched by."""
+    names = match_names(runs.described, apart_from)
+    several = names[names.duplicated()]
+    if apart_from and len(several):
+        settings = " and ".join(apart_from)
+        raise InputError(
+            f"{path}: {several.iloc[0]} is there more than once, with other values of {settings}; "
+            "each side may have one"
+        )
+    return set(names)
+
+
+def _apart_from(a: Runs, b: Runs, settings: Sequence[str]) -> list[str]:
+    """What each side has of the settings that runs are not matched by."""
+    notes = []
+    for setting in settings:
+        described = a.described, b.described
+        values = [sorted(runs[setting].unique()) if setting in runs else [] for runs in described]
+        if not any(values):
+            varied = {name for runs in described for name in setting_columns(runs)}
+            known = ", ".join(sorted(varied)) or "none"
+            raise InputError(f"apart from {setting}: no sweep varied this setting; known: {known}")
+        first, second = (" and ".join(each) or "as the scenario says" for each in values)
+        notes.append(f"matched apart from {setting}: {first} in the first, {second} in the second")
+    return notes
 
 
 def _judged(quantity: Quantity, method: str, values: pd.DataFrame, n_runs: int) -> dict[str, Any]:
@@ -157,12 +193,14 @@ def _flat(result: RunPath) -> dict[str, str]:
     return {str(name): json.dumps(value) for name, value in settings.items()}
 
 
-def _all_values(a: Runs, b: Runs) -> Iterator[tuple[Quantity, str, pd.DataFrame]]:
+def _all_values(
+    a: Runs, b: Runs, apart_from: Sequence[str]
+) -> Iterator[tuple[Quantity, str, pd.DataFrame]]:
     """All quantities that both have tables for, the method, and columns run_id, a, b, change."""
     for table in READ:
         if not (a.has(table) and b.has(table)):
             continue
-        rows = _joined(a, b, table)
+        rows = _joined(a, b, table, apart_from)
         for method in [
             *(judged_maps.methods_in(rows, oracle=True) if "aligner" in rows else []),
             "",
@@ -176,7 +214,7 @@ def _all_values(a: Runs, b: Runs) -> Iterator[tuple[Quantity, str, pd.DataFrame]
                         yield quantity, method, values
 
 
-def _joined(a: Runs, b: Runs, table: str) -> pd.DataFrame:
+def _joined(a: Runs, b: Runs, table: str, apart_from: Sequence[str]) -> pd.DataFrame:
     """Rows of both by run and keys, values with the suffixes _a and _b; the lesser counts."""
     columns, optional, reduce = READ[table]
     frames = []
@@ -184,7 +222,7 @@ def _joined(a: Runs, b: Runs, table: str) -> pd.DataFrame:
         parts = []
         for rows in runs.batches(table, columns, optional):
             named = rows.drop(columns=[*judged_maps.RUN_KEYS, *judged_maps.setting_columns(rows)])
-            parts.append(reduce(named.assign(run_id=match_names(rows))))
+            parts.append(reduce(named.assign(run_id=match_names(rows, apart_from))))
         # a run of one robot has no rows, and must not decide the columns' types
         parts = [part for part in parts if len(part)] or parts[:1]
         frames.append(pd.concat(parts, ignore_index=True))

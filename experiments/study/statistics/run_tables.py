@@ -4,7 +4,7 @@ Files are read some at a time and only in the columns asked for, so that whoever
 before going on holds that much in memory, however many runs there are.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import takewhile
@@ -114,12 +114,14 @@ class Runs:
         """
         return pd.concat(list(self.batches(table, columns, optional)), ignore_index=True)
 
-    @property
-    def names(self) -> set[str]:
-        """All runs that have errors or paths, by scenario, seed and settings."""
+    @cached_property
+    def described(self) -> pd.DataFrame:
+        """All runs that have errors or paths: run_id, scenario, seed, and what a sweep varied."""
         tables_there = filter(self.has, ("errors", "robots"))
         every = (rows for table in tables_there for rows in self.batches(table, ["iteration"]))
-        return {name for rows in every for name in match_names(rows.drop_duplicates("run_id"))}
+        parts = [rows.drop(columns="iteration").drop_duplicates("run_id") for rows in every]
+        none = pd.DataFrame(columns=pd.Index(RUN_KEYS))
+        return pd.concat(parts).drop_duplicates("run_id") if parts else none
 
     @cached_property
     def _told(self) -> pd.DataFrame:
@@ -159,10 +161,10 @@ def find_runs(paths: Path | Sequence[Path]) -> Runs:
     return Runs(tuple(results), tuple(sweeps))
 
 
-def match_names(frame: pd.DataFrame) -> pd.Series:
-    """What a run is matched by: scenario, seed, settings."""
+def match_names(frame: pd.DataFrame, apart_from: Collection[str] = ()) -> pd.Series:
+    """What a run is matched by: scenario, seed, settings but for those named."""
     names = frame["scenario"].astype(str) + " seed " + frame["seed"].astype(str)
-    for column in sorted(setting_columns(frame)):
+    for column in sorted(set(setting_columns(frame)).difference(apart_from)):
         names = names + " " + column + "=" + frame[column].astype(str)
     return names
 

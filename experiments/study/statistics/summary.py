@@ -101,7 +101,7 @@ def summarise(runs: Runs) -> Summary:
             made[name] = pd.concat(parts, ignore_index=True)
             timings = rows if table == "aligner_timings" else timings
     made = {name: table for name, table in made.items() if len(table)}
-    return Summary(len(runs.names), made, medians, timings, missing, runs.failed)
+    return Summary(len(runs.described), made, medians, timings, missing, runs.failed)
 
 
 class ReducedErrors(NamedTuple):

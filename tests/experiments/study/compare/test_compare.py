@@ -143,6 +143,33 @@ def test_nothing_in_common_is_one_clear_line(tmp_path: Path) -> None:
         compare(a, write_sweep(tmp_path / "c", (0,), settings))
 
 
+def test_runs_are_matched_apart_from_a_setting_that_is_named(tmp_path: Path) -> None:
+    """As two sweeps of one value each are compared with those of the other value."""
+    seeds = range(8)
+    changed = {seed: scaled(0.5, "ransac")(seed, tables_of(seed)) for seed in seeds}
+    few, many = ({"drive.frames": "9", "slam.particles": each} for each in ("50", "200"))
+    a = write_sweep(tmp_path / "a", seeds, [few])
+    b = write_sweep(tmp_path / "b", seeds, [many], made=changed)
+    with pytest.raises(InputError, match="no run in common"):
+        compare(a, b)
+    found = compare(a, b, ["slam.particles"])
+    assert found.n_runs == 8
+    assert verdicts(found.table)[("estimated error, m", "ransac")] == BETTER
+    assert verdicts(found.table)[("estimated error, m", "icp")] == SAME
+    assert "matched apart from slam.particles: 50 in the first, 200 in the second" in found.notes
+    plain = write_sweep(tmp_path / "c", seeds, [{"drive.frames": "9"}])
+    plain = compare(plain, b, ["slam.particles"])
+    assert plain.n_runs == 8
+    assert "as the scenario says in the first, 200 in the second" in plain.notes[0]
+    with pytest.raises(
+        InputError, match=r"slam\.particle: .* known: drive\.frames, slam\.particles$"
+    ):
+        compare(a, b, ["slam.particle"])
+    both = write_sweep(tmp_path / "d", seeds, [few, many])
+    with pytest.raises(InputError, match=r"d: world seed 0 .* is there more than once"):
+        compare(a, both, ["slam.particles"])
+
+
 def test_other_settings_under_the_same_name_are_told(tmp_path: Path) -> None:
     a = write_result(tmp_path / "a", 0, tables_of(0))
     b = write_result(tmp_path / "b", 0, tables_of(0))
