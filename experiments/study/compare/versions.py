@@ -109,12 +109,11 @@ def _names(path: Path, runs: Runs, apart_from: Sequence[str]) -> set[str]:
 def _apart_from(a: Runs, b: Runs, settings: Sequence[str]) -> list[str]:
     """What each side has of the settings that runs are not matched by."""
     notes = []
+    varied = [runs.described[setting_columns(runs.described)] for runs in (a, b)]
     for setting in settings:
-        described = a.described, b.described
-        values = [sorted(runs[setting].unique()) if setting in runs else [] for runs in described]
+        values = [sorted(each[setting].unique()) if setting in each else [] for each in varied]
         if not any(values):
-            varied = {name for runs in described for name in setting_columns(runs)}
-            known = ", ".join(sorted(varied)) or "none"
+            known = ", ".join(sorted({str(name) for each in varied for name in each})) or "none"
             raise InputError(f"apart from {setting}: no sweep varied this setting; known: {known}")
         first, second = (" and ".join(each) or "as the scenario says" for each in values)
         notes.append(f"matched apart from {setting}: {first} in the first, {second} in the second")
