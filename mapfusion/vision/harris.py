@@ -1,8 +1,5 @@
 """Harris corners (Harris and Stephens 1988), the strongest of each part of the image."""
 
-import functools
-import itertools
-import math
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -10,17 +7,11 @@ import cv2
 import numpy as np
 
 from mapfusion.arguments import Range, require_in_range
-from mapfusion.kernels import kernel, kernel_part
+from mapfusion.kernels import kernel
 from mapfusion.se2 import Float
 
 _SOBEL_APERTURE_PX = 3
 _SOBEL_GAIN = 2.0  # OpenCV divides its Sobel sum, 8 times the slope per pixel, by 4
-_SOBEL_SUM = 4.0  # what it divides by
-_OUR_BLOCK_PX = 3
-_PROBED_SIGMAS = 8  # more than OpenCV's window has to either side, and than its weights show
-_LEAST_SIDE_PX = 2  # what an image needs to be mirrored at its border
-_BITS, _ALL_BITS = np.uint64(32), np.uint32(0xFFFFFFFF)  # of a response
-_ONE = np.uintp(1)  # indices without a sign, which a kernel need not wrap around
 
 
 @dataclass(frozen=True)
@@ -76,8 +67,7 @@ def detect(image: np.ndarray, parameters: HarrisParameters) -> Float:
         raise ValueError(f"image: is {image.dtype} {image.shape}, expected uint8 (H, W)")
     if min(image.shape) <= 2 * parameters.border_px:
         return np.zeros((0, 2))
-    side = _window_px(parameters.smoothing_px)
-    smooth = cv2.GaussianBlur(image, (side, side), parameters.smoothing_px)
+    smooth = cv2.GaussianBlur(image, (0, 0), parameters.smoothing_px)
     response = harris_response(smooth, parameters)
     pixels = _strongest(response, parameters)
     if len(pixels) == 0:
@@ -85,81 +75,16 @@ def detect(image: np.ndarray, parameters: HarrisParameters) -> Float:
     return _peak(response, pixels)
 
 
-@functools.cache
-def _window_px(sigma_px: float) -> int:
-    """Side of the smallest window that smooths as OpenCV's own does.
-
-    Its weights have eight bits, of which the outermost may have none: to add them up takes time.
-    What becomes of one bright column shows all weights.
-    """
-    line = np.zeros((1, 2 * math.ceil(_PROBED_SIGMAS * sigma_px) + 1), np.uint8)
-    line[0, line.shape[1] // 2] = 255
-    smooth = cv2.GaussianBlur(line, (0, 0), sigma_px)
-    sides = range(1, line.shape[1] + 1, 2)
-    same = (np.array_equal(cv2.GaussianBlur(line, (n, n), sigma_px), smooth) for n in sides)
-    return next(itertools.compress(sides, same))
-
-
 def harris_response(image: np.ndarray, parameters: HarrisParameters) -> np.ndarray:
-    """Response (H, W) float32: values of OpenCV's `cornerHarris`, sooner for the usual block."""
-    block, aperture, k = parameters.block_px, _SOBEL_APERTURE_PX, parameters.k
-    if block != _OUR_BLOCK_PX or min(image.shape) < _LEAST_SIDE_PX:
-        return cv2.cornerHarris(image, block, aperture, k)
-    scale = 1 / (_SOBEL_SUM * block * 255)
-    slope_u = cv2.Sobel(image, cv2.CV_32F, 1, 0, ksize=aperture, scale=scale)
-    slope_v = cv2.Sobel(image, cv2.CV_32F, 0, 1, ksize=aperture, scale=scale)
-    response = np.empty(image.shape, dtype=np.float32)
-    _respond(slope_u, slope_v, np.float32(k), response)
-    return response
-
-
-@kernel
-def _respond(slope_u: np.ndarray, slope_v: np.ndarray, k: np.float32, response: np.ndarray) -> None:
-    """Fill in det M - k (trace M)^2, M the sum over 3 x 3 pixels of products of slopes (H, W).
-
-    Sums are in double precision, products and what follows in single, as OpenCV has them; beyond
-    the border the image is mirrored.
-    """
-    height, width = slope_u.shape
-    sums = np.empty((3, width + 2))
-    for v in range(height):
-        above, below = v - 1 if v > 0 else 1, v + 1 if v < height - 1 else height - 2
-        _sum_products(slope_u, slope_v, above, v, below, sums)
-        for c in range(3):
-            sums[c, 0], sums[c, width + 1] = sums[c, 2], sums[c, width - 1]
-        _combine(sums, k, response, v)
-
-
-@kernel_part
-def _sum_products(
-    slope_u: np.ndarray, slope_v: np.ndarray, above: int, v: int, below: int, sums: Float
-) -> None:
-    """Fill in the sums (3, W + 2) of uu, uv and vv over three rows, but for the outermost."""
-    for i in range(slope_u.shape[1]):
-        a, b, c = slope_u[above, i], slope_u[v, i], slope_u[below, i]
-        d, e, f = slope_v[above, i], slope_v[v, i], slope_v[below, i]
-        k = np.uintp(i + 1)
-        sums[0, k] = np.float64(a * a) + np.float64(b * b) + np.float64(c * c)
-        sums[1, k] = np.float64(a * d) + np.float64(b * e) + np.float64(c * f)
-        sums[2, k] = np.float64(d * d) + np.float64(e * e) + np.float64(f * f)
-
-
-@kernel_part
-def _combine(sums: Float, k: np.float32, response: np.ndarray, v: int) -> None:
-    for i in range(response.shape[1]):
-        before, here, after = np.uintp(i), np.uintp(i + 1), np.uintp(i + 2)
-        a = np.float32(sums[0, before] + sums[0, here] + sums[0, after])
-        b = np.float32(sums[1, before] + sums[1, here] + sums[1, after])
-        c = np.float32(sums[2, before] + sums[2, here] + sums[2, after])
-        trace = a + c
-        response[v, i] = (a * c - b * b) - k * (trace * trace)
+    """Compute the Harris response (H, W) float32 of an image (H, W)."""
+    return cv2.cornerHarris(image, parameters.block_px, _SOBEL_APERTURE_PX, parameters.k)
 
 
 def _strongest(response: np.ndarray, parameters: HarrisParameters) -> np.ndarray:
     """Pixels (N, 2) int64 of the corners to keep, strongest first."""
-    maxima = local_maxima(response, parameters.border_px, np.float32(parameters.min_response))
+    maxima = local_maxima(response, parameters.border_px, parameters.min_response)
     u, v = maxima.T
-    candidates = maxima[descending(response[v, u])]
+    candidates = maxima[np.argsort(-response[v, u], kind="stable")]
     height, width = response.shape
     cells = -(-height // parameters.cell_px) * -(-width // parameters.cell_px)
     share = -(-parameters.max_corners // cells)
@@ -175,73 +100,16 @@ def _strongest(response: np.ndarray, parameters: HarrisParameters) -> np.ndarray
     ]
 
 
-def descending(values: np.ndarray) -> np.ndarray:
-    """Rows of values (N,) float32 above zero from the highest on, equal ones in their own order.
+def local_maxima(response: np.ndarray, border: int, least: float) -> np.ndarray:
+    """Return the pixels (N, 2) int64 of the local maxima of a response (H, W), row by row.
 
-    The bits of such numbers grow as they do. With the row behind them no two keys are the same, so
-    that what sorts fastest, and leaves equals in any order, can sort them.
+    A local maximum exceeds `least` and no response of its 3 x 3 neighbourhood exceeds it. Pixels
+    within `border` of the image's edge are left out.
     """
-    rows = np.arange(len(values), dtype=np.uint64)
-    keys = (_ALL_BITS - values.view(np.uint32)).astype(np.uint64) << _BITS | rows
-    return (np.sort(keys) & np.uint64(_ALL_BITS)).astype(np.int64)
-
-
-def local_maxima(response: np.ndarray, border: int, least: np.float32) -> np.ndarray:
-    """Pixels (N, 2) int64, row by row, above `least` that no neighbour's response exceeds."""
-    height, width = response.shape
-    found = np.empty(((height - 2 * border) * (width - 2 * border), 2), dtype=np.int64)
-    # the mark of each column, and so many at once as a number has bytes
-    highest, is_peak = np.empty(width, np.float32), np.zeros(-(-width // 8) * 8, np.uint8)
-    marks = is_peak.view(np.uint64)
-    return found[: _list_maxima(response, border, least, highest, is_peak, marks, found)]
-
-
-@kernel
-def _list_maxima(
-    response: np.ndarray,
-    border: int,
-    least: np.float32,
-    highest: np.ndarray,
-    is_peak: np.ndarray,
-    marks: np.ndarray,
-    found: np.ndarray,
-) -> int:
-    """Fill in the first rows of `found`, and tell how many."""
-    count = 0
-    for v in range(border, response.shape[0] - border):
-        _mark_peaks(response, v, border, least, highest, is_peak)
-        for k in range(len(marks)):
-            if marks[k] == 0:
-                continue
-            for u in range(8 * k, 8 * k + 8):
-                if is_peak[u]:
-                    found[count, 0], found[count, 1] = u, v
-                    count += 1
-    return count
-
-
-@kernel_part
-def _mark_peaks(
-    response: np.ndarray,
-    v: int,
-    border: int,
-    least: np.float32,
-    highest: np.ndarray,
-    is_peak: np.ndarray,
-) -> None:
-    """Mark the maxima of row v; `highest` is room for what is highest in three rows."""
-    for u in range(response.shape[1]):
-        a, b, c = response[v - 1, u], response[v, u], response[v + 1, u]
-        most = a if a > b else b
-        highest[u] = c if c > most else most
-    begin = np.uintp(border)
-    for i in range(response.shape[1] - 2 * border):
-        u = begin + np.uintp(i)
-        a, b, c = highest[u - _ONE], highest[u], highest[u + _ONE]
-        most = a if a > b else b
-        most = c if c > most else most
-        here = response[v, u]
-        is_peak[u] = np.uint8(here == most) & np.uint8(here > least)
+    inner = (slice(border, -border), slice(border, -border))
+    highest = cv2.dilate(response, np.ones((3, 3), np.uint8))[inner]
+    v, u = np.nonzero((response[inner] == highest) & (response[inner] > least))
+    return np.stack([u, v], -1) + border
 
 
 def spread(
