@@ -14,12 +14,10 @@ from mapfusion.align.nearest_points import GROUP, Groups, look_up_group, room_fo
 from mapfusion.align.pairs import Pairs
 from mapfusion.align.rigid import fit_rigid
 from mapfusion.arguments import Range, require_in_range
-from mapfusion.kernels import kernel, kernel_part
+from mapfusion.kernels import kernel
 from mapfusion.se2 import Float
 
 MAX_ROUNDS = 200  # of pairing and solving
-_CHANGES, _REPEATS = -2, -1  # how a descent ended, where it met no other one
-_NO_ROUNDS = np.empty(0, np.int64)
 
 
 @dataclass(frozen=True)
@@ -54,11 +52,7 @@ def draw_motion(pairs: Pairs, rows: np.ndarray, rng: np.random.Generator) -> Flo
 
 
 class ClosestPoints:
-    """Pairs each landmark of map b with the nearest of map a (planar maps: in the plane).
-
-    Descents that come to the same motion go on as one: what was met on the way is kept, and a
-    descent that meets it again ends where that one did.
-    """
+    """Pairs each landmark of map b with the nearest of map a (planar maps: in the plane)."""
 
     def __init__(self, pairs: Pairs) -> None:
         upright = np.array([1.0, 1.0, 0.0 if pairs.planar else 1.0])
@@ -66,9 +60,6 @@ class ClosestPoints:
         self._tree = BoxTree.of(pairs.map_a.position_m * upright)
         self._p_b = pairs.map_b.position_m * upright
         self._groups = Groups.of(self._p_b)
-        self._ends: list[tuple[Float, np.ndarray]] = []  # T_a_b and what was nearest of each
-        # T_a_b of each round that led to one of them, which one, and after how many more
-        self._met, self._end, self._to_go = np.empty((0, 3)), _NO_ROUNDS, _NO_ROUNDS
 
     @classmethod
     def of(cls, pairs: Pairs) -> "ClosestPoints":
@@ -94,33 +85,20 @@ class ClosestPoints:
         return nearest
 
     def descend(self, T_a_b: Float, max_rounds: int) -> Fit:
-        """Pair and solve from T_a_b on until the pairing repeats; fitted to the last pairing."""
-        way, nearest, met = pair_and_solve(
-            T_a_b, max_rounds, self._p_b, self._groups, self._tree, self._met, self._to_go
-        )
-        if met == _CHANGES:
-            return self._fit(
-                way[-1].copy(), nearest, f"pairs still changed after {max_rounds} rounds"
-            )
-        if met == _REPEATS:
-            new, end, further = way, len(self._ends), 0
-            self._ends.append((way[-1].copy(), nearest))
-        else:
-            new, end, further = way[:-1], self._end[met], self._to_go[met]
-        to_go = further + len(way) - 1 - np.arange(len(new))
-        self._met = np.concatenate([self._met, new])
-        self._end = np.concatenate([self._end, np.full(len(new), end)])
-        self._to_go = np.concatenate([self._to_go, to_go])
-        return self._fit(*self._ends[end])
+        """Pair and solve, starting from T_a_b, until the pairing repeats.
 
-    def _fit(self, T_a_b: Float, nearest: np.ndarray, refusal: str = "") -> Fit:
+        The fit is the least-squares motion of the last pairing.
+        """
+        T_a_b, nearest, repeats = pair_and_solve(
+            T_a_b, max_rounds, self._p_b, self._groups, self._tree
+        )
         pairs, index_a, index_b = self._pairs, self._tree.row[nearest], np.arange(len(nearest))
         every = Correspondences(index_a, index_b, np.zeros(len(nearest)))
         return Fit(
             T_a_b,
             index_a[pairs.index_b] == pairs.index_a,
             fitted=Pairs(pairs.map_a, pairs.map_b, every),
-            refusal=refusal,
+            refusal="" if repeats else f"pairs still changed after {max_rounds} rounds",
         )
 
 
@@ -143,34 +121,19 @@ def summed_square_distance(T_a_b: Float, groups: Groups, tree: BoxTree, most: fl
 
 @kernel
 def pair_and_solve(
-    T_start: Float,
-    max_rounds: int,
-    p_b: Float,
-    groups: Groups,
-    tree: BoxTree,
-    met: Float,
-    to_go: np.ndarray,
-) -> tuple[Float, np.ndarray, int]:
+    T_start: Float, max_rounds: int, p_b: Float, groups: Groups, tree: BoxTree
+) -> tuple[Float, np.ndarray, bool]:
     """Pair p_b (N, 3), in groups, with the nearest of a tree and solve, until no pair changes.
 
-    All that follows, follows from the motion: at one of `met` (M, 3), from which `to_go` (M,) more
-    rounds lead to an end, there is nothing left to do.
-
     Returns:
-        T_a_b of each round (R, 3), index into the tree's points of each one's nearest (N,), and the
-        row of `met` that it came to; if to none, whether it repeats.
+        T_a_b (3,), index into the tree's points of each point's nearest (N,), and True if the last
+        round changed no pair.
     """
     p, n = tree.p, len(p_b)
     T_a_b, everyone, room = T_start.copy(), np.arange(n), room_for_groups()
     row_of, found = groups.row, room.nearest
     nearest, in_group, matched = np.full(n, -1), np.full(len(row_of), -1), np.empty((n, 3))
-    way = np.empty((max_rounds + 1, 3))
     for rounds in range(max_rounds + 1):
-        way[rounds, 0], way[rounds, 1], way[rounds, 2] = T_a_b[0], T_a_b[1], T_a_b[2]
-        row = _row_of(T_a_b, met)
-        # one round more than that if it came there by other pairs
-        if row >= 0 and rounds + to_go[row] < max_rounds:
-            return way[: rounds + 1], nearest, row
         changed = False
         for first in range(0, len(in_group), GROUP):
             look_up_group(T_a_b, first, groups, tree, in_group, room)
@@ -181,16 +144,7 @@ def pair_and_solve(
                     for axis in range(3):
                         matched[row_of[i], axis] = p[k, axis]
         if not changed:
-            return way[: rounds + 1], nearest, _REPEATS
+            return T_a_b, nearest, True
         if rounds < max_rounds:
             T_a_b[0], T_a_b[1], T_a_b[2] = fit_rigid(matched, p_b, everyone)
-    return way, nearest, _CHANGES
-
-
-@kernel_part
-def _row_of(T_a_b: Float, met: Float) -> int:
-    """Where a motion (3,) is among (M, 3), to the last bit; -1: nowhere."""
-    for row in range(len(met)):
-        if met[row, 2] == T_a_b[2] and met[row, 0] == T_a_b[0] and met[row, 1] == T_a_b[1]:
-            return row
-    return -1
+    return T_a_b, nearest, False

@@ -14,16 +14,6 @@ from mapfusion.align.rigid import fit_rigid
 from tests.mapfusion.align.map_pairs import error, given_pairs, landmarks
 
 
-def assert_same(first, second):
-    np.testing.assert_array_equal(first.T_a_b, second.T_a_b)
-    np.testing.assert_array_equal(first.inlier, second.inlier)
-    assert first.refusal == second.refusal
-    assert first.fitted is not None
-    assert second.fitted is not None
-    np.testing.assert_array_equal(first.fitted.index_a, second.fitted.index_a)
-    np.testing.assert_array_equal(first.fitted.index_b, second.fitted.index_b)
-
-
 def closest_points(pair):
     return ClosestPoints(Pairs(pair.map_a, pair.map_b, pair.correspondences))
 
@@ -55,33 +45,6 @@ def test_kernel_equals_its_twin(offset_m, max_rounds):
     np.testing.assert_allclose(found.T_a_b, T, atol=1e-9)
     np.testing.assert_array_equal(found.inlier, nearest == np.arange(300))
     assert ("still changed" in found.refusal) == (not repeats)
-
-
-@pytest.mark.parametrize("max_rounds", [3, 6, 200])
-def test_descents_that_meet_end_as_each_does_by_itself(max_rounds):
-    pair, rng = given_pairs(np.random.default_rng(5), 200, 0.7, 0.02), np.random.default_rng(6)
-    together = closest_points(pair)
-    alone = [pair.T_a_b + rng.normal(0, [0.3, 0.3, 0.03]) for _ in range(40)]
-    ends = [together.descend(T, max_rounds) for T in alone]
-    met = len(ends) - len({end.T_a_b.tobytes() for end in ends})
-    assert met > 10 or max_rounds == 3
-    for T, end in zip(alone, ends, strict=True):
-        assert_same(end, closest_points(pair).descend(T, max_rounds))
-
-
-def test_a_motion_met_before_ends_as_it_did():
-    """From anywhere on the way of another descent, as long as rounds are left to get there."""
-    pair = given_pairs(np.random.default_rng(0), 300, 0.7, 0.05)
-    closest, start = closest_points(pair), pair.T_a_b + np.array([0.5, -0.5, 0.05])
-    first = closest.descend(start, 200)
-    way = closest._met.copy()
-    assert len(way) > 5
-    assert not first.refusal
-    for T, left in zip(way, range(len(way) - 1, 0, -1), strict=False):
-        assert_same(closest.descend(T, 200), first)
-        few = closest.descend(T, left - 1)
-        assert "still changed" in few.refusal
-    assert len(closest._met) == len(way)
 
 
 def test_cost_is_the_summed_square_distance():
