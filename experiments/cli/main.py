@@ -1,13 +1,11 @@
 """The command `mapfusion`: its list of commands, and what becomes of their failures."""
 
-import gc
 import os
 import sys
 import warnings
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperGroup
 
 import mapfusion
 from experiments.cli import import_commands, run_commands, step_commands, study_commands
@@ -21,30 +19,7 @@ from experiments.cli.options import (
 )
 from mapfusion.errors import InputError, one_line
 
-# Objects made before Python looks for cycles among them, 700 by default: most are made by imports
-# and in drawing, and stay.
-_MADE_BETWEEN_COLLECTIONS = 50_000
-REPLACED = {
-    "aligners": "scenarios --aligners",
-    "schema": "scenarios --schema",
-    "figures": "report RESULT --figures",
-    "refusal": "study refusal",
-    "benchmark": "study benchmark",
-}
-
-
-class Commands(TyperGroup):
-    """The commands, and for those of earlier versions what took their place."""
-
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """The command asked for."""
-        if args and args[0] in REPLACED:
-            raise InputError(f"{args[0]}: is now `mapfusion {REPLACED[args[0]]}`")
-        return super().resolve_command(ctx, args)
-
-
 app = typer.Typer(
-    cls=Commands,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     help="Measures how well landmark maps of independent robots can be fused.\n\n"
@@ -76,7 +51,6 @@ def main() -> None:
     from experiments.run.defects import saved_defect
     from experiments.run.kernel_cache import use_kernel_cache
 
-    gc.set_threshold(_MADE_BETWEEN_COLLECTIONS)
     # Work is bound to one thread anyway, and those that BLAS starts when it is imported wait in a
     # loop. To be said before that.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

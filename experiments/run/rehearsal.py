@@ -5,7 +5,6 @@ few are compiled yet, small runs of the same stages go first, in processes of th
 world to robots' logs, the other from made-up logs to fused maps. What they find is thrown away.
 """
 
-import gc
 import os
 import tempfile
 from collections.abc import Iterable
@@ -29,10 +28,6 @@ LABEL = "compile kernels"
 # or two has made outdated is compiled sooner by those who need it.
 _MISSING_SHARE = 0.5
 _IN_NO_RUN = "experiments/study"
-# What a compiler makes mostly stays until it is done: to look through it for garbage as often as
-# Python does (each 700 objects) takes a twentieth of its time.
-_OBJECTS_PER_COLLECTION = 200_000
-
 _PICTURES = ("sim", "mapfusion/vision")
 _RAY_CASTER = "sim/raycast"
 # Robots that see each other, in a room that a few small pictures show.
@@ -98,14 +93,9 @@ def rehearse_maps(scenario: Simulation) -> None:
 
 
 def _run(stages: Iterable[Stage]) -> None:
-    usual = gc.get_threshold()
-    gc.set_threshold(_OBJECTS_PER_COLLECTION, *usual[1:])
-    try:
-        with tempfile.TemporaryDirectory() as folder:
-            for task in tasks_of(with_those_before(list(stages)), Store.of(Path(folder))).values():
-                task.run()
-    finally:
-        gc.set_threshold(*usual)
+    with tempfile.TemporaryDirectory() as folder:
+        for task in tasks_of(with_those_before(list(stages)), Store.of(Path(folder))).values():
+            task.run()
 
 
 def _made_up_log(robot: str, start: Float) -> RobotLog:

@@ -7,7 +7,7 @@ import pytest
 import typer
 from typer.main import get_command
 
-from experiments.cli.main import REPLACED, app
+from experiments.cli.main import app
 from experiments.scenario.loading import OWN
 from tests.helpers.tiny_scenario import assert_refused, command
 
@@ -26,24 +26,11 @@ def test_at_most_fifteen_commands_in_panels_in_the_order_of_a_day(
 ) -> None:
     top = get_command(app).commands  # type: ignore[attr-defined]
     assert len(top) <= 15
-    assert not top.keys() & REPLACED.keys()
     shown = command(capsys, "--help").out
     panels = ["Run", "Look and compare", "Your own maps, logs and recordings"]
     places = [shown.index(f"─ {panel} ─") for panel in panels]
     assert places == sorted(places)
     assert "─ Commands ─" not in shown
-
-
-@pytest.mark.parametrize("name", REPLACED)
-def test_a_removed_command_says_what_took_its_place(
-    name: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert_refused(command(capsys, name, "whatever", "-o", "x"), f"mapfusion {REPLACED[name]}")
-    words = [word for word in REPLACED[name].split() if not word.isupper()]
-    path = [word for word in words if not word.startswith("-")]
-    found = all_commands()[" ".join(path)]
-    for option in set(words) - set(path):
-        assert any(option in parameter.opts for parameter in found.params)
 
 
 def test_an_option_means_the_same_everywhere() -> None:
