@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mapfusion.se2 import Float
-from mapfusion.smoother.normal_equations import Estimate, Weights
+from mapfusion.smoother.normal_equations import Estimate, Weights, information_under
 from mapfusion.smoother.observation_level import first_observation_level, told_observation_level
 from mapfusion.smoother.odometry_levels import Untold
 from mapfusion.smoother.robust import NO_TAILS, Tails, unweighted
@@ -106,5 +106,5 @@ def _differ(levels: Float | float, others: Float | float) -> float:
 
 def _under(problem: Problem, levels: Levels, seen: Sightings) -> Problem:
     """The problem under levels, those of the observations being in `seen`."""
-    information = problem.information / levels.odometry
+    information = information_under(problem.information, levels.odometry)
     return problem._replace(seen=seen, information=information)

@@ -102,6 +102,23 @@ def information_of(sigma: Float) -> Float:
     return 1.0 / (sigma**2 + _STILL**2)
 
 
+def information_under(information: Float, levels: Float) -> Float:
+    """Return the information (N, 3) of motions whose variances are multiplied by `levels` (3,).
+
+    It stays bounded as in `information_of`: the bound is no noise that a level could scale.
+    """
+    return np.minimum(information / levels, _STILL**-2)
+
+
+def least_levels(information: Float) -> Float:
+    """Return the levels (3,) below which no motion's information (N, 3) grows any more.
+
+    They are 1 where no motion has any information.
+    """
+    least = np.min(np.where(information > 0, information, np.inf), axis=0, initial=np.inf)
+    return np.where(np.isfinite(least), least * _STILL**2, 1.0)
+
+
 def turns(path: Float) -> Float:
     """(T, 2) cosine and sine of each heading."""
     return np.stack([np.cos(path[:, 2]), np.sin(path[:, 2])], axis=1)

@@ -24,6 +24,10 @@ from mapfusion.smoother.settle import Problem, Settled
 from mapfusion.smoother.sightings import Sightings
 from mapfusion.smoother.student import fitted_dof, student_weights
 
+# Observations that agree to the last digit, as simulated without noise, have a level of zero. None
+# is taken to be closer, in m, than this: a tenth of what holds a robot that stands still.
+_LEAST_M = 1e-5
+
 
 def told_observation_level(end: Settled, level: float) -> float:
     """The level q of the stated covariances of observations on tracks that stray.
@@ -62,4 +66,6 @@ def _level(
         return 1.0
     beside = min(level, 1.0) * (square + of_point)
     found = student_weights(beside, fitted_dof(beside, n, tails.observation), n)
-    return float(level * np.sum(found * square) / known)
+    stated = np.median(np.trace(seen.information[rows], axis1=1, axis2=2)) * level / n
+    least = min(_LEAST_M**2 * stated, 1.0)
+    return max(float(level * np.sum(found * square) / known), least)

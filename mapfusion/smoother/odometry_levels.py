@@ -19,15 +19,18 @@ tell with information J whatever the others are, the share C / v that is left un
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import brentq
 
 from mapfusion.se2 import Float
 from mapfusion.smoother.motion_posterior import disturbance_variances
-from mapfusion.smoother.normal_equations import disturbances
+from mapfusion.smoother.normal_equations import disturbances, information_under, least_levels
 from mapfusion.smoother.settle import Problem, Settled
 
 # Disturbances that have to be told before a level is taken from them: a standard deviation is then
 # known to a tenth of itself, 1 / sqrt(2 n). Of fewer, covariances would be as uncertain as levels.
 LEAST_TOLD = 50.0
+_NONE_TOLD = 1e-9  # disturbances; fewer are none, but for rounding
+_LEVEL_TO = 1e-6  # share of itself that a level is solved to, far below its own error
 
 
 class Untold(NamedTuple):
@@ -44,17 +47,26 @@ class Untold(NamedTuple):
     @classmethod
     def of(cls, problem: Problem, end: Settled, levels: Float) -> "Untold":
         """Where steps ended under these levels, those of the problem being as stated."""
-        share = np.clip(disturbance_variances(end) * problem.information / levels, 0, 1)
+        information = information_under(problem.information, levels)
+        share = np.clip(disturbance_variances(end) * information, 0, 1)
         # nothing is said of the way from one robot's log to another's
         return cls(np.where(problem.information > 0, share, 1.0), levels)
 
     def known(self, levels: Float) -> Float:
-        """(3,) disturbances that are told under other levels, by each axis."""
-        more = levels / self.levels
-        return np.sum(1 - self.share / (self.share + (1 - self.share) * more), axis=0)
+        """Return how many disturbances (3,) are told under other levels, by each axis."""
+        return np.array([self._known(axis, level) for axis, level in enumerate(levels)])
+
+    def _known(self, axis: int, level: float) -> float:
+        share, more = self.share[:, axis], level / self.levels[axis]
+        return float(np.sum(1 - share / (share + (1 - share) * more)))
 
     def told_levels(self, problem: Problem, path: Float, levels: Float) -> Float:
-        """(3,) q of the variances along, across and in the heading.
+        """Return the levels (3,) of the variances along, across and in the heading.
+
+        Where fewer than `LEAST_TOLD` disturbances are told, those missing count as found at the
+        stated variance. So a level is as stated where nothing is told. It cannot fall below the
+        level at which the noise of `LEAST_TOLD` disturbances can still be told from none, which
+        bounds the odometry's information.
 
         Args:
             problem: with the odometry's information as stated.
@@ -62,5 +74,23 @@ class Untold(NamedTuple):
             levels: (3,) under which it was found.
         """
         found = np.sum(disturbances(path, problem.odometry) ** 2 * problem.information, axis=0)
-        is_told = self.known(self.levels) >= LEAST_TOLD
-        return np.where(is_told, found / np.maximum(self.known(levels), LEAST_TOLD), 1.0)
+        told = found / np.maximum(self.known(levels), _NONE_TOLD)
+        told = np.maximum(told, least_levels(problem.information))
+        return np.array([self._with_missing(axis, level) for axis, level in enumerate(told)])
+
+    def _with_missing(self, axis: int, told: float) -> float:
+        """Return the level q of an axis where what is told says `told`.
+
+        q (known(q) + missing(q)) = told known(q) + missing(q) has its root between `told` and 1.
+        It is solved for q on both sides: to repeat q = f(q) would end in a cycle of two levels.
+        """
+
+        def excess(level: float) -> float:
+            known = self._known(axis, level)
+            missing = max(LEAST_TOLD - known, 0.0)
+            return (told - level) * known + (1 - level) * missing
+
+        at_told = excess(told)
+        if at_told == 0 or told == 1:
+            return told
+        return float(brentq(excess, told, 1.0, rtol=_LEVEL_TO))
