@@ -313,3 +313,16 @@ def test_tails_are_found_and_no_tail_is_cut_off(
     assert least < found.dof < most
     several = np.count_nonzero(_fused(team).parents != ABSENT, axis=1) > 1
     assert np.count_nonzero(several) >= 0.98 * 300
+
+
+def test_a_fused_landmark_looks_as_the_parent_that_was_seen_most() -> None:
+    team, rng = DrawnTeam([slice(0, 40), slice(10, 50), slice(20, 60)], 4), np.random.default_rng(4)
+    counts = np.split(rng.permutation(120).astype(np.int32) + 3, 3)
+    team.maps = [replace(own, count=n) for own, n in zip(team.maps, counts, strict=True)]
+    fused = _fused(team)
+    assert fused.landmarks.descriptor is not None
+    for row, parents in enumerate(fused.parents):
+        own = [(counts[k][i], team.maps[k].descriptor[i]) for k, i in enumerate(parents) if i >= 0]
+        most = max(own, key=lambda each: each[0])
+        np.testing.assert_array_equal(fused.landmarks.descriptor[row], most[1])
+        assert fused.landmarks.count[row] == sum(n for n, _ in own)
