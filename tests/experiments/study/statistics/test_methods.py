@@ -217,3 +217,14 @@ def test_maps_that_one_method_did_not_see_leave_the_others_in_their_runs() -> No
     assert (row["n_runs"], row["first_wins"]) == (2, 0.5)
     assert (row["first_wins_low"], row["first_wins_high"]) == (0.0, 1.0)
     assert (row["ratio_low"], row["ratio_high"]) == pytest.approx((0.5, 2.0))
+
+
+def test_what_is_told_beside_the_ratio_is_a_median_too() -> None:
+    errors = rich(many_errors(1, methods={"one": (1.0, 0.0, 0.0)}))
+    off = np.geomspace(0.01, 2.0, errors["iteration"].nunique() * 2)
+    place = errors.groupby(["robot_a", "robot_b", "iteration"]).ngroup()
+    errors["translation_error_m"] = off[place]
+    errors["refined_translation_error_m"] = off[place] / 3
+    row = oracle_ratios(maps_of(errors), rng()).set_index("aligner").loc["one"]
+    assert row["estimated_m"] == pytest.approx(np.median(off))
+    assert row["refined_m"] == pytest.approx(np.median(off) / 3)
