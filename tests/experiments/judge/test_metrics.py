@@ -228,3 +228,9 @@ def test_nothing_to_measure_is_nan(tables: dict[str, pd.DataFrame], name: str) -
 
 def test_all_tables_used_are_named(tables: dict[str, pd.DataFrame]) -> None:
     assert set(metrics.USED_TABLES) == set(tables)
+
+
+def test_an_oracle_without_error_leaves_no_ratio(tables: dict[str, pd.DataFrame]) -> None:
+    errors = tables["errors"].copy()
+    errors.loc[errors["aligner"] == "oracle", "refined_translation_error_m"] = 0.0
+    assert np.isnan(compute("ransac.refined_over_oracle", tables | {"errors": errors}))
