@@ -326,3 +326,30 @@ def test_a_fused_landmark_looks_as_the_parent_that_was_seen_most() -> None:
         most = max(own, key=lambda each: each[0])
         np.testing.assert_array_equal(fused.landmarks.descriptor[row], most[1])
         assert fused.landmarks.count[row] == sum(n for n, _ in own)
+
+
+def test_weights_of_a_student_t_are_1_in_the_mean() -> None:
+    """As they are of errors about the true points (Lange et al. 1989), not about estimated ones."""
+    dof, means, rows = 2.5, [], np.arange(300)
+    for seed in range(2):
+        rng, team = np.random.default_rng(seed), DrawnTeam([slice(0, 300)] * 3, seed)
+        for k, own in enumerate(team.maps):
+            assert own.joint is not None
+            root = np.linalg.cholesky(own.joint.own_m2)
+            scale = np.sqrt(dof / rng.chisquare(dof, (300, 1)))
+            off = scale * np.einsum("nij,nj->ni", root, rng.normal(size=(300, 3)))
+            off += np.einsum("nri,r->ni", own.joint.common_m, rng.normal(size=own.joint.rank))
+            team.maps[k] = replace(own, position_m=team.truth(k) + off)
+        maps = [JointMap.of(own, 0.0, 3) for own in team.maps]
+        start = np.array([np.zeros(3), *(pair.alignment.T_a_b for pair in team.pairs[:2])])
+        found = estimate_jointly(maps, start, np.column_stack([rows] * 3))
+        means.append(found.weight.mean() / information_share(found.dof, 3))
+    assert np.mean(means) == pytest.approx(1.0, abs=0.06)
+
+
+def test_drift_counts_as_a_landmark_s_own_where_nothing_is_shared() -> None:
+    (own,) = DrawnTeam([slice(0, 10)], 0).maps
+    made = JointMap.of(replace(own, joint=None), 0.3, 3)
+    assert made.n_shared == 0
+    np.testing.assert_allclose(made.joint.own_m2, own.covariance_m2 + np.diag([0.09, 0.09, 0]))
+    assert JointMap.of(own, 0.3, 3).joint is own.joint  # which has it all
