@@ -2,12 +2,13 @@
 
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
 from experiments.study.compare.quantities import READ
 from experiments.study.compare.versions import compare
-from tests.helpers.made_up_runs import Tables, two_sweeps
+from tests.helpers.made_up_runs import Tables, tables_of, two_sweeps
 
 
 def row(found, metric: str, method: str) -> dict:
@@ -38,6 +39,22 @@ def test_values_and_counts_are_those_of_the_tables(tmp_path: Path) -> None:
     assert row(found, "fused RMSE, m", "")["n_rows"] == 6
     path = row(found, "path RMSE, m", "")
     assert (path["change"], path["n_rows"], path["verdict"]) == (1.0, 6 * 3, "identical")
+
+
+def test_what_is_told_of_either_version_is_a_median_of_errors_and_a_mean_of_shares(
+    tmp_path: Path,
+) -> None:
+    found = compare(*two_sweeps(tmp_path, changed, seeds=6))
+    made = [tables_of(seed) for seed in range(6)]
+    fits = pd.concat([each["map_fits"] for each in made])
+    rmse_m = np.median(fits[fits["map"] != "fused"]["rmse_m"])
+    landmarks = row(found, "landmark RMSE, m", "")
+    assert (landmarks["a"], landmarks["b"]) == pytest.approx((rmse_m, 3 * rmse_m))
+    errors = pd.concat([each["errors"] for each in made])
+    of_icp = errors[errors["aligner"] == "icp"]
+    right = (of_icp["refined_translation_error_m"] <= 0.5).mean()  # of as many answers a map
+    assert 0.3 < right < 0.9
+    assert row(found, "success refined", "icp")["a"] == pytest.approx(right)
 
 
 def test_nees_of_fused_pairs_is_per_degree_of_freedom() -> None:
