@@ -75,3 +75,30 @@ def test_long_logs_have_no_more_of_them() -> None:
     assert len(shared) <= 3 * 65
     stated = 9 * sigma[[100, 499], 0] ** 2 + sigma[[100, 499], 2] ** 2
     assert np.sum(shared**2, axis=0) == pytest.approx(stated, rel=0.1)
+
+
+def test_a_frame_measured_for_itself_shares_nothing_with_those_before() -> None:
+    """At frame 3 nothing is carried: the error starts anew there, not a frame later."""
+    path = np.column_stack([0.3 * np.arange(6.0), np.zeros((6, 2))])
+    carried = np.ones((6, 2))
+    carried[3] = 0.0
+    told = Attitude(np.zeros((6, 3)), np.tile([0.01, 0.01, 0.005], (6, 1)), carried)
+    frame, point = np.arange(6), path + np.array([1.0, 2.0, 0.0])
+    shared = shared_heights(told, path, frame, np.arange(6), point)
+    both = shared.T @ shared
+    assert not both[:3, 3:].any()
+    assert np.all(both[:3, :3] > 0)
+    assert np.all(both[3:, 3:] > 0)
+
+
+def test_a_tilt_of_any_heading_is_the_mean_of_the_variances_of_roll_and_pitch() -> None:
+    """Roll lifts what is beside the robot, pitch what is ahead: by headings all round, the mean."""
+    roll_rad, pitch_rad, heading = 0.01, 0.03, np.linspace(-np.pi, np.pi, 8, endpoint=False)
+    sigma = np.tile([roll_rad, pitch_rad, 0.0], (1, 1))
+    told = Attitude(np.zeros((1, 3)), sigma, np.zeros((1, 2)))
+    arm = np.array([2.0, 1.0, 0.0])
+    shared = shared_heights(told, np.zeros((1, 3)), np.array([0]), np.array([0]), arm[None])
+    ahead = arm[0] * np.cos(heading) + arm[1] * np.sin(heading)
+    beside = arm[1] * np.cos(heading) - arm[0] * np.sin(heading)
+    expected = np.mean((beside * roll_rad) ** 2 + (ahead * pitch_rad) ** 2)
+    assert np.sum(shared**2) == pytest.approx(expected)

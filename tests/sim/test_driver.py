@@ -141,6 +141,14 @@ def test_the_same_bits_in_another_process(driven: Trajectory) -> None:
         ),
         ([route("a", [3.4, 1, 0], (4.6, 3.4))], r"passes a wall at 0.\d+ m, the robot needs 0.25"),
         (
+            [route("a", [3.4, 1, 0], (4.6, 4.3))],
+            r"passes a wall at 0.17 m, the robot needs 0.25 m",
+        ),
+        (
+            [route(n, [x, 1, 0], (x, 3)) for n, x in (("a", 1.0), ("b", 6.0), ("c", 1.5))],
+            "robots a and c: they start 0.50 m apart",
+        ),
+        (
             [route("a", [1, 1, 0], (1, 3)), route("a", [6, 1, 0], (6, 3))],
             "robot a: two robots have this name",
         ),

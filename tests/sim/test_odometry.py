@@ -129,3 +129,13 @@ def test_bad_arguments_are_named() -> None:
         add_noise(np.full((4, 3), np.nan), OdometryNoise(), np.random.default_rng(0))
     with pytest.raises(InputError, match=r"scale_sigma: is -0\.1"):
         OdometryNoise(scale_sigma=-0.1)
+
+
+def test_the_walks_of_way_and_heading_are_independent() -> None:
+    noise = OdometryNoise(0.1, 0.1, 0.0, scale_sigma=0.0, track_sigma=0.0)
+    straight = np.tile([0.25, 0.0, 0.0], (20_000, 1))
+    measured = add_noise(straight, noise, np.random.default_rng(7))
+    along = np.hypot(measured[:, 0], measured[:, 1]) - 0.25
+    assert along.std() == pytest.approx(0.1 * np.sqrt(0.25), rel=0.03)
+    assert measured[:, 2].std() == pytest.approx(0.1 * np.sqrt(0.25), rel=0.03)
+    assert abs(np.corrcoef(along, measured[:, 2])[0, 1]) < 4 / np.sqrt(20_000)

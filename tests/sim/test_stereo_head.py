@@ -1,13 +1,15 @@
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from mapfusion.camera import StereoCamera
 from sim.floorplan import FloorPlan
 from sim.radiometry import RadiometricNoise
-from sim.stereo_head import StereoFrame, render_stereo
+from sim.stereo_head import StereoFrame, camera_pose, render_stereo
 from sim.world import World
 from tests.sim.ray_casting import CAMERA, NO_NOISE, POSE, off_surface_m, ray_cast
 
@@ -90,3 +92,16 @@ def test_camera_of_another_size_and_mount_is_exact_too(room: FloorPlan, faces: P
         world.add_painted_faces(faces)
         frame = render_stereo(world, camera, POSE, NO_NOISE, np.random.default_rng(0))
     assert off_surface_m(room, camera, frame.depth_m).max() < 2e-4
+
+
+def test_a_tilted_pair_on_a_turned_robot_looks_along_its_axes() -> None:
+    """Angles in the order of the mount: rolled, pitched, then turned with the robot."""
+    camera = replace(CAMERA, mount_roll_rad=0.1, mount_pitch_rad=0.2)
+    x, y, heading = 1.0, -2.0, 0.7
+    found = camera_pose(camera, [x, y, heading], 0.05)
+    mounted = Rotation.from_euler("ZYX", [0.0, 0.2, 0.1])
+    turned = Rotation.from_euler("Z", heading)
+    np.testing.assert_allclose(found[:3, :3], (turned * mounted).as_matrix(), atol=1e-12)
+    eye = camera.p_robot_eye(0.0) + mounted.apply([0.0, 0.05, 0.0])
+    np.testing.assert_allclose(found[:3, 3], turned.apply(eye) + np.array([x, y, 0.0]), atol=1e-12)
+    assert found[2, 0] < 0  # it looks down

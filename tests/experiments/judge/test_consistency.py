@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -109,3 +111,18 @@ def test_one_robot_alone() -> None:
     a, _ = two_robots(np.zeros((0, 3)), np.zeros((0, 3)))
     rows = landmark_nees_rows(FusedTeam([a], [], ITERATION, None), 0.1)
     assert [(row["landmarks"], row["n_landmarks"]) for row in rows] == [("own", 0)]
+
+
+@pytest.mark.parametrize(("planar", "dof"), [(True, 2), (False, 3)])
+def test_a_map_s_nees_worked_out_by_hand(planar: bool, dof: int) -> None:
+    """Squares of 0, 1, 4, 6.5 and 20: the gate of 95 % lies at 5.99 for 2 degrees, 7.81 for 3."""
+    squares = np.array([0.0, 1.0, 4.0, 6.5, 20.0])
+    points = np.random.default_rng(4).uniform(0, 9, (5, 3)) * [1, 1, not planar]
+    off = SIGMA_M * np.sqrt(squares)[:, None] * [0.6, -0.8, 0.0]
+    a = robot("A", points, T_WORLD_A, off, SIGMA_M)
+    a.maps[ITERATION] = replace(a.maps[ITERATION], planar=planar)
+    (row,) = landmark_nees_rows(FusedTeam([a], [], ITERATION, None), 0.1)
+    assert (row["n_landmarks"], row["degrees_of_freedom"]) == (5, dof)
+    assert row["nees_mean"] == pytest.approx(31.5 / 5)
+    assert row["nees_median"] == pytest.approx(4.0)
+    assert row["share_in_gate"] == pytest.approx((3 if planar else 4) / 5)

@@ -163,9 +163,10 @@ def test_a_robot_whose_log_ended_keeps_its_last_map() -> None:
 
 
 def test_paths_and_their_errors() -> None:
-    """A square of 1 m driven truly; odometry turns 0.1 rad too far at the first corner."""
+    """A square of 1 m; odometry turns 0.1 rad too far at one corner, 0.2 too little at another."""
     quarter = np.pi / 2
-    odometry = np.array([[0, 0, 0], [1, 0, quarter + 0.1], [1, 0, quarter], [1, 0, quarter]])
+    turns = quarter + 0.1, quarter, quarter - 0.2
+    odometry = np.array([[0, 0, 0], *([1, 0, turn] for turn in turns)])
     truth = np.array([[0, 0, 0], [1, 0, quarter], [1, 1, 2 * quarter], [0, 1, 3 * quarter]])
     poses = pd.DataFrame({"iteration": range(4)})
     for i, name in enumerate(("x_m", "y_m", "theta_rad")):
@@ -181,5 +182,5 @@ def test_paths_and_their_errors() -> None:
     np.testing.assert_array_equal(rows["final_x_m"], truth[:, 0])
     np.testing.assert_allclose(rows["path_error_m"], np.hypot(0.3, 0.3))
     np.testing.assert_allclose(rows["path_error_rad"], 0, atol=1e-12)  # a whole turn is none
-    np.testing.assert_allclose(rows["odometry_error_rad"], [0, 0.1, 0.1, 0.1], atol=1e-12)
+    np.testing.assert_allclose(rows["odometry_error_rad"], [0, 0.1, 0.1, -0.1], atol=1e-12)
     assert rows["odometry_error_m"].iloc[2] == pytest.approx(2 * np.sin(0.05))  # a chord

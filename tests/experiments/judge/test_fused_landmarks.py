@@ -143,3 +143,18 @@ def test_truth_of_fused_landmarks_and_fits() -> None:
     assert rows["n_landmarks"].to_dict() == {"A": 3, "B": 4, "fused": 4}
     assert rows["rmse_m"][["A", "B"]].to_numpy() == pytest.approx(0, abs=1e-9)
     assert list(pd.DataFrame(map_fit_rows(FusedTeam([a], [], ITERATION, None)))["map"]) == ["A"]
+
+
+@pytest.mark.parametrize(("radius_m", "true"), [(0.079, False), (0.081, True)])
+def test_a_pair_is_true_whose_points_lie_within_the_radius(radius_m: float, true: bool) -> None:
+    points = np.random.default_rng(1).uniform(0, 5, (6, 3))
+    a, b = (
+        robot("A", points, np.zeros(3)),
+        robot("B", points + np.array([0.0, 0.08, 0.0]), np.zeros(3)),
+    )
+    found = Alignment(
+        np.zeros(3), np.eye(3), np.ones(6, bool), 0.0, Status.ACCEPTED, drift_sigma_m=0.0
+    )
+    rows = fusion_rows(met(a, b, found), BY_RANSAC, radius_m)
+    assert rows["apart_m"].to_numpy() == pytest.approx(0.08)
+    assert (rows["true_pair"] == true).all()

@@ -1,5 +1,7 @@
 """The table of fusers, against figures computed landmark by landmark."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -91,3 +93,29 @@ def test_a_map_of_one_robot_has_no_parents_to_be_better_than() -> None:
     row = judged_team(team).row()
     assert np.isnan([row["over_better_parent"], row["alignment_nees_per_dof"]]).all()
     assert row["n_robots"] == 1
+
+
+def test_motions_are_judged_by_the_median_robot_and_across_the_half_turn() -> None:
+    """Three maps beside the first: off by 0.1, 0.2 and 0.9 m, and by 0.01, 0.02 and 0.3 rad."""
+    team = DrawnTeam([slice(0, 20)] * 4, 5, bent_m=BENT_M)
+    team.T_world_map[:, 2] = [3.1, -3.1, 0.5, -0.4]
+    fused = judged_team(team).fusion
+    sigma = np.diag([0.1, 0.1, 0.01]) ** 2
+    T = np.array([se2.between(team.T_world_map[0], own) for own in team.T_world_map])
+    T[1:, 0] += [0.1, -0.2, 0.9]
+    T[1:, 2] += [0.01 + 2 * np.pi, -0.02, 0.3]
+    fused = replace(fused, T_first_map=T, motion_covariance=np.tile(sigma, (4, 1, 1)))
+    given = [GivenMap.at(robot, None, K) for robot in evaluated_robots(team)]
+    row = JudgedFusion("joint", K, fused, given).row()
+    assert row["alignment_error_m"] == pytest.approx(0.2)
+    assert row["alignment_error_rad"] == pytest.approx(0.02)
+    assert row["alignment_nees_per_dof"] == pytest.approx((4 + 4) / 3)  # 2, 8 and 981 over 3
+
+
+def test_a_fused_map_is_held_against_the_truth_in_its_own_frame() -> None:
+    """The first robot met nobody: the map is in the frame of the second."""
+    team = DrawnTeam(PARTS, 6, bent_m=BENT_M)
+    team.pairs = [pair for pair in team.pairs if 0 not in (pair.a, pair.b)]
+    judged = judged_team(team)
+    assert judged.fusion.members.tolist() == [1, 2]
+    assert judged.row()["landmark_rmse_m"] < 0.1

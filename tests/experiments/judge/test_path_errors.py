@@ -138,3 +138,9 @@ def test_a_smoothed_path_is_a_source_where_there_is_one() -> None:
     assert rows.loc[rows["source"] == "smoothed", "rmse"].to_numpy() == pytest.approx(0, abs=1e-9)
     without = with_one.assign(smoothed_x_m=np.nan, smoothed_y_m=np.nan, smoothed_theta_rad=np.nan)
     assert set(pd.DataFrame(path_statistics_rows(without))["source"]) == {*SOURCES} - {"smoothed"}
+
+
+def test_a_way_of_just_the_length_is_long_enough() -> None:
+    """Steps of a quarter of a metre add up exactly: four of them are one metre."""
+    positions = np.column_stack([0.25 * np.arange(10), np.zeros(10)])
+    assert pairs_by_length(positions, 1.0).tolist() == [[0, 4], [4, 8]]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from experiments.methods.aligner_calls import callable_aligner, end_children, require_usable
+from experiments.methods.answers import NonsenseError, checked_answer
 from experiments.methods.catalogue import make_method
 from mapfusion import se2
 from mapfusion.align.registration import Registration, as_aligner
@@ -167,3 +168,26 @@ def test_undetermined_and_what_it_needs_are_answers_too() -> None:
 def test_what_is_no_method_is_told_before_a_run(name: str, parameters: dict, reason: str) -> None:
     with pytest.raises(ValueError, match=reason):
         require_usable(name, parameters)
+
+
+def _checked(covariance: np.ndarray) -> Alignment:
+    inlier, text = np.ones(4, dtype=bool), ""
+    given = Alignment(T_A_B, covariance, inlier, 0.0, Status.ACCEPTED, text, 0.05)
+    return checked_answer(given, 4, 0.0)
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
+def test_a_covariance_is_judged_by_its_own_size(scale: float) -> None:
+    """Of exact maps covariances are tiny: a wrong sign or place is as wrong there."""
+    good = np.array([[2.0, 0.5, 0.1], [0.5, 1.0, -0.2], [0.1, -0.2, 0.3]])
+    rounded, singular = good.copy(), np.outer([1.0, 2.0, -1.0], [1.0, 2.0, -1.0])
+    rounded[0, 1] *= 1 + 1e-12
+    singular -= 1e-12 * np.eye(3)
+    for each in (good, rounded, singular):
+        np.testing.assert_array_equal(_checked(scale * each).covariance, scale * each)
+    skewed, negative = good.copy(), good - 1.0 * np.eye(3)
+    skewed[0, 1] *= 1.001
+    with pytest.raises(NonsenseError, match="covariance is not symmetric"):
+        _checked(scale * skewed)
+    with pytest.raises(NonsenseError, match="covariance has a negative variance"):
+        _checked(scale * negative)

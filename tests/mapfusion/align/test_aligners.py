@@ -197,6 +197,18 @@ def test_oracle_starts_from_the_true_pairs_alone():
     assert error(found.T_a_b, pair.T_a_b) == pytest.approx((0, 0), abs=1e-9)
 
 
+def test_true_pairs_outside_the_gate_are_no_inliers_of_the_oracle():
+    """Drift may put a true pair metres off: it says nothing about the motion."""
+    pair = given_pairs(np.random.default_rng(7), 60)
+    far = np.array([3, 10, 41])
+    position = pair.map_b.position_m.copy()
+    position[far, :2] += [[5.0, 0.0], [0.0, -4.0], [3.0, 3.0]]
+    drifted = replace(pair, map_b=replace(pair.map_b, position_m=position))
+    found = estimate("oracle", drifted)
+    np.testing.assert_array_equal(np.flatnonzero(~found.inlier), far)
+    assert error(found.T_a_b, pair.T_a_b) == pytest.approx((0, 0), abs=1e-6)
+
+
 def test_unknown_names_and_parameters():
     with pytest.raises(ValueError, match="unknown aligner 'ransack', known are ransac, svd, icp"):
         make_aligner("ransack")

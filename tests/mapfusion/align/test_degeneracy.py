@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from mapfusion.align.degeneracy import SHAPE_FALSE_ALARM, lacks_extent
-from tests.mapfusion.align.map_pairs import covariances
+from mapfusion.align.correspondences import Correspondences
+from mapfusion.align.degeneracy import SHAPE_FALSE_ALARM, lacks_extent, why_one_place
+from mapfusion.align.pairs import Pairs
+from tests.mapfusion.align.map_pairs import covariances, landmarks
 
 
 def slow_share(p, covariance, drift_m2, dimensions):
@@ -37,3 +39,17 @@ def test_points_without_noise_have_the_extent_that_rounding_leaves(dimensions):
     assert lacks_extent(p, np.zeros((50, 2, 2)), 0.0, dimensions)
     p[0, 0] += 1e-3
     assert not lacks_extent(p, np.zeros((50, 2, 2)), 0.0, 1)
+
+
+@pytest.mark.parametrize("at_one_point", ["a", "b"])
+def test_either_map_at_one_point_leaves_the_angle_open(at_one_point):
+    p = np.random.default_rng(1).uniform(0, 9, (20, 3))
+    maps = {name: landmarks(p, name=name) for name in "ab"}
+    assert why_one_place(pairs_of(maps)) == ""
+    maps[at_one_point] = landmarks(np.tile(p[:1], (20, 1)), name=at_one_point)
+    assert f"map {at_one_point}'s landmarks" in why_one_place(pairs_of(maps))
+
+
+def pairs_of(maps):
+    each = np.arange(20)
+    return Pairs(maps["a"], maps["b"], Correspondences(each, each, np.zeros(20)))

@@ -6,7 +6,7 @@ from scipy.cluster.hierarchy import fcluster, linkage
 
 from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.refine import Refinement
-from mapfusion.evidence.rivals import self_motions
+from mapfusion.evidence.rivals import apart_m, self_motions
 from mapfusion.evidence.twins import largest_patch_m, twins
 from mapfusion.landmark_map import LandmarkMap
 from tests.mapfusion.evidence.two_rooms import Wall, mapped
@@ -59,3 +59,34 @@ def test_patches_are_single_linkage_clusters() -> None:
         sizes = [np.ptp(p[of == k], axis=0).max() for k in np.unique(of) if (of == k).sum() >= 5]
         assert largest_patch_m(p, 0.7, 5) == pytest.approx(max(sizes, default=0.0))
     assert largest_patch_m(np.zeros((0, 2)), 0.7, 5) == 0.0
+
+
+def test_a_room_that_is_its_own_half_turn_says_so_once() -> None:
+    """Both orders of a pair fit the same half turn; they are as much evidence as one of them."""
+    rng = np.random.default_rng(4)
+    p = rng.uniform(0, [8, 8, 2], (40, 3))
+    look = (0.1 * rng.standard_normal((40, 64))).astype(np.float32)
+    both = np.concatenate([p, [20.0, 12.0, 0.0] + p * [-1, -1, 1]])
+    covariance = np.tile(1e-3 * np.eye(3), (80, 1, 1))
+    counts, rows = np.full(80, 3, np.int32), np.arange(80)
+    landmarks = LandmarkMap(both, covariance, counts, rows, np.concatenate([look, look]))
+    pairs, (motion, *_) = self_motions(landmarks, 1, Acceptance(), Refinement())
+    assert len(pairs) == 80
+    assert motion.inlier.all()
+    np.testing.assert_allclose(motion.T_a_b[:2], [20, 12], atol=1e-6)
+    one_order = pairs[pairs.index_a < pairs.index_b]
+    refined = Refinement().refine(one_order, motion.T_a_b)
+    expected = Acceptance().judge(one_order, refined).log10_false_alarms
+    assert motion.log10_false_alarms == pytest.approx(expected, rel=1e-6)
+    assert expected < -20
+
+
+def test_motions_lie_apart_by_the_root_mean_square_over_the_points() -> None:
+    """A turn moves a point by twice the sine of its half for each metre from the middle."""
+    p = np.array([[1.0, 0.0], [0.0, -2.0], [3.0, 4.0]])
+    shift = np.array([0.3, -0.4, 0.0])
+    assert apart_m(shift, np.zeros(3), p) == pytest.approx(0.5)
+    turn = np.array([0.0, 0.0, 0.6])
+    expected = 2 * np.sin(0.3) * np.sqrt((1 + 4 + 25) / 3)
+    assert apart_m(turn, np.zeros(3), p) == pytest.approx(expected)
+    assert apart_m(np.zeros(3), turn, p) == pytest.approx(expected)

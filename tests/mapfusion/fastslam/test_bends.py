@@ -122,3 +122,27 @@ def test_bends_of_less_than_a_millimetre_are_put_off():
     assert found is not None
     assert found[-1, 0] == pytest.approx(1.3e-3, rel=1e-4)
     assert bends.due(np.zeros(2)) is None
+
+
+@pytest.mark.parametrize(("sigmas", "believed"), [(4.1, True), (4.45, False)])
+def test_the_gate_counts_the_directions_that_are_seen(sigmas, believed):
+    """The 0.9999 quantile of chi-square with 2 degrees of freedom is 18.4, 4.29 squared."""
+    bends, sigma_m = Bends(), 0.03
+    for _ in range(2 * SPACING):
+        bends.went_on(sigma_m**2 / (4 * SPACING) * np.diag([1, 1, 0]))
+    information = 2 / sigma_m**2 * np.diag([1.0, 1.0, 0.0])  # half of the variance each
+    pull = information @ [sigmas * sigma_m, 0, 0]
+    bends.closed(np.array([0]), information[None], pull[None], np.zeros((3, 3)), 0.9999)
+    assert (bends.due(np.zeros(2)) is not None) == believed
+
+
+def test_a_bend_is_due_where_it_moves_the_robot():
+    """The plane turned about (2, 3) leaves a robot there alone, and one at (-2, -3) it does not."""
+    bends, about = Bends(), np.array([2.0, 3.0])
+    for _ in range(2 * SPACING):
+        bends.went_on(1e2 * np.eye(3))
+    information = 1e6 * np.eye(3)
+    pull = information @ (0.01 * np.array([about[1], -about[0], 1.0]))
+    bends.closed(np.array([0]), information[None], pull[None], np.zeros((3, 3)), SURE)
+    assert bends.due(about) is None
+    assert bends.due(-about) is not None

@@ -9,12 +9,13 @@ from mapfusion.fastslam.bends import SPACING, Bends
 from mapfusion.fastslam.closing import Seen, close_loops, motion_by_odometry
 from mapfusion.fastslam.filter import FastSlam
 from mapfusion.fastslam.genealogy import MEMORY
+from mapfusion.fastslam.history import History
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.fastslam.particles import ParticleMaps
 from mapfusion.fastslam.sensor import sightings
 from mapfusion.fastslam.update import DROPPED, NEW
 from mapfusion.robot_log import Observations
-from mapfusion.se2 import compose, rotation_about_z, transform_points
+from mapfusion.se2 import between, compose, inverse, rotation_about_z, transform_points
 from tests.mapfusion.fastslam.landmark_worlds import drive, nothing, parameters
 
 GATE, SIGMA = 16.0, np.array([0.05, 0.03, 0.02])
@@ -213,3 +214,57 @@ def test_without_a_loop_nothing_bends():
         slam.step(np.array([0.1, 0, 0]), nothing())
         paths.append(slam.best_path())
     np.testing.assert_array_equal(*paths)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_after_two_closures_landmarks_lie_where_the_poses_saw_them(seed, monkeypatch):
+    """What a pose saw once stays where it saw it, and odometry holds across either closure.
+
+    One particle drives a circle blindly but for six looks. The groups 0 and 1 come back after more
+    than a turn, each closing a loop; 2 and 3 are seen once, before the first closure and after it.
+    """
+    n = 4 * SPACING
+    looks = {0: 0, SPACING: 1, SPACING + 10: 2, 2 * SPACING + 2: 0, 3 * SPACING: 3, n - 10: 1}
+    odometry = np.tile([0.1, 0.0, 0.06], (n, 1))
+    odometry[0] = 0.0
+    truth, rng = [np.zeros(3)], np.random.default_rng(seed)
+    for step in odometry[1:]:
+        truth.append(compose(truth[-1], step))
+    points = rng.uniform(-3, 4, (4, 6, 3))
+    motion = MotionNoise(
+        0.02, 0.03, 0.01, 0, 0, lateral_m_per_sqrt_m=0.02, lateral_slip_m_per_rad=0
+    )
+    settings = parameters(
+        n_particles=1,
+        motion=motion,
+        proposal="informed",
+        association="label",
+        gate_probability=1 - 1e-12,
+        close_loops=True,
+    )
+    turned, bent = [], History.bent
+
+    def counted(self, T_map_bent):
+        turned.append(np.abs(T_map_bent[:, 2]).max())
+        bent(self, T_map_bent)
+
+    monkeypatch.setattr(History, "bent", counted)
+    slam = FastSlam(settings, np.random.default_rng(seed))
+    seen = {}
+    for frame, step in enumerate(odometry):
+        if (group := looks.get(frame)) is None:
+            slam.step(step, nothing())
+            continue
+        at = transform_points(inverse(truth[frame]), points[group])
+        label = (6 * group + np.arange(6)).astype(np.int32)
+        seen[frame] = at
+        slam.step(step, Observations(at, np.tile(0.01 * np.eye(3), (6, 1, 1)), label=label))
+    assert sum(turn > 0.01 for turn in turned) == 2
+    path, found = slam.best_path(), slam.best_map(min_count=1)
+    for frame in (SPACING + 10, 3 * SPACING):
+        rows = np.flatnonzero(found.label // 6 == looks[frame])
+        own = transform_points(inverse(path[frame]), found.position_m[rows])
+        np.testing.assert_allclose(own, seen[frame], atol=1e-9)
+    for frame in (2 * SPACING + 2, n - 10):
+        off = between(path[frame - 1], path[frame]) - odometry[frame]
+        assert np.all(np.abs(off) < 6 * motion.standard_deviations(odometry[frame]))

@@ -313,3 +313,24 @@ def test_wrong_arguments_are_named():
         by_label.step(np.zeros(3), replace(frame, label=None))
     with pytest.raises(ValueError, match="label"):
         by_label.step(np.zeros(3), replace(frame, label=np.full(len(frame), -1, dtype=np.int32)))
+
+
+def test_a_landmark_looks_as_in_the_observation_it_came_from():
+    """Descriptors are not averaged; later sightings, each of another look, leave them alone."""
+    world = drive(3, n_frames=20)
+    slam = FastSlam(parameters(association="label"), np.random.default_rng(0))
+    for odometry, frame in zip(world.odometry, world.frames, strict=True):
+        slam.step(odometry, frame)
+    found = slam.best_map(min_count=2)
+    look, label = (
+        np.concatenate([getattr(frame, name) for frame in world.frames])
+        for name in ("descriptor", "label")
+    )
+    names, first = np.unique(label, return_index=True)
+    assert found.descriptor is not None
+    assert found.label is not None
+    np.testing.assert_array_equal(
+        found.source_observation, first[np.searchsorted(names, found.label)]
+    )
+    np.testing.assert_array_equal(found.descriptor, look[found.source_observation])
+    assert found.count.min() >= 2

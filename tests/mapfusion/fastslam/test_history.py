@@ -35,3 +35,26 @@ def test_one_life_is_kept_from_where_all_lines_have_met() -> None:
     """Without pruning 2500 steps keep 12 500 particles; unpruned are 256 steps at most."""
     history, _ = lives(5, 2500, resampled_every=2)
     assert history.n_kept < 2500 + 5 * 256
+
+
+def matrix(T: np.ndarray) -> np.ndarray:
+    """(3, 3) homogeneous matrix of a pose or motion of the plane."""
+    x, y, angle = T
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.array([[cos, -sin, x], [sin, cos, y], [0, 0, 1]])
+
+
+def test_each_bend_moves_the_path_as_the_bends_before_left_it() -> None:
+    """Against products of matrices, the last bend leftmost; bends with turns do not commute."""
+    rng = np.random.default_rng(5)
+    history, told = History(), []
+    for step in range(9):
+        pose = rng.normal(size=(1, 3))
+        history.add(pose, np.empty((0, 1), dtype=np.int32))
+        told.append(matrix(pose[0]))
+        if step in (3, 5, 8):
+            bend = rng.normal(size=(step + 1, 3))
+            history.bent(bend)
+            told = [matrix(T) @ pose for T, pose in zip(bend, told, strict=True)]
+    found = np.array([matrix(pose) for pose in history.path(0)])
+    np.testing.assert_allclose(found, told, atol=1e-12)

@@ -17,7 +17,7 @@ from mapfusion.fuse.kalman_drift import KalmanDrift
 from mapfusion.fuse.parameters import MergeParameters
 from mapfusion.fused_map import FusedMap
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.merge import merge
+from mapfusion.merge import connect, merge
 from mapfusion.smoother.student import information_share
 from tests.mapfusion.fuse.drawn_maps import BENT_M, DrawnTeam
 
@@ -313,3 +313,60 @@ def test_tails_are_found_and_no_tail_is_cut_off(
     assert least < found.dof < most
     several = np.count_nonzero(_fused(team).parents != ABSENT, axis=1) > 1
     assert np.count_nonzero(several) >= 0.98 * 300
+
+
+def test_a_fused_landmark_looks_as_the_parent_that_was_seen_most() -> None:
+    team, rng = DrawnTeam([slice(0, 40), slice(10, 50), slice(20, 60)], 4), np.random.default_rng(4)
+    counts = np.split(rng.permutation(120).astype(np.int32) + 3, 3)
+    team.maps = [replace(own, count=n) for own, n in zip(team.maps, counts, strict=True)]
+    fused = _fused(team)
+    assert fused.landmarks.descriptor is not None
+    for row, parents in enumerate(fused.parents):
+        own = [(counts[k][i], team.maps[k].descriptor[i]) for k, i in enumerate(parents) if i >= 0]
+        most = max(own, key=lambda each: each[0])
+        np.testing.assert_array_equal(fused.landmarks.descriptor[row], most[1])
+        assert fused.landmarks.count[row] == sum(n for n, _ in own)
+
+
+def test_weights_of_a_student_t_are_1_in_the_mean() -> None:
+    """As they are of errors about the true points (Lange et al. 1989), not about estimated ones."""
+    dof, means, rows = 2.5, [], np.arange(300)
+    for seed in range(2):
+        rng, team = np.random.default_rng(seed), DrawnTeam([slice(0, 300)] * 3, seed)
+        for k, own in enumerate(team.maps):
+            assert own.joint is not None
+            root = np.linalg.cholesky(own.joint.own_m2)
+            scale = np.sqrt(dof / rng.chisquare(dof, (300, 1)))
+            off = scale * np.einsum("nij,nj->ni", root, rng.normal(size=(300, 3)))
+            off += np.einsum("nri,r->ni", own.joint.common_m, rng.normal(size=own.joint.rank))
+            team.maps[k] = replace(own, position_m=team.truth(k) + off)
+        maps = [JointMap.of(own, 0.0, 3) for own in team.maps]
+        start = np.array([np.zeros(3), *(pair.alignment.T_a_b for pair in team.pairs[:2])])
+        found = estimate_jointly(maps, start, np.column_stack([rows] * 3))
+        means.append(found.weight.mean() / information_share(found.dof, 3))
+    assert np.mean(means) == pytest.approx(1.0, abs=0.06)
+
+
+def test_drift_counts_as_a_landmark_s_own_where_nothing_is_shared() -> None:
+    (own,) = DrawnTeam([slice(0, 10)], 0).maps
+    made = JointMap.of(replace(own, joint=None), 0.3, 3)
+    assert made.n_shared == 0
+    np.testing.assert_allclose(made.joint.own_m2, own.covariance_m2 + np.diag([0.09, 0.09, 0]))
+    assert JointMap.of(own, 0.3, 3).joint is own.joint  # which has it all
+
+
+def test_pairs_keep_their_distances_where_other_maps_of_the_robots_lack_landmarks() -> None:
+    team = DrawnTeam([slice(0, 30), slice(10, 40)], 7)
+    (pair,) = team.pairs
+    unlike = np.linspace(0.1, 0.2, len(pair.inliers))
+    pair = replace(pair, correspondences=replace(pair.correspondences, distance=unlike))
+    (component,) = connect(team.maps, [pair], MergeParameters().team).components
+    others = [team.maps[0][np.arange(29, 3, -1)], team.maps[1][np.array([3, 0, 19, 7, 25])]]
+    found = component.on(others).pairs[0].inliers
+    origin = [own.source_observation for own in others]
+    rows = zip(found.index_a, found.index_b, found.distance, strict=True)
+    got = {(int(origin[0][a]), int(origin[1][b])): unlike for a, b, unlike in rows}
+    rows = zip(pair.inliers.index_a, pair.inliers.index_b, unlike, strict=True)
+    expected = {(int(a), int(b)): unlike for a, b, unlike in rows}
+    assert len(got) == 4  # the fifth of map b is not in map a
+    assert got.items() <= expected.items()

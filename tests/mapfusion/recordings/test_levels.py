@@ -8,15 +8,17 @@ import pytest
 
 from mapfusion import se3
 from mapfusion.attitude import read_attitude
+from mapfusion.camera import StereoCamera
 from mapfusion.errors import InputError
-from mapfusion.recordings.floor import floor_of
+from mapfusion.recordings.floor import Floor, floor_of
 from mapfusion.recordings.inertial import Inertial
-from mapfusion.recordings.levels import known_from
+from mapfusion.recordings.levels import Levels, known_from
 from mapfusion.recordings.registry import read_recording
 from mapfusion.recordings.stereo_import import Cut, StereoImport, write_imported
 from mapfusion.recordings.stereo_recording import StereoRecording
 from mapfusion.recordings.timed_poses import TimedPoses
 from mapfusion.robot_log import Observations
+from mapfusion.vision.features import Features
 from mapfusion.vision.frontend import FrontEndParameters
 from tests.mapfusion.recordings.written_layouts import POSES, drive, write_kitti
 
@@ -50,6 +52,37 @@ def test_a_floor_alone_is_found_as_well_as_stated() -> None:
     assert np.mean(squares, axis=0) == pytest.approx([1, 1, 1], abs=0.4)
 
 
+@pytest.mark.parametrize(("rougher", "excess"), [(2.0, 2.43), (0.5, 1.0)])
+def test_a_floor_is_no_surer_than_its_points_lie(rougher: float, excess: float) -> None:
+    """Points twice as far off as stated: of those inside the gate the median square says 2.43.
+
+    By the normal law: P(|z| < 2.576 / 2) = 0.802, half of it within |z| < 0.526, of which twice the
+    square is 1.106, and 0.455 was stated. Points that lie nearer make it no surer than stated.
+    """
+    rng, n = np.random.default_rng(3), 4000
+    p = np.c_[rng.uniform([3, -4], [20, 4], (n, 2)), np.zeros(n)]
+    p[:, 2] = rougher * SIGMA_M * rng.standard_normal(n)
+    stated = np.zeros((n, 3, 3))
+    stated[:, 2, 2] = SIGMA_M**2
+    floor = floor_of(Observations(p, stated), HEIGHT_M, 0.99)
+    assert floor is not None
+    design = np.c_[p[:, :2], np.ones(n)]
+    alone = np.linalg.inv(design.T @ design) * SIGMA_M**2 * n / floor.n_points
+    np.testing.assert_allclose(floor.covariance[1, 1], excess * alone[1, 1], rtol=0.1)
+    np.testing.assert_allclose(floor.covariance[2, 2], excess * alone[2, 2], rtol=0.1)
+
+
+def test_attitude_above_a_floor_is_that_of_its_plane() -> None:
+    slope_x, slope_y, height = 0.3, -0.2, -1.5
+    floor = Floor(np.array([slope_x, slope_y, height]), np.diag([1e-4, 4e-4, 9e-4]), 60)
+    (roll, pitch, above), sigma = floor.attitude
+    normal = np.array([-slope_x, -slope_y, 1.0])
+    normal /= np.linalg.norm(normal)
+    np.testing.assert_allclose(se3.tilt(roll, pitch) @ normal, [0, 0, 1], atol=1e-12)
+    assert above == pytest.approx(-normal[2] * height)  # of the origin, along the normal
+    assert sigma == pytest.approx([0.02, 0.01, 0.03])  # roll by the slope in y
+
+
 def test_what_stands_on_it_does_not_tilt_it() -> None:
     rng = np.random.default_rng(1)
     for _ in range(20):
@@ -68,6 +101,16 @@ def test_where_no_floor_shows_there_is_none() -> None:
     line = road(rng, np.zeros(3), 60, 0)
     on_a_line = line.position_m * [1.0, 0.0, 0.0]
     assert floor_of(replace(line, position_m=on_a_line), HEIGHT_M, 0.99) is None
+
+
+def test_heights_of_a_trajectory_are_above_its_beginning() -> None:
+    """A trajectory may begin at any height, a map begins on its floor."""
+    odometry = se3.in_space(np.zeros((2, 3)), [[0.0, 0.0], [0.1, -0.2]])
+    odometry[:, 2, 3] = [5.0, 5.25]
+    levels = Levels("odometry", StereoCamera(), np.eye(4), odometry)
+    nothing = Features(np.empty((0, 2)), np.empty(0), np.empty(0), np.empty((0, 64)))
+    assert levels.measured(0, nothing, 0.3).value == pytest.approx([0.0, 0.0, 0.0])
+    assert levels.measured(1, nothing, 0.3).value == pytest.approx([0.1, -0.2, 0.25])
 
 
 def test_by_default_the_odometry_says_whether_the_body_is_level() -> None:

@@ -77,3 +77,12 @@ def test_a_level_camera_keeps_its_observations() -> None:
     seen = Observations(rng.normal(size=(5, 3)), np.tile(np.eye(3), (5, 1, 1)))
     T = level_mount(camera.baseline_m, camera.mount_x_m, camera.mount_z_m)
     assert levelled(seen, camera, T) is seen
+
+
+def test_what_is_fixed_to_a_body_moves_with_it() -> None:
+    """A point of the other body lies where the first body's pose carries it."""
+    rng = np.random.default_rng(3)
+    T, T_body_other, point = poses(rng, 4), poses(rng, 1)[0], np.array([*rng.normal(size=3), 1.0])
+    moved = TimedPoses(TIMES_NS, T).moved(T_body_other)
+    np.testing.assert_allclose(moved.T @ point, T @ (T_body_other @ point), atol=1e-12)
+    np.testing.assert_array_equal(moved.time_ns, TIMES_NS)

@@ -1,11 +1,15 @@
 """The robot's motion from that of its camera: exact, with the covariance of its errors."""
 
+from itertools import pairwise
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mapfusion import se3
+from mapfusion.attitude import Attitude
 from mapfusion.camera import StereoCamera
 from mapfusion.recordings.visual_odometry import visual_odometry
+from mapfusion.se2 import between
 from mapfusion.vision.rigid_links import RigidMotion
 
 CAMERA = StereoCamera()
@@ -67,3 +71,53 @@ def test_a_guess_errs_by_the_largest_step_so_far() -> None:
     sigma = np.sqrt(np.diagonal(made.covariance, axis1=1, axis2=2))
     np.testing.assert_allclose(sigma[1], [0.1, 0.1, 0.1])
     np.testing.assert_allclose(sigma[4], [2.0, 0.1, 0.3], atol=1e-9)
+
+
+def test_a_guess_is_of_the_speed_and_errs_with_the_time() -> None:
+    """A motion of two steps is half of it a step; a guess over three is three of these."""
+    T = RigidMotion(of_camera(se3.from_planar(MOVED[0])), 1e-6 * np.eye(6), 9)
+    made = found([None, T, None], [1, 2, 3])
+    speed = MOVED[0] / 2
+    np.testing.assert_allclose(made.increments[2], 3 * speed, atol=1e-12)
+    sigma = 3 * np.abs(speed) + 3 * np.maximum(np.abs(speed), 0.1)
+    np.testing.assert_allclose(made.covariance[2], np.diag(sigma**2), atol=1e-12)
+
+
+# Roll, pitch and height of the body in three frames, and where it is in the plane.
+TILTS = np.array([[0.1, -0.05, 0.0], [-0.2, 0.15, 0.0], [0.05, 0.25, 0.0]])
+PATH = np.array([[1.0, 2.0, 0.5], [1.6, 2.3, 0.9], [1.9, 3.0, 2.0]])
+SWAYING = Attitude(TILTS, np.zeros((3, 3)), np.zeros((3, 2)))
+
+
+def test_a_swaying_body_moves_in_the_plane_as_its_level_frame_does() -> None:
+    T_world_body = se3.in_space(PATH, TILTS[:, :2])
+    motions = [
+        RigidMotion(of_camera(se3.inverse(before) @ after), 1e-6 * np.eye(6), 9)
+        for before, after in pairwise(T_world_body)
+    ]
+    made = visual_odometry([None, *motions], np.ones(3), CAMERA, MOUNT, SWAYING)
+    np.testing.assert_allclose(made.increments[1:], between(PATH[:-1], PATH[1:]), atol=1e-12)
+
+
+def test_a_swaying_body_s_covariance_is_that_of_its_increments_by_differences() -> None:
+    T_world_body = se3.in_space(PATH, TILTS[:, :2])
+    true = se3.inverse(T_world_body[1]) @ T_world_body[2]
+    root = np.random.default_rng(1).normal(size=(6, 6))
+    mount = se3.pose(np.eye(3), CAMERA.p_robot_left)  # the camera is where it was taken to be
+
+    def told(error: np.ndarray):
+        turn = Rotation.from_rotvec(error[3:]).as_matrix()
+        T = se3.pose(turn @ true[:3, :3], true[:3, 3] + error[:3])
+        attitude = Attitude(TILTS[1:], np.zeros((2, 3)), np.zeros((2, 2)))
+        motions = [None, RigidMotion(T, root @ root.T, 9)]
+        return visual_odometry(motions, np.ones(2), CAMERA, mount, attitude)
+
+    step = 1e-6 * np.eye(6)
+    J = np.array([told(h).increments[1] - told(-h).increments[1] for h in step]).T / 2e-6
+    expected, found = J @ root @ root.T @ J.T, told(np.zeros(6)).covariance[1]
+    scale = np.sqrt(np.diag(expected))
+    # the heading's error is taken for the turn about the upright: to first order in the tilt
+    np.testing.assert_allclose(
+        found / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.15
+    )
+    np.testing.assert_allclose(found[:2, :2], expected[:2, :2], rtol=1e-6, atol=1e-9)

@@ -11,8 +11,19 @@ from mapfusion.robot_log import Observations, RobotLog
 from mapfusion.se2 import Float, compose, rotation
 from mapfusion.smoother.calibrate import Calibration, calibrate
 from mapfusion.smoother.elimination import pose_point_blocks
-from mapfusion.smoother.motion_posterior import disturbance_variances, motion_posterior
-from mapfusion.smoother.noise_levels import LEVELS
+from mapfusion.smoother.motion_posterior import (
+    MotionPosterior,
+    disturbance_variances,
+    motion_posterior,
+)
+from mapfusion.smoother.noise_levels import (
+    LEVELS,
+    Told,
+    pooled,
+    relative_errors,
+    told,
+    updated,
+)
 from mapfusion.smoother.normal_equations import (
     Estimate,
     disturbance_jacobians,
@@ -187,3 +198,52 @@ def test_a_log_that_saw_nothing_is_refused() -> None:
     nothing = np.full(len(log.observations), -1)
     with pytest.raises(InputError, match="R1"):
         calibrate([log], [nothing], [dead_reckoned(log)], SmootherParameters())
+
+
+def test_what_is_told_of_levels_is_the_curvature_of_their_likelihood() -> None:
+    """Of disturbances that are all seen: the expected one, by differences in the logarithms."""
+    rng = np.random.default_rng(8)
+    odometry = rng.normal(0, [0.2, 0.05, 0.3], (30, 3))
+    levels = np.array([getattr(NOISE, name) for name in LEVELS])
+
+    def variances(logs: Float) -> Float:
+        way, walk, turn = np.exp(logs)
+        motion = MotionNoise(way, walk, turn, 0, 0, lateral_m_per_sqrt_m=way)
+        motion = replace(motion, lateral_slip_m_per_rad=0)
+        return np.array([motion.standard_deviations(step) ** 2 for step in odometry[1:]])
+
+    true = variances(np.log(levels))
+
+    def cost(logs: Float) -> float:
+        v = variances(logs)
+        return float(np.sum(np.log(v) + true / v)) / 2
+
+    step, at = 1e-3 * np.eye(3), np.log(levels)
+    expected = [
+        [
+            (cost(at + h + k) - cost(at + h - k) - cost(at - h + k) + cost(at - h - k)) / 4e-6
+            for k in step
+        ]
+        for h in step
+    ]
+    seen = MotionPosterior(np.zeros((29, 3)), np.zeros((29, 3)), np.zeros((0, 0)), np.zeros(0))
+    found = told(seen, odometry, 1 / true, NOISE)
+    np.testing.assert_allclose(found.information, expected, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose([found.known[0], found.known[1:].sum()], [58, 29])
+
+
+def test_a_round_multiplies_the_squares_of_levels_by_what_was_found_over_what_is_told() -> None:
+    """A way is as uncertain across as along; of what hardly anything is told stays as it is."""
+    of_all = Told(np.array([20.0, 2.5, 9.0]), np.array([10.0, 10.0, 1.0]), np.eye(3))
+    made = updated(NOISE, of_all)
+    found = [getattr(made, name) for name in (*LEVELS, "lateral_m_per_sqrt_m")]
+    way = NOISE.translation_m_per_sqrt_m * np.sqrt(2)
+    expected = [way, NOISE.rotation_rad_per_sqrt_m / 2, NOISE.rotation_rad_per_sqrt_rad, way]
+    assert found == pytest.approx(expected)
+
+
+def test_two_logs_tell_what_both_tell() -> None:
+    each = [Told(np.full(3, n), np.full(3, 2 * n), n * np.eye(3)) for n in (3.0, 5.0)]
+    both = pooled(each)
+    assert (both.found.tolist(), both.known.tolist()) == ([8.0] * 3, [16.0] * 3)
+    assert relative_errors(both) == pytest.approx(np.full(3, 1 / 3))  # and 1 was known before

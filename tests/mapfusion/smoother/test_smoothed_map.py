@@ -1,10 +1,15 @@
 """The smoothed landmarks as a map."""
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from mapfusion.smoother.smooth import SmootherParameters, smooth
 from mapfusion.smoother.smoothed_map import smoothed_map
-from tests.mapfusion.smoother.white_noise_logs import dead_reckoned, white_noise_log
+from mapfusion.stray import STRAY_M
+from tests.mapfusion.fastslam.landmark_worlds import unit
+from tests.mapfusion.smoother.white_noise_logs import dead_reckoned, white_noise_log, with_tracks
 
 
 def test_planar_landmarks_have_no_height_and_are_not_unsure_of_it() -> None:
@@ -18,3 +23,25 @@ def test_planar_landmarks_have_no_height_and_are_not_unsure_of_it() -> None:
     assert not landmarks.covariance_m2[:, 2].any()
     assert not landmarks.joint.common_m[..., 2].any()
     assert np.linalg.eigvalsh(landmarks.joint.own_m2[:, :2, :2]).min() > 0
+
+
+@pytest.mark.parametrize("tracked", [False, True])
+@pytest.mark.parametrize("named_by", ["first", "last"])
+def test_landmarks_look_as_the_observations_they_are_named_by(named_by: str, tracked: bool) -> None:
+    """Of landmarks named by rows of the log, whichever rows these are."""
+    rng = np.random.default_rng(1)
+    known = white_noise_log(rng, 80, 15)
+    log = with_tracks(known, rng, STRAY_M).log if tracked else known.log
+    seen = log.observations
+    assert seen.label is not None
+    look = unit(rng.standard_normal((len(seen), 64))).astype(np.float32)
+    log = replace(log, observations=replace(seen, descriptor=look))
+    rows = {label: np.flatnonzero(seen.label == label) for label in np.unique(seen.label)}
+    name = np.array([rows[label][0 if named_by == "first" else -1] for label in seen.label])
+    found = smoothed_map(log, smooth(log, name, dead_reckoned(log), SmootherParameters()))
+    assert found.descriptor is not None
+    assert found.label is not None
+    counts = {own[0 if named_by == "first" else -1]: len(own) for own in rows.values()}
+    assert [counts[row] for row in found.source_observation] == found.count.tolist()
+    np.testing.assert_array_equal(found.descriptor, look[found.source_observation])
+    np.testing.assert_array_equal(found.label, seen.label[found.source_observation])

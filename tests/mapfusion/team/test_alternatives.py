@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from mapfusion.se2 import Float, between
+from mapfusion.team.alternatives import told_apart
+from mapfusion.team.readings import LoopTest
 from mapfusion.team.relations import Relations
 from mapfusion.team.team_graph import Place, TeamParameters, Unconfirmed, team_graph
 from tests.mapfusion.team.teams import SIDE_M, all_pairs, falsely_placed, measured, poses
@@ -89,3 +91,35 @@ def test_no_false_merge_in_many_teams() -> None:
         dropped = team_graph(accepted, DROP, None, alternatives.joined(right))
         assert len(falsely_placed(dropped, true)) == 0, seed
     assert n_found > 0.9 * n_right > 15
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    ("accepted_m", "rival_m", "told"), [(2.0, 2.0, False), (60.0, 2.0, True), (2.0, 60.0, True)]
+)
+def test_chance_closes_a_loop_as_far_as_any_alignment_reaches(
+    seed: int, accepted_m: float, rival_m: float, told: bool
+) -> None:
+    """Accepted 0-1 and 1-2, two alternatives of 0-2, of which one closes the loop.
+
+    Their deviations, 0.5 m and 0.05 rad, fill a fifth of all motions within 2 m, and less than a
+    thousandth of those within 60 m, whichever of them reaches so far.
+    """
+    rng = np.random.default_rng(seed)
+    way = rng.uniform(-np.pi, np.pi)
+    out = np.array([accepted_m * np.cos(way), accepted_m * np.sin(way), 0.3])
+    right = np.array([0.5, -0.4, 1.0])
+    rival = np.array([-rival_m, 0.0, -2.0])
+    covariance = np.diag([0.5, 0.5, 0.05]) ** 2
+
+    def relations(robots: list[tuple[int, int]], T: list[Float]) -> Relations:
+        n = len(robots)
+        return Relations(
+            3, np.array(robots), np.array(T), np.tile(covariance, (n, 1, 1)), -np.ones(n)
+        )
+
+    accepted = relations([(0, 1), (1, 2)], [out, between(out, right)])
+    alternatives = relations([(0, 2), (0, 2)], [rival, right])
+    kept, component = np.ones(2, dtype=bool), np.zeros(3, dtype=np.int64)
+    found = told_apart(accepted, kept, component, alternatives, LoopTest())
+    assert found.tolist() == ([1] if told else [])

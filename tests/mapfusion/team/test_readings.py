@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from mapfusion.se2 import between
 from mapfusion.team.readings import LoopTest, Team
@@ -41,3 +42,9 @@ def test_what_chance_would_close_is_no_loop() -> None:
     assert len(Team(relations, LoopTest()).readings(everything)) == 1
     relations.covariance[:] = np.diag([5.0, 5.0, 1.0]) ** 2
     assert Team(relations, LoopTest()).readings(everything) == []
+
+
+def test_the_gate_keeps_true_loops_with_its_probability() -> None:
+    """A loop leaves two coordinates and an angle open: three degrees of freedom."""
+    for probability in (0.9, 0.999):
+        assert LoopTest(probability).gate == pytest.approx(chi2.ppf(probability, 3))

@@ -10,6 +10,7 @@ from mapfusion import se3
 from mapfusion.camera import StereoCamera
 from mapfusion.robot_log import Observations
 from mapfusion.vision.attitude_filter import AttitudeFilter, Measured
+from mapfusion.vision.gyroscope import LOST_M
 from mapfusion.vision.levelling import Levelling
 from mapfusion.vision.rigid_links import RigidMotion
 
@@ -140,3 +141,105 @@ def test_far_points_are_expected_where_a_tilt_moves_them() -> None:
     p_world = rng.uniform([1e6, -3e5, -2e5], [2e6, 3e5, 2e5], (30, 3))
     uv_before, uv_after = (camera.project(p_world @ R)[:, :2] for R in (before, after))
     np.testing.assert_allclose(camera.turned(uv_before, after.T @ before), uv_after, atol=1e-3)
+
+
+def moved_from(value: np.ndarray, T: np.ndarray) -> np.ndarray:
+    """Where the filter's value goes from another by a motion."""
+    kept = AttitudeFilter(value=value)
+    kept.move(RigidMotion(T, np.zeros((6, 6)), 9))
+    return kept.value
+
+
+def test_a_step_carries_errors_as_it_carries_the_attitude() -> None:
+    """The covariance against derivatives of the value, by differences from a level body."""
+    rng = np.random.default_rng(6)
+    T = se3.pose(Rotation.from_euler("ZYX", [0.8, 0.1, -0.15]).as_matrix(), [0.5, -0.3, 0.1])
+    before, of_motion = (root @ root.T for root in (rng.normal(size=(n, n)) for n in (3, 6)))
+    kept = AttitudeFilter(covariance=before.copy())
+    kept.move(RigidMotion(T, of_motion, 9))
+    h = 1e-6
+
+    def by_turn(axis: np.ndarray) -> np.ndarray:
+        turned = se3.pose(Rotation.from_rotvec(axis).as_matrix() @ T[:3, :3], T[:3, 3])
+        return moved_from(np.zeros(3), turned)
+
+    by_value = [moved_from(e, T) - moved_from(-e, T) for e in h * np.eye(3)]
+    turns = [by_turn(e) - by_turn(-e) for e in h * np.eye(3)]
+    J_value, J_turn = np.array(by_value).T / (2 * h), np.array(turns).T / (2 * h)
+    J_motion = np.concatenate([np.zeros((3, 3)), J_turn], axis=1)
+    J_motion[2, :3] = [0.0, 0.0, 1.0]  # of a level body, what it rises by
+    expected = J_value @ before @ J_value.T + J_motion @ of_motion @ J_motion.T
+    scale = np.sqrt(np.diag(expected))
+    # roll and pitch are taken for turns about the level axes: to first order in the tilt
+    np.testing.assert_allclose(
+        kept.covariance / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.06
+    )
+    rise = before[2, 2] + 2 * before[2, :2] @ [T[1, 3], -T[0, 3]] + of_motion[2, 2]
+    rise += [T[1, 3], -T[0, 3]] @ before[:2, :2] @ [T[1, 3], -T[0, 3]]
+    assert kept.covariance[2, 2] == pytest.approx(rise)
+
+
+def test_a_lost_step_leaves_the_height_but_for_what_it_may_have_climbed() -> None:
+    kept = AttitudeFilter()
+    kept.measure(Measured(np.array([0.1, -0.1, 2.0]), np.array([0.01, 0.01, 0.05])))
+    before = kept.covariance[2, 2]
+    kept.move(None)
+    assert kept.covariance[2, 2] == pytest.approx(before + LOST_M**2)
+    assert kept.covariance[0, 0] == kept.covariance[1, 1] == pytest.approx(1.0)
+    assert kept.carried.tolist() == [0.0, 0.0, 1.0]
+    assert kept.value[2] == pytest.approx(2.0, abs=1e-4)
+
+
+def test_the_first_frame_s_plane_is_the_map_s() -> None:
+    kept = AttitudeFilter()
+    kept.measure(Measured(np.zeros(3), INCLINOMETER + 0.01))
+    assert not kept.fresh.any()
+
+
+@pytest.mark.parametrize("known", [[0, 2], [1, 2], [2], [0, 1, 2]])
+def test_what_is_measured_adds_its_information(known: list[int]) -> None:
+    """P'^-1 = P^-1 + H' R^-1 H, of those that were measured by their own deviations."""
+    root = np.random.default_rng(7).normal(size=(3, 3))
+    sigma, value = np.array([0.1, 0.5, 2.0]), np.full(3, np.nan)
+    value[known] = np.array([0.3, -0.2, 1.0])[known]
+    kept = AttitudeFilter(covariance=root @ root.T)
+    information = np.linalg.inv(kept.covariance)
+    information[known, known] += 1 / sigma[known] ** 2
+    kept.measure(Measured(value, sigma))
+    np.testing.assert_allclose(kept.covariance, np.linalg.inv(information), atol=1e-12)
+    vector = np.zeros(3)
+    vector[known] = value[known] / sigma[known] ** 2
+    np.testing.assert_allclose(kept.value, np.linalg.solve(information, vector), atol=1e-12)
+
+
+def two_frames(shared_rad: float) -> tuple[np.ndarray, np.ndarray]:
+    """Sigmas and carried shares of a body that stands still, measured once well and once badly."""
+    levelling = Levelling(shared_rad=shared_rad)
+    still = RigidMotion(np.eye(4), 1e-8 * np.eye(6), 9)
+    for k, sigma in enumerate((0.01, 0.03)):
+        measured = Measured(np.zeros(3), np.array([sigma, sigma, 0.01]))
+        levelling.add(still if k else None, measured)
+    return levelling.attitude.sigma, levelling.attitude.carried
+
+
+def test_what_all_measurements_err_by_alike_is_carried_whole() -> None:
+    """The covariance of own errors, and one part more that both frames share."""
+    shared_rad = 0.02
+    (own, carried), (sigma, found) = two_frames(0.0), two_frames(shared_rad)
+    together = np.array([[1.0, carried[1, 0]], [carried[1, 0], 0.0]]) * own[0, 0] ** 2
+    together[1, 1] = own[1, 0] ** 2
+    together += shared_rad**2
+    np.testing.assert_allclose(sigma[:, 0] ** 2, np.diag(together), rtol=1e-12)
+    assert found[1, 0] == pytest.approx(together[0, 1] / together[0, 0])
+    assert carried[1, 0] < found[1, 0] < 1
+    np.testing.assert_array_equal(found[:, 1], carried[:, 1])
+
+
+def test_the_share_of_a_tilt_that_is_carried_is_the_mean_of_both_angles() -> None:
+    """Roll is measured anew, pitch is not: of the one nothing is left, of the other all."""
+    levelling = Levelling()
+    levelling.add(None, Measured(np.zeros(3), np.full(3, 0.01)))
+    still = RigidMotion(np.eye(4), 1e-12 * np.eye(6), 9)
+    roll_alone = Measured(np.array([0.0, np.nan, np.nan]), np.array([1e-6, 1.0, 1.0]))
+    levelling.add(still, roll_alone)
+    np.testing.assert_allclose(levelling.attitude.carried[1], [0.5, 1.0], atol=1e-6)

@@ -121,9 +121,10 @@ def test_what_counts_as_success() -> None:
         trial(1, error_m=0.49),
         trial(2, error_m=0.51),  # wrong
         trial(3, error_rad=0.11),  # wrong
-        trial(4, "refused"),
-        trial(5, "degenerate", error_m=np.nan, error_rad=np.nan),
-        trial(6, "failed", **nan),
+        # no answers: what the oracle errs by there is not held against those that are
+        trial(4, "refused", oracle_error_m=0.9),
+        trial(5, "degenerate", error_m=np.nan, error_rad=np.nan, oracle_error_m=0.9),
+        trial(6, "failed", **nan, oracle_error_m=0.9),
         trial(7, oracle_error_m=0.5, error_m=0.04, elapsed_s=0.1),
     ]
     cell = summarise(pd.DataFrame(rows, columns=pd.Index(TRIALS.names))).iloc[0]

@@ -2,10 +2,13 @@
 
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
 import pytest
 
+from experiments.study.compare.quantities import READ
 from experiments.study.compare.versions import compare
-from tests.helpers.made_up_runs import Tables, two_sweeps
+from tests.helpers.made_up_runs import Tables, tables_of, two_sweeps
 
 
 def row(found, metric: str, method: str) -> dict:
@@ -36,3 +39,36 @@ def test_values_and_counts_are_those_of_the_tables(tmp_path: Path) -> None:
     assert row(found, "fused RMSE, m", "")["n_rows"] == 6
     path = row(found, "path RMSE, m", "")
     assert (path["change"], path["n_rows"], path["verdict"]) == (1.0, 6 * 3, "identical")
+
+
+def test_what_is_told_of_either_version_is_a_median_of_errors_and_a_mean_of_shares(
+    tmp_path: Path,
+) -> None:
+    found = compare(*two_sweeps(tmp_path, changed, seeds=6))
+    made = [tables_of(seed) for seed in range(6)]
+    fits = pd.concat([each["map_fits"] for each in made])
+    rmse_m = np.median(fits[fits["map"] != "fused"]["rmse_m"])
+    landmarks = row(found, "landmark RMSE, m", "")
+    assert (landmarks["a"], landmarks["b"]) == pytest.approx((rmse_m, 3 * rmse_m))
+    errors = pd.concat([each["errors"] for each in made])
+    of_icp = errors[errors["aligner"] == "icp"]
+    right = (of_icp["refined_translation_error_m"] <= 0.5).mean()  # of as many answers a map
+    assert 0.3 < right < 0.9
+    assert row(found, "success refined", "icp")["a"] == pytest.approx(right)
+
+
+def test_nees_of_fused_pairs_is_per_degree_of_freedom() -> None:
+    """Of each pair of robots the mean over its true pairs, planar ones and others."""
+    rows = {"robot_a": ["A"] * 3 + ["B"] * 2, "robot_b": "C", "run_id": "x"}
+    rows |= {"nees_with_drift": [2.0, 4.0, 99.0, 6.0, 3.0], "degrees_of_freedom": [2, 2, 2, 3, 3]}
+    fusion = pd.DataFrame(rows | {"true_pair": [True, True, False, True, True]})
+    _, _, reduced = READ["fusion"]
+    assert reduced(fusion)["nees"].tolist() == [1.5, 1.5]
+
+
+def test_an_edge_is_false_only_where_it_was_used() -> None:
+    _, _, reduced = READ["team_pairs"]
+    wrong = {"accepted": True, "n_common": 40, "refined_translation_error_m": 9.0}
+    pairs = pd.DataFrame([wrong | {"place": place} for place in ("confirmed", "contradicted")])
+    found = reduced(pairs.assign(refined_rotation_error_rad=0.0, team_translation_error_m=1.0))
+    assert (found["false"].tolist(), found["found"].tolist()) == ([1.0, 0.0], [0.0, 0.0])

@@ -203,3 +203,28 @@ def test_times_in_groups_along_the_overlap() -> None:
     assert (table["n_maps"] == 10).all()
     assert table["elapsed_s"].tolist() == pytest.approx(1e-3 * (4.5 + 10 * np.arange(8)))
     assert (table["elapsed_low_s"] < table["elapsed_s"]).all()
+
+
+def test_maps_that_one_method_did_not_see_leave_the_others_in_their_runs() -> None:
+    """Of a run lost to the second method nothing counts; one run is won whole, one lost whole."""
+    errors = rich(many_errors(3, methods={"a": (1.0, 0.0, 0.0), "b": (1.0, 0.0, 0.0)}))
+    errors = errors[errors["aligner"] != "oracle"].copy()
+    runs = errors["run_id"].unique()
+    first, factor = errors["aligner"] == "a", dict(zip(runs, (1.0, 0.5, 2.0), strict=True))
+    errors["translation_error_m"] = np.where(first, errors["run_id"].map(factor), 1.0)
+    seen = errors[first | (errors["run_id"] != runs[0])]
+    (row,) = compare_methods(maps_of(seen), rng()).to_dict("records")
+    assert (row["n_runs"], row["first_wins"]) == (2, 0.5)
+    assert (row["first_wins_low"], row["first_wins_high"]) == (0.0, 1.0)
+    assert (row["ratio_low"], row["ratio_high"]) == pytest.approx((0.5, 2.0))
+
+
+def test_what_is_told_beside_the_ratio_is_a_median_too() -> None:
+    errors = rich(many_errors(1, methods={"one": (1.0, 0.0, 0.0)}))
+    off = np.geomspace(0.01, 2.0, errors["iteration"].nunique() * 2)
+    place = errors.groupby(["robot_a", "robot_b", "iteration"]).ngroup()
+    errors["translation_error_m"] = off[place]
+    errors["refined_translation_error_m"] = off[place] / 3
+    row = oracle_ratios(maps_of(errors), rng()).set_index("aligner").loc["one"]
+    assert row["estimated_m"] == pytest.approx(np.median(off))
+    assert row["refined_m"] == pytest.approx(np.median(off) / 3)

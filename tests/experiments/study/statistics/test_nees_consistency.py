@@ -92,3 +92,34 @@ def test_every_landmark_counts_once_however_they_are_spread_over_maps() -> None:
     (row,) = nees_of_maps(pd.DataFrame(runs | maps), np.random.default_rng(0)).to_dict("records")
     assert (row["n_runs"], row["n_landmarks"]) == (2, 10)
     assert (row["nees_per_dof"], row["share_in_gate"]) == pytest.approx((1.2, 0.9))
+
+
+def test_planar_maps_and_others_are_pooled_by_their_degrees_of_freedom() -> None:
+    """All landmarks are one sum of squares: 200 of 2 and 100 of 3 degrees make 700."""
+    runs = {"run_id": ["x", "y"], "landmarks": "own", "degrees_of_freedom": [2, 3]}
+    maps = {"n_landmarks": [200, 100], "nees_mean": [1.6, 6.0], "share_in_gate": [1.0, 0.7]}
+    (row,) = nees_of_maps(pd.DataFrame(runs | maps), np.random.default_rng(0)).to_dict("records")
+    assert row["nees_per_dof"] == pytest.approx((200 * 1.6 + 100 * 6.0) / 700)
+    assert row["share_in_gate"] == pytest.approx(0.9)  # of landmarks, whatever their degrees
+    band = chi2.ppf([0.025, 0.975], 700) / 700
+    assert (row["band_low"], row["band_high"]) == pytest.approx(tuple(band))
+
+
+def test_consistent_planar_maps_and_others_keep_to_the_band_together() -> None:
+    rng, rows = np.random.default_rng(5), []
+    for run in range(20):
+        dof, n = 2 + run % 2, 300
+        nees = rng.chisquare(dof, n)
+        row = {"run_id": f"w-{run}", "landmarks": "own", "n_landmarks": n}
+        row |= {"degrees_of_freedom": dof, "nees_mean": nees.mean()}
+        rows.append(row | {"share_in_gate": np.mean(nees <= chi2.ppf(0.95, dof))})
+    row = nees_of_maps(pd.DataFrame(rows), np.random.default_rng(1)).iloc[0]
+    assert row["band_low"] < row["nees_per_dof"] < row["band_high"]
+    assert row["nees_per_dof_low"] < 1 < row["nees_per_dof_high"]
+    fusion = pd.DataFrame({"run_id": ["a"] * 2000 + ["b"] * 1000})
+    fusion["degrees_of_freedom"], fusion["true_pair"] = [2] * 2000 + [3] * 1000, True
+    fusion["nees_with_drift"] = rng.chisquare(fusion["degrees_of_freedom"])
+    fusion["nees_without_drift"] = 4 * fusion["nees_with_drift"]
+    table = nees_of_pairs(fusion, rng).set_index("landmarks")["nees_per_dof"]
+    expected = fusion["nees_with_drift"].sum() / fusion["degrees_of_freedom"].sum()
+    assert table.tolist() == pytest.approx([expected, 4 * expected])

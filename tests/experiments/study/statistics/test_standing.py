@@ -185,3 +185,38 @@ def test_a_further_column_is_shown_by_naming_it(monkeypatch: pytest.MonkeyPatch)
     ):
         found = aligner_summary(errors, timings(), [standing.aligner])[column][0]
         assert found == value
+
+
+def test_what_is_told_of_an_aligner_are_medians_over_its_maps() -> None:
+    """Each of skewed numbers, of which the mean is another."""
+    errors = made_up({"one": [0.1, 0.2, 0.45, 0.15, 0.4]})
+    of_oracle = errors["aligner"] == "oracle"
+    for name, values in (
+        ("refined_translation_error_m", [0.05, 0.06, 0.07, 0.08, 0.4]),
+        ("refined_rotation_error_rad", [0.001, -0.002, 0.003, -0.004, 0.09]),
+    ):
+        errors.loc[of_oracle, name] = values
+    errors.loc[~of_oracle, "refined_rotation_error_rad"] = [0.001, -0.002, 0.003, -0.004, 0.09]
+    times = pd.concat([timings(one=t) for t in (1, 2, 30)])
+    verdict = verdict_of(errors, times)
+    (one,) = verdict.standings
+    assert (one.estimated_m, one.refined_m, one.refined_rad) == (0.2, 0.2, 0.003)
+    assert one.time_ms == pytest.approx(2)
+    assert one.over_oracle == pytest.approx(0.2 / 0.07)
+    assert (verdict.oracle_m, verdict.oracle_rad) == (0.07, 0.003)
+
+
+def test_accepted_answers_are_counted_over_all_repetitions() -> None:
+    """Of three answers a map two are accepted; on two of five maps these are wrong."""
+    right = made_up({"one": [0.1] * 3 + [9.0] * 2})
+    answers = [right.assign(repetition=k, accepted=k < 2) for k in range(3)]
+    (one,) = verdict_of(pd.concat(answers)).standings
+    assert (one.n_accepted, one.n_false, one.n_maps) == (10, 4, 5)
+
+
+def test_nearer_on_most_maps_is_not_equal_though_its_median_error_is_larger() -> None:
+    """Half as far off on three maps of five; five maps prove nothing, so the median map tells."""
+    first, other = [0.05, 0.06, 0.1, 0.3, 0.32], [0.4, 0.4, 0.05, 0.14, 0.15]
+    verdict = verdict_of(made_up({"first": first, "other": other}), timings(first=9, other=1))
+    assert [s.aligner for s in verdict.standings] == ["first", "other"]
+    assert verdict.equals == ()

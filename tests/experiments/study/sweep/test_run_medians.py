@@ -36,6 +36,7 @@ def test_medians_over_runs_of_the_runs_own_medians(tmp_path: Path) -> None:
     written = {
         (0, "2"): [row("svd", 3, error) for error in (1.0, 2.0, 9.0)] + [row("svd", 2, 99.0)],
         (1, "2"): [row("svd", 30, 4.0)],
+        (2, "2"): [row("svd", 30, 90.0)],
         (0, "3"): [row("svd", 30, 5.0), row("ransac", 2, 7.0)],
     }
     made = {
@@ -44,7 +45,7 @@ def test_medians_over_runs_of_the_runs_own_medians(tmp_path: Path) -> None:
     }
     found = medians_over_runs(_joined(tmp_path, ("slam.min_count",), made), list(made))
     assert found.drop(columns=GIVEN).values.tolist() == [
-        ["x 2", "svd", 3.0, 0.375, 2],
+        ["x 2", "svd", 4.0, 0.5, 3],
         ["x 3", "svd", 5.0, 0.625, 1],
     ]
     assert (found[GIVEN] == 1).all(axis=None)
