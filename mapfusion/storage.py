@@ -266,6 +266,30 @@ def column(table: pa.Table, name: str) -> np.ndarray:
     return values.to_numpy(zero_copy_only=False)
 
 
+def require_cells(
+    path: Path,
+    table: pa.Table,
+    names: Sequence[str],
+    is_right: Callable[[np.ndarray], np.ndarray],
+    remedy: str,
+) -> None:
+    """Raise InputError that names file, column and row of the first cell that is not right.
+
+    Args:
+        path: of the table, for the message.
+        table: with one number a cell in these columns.
+        names: of the columns.
+        is_right: from the values (N,) of a column to (N,) bool.
+        remedy: end of the message: what the cells must hold, or what to do.
+    """
+    for name in names:
+        values = column(table, name)
+        wrong = np.flatnonzero(~is_right(values))
+        if len(wrong):
+            found = f"is {values[wrong[0]]:.9g} in row {wrong[0]}"
+            raise InputError(f"{path}: column {name}: {found}; {remedy}")
+
+
 def columns(table: pa.Table, names: Sequence[str]) -> np.ndarray:
     """Several columns as one array (N, len(names))."""
     return np.stack([column(table, name) for name in names], -1)
