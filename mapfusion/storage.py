@@ -87,9 +87,12 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
     """
     data = read_sealed(path, what)
     try:
-        found = {} | json.loads(data.decode())
-    except (ValueError, TypeError, RecursionError) as error:  # of JSON, or of no object
+        found = json.loads(data.decode())
+    except (ValueError, RecursionError) as error:
         raise DamagedFileError(path, f"no JSON object ({error}), expected a {what}") from error
+    if not isinstance(found, dict):
+        held = "null" if found is None else f"a {type(found).__name__}"
+        raise DamagedFileError(path, f"no JSON object (it holds {held}), expected a {what}")
     tell_unsealed(path, data)
     name, value = next(iter(found.items()), ("", ""))
     if name != SEAL and re.fullmatch("[0-9a-f]{64}", str(value)):
