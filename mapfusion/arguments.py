@@ -1,6 +1,7 @@
 """Arguments and settings of the library, refused with their names."""
 
 import functools
+import math
 from dataclasses import dataclass
 from numbers import Integral, Real
 from types import NoneType
@@ -87,6 +88,14 @@ class Range:
     high: float
     unit: str
 
+    def problem(self, number: float) -> str:
+        """Return what is wrong with a number outside the range; empty for one inside."""
+        if self.low <= number <= self.high:
+            return ""
+        unit = "" if self.unit == "1" else f" {self.unit}"
+        finite = "" if math.isfinite(number) else "finite and "
+        return f"is {number}, must be {finite}in [{self.low:.15g}, {self.high:.15g}]{unit}"
+
     def __get_pydantic_json_schema__(self, core_schema: Any, handler: Any) -> dict[str, Any]:
         """What pydantic asks for; nothing of it is needed here."""
         return handler(core_schema) | {"minimum": self.low, "maximum": self.high, "unit": self.unit}
@@ -97,9 +106,16 @@ Probability = Annotated[float, Range(1e-6, 1 - 1e-15, "1")]
 
 
 def require_in_range(settings: object) -> None:
-    """Raise OutOfRangeError for the first setting of a class outside the `Range` it declares."""
+    """Raise OutOfRangeError for the settings of a class outside the `Range` they declare."""
+    wrong = list[OutOfRangeError]()
     for name, hint in _ranged(type(settings)).items():
-        _require_as_declared(name, getattr(settings, name), hint)
+        try:
+            _require_as_declared(name, getattr(settings, name), hint)
+        except OutOfRangeError as error:
+            wrong.append(error)
+    if wrong:
+        first, *others = ((error.name, error.problem) for error in wrong)
+        raise OutOfRangeError(*first, others)
 
 
 @functools.cache
@@ -136,10 +152,8 @@ def _require_inside(name: str, number: Any, kind: Any, bounds: Range) -> None:
     called = "an integer" if kind is int else "a number"
     if isinstance(number, bool) or not isinstance(number, wanted):
         raise OutOfRangeError(name, f"is {number!r}, expected {called}")
-    if not bounds.low <= number <= bounds.high:
-        unit = "" if bounds.unit == "1" else f" {bounds.unit}"
-        ends = f"[{bounds.low:.15g}, {bounds.high:.15g}]"
-        raise OutOfRangeError(name, f"is {number}, must be in {ends}{unit}")
+    if problem := bounds.problem(number):
+        raise OutOfRangeError(name, problem)
 
 
 def require_at_least(least: float, settings: object, *names: str) -> None:

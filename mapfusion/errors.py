@@ -20,12 +20,26 @@ class InputError(ValueError):
         return one_line(super().__str__())
 
 
-class OutOfRangeError(InputError):
-    """A setting that cannot have its value: its `name`, and the `problem`."""
+class InputErrors(InputError):  # noqa: N818  # several of them
+    """Several things a user gave are unusable; the text has one line for each of `lines`."""
 
-    def __init__(self, name: str, problem: str) -> None:
+    def __init__(self, lines: Iterable[str]) -> None:
+        self.lines = tuple(one_line(line) for line in lines)
+        super().__init__(*self.lines)
+
+    def __str__(self) -> str:
+        return "\n".join(self.lines)
+
+
+class OutOfRangeError(InputError):
+    """A setting that cannot have its value: its `name`, and the `problem`.
+
+    `also` holds the name and problem of each further setting of the same class.
+    """
+
+    def __init__(self, name: str, problem: str, also: Iterable[tuple[str, str]] = ()) -> None:
         super().__init__(name, problem)
-        self.name, self.problem = name, problem
+        self.name, self.problem, self.also = name, problem, tuple(also)
 
     def __str__(self) -> str:
         return one_line(f"{self.name}: {self.problem}")

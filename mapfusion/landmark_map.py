@@ -21,15 +21,24 @@ from mapfusion.calibration_error import EXACT, CalibrationError, calibration_fro
 from mapfusion.errors import InputError
 from mapfusion.joint_covariance import JointCovariance
 from mapfusion.joint_files import read_joint, write_joint
-from mapfusion.looks import DESCRIPTOR_LENGTH, LOOK_FIELDS, look_columns, looks_from
+from mapfusion.looks import (
+    DESCRIPTOR_LENGTH,
+    LOOK_FIELDS,
+    look_columns,
+    looks_from,
+    require_looks,
+)
 from mapfusion.open_tables import read_open_table, told
 from mapfusion.robot_log import with_rows
 from mapfusion.se2 import Float
 from mapfusion.storage import (
+    COVARIANCE_FIELDS,
+    POSITION_FIELDS,
     column,
     point_columns,
     point_fields,
     points_from,
+    require_cells,
     schema,
     write_table,
 )
@@ -133,6 +142,13 @@ def write_map(path: Path, landmarks: LandmarkMap) -> None:
 def read_map(path: Path, alone: bool = False) -> LandmarkMap:
     """Read a map, with what lies beside it but for `alone`; raises InputError naming the file."""
     table, attributes = read_open_table(path, LANDMARKS)
+    finite = "give a finite number, or remove the row"
+    require_cells(path, table, [*POSITION_FIELDS, *COVARIANCE_FIELDS], np.isfinite, finite)
+    counted = "a landmark has at least one observation"
+    require_cells(path, table, ["count"], lambda count: count >= 1, counted)
+    of_log = "give -1 for none, or a row of the log: 0 and more"
+    require_cells(path, table, ["source_observation"], lambda row: row >= -1, of_log)
+    require_looks(path, table)
     position, covariance = points_from(table)
     planar = attributes.get("planar") == "true"
     try:

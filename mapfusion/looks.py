@@ -1,10 +1,13 @@
 """By what points are recognised: labels and descriptors, as columns of tables."""
 
+from pathlib import Path
+
 import numpy as np
 import pyarrow as pa
 
+from mapfusion.errors import InputError
 from mapfusion.open_tables import told
-from mapfusion.storage import column
+from mapfusion.storage import column, require_cells
 
 DESCRIPTOR_LENGTH = 64
 NO_LABEL = -1
@@ -36,3 +39,17 @@ def looks_from(table: pa.Table) -> tuple[np.ndarray | None, np.ndarray | None]:
         None if np.isnan(descriptor).all() else descriptor,
         None if np.all(label == NO_LABEL) else label,
     )
+
+
+def require_looks(path: Path, table: pa.Table) -> None:
+    """Raise InputError for the first row whose label or descriptor is not as documented."""
+    known_label = f"labels are {NO_LABEL} for none, or 0 and more"
+    require_cells(path, table, ["label"], lambda label: label >= NO_LABEL, known_label)
+    descriptor = column(table, "descriptor")
+    unusable = ~np.isfinite(descriptor).all(1) & ~np.isnan(descriptor).all(1)
+    if unusable.any():
+        row = np.flatnonzero(unusable)[0]
+        k = np.flatnonzero(~np.isfinite(descriptor[row]))[0]
+        found = f"number {k} is {descriptor[row, k]} in row {row}"
+        remedy = "give finite numbers, or leave the whole cell empty"
+        raise InputError(f"{path}: column descriptor: {found}; {remedy}")

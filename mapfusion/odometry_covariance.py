@@ -19,6 +19,7 @@ from mapfusion.storage import (
     covariances_from,
     float_fields,
     read_table,
+    require_cells,
     schema,
     write_table,
 )
@@ -58,4 +59,11 @@ def read_odometry_covariance(folder: Path) -> Float | None:
     table, _ = read_table(path, ODOMETRY_COVARIANCE)
     if not np.array_equal(column(table, "iteration"), np.arange(table.num_rows)):
         raise InputError(f"{path}: iterations must be 0, 1, 2, ..., one row each")
-    return covariances_from(table, _FIELDS)
+    require_cells(path, table, _FIELDS, np.isfinite, "give finite numbers, or remove the file")
+    covariance = covariances_from(table, _FIELDS)
+    low, high = np.linalg.eigvalsh(covariance[1:])[:, [0, -1]].T  # the first row has no motion
+    wrong = np.flatnonzero(low <= np.finfo(float).eps * high)
+    if len(wrong):
+        row = wrong[0] + 1
+        raise InputError(f"{path}: not positive definite in row {row}; mend it, or remove the file")
+    return covariance

@@ -23,10 +23,17 @@ from mapfusion.arguments import (
 )
 from mapfusion.calibration_error import EXACT, CalibrationError, calibration_from
 from mapfusion.errors import InputError
-from mapfusion.looks import DESCRIPTOR_LENGTH, LOOK_FIELDS, look_columns, looks_from
+from mapfusion.looks import (
+    DESCRIPTOR_LENGTH,
+    LOOK_FIELDS,
+    look_columns,
+    looks_from,
+    require_looks,
+)
 from mapfusion.open_tables import read_open_table, table_path, told
 from mapfusion.se2 import Float
 from mapfusion.storage import (
+    COVARIANCE_FIELDS,
     POSE_FIELDS,
     POSITION_FIELDS,
     column,
@@ -36,6 +43,7 @@ from mapfusion.storage import (
     point_columns,
     point_fields,
     points_from,
+    require_cells,
     schema,
     write_table,
 )
@@ -44,6 +52,10 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 NO_TRACK = -1
+# A turn of more than 360 degrees between two frames is not observable: it equals the same turn less
+# whole turns. The limit holds for radians and degrees alike, so that a log in degrees can be read,
+# and what reads it can name the unit.
+LARGEST_TURN = 360.0
 TRUTH_FILES = ("truth_poses.parquet", "truth_points.parquet")
 Arrays = TypeVar("Arrays", bound="DataclassInstance")
 _ITERATION = told(pa.field("iteration", pa.int32()), "number of the frame: 0, 1, 2, ...")
@@ -55,9 +67,12 @@ FRAMES = schema(
     1,
     [
         _ITERATION,
-        told(pa.field("time_s", pa.float64()), "when, increasing"),
+        told(pa.field("time_s", pa.float64()), "when, increasing from row to row"),
         *(
-            told(field, "motion since the row before, in the robot frame of that row")
+            told(
+                field,
+                "motion since the row before, in the robot frame of that row; row 0 is not used",
+            )
             for field in float_fields(_ODOMETRY_FIELDS)
         ),
     ],
@@ -220,6 +235,7 @@ def _observations(folder: Path) -> tuple[np.ndarray, Observations, bool]:
     """The same, and whether the file itself says that they are planar."""
     path = table_path(folder, "observations")
     table, attributes = read_open_table(path, OBSERVATIONS)
+    _require_sightings(path, table)
     position, covariance = points_from(table)
     uvd, track = columns(table, _PIXEL_FIELDS), column(table, "track")
     try:
@@ -268,17 +284,22 @@ def read_log(folder: Path) -> RobotLog:
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder (expected a robot log with frames.parquet)")
     frames, attributes = read_open_table(path, FRAMES)
-    _require_numbered(path, frames)
+    _require_frames(path, frames)
     iteration, observations, planar = _observations(folder)
     seen = table_path(folder, "observations")
+    beyond = np.flatnonzero(iteration >= frames.num_rows)
+    if len(beyond):
+        found = f"iteration is {iteration[beyond[0]]} in row {beyond[0]}"
+        last = f"{path.name} ends with frame {frames.num_rows - 1}"
+        raise InputError(f"{seen}: {found}, but {last}; add the frames or remove the rows")
     if "robot" in attributes:
         planar = attributes.get("planar") == "true"
     name, looks = attributes.get("robot", folder.resolve().name), observations.label
     odometry, time_s = columns(frames, _ODOMETRY_FIELDS), column(frames, "time_s")
+    odometry[:1] = 0.0  # the first frame has no row before
     calibration = calibration_from(attributes, path)
     try:
         log = RobotLog(name, planar, time_s, odometry, iteration, observations, calibration)
-        require_finite("time_s", time_s)
     except ValueError as error:
         raise InputError(f"{folder}: {error}") from error
     try:
@@ -289,6 +310,44 @@ def read_log(folder: Path) -> RobotLog:
     except ValueError as error:
         raise InputError(f"{seen}: {error}") from error
     return log
+
+
+def _require_frames(path: Path, table: pa.Table) -> None:
+    """Raise InputError for the first frame that is not as documented; names column and row."""
+    _require_numbered(path, table)
+    finite = "give a finite number"
+    require_cells(path, table, ["time_s", *_ODOMETRY_FIELDS], np.isfinite, finite)
+    time_s = column(table, "time_s")
+    still = np.flatnonzero(np.diff(time_s) <= 0)
+    if len(still):
+        row = still[0] + 1
+        found = f"is {time_s[row]:.15g} in row {row}, after {time_s[row - 1]:.15g}"
+        remedy = "times must increase from row to row; mend the clock or the order of the rows"
+        raise InputError(f"{path}: column time_s: {found}; {remedy}")
+    way = f"the motion since the row before is at most {LARGEST_POSITION_M:g} m"
+    require_cells(
+        path, table, _ODOMETRY_FIELDS[:2], lambda moved: abs(moved) <= LARGEST_POSITION_M, way
+    )
+    turn = f"the turn since the row before, in radians, is at most {LARGEST_TURN:g}"
+    require_cells(path, table, _ODOMETRY_FIELDS[2:], lambda by: abs(by) <= LARGEST_TURN, turn)
+
+
+def _require_sightings(path: Path, table: pa.Table) -> None:
+    """Raise InputError for the first observation that is not as documented, by column and row."""
+    iteration = column(table, "iteration")
+    require_cells(path, table, ["iteration"], lambda frame: frame >= 0, "frames are 0, 1, 2, ...")
+    back = np.flatnonzero(np.diff(iteration) < 0)
+    if len(back):
+        row = back[0] + 1
+        found = f"is {iteration[row]} in row {row}, after {iteration[row - 1]}"
+        raise InputError(f"{path}: column iteration: {found}; sort the rows by iteration")
+    finite = "give a finite number, or remove the row"
+    require_cells(path, table, [*POSITION_FIELDS, *COVARIANCE_FIELDS], np.isfinite, finite)
+    no_image = "give a finite number, or NaN for none"
+    require_cells(path, table, _PIXEL_FIELDS, lambda px: ~np.isinf(px), no_image)
+    numbered = f"tracks are {NO_TRACK} for none, or 0 and more"
+    require_cells(path, table, ["track"], lambda track: track >= NO_TRACK, numbered)
+    require_looks(path, table)
 
 
 def _require_numbered(path: Path, table: pa.Table) -> None:

@@ -87,9 +87,12 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
     """
     data = read_sealed(path, what)
     try:
-        found = {} | json.loads(data.decode())
-    except (ValueError, TypeError, RecursionError) as error:  # of JSON, or of no object
+        found = json.loads(data.decode())
+    except (ValueError, RecursionError) as error:
         raise DamagedFileError(path, f"no JSON object ({error}), expected a {what}") from error
+    if not isinstance(found, dict):
+        held = "null" if found is None else f"a {type(found).__name__}"
+        raise DamagedFileError(path, f"no JSON object (it holds {held}), expected a {what}")
     tell_unsealed(path, data)
     name, value = next(iter(found.items()), ("", ""))
     if name != SEAL and re.fullmatch("[0-9a-f]{64}", str(value)):
@@ -264,6 +267,30 @@ def column(table: pa.Table, name: str) -> np.ndarray:
     if pa.types.is_fixed_size_list(values.type):
         return values.flatten().to_numpy(zero_copy_only=False).reshape(-1, values.type.list_size)
     return values.to_numpy(zero_copy_only=False)
+
+
+def require_cells(
+    path: Path,
+    table: pa.Table,
+    names: Sequence[str],
+    is_right: Callable[[np.ndarray], np.ndarray],
+    remedy: str,
+) -> None:
+    """Raise InputError that names file, column and row of the first cell that is not right.
+
+    Args:
+        path: of the table, for the message.
+        table: with one number a cell in these columns.
+        names: of the columns.
+        is_right: from the values (N,) of a column to (N,) bool.
+        remedy: end of the message: what the cells must hold, or what to do.
+    """
+    for name in names:
+        values = column(table, name)
+        wrong = np.flatnonzero(~is_right(values))
+        if len(wrong):
+            found = f"is {values[wrong[0]]:.9g} in row {wrong[0]}"
+            raise InputError(f"{path}: column {name}: {found}; {remedy}")
 
 
 def columns(table: pa.Table, names: Sequence[str]) -> np.ndarray:

@@ -59,7 +59,8 @@ def main() -> None:
         use_kernel_cache()
         code = app(prog_name="mapfusion", standalone_mode=False) or 0
     except InputError as error:
-        complain(str(error))
+        for line in str(error).splitlines():
+            complain(line)
         code = EXIT_BAD_INPUT
     except BrokenPipeError:
         code = EXIT_FAILED

@@ -11,21 +11,15 @@ from experiments.judge import metrics, tables
 from experiments.judge.known_truth import why_no_truth
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import AnyScenario, Bound
-from mapfusion.errors import InputError, did_you_mean
+from mapfusion.errors import InputError
 
 
 def load_checked(path: Path, overrides: Sequence[str] = (), seed: int | None = None) -> AnyScenario:
     """A scenario as `load_scenario` gives it.
 
-    Raises InputError also for unknown metrics, and where the truth that they need is.
+    Raises InputError also where the truth is unknown that an expected metric needs.
     """
     scenario = load_scenario(path, overrides, seed)
-    aligners = [entry.name for entry in scenario.align.aligners]
-    known = metrics.known_metrics(aligners, scenario.fuse.fusers)
-    unknown = sorted(set(scenario.expect) - set(known))
-    if unknown:
-        there = f"known: {', '.join(known)}{did_you_mean(unknown[0], known)}"
-        raise InputError(f"{path}: expect.{unknown[0]}: unknown; {there}")
     judged = [name for name in scenario.expect if name not in metrics.WITHOUT_TRUTH]
     if judged and (reason := why_no_truth(scenario)):
         name = judged[0]

@@ -3,12 +3,13 @@
 Each takes the tables of one or more runs, pooled, with a column `seed`, and gives one number; NaN
 where the tables hold no row it could be computed from. Errors are compared as medians over seeds,
 robot pairs and iterations, after the repetitions on the same maps: single ratios exceed their bound
-by chance. A new metric is a function with `@metric()`; one that takes a further argument `aligner`
-is of each aligner; several of one shape are one function with `@metric(NAME=WHICH, ...)`.
+by chance. A new metric is a name in `experiments/scenario/expected.py` and a function here with
+`@metric()`; one that takes a further argument `aligner` is of each aligner; several of one shape
+are one function with `@metric(NAME=WHICH, ...)`.
 """
 
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
 
 import numpy as np
@@ -20,6 +21,7 @@ from experiments.judge.judged_maps import error_over_oracle, maps_of
 from experiments.judge.nothing_merged import merged_robots
 from experiments.judge.path_errors import path_rms, rms
 from experiments.judge.team_figures import edge_precision, edge_recall
+from experiments.scenario.expected import FUSER_METRICS
 
 # The four methods of the paper, algorithm 1 in both readings, as the default list names them.
 PAPER_ALIGNERS = ("ransac", "svd", "svd-solved", "icp", "impicp")
@@ -66,14 +68,6 @@ def path_over_odometry(tables: Tables) -> float:
 
 _SMOOTHER = ("path_rmse_m", "filter_over_smoother", "landmark_rmse_m", "gross_share")
 _SMOOTHER += ("nees_per_dof", "coverage_95")
-
-
-# Of each fuser that runs, under its name: columns of the table `fusers`.
-FUSER_METRICS = ("landmark_rmse_m", "gross_share", "fitted_rmse_m", "fitted_median_m")
-FUSER_METRICS += ("over_better_parent", "over_better_filter", "nees_per_dof", "frame_nees_per_dof")
-FUSER_METRICS += ("coverage_95", "frame_coverage_95", "alignment_nees_per_dof", "duplicate_share")
-FUSER_METRICS += ("alignment_error_m", "alignment_error_rad")
-FUSER_METRICS += ("alignment_sigma_m", "alignment_sigma_rad")
 
 
 def _of_a_fuser(tables: Tables, fuser: str, name: str) -> float:
@@ -225,13 +219,6 @@ def false_merges(tables: Tables, aligner: str) -> float:
 def missed_merges(tables: Tables, aligner: str) -> float:
     """Share refused of an aligner's answers where there are 20 or more true correspondences."""
     return (~criteria.mergeable(_of(tables["errors"], aligner))["accepted"]).mean()
-
-
-def known_metrics(aligners: Sequence[str], fusers: Sequence[str]) -> list[str]:
-    """Every metric name a scenario with these aligners and fusers may use."""
-    of_fusers = [f"{fuser}.{name}" for fuser in fusers for name in FUSER_METRICS]
-    of_aligners = [f"{aligner}.{name}" for aligner in aligners for name in ALIGNER_METRICS]
-    return [*METRICS, *of_fusers, *of_aligners]
 
 
 def compute(name: str, tables: Tables) -> float:

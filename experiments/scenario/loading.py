@@ -1,14 +1,15 @@
 """Scenario files in, validated scenarios out, or one line: the field, and what would be right."""
 
 import functools
+import json
 import reprlib
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
-from pydantic import ConfigDict, TypeAdapter, ValidationError, model_validator
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 from pydantic_core import to_jsonable_python
 
@@ -17,18 +18,32 @@ from experiments.scenario.generated import expanded
 from experiments.scenario.settings import (
     Align,
     AnyScenario,
+    ContradictingSections,
     GeneratedScenario,
     Recording,
     Scenario,
     SimulatedScenario,
     Simulation,
+    broken_rules,
+    merged_by_what_is_aligned,
+    sections_of,
 )
-from experiments.scenario.yaml_input import apply_overrides, read_mapping
-from mapfusion.errors import InputError, NameClashWarning, OutOfRangeError, did_you_mean
+from experiments.scenario.yaml_input import apply_overrides, lines_of_keys, read_mapping
+from mapfusion.arguments import Range
+from mapfusion.errors import (
+    InputError,
+    InputErrors,
+    NameClashWarning,
+    OutOfRangeError,
+    did_you_mean,
+)
 
 SHIPPED = Path(__file__).with_name("shipped")  # the repository's scenarios/, also where installed
 OWN = Path("scenarios")  # what shipped files name lies beside it, as it does in the repository
 S = TypeVar("S")
+Location = tuple[int | str, ...]  # keys and places in lists, from a scenario's root
+Place = Callable[[Location], str]  # where the value at a location was given, behind a file's name
+_MOST_LINES = 20  # about one scenario
 _MOST_SUGGESTED = 3  # keys that an error message offers
 _UNKNOWN = {"extra_forbidden", "unexpected_keyword_argument"}
 # Settings that were, and what says the same now.
@@ -50,25 +65,46 @@ _SIMULATION_S_OWN = {
 }
 
 
+def _nowhere(_: Location) -> str:
+    return ""
+
+
 def load_scenario(
     path: Path, overrides: Sequence[str] = (), seed: int | None = None
 ) -> AnyScenario:
     """Read and validate a scenario, with entries `key.sub=value` and the seed replaced.
 
     Raises:
-        InputError: one line that names the file, the field and what would be right.
+        InputError: a line for each thing that is wrong, with the file, its line, the key and what
+            would be right.
     """
     _require_whole_paths(overrides)
     data = apply_overrides(read_mapping(path), overrides)
     if seed is not None:
         data["seed"] = seed
-    scenario = scenario_of(data, str(path))
+    scenario = scenario_of(data, str(path), functools.partial(_place, path, overrides))
     _warn_of_name_clashes(scenario.align)
     if isinstance(scenario, Recording):
         folder = OWN if path.parent == SHIPPED else path.parent
         logs = [_resolved(path, folder, log) for log in scenario.logs]
         return scenario.model_copy(update={"logs": logs})
     return scenario
+
+
+# Every wrong key of one file asks for them.
+_lines = functools.lru_cache(maxsize=1)(lines_of_keys)
+
+
+def _place(path: Path, overrides: Sequence[str], location: Location) -> str:
+    """Return where the value at a location was given: a line of the file, or an override."""
+    for override in reversed(overrides):
+        own = override.partition("=")[0].split(".")
+        told = [str(part) for part in location[: len(own)]]
+        if told and own[: len(told)] == told:
+            return f", --set {override}"
+    above = (location[:n] for n in range(len(location), 0, -1))
+    line = next((_lines(path)[each] for each in above if each in _lines(path)), None)
+    return "" if line is None else f", line {line}"
 
 
 def _resolved(path: Path, folder: Path, log: str) -> str:
@@ -81,11 +117,11 @@ def _resolved(path: Path, folder: Path, log: str) -> str:
     return str(resolved)
 
 
-def scenario_of(data: dict[str, Any], where: str) -> AnyScenario:
+def scenario_of(data: dict[str, Any], where: str, place: Place = _nowhere) -> AnyScenario:
     """The simulation or the recording that the content of a file describes.
 
     Raises:
-        InputError: one line that begins with `where`.
+        InputError: lines that begin with `where` and the `place` of the value at fault.
     """
     data = {k: v for k, v in data.items() if k not in _OF_ONE_KIND or v not in (None, [])}
     drawn, recorded = "generate" in data, "logs" in data
@@ -99,14 +135,14 @@ def scenario_of(data: dict[str, Any], where: str) -> AnyScenario:
     if unclear and data.keys() <= _FIELDS.keys():  # a misspelt name is the better explanation
         raise InputError(f"{where}: {_EITHER}")
     if drawn:
-        asked = _validated(where, GeneratedScenario, data)
+        asked = _validated(where, GeneratedScenario, data, place)
         try:
             made = expanded(asked.generate, asked.seed)
         except InputError as error:
             raise InputError(f"{where}: generate.{error}") from error
         made["render"] = asked.render.model_dump()
         data = {key: value for key, value in data.items() if key != "generate"} | made
-    return _validated(where, Recording if recorded else Simulation, data)
+    return _validated(where, Recording if recorded else Simulation, data, place)
 
 
 def made_settings(
@@ -127,9 +163,7 @@ def made_settings(
 class _StepSettings(Scenario):
     """Settings of one step on files: aligning alone need not be able to merge."""
 
-    @model_validator(mode="after")
-    def _merges_what_it_aligns(self) -> Self:
-        return self
+    RULES = tuple(rule for rule in Scenario.RULES if rule is not merged_by_what_is_aligned)
 
 
 def default_settings(overrides: Sequence[str] = (), seed: int | None = None) -> Scenario:
@@ -175,33 +209,165 @@ def _known(kind: type[S]) -> TypeAdapter[S]:
 
 @functools.cache
 def _known_keys(kind: type) -> list[tuple[str, ...]]:
-    schema = _known(kind).json_schema()
+    schema = _schema(kind)
     return list(_keys(schema, schema))
 
 
-def _validated(where: str, kind: type[S], data: dict[str, Any]) -> S:
+@functools.cache
+def _schema(kind: type[S]) -> dict[str, Any]:
+    return _known(kind).json_schema()
+
+
+class Problem(NamedTuple):
+    """What is wrong with the value at a location."""
+
+    location: Location
+    text: str
+
+
+def _validated(where: str, kind: type[S], data: dict[str, Any], place: Place = _nowhere) -> S:
+    """A section of that kind; raises InputErrors with a line for each thing that is wrong."""
+    schema = _schema(kind)
+    problems = list(_unfit(schema, schema, data, ()))
+    unfit = {problem.location for problem in problems}
     try:
-        return _known(kind).validate_python(data)
+        made = _known(kind).validate_python(data)
+        if not problems:
+            return made
     except ValidationError as error:
-        raise InputError(f"{where}: {_first_problem(kind, error)}") from error
+        problems = [
+            *(each for each in _refused(kind, error) if not _reaches(each.location, unfit)),
+            *problems,
+        ]
+    if isinstance(kind, type) and issubclass(kind, Scenario):
+        problems += _contradictions(kind, data, {problem.location[:1] for problem in problems})
+    lines = []
+    for location, text in dict.fromkeys(problems):
+        named = f"{'.'.join(map(str, location))}: " if location else ""
+        lines.append(f"{where}{place(location)}: {named}{text}")
+    if len(lines) > _MOST_LINES:
+        lines[_MOST_LINES:] = [f"{where}: {len(lines) - _MOST_LINES} more things are wrong"]
+    raise InputErrors(lines)
 
 
-def _first_problem(kind: type, error: ValidationError) -> str:
-    """The first thing wrong with a section of that kind, and how many more there are."""
-    # A wrong name explains the missing one that follows from it, so it goes first.
-    problems = error.errors(include_url=False)
-    problem, *more = sorted(problems, key=lambda each: each["type"] not in _UNKNOWN)
-    location = problem["loc"]
-    message = problem["msg"].removeprefix("Value error, ")
-    cause = problem.get("ctx", {}).get("error")
-    if isinstance(cause, OutOfRangeError):
-        location, message = (*location, cause.name), cause.problem
-    elif problem["type"] in _UNKNOWN:
-        message = _about_unknown(location, _known_keys(kind))
-    elif problem["type"] != "value_error" and not isinstance(problem["input"], dict):
-        message = f"{message} (it is {reprlib.repr(problem['input'])})"
-    where = f"{'.'.join(map(str, location))}: " if location else ""
-    return f"{where}{message}" + (f" (and {len(more)} more)" if more else "")
+def _reaches(location: Location, others: Collection[Location]) -> bool:
+    """Return True if a location is one of the others or lies below one."""
+    return any(location[:n] in others for n in range(len(location) + 1))
+
+
+def _refused(kind: type, error: ValidationError) -> Iterator[Problem]:
+    """All that the validation of a section of that kind refused."""
+    # An unknown name explains the missing one that follows from it, so it goes first.
+    for each in sorted(
+        error.errors(include_url=False), key=lambda problem: problem["type"] not in _UNKNOWN
+    ):
+        location, text = each["loc"], each["msg"].removeprefix("Value error, ")
+        cause = each.get("ctx", {}).get("error")
+        if isinstance(cause, OutOfRangeError):
+            for name, problem in ((cause.name, cause.problem), *cause.also):
+                yield Problem((*location, *_parts(name)), problem)
+        elif isinstance(cause, ContradictingSections):
+            yield from map(_told, cause.problems)
+        elif each["type"] in _UNKNOWN:
+            yield Problem(location, _about_unknown(location, _known_keys(kind)))
+        elif each["type"] != "value_error" and not isinstance(each["input"], dict):
+            yield Problem(location, f"{text} (it is {reprlib.repr(each['input'])})")
+        else:
+            yield Problem(location, text)
+
+
+def _contradictions(
+    kind: type[Scenario], data: dict[str, Any], wrong: Collection[Location]
+) -> Iterator[Problem]:
+    """Contradictions between those sections of a scenario that are right by themselves."""
+    sections = {}
+    for name in sections_of(kind.RULES) & kind.model_fields.keys():
+        field = kind.model_fields[name]
+        if (name,) in wrong or (field.is_required() and name not in data):
+            continue
+        own: Any = field.annotation
+        sections[name] = (
+            _known(own).validate_python(data[name])
+            if name in data
+            else field.get_default(call_default_factory=True)
+        )
+    yield from map(_told, broken_rules(kind.RULES, sections))
+
+
+def _told(line: str) -> Problem:
+    """The key that a line about a scenario begins with, and the rest."""
+    name, _, text = line.partition(": ")
+    section, _, metric = name.partition(".")
+    return Problem((section, metric) if section == "expect" else _parts(name), text)
+
+
+def _parts(name: str) -> Location:
+    return tuple(int(part) if part.isdecimal() else part for part in name.split("."))
+
+
+_KINDS = {
+    "boolean": "true or false",
+    "integer": "an integer",
+    "number": "a number",
+    "string": "a text",
+    "array": "a list",
+    "object": "a mapping",
+}
+
+
+def _unfit(
+    root: dict[str, Any], node: dict[str, Any], value: Any, location: Location
+) -> Iterator[Problem]:
+    """Values of another type or range than the JSON schema `root` says, at and below a node.
+
+    A whole number may be written 5.0, as in any JSON schema; a text or a truth value is no number.
+    """
+    options = list(_options(root, node))
+    allowed = {option["type"] for option in options if "type" in option}
+    if not allowed or not all("type" in option for option in options):
+        return
+    if _kind_of(value) not in allowed | ({"integer"} if "number" in allowed else set()):
+        wanted = " or ".join(_KINDS[each] for each in _KINDS if each in allowed)
+        shown = json.dumps(value) if isinstance(value, bool | None) else reprlib.repr(value)
+        yield Problem(location, f"is {shown}, expected {wanted}")
+        return
+    for option in options:
+        if "unit" in option and isinstance(value, int | float):
+            bounds = Range(option["minimum"], option["maximum"], option["unit"])
+            if problem := bounds.problem(value):
+                yield Problem(location, problem)
+        if isinstance(value, dict) and option["type"] == "object":
+            others = option.get("additionalProperties")
+            for key, below in value.items():
+                own = option.get("properties", {}).get(key, others)
+                if isinstance(own, dict):
+                    yield from _unfit(root, own, below, (*location, key))
+        elif isinstance(value, list) and option["type"] == "array":
+            each = option.get("prefixItems", [option.get("items", {})] * len(value))
+            for i, (own, below) in enumerate(zip(each, value, strict=False)):
+                yield from _unfit(root, own, below, (*location, i))
+
+
+def _kind_of(value: Any) -> str:
+    """The type of a value, as JSON schemas call it."""
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return "boolean"
+    if isinstance(value, int) or (isinstance(value, float) and value.is_integer()):
+        return "integer"
+    return {float: "number", str: "string", list: "array", dict: "object"}[type(value)]
+
+
+def _options(root: dict[str, Any], node: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """The schemas that a node of a JSON schema stands for, any of which a value may follow."""
+    if "$ref" in node:
+        yield from _options(root, root["$defs"][node["$ref"].rsplit("/", 1)[1]])
+    elif "anyOf" in node:
+        for option in node["anyOf"]:
+            yield from _options(root, option)
+    else:
+        yield node
 
 
 def _about_unknown(location: tuple[int | str, ...], known: list[tuple[str, ...]]) -> str:

@@ -4,11 +4,14 @@ The stages' own parameter classes (`FrontEndParameters`, `FastSlamParameters`, .
 are: pydantic validates them in place, so a parameter is named and explained once, where it is used.
 """
 
-from typing import Annotated, Any, Literal, Self
+import inspect
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
 from experiments.methods.aligner_calls import require_usable
+from experiments.scenario.expected import why_unknown
 from experiments.scenario.generated import Generate
 from experiments.scenario.sections import (
     MAX_COUNT,
@@ -180,6 +183,67 @@ _UNFILTERED = {"plane_misfit_px": 0.7, "residual_correlation_px": 3.0, "sigma_fl
 _UNFILTERED_STRAY_M = 0.003
 
 
+# A rule about several sections: its arguments are sections by their names, its answers are lines
+# that begin with the key at fault.
+Rule = Callable[..., Iterator[str]]
+
+
+class ContradictingSections(ValueError):  # noqa: N818  # pydantic calls it an error itself
+    """Sections that are right by themselves contradict each other; `problems` has a line each."""
+
+    def __init__(self, problems: Sequence[str]) -> None:
+        super().__init__("; ".join(problems))
+        self.problems = tuple(problems)
+
+
+def sections_of(rules: Sequence[Rule]) -> set[str]:
+    """Return the names of the sections that some of the rules need."""
+    return {name for rule in rules for name in inspect.signature(rule).parameters}
+
+
+def broken_rules(rules: Sequence[Rule], sections: Mapping[str, Any]) -> list[str]:
+    """Apply the rules whose sections are all there; return the lines of those broken."""
+    broken = []
+    for rule in rules:
+        needed = sections_of([rule])
+        if sections.keys() >= needed:
+            broken += rule(**{name: sections[name] for name in needed})
+    return broken
+
+
+def merged_by_what_is_aligned(align: Align, merge: Merge, fuse: Fuse) -> Iterator[str]:
+    """Tell if the merge builds on an aligner or a fuser that does not run."""
+    aligners = [entry.name for entry in align.aligners]
+    if merge.aligner not in aligners:
+        known = f"is not among align.aligners ({', '.join(aligners)})"
+        yield f"merge.aligner: {merge.aligner} {known}"
+    if merge.fuser not in fuse.fusers:
+        known = f"is not among fuse.fusers ({', '.join(fuse.fusers)})"
+        yield f"merge.fuser: {merge.fuser} {known}"
+
+
+def _fused_when_evaluated(fuse: Fuse, evaluate: Evaluate) -> Iterator[str]:
+    if fuse.every is not None and fuse.every % evaluate.every:
+        wanted = f"must be a multiple of evaluate.every ({evaluate.every} frames)"
+        yield f"fuse.every: is {fuse.every}, {wanted}"
+
+
+def _known_metrics_expected(align: Align, fuse: Fuse, expect: dict[str, Bound]) -> Iterator[str]:
+    aligners = [entry.name for entry in align.aligners]
+    for name in expect:
+        if unknown := why_unknown(name, aligners, fuse.fusers):
+            yield f"expect.{name}: {unknown}"
+
+
+def _drawn_from_below_the_walls(
+    world: World, camera: StereoCamera, render: Render
+) -> Iterator[str]:
+    top_m, camera_m = world.wall_height_m, camera.mount_z_m
+    if render.renderer == "raycast" and camera_m >= top_m:
+        what = f"raycast draws from below the walls' upper edge ({top_m:g} m) only"
+        yield f"render.renderer: {what}; camera.mount_z_m is {camera_m:g}"
+
+
 class Scenario(Section):
     """What a simulation and a recording have in common.
 
@@ -213,23 +277,16 @@ class Scenario(Section):
     keep: Keep = Keep()
     expect: dict[str, Bound] = Field(default_factory=dict)
 
-    @model_validator(mode="after")
-    def _merges_what_it_aligns(self) -> Self:
-        aligners = [entry.name for entry in self.align.aligners]
-        if self.merge.aligner not in aligners:
-            known = f"is not among align.aligners ({', '.join(aligners)})"
-            raise ValueError(f"merge.aligner: {self.merge.aligner} {known}")
-        if self.merge.fuser not in self.fuse.fusers:
-            known = f"is not among fuse.fusers ({', '.join(self.fuse.fusers)})"
-            raise ValueError(f"merge.fuser: {self.merge.fuser} {known}")
-        return self
+    RULES: ClassVar[tuple[Rule, ...]] = (
+        merged_by_what_is_aligned,
+        _fused_when_evaluated,
+        _known_metrics_expected,
+    )
 
     @model_validator(mode="after")
-    def _fuses_what_it_evaluates(self) -> Self:
-        every, evaluated = self.fuse.every, self.evaluate.every
-        if every is not None and every % evaluated:
-            wanted = f"must be a multiple of evaluate.every ({evaluated} frames)"
-            raise ValueError(f"fuse.every: is {every}, {wanted}")
+    def _fits_together(self) -> Self:
+        if problems := broken_rules(self.RULES, vars(self)):
+            raise ContradictingSections(problems)
         return self
 
     def resolved(self) -> dict[str, Any]:
@@ -332,13 +389,7 @@ class Simulation(SimulatedScenario):
     robots: Annotated[list[Robot], Field(min_length=1, max_length=32), AfterValidator(different)]
     generated: Generated | None = None
 
-    @model_validator(mode="after")
-    def _drawable(self) -> Self:
-        top_m, camera_m = self.world.wall_height_m, self.camera.mount_z_m
-        if self.render.renderer == "raycast" and camera_m >= top_m:
-            what = f"raycast draws from below the walls' upper edge ({top_m:g} m) only"
-            raise ValueError(f"render.renderer: {what}; camera.mount_z_m is {camera_m:g}")
-        return self
+    RULES: ClassVar[tuple[Rule, ...]] = (*Scenario.RULES, _drawn_from_below_the_walls)
 
 
 AnyScenario = Simulation | Recording

@@ -1,11 +1,12 @@
 """Scenario files: safe YAML 1.2 in, plain mappings out, one clear line when that fails."""
 
-from collections.abc import Iterator, Sequence
+import json
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ruamel.yaml import YAML
-from ruamel.yaml.composer import MaxDepthExceededError
+from ruamel.yaml.composer import Composer, MaxDepthExceededError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode
 
 from mapfusion.errors import InputError
@@ -13,10 +14,26 @@ from mapfusion.sealed import SEAL
 
 _MOST_BYTES = 4_000_000  # the largest resolved scenario of ours takes 0.03 of that
 _MOST_VALUES = 200_000  # with every alias written out
+# The reader takes a second for 5 000 to 10 000 values; the 1000 walls that a world may have, of two
+# points each, are 9 000. JSON is read a hundred times as fast, and has no such limit.
+_MOST_WRITTEN = 20_000
 _MOST_DEPTH = 50  # a scenario needs 8
 _TOO_DEEP = "nested too deeply, or holds itself"
 _OPENCV_HEADER = "%YAML:1.0"  # of its own dialect, which only looks like a YAML directive
 _LARGEST_INTEGER = 2**63  # what tables and other people's readers of JSON can hold
+
+
+class _Counting(Composer):
+    """Gives up after so many values, before it has read all of a long text."""
+
+    n_values = 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        self.n_values += 1
+        if self.n_values > _MOST_WRITTEN:
+            remedy = "write it as JSON, which is read faster, or make it smaller"
+            raise InputError(f"holds more than {_MOST_WRITTEN} values in YAML; {remedy}")
+        return super().compose_node(parent, index)
 
 
 def read_mapping(
@@ -56,8 +73,10 @@ def parse_value(text: str, where: str) -> Any:
     Raises:
         InputError: one line that begins with `where`.
     """
-    reader = YAML(typ="safe", pure=True)
-    reader.max_depth = _MOST_DEPTH  # given up there: to read all of a deep text takes seconds
+    known, value = _as_json(text)
+    if known:
+        return _plain(value, where, ())
+    reader = _reader()
     try:
         node = reader.compose(text)
         if node is None:
@@ -74,6 +93,74 @@ def parse_value(text: str, where: str) -> Any:
         problem = str(getattr(error, "problem", None) or error).partition("\n")[0]
         raise InputError(f"{where}{line}: not plain YAML ({problem})") from error
     return _plain(value, where, ())
+
+
+def _reader() -> YAML:
+    reader = YAML(typ="safe", pure=True)
+    reader.Composer = _Counting
+    reader.max_depth = _MOST_DEPTH  # given up there: to read all of a deep text takes seconds
+    return reader
+
+
+def _as_json(text: str) -> tuple[bool, Any]:
+    """Whether a text is a JSON object, and what it holds.
+
+    All other texts are left to the reader of YAML, with what only that one refuses: keys that are
+    there twice, deep nesting, numbers that JSON does not know.
+    """
+    if not text.lstrip().startswith("{"):
+        return False, None
+
+    def object_of(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        found = dict(pairs)
+        if len(found) < len(pairs):
+            raise ValueError("a key is there twice")
+        return found
+
+    def no_number(name: str) -> Any:
+        raise ValueError(f"{name} is no number of JSON")
+
+    try:
+        value = json.loads(text, object_pairs_hook=object_of, parse_constant=no_number)
+    except (ValueError, RecursionError):
+        return False, None
+    return _depth_of(value) <= _MOST_DEPTH, value
+
+
+def _depth_of(value: Any) -> int:
+    """Levels of mappings and lists, as far as they count."""
+    level, depth = [value], 0
+    while level and depth <= _MOST_DEPTH:
+        depth += 1
+        level = [
+            below
+            for each in level
+            if isinstance(each, dict | list)
+            for below in (each.values() if isinstance(each, dict) else each)
+        ]
+    return depth
+
+
+def lines_of_keys(path: Path) -> dict[tuple[str | int, ...], int]:
+    """Line number of each key and list item of a YAML file, by its path; none if unreadable."""
+    try:
+        text = path.read_text(encoding="utf-8").removeprefix(_OPENCV_HEADER)
+        node = _reader().compose(text)
+        return {} if node is None else dict(_marked(node, ()))
+    except Exception:  # what cannot be read has been refused before, or is too long
+        return {}
+
+
+def _marked(node: Node, path: tuple[str | int, ...]) -> Iterator[tuple[tuple[str | int, ...], int]]:
+    """Paths and lines of all keys and items below a node; of an alias, those of its anchor."""
+    if isinstance(node, MappingNode):
+        items = [(key.value, key, value) for key, value in node.value]
+    else:
+        items = [(i, value, value) for i, value in enumerate(_children(node))]
+    for name, marked, value in items:
+        yield (*path, name), marked.start_mark.line + 1
+        if not isinstance(value, ScalarNode):
+            yield from _marked(value, (*path, name))
 
 
 def _measured(node: Node, known: dict[int, tuple[int, int]], depth: int = 0) -> tuple[int, int]:
@@ -156,6 +243,15 @@ def _key(node: Any, name: str, dotted: str) -> str | int:
     """What a part of a dotted name stands for: a mapping's key, or the place in a list."""
     if isinstance(node, dict):
         return name
-    if isinstance(node, list) and name.isdecimal() and int(name) < len(node):
-        return int(name)
-    raise InputError(f"--set {dotted}: {name} is not a key here")
+    if isinstance(node, list):
+        places = {str(place): place for place in range(len(node))}
+        if name in places:
+            return places[name]
+        named = [each.get("name") if isinstance(each, Mapping) else None for each in node]
+        there = ", ".join(
+            f"{place} ({called})" if isinstance(called, str) else place
+            for place, called in zip(places, named, strict=True)
+        )
+        raise InputError(f"--set {dotted}: {name}: no such entry; there: {there or 'none'}")
+    held = "null" if node is None else f"the value {node!r}"
+    raise InputError(f"--set {dotted}: {name} is not a key here, where {held} stands")

@@ -1,5 +1,6 @@
 """Lenses and matrices from the mappings that calibration files hold (EuRoC's and Kalibr's keys)."""
 
+import reprlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -54,19 +55,26 @@ def lens_of(where: str, camera: Mapping[str, Any]) -> Lens:
         raise InputError(f"{where}: {error}") from error
 
 
-def motion_of(where: str, key: str, value: Any) -> Float:
+def motion_of(where: str, key: str, holder: Mapping[str, Any]) -> Float:
     """A rigid motion (4, 4): rows of numbers, 16 numbers, or EuRoC's mapping with `data`.
+
+    Args:
+        where: file and place in it, for messages.
+        key: of the motion.
+        holder: the mapping that holds it.
 
     Raises:
         InputError: one line that begins with `where`.
     """
+    value, wanted = holder.get(key), "4 rows of 4 numbers"
     if isinstance(value, Mapping):
-        value = value.get("data")
+        key, value = f"{key}.data", value.get("data")
+    if value is None:
+        raise InputError(f"{where}: {key}: is missing, expected {wanted}")
     try:
-        T = np.array(value, dtype=np.float64)
-        T = T.reshape(4, 4)
+        T = np.array(value, dtype=np.float64).reshape(4, 4)
     except (TypeError, ValueError):
-        raise InputError(f"{where}: {key}: must be 4 rows of 4 numbers") from None
+        raise InputError(f"{where}: {key}: is {_short(value)}, expected {wanted}") from None
     try:
         require_rigid(key, T)
     except InputError as error:
@@ -74,11 +82,23 @@ def motion_of(where: str, key: str, value: Any) -> Float:
     return T
 
 
+def _short(value: Any) -> str:
+    """A value as messages show it."""
+    flat = (
+        [each for row in value for each in (row if isinstance(row, list) else [row])]
+        if (isinstance(value, list))
+        else []
+    )
+    is_numbers = flat and all(isinstance(each, int | float) for each in flat)
+    return f"{len(flat)} numbers" if is_numbers else reprlib.repr(value)
+
+
 def section(where: Path, document: Mapping[str, Any], key: str) -> Mapping[str, Any]:
     """A mapping within a document; raises InputError where there is none."""
     found = document.get(key)
     if not isinstance(found, Mapping):
-        raise InputError(f"{where}: {key}: missing, expected a mapping")
+        what = "is missing" if found is None else f"is {_short(found)}"
+        raise InputError(f"{where}: {key}: {what}, expected a mapping")
     return found
 
 
@@ -91,6 +111,6 @@ def _numbers(
     )
     if not is_list or (n is not None and len(value) != n):
         wanted = f"a list [{', '.join(names)}]" if names else "a list of numbers"
-        missing = "is missing" if value is None else f"is {value!r}"
-        raise InputError(f"{where}: {key}: {missing}, expected {wanted}")
+        what = "is missing" if value is None else f"is {reprlib.repr(value)}"
+        raise InputError(f"{where}: {key}: {what}, expected {wanted}")
     return [float(each) for each in value]

@@ -28,18 +28,21 @@ from mapfusion.recordings.mount import MountSettings, robot_in_body
 from mapfusion.recordings.pictures import PictureFile
 from mapfusion.recordings.stereo_recording import ReadYaml, Shot, StereoRecording, paired
 from mapfusion.recordings.text_tables import (
-    numbers,
+    POSES,
+    require_columns,
     require_increasing,
     rows_of,
     time_in_ns,
+    timed_numbers,
 )
 from mapfusion.recordings.timed_poses import TimedPoses
 from mapfusion.recordings.tum import ODOMETRY_FILE, read_tum
 from mapfusion.se2 import Float
 
 STATES = "state_groundtruth_estimate0"
-_FELT_COLUMNS = 7  # time, angular velocity, acceleration
-_POSE_COLUMNS = 8  # time, position, quaternion; speeds and biases follow
+_FELT_COLUMNS = "time wx wy wz ax ay az"
+_STATE_COLUMNS = "time x y z qw qx qy qz"  # speeds and biases follow
+_LEAST_PICTURES = 2  # of a camera, to make two pairs of
 
 
 @dataclass(frozen=True)
@@ -90,28 +93,35 @@ def read_euroc(folder: Path, settings: EurocSettings, read_yaml: ReadYaml) -> St
         read_tum(odometry) if odometry.exists() else None,
         (*lost_left, *lost_right, *dropped),
         felt,
+        f"{root}: sensor.yaml of cam0 and cam1",
     )
 
 
 def _camera(path: Path, read_yaml: ReadYaml) -> tuple[Any, Float]:
     """The lens, and T_BS (4, 4)."""
     found: Mapping[str, Any] = read_yaml(path)
-    return lens_of(str(path), found), motion_of(str(path), "T_BS", found.get("T_BS"))
+    return lens_of(str(path), found), motion_of(str(path), "T_BS", found)
 
 
 def _shots(camera: Path) -> tuple[list[Shot], list[str]]:
     """The pictures of one camera that are there, and what is said of those that are not."""
     path, shots, lines, missing = camera / "data.csv", list[Shot](), list[int](), list[str]()
     for line, words in rows_of(path, "times and names of pictures", ","):
-        if len(words) != 2:
-            raise InputError(f"{path}, line {line}: has {len(words)} columns, expected 2")
-        picture = camera / "data" / words[1]
+        require_columns(path, line, words, "time file")
+        time_ns, picture = time_in_ns(path, line, words[0], 1), camera / "data" / words[1]
         name = f"{camera.name}/data/{words[1]}"
         if picture.is_file():
-            shots.append(Shot(time_in_ns(path, line, words[0], 1), name, PictureFile(picture)))
+            shots.append(Shot(time_ns, name, PictureFile(picture)))
             lines.append(line)
         else:
             missing.append(f"{name} (no such file)")
+    if missing and len(shots) < _LEAST_PICTURES:
+        lost = f"{missing[0]}; {len(missing)} of the {len(missing) + len(shots)} listed are missing"
+        held = next(
+            (each.name for each in sorted((camera / "data").glob("*")) if each.is_file()), "none"
+        )
+        folder = f"names are relative to {camera.name}/data, whose first file is {held}"
+        raise InputError(f"{path}: {lost}; {folder}")
     require_increasing(path, lines, np.array([shot.time_ns for shot in shots], dtype=np.int64))
     return shots, missing
 
@@ -119,15 +129,8 @@ def _shots(camera: Path) -> tuple[list[Shot], list[str]]:
 def _felt(imu: Path, T_body_robot: Float, read_yaml: ReadYaml) -> Inertial:
     """Accelerations and angular velocities in the robot's axes."""
     sensor, path = imu / "sensor.yaml", imu / "data.csv"
-    T_body_imu = motion_of(str(sensor), "T_BS", read_yaml(sensor).get("T_BS"))
-    lines, times, rows = list[int](), list[int](), list[list[float]]()
-    for line, words in rows_of(path, "accelerations", ","):
-        lines.append(line)
-        times.append(time_in_ns(path, line, words[0], 1))
-        rows.append(numbers(path, line, words[1:], _FELT_COLUMNS - 1))
-    time_ns = np.array(times, dtype=np.int64)
-    require_increasing(path, lines, time_ns)
-    own = np.array(rows, dtype=np.float64).reshape(-1, _FELT_COLUMNS - 1)
+    T_body_imu = motion_of(str(sensor), "T_BS", read_yaml(sensor))
+    time_ns, own = timed_numbers(path, "accelerations", _FELT_COLUMNS, 1, ",")
     turn = se3.between(T_body_robot, T_body_imu)[:3, :3].T
     try:
         return Inertial(time_ns, own[:, 3:] @ turn, own[:, :3] @ turn)
@@ -137,16 +140,7 @@ def _felt(imu: Path, T_body_robot: Float, read_yaml: ReadYaml) -> Inertial:
 
 def _states(path: Path) -> TimedPoses:
     """T_world_body of the true states."""
-    lines, times, rows = list[int](), list[int](), list[list[float]]()
-    for line, words in rows_of(path, "true states", ","):
-        if len(words) < _POSE_COLUMNS:
-            raise InputError(f"{path}, line {line}: has {len(words)} columns, expected 8 or more")
-        lines.append(line)
-        times.append(time_in_ns(path, line, words[0], 1))
-        rows.append(numbers(path, line, words[1:_POSE_COLUMNS], _POSE_COLUMNS - 1))
-    values = np.array(rows, dtype=np.float64).reshape(-1, _POSE_COLUMNS - 1)
-    time_ns = np.array(times, dtype=np.int64)
-    require_increasing(path, lines, time_ns)
+    time_ns, values = timed_numbers(path, "true states", _STATE_COLUMNS, 1, ",", POSES, more=True)
     if not np.all(np.linalg.norm(values[:, 3:], axis=1) > 0):
         raise InputError(f"{path}: holds a quaternion of length 0")
     return TimedPoses(time_ns, se3.from_quaternions(values[:, :3], values[:, [4, 5, 6, 3]]))

@@ -33,7 +33,13 @@ from mapfusion.recordings.stereo_recording import (
     StereoRecording,
     paired,
 )
-from mapfusion.recordings.text_tables import NS, require_increasing, rows_of, time_in_ns
+from mapfusion.recordings.text_tables import (
+    NS,
+    require_columns,
+    require_increasing,
+    rows_of,
+    time_in_ns,
+)
 from mapfusion.recordings.tum import ODOMETRY_FILE, TRUTH_FILE, read_tum
 from mapfusion.se2 import Float
 
@@ -98,7 +104,15 @@ def read_images(folder: Path, settings: ImagesSettings, read_yaml: ReadYaml) -> 
     T_robot_left = settings.mount.applied(T_robot_left)
     name = folder.resolve().name
     return StereoRecording(
-        name, time_ns, pictures, calibration, T_robot_left, truth, odometry, dropped
+        name,
+        time_ns,
+        pictures,
+        calibration,
+        T_robot_left,
+        truth,
+        odometry,
+        dropped,
+        calibrated_by=str(folder / settings.calibration),
     )
 
 
@@ -106,7 +120,7 @@ def _calibration(path: Path, read_yaml: ReadYaml) -> tuple[StereoCalibration, Fl
     """The pair, and T_robot_left (4, 4)."""
     document = read_yaml(path)
     left, right = (section(path, document, name) for name in ("cam0", "cam1"))
-    T_right_left = motion_of(f"{path}: cam1", "T_cn_cnm1", right.get("T_cn_cnm1"))
+    T_right_left = motion_of(f"{path}: cam1", "T_cn_cnm1", right)
     try:
         lenses = lens_of(f"{path}: cam0", left), lens_of(f"{path}: cam1", right)
         calibration = StereoCalibration(*lenses, se3.inverse(T_right_left))
@@ -116,7 +130,7 @@ def _calibration(path: Path, read_yaml: ReadYaml) -> tuple[StereoCalibration, Fl
     if "T_BS" not in left:
         baseline_m = float(calibration.T_left_right[0, 3])
         return calibration, level_mount(baseline_m, 0.0, _HEIGHT_M)
-    T_body_left = motion_of(f"{path}: cam0", "T_BS", left["T_BS"])
+    T_body_left = motion_of(f"{path}: cam0", "T_BS", left)
     return calibration, robot_in_body(T_body_left)[1]
 
 
@@ -125,6 +139,9 @@ def _named(folder: Path, times: Path) -> list[Shot]:
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder (pictures of one camera)")
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in _KINDS)
+    if not paths:
+        kinds = ", ".join(sorted(_KINDS))
+        raise InputError(f"{folder}: holds no picture of one camera ({kinds})")
     if times.is_file():
         rows = list(rows_of(times, "times of pictures"))
         if len(rows) != len(paths):
@@ -156,9 +173,7 @@ def _time_of(path: Path, times: Path) -> int:
 def _listed(path: Path) -> tuple[list[Shot], list[Shot]]:
     left, right, lines = list[Shot](), list[Shot](), list[int]()
     for line, words in rows_of(path, "pairs of pictures", ","):
-        if len(words) != 3:
-            expected = "expected 3: time in seconds, left file, right file"
-            raise InputError(f"{path}, line {line}: has {len(words)} columns, {expected}")
+        require_columns(path, line, words, "time left_file right_file")
         time_ns = time_in_ns(path, line, words[0], NS)
         for name, shots in zip(words[1:], (left, right), strict=True):
             picture = path.parent / name

@@ -23,13 +23,22 @@ from mapfusion.recordings.lens import R_ROBOT_OPTICAL, Lens, StereoCalibration, 
 from mapfusion.recordings.mount import MountSettings, level_mount
 from mapfusion.recordings.numbered import numbered_shots
 from mapfusion.recordings.stereo_recording import ReadYaml, StereoRecording, paired
-from mapfusion.recordings.text_tables import NS, numbers, require_increasing, rows_of, time_in_ns
+from mapfusion.recordings.text_tables import (
+    NS,
+    POSES,
+    numbers,
+    require_columns,
+    require_increasing,
+    rows_of,
+    time_in_ns,
+)
 from mapfusion.recordings.timed_poses import TimedPoses
 from mapfusion.recordings.tum import ODOMETRY_FILE, read_tum
 from mapfusion.se2 import Float
 
 HEIGHT_M = 1.65  # of KITTI's cameras above the road, by its publication
 _DIGITS = 6  # of a picture's name
+_POSE_COLUMNS = "r11 r12 r13 x r21 r22 r23 y r31 r32 r33 z"
 
 
 @dataclass(frozen=True)
@@ -76,12 +85,14 @@ def read_kitti(folder: Path, settings: KittiSettings, _: ReadYaml) -> StereoReco
         None if truth is None else _truth(truth, times, T_robot_left),
         read_tum(odometry) if odometry.exists() else None,
         dropped,
+        calibrated_by=str(folder / "calib.txt"),
     )
 
 
 def _times(path: Path) -> np.ndarray:
     lines, times = list[int](), list[int]()
     for line, words in rows_of(path, "times of a KITTI sequence"):
+        require_columns(path, line, words, "time")
         lines.append(line)
         times.append(time_in_ns(path, line, words[0], NS))
     time_ns = np.array(times, dtype=np.int64)
@@ -96,11 +107,32 @@ def _calibration(path: Path, first: int, shape: tuple[int, int]) -> StereoCalibr
     }
     found = []
     for name in (f"P{first}", f"P{first + 1}"):
-        if name not in matrices:
-            raise InputError(f"{path}: has no line {name}: (projection matrix of 12 numbers)")
-        line, words = matrices[name]
-        found.append(np.array(numbers(path, line, words, 12)).reshape(3, 4))
+        found.append(named_matrix(path, matrices, name, (3, 4)))
     return rectified_pair(path, found, (shape[1], shape[0]))
+
+
+def named_matrix(
+    path: Path, told: dict[str, tuple[int, list[str]]], name: str, shape: tuple[int, ...]
+) -> Float:
+    """A matrix of a calibration file, by the name that its line begins with.
+
+    Args:
+        path: of the file, for messages.
+        told: line number and words behind the name, by name.
+        name: of the matrix.
+        shape: of the matrix, row by row.
+
+    Raises:
+        InputError: names file and line.
+    """
+    n = int(np.prod(shape))
+    if name not in told:
+        raise InputError(f"{path}: has no line {name}: ({n} numbers)")
+    line, words = told[name]
+    if len(words) != n:
+        found = f"{name}: has {len(words)} numbers, expected {n} ({' x '.join(map(str, shape))})"
+        raise InputError(f"{path}, line {line}: {found}")
+    return np.array(numbers(path, line, words)).reshape(shape)
 
 
 def rectified_pair(path: Path, found: list[Float], size_px: tuple[int, int]) -> StereoCalibration:
@@ -120,7 +152,10 @@ def rectified_pair(path: Path, found: list[Float], size_px: tuple[int, int]) -> 
 
 def _truth(path: Path, time_ns: np.ndarray, T_robot_left: Float) -> TimedPoses:
     """T_world_robot; the world is the robot's frame at the beginning."""
-    rows = [numbers(path, line, words, 12) for line, words in rows_of(path, "true poses")]
+    rows = []
+    for line, words in rows_of(path, "true poses"):
+        require_columns(path, line, words, _POSE_COLUMNS, POSES)
+        rows.append(numbers(path, line, words))
     if len(rows) != len(time_ns):
         raise InputError(f"{path}: has {len(rows)} poses for {len(time_ns)} times")
     P = np.array(rows).reshape(-1, 3, 4)

@@ -19,7 +19,7 @@ import numpy as np
 
 from mapfusion import se3
 from mapfusion.errors import InputError
-from mapfusion.recordings.kitti import HEIGHT_M, KittiSettings, rectified_pair
+from mapfusion.recordings.kitti import HEIGHT_M, KittiSettings, named_matrix, rectified_pair
 from mapfusion.recordings.lens import R_ROBOT_OPTICAL, require_rigid
 from mapfusion.recordings.mount import level_mount
 from mapfusion.recordings.numbered import numbered_shots
@@ -55,8 +55,8 @@ def read_kitti_raw(folder: Path, settings: KittiSettings, _: ReadYaml) -> Stereo
         raise InputError(f"{folder}: {error}") from error
     calibration = _day_file(drive, "calib_cam_to_cam.txt")
     told = _named(calibration)
-    P = [_matrix(calibration, told, f"P_rect_{first + k:02d}", (3, 4)) for k in (0, 1)]
-    width, height = _matrix(calibration, told, f"S_rect_{first:02d}", (2,)).astype(int)
+    P = [named_matrix(calibration, told, f"P_rect_{first + k:02d}", (3, 4)) for k in (0, 1)]
+    width, height = named_matrix(calibration, told, f"S_rect_{first:02d}", (2,)).astype(int)
     size = pictures[0][0]().shape[1::-1]
     if size != (width, height):
         found = f"pictures are {size[0]}x{size[1]}, rectified ones {width}x{height}"
@@ -66,7 +66,7 @@ def read_kitti_raw(folder: Path, settings: KittiSettings, _: ReadYaml) -> Stereo
     T_robot_left = settings.mount.applied(level_mount(baseline_m, 0.0, HEIGHT_M))
     truth = None
     if (drive / "oxts").is_dir():
-        R_rect = _matrix(calibration, told, "R_rect_00", (3, 3))
+        R_rect = named_matrix(calibration, told, "R_rect_00", (3, 3))
         beside = [-P[0][0, 3] / P[0][0, 0], 0.0, 0.0]  # of the left camera, from the rectified 0
         T_imu_left = se3.inverse(_rectified_from_imu(drive, R_rect)) @ se3.pose(np.eye(3), beside)
         T_imu_ahead = T_imu_left @ se3.inverse(se3.pose(R_ROBOT_OPTICAL, np.zeros(3)))
@@ -74,7 +74,15 @@ def read_kitti_raw(folder: Path, settings: KittiSettings, _: ReadYaml) -> Stereo
     odometry = folder / ODOMETRY_FILE
     reckoned = read_tum(odometry) if odometry.exists() else None
     return StereoRecording(
-        drive.name, time_ns, pictures, pair, T_robot_left, truth, reckoned, dropped
+        drive.name,
+        time_ns,
+        pictures,
+        pair,
+        T_robot_left,
+        truth,
+        reckoned,
+        dropped,
+        calibrated_by=str(calibration),
     )
 
 
@@ -104,23 +112,13 @@ def _named(path: Path) -> dict[str, tuple[int, list[str]]]:
     return {words[0].removesuffix(":"): (line, words[1:]) for line, words in rows}
 
 
-def _matrix(
-    path: Path, told: dict[str, tuple[int, list[str]]], name: str, shape: tuple[int, ...]
-) -> Float:
-    n = int(np.prod(shape))
-    if name not in told:
-        raise InputError(f"{path}: has no line {name}: ({n} numbers)")
-    line, words = told[name]
-    return np.array(numbers(path, line, words, n)).reshape(shape)
-
-
 def _rectified_from_imu(drive: Path, R_rect: Float) -> Float:
     """(4, 4) that maps points of the inertial unit into the rectified camera 0."""
     T = se3.pose(R_rect, np.zeros(3))
     for name in ("calib_velo_to_cam.txt", "calib_imu_to_velo.txt"):
         path = _day_file(drive, name)
         told = _named(path)
-        step = se3.pose(_matrix(path, told, "R", (3, 3)), _matrix(path, told, "T", (3,)))
+        step = se3.pose(named_matrix(path, told, "R", (3, 3)), named_matrix(path, told, "T", (3,)))
         require_rigid(f"{path}: R and T", step)
         T = T @ step
     return T
@@ -133,9 +131,15 @@ def _driven(oxts: Path) -> TimedPoses:
     for k, stamp_ns in enumerate(time_ns.tolist()):
         path = oxts / "data" / f"{k:0{_DIGITS}d}.txt"
         if path.is_file():  # some drives lack a few
-            row = [numbers(path, n, words, _OXTS_NUMBERS) for n, words in rows_of(path, "a state")]
-            known += [stamp_ns] * len(row[:1])
-            rows += row[:1]
+            state = next(rows_of(path, "a state"), None)
+            if state is None:
+                continue
+            line, words = state
+            if len(words) != _OXTS_NUMBERS:
+                found = f"has {len(words)} columns, expected {_OXTS_NUMBERS} (of an OXTS unit)"
+                raise InputError(f"{path}, line {line}: {found}")
+            known.append(stamp_ns)
+            rows.append(numbers(path, line, words))
     if not rows:
         raise InputError(f"{oxts}: holds no data/{'0' * _DIGITS}.txt")
     latitude, longitude, up, roll, pitch, yaw = np.array(rows)[:, :6].T

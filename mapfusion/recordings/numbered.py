@@ -28,6 +28,10 @@ def numbered_shots(
         raise InputError(f"{folder}: no such folder (pictures of a KITTI recording)")
     named = "[0-9]" * digits + ".png"
     pictures = {int(path.stem): path for path in sorted(folder.glob(named))}
+    if not pictures:
+        there = next((path.name for path in sorted(folder.iterdir()) if path.is_file()), "no file")
+        named = f"{'0' * digits}.png, ..., expected of a KITTI recording; it holds {there}"
+        raise InputError(f"{folder}: holds no picture named {named}")
     late = [number for number in pictures if number >= len(time_ns)]
     if late:
         raise InputError(f"{times}: has {len(time_ns)} times, none for {pictures[late[0]]}")

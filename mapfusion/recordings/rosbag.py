@@ -107,7 +107,16 @@ def read_rosbag(path: Path, settings: RosbagSettings, _: ReadYaml) -> StereoReco
         _poses(bag, topic) if topic else None for topic in (settings.odom, settings.truth)
     )
     return StereoRecording(
-        path.resolve().stem, time_ns, pictures, pair, T_robot_left, truth, odometry, dropped, felt
+        path.resolve().stem,
+        time_ns,
+        pictures,
+        pair,
+        T_robot_left,
+        truth,
+        odometry,
+        dropped,
+        felt,
+        f"{path}: camera_info of {settings.left} and {settings.right}",
     )
 
 
@@ -139,6 +148,8 @@ def _shots(bag: Bag, topic: str) -> list[Shot]:
         last_ns = own_ns
         load = _Message(bag, topic, recorded_ns, own_ns)
         shots.append(Shot(own_ns, f"{topic} at {own_ns} ns", load))
+    if not shots:
+        raise InputError(f"{bag.path}: topic {topic} holds no message")
     return shots
 
 

@@ -10,7 +10,7 @@ from mapfusion import se3
 from mapfusion.attitude import Attitude, write_attitude
 from mapfusion.calibration_error import CalibrationError, usual_calibration
 from mapfusion.camera import StereoCamera
-from mapfusion.errors import InputError
+from mapfusion.errors import InputError, OutOfRangeError
 from mapfusion.odometry_covariance import write_odometry_covariance
 from mapfusion.recordings.derived_vision import derived_vision, measured_vision
 from mapfusion.recordings.level import Level
@@ -113,16 +113,28 @@ class StereoImport:
         try:
             self._rectification = Rectification.of(recording.calibration)
         except InputError as error:
-            raise InputError(f"{recording.name}: {error}") from error
+            raise InputError(f"{recording.calibrated_by or recording.name}: {error}") from error
         self.camera: StereoCamera = self._rectification.camera
+        by_camera = self._vision_of_camera()
         self.calibration_error = calibration(usual_calibration(self.camera))
         pairs = [self.rectified(k) for k in sampled(len(recording))]
-        self._require_rows(pairs, derived_vision(self.camera))
+        self._require_rows(pairs, by_camera)
         middle = max((len(recording) - _RUN) // 2, 0)
         run = [self.rectified(k) for k in range(len(recording))[middle : middle + _RUN]]
         self.vision = adjust(measured_vision(self.camera, pairs, run))
         turn = se3.pose(self._rectification.R_left_rectified, np.zeros(3))
         self.T_robot_camera: Float = recording.T_robot_left @ turn
+
+    def _vision_of_camera(self) -> FrontEndParameters:
+        """What the calibration alone makes of the front end; raises InputError that names it."""
+        try:
+            return derived_vision(self.camera)
+        except OutOfRangeError as error:
+            told = self._recording.calibrated_by or self._recording.name
+            pair = f"the baseline is {self.camera.baseline_m:g} m"
+            pair += f" and the focal length {self.camera.focal_px:g} px"
+            beyond = f"no setting fits such a pair ({error}); are they in metres and pixels?"
+            raise InputError(f"{told}: {pair}; {beyond}") from error
 
     def rectified(self, k: int) -> tuple[np.ndarray, np.ndarray]:
         """The pair k of the recording, rectified; raises InputError."""

@@ -48,6 +48,7 @@ class StereoRecording:
         odometry: T_start_robot by dead reckoning, where it was recorded.
         dropped: pictures without a partner, and why, for people.
         inertial: accelerations, where they were recorded.
+        calibrated_by: what holds the calibration, for messages.
     """
 
     name: str
@@ -59,6 +60,7 @@ class StereoRecording:
     odometry: TimedPoses | None = None
     dropped: tuple[str, ...] = ()
     inertial: Inertial | None = None
+    calibrated_by: str = ""
     _shift: list[int] = field(default_factory=list, repr=False)
 
     def __len__(self) -> int:
@@ -105,9 +107,11 @@ def paired(
     ]
     if len(both) < 2:
         found = f"{len(left)} pictures of the left camera and {len(right)} of the right one"
-        raise InputError(
-            f"{found} make {len(both)} pairs within {most_apart_ns / 1e6:g} ms; 2 are the least"
-        )
+        made = f"{len(both)} pairs within {most_apart_ns / 1e6:g} ms; 2 are the least"
+        if len(left) > 1 and len(right) > 1:
+            apart_s = float(np.abs(right_ns[partner] - left_ns).min()) / 1e9
+            made += f"; the nearest two are {apart_s:.9g} s apart: are they of one clock?"
+        raise InputError(f"{found} make {made}")
     alone = f"no partner within {most_apart_ns / 1e6:g} ms"
     paired_left, paired_right = (set(rows) for rows in zip(*both, strict=True))
     dropped = [f"{s.name} ({alone})" for i, s in enumerate(left) if i not in paired_left]

@@ -12,7 +12,7 @@ import numpy as np
 from mapfusion import se3
 from mapfusion.arguments import require_shape
 from mapfusion.errors import InputError
-from mapfusion.recordings.text_tables import NS, timed_numbers
+from mapfusion.recordings.text_tables import NS, POSES, timed_numbers
 from mapfusion.recordings.timed_poses import TimedPoses
 from mapfusion.se2 import Float
 
@@ -52,7 +52,8 @@ def read_tum(path: Path) -> TimedPoses:
     Raises:
         InputError: the file is missing, damaged or foreign; names the line.
     """
-    time_ns, values = timed_numbers(path, "a trajectory in the TUM format", 7, NS)
+    what, columns = "a trajectory in the TUM format", "time x y z qx qy qz qw"
+    time_ns, values = timed_numbers(path, what, columns, NS, formats=POSES)
     if not len(values):
         raise InputError(f"{path}: holds no pose")
     if not np.all(np.linalg.norm(values[:, 3:], axis=1) > 0):

@@ -40,7 +40,7 @@ def test_both_ends_and_none_are_allowed() -> None:
         ({"n": None}, "n: is None, expected an integer"),
         ({"sides": (1, 5.5)}, "sides.1: is 5.5, must be in [1, 5] m"),
         ({"place": (1, 1)}, "place.1: is 1, must be in [-1, 0] rad"),
-        ({"perhaps": float("nan")}, "perhaps: is nan, must be in [0, 1]"),
+        ({"perhaps": float("nan")}, "perhaps: is nan, must be finite and in [0, 1]"),
         ({"perhaps": "x"}, "perhaps: is 'x', expected a number"),
     ],
 )

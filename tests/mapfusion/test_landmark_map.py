@@ -73,7 +73,26 @@ def test_unusable_file_is_named(tmp_path):
     spoilt = a_map()
     spoilt.position_m[2, 0] = np.inf
     write_map(path, spoilt)
-    with pytest.raises(InputError, match=r"map\.parquet: position_m: contains NaN or infinity"):
+    with pytest.raises(InputError, match=r"map\.parquet: column x_m: is inf in row 2; give a"):
+        read_map(path)
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "said"),
+    [
+        ("cov_yz_m2", np.nan, "is nan in row 3; give a finite number"),
+        ("count", 0, "is 0 in row 3; a landmark has at least one observation"),
+        ("source_observation", -2, "is -2 in row 3; give -1 for none"),
+        ("label", -5, "is -5 in row 3; labels are -1 for none"),
+    ],
+)
+def test_a_cell_that_is_not_as_documented_is_named(tmp_path, column, value, said):
+    path = tmp_path / "map.parquet"
+    write_map(path, a_map())
+    rows = pd.read_parquet(path)
+    rows.loc[3, column] = value
+    rows.to_parquet(path)
+    with pytest.raises(InputError, match=f"column {column}: {said}"):
         read_map(path)
 
 

@@ -31,3 +31,21 @@ def test_a_damaged_file_is_one_line(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-9])
     with pytest.raises(InputError, match=FILE):
         read_odometry_covariance(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda c: c.__setitem__((2, 1, 1), np.nan), "column cov_yy: is nan in row 2"),
+        (lambda c: c.__setitem__((2, 1, 1), -1e-3), "not positive definite in row 2"),
+    ],
+)
+def test_what_is_no_covariance_is_named_by_row(tmp_path: Path, spoil, said: str) -> None:
+    covariance = np.tile(np.eye(3), (4, 1, 1))
+    covariance[0] = 0.0  # of no motion
+    write_odometry_covariance(tmp_path, covariance)
+    assert read_odometry_covariance(tmp_path) is not None
+    spoil(covariance)
+    write_odometry_covariance(tmp_path, covariance)
+    with pytest.raises(InputError, match=f"{FILE}: {said}"):
+        read_odometry_covariance(tmp_path)

@@ -93,8 +93,8 @@ def spoilt(frame, column, value, row=7):
 @pytest.mark.parametrize(
     ("column", "value", "message"),
     [
-        ("x_m", np.nan, "position_m: contains NaN"),
-        ("x_m", None, "position_m: contains NaN"),
+        ("x_m", np.nan, "column x_m: is nan in row 7"),
+        ("x_m", None, "column x_m: is nan in row 7"),
         ("x_m", 1e30, "position_m: above 1e[+]07 m in row 7"),
         ("cov_xx_m2", 1e30, "covariance_m2: above 100000 m squared in row 7"),
         ("cov_xx_m2", -1.0, "covariance_m2: not positive definite in row 7"),
@@ -162,7 +162,7 @@ def test_a_log_and_its_truth(tmp_path, rng, kind):
     ("table", "column", "value", "message"),
     [
         ("frames", "iteration", 1, r"frames.parquet: iteration is 1 in row 2"),
-        ("frames", "time_s", np.inf, "time_s: contains NaN or infinity"),
+        ("frames", "time_s", np.inf, "column time_s: is inf in row 2"),
         ("observations", "iteration", None, "observations.parquet: column iteration is empty"),
         ("observations", "cov_xx_m2", 0.0, "observations.parquet: covariance_m2: not positive"),
         ("truth_poses", "iteration", 3, "truth_poses.parquet: iteration is 3 in row 2"),

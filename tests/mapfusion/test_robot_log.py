@@ -132,7 +132,11 @@ def test_missing_folder_is_named(tmp_path):
 
 @pytest.mark.parametrize(
     ("iteration", "message"),
-    [([3, 2, 2, 2, 0, 0], "ordered"), ([0, 0, 0, 0, 0, 9], "0..3"), ([-1, 0, 0, 0, 0, 0], "0..3")],
+    [
+        ([3, 2, 2, 2, 0, 0], "is 2 in row 1, after 3; sort the rows"),
+        ([0, 0, 0, 0, 0, 9], "is 9 in row 5, but frames.parquet ends with frame 3"),
+        ([-1, 0, 0, 0, 0, 0], "is -1 in row 0; frames are 0, 1, 2"),
+    ],
 )
 def test_observations_of_no_frame_are_bad_input(tmp_path, iteration, message):
     log = a_log()
@@ -142,15 +146,70 @@ def test_observations_of_no_frame_are_bad_input(tmp_path, iteration, message):
         read_log(tmp_path)
 
 
-def test_nan_position_is_bad_input(tmp_path):
+def read_with(folder, table, column, row, value):
+    """Write a log as CSV tables, one cell replaced, and read it."""
+    write_log(folder, a_log(descriptor=False))
+    for name in ("frames", "observations"):
+        rows = pd.read_parquet(folder / f"{name}.parquet").drop(
+            columns="descriptor", errors="ignore"
+        )
+        if name == table:
+            rows[column] = rows[column].astype(object)
+            rows.loc[row, column] = value
+        (folder / f"{name}.parquet").unlink()
+        rows.to_csv(folder / f"{name}.csv", index=False)
+    return read_log(folder)
+
+
+@pytest.mark.parametrize(
+    ("table", "column", "row", "value", "said"),
+    [
+        ("frames", "time_s", 2, 0.1, "is 0.1 in row 2, after 0.1; times must increase"),
+        ("frames", "time_s", 3, 0.05, "is 0.05 in row 3, after 0.2; times must increase"),
+        ("frames", "time_s", 1, "nan", "is nan in row 1"),
+        ("frames", "odometry_x_m", 2, 1e300, "is 1e[+]300 in row 2; .* at most 1e[+]07 m"),
+        ("frames", "odometry_y_m", 2, -1.1e7, "is -11000000 in row 2; .* at most 1e[+]07 m"),
+        ("frames", "odometry_theta_rad", 3, 1e9, "is 1e[+]09 in row 3; .* in radians, is at most"),
+        ("frames", "odometry_theta_rad", 3, "-inf", "is -inf in row 3"),
+        ("observations", "x_m", 3, "nan", "is nan in row 3"),
+        ("observations", "cov_xy_m2", 4, "inf", "is inf in row 4"),
+        ("observations", "u_px", 1, "-inf", "is -inf in row 1; .* NaN for none"),
+        ("observations", "label", 5, -2, "is -2 in row 5; labels are -1 for none"),
+        ("observations", "track", 5, -7, "is -7 in row 5; tracks are -1 for none"),
+    ],
+)
+def test_a_cell_that_is_not_as_documented_is_named(tmp_path, table, column, row, value, said):
+    with pytest.raises(InputError, match=f"{table}.csv: column {column}: {said}"):
+        read_with(tmp_path, table, column, row, value)
+
+
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [("odometry_x_m", 1e7), ("odometry_theta_rad", 360.0), ("odometry_theta_rad", -360.0)],
+)
+def test_values_on_the_bounds_are_read(tmp_path, column, value):
+    # a turn of 360 may be one in degrees; who reads the log can say so
+    log = read_with(tmp_path, "frames", column, 2, value)
+    assert value in log.odometry[2]
+
+
+def test_motion_before_the_first_frame_is_not_used(tmp_path):
+    log = read_with(tmp_path, "frames", "odometry_x_m", 0, 5.0)
+    np.testing.assert_array_equal(log.odometry, a_log(descriptor=False).odometry)
+
+
+def test_half_a_descriptor_is_bad_input(tmp_path):
     log = a_log()
     write_log(tmp_path, log)
-    path = tmp_path / "observations.parquet"
-    log.observations.position_m[3, 1] = np.nan
+    log.observations.descriptor[2, 7:] = np.nan
     write_observations(tmp_path, log.iteration, log.observations)
-    with pytest.raises(InputError, match="position_m: contains NaN") as caught:
+    with pytest.raises(
+        InputError, match=r"descriptor: number 7 is nan in row 2; .* whole cell empty"
+    ):
         read_log(tmp_path)
-    assert str(path) in str(caught.value)
+    log.observations.descriptor[2] = np.nan  # none is fine
+    write_observations(tmp_path, log.iteration, log.observations)
+    assert np.isnan(read_log(tmp_path).observations.descriptor[2]).all()
 
 
 def test_wrong_arguments_are_named():

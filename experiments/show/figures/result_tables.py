@@ -263,6 +263,9 @@ def positions_and_covariances(rows: pd.DataFrame) -> tuple[Float, Float]:
 def json_object(text: str, where: Path) -> dict[str, Any]:
     """What a text holds; raises InputError, which says where it stands, if that is no object."""
     try:
-        return {} | json.loads(text)
-    except (ValueError, TypeError) as error:  # of JSON, or of another value than an object
+        found = json.loads(text)
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{where}: cannot be read as a JSON object ({error})") from error
+    if not isinstance(found, dict):
+        raise InputError(f"{where}: holds a {type(found).__name__}, expected a JSON object")
+    return found

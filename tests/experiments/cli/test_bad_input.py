@@ -65,7 +65,7 @@ SCENARIOS = Path(__file__).parents[3] / "scenarios"
             ["world.texture", "poster_width_m: is 2 to 1", "the smallest is above the largest"],
         ),
         ("robots.0.start=[1, 1]", ["robots.0.start.2", "required"]),
-        ("robots.9.name=x", ["--set robots.9.name", "9 is not a key"]),
+        ("robots.9.name=x", ["--set robots.9.name", "9: no such entry; there: 0 (R1), 1 (R2)"]),
         ("seed.x=1", ["--set seed.x", "x is not a key"]),
         ("x", ["--set x", "key=value"]),
         ("=1", ["--set =1", "key=value"]),

@@ -13,11 +13,11 @@ from experiments.judge import metrics
 from experiments.judge.criteria import is_false_merge
 from experiments.judge.metrics import (
     ALIGNER_METRICS,
-    FUSER_METRICS,
     METRICS,
     compute,
-    known_metrics,
 )
+from experiments.scenario import expected
+from experiments.scenario.expected import FUSER_METRICS, known_metrics
 from mapfusion.fuse.registry import FUSERS
 
 
@@ -202,6 +202,8 @@ def test_no_metric_is_left_untested() -> None:
     of_methods = {name.rpartition(".")[2] for name in KNOWN.keys() - METRICS.keys()}
     assert set(METRICS) <= set(KNOWN)
     assert set(ALIGNER_METRICS) | set(FUSER_METRICS) == of_methods
+    assert set(METRICS) == set(expected.RUN_METRICS)
+    assert set(ALIGNER_METRICS) == set(expected.ALIGNER_METRICS)
     assert set(known_metrics(["ransac", "svd"], FUSERS)) >= set(KNOWN)
 
 

@@ -101,7 +101,7 @@ def test_an_override_changes_what_is_drawn(path: Path) -> None:
 @pytest.mark.parametrize(
     ("override", "words"),
     [
-        ("generate.overlap=2", ["generate.overlap: is 2.0", "[0, 1]"]),
+        ("generate.overlap=2", ["generate.overlap: is 2,", "[0, 1]"]),
         ("generate.overlap=lots", ["generate.overlap", "'lots'"]),
         ("generate.bogus=1", ["generate.bogus: unknown key", "rooms_a_side"]),
         ("generate.door_m=0.5", ["door_m: is 0.5"]),

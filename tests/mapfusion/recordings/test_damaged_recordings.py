@@ -1,5 +1,6 @@
 """Recordings that are damaged, foreign or contradict themselves: one line each, nothing written."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -37,6 +38,29 @@ def _edit(path: Path, old: str, new: str) -> None:
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new))
+
+
+def _rows(path: Path, change: Callable[[list[str]], list[str]]) -> None:
+    """Change the words of each row behind the header."""
+    header, *rows = path.read_text().splitlines()
+    path.write_text("\n".join([header, *(",".join(change(row.split(","))) for row in rows), ""]))
+
+
+def _edit_motion(path: Path) -> None:
+    """Leave the last row of the motion out."""
+    document = read_yaml(path)
+    document["cam1"]["T_cn_cnm1"] = document["cam1"]["T_cn_cnm1"][:3]
+    path.write_text(json.dumps(document))  # JSON is YAML
+
+
+def _mistype_baseline(root: Path) -> None:
+    for camera in ("cam0", "cam1"):
+        _edit(root / camera / "sensor.yaml", "216.0, 216.0", "577.0, 577.0")
+    _edit(root / "cam1/sensor.yaml", "-0.045", "-8.955")
+
+
+def _seconds(words: list[str]) -> list[str]:
+    return [f"{int(words[0]) / 1e9:.3f}", *words[1:]]
 
 
 def _swap(folder: Path) -> None:
@@ -127,7 +151,11 @@ DAMAGE: dict[str, tuple[str, Callable[[Path], Any], str]] = {
         "calib_imu_to_velo.txt: R and T: is no rotation",
     ),
     "no calibration": ("euroc", lambda f: (f / "mav0/cam1/sensor.yaml").unlink(), "sensor.yaml"),
-    "no mount": ("euroc", lambda f: _edit(f / SENSOR, "T_BS:", "T_B:"), "T_BS"),
+    "no mount": (
+        "euroc",
+        lambda f: _edit(f / SENSOR, "T_BS:", "T_B:"),
+        "T_BS: is missing, expected 4 rows",
+    ),
     "model": (
         "euroc",
         lambda f: _edit(f / SENSOR, "model: pinhole", "model: omni"),
@@ -157,6 +185,81 @@ DAMAGE: dict[str, tuple[str, Callable[[Path], Any], str]] = {
         "resolution",
     ),
     "tum": ("images", lambda f: (f / "odometry.tum").write_text("1 2 3\n"), "odometry.tum, line 1"),
+    "tum of KITTI": (
+        "images",
+        lambda f: (f / "odometry.tum").write_text(ONE_POSE),
+        r"odometry.tum, line 1: has 12 columns, expected 8 \(time x y z qx qy qz qw\); KITTI's",
+    ),
+    "tum with a number in front": (
+        "images",
+        lambda f: (f / "odometry.tum").write_text("1 1 0 0 0 0 0 0 1\n"),
+        r"has 9 columns, expected 8 \(time x y z",
+    ),
+    "tum with commas": (
+        "images",
+        lambda f: (f / "odometry.tum").write_text("1,0,0,0,0,0,0,1\n"),
+        "has 1 columns, expected 8 .* separated by commas",
+    ),
+    "KITTI's poses with times": (
+        "kitti",
+        lambda f: (f.parents[1] / "poses/07.txt").write_text("1 0 0 0 0 0 0 1\n"),
+        "07.txt, line 1: has 8 columns, expected 12 .*; TUM's poses have 8",
+    ),
+    "eleven numbers": (
+        "kitti",
+        lambda f: (f / "calib.txt").write_text("P0: 1 2 3\n"),
+        r"calib.txt, line 1: P0: has 3 numbers, expected 12 \(3 x 4\)",
+    ),
+    "other pictures": (
+        "kitti",
+        lambda f: [each.rename(each.with_suffix(".jpg")) for each in (f / "image_1").iterdir()],
+        "image_1: holds no picture named 000000.png.*; it holds 000000.jpg",
+    ),
+    "empty folder": (
+        "images",
+        lambda f: [each.unlink() for each in (f / "right").iterdir()],
+        "right: holds no picture of one camera",
+    ),
+    "seconds in a list of nanoseconds": (
+        "euroc",
+        lambda f: _rows(f / "mav0/cam0/data.csv", _seconds),
+        "cam0/data.csv, line 2: time .* whole number of nanoseconds; is it in seconds",
+    ),
+    "names with a folder": (
+        "euroc",
+        lambda f: _rows(f / "mav0/cam1/data.csv", lambda w: [w[0], f"cam1/data/{w[1]}"]),
+        r"cam1/data.csv: cam1/data/cam1/data/.*png \(no such file\); 5 of the 5 listed",
+    ),
+    "clocks apart": (
+        "euroc",
+        lambda f: _rows(f / "mav0/cam1/data.csv", lambda w: [f"{int(w[0]) + 10**10}", w[1]]),
+        "make 0 pairs within 2 ms; .* nearest two are 9 s apart: are they of one clock",
+    ),
+    "mistyped baseline": (
+        "euroc",
+        lambda f: _mistype_baseline(f / "mav0"),
+        "sensor.yaml of cam0 and cam1: the baseline is 9 m and the focal length 577 px",
+    ),
+    "no data": (
+        "euroc",
+        lambda f: _edit(f / SENSOR, "data:", "date:"),
+        "cam0/sensor.yaml: T_BS.data: is missing, expected 4 rows of 4 numbers",
+    ),
+    "missing motion": (
+        "images",
+        lambda f: _edit(f / "calibration.yaml", "T_cn_cnm1", "T_cn"),
+        "cam1: T_cn_cnm1: is missing, expected 4 rows",
+    ),
+    "short motion": (
+        "images",
+        lambda f: _edit_motion(f / "calibration.yaml"),
+        "cam1: T_cn_cnm1: is 12 numbers, expected 4 rows of 4 numbers",
+    ),
+    "camera that is a list": (
+        "images",
+        lambda f: (f / "calibration.yaml").write_text("cam0: [1, 2]\n"),
+        "calibration.yaml: cam0: is 2 numbers, expected a mapping",
+    ),
     "short tum": (
         "images",
         lambda f: (f / "odometry.tum").write_text("1 0 0 0 0 0 0 1\n"),

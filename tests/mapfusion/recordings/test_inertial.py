@@ -43,6 +43,16 @@ def test_at_rest_it_is_the_body_s_tilt() -> None:
     assert np.all(sigma > 0)
 
 
+def test_each_frame_averages_the_whole_time_halfway_to_its_neighbours() -> None:
+    """The mean over a window about the frame is the tilt there, of a body that rolls steadily."""
+    frames = 10**9 + np.arange(5) * 10**8
+    sample_ns = np.arange(0, 2 * 10**9, 10**6) + 5 * 10**5  # none on an edge of a window
+    roll = 0.3 * (sample_ns / 1e9 - 1.2)
+    felt = at_rest(np.column_stack([roll, np.zeros_like(roll)]))
+    found, _ = Inertial(sample_ns, felt).tilts(frames)
+    np.testing.assert_allclose(found[:, 0], 0.3 * (frames / 1e9 - 1.2), atol=1e-12)
+
+
 def test_frames_without_it_are_unknown() -> None:
     frames = np.arange(8) * 10**8
     found, _ = Inertial(frames[:4], at_rest(np.zeros((4, 2)))).tilts(frames)

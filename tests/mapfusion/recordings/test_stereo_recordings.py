@@ -25,6 +25,7 @@ from tests.mapfusion.recordings.written_layouts import (
     Pair,
     drive,
     read_yaml,
+    write_calibration,
     write_euroc,
     write_images,
     write_kitti,
@@ -226,3 +227,17 @@ def test_front_end_settings_can_be_replaced(folders: dict[str, Path]) -> None:
 
     work = StereoImport(read("kitti", folders["kitti"]), fewer)
     assert work.log_of(Cut("R1", slice(None))).observations.max() <= 20
+
+
+def test_pictures_go_with_the_times_in_their_names(tmp_path: Path) -> None:
+    """By name 10.0.png comes before 9.5.png; each picture is one grey level, which tells it."""
+    seconds, size = ("9.0", "9.5", "10.0", "10.5"), (CAMERA.height_px, CAMERA.width_px)
+    for side in ("left", "right"):
+        (tmp_path / side).mkdir()
+        for level, name in enumerate(seconds):
+            cv2.imwrite(str(tmp_path / side / f"{name}.png"), np.full(size, 40 + level, np.uint8))
+    write_calibration(tmp_path / "calibration.yaml")
+    recording = read("images", tmp_path)
+    np.testing.assert_array_equal(recording.time_ns, [int(1e9 * float(s)) for s in seconds])
+    levels = [int(left[0, 0]) for _, left, _ in recording]
+    assert levels == [40, 41, 42, 43]
