@@ -324,8 +324,8 @@ def write_truth_poses(folder: Path, T_world_robot: Float) -> None:
 def read_truth(folder: Path) -> RobotTruth:
     """Read the truth beside a log; raises InputError. For evaluation only."""
     paths = [table_path(folder, name) for name in ("truth_poses", "truth_points")]
-    poses, _ = read_open_table(paths[0], TRUTH_POSES)
-    points, _ = read_open_table(paths[1], TRUTH_POINTS)
+    poses, _ = read_open_table(paths[0], TRUTH_POSES, finite=False)
+    points, _ = read_open_table(paths[1], TRUTH_POINTS, finite=False)
     _require_numbered(paths[0], poses)
     truth = RobotTruth(columns(poses, POSE_FIELDS), columns(points, POSITION_FIELDS))
     for path, values in zip(paths, (truth.T_world_robot, truth.point_world_m), strict=True):

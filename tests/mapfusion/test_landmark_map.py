@@ -73,7 +73,7 @@ def test_unusable_file_is_named(tmp_path):
     spoilt = a_map()
     spoilt.position_m[2, 0] = np.inf
     write_map(path, spoilt)
-    with pytest.raises(InputError, match=r"map\.parquet: position_m: contains NaN or infinity"):
+    with pytest.raises(InputError, match=r"map\.parquet: column x_m is inf in row 2"):
         read_map(path)
 
 

@@ -148,7 +148,7 @@ def test_nan_position_is_bad_input(tmp_path):
     path = tmp_path / "observations.parquet"
     log.observations.position_m[3, 1] = np.nan
     write_observations(tmp_path, log.iteration, log.observations)
-    with pytest.raises(InputError, match="position_m: contains NaN") as caught:
+    with pytest.raises(InputError, match="column y_m is nan in row 3") as caught:
         read_log(tmp_path)
     assert str(path) in str(caught.value)
 
