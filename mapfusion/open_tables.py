@@ -53,6 +53,27 @@ def table_path(folder: Path, name: str) -> Path:
     return csv if csv.is_file() and not parquet.is_file() else parquet
 
 
+def is_csv(path: Path) -> bool:
+    """Return True for a file that is read and written as CSV, by its name."""
+    return path.suffix.lower() == ".csv"
+
+
+def csv_bytes(columns: Mapping[str, np.ndarray]) -> bytes:
+    """Return columns as CSV that `read_open_table` reads as they are, to the last bit.
+
+    A column (N, k) becomes k columns NAME_0, NAME_1, ...; NaN is an empty cell.
+    """
+    apart = {
+        name if values.ndim == 1 else f"{name}_{place}": each
+        for name, values in columns.items()
+        for place, each in enumerate([values] if values.ndim == 1 else values.T)
+    }
+    table = pa.table({name: pa.array(each, from_pandas=True) for name, each in apart.items()})
+    text = pa.BufferOutputStream()
+    pyarrow.csv.write_csv(table, text, pyarrow.csv.WriteOptions(include_header=False))
+    return f"{','.join(apart)}\n".encode() + text.getvalue().to_pybytes()
+
+
 def read_open_table(
     path: Path, table_schema: pa.Schema, finite: bool = True
 ) -> tuple[pa.Table, dict[str, str]]:
@@ -72,8 +93,7 @@ def read_open_table(
             name, or has a cell that holds no number where one must be.
     """
     kind = table_schema.metadata[b"mapfusion.kind"].decode()
-    is_csv = path.suffix == ".csv"
-    table = _read_csv(path, table_schema) if is_csv else read_parquet(path, f"{kind} table")
+    table = _read_csv(path, table_schema) if is_csv(path) else read_parquet(path, f"{kind} table")
     attributes = text_attributes(path, table)
     if "kind" in attributes and not _is_earlier(attributes, table_schema):
         require_kind(path, table, attributes, table_schema)

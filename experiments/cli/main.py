@@ -1,6 +1,7 @@
 """The command `mapfusion`: its list of commands, and what becomes of their failures."""
 
 import gc
+import io
 import os
 import sys
 import warnings
@@ -76,6 +77,9 @@ def main() -> None:
     from experiments.run.defects import saved_defect
     from experiments.run.kernel_cache import use_kernel_cache
 
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # None without a terminal
+            stream.reconfigure(errors="replace")  # whatever the terminal's encoding lacks
     gc.set_threshold(_MADE_BETWEEN_COLLECTIONS)
     # Work is bound to one thread anyway, and those that BLAS starts when it is imported wait in a
     # loop. To be said before that.
