@@ -29,6 +29,7 @@ from mapfusion.se2 import Float
 from mapfusion.storage import (
     Write,
     column,
+    name_in_text,
     point_columns,
     point_fields,
     points_from,
@@ -184,7 +185,7 @@ def read_map(path: Path, alone: bool = False) -> LandmarkMap:
             column(table, "source_observation"),
             *looks_from(table),
             planar,
-            attributes.get("name", path.stem),
+            attributes.get("name", name_in_text(path.stem)),
             calibration=calibration_from(attributes, path),
         )
         require_points(position, covariance, planar)

@@ -32,6 +32,7 @@ from mapfusion.storage import (
     column,
     columns,
     float_fields,
+    name_in_text,
     named_columns,
     point_columns,
     point_fields,
@@ -273,7 +274,8 @@ def read_log(folder: Path) -> RobotLog:
     seen = table_path(folder, "observations")
     if "robot" in attributes:
         planar = attributes.get("planar") == "true"
-    name, looks = attributes.get("robot", folder.resolve().name), observations.label
+    name = attributes.get("robot", name_in_text(folder.resolve().name))
+    looks = observations.label
     odometry, time_s = columns(frames, _ODOMETRY_FIELDS), column(frames, "time_s")
     calibration = calibration_from(attributes, path)
     try:

@@ -57,6 +57,8 @@ def write_together(writes: Mapping[Path, Write]) -> None:
     filled: dict[Path, Path] = {}
     try:
         for path, write in writes.items():
+            if path.is_dir():
+                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
             if write is not None:
                 filled[path] = _filled_beside(path, write)
         for path in writes:
@@ -71,8 +73,6 @@ def write_together(writes: Mapping[Path, Write]) -> None:
 
 def _filled_beside(path: Path, write: Callable[[Path], object]) -> Path:
     """Return a temporary file beside `path` that `write` filled; an OSError names `path`."""
-    if path.is_dir():
-        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(PART, temporary_prefix(path.name), path.parent)
     os.close(handle)
@@ -158,6 +158,15 @@ def _lives(pid: int) -> bool:
     except OSError:  # somebody else's
         return True
     return True
+
+
+def name_in_text(name: str) -> str:
+    """Return a file's name as text that every file can hold.
+
+    A locale without UTF-8 leaves Python the bytes of a name in place of its characters: they are
+    read as UTF-8. What is none is replaced.
+    """
+    return name.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
 
 
 def require_writable(folder: Path) -> None:
