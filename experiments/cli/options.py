@@ -76,4 +76,5 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document in
 
 def complain(text: str) -> None:
     """Tell what is wrong, in one line whatever was quoted."""
-    print(f"mapfusion: {plain(' '.join(text.split()))}", file=sys.stderr)
+    # to this stream, which replaces what the terminal lacks; `err=True` may open another
+    typer.echo(f"mapfusion: {plain(' '.join(text.split()))}", file=sys.stderr)

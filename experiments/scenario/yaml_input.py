@@ -158,4 +158,5 @@ def _key(node: Any, name: str, dotted: str) -> str | int:
         return name
     if isinstance(node, list) and name.isdecimal() and int(name) < len(node):
         return int(name)
-    raise InputError(f"--set {dotted}: {name} is not a key here")
+    here = f" (items 0 to {len(node) - 1})" if isinstance(node, list) and node else ""
+    raise InputError(f"--set {dotted}: {name} is not a key here{here}")
