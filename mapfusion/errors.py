@@ -1,13 +1,17 @@
 """The one error a person is meant to read, and what they are warned of."""
 
 import difflib
-from collections.abc import Iterable
+import itertools
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-MOST_CHARACTERS = 300  # of a line that a person reads at one glance
+MOST_CHARACTERS = 500  # of a line: our longest messages fit, with two long paths in them
 _MOST_OF_A_WORD = 120  # a path, as a rule
-_GAP = " ... "
+_GAP = "..."
 _MOST_SUGGESTED = 3  # names; more are no help
+# Share of letters in common, as `difflib` counts them, of names that are alike: two letters of
+# three changed places (ipc, icp) give 2/3; words that only share some letters (nope, opencv) 0.6.
+_LEAST_ALIKE = 0.65
 
 
 class InputError(ValueError):
@@ -74,26 +78,38 @@ class NameClashWarning(TellingWarning):
 
 def did_you_mean(wrong: str, known: Iterable[str]) -> str:
     """The end of a line about an unknown name: those of the known ones that look like it."""
-    like = difflib.get_close_matches(wrong, list(known), _MOST_SUGGESTED)
+    like = difflib.get_close_matches(wrong, list(known), _MOST_SUGGESTED, _LEAST_ALIKE)
     return f"; did you mean {' or '.join(like)}?" if like else ""
 
 
 def one_line(text: str) -> str:
-    """The text as one line of printable characters, cut in the middle where it is too long.
+    """Return the text as one line of printable characters, without its middle if it is too long.
 
-    Long words are cut first, so that what was put in does not push out what is said about it.
+    Long words are shortened first, so that a quoted value does not displace what is said about it.
+    What is left out of the line are whole words.
     """
-    words = (_cut(_printable(word), _MOST_OF_A_WORD, "...") for word in text.split())
-    return _cut(" ".join(words), MOST_CHARACTERS, _GAP)
+    words = [_shortened(_printable(word)) for word in text.split()]
+    line = " ".join(words)
+    if len(line) <= MOST_CHARACTERS:
+        return line
+    last = _first_of(words[::-1], MOST_CHARACTERS // 3)[::-1]
+    room = MOST_CHARACTERS - len(_GAP) - 2 - len(" ".join(last))
+    return " ".join([*_first_of(words, room), _GAP, *last])
+
+
+def _first_of(words: Sequence[str], most: int) -> list[str]:
+    """Return the first of the words that take at most so many characters, with blanks between."""
+    ends = itertools.accumulate(len(word) + 1 for word in words)
+    return [word for word, end in zip(words, ends, strict=True) if end - 1 <= most]
 
 
 def _printable(word: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in word)
 
 
-def _cut(text: str, most: int, gap: str) -> str:
-    """The first two thirds and the end of what is too long."""
-    if len(text) <= most:
-        return text
-    first = 2 * most // 3
-    return text[:first] + gap + text[len(text) - most + first + len(gap) :]
+def _shortened(word: str) -> str:
+    """Return the first two thirds and the end of a word that is too long."""
+    if len(word) <= _MOST_OF_A_WORD:
+        return word
+    first = 2 * _MOST_OF_A_WORD // 3
+    return word[:first] + _GAP + word[len(word) - _MOST_OF_A_WORD + first + len(_GAP) :]

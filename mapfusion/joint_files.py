@@ -15,6 +15,7 @@ from mapfusion.open_tables import told
 from mapfusion.se2 import Float
 from mapfusion.storage import (
     COVARIANCE_FIELDS,
+    Write,
     column,
     covariance_columns,
     covariances_from,
@@ -22,8 +23,8 @@ from mapfusion.storage import (
     read_parquet,
     require_kind,
     schema,
+    table_write,
     text_attributes,
-    write_table,
 )
 
 _OWN_FIELDS = [f"own_{name}" for name in COVARIANCE_FIELDS]
@@ -60,14 +61,13 @@ def joint_path(map_path: Path) -> Path:
     return map_path.with_suffix(".joint.parquet")
 
 
-def write_joint(map_path: Path, joint: JointCovariance | None) -> None:
-    """Write it beside the map's file; of None what lay there is removed."""
+def joint_writes(map_path: Path, joint: JointCovariance | None) -> dict[Path, Write]:
+    """Return what is to be written beside a map's file; of None what lay there is removed."""
     path = joint_path(map_path)
     if joint is None:
-        path.unlink(missing_ok=True)
-        return
+        return {path: None}
     rank = max(joint.rank, 1)  # a cell of no numbers is none
-    write_table(path, _joint_columns(joint, rank), joint_schema(rank))
+    return {path: table_write(_joint_columns(joint, rank), joint_schema(rank))}
 
 
 def read_joint(map_path: Path, covariance_m2: Float) -> JointCovariance | None:

@@ -5,6 +5,7 @@ label) of the observation that each landmark came from is carried with it. What 
 errors have in common, and from where they were seen, lies in files beside it, where it is known.
 """
 
+import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,9 +19,9 @@ from mapfusion.arguments import (
     require_shape,
 )
 from mapfusion.calibration_error import EXACT, CalibrationError, calibration_from
-from mapfusion.errors import InputError
+from mapfusion.errors import InputError, TellingWarning
 from mapfusion.joint_covariance import JointCovariance
-from mapfusion.joint_files import read_joint, write_joint
+from mapfusion.joint_files import joint_writes, read_joint
 from mapfusion.looks import (
     DESCRIPTOR_LENGTH,
     LOOK_FIELDS,
@@ -28,22 +29,25 @@ from mapfusion.looks import (
     looks_from,
     require_looks,
 )
-from mapfusion.open_tables import read_open_table, told
+from mapfusion.open_tables import HEIGHT, csv_bytes, is_csv, read_open_table, told
 from mapfusion.robot_log import with_rows
 from mapfusion.se2 import Float
 from mapfusion.storage import (
     COVARIANCE_FIELDS,
     POSITION_FIELDS,
+    Write,
     column,
+    name_in_text,
     point_columns,
     point_fields,
     points_from,
     require_cells,
     schema,
-    write_table,
+    table_write,
+    write_together,
 )
 from mapfusion.viewing import Viewing
-from mapfusion.viewing_files import read_viewing, write_viewing
+from mapfusion.viewing_files import read_viewing, viewing_writes
 
 LANDMARKS = schema(
     "landmark_map",
@@ -118,29 +122,67 @@ class LandmarkMap:
         return replace(bare, joint=joint, viewing=viewing)
 
 
+MAP_ENDINGS = (".parquet", ".csv")  # that maps are written with
+
+
 def write_map(path: Path, landmarks: LandmarkMap) -> None:
-    """Write a map to a file; what it has of a joint covariance and viewing evidence beside it."""
-    write_joint(path, landmarks.joint)
-    write_viewing(path, landmarks.viewing)
-    write_table(
-        path,
-        {
-            **point_columns(landmarks.position_m, landmarks.covariance_m2),
-            "count": landmarks.count.astype(np.int32),
-            "source_observation": landmarks.source_observation.astype(np.int64),
-            **look_columns(len(landmarks), landmarks.descriptor, landmarks.label),
-        },
-        LANDMARKS,
-        {
-            "name": landmarks.name,
-            "planar": str(landmarks.planar).lower(),
-            **landmarks.calibration.attributes(),
-        },
-    )
+    """Write a map to a file, Parquet or CSV by its ending, and replace what was there.
+
+    What a Parquet map has of a joint covariance and viewing evidence lies beside it. A CSV map is
+    one file, without these and without metadata: what it leaves out is told by a TellingWarning.
+
+    Raises:
+        InputError: the ending is another.
+        OSError: a file cannot be written; then what was there stays as it was.
+    """
+    write_together(map_writes(path, landmarks))
+
+
+def map_writes(path: Path, landmarks: LandmarkMap) -> dict[Path, Write]:
+    """Return what `write_map` is to write or remove, by file."""
+    if path.suffix.lower() not in MAP_ENDINGS:
+        raise InputError(f"{path}: maps are written as {' or '.join(MAP_ENDINGS)}")
+    columns = {
+        **point_columns(landmarks.position_m, landmarks.covariance_m2),
+        "count": landmarks.count.astype(np.int32),
+        "source_observation": landmarks.source_observation.astype(np.int64),
+        **look_columns(len(landmarks), landmarks.descriptor, landmarks.label),
+    }
+    if is_csv(path):
+        _tell_left_out(path, landmarks)
+        absent = {"label"} if landmarks.label is None else set()
+        absent |= {"descriptor"} if landmarks.descriptor is None else set()
+        absent |= set(HEIGHT) if landmarks.planar else set()
+        kept = {name: values for name, values in columns.items() if name not in absent}
+        text = csv_bytes(kept)
+        return {path: lambda temporary: temporary.write_bytes(text)}
+    attributes = {"name": landmarks.name, "planar": str(landmarks.planar).lower()}
+    attributes |= landmarks.calibration.attributes()
+    return {
+        path: table_write(columns, LANDMARKS, attributes),
+        **joint_writes(path, landmarks.joint),
+        **viewing_writes(path, landmarks.viewing),
+    }
+
+
+def _tell_left_out(path: Path, landmarks: LandmarkMap) -> None:
+    """Warn of what a CSV map cannot hold of a map."""
+    parts = {
+        "joint covariance": landmarks.joint is not None,
+        "viewing evidence": landmarks.viewing is not None,
+        "calibration error": landmarks.calibration != EXACT,
+    }
+    if lost := [name for name, there in parts.items() if there]:
+        text = f"{path}: CSV cannot hold the map's {' and '.join(lost)}; .parquet keeps all"
+        warnings.warn(text, TellingWarning, stacklevel=4)
 
 
 def read_map(path: Path, alone: bool = False) -> LandmarkMap:
-    """Read a map, with what lies beside it but for `alone`; raises InputError naming the file."""
+    """Read a map; raises InputError naming the file.
+
+    Of a Parquet map what lies beside it is read, too, unless it is asked for `alone`. A CSV map
+    stands alone: what lies beside it belongs to the Parquet map of its name.
+    """
     table, attributes = read_open_table(path, LANDMARKS)
     finite = "give a finite number, or remove the row"
     require_cells(path, table, [*POSITION_FIELDS, *COVARIANCE_FIELDS], np.isfinite, finite)
@@ -159,14 +201,14 @@ def read_map(path: Path, alone: bool = False) -> LandmarkMap:
             column(table, "source_observation"),
             *looks_from(table),
             planar,
-            attributes.get("name", path.stem),
+            attributes.get("name", name_in_text(path.stem)),
             calibration=calibration_from(attributes, path),
         )
         require_points(position, covariance, planar)
         require_no_twins("landmarks", position, covariance.reshape(-1, 9))
     except ValueError as error:
         raise InputError(f"{path}: {error}") from error
-    if alone:
+    if alone or is_csv(path):
         return found
     viewing = read_viewing(path, len(found))
     return replace(found, joint=read_joint(path, covariance), viewing=viewing)

@@ -1,11 +1,14 @@
 """Tables that anybody may write: maps and logs, by this program, by pandas, or as CSV.
 
 A file of another program needs no metadata and may leave out what has a default. Numbers may be of
-any width, lists of any list type; in CSV a list is columns NAME_0, NAME_1, ... Without any height
-(z_m and its covariances) data are planar. `experiments/docs/formats.md` lists all columns.
+any width, lists of any list type; in CSV a list is columns NAME_0, NAME_1, ... (or from 1 on).
+Without any height (z_m and its covariances) data are planar. A column that has nearly the name of a
+known one is refused, since a column left out may change what the data mean.
+`experiments/docs/formats.md` lists all columns.
 """
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +21,11 @@ from mapfusion.storage import UNREADABLE, read_parquet, require_kind, text_attri
 
 _ABOUT, _DEFAULT = b"about", b"default"
 HEIGHT = ("z_m", "cov_xz_m2", "cov_yz_m2", "cov_zz_m2")
+# Other names that heights have, without their units.
+_HEIGHT_NAMES = ("z", "height", "elevation", "altitude", "alt", "pos_z", "position_z", "p_z", "pz")
+_UNIT = re.compile(r"_?(\[.*\]|\(.*\)|[mc]?m2?|met(er|re)s?|ft|feet|m?s|rad|deg|px)$")
+_MOST_NAMED = 3  # columns of other names in one line
+_SEPARATORS = {";": "';'", "\t": "tabs", "|": "'|'", " ": "blanks"}
 
 
 def told(field: pa.Field, about: str, default: float | None = None) -> pa.Field:
@@ -45,34 +53,93 @@ def table_path(folder: Path, name: str) -> Path:
     return csv if csv.is_file() and not parquet.is_file() else parquet
 
 
+def is_csv(path: Path) -> bool:
+    """Return True for a file that is read and written as CSV, by its name."""
+    return path.suffix.lower() == ".csv"
+
+
+def csv_bytes(columns: Mapping[str, np.ndarray]) -> bytes:
+    """Return columns as CSV that `read_open_table` reads as they are, to the last bit.
+
+    A column (N, k) becomes k columns NAME_0, NAME_1, ...; NaN is an empty cell.
+    """
+    apart = {
+        name if values.ndim == 1 else f"{name}_{place}": each
+        for name, values in columns.items()
+        for place, each in enumerate([values] if values.ndim == 1 else values.T)
+    }
+    table = pa.table({name: pa.array(each, from_pandas=True) for name, each in apart.items()})
+    text = pa.BufferOutputStream()
+    pyarrow.csv.write_csv(table, text, pyarrow.csv.WriteOptions(include_header=False))
+    return f"{','.join(apart)}\n".encode() + text.getvalue().to_pybytes()
+
+
 def read_open_table(path: Path, table_schema: pa.Schema) -> tuple[pa.Table, dict[str, str]]:
     """Read a table whoever wrote it.
+
+    Args:
+        path: of the file; one that ends in `.csv` is CSV, others are Parquet.
+        table_schema: columns that the table needs, or may have.
 
     Returns:
         The table with the columns of the schema, and its text attributes; `planar` is among them
         for a table without heights.
 
     Raises:
-        InputError: it is missing, damaged, of another kind, lacks a column, or has an empty cell
-            where a number must be.
+        InputError: it is missing, damaged, of another kind, lacks a column, has one under another
+            name, or has text or an empty cell where a number must be.
     """
     kind = table_schema.metadata[b"mapfusion.kind"].decode()
-    table = _read_csv(path, kind) if path.suffix == ".csv" else read_parquet(path, f"{kind} table")
+    table = _read_csv(path, table_schema) if is_csv(path) else read_parquet(path, f"{kind} table")
     attributes = text_attributes(path, table)
     if "kind" in attributes and not _is_earlier(attributes, table_schema):
         require_kind(path, table, attributes, table_schema)
     names = table.column_names
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise InputError(f"{path}: has two columns {', '.join(twice)}")
+    meant = _meant(names, table_schema)
     planar = not set(HEIGHT) & set(names)
     found = {field.name: _column(path, table, field, planar) for field in table_schema}
     if missing := [name for name, values in found.items() if values is None]:
         remedy = f"add to this {kind} table what experiments/docs/formats.md says of them"
+        if here := [f"{name} for {meant[name]}" for name in missing if name in meant]:
+            more = ", ..." if len(here) > _MOST_NAMED else ""
+            remedy = f"did you mean {', '.join(here[:_MOST_NAMED])}{more}?"
         raise InputError(f"{path}: has no column {', '.join(missing)}; {remedy}")
+    if meant:
+        asked = " and ".join(f"{there} to {name}" for name, there in meant.items())
+        reason = "a column of an unknown name is left out"
+        raise InputError(f"{path}: rename column {asked} (mind the unit), or remove it: {reason}")
     if planar:
         attributes = {"planar": "true"} | attributes
     plain = [pa.field(field.name, field.type) for field in table_schema]
-    return pa.table(found, schema=pa.schema(plain)), attributes
+    columns = pa.table(found, schema=pa.schema(plain))
+    return columns, attributes
+
+
+def _meant(names: Sequence[str], table_schema: pa.Schema) -> dict[str, str]:
+    """Return unknown columns that have nearly the name of a known one, by the known name.
+
+    Names are alike that differ in letter case, blanks and hyphens alone, or that lack the unit. All
+    names of heights stand for z_m, as without it data would be taken for planar.
+    """
+    known = {_plain_name(field.name): field.name for field in table_schema}
+    known = {_UNIT.sub("", name): field for name, field in known.items()} | known
+    if "z_m" in table_schema.names and "z_m" not in names:
+        known |= dict.fromkeys(_HEIGHT_NAMES, "z_m")
+    meant: dict[str, str] = {}
+    for name in names:
+        if name in table_schema.names:
+            continue
+        plain = _plain_name(name)
+        like = known.get(plain) or known.get(_UNIT.sub("", plain))
+        if like is not None and like not in names:
+            meant.setdefault(like, name)
+    return meant
+
+
+def _plain_name(name: str) -> str:
+    return re.sub(r"[\s-]+", "_", name.strip().lower())
 
 
 def _is_earlier(attributes: Mapping[str, str], table_schema: pa.Schema) -> bool:
@@ -85,15 +152,43 @@ def _is_earlier(attributes: Mapping[str, str], table_schema: pa.Schema) -> bool:
     return attributes["kind"] == kind and found.isdecimal() and 0 < int(found) < int(version)
 
 
-def _read_csv(path: Path, kind: str) -> pa.Table:
+def _read_csv(path: Path, table_schema: pa.Schema) -> pa.Table:
+    """Read a CSV file, its names without blanks around them; raises InputError."""
+    kind = table_schema.metadata[b"mapfusion.kind"].decode()
     if not path.is_file():
         raise InputError(f"{path}: no such file (expected a {kind} table)")
+    data = path.read_bytes()
     try:
-        table = pyarrow.csv.read_csv(pa.BufferReader(path.read_bytes()))
-        _ = table.column_names  # decoded here first: they may be no UTF-8
-        return table
+        table = pyarrow.csv.read_csv(pa.BufferReader(data))
+        names = [name.strip() for name in table.column_names]  # they may be no UTF-8
     except UNREADABLE as error:
+        _require_dialect(path, data, table_schema)
         raise InputError(f"{path}: not readable as CSV ({error})") from error
+    if not set(names) & set(table_schema.names):
+        _require_dialect(path, data, table_schema)
+    return table.rename_columns(names)
+
+
+def _require_dialect(path: Path, data: bytes, table_schema: pa.Schema) -> None:
+    """Raise InputError if the first line of a CSV file has another separator, or holds no names."""
+    first = data.split(b"\n", 1)[0].decode("utf-8-sig", "replace").strip()
+    for separator, called in _SEPARATORS.items():
+        names = {_plain_name(each.strip("\"'")) for each in first.split(separator)}
+        if len(names) > 1 and names & set(table_schema.names):
+            raise InputError(f"{path}: is separated by {called}; write it with commas")
+    cells = [each for each in re.split(r"[,;\s]+", first.replace('"', "")) if each]
+    if cells and all(_is_number(each) for each in cells):
+        required = ", ".join(f.name for f in table_schema if default_of(f) is None)
+        wanted = f"put one with the columns' names above the numbers ({required}, ...)"
+        raise InputError(f"{path}: has no header line; {wanted}")
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _column(path: Path, table: pa.Table, field: pa.Field, planar: bool) -> pa.Array | None:
@@ -101,14 +196,14 @@ def _column(path: Path, table: pa.Table, field: pa.Field, planar: bool) -> pa.Ar
     default = 0.0 if planar and field.name in HEIGHT else default_of(field)
     try:
         if pa.types.is_fixed_size_list(field.type):
-            return _rows_of_numbers(table, field)
+            return _rows_of_numbers(path, table, field)
         if field.name not in table.column_names:
             filled = None if default is None else np.full(table.num_rows, default)
             return None if filled is None else pa.array(filled).cast(field.type)
         values = table.column(field.name).combine_chunks()
         is_number = pa.types.is_integer(values.type) or pa.types.is_floating(values.type)
         if not is_number and values.null_count < len(values):
-            raise InputError(f"{path}: column {field.name} holds {values.type}, not numbers")
+            raise InputError(f"{path}: column {field.name} {_no_number(values)}")
         is_float = pa.types.is_floating(field.type)
         if pa.types.is_floating(values.type) and not is_float:  # as pandas makes of gaps
             values = pa.array(values.to_numpy(zero_copy_only=False), from_pandas=True)
@@ -123,24 +218,36 @@ def _column(path: Path, table: pa.Table, field: pa.Field, planar: bool) -> pa.Ar
         raise InputError(f"{path}: column {field.name}: {reason}") from error
 
 
+def _no_number(values: pa.Array) -> str:
+    """Return which cell of a column of another type holds no number."""
+    if pa.types.is_string(values.type) or pa.types.is_large_string(values.type):
+        for row, cell in enumerate(values.to_pylist()):
+            if cell is not None and not _is_number(cell):
+                return f"holds {cell!r} in row {row}, expected a number"
+    return f"holds {values.type}, not numbers"
+
+
 def _call(name: str, values: pa.Array) -> pa.Array:
     return pc.call_function(name, [values])
 
 
-def _rows_of_numbers(table: pa.Table, field: pa.Field) -> pa.Array:
+def _rows_of_numbers(path: Path, table: pa.Table, field: pa.Field) -> pa.Array:
     """A column of lists, (N, k) of NaN where there is none; also of columns NAME_0, NAME_1, ..."""
     width, n = field.type.list_size, table.num_rows
-    apart = [f"{field.name}_{i}" for i in range(width)]
-    is_apart, values = set(apart) <= set(table.column_names), None
-    if not is_apart and field.name in table.column_names:
+    apart, values = _columns_apart(path, table, field), None
+    if not apart and field.name in table.column_names:
         values = table.column(field.name).combine_chunks()
         if values.type == field.type and not values.null_count and not values.flatten().null_count:
             return values
     matrix = np.full((n, width), np.nan)
-    if is_apart:
-        for i, name in enumerate(apart):
-            matrix[:, i] = table.column(name).cast(pa.float64()).fill_null(np.nan).to_numpy()
-    elif values is not None and values.null_count < n:
+    for i, name in enumerate(apart):
+        cells = table.column(name).combine_chunks()
+        if cells.null_count == n:
+            continue
+        if pa.types.is_string(cells.type):
+            raise InputError(f"{path}: column {name} {_no_number(cells)}")
+        matrix[:, i] = cells.cast(pa.float64()).fill_null(np.nan).to_numpy(zero_copy_only=False)
+    if values is not None and values.null_count < n:
         lengths = _call("list_value_length", values).drop_null().unique().to_pylist()
         if lengths != [width]:
             raise pa.ArrowInvalid(f"lists of {sorted(lengths)} numbers")
@@ -149,3 +256,22 @@ def _rows_of_numbers(table: pa.Table, field: pa.Field) -> pa.Array:
         matrix[there] = flat.to_numpy(zero_copy_only=False).reshape(-1, width)
     flat = pa.array(matrix.ravel().astype(field.type.value_type.to_pandas_dtype()))
     return pa.FixedSizeListArray.from_arrays(flat, type=field.type)
+
+
+def _columns_apart(path: Path, table: pa.Table, field: pa.Field) -> list[str]:
+    """Return the columns NAME_0, NAME_1, ... (or from 1 on) of a list, in order; none without any.
+
+    Raises:
+        InputError: there are some, but not one for each number of the list.
+    """
+    pattern = re.compile(re.escape(field.name) + r"_?(\d{1,9})", re.IGNORECASE)
+    numbered = {
+        int(match[1]): name for name in table.column_names if (match := pattern.fullmatch(name))
+    }
+    width, order = field.type.list_size, sorted(numbered)
+    if order and order not in (list(range(width)), list(range(1, width + 1))):
+        first, last = numbered[order[0]], numbered[order[-1]]
+        found = f"has {len(order)} columns {first} to {last}" if first != last else f"has {first}"
+        wanted = f"{field.name}_0 to {field.name}_{width - 1}, {width} of them"
+        raise InputError(f"{path}: {found}; expected {wanted}")
+    return [numbered[k] for k in order]

@@ -39,6 +39,7 @@ from mapfusion.storage import (
     column,
     columns,
     float_fields,
+    name_in_text,
     named_columns,
     point_columns,
     point_fields,
@@ -294,7 +295,8 @@ def read_log(folder: Path) -> RobotLog:
         raise InputError(f"{seen}: {found}, but {last}; add the frames or remove the rows")
     if "robot" in attributes:
         planar = attributes.get("planar") == "true"
-    name, looks = attributes.get("robot", folder.resolve().name), observations.label
+    name = attributes.get("robot", name_in_text(folder.resolve().name))
+    looks = observations.label
     odometry, time_s = columns(frames, _ODOMETRY_FIELDS), column(frames, "time_s")
     odometry[:1] = 0.0  # the first frame has no row before
     calibration = calibration_from(attributes, path)

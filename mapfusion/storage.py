@@ -35,12 +35,44 @@ PART = ".part"
 _WRITER = re.compile(rf"\.{re.escape(platform.node())}-(?P<pid>\d+)\.[^.]+\.part$")
 
 
+# Fills a file of this path; None stands for a file that is to be removed.
+Write = Callable[[Path], object] | None
+
+
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write` fill a temporary file beside `path`, then rename it: nobody sees half a file.
 
     The temporary name ends in `.part`, so that no pattern like `*.parquet` finds it, also where a
     killed process left it behind; see `remove_abandoned`. An OSError names `path`.
     """
+    write_together({path: write})
+
+
+def write_together(writes: Mapping[Path, Write]) -> None:
+    """Write files that belong together as `write_whole` does, and remove those of None.
+
+    All are filled before the first is renamed or removed: if one of them cannot be written, what
+    was there stays as it was.
+    """
+    filled: dict[Path, Path] = {}
+    try:
+        for path, write in writes.items():
+            if path.is_dir():
+                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+            if write is not None:
+                filled[path] = _filled_beside(path, write)
+        for path in writes:
+            if path in filled:
+                filled[path].replace(path)
+            else:
+                path.unlink(missing_ok=True)
+    finally:
+        for temporary in filled.values():
+            temporary.unlink(missing_ok=True)
+
+
+def _filled_beside(path: Path, write: Callable[[Path], object]) -> Path:
+    """Return a temporary file beside `path` that `write` filled; an OSError names `path`."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(PART, temporary_prefix(path.name), path.parent)
     os.close(handle)
@@ -48,14 +80,14 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     try:
         write(temporary)
         temporary.chmod(0o644)
-        temporary.replace(path)
-    except OSError as error:  # a full disk is told without a name, or with one that nobody knows
-        if error.filename not in (None, name):
-            raise
-        reason = error.strerror or str(error)
-        raise OSError(error.errno or errno.EIO, reason, str(path)) from error
-    finally:
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        # a full disk is told without a name, or with one that nobody knows
+        if isinstance(error, OSError) and error.filename in (None, name):
+            reason = error.strerror or str(error)
+            raise OSError(error.errno or errno.EIO, reason, str(path)) from error
+        raise
+    return temporary
 
 
 def temporary_prefix(name: str) -> str:
@@ -65,13 +97,18 @@ def temporary_prefix(name: str) -> str:
 
 def write_sealed(path: Path, data: bytes) -> None:
     """Fill in the empty seal that a file's bytes hold, and write them whole."""
+    write_whole(path, sealed_write(data))
+
+
+def sealed_write(data: bytes) -> Callable[[Path], object]:
+    """Return what writes a file's bytes with the empty seal in them filled in."""
     pieces = sealed_pieces(data)
 
     def write(temporary: Path) -> None:
         with temporary.open("wb") as file:
             file.writelines(pieces)
 
-    write_whole(path, write)
+    return write
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
@@ -126,6 +163,15 @@ def _lives(pid: int) -> bool:
     return True
 
 
+def name_in_text(name: str) -> str:
+    """Return a file's name as text that every file can hold.
+
+    A locale without UTF-8 leaves Python the bytes of a name in place of its characters: they are
+    read as UTF-8. What is none is replaced.
+    """
+    return name.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+
+
 def require_writable(folder: Path) -> None:
     """Raise InputError, which says why, unless files can be put into a folder, there yet or not."""
     there = folder
@@ -149,6 +195,15 @@ def write_table(
     attributes: Mapping[str, str] | None = None,
 ) -> None:
     """Write columns (arrays by name, all the schema names) with further text attributes."""
+    write_whole(path, table_write(columns, table_schema, attributes))
+
+
+def table_write(
+    columns: Mapping[Any, Any],
+    table_schema: pa.Schema,
+    attributes: Mapping[str, str] | None = None,
+) -> Callable[[Path], object]:
+    """Return what writes a table, with arguments as `write_table` has them."""
     metadata = dict(table_schema.metadata)
     metadata |= {f"{_PREFIX}{k}".encode(): v.encode() for k, v in (attributes or {}).items()}
     arrays = [_to_arrow(columns[field.name], field.type) for field in table_schema]
@@ -164,7 +219,7 @@ def write_table(
     }
     options = {"compression": packed, "use_dictionary": repeats}
     pq.write_table(table, buffer, **options, write_page_checksum=True)
-    write_sealed(path, parquet_with_seal(memoryview(buffer.getvalue())))
+    return sealed_write(parquet_with_seal(memoryview(buffer.getvalue())))
 
 
 def _leaf(field: pa.Field) -> str:

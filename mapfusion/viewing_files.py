@@ -14,13 +14,14 @@ from mapfusion.errors import InputError
 from mapfusion.open_tables import told
 from mapfusion.storage import (
     POSE_FIELDS,
+    Write,
     column,
     columns,
     float_fields,
     named_columns,
     read_table,
     schema,
-    write_table,
+    table_write,
 )
 from mapfusion.viewing import BEARINGS, RANGES, FieldOfView, Viewing
 
@@ -55,18 +56,19 @@ def viewing_paths(map_path: Path) -> tuple[Path, Path]:
     return map_path.with_suffix(".viewing.parquet"), map_path.with_suffix(".frames.parquet")
 
 
-def write_viewing(map_path: Path, viewing: Viewing | None) -> None:
-    """Write it beside the map's file; of None what lay there is removed."""
+def viewing_writes(map_path: Path, viewing: Viewing | None) -> dict[Path, Write]:
+    """Return what is to be written beside a map's file; of None what lay there is removed."""
     of_landmarks, of_frames = viewing_paths(map_path)
     if viewing is None:
-        of_landmarks.unlink(missing_ok=True)
-        of_frames.unlink(missing_ok=True)
-        return
-    write_table(of_landmarks, {name: getattr(viewing, name) for name in _OF_LANDMARKS}, VIEWING)
+        return {of_landmarks: None, of_frames: None}
     rows = {"iteration": np.arange(len(viewing.pose), dtype=np.int32)}
     rows |= named_columns(POSE_FIELDS, viewing.pose) | {"reach_m": viewing.reach_m}
     field = {name: values.tolist() for name, values in vars(viewing.field).items()}
-    write_table(of_frames, rows, VIEWED_FRAMES, {_FIELD: json.dumps(field)})
+    views = {name: getattr(viewing, name) for name in _OF_LANDMARKS}
+    return {
+        of_landmarks: table_write(views, VIEWING),
+        of_frames: table_write(rows, VIEWED_FRAMES, {_FIELD: json.dumps(field)}),
+    }
 
 
 def read_viewing(map_path: Path, n_landmarks: int) -> Viewing | None:

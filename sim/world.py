@@ -17,7 +17,7 @@ import numpy as np
 from mapfusion.errors import DamagedFileError
 from mapfusion.se2 import Float
 from mapfusion.sealed import LINE, read_sealed
-from mapfusion.storage import write_sealed
+from mapfusion.storage import name_in_text, write_sealed
 from sim.floorplan import Face, FloorPlan
 from sim.renderer import BulletRenderer, egl_driver, load_egl
 from sim.textures import AS_PAINTED, Texture, paint, paint_posters
@@ -169,7 +169,9 @@ class World:
             for i in range(len(corners_m)):
                 mesh, picture = face_files(folder, i)
                 read_sealed(mesh, "mesh", only_ours=True)  # Bullet reads the file by itself
-                shape = p.createVisualShape(p.GEOM_MESH, fileName=str(mesh), physicsClientId=client)
+                shape = p.createVisualShape(
+                    p.GEOM_MESH, fileName=name_in_text(str(mesh)), physicsClientId=client
+                )
                 body = p.createMultiBody(0, baseVisualShapeIndex=shape, physicsClientId=client)
                 texture = self._load_texture(picture)
                 p.changeVisualShape(body, -1, textureUniqueId=texture, physicsClientId=client)
@@ -186,7 +188,7 @@ class World:
         p, client = self.bullet, self.client
         data = read_sealed(picture, "picture", only_ours=True)
         if self.renderer == "tiny":
-            return p.loadTexture(str(picture), physicsClientId=client)
+            return p.loadTexture(name_in_text(str(picture)), physicsClientId=client)
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         if image is None:
             raise DamagedFileError(picture, "is no picture")

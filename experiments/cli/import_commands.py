@@ -75,9 +75,11 @@ def _log_command(format_name: str) -> Callable[..., None]:
     """The command that reads logs of one format; `--param` takes what its settings have."""
 
     def command(folder: Folder, output: options.Output, overrides: options.ImportOverrides) -> None:
+        from experiments.cli.outputs import require_folder
         from experiments.scenario.loading import made_settings
         from experiments.show.terminal.layout import print_paths
 
+        require_folder(output, [folder])
         settings = made_settings(format_name, settings_class(format_name), overrides)
         print_paths(output, import_recording(format_name, folder, output, settings))
 
@@ -101,12 +103,14 @@ def _stereo_command(format_name: str) -> Callable[..., None]:
         jobs: options.Jobs = options.ALL_CORES,
         **chosen: str | None,
     ) -> None:
+        from experiments.cli.outputs import require_folder
         from experiments.run.stereo_logs import Source, import_stereo, vision_of
         from experiments.run.workers import make_ready
         from experiments.scenario.loading import made_settings
         from experiments.show.terminal.import_screen import print_imported
         from experiments.show.terminal.layout import progress
 
+        require_folder(output, [*folders, odometry, truth, scenario])
         if len(folders) > 1 and (odometry not in (None, "images") or truth is not None):
             raise InputError("--odometry and --truth: are files of one recording; import one")
         named = {name: value for name, value in chosen.items() if value is not None}

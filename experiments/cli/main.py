@@ -1,5 +1,6 @@
 """The command `mapfusion`: its list of commands, and what becomes of their failures."""
 
+import io
 import os
 import sys
 import warnings
@@ -51,6 +52,9 @@ def main() -> None:
     from experiments.run.defects import saved_defect
     from experiments.run.kernel_cache import use_kernel_cache
 
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # None without a terminal
+            stream.reconfigure(errors="replace")  # whatever the terminal's encoding lacks
     # Work is bound to one thread anyway, and those that BLAS starts when it is imported wait in a
     # loop. To be said before that.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

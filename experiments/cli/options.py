@@ -1,6 +1,7 @@
 """What several commands take and give: options, exit codes."""
 
 import os
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -75,4 +76,5 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document in
 
 def complain(text: str) -> None:
     """Tell what is wrong, in one line whatever was quoted."""
-    typer.echo(f"mapfusion: {plain(' '.join(text.split()))}", err=True)
+    # to this stream, which replaces what the terminal lacks; `err=True` may open another
+    typer.echo(f"mapfusion: {plain(' '.join(text.split()))}", file=sys.stderr)

@@ -31,9 +31,11 @@ def run(
 
     Finished stages are reused; an interrupted run goes on where it was.
     """
+    from experiments.cli.outputs import require_result_folder
     from experiments.judge.expectations import load_checked
     from experiments.scenario.suite import scenarios_of
 
+    require_result_folder(output)
     checked = [load_checked(path, overrides, seed) for path in scenarios_of(scenarios)]
     if output is not None and len(checked) > 1:
         several = f"is one folder for {len(checked)} runs; give --results"
@@ -70,12 +72,14 @@ def report(
     jobs: options.Jobs = options.ALL_CORES,
 ) -> None:
     """Show a result in one HTML file that works offline: `mapfusion report results/quick-0`."""
+    from experiments.cli.outputs import REPORT, require_file
     from experiments.judge.result import require_result
     from experiments.run.workers import make_ready
     from experiments.show.figures.drawing import draw_all
     from experiments.show.report.document import write_report
     from experiments.show.terminal import layout
 
+    require_file("--output", output, REPORT)
     if figures:
         require_result(result)
         make_ready(jobs)
@@ -99,9 +103,11 @@ def export(
 
     What files, frames and keys mean, experiments/docs/export.md says.
     """
+    from experiments.cli.outputs import require_folder
     from experiments.show.exported import export_result
     from experiments.show.terminal.layout import print_lines
 
+    require_folder(output, [result])
     print_lines(map(str, export_result(result, kind, output)))
 
 
@@ -133,12 +139,16 @@ def check(
     A run that merges no two maps although some share ground fails, too.
     Exit code 2 if a scenario cannot be read, and then none is run, or if it cannot be run.
     """
+    from experiments.cli.outputs import DOCUMENT, JUNIT, require_file
     from experiments.judge.checking import CheckedScenario, check_all
     from experiments.scenario.seeds import parse_seeds
     from experiments.scenario.settings import AnyScenario
     from experiments.show import json_document
     from experiments.show.junit import write_junit
     from experiments.show.terminal import layout, run_screen
+
+    require_file("--output", output, DOCUMENT, scenarios)
+    require_file("--junit", junit, JUNIT, scenarios)
 
     def run_one(scenario: AnyScenario) -> Path:
         from experiments.judge.result import run_scenario  # as in `run`

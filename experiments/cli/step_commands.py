@@ -26,6 +26,7 @@ def record(
     With `--format` what the robots see, count and truly do, for other people's programs, see
     experiments/docs/recordings.md.
     """
+    from experiments.cli.outputs import require_folder
     from experiments.judge import user_files as single
     from experiments.judge.expectations import load_checked
     from experiments.judge.written_drives import write_drives
@@ -33,6 +34,7 @@ def record(
     from experiments.scenario.suite import one_scenario
     from experiments.show.terminal.layout import print_paths, progress
 
+    require_folder(output, [scenario])
     loaded = load_checked(one_scenario(scenario), overrides, seed)
     make_ready(jobs)
     with progress() as show:
@@ -54,11 +56,13 @@ def slam(
     as_json: options.AsJson = False,
 ) -> None:
     """Build one robot's map from its log: `mapfusion slam logs/R1 -o R1.parquet`."""
+    from experiments.cli.outputs import require_map_file
     from experiments.judge import user_files as single
     from experiments.scenario.suite import settings_of
     from experiments.show import json_document
     from experiments.show.terminal import layout
 
+    require_map_file(output, [log, scenario])
     settings = settings_of(scenario, overrides, seed)
     with layout.progress() as show:
         landmarks = single.slam(log, settings, show)
@@ -81,11 +85,13 @@ def align(
     as_json: options.AsJson = False,
 ) -> None:
     """Estimate T_a_b with every aligner: `mapfusion align R1.parquet R2.parquet`."""
+    from experiments.cli.outputs import DOCUMENT, require_file
     from experiments.judge import user_files as single
     from experiments.scenario.suite import settings_of
     from experiments.show import json_document
     from experiments.show.terminal.step_screen import print_estimates
 
+    require_file("--output", output, DOCUMENT, [map_a, map_b, scenario])
     settings = settings_of(scenario, overrides, seed)
     rows = single.align(map_a, map_b, settings)
     found = json_document.of_alignment((map_a, map_b), settings.seed, rows)
@@ -104,19 +110,27 @@ def merge(
     seed: options.Seed = None,
     as_json: options.AsJson = False,
 ) -> None:
-    """Fuse maps that alignments connect: `mapfusion merge A.parquet B.parquet -o F.parquet`."""
+    """Fuse maps that alignments connect: `mapfusion merge A.parquet B.parquet -o F.parquet`.
+
+    Exit code 1, and nothing is written, if no two maps were merged.
+    """
+    from experiments.cli.outputs import require_map_file
     from experiments.judge import user_files as single
     from experiments.scenario.suite import settings_of
     from experiments.show import json_document
-    from experiments.show.terminal.step_screen import print_fused
+    from experiments.show.terminal.step_screen import print_fused, print_unmerged
 
+    require_map_file(output, [*maps, scenario], n_maps=max(len(maps) // 2, 1))
     settings = settings_of(scenario, overrides, seed)
-    fusion = single.merge(maps, settings)
-    paths = single.save_fused(output, fusion)
-    found = json_document.of_fusion(paths, settings.seed, fusion, maps)
+    merged = single.merge(maps, settings)
+    paths = single.save_fused(output, merged)
+    found = json_document.of_fusion(paths, settings.seed, merged, maps)
     json_document.publish("merge", found, as_json)
+    if not paths:
+        if not as_json:
+            print_unmerged(merged, maps)
+        options.complain(f"no two maps were merged; {output} is not written")
+        raise typer.Exit(options.EXIT_FAILED)
     if not as_json:
-        for path, fused in zip(paths, fusion.fused, strict=True):
+        for path, fused in zip(paths, merged.fusion.fused, strict=True):
             print_fused(path, fused, maps)
-    if len(fusion.fused[0].members) < 2:
-        options.complain("warning: no two maps were merged")

@@ -41,6 +41,7 @@ def refusal(
     """
     import numpy as np
 
+    from experiments.cli.outputs import require_folder
     from experiments.run.workers import make_ready
     from experiments.scenario.seeds import parse_seeds
     from experiments.show.refusal_files import draw_refusals, write_kinds
@@ -50,6 +51,7 @@ def refusal(
     from experiments.study.refusal.reliability import judged_answers, reliability
     from experiments.study.refusal.stored_worlds import worlds_of
 
+    require_folder(output, worlds)
     make_ready(jobs)
     mapped, drawn = worlds_of(worlds, parse_seeds(seeds), results), PairsDrawn(pairs, every)
     with layout.progress() as show:
@@ -99,10 +101,12 @@ def sweep(
     What is finished is kept, also in the middle of a run; the same command goes on from there, and
     with more seeds or values adds to the same tables. Exit code 1 if a run failed.
     """
+    from experiments.cli.outputs import require_folder
     from experiments.scenario.seeds import parse_seeds
     from experiments.show.terminal import layout, sweep_screen
     from experiments.study.sweep import sweep_driver, sweep_plan
 
+    require_folder(output, scenarios)
     asked = sweep_plan.prepare(scenarios, parse_seeds(seeds), settings or (), results, output)
     if dry_run:
         sweep_screen.print_survey(sweep_plan.survey(asked))
@@ -124,8 +128,10 @@ def statistics(
     as_json: options.AsJson = False,
 ) -> None:
     """Success, errors and consistency over many runs: `mapfusion statistics results/quick-*`."""
+    from experiments.cli.outputs import require_folder
     from experiments.show.statistics_files import run_statistics
 
+    require_folder(output, paths)
     run_statistics(paths, output, as_json)
 
 
@@ -149,10 +155,12 @@ def compare(
 
     Runs are matched by scenario, seed and settings; a verdict means more than noise.
     """
+    from experiments.cli.outputs import require_folder
     from experiments.show.export import write_tables
     from experiments.show.terminal.statistics_screen import print_comparison
     from experiments.study.compare import versions
 
+    require_folder(output, [first, second])
     found = versions.compare(first, second, apart_from or ())
     if output is not None:
         write_tables(output, {"comparison": found.table})
@@ -188,12 +196,14 @@ def benchmark(
 
     Serial, so that times can be compared; finished cells are reused.
     """
+    from experiments.cli.outputs import require_folder
     from experiments.run.store import Store
     from experiments.scenario.suite import settings_of
     from experiments.show.benchmark_files import write_benchmark
     from experiments.show.terminal import layout, study_screen
     from experiments.study.benchmark import cells
 
+    require_folder(output, [scenario])
     entries = cells.entries_of(methods or (), scenario)
     counts, shares = tuple(pairs or cells.PAIR_COUNTS), tuple(outliers or cells.OUTLIER_SHARES)
     chosen_seed = settings_of(scenario, (), seed).seed
@@ -228,6 +238,7 @@ def independence(
     For example: `mapfusion study independence paper --seeds 0..2`. What is measured is measured
     serially; finished pieces are reused.
     """
+    from experiments.cli.outputs import require_folder
     from experiments.run.store import Store
     from experiments.scenario.loading import load_scenario
     from experiments.scenario.seeds import parse_seeds
@@ -235,13 +246,13 @@ def independence(
     from experiments.show.independence_files import write_independence
     from experiments.show.terminal import layout, study_screen
     from experiments.study.independence import independence_trial, recorded_teams
-    from mapfusion.storage import require_writable
 
+    require_folder(output, [scenario])
     path = one_scenario(scenario)
     loaded = [load_scenario(path, overrides, seed) for seed in parse_seeds(seeds)]
     sizes = recorded_teams.team_sizes(robots, loaded[0])
     folder = output or results / f"independence-{loaded[0].name}"
-    require_writable(folder)  # hours before it is written
+    require_folder(folder)  # hours before it is written
     with layout.progress() as show:
         store = Store.of(results)
         found = independence_trial.run_independence(loaded, sizes, store, jobs, show)
@@ -260,11 +271,13 @@ def calibrate(
     as_json: options.AsJson = False,
 ) -> None:
     """Correct odometry by what logs say of it: `mapfusion study calibrate raw/robot* -o logs`."""
+    from experiments.cli.outputs import require_folder
     from experiments.judge.user_calibration import calibrated
     from experiments.scenario.suite import settings_of
     from experiments.show import json_document
     from experiments.show.terminal import calibration_screen, layout
 
+    require_folder(output, [*logs, scenario])
     settings = settings_of(scenario, overrides, seed)
     with layout.progress() as show:
         found = calibrated(logs, output, settings, show)

@@ -3,7 +3,7 @@
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from experiments.judge.judged_run import JudgedRun
 from experiments.methods.aligner_calls import callable_aligner
@@ -22,11 +22,13 @@ from mapfusion.errors import InputError
 from mapfusion.fastslam.run import run_log
 from mapfusion.fuse.registry import make_fuser
 from mapfusion.fused_map import AlignedPair, Fusion
-from mapfusion.landmark_map import LandmarkMap, read_map, write_map
+from mapfusion.landmark_map import LandmarkMap, map_writes, read_map
 from mapfusion.merge import merge as merge_maps
 from mapfusion.name_order import name_order
 from mapfusion.odometry_covariance import read_odometry_covariance
 from mapfusion.robot_log import read_log
+from mapfusion.storage import Write, write_together
+from mapfusion.team.team_graph import Place
 
 
 def require_simulation(scenario: AnyScenario) -> None:
@@ -70,18 +72,72 @@ def slam(log: Path, settings: Scenario, on_progress: OnProgress) -> LandmarkMap:
 
 def save_map(path: Path, landmarks: LandmarkMap) -> None:
     """Write a map where the user wants it; raises InputError where that is impossible."""
+    _save(path, map_writes(path, landmarks))
+
+
+def _save(path: Path, writes: Mapping[Path, Write]) -> None:
     try:
-        write_map(path, landmarks)
+        write_together(writes)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror})") from error
 
 
-def save_fused(path: Path, fusion: Fusion) -> list[Path]:
-    """Write the fused maps: that of the most maps to `path`, others beside it, from `.2` on."""
-    paths = [path.with_stem(f"{path.stem}.{k}") for k in range(2, len(fusion.fused) + 1)]
-    for place, fused in zip([path, *paths], fusion.fused, strict=True):
-        save_map(place, fused.landmarks)
-    return [path, *paths]
+# Why an alignment that is accepted by itself is not used.
+_OF_THE_TEAM = {
+    Place.UNCONFIRMED: "no other alignment confirms this one",
+    Place.CONTRADICTED: "other alignments contradict this one",
+    Place.AMBIGUOUS: "several motions fit, and other alignments do not tell which is right",
+}
+
+
+class Merged(NamedTuple):
+    """Maps of the user's own made one.
+
+    Attributes:
+        fusion: what became of them.
+        pairs: the alignments of each two of them, in the order of `fusion.place`; of ambiguous ones
+            the alternatives, too.
+    """
+
+    fusion: Fusion
+    pairs: list[AlignedPair]
+
+    @property
+    def any_merged(self) -> bool:
+        """Whether two maps or more became one."""
+        return len(self.fusion.fused[0].members) > 1
+
+    def reasons(self) -> dict[tuple[int, int], str]:
+        """Return why each two maps were not merged by their own alignment; empty if they were."""
+        found: dict[tuple[int, int], str] = {}
+        for pair, place in zip(self.pairs, self.fusion.place, strict=True):
+            reason = pair.alignment.reason or _OF_THE_TEAM.get(place, "")
+            if place in (Place.CONFIRMED, Place.BRIDGE):
+                found[pair.a, pair.b] = ""
+            else:
+                found.setdefault((pair.a, pair.b), reason)
+        return found
+
+
+def numbered(path: Path, k: int) -> Path:
+    """Return where the k-th of several fused maps goes: `path` itself, then `.2` and so on."""
+    return path if k == 1 else path.with_stem(f"{path.stem}.{k}")
+
+
+def save_fused(path: Path, merged: Merged) -> list[Path]:
+    """Write the fused maps: that of the most maps to `path`, others beside it, from `.2` on.
+
+    All are written or none. Where nothing was merged there is none.
+    """
+    if not merged.any_merged:
+        return []
+    fused = merged.fusion.fused
+    paths = [numbered(path, k) for k in range(1, len(fused) + 1)]
+    writes: dict[Path, Write] = {}
+    for place, each in zip(paths, fused, strict=True):
+        writes |= map_writes(place, each.landmarks)
+    _save(path, writes)
+    return paths
 
 
 def _registration(entry: AlignerEntry, settings: Align) -> Registration:
@@ -121,7 +177,7 @@ def verdict_on(row: Mapping[str, Any]) -> tuple[Status, str]:
     return status, row["reason"] or row["refined_reason"] or row["acceptance_reason"]
 
 
-def merge(paths: Sequence[Path], settings: Scenario) -> Fusion:
+def merge(paths: Sequence[Path], settings: Scenario) -> Merged:
     """Fuse maps by the alignments of each with each, a pair in the order of its robots' names."""
     if len(paths) < 2:
         raise InputError("merge: give two maps or more")
@@ -142,4 +198,5 @@ def merge(paths: Sequence[Path], settings: Scenario) -> Fusion:
             rivals = ready.judge.rivals_of(done.refined)
             pairs += [AlignedPair(a, b, rival, offered, sureness) for rival in rivals]
     chosen = settings.merge
-    return merge_maps(maps, pairs, chosen.parameters, make_fuser(chosen.fuser))
+    fusion = merge_maps(maps, pairs, chosen.parameters, make_fuser(chosen.fuser))
+    return Merged(fusion, pairs)

@@ -26,12 +26,13 @@ from typing import Any
 
 import numpy as np
 
-from experiments.methods.answers import one_line, read
+from experiments.methods.answers import read
 from experiments.methods.catalogue import Kind, KnownMethod, find_method, make_method
 from experiments.methods.channel import Channel, GarbledError
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.registration import Aligner, as_aligner
 from mapfusion.align.result import Alignment, Status, without_answer
+from mapfusion.errors import one_line
 from mapfusion.landmark_map import LandmarkMap
 
 _START_LIMIT_S = 120.0  # imports take a second, many times that from a cold network disk
@@ -99,7 +100,7 @@ class Child:
         made = self._understood(json.loads, self._ask(*request))
         if not isinstance(made, bool):
             self.kill()
-            raise ChildFailedError(one_line(made))
+            raise ChildFailedError(one_line(str(made)))
         self.randomised = made
         self._memory_at_start = self._memory_bytes()
 

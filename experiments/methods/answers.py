@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from mapfusion.align.result import Alignment, Status, without_answer
+from mapfusion.errors import one_line
 
 _ANSWERS = (Status.ACCEPTED, Status.REFUSED, Status.DEGENERATE)
 _ASYMMETRY = 1e-9  # relative: more than rounding leaves of a symmetric product
-_TEXT_LENGTH = 200  # of what a plug-in says about itself in a table
 _LEAST_EIGENVALUE = -1e-9  # relative to the largest: rounding of a singular covariance
 
 
@@ -50,7 +50,7 @@ def checked_answer(answer: Any, n_correspondences: int, elapsed_s: float) -> Ali
         require(abs(T_a_b[2]) <= math.pi, f"theta is {T_a_b[2]:g} rad, expected -pi to pi")
     if accepted or not np.isnan(covariance).all():
         _require_covariance(covariance)
-    reason = one_line(reason)
+    reason = one_line(str(reason))
     return Alignment(T_a_b, covariance, inlier, elapsed_s, status, reason, drift_sigma_m)
 
 
@@ -87,13 +87,6 @@ def array(name: str, values: Any, shape: tuple[int, ...], of: str = "float") -> 
         return np.array(values, dtype=of)
 
 
-def one_line(text: str) -> str:
-    """In one line, no longer than a table can show, of characters that every file can hold."""
-    line = " ".join(str(text).split())
-    line = "".join(each if each.isprintable() else ascii(each)[1:-1] for each in line)
-    return line if len(line) <= _TEXT_LENGTH else line[: _TEXT_LENGTH - 3] + "..."
-
-
 def written(answer: Alignment) -> str:
     """An alignment, or what is said in place of one, as `read` understands it."""
     numbers = {"T_a_b": answer.T_a_b.tolist(), "covariance": answer.covariance.tolist()}
@@ -106,7 +99,7 @@ def read(text: bytes, n_correspondences: int) -> Alignment:
     """An answer about this many correspondences; NonsenseError where it is none."""
     said = json.loads(text)
     if said["status"] == Status.FAILED:
-        return without_answer(Status.FAILED, one_line(said["reason"]), n_correspondences)
+        return without_answer(Status.FAILED, one_line(str(said["reason"])), n_correspondences)
     bits = np.frombuffer(bytes.fromhex(said["inlier"]), np.uint8)
     said["inlier"] = np.unpackbits(bits, count=n_correspondences).astype(bool)
     said |= {name: np.array(said[name], dtype=float) for name in ("T_a_b", "covariance")}

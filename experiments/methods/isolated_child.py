@@ -23,7 +23,6 @@ from experiments.methods.answers import (
     NonsenseError,
     array,
     checked_answer,
-    one_line,
     require,
     require_type,
     written,
@@ -35,6 +34,7 @@ from mapfusion.align.method import Fit, Needs, Undetermined
 from mapfusion.align.pairs import Pairs
 from mapfusion.align.registration import Aligner, MethodAligner
 from mapfusion.align.result import Alignment, Status, without_answer
+from mapfusion.errors import one_line
 
 # Past the limit this process ends even when the plug-in holds the interpreter's lock and the one
 # who should have ended it is gone.

@@ -74,7 +74,7 @@ def _named(wanted: str, folder: Path | None) -> list[Path]:
 
 def _mentions(path: Path, word: str) -> bool:
     try:
-        return word.encode() in path.read_bytes()
+        return word.encode("utf-8", "surrogateescape") in path.read_bytes()
     except OSError:
         return True  # to be told by who reads it
 

@@ -4,12 +4,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pandas as pd
+import pyarrow as pa
 
 from experiments.judge import tables
 from experiments.scenario.loading import load_scenario
 from experiments.show.terminal.layout import print_lines, print_table
 from mapfusion import attitude, landmark_map, odometry_covariance, robot_log
 from mapfusion.errors import InputError
+from mapfusion.open_tables import is_csv, read_open_table
 from mapfusion.storage import read_json, read_parquet, read_table, text_attributes
 from sim import trajectory
 
@@ -19,6 +21,13 @@ _SCHEMAS = [*tables.ALL.values(), landmark_map.LANDMARKS, trajectory.TRAJECTORY]
 _SCHEMAS += [robot_log.FRAMES, robot_log.OBSERVATIONS, odometry_covariance.ODOMETRY_COVARIANCE]
 _SCHEMAS += [attitude.ATTITUDE]
 _SCHEMAS += [robot_log.TRUTH_POSES, robot_log.TRUTH_POINTS]
+# Tables that anybody may write; without metadata their file's name tells which one it is.
+_OPEN = {
+    "frames": robot_log.FRAMES,
+    "observations": robot_log.OBSERVATIONS,
+    "truth_poses": robot_log.TRUTH_POSES,
+    "truth_points": robot_log.TRUTH_POINTS,
+}
 _CHECKED = {each.metadata[f"{_PREFIX}{_KIND}".encode()].decode(): each for each in _SCHEMAS}
 _UNITS = {"m": "m", "m2": "m²", "rad": "rad", "s": "s", "ms": "ms", "px": "px"}
 # the upper triangle of an alignment's covariance names its axes instead
@@ -40,8 +49,10 @@ _FOLDER_MARKS = {
     "scenario.json": _RESULT,
     "done.json": "finished stage",
     "frames.parquet": _LOG,
+    "frames.csv": _LOG,
     "*/*/done.json": "store of stages",
     "*/frames.parquet": "folder of robot logs",
+    "*/frames.csv": "folder of robot logs",
     "*.parquet": "folder of tables",
 }
 
@@ -72,12 +83,12 @@ def contents_of(path: Path) -> Contents:
         return _folder(path)
     if not path.exists():
         raise InputError(f"{path}: no such file or folder")
-    if path.suffix == ".parquet":
+    if path.suffix.lower() in landmark_map.MAP_ENDINGS:
         return _table(path)
     if path.suffix in {".yaml", ".yml"}:
         return Contents("scenario", _brief(load_scenario(path).resolved()))
     if path.suffix != ".json":
-        raise InputError(f"{path}: no file of mapfusion's (known: .parquet, .yaml, .json)")
+        raise InputError(f"{path}: no file of mapfusion's (known: .parquet, .csv, .yaml, .json)")
     found = _json(path)
     if found.kind == _RESOLVED:
         load_scenario(path)  # raises where it is none of this program's
@@ -91,16 +102,46 @@ def unit_of(name: str) -> str:
 
 
 def _table(path: Path) -> Contents:
+    if is_csv(path):
+        return _open_table(path, _open_schema(path))
     table = read_parquet(path, "table")
     facts: dict[str, Any] = dict(text_attributes(path, table))
     kind = facts.pop(_KIND, None)
+    table_schema = _CHECKED.get(kind or "")
     if kind is None:
-        raise InputError(f"{path}: none of mapfusion's (no mapfusion.kind in its metadata)")
-    if kind in _CHECKED:
-        read_table(path, _CHECKED[kind])  # raises where version or columns are others
-    facts |= {"rows": table.num_rows, "MB": f"{path.stat().st_size / 1e6:.2f}"}
+        table_schema = _open_schema(path)
+        if not set(table_schema.names) & set(table.column_names):
+            raise InputError(f"{path}: none of mapfusion's (no mapfusion.kind in its metadata)")
+    if table_schema in (landmark_map.LANDMARKS, *_OPEN.values()):
+        return _open_table(path, table_schema)
+    if table_schema is not None:
+        read_table(path, table_schema)  # raises where version or columns are others
+    return _of_table(path, str(kind), table, facts)
+
+
+def _of_table(path: Path, kind: str, table: pa.Table, facts: dict[str, Any]) -> Contents:
+    facts = facts | {"rows": table.num_rows, "MB": f"{path.stat().st_size / 1e6:.2f}"}
     columns = {"column": table.column_names, "type": map(str, table.schema.types)}
     return Contents(kind, facts, pd.DataFrame(columns | {"unit": map(unit_of, table.column_names)}))
+
+
+def _open_schema(path: Path) -> pa.Schema:
+    """Return which table a file without metadata is read as."""
+    return _OPEN.get(path.stem, landmark_map.LANDMARKS)
+
+
+def _open_table(path: Path, table_schema: pa.Schema) -> Contents:
+    """A table whoever wrote it, read as `align`, `merge` and `slam` do; raises InputError."""
+    table, facts = read_open_table(path, table_schema)
+    kind = table_schema.metadata[f"{_PREFIX}{_KIND}".encode()].decode()
+    known: dict[str, Any] = {name: value for name, value in facts.items() if name != _KIND}
+    if table_schema is landmark_map.LANDMARKS:
+        landmarks = landmark_map.read_map(path)
+        known |= {"name": landmarks.name, "planar": str(landmarks.planar).lower()}
+        looks = {"descriptors": landmarks.descriptor, "labels": landmarks.label}
+        there = [name for name, values in looks.items() if values is not None]
+        known["matched by"] = " and ".join(there) or "nothing: neither descriptors nor labels"
+    return _of_table(path, kind, table, known)
 
 
 def _json(path: Path) -> Contents:
@@ -141,7 +182,15 @@ def _folder(path: Path) -> Contents:
         facts = {name: value for each in told for name, value in each.facts.items()}
     n_levels = 2 if kind == _RESULT else 1
     files = sorted(path.rglob("[!.]*.parquet"))
+    csv = [file for name in _OPEN for file in path.rglob(f"{name}.csv")]
+    files += sorted(file for file in csv if file.with_suffix(".parquet") not in files)
     inside = [file.relative_to(path).with_suffix("").parts[:n_levels] for file in files]
-    n_rows = [read_parquet(file, "table").num_rows for file in files]
+    n_rows = [_n_rows(file) for file in files]
     parts = pd.DataFrame({"holds": map("/".join, inside), "files": 1, "rows": n_rows})
     return Contents(kind, facts, parts.groupby("holds", sort=False, as_index=False).sum())
+
+
+def _n_rows(path: Path) -> int:
+    if is_csv(path):
+        return read_open_table(path, _open_schema(path))[0].num_rows
+    return read_parquet(path, "table").num_rows

@@ -15,11 +15,11 @@ import numpy as np
 import pandas as pd
 
 from experiments.judge.checking import CheckedScenario
-from experiments.judge.user_files import verdict_on
+from experiments.judge.user_files import Merged, verdict_on
 from experiments.run.stage_tables import COVARIANCE, MOTION
 from experiments.show.export import write_text
 from mapfusion.align.result import Status
-from mapfusion.fused_map import FusedMap, Fusion
+from mapfusion.fused_map import FusedMap
 from mapfusion.landmark_map import LandmarkMap
 
 SCHEMA_VERSION = 1
@@ -89,16 +89,24 @@ def of_map(path: Path, log: Path, seed: int, landmarks: LandmarkMap) -> dict[str
 
 
 def of_fusion(
-    paths: Sequence[Path], seed: int, fusion: Fusion, maps: Sequence[Path]
+    paths: Sequence[Path], seed: int, merged: Merged, maps: Sequence[Path]
 ) -> dict[str, Any]:
-    """What maps became: the fused map of the most of them, and others beside it."""
-    first, *others = (
-        _fused(path, fused, maps) for path, fused in zip(paths, fusion.fused, strict=True)
-    )
-    return {"seed": seed, **first, "others": others}
+    """What maps became: the fused map of the most of them, and others beside it.
+
+    Without `paths` nothing was merged, and `map` is null.
+    """
+    pairs = [
+        {"map_a": maps[a], "map_b": maps[b], "merged": not reason, "reason": reason or None}
+        for (a, b), reason in merged.reasons().items()
+    ]
+    known = zip(paths or [None], merged.fusion.fused, strict=True)
+    first, *others = (_fused(path, fused, maps) for path, fused in known)
+    if not paths:
+        first |= {"n_landmarks": 0, "n_fused_of_several": 0, "duplicate_share": None}
+    return {"seed": seed, **first, "others": others, "pairs": pairs}
 
 
-def _fused(path: Path, fused: FusedMap, maps: Sequence[Path]) -> dict[str, Any]:
+def _fused(path: Path | None, fused: FusedMap, maps: Sequence[Path]) -> dict[str, Any]:
     """What a fused map was made of; `T_first_map` is null for a map that was left out."""
     reasons = (reason for _, reason in fused.left_out)
     sources = []

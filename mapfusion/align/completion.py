@@ -1,5 +1,7 @@
 """What follows an estimate, whichever method made it: the common least squares, and the verdict."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from mapfusion.align.acceptance import Verdict
@@ -35,7 +37,10 @@ class Completion:
         if estimated.status not in NOT_RUN:
             known = (estimated.T_a_b.tobytes(), estimated.status, estimated.reason)
             if known not in self._refined:
-                self._refined[known] = self._refinement.refine(self.pairs, estimated.T_a_b)
+                found = self._refinement.refine(self.pairs, estimated.T_a_b)
+                if np.isnan(estimated.T_a_b).any():  # why, only the estimator can tell
+                    found = replace(found, reason=estimated.reason)
+                self._refined[known] = found
             refined = self._refined[known]
         arrays = (array.tobytes() for array in (refined.T_a_b, refined.covariance, refined.inlier))
         known = (*arrays, refined.drift_sigma_m, refined.status, refined.reason)

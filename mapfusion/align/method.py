@@ -28,7 +28,7 @@ class Needs:
         """Why the pairs span too little; empty when they do not."""
         if self.dimensions == 0:
             return ""
-        return why_one_place(pairs) if self.dimensions == 1 else why_one_line(pairs)
+        return why_one_place(pairs, which="") if self.dimensions == 1 else why_one_line(pairs)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mapfusion.align.correspondences import Correspondences, HeightGate
+from mapfusion.align.correspondences import FEW, Correspondences, HeightGate, scale_note
 from mapfusion.align.mahalanobis_gate import PlanarPairs
 from mapfusion.align.result import Alignment, degenerate
 from mapfusion.landmark_map import LandmarkMap
@@ -92,6 +92,17 @@ class Pairs:
         """(N, 3, 3) in frame b."""
         return self.map_b.covariance_m2.take(self.index_b, axis=0)
 
+    @cached_property
+    def note(self) -> str:
+        """What the maps themselves have against any motion of many pairs; empty for nothing."""
+        if len(self) < FEW:
+            return ""
+        if scale := scale_note(self.map_a, self.map_b, self.index_a, self.index_b):
+            return scale
+        if self.by_name:
+            return f"{len(self)} labels are in both maps: do they name the same landmarks?"
+        return ""
+
     def points(self) -> tuple[Float, Float]:
         """Positions (N, 3) in both frames, (N, 2) where heights carry no information."""
         dimensions = 2 if self.planar else 3
@@ -129,18 +140,24 @@ class Pairs:
         )
 
 
-def why_too_few(map_a: LandmarkMap, map_b: LandmarkMap, n_pairs: int, needed: int) -> str:
-    """Why there are fewer than `needed` pairs; empty when there are enough."""
+def why_too_few(
+    map_a: LandmarkMap, map_b: LandmarkMap, n_pairs: int, needed: int, shortage: str = ""
+) -> str:
+    """Return why there are fewer than `needed` pairs; empty when there are enough.
+
+    `shortage` is that of the correspondences, which names the test that left so few.
+    """
     if n_pairs >= needed:
         return ""
     for landmarks in (map_a, map_b):
         if len(landmarks) == 0:
             return f"map {landmarks.name} is empty"
-    if n_pairs == 0:
+    if n_pairs == 0 and not shortage:
         for landmarks in (map_a, map_b):
             if landmarks.descriptor is None and landmarks.label is None:
                 return f"map {landmarks.name} has neither descriptors nor labels to match by"
-    return f"{n_pairs} correspondences, at least {needed} are needed"
+    few = f"{n_pairs} correspondences, at least {needed} are needed"
+    return f"{few}: {shortage}" if shortage else few
 
 
 def undetermined(reason: str, n_pairs: int, started_s: float) -> Alignment:

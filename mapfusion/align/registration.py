@@ -14,7 +14,7 @@ from mapfusion.align.drift import estimate_drift_m
 from mapfusion.align.method import Fit, Method, Needs, Undetermined
 from mapfusion.align.pairs import MIN_PAIRS, Pairs, undetermined, why_too_few
 from mapfusion.align.refine import Refinement
-from mapfusion.align.result import Alignment, Status
+from mapfusion.align.result import NOT_RUN, Alignment, Status
 from mapfusion.align.rigid import (
     least_squares_gain,
     motion_covariance,
@@ -119,7 +119,8 @@ class _Offer(NamedTuple):
 
 def _why_not_called(needs: Needs, pairs: Pairs, given: Pairs) -> str:
     """Why the pairs given to a method are less than it needs; empty when they are not."""
-    reason = why_too_few(pairs.map_a, pairs.map_b, len(pairs), needs.pairs)
+    shortage = pairs.correspondences.shortage
+    reason = why_too_few(pairs.map_a, pairs.map_b, len(pairs), needs.pairs, shortage)
     if not reason and len(given) < needs.pairs:
         n, least = len(given), needs.pairs
         reason = f"the heights of {n} correspondences agree, at least {least} are needed"
@@ -193,6 +194,19 @@ class Registered(NamedTuple):
     def applied(self) -> Alignment:
         """What merging may use: the refined alignment, refused where the verdict says so."""
         return self.verdict.applied_to(self.refined)
+
+    def explained(self, note: str) -> "Registered":
+        """Return the same with a note on the maps behind each reason why it is not accepted."""
+        if not note or self.verdict.accepted or self.estimated.status in NOT_RUN:
+            return self
+        return Registered(
+            *(
+                each
+                if each.status is Status.ACCEPTED or not each.reason
+                else replace(each, reason=f"{each.reason}; {note}")
+                for each in self
+            )
+        )
 
 
 @dataclass(frozen=True)
@@ -269,7 +283,8 @@ class PairRegistration:
     def register(self, rng: np.random.Generator) -> Registered:
         """Estimate once more, and complete it."""
         estimated = self._estimated(rng)
-        return Registered(estimated, *self._completion.of(estimated))
+        done = Registered(estimated, *self._completion.of(estimated))
+        return done if done.verdict.accepted else done.explained(self._completion.pairs.note)
 
     def _estimated(self, rng: np.random.Generator) -> Alignment:
         pairs = self._completion.pairs

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mapfusion.arguments import Range, require_in_range, require_no_twins
-from mapfusion.errors import InputError, OutOfRangeError, did_you_mean, one_line
+from mapfusion.errors import MOST_CHARACTERS, InputError, OutOfRangeError, did_you_mean, one_line
 
 Side = Annotated[float, Range(1, 5, "m")]
 
@@ -56,14 +56,27 @@ def test_an_error_is_one_short_line_whatever_was_put_in() -> None:
         line = str(InputError(f"file.yaml: name: {text}: expected less"))
         assert line.startswith("file.yaml: name: ")
         assert line.endswith(": expected less")
-        assert len(line) <= 300
+        assert len(line) <= MOST_CHARACTERS
         assert line.isprintable()
     assert one_line("as  it\tis") == "as it is"
 
 
+def test_a_long_line_loses_whole_words_of_its_middle() -> None:
+    words = [f"{k}." for k in range(400)]
+    line = one_line(" ".join(words))
+    first, last = (part.split() for part in line.split(" ... "))
+    assert words[: len(first)] == first
+    assert words[-len(last) :] == last
+    assert len(last) > 20
+    assert MOST_CHARACTERS - 10 < len(line) <= MOST_CHARACTERS
+    assert one_line("x" * MOST_CHARACTERS + " y").endswith("x y")
+
+
 def test_names_that_look_alike_are_offered() -> None:
     assert did_you_mean("ransak", ["svd", "ransac"]) == "; did you mean ransac?"
+    assert did_you_mean("ipc", ["svd", "icp"]) == "; did you mean icp?"
     assert did_you_mean("magic", ["svd", "ransac"]) == ""
+    assert did_you_mean("nope", ["svd", "opencv"]) == ""
 
 
 @pytest.mark.parametrize("named", [[0, 1, 2, 3], [0, 0, 1, 1], [0, 0, 0, 0]])

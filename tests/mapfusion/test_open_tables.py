@@ -53,6 +53,7 @@ def test_without_heights_a_map_is_planar(tmp_path, rng):
     landmarks = read_map(write(frame, tmp_path / "m.parquet"))
     assert landmarks.planar
     assert not landmarks.position_m[:, 2].any()
+    assert read_map(write(frame.assign(z_score=1.0), tmp_path / "m.parquet")).planar
     write(frame.assign(z_m=0.0), tmp_path / "m.parquet")
     with pytest.raises(InputError, match=r"no column cov_xz_m2, .*, cov_zz_m2; .*formats\.md"):
         read_map(tmp_path / "m.parquet")
@@ -83,6 +84,89 @@ def test_descriptors_in_csv(tmp_path, rng):
     np.testing.assert_allclose(landmarks.descriptor, look, rtol=1e-6)
 
 
+def test_descriptors_are_counted_from_0_or_1_and_are_64(tmp_path, rng):
+    look = rng.normal(size=(N, 70))
+    for first in (0, 1):
+        names = [f"descriptor_{i + first}" for i in range(64)]
+        frame = plain_map(rng).join(pd.DataFrame(look[:, :64], columns=names)[names[::-1]])
+        landmarks = read_map(write(frame, tmp_path / "m.csv"))
+        np.testing.assert_allclose(landmarks.descriptor, look[:, :64], rtol=1e-6)
+    for kept, said in (
+        (range(32), "32 columns descriptor_0 to descriptor_31; expected descriptor_0 to"),
+        (range(70), "70 columns descriptor_0 to descriptor_69"),
+        ([*range(63), 65], "64 columns descriptor_0 to descriptor_65"),
+    ):
+        columns = pd.DataFrame({f"descriptor_{i}": look[:, i] for i in kept})
+        with pytest.raises(InputError, match=said):
+            read_map(write(plain_map(rng).join(columns), tmp_path / "m.csv"))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda text: text.replace(",", ";"), "m.csv: is separated by ';'; write it with commas"),
+        (lambda text: text.replace(",", "\t"), "m.csv: is separated by tabs"),
+        (str.upper, "has no column x_m, y_m, .*; did you mean x_m for X_M, y_m for Y_M, cov"),
+        (lambda text: text.split("\n", 1)[1], "has no header line; put one with .*[(]x_m, y_m"),
+        (lambda text: text.replace("x_m,", "x,"), "has no column x_m; did you mean x_m for x[?]"),
+    ],
+)
+@pytest.mark.parametrize("n_columns", [1, 9])
+def test_csv_of_another_dialect_is_told_what_it_is(tmp_path, rng, change, said, n_columns):
+    frame = plain_map(rng)
+    if n_columns == 1:  # of a planar map the names are others
+        frame = frame.drop(columns=["z_m", "cov_xz_m2", "cov_yz_m2", "cov_zz_m2"])
+    (tmp_path / "m.csv").write_text(change(frame.to_csv(index=False)))
+    with pytest.raises(InputError, match=said):
+        read_map(tmp_path / "m.csv")
+
+
+def test_blanks_around_names_and_numbers_change_nothing(tmp_path, rng):
+    text = plain_map(rng).to_csv(index=False)
+    (tmp_path / "a.csv").write_text(text)
+    (tmp_path / "b.csv").write_text(text.replace(",", " , "))
+    a, b = (read_map(tmp_path / name) for name in ("a.csv", "b.csv"))
+    np.testing.assert_array_equal(a.position_m, b.position_m)
+    assert not b.planar
+
+
+@pytest.mark.parametrize("name", ["z", "Z_M", "height_m", "Height (m)", "z_mm", "altitude"])
+def test_heights_of_another_name_make_no_map_planar(tmp_path, rng, name):
+    flat = plain_map(rng).drop(columns=["z_m", "cov_xz_m2", "cov_yz_m2", "cov_zz_m2"])
+    for kind in ("csv", "parquet"):
+        with pytest.raises(InputError, match=r"rename column .* to z_m .*or remove it"):
+            read_map(write(flat.assign(**{name: 1.0}), tmp_path / f"m.{kind}"))
+    with pytest.raises(InputError, match="cov_zz to cov_zz_m2"):
+        read_map(write(flat.assign(cov_zz=1.0), tmp_path / "m.csv"))
+    with pytest.raises(InputError, match="LABEL to label"):
+        read_map(write(flat.assign(LABEL=1), tmp_path / "m.csv"))
+
+
+@pytest.mark.parametrize(
+    ("cell", "said"),
+    [
+        ("inf", "column x_m is inf in row 3"),
+        ("NA", "column x_m is nan in row 3"),
+        ("near", "column x_m holds 'near' in row 3, expected a number"),
+        ("1e400", "column x_m is inf in row 3"),
+        (2**64, "position_m: above 1e[+]07 m in row 3"),
+    ],
+)
+def test_cells_of_csv_that_are_no_numbers_are_named(tmp_path, rng, cell, said):
+    frame = plain_map(rng).astype({"x_m": object})
+    frame.loc[3, "x_m"] = cell
+    with pytest.raises(InputError, match=said):
+        read_map(write(frame, tmp_path / "m.csv"))
+    look = pd.DataFrame(rng.normal(size=(N, 64)), columns=[f"descriptor_{i}" for i in range(64)])
+    spoilt_look = look.astype({"descriptor_5": object})
+    spoilt_look.loc[2, "descriptor_5"] = "inf" if cell == "inf" else "x"
+    with pytest.raises(InputError, match=r"column descriptor_5 (is inf|holds 'x') in row 2"):
+        read_map(write(plain_map(rng).join(spoilt_look), tmp_path / "m.csv"))
+    for huge in (2**64, 10**30):
+        with pytest.raises(InputError, match="column count"):
+            read_map(write(plain_map(rng).assign(count=str(huge)), tmp_path / "m.csv"))
+
+
 def spoilt(frame, column, value, row=7):
     frame = frame.copy()
     frame[column] = frame[column].astype(object)
@@ -95,6 +179,7 @@ def spoilt(frame, column, value, row=7):
     [
         ("x_m", np.nan, "column x_m: is nan in row 7"),
         ("x_m", None, "column x_m: is nan in row 7"),
+        ("cov_zz_m2", -np.inf, "column cov_zz_m2: is -inf in row 7"),
         ("x_m", 1e30, "position_m: above 1e[+]07 m in row 7"),
         ("cov_xx_m2", 1e30, "covariance_m2: above 100000 m squared in row 7"),
         ("cov_xx_m2", -1.0, "covariance_m2: not positive definite in row 7"),
@@ -116,7 +201,8 @@ def test_tables_that_are_wrong_as_a_whole(tmp_path, rng):
     cases = {
         "row 30 repeats row 3": pd.concat([frame, frame[3:4]]),
         "no column x_m, y_m;": frame.drop(columns=["x_m", "y_m"]),
-        "column x_m holds .*string, not numbers": frame.assign(x_m="near"),
+        "column x_m holds 'near' in row 0, expected a number": frame.assign(x_m="near"),
+        "column x_m holds bool, not numbers": frame.assign(x_m=True),
         "descriptor: lists of .3. numbers": frame.assign(descriptor=[[1.0, 2.0, 3.0]] * N),
         "descriptor": frame.assign(descriptor="like a door"),
     }

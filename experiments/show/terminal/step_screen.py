@@ -7,7 +7,7 @@ from typing import Any
 
 import pandas as pd
 
-from experiments.judge.user_files import verdict_on
+from experiments.judge.user_files import Merged, verdict_on
 from experiments.run.estimates import covariances_of
 from experiments.show.numbers import two_digits
 from experiments.show.terminal.layout import columns, print_frame, print_lines
@@ -52,10 +52,10 @@ def print_fused(path: Path, fused: FusedMap, maps: Sequence[Path]) -> None:
     """What a fused map was made of."""
     several = int(((fused.parents >= 0).sum(axis=1) > 1).sum())
     n_maps = len(fused.members)
-    what = f"fused from {n_maps} maps" if n_maps > 1 else "nothing was fused, it is the first map"
     lines = [
-        f"{len(fused.landmarks)} landmarks in {path}: {what}; {several} landmarks are of several "
-        f"maps, {fused.duplicate_share:.1%} look like duplicates that remain"
+        f"{len(fused.landmarks)} landmarks in {path}: fused from {n_maps} maps; {several} "
+        f"landmarks are of several maps, {fused.duplicate_share:.1%} look like duplicates that "
+        "remain"
     ]
     sigmas = zip(*motion_sigma(fused.motion_covariance), strict=True)
     for name, (x_m, y_m, theta_rad), sigma in zip(maps, fused.T_first_map, sigmas, strict=True):
@@ -65,3 +65,11 @@ def print_fused(path: Path, fused: FusedMap, maps: Sequence[Path]) -> None:
             lines.append(f"  {name}: T_first_map = {T}, {stated}")
     lines += [f"  {name}: left out ({reason})" for name, reason in fused.left_out]
     print_lines(lines)
+
+
+def print_unmerged(merged: Merged, maps: Sequence[Path]) -> None:
+    """Why each two maps were not merged."""
+    print_lines(
+        f"  {maps[a]} and {maps[b]}: not merged: {reason}"
+        for (a, b), reason in merged.reasons().items()
+    )

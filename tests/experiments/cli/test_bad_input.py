@@ -7,7 +7,8 @@ import pandas as pd
 import pytest
 
 from experiments.scenario.loading import load_scenario
-from experiments.scenario.yaml_input import read_mapping
+from experiments.scenario.yaml_input import parse_value, read_mapping
+from mapfusion.errors import InputError
 from tests.helpers.tiny_scenario import TINY, assert_refused, command
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
@@ -66,6 +67,7 @@ SCENARIOS = Path(__file__).parents[3] / "scenarios"
         ),
         ("robots.0.start=[1, 1]", ["robots.0.start.2", "required"]),
         ("robots.9.name=x", ["--set robots.9.name", "9: no such entry; there: 0 (R1), 1 (R2)"]),
+        ("robots.2.name=x", ["--set robots.2.name", "2: no such entry; there: 0 (R1), 1 (R2)"]),
         ("seed.x=1", ["--set seed.x", "x is not a key"]),
         ("x", ["--set x", "key=value"]),
         ("=1", ["--set =1", "key=value"]),
@@ -82,7 +84,7 @@ def test_wrong_value(
     results = tmp_path / "results"
     reply = command(capsys, "run", tiny_path, "--set", override, "--results", results)
     assert_refused(reply, *words)
-    if not override.startswith(("x", "=", "robots.9", "seed.x", "drive.frames=[")):
+    if not override.startswith(("x", "=", "robots.9", "robots.2", "seed.x", "drive.frames=[")):
         assert str(tiny_path) in reply.err
     assert not results.exists()
 
@@ -116,6 +118,15 @@ def test_not_utf8(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "wrong.yaml"
     path.write_bytes(b"name: \xff\xfe\n")
     assert_refused(command(capsys, "run", path), "wrong.yaml", "UTF-8")
+
+
+def test_integers_are_those_of_63_bits() -> None:
+    """What tables can hold; also of values that are no setting of ours, as of a plug-in."""
+    for value in (2**63 - 1, 1 - 2**63):
+        assert parse_value(str(value), "x") == value
+    for value in (2**63, -(2**63), 2**64, 10**400):
+        with pytest.raises(InputError, match=r"x: an integer of .* bits, 63 are the most"):
+            parse_value(str(value), "x")
 
 
 def test_values_keep_their_yaml_1_2_types(tmp_path: Path) -> None:

@@ -30,12 +30,12 @@ def paths(tmp_path: Path) -> list[Path]:
 
 def test_the_order_of_the_files_changes_nothing_but_the_frame(paths: list[Path]) -> None:
     settings = default_settings(["merge.aligner=ransac"], 0)
-    one = merge(paths, settings).fused[0]
+    one = merge(paths, settings).fusion.fused[0]
     assert len(one.members) == 4
     orders = list(itertools.permutations(range(4)))
     for place in np.random.default_rng(0).choice(len(orders), 4, replace=False):
         order = orders[place]
-        two = merge([paths[k] for k in order], settings).fused[0]
+        two = merge([paths[k] for k in order], settings).fusion.fused[0]
         assert_same_points(one, two, order, WITHIN)
 
 

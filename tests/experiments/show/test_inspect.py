@@ -92,6 +92,42 @@ def test_a_kind_it_does_not_know_describes_itself(
     assert "[bold]" in reply.out  # as text, no markup
 
 
+def test_maps_of_other_programs_as_align_reads_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frame = pd.DataFrame({"x_m": [0.0, 1.0], "y_m": [0.0, 2.0], "cov_xx_m2": 0.01})
+    frame = frame.assign(cov_xy_m2=0.0, cov_yy_m2=0.01)
+    frame.assign(label=[3, 4]).to_csv(tmp_path / "north.csv", index=False)
+    frame.to_parquet(tmp_path / "south.parquet")
+    for name, by in (("north.csv", "labels"), ("south.parquet", "nothing")):
+        reply = command(capsys, "inspect", tmp_path / name)
+        assert reply.code == 0
+        assert f"{name}: landmark_map" in reply.out.replace("\n", " ")
+        assert "rows: 2" in reply.out
+        assert "planar: true" in reply.out
+        assert f"matched by: {by}" in reply.out
+    frame.drop(columns="cov_yy_m2").to_csv(tmp_path / "west.csv", index=False)
+    reply = command(capsys, "inspect", tmp_path / "west.csv")
+    assert reply.code == 2
+    assert "west.csv: has no column cov_yy_m2" in reply.err
+
+
+def test_logs_of_other_programs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    motion = dict.fromkeys(("odometry_x_m", "odometry_y_m", "odometry_theta_rad"), 0.0)
+    frames = pd.DataFrame({"iteration": [0, 1], "time_s": [0.0, 0.1]} | motion)
+    point = {"x_m": 1.0, "y_m": 2.0, "cov_xx_m2": 0.01, "cov_xy_m2": 0.0, "cov_yy_m2": 0.01}
+    seen = pd.DataFrame({"iteration": [0, 1, 1], "label": [0, 0, 1]} | point)
+    (tmp_path / "R7").mkdir()
+    frames.to_csv(tmp_path / "R7" / "frames.csv", index=False)
+    seen.to_csv(tmp_path / "R7" / "observations.csv", index=False)
+    assert "robot: R7" in command(capsys, "inspect", tmp_path / "R7").out
+    assert "folder of robot logs" in command(capsys, "inspect", tmp_path).out
+    reply = command(capsys, "inspect", tmp_path / "R7" / "observations.csv")
+    assert reply.code == 0
+    assert "robot_log.observations" in reply.out
+    assert "rows: 3" in reply.out
+
+
 def truncated(result: Path, folder: Path) -> Path:
     path = folder / "cut.parquet"
     path.write_bytes(tables.table_path(result, "errors").read_bytes()[:-100])

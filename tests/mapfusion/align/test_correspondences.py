@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 
 from mapfusion.align import nearest_descriptors as module
-from mapfusion.align.correspondences import Correspondences, HeightGate, MatchParameters, match
+from mapfusion.align.correspondences import (
+    Correspondences,
+    HeightGate,
+    MatchParameters,
+    match,
+    scale_note,
+)
 from tests.mapfusion.align.map_pairs import landmarks, unit_vectors
 
 
@@ -150,3 +156,75 @@ def test_heights_of_one_point_agree_as_often_as_stated():
     variance = np.full(n, sigma_m**2)
     off = np.mean(~HeightGate().agrees(z_a, variance, z_b, variance))
     assert off == pytest.approx(0.001, rel=0.25)  # 200 of them: 3.5 standard deviations
+
+
+def unlike_maps(rng, n=40):
+    """Two maps of the same landmarks, the second moved in plan, with descriptors of norm one."""
+    descriptor, p = unit_vectors(rng, n), rng.uniform(-6, 6, (n, 3)) * [1, 1, 0.1]
+    moved = p @ np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]) + [2.0, 5.0, 0.0]
+    return landmarks(p, descriptor=descriptor), landmarks(moved, descriptor=descriptor)
+
+
+def told_apart(a, b, **parameters):
+    found = match(a, b, MatchParameters(**parameters))
+    assert len(found) < 3
+    return found.shortage
+
+
+def test_the_test_that_left_too_few_pairs_is_named():
+    """Each of the causes, once and by itself; what else is told is true of the maps."""
+    a, b = unlike_maps(np.random.default_rng(7))
+    label = np.arange(40, dtype=np.int32)
+    assert match(a, b).shortage == ""
+    lifted = replace(b, position_m=b.position_m + np.array([0, 0, 1.0]))
+    said = told_apart(a, lifted)
+    assert "40 mutually nearest descriptors, 0 within 0.23 m of height" in said
+    assert "median difference 1.00 m" in said
+    assert "times" not in said
+    said = told_apart(a, replace(b, position_m=1000 * b.position_m, name="north"))
+    assert "distances between landmarks of map north are 1000 times those of map" in said
+    assert "millimetres" in said
+    said = told_apart(a, replace(b, descriptor=None, label=label, name="north"))
+    assert "has descriptors, map north only labels" in said
+    # 0.01 of unit vectors of 64 numbers: 8 times that apart, more than the 0.05 allowed
+    off = b.descriptor + np.random.default_rng(1).normal(0, 0.01, (40, 64))
+    said = told_apart(a, replace(b, descriptor=off), max_descriptor_distance=0.05)
+    assert "40 mutually nearest descriptors, 0 at most 0.05 apart (median 0.08" in said
+    assert "different kinds" in said
+    bytes_of = [replace(m, descriptor=100 * m.descriptor) for m in (a, b)]
+    bytes_of[1] = replace(bytes_of[1], descriptor=bytes_of[1].descriptor + 1.0)
+    said = told_apart(*bytes_of)
+    assert "0 at most 0.6 apart (median 8)" in said
+    assert "norm 100" in said
+    named = [replace(m, descriptor=None) for m in (a, b)]
+    said = told_apart(replace(named[0], label=label), replace(named[1], label=label + 100))
+    assert "none are labels of both maps" in said
+    assert "40 from 0 to 39" in said
+    assert "40 from 100 to 139" in said
+    assert "neither descriptors nor labels" in told_apart(a, named[1])
+    few = b.descriptor.copy()
+    few[1:] = np.nan
+    assert "1 mutually nearest descriptors" in told_apart(a, replace(b, descriptor=few))
+    assert "is empty" in told_apart(a, b[np.zeros(0, np.int64)])
+
+
+@pytest.mark.parametrize(
+    ("factor", "unit"), [(1000, "millimetres"), (1 / 3.281, "feet"), (100, "centimetres"), (7, "")]
+)
+def test_a_scale_is_seen_among_false_pairs_and_none_without_one(factor, unit):
+    rng = np.random.default_rng(2)
+    for trial in range(20):
+        a, b = unlike_maps(rng, 60)
+        index = np.arange(60)
+        shuffled = index.copy()
+        shuffled[:25] = rng.permutation(25)  # two fifths of the pairs are false
+        larger = replace(b, position_m=factor * b.position_m, name="north")
+        said = scale_note(a, larger, index, shuffled)
+        assert f" {max(factor, 1 / factor):.2g}" in said or f" {factor}" in said, (trial, said)
+        assert (unit in said) if unit else ("are both in metres?" in said)
+        larger_one = "north" if factor > 1 else a.name
+        assert f"landmarks of map {larger_one} are" in said
+        assert scale_note(a, b, index, shuffled) == ""
+        assert scale_note(a, b, index, rng.permutation(60)) == ""
+    far = replace(b, position_m=1000 * b.position_m, name="north")
+    assert "spans" in scale_note(a, far, index, rng.permutation(60))

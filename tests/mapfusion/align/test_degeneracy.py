@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from mapfusion.align import degeneracy as module
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.degeneracy import SHAPE_FALSE_ALARM, lacks_extent, why_one_place
 from mapfusion.align.pairs import Pairs
@@ -11,12 +12,40 @@ from tests.mapfusion.align.map_pairs import covariances, landmarks
 
 
 def slow_share(p, covariance, drift_m2, dimensions):
-    """The spread along the axis in question over the most that noise gives."""
-    plan = p[:, :2] - p[:, :2].mean(axis=0)
-    _, sizes, axes = np.linalg.svd(plan)
-    axis = axes[dimensions - 1]
-    noise = axis @ (covariance[:, :2, :2].mean(axis=0) + drift_m2 * np.eye(2)) @ axis
-    return sizes[dimensions - 1] ** 2 / noise / chi2.ppf(1 - SHAPE_FALSE_ALARM, len(p) - dimensions)
+    """The squared deviations along the axis, each over its variance, over the most noise gives."""
+    C = covariance[:, :2, :2] + drift_m2 * np.eye(2)
+    weight = np.array([2 / np.trace(S) for S in C])
+    plan = p[:, :2] - np.average(p[:, :2], axis=0, weights=weight)
+    axis = np.linalg.svd(np.sqrt(weight)[:, None] * plan)[2][dimensions - 1]
+    variance = np.array([axis @ S @ axis for S in C])
+    along = plan @ axis
+    along = along - np.average(along, weights=1 / variance)
+    most = chi2.ppf(1 - SHAPE_FALSE_ALARM, len(p) - dimensions)
+    return np.sum(along**2 / variance) / most
+
+
+def test_landmarks_of_one_point_pass_for_a_shape_as_seldom_as_stated(monkeypatch):
+    """However different their noise."""
+    monkeypatch.setattr(module, "SHAPE_FALSE_ALARM", 0.1)
+    rng, n, trials = np.random.default_rng(3), 30, 2000
+    sigma = np.where(np.arange(n) % 3, 0.01, 0.5)
+    covariance = np.zeros((n, 2, 2))
+    covariance[:, 0, 0], covariance[:, 1, 1] = sigma**2, 1e-12  # of one axis alone
+    shapes = 0
+    for _ in range(trials):
+        p = np.column_stack([rng.normal(0, sigma), np.zeros(n)])
+        shapes += not lacks_extent(p, covariance, 0.0, 1)
+    assert shapes / trials == pytest.approx(0.1, abs=0.025)
+
+
+def test_one_uncertain_landmark_does_not_hide_the_extent_of_the_others():
+    rng = np.random.default_rng(0)
+    p, covariance = rng.uniform(-6, 6, (40, 2)), np.tile(4e-4 * np.eye(2), (40, 1, 1))
+    covariance[7] = 1e10 * np.eye(2)
+    for dimensions in (1, 2):
+        assert not lacks_extent(p, covariance, 0.0, dimensions)
+    covariance[:] = 1e10 * np.eye(2)
+    assert lacks_extent(p, covariance, 0.0, 1)
 
 
 @pytest.mark.parametrize("dimensions", [1, 2])
