@@ -9,6 +9,7 @@ import numpy as np
 
 from mapfusion.arguments import Range, require_in_range
 from mapfusion.errors import InputError
+from mapfusion.se2 import Float
 from sim.floorplan import FloorPlan
 from sim.p3at import (
     OUTER_RADIUS_M,
@@ -19,6 +20,7 @@ from sim.p3at import (
     P3at,
     Pose,
 )
+from sim.right_of_way import Driven, Hold, Holding, Progress, circle_among, hold_for
 from sim.route import Route, check_routes, place
 from sim.solid_walls import SolidWalls
 from sim.trajectory import Trajectory
@@ -32,6 +34,8 @@ STOPPING_GAP_M = 0.15  # between robots, kept also by the one that has the right
 ALIGNED_RAD = 0.1  # heading error with which a turn in place ends; what is left is steered out
 # Apart by this no robot stands in another's way: as `_Other.is_in_the_way` says at the most.
 _REACH_M = math.hypot(2 * OUTER_RADIUS_M + STOPPING_GAP_M, 2 * OUTER_RADIUS_M)
+CIRCLE_S = 1.0  # robots that wait for each other for so long will not move again by themselves
+_MOST_HOLDS = 10  # a robot; each costs one drive more, and the drives of generated worlds need few
 HEADING_GAIN_PER_S = 2.0  # turn rate per radian of heading error: half of it gone in 0.35 s
 
 
@@ -85,18 +89,41 @@ def drive(
         n_frames: frames to record; the first shows the start.
         frame_interval_s: a multiple of the controller's period, 1/60 s.
 
+    Where robots come to wait for each other in a circle, all drive anew and one of them waits
+    earlier, where it is in nobody's way (`right_of_way.py`).
+
     Raises:
         InputError: an impossible route or frame interval; a robot that hits something or is stuck
             (names robot, time and place).
     """
     check_routes(plan, routes)
+    _controls_per_frame(frame_interval_s)
+    holds: list[Hold] = []
+    while True:
+        found = _driven(plan, routes, settings, n_frames, frame_interval_s, holds)
+        if isinstance(found, Trajectory):
+            return found
+        holds.append(found)
+
+
+def _driven(
+    plan: FloorPlan,
+    routes: Sequence[Route],
+    settings: DriverSettings,
+    n_frames: int,
+    frame_interval_s: float,
+    holds: Sequence[Hold],
+) -> Trajectory | Hold:
+    """Drive under these holds; give one more hold where one is needed and there is one."""
     controls_per_frame = _controls_per_frame(frame_interval_s)
     with World() as world:
         ground = world.start_physics()
         robots = [P3at(world, route.T_world_start, route.tire_friction) for route in routes]
         drivers = [
-            _Driver(route, robot, settings) for route, robot in zip(routes, robots, strict=True)
+            _Driver(route, robot, settings, [each for each in holds if each.robot == i])
+            for i, (route, robot) in enumerate(zip(routes, robots, strict=True))
         ]
+        circles = _Circles(drivers, settings, holds)
         names = {robot.body: route.robot for route, robot in zip(routes, robots, strict=True)}
         walls = SolidWalls(world, plan, len(robots))
         world.step(round(SETTLING_S * PHYSICS_HZ))
@@ -106,13 +133,17 @@ def drive(
         now = [robot.pose() for robot in robots]
         for frame in range(n_frames):
             poses[:, frame] = now
+            circles.record(now)
             for i, robot in enumerate(robots):
                 wheels[i, frame] = robot.wheel_angles() - encoder_zero[i]
             for control in range(controls_per_frame if frame + 1 < n_frames else 0):
                 time_s = frame * frame_interval_s + control / CONTROL_HZ
                 parked = [driver.parked for driver in drivers]
+                circles.hold(now)
                 for i, driver in enumerate(drivers):
                     driver.control(time_s, now[i], _others(i, now, parked, drivers))
+                if (hold := circles.hold_needed(now)) is not None:
+                    return hold
                 walls.stand_near(now)
                 world.step(STEPS_PER_CONTROL)
                 for driver in drivers:
@@ -164,23 +195,27 @@ def _others(
     """All robots but one, as that one sees them."""
     for i, driver in enumerate(drivers):
         if i != of:
-            yield _Other(now[i], i, i < of and not parked[i], driver.lets_by == of)
+            yield _Other(now[i], i, i < of and not parked[i], of in driver.waits_for)
 
 
 class _Driver:
     """Steers one robot from waypoint to waypoint by its true pose."""
 
-    def __init__(self, route: Route, robot: P3at, settings: DriverSettings) -> None:
+    def __init__(
+        self, route: Route, robot: P3at, settings: DriverSettings, holds: Sequence[Hold] = ()
+    ) -> None:
         self._route, self._robot, self._settings = route, robot, settings
         self._waypoints_m: list[list[float]] = route.waypoints_m.tolist()
-        self._target = 0
+        self._target = self._visited = 0
         self._done = False
+        self._holds = [Holding(each) for each in holds]
+        self._holding_for: set[int] = set()
         self._speed_m_s = 0.0
         self._turn_rad_s = 0.0
         self._nearest_m = np.inf
         self._progress_s = 0.0
         self._turning = False
-        self.lets_by: int | None = None  # the robot that it waits for
+        self.lets_by: int | None = None  # the robot that it stops for
         # beyond, no other is in the way, whatever is rounded
         self._looks_m = 1.01 * max(settings.give_way_m, _REACH_M)
 
@@ -189,11 +224,50 @@ class _Driver:
         """Whether it has come to the end of its route."""
         return self._done
 
+    @property
+    def waits_for(self) -> set[int]:
+        """The robots that it stands for, or is about to."""
+        return self._holding_for if self.lets_by is None else {self.lets_by}
+
+    @property
+    def stands(self) -> bool:
+        """Whether it neither drives nor turns."""
+        return self._speed_m_s == 0 and self._turn_rad_s == 0
+
+    def ahead_m(self) -> Iterator[Float]:
+        """The waypoints (2,) that it visits next, without end where its route is a loop."""
+        yield from self._route.waypoints_m[self._target :]
+        while self._route.loop:
+            yield from self._route.waypoints_m
+
+    def progress(self, pose: Pose) -> Progress:
+        """How far it has come."""
+        return Progress(self._visited, -self._distance_m(pose))
+
+    def stopping_m(self) -> float:
+        """How far it rolls on if it brakes now."""
+        return self._speed_m_s**2 / (2 * self._settings.acceleration_m_s2)
+
+    def hold(self, came: Sequence[Progress], now: Sequence[Pose], clearance_m: float) -> None:
+        """See which robots its holds have it wait for, given how far all have come."""
+        self._holding_for = set()
+        for each in self._holds:
+            self._holding_for |= each.waits_for(came, now, clearance_m)
+
+    def bear_with(self, time_s: float) -> None:
+        """Count no time until then as time without progress."""
+        self._progress_s = max(self._progress_s, time_s)
+
+    @property
+    def progress_s(self) -> float:
+        """When it last came nearer to its waypoint, or visited one."""
+        return self._progress_s
+
     def control(self, time_s: float, pose: Pose, others: Iterable[_Other]) -> None:
         """One step, given where all robots are."""
         settings = self._settings
         self._advance(time_s, pose)
-        stands = self._done or time_s < settings.stand_s
+        stands = self._done or time_s < settings.stand_s or bool(self._holding_for)
         speed, turn = (0.0, 0.0) if stands else self._wish(pose)
         self.lets_by = self._first_in_the_way(pose, others) if speed > 0 else None
         if self.lets_by is not None:
@@ -211,12 +285,13 @@ class _Driver:
         distance = self._distance_m(pose)
         if not self._done and distance < self._settings.arrival_m:
             self._target += 1
+            self._visited += 1
             if self._target == len(self._waypoints_m):
                 self._done = not self._route.loop
                 self._target = 0
             self._nearest_m, self._progress_s = np.inf, time_s
             distance = self._distance_m(pose)
-        if self._done or distance < self._nearest_m - PROGRESS_M:
+        if self._done or self._holding_for or distance < self._nearest_m - PROGRESS_M:
             self._nearest_m, self._progress_s = distance, time_s
         if time_s - self._progress_s > self._settings.patience_s:
             why = "waits for another robot" if self.lets_by is not None else "is stuck"
@@ -271,6 +346,55 @@ class _Driver:
                 f"robot {self._route.robot}: hits {what} at {place(self._robot.pose())}, "
                 f"t = {time_s:.1f} s"
             )
+
+
+class _Circles:
+    """Keeps the robots to their holds, and finds those that wait for each other."""
+
+    def __init__(
+        self, drivers: Sequence[_Driver], settings: DriverSettings, holds: Sequence[Hold]
+    ) -> None:
+        self._drivers, self._holds = drivers, holds
+        self._driven = [Driven() for _ in drivers]
+        # from the middle of a leg, which a robot may be beside by the arrival tolerance
+        self._clearance_m = _REACH_M + settings.arrival_m
+        self._most_holds = _MOST_HOLDS * len(drivers)
+        self._circle: tuple[int, ...] = ()
+        self._n_steps = 0
+
+    def record(self, now: Sequence[Pose]) -> None:
+        """Take down where the robots are at a frame."""
+        for own, driver, pose in zip(self._driven, self._drivers, now, strict=True):
+            own.add(pose, driver.progress(pose), driver.stopping_m())
+
+    def hold(self, now: Sequence[Pose]) -> None:
+        """Tell the robots which others their holds have them wait for."""
+        if self._holds:
+            came = [each.progress(pose) for each, pose in zip(self._drivers, now, strict=True)]
+            for driver in self._drivers:
+                driver.hold(came, now, self._clearance_m)
+
+    def hold_needed(self, now: Sequence[Pose]) -> Hold | None:
+        """After a step: what keeps robots from waiting for each other as they do; None if none do.
+
+        One that waits, and not in a circle, is not stuck as long as the one ahead makes progress.
+        """
+        waits_for = {
+            i: driver.waits_for
+            for i, driver in enumerate(self._drivers)
+            if driver.stands and driver.waits_for
+        }
+        circle = circle_among(waits_for) if len(waits_for) > 1 else ()
+        self._n_steps = self._n_steps + 1 if circle and circle == self._circle else 0
+        self._circle = circle
+        for i in waits_for.keys() - set(circle):
+            ahead = [k for k in waits_for[i] if not self._drivers[k].parked]
+            self._drivers[i].bear_with(max((self._drivers[k].progress_s for k in ahead), default=0))
+        if self._n_steps != CIRCLE_S * CONTROL_HZ or len(self._holds) == self._most_holds:
+            return None
+        self.record(now)
+        ahead_m = [driver.ahead_m() for driver in self._drivers]
+        return hold_for(circle, self._driven, ahead_m, self._clearance_m, self._holds)
 
 
 def _towards(value: float, target: float, step: float) -> float:

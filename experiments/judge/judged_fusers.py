@@ -44,6 +44,7 @@ class GivenMap:
         points_world_m: (N, 3) true points.
         of_filter: the filter's map at that iteration.
         of_filter_world_m: (L, 3) its true points.
+        fallback: which map stands in for the smoothed one, and why; empty if none does.
     """
 
     robot: EvaluatedRobot
@@ -51,16 +52,26 @@ class GivenMap:
     points_world_m: Float
     of_filter: LandmarkMap
     of_filter_world_m: Float
+    fallback: str = ""
 
     @classmethod
     def at(cls, robot: EvaluatedRobot, smoothed: SmoothedRobot | None, k: int) -> "GivenMap":
-        """At an iteration; of a fuser that takes smoothed maps, that one if there is one."""
+        """At an iteration, as the stage `fuse` chooses it (`given_teams`).
+
+        Args:
+            robot: whose map it is.
+            smoothed: for a fuser that takes smoothed maps: the last one until then is given, the
+                filter's where there is none.
+            k: the iteration.
+        """
         filtered = robot.at(k)
-        known = [] if smoothed is None else [i for i in smoothed.maps if i <= k]
-        if smoothed is None or not known:
+        if smoothed is None:
             return cls(robot, *filtered, *filtered)
-        at = max(known)
-        return cls(robot, smoothed.maps[at], smoothed.points_world_m[at], *filtered)
+        at, why = smoothed.given_at(k)
+        fallback = f"{robot.name} is not smoothed: it {why}" if why else ""
+        if at is None:
+            return cls(robot, *filtered, *filtered, fallback)
+        return cls(robot, smoothed.maps[at], smoothed.points_world_m[at], *filtered, fallback)
 
 
 @dataclass(frozen=True)
@@ -86,6 +97,13 @@ class JudgedFusion:
             maps, points = {k: given.landmarks}, {k: given.points_world_m}
             robots.append(replace(given.robot, maps=maps, points_world_m=points))
         return FusedTeam(robots, (), k, Fusion((self.fusion,), ()))
+
+    @property
+    def fallback(self) -> str:
+        """What stood in for the fuser or for a smoothed map, and why; empty if nothing did."""
+        own = f"a simpler fuser stands in: {self.fusion.fallback}" if self.fusion.fallback else ""
+        maps = (self.given[k].fallback for k in self.fusion.members)
+        return "; ".join(filter(None, (own, *maps)))
 
     @cached_property
     def fit(self) -> FittedMap:
@@ -120,7 +138,7 @@ class JudgedFusion:
             "frame_nees_per_dof": in_frame.marginal_nees_per_dof,
             "frame_coverage_95": in_frame.coverage_95,
             "duplicate_share": self.fusion.duplicate_share,
-            "fallback": self.fusion.fallback,
+            "fallback": self.fallback,
         } | self._motions()
 
     def _over_better(self, fit: FittedMap, of_filter: bool) -> float:

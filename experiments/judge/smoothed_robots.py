@@ -1,7 +1,7 @@
 """What the filter loses against a batch: each robot's smoothed map and path against the truth."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,7 @@ class SmoothedRobot:
         points_world_m: (N, 3) true points for each map, NaN where unknown.
         paths: (k + 1, 3) up to each iteration k.
         ending: how smoothing ended at the robot's last iteration.
+        not_smoothed: why there is no map, by the iterations that have none.
     """
 
     robot: EvaluatedRobot
@@ -46,12 +47,27 @@ class SmoothedRobot:
     points_world_m: dict[int, Float]
     paths: dict[int, Float]
     ending: dict[str, Any]
+    not_smoothed: Mapping[int, str] = field(default_factory=dict)
 
     @property
     def last_path(self) -> Float:
         """(T, 3); NaN where the whole log was not smoothed."""
         unknown = np.full_like(self.filter_path, np.nan)
         return self.paths.get(len(self.filter_path) - 1, unknown)
+
+    def given_at(self, iteration: int) -> tuple[int | None, str]:
+        """The smoothed map that a fuser is given at an iteration, by the iteration that it is of.
+
+        Returns:
+            The last one until then, None for the filter's map where there is none; and why that
+            stands in for a map smoothed until then, empty where there is one.
+        """
+        at = max((k for k in self.maps if k <= iteration), default=None)
+        asked = max((k for k in (*self.maps, *self.not_smoothed) if k <= iteration), default=at)
+        if asked == at:
+            return at, ""
+        instead = "FastSLAM's map" if at is None else f"its map until frame {at}"
+        return at, f"{self.not_smoothed[asked]}; {instead} stands in"
 
 
 def load_smoothed(
@@ -60,10 +76,12 @@ def load_smoothed(
     """A robot's smoothed maps joined with the truth beside its log, NaN where it is unknown."""
     truth, maps = truth_of(folders.log, log), read_smoothed(smooth, last_whole=True)
     points = landmark_truth(truth, partial(smoothed_owners, smooth, folders.slam), maps)
-    ending = read_endings(smooth).to_dict("records")[-1]
-    paths = read_smoothed_path(smooth)
-    whole = {str(name): value for name, value in ending.items()}
-    return SmoothedRobot(robot, final_path(folders.slam), maps, points, paths, whole)
+    endings = read_endings(smooth)
+    reasons = dict(zip(endings["iteration"].tolist(), endings["not_smoothed"], strict=True))
+    not_smoothed = {k: str(why) for k, why in reasons.items() if why}
+    whole = {str(name): value for name, value in endings.to_dict("records")[-1].items()}
+    path, paths = final_path(folders.slam), read_smoothed_path(smooth)
+    return SmoothedRobot(robot, path, maps, points, paths, whole, not_smoothed)
 
 
 def smoothed_path_rows(smoothed: Sequence[SmoothedRobot]) -> pd.DataFrame:
@@ -91,6 +109,7 @@ def _row(smoothed: SmoothedRobot) -> dict[str, Any]:
     )
     row = {"robot": robot.name, "path_rmse_m": path_m, "filter_path_rmse_m": filter_m}
     row |= {"filter_over_smoother": filter_m / path_m if path_m > 0 else np.nan} | smoothed.ending
+    row["not_smoothed"] = smoothed.given_at(last)[1]
     of_filter = fitted(robot.maps[last], robot.points_world_m[last])
     row |= {"filter_landmark_rmse_m": of_filter.rmse_m, "filter_gross_share": of_filter.gross_share}
     if last not in smoothed.maps:

@@ -68,7 +68,7 @@ _COLUMNS = {
     # consistency with the gauge removed. filter_: of FastSLAM's last map and final path. The
     # degrees of freedom are of the Student-t's that observations and tracks' offsets were found to
     # be of; observation_level is the factor on the observations' stated covariances that the log
-    # told. not_smoothed: why there is nothing (else empty).
+    # told. not_smoothed: why there is nothing, and what stands in (else empty).
     "smoother": """robot n_landmarks path_rmse_m filter_path_rmse_m filter_over_smoother
         landmark_rmse_m gross_share filter_landmark_rmse_m filter_gross_share
         nees_per_dof marginal_nees_per_dof coverage_95
@@ -97,8 +97,8 @@ _COLUMNS = {
     # gauge removed, the first of all landmarks at once; a map that has no joint covariance (all but
     # the last of each fuser) is taken for one of independent errors. frame_: in the frame, of each
     # landmark for itself. alignment_: how the other robots' maps were moved, medians; sigma:
-    # as stated, see se2.motion_sigma. fallback: why
-    # a simpler fuser stood in (else empty).
+    # as stated, see se2.motion_sigma. fallback: whether a simpler fuser stood in, or another map
+    # for a robot's smoothed one, which and why (else empty).
     "fusers": """fuser iteration n_robots n_landmarks landmark_rmse_m fitted_rmse_m fitted_median_m
         gross_share over_better_parent over_better_filter
         nees_per_dof marginal_nees_per_dof coverage_95 frame_nees_per_dof frame_coverage_95

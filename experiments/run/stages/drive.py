@@ -10,7 +10,7 @@ from experiments.run.stages.walls import Walls
 from experiments.scenario.randomness import generator
 from sim.driver import DriverSettings, Route, drive
 from sim.sway import BodySway
-from sim.trajectory import write_trajectory
+from sim.trajectory import Trajectory, write_trajectory
 
 LABEL = "drive the robots"
 TRAJECTORY_FILE = "trajectory.parquet"
@@ -44,6 +44,11 @@ class DriveSettings:
 
 
 def run(settings: DriveSettings, job: Job) -> None:
+    """Drive, and write the trajectory."""
+    write_trajectory(job.output / TRAJECTORY_FILE, driven(settings))
+
+
+def driven(settings: DriveSettings) -> Trajectory:
     """Drive, from the scenario's starts moved by the seed within the jitter; bodies sway on top.
 
     Raises:
@@ -63,4 +68,4 @@ def run(settings: DriveSettings, job: Job) -> None:
             for robot in trajectory.robots
         ]
         trajectory = replace(trajectory, tilt_rad=np.stack(tilts))
-    write_trajectory(job.output / TRAJECTORY_FILE, trajectory)
+    return trajectory

@@ -17,6 +17,7 @@ from experiments.run.kept_logs import kept_log
 from experiments.run.stages.slam import evaluated_iterations, final_path
 from experiments.run.stages.snapshots import Associations
 from mapfusion.attitude import Attitude, read_attitude
+from mapfusion.errors import DamagedFileError
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map
 from mapfusion.log_part import first_frames
 from mapfusion.odometry_covariance import read_odometry_covariance
@@ -47,13 +48,13 @@ PATH = schema("smooth.path", 2, [*fields(iteration=INT), *float_fields(POSE_FIEL
 PARTED = schema("smooth.parted", 1, fields(observation=INT, source_observation=INT))
 
 LABEL = "smooth the logs"
-WRITES = (
+WRITES = ("parted_{part}.parquet", "path_{part}.parquet")
+# Beside these where the log was smoothed: `PATH` tells whether it was.
+_MAP_FILES = (
     "map_{part}.parquet",
     "map_{part}.joint.parquet",
     "map_{part}.viewing.parquet",
     "map_{part}.frames.parquet",
-    "parted_{part}.parquet",
-    "path_{part}.parquet",
 )
 # Unless they are said, maps are fused at so many evenly spread iterations, the last among them.
 _FUSED_ITERATIONS = 5
@@ -91,12 +92,16 @@ def parts(iterations: tuple[int, ...]) -> tuple[str, ...]:
 
 
 def run(settings: SmoothSettings, job: Job) -> None:
-    """Smooth the log up to one iteration; write the map with its joint covariance, and the path."""
+    """Smooth the log up to one iteration; write the map with its joint covariance, and the path.
+
+    A log that cannot be smoothed has no map and an empty path, with the reason.
+    """
     given = filtered_until(job, kept_log(job.inputs["log"]), int(job.part), settings.noise_floor_m)
     own = replace(settings, smoother=smoother_of(settings.smoother, job.inputs["log"]))
     made = smoothed_anew(own, *given, read_attitude(job.inputs["log"]))
     landmarks, path, landmark, ended = made
-    write_map(_map_path(job.output, job.part), landmarks)
+    if landmarks is not None:
+        write_map(_map_path(job.output, job.part), landmarks)
     _, filters, _ = given
     changed = np.flatnonzero(landmark != filters)
     rows = {"observation": changed, "source_observation": landmark[changed]}
@@ -133,11 +138,14 @@ def smoothed_anew(
     landmark: np.ndarray,
     path: Float,
     attitude: Attitude | None,
-) -> tuple[LandmarkMap, Float, np.ndarray, tuple[object, ...]]:
-    """Map, path, which landmark observations are of, and how smoothing ended, see `_ENDED`."""
+) -> tuple[LandmarkMap | None, Float, np.ndarray, tuple[object, ...]]:
+    """Map, path, which landmark observations are of, and how smoothing ended, see `_ENDED`.
+
+    There is no map, and no pose in the path, where the log cannot be smoothed.
+    """
     found = _smoothed(log, landmark, path, settings)
     if isinstance(found, str):
-        return _no_map(log), np.empty((0, 3)), landmark, (0, np.nan, np.nan, np.nan, found)
+        return None, np.empty((0, 3)), landmark, (0, np.nan, np.nan, np.nan, found)
     ended = (found.n_steps, *found.tails, found.observation_level, "")
     made = smoothed_map(log, found, attitude=attitude)
     return made, found.estimate.path, found.landmark, ended
@@ -154,40 +162,39 @@ def _smoothed(
     try:
         return smooth(log, landmark, path, settings.smoother)
     except np.linalg.LinAlgError:
-        return "its covariances are of sizes too different to be computed with"
-
-
-def _no_map(log: RobotLog) -> LandmarkMap:
-    none = np.empty((0, 3))
-    counts, sources = np.empty(0, dtype=np.int32), np.empty(0, dtype=np.int64)
-    return LandmarkMap(
-        none, np.empty((0, 3, 3)), counts, sources, None, None, log.planar, log.robot
-    )
+        return "has covariances of sizes too different to be computed with"
 
 
 def map_files(folder: Path, iteration: int) -> list[Path]:
-    """The files of the map at an iteration: the map, and what lies beside it."""
-    return [folder / name.format(part=iteration) for name in WRITES[:-2]]
+    """The files of the map at an iteration that has one: the map, and what lies beside it."""
+    return [folder / name.format(part=iteration) for name in _MAP_FILES]
 
 
 def _map_path(folder: Path, part: str) -> Path:
-    return folder / WRITES[0].format(part=part)
+    return folder / _MAP_FILES[0].format(part=part)
 
 
 def _parted_path(folder: Path, part: str) -> Path:
-    return folder / WRITES[-2].format(part=part)
+    return folder / WRITES[0].format(part=part)
 
 
 def _path_path(folder: Path, part: str) -> Path:
-    return folder / WRITES[-1].format(part=part)
+    return folder / WRITES[1].format(part=part)
 
 
 def read_smoothed(folder: Path, last_whole: bool = False) -> dict[int, LandmarkMap]:
     """The robot's smoothed map, with its joint covariance, at each iteration that has one.
 
     If `last_whole` only the last one has that, and viewing evidence: it is most of what is read.
+
+    Raises:
+        DamagedFileError: a file of a map is damaged or missing.
     """
     known = list(read_smoothed_path(folder))
+    for k in known:
+        for file in map_files(folder, k):
+            if not file.is_file():
+                raise DamagedFileError(file, "is missing")
     alone = known[:-1] if last_whole else ()
     return {k: read_map(_map_path(folder, str(k)), alone=k in alone) for k in known}
 
@@ -229,6 +236,6 @@ def read_endings(folder: Path) -> pd.DataFrame:
 
 
 def _iterations(folder: Path) -> list[int]:
-    begin, _, end = WRITES[-1].partition("{part}")
+    begin, _, end = WRITES[1].partition("{part}")
     files = (path.name for path in folder.glob(f"{begin}[0-9]*{end}"))
     return sorted(int(name.removeprefix(begin).removesuffix(end)) for name in files)

@@ -91,7 +91,7 @@ def _print_fusers(rows: pd.DataFrame) -> None:
     last = last_fused(rows)
     print_frame(last, shown, "Fusers: maps of all robots together, at the end", note)
     reasons = last[["fuser", "fallback"]].itertuples(index=False)
-    print_lines(f"  {fuser} fell back on a simpler fuser: {why}" for fuser, why in reasons if why)
+    print_lines(f"  {fuser}: {why}" for fuser, why in reasons if why)
 
 
 def _print_team_pairs(pairs: pd.DataFrame) -> None:

@@ -26,7 +26,7 @@ _KEYS = {"scenario": TEXT, "seed": INT, "n_robots": INT, "strategy": TEXT, "iter
 # One row a strategy and iteration; the same, bit for bit, in every run. first_shared: the first
 # evaluated iteration at which two maps have common ground, -1 for never; n_merged: robots whose
 # maps became one. Errors are of that map and of these robots' paths, NaN where nothing was merged;
-# fallback: why it is by a simpler fuser (else empty). sent: by all robots; most_sent: by one.
+# fallback: as in the table `fusers` (else empty). sent: by all robots; most_sent: by one.
 TEAMS = schema(
     "independence.teams",
     1,

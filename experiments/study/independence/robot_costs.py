@@ -112,15 +112,19 @@ def _smooth_at(settings: SmoothSettings, job: Job, log: RobotLog, iteration: int
 
 
 def _sent(filtered: _Filtered, log: RobotLog, smoothed: Path) -> Iterator[dict[str, Any]]:
-    """Rows of `SENT` at an iteration: the sizes of the files that would be sent."""
+    """Rows of `SENT` at an iteration: the sizes of the files that would be sent.
+
+    A robot whose log is not smoothed until then sends the filter's map instead.
+    """
     k = filtered.iteration
     with tempfile.TemporaryDirectory() as place:
         own_map, own_log = Path(place) / "map", Path(place) / "log"
         write_map(own_map / "map.parquet", filtered.landmarks)
         write_log(own_log, smooth.log_until(log, k))
+        has_map = k in smooth.read_smoothed_path(smoothed)
         files = {
             FILTER_MAP: own_map.iterdir(),
-            SMOOTHED_MAP: smooth.map_files(smoothed, k),
+            SMOOTHED_MAP: smooth.map_files(smoothed, k) if has_map else own_map.iterdir(),
             LOG: own_log.iterdir(),
         }
         for what, own in files.items():

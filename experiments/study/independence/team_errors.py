@@ -58,7 +58,7 @@ def error_rows(team: RecordedTeam) -> Iterator[dict[str, Any]]:
 def _errors(fusion: JudgedFusion, known: _Known, anew: _Paths) -> dict[str, Any]:
     """One fused map's; paths in its frame, where its fuser found them anew, are taken first."""
     fused = fusion.fusion
-    row = {"n_merged": len(fused.members), "fallback": fused.fallback}
+    row = {"n_merged": len(fused.members), "fallback": fusion.fallback}
     if len(fused.members) < 2:
         return row
     fit, paths = fusion.fit, []

@@ -1,0 +1,93 @@
+"""Drives of generated scenarios: which seeds give a world that robots do not get through.
+
+    python -m tests.benchmarks.generated_drives --seeds 0..199 --jobs 2
+    python -m tests.benchmarks.generated_drives --seeds 0..199 --robots 4 --wheels-alone
+
+Every generated scenario of `scenarios/` is driven with each seed, and nothing else is done with it.
+With `--wheels-alone` robots go as their wheels turn, without physics, which takes a tenth of the
+time. Prints a line for each seed that fails, then a line for each scenario: how many drives there
+were, how many had to begin anew because robots waited for each other, how many asked for a world
+that cannot be drawn, and how many failed. Exit code 1 if one failed.
+"""
+
+import argparse
+import itertools
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import nullcontext
+from functools import partial
+from pathlib import Path
+from typing import cast
+from unittest.mock import patch
+
+from experiments.methods.threads import single_threaded
+from experiments.run.pipeline import lay_out
+from experiments.run.stages import drive
+from experiments.scenario.loading import load_scenario
+from experiments.scenario.seeds import parse_seeds
+from mapfusion.errors import InputError
+from sim.right_of_way import hold_for
+from tests.benchmarks.generated_runs import REPOSITORY, generated_scenarios
+from tests.helpers.wheels_alone import wheels_alone
+
+REFUSED, DRIVEN = "cannot be drawn", "driven"
+
+
+def outcome(
+    asked: tuple[Path, int], overrides: Sequence[str], without_physics: bool
+) -> tuple[str, int]:
+    """`DRIVEN`, or why not, and how often the drive began anew, of one scenario and seed."""
+    path, seed = asked
+    try:
+        scenario = load_scenario(REPOSITORY / path, overrides, seed)
+    except InputError:
+        return REFUSED, 0
+    (stage,) = (each for each in lay_out(scenario).stages() if each.name == "drive")
+    settings = cast(drive.DriveSettings, stage.settings)
+    with (
+        wheels_alone() if without_physics else nullcontext(),
+        patch("sim.driver.hold_for", side_effect=hold_for) as asked_for,
+    ):
+        try:
+            drive.driven(settings)
+        except InputError as error:
+            return str(error), asked_for.call_count
+    return DRIVEN, asked_for.call_count
+
+
+def _say(line: str) -> None:
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
+def main() -> None:
+    """Drive them all; print what fails, then the counts."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--seeds", default="0..199", help="A number, a range or a list.")
+    parser.add_argument("--robots", type=int, help="In place of each scenario's own number.")
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--wheels-alone", action="store_true", help="Without physics.")
+    asked = parser.parse_args()
+    overrides = [] if asked.robots is None else [f"generate.robots={asked.robots}"]
+    runs = list(itertools.product(generated_scenarios(), parse_seeds(asked.seeds)))
+    drive_one = partial(outcome, overrides=overrides, without_physics=asked.wheels_alone)
+    counts: dict[str, Counter[str]] = {}
+    with ProcessPoolExecutor(asked.jobs, initializer=single_threaded) as pool:
+        for (path, seed), (how, n_anew) in zip(runs, pool.map(drive_one, runs), strict=True):
+            known = how in (DRIVEN, REFUSED)
+            if not known:
+                _say(f"{path.stem}, seed {seed}: {how}")
+            found = counts.setdefault(path.stem, Counter())
+            found.update({how if known else "failed": 1, "began anew": n_anew > 0})
+    for name, found in counts.items():
+        told = (DRIVEN, "began anew", REFUSED, "failed")
+        _say(f"{name}: {', '.join(f'{found[each]} {each}' for each in told)}")
+    sys.exit(1 if any(found["failed"] for found in counts.values()) else 0)
+
+
+if __name__ == "__main__":
+    main()
