@@ -11,7 +11,7 @@ from mapfusion.joint_covariance import SharedErrors
 from mapfusion.one_thread import one_blas_thread
 from mapfusion.robot_log import RobotLog
 from mapfusion.se2 import Float, between
-from mapfusion.smoother.elimination import shared_errors
+from mapfusion.smoother.elimination import require_memory, shared_errors
 from mapfusion.smoother.levels import AS_STATED, Levels, settled_with_levels
 from mapfusion.smoother.normal_equations import (
     Estimate,
@@ -127,7 +127,11 @@ class Smoothed:
 
 @one_blas_thread
 def smooth(
-    log: RobotLog, landmark: np.ndarray, path: Float, parameters: SmootherParameters
+    log: RobotLog,
+    landmark: np.ndarray,
+    path: Float,
+    parameters: SmootherParameters,
+    max_memory_gb: float = np.inf,
 ) -> Smoothed:
     """The most probable path and landmarks.
 
@@ -138,15 +142,21 @@ def smooth(
         landmark: (N,) which landmark each observation is of, negative for none.
         path: (T, 3) where to start from; its first pose is the map's frame.
         parameters: settings.
+        max_memory_gb: smoothing is refused where it may take more.
 
     Raises:
+        LinAlgError: the equations cannot be solved.
+        MemoryError: it may take more than `max_memory_gb`.
         ValueError: shapes that do not fit.
     """
     require_shape("path", path, (len(log), 3))
     information, path = parameters.odometry_information(log), between(path[0], path)
     known = _problem(log, landmark, parameters, information)
+    require_memory(known.seen, max_memory_gb)
     first = _without_gross(known, path)
     start, path = (first.estimate, first.weights, first.tails), first.estimate.path
+    n_steps = first.n_steps
+    del first  # its factor takes as much memory as all else
     parts = parted(known.seen, landmark, path, parameters.stray_m)
     if not np.array_equal(parts, landmark):
         known = _problem(log, parts, parameters, information)
@@ -162,7 +172,7 @@ def smooth(
     else:  # odometry that pictures told is used where these say nothing: they tell no level
         at, weights, tails = start
         end, levels = settled(known, at, weights=weights, tails=tails), AS_STATED
-    return Smoothed.of(end, parts, levels, first.n_steps)
+    return Smoothed.of(end, parts, levels, n_steps)
 
 
 def _without_gross(problem: Problem, path: Float) -> Settled:
