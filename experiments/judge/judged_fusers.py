@@ -68,7 +68,7 @@ class GivenMap:
         if smoothed is None:
             return cls(robot, *filtered, *filtered)
         at, why = smoothed.given_at(k)
-        fallback = f"{robot.name} is not smoothed: it {why}" if why else ""
+        fallback = f"{robot.name} is not smoothed: {why}" if why else ""
         if at is None:
             return cls(robot, *filtered, *filtered, fallback)
         return cls(robot, smoothed.maps[at], smoothed.points_world_m[at], *filtered, fallback)

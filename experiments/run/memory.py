@@ -38,8 +38,6 @@ _PIXEL_BYTES = 100
 _TEXEL_BYTES, _PAINTED_BYTES = 4, 20
 # A landmark of an evaluated map is a row of twelve numbers, and there once more when it is written.
 _EVALUATED_BYTES = 2 * 12 * 8
-# Of each two frames: a pose's three coordinates with another's, in three matrices of the smoother.
-_SMOOTHED_BYTES = 3 * 3**2 * 8
 _CGROUP_LIMITS = ("memory.max", "memory/memory.limit_in_bytes")  # of version 2 and 1
 
 
@@ -69,15 +67,14 @@ def require_memory(pipeline: Pipeline, jobs: int, machine_bytes: float | None = 
 
 
 def needs(pipeline: Pipeline) -> Iterator[Need]:
-    """What the tasks that need most of a process need."""
-    scenario, bytes_given = pipeline.scenario, pipeline.scenario.smooth.max_memory_gb * _GB
+    """Yield what the tasks that need most of a process need.
+
+    The smoother is not among them: its need depends on what was seen. It is bounded when the log is
+    there, by `smooth.max_memory_gb` (`mapfusion.smoother.elimination.memory_bytes`).
+    """
+    scenario = pipeline.scenario
     for robot in pipeline.robots:
         yield from _of_filter(scenario, robot)
-        yield Need(
-            min(bytes_given, _SMOOTHED_BYTES * robot.n_frames**2),
-            "smooth.max_memory_gb",
-            f"smoothing {robot.n_frames} frames may",
-        )
     if isinstance(scenario, Simulation):
         camera = scenario.camera
         pixels = camera.width_px * camera.height_px

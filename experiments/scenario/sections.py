@@ -199,8 +199,9 @@ class Smooth(Section):
             a wall, it is larger. Tracks that the filter took for one landmark and that lie farther
             apart are parted. The filter's own (`slam.filter.stray_m`) is larger: along its path
             they cannot be told apart.
-        max_memory_gb: of its matrices, which grow with the square of the log: a robot is not
-            smoothed beyond the iteration where they would take more; 0 for no robot at all.
+        max_memory_gb: of one robot's smoothing. It grows with the log, and with how much of it saw
+            the same places. A robot is not smoothed beyond the iteration where it may take more; 0
+            for no robot at all.
     """
 
     stray_m: Annotated[float, Range(0, 10, "m")] = STRAY_M

@@ -1,8 +1,8 @@
 """The normal equations solved: landmarks and their tracks are eliminated first, or all poses.
 
-Both are exact. With the landmarks gone a dense system of the poses is left; with the poses gone,
-which are a chain, one of the landmarks and tracks: the smaller of the two is taken. The first pose
-is the frame and no unknown.
+Both are exact. With the landmarks gone a sparse system of the poses is left; with the poses gone,
+which are a chain, a dense one of the landmarks and tracks. The one that takes fewer products is
+solved. The first pose is the frame and no unknown.
 """
 
 from typing import NamedTuple
@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
-from mapfusion.joint_covariance import KnownErrors, SharedErrors
+from mapfusion.joint_covariance import RANK, KnownErrors, SharedErrors
 from mapfusion.se2 import Float
 from mapfusion.smoother.landmark_elimination import along_way
 from mapfusion.smoother.normal_equations import Estimate, NormalEquations, Weights, point_equations
@@ -20,8 +20,14 @@ from mapfusion.smoother.reduced_poses import ReducedPoses
 from mapfusion.smoother.sightings import Sightings
 from mapfusion.smoother.skyline import Envelope, Factor, factor_in_envelope
 
+_GB = 1e9
 _ITEM = np.dtype(np.float64).itemsize
-_COPIES = 3  # of a matrix that are there at once: as it is made, in LAPACK's order, and solved
+# Arrays that are there at once. In the envelope: the factor of a step before with its inverse and
+# its copy in single precision, and those of the next. Of points: blocks with the poses as they are
+# made, in rows, solved, and LAPACK's copies; and the points' own.
+_FACTORS, _WIDE, _SQUARE = 5.5, 5.0, 6.0
+_BLOCK, _BLOCKS = 9, 12  # entries of a block of three by three; blocks of a pose, sighting, track
+_CONDENSED = 6.0  # arrays of the map's shared directions
 _BAND = 5  # below the diagonal of a chain of poses of three coordinates
 
 
@@ -57,7 +63,7 @@ def solve(seen: Sightings, equations: NormalEquations, nearby: Factor | None = N
         equations: what they say.
         nearby: factor that was found for the same observations at a step before.
     """
-    if _is_landmarks_first(seen, len(equations.pose_block)):
+    if _is_landmarks_first(seen):
         return _landmarks_first(seen, equations, nearby)
     return _poses_first(seen, equations)
 
@@ -80,17 +86,32 @@ def solve_points(
     return Estimate(np.zeros_like(at.path), *moved), known_points(seen, left)
 
 
-def matrix_bytes(seen: Sightings, n_poses: int) -> int:
-    """Memory that the dense matrices take at most, in bytes: grows as the square of the log."""
-    if _is_landmarks_first(seen, n_poses):  # the last factor, then a system or what is shared
-        n, n_landmarks = 3 * n_poses, 3 * seen.n_landmarks
-        return _ITEM * n * (2 * n + max(n, n_landmarks))
-    n = 3 * _n_points(seen)
-    return _ITEM * _COPIES * n * (n + 3 * n_poses)
+def memory_bytes(seen: Sightings) -> float:
+    """Return an upper bound of the memory that smoothing these observations takes, in bytes.
+
+    It counts what is there at once when most is: the matrices of `solve` and of the covariances,
+    the observations' and tracks' blocks, and the map's joint covariance.
+    """
+    n_poses, n_landmarks = 3 * seen.order.n_poses, 3 * seen.n_landmarks
+    if _is_landmarks_first(seen):
+        entries, n_shared = _FACTORS * int(seen.order.envelope.offset[-1]), n_poses
+    else:
+        n = 3 * _n_points(seen)
+        entries, n_shared = n * (_WIDE * n_poses + _SQUARE * n), n_landmarks
+    blocks = len(seen) + len(seen.strays) + seen.order.n_poses
+    condensed = min(RANK, n_shared) * (n_shared + n_landmarks)
+    return _ITEM * (entries + _BLOCK * _BLOCKS * blocks + _CONDENSED * condensed)
 
 
-def _is_landmarks_first(seen: Sightings, n_poses: int) -> bool:
-    return n_poses - 1 < _n_points(seen)
+def require_memory(seen: Sightings, max_memory_gb: float) -> None:
+    """Raise MemoryError if smoothing these observations may take more."""
+    needed_gb = memory_bytes(seen) / _GB
+    if needed_gb > max_memory_gb:
+        raise MemoryError(f"may take {needed_gb:.2g} GB, more than it is given")
+
+
+def _is_landmarks_first(seen: Sightings) -> bool:
+    return seen.order.is_sparser_than(_n_points(seen))
 
 
 def _n_points(seen: Sightings) -> int:

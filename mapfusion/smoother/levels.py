@@ -56,18 +56,23 @@ AS_STATED = Levels(np.ones(3), 1.0)
 
 
 def settled_with_levels(
-    problem: Problem, at: Estimate, weights: Weights | None = None, tails: Tails = NO_TAILS
+    problem: Problem,
+    at: Estimate,
+    weights: Weights | None = None,
+    tails: Tails = NO_TAILS,
+    odometry: Float = AS_STATED.odometry,
 ) -> tuple[Settled, Levels]:
     """Where steps end under the levels that the log tells, for the rest as `settled`.
 
     The observations' costs little to tell and follows each step, as the tails do. The odometry's
     takes the variances of what was found: these are told once steps are near their end, levels
     follow each step from there on, and where steps end it shows whether they are right. The factor
-    and its inverse that this takes are those of the covariances.
+    and its inverse that this takes are those of the covariances. `odometry` (3,) are its levels to
+    begin with.
     """
     weights = unweighted(problem.seen) if weights is None else weights
-    levels = AS_STATED._replace(observation=first_observation_level(problem, at, weights, tails))
-    told, untold, known, before, n_steps = [AS_STATED.odometry], None, False, None, 0
+    levels = Levels(odometry, first_observation_level(problem, at, weights, tails))
+    told, untold, known, before, n_steps = [odometry], None, False, None, 0
     stretch = 1.0  # of the step before: that the one after a stretched one is short, tells no end
     under = _under(problem, levels, problem.seen.on_level(levels.observation))
     at, weights, tails = followed(under, at, weights, tails)

@@ -17,13 +17,15 @@ import numpy as np
 from mapfusion.se2 import Float
 from mapfusion.smoother.elimination import solve_points
 from mapfusion.smoother.normal_equations import Estimate, Weights
-from mapfusion.smoother.odometry_levels import LEAST_TOLD
 from mapfusion.smoother.residuals import squared_distances, squares_of_points
 from mapfusion.smoother.robust import Tails
 from mapfusion.smoother.settle import Problem, Settled
 from mapfusion.smoother.sightings import Sightings
 from mapfusion.smoother.student import fitted_dof, student_weights
 
+# Coordinates that have to be told before a level is taken from them: a standard deviation is then
+# known to a tenth of itself, 1 / sqrt(2 n).
+LEAST_TOLD = 50.0
 # Observations that agree to the last digit, as simulated without noise, have a level of zero. None
 # is taken to be closer, in m, than this: a tenth of what holds a robot that stands still.
 _LEAST_M = 1e-5

@@ -23,12 +23,10 @@ from scipy.optimize import brentq
 
 from mapfusion.se2 import Float
 from mapfusion.smoother.motion_posterior import disturbance_variances
+from mapfusion.smoother.noise_levels import LEAST_TOLD
 from mapfusion.smoother.normal_equations import disturbances, information_under, least_levels
 from mapfusion.smoother.settle import Problem, Settled
 
-# Disturbances that have to be told before a level is taken from them: a standard deviation is then
-# known to a tenth of itself, 1 / sqrt(2 n). Of fewer, covariances would be as uncertain as levels.
-LEAST_TOLD = 50.0
 _NONE_TOLD = 1e-9  # disturbances; fewer are none, but for rounding
 _LEVEL_TO = 1e-6  # share of itself that a level is solved to, far below its own error
 

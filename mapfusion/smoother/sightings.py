@@ -42,6 +42,32 @@ class PoseOrder:
         chosen = (self.landmark[later], self.frame[later] - 1, self.place[1:] - 1)
         return Envelope(np.repeat(3 * first_entries(*chosen), 3))
 
+    def is_sparser_than(self, n_points: int) -> bool:
+        """Return True if a factor of the poses takes fewer products than one of `n_points` points.
+
+        These are multiplications of floating-point numbers: the poses' factor takes half the
+        squares of its rows' lengths, the points' a product with all poses and a dense factor.
+        """
+        n_rows, n = 3 * self.n_poses, 3 * n_points
+        of_points = n_rows * n**2 + n**3 / 6
+        return self._least_products < of_points and self._products < of_points
+
+    @cached_property
+    def _products(self) -> float:
+        """Of the poses' factor."""
+        lengths = np.arange(len(self.envelope)) - self.envelope.first
+        return float(np.sum(lengths.astype(np.float64) ** 2) / 2)
+
+    @cached_property
+    def _least_products(self) -> float:
+        """Of the poses' factor whatever the order: the poses of one landmark are all related.
+
+        Where this is too much already, no order has to be found.
+        """
+        pairs = np.unique(self.landmark * np.int64(self.n_poses) + self.frame)
+        most = np.bincount(pairs // self.n_poses).max(initial=0)
+        return (3.0 * most) ** 3 / 6
+
 
 @dataclass(frozen=True)
 class Sightings:

@@ -11,12 +11,13 @@ from mapfusion.joint_covariance import SharedErrors
 from mapfusion.one_thread import one_blas_thread
 from mapfusion.robot_log import RobotLog
 from mapfusion.se2 import Float, between
-from mapfusion.smoother.elimination import shared_errors
+from mapfusion.smoother.elimination import require_memory, shared_errors
 from mapfusion.smoother.levels import AS_STATED, Levels, settled_with_levels
 from mapfusion.smoother.normal_equations import (
     Estimate,
     Weights,
     information_of,
+    information_under,
     odometry_information,
 )
 from mapfusion.smoother.one_corner import parted
@@ -24,12 +25,16 @@ from mapfusion.smoother.residuals import first_points
 from mapfusion.smoother.robust import Tails
 from mapfusion.smoother.settle import Problem, Settled, finished, followed, settled
 from mapfusion.smoother.sightings import Sightings, sightings_of
+from mapfusion.smoother.student import MOST_DOF
 from mapfusion.stray import STRAY_M
 
 # Factor on the observations' standard deviations in a first round (graduated non-convexity): where
 # the path to start from is far off, most observations look gross and lose the weight to mend it.
 # It need not end closer than this, in squared sigmas a coordinate, to where the next one goes on.
 _THOUGHT_WORSE, _CLOSE = 4.0, 3e-2
+# Where odometry is this many times worse than stated (level of its variances), observations that
+# contradict it look gross before the level is known. They are then judged anew, under the level.
+_FAR_WORSE = 4.0
 # Of a motion that nothing but observations tells: what a robot does between frames is less.
 _UNTOLD_M, _UNTOLD_RAD = 10.0, 1.0
 _LEAST_SEEN = 3  # observations that fix a pose, with one to spare
@@ -122,7 +127,11 @@ class Smoothed:
 
 @one_blas_thread
 def smooth(
-    log: RobotLog, landmark: np.ndarray, path: Float, parameters: SmootherParameters
+    log: RobotLog,
+    landmark: np.ndarray,
+    path: Float,
+    parameters: SmootherParameters,
+    max_memory_gb: float = np.inf,
 ) -> Smoothed:
     """The most probable path and landmarks.
 
@@ -133,27 +142,45 @@ def smooth(
         landmark: (N,) which landmark each observation is of, negative for none.
         path: (T, 3) where to start from; its first pose is the map's frame.
         parameters: settings.
+        max_memory_gb: smoothing is refused where it may take more.
 
     Raises:
+        LinAlgError: the equations cannot be solved.
+        MemoryError: it may take more than `max_memory_gb`.
         ValueError: shapes that do not fit.
     """
     require_shape("path", path, (len(log), 3))
     information, path = parameters.odometry_information(log), between(path[0], path)
     known = _problem(log, landmark, parameters, information)
-    worse = replace(known.seen, information=known.seen.information / _THOUGHT_WORSE**2)
-    blurred = known._replace(seen=worse)
-    first = finished(blurred, settled(blurred, _start(known, path), _CLOSE))
+    require_memory(known.seen, max_memory_gb)
+    first = _without_gross(known, path)
     start, path = (first.estimate, first.weights, first.tails), first.estimate.path
+    n_steps = first.n_steps
+    del first  # its factor takes as much memory as all else
     parts = parted(known.seen, landmark, path, parameters.stray_m)
     if not np.array_equal(parts, landmark):
         known = _problem(log, parts, parameters, information)
         start = followed(known, _start(known, path))
     if parameters.odometry_covariance is None:
         end, levels = settled_with_levels(known, *start)
+        if levels.odometry.max() > _FAR_WORSE and end.tails.observation < MOST_DOF:
+            odometry = levels.odometry
+            under = known._replace(information=information_under(information, odometry))
+            again = _without_gross(under, end.estimate.path)
+            start = again.estimate, again.weights, again.tails
+            end, levels = settled_with_levels(known, *start, odometry)
     else:  # odometry that pictures told is used where these say nothing: they tell no level
         at, weights, tails = start
         end, levels = settled(known, at, weights=weights, tails=tails), AS_STATED
-    return Smoothed.of(end, parts, levels, first.n_steps)
+    return Smoothed.of(end, parts, levels, n_steps)
+
+
+def _without_gross(problem: Problem, path: Float) -> Settled:
+    """Take the steps of a first round, in which observations are thought worse than stated."""
+    seen = problem.seen
+    worse = replace(seen, information=seen.information / _THOUGHT_WORSE**2)
+    blurred = problem._replace(seen=worse)
+    return finished(blurred, settled(blurred, _start(problem, path), _CLOSE))
 
 
 def _problem(

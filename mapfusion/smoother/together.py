@@ -12,7 +12,7 @@ import numpy as np
 
 from mapfusion.robot_log import NO_TRACK, Observations, RobotLog
 from mapfusion.se2 import IDENTITY, Float, between, compose
-from mapfusion.smoother.elimination import matrix_bytes, pose_covariances
+from mapfusion.smoother.elimination import pose_covariances, require_memory
 from mapfusion.smoother.levels import AS_STATED, settled_with_levels
 from mapfusion.smoother.normal_equations import Estimate
 from mapfusion.smoother.recording import Recording
@@ -22,7 +22,6 @@ from mapfusion.smoother.sightings import sightings_of
 from mapfusion.smoother.smooth import Smoothed
 
 _NOTHING = np.zeros((1, 3))  # what odometry says of the way from one robot's end to another's start
-_GB = 1e9
 
 
 @dataclass(frozen=True)
@@ -59,18 +58,16 @@ def smooth_together(
         points: of each, (N_k,) which point each observation is of, whoever saw it; negative for
             none.
         T_first_robot: (K, 3) where the robots' frames lie in the first one's, to start from.
-        max_memory_gb: of the matrices.
+        max_memory_gb: smoothing is refused where it may take more.
 
     Raises:
         LinAlgError: nothing says where a robot is.
-        MemoryError: they would take more.
+        MemoryError: it may take more than `max_memory_gb`.
     """
     log, point = _one_log([each.log for each in recordings]), np.concatenate(points)
     stray_information = recordings[0].parameters.stray_information
     seen = sightings_of(log, point, min_count=1, stray=stray_information > 0)
-    needed_gb = matrix_bytes(seen, len(log)) / _GB
-    if needed_gb > max_memory_gb:
-        raise MemoryError(f"takes {needed_gb:.1f} GB, allowed are {max_memory_gb:g}")
+    require_memory(seen, max_memory_gb)
     starts = np.cumsum([0, *(len(each.log) for each in recordings[:-1])])
     path = np.concatenate(
         [

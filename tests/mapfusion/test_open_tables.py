@@ -145,10 +145,10 @@ def test_heights_of_another_name_make_no_map_planar(tmp_path, rng, name):
 @pytest.mark.parametrize(
     ("cell", "said"),
     [
-        ("inf", "column x_m is inf in row 3"),
-        ("NA", "column x_m is nan in row 3"),
+        ("inf", "column x_m: is inf in row 3"),
+        ("NA", "column x_m: is nan in row 3"),
         ("near", "column x_m holds 'near' in row 3, expected a number"),
-        ("1e400", "column x_m is inf in row 3"),
+        ("1e400", "column x_m: is inf in row 3"),
         (2**64, "position_m: above 1e[+]07 m in row 3"),
     ],
 )

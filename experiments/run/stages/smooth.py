@@ -23,8 +23,6 @@ from mapfusion.log_part import first_frames
 from mapfusion.odometry_covariance import read_odometry_covariance
 from mapfusion.robot_log import RobotLog
 from mapfusion.se2 import Float
-from mapfusion.smoother.elimination import matrix_bytes
-from mapfusion.smoother.sightings import sightings_of
 from mapfusion.smoother.smooth import Smoothed, SmootherParameters, smooth
 from mapfusion.smoother.smoothed_map import smoothed_map
 from mapfusion.storage import (
@@ -154,15 +152,13 @@ def smoothed_anew(
 def _smoothed(
     log: RobotLog, landmark: np.ndarray, path: Float, settings: SmoothSettings
 ) -> Smoothed | str:
-    """What the smoother finds, or why it cannot."""
-    least, stray = settings.smoother.min_count, settings.smoother.stray_m > 0
-    needed_gb = matrix_bytes(sightings_of(log, landmark, least, stray=stray), len(log)) / _GB
-    if needed_gb > settings.max_memory_gb:
-        return f"takes {needed_gb:.1f} GB, smooth.max_memory_gb is {settings.max_memory_gb:g}"
+    """Return what the smoother finds, or why it finds nothing and what can be done."""
     try:
-        return smooth(log, landmark, path, settings.smoother)
-    except np.linalg.LinAlgError:
-        return "has covariances of sizes too different to be computed with"
+        return smooth(log, landmark, path, settings.smoother, settings.max_memory_gb)
+    except MemoryError as error:
+        return f"smoothing {error}: smooth.max_memory_gb is {settings.max_memory_gb:g}"
+    except np.linalg.LinAlgError as error:
+        return f"{error}; check the covariances of the log's observations"
 
 
 def map_files(folder: Path, iteration: int) -> list[Path]:

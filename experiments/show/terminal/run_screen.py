@@ -76,7 +76,7 @@ def _print_smoother(rows: pd.DataFrame) -> None:
         note = f"paths from the start; landmarks fitted, without gross ones (over {GROSS_M} m)"
         print_frame(smoothed, shown, "Batch smoother: what the filter loses against it", note)
     reasons = rows[["robot", "not_smoothed"]].itertuples(index=False)
-    print_lines(f"  {robot} is not smoothed: it {why}" for robot, why in reasons if why)
+    print_lines(f"  {robot} is not smoothed: {why}" for robot, why in reasons if why)
 
 
 def _print_fusers(rows: pd.DataFrame) -> None:
