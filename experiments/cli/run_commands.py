@@ -39,6 +39,7 @@ def run(
         several = f"is one folder for {len(checked)} runs; give --results"
         raise InputError(f"--output {output}: {several}")
     # What draws takes time to import: a scenario is refused before.
+    from experiments.judge.findings import finding_lines
     from experiments.judge.nothing_merged import nothing_merged
     from experiments.judge.result import run_scenario
     from experiments.run.workers import make_ready, workers
@@ -52,6 +53,8 @@ def run(
             folder = run_scenario(loaded, results, jobs, show, fresh, output, drawing.written)
             drawn = drawing.finish(folder, partial(show, _DRAWING))
         run_screen.print_result(folder, drawn.skipped)
+        for line in finding_lines(folder):
+            options.complain(f"warning: {line}")
         if nothing := nothing_merged(folder):
             options.complain(f"warning: {nothing.text}")
 
