@@ -18,8 +18,8 @@ The agreement of a stated motion u with an observed one m is, for shifts and tur
 
 1 where they are equal, 1 / s where one is s times the other, cos(phi) where they differ by an angle
 phi, and below 0 where they are opposed. Its median over a log does not follow single jumps and
-outliers. The upper end of a confidence interval of the median must lie below a limit before anything
-is said: sound logs are left alone however noisy or short they are.
+outliers. The upper end of a confidence interval of the median must lie below a limit before
+anything is said: sound logs are left alone however noisy or short they are.
 """
 
 import itertools
@@ -33,16 +33,16 @@ from mapfusion import se3
 from mapfusion.chi_square import chi_square_bound
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.looks import NO_LABEL
-from mapfusion.robot_log import NO_TRACK, Observations, RobotLog
-from mapfusion.se2 import Float, between, compose, inverse, rotation, wrap
+from mapfusion.robot_log import NO_TRACK, RobotLog
+from mapfusion.se2 import Float, between, inverse, rotation, wrap
 from mapfusion.vision.rigid_links import MIN_LINKS, RigidMotion, rigid_links
 
 # Probability that anything is said of a sound log.
 _FALSE_ALARM = 1e-3
-# Agreement below which motions contradict each other. Wheels that wear, slip or are badly calibrated
-# are off by a third of a distance at most (a P3-AT's track in simulation: 0.42 to 0.62 m, a third of
-# the angle); a factor of 1.43 or an angle of 45 degrees is something else. Turns of skid-steered
-# robots are known less well than distances: a factor of 2.
+# Agreement below which motions contradict each other. Wheels that wear, slip or are badly
+# calibrated are off by a third of a distance at most (a P3-AT's track in simulation: 0.42 to
+# 0.62 m, a third of the angle); a factor of 1.43 or an angle of 45 degrees is something else. Turns
+# of skid-steered robots are known less well than distances: a factor of 2.
 _LEAST_AGREEMENT = {"shift": 0.7, "turn": 0.5}
 # A motion counts where it is this many standard deviations of what is observed, or stated, above
 # zero: below, its direction is noise.
@@ -82,7 +82,7 @@ _STANDS_STILL = 0.02  # of the observed distance: stated distances that are none
 # observations whose covariances are in another unit still tell how the robot moved.
 _LEVELS, _TRIED_FRAMES = (1.0, 1e2, 1e4, 1e6), 40
 # Units that are taken for others: how many of them make a metre, and a radian.
-_UNITS_M = {1000.0: "millimetres", 100.0: "centimetres", 1 / 0.3048: "feet", 1e-3: "kilometres"}
+_UNITS_M = {1000.0: "millimetres", 100.0: "centimetres", 1 / 0.3048: "feet"}
 _DEGREES = 180 / np.pi
 _LIKE_A_UNIT = 0.15  # relative
 
@@ -356,7 +356,7 @@ class Agreement(NamedTuple):
         n: motions that are sure enough to count.
         median: of their agreement, -1 to 1; NaN where none counts.
         upper: end of the confidence interval of the median; infinite where too few count.
-        ratio: median of the stated length over the observed one; NaN where none is observed.
+        ratio: median of the stated length over the observed one; NaN where none counts.
     """
 
     n: int
@@ -370,9 +370,11 @@ def agreement(
 ) -> Agreement:
     """Compare stated vectors with observed ones.
 
-    The interval is that of the median of n values, with standard error sqrt(pi / 2) s / sqrt(n)
-    (s their spread by the median absolute deviation) and Student's quantile for n - 1 degrees of
-    freedom; s is at least what the observations' own errors make of it.
+    The interval of the median of n values is the better of two. One has the standard error
+    sqrt(pi / 2) s / sqrt(n), with s their spread by the median absolute deviation, and Student's
+    quantile for n - 1 degrees of freedom; s is at least what the observations' own errors make of
+    it. The other ends at the ordered value that the sign test leaves (binomial of n halves): it
+    holds for any distribution and needs a dozen values.
 
     Args:
         observed: (N, 3).
@@ -381,7 +383,7 @@ def agreement(
         sigma: (N,) of the differences of both.
         false_alarm: probability that the true median lies above the interval.
     """
-    from scipy.special import stdtrit
+    from scipy.special import bdtr, stdtrit
 
     lengths = np.stack([np.linalg.norm(values, axis=1) for values in (observed, stated)])
     sure = np.isfinite(lengths).all(axis=0) & (lengths > _SURE * sigma).any(axis=0)
@@ -395,11 +397,24 @@ def agreement(
     spread = max(spread, float(np.median(sigma_observed[sure] / longest)))
     upper = np.inf
     if n >= _LEAST_MOTIONS:
-        quantile = float(stdtrit(n - 1, 1 - false_alarm))
+        quantile = float(stdtrit(n - 1, 1 - false_alarm / 2))
         upper = middle + quantile * np.sqrt(np.pi / 2) * spread / np.sqrt(n)
-    seen = sure & (lengths[0] > _SURE * sigma_observed)
-    ratio = float(np.median(lengths[1, seen] / lengths[0, seen])) if seen.any() else np.nan
-    return Agreement(n, middle, upper, ratio)
+        n_above = int(np.searchsorted(bdtr(np.arange(n), n, 0.5), false_alarm / 2, side="right"))
+        if n_above:
+            upper = min(upper, float(np.sort(values)[n - n_above]))
+    return Agreement(n, middle, upper, _ratio(observed[sure], stated[sure]))
+
+
+def _ratio(observed: Float, stated: Float) -> float:
+    """Median length of stated vectors (N, 3) over that of the observed ones along them."""
+    square = np.sum(stated**2, axis=1)
+    if not np.median(square) > 0:
+        return 0.0
+    along = float(np.median(np.sum(observed * stated, axis=1)[square > 0] / square[square > 0]))
+    if along > 0:
+        return 1.0 / along
+    lengths = [float(np.median(np.linalg.norm(values, axis=1))) for values in (stated, observed)]
+    return lengths[0] / lengths[1] if lengths[1] > 0 else np.inf
 
 
 class Comparison(NamedTuple):
@@ -496,17 +511,23 @@ def likely_cause(
         What people would call it; of none that explains enough, that it is another log's.
     """
     sigma = Stated(mistakes[""], noise).sigma(observed)
-    still = compare(observed, Stated(mistakes[""], noise)).shift
-    if still.ratio < _STANDS_STILL:
-        return "it says that the robot stands still"
     best: _Cause | None = None
-    for cause in _causes(observed, mistakes, sigma):
-        if best is None or cause.comparison.worst > best.comparison.worst + _TIE:
-            best = cause
+    ways = list(itertools.product(_axes(), mistakes.items()))
+    for n_mistakes in range(3):  # the simplest explanation that is enough
+        several = [way for way in ways if bool(way[0][1]) + bool(way[1][0]) == n_mistakes]
+        for (axes, axes_text), (text, poses) in several:
+            told = ", and ".join(each for each in (text, axes_text) if each)
+            cause = _put_right(told, observed, axes, poses, sigma)
+            if best is None or cause.comparison.worst > best.comparison.worst + _TIE:
+                best = cause
+        if best is not None and best.comparison.worst >= _EXPLAINED:
+            break
     if best is None or best.comparison.worst < _EXPLAINED:
         late = _frames_late(observed, mistakes[""])
         if late:
             return f"its times look {abs(late)} frames too {'late' if late > 0 else 'early'}"
+        if compare(observed, Stated(mistakes[""], noise)).shift.ratio < _STANDS_STILL:
+            return "it says that the robot stands still"
         return "no common mistake explains it; is it of another run or robot?"
     units = _unit_text(best.ratio)
     return ", and ".join(text for text in (best.text, units) if text)
@@ -528,22 +549,20 @@ def _frames_late(observed: Motions, poses: Float) -> int:
     return late
 
 
-def _causes(observed: Motions, mistakes: Mapping[str, Float], sigma: Float) -> Iterator[_Cause]:
-    for axes, axes_text in _axes():
-        for text, poses in mistakes.items():
-            shift, turn = stated_motions(poses, observed.start, observed.end)
-            # a rotation vector of a frame with mirrored axes has the other sign, too
-            moved, turned = shift @ axes.T, np.linalg.det(axes) * turn @ axes.T
-            ratio = _compared(observed, moved, turned, sigma).shift.ratio
-            if not ratio > 0 or abs(np.log(ratio)) < np.log1p(_LIKE_A_UNIT):
-                ratio = 1.0
-            told = ", and ".join(each for each in (text, axes_text) if each)
-            yield _Cause(told, _compared(observed, moved / ratio, turned, sigma), ratio)
+def _put_right(text: str, observed: Motions, axes: Float, poses: Float, sigma: Float) -> _Cause:
+    """A cause with axes R_robot_stated (3, 3) and the unit put right."""
+    shift, turn = stated_motions(poses, observed.start, observed.end)
+    # a rotation vector of a frame with mirrored axes has the other sign, too
+    moved, turned = shift @ axes.T, np.linalg.det(axes) * turn @ axes.T
+    ratio = _compared(observed, moved, turned, sigma).shift.ratio
+    if not ratio > 0 or abs(np.log(ratio)) < np.log1p(_LIKE_A_UNIT):
+        ratio = 1.0
+    return _Cause(text, _compared(observed, moved / ratio, turned, sigma), ratio)
 
 
 def _axes() -> Iterator[tuple[Float, str]]:
     """R_robot_stated (3, 3) of all ways to name axes, the usual ones first, with their texts."""
-    named = {
+    named: dict[tuple[int, ...], str] = {
         (0, 1, 2, 1, 1, 1): "",
         (0, 1, 2, 1, -1, 1): "the heading has the other sign (clockwise, or y to the right)",
         (2, 0, 1, 1, -1, -1): "the axes are a camera's (z ahead, x right, y down)",
@@ -573,6 +592,8 @@ def _unit_text(ratio: float) -> str:
     for many, unit in _UNITS_M.items():
         if abs(np.log(ratio / many)) < np.log1p(_LIKE_A_UNIT):
             return f"{told}: {unit}?"
+        if abs(np.log(ratio * many)) < np.log1p(_LIKE_A_UNIT):
+            return f"{told}: are the observed ones {unit}?"
     return f"{told}: are unit, focal length and baseline right?"
 
 

@@ -29,7 +29,8 @@ def run(
 ) -> None:
     """Simulate, map, align, merge, evaluate and draw: `mapfusion run scenarios/quick.yaml`.
 
-    Finished stages are reused; an interrupted run goes on where it was.
+    Finished stages are reused; an interrupted run goes on where it was. Exit code 1 if no robot's
+    map can be used.
     """
     from experiments.judge.expectations import load_checked
     from experiments.scenario.suite import scenarios_of
@@ -39,7 +40,7 @@ def run(
         several = f"is one folder for {len(checked)} runs; give --results"
         raise InputError(f"--output {output}: {several}")
     # What draws takes time to import: a scenario is refused before.
-    from experiments.judge.findings import finding_lines
+    from experiments.judge.findings import finding_lines, has_usable_map
     from experiments.judge.nothing_merged import nothing_merged
     from experiments.judge.result import run_scenario
     from experiments.run.workers import make_ready, workers
@@ -47,6 +48,7 @@ def run(
     from experiments.show.terminal import layout, run_screen
 
     make_ready(jobs)
+    unusable = False
     for loaded in checked:
         with layout.progress() as show, workers(jobs) as pool:
             drawing = Drawing(pool)
@@ -57,6 +59,11 @@ def run(
             options.complain(f"warning: {line}")
         if nothing := nothing_merged(folder):
             options.complain(f"warning: {nothing.text}")
+        if not has_usable_map(folder):
+            options.complain(f"{folder}: no robot's map can be used: all are empty or contradicted")
+            unusable = True
+    if unusable:
+        raise typer.Exit(options.EXIT_FAILED)
 
 
 @app.command(rich_help_panel=options.LOOK)

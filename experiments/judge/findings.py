@@ -68,3 +68,12 @@ def finding_lines(result: Path) -> Iterator[str]:
 def lines_of(rows: pd.DataFrame) -> Iterator[str]:
     """A line for each row of the table `findings`."""
     yield from (f"{row.robot}: {row.finding}" for row in rows.itertuples(index=False))
+
+
+def has_usable_map(result: Path) -> bool:
+    """Whether a result folder holds landmarks of a robot whose observations agree with them."""
+    mapped, found = (
+        tables.read(tables.table_path(result, name), name) for name in ("landmarks", "findings")
+    )
+    contradicted = found.loc[found["check"] == "gate", "robot"]
+    return bool(set(mapped["robot"]) - set(contradicted))

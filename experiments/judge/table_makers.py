@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 
 from experiments.judge import fused_landmarks, tables
-from experiments.judge.fused_landmarks import FusedTeam
 from experiments.judge.findings import finding_rows
+from experiments.judge.fused_landmarks import FusedTeam
 from experiments.judge.fuser_coverage import coverage_rows
 from experiments.judge.judged_fusers import JudgedFusion, fuser_rows
 from experiments.judge.judged_run import JudgedRun

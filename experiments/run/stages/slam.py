@@ -50,8 +50,8 @@ POSES = schema("slam.poses", 1, [*_ITERATION, *float_fields(_ONLINE + _FINAL), *
 _PARTICLE = fields(iteration=INT, particle=INT)
 CLOUDS = schema("slam.clouds", 1, [*_PARTICLE, *float_fields([*POSE_FIELDS, "log_weight"])])
 # The most probable particle's path at each evaluated iteration, which its map was made along.
-# What a log says against itself (mapfusion/log_consistency.py): a line each, the iteration of a jump
-# or -1, and of jumps the motion that the observations show in place of the odometry.
+# What a log says against itself (mapfusion/log_consistency.py): a line each, the iteration of a
+# jump or -1, and of jumps the motion that the observations show in place of the odometry.
 _OBSERVED = [f"observed_{name}" for name in POSE_FIELDS]
 _OBSERVED_COVARIANCE = ["cov_xx", "cov_xy", "cov_xt", "cov_yy", "cov_yt", "cov_tt"]
 FINDINGS = schema(
@@ -176,7 +176,7 @@ def read_findings(slam: Path) -> pd.DataFrame:
 
 
 def log_as_filtered(log: Path, slam: Path) -> tuple[RobotLog, Float | None]:
-    """A log as the filter took it, without jumps, and what is known of its odometry's covariance."""
+    """A log as the filter took it, without jumps, and the covariance of its odometry if known."""
     table, _ = read_table(slam / WRITES[-1], FINDINGS)
     recorded = kept_log(log)
     observed, covariance = columns(table, _OBSERVED), covariances_from(table, _OBSERVED_COVARIANCE)
