@@ -29,7 +29,8 @@ def run(
 ) -> None:
     """Simulate, map, align, merge, evaluate and draw: `mapfusion run scenarios/quick.yaml`.
 
-    Finished stages are reused; an interrupted run goes on where it was.
+    Finished stages are reused; an interrupted run goes on where it was. Exit code 1 if no robot's
+    map can be used.
     """
     from experiments.cli.outputs import require_result_folder
     from experiments.judge.expectations import load_checked
@@ -41,6 +42,7 @@ def run(
         several = f"is one folder for {len(checked)} runs; give --results"
         raise InputError(f"--output {output}: {several}")
     # What draws takes time to import: a scenario is refused before.
+    from experiments.judge.findings import finding_lines, has_usable_map
     from experiments.judge.nothing_merged import nothing_merged
     from experiments.judge.result import run_scenario
     from experiments.run.workers import make_ready, workers
@@ -48,14 +50,22 @@ def run(
     from experiments.show.terminal import layout, run_screen
 
     make_ready(jobs)
+    unusable = False
     for loaded in checked:
         with layout.progress() as show, workers(jobs) as pool:
             drawing = Drawing(pool)
             folder = run_scenario(loaded, results, jobs, show, fresh, output, drawing.written)
             drawn = drawing.finish(folder, partial(show, _DRAWING))
         run_screen.print_result(folder, drawn.skipped)
+        for line in finding_lines(folder):
+            options.complain(f"warning: {line}")
         if nothing := nothing_merged(folder):
             options.complain(f"warning: {nothing.text}")
+        if not has_usable_map(folder):
+            options.complain(f"{folder}: no robot's map can be used: all are empty or contradicted")
+            unusable = True
+    if unusable:
+        raise typer.Exit(options.EXIT_FAILED)
 
 
 @app.command(rich_help_panel=options.LOOK)

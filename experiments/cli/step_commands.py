@@ -55,7 +55,10 @@ def slam(
     seed: options.Seed = None,
     as_json: options.AsJson = False,
 ) -> None:
-    """Build one robot's map from its log: `mapfusion slam logs/R1 -o R1.parquet`."""
+    """Build one robot's map from its log: `mapfusion slam logs/R1 -o R1.parquet`.
+
+    Exit code 1 if the map is empty or most of the log's observations contradict it.
+    """
     from experiments.cli.outputs import require_map_file
     from experiments.judge import user_files as single
     from experiments.scenario.suite import settings_of
@@ -65,12 +68,19 @@ def slam(
     require_map_file(output, [log, scenario])
     settings = settings_of(scenario, overrides, seed)
     with layout.progress() as show:
-        landmarks = single.slam(log, settings, show)
+        made = single.slam(log, settings, show)
+    landmarks = made.landmarks
     single.save_map(output, landmarks)
-    made = json_document.of_map(output, log, settings.seed, landmarks)
-    json_document.publish("slam", made, as_json)
+    told = json_document.of_map(output, log, settings.seed, landmarks, made.findings)
+    json_document.publish("slam", told, as_json)
     if not as_json:
         layout.print_lines([f"{len(landmarks)} landmarks of {landmarks.name} in {output}"])
+    for finding in made.findings:
+        if finding.kind != "gate":  # which makes the map unusable, see below
+            options.complain(f"warning: {log}: {finding.text}")
+    if made.unusable:
+        options.complain(f"{log}: {made.unusable}")
+        raise typer.Exit(options.EXIT_FAILED)
 
 
 @app.command(rich_help_panel=options.STEPS)

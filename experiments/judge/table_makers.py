@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.judge import fused_landmarks, tables
+from experiments.judge.findings import finding_rows
 from experiments.judge.fused_landmarks import FusedTeam
 from experiments.judge.fuser_coverage import coverage_rows
 from experiments.judge.judged_fusers import JudgedFusion, fuser_rows
@@ -96,6 +97,7 @@ def makers(run: JudgedRun, team: FusedTeam) -> dict[str, Maker]:
     of_all |= dict.fromkeys(judged, list) if run.no_truth else judged
     return of_all | {
         "frame_times": lambda: _frame_times(run),
+        "findings": lambda: finding_rows(run),
         "smoother": lambda: smoother_rows(smoothed()),
         "team_edges": lambda: fused_landmarks.team_edge_rows(team),
         "timings": lambda: [

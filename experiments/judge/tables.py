@@ -18,9 +18,9 @@ from mapfusion.storage import COVARIANCE_FIELDS, POSITION_FIELDS, schema
 
 # Names that are no floats.
 _NAMES = {
-    frames.TEXT: """acceptance_reason aligner delta_unit fallback fuser landmarks left_out map name
-        not_smoothed place quantity reason refined_reason refined_status robot robot_a robot_b
-        source stage status verdict""",
+    frames.TEXT: """acceptance_reason aligner check delta_unit fallback finding fuser landmarks
+        left_out map name not_smoothed place quantity reason refined_reason refined_status robot
+        robot_a robot_b source stage status verdict""",
     frames.INT: """component count degrees_of_freedom frame iteration landmark landmark_a landmark_b
         n n_common n_confirmed n_contradicted n_correspondences n_inliers n_landmarks n_parents
         n_robots n_steps n_team n_true particle repetition""",
@@ -73,6 +73,10 @@ _COLUMNS = {
         landmark_rmse_m gross_share filter_landmark_rmse_m filter_gross_share
         nees_per_dof marginal_nees_per_dof coverage_95
         n_steps observation_dof offset_dof observation_level not_smoothed""",
+    # What each robot's log says against itself, see mapfusion/log_consistency.py. check: odometry
+    # (as a whole), truth, jump (a single increment, which is not used) or gate (most observations
+    # fell outside that of their landmark); iteration: of a jump, else -1.
+    "findings": "robot check iteration finding",
     # The smoothed path, in the robot's own frame, up to each iteration that maps are fused at.
     "smoothed_paths": "robot iteration frame x_m y_m theta_rad",
     # Particles at the kept iterations, in the robot's own frame.

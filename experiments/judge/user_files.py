@@ -23,6 +23,7 @@ from mapfusion.fastslam.run import run_log
 from mapfusion.fuse.registry import make_fuser
 from mapfusion.fused_map import AlignedPair, Fusion
 from mapfusion.landmark_map import LandmarkMap, map_writes, read_map
+from mapfusion.log_consistency import Finding, check_log, gate_finding, without_jumps
 from mapfusion.merge import merge as merge_maps
 from mapfusion.name_order import name_order
 from mapfusion.odometry_covariance import read_odometry_covariance
@@ -55,19 +56,44 @@ def record(
     return [output / robot.name for robot in run.pipeline.robots]
 
 
-def slam(log: Path, settings: Scenario, on_progress: OnProgress) -> LandmarkMap:
+class MadeMap(NamedTuple):
+    """What became of one robot's log.
+
+    Attributes:
+        landmarks: the most probable map at its end.
+        findings: what the log says against itself.
+    """
+
+    landmarks: LandmarkMap
+    findings: tuple[Finding, ...]
+
+    @property
+    def unusable(self) -> str:
+        """Why nothing can be done with the map; empty where it can be used."""
+        if not len(self.landmarks):
+            return "the map is empty: no landmark was seen often enough where it was expected"
+        gate = [finding.text for finding in self.findings if finding.kind == "gate"]
+        return f"the map does not describe its log: {gate[0]}" if gate else ""
+
+
+def slam(log: Path, settings: Scenario, on_progress: OnProgress) -> MadeMap:
     """The most probable map at the end of a log, by a scenario's `slam` section and seed."""
     robot_log = read_log(log)
     if not len(robot_log):
         raise InputError(f"{log}: frames.parquet holds no frame")
     n_frames, rng = len(robot_log), generator(settings.seed, "slam", robot_log.robot)
-    wanted, least, landmarks = [n_frames - 1], settings.slam.min_count, None
-    told = read_odometry_covariance(log), read_attitude(log)
-    for frame in run_log(robot_log, settings.slam.filter, rng, wanted, least, *told):
+    found = check_log(robot_log, settings.slam.filter.motion)
+    own = without_jumps(robot_log, found.jumps, read_odometry_covariance(log))
+    wanted, least, made = [n_frames - 1], settings.slam.min_count, None
+    told = own[1], read_attitude(log)
+    for frame in run_log(own[0], settings.slam.filter, rng, wanted, least, *told):
         on_progress("FastSLAM", frame.iteration + 1, n_frames)
-        landmarks = frame.landmarks
-    assert landmarks is not None
-    return landmarks
+        made = frame
+    assert made is not None
+    assert made.landmarks is not None
+    assert made.associations is not None
+    gate = gate_finding(robot_log, made.associations)
+    return MadeMap(made.landmarks, (*found.findings, *([] if gate is None else [gate])))
 
 
 def save_map(path: Path, landmarks: LandmarkMap) -> None:

@@ -22,7 +22,7 @@ from mapfusion.recordings.stereo_import import (
     write_imported,
 )
 from mapfusion.recordings.stereo_recording import StereoRecording
-from mapfusion.recordings.tum import read_tum
+from mapfusion.recordings.tum import read_odometry, read_tum
 from mapfusion.vision.frontend import FrontEndParameters
 
 BY_IMAGES = "images"  # in place of a file of odometry
@@ -58,7 +58,7 @@ class Source:
         """The recording with the trajectories that are given; raises InputError."""
         recording = read_recording(self.format_name, self.folder, self.settings, read_calibration)
         if self.odometry is not None:
-            recorded = None if self.odometry == BY_IMAGES else read_tum(Path(self.odometry))
+            recorded = None if self.odometry == BY_IMAGES else read_odometry(Path(self.odometry))
             recording = replace(recording, odometry=recorded)
         if self.truth is not None:
             recording = replace(recording, truth=read_tum(self.truth))

@@ -21,6 +21,7 @@ from experiments.show.export import write_text
 from mapfusion.align.result import Status
 from mapfusion.fused_map import FusedMap
 from mapfusion.landmark_map import LandmarkMap
+from mapfusion.log_consistency import Finding
 
 SCHEMA_VERSION = 1
 _AXES = ("xx_m2", "xy_m2", "xt_m_rad", "yy_m2", "yt_m_rad", "tt_rad2")  # those of COVARIANCE
@@ -82,9 +83,19 @@ def _aligner(row: Mapping[str, Any]) -> dict[str, Any]:
     return told | {name: row[name] for name in numbers}
 
 
-def of_map(path: Path, log: Path, seed: int, landmarks: LandmarkMap) -> dict[str, Any]:
-    """What `slam` made of a log."""
-    made = {"robot": landmarks.name, "n_landmarks": len(landmarks)}
+def of_map(
+    path: Path, log: Path, seed: int, landmarks: LandmarkMap, findings: Sequence[Finding] = ()
+) -> dict[str, Any]:
+    """What `slam` made of a log, and what the log says against itself."""
+    made: dict[str, Any] = {"robot": landmarks.name, "n_landmarks": len(landmarks)}
+    made["findings"] = [
+        {
+            "check": finding.kind,
+            "iteration": finding.frame if finding.frame >= 0 else None,
+            "finding": finding.text,
+        }
+        for finding in findings
+    ]
     return {"log": log, "seed": seed, "map": path} | made
 
 

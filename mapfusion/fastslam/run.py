@@ -66,7 +66,8 @@ def run_log(
         min_count: sightings that a landmark needs to be in it.
         odometry_covariance: (T, 3, 3) of odometry that was taken from what the log observes, in
             place of the motion noise, of which only the floor is added. How much both share is not
-            known, so each counts half (covariance intersection).
+            known, so each counts half (covariance intersection). NaN at a frame: its odometry is a
+            source of its own, as noisy as the settings say.
         attitude: by which the log's observations were levelled; None: of a level body.
         viewing: whether maps come with their viewing evidence, which is of the whole log so far.
 
@@ -86,7 +87,7 @@ def run_log(
     starts = log.frame_starts()
     for iteration, odometry in enumerate(log.odometry):
         frame, sigma = log.observations[starts[iteration] : starts[iteration + 1]], None
-        if odometry_covariance is not None:
+        if odometry_covariance is not None and np.isfinite(odometry_covariance[iteration]).all():
             own = odometry_covariance[iteration] / _HALF
             sigma = parameters.motion.with_floor(own)
             frame = replace(frame, covariance_m2=frame.covariance_m2 / _HALF)

@@ -36,7 +36,7 @@ from mapfusion.recordings.text_tables import (
     timed_numbers,
 )
 from mapfusion.recordings.timed_poses import TimedPoses
-from mapfusion.recordings.tum import ODOMETRY_FILE, read_tum
+from mapfusion.recordings.tum import ODOMETRY_FILE, read_odometry
 from mapfusion.se2 import Float
 
 STATES = "state_groundtruth_estimate0"
@@ -90,7 +90,7 @@ def read_euroc(folder: Path, settings: EurocSettings, read_yaml: ReadYaml) -> St
         calibration,
         settings.mount.applied(T_robot_left),
         _states(states).moved(T_body_robot) if states.exists() else None,
-        read_tum(odometry) if odometry.exists() else None,
+        read_odometry(odometry) if odometry.exists() else None,
         (*lost_left, *lost_right, *dropped),
         felt,
         f"{root}: sensor.yaml of cam0 and cam1",

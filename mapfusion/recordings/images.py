@@ -40,7 +40,7 @@ from mapfusion.recordings.text_tables import (
     rows_of,
     time_in_ns,
 )
-from mapfusion.recordings.tum import ODOMETRY_FILE, TRUTH_FILE, read_tum
+from mapfusion.recordings.tum import ODOMETRY_FILE, TRUTH_FILE, read_odometry, read_tum
 from mapfusion.se2 import Float
 
 _KINDS = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp"}
@@ -98,8 +98,8 @@ def read_images(folder: Path, settings: ImagesSettings, read_yaml: ReadYaml) -> 
         raise InputError(f"{folder}: {error}") from error
     time_ns, pictures, dropped = made
     odometry, truth = (
-        read_tum(path) if path.exists() else None
-        for path in (folder / ODOMETRY_FILE, folder / TRUTH_FILE)
+        read(path) if path.exists() else None
+        for read, path in ((read_odometry, folder / ODOMETRY_FILE), (read_tum, folder / TRUTH_FILE))
     )
     T_robot_left = settings.mount.applied(T_robot_left)
     name = folder.resolve().name

@@ -33,7 +33,7 @@ from mapfusion.recordings.text_tables import (
     time_in_ns,
 )
 from mapfusion.recordings.timed_poses import TimedPoses
-from mapfusion.recordings.tum import ODOMETRY_FILE, read_tum
+from mapfusion.recordings.tum import ODOMETRY_FILE, read_odometry
 from mapfusion.se2 import Float
 
 HEIGHT_M = 1.65  # of KITTI's cameras above the road, by its publication
@@ -83,7 +83,7 @@ def read_kitti(folder: Path, settings: KittiSettings, _: ReadYaml) -> StereoReco
         calibration,
         T_robot_left,
         None if truth is None else _truth(truth, times, T_robot_left),
-        read_tum(odometry) if odometry.exists() else None,
+        read_odometry(odometry) if odometry.exists() else None,
         dropped,
         calibrated_by=str(folder / "calib.txt"),
     )

@@ -26,7 +26,7 @@ from mapfusion.recordings.numbered import numbered_shots
 from mapfusion.recordings.stereo_recording import ReadYaml, StereoRecording, paired
 from mapfusion.recordings.text_tables import numbers, require_increasing, rows_of
 from mapfusion.recordings.timed_poses import TimedPoses
-from mapfusion.recordings.tum import ODOMETRY_FILE, read_tum
+from mapfusion.recordings.tum import ODOMETRY_FILE, read_odometry
 from mapfusion.se2 import Float
 
 _DIGITS = 10  # of a file's name
@@ -72,7 +72,7 @@ def read_kitti_raw(folder: Path, settings: KittiSettings, _: ReadYaml) -> Stereo
         T_imu_ahead = T_imu_left @ se3.inverse(se3.pose(R_ROBOT_OPTICAL, np.zeros(3)))
         truth = _driven(drive / "oxts").moved(T_imu_ahead @ se3.inverse(T_robot_left))
     odometry = folder / ODOMETRY_FILE
-    reckoned = read_tum(odometry) if odometry.exists() else None
+    reckoned = read_odometry(odometry) if odometry.exists() else None
     return StereoRecording(
         drive.name,
         time_ns,

@@ -110,6 +110,11 @@ def import_mrclam(
     last_s = max(odometry[-1, 0] for _, odometry, _, _ in recordings)
     n_frames = _n_frames(folder, last_s - first_s, settings.frame_s)
     clock_s = first_s + settings.frame_s * np.arange(n_frames)
+    for robot, _, _, truth in recordings:
+        if truth is not None and (truth[-1, 0] < first_s or truth[0, 0] > last_s):
+            spans = f"{truth[0, 0]:.3f} to {truth[-1, 0]:.3f} s, odometry of {first_s:.3f} to"
+            path = folder / f"{robot.capitalize()}_Groundtruth.dat"
+            raise InputError(f"{path}: the truth is of {spans} {last_s:.3f} s; no time is in both")
     written = []
     for robot, odometry, sighted, truth in recordings:
         path = destination / robot

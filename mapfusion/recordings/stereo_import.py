@@ -11,6 +11,16 @@ from mapfusion.attitude import Attitude, write_attitude
 from mapfusion.calibration_error import CalibrationError, usual_calibration
 from mapfusion.camera import StereoCamera
 from mapfusion.errors import InputError, OutOfRangeError
+from mapfusion.fastslam.motion import MotionNoise
+from mapfusion.log_consistency import (
+    Finding,
+    Stated,
+    composed_spans,
+    disagreement,
+    motions_between_frames,
+    pose_mistakes,
+    truth_finding,
+)
 from mapfusion.odometry_covariance import write_odometry_covariance
 from mapfusion.recordings.derived_vision import derived_vision, measured_vision
 from mapfusion.recordings.level import Level
@@ -20,11 +30,13 @@ from mapfusion.recordings.pictures import sampled
 from mapfusion.recordings.rectify import Rectification
 from mapfusion.recordings.stereo_recording import StereoRecording
 from mapfusion.recordings.text_tables import NS
-from mapfusion.recordings.visual_odometry import visual_odometry
+from mapfusion.recordings.timed_poses import TimedPoses
+from mapfusion.recordings.visual_odometry import robot_motions, visual_odometry
 from mapfusion.robot_log import TRUTH_FILES, RobotLog, write_log, write_truth_poses
 from mapfusion.se2 import Float
 from mapfusion.vision.frontend import FrontEnd, FrontEndParameters
 from mapfusion.vision.observing import joined
+from mapfusion.vision.rigid_links import RigidMotion
 from mapfusion.vision.row_errors import offsets
 
 # Windows of the row search are 17 px: what lies a row off is found there still, two rows cost
@@ -63,6 +75,7 @@ class Imported:
         odometry_covariance: (T, 3, 3) of odometry that the pictures told; None: it was recorded.
         attitude: by which the observations were levelled; None: the body was taken for level.
         guessed: frames whose motion too few links told.
+        findings: what recorded odometry and truth contradict.
     """
 
     log: RobotLog
@@ -71,6 +84,7 @@ class Imported:
     odometry_covariance: Float | None = None
     attitude: Attitude | None = None
     guessed: int = 0
+    findings: tuple[Finding, ...] = ()
 
     @property
     def observations(self) -> np.ndarray:
@@ -174,7 +188,8 @@ class StereoImport:
             found = f"frames of {cut.robot} are {len(rows)} of {len(self._recording)} pairs"
             raise InputError(f"{self._recording.name}: {found}; 2 are the least")
         time_ns = self._recording.time_ns[rows]
-        reckoned, truth = self._odometry(time_ns), self._truth(time_ns)
+        reckoned, T_world_robot = self._odometry(time_ns), self._truth(time_ns)
+        truth = None if T_world_robot is None else se3.planar(T_world_robot)
         known = known_from(level, reckoned, self._recording.inertial)
         if known == "odometry" and reckoned is None:
             raise InputError(f"--level odometry: {self._recording.name} has no odometry")
@@ -188,14 +203,25 @@ class StereoImport:
             frames.add(front_end.extract(*self.rectified(k)), float(steps[n]))
             on_progress(f"{cut.robot}: track features", n + 1, len(rows))
         time_s = (time_ns - self._recording.time_ns[0]) / 1e9
-        attitude, linked = frames.attitude, np.array(frames.linked)
+        attitude, linked = self._attitude(frames, known), np.array(frames.linked)
         seen = visual_odometry(frames.motions, steps, self.camera, self.T_robot_camera, attitude)
         odometry = seen.increments if reckoned is None else _increments(reckoned)
         observed = joined(frames.observed)
         log = RobotLog(cut.robot, False, time_s, odometry, *observed, self.calibration_error)
+        shown = robot_motions(frames.motions, self.camera, self.T_robot_camera)
+        findings = _findings(shown, reckoned, T_world_robot)
         if reckoned is not None:
-            return Imported(log, truth, linked, attitude=attitude)
-        return Imported(log, truth, linked, seen.covariance, attitude, int(seen.guessed.sum()))
+            return Imported(log, truth, linked, attitude=attitude, findings=findings)
+        told = seen.covariance, attitude, int(seen.guessed.sum())
+        return Imported(log, truth, linked, *told, findings=findings)
+
+    def _attitude(self, frames: LevelFrames, known: Level) -> Attitude | None:
+        """By which the frames were levelled; raises InputError."""
+        try:
+            return frames.attitude
+        except ValueError as error:
+            reason = f"{error}; by --level {known} the robot's attitude is no robot's"
+            raise InputError(f"{self._recording.name}: {reason}") from error
 
     def _felt(self, time_ns: np.ndarray) -> tuple[tuple[Float, Float], tuple[Float, Float] | None]:
         """Tilts by the accelerometer, and turns by the gyroscopes, as `Levels` has them."""
@@ -216,14 +242,67 @@ class StereoImport:
         T = recorded.at(time_ns, _LONGEST_ODOMETRY_GAP_S)
         unknown = np.flatnonzero(np.isnan(T[:, 0, 0]))
         if len(unknown):
+            if len(unknown) == len(T):
+                raise InputError(f"{self._recording.name}: {_apart('odometry', recorded, time_ns)}")
             when = f"{(int(time_ns[unknown[0]]) - int(self._recording.time_ns[0])) / 1e9:g} s"
             missing = f"at {len(unknown)} of {len(T)} frames, the first {when} after the beginning"
             raise InputError(f"{self._recording.name}: no odometry {missing}")
+        fallen = np.flatnonzero(T[:, 2, 2] <= 0)
+        if len(fallen):
+            found = f"by the odometry the robot stands on its head in frame {int(fallen[0])}"
+            raise InputError(f"{self._recording.name}: {found}; is its quaternion x y z w?")
         return T
 
     def _truth(self, time_ns: np.ndarray) -> Float | None:
+        """True poses (T, 4, 4) at the frames, NaN where unknown; raises InputError without any."""
         truth = self._recording.truth
-        return None if truth is None else se3.planar(truth.at(time_ns, _LONGEST_TRUTH_GAP_S))
+        if truth is None:
+            return None
+        T = truth.at(time_ns, _LONGEST_TRUTH_GAP_S)
+        if np.isnan(T[:, 0, 0]).all() and not _overlap(truth, self._recording.time_ns):
+            raise InputError(f"{self._recording.name}: {_apart('truth', truth, time_ns)}")
+        return T
+
+
+def _overlap(poses: TimedPoses, time_ns: np.ndarray) -> bool:
+    """Whether any time of poses lies among the times of a recording."""
+    return bool(len(poses.time_ns)) and bool(
+        poses.time_ns[0] <= time_ns[-1] and time_ns[0] <= poses.time_ns[-1]
+    )
+
+
+def _apart(what: str, poses: TimedPoses, time_ns: np.ndarray) -> str:
+    """Words for poses that lie at other times than frames."""
+    if not len(poses.time_ns):
+        return f"the {what} holds no pose"
+    spans = [
+        f"{int(times[0]) / NS:.3f} to {int(times[-1]) / NS:.3f} s"
+        for times in (poses.time_ns, time_ns)
+    ]
+    reason = f"the {what} is of {spans[0]}, the pictures are of {spans[1]}"
+    return f"{reason}: it has no pose at any of them; is it another recording's, or another clock?"
+
+
+def _findings(
+    shown: Sequence[RigidMotion | None],
+    reckoned: Float | None,
+    T_world_robot: Float | None,
+) -> tuple[Finding, ...]:
+    """What recorded odometry and truth (T, 4, 4) contradict, by the motions that pictures show."""
+    known = [(k, motion) for k, motion in enumerate(shown) if k and motion is not None]
+    spans = composed_spans(motions_between_frames(known), len(shown))
+    found = []
+    if reckoned is not None:
+        what = "the odometry contradicts the motion that the pictures show"
+        given = Stated(reckoned, MotionNoise()), pose_mistakes(reckoned)
+        found.append(disagreement("odometry", what, spans, *given))
+    if T_world_robot is not None and np.isnan(T_world_robot[:, 0, 0]).all():
+        gap = f"over gaps longer than {_LONGEST_TRUTH_GAP_S:g} s it is not interpolated"
+        found.append(Finding("truth", -1, f"the truth is known at none of the frames: {gap}"))
+    elif T_world_robot is not None:
+        reference = "the motion that the pictures show"
+        found.append(truth_finding(reference, spans, T_world_robot))
+    return tuple(one for one in found if one is not None)
 
 
 def _increments(T_start_robot: Float) -> Float:

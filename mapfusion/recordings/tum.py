@@ -12,7 +12,7 @@ import numpy as np
 from mapfusion import se3
 from mapfusion.arguments import require_shape
 from mapfusion.errors import InputError
-from mapfusion.recordings.text_tables import NS, POSES, timed_numbers
+from mapfusion.recordings.text_tables import NS, POSES, rows_of, timed_numbers
 from mapfusion.recordings.timed_poses import TimedPoses
 from mapfusion.se2 import Float
 
@@ -59,3 +59,19 @@ def read_tum(path: Path) -> TimedPoses:
     if not np.all(np.linalg.norm(values[:, 3:], axis=1) > 0):
         raise InputError(f"{path}: holds a quaternion of length 0")
     return TimedPoses(time_ns, se3.from_quaternions(values[:, :3], values[:, 3:]))
+
+
+def read_odometry(path: Path) -> TimedPoses:
+    """A trajectory by dead reckoning, of a robot that stands on a floor.
+
+    Raises:
+        InputError: as `read_tum`, or a pose stands on end or on its head; names the line.
+    """
+    poses = read_tum(path)
+    fallen = np.flatnonzero(poses.T[:, 2, 2] <= 0)
+    if len(fallen):
+        lines = [line for line, _ in rows_of(path, "a trajectory in the TUM format")]
+        line = lines[int(fallen[0])]
+        remedy = "is the quaternion x y z w?"
+        raise InputError(f"{path}, line {line}: the robot stands on its head; {remedy}")
+    return poses

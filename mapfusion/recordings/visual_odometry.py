@@ -53,16 +53,14 @@ def visual_odometry(
     increments, covariance = np.zeros((n, 3)), np.zeros((n, 3, 3))
     guessed = np.array([motion is None for motion in motions])
     guessed[0] = False
-    taken = se3.pose(np.eye(3), camera.p_robot_left)
-    T_robot_taken = T_robot_camera @ se3.inverse(taken)
+    by_robot = robot_motions(motions, camera, T_robot_camera)
     speed, widest = np.zeros(3), _FIRST_STEP  # a step
     for k in range(1, n):
-        motion = motions[k]
-        if motion is None:
+        own = by_robot[k]
+        if own is None:
             increments[k] = steps[k] * speed
             covariance[k] = np.diag((np.abs(increments[k]) + steps[k] * widest) ** 2)
         else:
-            own = motion.of(T_robot_taken)
             level = np.eye(3) if attitude is None else se3.tilt(*attitude.value[k - 1, :2])
             increments[k] = se3.planar(se3.pose(level, np.zeros(3)) @ own.T_before_after)
             turned = np.kron(np.eye(2), level)
@@ -70,3 +68,12 @@ def visual_odometry(
             speed = increments[k] / steps[k]
             widest = np.maximum(widest, np.abs(speed))
     return VisualOdometry(increments, covariance, guessed)
+
+
+def robot_motions(
+    motions: Sequence[RigidMotion | None], camera: StereoCamera, T_robot_camera: Float
+) -> list[RigidMotion | None]:
+    """Motions of the robot's body by those of a camera that was taken for level, see above."""
+    taken = se3.pose(np.eye(3), camera.p_robot_left)
+    T_robot_taken = T_robot_camera @ se3.inverse(taken)
+    return [None if motion is None else motion.of(T_robot_taken) for motion in motions]

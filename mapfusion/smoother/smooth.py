@@ -51,7 +51,8 @@ class SmootherParameters:
         min_count: observations that a landmark needs.
         odometry_covariance: (T, 3, 3) or longer, of odometry that was taken from what the log
             observes and must not count twice: it says only how to come to frames that see too
-            little to tell, and from them. None: the odometry is a source of its own.
+            little to tell, and from them. None, or NaN at a frame: the odometry is a source of its
+            own.
     """
 
     motion: MotionNoise = field(default_factory=MotionNoise)
@@ -67,6 +68,12 @@ class SmootherParameters:
         """Of a track's offset along each axis, in 1/m^2; 0 where there are no offsets."""
         return 1 / self.stray_m**2 if self.stray_m else 0.0
 
+    @property
+    def has_own_odometry(self) -> bool:
+        """Whether any odometry is a source of its own, so that its noise can be learned."""
+        known = self.odometry_covariance
+        return known is None or bool(np.isnan(known).any())
+
     def odometry_information(self, log: RobotLog) -> Float:
         """(T - 1, 3) inverse variances of the log's increments after the first."""
         if self.odometry_covariance is None:
@@ -76,7 +83,10 @@ class SmootherParameters:
         told = self.odometry_covariance[1 : len(log)]
         sigma = np.array([self.motion.with_floor(own) for own in told]).reshape(-1, 3)
         sigma[~needed] = [_UNTOLD_M, _UNTOLD_M, _UNTOLD_RAD]
-        return information_of(sigma)
+        own = np.isnan(told).any(axis=(1, 2))
+        information = information_of(sigma)
+        information[own] = odometry_information(log.odometry, self.motion)[own]
+        return information
 
 
 @dataclass(frozen=True)
@@ -161,7 +171,7 @@ def smooth(
     if not np.array_equal(parts, landmark):
         known = _problem(log, parts, parameters, information)
         start = followed(known, _start(known, path))
-    if parameters.odometry_covariance is None:
+    if parameters.has_own_odometry:
         end, levels = settled_with_levels(known, *start)
         if levels.odometry.max() > _FAR_WORSE and end.tails.observation < MOST_DOF:
             odometry = levels.odometry

@@ -82,7 +82,7 @@ def smooth_together(
     ]
     problem = Problem(seen, log.odometry, np.concatenate(information)[:-1], stray_information)
     start = Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
-    own_odometry = all(each.parameters.odometry_covariance is None for each in recordings)
+    own_odometry = all(each.parameters.has_own_odometry for each in recordings)
     if own_odometry:
         end, levels = settled_with_levels(problem, start)
     else:

@@ -11,6 +11,7 @@ from the first seed's; then the medians over the logs.
 import argparse
 import sys
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from experiments.judge.smoothed_robots import path_rmse_m
 from experiments.judge.truth import PathTruth
 from experiments.methods.threads import single_threaded
 from experiments.run.pipeline import smoother_parameters
-from experiments.run.stages.smooth import log_until, smoother_of
+from experiments.run.stages.smooth import log_until
 from experiments.scenario.loading import load_scenario
 from mapfusion.attitude import read_attitude
 from mapfusion.fastslam.run import run_log
@@ -42,7 +43,7 @@ def off_m(asked: tuple[str, Path, int]) -> tuple[float, float]:
     if seed:
         return path_rmse_m(path, truth), np.nan
     noisy = log_until(log, end, slam.filter.noise_floor_m)
-    settings = smoother_of(smoother_parameters(scenario), folder)
+    settings = replace(smoother_parameters(scenario), odometry_covariance=told[0])
     smoothed = smooth(noisy, last.slam.best_associations(), path, settings)
     return path_rmse_m(path, truth), path_rmse_m(smoothed.estimate.path, truth)
 

@@ -16,16 +16,14 @@ import pyarrow as pa
 from experiments.run.estimates import alignment_of, correspondences_of, covariances_of
 from experiments.run.frames import FLOAT, INT, TEXT, fields, read_rows, write_rows
 from experiments.run.job import Job
-from experiments.run.kept_logs import kept_log
 from experiments.run.stage_tables import CORRESPONDENCES, COVARIANCE, ESTIMATES
 from experiments.run.stages import match
-from experiments.run.stages.slam import RobotFolders
+from experiments.run.stages.slam import RobotFolders, log_as_filtered
 from experiments.run.stages.smooth import (
     log_until,
     read_smoothed,
     read_smoothed_path,
     smoothed_owners,
-    smoother_of,
 )
 from experiments.run.stages.snapshots import stored_maps
 from mapfusion.aligned_landmarks import ABSENT
@@ -34,7 +32,6 @@ from mapfusion.fuse.registry import make_fuser
 from mapfusion.fused_map import AlignedPair, FusedMap
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map
 from mapfusion.merge import ConnectedMaps, connect
-from mapfusion.robot_log import RobotLog
 from mapfusion.smoother.recording import Recording
 from mapfusion.smoother.smooth import SmootherParameters
 from mapfusion.storage import (
@@ -114,7 +111,6 @@ class GivenTeam:
 class _Robot:
     """What is known of a robot at all iterations."""
 
-    log: RobotLog
     filtered: Mapping[int, LandmarkMap]
     smoothed: Mapping[int, LandmarkMap]  # none for a fuser that does not take them
 
@@ -141,7 +137,7 @@ def given_teams(settings: FuseSettings, job: Job) -> Iterator[tuple[int, GivenTe
         for name, robot in robots.items():
             known = {i: own for i, own in robot.smoothed.items() if i <= k}
             given.append(_at(known, k) if known else _at(robot.filtered, k))
-            recordings.append(_recording(settings, job, robot.log, name, known))
+            recordings.append(_recording(settings, job, name, known))
         maps = [_at(robot.filtered, k) for robot in robots.values()]
         pairs = [pair for each in alignments if (pair := each.at(k)) is not None]
         yield k, GivenTeam(maps, pairs, given, recordings)
@@ -151,7 +147,7 @@ def _read_robot(job: Job, name: str, smoothed: bool, viewing: bool) -> _Robot:
     """What there is of a robot; with viewing evidence, which none of our fusers looks at, if so."""
     folders = RobotFolders(job.inputs[f"log {name}"], job.inputs[f"slam {name}"])
     maps = read_smoothed(job.inputs[f"smooth {name}"]) if smoothed else {}
-    return _Robot(kept_log(folders.log), stored_maps(folders, viewing), maps)
+    return _Robot(stored_maps(folders, viewing), maps)
 
 
 def _at(maps: Mapping[int, LandmarkMap], iteration: int) -> LandmarkMap:
@@ -162,7 +158,6 @@ def _at(maps: Mapping[int, LandmarkMap], iteration: int) -> LandmarkMap:
 def _recording(
     settings: FuseSettings,
     job: Job,
-    log: RobotLog,
     name: str,
     smoothed: Mapping[int, LandmarkMap],
 ) -> Recording | None:
@@ -170,11 +165,12 @@ def _recording(
     if not smoothed:
         return None
     k = max(smoothed)
-    log = log_until(log, k, settings.noise_floor_m)
     smooth, slam = (job.inputs[f"{stage} {name}"] for stage in ("smooth", "slam"))
+    log, covariance = log_as_filtered(job.inputs[f"log {name}"], slam)
+    log = log_until(log, k, settings.noise_floor_m)
     landmark = smoothed_owners(smooth, slam, k, len(log.observations))
     path = read_smoothed_path(smooth)[k]
-    smoother = smoother_of(settings.smoother, job.inputs[f"log {name}"])
+    smoother = replace(settings.smoother, odometry_covariance=covariance)
     return Recording(log, landmark, path, smoother)
 
 

@@ -1,14 +1,15 @@
 """Stage: one robot's FastSLAM over its log, with its map at each evaluated iteration."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 
-from experiments.run.frames import BOOL, FLOAT, INT, fields, read_rows
+from experiments.run.frames import BOOL, FLOAT, INT, TEXT, fields, read_rows
 from experiments.run.job import Job
 from experiments.run.kept_logs import kept_log
 from experiments.scenario.randomness import generator
@@ -16,14 +17,21 @@ from mapfusion.attitude import read_attitude
 from mapfusion.fastslam.filter import StepResult
 from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.fastslam.run import run_log
+from mapfusion.log_consistency import Finding, Jump, check_log, gate_finding, without_jumps
 from mapfusion.odometry_covariance import read_odometry_covariance
+from mapfusion.robot_log import RobotLog
 from mapfusion.se2 import Float
 from mapfusion.storage import (
     POSE_FIELDS,
+    column,
+    columns,
+    covariance_columns,
+    covariances_from,
     float_fields,
     named_columns,
     point_columns,
     point_fields,
+    read_table,
     schema,
     write_table,
 )
@@ -42,6 +50,18 @@ POSES = schema("slam.poses", 1, [*_ITERATION, *float_fields(_ONLINE + _FINAL), *
 _PARTICLE = fields(iteration=INT, particle=INT)
 CLOUDS = schema("slam.clouds", 1, [*_PARTICLE, *float_fields([*POSE_FIELDS, "log_weight"])])
 # The most probable particle's path at each evaluated iteration, which its map was made along.
+# What a log says against itself (mapfusion/log_consistency.py): a line each, the iteration of a
+# jump or -1, and of jumps the motion that the observations show in place of the odometry.
+_OBSERVED = [f"observed_{name}" for name in POSE_FIELDS]
+_OBSERVED_COVARIANCE = ["cov_xx", "cov_xy", "cov_xt", "cov_yy", "cov_yt", "cov_tt"]
+FINDINGS = schema(
+    "slam.findings",
+    1,
+    [
+        *fields(check=TEXT, iteration=INT, finding=TEXT),
+        *float_fields([*_OBSERVED, *_OBSERVED_COVARIANCE]),
+    ],
+)
 PATHS = schema("slam.paths", 1, [*fields(evaluated=INT), *_ITERATION, *float_fields(POSE_FIELDS)])
 
 LABEL = "FastSLAM"
@@ -51,6 +71,7 @@ WRITES = (
     "poses.parquet",
     "clouds.parquet",
     "paths.parquet",
+    "findings.parquet",
 )
 
 
@@ -85,13 +106,15 @@ def evaluated_iterations(n_frames: int, every: int) -> list[int]:
 def run(settings: SlamSettings, job: Job) -> None:
     """Run the filter over a log and write maps, poses, associations and particle clouds."""
     log = kept_log(job.inputs["log"])
+    found = check_log(log, settings.filter.motion)
+    log, covariance = without_jumps(log, found.jumps, read_odometry_covariance(job.inputs["log"]))
     last = len(log) - 1
     steps = list[dict[str, float]]()
     maps, associations, clouds, paths = _Rows(), _Rows(), _Rows(), _Rows()
     counted = np.empty(0, dtype=np.int64)
     iterations = evaluated_iterations(len(log), settings.every)
     rng = generator(settings.seed, "slam", log.robot)
-    told = read_odometry_covariance(job.inputs["log"]), read_attitude(job.inputs["log"])
+    told = covariance, read_attitude(job.inputs["log"])
     filtered = run_log(
         log, settings.filter, rng, iterations, settings.min_count, *told, viewing=False
     )
@@ -110,8 +133,8 @@ def run(settings: SlamSettings, job: Job) -> None:
             counts_for = frame.associations
             new = np.full(len(counts_for) - len(counted), -1)
             changed = np.flatnonzero(counts_for != np.concatenate([counted, new]))
-            columns = {"observation": changed, "source_observation": counts_for[changed]}
-            associations.add(columns, from_iteration=k)
+            changes = {"observation": changed, "source_observation": counts_for[changed]}
+            associations.add(changes, from_iteration=k)
             counted, path = counts_for, frame.path
             rows = {"iteration": np.arange(len(path))} | named_columns(POSE_FIELDS, path)
             paths.add(rows, evaluated=k)
@@ -121,8 +144,48 @@ def run(settings: SlamSettings, job: Job) -> None:
     evaluated = {"iterations": ",".join(map(str, iterations))}
     tables = (maps.columns, associations.columns, poses, clouds.columns, paths.columns)
     schemas = (SNAPSHOTS, ASSOCIATIONS, POSES, CLOUDS, PATHS)
-    for file, table_schema, columns in zip(WRITES, schemas, tables, strict=True):
-        write_table(job.output / file, columns, table_schema, evaluated)
+    for file, table_schema, rows in zip(WRITES[:-1], schemas, tables, strict=True):
+        write_table(job.output / file, rows, table_schema, evaluated)
+    gate = gate_finding(log, counted)
+    findings = [*found.findings, *([] if gate is None else [gate])]
+    write_table(job.output / WRITES[-1], _finding_columns(findings, found.jumps), FINDINGS)
+
+
+def _finding_columns(
+    findings: Sequence[Finding], jumps: Sequence[Jump]
+) -> Mapping[str, np.ndarray | list[str]]:
+    observed, covariance = (
+        np.full((len(findings), 3), np.nan),
+        np.full((len(findings), 3, 3), np.nan),
+    )
+    row = {finding.frame: n for n, finding in enumerate(findings) if finding.kind == "jump"}
+    for jump in jumps:
+        observed[row[jump.frame]], covariance[row[jump.frame]] = jump.observed, jump.covariance
+    return {
+        "check": [finding.kind for finding in findings],
+        "iteration": np.array([finding.frame for finding in findings], dtype=np.int32),
+        "finding": [finding.text for finding in findings],
+        **named_columns(_OBSERVED, observed),
+        **covariance_columns(_OBSERVED_COVARIANCE, covariance),
+    }
+
+
+def read_findings(slam: Path) -> pd.DataFrame:
+    """What a robot's log says against itself."""
+    return read_rows(slam / WRITES[-1], FINDINGS)
+
+
+def log_as_filtered(log: Path, slam: Path) -> tuple[RobotLog, Float | None]:
+    """A log as the filter took it, without jumps, and the covariance of its odometry if known."""
+    table, _ = read_table(slam / WRITES[-1], FINDINGS)
+    recorded = kept_log(log)
+    observed, covariance = columns(table, _OBSERVED), covariances_from(table, _OBSERVED_COVARIANCE)
+    jumps = [
+        Jump(int(k), observed[n], covariance[n], recorded.odometry[k])
+        for n, k in enumerate(column(table, "iteration"))
+        if k >= 0
+    ]
+    return without_jumps(recorded, jumps, read_odometry_covariance(log))
 
 
 class _Rows:

@@ -13,14 +13,12 @@ import pandas as pd
 
 from experiments.run.frames import INT, fields
 from experiments.run.job import Job
-from experiments.run.kept_logs import kept_log
-from experiments.run.stages.slam import evaluated_iterations, final_path
+from experiments.run.stages.slam import evaluated_iterations, final_path, log_as_filtered
 from experiments.run.stages.snapshots import Associations
 from mapfusion.attitude import Attitude, read_attitude
 from mapfusion.errors import DamagedFileError
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map
 from mapfusion.log_part import first_frames
-from mapfusion.odometry_covariance import read_odometry_covariance
 from mapfusion.robot_log import RobotLog
 from mapfusion.se2 import Float
 from mapfusion.smoother.smooth import Smoothed, SmootherParameters, smooth
@@ -94,8 +92,9 @@ def run(settings: SmoothSettings, job: Job) -> None:
 
     A log that cannot be smoothed has no map and an empty path, with the reason.
     """
-    given = filtered_until(job, kept_log(job.inputs["log"]), int(job.part), settings.noise_floor_m)
-    own = replace(settings, smoother=smoother_of(settings.smoother, job.inputs["log"]))
+    log, covariance = log_as_filtered(job.inputs["log"], job.inputs["slam"])
+    given = filtered_until(job, log, int(job.part), settings.noise_floor_m)
+    own = replace(settings, smoother=replace(settings.smoother, odometry_covariance=covariance))
     made = smoothed_anew(own, *given, read_attitude(job.inputs["log"]))
     landmarks, path, landmark, ended = made
     if landmarks is not None:
@@ -107,11 +106,6 @@ def run(settings: SmoothSettings, job: Job) -> None:
     rows = {"iteration": np.arange(len(path))} | named_columns(POSE_FIELDS, path)
     attributes = {name: str(value) for name, value in zip(_ENDED, ended, strict=True)}
     write_table(_path_path(job.output, job.part), rows, PATH, attributes)
-
-
-def smoother_of(parameters: SmootherParameters, log: Path) -> SmootherParameters:
-    """Those for a log's folder: odometry that pictures told is no news beside what they show."""
-    return replace(parameters, odometry_covariance=read_odometry_covariance(log))
 
 
 def log_until(log: RobotLog, iteration: int, noise_floor_m: float = 0.0) -> RobotLog:

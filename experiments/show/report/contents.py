@@ -14,6 +14,7 @@ from ruamel.yaml import YAML
 from experiments.judge import metrics
 from experiments.judge.criteria import that_ever_meet
 from experiments.judge.expectations import Outcome
+from experiments.judge.findings import lines_of
 from experiments.judge.judged_fusers import last_fused
 from experiments.judge.judged_maps import methods_in, setting_columns
 from experiments.judge.path_errors import path_rms
@@ -107,7 +108,7 @@ def _without_truth(path: Path, runs: Runs, data: ResultTables) -> dict[str, Any]
 def _of_sweep(path: Path, maps: pd.DataFrame) -> dict[str, Any]:
     """Title of a sweep, and the sections that it has not."""
     none = ("outcomes", "robots", "fits", "smoother", "team", "edges", "figures", "missing")
-    none += ("scenario_text", "fusers", "fuser_figures", "places")
+    none += ("scenario_text", "fusers", "fuser_figures", "places", "findings")
     return dict.fromkeys(none, ()) | {
         "title": f"{path.name}, {maps['run_id'].nunique()} runs",
         "description": ", ".join(maps["scenario"].unique()),
@@ -138,6 +139,7 @@ def _of_result(data: ResultTables) -> dict[str, Any]:
         "map": map_view(data),
         "robot_colours": data.colours,
         "outcomes": list(_outcomes(data)),
+        "findings": list(lines_of(data.rows("findings"))),
         "robots": path_rms(data.table("robots")).to_dict("records"),
         "fits": data.rows("map_fits").to_dict("records"),
         "smoother": data.rows("smoother").to_dict("records"),

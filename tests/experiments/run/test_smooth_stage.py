@@ -21,10 +21,9 @@ from experiments.run.stages.smooth import (
     read_smoothed,
     read_smoothed_path,
     run,
-    smoother_of,
 )
 from experiments.run.stages.snapshots import Associations
-from mapfusion.odometry_covariance import write_odometry_covariance
+from mapfusion.odometry_covariance import read_odometry_covariance, write_odometry_covariance
 from mapfusion.robot_log import RobotLog, read_log, write_log
 from mapfusion.smoother.smooth import SmootherParameters, smooth
 from mapfusion.smoother.smoothed_map import smoothed_map
@@ -149,7 +148,8 @@ def test_odometry_that_pictures_told_does_not_count_twice(tmp_path: Path) -> Non
     apart = []
     for covariance in (None, np.zeros((N_FRAMES, 3, 3))):
         write_odometry_covariance(tmp_path, covariance)
-        own = smoother_of(SmootherParameters(stray_m=0.0), tmp_path)
+        told = read_odometry_covariance(tmp_path)
+        own = SmootherParameters(stray_m=0.0, odometry_covariance=told)
         right, pulled = (
             smooth(log, owners(log), known.path, own).estimate.path for log in (known.log, wrong)
         )
@@ -167,7 +167,7 @@ def test_frames_that_see_nothing_hang_on_what_pictures_told(tmp_path: Path) -> N
     )
     told = np.tile(np.diag([1e-4, 1e-4, 1e-6]), (N_FRAMES, 1, 1))
     write_odometry_covariance(tmp_path, told)
-    own = smoother_of(SmootherParameters(stray_m=0.0), tmp_path)
+    own = SmootherParameters(stray_m=0.0, odometry_covariance=read_odometry_covariance(tmp_path))
     made = smooth(log, owners(known.log)[later], known.path, own)
     assert np.hypot(*(made.estimate.path - known.path)[2, :2]) < 0.1
     # the way to the first frame that sees is known to 2 cm, and so is the map in its frame

@@ -1,0 +1,302 @@
+"""Logs that contradict themselves are told, with the cause; sound ones are left as they are."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mapfusion.align.rigid import fit_rigid
+from mapfusion.fastslam.association import Association
+from mapfusion.fastslam.motion import MotionNoise
+from mapfusion.fastslam.parameters import FastSlamParameters
+from mapfusion.fastslam.run import Frame, run_log
+from mapfusion.log_consistency import (
+    Stated,
+    agreement,
+    chained,
+    check_log,
+    compare,
+    composed_spans,
+    gate_finding,
+    observed_motions,
+    odometry_motions,
+    outside_gate,
+    pose_mistakes,
+    truth_finding,
+    without_jumps,
+)
+from mapfusion.robot_log import Observations, RobotLog
+from mapfusion.se2 import Float, between, compose, inverse, rotation, transform_points, wrap
+from mapfusion.se3 import from_planar
+from mapfusion.smoother.smooth import SmootherParameters, smooth
+from tests.mapfusion.contradicting_logs import (
+    JUMPS,
+    LANDMARKS,
+    MISTAKES,
+    circling_log,
+    true_poses,
+)
+
+NOISE = MotionNoise()
+LABELS = FastSlamParameters(n_particles=50, association=Association.LABEL)
+
+
+@pytest.fixture(scope="module")
+def sound() -> RobotLog:
+    return circling_log()
+
+
+def filtered(log: RobotLog, covariance: Float | None = None) -> Frame:
+    last = len(log) - 1
+    *_, end = run_log(log, LABELS, np.random.default_rng(0), [last], 3, covariance, viewing=False)
+    return end
+
+
+def error_m(log: RobotLog, covariance: Float | None = None) -> float:
+    """RMS of all landmarks after the best rigid fit."""
+    landmarks = filtered(log, covariance).landmarks
+    assert landmarks is not None
+    assert landmarks.label is not None
+    truth = np.column_stack([LANDMARKS[landmarks.label], np.zeros(len(landmarks))])
+    fit = fit_rigid(landmarks.position_m, truth, np.arange(len(truth)))
+    off = landmarks.position_m - transform_points(np.array(fit), truth)
+    return float(np.sqrt(np.mean(np.sum(off[:, :2] ** 2, axis=1))))
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_mistakes_are_named(name: str, sound: RobotLog) -> None:
+    change, words = MISTAKES[name]
+    found = check_log(replace(sound, odometry=change(sound.odometry)), NOISE)
+    assert [each.kind for each in found.findings] == ["odometry"]
+    for word in words:
+        assert word in found.findings[0].text
+    assert not found.jumps
+
+
+def test_observations_in_millimetres_are_named(sound: RobotLog) -> None:
+    """Whether their covariances are in millimetres, too, or not."""
+    seen = sound.observations
+    for share in (1e6, 1.0):
+        larger = replace(
+            seen, position_m=1000 * seen.position_m, covariance_m2=share * seen.covariance_m2
+        )
+        (finding,) = check_log(replace(sound, observations=larger), NOISE).findings
+        assert finding.kind == "odometry"
+        assert "the observed ones millimetres" in finding.text
+
+
+def test_odometry_of_another_run_is_told(sound: RobotLog) -> None:
+    turns = 0.15 * np.sign(np.sin(np.arange(len(sound)) / 3))
+    other = np.column_stack([np.full(len(sound), 0.1), np.zeros(len(sound)), turns])
+    (finding,) = check_log(replace(sound, odometry=other), NOISE).findings
+    assert "another run" in finding.text
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.003, 0.015, 0.03])
+def test_sound_logs_are_left_as_they_are(noise: float) -> None:
+    """Of steps of 0.1 m and 0.05 rad."""
+    for seed in range(3):
+        log = circling_log(40, noise, seed)
+        found = check_log(log, NOISE)
+        assert not found.findings
+        covariance = np.zeros((len(log), 3, 3))
+        assert without_jumps(log, found.jumps, covariance) == (log, covariance)
+
+
+def test_robots_that_stand_turn_or_go_straight_are_sound() -> None:
+    still, ahead = np.zeros((40, 3)), np.tile([0.1, 0, 0], (40, 1))
+    turning = np.tile([0, 0, 0.05], (40, 1))
+    for steps in (still, ahead, turning, np.concatenate([still[:20], ahead[:20]])):
+        assert not check_log(circling_log(40, 0.002, poses=chained(steps)), NOISE).findings
+
+
+@pytest.mark.parametrize("name", JUMPS)
+def test_single_jumps_count_for_nothing(name: str, sound: RobotLog) -> None:
+    """The map is as good as without them; with them it is far off."""
+    change, frames = JUMPS[name]
+    log = replace(sound, odometry=change(sound.odometry))
+    found = check_log(log, NOISE)
+    assert tuple(jump.frame for jump in found.jumps) == frames
+    assert tuple(finding.frame for finding in found.findings) == frames
+    for jump, finding in zip(found.jumps, found.findings, strict=True):
+        off = jump.observed - [0.1, 0, 0.05]
+        assert off @ np.linalg.solve(jump.covariance, off) < 25
+        assert f"frame {jump.frame}: odometry" in finding.text
+    assert error_m(*without_jumps(log, found.jumps)) < 0.03
+
+
+def test_a_jump_is_told_in_metres(sound: RobotLog) -> None:
+    (finding,) = check_log(replace(sound, odometry=JUMPS["3 m"][0](sound.odometry)), NOISE).findings
+    assert "odometry moved 3.00 m, the observations 0." in finding.text
+
+
+def test_the_smoother_gives_a_jump_no_weight(sound: RobotLog) -> None:
+    log = replace(sound, odometry=JUMPS["3 m"][0](sound.odometry))
+    mended, covariance = without_jumps(log, check_log(log, NOISE).jumps)
+    own = SmootherParameters(stray_m=0.0, odometry_covariance=covariance)
+    assert own.has_own_odometry
+    information = own.odometry_information(mended)
+    assert information[39].max() < 2  # of 10 m and a radian
+    np.testing.assert_array_equal(
+        np.delete(information, 39, 0),
+        np.delete(SmootherParameters().odometry_information(mended), 39, 0),
+    )
+    path = smooth(mended, mended.observations.label, true_poses(len(log)), own).estimate.path
+    assert np.abs(path - true_poses(len(log)))[:, :2].max() < 0.05
+
+
+def test_observations_that_jump_are_no_odometry_s_jump(sound: RobotLog) -> None:
+    """Barcodes that are taken for others move the robot by metres; the odometry is right."""
+    seen, frame = sound.observations, sound.iteration == 30
+    position = seen.position_m.copy()
+    position[frame, :2] += [4.0, 0.0]
+    found = check_log(replace(sound, observations=replace(seen, position_m=position)), NOISE)
+    assert not found.findings
+
+
+def test_share_outside_the_gate(sound: RobotLog) -> None:
+    end = filtered(sound)
+    assert end.associations is not None
+    assert gate_finding(sound, end.associations) is None
+    n_outside, n_expected = outside_gate(sound, end.associations)
+    assert n_expected == len(sound.observations) - len(np.unique(sound.observations.label))
+    dropped = end.associations.copy()
+    dropped[sound.iteration % 3 > 0] = -1
+    assert outside_gate(sound, dropped)[0] > 0.6 * n_expected > n_outside
+    finding = gate_finding(sound, dropped)
+    assert finding is not None
+    assert finding.kind == "gate"
+
+
+def test_planar_motions_and_their_covariance() -> None:
+    """Against the motion that was made, over a thousand draws; one false link changes nothing."""
+    T, sigma = np.array([0.3, -0.1, 0.2]), 0.02
+    rng, off = np.random.default_rng(3), []
+    points = rng.uniform(-4, 4, (12, 2))
+    before = points @ rotation(T[2]).T + T[:2]
+    for draw in range(150):
+        seen = np.concatenate([before, points]) + rng.normal(0, sigma, (24, 2))
+        if draw % 2:
+            seen[3] += 1.0
+        made = Observations(
+            np.column_stack([seen, np.zeros(24)]),
+            np.tile(np.diag([sigma**2, sigma**2, 0]), (24, 1, 1)),
+            label=np.tile(np.arange(12, dtype=np.int32), 2),
+        )
+        log = RobotLog("R1", True, np.arange(2.0), np.zeros((2, 3)), np.repeat([0, 1], 12), made)
+        found = observed_motions(log)
+        error = found.motion[0, [0, 1, 5]] - T
+        own = found.covariance[0][np.ix_([0, 1, 5], [0, 1, 5])]
+        off.append(error @ np.linalg.solve(own, error))
+    assert np.mean(off) == pytest.approx(3, abs=0.7)  # chi-square of 3 degrees of freedom
+
+
+def test_motions_in_space_by_tracks() -> None:
+    """Of a log with heights: a robot that goes ahead, and odometry in a camera's axes."""
+    rng, n = np.random.default_rng(5), 12
+    world = np.column_stack([rng.uniform(2, 6, 30), rng.uniform(-3, 3, 30), rng.uniform(0, 2, 30)])
+    path = np.column_stack([0.1 * np.arange(n), np.zeros((n, 2))])
+    seen = (world[None] - np.column_stack([path[:, :2], np.zeros(n)])[:, None]).reshape(-1, 3)
+    made = Observations(
+        seen + rng.normal(0, 0.01, seen.shape),
+        np.tile(1e-4 * np.eye(3), (len(seen), 1, 1)),
+        track=np.tile(np.arange(30, dtype=np.int32), n),
+    )
+    odometry = np.zeros((n, 3))
+    odometry[1:, 0] = 0.1
+    log = RobotLog("R1", False, np.arange(n) * 1.0, odometry, np.repeat(np.arange(n), 30), made)
+    np.testing.assert_allclose(observed_motions(log).motion[:, :3], [[0.1, 0, 0]] * 11, atol=0.02)
+    assert not check_log(log, NOISE).findings
+    in_mm = replace(log, odometry=1000 * odometry)
+    assert "millimetres" in check_log(in_mm, NOISE).findings[0].text
+
+
+@pytest.mark.parametrize("share", [0.4, 1.0, 3.0])
+def test_the_ratio_of_lengths_is_recovered(share: float) -> None:
+    log = circling_log(60, 0.0)
+    observed = observed_motions(log, 4)
+    poses = chained(log.odometry * [share, share, 1])
+    found = compare(observed, Stated(poses, NOISE))
+    assert found.shift.ratio == pytest.approx(share, rel=0.06)
+    assert found.shift.median == pytest.approx(min(share, 1 / share), rel=0.1)
+    assert found.turn.median > 0.9
+
+
+def test_medians_at_the_limit_pass_as_seldom_as_asked() -> None:
+    """The upper end of the interval lies below the true median with the probability asked for."""
+    rng, asked, n = np.random.default_rng(0), 0.05, 25
+    observed = np.tile([1.0, 0, 0], (n, 1))
+    none = np.full(n, 1e-3)
+    below = 0
+    for _ in range(600):
+        stated = observed * (0.7 + rng.normal(0, 0.05, (n, 1)))
+        below += agreement(observed, stated, none, none, asked).upper < 0.7
+    assert 0.01 < below / 600 < 0.085
+
+
+def test_few_or_unsure_motions_say_nothing() -> None:
+    ahead, back, sigma = np.tile([1.0, 0, 0], (3, 1)), np.tile([-1.0, 0, 0], (3, 1)), np.ones(3)
+    assert agreement(ahead, back, sigma / 100, sigma / 100, 0.001).upper == np.inf
+    many = np.tile([[1.0, 0, 0]], (50, 1))
+    assert agreement(many, -many, np.ones(50), np.ones(50), 0.001).n == 0
+    opposed = agreement(many, -many, np.ones(50) / 100, np.ones(50) / 100, 0.001)
+    assert opposed.median == pytest.approx(-1)
+    assert opposed.upper < -0.9
+
+
+TRUTHS = {
+    "sound": (lambda T: compose([5.0, 3.0, 1.0], T), None),
+    "mirrored": (lambda T: T * [1, -1, -1], "other sign"),
+    "millimetres": (lambda T: T * [1000, 1000, 1], "millimetres"),
+    "inverted": (inverse, "inverted"),
+    "degrees": (lambda T: T * [1, 1, 180 / np.pi], "degrees"),
+    "late": (lambda T: np.concatenate([np.tile(T[:1], (12, 1)), T[:-12]]), "12 frames too late"),
+}
+
+
+@pytest.mark.parametrize("name", TRUTHS)
+def test_truth_against_odometry(name: str) -> None:
+    change, words = TRUTHS[name]
+    turn = 0.15 * np.sign(np.sin(np.arange(60) / 4))
+    steps = np.column_stack([np.where(np.arange(60) % 20 < 14, 0.1, 0), np.zeros(60), turn])
+    path = chained(steps)
+    log = circling_log(60, poses=path)
+    spans = composed_spans(odometry_motions(log, NOISE), len(log))
+    truth = change(path)
+    truth[5:8] = np.nan  # it has gaps
+    finding = truth_finding("the odometry", spans, truth)
+    if words is None:
+        assert finding is None
+    else:
+        assert finding is not None
+        assert words in finding.text
+
+
+def test_truth_with_quaternions_in_another_order() -> None:
+    path = true_poses(60)
+    log = circling_log(60, poses=path)
+    spans = composed_spans(odometry_motions(log, NOISE), len(log))
+    right = from_planar(path)
+    for other in pose_mistakes(right).values():
+        if np.allclose(other, right):
+            assert truth_finding("the odometry", spans, other) is None
+    half = path[:, 2] / 2
+    xyzw = np.column_stack([np.zeros((60, 2)), np.sin(half), np.cos(half)])
+    from mapfusion.se3 import from_quaternions
+
+    wrong = from_quaternions(right[:, :3, 3], np.roll(xyzw, 1, axis=1))
+    finding = truth_finding("the odometry", spans, wrong)
+    assert finding is not None
+    assert "quaternions look like" in finding.text
+
+
+def test_spans_compose_motions() -> None:
+    log = circling_log(21, 0.01)
+    spans = composed_spans(odometry_motions(log, NOISE), len(log))
+    path = chained(log.odometry)
+    for span in spans:
+        expected = between(path[span.start], path[span.end])
+        found = span.motion[:, [0, 1, 5]]
+        np.testing.assert_allclose(found[:, :2], expected[:, :2], atol=1e-12)
+        np.testing.assert_allclose(wrap(found[:, 2] - expected[:, 2]), 0, atol=1e-12)
+    assert [int((span.end - span.start)[0]) for span in spans] == [1, 2, 4]
