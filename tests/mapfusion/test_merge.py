@@ -257,9 +257,9 @@ def test_wrong_arguments_are_named():
 
 
 def test_drift_shifts_and_turns_a_map_about_what_was_aligned_in_the_other():
-    """Of s_drift: a shift of each axis, and a turn by s over the arm about the pairs' middle.
+    """s_drift shifts each axis, and turns the map by s_drift over the arm about the pairs' middle.
 
-    Against differences of the motion that a shift or a turn about that middle makes of it.
+    The expected covariance comes from numerical derivatives of such a shift and turn.
     """
     robots = Robots([slice(0, 20), slice(10, 30)])
     drift_m, own = 0.3, robots.alignments[0].covariance

@@ -1,4 +1,4 @@
-"""The test for one point, against all pairs one by one."""
+"""The test for one point equals a loop over all pairs."""
 
 import numpy as np
 import pytest
@@ -12,9 +12,9 @@ from mapfusion.same_point import SamePoint
 
 
 def drawn(seed: int, n: int, n_labels: int) -> AlignedLandmarks:
-    """Landmarks in a square of 4 m, of very different accuracy; the first `n_labels` are named.
+    """Draw landmarks of different accuracy in a square of 4 m; the first `n_labels` have labels.
 
-    Their looks are unit vectors in a plane of the descriptors' space: many are alike.
+    Their descriptors are unit vectors in a plane, so that many are alike.
     """
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(n, 3, 3)) * rng.choice([0.01, 0.05, 0.4], (n, 1, 1))
@@ -37,7 +37,7 @@ def drawn(seed: int, n: int, n_labels: int) -> AlignedLandmarks:
 def slow_candidates(
     test: SamePoint, a: AlignedLandmarks, b: AlignedLandmarks
 ) -> dict[tuple[int, int], float]:
-    """Pairs that pass, with the distances of their descriptors."""
+    """Return the pairs that pass, with the distances of their descriptors."""
     found = {}
     for i in range(len(a)):
         for j in range(len(b)):

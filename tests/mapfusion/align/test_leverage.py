@@ -104,7 +104,7 @@ def test_true_pairs_are_called_false_as_seldom_as_promised(n: int) -> None:
 
 @pytest.mark.parametrize("n", [4, 6, 20])
 def test_the_limit_of_a_pair_is_that_of_the_f_distribution(n: int) -> None:
-    """Of n pairs the others leave m = 2 (n - 1) - 3 numbers for s_drift: D is 2 F(2, m)."""
+    """The other n - 1 pairs leave m = 2 (n - 1) - 3 degrees of freedom, so D is 2 F(2, m)."""
     rng, sigma_m, k = np.random.default_rng(n), 0.05, 2
     p_b = rng.uniform(0, 9, (n, 2))
     p_a, none, known = se2.transform_points(T_TRUE, p_b), np.zeros((n, 2, 2)), np.zeros((3, 3))

@@ -42,7 +42,7 @@ def test_it_is_what_the_formula_says() -> None:
 
 
 def test_namesakes_may_be_twice_as_far_off_as_the_widest_gate() -> None:
-    """Both maps may be bent by what the widest gate allows for one: 0.8 m hold what 0.4 do not."""
+    """The pairs are 0.6 m off: outside the widest gate of 0.4 m, inside twice that gate."""
     rng = np.random.default_rng(4)
     p_a, way = rng.uniform(0, [40, 30], (10, 2)), rng.uniform(-np.pi, np.pi, 10)
     off = np.array([0.01, 0.01] + [0.6] * 6 + [0.81, 5.0])

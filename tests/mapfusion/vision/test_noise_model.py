@@ -67,9 +67,9 @@ def test_a_surer_limit_is_a_wider_one() -> None:
 
 
 def test_limits_are_those_of_a_mean_of_so_many_squares() -> None:
-    """A half of 17 by 8 pixels holds 136 of them, 34 squares of side 2: each one part.
+    """A half of 17 by 8 pixels has 136 pixels, which are 34 independent squares of side 2.
 
-    The four halves together pass at 0.9 where none fails with more than a quarter of 0.1.
+    Each half may fail with a quarter of the probability 0.1 that the four together may.
     """
     noise = NoiseModel(2.0, 0.5, 0.4, np.ones((50, 3)))
     limits = limits_for(replace(STEREO, residual_correlation_px=2.0), noise, 0.9)

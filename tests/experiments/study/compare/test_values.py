@@ -58,7 +58,7 @@ def test_what_is_told_of_either_version_is_a_median_of_errors_and_a_mean_of_shar
 
 
 def test_nees_of_fused_pairs_is_per_degree_of_freedom() -> None:
-    """Of each pair of robots the mean over its true pairs, planar ones and others."""
+    """Each pair of robots gives the mean over its true pairs, in the plane or in space."""
     rows = {"robot_a": ["A"] * 3 + ["B"] * 2, "robot_b": "C", "run_id": "x"}
     rows |= {"nees_with_drift": [2.0, 4.0, 99.0, 6.0, 3.0], "degrees_of_freedom": [2, 2, 2, 3, 3]}
     fusion = pd.DataFrame(rows | {"true_pair": [True, True, False, True, True]})

@@ -207,7 +207,7 @@ def test_times_in_groups_along_the_overlap() -> None:
 
 
 def test_maps_that_one_method_did_not_see_leave_the_others_in_their_runs() -> None:
-    """The interval is that of the maps both saw, resampled by the runs that these are of."""
+    """The interval resamples the runs of the maps that both methods saw."""
     alike = (1.1, 0.3, 0.0)  # which of them is nearer differs from map to map
     errors = rich(many_errors(5, methods={"one": alike, "other": alike}, repetitions=1))
     keys = ["run_id", "robot_a", "robot_b", "iteration"]
