@@ -39,6 +39,7 @@ def slow_candidates(
 ) -> dict[tuple[int, int], float]:
     """Return the pairs that pass, with the distances of their descriptors."""
     found = {}
+    gate, most_up = chi2.ppf(test.gate_probability, 2), chi2.ppf(test.height.probability, 1)
     for i in range(len(a)):
         for j in range(len(b)):
             if a.label[i] != NO_LABEL and b.label[j] != NO_LABEL:
@@ -48,12 +49,12 @@ def slow_candidates(
             S = a.covariance_m2[i, :2, :2] + b.covariance_m2[j, :2, :2]
             S = S + (a.drift_m2[i] + b.drift_m2[j]) * np.eye(2)
             off = (a.position_m[i] - b.position_m[j])[:2]
-            if off @ np.linalg.solve(S, off) > chi2.ppf(test.gate_probability, 2):
+            if off @ np.linalg.solve(S, off) > gate:
                 continue
             up = a.position_m[i, 2] - b.position_m[j, 2]
             variance = a.covariance_m2[i, 2, 2] + b.covariance_m2[j, 2, 2]
             variance += test.height.floor_m**2
-            if not test.planar and up**2 > chi2.ppf(test.height.probability, 1) * variance:
+            if not test.planar and up**2 > most_up * variance:
                 continue
             unlike = float(np.linalg.norm(a.descriptor[i] - b.descriptor[j]))
             if unlike <= test.max_descriptor_distance:
