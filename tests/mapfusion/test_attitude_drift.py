@@ -78,7 +78,7 @@ def test_long_logs_have_no_more_of_them() -> None:
 
 
 def test_a_frame_measured_for_itself_shares_nothing_with_those_before() -> None:
-    """At frame 3 nothing is carried: the error starts anew there, not a frame later."""
+    """Frame 3 carries nothing, so its error is independent of the errors before it."""
     path = np.column_stack([0.3 * np.arange(6.0), np.zeros((6, 2))])
     carried = np.ones((6, 2))
     carried[3] = 0.0
@@ -92,7 +92,7 @@ def test_a_frame_measured_for_itself_shares_nothing_with_those_before() -> None:
 
 
 def test_a_tilt_of_any_heading_is_the_mean_of_the_variances_of_roll_and_pitch() -> None:
-    """Roll lifts what is beside the robot, pitch what is ahead: by headings all round, the mean."""
+    """Roll lifts what is beside the robot, pitch what is ahead; the test averages over headings."""
     roll_rad, pitch_rad, heading = 0.01, 0.03, np.linspace(-np.pi, np.pi, 8, endpoint=False)
     sigma = np.tile([roll_rad, pitch_rad, 0.0], (1, 1))
     told = Attitude(np.zeros((1, 3)), sigma, np.zeros((1, 2)))

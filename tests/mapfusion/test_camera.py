@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from mapfusion.camera import StereoCamera
 
@@ -79,3 +80,12 @@ def test_disparity_noise_may_differ_from_point_to_point():
     for i, sigma in enumerate((0.1, 0.4)):
         _, alone = CAMERA.triangulate(uvd[:1, :2], uvd[:1, 2], 0.3, sigma)
         np.testing.assert_allclose(covariance[i], alone[0])
+
+
+def test_far_points_are_seen_where_a_turn_of_the_robot_leaves_them():
+    rng = np.random.default_rng(3)
+    far = 1e7 * np.column_stack([np.ones(20), rng.uniform(-0.4, 0.4, (20, 2))])
+    R_robot_before = Rotation.from_euler("ZYX", [0.1, -0.06, 0.03]).as_matrix()
+    found = CAMERA.turned(CAMERA.project(far)[:, :2], R_robot_before)
+    expected = CAMERA.project(np.array([R_robot_before @ p for p in far]))[:, :2]
+    np.testing.assert_allclose(found, expected, atol=1e-4)

@@ -254,3 +254,28 @@ def test_wrong_arguments_are_named():
         MergeParameters(gate_probability=1.0)
     with pytest.raises(ValueError, match="max_descriptor_distance"):
         MergeParameters(max_descriptor_distance=0.0)
+
+
+def test_drift_shifts_and_turns_a_map_about_what_was_aligned_in_the_other():
+    """s_drift shifts each axis, and turns the map by s_drift over the arm about the pairs' middle.
+
+    The expected covariance comes from numerical derivatives of such a shift and turn.
+    """
+    robots = Robots([slice(0, 20), slice(10, 30)])
+    drift_m, own = 0.3, robots.alignments[0].covariance
+    T = robots.alignments[0].T_a_b
+    robots.alignments[0] = replace(robots.alignments[0], drift_sigma_m=drift_m)
+    p_a = robots.maps[0].position_m[robots.correspondences[0].index_a, :2]
+    middle = p_a.mean(axis=0)
+    arm_m = np.sqrt(np.mean(np.sum((p_a - middle) ** 2, axis=1)))
+
+    def moved(x: float, y: float, turn: float) -> np.ndarray:
+        at = np.array([*middle, 0.0])
+        about = se2.compose(se2.compose(at, np.array([x, y, turn])), -at)
+        return se2.compose(about, T)
+
+    h = 1e-6
+    ways = [moved(*step) - moved(*-step) for step in h * np.diag([1, 1, 1 / arm_m])]
+    J = np.array(ways).T / (2 * h)
+    found = robots.merge().motion_covariance[1]
+    np.testing.assert_allclose(found, own + drift_m**2 * J @ J.T, rtol=1e-6, atol=1e-12)

@@ -1,4 +1,4 @@
-"""The test for one point, against all pairs one by one."""
+"""The test for one point equals a loop over all pairs."""
 
 import numpy as np
 import pytest
@@ -12,9 +12,9 @@ from mapfusion.same_point import SamePoint
 
 
 def drawn(seed: int, n: int, n_labels: int) -> AlignedLandmarks:
-    """Landmarks in a square of 4 m, of very different accuracy; the first `n_labels` are named.
+    """Draw landmarks of different accuracy in a square of 4 m; the first `n_labels` have labels.
 
-    Their looks are unit vectors in a plane of the descriptors' space: many are alike.
+    Their descriptors are unit vectors in a plane, so that many are alike.
     """
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(n, 3, 3)) * rng.choice([0.01, 0.05, 0.4], (n, 1, 1))
@@ -37,8 +37,9 @@ def drawn(seed: int, n: int, n_labels: int) -> AlignedLandmarks:
 def slow_candidates(
     test: SamePoint, a: AlignedLandmarks, b: AlignedLandmarks
 ) -> dict[tuple[int, int], float]:
-    """Pairs that pass, with the distances of their descriptors."""
+    """Return the pairs that pass, with the distances of their descriptors."""
     found = {}
+    gate, most_up = chi2.ppf(test.gate_probability, 2), chi2.ppf(test.height.probability, 1)
     for i in range(len(a)):
         for j in range(len(b)):
             if a.label[i] != NO_LABEL and b.label[j] != NO_LABEL:
@@ -48,12 +49,12 @@ def slow_candidates(
             S = a.covariance_m2[i, :2, :2] + b.covariance_m2[j, :2, :2]
             S = S + (a.drift_m2[i] + b.drift_m2[j]) * np.eye(2)
             off = (a.position_m[i] - b.position_m[j])[:2]
-            if off @ np.linalg.solve(S, off) > chi2.ppf(test.gate_probability, 2):
+            if off @ np.linalg.solve(S, off) > gate:
                 continue
             up = a.position_m[i, 2] - b.position_m[j, 2]
             variance = a.covariance_m2[i, 2, 2] + b.covariance_m2[j, 2, 2]
             variance += test.height.floor_m**2
-            if not test.planar and up**2 > chi2.ppf(test.height.probability, 1) * variance:
+            if not test.planar and up**2 > most_up * variance:
                 continue
             unlike = float(np.linalg.norm(a.descriptor[i] - b.descriptor[j]))
             if unlike <= test.max_descriptor_distance:

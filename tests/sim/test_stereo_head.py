@@ -95,7 +95,7 @@ def test_camera_of_another_size_and_mount_is_exact_too(room: FloorPlan, faces: P
 
 
 def test_a_tilted_pair_on_a_turned_robot_looks_along_its_axes() -> None:
-    """Angles in the order of the mount: rolled, pitched, then turned with the robot."""
+    """The pair is rolled, then pitched, then turned with the robot."""
     camera = replace(CAMERA, mount_roll_rad=0.1, mount_pitch_rad=0.2)
     x, y, heading = 1.0, -2.0, 0.7
     found = camera_pose(camera, [x, y, heading], 0.05)

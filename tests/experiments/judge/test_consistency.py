@@ -115,7 +115,7 @@ def test_one_robot_alone() -> None:
 
 @pytest.mark.parametrize(("planar", "dof"), [(True, 2), (False, 3)])
 def test_a_map_s_nees_worked_out_by_hand(planar: bool, dof: int) -> None:
-    """Squares of 0, 1, 4, 6.5 and 20: the gate of 95 % lies at 5.99 for 2 degrees, 7.81 for 3."""
+    """The NEES are 0, 1, 4, 6.5 and 20; the 95 % gate is 5.99 with 2 degrees, 7.81 with 3."""
     squares = np.array([0.0, 1.0, 4.0, 6.5, 20.0])
     points = np.random.default_rng(4).uniform(0, 9, (5, 3)) * [1, 1, not planar]
     off = SIGMA_M * np.sqrt(squares)[:, None] * [0.6, -0.8, 0.0]

@@ -96,7 +96,7 @@ def test_a_map_of_one_robot_has_no_parents_to_be_better_than() -> None:
 
 
 def test_motions_are_judged_by_the_median_robot_and_across_the_half_turn() -> None:
-    """Three maps beside the first: off by 0.1, 0.2 and 0.9 m, and by 0.01, 0.02 and 0.3 rad."""
+    """Three maps are off by 0.1, 0.2 and 0.9 m, and by 0.01, 0.02 and 0.3 rad."""
     team = DrawnTeam([slice(0, 20)] * 4, 5, bent_m=BENT_M)
     team.T_world_map[:, 2] = [3.1, -3.1, 0.5, -0.4]
     fused = judged_team(team).fusion
@@ -113,7 +113,7 @@ def test_motions_are_judged_by_the_median_robot_and_across_the_half_turn() -> No
 
 
 def test_a_fused_map_is_held_against_the_truth_in_its_own_frame() -> None:
-    """The first robot met nobody: the map is in the frame of the second."""
+    """The first robot met nobody, so the map is in the frame of the second."""
     team = DrawnTeam(PARTS, 6, bent_m=BENT_M)
     team.pairs = [pair for pair in team.pairs if 0 not in (pair.a, pair.b)]
     judged = judged_team(team)

@@ -1,6 +1,6 @@
 """Each metric on tables small enough to be worked out by hand.
 
-What a metric takes a median of is skewed, so that no mean passes for it.
+The values are skewed, so that a mean in place of a median gives another number.
 """
 
 import math

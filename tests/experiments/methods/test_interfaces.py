@@ -178,7 +178,7 @@ def _checked(covariance: np.ndarray) -> Alignment:
 
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
 def test_a_covariance_is_judged_by_its_own_size(scale: float) -> None:
-    """Of exact maps covariances are tiny: a wrong sign or place is as wrong there."""
+    """The checks are relative: they hold for tiny covariances of exact maps and for large ones."""
     good = np.array([[2.0, 0.5, 0.1], [0.5, 1.0, -0.2], [0.1, -0.2, 0.3]])
     rounded, singular = good.copy(), np.outer([1.0, 2.0, -1.0], [1.0, 2.0, -1.0])
     rounded[0, 1] *= 1 + 1e-12

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from experiments.run.stages.slam import _step
+from experiments.run.stages.slam import _step, evaluated_iterations
 from mapfusion.fastslam.filter import StepResult
 
 
@@ -17,3 +17,10 @@ def test_spread_is_that_of_the_weighted_particles() -> None:
     assert told["spread_m"] == pytest.approx(np.sqrt(3.0))
     assert [told[f"online_{name}"] for name in ("x_m", "y_m", "theta_rad")] == [1.0, 2.0, 0.3]
     assert (told["effective_sample_size"], told["resampled"], told["n_landmarks"]) == (1.6, True, 9)
+
+
+@pytest.mark.parametrize(
+    ("n_frames", "expected"), [(44, [20, 40, 43]), (41, [20, 40]), (40, [20, 39]), (1, [0])]
+)
+def test_the_last_frame_is_evaluated_and_none_beyond(n_frames: int, expected: list[int]) -> None:
+    assert evaluated_iterations(n_frames, 20) == expected

@@ -198,7 +198,7 @@ def test_oracle_starts_from_the_true_pairs_alone():
 
 
 def test_true_pairs_outside_the_gate_are_no_inliers_of_the_oracle():
-    """Drift may put a true pair metres off: it says nothing about the motion."""
+    """Three true pairs are metres off, as drift may leave them."""
     pair = given_pairs(np.random.default_rng(7), 60)
     far = np.array([3, 10, 41])
     position = pair.map_b.position_m.copy()

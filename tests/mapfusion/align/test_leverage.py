@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.stats import f
 
 from mapfusion import se2
 from mapfusion.align.correspondences import Correspondences
@@ -99,3 +100,17 @@ def test_true_pairs_are_called_false_as_seldom_as_promised(n: int) -> None:
     far = p_a.copy()
     far[0] += 300.0
     assert is_unlike_the_others(T, covariance, variance, pairs._replace(p_a=far), 0)
+
+
+@pytest.mark.parametrize("n", [4, 6, 20])
+def test_the_limit_of_a_pair_is_that_of_the_f_distribution(n: int) -> None:
+    """The other n - 1 pairs leave m = 2 (n - 1) - 3 degrees of freedom, so D is 2 F(2, m)."""
+    rng, sigma_m, k = np.random.default_rng(n), 0.05, 2
+    p_b = rng.uniform(0, 9, (n, 2))
+    p_a, none, known = se2.transform_points(T_TRUE, p_b), np.zeros((n, 2, 2)), np.zeros((3, 3))
+    limit = 2 * f.isf(1e-3 / n, 2, 2 * (n - 1) - 3)
+    for share, unlike in ((0.999, False), (1.001, True)):
+        moved = p_a.copy()
+        moved[k] += sigma_m * np.sqrt(share * limit) * np.array([0.6, -0.8])
+        pairs = PlanarPairs(moved, p_b, none, none)
+        assert is_unlike_the_others(T_TRUE, known, sigma_m**2, pairs, k) == unlike

@@ -41,6 +41,20 @@ def test_it_is_what_the_formula_says() -> None:
     assert log10 == pytest.approx(math.log10(5 * 90 / 42 * tail))
 
 
+def test_namesakes_may_be_twice_as_far_off_as_the_widest_gate() -> None:
+    """The pairs are 0.6 m off: outside the widest gate of 0.4 m, inside twice that gate."""
+    rng = np.random.default_rng(4)
+    p_a, way = rng.uniform(0, [40, 30], (10, 2)), rng.uniform(-np.pi, np.pi, 10)
+    off = np.array([0.01, 0.01] + [0.6] * 6 + [0.81, 5.0])
+    moved = p_a + off[:, None] * np.column_stack([np.cos(way), np.sin(way)])
+    p_b = se2.transform_points(se2.inverse(T_A_B), moved)
+    log10, gate_m, n, k = named_false_alarms(p_a, p_b, T_A_B, GATES_M)
+    assert (gate_m, n, k) == (2 * GATES_M[-1], 10, 8)
+    width, depth = np.ptp(p_a, axis=0) + 2 * gate_m
+    tail = binom.sf(5, 8, math.pi * gate_m**2 / (width * depth))
+    assert log10 == pytest.approx(math.log10(5 * 90 / 56 * tail))
+
+
 @pytest.mark.parametrize(("sigma_m", "accepted"), [(0.01, True), (1.5, False)])
 def test_three_namesakes_that_agree_are_evidence(sigma_m: float, accepted: bool) -> None:
     rng = np.random.default_rng(1)

@@ -110,7 +110,7 @@ def test_without_supporters_squares_lie_about_the_origin() -> None:
 
 
 def _regions(n_confirmed: int, n_contradicted: int, part: int) -> Regions:
-    """Each with twenty landmarks that must be seen, all of them found or none."""
+    """Make regions with twenty landmarks that must be seen; all of them are found, or none."""
     n = n_confirmed + n_contradicted
     expected, found = np.zeros((n, 2, 2), np.int64), np.zeros((n, 2, 2), np.int64)
     expected[:, part, 0] = 20
@@ -121,9 +121,9 @@ def _regions(n_confirmed: int, n_contradicted: int, part: int) -> Regions:
 
 
 def test_shares_of_twins_count_regions_under_wrong_motions() -> None:
-    """The best motion between the maps may be right; of each other one the best region led to it.
+    """The best motion between the maps is left out, and the best region of each other motion.
 
-    Before any region is seen, 0.44 of 3.85 regions are twins, of copies 1.14 of 6.1.
+    The prior counts are 0.44 of 3.85 regions, and 1.14 of 6.1 copies.
     """
     right, wrong = _regions(6, 0, OWN), [_regions(3, 2, OWN), _regions(1, 3, OWN)]
     onto_itself = _regions(4, 1, COPIED)

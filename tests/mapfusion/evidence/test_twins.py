@@ -62,7 +62,7 @@ def test_patches_are_single_linkage_clusters() -> None:
 
 
 def test_a_room_that_is_its_own_half_turn_says_so_once() -> None:
-    """Both orders of a pair fit the same half turn; they are as much evidence as one of them."""
+    """Both orders of a pair fit the same half turn, and count as one pair."""
     rng = np.random.default_rng(4)
     p = rng.uniform(0, [8, 8, 2], (40, 3))
     look = (0.1 * rng.standard_normal((40, 64))).astype(np.float32)
@@ -82,7 +82,7 @@ def test_a_room_that_is_its_own_half_turn_says_so_once() -> None:
 
 
 def test_motions_lie_apart_by_the_root_mean_square_over_the_points() -> None:
-    """A turn moves a point by twice the sine of its half for each metre from the middle."""
+    """A turn by an angle t moves a point at distance r from the origin by 2 r sin(t / 2)."""
     p = np.array([[1.0, 0.0], [0.0, -2.0], [3.0, 4.0]])
     shift = np.array([0.3, -0.4, 0.0])
     assert apart_m(shift, np.zeros(3), p) == pytest.approx(0.5)

@@ -137,7 +137,7 @@ def test_the_gate_counts_the_directions_that_are_seen(sigmas, believed):
 
 
 def test_a_bend_is_due_where_it_moves_the_robot():
-    """The plane turned about (2, 3) leaves a robot there alone, and one at (-2, -3) it does not."""
+    """A turn of the plane about (2, 3) does not move a robot there; it moves one at (-2, -3)."""
     bends, about = Bends(), np.array([2.0, 3.0])
     for _ in range(2 * SPACING):
         bends.went_on(1e2 * np.eye(3))

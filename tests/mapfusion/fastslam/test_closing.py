@@ -218,10 +218,11 @@ def test_without_a_loop_nothing_bends():
 
 @pytest.mark.parametrize("seed", range(4))
 def test_after_two_closures_landmarks_lie_where_the_poses_saw_them(seed, monkeypatch):
-    """What a pose saw once stays where it saw it, and odometry holds across either closure.
+    """Landmarks that were seen once keep their place relative to the pose that saw them.
 
-    One particle drives a circle blindly but for six looks. The groups 0 and 1 come back after more
-    than a turn, each closing a loop; 2 and 3 are seen once, before the first closure and after it.
+    One particle drives in circles and sees landmarks in six frames. Groups 0 and 1 are seen twice
+    and close a loop each; groups 2 and 3 are seen once, before and after the first closure. The
+    path follows the odometry across both closures.
     """
     n = 4 * SPACING
     looks = {0: 0, SPACING: 1, SPACING + 10: 2, 2 * SPACING + 2: 0, 3 * SPACING: 3, n - 10: 1}

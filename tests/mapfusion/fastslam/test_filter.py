@@ -316,7 +316,7 @@ def test_wrong_arguments_are_named():
 
 
 def test_a_landmark_looks_as_in_the_observation_it_came_from():
-    """Descriptors are not averaged; later sightings, each of another look, leave them alone."""
+    """Descriptors are not averaged: later observations leave them as they are."""
     world = drive(3, n_frames=20)
     slam = FastSlam(parameters(association="label"), np.random.default_rng(0))
     for odometry, frame in zip(world.odometry, world.frames, strict=True):

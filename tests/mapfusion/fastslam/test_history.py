@@ -45,7 +45,7 @@ def matrix(T: np.ndarray) -> np.ndarray:
 
 
 def test_each_bend_moves_the_path_as_the_bends_before_left_it() -> None:
-    """Against products of matrices, the last bend leftmost; bends with turns do not commute."""
+    """The path equals a product of matrices with the last bend leftmost."""
     rng = np.random.default_rng(5)
     history, told = History(), []
     for step in range(9):

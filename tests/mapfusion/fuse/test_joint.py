@@ -329,7 +329,7 @@ def test_a_fused_landmark_looks_as_the_parent_that_was_seen_most() -> None:
 
 
 def test_weights_of_a_student_t_are_1_in_the_mean() -> None:
-    """As they are of errors about the true points (Lange et al. 1989), not about estimated ones."""
+    """The E step of Lange et al. (1989) expects this of errors about the true points."""
     dof, means, rows = 2.5, [], np.arange(300)
     for seed in range(2):
         rng, team = np.random.default_rng(seed), DrawnTeam([slice(0, 300)] * 3, seed)

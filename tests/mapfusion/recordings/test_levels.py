@@ -54,10 +54,12 @@ def test_a_floor_alone_is_found_as_well_as_stated() -> None:
 
 @pytest.mark.parametrize(("rougher", "excess"), [(2.0, 2.43), (0.5, 1.0)])
 def test_a_floor_is_no_surer_than_its_points_lie(rougher: float, excess: float) -> None:
-    """Points twice as far off as stated: of those inside the gate the median square says 2.43.
+    """The covariance grows with the median square of the points inside the gate.
 
-    By the normal law: P(|z| < 2.576 / 2) = 0.802, half of it within |z| < 0.526, of which twice the
-    square is 1.106, and 0.455 was stated. Points that lie nearer make it no surer than stated.
+    For points with twice the stated deviation: P(|z| < 2.576 / 2) = 0.802 for normal z, and half of
+    these have |z| < 0.526, so the median square is (2 * 0.526)^2 = 1.106. A chi-square with one
+    degree of freedom has the median 0.455, and 1.106 / 0.455 = 2.43. Smaller residuals do not
+    shrink the covariance.
     """
     rng, n = np.random.default_rng(3), 4000
     p = np.c_[rng.uniform([3, -4], [20, 4], (n, 2)), np.zeros(n)]

@@ -1,5 +1,6 @@
 """Four layouts of one rendered drive give one log; what is wrong with any is one line."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mapfusion import se2
+from mapfusion import se2, se3
 from mapfusion.errors import InputError
 from mapfusion.recordings.mount import MountSettings
 from mapfusion.recordings.registry import import_recording, read_recording, settings_class
@@ -95,6 +96,30 @@ def test_observations_lie_on_the_walls(name: str, logs: dict[str, Imported]) -> 
     )
     walls = np.stack([p_world[:, 0] - 3, p_world[:, 1] - 1.5, p_world[:, 1] + 1.5], -1)
     assert np.median(np.abs(walls).min(axis=1)) < 0.02
+
+
+def test_the_truth_of_a_colour_pair_is_of_a_robot_that_carries_it(
+    folders: dict[str, Path], tmp_path: Path
+) -> None:
+    """The colour pair stands 0.06 m to the left of the grey one, and so does its robot."""
+    day = Path(shutil.copytree(folders["kitti_raw"].parent, tmp_path / "day"))
+    drive, aside_m = day / folders["kitti_raw"].name, 0.06
+    for grey, colour in ((0, 2), (1, 3)):
+        (drive / f"image_0{grey}").rename(drive / f"image_0{colour}")
+    f, (cu, cv) = CAMERA.focal_px, CAMERA.center_px
+    calibration = day / "calib_cam_to_cam.txt"
+    rows = [calibration.read_text(encoding="utf-8").rstrip("\n")]
+    for k in (0, 1):
+        beside_px = f * (aside_m - k * CAMERA.baseline_m)
+        rows.append(f"S_rect_0{k + 2}: {CAMERA.width_px} {CAMERA.height_px}")
+        rows.append(f"P_rect_0{k + 2}: {f} 0 {cu} {beside_px} 0 {f} {cv} 0 0 0 1 0")
+    calibration.write_text("\n".join([*rows, ""]), encoding="utf-8")
+    settings = settings_class("kitti_raw")(cameras="colour", mount=MountSettings(z_m=0.45))
+    found = read_recording("kitti_raw", drive, settings, read_yaml).truth
+    assert found is not None
+    carried = se2.compose(POSES, np.array([0.0, aside_m, 0.0]))
+    T = se3.planar(found.T)
+    np.testing.assert_allclose(se2.between(T[0], T), se2.between(carried[0], carried), atol=1e-9)
 
 
 def test_one_drive_in_four_layouts_is_one_log(logs: dict[str, Imported]) -> None:

@@ -74,7 +74,7 @@ def test_a_guess_errs_by_the_largest_step_so_far() -> None:
 
 
 def test_a_guess_is_of_the_speed_and_errs_with_the_time() -> None:
-    """A motion of two steps is half of it a step; a guess over three is three of these."""
+    """The speed is the last motion over its steps; a guess is the speed times the steps."""
     T = RigidMotion(of_camera(se3.from_planar(MOVED[0])), 1e-6 * np.eye(6), 9)
     made = found([None, T, None], [1, 2, 3])
     speed = MOVED[0] / 2

@@ -201,7 +201,7 @@ def test_a_log_that_saw_nothing_is_refused() -> None:
 
 
 def test_what_is_told_of_levels_is_the_curvature_of_their_likelihood() -> None:
-    """Of disturbances that are all seen: the expected one, by differences in the logarithms."""
+    """The expected information equals second differences of the expected cost."""
     rng = np.random.default_rng(8)
     odometry = rng.normal(0, [0.2, 0.05, 0.3], (30, 3))
     levels = np.array([getattr(NOISE, name) for name in LEVELS])
@@ -233,7 +233,7 @@ def test_what_is_told_of_levels_is_the_curvature_of_their_likelihood() -> None:
 
 
 def test_a_round_multiplies_the_squares_of_levels_by_what_was_found_over_what_is_told() -> None:
-    """A way is as uncertain across as along; of what hardly anything is told stays as it is."""
+    """The lateral level follows the one along the way; a level that nothing tells stays."""
     of_all = Told(np.array([20.0, 2.5, 9.0]), np.array([10.0, 10.0, 1.0]), np.eye(3))
     made = updated(NOISE, of_all)
     found = [getattr(made, name) for name in (*LEVELS, "lateral_m_per_sqrt_m")]

@@ -28,7 +28,7 @@ def test_planar_landmarks_have_no_height_and_are_not_unsure_of_it() -> None:
 @pytest.mark.parametrize("tracked", [False, True])
 @pytest.mark.parametrize("named_by", ["first", "last"])
 def test_landmarks_look_as_the_observations_they_are_named_by(named_by: str, tracked: bool) -> None:
-    """Of landmarks named by rows of the log, whichever rows these are."""
+    """The landmarks may be named by any of their rows in the log."""
     rng = np.random.default_rng(1)
     known = white_noise_log(rng, 80, 15)
     log = with_tracks(known, rng, STRAY_M).log if tracked else known.log

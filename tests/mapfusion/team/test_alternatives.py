@@ -100,10 +100,10 @@ def test_no_false_merge_in_many_teams() -> None:
 def test_chance_closes_a_loop_as_far_as_any_alignment_reaches(
     seed: int, accepted_m: float, rival_m: float, told: bool
 ) -> None:
-    """Accepted 0-1 and 1-2, two alternatives of 0-2, of which one closes the loop.
+    """One of two alternatives of 0-2 closes the loop of the accepted 0-1 and 1-2.
 
-    Their deviations, 0.5 m and 0.05 rad, fill a fifth of all motions within 2 m, and less than a
-    thousandth of those within 60 m, whichever of them reaches so far.
+    A gate with deviations of 0.5 m and 0.05 rad holds a fifth of all motions within 2 m, and less
+    than a thousandth of those within 60 m. It does not matter which alignment reaches so far.
     """
     rng = np.random.default_rng(seed)
     way = rng.uniform(-np.pi, np.pi)

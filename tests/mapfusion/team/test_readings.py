@@ -45,6 +45,6 @@ def test_what_chance_would_close_is_no_loop() -> None:
 
 
 def test_the_gate_keeps_true_loops_with_its_probability() -> None:
-    """A loop leaves two coordinates and an angle open: three degrees of freedom."""
+    """The error of a loop has three degrees of freedom: two coordinates and an angle."""
     for probability in (0.9, 0.999):
         assert LoopTest(probability).gate == pytest.approx(chi2.ppf(probability, 3))

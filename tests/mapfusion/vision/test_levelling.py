@@ -144,14 +144,14 @@ def test_far_points_are_expected_where_a_tilt_moves_them() -> None:
 
 
 def moved_from(value: np.ndarray, T: np.ndarray) -> np.ndarray:
-    """Where the filter's value goes from another by a motion."""
+    """Return the value to which a motion takes the filter from another value."""
     kept = AttitudeFilter(value=value)
     kept.move(RigidMotion(T, np.zeros((6, 6)), 9))
     return kept.value
 
 
 def test_a_step_carries_errors_as_it_carries_the_attitude() -> None:
-    """The covariance against derivatives of the value, by differences from a level body."""
+    """The covariance follows from numerical derivatives of the value at a level body."""
     rng = np.random.default_rng(6)
     T = se3.pose(Rotation.from_euler("ZYX", [0.8, 0.1, -0.15]).as_matrix(), [0.5, -0.3, 0.1])
     before, of_motion = (root @ root.T for root in (rng.normal(size=(n, n)) for n in (3, 6)))
@@ -198,7 +198,7 @@ def test_the_first_frame_s_plane_is_the_map_s() -> None:
 
 @pytest.mark.parametrize("known", [[0, 2], [1, 2], [2], [0, 1, 2]])
 def test_what_is_measured_adds_its_information(known: list[int]) -> None:
-    """P'^-1 = P^-1 + H' R^-1 H, of those that were measured by their own deviations."""
+    """P'^-1 = P^-1 + H' R^-1 H, where H picks what was measured and R has its deviations."""
     root = np.random.default_rng(7).normal(size=(3, 3))
     sigma, value = np.array([0.1, 0.5, 2.0]), np.full(3, np.nan)
     value[known] = np.array([0.3, -0.2, 1.0])[known]
@@ -213,7 +213,7 @@ def test_what_is_measured_adds_its_information(known: list[int]) -> None:
 
 
 def two_frames(shared_rad: float) -> tuple[np.ndarray, np.ndarray]:
-    """Sigmas and carried shares of a body that stands still, measured once well and once badly."""
+    """Return sigmas and carried shares of a body that stands still, measured well, then badly."""
     levelling = Levelling(shared_rad=shared_rad)
     still = RigidMotion(np.eye(4), 1e-8 * np.eye(6), 9)
     for k, sigma in enumerate((0.01, 0.03)):
@@ -223,7 +223,7 @@ def two_frames(shared_rad: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_what_all_measurements_err_by_alike_is_carried_whole() -> None:
-    """The covariance of own errors, and one part more that both frames share."""
+    """The shared error adds its variance to every element of the frames' covariance."""
     shared_rad = 0.02
     (own, carried), (sigma, found) = two_frames(0.0), two_frames(shared_rad)
     together = np.array([[1.0, carried[1, 0]], [carried[1, 0], 0.0]]) * own[0, 0] ** 2
@@ -236,7 +236,7 @@ def test_what_all_measurements_err_by_alike_is_carried_whole() -> None:
 
 
 def test_the_share_of_a_tilt_that_is_carried_is_the_mean_of_both_angles() -> None:
-    """Roll is measured anew, pitch is not: of the one nothing is left, of the other all."""
+    """Roll is measured anew and carries nothing; pitch is not measured and carries all."""
     levelling = Levelling()
     levelling.add(None, Measured(np.zeros(3), np.full(3, 0.01)))
     still = RigidMotion(np.eye(4), 1e-12 * np.eye(6), 9)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from mapfusion.vision.harris import HarrisParameters
 from mapfusion.vision.noise_model import NoiseModel, limits_for, measured_noise
@@ -63,3 +64,15 @@ def test_a_surer_limit_is_a_wider_one() -> None:
     assert wide.plane_half_px == STEREO.half_px
     assert wide.min_correlation < narrow.min_correlation <= STEREO.min_correlation
     assert narrow.row_sigma_px == noise.rows_px
+
+
+def test_limits_are_those_of_a_mean_of_so_many_squares() -> None:
+    """A half of 17 by 8 pixels has 136 pixels, which are 34 independent squares of side 2.
+
+    Each half may fail with a quarter of the probability 0.1 that the four together may.
+    """
+    noise = NoiseModel(2.0, 0.5, 0.4, np.ones((50, 3)))
+    limits = limits_for(replace(STEREO, residual_correlation_px=2.0), noise, 0.9)
+    rms = np.sqrt(chi2.ppf(1 - 0.1 / 4, 34) / 34)
+    assert limits.max_rows_px == pytest.approx(0.4 * rms)
+    assert limits.plane_misfit_px == limits.max_misfit_px == pytest.approx(0.5 * rms)

@@ -81,3 +81,19 @@ def test_times_are_milliseconds_by_number_of_correspondences() -> None:
     assert grouped["n"] == grouped["median"]  # 1 ms a correspondence
     assert len(grouped["n"]) == 40
     assert grouped["n"][0] == pytest.approx(5.5)  # of 1 to 10
+
+
+def test_what_was_offered_is_a_median_over_maps() -> None:
+    parts = [
+        errors(10, n_true, [0.1, 0.2]).assign(robot_b=f"R{k}", n_correspondences=n)
+        for k, (n_true, n) in enumerate(((3, 10), (5, 20), (70, 900)))
+    ]
+    found = error_curves(pd.concat(parts), ["icp"])
+    assert (found["n_true"], found["n_correspondences"]) == ([5.0], [20.0])
+
+
+def test_a_rate_counts_the_maps_with_common_ground() -> None:
+    rows = many_errors(2, methods={"ransac": (1.0, 0.0, 0.0)}, repetitions=1).assign(n_true=5)
+    rows["n_common"] = np.where(rows["iteration"] <= 25, 2, 9)  # one iteration of four
+    curves = success_curves(maps_of(rows).assign(overlap_share=np.nan), ["ransac"])
+    assert curves[0]["aligners"]["ransac"]["n"] == [2 * 2 * 3]

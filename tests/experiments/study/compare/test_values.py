@@ -1,13 +1,11 @@
 """What two versions are compared in, read back from tables whose values are known."""
 
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
 
 from experiments.study.compare.quantities import READ
-from experiments.study.compare.versions import compare
+from experiments.study.compare.versions import VersionComparison, compare
 from tests.helpers.made_up_runs import Tables, tables_of, two_sweeps
 
 
@@ -26,8 +24,12 @@ def changed(seed: int, made: Tables) -> Tables:
     return made
 
 
-def test_values_and_counts_are_those_of_the_tables(tmp_path: Path) -> None:
-    found = compare(*two_sweeps(tmp_path, changed, seeds=6))
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> VersionComparison:
+    return compare(*two_sweeps(tmp_path_factory.mktemp("versions"), changed, seeds=6))
+
+
+def test_values_and_counts_are_those_of_the_tables(found: VersionComparison) -> None:
     over = row(found, "refined / oracle", "ransac")
     assert (over["a"], over["b"], over["change"]) == pytest.approx((1.01, 2.02, 2.0), rel=1e-6)
     # 6 runs of 2 pairs at 4 iterations; where either version has too few pairs it does not count
@@ -42,9 +44,8 @@ def test_values_and_counts_are_those_of_the_tables(tmp_path: Path) -> None:
 
 
 def test_what_is_told_of_either_version_is_a_median_of_errors_and_a_mean_of_shares(
-    tmp_path: Path,
+    found: VersionComparison,
 ) -> None:
-    found = compare(*two_sweeps(tmp_path, changed, seeds=6))
     made = [tables_of(seed) for seed in range(6)]
     fits = pd.concat([each["map_fits"] for each in made])
     rmse_m = np.median(fits[fits["map"] != "fused"]["rmse_m"])
@@ -58,7 +59,7 @@ def test_what_is_told_of_either_version_is_a_median_of_errors_and_a_mean_of_shar
 
 
 def test_nees_of_fused_pairs_is_per_degree_of_freedom() -> None:
-    """Of each pair of robots the mean over its true pairs, planar ones and others."""
+    """Each pair of robots gives the mean over its true pairs, in the plane or in space."""
     rows = {"robot_a": ["A"] * 3 + ["B"] * 2, "robot_b": "C", "run_id": "x"}
     rows |= {"nees_with_drift": [2.0, 4.0, 99.0, 6.0, 3.0], "degrees_of_freedom": [2, 2, 2, 3, 3]}
     fusion = pd.DataFrame(rows | {"true_pair": [True, True, False, True, True]})

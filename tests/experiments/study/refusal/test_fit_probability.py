@@ -37,3 +37,14 @@ def test_a_kind_left_out_is_told_by_the_others() -> None:
     p = left_out(Answers(features, right, kind))
     of_b = fit(features[kind == "b"], right[kind == "b"])
     np.testing.assert_allclose(p[kind == "a"], stated(of_b, features[kind == "a"]))
+
+
+def test_the_units_and_the_origin_of_a_feature_do_not_change_what_is_stated() -> None:
+    """In thousandths of the unit a weight is a thousandth; the probability stays the same."""
+    features, right = drawn(2000, 3)
+    in_mm = 1e3 * (features + np.array([5.0, -2.0]))
+    one, other = fit(features, right), fit(in_mm, right)
+    np.testing.assert_allclose(1e3 * other[1:], one[1:], rtol=1e-3)
+    np.testing.assert_allclose(stated(other, in_mm), stated(one, features), atol=1e-4)
+    # the intercept makes the mean probability that of the answers
+    assert stated(other, in_mm).mean() == pytest.approx(right.mean(), abs=1e-3)

@@ -70,6 +70,10 @@ def test_rates_of_a_kind_worked_out_by_hand() -> None:
     assert (row["first_iteration_by_chance"], row["first_true_pairs_by_chance"]) == (30, 27)
 
 
+def test_rates_do_not_depend_on_the_order_of_the_rows() -> None:
+    assert by_kind(table().iloc[::-1]) == by_kind(table())
+
+
 def test_what_any_method_does_counts_once_for_two_maps() -> None:
     """Another method refuses all but one pair of maps that the first refused, and merges it."""
     other = table(aligner="icp").assign(status="refused", accepted=False)

@@ -15,7 +15,7 @@ KEYS = {"run_id": "x-0", "scenario": "x", "seed": 0, "robot_a": "A", "robot_b": 
 
 
 def rows_of(iteration: int, off: list[float], **more: object) -> pd.DataFrame:
-    """Repetitions with errors of so many m, and of as many rad the other way round."""
+    """Make repetitions with these errors in m, and the negative ones in rad."""
     names = ("translation_error_m", "refined_translation_error_m")
     rows = pd.DataFrame(dict.fromkeys(names, off))
     for name in ("rotation_error_rad", "refined_rotation_error_rad"):
@@ -26,7 +26,7 @@ def rows_of(iteration: int, off: list[float], **more: object) -> pd.DataFrame:
 
 
 def test_the_line_is_the_median_and_the_band_holds_four_fifths() -> None:
-    """Of 0, 1, ..., 9 and 100 the tenths lie at the second and at the last but one."""
+    """The values are 0, 1, ..., 9 and 100: 10 % lie below 1 and 90 % below 9."""
     (row,) = error_bands(rows_of(5, [*map(float, range(10)), 100.0])).to_dict("records")
     names = [f"translation_error_m{end}" for end in ("_low", "", "_high")]
     assert [row[name] for name in names] == [1.0, 5.0, 9.0]

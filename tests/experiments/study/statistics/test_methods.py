@@ -16,6 +16,7 @@ from experiments.study.statistics.error_bands import (
     scarce_spans,
     time_bands,
 )
+from experiments.study.statistics.intervals import clusters_of, median_interval
 from experiments.study.statistics.methods_compared import compare_methods, oracle_ratios
 from tests.helpers.made_up_runs import many_errors
 
@@ -206,17 +207,19 @@ def test_times_in_groups_along_the_overlap() -> None:
 
 
 def test_maps_that_one_method_did_not_see_leave_the_others_in_their_runs() -> None:
-    """Of a run lost to the second method nothing counts; one run is won whole, one lost whole."""
-    errors = rich(many_errors(3, methods={"a": (1.0, 0.0, 0.0), "b": (1.0, 0.0, 0.0)}))
-    errors = errors[errors["aligner"] != "oracle"].copy()
-    runs = errors["run_id"].unique()
-    first, factor = errors["aligner"] == "a", dict(zip(runs, (1.0, 0.5, 2.0), strict=True))
-    errors["translation_error_m"] = np.where(first, errors["run_id"].map(factor), 1.0)
-    seen = errors[first | (errors["run_id"] != runs[0])]
-    (row,) = compare_methods(maps_of(seen), rng()).to_dict("records")
-    assert (row["n_runs"], row["first_wins"]) == (2, 0.5)
-    assert (row["first_wins_low"], row["first_wins_high"]) == (0.0, 1.0)
-    assert (row["ratio_low"], row["ratio_high"]) == pytest.approx((0.5, 2.0))
+    """The interval resamples the runs of the maps that both methods saw."""
+    alike = (1.1, 0.3, 0.0)  # which of them is nearer differs from map to map
+    errors = rich(many_errors(5, methods={"one": alike, "other": alike}, repetitions=1))
+    keys = ["run_id", "robot_a", "robot_b", "iteration"]
+    unseen = errors.groupby(keys).ngroup() % 3 == 1
+    errors = errors[~(unseen & (errors["aligner"] == "other"))]
+    one, other = (errors[errors["aligner"] == name].set_index(keys) for name in ("one", "other"))
+    both = np.log(one["translation_error_m"] / other["translation_error_m"]).dropna().sort_index()
+    runs = clusters_of(both.reset_index())
+    expected = np.exp(median_interval(both.to_numpy(), runs, rng()))
+    (row,) = compare_methods(maps_of(errors), rng()).to_dict("records")
+    assert (row["n_maps"], row["n_runs"]) == (len(both), 5)
+    assert [row[f"ratio{end}"] for end in ("", "_low", "_high")] == pytest.approx(expected)
 
 
 def test_what_is_told_beside_the_ratio_is_a_median_too() -> None:

@@ -95,7 +95,7 @@ def test_every_landmark_counts_once_however_they_are_spread_over_maps() -> None:
 
 
 def test_planar_maps_and_others_are_pooled_by_their_degrees_of_freedom() -> None:
-    """All landmarks are one sum of squares: 200 of 2 and 100 of 3 degrees make 700."""
+    """200 landmarks with 2 degrees of freedom and 100 with 3 have 700 degrees together."""
     runs = {"run_id": ["x", "y"], "landmarks": "own", "degrees_of_freedom": [2, 3]}
     maps = {"n_landmarks": [200, 100], "nees_mean": [1.6, 6.0], "share_in_gate": [1.0, 0.7]}
     (row,) = nees_of_maps(pd.DataFrame(runs | maps), np.random.default_rng(0)).to_dict("records")

@@ -188,7 +188,7 @@ def test_a_further_column_is_shown_by_naming_it(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_what_is_told_of_an_aligner_are_medians_over_its_maps() -> None:
-    """Each of skewed numbers, of which the mean is another."""
+    """The numbers are skewed, so that their mean is another number."""
     errors = made_up({"one": [0.1, 0.2, 0.45, 0.15, 0.4]})
     of_oracle = errors["aligner"] == "oracle"
     for name, values in (
@@ -207,7 +207,7 @@ def test_what_is_told_of_an_aligner_are_medians_over_its_maps() -> None:
 
 
 def test_accepted_answers_are_counted_over_all_repetitions() -> None:
-    """Of three answers a map two are accepted; on two of five maps these are wrong."""
+    """Two of three answers are accepted on each map; on two of five maps they are wrong."""
     right = made_up({"one": [0.1] * 3 + [9.0] * 2})
     answers = [right.assign(repetition=k, accepted=k < 2) for k in range(3)]
     (one,) = verdict_of(pd.concat(answers)).standings
@@ -215,7 +215,7 @@ def test_accepted_answers_are_counted_over_all_repetitions() -> None:
 
 
 def test_nearer_on_most_maps_is_not_equal_though_its_median_error_is_larger() -> None:
-    """Half as far off on three maps of five; five maps prove nothing, so the median map tells."""
+    """The other is half as far off on three maps of five; five maps prove nothing in the t test."""
     first, other = [0.05, 0.06, 0.1, 0.3, 0.32], [0.4, 0.4, 0.05, 0.14, 0.15]
     verdict = verdict_of(made_up({"first": first, "other": other}), timings(first=9, other=1))
     assert [s.aligner for s in verdict.standings] == ["first", "other"]
