@@ -153,11 +153,11 @@ def _largest_twin_m(alike: Pairs, motions: list[Supported], acceptance: Acceptan
 
 
 def _twin_shares(rivals: list[Regions], selves: list[Regions]) -> TwinShares:
-    """Shares of regions confirmed under wrong motions, but for those that led to them.
+    """Compute the shares of regions that wrong motions confirm, without the regions they came from.
 
-    Of the motions between the maps one may be right: that of most regions confirmed is left out. A
-    motion of a map onto itself was looked for where it holds things twice, and says nothing of the
-    others.
+    One of the motions between the maps may be right. The motion with the most confirmed minus
+    contradicted regions is therefore left out. A motion of a map onto itself was searched for where
+    the map holds a structure twice, and says nothing of other regions.
     """
     wrong = sorted(rivals, key=lambda r: r.n_contradicted - r.n_confirmed)[1:]
     own = [_TWINS_BEFORE, *(regions.seen_again(OWN) for regions in wrong)]
