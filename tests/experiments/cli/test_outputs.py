@@ -218,9 +218,10 @@ def test_maps_that_cannot_all_be_written_leave_the_earlier_ones(
     path = tmp_path / "m.parquet"
     write_map(path, old)
     before = contents(tmp_path)
+    assert {each.name for each in before} == {"m.parquet", "m.joint.parquet"}
     (tmp_path / "m.frames.parquet").mkdir()  # where no file can be
     with pytest.raises(OSError, match="directory"):
-        write_map(path, replace(new, viewing=None))
+        write_map(path, new)
     (tmp_path / "m.frames.parquet").rmdir()
     assert contents(tmp_path) == before
 
