@@ -199,13 +199,16 @@ class Registered(NamedTuple):
         """Return the same with a note on the maps behind each reason why it is not accepted."""
         if not note or self.verdict.accepted or self.estimated.status in NOT_RUN:
             return self
+        estimated, refined, verdict = (
+            {"reason": f"{each.reason}; {note}"}
+            if each.reason and each.status is not Status.ACCEPTED
+            else {}
+            for each in self
+        )
         return Registered(
-            *(
-                each
-                if each.status is Status.ACCEPTED or not each.reason
-                else replace(each, reason=f"{each.reason}; {note}")
-                for each in self
-            )
+            replace(self.estimated, **estimated),
+            replace(self.refined, **refined),
+            replace(self.verdict, **verdict),
         )
 
 

@@ -176,7 +176,7 @@ def test_the_test_that_left_too_few_pairs_is_named():
     a, b = unlike_maps(np.random.default_rng(7))
     label = np.arange(40, dtype=np.int32)
     assert match(a, b).shortage == ""
-    lifted = replace(b, position_m=b.position_m + [0, 0, 1.0])
+    lifted = replace(b, position_m=b.position_m + np.array([0, 0, 1.0]))
     said = told_apart(a, lifted)
     assert "40 mutually nearest descriptors, 0 within 0.23 m of height" in said
     assert "median difference 1.00 m" in said
