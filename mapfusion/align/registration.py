@@ -287,7 +287,10 @@ class PairRegistration:
         """Estimate once more, and complete it."""
         estimated = self._estimated(rng)
         done = Registered(estimated, *self._completion.of(estimated))
-        return done if done.verdict.accepted else done.explained(self._completion.pairs.note)
+        if done.verdict.accepted:
+            return done
+        n_support = int(np.count_nonzero(done.refined.inlier))
+        return done.explained(self._completion.pairs.note(n_support))
 
     def _estimated(self, rng: np.random.Generator) -> Alignment:
         pairs = self._completion.pairs
