@@ -18,6 +18,9 @@ DOCUMENT, JUNIT, REPORT = (".json",), (".xml",), (".html", ".htm")
 # Endings of files that commands write: a folder of such a name is a mistake.
 _OF_FILES = {*MAP_ENDINGS, *DOCUMENT, *JUNIT, *REPORT, ".yaml", ".ply", ".g2o", ".tum", ".bag"}
 _OF_RESULTS = {".ply", ".g2o", ".tum", ".rrd"}
+# Tables of a robot log, as Parquet or CSV.
+_OF_LOGS = {"frames", "observations", "truth_poses", "truth_points"}
+_OF_LOGS |= {"odometry_covariance", "attitude"}
 _RESULT = ("scenario.json", "world.json", "provenance.json", "tables", "keyframes")
 
 
@@ -34,19 +37,20 @@ def require_file(
     """
     if path is None:
         return
+    if path.is_dir():
+        raise InputError(f"{option} {path}: is a folder, which cannot be a file; name a file")
     if path.suffix.lower() not in endings:
         found = f"ends in {path.suffix}" if path.suffix else "has no ending"
         hint = "; `mapfusion export RESULT --format` writes others"
         export = hint if path.suffix.lower() in _OF_RESULTS else ""
         raise InputError(f"{option} {path}: {found}, expected {' or '.join(endings)}{export}")
-    if path.is_dir():
-        raise InputError(f"{option} {path}: is a folder; name a file")
     require_writable(path.parent)
     for each in _paths(inputs):
         if _is_same(path, each):
             raise InputError(f"{option} {path}: is an input ({each}); name another file")
-        if each.is_dir() and path.resolve().is_relative_to(each.resolve()):
-            raise InputError(f"{option} {path}: lies in an input ({each}); name a file elsewhere")
+        in_log = each.is_dir() and path.resolve().parent == each.resolve()
+        if in_log and path.stem in _OF_LOGS:
+            raise InputError(f"{option} {path}: is a file of the log {each}; name another file")
 
 
 def require_map_file(path: Path, inputs: Sequence[Path | str | None], n_maps: int = 1) -> None:

@@ -31,15 +31,13 @@ def calibrated(
     scenario's settings. The truth, where there is one, is passed on unread.
 
     Raises:
-        InputError: a log cannot be read or calibrated, or stands where another is to be written.
+        InputError: a log cannot be read or calibrated.
     """
     known = [read_log(path) for path in logs]
     names = [log.robot for log in known]
     for path, name in zip(logs, names, strict=True):
         if names.count(name) > 1:
             raise InputError(f"{path}: robot {name} has more than one log here")
-        if output is not None and (output / name).resolve() == path.resolve():
-            raise InputError(f"--output: {path} would be overwritten; name another folder")
     found = [_associations(log, settings, on_progress) for log in known]
     parameters = SmootherParameters(
         stray_m=settings.smooth.stray_m, min_count=settings.slam.min_count

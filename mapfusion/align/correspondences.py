@@ -242,7 +242,7 @@ def why_few(map_a: LandmarkMap, map_b: LandmarkMap, parameters: MatchParameters)
 def _has_descriptor(landmarks: LandmarkMap) -> np.ndarray:
     """Return which landmarks (N,) of a map with descriptors have one, as bool."""
     assert landmarks.descriptor is not None
-    return ~np.isnan(landmarks.descriptor).any(axis=1)
+    return np.logical_not(np.any(np.isnan(landmarks.descriptor), axis=1))
 
 
 def scale_note(

@@ -93,15 +93,18 @@ class Pairs:
         return self.map_b.covariance_m2.take(self.index_b, axis=0)
 
     @cached_property
-    def note(self) -> str:
-        """What the maps themselves have against any motion of many pairs; empty for nothing."""
-        if len(self) < FEW:
-            return ""
-        if scale := scale_note(self.map_a, self.map_b, self.index_a, self.index_b):
-            return scale
-        if self.by_name:
+    def scale_note(self) -> str:
+        """By what factor one map is larger than the other, in words; empty if by none."""
+        return scale_note(self.map_a, self.map_b, self.index_a, self.index_b) if len(self) else ""
+
+    def note(self, n_support: int) -> str:
+        """Return what about the maps explains that no motion is accepted; empty for nothing.
+
+        `n_support` is how many pairs support the motion found.
+        """
+        if self.by_name and not self.scale_note and FEW <= len(self) > 2 * n_support:
             return f"{len(self)} labels are in both maps: do they name the same landmarks?"
-        return ""
+        return self.scale_note
 
     def points(self) -> tuple[Float, Float]:
         """Positions (N, 3) in both frames, (N, 2) where heights carry no information."""

@@ -199,13 +199,16 @@ class Registered(NamedTuple):
         """Return the same with a note on the maps behind each reason why it is not accepted."""
         if not note or self.verdict.accepted or self.estimated.status in NOT_RUN:
             return self
+        estimated, refined, verdict = (
+            {"reason": f"{each.reason}; {note}"}
+            if each.reason and each.status is not Status.ACCEPTED
+            else {}
+            for each in self
+        )
         return Registered(
-            *(
-                each
-                if each.status is Status.ACCEPTED or not each.reason
-                else replace(each, reason=f"{each.reason}; {note}")
-                for each in self
-            )
+            replace(self.estimated, **estimated),
+            replace(self.refined, **refined),
+            replace(self.verdict, **verdict),
         )
 
 
@@ -284,7 +287,10 @@ class PairRegistration:
         """Estimate once more, and complete it."""
         estimated = self._estimated(rng)
         done = Registered(estimated, *self._completion.of(estimated))
-        return done if done.verdict.accepted else done.explained(self._completion.pairs.note)
+        if done.verdict.accepted:
+            return done
+        n_support = int(np.count_nonzero(done.refined.inlier))
+        return done.explained(self._completion.pairs.note(n_support))
 
     def _estimated(self, rng: np.random.Generator) -> Alignment:
         pairs = self._completion.pairs

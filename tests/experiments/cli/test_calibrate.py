@@ -58,7 +58,7 @@ def test_rounds_that_end_before_their_time_say_so(
 def test_a_log_is_not_written_over(raw: Path, capsys: pytest.CaptureFixture[str]) -> None:
     own = raw.rename(raw.parent / "R1")
     assert_refused(
-        command(capsys, "study", "calibrate", own, "-o", own.parent), "--output", "overwritten"
+        command(capsys, "study", "calibrate", own, "-o", own.parent), "--output", "holds the input"
     )
     reply = command(capsys, "study", "calibrate", own, own, "-o", own.parent / "logs")
     assert_refused(reply, "R1", "more than one log")

@@ -52,8 +52,11 @@ def test_an_option_means_the_same_everywhere() -> None:
     [
         (("align", *MAPS, "--set", "repetitions=3"), "align.repetitions"),
         (("align", *MAPS, "--set", "aligners.0.name=x"), "align.aligners.0.name"),
-        (("slam", "log", "-o", "m", "--set", "filter.n_particles=3"), "slam.filter.n_particles"),
-        (("merge", *MAPS, "-o", "m", "--set", "aligner=svd"), "merge.aligner"),
+        (
+            ("slam", "log", "-o", "m.parquet", "--set", "filter.n_particles=3"),
+            "slam.filter.n_particles",
+        ),
+        (("merge", *MAPS, "-o", "m.parquet", "--set", "aligner=svd"), "merge.aligner"),
         (("run", "quick", "--set", "n_particles=3"), "slam.filter.n_particles"),
     ],
 )

@@ -1,17 +1,18 @@
 """Estimate, refine, judge: composed as by hand, and each estimate completed once."""
 
+import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
 
-from mapfusion.align.acceptance import Acceptance
+from mapfusion.align.acceptance import Acceptance, Verdict
 from mapfusion.align.correspondences import Correspondences, HeightGate
 from mapfusion.align.method import Fit, Needs, Undetermined, supported
 from mapfusion.align.pairs import Pairs
 from mapfusion.align.ransac import Ransac
 from mapfusion.align.refine import Refinement
-from mapfusion.align.registration import Registration, as_aligner
+from mapfusion.align.registration import Registered, Registration, as_aligner
 from mapfusion.align.registry import ALIGNERS, make_aligner
 from mapfusion.align.result import Alignment, Status, without_answer
 from mapfusion.align.rigid import (
@@ -295,3 +296,25 @@ def test_index_outside_its_map_is_named():
     wrong = Correspondences(np.array([0, 5]), np.array([0, 1]), np.zeros(2))
     with pytest.raises(ValueError, match="index_a"):
         Registration(Ransac()).on(full, full, wrong)
+
+
+def test_a_refusal_tells_what_about_the_maps_explains_it():
+    """Once in each reason; a map in other units and labels of other landmarks, and nothing else."""
+    rng = np.random.default_rng(6)
+    pair, registration = given_pairs(rng, 40), Registration(make_aligner("ransac"))
+    assert registration.register(*maps_of(pair), rng).verdict.accepted
+    larger = replace(pair.map_b, position_m=1000 * pair.map_b.position_m, planar=True)
+    done = registration.register(pair.map_a, larger, pair.correspondences, rng)
+    assert done.estimated.reason.count("are 1000 times those of map") == 1
+    assert done.applied.reason.count("is it in millimetres?") == 1
+    named = [
+        replace(each, label=np.arange(len(each), dtype=np.int32)) for each in maps_of(pair)[:2]
+    ]
+    wrong = replace(pair.correspondences, index_b=rng.permutation(pair.correspondences.index_b))
+    done = registration.register(*named, wrong, rng)
+    assert "40 labels are in both maps: do they name the same landmarks?" in done.applied.reason
+    pairs = Pairs(*named, pair.correspondences)
+    assert (pairs.note(20), pairs.note(19) != "") == ("", True)
+    failed = without_answer(Status.FAILED, "ended", 40)
+    ended = Registered(failed, failed, Verdict(Status.FAILED, math.nan, "ended"))
+    assert ended.explained("a note") is ended
