@@ -24,6 +24,10 @@ from mapfusion.errors import InputError, one_line
 # Objects made before Python looks for cycles among them, 700 by default: most are made by imports
 # and in drawing, and stay.
 _MADE_BETWEEN_COLLECTIONS = 50_000
+_THREAD_COUNTS = (
+    *("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"),
+    *("NUMEXPR_NUM_THREADS", "NUMEXPR_MAX_THREADS"),
+)
 REPLACED = {
     "aligners": "scenarios --aligners",
     "schema": "scenarios --schema",
@@ -80,6 +84,8 @@ def main() -> None:
     # Work is bound to one thread anyway, and those that BLAS starts when it is imported wait in a
     # loop. To be said before that.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    os.environ["MPLBACKEND"] = "agg"  # figures go to files; a name unknown here ends the import
+    _mend_thread_counts()
     unsealed = _tell_warnings()
     try:
         use_kernel_cache()
@@ -115,6 +121,23 @@ def main() -> None:
     if code == EXIT_INTERRUPTED:
         complain("interrupted; what was finished is kept, the same command goes on from there")
     sys.exit(code)
+
+
+def _mend_thread_counts() -> None:
+    """Take one thread where a variable names no number of them, and say so.
+
+    Libraries read these variables when they are imported, and some fail then. OpenMP allows a list
+    with a number for each level of nesting; other libraries do not.
+    """
+    for name in _THREAD_COUNTS:
+        given = os.environ.get(name)
+        first = (given or "1").split(",")[0].strip()
+        is_count = first.isascii() and first.isdecimal() and 0 < int(first[:9]) == int(first)
+        if given is None or (is_count and first == given):
+            continue
+        os.environ[name] = first if is_count else "1"
+        if not is_count:
+            complain(f"warning: {name}={one_line(given)}: is no number of threads; 1 is taken")
 
 
 def _tell_warnings() -> list[str]:

@@ -83,15 +83,13 @@ def test_tables_that_disagree_on_a_robot_are_refused(result: Path) -> None:
     write_names(result, "robots", "robot", ["R1", "R2"])
     for name, column in (("paths", "robot"), ("fused_motions", "robot"), ("errors", "robot_b")):
         others = {other: "R1" for other in ("robot", "robot_a", "robot_b") if other != column}
-        write_names(result, name, column, ["R2", "R7", None, ""], **others)
+        write_names(result, name, column, ["R2", "R7", ""], **others)
         found = rf"{name}\.parquet: column {column}: robot R7 is not in robots.*R1, R2"
         with pytest.raises(InputError, match=found):
             ResultTables(result).table(name)
 
 
-def write_names(
-    result: Path, table: str, column: str, names: list[str | None], **others: str
-) -> None:
+def write_names(result: Path, table: str, column: str, names: list[str], **others: str) -> None:
     """A table with these names in a column; whatever else it has is empty, or zero."""
     none = {pa.string(): "", pa.binary(): b"", pa.bool_(): False}
     rows = {field.name: [none.get(field.type, 0)] * len(names) for field in tables.ALL[table]}
