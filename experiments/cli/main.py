@@ -2,6 +2,7 @@
 
 import gc
 import os
+import re
 import sys
 import warnings
 from typing import Annotated, Any
@@ -132,7 +133,7 @@ def _mend_thread_counts() -> None:
     for name in _THREAD_COUNTS:
         given = os.environ.get(name)
         first = (given or "1").split(",")[0].strip()
-        is_count = first.isascii() and first.isdecimal() and 0 < int(first[:9]) == int(first)
+        is_count = re.fullmatch("0*[1-9][0-9]{0,4}", first) is not None
         if given is None or (is_count and first == given):
             continue
         os.environ[name] = first if is_count else "1"
