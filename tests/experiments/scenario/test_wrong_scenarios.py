@@ -183,6 +183,6 @@ def test_a_pipe_is_read_once(tmp_path: Path) -> None:
     os.mkfifo(path)
     writer = threading.Thread(target=path.write_text, args=(WRONG,), daemon=True)
     writer.start()
-    with pytest.raises(InputErrors, match="pipe: camera.focal_px: is true, expected a number"):
+    with pytest.raises(InputErrors, match=r"pipe: camera\.focal_px: is true, expected"):
         load_scenario(path)
     writer.join()
