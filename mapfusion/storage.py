@@ -138,6 +138,17 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
     return found
 
 
+def require_version(path: Path, content: Mapping[str, Any], known: int) -> None:
+    """Raise InputError for a JSON object whose `schema_version` is above the known one.
+
+    Objects of earlier versions may have none.
+    """
+    version = content.get("schema_version", known)
+    if type(version) is not int or not 1 <= version <= known:
+        reads = f"this program reads up to {known}; use the version of mapfusion that wrote it"
+        raise InputError(f"{path}: schema_version is {version!r}, {reads}")
+
+
 def remove_abandoned(folder: Path) -> None:
     """Remove what processes that were killed left below a folder, named by `temporary_prefix`.
 

@@ -2,6 +2,7 @@
 
 import io
 import os
+import re
 import sys
 import warnings
 from typing import Annotated, Any
@@ -19,6 +20,11 @@ from experiments.cli.options import (
     complain,
 )
 from mapfusion.errors import InputError, one_line
+
+_THREAD_COUNTS = (
+    *("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"),
+    *("NUMEXPR_NUM_THREADS", "NUMEXPR_MAX_THREADS"),
+)
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -58,6 +64,8 @@ def main() -> None:
     # Work is bound to one thread anyway, and those that BLAS starts when it is imported wait in a
     # loop. To be said before that.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    os.environ["MPLBACKEND"] = "agg"  # figures go to files; a name unknown here ends the import
+    _mend_thread_counts()
     unsealed = _tell_warnings()
     try:
         use_kernel_cache()
@@ -93,6 +101,23 @@ def main() -> None:
     if code == EXIT_INTERRUPTED:
         complain("interrupted; what was finished is kept, the same command goes on from there")
     sys.exit(code)
+
+
+def _mend_thread_counts() -> None:
+    """Take one thread where a variable names no number of them, and say so.
+
+    Libraries read these variables when they are imported, and some fail then. OpenMP allows a list
+    with a number for each level of nesting; other libraries do not.
+    """
+    for name in _THREAD_COUNTS:
+        given = os.environ.get(name)
+        first = (given or "1").split(",")[0].strip()
+        is_count = re.fullmatch("0*[1-9][0-9]{0,4}", first) is not None
+        if given is None or (is_count and first == given):
+            continue
+        os.environ[name] = first if is_count else "1"
+        if not is_count:
+            complain(f"warning: {name}={one_line(given)}: is no number of threads; 1 is taken")
 
 
 def _tell_warnings() -> list[str]:

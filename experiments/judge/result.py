@@ -17,6 +17,7 @@ import numpy as np
 from experiments.judge import tables
 from experiments.judge.errors import EvaluatedRobot
 from experiments.judge.judged_run import JudgedRun
+from experiments.judge.result_files import RESULT_SCHEMA_VERSION, require_tables
 from experiments.judge.table_makers import Maker, history_makers, in_order, makers
 from experiments.methods.catalogue import find_method
 from experiments.run.code_version import library_versions
@@ -39,7 +40,6 @@ from mapfusion.viewing_files import viewing_paths
 from sim.floorplan import Wall
 from sim.renderer import renderer_name
 
-RESULT_SCHEMA_VERSION = 1
 OnWritten = Callable[[Path, str], None]
 _SUBFOLDERS = ("tables", "maps", "keyframes", "figures")
 _LABEL = "write the tables"
@@ -47,10 +47,11 @@ _FACE_DECIMALS = 6  # a micrometre: what is beyond is rounding
 
 
 def require_result(result: Path) -> None:
-    """Raise InputError unless the folder holds a finished result."""
+    """Raise InputError unless the folder holds a finished result with all its tables."""
     for name in ("scenario.json", "tables"):
         if not (result / name).exists():
             raise InputError(f"{result}: not a result folder (no {name}); make one with `run`")
+    require_tables(result)
 
 
 def run_scenario(
@@ -112,7 +113,8 @@ def write_result(
     on_written(folder, "scenario")
     write_tables(others)
     _write_maps(run, folder / "maps")
-    write_json(folder / "provenance.json", provenance(run))
+    about = provenance(run) | {"tables": sorted([*of_figures, *others])}
+    write_json(folder / "provenance.json", about)
 
 
 def measure_aligners(run: JudgedRun) -> None:

@@ -5,9 +5,12 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
+from experiments.judge.tables import table_path
 from experiments.scenario.settings import Bound
-from mapfusion.errors import DamagedFileError
-from mapfusion.storage import read_json
+from mapfusion.errors import DamagedFileError, InputError
+from mapfusion.storage import read_json, require_version
+
+RESULT_SCHEMA_VERSION = 1
 
 
 class _ResolvedScenario(BaseModel):
@@ -25,6 +28,7 @@ class _World(BaseModel):
 
 class _Provenance(BaseModel):
     stages: dict[str, Any] = {}
+    tables: list[str] = []
     libraries: dict[str, str] = {}
 
 
@@ -43,8 +47,24 @@ def read_provenance(path: Path) -> dict[str, Any]:
     return _checked(path, "provenance of a result", _Provenance)
 
 
+def require_tables(result: Path) -> None:
+    """Raise InputError if a table is gone that the run wrote into its result folder.
+
+    Results of earlier versions do not say which tables they have.
+    """
+    path = result / "provenance.json"
+    written = read_provenance(path).get("tables", ()) if path.is_file() else ()
+    gone = [name for name in written if not table_path(result, name).is_file()]
+    if gone:
+        others = f" (and {len(gone) - 1} more)" if len(gone) > 1 else ""
+        remedy = "put it back, or run the scenario again"
+        missing = table_path(result, gone[0])
+        raise InputError(f"{missing}: is missing{others}, but the run wrote it; {remedy}")
+
+
 def _checked(path: Path, what: str, model: type[BaseModel]) -> dict[str, Any]:
     found = read_json(path, what)
+    require_version(path, found, RESULT_SCHEMA_VERSION)
     try:
         model.model_validate(found)
     except ValidationError as error:

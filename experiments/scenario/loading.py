@@ -231,7 +231,7 @@ def _validated(where: str, kind: type[S], data: dict[str, Any], place: Place = _
     problems = list(_unfit(schema, schema, data, ()))
     unfit = {problem.location for problem in problems}
     try:
-        made = _known(kind).validate_python(data)
+        made: Any = _known(kind).validate_python(data)
         if not problems:
             return made
     except ValidationError as error:

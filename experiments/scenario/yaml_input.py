@@ -143,6 +143,8 @@ def _depth_of(value: Any) -> int:
 
 def lines_of_keys(path: Path) -> dict[tuple[str | int, ...], int]:
     """Line number of each key and list item of a YAML file, by its path; none if unreadable."""
+    if not path.is_file():  # a pipe, which can be read once only
+        return {}
     try:
         text = path.read_text(encoding="utf-8").removeprefix(_OPENCV_HEADER)
         node = _reader().compose(text)

@@ -58,7 +58,9 @@ def _json(data: bytes, rng: Random) -> bytes:
     """An object whose values, or itself, are others; sealed."""
     content = json.loads(data)
     name = rng.choice(sorted(content))
-    if rng.random() < 0.3:
+    if rng.random() < 0.1:
+        content["schema_version"] = rng.choice(_VERSIONS)
+    elif rng.random() < 0.3:
         del content[name]
     else:
         content[name] = rng.choice(_STRANGE)
@@ -120,14 +122,31 @@ def _array(data: bytes, rng: Random) -> bytes:
 
 
 def _text(data: bytes, rng: Random) -> bytes:
-    """A file of text in which some words are others."""
+    """A file of text in which some words are others, or which is of another dialect."""
+    if rng.random() < 0.3:
+        return rng.choice(_DIALECTS)(data)
     words = re.split(rb"([ ,\n]+)", data)
     for _ in range(rng.randint(1, 3)):
         words[2 * rng.randrange(len(words) // 2)] = rng.choice(_WORDS)
     return b"".join(words)
 
 
+_DIALECTS: list[Callable[[bytes], bytes]] = [
+    lambda data: data.replace(b",", b";"),
+    lambda data: data.replace(b",", b"\t"),
+    lambda data: data.replace(b",", b", "),
+    lambda data: data.replace(b".", b","),
+    lambda data: data.replace(b"\n", b"\r\n"),
+    lambda data: data.upper(),
+    lambda data: data.partition(b"\n")[2],  # no header
+    lambda data: b"\n".join(reversed(data.splitlines())),
+    lambda data: b"\xef\xbb\xbf" + data,  # a mark of the order of bytes
+    lambda data: data.decode().encode("utf-16"),
+    lambda data: b"".join(b'"' + line + b'"\n' for line in data.splitlines()),
+]
 _WORDS = [*(b"", b"x", b"nan", b"inf", b"-1", b"0", b"1e300", b"-1e18", b"1e-320", b"\xff", b'"')]
+_WORDS += [b"18446744073709551616", b"9223372036854775808", b"-9223372036854775809", b"1e9", b"1.5"]
+_VERSIONS: list[Any] = [99, 0, -1, 2**64, "1", 1.0, True, None, [1]]
 # Half of all damages: what was written so, seal and all.
 SEALED = {".json": _json, ".parquet": _table, ".npy": _array, ".csv": _text, ".dat": _text}
 

@@ -1,4 +1,4 @@
-"""Broken scenarios: each is refused in one short line, or is a scenario.
+"""Broken scenarios: each is refused in short lines, one for each error, or is a scenario.
 
 Scenarios of the suite are mutated, as values and as text; what validates is run where it costs
 little (`small_enough`), and ends with a result or with one line as well.
@@ -88,6 +88,8 @@ def _damage(rng: random.Random, node: Any) -> None:
 def _other(rng: random.Random, value: Any) -> Any:
     """Another value, of the same kind as a rule."""
     number = isinstance(value, int | float) and not isinstance(value, bool)
+    if isinstance(value, bool | int | float) and rng.random() < 0.1:  # of another type
+        return rng.choice([str(value), str(value).lower(), [value], {"a": value}, bool(value)])
     if number and rng.random() < 0.75:
         near = value * rng.choice([-1, 0.1, 0.5, 0.9, 1.1, 2, 10, 1000]) + rng.choice([0, 0, 1])
         whole = int(near) if math.isfinite(near) else 0
@@ -105,6 +107,8 @@ def as_text(rng: random.Random, data: Any) -> bytes:
     text = json.dumps(data, indent=rng.choice([None, 1]))
     for name, own in (("-Infinity", "-.inf"), ("Infinity", ".inf"), ("NaN", ".nan")):
         text = text.replace(name, own)
+    if rng.random() < 0.3:
+        text = f"---\n{text}"  # read as YAML, not as JSON
     if rng.random() < 0.15:
         at = rng.randrange(len(text))
         cut = rng.choice([0, 0, 1, 3, len(text)])
@@ -135,8 +139,9 @@ def complaint(load: Callable[[], AnyScenario]) -> tuple[str, AnyScenario | None]
         said = str(error)
     except Exception as error:
         return f"{type(error).__name__}: {str(error)[:200]}", None
-    if len(said) > MOST_CHARACTERS or not said.isprintable():
-        return f"not one line of {MOST_CHARACTERS} characters: {said[:400]!r}", None
+    for line in said.split("\n"):
+        if len(line) > MOST_CHARACTERS or not line.isprintable():
+            return f"not a line of {MOST_CHARACTERS} characters: {line[:400]!r}", None
     return "", None
 
 
@@ -167,8 +172,8 @@ def run_fault(path: Path, results: Path, figures: Sequence[str]) -> str:
     said = [line for line in text.splitlines() if line.startswith("mapfusion: ")]
     if code not in {0, 2} or "Traceback" in text:
         return f"ended with {code}: {text[-600:]}"
-    if code == 2 and (len(said) != 1 or len(said[0]) > MOST_CHARACTERS + 20):
-        return f"complained in other than one line: {said}"
+    if code == 2 and (not said or max(map(len, said)) > MOST_CHARACTERS + 20):
+        return f"complained in no line, or in too long ones: {said}"
     return ""
 
 

@@ -57,6 +57,12 @@ def _damage(seed: str, shares: int, folder: Path) -> Found:
     return damaged_files.explore(seed, 70, folder)
 
 
+def _surroundings(seed: str, shares: int, folder: Path) -> Found:
+    from tests.campaign import surroundings
+
+    return surroundings.explore(seed, 40, folder)
+
+
 def _flips(seed: str, shares: int, folder: Path) -> Found:
     from tests.campaign import flipped_bits
 
@@ -69,6 +75,9 @@ PARTS = {
     "killed_runs": Part({"kills": 100}, 2, _kills),
     "misbehaving_plugins": Part({"misbehaviours": 60}, 1, _plugins),
     "flipped_bits": Part({"flips": 2000, "in footers": 666}, 1, _flips),
+    "surroundings": Part(
+        {"tables deleted": 100, "versions": 18, "environments": 40}, 1, _surroundings
+    ),
     "damaged_files": Part({"damaged": 1000}, 1, _damage),
 }
 

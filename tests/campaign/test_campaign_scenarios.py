@@ -28,7 +28,7 @@ LOGS = "schema_version: 1\nname: x\nlogs: [{}]\n"
     ("text", "said"),
     [
         (DRAWN + "seed: -1\n", "seed: is -1, must be in [0, 4294967295]"),
-        (DRAWN + "seed: [1]\n", "seed: Input should be a valid integer"),
+        (DRAWN + "seed: [1]\n", "seed: is [1], expected an integer"),
         (TINY.replace("name: R1", "name: fused"), "robots.0.name: the name fused is taken"),
         (TINY.replace("name: R1", "name: oracle"), "robots.0.name: the name oracle is taken"),
         (TINY.replace("  path_rmse_m:", "  1:"), "expect: the key 1 is no text"),
@@ -102,4 +102,4 @@ def test_the_campaign_sees_what_is_wrong() -> None:
     assert not complaint(lambda: raises(InputError("x\n\x1b" * 400)))[0]  # cut by construction
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(InputError, "__str__", lambda error: "x" * 301)
-        assert "not one line" in complaint(lambda: raises(InputError("")))[0]
+        assert "not a line" in complaint(lambda: raises(InputError("")))[0]

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.campaign import damaged_files, flipped_bits
+from tests.campaign import damaged_files, flipped_bits, surroundings
 from tests.helpers import killing
 from tests.helpers.tiny_scenario import SHORT
 
@@ -15,6 +15,10 @@ def test_flipped_bits(tmp_path: Path) -> None:
 
 def test_damaged_files(tmp_path: Path) -> None:
     assert damaged_files.explore("1", 20, tmp_path).faults == []
+
+
+def test_surroundings(tmp_path: Path) -> None:
+    assert surroundings.explore("1", 1, tmp_path).faults == []
 
 
 def test_a_command_that_does_not_end_says_where_it_is(

@@ -135,6 +135,7 @@ def test_missing_folder_is_named(tmp_path):
     [
         ([3, 2, 2, 2, 0, 0], "is 2 in row 1, after 3; sort the rows"),
         ([0, 0, 0, 0, 0, 9], "is 9 in row 5, but frames.parquet ends with frame 3"),
+        ([0, 0, 0, 0, 0, 4], "is 4 in row 5, but frames.parquet ends with frame 3"),
         ([-1, 0, 0, 0, 0, 0], "is -1 in row 0; frames are 0, 1, 2"),
     ],
 )

@@ -69,10 +69,24 @@ class ResultTables:
         """The table of that name (see experiments.judge.tables)."""
         self._require_written(name)
         if name not in self._tables:
-            self._tables[name] = read(table_path(self.folder, name), name)
+            rows = read(table_path(self.folder, name), name)
+            self._tables[name] = rows
+            if name != "robots" and self._written is None and self.has("robots"):
+                self._require_robots(name, rows)
         if self._tables[name].columns.empty:
             raise NothingToDraw(f"no run has a table {name}")
         return self._tables[name]
+
+    def _require_robots(self, name: str, rows: pd.DataFrame) -> None:
+        """Raise InputError for a robot that the table `robots` does not have."""
+        for column in {"robot", "robot_a", "robot_b"} & set(rows.columns):
+            others = sorted({each for each in rows[column].dropna() if each} - set(self.robots))
+            if others:
+                known = f"which has {', '.join(self.robots)}"
+                raise InputError(
+                    f"{table_path(self.folder, name)}: column {column}: robot {others[0]} is not in"
+                    f" robots.parquet, {known}; the tables are of different runs"
+                )
 
     def has(self, name: str) -> bool:
         """Whether there is a table of that name; older results lack some."""

@@ -14,6 +14,7 @@ from experiments.show import numbers
 from experiments.show.export import write_text
 from experiments.show.report.contents import contents_of
 from experiments.show.report.theme import css_name, palette
+from experiments.study.statistics.better import FEW_RUNS
 from experiments.study.statistics.error_bands import BAND
 
 _PAGE = Path(__file__).parent / "page"
@@ -40,6 +41,7 @@ def templates() -> jinja2.Environment:
         lstrip_blocks=True,
     )
     environment.globals |= {"text": numbers, "criteria": criteria, "shown": tables.SHOWN}
+    environment.globals["few_worlds"] = FEW_RUNS  # runs of one world are not independent
     environment.globals["gross_m"] = GROSS_M
     environment.tests["nan"] = math.isnan
     return environment

@@ -211,9 +211,10 @@ def _caveats(summary: Summary) -> list[str]:
     if n_runs == 1:
         depend = "which depend on each other, and nothing of other seeds"
         lines.append(f"One run: the brackets tell of the {MAPS_OF_ONE_RUN}, {depend}.")
-    elif n_runs < FEW_RUNS:
+    elif summary.n_worlds < FEW_RUNS:
         too_narrow = f"bootstrap intervals of so few are too narrow; take {FEW_RUNS} seeds or more"
-        lines.append(f"{n_runs} runs: {too_narrow}.")
+        worlds = f"{summary.n_worlds} world{'s' * (summary.n_worlds > 1)}"
+        lines.append(f"{n_runs} runs in {worlds} (scenario and seed): {too_narrow}.")
     if n_settings > _MAX_CONFIGURATIONS:
         shown = f"{_MAX_CONFIGURATIONS} of {n_settings} settings"
         lines.append(f"Shown are {shown}; `-o FOLDER` writes all.")

@@ -89,7 +89,9 @@ def compare(path_a: Path, path_b: Path, apart_from: Sequence[str] = ()) -> Versi
         if names:
             runs = f"{len(names)} run{'s' * (len(names) > 1)} of the {which}"
             notes.append(f"left out: {runs} that the other has not ({_some(names)})")
-    notes += _notes_on(table, unit, len(common))
+    is_common = match_names(a.described, apart_from).isin(common)
+    worlds = a.described.loc[is_common, ["scenario", "seed"]].drop_duplicates()
+    notes += _notes_on(table, unit, len(common), len(worlds))
     return VersionComparison(table.drop(columns=_NOT_SHOWN), unit, len(common), tuple(notes))
 
 
@@ -152,17 +154,18 @@ def _some(names: set[str]) -> str:
     return shown + (f" and {len(names) - _SHOWN_NAMES} more" if len(names) > _SHOWN_NAMES else "")
 
 
-def _notes_on(table: pd.DataFrame, unit: str, n_runs: int) -> list[str]:
+def _notes_on(table: pd.DataFrame, unit: str, n_runs: int, n_worlds: int) -> list[str]:
     notes = []
     if unit == MAPS_OF_ONE_RUN:
         notes.append(
             "weak: one run each. The noise is that between the robots and maps of this run, which "
             "depend on each other; another seed may say otherwise. Compare six seeds or more"
         )
-    elif n_runs < better.FEW_RUNS:
+    elif n_worlds < better.FEW_RUNS:
+        worlds = f"{n_worlds} world{'s' * (n_worlds > 1)} (scenario and seed)"
         notes.append(
-            f"weak: {n_runs} runs. The test takes the changes for normally distributed, which so "
-            f"few cannot show; compare {better.FEW_RUNS} seeds or more"
+            f"weak: {n_runs} runs in {worlds}. The test takes the changes for normally "
+            f"distributed, which so few cannot show; compare {better.FEW_RUNS} seeds or more"
         )
     if table["timed"].any():
         notes.append(

@@ -16,10 +16,11 @@ import pyarrow as pa
 
 from experiments.judge import tables
 from experiments.judge.judged_maps import RUN_KEYS, setting_columns
-from experiments.judge.result_files import read_scenario
+from experiments.judge.result_files import read_scenario, require_tables
 from experiments.run.frames import row_groups
+from experiments.study.sweep.sweep_dataset import SCHEMA_VERSION
 from mapfusion.errors import InputError
-from mapfusion.storage import text_attributes
+from mapfusion.storage import read_json, require_version, text_attributes
 
 _VERSION = b"mapfusion.schema_version"
 _TOLD = ("status", "reason")  # of each run of a sweep
@@ -151,8 +152,11 @@ def find_runs(paths: Path | Sequence[Path]) -> Runs:
     results, sweeps = [], []
     for path in [paths] if isinstance(paths, Path) else paths:
         if (path / "sweep.json").is_file():
+            about = path / "sweep.json"
+            require_version(about, read_json(about, "description of a sweep"), SCHEMA_VERSION)
             sweeps.append(path)
         elif (path / "scenario.json").is_file():
+            require_tables(path)
             results.append(RunPath(path, _run_of(path / "scenario.json")))
         else:
             what = "no such folder" if not path.is_dir() else "no scenario.json and no sweep.json"

@@ -68,7 +68,8 @@ class Recommendation:
 
     `best` is None where no aligner was ever right; these data cannot tell the `equals` from it.
     `standings` are all aligners but the oracle, the best first. Of `n_maps` pairs of maps
-    `n_common` have common ground; runs are the only things here that are independent of each other.
+    `n_common` have common ground. Runs of different worlds are the only things here that are
+    independent of each other; runs of one scenario and seed share their world.
     """
 
     best: Standing | None
@@ -77,6 +78,8 @@ class Recommendation:
     n_maps: int
     n_common: int
     n_runs: int
+    n_worlds: int
+    n_scenarios: int
     oracle_m: float
     oracle_rad: float
 
@@ -133,6 +136,8 @@ def recommend(maps: pd.DataFrame, timings: pd.DataFrame, aligners: list[str]) ->
         len(maps.drop_duplicates(MAP_PAIR)),
         len(ground.drop_duplicates(MAP_PAIR)),
         maps["run_id"].nunique(),
+        len(maps[["scenario", "seed"]].drop_duplicates()),
+        maps["scenario"].nunique(),
         float(oracle["refined_translation_error_m"].median()),
         float(oracle["refined_rotation_error_rad"].median()),
     )

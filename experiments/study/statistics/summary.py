@@ -62,6 +62,7 @@ class Summary(NamedTuple):
     """
 
     n_runs: int
+    n_worlds: int
     tables: dict[str, pd.DataFrame]
     run_medians: pd.DataFrame
     timings: pd.DataFrame
@@ -101,7 +102,8 @@ def summarise(runs: Runs) -> Summary:
             made[name] = pd.concat(parts, ignore_index=True)
             timings = rows if table == "aligner_timings" else timings
     made = {name: table for name, table in made.items() if len(table)}
-    return Summary(len(runs.described), made, medians, timings, missing, runs.failed)
+    worlds = runs.described[["scenario", "seed"]].drop_duplicates()
+    return Summary(len(runs.described), len(worlds), made, medians, timings, missing, runs.failed)
 
 
 class ReducedErrors(NamedTuple):

@@ -1,6 +1,8 @@
 """All that is wrong with a scenario is told at once: the line of the file, the key, the remedy."""
 
 import json
+import os
+import threading
 import time
 from pathlib import Path
 
@@ -174,3 +176,13 @@ def test_a_result_file_that_is_no_object_says_what_it_holds(tmp_path: Path, text
     with pytest.raises(InputError, match=r"no JSON object \(it holds") as e:
         read_json(path, "resolved scenario")
     assert "operand" not in str(e.value)
+
+
+def test_a_pipe_is_read_once(tmp_path: Path) -> None:
+    path = tmp_path / "pipe"
+    os.mkfifo(path)
+    writer = threading.Thread(target=path.write_text, args=(WRONG,), daemon=True)
+    writer.start()
+    with pytest.raises(InputErrors, match=r"pipe: camera\.focal_px: is true, expected"):
+        load_scenario(path)
+    writer.join()

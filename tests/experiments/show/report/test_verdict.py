@@ -32,6 +32,8 @@ ONE_RUN = Recommendation(
     n_maps=24,
     n_common=20,
     n_runs=1,
+    n_worlds=1,
+    n_scenarios=1,
     oracle_m=0.095,
     oracle_rad=0.005,
 )
@@ -93,6 +95,17 @@ def test_a_method_that_mostly_fails_is_not_recommended() -> None:
 
 def test_one_run_is_indicative_and_settings_of_several_are_named() -> None:
     assert "Indicative: one run" in sentences(ONE_RUN)
-    several = sentences(replace(ONE_RUN, n_runs=10), ("slam.filter.n_particles",))
-    assert "Measured over 10 runs" in several
+    many = replace(ONE_RUN, n_runs=12, n_worlds=6)
+    several = sentences(many, ("slam.filter.n_particles",))
+    assert "Measured over 12 runs in 6 worlds" in several
+    assert "apply to other seeds of the same scenario." in several
     assert "differ in slam.filter.n_particles" in several
+
+
+def test_runs_in_few_worlds_say_nothing_of_other_seeds() -> None:
+    """Ten settings in two worlds are twenty runs, and still two worlds."""
+    for n_worlds, words in ((2, "2 worlds"), (1, "one world")):
+        text = sentences(replace(ONE_RUN, n_runs=20, n_worlds=n_worlds))
+        assert f"Indicative: measured over 20 runs in {words}." in text
+        assert "a sweep over 6 seeds or more" in text
+        assert "other seeds" not in text

@@ -37,9 +37,10 @@ def said(capsys: pytest.CaptureFixture[str]) -> list[str]:
     return [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
 
 
-def summary(n_runs: int, **tables: pd.DataFrame) -> Summary:
+def summary(n_runs: int, n_worlds: int | None = None, **tables: pd.DataFrame) -> Summary:
+    worlds = n_runs if n_worlds is None else n_worlds
     failed = pd.DataFrame({"scenario": ["hall"], "seed": [7], "reason": ["R1 hit a wall"]})
-    return Summary(n_runs, tables, pd.DataFrame(), pd.DataFrame(), ("robots",), failed)
+    return Summary(n_runs, worlds, tables, pd.DataFrame(), pd.DataFrame(), ("robots",), failed)
 
 
 def test_the_best_method_is_held_against_the_others(capsys: pytest.CaptureFixture[str]) -> None:
@@ -55,7 +56,8 @@ def test_the_best_method_is_held_against_the_others(capsys: pytest.CaptureFixtur
 
 
 @pytest.mark.parametrize(
-    ("n_runs", "beginning"), [(1, "One run: the brackets tell"), (5, "5 runs: bootstrap intervals")]
+    ("n_runs", "beginning"),
+    [(1, "One run: the brackets tell"), (5, "5 runs in 5 worlds (scenario and seed): bootstrap")],
 )
 def test_few_runs_are_a_caveat_and_tables_may_be_missing(
     n_runs: int, beginning: str, capsys: pytest.CaptureFixture[str]
@@ -106,3 +108,10 @@ def test_what_got_worse_comes_first_and_all_is_counted(capsys: pytest.CaptureFix
     assert any("5 % over 3 tests" in line for line in lines)
     print_comparison(found, show_all=True, written=None)
     assert "oracle true pairs 40 40 same" in said(capsys)
+
+
+def test_many_runs_in_few_worlds_are_a_caveat(capsys: pytest.CaptureFixture[str]) -> None:
+    print_summary(summary(20, n_worlds=2), None, [])
+    assert any(line.startswith("20 runs in 2 worlds") for line in said(capsys))
+    print_summary(summary(20, n_worlds=6), None, [])
+    assert not any("worlds" in line for line in said(capsys))
