@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -14,12 +15,17 @@ from experiments.scenario.settings import AnyScenario, Bound
 from mapfusion.errors import InputError, did_you_mean
 
 
-def load_checked(path: Path, overrides: Sequence[str] = (), seed: int | None = None) -> AnyScenario:
+def load_checked(
+    path: Path,
+    overrides: Sequence[str] = (),
+    seed: int | None = None,
+    content: dict[str, Any] | None = None,
+) -> AnyScenario:
     """A scenario as `load_scenario` gives it.
 
     Raises InputError also for unknown metrics, and where the truth that they need is.
     """
-    scenario = load_scenario(path, overrides, seed)
+    scenario = load_scenario(path, overrides, seed, content)
     aligners = [entry.name for entry in scenario.align.aligners]
     known = metrics.known_metrics(aligners, scenario.fuse.fusers)
     unknown = sorted(set(scenario.expect) - set(known))

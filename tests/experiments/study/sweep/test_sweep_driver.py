@@ -1,5 +1,6 @@
 """The driver on two processes, with tasks that fail in every way."""
 
+import http.client
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -8,8 +9,10 @@ from typing import Any, cast
 
 import dask.config
 import pandas as pd
+import psutil
 import pytest
 from distributed import Client, LocalCluster
+from distributed.security import Security
 
 from experiments.run.dask_cluster import connected
 from experiments.run.dask_worker import Terms, code_version
@@ -276,6 +279,52 @@ def test_an_existing_cluster_of_unfit_workers_ends_the_sweep(scene: Scene, tmp_p
 
 def test_no_scheduler_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("experiments.run.dask_cluster.CONNECT_TIMEOUT_S", 0.2)
-    for address in ("tcp://127.0.0.1:1", "nonsense://x"):
+    for address in ("tcp://127.0.0.1:1", "nonsense://x", "tls://127.0.0.1:1"):
         with pytest.raises(InputError, match=f"--scheduler {address}"), connected(1, address):
             pass
+
+
+def listening() -> list[tuple[str, int]]:
+    """Where this process and those that it started wait for connections."""
+    own = psutil.Process()
+    return [
+        (found.laddr.ip, found.laddr.port)
+        for process in (own, *own.children(recursive=True))
+        for found in process.net_connections("inet")
+        if found.status == psutil.CONN_LISTEN
+    ]
+
+
+def test_nobody_without_the_credentials_runs_anything_on_the_cluster(client: Client) -> None:
+    ports = listening()
+    assert {host for host, _ in ports} == {"127.0.0.1"}
+    assert len(ports) >= 2 * 2 + 1  # two workers with their web servers, and the scheduler
+    stranger = Security.temporary()
+    told = {"timeout": 0.5, "set_as_default": False}
+    assert client.scheduler is not None
+    for address in map(str, (client.scheduler.address, *client.scheduler_info()["workers"])):
+        host = address.removeprefix("tls://")
+        assert host != address
+        with (
+            pytest.raises(OSError, match="Timed out"),
+            Client(f"tls://{host}", security=stranger, **told),
+        ):
+            pass
+        with pytest.raises(OSError, match="Timed out"), Client(f"tcp://{host}", **told):
+            pass
+
+
+def test_web_servers_of_the_cluster_have_no_pages(client: Client) -> None:
+    assert client.submit(abs, -1).result() == 1
+    answers = Counter[int]()
+    for host, port in listening():
+        for page in ("/info/main/workers.html", "/metrics", "/health", "/json/counts.json"):
+            web = http.client.HTTPConnection(host, port, timeout=0.5)
+            try:
+                web.request("GET", page)
+                answers[web.getresponse().status] += 1
+            except (OSError, http.client.HTTPException):  # it speaks another protocol
+                pass
+            finally:
+                web.close()
+    assert set(answers) == {404}
