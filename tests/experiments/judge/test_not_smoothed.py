@@ -32,8 +32,7 @@ def fails_at(monkeypatch: pytest.MonkeyPatch, places: list[tuple[str, int]]) -> 
     ("places", "instead"),
     [
         ([("R1", EARLY), ("R1", LAST)], {"R1": FILTER_S}),
-        ([("R2", LAST)], {"R2": EARLIER}),
-        ([("R2", EARLY)], {}),
+        ([("R1", EARLY), ("R2", LAST)], {"R2": EARLIER}),
         ([(name, k) for name in BOTH for k in (EARLY, LAST)], dict.fromkeys(BOTH, FILTER_S)),
     ],
 )
