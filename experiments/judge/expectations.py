@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -14,12 +15,17 @@ from experiments.scenario.settings import AnyScenario, Bound
 from mapfusion.errors import InputError
 
 
-def load_checked(path: Path, overrides: Sequence[str] = (), seed: int | None = None) -> AnyScenario:
+def load_checked(
+    path: Path,
+    overrides: Sequence[str] = (),
+    seed: int | None = None,
+    content: dict[str, Any] | None = None,
+) -> AnyScenario:
     """A scenario as `load_scenario` gives it.
 
     Raises InputError also where the truth is unknown that an expected metric needs.
     """
-    scenario = load_scenario(path, overrides, seed)
+    scenario = load_scenario(path, overrides, seed, content)
     judged = [name for name in scenario.expect if name not in metrics.WITHOUT_TRUTH]
     if judged and (reason := why_no_truth(scenario)):
         name = judged[0]

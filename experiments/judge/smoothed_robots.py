@@ -63,11 +63,11 @@ class SmoothedRobot:
             stands in for a map smoothed until then, empty where there is one.
         """
         at = max((k for k in self.maps if k <= iteration), default=None)
-        asked = max((k for k in (*self.maps, *self.not_smoothed) if k <= iteration), default=at)
-        if asked == at:
+        lacking = max((k for k in self.not_smoothed if k <= iteration), default=-1)
+        if (at is not None and at > lacking) or lacking < 0:
             return at, ""
         instead = "FastSLAM's map" if at is None else f"its map until frame {at}"
-        return at, f"{self.not_smoothed[asked]}; {instead} stands in"
+        return at, f"{self.not_smoothed[lacking]}; {instead} stands in"
 
 
 def load_smoothed(

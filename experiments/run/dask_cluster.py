@@ -1,4 +1,10 @@
-"""The Dask cluster a sweep runs on: processes of this machine, or one that is there already."""
+"""The Dask cluster a sweep runs on: processes of this machine, or one that is there already.
+
+Dask runs whatever its clients send. Processes of this machine listen on its loopback interface,
+which all its users can reach, so they take part only with the credentials of this sweep: a TLS key
+that is drawn for it and is kept in memory. Their web servers, which know no credentials, have no
+pages.
+"""
 
 import logging
 from collections.abc import Iterator
@@ -6,6 +12,7 @@ from contextlib import AbstractContextManager, contextmanager
 
 import dask.config
 from distributed import Client, LocalCluster
+from distributed.security import Security
 
 from experiments.run.interrupts import held_back_interrupts
 from mapfusion.errors import InputError
@@ -29,19 +36,28 @@ _LOCAL_SETTINGS = {
     "distributed.admin.low-level-log-length": 100,
     "distributed.admin.log-length": 100,
     "distributed.admin.system-monitor.log-length": 100,
+    "distributed.scheduler.http.routes": [],
+    "distributed.worker.http.routes": [],
 }
 
 
 def connected(jobs: int, scheduler: str | None) -> AbstractContextManager[Client]:
-    """A client for a `with` block: of the scheduler at `tcp://...`, else of `jobs` processes.
+    """A client for a `with` block: of the scheduler at an address, else of `jobs` processes.
+
+    Credentials for one at `tls://...` are those of Dask's configuration.
 
     Raises:
-        InputError: no scheduler answers there.
+        InputError: no scheduler answers there, or it is not one for these credentials.
     """
     if scheduler is None:
         return _local(jobs)
     try:
         return Client(scheduler, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
+    except TypeError as error:  # how Dask takes it that there are no credentials
+        named = (
+            "set distributed.comm.tls in Dask's configuration (DASK_DISTRIBUTED__COMM__TLS__...)"
+        )
+        raise InputError(f"--scheduler {scheduler}: needs TLS credentials; {named}") from error
     except (OSError, ValueError) as error:
         reason = f"no Dask scheduler answers ({str(error).splitlines()[0]})"
         raise InputError(f"--scheduler {scheduler}: {reason}") from error
@@ -68,13 +84,16 @@ def _local(jobs: int) -> Iterator[Client]:
 
 def _started(jobs: int) -> LocalCluster:
     """A cluster with all its workers; where one was killed before it answered, once more."""
+    credentials = Security.temporary()
     for attempt in range(_STARTS):
         try:
             return LocalCluster(
                 n_workers=jobs,
                 threads_per_worker=1,
                 processes=True,
-                dashboard_address="localhost:0",  # any port that is free
+                host="127.0.0.1",
+                security=credentials,
+                dashboard_address="127.0.0.1:0",  # any port that is free
                 silence_logs=logging.CRITICAL,
             )
         except RuntimeError as error:  # "Nanny failed to start."

@@ -70,16 +70,25 @@ def _nowhere(_: Location) -> str:
 
 
 def load_scenario(
-    path: Path, overrides: Sequence[str] = (), seed: int | None = None
+    path: Path,
+    overrides: Sequence[str] = (),
+    seed: int | None = None,
+    content: dict[str, Any] | None = None,
 ) -> AnyScenario:
     """Read and validate a scenario, with entries `key.sub=value` and the seed replaced.
+
+    Args:
+        path: of the file.
+        overrides: the entries.
+        seed: in place of the file's; None for that.
+        content: of the file, where it was read before; None to read it.
 
     Raises:
         InputError: a line for each thing that is wrong, with the file, its line, the key and what
             would be right.
     """
     _require_whole_paths(overrides)
-    data = apply_overrides(read_mapping(path), overrides)
+    data = apply_overrides(read_mapping(path) if content is None else content, overrides)
     if seed is not None:
         data["seed"] = seed
     scenario = scenario_of(data, str(path), functools.partial(_place, path, overrides))

@@ -43,7 +43,8 @@ _LEAST_DOF = 2.0
 class JointFuser:
     """All maps at once; the first member's frame is the frame.
 
-    Where landmarks do not tie the maps to each other, Kalman fusion with drift stands in.
+    Where landmarks do not tie the maps to each other, or covariances are of sizes too different to
+    be computed with, Kalman fusion with drift stands in.
     """
 
     smoothed = True
@@ -51,6 +52,17 @@ class JointFuser:
     @one_blas_thread
     def fuse(self, component: Component, parameters: MergeParameters) -> FusedMap:
         """Fuse the component's members."""
+        try:
+            made = self._fused(component, parameters)
+        except np.linalg.LinAlgError:
+            made = "the maps' covariances are of sizes too different to be computed with together"
+        if isinstance(made, str):
+            return replace(KalmanDrift().fuse(component, parameters), fallback=made)
+        return made
+
+    @staticmethod
+    def _fused(component: Component, parameters: MergeParameters) -> FusedMap | str:
+        """The fused map, or why it cannot be made so."""
         n_dimensions = 2 if component.planar else 3
         drift = component.drift_sigma_m
         given = [component.maps[k] for k in component.members]
@@ -61,8 +73,7 @@ class JointFuser:
         sizes, inliers = [len(landmarks) for landmarks in given], _inliers(component)
         points = joined(inliers, sizes)
         if not _tied(points):
-            why = f"fewer than {MIN_PAIRS} landmarks tie some map to the others"
-            return replace(KalmanDrift().fuse(component, parameters), fallback=why)
+            return f"fewer than {MIN_PAIRS} landmarks tie some map to the others"
         estimate = _estimated(maps, component.T_first_map[component.members], points)
         for _ in range(_MOST_ROUNDS):
             pairs = _candidates(given, _placed(maps, estimate), inliers, parameters, estimate.dof)

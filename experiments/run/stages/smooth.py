@@ -136,11 +136,14 @@ def smoothed_anew(
     There is no map, and no pose in the path, where the log cannot be smoothed.
     """
     found = _smoothed(log, landmark, path, settings)
-    if isinstance(found, str):
-        return None, np.empty((0, 3)), landmark, (0, np.nan, np.nan, np.nan, found)
-    ended = (found.n_steps, *found.tails, found.observation_level, "")
-    made = smoothed_map(log, found, attitude=attitude)
-    return made, found.estimate.path, found.landmark, ended
+    if not isinstance(found, str):
+        ended = (found.n_steps, *found.tails, found.observation_level, "")
+        try:
+            made = smoothed_map(log, found, attitude=attitude)
+            return made, found.estimate.path, found.landmark, ended
+        except np.linalg.LinAlgError:
+            found = "has a map whose covariance cannot be computed"
+    return None, np.empty((0, 3)), landmark, (0, np.nan, np.nan, np.nan, found)
 
 
 def _smoothed(

@@ -4,13 +4,13 @@ import hashlib
 import itertools
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from experiments.judge.expectations import load_checked
 from experiments.scenario.settings import AnyScenario
-from experiments.scenario.yaml_input import parse_value
+from experiments.scenario.yaml_input import parse_value, read_mapping
 from mapfusion.errors import InputError
 
 _HASH_LENGTH = 8  # hexadecimal digits of a run's values: 32 bits, and clashes are refused
@@ -23,12 +23,17 @@ Axes = Mapping[str, tuple[str, ...]]
 
 @dataclass(frozen=True)
 class SweepRun:
-    """One run of a sweep: a scenario's file and name, a seed, and the value of each key."""
+    """One run of a sweep: a scenario's file and name, a seed, and the value of each key.
+
+    `content` is what the file held when the sweep began, one object for all runs of a scenario: who
+    edits the file meanwhile does not change what runs.
+    """
 
     path: Path
     scenario: str
     seed: int
     settings: tuple[tuple[str, str], ...] = ()
+    content: dict[str, Any] = field(default_factory=dict, compare=False, repr=False)
 
     @property
     def run_id(self) -> str:
@@ -41,7 +46,7 @@ class SweepRun:
     def load(self) -> AnyScenario:
         """The scenario of this run; raises InputError."""
         overrides = [f"{key}={value}" for key, value in self.settings]
-        return load_checked(self.path, overrides, self.seed)
+        return load_checked(self.path, overrides, self.seed, self.content)
 
 
 def parse_axes(entries: Sequence[str]) -> Axes:
@@ -73,8 +78,8 @@ def _one_spelling(value: Any) -> str:
 def runs_of(paths: Sequence[Path], seeds: Sequence[int], axes: Axes) -> list[SweepRun]:
     """All combinations; runs that share most come one after the other.
 
-    Every scenario is loaded once with every combination of values, so that a wrong one is told
-    before anything is computed.
+    Every scenario's file is read once, here. It is loaded with every combination of values, so that
+    a wrong one is told before anything is computed.
 
     Raises:
         InputError: a scenario, key or value is wrong, or two scenarios have the same name.
@@ -84,10 +89,14 @@ def runs_of(paths: Sequence[Path], seeds: Sequence[int], axes: Axes) -> list[Swe
     runs: list[SweepRun] = []
     names: dict[str, Path] = {}
     for path in paths:
-        (name,) = {SweepRun(path, "", seeds[0], each).load().name for each in combinations}
+        content = read_mapping(path)
+        first = (SweepRun(path, "", seeds[0], each, content) for each in combinations)
+        (name,) = {run.load().name for run in first}
         if names.setdefault(name, path) != path:
             raise InputError(f"{path}: is named {name}, as {names[name]} is; names must differ")
-        runs += [SweepRun(path, name, *each) for each in itertools.product(seeds, combinations)]
+        runs += [
+            SweepRun(path, name, *each, content) for each in itertools.product(seeds, combinations)
+        ]
     if len({run.run_id for run in runs}) < len(runs):
         raise InputError("--set: two combinations of values have the same hash; split the sweep")
     return runs

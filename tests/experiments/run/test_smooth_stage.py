@@ -12,10 +12,12 @@ from experiments.run.job import Job
 from experiments.run.kept_logs import kept_log
 from experiments.run.stages.slam import ASSOCIATIONS, POSES
 from experiments.run.stages.smooth import (
+    WRITES,
     SmoothSettings,
     fused_iterations,
     iterations_of,
     log_until,
+    map_files,
     parts,
     read_endings,
     read_smoothed,
@@ -23,6 +25,7 @@ from experiments.run.stages.smooth import (
     run,
 )
 from experiments.run.stages.snapshots import Associations
+from mapfusion.errors import DamagedFileError
 from mapfusion.odometry_covariance import read_odometry_covariance, write_odometry_covariance
 from mapfusion.robot_log import RobotLog, read_log, write_log
 from mapfusion.smoother.smooth import SmootherParameters, smooth
@@ -130,6 +133,25 @@ def test_a_log_too_long_for_the_memory_given_has_no_map(tmp_path: Path) -> None:
     reasons = read_endings(tmp_path / "out").set_index("iteration")["not_smoothed"]
     assert reasons[5] == ""
     assert "smooth.max_memory_gb is 0.0001" in reasons[N_FRAMES - 1]
+    assert not any(path.exists() for path in map_files(tmp_path / "out", N_FRAMES - 1))
+
+
+def test_all_that_is_promised_is_written_whether_smoothed_or_not(tmp_path: Path) -> None:
+    log = white_noise_log(np.random.default_rng(3), N_FRAMES, 25).log
+    smoothed_at(filtered(tmp_path, log, owners(log)), tmp_path / "out", 5, 39, max_memory_gb=1e-4)
+    written = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {name.format(part=k) for name in WRITES for k in (5, 39)} <= written
+    assert {path.name for path in map_files(tmp_path / "out", 5)} <= written
+
+
+@pytest.mark.parametrize("which", range(4))
+def test_a_file_of_a_map_that_was_removed_is_damage(tmp_path: Path, which: int) -> None:
+    log = white_noise_log(np.random.default_rng(3), N_FRAMES, 25).log
+    smoothed_at(filtered(tmp_path, log, owners(log)), tmp_path / "out", 5)
+    removed = map_files(tmp_path / "out", 5)[which]
+    removed.unlink()
+    with pytest.raises(DamagedFileError, match=f"{removed.name}: is missing"):
+        read_smoothed(tmp_path / "out")
 
 
 def test_fused_iterations_are_evaluated_ones() -> None:

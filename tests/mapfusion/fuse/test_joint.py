@@ -280,6 +280,17 @@ def test_maps_that_no_landmarks_tie_are_fused_by_what_stands_in(n_left: int) -> 
     assert "tie some map to the others" in found.fallback
 
 
+def test_covariances_that_cannot_be_computed_with_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object) -> None:
+        raise np.linalg.LinAlgError
+
+    monkeypatch.setattr("mapfusion.fuse.joint.estimate_jointly", fails)
+    team = DrawnTeam([slice(0, 40), slice(20, 60)], 4)
+    found, instead = _fused(team), _fused(team, team.pairs, KalmanDrift())
+    np.testing.assert_array_equal(found.landmarks.position_m, instead.landmarks.position_m)
+    assert "sizes too different" in found.fallback
+
+
 def test_a_wrong_alignment_whose_pairs_pass_no_gate_breaks_nothing() -> None:
     """A motion metres off, of landmarks that do not look alike: the gate refuses them all."""
     team = DrawnTeam([slice(0, 40), slice(20, 60)], 5)

@@ -1,5 +1,6 @@
 """Scenarios x seeds x values."""
 
+import pickle
 from pathlib import Path
 
 import pytest
@@ -86,6 +87,18 @@ def test_all_combinations_with_names_of_their_own(tmp_path: Path) -> None:
     assert (loaded.name, loaded.seed) == ("one", 0)
     assert (loaded.slam.filter.n_particles, loaded.align.repetitions) == (30, 1)
     assert (runs[-1].scenario, runs[-1].seed, values[-1]) == ("two", 5, ("30", "2"))
+
+
+def test_a_file_that_is_edited_after_the_sweep_began_changes_no_run(tmp_path: Path) -> None:
+    path = scenario(tmp_path, "one")
+    axes = parse_axes(["slam.min_count=2,3"])
+    runs = runs_of([path], [0, 1], axes)
+    before = [run.load() for run in runs]
+    path.write_text("name: another\n", encoding="utf-8")
+    assert [run.load() for run in runs] == before
+    path.unlink()
+    assert [pickle.loads(pickle.dumps(run)).load() for run in runs] == before
+    assert len({id(run.content) for run in runs}) == 1  # one for ten thousand runs
 
 
 def test_names_do_not_depend_on_the_rest_of_the_sweep(tmp_path: Path) -> None:

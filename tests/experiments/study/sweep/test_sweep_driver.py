@@ -1,5 +1,7 @@
 """The driver on two processes, with tasks that fail in every way."""
 
+import contextlib
+import http.client
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -8,8 +10,10 @@ from typing import Any, cast
 
 import dask.config
 import pandas as pd
+import psutil
 import pytest
 from distributed import Client, LocalCluster
+from distributed.security import Security
 
 from experiments.run.dask_cluster import connected
 from experiments.run.dask_worker import Terms, code_version
@@ -276,6 +280,51 @@ def test_an_existing_cluster_of_unfit_workers_ends_the_sweep(scene: Scene, tmp_p
 
 def test_no_scheduler_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("experiments.run.dask_cluster.CONNECT_TIMEOUT_S", 0.2)
-    for address in ("tcp://127.0.0.1:1", "nonsense://x"):
+    for address in ("tcp://127.0.0.1:1", "nonsense://x", "tls://127.0.0.1:1"):
         with pytest.raises(InputError, match=f"--scheduler {address}"), connected(1, address):
             pass
+
+
+def listening(client: Client) -> tuple[list[str], list[tuple[str, int]]]:
+    """Addresses of scheduler, workers and their nannies, and where all of them listen."""
+    cluster = cast(LocalCluster, client.cluster)
+    nannies = [nanny.address for nanny in cast(dict, cluster.workers).values()]
+    speaking = [cluster.scheduler_address, *client.scheduler_info()["workers"], *nannies]
+    web = cluster.scheduler.http_server
+    places = [tuple(address.rpartition("/")[2].split(":")) for address in speaking]
+    places += [(web.address, web.port)]
+    for worker in psutil.Process().children(recursive=True):
+        with contextlib.suppress(psutil.Error):  # it has ended
+            found = worker.net_connections("inet")
+            places += [each.laddr for each in found if each.status == psutil.CONN_LISTEN]
+    return speaking, sorted({(host, int(port)) for host, port in places})
+
+
+def test_nobody_without_the_credentials_runs_anything_on_the_cluster(client: Client) -> None:
+    speaking, places = listening(client)
+    assert {host for host, _ in places} == {"127.0.0.1"}
+    assert len(places) > len(speaking) >= 5  # the rest are web servers
+    stranger, refused = Security.temporary(), "Timed out|TCP|TLS"
+    told = {"timeout": 0.5, "set_as_default": False}
+    for address in speaking:
+        host = address.removeprefix("tls://")
+        assert host != address
+        with pytest.raises(OSError, match=refused), Client(f"tcp://{host}", **told):
+            pass
+    with pytest.raises(OSError, match=refused), Client(speaking[0], security=stranger, **told):
+        pass
+
+
+def test_web_servers_of_the_cluster_have_no_pages(client: Client) -> None:
+    answers, (_, places) = Counter[int](), listening(client)
+    for host, port in places:
+        for page in ("/info/main/workers.html", "/metrics", "/health", "/json/counts.json"):
+            web = http.client.HTTPConnection(host, port, timeout=0.5)
+            try:
+                web.request("GET", page)
+                answers[web.getresponse().status] += 1
+            except (OSError, http.client.HTTPException):  # it speaks another protocol
+                pass
+            finally:
+                web.close()
+    assert set(answers) == {404}
