@@ -91,6 +91,8 @@ class Smoothed:
         tails: of their Student-t's.
         observation_level: factor on the stated covariances of observations on tracks, as the log
             tells it.
+        odometry_level: (3,) factors on the odometry's stated variances along, across and in the
+            heading, likewise.
         n_steps: Gauss-Newton steps that were taken.
         own_m2: (L, 3, 3), see `common`.
         common: Y (R, 3L): the landmarks' joint covariance is block diagonal of `own_m2` plus Y' Y.
@@ -102,6 +104,7 @@ class Smoothed:
     weights: Weights
     tails: Tails
     observation_level: float
+    odometry_level: Float
     n_steps: int
     own_m2: Float
     common: SharedErrors
@@ -112,7 +115,8 @@ class Smoothed:
     ) -> "Smoothed":
         """Where steps ended under some levels, after some of earlier rounds."""
         common = shared_errors(end.seen, end.equations, end.solution)
-        found = (end.estimate, end.seen, end.weights, end.tails, levels.observation)
+        of_levels = levels.observation, levels.odometry
+        found = (end.estimate, end.seen, end.weights, end.tails, *of_levels)
         n_steps, own_m2 = steps_before + end.n_steps, end.solution.own_m2
         return cls(landmark, *found, n_steps, own_m2, common)
 
