@@ -157,10 +157,8 @@ def smooth(
     information, path = parameters.odometry_information(log), between(path[0], path)
     known = _problem(log, landmark, parameters, information)
     require_memory(known.seen, max_memory_gb)
-    first = _without_gross(known, path)
-    start, path = (first.estimate, first.weights, first.tails), first.estimate.path
-    n_steps = first.n_steps
-    del first  # its factor takes as much memory as all else
+    start, n_steps = _without_gross(known, path)
+    path = start[0].path
     parts = parted(known.seen, landmark, path, parameters.stray_m)
     if not np.array_equal(parts, landmark):
         known = _problem(log, parts, parameters, information)
@@ -168,23 +166,25 @@ def smooth(
     if parameters.odometry_covariance is None:
         end, levels = settled_with_levels(known, *start)
         if levels.odometry.max() > _FAR_WORSE and end.tails.observation < MOST_DOF:
-            odometry = levels.odometry
-            under = known._replace(information=information_under(information, odometry))
-            again = _without_gross(under, end.estimate.path)
-            start = again.estimate, again.weights, again.tails
-            end, levels = settled_with_levels(known, *start, odometry)
+            path, n_steps = end.estimate.path, n_steps + end.n_steps
+            del end  # its factors take as much memory as all else
+            under = information_under(information, levels.odometry)
+            start, n_again = _without_gross(known._replace(information=under), path)
+            n_steps += n_again
+            end, levels = settled_with_levels(known, *start, levels.odometry)
     else:  # odometry that pictures told is used where these say nothing: they tell no level
         at, weights, tails = start
         end, levels = settled(known, at, weights=weights, tails=tails), AS_STATED
     return Smoothed.of(end, parts, levels, n_steps)
 
 
-def _without_gross(problem: Problem, path: Float) -> Settled:
-    """Take the steps of a first round, in which observations are thought worse than stated."""
+def _without_gross(problem: Problem, path: Float) -> tuple[tuple[Estimate, Weights, Tails], int]:
+    """Return where a round ends in which observations are thought worse than stated; its steps."""
     seen = problem.seen
     worse = replace(seen, information=seen.information / _THOUGHT_WORSE**2)
     blurred = problem._replace(seen=worse)
-    return finished(blurred, settled(blurred, _start(problem, path), _CLOSE))
+    end = finished(blurred, settled(blurred, _start(problem, path), _CLOSE))
+    return (end.estimate, end.weights, end.tails), end.n_steps
 
 
 def _problem(

@@ -150,7 +150,10 @@ def _smoothed(
     except MemoryError as error:
         return f"smoothing {error}: smooth.max_memory_gb is {settings.max_memory_gb:g}"
     except np.linalg.LinAlgError as error:
-        return f"{error}: check the covariances of the log's observations (covariance_m2)"
+        return (
+            f"its equations have no solution ({error}): the covariances of its observations, or what "
+            "slam.filter.motion states of its odometry, differ by too many orders of magnitude"
+        )
 
 
 def _no_map(log: RobotLog) -> LandmarkMap:

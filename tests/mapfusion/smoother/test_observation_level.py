@@ -182,7 +182,7 @@ def test_what_weights_leave_of_a_track_tells_its_point() -> None:
     found = levels.first_observation_level(problem, at, weights, NO_TAILS)
     rows = seen.strays[seen.track]
     known = seen.n_dimensions * (rows.sum() - seen.strays.sum())
-    step, points = solve_points(seen, at, weights, problem.stray_information)
+    _, points = solve_points(seen, at, weights, problem.stray_information)
     square = squared_distances(seen, at)[rows]
     beside = square + squares_of_points(seen, path, points.track_m2)[rows]
     own = student_weights(beside, fitted_dof(beside, seen.n_dimensions), seen.n_dimensions)

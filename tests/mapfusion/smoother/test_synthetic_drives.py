@@ -29,9 +29,7 @@ from tests.mapfusion.smoother.white_noise_logs import white_noise_log
         ("still", 60, 1.0, 4),
     ],
 )
-def test_errors_obey_the_covariances(
-    shape: str, n_frames: int, noise: float, n_seeds: int
-) -> None:
+def test_errors_obey_the_covariances(shape: str, n_frames: int, noise: float, n_seeds: int) -> None:
     """Whatever the odometry is beside what it states; exact odometry may err less."""
     found = []
     for seed in range(n_seeds):
