@@ -151,7 +151,7 @@ def _smoothed(
         return f"smoothing {error}: smooth.max_memory_gb is {settings.max_memory_gb:g}"
     except np.linalg.LinAlgError as error:
         return (
-            f"its equations have no solution ({error}): the covariances of its observations, or what "
+            f"its equations have no solution ({error}): covariances of its observations, or what "
             "slam.filter.motion states of its odometry, differ by too many orders of magnitude"
         )
 

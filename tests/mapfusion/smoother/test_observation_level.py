@@ -109,7 +109,7 @@ def test_steps_end_where_more_of_them_would(monkeypatch: pytest.MonkeyPatch) -> 
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     for each, its in ((found, told), (again, told_again)):
         assert its.observation == pytest.approx(at_end.observation, rel=5e-3)
-        np.testing.assert_allclose(its.odometry, at_end.odometry, rtol=0.1)
+        np.testing.assert_allclose(its.odometry, at_end.odometry, rtol=0.2)
         off = (each.estimate.path - end.estimate.path)[1:] / sigma
         assert np.sqrt(np.mean(off**2)) < 0.01
         assert each.n_steps < end.n_steps
