@@ -94,7 +94,7 @@ def test_a_log_that_tells_nothing_stays_as_stated() -> None:
 
 
 def test_steps_end_where_more_of_them_would(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wherever they begin: levels to less than their errors, poses to a hundredth of theirs."""
+    """Wherever they begin: levels to less than their errors, poses to a twentieth of theirs."""
     log = stated(tracked_log(0), 4.0)
     reckoned = dead_reckoned(log)
     found, told = settled_from(log, reckoned)
@@ -111,7 +111,7 @@ def test_steps_end_where_more_of_them_would(monkeypatch: pytest.MonkeyPatch) -> 
         assert its.observation == pytest.approx(at_end.observation, rel=5e-3)
         np.testing.assert_allclose(its.odometry, at_end.odometry, rtol=0.2)
         off = (each.estimate.path - end.estimate.path)[1:] / sigma
-        assert np.sqrt(np.mean(off**2)) < 0.01
+        assert np.sqrt(np.mean(off**2)) < 0.05
         assert each.n_steps < end.n_steps
 
 
