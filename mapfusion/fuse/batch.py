@@ -27,7 +27,7 @@ class Batch:
     """All logs of a component at once; what hinders that is the joint map's `fallback`.
 
     Attributes:
-        max_memory_gb: of its matrices, which grow with the square of all logs' length.
+        max_memory_gb: that smoothing may take; it grows with the length of all logs together.
     """
 
     max_memory_gb: float = 8.0

@@ -19,7 +19,7 @@ tell with information J whatever the others are, the share C / v that is left un
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import brentq
+from scipy.optimize import root_scalar
 
 from mapfusion.se2 import Float
 from mapfusion.smoother.motion_posterior import disturbance_variances
@@ -62,9 +62,9 @@ class Untold(NamedTuple):
         """Return the levels (3,) of the variances along, across and in the heading.
 
         Where fewer than `LEAST_TOLD` disturbances are told, those missing count as found at the
-        stated variance. So a level is as stated where nothing is told. It cannot fall below the
-        level at which the noise of `LEAST_TOLD` disturbances can still be told from none, which
-        bounds the odometry's information.
+        stated variance, as under a scaled inverse chi-square prior. So a level is as stated where
+        nothing is told. It cannot fall below the level at which the noise of `LEAST_TOLD`
+        disturbances can still be told from none, which bounds the odometry's information.
 
         Args:
             problem: with the odometry's information as stated.
@@ -91,4 +91,5 @@ class Untold(NamedTuple):
         at_told = excess(told)
         if at_told == 0 or told == 1:
             return told
-        return float(brentq(excess, told, 1.0, rtol=_LEVEL_TO))
+        found = root_scalar(excess, bracket=(told, 1.0), method="brentq", rtol=_LEVEL_TO)
+        return float(found.root)

@@ -101,6 +101,8 @@ class Smoothed:
         tails: of their Student-t's.
         observation_level: factor on the stated covariances of observations on tracks, as the log
             tells it.
+        odometry_level: (3,) factors on the odometry's stated variances along, across and in the
+            heading, likewise.
         n_steps: Gauss-Newton steps that were taken.
         own_m2: (L, 3, 3), see `common`.
         common: Y (R, 3L): the landmarks' joint covariance is block diagonal of `own_m2` plus Y' Y.
@@ -112,6 +114,7 @@ class Smoothed:
     weights: Weights
     tails: Tails
     observation_level: float
+    odometry_level: Float
     n_steps: int
     own_m2: Float
     common: SharedErrors
@@ -122,7 +125,8 @@ class Smoothed:
     ) -> "Smoothed":
         """Where steps ended under some levels, after some of earlier rounds."""
         common = shared_errors(end.seen, end.equations, end.solution)
-        found = (end.estimate, end.seen, end.weights, end.tails, levels.observation)
+        of_levels = levels.observation, levels.odometry
+        found = (end.estimate, end.seen, end.weights, end.tails, *of_levels)
         n_steps, own_m2 = steps_before + end.n_steps, end.solution.own_m2
         return cls(landmark, *found, n_steps, own_m2, common)
 
@@ -163,10 +167,8 @@ def smooth(
     information, path = parameters.odometry_information(log), between(path[0], path)
     known = _problem(log, landmark, parameters, information)
     require_memory(known.seen, max_memory_gb)
-    first = _without_gross(known, path)
-    start, path = (first.estimate, first.weights, first.tails), first.estimate.path
-    n_steps = first.n_steps
-    del first  # its factor takes as much memory as all else
+    start, n_steps = _without_gross(known, path)
+    path = start[0].path
     parts = parted(known.seen, landmark, path, parameters.stray_m)
     if not np.array_equal(parts, landmark):
         known = _problem(log, parts, parameters, information)
@@ -174,23 +176,25 @@ def smooth(
     if parameters.has_own_odometry:
         end, levels = settled_with_levels(known, *start)
         if levels.odometry.max() > _FAR_WORSE and end.tails.observation < MOST_DOF:
-            odometry = levels.odometry
-            under = known._replace(information=information_under(information, odometry))
-            again = _without_gross(under, end.estimate.path)
-            start = again.estimate, again.weights, again.tails
-            end, levels = settled_with_levels(known, *start, odometry)
+            path, n_steps = end.estimate.path, n_steps + end.n_steps
+            del end  # its factors take as much memory as all else
+            under = information_under(information, levels.odometry)
+            start, n_again = _without_gross(known._replace(information=under), path)
+            n_steps += n_again
+            end, levels = settled_with_levels(known, *start, levels.odometry)
     else:  # odometry that pictures told is used where these say nothing: they tell no level
         at, weights, tails = start
         end, levels = settled(known, at, weights=weights, tails=tails), AS_STATED
     return Smoothed.of(end, parts, levels, n_steps)
 
 
-def _without_gross(problem: Problem, path: Float) -> Settled:
-    """Take the steps of a first round, in which observations are thought worse than stated."""
+def _without_gross(problem: Problem, path: Float) -> tuple[tuple[Estimate, Weights, Tails], int]:
+    """Return where a round ends in which observations are thought worse than stated; its steps."""
     seen = problem.seen
     worse = replace(seen, information=seen.information / _THOUGHT_WORSE**2)
     blurred = problem._replace(seen=worse)
-    return finished(blurred, settled(blurred, _start(problem, path), _CLOSE))
+    end = finished(blurred, settled(blurred, _start(problem, path), _CLOSE))
+    return (end.estimate, end.weights, end.tails), end.n_steps
 
 
 def _problem(

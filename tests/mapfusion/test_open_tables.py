@@ -160,7 +160,7 @@ def test_cells_of_csv_that_are_no_numbers_are_named(tmp_path, rng, cell, said):
     look = pd.DataFrame(rng.normal(size=(N, 64)), columns=[f"descriptor_{i}" for i in range(64)])
     spoilt_look = look.astype({"descriptor_5": object})
     spoilt_look.loc[2, "descriptor_5"] = "inf" if cell == "inf" else "x"
-    with pytest.raises(InputError, match="descriptor(: number 5 is inf|_5 holds 'x') in row 2"):
+    with pytest.raises(InputError, match=r"descriptor(: number 5 is inf|_5 holds 'x') in row 2"):
         read_map(write(plain_map(rng).join(spoilt_look), tmp_path / "m.csv"))
     for huge in (2**64, 10**30):
         with pytest.raises(InputError, match="column count"):

@@ -155,7 +155,10 @@ def _smoothed(
     except MemoryError as error:
         return f"smoothing {error}: smooth.max_memory_gb is {settings.max_memory_gb:g}"
     except np.linalg.LinAlgError as error:
-        return f"{error}; check the covariances of the log's observations"
+        return (
+            f"its equations have no solution ({error}): covariances of its observations, or what "
+            "slam.filter.motion states of its odometry, differ by too many orders of magnitude"
+        )
 
 
 def map_files(folder: Path, iteration: int) -> list[Path]:

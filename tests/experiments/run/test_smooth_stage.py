@@ -176,7 +176,7 @@ def test_odometry_that_pictures_told_does_not_count_twice(tmp_path: Path) -> Non
             smooth(log, owners(log), known.path, own).estimate.path for log in (known.log, wrong)
         )
         apart.append(np.abs(pulled - right)[:, :2].max())
-    assert apart[0] > 0.01
+    assert apart[0] > 0.003  # its level tells how wrong it is, so that it weighs little
     assert apart[1] < 0.001
 
 

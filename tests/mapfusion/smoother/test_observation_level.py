@@ -8,12 +8,15 @@ import pytest
 from mapfusion.robot_log import RobotLog
 from mapfusion.se2 import Float, rotation
 from mapfusion.smoother import levels
-from mapfusion.smoother.elimination import pose_covariances
+from mapfusion.smoother.elimination import pose_covariances, solve_points
 from mapfusion.smoother.levels import Levels, settled_with_levels
 from mapfusion.smoother.normal_equations import Estimate, odometry_information
-from mapfusion.smoother.residuals import first_points
+from mapfusion.smoother.observation_level import _LEAST_M
+from mapfusion.smoother.residuals import first_points, squared_distances, squares_of_points
+from mapfusion.smoother.robust import NO_TAILS, unweighted
 from mapfusion.smoother.settle import Problem, Settled, followed, stretched
 from mapfusion.smoother.sightings import sightings_of
+from mapfusion.smoother.student import fitted_dof, student_weights
 from tests.mapfusion.smoother.white_noise_logs import (
     NOISE,
     dead_reckoned,
@@ -91,7 +94,7 @@ def test_a_log_that_tells_nothing_stays_as_stated() -> None:
 
 
 def test_steps_end_where_more_of_them_would(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wherever they begin: levels to less than their errors, poses to a hundredth of theirs."""
+    """Wherever they begin: levels to less than their errors, poses to a twentieth of theirs."""
     log = stated(tracked_log(0), 4.0)
     reckoned = dead_reckoned(log)
     found, told = settled_from(log, reckoned)
@@ -105,10 +108,10 @@ def test_steps_end_where_more_of_them_would(monkeypatch: pytest.MonkeyPatch) -> 
     covariance = pose_covariances(end.seen, end.equations, end.solution, frames)
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     for each, its in ((found, told), (again, told_again)):
-        assert its.observation == pytest.approx(at_end.observation, rel=2e-3)
-        np.testing.assert_allclose(its.odometry, at_end.odometry, rtol=0.1)
+        assert its.observation == pytest.approx(at_end.observation, rel=5e-3)
+        np.testing.assert_allclose(its.odometry, at_end.odometry, rtol=0.2)
         off = (each.estimate.path - end.estimate.path)[1:] / sigma
-        assert np.sqrt(np.mean(off**2)) < 0.01
+        assert np.sqrt(np.mean(off**2)) < 0.05
         assert each.n_steps < end.n_steps
 
 
@@ -159,3 +162,44 @@ def test_stretched_steps_end_where_others_do(monkeypatch: pytest.MonkeyPatch) ->
     assert found.n_steps < slow.n_steps
     np.testing.assert_allclose(found.estimate.path, slow.estimate.path, rtol=0, atol=1e-5)
     assert told.observation == pytest.approx(told_slowly.observation, rel=1e-4)
+
+
+def test_what_weights_leave_of_a_track_tells_its_point() -> None:
+    """A track told by itself takes as many coordinates as it has, whatever its weights are.
+
+    Its offset is so loose that its own observations alone tell its point: their squares' expected
+    excess, sum of w tr(W C) with C = (sum of w W)^-1, is the number of dimensions.
+    """
+    log = tracked_log(5)
+    label, loose_m = log.observations.label, 1e4
+    assert label is not None
+    seen = sightings_of(log, label, 1, stray=True)
+    problem = Problem(seen, log.odometry, odometry_information(log.odometry, NOISE), loose_m**-2)
+    path = dead_reckoned(log)
+    at = Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
+    weights = unweighted(seen)
+    weights.observation[::2] = 0.1
+    found = levels.first_observation_level(problem, at, weights, NO_TAILS)
+    rows = seen.strays[seen.track]
+    known = seen.n_dimensions * (rows.sum() - seen.strays.sum())
+    _, points = solve_points(seen, at, weights, problem.stray_information)
+    square = squared_distances(seen, at)[rows]
+    beside = square + squares_of_points(seen, path, points.track_m2)[rows]
+    own = student_weights(beside, fitted_dof(beside, seen.n_dimensions), seen.n_dimensions)
+    assert found == pytest.approx(np.sum(own * square) / known, rel=1e-3)
+
+
+def test_observations_without_noise_have_a_level_that_is_not_zero() -> None:
+    """Simulated to the last digit: the level stays where an observation errs by `_LEAST_M`."""
+    rng = np.random.default_rng(6)
+    known = with_tracks(white_noise_log(rng, 60, 30), rng, 0.0)
+    log = known.log
+    assert log.observations.label is not None
+    pose = known.path[log.iteration]
+    exact = known.point_m[log.observations.label]
+    exact[:, :2] = np.einsum("nji,nj->ni", rotation(pose[:, 2]), exact[:, :2] - pose[:, :2])
+    one = np.tile(0.01**2 * np.eye(3), (len(exact), 1, 1))
+    seen = replace(log.observations, position_m=exact, covariance_m2=one)
+    end, told = settled_from(replace(log, observations=seen), known.path)
+    assert told.observation == pytest.approx((_LEAST_M / 0.01) ** 2)
+    assert np.isfinite(end.solution.own_m2).all()

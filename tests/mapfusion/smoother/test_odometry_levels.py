@@ -3,12 +3,19 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from scipy.optimize import minimize_scalar
 
 from mapfusion.robot_log import RobotLog
 from mapfusion.se2 import Float, compose, rotation
 from mapfusion.smoother.levels import settled_with_levels
-from mapfusion.smoother.normal_equations import Estimate, odometry_information
+from mapfusion.smoother.noise_levels import LEAST_TOLD
+from mapfusion.smoother.normal_equations import (
+    Estimate,
+    information_under,
+    least_levels,
+    odometry_information,
+)
 from mapfusion.smoother.odometry_levels import Untold
 from mapfusion.smoother.residuals import first_points
 from mapfusion.smoother.settle import Problem
@@ -99,11 +106,47 @@ def test_levels_that_follow_steps_end_where_they_are_likeliest() -> None:
     np.testing.assert_allclose(untold.known(levels), exact, rtol=1e-12)
 
 
-def test_axes_that_too_little_was_told_of_stay_as_stated() -> None:
-    """Whatever other levels would make of it: they would come and go."""
+def test_disturbances_that_are_missing_count_as_stated() -> None:
+    """An axis that tells one disturbance is by four fifths as stated; one that tells none, wholly.
+
+    The weighted mean is of what that one says and of four at the stated level.
+    """
     problem, measured, J = told_by_themselves(np.random.default_rng(1), np.ones(3), 60)
     share = np.clip(1 / (1 + J / problem.information), 0, 1)
-    share[:, 1] = 0.5
-    path = path_of(problem.odometry, measured)
-    levels = Untold(share, np.ones(3)).told_levels(problem, path, np.array([1.0, 100.0, 1.0]))
-    assert levels[1] == 1.0
+    share[:, 1], share[:, 2] = 1 - 1 / 60, 1.0
+    disturbance = measured.copy()
+    disturbance[:, 1] = np.sqrt(3 / 60 / problem.information[:, 1])  # one disturbance at level 3
+    path = path_of(problem.odometry, disturbance)
+    untold = Untold(share, np.ones(3))
+    levels = untold.told_levels(problem, path, np.ones(3))
+    told = untold.known(levels)[1]
+    assert levels[1] == pytest.approx((3 * told + (LEAST_TOLD - told)) / LEAST_TOLD, rel=1e-4)
+    assert 1 < levels[1] < 3
+    assert levels[2] == 1.0
+
+
+@pytest.mark.parametrize("n", [20, 200, 2000])
+def test_exact_odometry_ends_where_its_noise_could_still_be_told(n: int) -> None:
+    """The level falls until `LEAST_TOLD` disturbances are told, and no further; fewer with more."""
+    problem, _, J = told_by_themselves(np.random.default_rng(2), np.ones(3), n)
+    v, levels = 1 / problem.information, np.ones(3)
+    path = path_of(problem.odometry, np.zeros((n, 3)))
+    untold = Untold(1 / (1 + J * v), levels)
+    for _ in range(50):
+        levels = untold.told_levels(problem, path, levels)
+    known = np.sum(1 - 1 / (1 + J * v * levels), axis=0)
+    np.testing.assert_allclose(known, LEAST_TOLD * (1 - levels), rtol=1e-3)
+    assert np.all(levels < 12 / n)
+
+
+def test_what_holds_a_robot_is_no_noise_that_a_level_scales() -> None:
+    """Where wheels stand still the information is bounded under any level."""
+    odometry = np.array([[0, 0, 0], [0.1, 0, 0.1], [0, 0, 0]])
+    stated = odometry_information(odometry, NOISE)
+    under = information_under(stated, np.full(3, 0.01))
+    np.testing.assert_allclose(under[0], 100 * stated[0])
+    np.testing.assert_allclose(under[1], stated[1])
+    np.testing.assert_allclose(information_under(stated, np.full(3, 4.0)), stated / 4)
+    least = least_levels(stated)
+    np.testing.assert_allclose(information_under(stated, least), np.tile(stated[1], (2, 1)))
+    np.testing.assert_allclose(information_under(stated, 2 * least)[0], stated[1] / 2)
