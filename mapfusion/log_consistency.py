@@ -37,8 +37,9 @@ from mapfusion.robot_log import NO_TRACK, RobotLog
 from mapfusion.se2 import Float, between, inverse, rotation, wrap
 from mapfusion.vision.rigid_links import MIN_LINKS, RigidMotion, rigid_links
 
-# Probability that anything is said of a sound log.
-_FALSE_ALARM = 1e-3
+# Probability that anything is said of a log whose agreement lies at the limit; that of sound logs
+# lies far above.
+_FALSE_ALARM = 0.01
 # Agreement below which motions contradict each other. Wheels that wear, slip or are badly
 # calibrated are off by a third of a distance at most (a P3-AT's track in simulation: 0.42 to
 # 0.62 m, a third of the angle); a factor of 1.43 or an angle of 45 degrees is something else. Turns
@@ -65,6 +66,7 @@ _LEAST_PLANAR_LINKS = 2  # that fix a motion of the plane; their distance is che
 # A jump is a difference larger than chance makes it (Bonferroni over the frames of a log whose
 # noise is as the log's own median says) and larger than any ordinary step: wheels that spin or
 # lock are off by one step at most. Frames without a step allow the floor, as a bumped robot moves.
+_JUMP_BY_CHANCE = 1e-3  # probability of a jump in a log without
 _JUMP_STEPS = 2.0
 _JUMP_FLOOR = np.array([0.2, 0.2])  # m, rad
 _LEAST_JUMP_LINKS = 3  # that agree on the motion at a jump, and at least half of all
@@ -77,6 +79,7 @@ _MOST_JUMPS = 0.1
 MOST_OUTSIDE = 0.5
 _UPRIGHT = 0.5  # cosine of a tilt that no robot on wheels has
 ORDER_OF_QUATERNIONS = "its quaternions look like w x y z in place of x y z w, or the reverse"
+_USUAL_AXES = 6  # of `_axes`: those that people take for the robot's
 _STANDS_STILL = 0.02  # of the observed distance: stated distances that are none
 # Factors on stated covariances that are tried, and frames that they are tried on, so that
 # observations whose covariances are in another unit still tell how the robot moved.
@@ -397,9 +400,10 @@ def agreement(
     spread = max(spread, float(np.median(sigma_observed[sure] / longest)))
     upper = np.inf
     if n >= _LEAST_MOTIONS:
-        quantile = float(stdtrit(n - 1, 1 - false_alarm / 2))
-        upper = middle + quantile * np.sqrt(np.pi / 2) * spread / np.sqrt(n)
+        # so many values may lie above the median by chance; of few values it is none
         n_above = int(np.searchsorted(bdtr(np.arange(n), n, 0.5), false_alarm / 2, side="right"))
+        quantile = float(stdtrit(n - 1, 1 - (false_alarm / 2 if n_above else false_alarm)))
+        upper = middle + quantile * np.sqrt(np.pi / 2) * spread / np.sqrt(n)
         if n_above:
             upper = min(upper, float(np.sort(values)[n - n_above]))
     return Agreement(n, middle, upper, _ratio(observed[sure], stated[sure]))
@@ -512,12 +516,9 @@ def likely_cause(
     """
     sigma = Stated(mistakes[""], noise).sigma(observed)
     best: _Cause | None = None
-    ways = list(itertools.product(_axes(), mistakes.items()))
-    for n_mistakes in range(3):  # the simplest explanation that is enough
-        several = [way for way in ways if bool(way[0][1]) + bool(way[1][0]) == n_mistakes]
-        for (axes, axes_text), (text, poses) in several:
-            told = ", and ".join(each for each in (text, axes_text) if each)
-            cause = _put_right(told, observed, axes, poses, sigma)
+    for several in _simplest_first(mistakes):
+        for text, axes, poses in several:
+            cause = _put_right(text, observed, axes, poses, sigma)
             if best is None or cause.comparison.worst > best.comparison.worst + _TIE:
                 best = cause
         if best is not None and best.comparison.worst >= _EXPLAINED:
@@ -526,9 +527,12 @@ def likely_cause(
         late = _frames_late(observed, mistakes[""])
         if late:
             return f"its times look {abs(late)} frames too {'late' if late > 0 else 'early'}"
-        if compare(observed, Stated(mistakes[""], noise)).shift.ratio < _STANDS_STILL:
+        plain = compare(observed, Stated(mistakes[""], noise))
+        if plain.shift.ratio < _STANDS_STILL:
             return "it says that the robot stands still"
-        return "no common mistake explains it; is it of another run or robot?"
+        if scaled := _scaled_text(observed, mistakes[""], plain, sigma):
+            return scaled
+        return "no common mistake explains it: is it another run's, or the calibration another's?"
     units = _unit_text(best.ratio)
     return ", and ".join(text for text in (best.text, units) if text)
 
@@ -547,6 +551,29 @@ def _frames_late(observed: Motions, poses: Float) -> int:
         if found.shift.n >= _LEAST_MOTIONS <= found.turn.n and found.worst > best:
             best, late = found.worst, shift
     return late
+
+
+def _simplest_first(mistakes: Mapping[str, Float]) -> Iterator[list[tuple[str, Float, Float]]]:
+    """Text, axes and poses of causes: none or usual axes, mistakes, other axes, both together."""
+    axes = list(_axes())
+    usual, others = axes[:_USUAL_AXES], axes[_USUAL_AXES:]
+    right, *wrong = mistakes.items()
+    yield [(text, R, right[1]) for R, text in usual]
+    yield [(text, usual[0][0], poses) for text, poses in wrong]
+    yield [(text, R, right[1]) for R, text in others]
+    yield [(f"{text}, and {own}", R, poses) for R, own in axes[1:] for text, poses in wrong]
+
+
+def _scaled_text(observed: Motions, poses: Float, plain: Comparison, sigma: Float) -> str:
+    """Words for stated motions whose distances and angles are both in another unit; else none."""
+    if not (plain.shift.median > 0 and plain.turn.median > 0):
+        return ""
+    shift, turn = stated_motions(poses, observed.start, observed.end)
+    scaled = _compared(observed, shift / plain.shift.ratio, turn / plain.turn.ratio, sigma)
+    if scaled.worst < _EXPLAINED:
+        return ""
+    told = f"distances are {plain.shift.ratio:.3g} and turns {plain.turn.ratio:.3g} times those"
+    return f"{told} that are observed: are units, focal length and baseline right?"
 
 
 def _put_right(text: str, observed: Motions, axes: Float, poses: Float, sigma: Float) -> _Cause:
@@ -594,7 +621,7 @@ def _unit_text(ratio: float) -> str:
             return f"{told}: {unit}?"
         if abs(np.log(ratio * many)) < np.log1p(_LIKE_A_UNIT):
             return f"{told}: are the observed ones {unit}?"
-    return f"{told}: are unit, focal length and baseline right?"
+    return f"{told}: are units, focal length and baseline right?"
 
 
 def odometry_mistakes(increments: Float) -> dict[str, Float]:
@@ -734,7 +761,7 @@ def find_jumps(log: RobotLog, observed: Motions, noise: MotionNoise) -> list[Jum
     square = np.einsum("ni,ni->n", off, np.linalg.solve(spread, off[:, :, None])[:, :, 0])
     # where all noise is larger than stated, chance makes larger differences, too
     square /= max(float(np.median(square)) / chi_square_bound(0.5, 3), 1.0)
-    by_chance = chi_square_bound(1 - _FALSE_ALARM / len(square), 3)
+    by_chance = chi_square_bound(1 - _JUMP_BY_CHANCE / len(square), 3)
     sizes = np.stack([_sizes(motion), _sizes(odometry)])
     ordinary = np.quantile(sizes.min(axis=0), _ORDINARY, axis=0)
     least = np.maximum(_JUMP_STEPS * ordinary, _JUMP_FLOOR)

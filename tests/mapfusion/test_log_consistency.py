@@ -89,7 +89,7 @@ def test_odometry_of_another_run_is_told(sound: RobotLog) -> None:
     turns = 0.15 * np.sign(np.sin(np.arange(len(sound)) / 3))
     other = np.column_stack([np.full(len(sound), 0.1), np.zeros(len(sound)), turns])
     (finding,) = check_log(replace(sound, odometry=other), NOISE).findings
-    assert "another run" in finding.text
+    assert "another run's" in finding.text
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.003, 0.015, 0.03])
