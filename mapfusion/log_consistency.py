@@ -367,6 +367,11 @@ class Agreement(NamedTuple):
     upper: float
     ratio: float
 
+    @property
+    def known(self) -> bool:
+        """Whether enough motions count for a median."""
+        return self.n >= _LEAST_MOTIONS
+
 
 def agreement(
     observed: Float, stated: Float, sigma_observed: Float, sigma: Float, false_alarm: float
@@ -427,10 +432,9 @@ class Comparison(NamedTuple):
     shift: Agreement
     turn: Agreement
 
-    @property
-    def contradicts(self) -> bool:
-        """Whether either lies below its limit for sure."""
-        return any(each.upper < _LEAST_AGREEMENT[name] for name, each in self._asdict().items())
+    def contradicts(self, name: str) -> bool:
+        """Whether shifts or turns lie below their limit for sure."""
+        return getattr(self, name).upper < _LEAST_AGREEMENT[name]
 
     @property
     def n(self) -> int:
@@ -440,7 +444,7 @@ class Comparison(NamedTuple):
     @property
     def worst(self) -> float:
         """The smaller median of those that are known; -1 where none is."""
-        return min((each.median for each in self if each.n >= _LEAST_MOTIONS), default=-1.0)
+        return min((each.median for each in self if each.known), default=-1.0)
 
 
 class Stated(NamedTuple):
@@ -548,7 +552,7 @@ def _frames_late(observed: Motions, poses: Float) -> int:
             continue
         moved = stated_motions(poses, part.start + shift, part.end + shift)
         found = _compared(part, *moved, part.sigma)
-        if found.shift.n >= _LEAST_MOTIONS <= found.turn.n and found.worst > best:
+        if found.shift.known and found.turn.known and found.worst > best:
             best, late = found.worst, shift
     return late
 
@@ -692,6 +696,16 @@ def _lags(n_frames: int) -> list[int]:
     return [2**k for k in range(1, int(np.log2(longest)) + 1)]
 
 
+def _in_most_spans(each: Sequence[Comparison], name: str) -> bool:
+    """Whether shifts or turns lie below their limit in half of the spans that tell any or more.
+
+    Noise and resolution of what is stated contradict short spans alone.
+    """
+    medians = [found.median for found in (getattr(c, name) for c in each) if found.known]
+    n_below = sum(median < _LEAST_AGREEMENT[name] for median in medians)
+    return 2 * n_below >= len(medians) > 0
+
+
 def disagreement(
     kind: str, what: str, spans: Sequence[Motions], stated: Stated, mistakes: Mapping[str, Float]
 ) -> Finding | None:
@@ -705,14 +719,13 @@ def disagreement(
         mistakes: as `likely_cause` has them.
     """
     each = [compare(observed, stated, _FALSE_ALARM / len(spans)) for observed in spans]
-    wrong = [k for k, found in enumerate(each) if found.contradicts]
+    quantities = [name for name in _LEAST_AGREEMENT if _in_most_spans(each, name)]
+    wrong = [k for k, found in enumerate(each) if any(map(found.contradicts, quantities))]
     if not wrong:
         return None
     most = max(wrong, key=lambda k: each[k].n)
     shown = [
-        f"{name}s {found.median:.2f}"
-        for name, found in each[most]._asdict().items()
-        if found.n >= _LEAST_MOTIONS
+        f"{name}s {found.median:.2f}" for name, found in each[most]._asdict().items() if found.known
     ]
     cause = likely_cause(spans[most], mistakes, stated.noise)
     text = f"{what} in most frames (agreement of {', '.join(shown)}; 1 is full): {cause}"
