@@ -135,9 +135,9 @@ def test_the_filter_takes_one_increment_as_unsure_as_it_is(sound: RobotLog) -> N
     """NaN stands for the noise of the settings, as if nothing had been said."""
     log = first_frames(sound, 20)
     paths = []
-    for variance in (None, np.nan, 1.0):
-        covariance = None if variance is None else np.full((20, 3, 3), np.nan)
-        if covariance is not None:
+    for variance in (None, float("nan"), 1.0):
+        covariance = np.full((20, 3, 3), np.nan) if variance else None
+        if covariance is not None and variance is not None:
             covariance[10] = variance * np.eye(3)
         paths.append(filtered(log, covariance).slam.best_path())
     np.testing.assert_array_equal(paths[1], paths[0])
