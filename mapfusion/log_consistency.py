@@ -37,8 +37,9 @@ from mapfusion.robot_log import NO_TRACK, RobotLog
 from mapfusion.se2 import Float, between, inverse, rotation, wrap
 from mapfusion.vision.rigid_links import MIN_LINKS, RigidMotion, rigid_links
 
-# Probability that anything is said of a sound log.
-_FALSE_ALARM = 1e-3
+# Probability that anything is said of a log whose agreement lies at the limit; that of sound logs
+# lies far above.
+_FALSE_ALARM = 0.01
 # Agreement below which motions contradict each other. Wheels that wear, slip or are badly
 # calibrated are off by a third of a distance at most (a P3-AT's track in simulation: 0.42 to
 # 0.62 m, a third of the angle); a factor of 1.43 or an angle of 45 degrees is something else. Turns
@@ -65,6 +66,7 @@ _LEAST_PLANAR_LINKS = 2  # that fix a motion of the plane; their distance is che
 # A jump is a difference larger than chance makes it (Bonferroni over the frames of a log whose
 # noise is as the log's own median says) and larger than any ordinary step: wheels that spin or
 # lock are off by one step at most. Frames without a step allow the floor, as a bumped robot moves.
+_JUMP_BY_CHANCE = 1e-3  # probability of a jump in a log without
 _JUMP_STEPS = 2.0
 _JUMP_FLOOR = np.array([0.2, 0.2])  # m, rad
 _LEAST_JUMP_LINKS = 3  # that agree on the motion at a jump, and at least half of all
@@ -77,6 +79,7 @@ _MOST_JUMPS = 0.1
 MOST_OUTSIDE = 0.5
 _UPRIGHT = 0.5  # cosine of a tilt that no robot on wheels has
 ORDER_OF_QUATERNIONS = "its quaternions look like w x y z in place of x y z w, or the reverse"
+_USUAL_AXES = 6  # of `_axes`: those that people take for the robot's
 _STANDS_STILL = 0.02  # of the observed distance: stated distances that are none
 # Factors on stated covariances that are tried, and frames that they are tried on, so that
 # observations whose covariances are in another unit still tell how the robot moved.
@@ -364,6 +367,11 @@ class Agreement(NamedTuple):
     upper: float
     ratio: float
 
+    @property
+    def known(self) -> bool:
+        """Whether enough motions count for a median."""
+        return self.n >= _LEAST_MOTIONS
+
 
 def agreement(
     observed: Float, stated: Float, sigma_observed: Float, sigma: Float, false_alarm: float
@@ -397,9 +405,10 @@ def agreement(
     spread = max(spread, float(np.median(sigma_observed[sure] / longest)))
     upper = np.inf
     if n >= _LEAST_MOTIONS:
-        quantile = float(stdtrit(n - 1, 1 - false_alarm / 2))
-        upper = middle + quantile * np.sqrt(np.pi / 2) * spread / np.sqrt(n)
+        # so many values may lie above the median by chance; of few values it is none
         n_above = int(np.searchsorted(bdtr(np.arange(n), n, 0.5), false_alarm / 2, side="right"))
+        quantile = float(stdtrit(n - 1, 1 - (false_alarm / 2 if n_above else false_alarm)))
+        upper = middle + quantile * np.sqrt(np.pi / 2) * spread / np.sqrt(n)
         if n_above:
             upper = min(upper, float(np.sort(values)[n - n_above]))
     return Agreement(n, middle, upper, _ratio(observed[sure], stated[sure]))
@@ -423,10 +432,9 @@ class Comparison(NamedTuple):
     shift: Agreement
     turn: Agreement
 
-    @property
-    def contradicts(self) -> bool:
-        """Whether either lies below its limit for sure."""
-        return any(each.upper < _LEAST_AGREEMENT[name] for name, each in self._asdict().items())
+    def contradicts(self, name: str) -> bool:
+        """Whether shifts or turns lie below their limit for sure."""
+        return getattr(self, name).upper < _LEAST_AGREEMENT[name]
 
     @property
     def n(self) -> int:
@@ -436,7 +444,7 @@ class Comparison(NamedTuple):
     @property
     def worst(self) -> float:
         """The smaller median of those that are known; -1 where none is."""
-        return min((each.median for each in self if each.n >= _LEAST_MOTIONS), default=-1.0)
+        return min((each.median for each in self if each.known), default=-1.0)
 
 
 class Stated(NamedTuple):
@@ -512,12 +520,9 @@ def likely_cause(
     """
     sigma = Stated(mistakes[""], noise).sigma(observed)
     best: _Cause | None = None
-    ways = list(itertools.product(_axes(), mistakes.items()))
-    for n_mistakes in range(3):  # the simplest explanation that is enough
-        several = [way for way in ways if bool(way[0][1]) + bool(way[1][0]) == n_mistakes]
-        for (axes, axes_text), (text, poses) in several:
-            told = ", and ".join(each for each in (text, axes_text) if each)
-            cause = _put_right(told, observed, axes, poses, sigma)
+    for several in _simplest_first(mistakes):
+        for text, axes, poses in several:
+            cause = _put_right(text, observed, axes, poses, sigma)
             if best is None or cause.comparison.worst > best.comparison.worst + _TIE:
                 best = cause
         if best is not None and best.comparison.worst >= _EXPLAINED:
@@ -526,9 +531,12 @@ def likely_cause(
         late = _frames_late(observed, mistakes[""])
         if late:
             return f"its times look {abs(late)} frames too {'late' if late > 0 else 'early'}"
-        if compare(observed, Stated(mistakes[""], noise)).shift.ratio < _STANDS_STILL:
+        plain = compare(observed, Stated(mistakes[""], noise))
+        if plain.shift.ratio < _STANDS_STILL:
             return "it says that the robot stands still"
-        return "no common mistake explains it; is it of another run or robot?"
+        if scaled := _scaled_text(observed, mistakes[""], plain, sigma):
+            return scaled
+        return "no common mistake explains it: is it another run's, or the calibration another's?"
     units = _unit_text(best.ratio)
     return ", and ".join(text for text in (best.text, units) if text)
 
@@ -544,9 +552,32 @@ def _frames_late(observed: Motions, poses: Float) -> int:
             continue
         moved = stated_motions(poses, part.start + shift, part.end + shift)
         found = _compared(part, *moved, part.sigma)
-        if found.shift.n >= _LEAST_MOTIONS <= found.turn.n and found.worst > best:
+        if found.shift.known and found.turn.known and found.worst > best:
             best, late = found.worst, shift
     return late
+
+
+def _simplest_first(mistakes: Mapping[str, Float]) -> Iterator[list[tuple[str, Float, Float]]]:
+    """Text, axes and poses of causes: none or usual axes, mistakes, other axes, both together."""
+    axes = list(_axes())
+    usual, others = axes[:_USUAL_AXES], axes[_USUAL_AXES:]
+    right, *wrong = mistakes.items()
+    yield [(text, R, right[1]) for R, text in usual]
+    yield [(text, usual[0][0], poses) for text, poses in wrong]
+    yield [(text, R, right[1]) for R, text in others]
+    yield [(f"{text}, and {own}", R, poses) for R, own in axes[1:] for text, poses in wrong]
+
+
+def _scaled_text(observed: Motions, poses: Float, plain: Comparison, sigma: Float) -> str:
+    """Words for stated motions whose distances and angles are both in another unit; else none."""
+    if not (plain.shift.median > 0 and plain.turn.median > 0):
+        return ""
+    shift, turn = stated_motions(poses, observed.start, observed.end)
+    scaled = _compared(observed, shift / plain.shift.ratio, turn / plain.turn.ratio, sigma)
+    if scaled.worst < _EXPLAINED:
+        return ""
+    told = f"distances are {plain.shift.ratio:.3g} and turns {plain.turn.ratio:.3g} times those"
+    return f"{told} that are observed: are units, focal length and baseline right?"
 
 
 def _put_right(text: str, observed: Motions, axes: Float, poses: Float, sigma: Float) -> _Cause:
@@ -594,7 +625,7 @@ def _unit_text(ratio: float) -> str:
             return f"{told}: {unit}?"
         if abs(np.log(ratio * many)) < np.log1p(_LIKE_A_UNIT):
             return f"{told}: are the observed ones {unit}?"
-    return f"{told}: are unit, focal length and baseline right?"
+    return f"{told}: are units, focal length and baseline right?"
 
 
 def odometry_mistakes(increments: Float) -> dict[str, Float]:
@@ -665,6 +696,16 @@ def _lags(n_frames: int) -> list[int]:
     return [2**k for k in range(1, int(np.log2(longest)) + 1)]
 
 
+def _in_most_spans(each: Sequence[Comparison], name: str) -> bool:
+    """Whether shifts or turns lie below their limit in half of the spans that tell any or more.
+
+    Noise and resolution of what is stated contradict short spans alone.
+    """
+    medians = [found.median for found in (getattr(c, name) for c in each) if found.known]
+    n_below = sum(median < _LEAST_AGREEMENT[name] for median in medians)
+    return 2 * n_below >= len(medians) > 0
+
+
 def disagreement(
     kind: str, what: str, spans: Sequence[Motions], stated: Stated, mistakes: Mapping[str, Float]
 ) -> Finding | None:
@@ -678,14 +719,13 @@ def disagreement(
         mistakes: as `likely_cause` has them.
     """
     each = [compare(observed, stated, _FALSE_ALARM / len(spans)) for observed in spans]
-    wrong = [k for k, found in enumerate(each) if found.contradicts]
+    quantities = [name for name in _LEAST_AGREEMENT if _in_most_spans(each, name)]
+    wrong = [k for k, found in enumerate(each) if any(map(found.contradicts, quantities))]
     if not wrong:
         return None
     most = max(wrong, key=lambda k: each[k].n)
     shown = [
-        f"{name}s {found.median:.2f}"
-        for name, found in each[most]._asdict().items()
-        if found.n >= _LEAST_MOTIONS
+        f"{name}s {found.median:.2f}" for name, found in each[most]._asdict().items() if found.known
     ]
     cause = likely_cause(spans[most], mistakes, stated.noise)
     text = f"{what} in most frames (agreement of {', '.join(shown)}; 1 is full): {cause}"
@@ -734,7 +774,7 @@ def find_jumps(log: RobotLog, observed: Motions, noise: MotionNoise) -> list[Jum
     square = np.einsum("ni,ni->n", off, np.linalg.solve(spread, off[:, :, None])[:, :, 0])
     # where all noise is larger than stated, chance makes larger differences, too
     square /= max(float(np.median(square)) / chi_square_bound(0.5, 3), 1.0)
-    by_chance = chi_square_bound(1 - _FALSE_ALARM / len(square), 3)
+    by_chance = chi_square_bound(1 - _JUMP_BY_CHANCE / len(square), 3)
     sizes = np.stack([_sizes(motion), _sizes(odometry)])
     ordinary = np.quantile(sizes.min(axis=0), _ORDINARY, axis=0)
     least = np.maximum(_JUMP_STEPS * ordinary, _JUMP_FLOOR)

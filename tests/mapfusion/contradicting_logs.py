@@ -38,7 +38,9 @@ def circling_log(
         np.tile(np.diag([SIGMA_M**2, SIGMA_M**2, 0.0]), (len(points), 1, 1)),
         label=np.concatenate(label).astype(np.int32),
     )
-    return RobotLog("R1", True, np.arange(n) * 0.1, odometry, np.array(iteration), made)
+    return RobotLog(
+        "R1", True, np.linspace(0, 0.1 * (n - 1), n), odometry, np.array(iteration), made
+    )
 
 
 def _set(frame: int, axis: int, value: float) -> Callable[[Float], Float]:

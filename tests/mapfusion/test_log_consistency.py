@@ -25,9 +25,10 @@ from mapfusion.log_consistency import (
     truth_finding,
     without_jumps,
 )
+from mapfusion.log_part import first_frames
 from mapfusion.robot_log import Observations, RobotLog
 from mapfusion.se2 import Float, between, compose, inverse, rotation, transform_points, wrap
-from mapfusion.se3 import from_planar
+from mapfusion.se3 import from_planar, from_quaternions
 from mapfusion.smoother.smooth import SmootherParameters, smooth
 from tests.mapfusion.contradicting_logs import (
     JUMPS,
@@ -89,7 +90,7 @@ def test_odometry_of_another_run_is_told(sound: RobotLog) -> None:
     turns = 0.15 * np.sign(np.sin(np.arange(len(sound)) / 3))
     other = np.column_stack([np.full(len(sound), 0.1), np.zeros(len(sound)), turns])
     (finding,) = check_log(replace(sound, odometry=other), NOISE).findings
-    assert "another run" in finding.text
+    assert "another run's" in finding.text
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.003, 0.015, 0.03])
@@ -130,6 +131,28 @@ def test_a_jump_is_told_in_metres(sound: RobotLog) -> None:
     assert "odometry moved 3.00 m, the observations 0." in finding.text
 
 
+def test_the_filter_takes_one_increment_as_unsure_as_it_is(sound: RobotLog) -> None:
+    """NaN stands for the noise of the settings, as if nothing had been said."""
+    log = first_frames(sound, 20)
+    paths = []
+    for variance in (None, float("nan"), 1.0):
+        covariance = np.full((20, 3, 3), np.nan) if variance else None
+        if covariance is not None and variance is not None:
+            covariance[10] = variance * np.eye(3)
+        paths.append(filtered(log, covariance).slam.best_path())
+    np.testing.assert_array_equal(paths[1], paths[0])
+    assert np.abs(paths[2] - paths[0]).max() > 1e-6
+
+
+def test_encoders_with_a_coarse_resolution_are_sound(sound: RobotLog) -> None:
+    """Increments that are whole steps: 0 or 0.25 m, 0 or 0.1 rad, and right in the sum."""
+    resolution = np.array([0.25, 0.25, 0.1])
+    whole = np.round(np.cumsum(circling_log(100, 0.0).odometry, axis=0) / resolution) * resolution
+    log = circling_log(100, 0.0)
+    coarse = np.concatenate([np.zeros((1, 3)), np.diff(whole, axis=0)])
+    assert not check_log(replace(log, odometry=coarse), NOISE).findings
+
+
 def test_the_smoother_gives_a_jump_no_weight(sound: RobotLog) -> None:
     log = replace(sound, odometry=JUMPS["3 m"][0](sound.odometry))
     mended, covariance = without_jumps(log, check_log(log, NOISE).jumps)
@@ -141,7 +164,9 @@ def test_the_smoother_gives_a_jump_no_weight(sound: RobotLog) -> None:
         np.delete(information, 39, 0),
         np.delete(SmootherParameters().odometry_information(mended), 39, 0),
     )
-    path = smooth(mended, mended.observations.label, true_poses(len(log)), own).estimate.path
+    label = mended.observations.label
+    assert label is not None
+    path = smooth(mended, label, true_poses(len(log)), own).estimate.path
     assert np.abs(path - true_poses(len(log)))[:, :2].max() < 0.05
 
 
@@ -159,7 +184,9 @@ def test_share_outside_the_gate(sound: RobotLog) -> None:
     assert end.associations is not None
     assert gate_finding(sound, end.associations) is None
     n_outside, n_expected = outside_gate(sound, end.associations)
-    assert n_expected == len(sound.observations) - len(np.unique(sound.observations.label))
+    labels = sound.observations.label
+    assert labels is not None
+    assert n_expected == len(labels) - len(np.unique(labels))
     dropped = end.associations.copy()
     dropped[sound.iteration % 3 > 0] = -1
     assert outside_gate(sound, dropped)[0] > 0.6 * n_expected > n_outside
@@ -183,7 +210,9 @@ def test_planar_motions_and_their_covariance() -> None:
             np.tile(np.diag([sigma**2, sigma**2, 0]), (24, 1, 1)),
             label=np.tile(np.arange(12, dtype=np.int32), 2),
         )
-        log = RobotLog("R1", True, np.arange(2.0), np.zeros((2, 3)), np.repeat([0, 1], 12), made)
+        log = RobotLog(
+            "R1", True, np.array([0.0, 1.0]), np.zeros((2, 3)), np.repeat([0, 1], 12), made
+        )
         found = observed_motions(log)
         error = found.motion[0, [0, 1, 5]] - T
         own = found.covariance[0][np.ix_([0, 1, 5], [0, 1, 5])]
@@ -204,7 +233,9 @@ def test_motions_in_space_by_tracks() -> None:
     )
     odometry = np.zeros((n, 3))
     odometry[1:, 0] = 0.1
-    log = RobotLog("R1", False, np.arange(n) * 1.0, odometry, np.repeat(np.arange(n), 30), made)
+    log = RobotLog(
+        "R1", False, np.linspace(0, n - 1, n), odometry, np.repeat(np.arange(n), 30), made
+    )
     np.testing.assert_allclose(observed_motions(log).motion[:, :3], [[0.1, 0, 0]] * 11, atol=0.02)
     assert not check_log(log, NOISE).findings
     in_mm = replace(log, odometry=1000 * odometry)
@@ -282,8 +313,6 @@ def test_truth_with_quaternions_in_another_order() -> None:
             assert truth_finding("the odometry", spans, other) is None
     half = path[:, 2] / 2
     xyzw = np.column_stack([np.zeros((60, 2)), np.sin(half), np.cos(half)])
-    from mapfusion.se3 import from_quaternions
-
     wrong = from_quaternions(right[:, :3, 3], np.roll(xyzw, 1, axis=1))
     finding = truth_finding("the odometry", spans, wrong)
     assert finding is not None

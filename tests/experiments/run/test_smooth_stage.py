@@ -10,7 +10,7 @@ import pytest
 from experiments.run.frames import write_rows
 from experiments.run.job import Job
 from experiments.run.kept_logs import kept_log
-from experiments.run.stages.slam import ASSOCIATIONS, POSES
+from experiments.run.stages.slam import ASSOCIATIONS, FINDINGS, POSES
 from experiments.run.stages.smooth import (
     WRITES,
     SmoothSettings,
@@ -55,6 +55,7 @@ def filtered(folder: Path, log: RobotLog, owner: np.ndarray) -> dict[str, Path]:
     poses = pd.DataFrame(dead_reckoned(log), columns=[f"final_{name}" for name in POSE_FIELDS])
     poses = poses.assign(iteration=np.arange(len(poses)), resampled=False, n_landmarks=0)
     write_rows(folder / "slam" / "poses.parquet", POSES, poses)
+    write_rows(folder / "slam" / "findings.parquet", FINDINGS, [])
     return {"log": folder / "log", "slam": folder / "slam"}
 
 

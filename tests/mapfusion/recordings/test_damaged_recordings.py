@@ -263,7 +263,7 @@ DAMAGE: dict[str, tuple[str, Callable[[Path], Any], str]] = {
     "short tum": (
         "images",
         lambda f: (f / "odometry.tum").write_text("1 0 0 0 0 0 0 1\n"),
-        "no odometry at 5 of 5",
+        "the odometry is of 1.000 to 1.000 s, the pictures are of",
     ),
 }
 

@@ -1,0 +1,198 @@
+"""Logs and recordings that contradict themselves: warnings, likely causes and exit codes."""
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapfusion.landmark_map import read_map
+from mapfusion.robot_log import read_log, write_log
+from mapfusion.se2 import Float
+from tests.helpers.tiny_scenario import Reply, assert_refused, command
+from tests.mapfusion.contradicting_logs import JUMPS, MISTAKES, circling_log
+from tests.mapfusion.recordings.written_layouts import (
+    CAMERA,
+    POSES,
+    START_NS,
+    drive,
+    tum_lines,
+    write_calibration,
+    write_images,
+)
+
+OWN = ("--set", "slam.filter.association=label", "--set", "slam.filter.n_particles=20")
+VISION = ("--vision", "tracks.min_length=1", "--jobs", 1)
+
+
+def mapped(
+    change: Callable[[Float], Float], tmp_path: Path, capsys: pytest.CaptureFixture[str], *more: str
+) -> Reply:
+    log = circling_log()
+    write_log(tmp_path / "log", replace(log, odometry=change(log.odometry)))
+    return command(capsys, "slam", tmp_path / "log", "-o", tmp_path / "m.parquet", *OWN, *more)
+
+
+@pytest.mark.parametrize("name", ["absolute poses", "degrees", "millimetres"])
+def test_a_map_that_its_log_contradicts_is_no_success(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    change, words = MISTAKES[name]
+    reply = mapped(change, tmp_path, capsys)
+    assert reply.code == 1
+    warning, verdict = reply.complaints[-2:]
+    assert warning.startswith(f"mapfusion: warning: {tmp_path / 'log'}: the odometry contradicts")
+    assert all(word in warning for word in words)
+    if name == "millimetres":
+        assert "the map is empty: no landmark was seen often enough" in verdict
+    else:
+        assert "fell outside the gate" in verdict
+
+
+def test_a_jump_is_named_and_the_map_is_right(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reply = mapped(JUMPS["3 m"][0], tmp_path, capsys, "--json")
+    assert reply.code == 0
+    (warning,) = [line for line in reply.complaints if "warning" in line]
+    assert "frame 40: odometry moved 3.00 m, the observations" in warning
+    (finding,) = json.loads(reply.out)["findings"]
+    assert (finding["check"], finding["iteration"]) == ("jump", 40)
+    jumped = read_map(tmp_path / "m.parquet").position_m
+    assert mapped(np.array, tmp_path, capsys).code == 0
+    np.testing.assert_allclose(jumped, read_map(tmp_path / "m.parquet").position_m, atol=0.1)
+
+
+def test_a_sound_log_is_mapped_without_a_word(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reply = mapped(np.array, tmp_path, capsys)
+    assert (reply.code, [line for line in reply.complaints if "mapfusion" in line]) == (0, [])
+
+
+def test_a_run_keeps_and_tells_what_logs_say_against_themselves(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A jump of one robot, and odometry in millimetres of the only other one's."""
+    from experiments.judge import tables
+
+    monkeypatch.setattr("experiments.show.figures.drawing.FIGURES", ())  # drawn in other tests
+    log = circling_log(30)
+    jumped = replace(log, odometry=log.odometry + 3.0 * (np.arange(30)[:, None] == 20) * [1, 0, 0])
+    write_log(tmp_path / "R1", jumped)
+    wrong = replace(log, robot="R2", odometry=log.odometry * [1000, 1000, 1])
+    write_log(tmp_path / "R2", wrong)
+    text = "schema_version: 1\nname: two\nlogs: [R1, R2]\nevaluate: {every: 29}\n"
+    text += "slam: {filter: {association: label, n_particles: 20}}\n"
+    text += "align: {repetitions: 1, aligners: [{name: ransac, method: ransac}]}\n"
+    (tmp_path / "two.yaml").write_text(text)
+    path, results = tmp_path / "two.yaml", tmp_path / "results"
+    reply = command(capsys, "run", path, "--jobs", 1, "--results", results)
+    assert reply.code == 0
+    said = "\n".join(reply.complaints)
+    assert "warning: R1: frame 20: odometry moved 3." in said
+    assert "warning: R2: the odometry contradicts" in said
+    found = tables.read(tables.table_path(results / "two-0", "findings"), "findings")
+    assert set(zip(found["robot"], found["check"], strict=True)) >= {
+        ("R1", "jump"),
+        ("R2", "odometry"),
+    }
+    assert command(capsys, "report", results / "two-0").code == 0
+    assert "frame 20: odometry moved" in (results / "two-0" / "report.html").read_text()
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_images(tmp_path_factory.mktemp("recorded"), drive())
+
+
+def imported(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], **files: str
+) -> Reply:
+    folder = shutil.copytree(recording, tmp_path / "recording")
+    for name, text in files.items():
+        (folder / f"{name}.tum").write_text(text)
+    return command(capsys, "import", "images", folder, "-o", tmp_path / "logs", *VISION)
+
+
+def reordered(order: list[int], factor: float = 1.0) -> str:
+    """The true trajectory with its columns in another order and positions times `factor`."""
+    rows = []
+    for line in tum_lines(START_NS, POSES).splitlines()[1:]:
+        words = line.split()
+        words[1:4] = [str(factor * float(word)) for word in words[1:4]]
+        rows.append(" ".join(f"-{words[-k]}" if k < 0 else words[k] for k in order))
+    return "\n".join(rows).replace("--", "") + "\n"
+
+
+def test_sound_trajectories_are_taken_without_a_word(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = tum_lines(START_NS, POSES)
+    reply = imported(recording, tmp_path, capsys, odometry=own, truth=own)
+    assert reply.code == 0
+    assert "contradict" not in reply.err
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (reordered([0, -2, -3, 1, -5, -6, 4, 7]), "axes are a camera's (z ahead, x right, y down)"),
+        (reordered([*range(8)], 1000), "millimetres?"),
+        (tum_lines(START_NS, POSES * [-1, -1, 1]), "x points back"),
+    ],
+)
+def test_odometry_that_pictures_contradict_is_named(
+    text: str, words: str, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reply = imported(recording, tmp_path, capsys, odometry=text)
+    assert reply.code == 1
+    warning, verdict = reply.complaints[-2:]
+    assert "the odometry contradicts the motion that the pictures show" in warning
+    assert words in warning
+    assert "--odometry images" in verdict
+    assert len(read_log(tmp_path / "logs" / "recording")) == len(POSES)
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_a_wrong_focal_length_is_named(
+    factor: float, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = shutil.copytree(recording, tmp_path / "recording")
+    f = factor * CAMERA.focal_px
+    write_calibration(folder / "calibration.yaml", intrinsics=[f, f, *CAMERA.center_px])
+    (folder / "odometry.tum").write_text(tum_lines(START_NS, POSES))
+    reply = command(capsys, "import", "images", folder, "-o", tmp_path / "logs", *VISION)
+    assert reply.code == 1
+    for what in ("odometry", "truth"):
+        (warning,) = [line for line in reply.complaints if f"the {what} contradicts" in line]
+        assert "focal length" in warning or "calibration" in warning
+
+
+def test_truth_that_pictures_contradict_is_named(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reply = imported(recording, tmp_path, capsys, truth=reordered([0, 1, 2, 3, 7, 4, 5, 6]))
+    assert reply.code == 0
+    assert "the truth stands on end or on its head" in reply.complaints[-1]
+    assert "w x y z in place of x y z w" in reply.complaints[-1]
+
+
+def test_odometry_on_its_head_is_refused_by_its_line(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = "# a comment\n" + reordered([0, 1, 2, 3, 7, 4, 5, 6])
+    reply = imported(recording, tmp_path, capsys, odometry=text)
+    assert_refused(reply, "odometry.tum, line 2", "on its head", "is the quaternion x y z w?")
+    assert not (tmp_path / "logs").exists()
+
+
+def test_truth_of_another_time_is_refused(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reply = imported(recording, tmp_path, capsys, truth=tum_lines(0, POSES))
+    spans = ("the truth is of 0.000 to 1.000 s", f"{START_NS / 1e9:.3f} to")
+    assert_refused(reply, *spans, "another clock")
