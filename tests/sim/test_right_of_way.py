@@ -1,6 +1,7 @@
 """Robots that would wait for each other for ever get through, by one of them waiting earlier."""
 
 import math
+from typing import cast
 from unittest.mock import patch
 
 import numpy as np
@@ -9,9 +10,9 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from mapfusion.errors import InputError
-from sim.driver import DriverSettings, drive
+from sim.driver import DriverSettings, _Driver, _others, drive
 from sim.floorplan import FloorPlan, Wall
-from sim.p3at import OUTER_RADIUS_M
+from sim.p3at import OUTER_RADIUS_M, P3at
 from sim.right_of_way import Driven, Hold, Holding, Passage, Progress, circle_among, hold_for
 from sim.route import Route
 from sim.trajectory import Trajectory
@@ -55,19 +56,18 @@ def test_two_that_come_head_on_get_through(first: str) -> None:
     assert apart_m.min() > 2 * OUTER_RADIUS_M
 
 
-def test_the_last_listed_goes_first_where_it_alone_has_no_place_to_wait() -> None:
-    """It starts on the way that the other would take."""
-    routes = [
-        Route("a", np.array([4, 2, UP]), np.array([[4, 4], [1, 4]])),
-        Route("b", np.array([2.6, 4, 0.0]), np.array([[4, 4], [7, 4]])),
+def test_a_robot_that_holds_lets_the_others_by() -> None:
+    """So that these do not give way to it, though it is listed first."""
+    here, there = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0)
+    hold = Hold(0, Progress(0, -9.0), (Passage(1, Progress(0, -1.0), (0.0, 0.0)),))
+    drivers = [
+        _Driver(route, cast(P3at, None), DriverSettings(), holds)
+        for route, holds in zip(joining(), ([hold], []), strict=True)
     ]
-    both = driven(routes)
-    assert arrived(both, routes) == [True, True]
-    reached = [
-        int(np.argmax(np.linalg.norm(both.T_world_robot[k, :, :2] - [4, 4], axis=1) < 0.25))
-        for k in (0, 1)
-    ]
-    assert 0 < reached[1] < reached[0]
+    came = [driver.progress(here) for driver in drivers]
+    drivers[0].hold(came, [here, there], 1.0)
+    (seen,) = _others(1, [here, there], [False, False], drivers)
+    assert (seen.goes_first, seen.lets_by) == (True, True)
 
 
 def test_a_circle_of_three_is_found() -> None:
@@ -117,6 +117,15 @@ def test_the_place_is_the_last_one_clear_of_the_other_s_way() -> None:
     again = hold_for((0, 1), [other, mine], ahead[::-1], 1.25, [hold])
     assert again is not None
     assert again.at.minus_left_m == pytest.approx(3.3 - 10)
+
+
+def test_the_one_listed_before_holds_where_the_last_has_no_place() -> None:
+    mine, other = straight(*np.arange(0, 4.3, 0.1)), straight(5.0, y_m=-0.5)
+    ahead = [np.array([[10.0, 0.0]]), np.array([[5.0, 6.0]])]
+    hold = hold_for((0, 1), [mine, other], ahead, 1.25)
+    assert hold is not None
+    assert hold.robot == 0
+    assert [passage.robot for passage in hold.passages] == [1]
 
 
 def test_nobody_holds_where_all_stand_on_the_others_ways() -> None:
