@@ -23,7 +23,7 @@ def page(sweep: Path) -> Page:
 
 def test_it_tells_of_all_runs(page: Page) -> None:
     words = " ".join(page.words.split())
-    assert "Measured over 10 runs" in words
+    assert "Indicative: measured over 10 runs in 5 worlds" in words
     assert "slam.filter.n_particles" in words
     assert "0..4" in words  # the seeds that finished
     assert "Use ransac" in words
