@@ -122,9 +122,10 @@ def match(
     By descriptor a pair is kept when each is the other's nearest among the landmarks of compatible
     height (planar maps: among all), and near enough. Maps with neither give no pairs.
     """
-    if map_a.label is not None and map_b.label is not None:
+    empty = not len(map_a) or not len(map_b)
+    if map_a.label is not None and map_b.label is not None and not empty:
         return _match_labels(map_a, map_b)
-    if map_a.descriptor is None or map_b.descriptor is None or not len(map_a) or not len(map_b):
+    if map_a.descriptor is None or map_b.descriptor is None or empty:
         none = np.zeros(0, np.int64)
         return Correspondences(none, none, np.zeros(0), _nothing_to_match_by(map_a, map_b))
     return _match_descriptors(map_a, map_b, parameters)
@@ -154,7 +155,8 @@ def _match_labels(map_a: LandmarkMap, map_b: LandmarkMap) -> Correspondences:
     if len(common) < FEW:
         both = "are labels of both maps" if len(common) != 1 else "is a label of both maps"
         a, b = (
-            f"{len(labels)} from {labels[0]} to {labels[-1]}" for labels in (labels_a, labels_b)
+            f"{len(labels)} from {labels[0]} to {labels[-1]}" if len(labels) else "none"
+            for labels in (labels_a, labels_b)
         )
         shortage = (
             f"{len(common) or 'none'} {both} (map {map_a.name}: {a}; map {map_b.name}: {b}); where "

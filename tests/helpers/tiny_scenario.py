@@ -9,6 +9,7 @@ import pytest
 
 from experiments.cli import main as cli
 from experiments.judge import tables
+from mapfusion.storage import read_json, write_json
 
 TINY = """
 schema_version: 1
@@ -97,3 +98,12 @@ def assert_same_tables(result: Path, other: Path) -> None:
     first, second = estimated_tables(result), estimated_tables(other)
     for name, table in first.items():
         pd.testing.assert_frame_equal(table, second[name], check_exact=True, obj=name)
+
+
+def without_tables(result: Path, *names: str) -> None:
+    """Make a result one of an earlier version that had no such tables."""
+    provenance = read_json(result / "provenance.json", "provenance")
+    provenance["tables"] = [name for name in provenance["tables"] if name not in names]
+    write_json(result / "provenance.json", provenance)
+    for name in names:
+        tables.table_path(result, name).unlink()

@@ -156,7 +156,7 @@ def test_what_is_wrong_is_one_line(
 
 @pytest.mark.parametrize(
     ("text", "words"),
-    [("%YAML:1.0\ncam2: 1\n", "cam0: missing"), ("%YAML:1.0\n", "holds nothing"), ("[", "line")],
+    [("%YAML:1.0\ncam2: 1\n", "cam0: is missing"), ("%YAML:1.0\n", "holds nothing"), ("[", "line")],
 )
 def test_a_calibration_that_is_none_is_one_line(
     text: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

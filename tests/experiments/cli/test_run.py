@@ -30,7 +30,7 @@ def quietly(stage: str, done: int, total: int) -> None:
 def test_every_table_is_there(tiny_result: Path, tiny: Simulation) -> None:
     for name in tables.ALL:
         table = tables.read(tables.table_path(tiny_result, name), name)  # checks the schema
-        assert len(table), name
+        assert len(table) or name == "findings", name  # sound logs have none
     found = estimated_tables(tiny_result)
     errors, estimates = found["errors"], found["estimates"]
     repetitions = {"ransac": 2, "svd": 1, "icp": 2}  # what draws nothing at random runs once
@@ -321,8 +321,10 @@ def test_runs_with_little_to_go_on(
     if not any("drive.frames" in override for override in overrides):
         changes += ["--set", "drive.frames=12", "--set", "evaluate.every=5"]
     reply = command(capsys, "run", path, "--jobs", 1, "--results", tmp_path, *changes)
-    assert reply.code == 0
-    told = [line.partition("merged")[2] for line in reply.complaints]
+    assert reply.code == (1 if name == "blind" else 0)
+    told = [line.partition("merged")[2] for line in reply.complaints if "merged" in line]
+    unusable = [line for line in reply.complaints if "no robot's map can be used" in line]
+    assert bool(unusable) == (name == "blind")
     unmerged = {
         "blind": [", and none share ground"],
         "nothing alike": [", though some share ground"],

@@ -49,9 +49,7 @@ def test_the_run_ends_and_says_what_stands_in(
     fails_at(monkeypatch, places)
     scenario = load_scenario(tiny_path, ["smooth.max_memory_gb=0.9"])  # a key of its own
     result = run_scenario(scenario, tmp_path, 1, lambda *_: None)
-    told = {
-        name: f"{name} is not smoothed: it fails here; {what}" for name, what in instead.items()
-    }
+    told = {name: f"{name} is not smoothed: fails here; {what}" for name, what in instead.items()}
 
     smoother = tables.read(tables.table_path(result, "smoother"), "smoother")
     reasons = smoother.set_index("robot")["not_smoothed"]

@@ -169,7 +169,7 @@ def test_odometry_that_pictures_told_does_not_count_twice(tmp_path: Path) -> Non
     known = white_noise_log(np.random.default_rng(0), N_FRAMES, 200)
     wrong = replace(known.log, odometry=known.log.odometry * [1.5, 1, 1])
     apart = []
-    for covariance in (None, np.zeros((N_FRAMES, 3, 3))):
+    for covariance in (None, np.tile(1e-12 * np.eye(3), (N_FRAMES, 1, 1))):
         write_odometry_covariance(tmp_path, covariance)
         told = read_odometry_covariance(tmp_path)
         own = SmootherParameters(stray_m=0.0, odometry_covariance=told)

@@ -14,7 +14,7 @@ from experiments.judge import tables
 from experiments.show.figures.result_tables import ResultTables
 from mapfusion import se2
 from mapfusion.landmark_map import read_map
-from tests.helpers.tiny_scenario import assert_refused, command
+from tests.helpers.tiny_scenario import assert_refused, command, without_tables
 
 ROBOTS = ("R1", "R2", "R3")
 
@@ -292,7 +292,7 @@ def test_bad_input_is_one_line_and_writes_nothing(
     refused(trio_copy, "obj", "--format obj: unknown; known: tum, kitti, g2o, ply")
     refused(tmp_path / "none", "tum", "not a result folder")
     assert_refused(command(capsys, "export", trio_copy), "--format")
-    tables.table_path(trio_copy, "frame_times").unlink()
+    without_tables(trio_copy, "frame_times")
     refused(trio_copy, "tum", "holds no times of frames; run it again")
     (trio_copy / "maps" / "R3.parquet").write_bytes(b"none")
     refused(trio_copy, "ply", "R3.parquet")

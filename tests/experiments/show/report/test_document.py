@@ -16,7 +16,7 @@ from experiments.show.figures.result_tables import ResultTables
 from experiments.show.report.document import write_report
 from mapfusion.storage import read_json, write_json
 from tests.helpers.report_page import HOSTILE, Page, hostile, page_of
-from tests.helpers.tiny_scenario import command
+from tests.helpers.tiny_scenario import command, without_tables
 
 MAX_BYTES = 15_000_000
 
@@ -91,8 +91,7 @@ def test_fusers_stand_with_their_figures_and_how_to_read_them(trio_copy: Path) -
 
 
 def test_a_result_without_fusers_has_no_such_section(trio_copy: Path) -> None:
-    for name in ("fusers", "fuser_coverage"):
-        tables.table_path(trio_copy, name).unlink()
+    without_tables(trio_copy, "fusers", "fuser_coverage")
     scenario = read_json(trio_copy / "scenario.json", "scenario")
     write_json(trio_copy / "scenario.json", scenario | {"expect": {"path_rmse_m": {"max": 9}}})
     page = page_of(trio_copy, trio_copy / "r.html")
@@ -102,7 +101,7 @@ def test_a_result_without_fusers_has_no_such_section(trio_copy: Path) -> None:
 
 @pytest.mark.parametrize("name", ["aligner_timings", "clouds", "fusion", "map_history"])
 def test_without_a_table_the_rest_is_shown(name: str, trio_copy: Path) -> None:
-    tables.table_path(trio_copy, name).unlink()
+    without_tables(trio_copy, name)
     assert "Use ransac" in re.sub(r"\s+", " ", page_of(trio_copy, trio_copy / "r.html").words)
 
 
