@@ -1,8 +1,8 @@
 """All that the project must stand, at random: `python -m tests.campaign --seed 0`.
 
 Broken scenarios, damaged files, flipped bits, plug-ins that misbehave, kills, results that lack
-tables, environments that libraries trip over. Says of each part how
-much was tried and what was found, and ends with 1 where anything was. `--only PART` for one.
+tables, outputs that are inputs, environments that libraries trip over. Says of each part how much
+was tried and what was found, and ends with 1 where anything was. `--only PART` for one.
 """
 
 import argparse

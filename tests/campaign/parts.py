@@ -76,7 +76,7 @@ PARTS = {
     "misbehaving_plugins": Part({"misbehaviours": 60}, 1, _plugins),
     "flipped_bits": Part({"flips": 2000, "in footers": 666}, 1, _flips),
     "surroundings": Part(
-        {"tables deleted": 100, "versions": 18, "environments": 40}, 1, _surroundings
+        {"tables deleted": 100, "versions": 18, "outputs": 40, "environments": 40}, 1, _surroundings
     ),
     "damaged_files": Part({"damaged": 1000}, 1, _damage),
 }

@@ -1,4 +1,4 @@
-"""Results that lack tables, files of other versions, and environments that libraries trip over.
+"""Results that lack tables, files of other versions, outputs that are inputs, and environments.
 
 Each command ends with its work done or with lines that name the file or the variable.
 """
@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
+from experiments.cli.main import app
 from experiments.judge import tables
 from experiments.show.exported import export_result
 from experiments.show.report.contents import contents_of
@@ -37,6 +38,15 @@ _VALUES = {
     "COLUMNS": ("", "0", "-1", "abc", "1" * 30),
 }
 _SECONDS = 120  # of one command
+_OUTPUTS = 40  # that are drawn
+# Words of a command whose output, added at the end, must be none of the files that it reads.
+_WRITERS: dict[str, tuple[str, ...]] = {
+    "merge": ("a.csv", "b.csv"),
+    "align": ("a.csv", "b.csv"),
+    "slam": ("log",),
+    "export": ("result", "--format", "tum"),
+    "report": ("result",),
+}
 
 
 def written(folder: Path) -> Path:
@@ -74,11 +84,51 @@ def explore(seed: str, n_environments: int, folder: Path) -> Found:
             told = f"{name} of version {version!r}"
             faults += _unnamed(told, lambda: contents_of(result), path)
         path.write_text(whole)
+    for _ in range(_OUTPUTS):
+        counts["outputs"] += 1
+        faults += _overwritten(rng, folder)
     for _ in range(n_environments):
         own = {name: rng.choice(_VALUES[name]) for name in rng.sample(sorted(_VALUES), 2)}
         counts["environments"] += 1
         faults += _ended_wrongly(own, folder)
     return Found(counts, faults)
+
+
+def _overwritten(rng: random.Random, folder: Path) -> list[str]:
+    """Return the fault, if any, of a command that is told to write to one of its inputs."""
+    for name in ("a.csv", "b.csv", "log/frames.csv", "log/observations.csv"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text("x_m,y_m\n0,0\n")
+    command = rng.choice(sorted(_WRITERS))
+    words = _WRITERS[command]
+    inputs = [folder / word for word in words if (folder / word).exists()]
+    output = rng.choice(inputs)
+    if output.is_dir() and command != "export":
+        output = rng.choice(sorted(path for path in output.rglob("*") if path.is_file()))
+    kind = rng.choice(["same", "relative", "link", "hard link"])
+    if kind == "relative":
+        output = Path(os.path.relpath(output))
+    elif kind == "link" or output.is_dir():
+        link = folder / f"link{output.suffix}"
+        link.unlink(missing_ok=True)
+        link.symlink_to(output)
+        output = link
+    elif kind == "hard link":
+        (folder / f"hard{output.suffix}").unlink(missing_ok=True)
+        os.link(output, folder / f"hard{output.suffix}")
+        output = folder / f"hard{output.suffix}"
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    called = [command, *(str(folder / w) if (folder / w).exists() else w for w in words)]
+    what = f"{command} with its output over an input ({kind}, {output.name})"
+    try:
+        app([*called, "-o", str(output)], prog_name="mapfusion", standalone_mode=False)
+        faults = [f"{what}: was not refused"]
+    except InputError:
+        faults = []
+    except Exception as error:
+        faults = [f"{what}: {type(error).__name__} {error}"]
+    after = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return faults if before == after else [*faults, f"{what}: files changed"]
 
 
 def _unnamed(what: str, read: Callable[[], object], path: Path) -> list[str]:
