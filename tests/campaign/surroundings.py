@@ -6,6 +6,7 @@ Each command ends with its work done or with lines that name the file or the var
 import json
 import os
 import random
+import re
 import subprocess
 import sys
 from collections import Counter
@@ -39,6 +40,8 @@ _VALUES = {
 }
 _SECONDS = 120  # of one command
 _OUTPUTS = 40  # that are drawn
+_COLUMNS = "x_m,y_m,cov_xx_m2,cov_xy_m2,cov_yy_m2,label"
+_MAP = "\n".join([_COLUMNS, *(f"{k},{k * k % 7},1e-4,0,1e-4,{k}" for k in range(20)), ""])
 # Words of a command whose output, added at the end, must be none of the files that it reads.
 _WRITERS: dict[str, tuple[str, ...]] = {
     "merge": ("a.csv", "b.csv"),
@@ -98,7 +101,7 @@ def _overwritten(rng: random.Random, folder: Path) -> list[str]:
     """Return the fault, if any, of a command that is told to write to one of its inputs."""
     for name in ("a.csv", "b.csv", "log/frames.csv", "log/observations.csv"):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text("x_m,y_m\n0,0\n")
+        (folder / name).write_text(_MAP)
     command = rng.choice(sorted(_WRITERS))
     words = _WRITERS[command]
     inputs = [folder / word for word in words if (folder / word).exists()]
@@ -123,8 +126,9 @@ def _overwritten(rng: random.Random, folder: Path) -> list[str]:
     try:
         app([*called, "-o", str(output)], prog_name="mapfusion", standalone_mode=False)
         faults = [f"{what}: was not refused"]
-    except InputError:
-        faults = []
+    except InputError as error:
+        is_right = re.search("is an input|is a file of|lies in|holds|would replace|ends in", str(error))
+        faults = [] if is_right else [f"{what}: refused for another reason: {error}"]
     except Exception as error:
         faults = [f"{what}: {type(error).__name__} {error}"]
     after = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
