@@ -48,8 +48,11 @@ def require_file(
     for each in _paths(inputs):
         if _is_same(path, each):
             raise InputError(f"{option} {path}: is an input ({each}); name another file")
-        in_log = each.is_dir() and path.resolve().parent == each.resolve()
-        if in_log and path.stem in _OF_LOGS:
+        if not each.is_dir():
+            continue
+        in_log = path.resolve().parent == each.resolve() and path.resolve().stem in _OF_LOGS
+        files = (file for file in each.iterdir() if file.stem in _OF_LOGS)
+        if in_log or any(_is_same(path, file) for file in files):
             raise InputError(f"{option} {path}: is a file of the log {each}; name another file")
 
 

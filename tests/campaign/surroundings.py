@@ -127,7 +127,7 @@ def _overwritten(rng: random.Random, folder: Path) -> list[str]:
         app([*called, "-o", str(output)], prog_name="mapfusion", standalone_mode=False)
         faults = [f"{what}: was not refused"]
     except InputError as error:
-        is_right = re.search("is an input|is a file of|lies in|holds|would replace|ends in", str(error))
+        is_right = re.search("is an input|is a file of|holds|would replace|ends in", str(error))
         faults = [] if is_right else [f"{what}: refused for another reason: {error}"]
     except Exception as error:
         faults = [f"{what}: {type(error).__name__} {error}"]

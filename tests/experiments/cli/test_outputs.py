@@ -75,6 +75,16 @@ def test_an_input_is_no_output_under_any_name(
     assert contents(maps[0].parent) == before
 
 
+@pytest.mark.parametrize("name", [link, hard_link])
+def test_a_file_of_a_log_is_no_output_under_another_name(
+    tmp_path: Path, name: Callable[[Path], Path]
+) -> None:
+    (tmp_path / "log").mkdir()
+    (tmp_path / "log" / "frames.csv").write_text("iteration\n")
+    with pytest.raises(InputError, match="is a file of the log"):
+        require_map_file(name(tmp_path / "log" / "frames.csv"), [tmp_path / "log"])
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
