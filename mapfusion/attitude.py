@@ -20,12 +20,12 @@ from mapfusion.robot_log import Observations
 from mapfusion.se2 import Float
 from mapfusion.se3 import tilt
 from mapfusion.storage import (
-    column,
     columns,
     float_fields,
     named_columns,
     read_parquet,
     require_kind,
+    require_one_row_a_frame,
     schema,
     text_attributes,
     write_table,
@@ -129,8 +129,16 @@ def write_attitude(folder: Path, attitude: Attitude | None) -> None:
     write_table(folder / FILE, rows | values, ATTITUDE)
 
 
-def read_attitude(folder: Path) -> Attitude | None:
-    """Attitude of a log's folder, None for a level one, which has none; raises InputError."""
+def read_attitude(folder: Path, n_frames: int | None = None) -> Attitude | None:
+    """Read the attitude of a log; None if its folder holds none, as for level robots.
+
+    Args:
+        folder: of the log.
+        n_frames: of the log; None if it is not known.
+
+    Raises:
+        InputError: the file is damaged, or not as documented.
+    """
     path = folder / FILE
     if not path.is_file():
         return None
@@ -138,8 +146,7 @@ def read_attitude(folder: Path) -> Attitude | None:
     attributes = text_attributes(path, table)
     earlier = attributes.get("schema_version") == "1"
     require_kind(path, table, attributes, _ATTITUDE_1 if earlier else ATTITUDE)
-    if not np.array_equal(column(table, "iteration"), np.arange(table.num_rows)):
-        raise InputError(f"{path}: iterations must be 0, 1, 2, ..., one row each")
+    require_one_row_a_frame(path, table, n_frames)
     try:
         carried = np.zeros((table.num_rows, 2)) if earlier else columns(table, _CARRIED)
         return Attitude(columns(table, _FIELDS), columns(table, _SIGMAS), carried)

@@ -14,12 +14,12 @@ from mapfusion.errors import InputError
 from mapfusion.open_tables import told
 from mapfusion.se2 import Float
 from mapfusion.storage import (
-    column,
     covariance_columns,
     covariances_from,
     float_fields,
     read_table,
     require_cells,
+    require_one_row_a_frame,
     schema,
     write_table,
 )
@@ -51,14 +51,21 @@ def write_odometry_covariance(folder: Path, covariance: Float | None) -> None:
     write_table(folder / FILE, rows, ODOMETRY_COVARIANCE)
 
 
-def read_odometry_covariance(folder: Path) -> Float | None:
-    """(T, 3, 3) of a log's folder, or None where it holds none; raises InputError."""
+def read_odometry_covariance(folder: Path, n_frames: int | None = None) -> Float | None:
+    """Read the covariance (T, 3, 3) of a log's odometry; None if its folder holds none.
+
+    Args:
+        folder: of the log.
+        n_frames: of the log; None if it is not known.
+
+    Raises:
+        InputError: the file is damaged, or not as documented.
+    """
     path = folder / FILE
     if not path.is_file():
         return None
     table, _ = read_table(path, ODOMETRY_COVARIANCE)
-    if not np.array_equal(column(table, "iteration"), np.arange(table.num_rows)):
-        raise InputError(f"{path}: iterations must be 0, 1, 2, ..., one row each")
+    require_one_row_a_frame(path, table, n_frames)
     require_cells(path, table, _FIELDS, np.isfinite, "give finite numbers, or remove the file")
     covariance = covariances_from(table, _FIELDS)
     low, high = np.linalg.eigvalsh(covariance[1:])[:, [0, -1]].T  # the first row has no motion

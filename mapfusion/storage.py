@@ -359,6 +359,21 @@ def require_cells(
             raise InputError(f"{path}: column {name}: {found}; {remedy}")
 
 
+def require_one_row_a_frame(path: Path, table: pa.Table, n_frames: int | None = None) -> None:
+    """Raise InputError unless the column `iteration` is 0, 1, 2, ..., one row a frame of the log.
+
+    Args:
+        path: of the table, for the message.
+        table: with the column.
+        n_frames: of the log that the table lies beside; None if it is not known.
+    """
+    if not np.array_equal(column(table, "iteration"), np.arange(table.num_rows)):
+        raise InputError(f"{path}: iterations must be 0, 1, 2, ..., one row each")
+    if n_frames is not None and table.num_rows != n_frames:
+        frames = f"has {table.num_rows} rows, the log {n_frames} frames"
+        raise InputError(f"{path}: {frames}; write one row for each frame, or remove the file")
+
+
 def columns(table: pa.Table, names: Sequence[str]) -> np.ndarray:
     """Several columns as one array (N, len(names))."""
     return np.stack([column(table, name) for name in names], -1)

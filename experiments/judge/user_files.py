@@ -83,9 +83,9 @@ def slam(log: Path, settings: Scenario, on_progress: OnProgress) -> MadeMap:
         raise InputError(f"{log}: frames.parquet holds no frame")
     n_frames, rng = len(robot_log), generator(settings.seed, "slam", robot_log.robot)
     found = check_log(robot_log, settings.slam.filter.motion)
-    own = without_jumps(robot_log, found.jumps, read_odometry_covariance(log))
+    own = without_jumps(robot_log, found.jumps, read_odometry_covariance(log, n_frames))
     wanted, least, made = [n_frames - 1], settings.slam.min_count, None
-    told = own[1], read_attitude(log)
+    told = own[1], read_attitude(log, n_frames)
     for frame in run_log(own[0], settings.slam.filter, rng, wanted, least, *told):
         on_progress("FastSLAM", frame.iteration + 1, n_frames)
         made = frame

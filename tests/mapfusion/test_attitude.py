@@ -133,3 +133,11 @@ def test_what_no_body_has_is_refused(value: list, sigma: list, message: str) -> 
 def test_no_more_is_carried_than_there_is(carried: float) -> None:
     with pytest.raises(ValueError, match="carried: is not between"):
         Attitude(np.zeros((1, 3)), np.zeros((1, 3)), np.array([[carried, 1.0]]))
+
+
+@pytest.mark.parametrize("n_frames", [3, 5])
+def test_one_row_belongs_to_each_frame_of_the_log(tmp_path, n_frames):
+    write_attitude(tmp_path, Attitude(np.zeros((4, 3)), np.ones((4, 3)), np.zeros((4, 2))))
+    assert read_attitude(tmp_path, 4) is not None
+    with pytest.raises(InputError, match=f"has 4 rows, the log {n_frames} frames"):
+        read_attitude(tmp_path, n_frames)

@@ -49,3 +49,11 @@ def test_what_is_no_covariance_is_named_by_row(tmp_path: Path, spoil, said: str)
     write_odometry_covariance(tmp_path, covariance)
     with pytest.raises(InputError, match=f"{FILE}: {said}"):
         read_odometry_covariance(tmp_path)
+
+
+@pytest.mark.parametrize("n_frames", [3, 5])
+def test_one_row_belongs_to_each_frame_of_the_log(tmp_path: Path, n_frames: int) -> None:
+    write_odometry_covariance(tmp_path, np.tile(np.eye(3), (4, 1, 1)))
+    assert read_odometry_covariance(tmp_path, 4) is not None
+    with pytest.raises(InputError, match=f"{FILE}: has 4 rows, the log {n_frames} frames"):
+        read_odometry_covariance(tmp_path, n_frames)

@@ -107,14 +107,15 @@ def run(settings: SlamSettings, job: Job) -> None:
     """Run the filter over a log and write maps, poses, associations and particle clouds."""
     log = kept_log(job.inputs["log"])
     found = check_log(log, settings.filter.motion)
-    log, covariance = without_jumps(log, found.jumps, read_odometry_covariance(job.inputs["log"]))
+    known = read_odometry_covariance(job.inputs["log"], len(log))
+    log, covariance = without_jumps(log, found.jumps, known)
     last = len(log) - 1
     steps = list[dict[str, float]]()
     maps, associations, clouds, paths = _Rows(), _Rows(), _Rows(), _Rows()
     counted = np.empty(0, dtype=np.int64)
     iterations = evaluated_iterations(len(log), settings.every)
     rng = generator(settings.seed, "slam", log.robot)
-    told = covariance, read_attitude(job.inputs["log"])
+    told = covariance, read_attitude(job.inputs["log"], len(log))
     filtered = run_log(
         log, settings.filter, rng, iterations, settings.min_count, *told, viewing=False
     )

@@ -62,7 +62,7 @@ def run(settings: RobotCostSettings, job: Job) -> None:
     single_threaded()
     log, iterations = read_log(job.inputs["log"]), settings.smooth.iterations
     folder = job.inputs["log"]
-    told = read_odometry_covariance(folder), read_attitude(folder)
+    told = read_odometry_covariance(folder, len(log)), read_attitude(folder, len(log))
     _filter(settings.slam, log, told, iterations[:1])  # compiles, and fills caches
     _smooth_at(settings.smooth, job, log, iterations[0])
     filtered = _filter(settings.slam, log, told, iterations)

@@ -11,6 +11,7 @@ from mapfusion.align.correspondences import (
     match,
     scale_note,
 )
+from mapfusion.looks import NO_LABEL
 from tests.mapfusion.align.map_pairs import landmarks, unit_vectors
 
 
@@ -228,3 +229,13 @@ def test_a_scale_is_seen_among_false_pairs_and_none_without_one(factor, unit):
         assert scale_note(a, b, index, rng.permutation(60)) == ""
     far = replace(b, position_m=1000 * b.position_m, name="north")
     assert "spans" in scale_note(a, far, index, rng.permutation(60))
+
+
+@pytest.mark.parametrize("n", [0, 1])
+def test_labelled_maps_without_landmarks_give_no_pairs_and_say_so(n):
+    none = replace(landmarks(np.zeros((0, 3))), label=np.zeros(0, np.int32))
+    other = replace(landmarks(np.zeros((n, 3))), label=np.zeros(n, np.int32))
+    assert "is empty" in match(none, other).shortage
+    assert "is empty" in match(other, none).shortage
+    nameless = replace(other, label=np.full(n, NO_LABEL, np.int32))
+    assert len(match(nameless, nameless)) == 0
