@@ -53,6 +53,9 @@ _LEAST_MOTIONS = 4  # whose median says anything
 # log's.
 _EXPLAINED = 0.8
 _MOST_FRAMES_LATE = 300  # that are tried where clocks may differ
+_MOST_PARTS = 2  # mistakes at once; more of them explain anything
+_AND = ", and "  # between the mistakes of a cause
+_MOST_SHIFTS = 3  # in time that are named, where a robot's motion repeats
 _TIE = 0.03  # of two causes that explain as much, the simpler is named
 # Share of true links of consecutive frames that are believed, and descriptors that are alike.
 _LINK_PROBABILITY = 0.999
@@ -503,6 +506,11 @@ class _Cause(NamedTuple):
     comparison: Comparison
     ratio: float
 
+    @property
+    def n_parts(self) -> int:
+        """Mistakes that it consists of."""
+        return len(self.text.split(_AND)) + (self.ratio != 1)
+
 
 def likely_cause(
     observed: Motions, mistakes: Mapping[str, Float], noise: MotionNoise | None = None
@@ -527,10 +535,10 @@ def likely_cause(
                 best = cause
         if best is not None and best.comparison.worst >= _EXPLAINED:
             break
-    if best is None or best.comparison.worst < _EXPLAINED:
-        late = _frames_late(observed, mistakes[""])
-        if late:
-            return f"its times look {abs(late)} frames too {'late' if late > 0 else 'early'}"
+    if best is None or best.comparison.worst < _EXPLAINED or best.n_parts > _MOST_PARTS:
+        if late := _frames_late(observed, mistakes[""]):
+            each = (f"{abs(n)} frames too {'late' if n > 0 else 'early'}" for n in late)
+            return f"its times look {' or '.join(itertools.islice(each, _MOST_SHIFTS))}"
         plain = compare(observed, Stated(mistakes[""], noise))
         if plain.shift.ratio < _STANDS_STILL:
             return "it says that the robot stands still"
@@ -538,23 +546,32 @@ def likely_cause(
             return scaled
         return "no common mistake explains it: is it another run's, or the calibration another's?"
     units = _unit_text(best.ratio)
-    return ", and ".join(text for text in (best.text, units) if text)
+    return _AND.join(text for text in (best.text, units) if text)
 
 
-def _frames_late(observed: Motions, poses: Float) -> int:
-    """By how many frames stated poses (T, ...) lag behind the observed motions; 0 if by none."""
-    best, late = _EXPLAINED, 0
-    most = min(len(poses) // 2, _MOST_FRAMES_LATE)
-    for shift in sorted(range(-most, most + 1), key=abs):
+def _frames_late(observed: Motions, poses: Float) -> list[int]:
+    """Return by how many frames stated poses (T, ...) may lag behind observed motions.
+
+    Motions that repeat agree at several shifts. The shifts whose agreement is a local maximum, and
+    about as good as the best, are returned, the smallest first; none if no shift explains them.
+    """
+    most, worst = min(len(poses) // 2, _MOST_FRAMES_LATE), dict[int, float]()
+    for shift in range(-most, most + 1):
         inside = (observed.start + shift >= 0) & (observed.end + shift < len(poses))
         part = Motions(*(values[inside] for values in observed))
         if 2 * len(part.start) < len(observed.start):
             continue
         moved = stated_motions(poses, part.start + shift, part.end + shift)
         found = _compared(part, *moved, part.sigma)
-        if found.shift.known and found.turn.known and found.worst > best:
-            best, late = found.worst, shift
-    return late
+        if found.shift.known and found.turn.known:
+            worst[shift] = found.worst
+    least = max(_EXPLAINED, max(worst.values(), default=0.0) - _TIE)
+    peaks = [
+        shift
+        for shift, value in worst.items()
+        if value > least and value >= max(worst.get(shift + by, -1.0) for by in (-1, 1))
+    ]
+    return sorted(peaks, key=abs)
 
 
 def _simplest_first(mistakes: Mapping[str, Float]) -> Iterator[list[tuple[str, Float, Float]]]:
@@ -651,6 +668,7 @@ def pose_mistakes(poses: Float) -> dict[str, Float]:
             "its heading looks like degrees (factor 57.3)": poses / [1, 1, _DEGREES],
             "its poses look inverted (T_robot_world)": inverse(poses),
             "only its heading has the other sign": poses * [1, 1, -1],
+            "only its y has the other sign": poses * [1, -1, 1],
         }
     known = np.isfinite(poses).all(axis=(1, 2))
     made = {"": poses}

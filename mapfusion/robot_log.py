@@ -57,7 +57,8 @@ NO_TRACK = -1
 # whole turns. The limit holds for radians and degrees alike, so that a log in degrees can be read,
 # and what reads it can name the unit.
 LARGEST_TURN = 360.0
-TRUTH_FILES = ("truth_poses.parquet", "truth_points.parquet")
+TRUTH_TABLES = ("truth_poses", "truth_points")
+TRUTH_FILES = tuple(f"{name}.parquet" for name in TRUTH_TABLES)
 Arrays = TypeVar("Arrays", bound="DataclassInstance")
 _ITERATION = told(pa.field("iteration", pa.int32()), "number of the frame: 0, 1, 2, ...")
 _ODOMETRY_FIELDS = ["odometry_x_m", "odometry_y_m", "odometry_theta_rad"]
@@ -382,9 +383,23 @@ def write_truth_poses(folder: Path, T_world_robot: Float) -> None:
     )
 
 
+def read_true_poses(folder: Path) -> Float | None:
+    """Read the true poses T_world_robot (T, 3) beside a log; None if there are none.
+
+    Raises:
+        InputError: the table is damaged, or not as documented.
+    """
+    path = table_path(folder, TRUTH_TABLES[0])
+    if not path.is_file():
+        return None
+    table, _ = read_open_table(path, TRUTH_POSES)
+    _require_numbered(path, table)
+    return columns(table, POSE_FIELDS)
+
+
 def read_truth(folder: Path) -> RobotTruth:
     """Read the truth beside a log; raises InputError. For evaluation only."""
-    paths = [table_path(folder, name) for name in ("truth_poses", "truth_points")]
+    paths = [table_path(folder, name) for name in TRUTH_TABLES]
     poses, _ = read_open_table(paths[0], TRUTH_POSES)
     points, _ = read_open_table(paths[1], TRUTH_POINTS)
     _require_numbered(paths[0], poses)

@@ -21,6 +21,7 @@ _OF_RESULTS = {".ply", ".g2o", ".tum", ".rrd"}
 # Tables of a robot log, as Parquet or CSV.
 _OF_LOGS = {"frames", "observations", "truth_poses", "truth_points"}
 _OF_LOGS |= {"odometry_covariance", "attitude"}
+_COMPANIONS = (".joint", ".viewing", ".frames")  # ends of the stems of files beside a map
 _RESULT = ("scenario.json", "world.json", "provenance.json", "tables", "keyframes")
 
 
@@ -65,6 +66,11 @@ def require_map_file(path: Path, inputs: Sequence[Path | str | None], n_maps: in
     from experiments.judge.user_files import numbered
 
     require_file("--output", path, MAP_ENDINGS, inputs)
+    companion = next((each for each in _COMPANIONS if path.stem.lower().endswith(each)), None)
+    if companion and not is_csv(path):
+        owner = f"{path.stem[: -len(companion)]}.parquet"
+        reason = f"a file NAME{companion}.parquet belongs to the map NAME.parquet ({owner})"
+        raise InputError(f"--output {path}: {reason}; choose another name")
     known = _paths(inputs)
     read = [*known, *(each for one in known for each in _beside(one) if each.is_file())]
     for k in range(1, n_maps + 1):

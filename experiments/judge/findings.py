@@ -9,7 +9,6 @@ import pandas as pd
 
 from experiments.judge import tables
 from experiments.judge.judged_run import JudgedRun
-from experiments.judge.judging import truth_of
 from experiments.run.stages.slam import read_findings
 from experiments.scenario.settings import Recording
 from mapfusion.fastslam.motion import MotionNoise
@@ -20,7 +19,7 @@ from mapfusion.log_consistency import (
     odometry_motions,
     truth_finding,
 )
-from mapfusion.robot_log import RobotLog
+from mapfusion.robot_log import RobotLog, read_true_poses
 from mapfusion.se2 import Float
 
 
@@ -32,10 +31,10 @@ def finding_rows(run: JudgedRun) -> list[dict[str, Any]]:
         known = read_findings(folders.slam)
         found = known[["check", "iteration", "finding"]].assign(robot=robot.name)
         rows += found.to_dict("records")
-        if recorded and not run.no_truth:
+        poses = read_true_poses(folders.log) if recorded else None
+        if poses is not None and len(poses) == len(log):
             sound = not (known["check"] == "odometry").any()
-            poses, noise = truth_of(folders.log, log).T_world_robot, run.scenario.slam.filter.motion
-            one = finding_of_truth(log, poses, noise, sound)
+            one = finding_of_truth(log, poses, run.scenario.slam.filter.motion, sound)
             if one is not None:
                 told = {"check": one.kind, "iteration": one.frame, "finding": one.text}
                 rows.append({"robot": robot.name} | told)

@@ -17,7 +17,8 @@ from experiments.run.stages.slam import RobotFolders, folders_of_both
 from experiments.run.stages.snapshots import ROBOTS_KEPT, stored_maps
 from mapfusion.errors import InputError
 from mapfusion.evidence.judge import Judge
-from mapfusion.robot_log import TRUTH_FILES, RobotLog, RobotTruth, read_truth
+from mapfusion.open_tables import table_path
+from mapfusion.robot_log import TRUTH_TABLES, RobotLog, RobotTruth, read_truth
 
 WRITES = ("errors.parquet", "fusion.parquet")
 ALIGNED = ("estimates", "correspondences", "rivals")  # tables of the align stage, per pair of maps
@@ -34,7 +35,7 @@ class JudgeSettings:
 
 def truth_of(folder: Path, log: RobotLog) -> RobotTruth:
     """The truth beside a log; NaN where there is none."""
-    if all((folder / name).is_file() for name in TRUTH_FILES):
+    if all(table_path(folder, name).is_file() for name in TRUTH_TABLES):
         return read_truth(folder)
     return RobotTruth(np.full((len(log), 3), np.nan), np.full((len(log.observations), 3), np.nan))
 

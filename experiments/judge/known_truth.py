@@ -3,7 +3,8 @@
 from pathlib import Path
 
 from experiments.scenario.settings import AnyScenario, Recording
-from mapfusion.robot_log import TRUTH_FILES
+from mapfusion.open_tables import table_path
+from mapfusion.robot_log import TRUTH_TABLES
 
 
 def why_no_truth(scenario: AnyScenario) -> str:
@@ -13,7 +14,7 @@ def why_no_truth(scenario: AnyScenario) -> str:
     """
     logs = map(Path, scenario.logs) if isinstance(scenario, Recording) else ()
     for log in logs:
-        lacking = [name for name in TRUTH_FILES if not (log / name).is_file()]
+        lacking = [name for name in TRUTH_TABLES if not table_path(log, name).is_file()]
         if lacking and log.is_dir():
-            return f"no truth is known: {log} has no {lacking[0]}"
+            return f"no truth is known: {log} has no {lacking[0]}.parquet or .csv"
     return ""

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from experiments.judge.findings import finding_of_truth
 from experiments.judge.judged_run import JudgedRun
 from experiments.methods.aligner_calls import callable_aligner
 from experiments.run.estimates import estimate_row
@@ -27,7 +28,7 @@ from mapfusion.log_consistency import Finding, check_log, gate_finding, without_
 from mapfusion.merge import merge as merge_maps
 from mapfusion.name_order import name_order
 from mapfusion.odometry_covariance import read_odometry_covariance
-from mapfusion.robot_log import read_log
+from mapfusion.robot_log import read_log, read_true_poses
 from mapfusion.storage import Write, write_together
 from mapfusion.team.team_graph import Place
 
@@ -93,7 +94,13 @@ def slam(log: Path, settings: Scenario, on_progress: OnProgress) -> MadeMap:
     assert made.landmarks is not None
     assert made.associations is not None
     gate = gate_finding(robot_log, made.associations)
-    return MadeMap(made.landmarks, (*found.findings, *([] if gate is None else [gate])))
+    findings = [*found.findings, *([] if gate is None else [gate])]
+    poses = read_true_poses(log)  # for this check alone, after the map is made
+    if poses is not None and len(poses) == n_frames:
+        sound = not any(finding.kind == "odometry" for finding in findings)
+        truth = finding_of_truth(robot_log, poses, settings.slam.filter.motion, sound)
+        findings += [] if truth is None else [truth]
+    return MadeMap(made.landmarks, tuple(findings))
 
 
 def save_map(path: Path, landmarks: LandmarkMap) -> None:

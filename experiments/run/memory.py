@@ -16,6 +16,7 @@ from experiments.run.pipeline import Pipeline, RobotStages
 from experiments.run.stage import RecordedLog
 from experiments.scenario.settings import Scenario, SimulatedScenario, Simulation
 from mapfusion.errors import InputError
+from mapfusion.open_tables import is_csv, table_path
 from sim.textures import STYLES
 
 _GB = 1e9
@@ -83,13 +84,21 @@ def needs(pipeline: Pipeline) -> Iterator[Need]:
         yield _of_textures(scenario)
 
 
+def _n_rows(path: Path) -> int:
+    """Return the number of rows of a log's table, Parquet or CSV, without reading the table."""
+    if is_csv(path):
+        with path.open("rb") as file:
+            return max(sum(1 for _ in file) - 1, 0)
+    return pq.read_metadata(path).num_rows
+
+
 def _of_filter(scenario: Scenario, robot: RobotStages) -> Iterator[Need]:
     """The log, its landmarks, and of late: particles x landmarks, frames and observations."""
     settings = scenario.slam.filter
     n_frames = n_observations = robot.n_frames
     where = "drive.frames"
     if isinstance(robot.log, RecordedLog):
-        n_observations = pq.read_metadata(robot.log.path / "observations.parquet").num_rows
+        n_observations = _n_rows(table_path(robot.log.path, "observations"))
         where = "logs"
     elif isinstance(scenario, SimulatedScenario):
         n_observations = n_frames * scenario.vision.harris.max_corners

@@ -303,6 +303,29 @@ def test_truth_against_odometry(name: str) -> None:
         assert words in finding.text
 
 
+@pytest.mark.parametrize("late", [-9, 9])
+def test_shifts_of_motions_that_repeat_are_named_from_the_smallest_on(late: int) -> None:
+    """Turns repeat every 25 frames, so that other shifts explain the truth as well."""
+    turn = 0.15 * np.sin(2 * np.pi * np.arange(120) / 25)
+    path = chained(np.column_stack([np.full(120, 0.1), np.zeros(120), turn]))
+    log = circling_log(120, poses=path)
+    spans = composed_spans(odometry_motions(log, NOISE), len(log))
+    truth = path[np.clip(np.arange(120) - late, 0, 119)]
+    finding = truth_finding("the odometry", spans, truth)
+    assert finding is not None
+    assert f"its times look 9 frames too {'late' if late > 0 else 'early'}" in finding.text
+
+
+def test_two_mistakes_explain_more_than_three() -> None:
+    """Observations as range and bearing in degrees are no sum of mistakes of the odometry."""
+    log = circling_log(60)
+    x, y, _ = log.observations.position_m.T
+    polar = np.column_stack([np.hypot(x, y), np.degrees(np.arctan2(y, x)), 0 * x])
+    wrong = replace(log, observations=replace(log.observations, position_m=polar))
+    (finding,) = check_log(wrong, NOISE).findings
+    assert "no common mistake explains it" in finding.text
+
+
 def test_truth_with_quaternions_in_another_order() -> None:
     path = true_poses(60)
     log = circling_log(60, poses=path)

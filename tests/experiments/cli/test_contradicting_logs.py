@@ -7,13 +7,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from mapfusion.landmark_map import read_map
-from mapfusion.robot_log import read_log, write_log
+from mapfusion.open_tables import HEIGHT
+from mapfusion.robot_log import read_log, write_log, write_truth_poses
 from mapfusion.se2 import Float
 from tests.helpers.tiny_scenario import Reply, assert_refused, command
-from tests.mapfusion.contradicting_logs import JUMPS, MISTAKES, circling_log
+from tests.mapfusion.contradicting_logs import JUMPS, MISTAKES, circling_log, true_poses
 from tests.mapfusion.recordings.written_layouts import (
     CAMERA,
     POSES,
@@ -66,6 +68,21 @@ def test_a_jump_is_named_and_the_map_is_right(
     np.testing.assert_allclose(jumped, read_map(tmp_path / "m.parquet").position_m, atol=0.1)
 
 
+def test_truth_that_contradicts_a_log_is_told_by_slam(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "log").mkdir()
+    write_truth_poses(tmp_path / "log", true_poses(60) * [1, 1, 180 / np.pi])
+    reply = mapped(np.array, tmp_path, capsys)
+    assert reply.code == 0
+    assert "the truth contradicts the odometry" in reply.complaints[-1]
+    assert "its heading looks like degrees" in reply.complaints[-1]
+    before = (tmp_path / "m.parquet").read_bytes()
+    write_truth_poses(tmp_path / "log", true_poses(60))
+    assert not mapped(np.array, tmp_path, capsys).complaints
+    assert (tmp_path / "m.parquet").read_bytes() == before  # the truth decides no number
+
+
 def test_a_sound_log_is_mapped_without_a_word(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -76,7 +93,7 @@ def test_a_sound_log_is_mapped_without_a_word(
 def test_a_run_keeps_and_tells_what_logs_say_against_themselves(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A jump of one robot, and odometry in millimetres of the only other one's."""
+    """A jump of one robot, its truth in millimetres; odometry in millimetres of the other, as CSV."""
     from experiments.judge import tables
 
     monkeypatch.setattr("experiments.show.figures.drawing.FIGURES", ())  # drawn in other tests
@@ -85,6 +102,14 @@ def test_a_run_keeps_and_tells_what_logs_say_against_themselves(
     write_log(tmp_path / "R1", jumped)
     wrong = replace(log, robot="R2", odometry=log.odometry * [1000, 1000, 1])
     write_log(tmp_path / "R2", wrong)
+    for table in ("frames", "observations"):
+        file = tmp_path / "R2" / f"{table}.parquet"
+        rows = pd.read_parquet(file).drop(columns="descriptor", errors="ignore")
+        rows.drop(columns=list(HEIGHT), errors="ignore").to_csv(
+            file.with_suffix(".csv"), index=False
+        )
+        file.unlink()
+    write_truth_poses(tmp_path / "R1", true_poses(30) * [1000, 1000, 1])
     text = "schema_version: 1\nname: two\nlogs: [R1, R2]\nevaluate: {every: 29}\n"
     text += "slam: {filter: {association: label, n_particles: 20}}\n"
     text += "align: {repetitions: 1, aligners: [{name: ransac, method: ransac}]}\n"
@@ -93,11 +118,14 @@ def test_a_run_keeps_and_tells_what_logs_say_against_themselves(
     reply = command(capsys, "run", path, "--jobs", 1, "--results", results)
     assert reply.code == 0
     said = "\n".join(reply.complaints)
+    assert "R1: the truth contradicts the odometry in most frames" in said
+    assert "998 times those that are observed: millimetres?" in said
     assert "warning: R1: frame 20: odometry moved 3." in said
     assert "warning: R2: the odometry contradicts" in said
     found = tables.read(tables.table_path(results / "two-0", "findings"), "findings")
     assert set(zip(found["robot"], found["check"], strict=True)) >= {
         ("R1", "jump"),
+        ("R1", "truth"),
         ("R2", "odometry"),
     }
     assert command(capsys, "report", results / "two-0").code == 0

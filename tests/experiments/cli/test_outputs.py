@@ -91,6 +91,8 @@ def test_a_file_of_a_log_is_no_output_under_another_name(
         ("merge a.csv b.csv -o f.ply", ["ends in .ply", ".parquet or .csv", "mapfusion export"]),
         ("merge a.csv b.csv -o f", ["has no ending", ".parquet or .csv"]),
         ("merge a.csv b.csv -o .", ["is a folder"]),
+        ("merge a.csv b.csv -o b.joint.parquet", ["belongs to the map NAME.parquet"]),
+        ("slam log -o m.frames.parquet", ["belongs to the map NAME.parquet (m.parquet)"]),
         ("align a.csv b.csv -o b.csv", ["ends in .csv", "expected .json"]),
         ("slam log -o log/frames.parquet", ["is a file of the log log"]),
         ("slam log -o sub/../log/observations.csv", ["is a file of the log log"]),
