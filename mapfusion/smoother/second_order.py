@@ -37,8 +37,8 @@ from mapfusion.smoother.settle import Problem, Settled, factored
 # Draws. The square of one normal error is the worst case: its mean square over so many is known to
 # a third of itself. The errors that count are of several directions, whose sum is known better.
 _DRAWS = 100
-# A few draws tell first whether the squares matter: they do not where they add less than this share
-# to the covariance of any pose, which is a fortieth of a standard deviation.
+# Errors of second order matter where they add more than this share to the covariance of some pose,
+# which is a fortieth of a standard deviation. A bound tells first, and then a few draws.
 _FIRST_DRAWS, _NEGLIGIBLE = 4, 0.05
 _SEED = 0
 
@@ -73,9 +73,12 @@ def second_order_errors(problem: Problem, end: Settled) -> SecondOrder | None:
     if not end.solution.landmarks_first or len(end.estimate.path) < 2:
         return None
     end = factored(end)
+    covariance = _pose_covariances(end)
+    if np.max(_bound(end.estimate.path, covariance)) < _NEGLIGIBLE:
+        return None
     drawing, rng = _Drawing.of(problem, end), np.random.default_rng(_SEED)
     path, point_m = drawing.errors(rng, _FIRST_DRAWS)
-    if np.max(_squared_sigmas(end, path)) < _NEGLIGIBLE:
+    if np.max(_squared_sigmas(path, covariance)) < _NEGLIGIBLE:
         return None
     more = drawing.errors(rng, _DRAWS - _FIRST_DRAWS)
     share = 1 / np.sqrt(_DRAWS)
@@ -84,11 +87,28 @@ def second_order_errors(problem: Problem, end: Settled) -> SecondOrder | None:
     )
 
 
-def _squared_sigmas(end: Settled, path: Float) -> Float:
-    """Return (T - 1,) the mean square of errors (S, T, 3) of each pose, a coordinate, in sigmas."""
+def _pose_covariances(end: Settled) -> Float:
+    """Return (T - 1, 3, 3) those of the poses after the first under the linearised equations."""
     factor, place = end.solution.factor, end.seen.pose_place[1:] - 1
     assert factor is not None
-    covariance = factor.envelope.between(factor.inverse, place, place)
+    return factor.envelope.between(factor.inverse, place, place)
+
+
+def _bound(path: Float, covariance: Float) -> Float:
+    """Return (T - 1,) what the mean squares of each pose are at most, a coordinate, in sigmas.
+
+    If every error of the heading shortened its part of the way, and none of it were mended by
+    observations, a pose would be off by b, the sum of length * variance / 2. The mean square of
+    that is at most 3 b^2, as of the square of one normal variable.
+    """
+    length_m = np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1)
+    off_m = np.cumsum(length_m * covariance[:, 2, 2]) / 2
+    least_m2 = np.linalg.eigvalsh(covariance[:, :2, :2])[:, 0]
+    return off_m**2 / least_m2
+
+
+def _squared_sigmas(path: Float, covariance: Float) -> Float:
+    """Return (T - 1,) the mean square of errors (S, T, 3) of each pose, a coordinate, in sigmas."""
     squares = np.einsum("ski,skj->kij", path[:, 1:], path[:, 1:]) / len(path)
     return np.trace(np.linalg.solve(covariance, squares), axis1=1, axis2=2) / 3
 
