@@ -170,9 +170,7 @@ class StackedErrors:
 
     def gathered(self, by_landmark: Float) -> Float:
         """Return (R, c) Y times columns (3N, c)."""
-        return np.concatenate(
-            [self.first.gathered(by_landmark), self.known.gathered(by_landmark)]
-        )
+        return np.concatenate([self.first.gathered(by_landmark), self.known.gathered(by_landmark)])
 
     def squares(self) -> Float:
         """(N, 3, 3) blocks of Y' Y, each landmark's with itself."""

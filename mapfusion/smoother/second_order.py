@@ -103,8 +103,9 @@ def _bound(path: Float, covariance: Float) -> Float:
     """
     length_m = np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1)
     off_m = np.cumsum(length_m * covariance[:, 2, 2]) / 2
-    least_m2 = np.linalg.eigvalsh(covariance[:, :2, :2])[:, 0]
-    return off_m**2 / least_m2
+    xx, yy, xy = covariance[:, 0, 0], covariance[:, 1, 1], covariance[:, 0, 1]
+    most_m2 = (xx + yy) / 2 + np.hypot((xx - yy) / 2, xy)
+    return off_m**2 * most_m2 / (xx * yy - xy**2)  # over the least variance in any direction
 
 
 def _squared_sigmas(path: Float, covariance: Float) -> Float:
