@@ -38,7 +38,9 @@ def chain(rng: np.random.Generator) -> Drive:
     covariance = np.tile(SIGMA_M**2 * np.eye(3), (len(path), 1, 1))
     frame = np.arange(len(path))
     seen = Observations(position, covariance, None, frame.astype(np.int32))
-    return Drive(RobotLog("R1", False, 0.2 * frame, motion, frame, seen), path, point_m)
+    return Drive(
+        RobotLog("R1", False, frame.astype(np.float64), motion, frame, seen), path, point_m
+    )
 
 
 def solved_chain() -> tuple[Problem, Settled]:
