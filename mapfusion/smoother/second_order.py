@@ -32,7 +32,7 @@ from mapfusion.smoother.normal_equations import (
 from mapfusion.smoother.offsets import moved_points, without_offsets
 from mapfusion.smoother.reduced_poses import ReducedPoses
 from mapfusion.smoother.robust import informative
-from mapfusion.smoother.settle import Problem, Settled, factored
+from mapfusion.smoother.settle import Problem, Settled, factored, solved
 
 # Draws. The square of one normal error is the worst case: its mean square over so many is known to
 # a third of itself. The errors that count are of several directions, whose sum is known better.
@@ -72,10 +72,13 @@ def second_order_errors(problem: Problem, end: Settled) -> SecondOrder | None:
     """
     if not end.solution.landmarks_first or len(end.estimate.path) < 2:
         return None
-    end = factored(end)
-    covariance = _pose_covariances(end)
+    covariance = _pose_covariances(factored(end))
     if np.max(_bound(end.estimate.path, covariance)) < _NEGLIGIBLE:
         return None
+    # Equations of the step before differ little, but q is what stiff directions leave to weak ones:
+    # matrix and gradient are of the same place.
+    problem = problem._replace(seen=end.seen)
+    end = solved(problem, end.estimate, end.weights, end.tails)
     drawing, rng = _Drawing.of(problem, end), np.random.default_rng(_SEED)
     path, point_m = drawing.errors(rng, _FIRST_DRAWS)
     if np.max(_squared_sigmas(path, covariance)) < _NEGLIGIBLE:
