@@ -136,6 +136,19 @@ def test_a_path_that_is_too_short_is_in_the_covariances() -> None:
     assert 0.5 < np.mean(known) / 3 < 2
 
 
+def test_is_that_of_the_estimate_whatever_equations_led_to_it() -> None:
+    """The last step goes on from the equations whose factor is known; the path may bend by it."""
+    problem, end = solved_chain()
+    error = second_order._Drawing.of(problem, end)._drawn(np.random.default_rng(0))
+    at = _moved(end.estimate, error, 0.1)
+    fresh = factored(solved(problem, at, end.weights, end.tails))
+    found = second_order_errors(problem, end._replace(estimate=at))
+    expected = second_order_errors(problem, fresh)
+    assert found is not None
+    assert expected is not None
+    np.testing.assert_allclose(found.path, expected.path, rtol=1e-9, atol=1e-9)
+
+
 def test_a_path_that_turns_nowhere_has_none() -> None:
     """The heading is known, and with it everything is linear."""
     problem, end = solved_chain()
