@@ -72,22 +72,19 @@ def second_order_errors(problem: Problem, end: Settled) -> SecondOrder | None:
     """
     if not end.solution.landmarks_first or len(end.estimate.path) < 2:
         return None
-    covariance = _pose_covariances(factored(end))
+    end, problem = factored(end), problem._replace(seen=end.seen)
+    covariance = _pose_covariances(end)
     if np.max(_bound(end.estimate.path, covariance)) < _NEGLIGIBLE:
         return None
-    # Equations of the step before differ little, but q is what stiff directions leave to weak ones:
-    # matrix and gradient are of the same place.
-    problem = problem._replace(seen=end.seen)
-    end = solved(problem, end.estimate, end.weights, end.tails)
-    drawing, rng = _Drawing.of(problem, end), np.random.default_rng(_SEED)
-    path, point_m = drawing.errors(rng, _FIRST_DRAWS)
+    path, _ = _Drawing.of(problem, end).errors(np.random.default_rng(_SEED), _FIRST_DRAWS)
     if np.max(_squared_sigmas(path, covariance)) < _NEGLIGIBLE:
         return None
-    more = drawing.errors(rng, _DRAWS - _FIRST_DRAWS)
+    # Equations of the step before differ little, but a little of what stiff directions hold moves
+    # weak ones far: matrix and gradient are of the same estimate.
+    end = solved(problem, end.estimate, end.weights, end.tails)
+    path, point_m = _Drawing.of(problem, end).errors(np.random.default_rng(_SEED), _DRAWS)
     share = 1 / np.sqrt(_DRAWS)
-    return SecondOrder(
-        share * np.concatenate([path, more[0]]), share * np.concatenate([point_m, more[1]])
-    )
+    return SecondOrder(share * path, share * point_m)
 
 
 def _pose_covariances(end: Settled) -> Float:
