@@ -93,6 +93,10 @@ class SharedErrors(Protocol):
         """(3N, c) Y' times columns (R, c)."""
         ...
 
+    def gathered(self, by_landmark: Float) -> Float:
+        """Return (R, c) Y times columns (3N, c)."""
+        ...
+
     def squares(self) -> Float:
         """(N, 3, 3) blocks of Y' Y, each landmark's with itself."""
         ...
@@ -128,9 +132,54 @@ class KnownErrors:
         """(3N, c) Y' times columns (R, c)."""
         return self.common.T @ columns
 
+    def gathered(self, by_landmark: Float) -> Float:
+        """Return (R, c) Y times columns (3N, c)."""
+        return self.common @ by_landmark
+
     def squares(self) -> Float:
         """(N, 3, 3) blocks of Y' Y, each landmark's with itself."""
         return _squares(_by_landmark(self.common))
+
+
+@dataclass(frozen=True)
+class StackedErrors:
+    """Y of the rows of one and, after them, of few known others, independent of the first."""
+
+    first: SharedErrors
+    known: KnownErrors
+
+    def __len__(self) -> int:
+        return len(self.first) + len(self.known)
+
+    def rows_by_all(self, rows: np.ndarray) -> Float:
+        """(R, r) columns of Y Y', those of `rows` (r,)."""
+        chosen = np.zeros((len(self), len(rows)))
+        chosen[rows, np.arange(len(rows))] = 1.0
+        return self.gram(chosen)
+
+    def gram(self, columns: Float) -> Float:
+        """Y Y' times columns (R, c)."""
+        upper, lower = columns[: len(self.first)], columns[len(self.first) :]
+        of_first = self.first.gram(upper) + self._between @ lower
+        return np.concatenate([of_first, self._between.T @ upper + self.known.gram(lower)])
+
+    def spread(self, columns: Float) -> Float:
+        """(3N, c) Y' times columns (R, c)."""
+        upper, lower = columns[: len(self.first)], columns[len(self.first) :]
+        return self.first.spread(upper) + self.known.spread(lower)
+
+    def gathered(self, by_landmark: Float) -> Float:
+        """Return (R, c) Y times columns (3N, c)."""
+        return np.concatenate([self.first.gathered(by_landmark), self.known.gathered(by_landmark)])
+
+    def squares(self) -> Float:
+        """(N, 3, 3) blocks of Y' Y, each landmark's with itself."""
+        return self.first.squares() + self.known.squares()
+
+    @cached_property
+    def _between(self) -> Float:
+        """Rows of the first times those that are known."""
+        return self.first.gathered(self.known.common.T)
 
 
 def condensed(own_m2: Float, common: Float | SharedErrors, rank: int = RANK) -> JointCovariance:

@@ -62,6 +62,10 @@ class PathErrors:
         """(3L, c) Y' times columns (R, c)."""
         return self._moving @ self.factor.solve_transposed(columns)
 
+    def gathered(self, by_landmark: Float) -> Float:
+        """Return (R, c) Y times columns (3L, c)."""
+        return self.factor.solve(self._moving.T @ by_landmark)
+
     def squares(self) -> Float:
         """(L, 3, 3) blocks of Y' Y, each landmark's with itself."""
         total = np.zeros((self.seen.n_landmarks, 3, 3))

@@ -70,7 +70,7 @@ class ReducedPoses:
     def solved(self, factor: Factor, right: Float) -> Float:
         """(T, 3) what a matrix with this factor turns into `right` (T, 3)."""
         solved = factor.solve_transposed(factor.solve(self._ordered(right)))
-        return self._by_frame(solved)
+        return self.by_frame(solved)
 
     def solved_nearby(self, factor: Factor, right: Float) -> Float | None:
         """(T, 3) what the matrix turns into `right` (T, 3), by a factor that is nearly its own.
@@ -79,7 +79,7 @@ class ReducedPoses:
         """
 
         def roughly(rest: Float) -> Float:
-            return self._by_frame(factor.solve_both_roughly(self._ordered(rest)))
+            return self.by_frame(factor.solve_both_roughly(self._ordered(rest)))
 
         return solved_by_products(self.times, roughly, right, _OFF, _MOST_PRODUCTS)
 
@@ -89,7 +89,7 @@ class ReducedPoses:
         ordered[self.seen.pose_place[1:] - 1] = of_poses[1:]
         return ordered.ravel()
 
-    def _by_frame(self, ordered: Float) -> Float:
+    def by_frame(self, ordered: Float) -> Float:
         """(T, 3) the same by frame; zero for the first pose."""
         place = self.seen.pose_place
         found = np.zeros((len(place), 3))

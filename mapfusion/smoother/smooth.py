@@ -7,7 +7,7 @@ import numpy as np
 
 from mapfusion.arguments import Range, require_in_range, require_shape
 from mapfusion.fastslam.motion import MotionNoise
-from mapfusion.joint_covariance import SharedErrors
+from mapfusion.joint_covariance import KnownErrors, SharedErrors, StackedErrors
 from mapfusion.one_thread import one_blas_thread
 from mapfusion.robot_log import RobotLog
 from mapfusion.se2 import Float, between
@@ -23,7 +23,15 @@ from mapfusion.smoother.normal_equations import (
 from mapfusion.smoother.one_corner import parted
 from mapfusion.smoother.residuals import first_points
 from mapfusion.smoother.robust import Tails
-from mapfusion.smoother.settle import Problem, Settled, finished, followed, settled
+from mapfusion.smoother.second_order import SecondOrder, second_order_errors
+from mapfusion.smoother.settle import (
+    Problem,
+    Settled,
+    factored,
+    finished,
+    followed,
+    settled,
+)
 from mapfusion.smoother.sightings import Sightings, sightings_of
 from mapfusion.smoother.student import MOST_DOF
 from mapfusion.stray import STRAY_M
@@ -106,6 +114,8 @@ class Smoothed:
         n_steps: Gauss-Newton steps that were taken.
         own_m2: (L, 3, 3), see `common`.
         common: Y (R, 3L): the landmarks' joint covariance is block diagonal of `own_m2` plus Y' Y.
+        second_order: errors of second order, which `common` has among its own; None where they do
+            not matter.
     """
 
     landmark: np.ndarray
@@ -118,17 +128,32 @@ class Smoothed:
     n_steps: int
     own_m2: Float
     common: SharedErrors
+    second_order: SecondOrder | None = None
 
     @classmethod
     def of(
-        cls, end: Settled, landmark: np.ndarray, levels: Levels = AS_STATED, steps_before: int = 0
+        cls,
+        problem: Problem,
+        end: Settled,
+        landmark: np.ndarray,
+        levels: Levels = AS_STATED,
+        steps_before: int = 0,
     ) -> "Smoothed":
-        """Where steps ended under some levels, after some of earlier rounds."""
+        """Where steps ended under some levels, after some of earlier rounds.
+
+        The problem's odometry is as stated.
+        """
+        end = factored(end)
         common = shared_errors(end.seen, end.equations, end.solution)
+        information = information_under(problem.information, levels.odometry)
+        further = second_order_errors(problem._replace(information=information), end)
+        if further is not None:
+            rows = further.point_m.reshape(len(further.point_m), -1)
+            common = StackedErrors(common, KnownErrors(rows))
         of_levels = levels.observation, levels.odometry
         found = (end.estimate, end.seen, end.weights, end.tails, *of_levels)
         n_steps, own_m2 = steps_before + end.n_steps, end.solution.own_m2
-        return cls(landmark, *found, n_steps, own_m2, common)
+        return cls(landmark, *found, n_steps, own_m2, common, further)
 
     def joint_covariance(self) -> Float:
         """(3L, 3L), dense: for small maps."""
@@ -185,7 +210,7 @@ def smooth(
     else:  # odometry that pictures told is used where these say nothing: they tell no level
         at, weights, tails = start
         end, levels = settled(known, at, weights=weights, tails=tails), AS_STATED
-    return Smoothed.of(end, parts, levels, n_steps)
+    return Smoothed.of(known, end, parts, levels, n_steps)
 
 
 def _without_gross(problem: Problem, path: Float) -> tuple[tuple[Estimate, Weights, Tails], int]:

@@ -91,9 +91,10 @@ def smooth_together(
     covariance[1:] = pose_covariances(seen, end.equations, end.solution, starts[1:])
     names = point[seen.row[seen.starts[:-1]]]
     paths = tuple(np.split(end.estimate.path, starts[1:]))
-    return SmoothedTogether(
-        Smoothed.of(end, point, levels), names, end.estimate.path[starts], covariance, paths
-    )
+    smoothed = Smoothed.of(problem, end, point, levels)
+    if smoothed.second_order is not None:
+        covariance += smoothed.second_order.pose_covariances(starts)
+    return SmoothedTogether(smoothed, names, end.estimate.path[starts], covariance, paths)
 
 
 def _one_log(logs: Sequence[RobotLog]) -> RobotLog:

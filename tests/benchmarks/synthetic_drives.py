@@ -71,7 +71,9 @@ def _pose_covariances(driven: Drive, found: Smoothed, frames: np.ndarray) -> Flo
     information = information_under(parameters.odometry_information(log), found.odometry_level)
     problem = Problem(found.seen, log.odometry, information, parameters.stray_information)
     end = factored(solved(problem, found.estimate, found.weights, found.tails))
-    return pose_covariances(end.seen, end.equations, end.solution, frames)
+    covariance = pose_covariances(end.seen, end.equations, end.solution, frames)
+    further = found.second_order
+    return covariance if further is None else covariance + further.pose_covariances(frames)
 
 
 def _mean_square(off: Float, covariance: Float) -> float:

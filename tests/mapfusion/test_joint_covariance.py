@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mapfusion import joint_covariance
-from mapfusion.joint_covariance import JointCovariance, condensed
+from mapfusion.joint_covariance import JointCovariance, KnownErrors, StackedErrors, condensed
 
 
 def _parts(
@@ -65,6 +65,18 @@ def test_rows_are_those_of_the_dense_covariance() -> None:
     joint, rows = condensed(own, common), np.array([4, 1])
     of = (3 * rows[:, None] + np.arange(3)).ravel()
     np.testing.assert_allclose(joint[rows].dense_m2(), _dense(own, common)[np.ix_(of, of)])
+
+
+def test_stacked_errors_are_those_of_all_rows() -> None:
+    rng = np.random.default_rng(4)
+    Y, columns = rng.normal(size=(9, 15)), rng.normal(size=(9, 2))
+    stacked = StackedErrors(KnownErrors(Y[:5]), KnownErrors(Y[5:]))
+    rows = np.array([7, 1])
+    np.testing.assert_allclose(stacked.rows_by_all(rows), (Y @ Y.T)[:, rows])
+    np.testing.assert_allclose(stacked.gram(columns), Y @ Y.T @ columns)
+    np.testing.assert_allclose(stacked.spread(columns), Y.T @ columns)
+    np.testing.assert_allclose(stacked.gathered(Y.T @ columns), Y @ Y.T @ columns)
+    np.testing.assert_allclose(stacked.squares(), KnownErrors(Y).squares())
 
 
 def test_parts_of_different_landmarks_are_refused() -> None:

@@ -183,6 +183,8 @@ def test_errors_of_the_path_are_those_of_their_large_matrix(planar: bool, tracks
     columns = np.random.default_rng(0).standard_normal((n, 4))
     scale = np.abs(gram).max()
     np.testing.assert_allclose(errors.gram(columns), gram @ columns, atol=1e-5 * scale)
+    again = errors.gathered(errors.spread(columns))
+    np.testing.assert_allclose(again, gram @ columns, rtol=0, atol=1e-9 * scale)
     rows = np.array([2, 0, n - 1])
     np.testing.assert_allclose(errors.rows_by_all(rows), gram[:, rows], atol=1e-5 * scale)
     squares = KnownErrors(Y).squares()

@@ -1,0 +1,223 @@
+"""Errors of path and landmarks of second order, beside those of the linearised equations.
+
+Where the heading is off by e, a path of length s ends s e to the side, and it ends s e^2 / 2 short.
+The linearised equations know of the first alone. Along a long path little else is uncertain, so
+that the second can exceed all that they state.
+
+With the residuals r(x + d) = r + J d + rho(d) to second order in an error d, and their information
+W, the estimate that fits the same data as x + d is off by a further
+
+    q(d) = -(J' W J)^-1 J' W rho(d)
+
+(Box 1971, "Bias in nonlinear estimation", J. R. Stat. Soc. B 33). Errors d are normal with the
+covariance (J' W J)^-1. Their third moments vanish, so that d and q(d) are uncorrelated and the mean
+square of the whole error is (J' W J)^-1 + E[q q']. The last is the mean over random draws of d.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from mapfusion.se2 import Float, rotation, wrap
+from mapfusion.smoother.landmark_elimination import along_way
+from mapfusion.smoother.normal_equations import (
+    Estimate,
+    NormalEquations,
+    Weights,
+    disturbance_jacobians,
+    disturbances,
+    normal_equations,
+)
+from mapfusion.smoother.offsets import moved_points, without_offsets
+from mapfusion.smoother.reduced_poses import ReducedPoses
+from mapfusion.smoother.robust import informative
+from mapfusion.smoother.settle import Problem, Settled, factored, solved
+
+# Draws. The square of one normal error is the worst case: its mean square over so many is known to
+# a third of itself. The errors that count are of several directions, whose sum is known better.
+_DRAWS = 100
+# Errors of second order matter where they add more than this share to the covariance of some pose,
+# which is a fortieth of a standard deviation. A bound tells first, and then a few draws.
+_FIRST_DRAWS, _NEGLIGIBLE = 4, 0.05
+_SEED = 0
+
+
+class SecondOrder(NamedTuple):
+    """Independent errors, each of which adds its square to the covariance.
+
+    Attributes:
+        path: (S, T, 3) of the poses.
+        point_m: (S, L, 3) of the landmarks.
+    """
+
+    path: Float
+    point_m: Float
+
+    def pose_covariances(self, frames: np.ndarray) -> Float:
+        """Return (n, 3, 3) what is added to the covariances of the poses of these frames (n,)."""
+        chosen = self.path[:, frames]
+        return np.einsum("sni,snj->nij", chosen, chosen)
+
+
+def second_order_errors(problem: Problem, end: Settled) -> SecondOrder | None:
+    """Return the errors of second order about where steps ended; None where they do not matter.
+
+    Where all poses see the same few landmarks, these hold the headings, and the poses are
+    eliminated first (`elimination.py`). No errors are drawn there.
+
+    Args:
+        problem: under the levels that steps ended with.
+        end: where they ended.
+    """
+    if not end.solution.landmarks_first or len(end.estimate.path) < 2:
+        return None
+    end, problem = factored(end), problem._replace(seen=end.seen)
+    covariance = _pose_covariances(end)
+    if np.max(_bound(end.estimate.path, covariance)) < _NEGLIGIBLE:
+        return None
+    path, _ = _Drawing.of(problem, end).errors(np.random.default_rng(_SEED), _FIRST_DRAWS)
+    if np.max(_squared_sigmas(path, covariance)) < _NEGLIGIBLE:
+        return None
+    # Equations of the step before differ little, but a little of what stiff directions hold moves
+    # weak ones far: matrix and gradient are of the same estimate.
+    end = solved(problem, end.estimate, end.weights, end.tails)
+    path, point_m = _Drawing.of(problem, end).errors(np.random.default_rng(_SEED), _DRAWS)
+    share = 1 / np.sqrt(_DRAWS)
+    return SecondOrder(share * path, share * point_m)
+
+
+def _pose_covariances(end: Settled) -> Float:
+    """Return (T - 1, 3, 3) those of the poses after the first under the linearised equations."""
+    factor, place = end.solution.factor, end.seen.pose_place[1:] - 1
+    assert factor is not None
+    return factor.envelope.between(factor.inverse, place, place)
+
+
+def _bound(path: Float, covariance: Float) -> Float:
+    """Return (T - 1,) what the mean squares of each pose are at most, a coordinate, in sigmas.
+
+    If every error of the heading shortened its part of the way, and none of it were mended by
+    observations, a pose would be off by b, the sum of length * variance / 2. The mean square of
+    that is at most 3 b^2, as of the square of one normal variable.
+    """
+    length_m = np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1)
+    off_m = np.cumsum(length_m * covariance[:, 2, 2]) / 2
+    xx, yy, xy = covariance[:, 0, 0], covariance[:, 1, 1], covariance[:, 0, 1]
+    most_m2 = (xx + yy) / 2 + np.hypot((xx - yy) / 2, xy)
+    return off_m**2 * most_m2 / (xx * yy - xy**2)  # over the least variance in any direction
+
+
+def _squared_sigmas(path: Float, covariance: Float) -> Float:
+    """Return (T - 1,) the mean square of errors (S, T, 3) of each pose, a coordinate, in sigmas."""
+    squares = np.einsum("ski,skj->kij", path[:, 1:], path[:, 1:]) / len(path)
+    return np.trace(np.linalg.solve(covariance, squares), axis1=1, axis2=2) / 3
+
+
+class _Drawing(NamedTuple):
+    """What is the same for all draws.
+
+    Attributes:
+        problem: what is explained.
+        end: where steps ended, with its own factor.
+        at: the estimate there.
+        weights: that the matrix of the equations is of.
+        poses: the equations of the poses.
+        to_robot: (N, 2, 2) from the map's frame to that of each observation's pose.
+        seen_m: (N, 3) where each observation should be, in the robot's frame.
+    """
+
+    problem: Problem
+    end: Settled
+    at: Estimate
+    weights: Weights
+    poses: ReducedPoses
+    to_robot: Float
+    seen_m: Float
+
+    @classmethod
+    def of(cls, problem: Problem, end: Settled) -> "_Drawing":
+        """Return it for where steps ended."""
+        seen, at = end.seen, end.estimate
+        shares = informative(end.tails, seen.n_dimensions)
+        weights = Weights(
+            shares.observation * end.weights.observation, shares.offset * end.weights.offset
+        )
+        poses = ReducedPoses(seen, end.equations, without_offsets(seen, end.equations.points))
+        to_robot = np.swapaxes(rotation(at.path[seen.frame, 2]), 1, 2)
+        seen_m = _from_poses(end, at)
+        return cls(problem, end, at, weights, poses, to_robot, seen_m)
+
+    def errors(self, rng: np.random.Generator, n: int) -> tuple[Float, Float]:
+        """Return the further errors q (n, T, 3) of the path and (n, L, 3) of the landmarks."""
+        path = np.empty((n, *self.at.path.shape))
+        point_m = np.empty((n, *self.at.point_m.shape))
+        for k in range(n):
+            path[k], point_m[k] = self._further(self._drawn(rng))
+        return path, point_m
+
+    def _drawn(self, rng: np.random.Generator) -> Estimate:
+        """Return an error d: of the path, and of the points that follow it.
+
+        The points' own errors if the path were known turn no lever and are left out.
+        """
+        factor, left = self.end.solution.factor, self.poses.left
+        assert factor is not None
+        normal = rng.standard_normal(len(factor))
+        way = self.poses.by_frame(factor.solve_transposed(normal))
+        still = left._replace(
+            pull=np.zeros_like(left.pull), point_gradient=np.zeros_like(left.point_gradient)
+        )
+        equations = self.end.equations
+        along = along_way(self.end.seen, equations.coupling, way)
+        return Estimate(way, *moved_points(self.end.seen, equations.points, still, along))
+
+    def _further(self, error: Estimate) -> tuple[Float, Float]:
+        """Return q of path and landmarks for an error d."""
+        equations, seen, factor = self._equations(error), self.end.seen, self.end.solution.factor
+        assert factor is not None
+        left = without_offsets(seen, equations.points)
+        gradient = ReducedPoses(seen, equations, left).gradient()
+        way = self.poses.solved(factor, -gradient)
+        along = along_way(seen, equations.coupling, way)
+        return way, moved_points(seen, equations.points, left, along)[0]
+
+    def _equations(self, error: Estimate) -> NormalEquations:
+        """Return the equations whose residuals are rho(d): the data are what leaves no others.
+
+        Offsets are residuals themselves and have none of second order.
+        """
+        seen, at, way = self.end.seen, self.at, error.path
+        moved = Estimate(*(old + off for old, off in zip(at, error, strict=True)))
+        before, after = disturbance_jacobians(at.path)
+        found = disturbances(at.path, self.problem.odometry)
+        linear = np.einsum("kij,kj->ki", before, way[:-1])
+        linear += np.einsum("kij,kj->ki", after, way[1:])
+        of_motion = disturbances(moved.path, self.problem.odometry) - found - linear
+        of_motion[:, 2] = wrap(of_motion[:, 2])
+        odometry = self.problem.odometry.copy()
+        odometry[1:] += found - of_motion
+
+        off = error.point_m[seen.landmark] + error.offset_m[seen.track]
+        off[:, :2] -= way[seen.frame, :2]
+        off[:, :2] = np.einsum("nij,nj->ni", self.to_robot, off[:, :2])
+        turned = way[seen.frame, 2]
+        off[:, 0] += turned * self.seen_m[:, 1]
+        off[:, 1] -= turned * self.seen_m[:, 0]
+        of_points = _from_poses(self.end, moved) - self.seen_m - off
+        explained = replace(seen, position_m=self.seen_m - of_points)
+        stray_information, information = self.problem.stray_information, self.problem.information
+        made = normal_equations(
+            explained, at, self.weights, stray_information, odometry, information
+        )
+        made.points.offset_gradient[:] = 0
+        return made
+
+
+def _from_poses(end: Settled, at: Estimate) -> Float:
+    """Return (N, 3) where the point of each observation is, in the robot's frame."""
+    seen = end.seen
+    point, pose = at.point_m[seen.landmark] + at.offset_m[seen.track], at.path[seen.frame]
+    offset = point[:, :2] - pose[:, :2]
+    point[:, :2] = np.einsum("nji,nj->ni", rotation(pose[:, 2]), offset)
+    return point
