@@ -1,4 +1,4 @@
-"""How well a robot log agrees with itself: odometry, observations and truth.
+"""Consistency of a robot log: odometry, observations and truth compared with each other.
 
 The same points seen from two frames tell how the robot moved between them. That motion is compared
 with the motion that the odometry, or the truth, states for the same frames. Three questions are
@@ -356,7 +356,7 @@ def stated_motions(poses: Float, start: np.ndarray, end: np.ndarray) -> tuple[Fl
 
 
 class Agreement(NamedTuple):
-    """How stated motions agree with observed ones, of shifts or of turns.
+    """Agreement of stated motions with observed ones, for shifts or for turns.
 
     Attributes:
         n: motions that are sure enough to count.
@@ -372,7 +372,7 @@ class Agreement(NamedTuple):
 
     @property
     def known(self) -> bool:
-        """Whether enough motions count for a median."""
+        """Return True if enough motions count for a median."""
         return self.n >= _LEAST_MOTIONS
 
 
@@ -436,7 +436,7 @@ class Comparison(NamedTuple):
     turn: Agreement
 
     def contradicts(self, name: str) -> bool:
-        """Whether shifts or turns lie below their limit for sure."""
+        """Return True if the interval of shifts or turns lies below the limit."""
         return getattr(self, name).upper < _LEAST_AGREEMENT[name]
 
     @property
@@ -715,7 +715,7 @@ def _lags(n_frames: int) -> list[int]:
 
 
 def _in_most_spans(each: Sequence[Comparison], name: str) -> bool:
-    """Whether shifts or turns lie below their limit in half of the spans that tell any or more.
+    """Return True if shifts or turns lie below the limit in at least half of the spans.
 
     Noise and resolution of what is stated contradict short spans alone.
     """
@@ -727,7 +727,7 @@ def _in_most_spans(each: Sequence[Comparison], name: str) -> bool:
 def disagreement(
     kind: str, what: str, spans: Sequence[Motions], stated: Stated, mistakes: Mapping[str, Float]
 ) -> Finding | None:
-    """What is to be said of stated motions that contradict the observed ones; None of sound ones.
+    """Return the finding about stated motions that contradict observed ones; None if they agree.
 
     Args:
         kind: of the finding.
@@ -751,14 +751,14 @@ def disagreement(
 
 
 def odometry_finding(log: RobotLog, spans: Sequence[Motions], noise: MotionNoise) -> Finding | None:
-    """What is to be said of a log's odometry as a whole."""
+    """Return the finding about a log's odometry as a whole; None if it is sound."""
     what = "the odometry contradicts the motion that the observations show"
     mistakes = odometry_mistakes(log.odometry)
     return disagreement("odometry", what, spans, Stated(mistakes[""], noise), mistakes)
 
 
 def truth_finding(kind_of_reference: str, spans: Sequence[Motions], poses: Float) -> Finding | None:
-    """What is to be said of true poses (T, 3) or (T, 4, 4), NaN where unknown.
+    """Return the finding about true poses (T, 3) or (T, 4, 4), NaN where unknown.
 
     Args:
         kind_of_reference: what tells the motions that they are compared with.
@@ -839,7 +839,7 @@ def without_jumps(
 
 
 class LogConsistency(NamedTuple):
-    """What a log says against itself.
+    """Result of the consistency checks of a log.
 
     Attributes:
         findings: one line each; none of a sound log.
@@ -891,7 +891,7 @@ def outside_gate(log: RobotLog, landmark: np.ndarray) -> tuple[int, int]:
 
 
 def gate_finding(log: RobotLog, landmark: np.ndarray) -> Finding | None:
-    """What is to be said of a map that most observations contradict; `landmark` as above."""
+    """Return the finding about a map that most observations contradict; `landmark` as above."""
     n_outside, n_expected = outside_gate(log, landmark)
     if n_outside <= MOST_OUTSIDE * n_expected:
         return None

@@ -29,14 +29,14 @@ _MOST_LEGS = 8  # of a way that leads past the others; a rectangle's loop has fo
 
 
 class Progress(NamedTuple):
-    """How far a robot has come: waypoints visited since the start, and minus the metres to go."""
+    """Progress of a robot: waypoints visited since the start, and minus the metres to go."""
 
     visited: int
     minus_left_m: float
 
 
 class Passage(NamedTuple):
-    """What a robot that holds waits for.
+    """Condition that a holding robot waits for.
 
     Attributes:
         robot: the one that is to pass, by its place in the list.
@@ -65,7 +65,7 @@ class Hold(NamedTuple):
 
 @dataclass
 class Driven:
-    """What one robot has done so far, frame by frame.
+    """Record of one robot's drive so far, frame by frame.
 
     Attributes:
         position_m: (x, y).
@@ -170,7 +170,7 @@ def hold_for(
 
 
 def _is_of(hold: Hold, robot: int, passages: tuple[Passage, ...]) -> bool:
-    """Whether a hold is of the same circle: of robots on the way to the same waypoints."""
+    """Return True if a hold is of the same circle: robots on the way to the same waypoints."""
     asked, found = (
         {(p.robot, p.beyond.visited) for p in each} for each in (passages, hold.passages)
     )

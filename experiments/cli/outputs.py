@@ -123,7 +123,7 @@ def _paths(inputs: Iterable[Path | str | None]) -> list[Path]:
 
 
 def _is_same(path: Path, other: Path) -> bool:
-    """Whether two paths are one file or folder: by links, too, and where it is not there yet."""
+    """Return True if two paths are the same file or folder, also through links."""
     if path.exists() and other.exists():
         return path.samefile(other)
     return path.resolve() == other.resolve()

@@ -1,4 +1,4 @@
-"""What the logs of a run say against themselves, and against their truth."""
+"""Findings: contradictions of the logs of a run with themselves and with their truth."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -44,9 +44,9 @@ def finding_rows(run: JudgedRun) -> list[dict[str, Any]]:
 def finding_of_truth(
     log: RobotLog, T_world_robot: Float, noise: MotionNoise, sound: bool
 ) -> Finding | None:
-    """What is to be said of a log's true poses (T, 3), by its odometry if that is `sound`.
+    """Compare a log's true poses (T, 3) with its odometry if that is `sound`.
 
-    Else by the motions that the observations show.
+    If it is not, they are compared with the motions that the observations show.
     """
     if not np.isfinite(T_world_robot).all(axis=1).any():
         return None
@@ -70,7 +70,7 @@ def lines_of(rows: pd.DataFrame) -> Iterator[str]:
 
 
 def has_usable_map(result: Path) -> bool:
-    """Whether a result folder holds landmarks of a robot whose observations agree with them."""
+    """Return True if a result has landmarks of a robot whose observations agree with its map."""
     mapped, found = (
         tables.read(tables.table_path(result, name), name) for name in ("landmarks", "findings")
     )

@@ -100,7 +100,7 @@ class JudgedFusion:
 
     @property
     def fallback(self) -> str:
-        """What stood in for the fuser or for a smoothed map, and why; empty if nothing did."""
+        """Replacement of the fuser or of a smoothed map, with the reason; else empty."""
         own = f"a simpler fuser stands in: {self.fusion.fallback}" if self.fusion.fallback else ""
         maps = (self.given[k].fallback for k in self.fusion.members)
         return "; ".join(filter(None, (own, *maps)))

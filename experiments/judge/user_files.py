@@ -58,7 +58,7 @@ def record(
 
 
 class MadeMap(NamedTuple):
-    """What became of one robot's log.
+    """Map of one robot's log.
 
     Attributes:
         landmarks: the most probable map at its end.
@@ -137,7 +137,7 @@ class Merged(NamedTuple):
 
     @property
     def any_merged(self) -> bool:
-        """Whether two maps or more became one."""
+        """Return True if two maps or more were merged."""
         return len(self.fusion.fused[0].members) > 1
 
     def reasons(self) -> dict[tuple[int, int], str]:

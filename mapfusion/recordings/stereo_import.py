@@ -65,7 +65,7 @@ class Cut:
 
 @dataclass(frozen=True)
 class Imported:
-    """What became of one robot's frames.
+    """Import of one robot's frames.
 
     Attributes:
         log: as written.

@@ -115,7 +115,7 @@ def _squared_sigmas(path: Float, covariance: Float) -> Float:
 
 
 class _Drawing(NamedTuple):
-    """What is the same for all draws.
+    """Quantities that all draws share.
 
     Attributes:
         problem: what is explained.

@@ -67,7 +67,7 @@ class Drawn:
 
 @dataclass(frozen=True)
 class Ended:
-    """How a run ended: one line of runs.jsonl.
+    """Ending of a run: one line of runs.jsonl.
 
     Attributes:
         number: see `Drawn`.
@@ -207,7 +207,7 @@ def classified(code: int, err: str, results: Path) -> tuple[str, list[str]]:
 
 
 def _missing(results: Path) -> list[str]:
-    """What a finished run must have written and has not."""
+    """Return the names of what a finished run has not written."""
     folders = _result_folders(results)
     if len(folders) != 1:
         return [f"{results}: holds {len(folders)} results, not one"]

@@ -172,7 +172,7 @@ def _finding_columns(
 
 
 def read_findings(slam: Path) -> pd.DataFrame:
-    """What a robot's log says against itself."""
+    """Read the findings about a robot's log."""
     return read_rows(slam / WRITES[-1], FINDINGS)
 
 
