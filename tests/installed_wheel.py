@@ -101,7 +101,7 @@ def test_a_bad_scenario_is_refused(installed: Installed) -> None:
         work_s -= worked.children_user + worked.children_system
         print(f"{start} bad scenario: {took_s:.1f} s, of the processor {work_s:.1f} s")  # noqa: T201
         assert done.returncode == 2
-        assert re.fullmatch(r"mapfusion: bad\.yaml: drive\.frames: .*\n", done.stderr)
+        assert re.fullmatch(r"mapfusion: bad\.yaml, line \d+: drive\.frames: .*\n", done.stderr)
 
 
 def test_the_demo_runs_by_name_and_its_maps_align(installed: Installed) -> None:
