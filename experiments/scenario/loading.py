@@ -228,7 +228,7 @@ def _schema(kind: type[S]) -> dict[str, Any]:
 
 
 class Problem(NamedTuple):
-    """What is wrong with the value at a location."""
+    """Return the reason why the value at a location is refused."""
 
     location: Location
     text: str

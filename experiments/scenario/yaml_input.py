@@ -103,7 +103,7 @@ def _reader() -> YAML:
 
 
 def _as_json(text: str) -> tuple[bool, Any]:
-    """Whether a text is a JSON object, and what it holds.
+    """Read a text as a JSON object, if it is one.
 
     All other texts are left to the reader of YAML, with what only that one refuses: keys that are
     there twice, deep nesting, numbers that JSON does not know.

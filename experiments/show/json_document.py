@@ -86,7 +86,7 @@ def _aligner(row: Mapping[str, Any]) -> dict[str, Any]:
 def of_map(
     path: Path, log: Path, seed: int, landmarks: LandmarkMap, findings: Sequence[Finding] = ()
 ) -> dict[str, Any]:
-    """What `slam` made of a log, and what the log says against itself."""
+    """Return the document of `slam`: the map and the findings about the log."""
     made: dict[str, Any] = {"robot": landmarks.name, "n_landmarks": len(landmarks)}
     made["findings"] = [
         {
@@ -102,7 +102,7 @@ def of_map(
 def of_fusion(
     paths: Sequence[Path], seed: int, merged: Merged, maps: Sequence[Path]
 ) -> dict[str, Any]:
-    """What maps became: the fused map of the most of them, and others beside it.
+    """Return the document of `merge`: the fused map of most maps, and the others.
 
     Without `paths` nothing was merged, and `map` is null.
     """

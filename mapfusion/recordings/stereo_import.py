@@ -140,7 +140,7 @@ class StereoImport:
         self.T_robot_camera: Float = recording.T_robot_left @ turn
 
     def _vision_of_camera(self) -> FrontEndParameters:
-        """What the calibration alone makes of the front end; raises InputError that names it."""
+        """Derive front-end settings from the calibration; raises InputError that names it."""
         try:
             return derived_vision(self.camera)
         except OutOfRangeError as error:
@@ -265,7 +265,7 @@ class StereoImport:
 
 
 def _overlap(poses: TimedPoses, time_ns: np.ndarray) -> bool:
-    """Whether any time of poses lies among the times of a recording."""
+    """Return True if any time of the poses lies within the times of a recording."""
     return bool(len(poses.time_ns)) and bool(
         poses.time_ns[0] <= time_ns[-1] and time_ns[0] <= poses.time_ns[-1]
     )
@@ -288,7 +288,7 @@ def _findings(
     reckoned: Float | None,
     T_world_robot: Float | None,
 ) -> tuple[Finding, ...]:
-    """What recorded odometry and truth (T, 4, 4) contradict, by the motions that pictures show."""
+    """Return findings about odometry and truth (T, 4, 4) that contradict the pictures' motions."""
     known = [(k, motion) for k, motion in enumerate(shown) if k and motion is not None]
     spans = composed_spans(motions_between_frames(known), len(shown))
     found = []

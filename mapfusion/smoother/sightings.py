@@ -54,13 +54,13 @@ class PoseOrder:
 
     @cached_property
     def _products(self) -> float:
-        """Of the poses' factor."""
+        """Return the number of multiplications of the poses' Cholesky factor."""
         lengths = np.arange(len(self.envelope)) - self.envelope.first
         return float(np.sum(lengths.astype(np.float64) ** 2) / 2)
 
     @cached_property
     def _least_products(self) -> float:
-        """Of the poses' factor whatever the order: the poses of one landmark are all related.
+        """Return a lower bound of `_products` in any order: poses of one landmark are all related.
 
         Where this is too much already, no order has to be found.
         """

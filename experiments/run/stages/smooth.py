@@ -54,7 +54,6 @@ _MAP_FILES = (
 )
 # Unless they are said, maps are fused at so many evenly spread iterations, the last among them.
 _FUSED_ITERATIONS = 5
-_GB = 1e9
 _ENDED = ("n_steps", "observation_dof", "offset_dof", "observation_level", "not_smoothed")
 
 
