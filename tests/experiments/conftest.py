@@ -62,6 +62,12 @@ def tiny_results(tiny_result: Path) -> Path:
     return tiny_result.parent
 
 
+@pytest.fixture
+def tiny_results_copy(tiny_results: Path, tmp_path: Path) -> Path:
+    """A copy of that folder, for commands that write a result again."""
+    return Path(shutil.copytree(tiny_results, tmp_path / "tiny_results"))
+
+
 @pytest.fixture(scope="session")
 def tiny_log(tiny: Simulation, tiny_results: Path) -> Path:
     """The log of R1 in the store of that run."""

@@ -268,18 +268,18 @@ def test_figures_of_a_folder_that_is_no_result(
 
 def test_output_that_cannot_be_written(
     tiny_path: Path,
-    tiny_results: Path,
+    tiny_results_copy: Path,
     tiny_log: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     blocked = tmp_path / "file" / "deep"
     blocked.parent.write_text("a file, not a folder")
-    maps = [tiny_results / "tiny-3" / "maps" / f"{name}.parquet" for name in ("R1", "R2")]
-    check = ("check", tiny_path, "--jobs", 1, "--results", tiny_results, "--seeds", 3)
+    maps = [tiny_results_copy / "tiny-3" / "maps" / f"{name}.parquet" for name in ("R1", "R2")]
+    check = ("check", tiny_path, "--jobs", 1, "--results", tiny_results_copy, "--seeds", 3)
     for arguments in (
         ("run", tiny_path, "--jobs", 1, "--results", blocked),
-        ("record", tiny_path, "--jobs", 1, "--results", tiny_results, "-o", blocked),
+        ("record", tiny_path, "--jobs", 1, "--results", tiny_results_copy, "-o", blocked),
         ("slam", tiny_log, "-o", blocked / "m.parquet", "--set", "slam.filter.n_particles=2"),
         ("merge", *maps, "-o", blocked / "m.parquet"),
         ("merge", *maps, "-o", tmp_path),

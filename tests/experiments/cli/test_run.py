@@ -259,7 +259,7 @@ def test_figures(tiny_result: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
 @pytest.mark.parametrize(("most", "code"), [(1.0, 0), (1e-9, 1)])
 def test_check(
     tiny_path: Path,
-    tiny_results: Path,
+    tiny_results_copy: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     most: float,
@@ -268,7 +268,7 @@ def test_check(
     junit = tmp_path / "junit.xml"
     reply = command(
         capsys,
-        *("check", tiny_path, "--jobs", 1, "--results", tiny_results, "--seeds", 3),
+        *("check", tiny_path, "--jobs", 1, "--results", tiny_results_copy, "--seeds", 3),
         *("--set", f"expect.path_rmse_m.max={most}", "--junit", junit),
     )
     assert reply.code == code
@@ -278,15 +278,15 @@ def test_check(
 
 def test_run_shows_the_aligners(
     tiny_path: Path,
-    tiny_results: Path,
+    tiny_results_copy: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("experiments.show.figures.drawing.FIGURES", ())  # drawn in other tests
-    reply = command(capsys, "run", tiny_path, "--jobs", 1, "--results", tiny_results)
+    reply = command(capsys, "run", tiny_path, "--jobs", 1, "--results", tiny_results_copy)
     assert reply.code == 0
     assert all(name in reply.out for name in ("ransac", "svd", "icp", "oracle", "R1", "R2"))
-    resolved = json.loads((tiny_results / "tiny-3" / "scenario.json").read_text())
+    resolved = json.loads((tiny_results_copy / "tiny-3" / "scenario.json").read_text())
     assert resolved["slam"]["filter"]["n_particles"] == 30
 
 
