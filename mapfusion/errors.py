@@ -1,4 +1,4 @@
-"""The one error a person is meant to read, and what they are warned of."""
+"""Errors and warnings that a user reads."""
 
 import difflib
 import itertools

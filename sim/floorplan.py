@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mapfusion.arguments import require_finite, require_shape
 from mapfusion.errors import InputError
-from mapfusion.se2 import Float
+from mapfusion.geometry.numerics import Float
+from mapfusion.parameters import require_finite, require_shape
 
 SHARPEST_CORNER_RAD = np.radians(30)  # below it the mitred outer edge runs off towards infinity
 BURIED_M = 0.001  # deeper in a wall than rounding puts a wall's own surface

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mapfusion.se2 import Float
-from mapfusion.se3 import from_planar, quaternions
+from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.se3 import from_planar, quaternions
 from sim.world import BODY, GROUND, WHEEL, World
 
 URDF = Path(__file__).with_name("p3at.urdf")

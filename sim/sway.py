@@ -5,8 +5,8 @@ from typing import Annotated
 
 import numpy as np
 
-from mapfusion.arguments import Range, require_in_range
-from mapfusion.se2 import Float
+from mapfusion.geometry.numerics import Float
+from mapfusion.parameters import Range, require_in_range
 
 _THREE_TENTHS_RAD = 0.0052  # of a degree: a small IMU's inclinometer on a robot that moves
 

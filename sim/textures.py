@@ -13,8 +13,8 @@ from typing import Annotated
 import cv2
 import numpy as np
 
-from mapfusion.arguments import Range, require_in_range
 from mapfusion.errors import OutOfRangeError
+from mapfusion.parameters import Range, require_in_range
 from sim.floorplan import Face
 
 _PosterSide = Annotated[float, Range(0.05, 10, "m")]

@@ -10,11 +10,8 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from mapfusion.arguments import require_finite, require_shape
 from mapfusion.errors import InputError
-from mapfusion.se2 import Float
-from mapfusion.se3 import in_space
-from mapfusion.storage import (
+from mapfusion.files import (
     POSE_FIELDS,
     column,
     columns,
@@ -26,6 +23,9 @@ from mapfusion.storage import (
     text_attributes,
     write_table,
 )
+from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.se3 import in_space
+from mapfusion.parameters import require_finite, require_shape
 
 _WHEEL_FIELDS = ["left_wheel_rad", "right_wheel_rad"]
 _TILT_FIELDS = ["roll_rad", "pitch_rad"]

@@ -15,9 +15,8 @@ import cv2
 import numpy as np
 
 from mapfusion.errors import DamagedFileError
-from mapfusion.se2 import Float
-from mapfusion.sealed import LINE, read_sealed
-from mapfusion.storage import name_in_text, write_sealed
+from mapfusion.files import LINE, name_in_text, read_sealed, write_sealed
+from mapfusion.geometry.numerics import Float
 from sim.floorplan import Face, FloorPlan
 from sim.renderer import BulletRenderer, egl_driver, load_egl
 from sim.textures import AS_PAINTED, Texture, paint, paint_posters

@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, settings
 from xdist.scheduler import LoadFileScheduling
 
 from experiments.methods.threads import single_threaded
-from experiments.run.kernel_cache import use_kernel_cache
+from experiments.pipeline.code_version import use_kernel_cache
 
 # No test may depend on how fast the machine is; by default an example may take 0.2 s.
 settings.register_profile("any_speed", deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -9,9 +9,9 @@ from collections import defaultdict
 import numpy as np
 import pytest
 
-from experiments.run.code_version import PACKAGES, SOURCE_ROOT
-from mapfusion import planar
-from mapfusion.kernels import source_of
+from experiments.pipeline.code_version import PACKAGES, SOURCE_ROOT
+from mapfusion.geometry import se2
+from mapfusion.geometry.numerics import source_of
 
 _MOST_COPIED = 20  # statements; more of them take longer to compile than a kernel apart
 
@@ -89,8 +89,8 @@ def test_inner_kernels_are_found() -> None:
 
 def test_an_inner_kernel_called_from_python_says_so_and_ends_nothing() -> None:
     with pytest.raises(TypeError, match="moved_point: only kernels can call it"):
-        planar.moved_point(np.zeros(3), 1.0, 0.0, 1.0, 1.0)
-    assert source_of(planar.moved_point)(np.ones(3), 1.0, 0.0, 1.0, 1.0) == (2.0, 2.0)
+        se2.moved_point(np.zeros(3), 1.0, 0.0, 1.0, 1.0)
+    assert source_of(se2.moved_point)(np.ones(3), 1.0, 0.0, 1.0, 1.0) == (2.0, 2.0)
 
 
 @pytest.mark.parametrize("module", TREES)

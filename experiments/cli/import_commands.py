@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from experiments.cli import options
-from mapfusion.errors import InputError
-from mapfusion.recordings.level import Level
-from mapfusion.recordings.registry import (
+from mapfusion.datasets.formats import (
     IMPORTERS,
+    Level,
     import_recording,
     robot_name,
     settings_class,
 )
+from mapfusion.errors import InputError
 
 if TYPE_CHECKING:
-    from mapfusion.recordings.stereo_import import Cut
+    from mapfusion.datasets.stereo_import import Cut
 
 app = typer.Typer(no_args_is_help=True, help="Turn recordings in foreign formats into robot logs.")
 Folder = Annotated[Path, typer.Argument(metavar="FOLDER", help="The recording.")]
@@ -75,9 +75,9 @@ def _log_command(format_name: str) -> Callable[..., None]:
     """The command that reads logs of one format; `--param` takes what its settings have."""
 
     def command(folder: Folder, output: options.Output, overrides: options.ImportOverrides) -> None:
-        from experiments.cli.outputs import require_folder
+        from experiments.cli.options import require_folder
+        from experiments.reports.terminal.layout import print_paths
         from experiments.scenario.loading import made_settings
-        from experiments.show.terminal.layout import print_paths
 
         require_folder(output, [folder])
         settings = made_settings(format_name, settings_class(format_name), overrides)
@@ -103,12 +103,12 @@ def _stereo_command(format_name: str) -> Callable[..., None]:
         jobs: options.Jobs = options.ALL_CORES,
         **chosen: str | None,
     ) -> None:
-        from experiments.cli.outputs import require_folder
-        from experiments.run.stereo_logs import Source, import_stereo, vision_of
-        from experiments.run.workers import make_ready
+        from experiments.cli.options import require_folder
+        from experiments.pipeline.stereo_import import Source, import_stereo, vision_of
+        from experiments.pipeline.workers import make_ready
+        from experiments.reports.terminal.layout import progress
+        from experiments.reports.terminal.run_screen import print_imported
         from experiments.scenario.loading import made_settings
-        from experiments.show.terminal.import_screen import print_imported
-        from experiments.show.terminal.layout import progress
 
         require_folder(output, [*folders, odometry, truth, scenario])
         if len(folders) > 1 and (odometry not in (None, "images") or truth is not None):
@@ -163,7 +163,7 @@ def _with_options(command: Callable[..., None], own: Mapping[str, str]) -> Calla
 
 def _cuts(recording: str, frames: Sequence[str]) -> "list[Cut]":
     """Robots by what `--frames` says; raises InputError."""
-    from mapfusion.recordings.stereo_import import Cut
+    from mapfusion.datasets.stereo_import import Cut
 
     if not frames:
         return [Cut(recording, slice(None))]

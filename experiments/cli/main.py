@@ -55,8 +55,8 @@ def _options(
 
 def main() -> None:
     """Run the command; every failure a user can cause is one line and an exit code."""
-    from experiments.run.defects import saved_defect
-    from experiments.run.kernel_cache import use_kernel_cache
+    from experiments.pipeline.code_version import use_kernel_cache
+    from experiments.pipeline.workers import saved_defect
 
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # None without a terminal
@@ -127,7 +127,7 @@ def _tell_warnings() -> list[str]:
         What is to be said of files without digest, once all else has gone well.
     """
     from mapfusion.errors import TellingWarning, UnsealedWarning
-    from mapfusion.sealed import say_again
+    from mapfusion.files import say_again
 
     show, unsealed = warnings.showwarning, list[str]()
     say_again()

@@ -32,8 +32,8 @@ def run(
     Finished stages are reused; an interrupted run goes on where it was. Exit code 1 if no robot's
     map can be used.
     """
-    from experiments.cli.outputs import require_result_folder
-    from experiments.judge.expectations import load_checked
+    from experiments.cli.options import require_result_folder
+    from experiments.evaluation.checks import load_checked
     from experiments.scenario.suite import scenarios_of
 
     require_result_folder(output)
@@ -42,12 +42,12 @@ def run(
         several = f"is one folder for {len(checked)} runs; give --results"
         raise InputError(f"--output {output}: {several}")
     # What draws takes time to import: a scenario is refused before.
-    from experiments.judge.findings import finding_lines, has_usable_map
-    from experiments.judge.nothing_merged import nothing_merged
-    from experiments.judge.result import run_scenario
-    from experiments.run.workers import make_ready, workers
-    from experiments.show.figures.drawing import Drawing
-    from experiments.show.terminal import layout, run_screen
+    from experiments.evaluation.criteria import nothing_merged
+    from experiments.evaluation.evaluated_run import finding_lines, has_usable_map
+    from experiments.evaluation.result import run_scenario
+    from experiments.pipeline.workers import make_ready, workers
+    from experiments.reports.figures.drawing import Drawing
+    from experiments.reports.terminal import layout, run_screen
 
     make_ready(jobs)
     unusable = False
@@ -82,12 +82,12 @@ def report(
     jobs: options.Jobs = options.ALL_CORES,
 ) -> None:
     """Show a result in one HTML file that works offline: `mapfusion report results/quick-0`."""
-    from experiments.cli.outputs import REPORT, require_file
-    from experiments.judge.result import require_result
-    from experiments.run.workers import make_ready
-    from experiments.show.figures.drawing import draw_all
-    from experiments.show.report.document import write_report
-    from experiments.show.terminal import layout
+    from experiments.cli.options import REPORT, require_file
+    from experiments.evaluation.result import require_result
+    from experiments.pipeline.workers import make_ready
+    from experiments.reports.figures.drawing import draw_all
+    from experiments.reports.report.document import write_report
+    from experiments.reports.terminal import layout
 
     require_file("--output", output, REPORT)
     if figures:
@@ -113,9 +113,9 @@ def export(
 
     What files, frames and keys mean, experiments/docs/export.md says.
     """
-    from experiments.cli.outputs import require_folder
-    from experiments.show.exported import export_result
-    from experiments.show.terminal.layout import print_lines
+    from experiments.cli.options import require_folder
+    from experiments.reports.result_export import export_result
+    from experiments.reports.terminal.layout import print_lines
 
     require_folder(output, [result])
     print_lines(map(str, export_result(result, kind, output)))
@@ -126,7 +126,7 @@ def inspect_command(
     path: Annotated[Path, typer.Argument(metavar="FILE", help="A file or folder of mapfusion's.")],
 ) -> None:
     """Tell what a file or folder of mapfusion's holds: `mapfusion inspect R1.parquet`."""
-    from experiments.show.inspect import inspect
+    from experiments.reports.inspect import inspect
 
     inspect(path)
 
@@ -149,20 +149,20 @@ def check(
     A run that merges no two maps although some share ground fails, too.
     Exit code 2 if a scenario cannot be read, and then none is run, or if it cannot be run.
     """
-    from experiments.cli.outputs import DOCUMENT, JUNIT, require_file
-    from experiments.judge.checking import CheckedScenario, check_all
+    from experiments.cli.options import DOCUMENT, JUNIT, require_file
+    from experiments.evaluation.checks import CheckedScenario, check_all
+    from experiments.reports import json_document
+    from experiments.reports.junit import write_junit
+    from experiments.reports.terminal import layout, run_screen
     from experiments.scenario.seeds import parse_seeds
     from experiments.scenario.settings import AnyScenario
-    from experiments.show import json_document
-    from experiments.show.junit import write_junit
-    from experiments.show.terminal import layout, run_screen
 
     require_file("--output", output, DOCUMENT, scenarios)
     require_file("--junit", junit, JUNIT, scenarios)
 
     def run_one(scenario: AnyScenario) -> Path:
-        from experiments.judge.result import run_scenario  # as in `run`
-        from experiments.run.workers import make_ready
+        from experiments.evaluation.result import run_scenario  # as in `run`
+        from experiments.pipeline.workers import make_ready
 
         make_ready(jobs)
         with layout.progress() as show:
@@ -203,7 +203,7 @@ def list_scenarios(
     ] = False,
 ) -> None:
     """List the suite, with the tags that `run` and `check` take: `mapfusion scenarios`."""
-    from experiments.scenario.schema import schema_text
+    from experiments.scenario.loading import schema_text
     from experiments.scenario.suite import copy_to_edit, entries
 
     if copy is not None:
@@ -212,7 +212,7 @@ def list_scenarios(
     if schema:
         typer.echo(schema_text(), nl=False)
         return
-    from experiments.show.terminal import study_screen
+    from experiments.reports.terminal import study_screen
 
     if aligners:
         study_screen.print_methods()

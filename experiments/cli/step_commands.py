@@ -26,13 +26,13 @@ def record(
     With `--format` what the robots see, count and truly do, for other people's programs, see
     experiments/docs/recordings.md.
     """
-    from experiments.cli.outputs import require_folder
-    from experiments.judge import user_files as single
-    from experiments.judge.expectations import load_checked
-    from experiments.judge.written_drives import write_drives
-    from experiments.run.workers import make_ready
+    from experiments.cli.options import require_folder
+    from experiments.evaluation import single_steps as single
+    from experiments.evaluation.checks import load_checked
+    from experiments.evaluation.dataset_export import write_drives
+    from experiments.pipeline.workers import make_ready
+    from experiments.reports.terminal.layout import print_paths, progress
     from experiments.scenario.suite import one_scenario
-    from experiments.show.terminal.layout import print_paths, progress
 
     require_folder(output, [scenario])
     loaded = load_checked(one_scenario(scenario), overrides, seed)
@@ -59,11 +59,11 @@ def slam(
 
     Exit code 1 if the map is empty or most of the log's observations contradict it.
     """
-    from experiments.cli.outputs import require_map_file
-    from experiments.judge import user_files as single
+    from experiments.cli.options import require_map_file
+    from experiments.evaluation import single_steps as single
+    from experiments.reports import json_document
+    from experiments.reports.terminal import layout
     from experiments.scenario.suite import settings_of
-    from experiments.show import json_document
-    from experiments.show.terminal import layout
 
     require_map_file(output, [log, scenario])
     settings = settings_of(scenario, overrides, seed)
@@ -95,11 +95,11 @@ def align(
     as_json: options.AsJson = False,
 ) -> None:
     """Estimate T_a_b with every aligner: `mapfusion align R1.parquet R2.parquet`."""
-    from experiments.cli.outputs import DOCUMENT, require_file
-    from experiments.judge import user_files as single
+    from experiments.cli.options import DOCUMENT, require_file
+    from experiments.evaluation import single_steps as single
+    from experiments.reports import json_document
+    from experiments.reports.terminal.run_screen import print_estimates
     from experiments.scenario.suite import settings_of
-    from experiments.show import json_document
-    from experiments.show.terminal.step_screen import print_estimates
 
     require_file("--output", output, DOCUMENT, [map_a, map_b, scenario])
     settings = settings_of(scenario, overrides, seed)
@@ -124,11 +124,11 @@ def merge(
 
     Exit code 1, and nothing is written, if no two maps were merged.
     """
-    from experiments.cli.outputs import require_map_file
-    from experiments.judge import user_files as single
+    from experiments.cli.options import require_map_file
+    from experiments.evaluation import single_steps as single
+    from experiments.reports import json_document
+    from experiments.reports.terminal.run_screen import print_fused, print_unmerged
     from experiments.scenario.suite import settings_of
-    from experiments.show import json_document
-    from experiments.show.terminal.step_screen import print_fused, print_unmerged
 
     require_map_file(output, [*maps, scenario], n_maps=max(len(maps) // 2, 1))
     settings = settings_of(scenario, overrides, seed)

@@ -41,15 +41,15 @@ def refusal(
     """
     import numpy as np
 
-    from experiments.cli.outputs import require_folder
-    from experiments.run.workers import make_ready
+    from experiments.cli.options import require_folder
+    from experiments.pipeline.workers import make_ready
+    from experiments.reports.study_files import draw_refusals, write_kinds
+    from experiments.reports.terminal import layout, study_screen
     from experiments.scenario.seeds import parse_seeds
-    from experiments.show.refusal_files import draw_refusals, write_kinds
-    from experiments.show.terminal import layout, refusal_screen
-    from experiments.study.refusal import kind_rates, refusal_rates, refusal_trial
-    from experiments.study.refusal.refusal_trial import PairsDrawn
-    from experiments.study.refusal.reliability import judged_answers, reliability
-    from experiments.study.refusal.stored_worlds import worlds_of
+    from experiments.studies.refusal import rates, refusal_trial
+    from experiments.studies.refusal.cases import worlds_of
+    from experiments.studies.refusal.rates import judged_answers, reliability
+    from experiments.studies.refusal.refusal_trial import PairsDrawn
 
     require_folder(output, worlds)
     make_ready(jobs)
@@ -57,13 +57,13 @@ def refusal(
     with layout.progress() as show:
         false_alarms = refusal_trial.run(mapped, output, drawn, jobs, show)
     refusals, calibration = (refusal_trial.read(output, name) for name in refusal_trial.TABLES)
-    refusal_screen.print_refusals(refusal_rates.summary(refusals), false_alarms)
-    kinds = kind_rates.by_kind(refusals)
-    refusal_screen.print_kinds(kinds)
+    study_screen.print_refusals(rates.summary(refusals), false_alarms)
+    kinds = rates.by_kind(refusals)
+    study_screen.print_kinds(kinds)
     answers = judged_answers(refusals)
     held = reliability(answers, np.random.default_rng(0)) if len(answers) else None
     if held is not None:
-        refusal_screen.print_reliability(held)
+        study_screen.print_reliability(held)
     pictures = draw_refusals(output, refusals, calibration, false_alarms, held)
     layout.print_paths(output, [write_kinds(output, refusals, kinds), *pictures])
 
@@ -101,21 +101,21 @@ def sweep(
     What is finished is kept, also in the middle of a run; the same command goes on from there, and
     with more seeds or values adds to the same tables. Exit code 1 if a run failed.
     """
-    from experiments.cli.outputs import require_folder
+    from experiments.cli.options import require_folder
+    from experiments.reports.terminal import layout, study_screen
     from experiments.scenario.seeds import parse_seeds
-    from experiments.show.terminal import layout, sweep_screen
-    from experiments.study.sweep import sweep_driver, sweep_plan
+    from experiments.studies import sweep, sweep_plan
 
     require_folder(output, scenarios)
     asked = sweep_plan.prepare(scenarios, parse_seeds(seeds), settings or (), results, output)
     if dry_run:
-        sweep_screen.print_survey(sweep_plan.survey(asked))
+        study_screen.print_survey(sweep_plan.survey(asked))
         return
     with layout.progress() as show:
-        ended = sweep_driver.execute(asked, jobs, scheduler, sweep_screen.shown_by(show))
+        ended = sweep.execute(asked, jobs, scheduler, study_screen.shown_by(show))
         if timings:
-            sweep_driver.measure_times(asked, ended.failed, show)
-    sweep_screen.print_sweep(asked.dataset, asked.runs, ended.failed)
+            sweep.measure_times(asked, ended.failed, show)
+    study_screen.print_sweep(asked.dataset, asked.runs, ended.failed)
     if ended.failed:
         raise typer.Exit(options.EXIT_DEFECT if ended.defects else options.EXIT_FAILED)
 
@@ -128,8 +128,8 @@ def statistics(
     as_json: options.AsJson = False,
 ) -> None:
     """Success, errors and consistency over many runs: `mapfusion statistics results/quick-*`."""
-    from experiments.cli.outputs import require_folder
-    from experiments.show.statistics_files import run_statistics
+    from experiments.cli.options import require_folder
+    from experiments.reports.study_files import run_statistics
 
     require_folder(output, paths)
     run_statistics(paths, output, as_json)
@@ -155,13 +155,13 @@ def compare(
 
     Runs are matched by scenario, seed and settings; a verdict means more than noise.
     """
-    from experiments.cli.outputs import require_folder
-    from experiments.show.export import write_tables
-    from experiments.show.terminal.statistics_screen import print_comparison
-    from experiments.study.compare import versions
+    from experiments.cli.options import require_folder
+    from experiments.reports.export import write_tables
+    from experiments.reports.terminal.statistics_screen import print_comparison
+    from experiments.studies import comparison
 
     require_folder(output, [first, second])
-    found = versions.compare(first, second, apart_from or ())
+    found = comparison.compare(first, second, apart_from or ())
     if output is not None:
         write_tables(output, {"comparison": found.table})
     print_comparison(found, show_all, output)
@@ -196,22 +196,25 @@ def benchmark(
 
     Serial, so that times can be compared; finished cells are reused.
     """
-    from experiments.cli.outputs import require_folder
-    from experiments.run.store import Store
+    from experiments.cli.options import require_folder
+    from experiments.pipeline.store import Store
+    from experiments.reports.study_files import write_benchmark
+    from experiments.reports.terminal import layout, study_screen
     from experiments.scenario.suite import settings_of
-    from experiments.show.benchmark_files import write_benchmark
-    from experiments.show.terminal import layout, study_screen
-    from experiments.study.benchmark import cells
+    from experiments.studies import benchmark
 
     require_folder(output, [scenario])
-    entries = cells.entries_of(methods or (), scenario)
-    counts, shares = tuple(pairs or cells.PAIR_COUNTS), tuple(outliers or cells.OUTLIER_SHARES)
+    entries = benchmark.entries_of(methods or (), scenario)
+    counts, shares = (
+        tuple(pairs or benchmark.PAIR_COUNTS),
+        tuple(outliers or benchmark.OUTLIER_SHARES),
+    )
     chosen_seed = settings_of(scenario, (), seed).seed
-    design = cells.BenchmarkDesign(entries, trials, chosen_seed, budget_s, counts, shares)
+    design = benchmark.BenchmarkDesign(entries, trials, chosen_seed, budget_s, counts, shares)
     folder = output or results / "benchmark"
     with layout.progress() as show:
-        rows = cells.run_benchmark(design, Store(results / "store"), show)
-    summary = cells.summarise(rows)
+        rows = benchmark.run_benchmark(design, Store(results / "store"), show)
+    summary = benchmark.summarise(rows)
     write_benchmark(folder, design, rows, summary)
     study_screen.print_benchmark(folder, summary)
 
@@ -238,14 +241,14 @@ def independence(
     For example: `mapfusion study independence paper --seeds 0..2`. What is measured is measured
     serially; finished pieces are reused.
     """
-    from experiments.cli.outputs import require_folder
-    from experiments.run.store import Store
+    from experiments.cli.options import require_folder
+    from experiments.pipeline.store import Store
+    from experiments.reports.study_files import write_independence
+    from experiments.reports.terminal import layout, study_screen
     from experiments.scenario.loading import load_scenario
     from experiments.scenario.seeds import parse_seeds
     from experiments.scenario.suite import one_scenario
-    from experiments.show.independence_files import write_independence
-    from experiments.show.terminal import layout, study_screen
-    from experiments.study.independence import independence_trial, recorded_teams
+    from experiments.studies.independence import independence_trial, recorded_teams
 
     require_folder(output, [scenario])
     path = one_scenario(scenario)
@@ -271,18 +274,18 @@ def calibrate(
     as_json: options.AsJson = False,
 ) -> None:
     """Correct odometry by what logs say of it: `mapfusion study calibrate raw/robot* -o logs`."""
-    from experiments.cli.outputs import require_folder
-    from experiments.judge.user_calibration import calibrated
+    from experiments.cli.options import require_folder
+    from experiments.evaluation.odometry_calibration import calibrated
+    from experiments.reports import json_document
+    from experiments.reports.terminal import layout, study_screen
     from experiments.scenario.suite import settings_of
-    from experiments.show import json_document
-    from experiments.show.terminal import calibration_screen, layout
 
     require_folder(output, [*logs, scenario])
     settings = settings_of(scenario, overrides, seed)
     with layout.progress() as show:
         found = calibrated(logs, output, settings, show)
     written = [] if output is None else [output / each.robot for each in found.robots]
-    made = calibration_screen.document(found, written)
+    made = study_screen.document(found, written)
     json_document.publish("calibrate", made, as_json)
     if not as_json:
-        calibration_screen.print_calibration(found, written)
+        study_screen.print_calibration(found, written)

@@ -29,11 +29,11 @@ import numpy as np
 from experiments.methods.answers import read
 from experiments.methods.catalogue import Kind, KnownMethod, find_method, make_method
 from experiments.methods.channel import Channel, GarbledError
+from mapfusion.align.alignment import Alignment, Status, without_answer
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.registration import Aligner, as_aligner
-from mapfusion.align.result import Alignment, Status, without_answer
 from mapfusion.errors import one_line
 from mapfusion.landmark_map import LandmarkMap
+from mapfusion.registration import Aligner, as_aligner
 
 _START_LIMIT_S = 120.0  # imports take a second, many times that from a cold network disk
 _END_LIMIT_S = 5.0  # from a broken connection to the end of the process behind it

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mapfusion.align.result import Alignment, Status, without_answer
+from mapfusion.align.alignment import Alignment, Status, without_answer
 from mapfusion.errors import one_line
 
 _ANSWERS = (Status.ACCEPTED, Status.REFUSED, Status.DEGENERATE)

@@ -15,7 +15,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-from mapfusion.align.registry import ALIGNERS, PEERS, construct
+from mapfusion.align.aligners import ALIGNERS, PEERS, construct
 from mapfusion.errors import did_you_mean
 
 ENTRY_POINTS = "mapfusion.aligners"  # the group by which an installed package declares aligners

@@ -30,11 +30,10 @@ from experiments.methods.answers import (
 from experiments.methods.catalogue import make_method
 from experiments.methods.channel import Channel
 from experiments.methods.threads import single_threaded
+from mapfusion.align.alignment import Alignment, Pairs, Status, without_answer
 from mapfusion.align.method import Fit, Needs, Undetermined
-from mapfusion.align.pairs import Pairs
-from mapfusion.align.registration import Aligner, MethodAligner
-from mapfusion.align.result import Alignment, Status, without_answer
 from mapfusion.errors import one_line
+from mapfusion.registration import Aligner, MethodAligner
 
 # Past the limit this process ends even when the plug-in holds the interpreter's lock and the one
 # who should have ended it is gone.

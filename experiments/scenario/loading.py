@@ -1,7 +1,9 @@
-"""Scenario files in, validated scenarios out, or one line: the field, and what would be right."""
+"""Load a scenario file into a validated scenario, or report each wrong field in one line."""
 
 import functools
+import inspect
 import json
+import re
 import reprlib
 import warnings
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -11,10 +13,10 @@ from typing import Any, NamedTuple, TypeVar
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
+from pydantic.json_schema import GenerateJsonSchema
 from pydantic_core import to_jsonable_python
 
 from experiments.methods.catalogue import name_clashes
-from experiments.scenario.generated import expanded
 from experiments.scenario.settings import (
     Align,
     AnyScenario,
@@ -28,8 +30,8 @@ from experiments.scenario.settings import (
     merged_by_what_is_aligned,
     sections_of,
 )
-from experiments.scenario.yaml_input import apply_overrides, lines_of_keys, read_mapping
-from mapfusion.arguments import Range
+from experiments.scenario.world_settings import expanded
+from experiments.scenario.yaml_files import apply_overrides, lines_of_keys, read_mapping
 from mapfusion.errors import (
     InputError,
     InputErrors,
@@ -37,6 +39,7 @@ from mapfusion.errors import (
     OutOfRangeError,
     did_you_mean,
 )
+from mapfusion.parameters import Range
 
 SHIPPED = Path(__file__).with_name("shipped")  # the repository's scenarios/, also where installed
 OWN = Path("scenarios")  # what shipped files name lies beside it, as it does in the repository
@@ -408,3 +411,55 @@ def _keys(root: dict[str, Any], node: dict[str, Any], *above: str) -> Iterator[t
     for children in (node.get("items"), node.get("additionalProperties")):
         if isinstance(children, dict):
             yield from _keys(root, children, *above, "*")
+
+
+# "name, other: text", further lines indented.
+_ENTRY = re.compile(r"^    (\w+(?:, \w+)*): (.+(?:\n {5,}.+)*)", re.MULTILINE)
+
+
+class _Described(GenerateJsonSchema):
+    """Adds to each field what its class says of it under `Attributes:`, and its unit."""
+
+    def model_schema(self, schema: Any) -> dict[str, Any]:
+        return _described(super().model_schema(schema), schema["cls"])
+
+    def dataclass_schema(self, schema: Any) -> dict[str, Any]:
+        return _described(super().dataclass_schema(schema), schema["cls"])
+
+
+def schema_text() -> str:
+    """The schema, as JSON that ends with a line break."""
+    kinds = TypeAdapter[object](Simulation | GeneratedScenario | Recording)
+    schema = kinds.json_schema(schema_generator=_Described)
+    return json.dumps(schema, indent=1) + "\n"
+
+
+def _described(schema: dict[str, Any], owner: type) -> dict[str, Any]:
+    described = attributes_of(owner)
+    schema["description"] = schema["description"].partition("\n\nAttributes:")[0]
+    for name, field in schema["properties"].items():
+        units = dict.fromkeys(_units(field))
+        unit = f" [{', '.join(units)}]" if units else ""
+        field["description"] = described[name] + unit
+        field.pop("title", None)  # the name once more
+    return schema
+
+
+def attributes_of(owner: type) -> dict[str, str]:
+    """What the docstrings of a class and its bases say of each attribute, on one line each."""
+    found: dict[str, str] = {}
+    for kind in reversed(owner.__mro__):
+        text = inspect.cleandoc(kind.__doc__ or "").partition("Attributes:\n")[2]
+        for names, about in _ENTRY.findall(text):
+            found |= dict.fromkeys(names.split(", "), " ".join(about.split()))
+    return found
+
+
+def _units(node: Any) -> list[str]:
+    """Units of all numbers in a field, which the ranges leave in its schema."""
+    if isinstance(node, list):
+        return [unit for each in node for unit in _units(each)]
+    if not isinstance(node, dict):
+        return []
+    own = [node.pop("unit")] if "unit" in node else []
+    return own + [unit for each in node.values() for unit in _units(each)]

@@ -1,6 +1,17 @@
-"""The seeds a command is given: one, a range or a list."""
+"""Random generators for each purpose, and lists of seeds."""
+
+import zlib
+
+import numpy as np
 
 from mapfusion.errors import InputError
+
+
+def generator(seed: int, *purpose: str | int) -> np.random.Generator:
+    """A generator for one purpose, for example ("odometry", "R1"), under the scenario's seed."""
+    key = tuple(zlib.crc32(str(part).encode()) for part in purpose)
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
+
 
 MAX_SEEDS = 1000  # days of computing: more is a slip of the keyboard
 

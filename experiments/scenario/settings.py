@@ -1,4 +1,6 @@
-"""Scenarios: one validated, frozen value from one YAML file.
+"""Scenario: one validated, frozen value from one YAML file.
+
+`experiments/evaluation/metrics.py` computes them; here they are known before anything is computed.
 
 The stages' own parameter classes (`FrontEndParameters`, `FastSlamParameters`, ...) are used as they
 are: pydantic validates them in place, so a parameter is named and explained once, where it is used.
@@ -11,13 +13,12 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import AfterValidator, Field, model_validator
 
 from experiments.methods.aligner_calls import require_usable
-from experiments.scenario.expected import why_unknown
-from experiments.scenario.generated import Generate
-from experiments.scenario.sections import (
+from experiments.scenario.world_settings import (
     MAX_COUNT,
     MAX_NAMED,
     Drive,
     Fuse,
+    Generate,
     Keep,
     Name,
     Render,
@@ -29,20 +30,84 @@ from experiments.scenario.sections import (
     different,
     free,
 )
-from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.correspondences import MatchParameters
-from mapfusion.align.refine import Refinement
-from mapfusion.arguments import Range
-from mapfusion.camera import StereoCamera
-from mapfusion.errors import OutOfRangeError
-from mapfusion.evidence.judge import Judge
-from mapfusion.evidence.parameters import EvidenceParameters
-from mapfusion.fuse.parameters import MergeParameters
-from mapfusion.fuse.registry import USUAL
-from mapfusion.vision.frontend import FrontEndParameters
+from mapfusion.align.refinement import Refinement
+from mapfusion.errors import OutOfRangeError, did_you_mean
+from mapfusion.fusion.fused_map import MergeParameters
+from mapfusion.fusion.fusers import USUAL
+from mapfusion.geometry.camera import StereoCamera
+from mapfusion.parameters import Range
+from mapfusion.verification.false_alarms import Acceptance
+from mapfusion.verification.parameters import EvidenceParameters
+from mapfusion.verification.verdict import Judge
+from mapfusion.vision.front_end import FrontEndParameters
 from sim.odometry import OdometryNoise
-from sim.radiometry import RadiometricNoise
+from sim.stereo_head import RadiometricNoise
 from sim.sway import AttitudeNoise
+
+# Of a whole run.
+RUN_METRICS = ("path_rmse_m", "odometry_rmse_m", "path_over_odometry")
+RUN_METRICS += tuple(
+    f"smoother.{name}"
+    for name in (
+        *("path_rmse_m", "filter_over_smoother", "landmark_rmse_m", "gross_share"),
+        *("nees_per_dof", "coverage_95"),
+    )
+)
+RUN_METRICS += ("oracle_translation_m", "oracle_rotation_rad", "true_pairs_at_end")
+RUN_METRICS += (
+    "fused_over_parents",
+    "fused_nees_with_drift",
+    "fused_nees_without_drift",
+    "landmark_rmse_median_m",
+    "landmark_rmse_worst_m",
+    "fused_landmark_rmse_m",
+    "team.merged_robots",
+    "team.ate_rmse_m",
+    "team.translation_m",
+    "team.rotation_rad",
+    "team.edge_precision",
+    "team.edge_recall",
+)
+# Of each fuser that runs, under its name: columns of the table `fusers`.
+FUSER_METRICS = ("landmark_rmse_m", "gross_share", "fitted_rmse_m", "fitted_median_m")
+FUSER_METRICS += ("over_better_parent", "over_better_filter", "nees_per_dof", "frame_nees_per_dof")
+FUSER_METRICS += ("coverage_95", "frame_coverage_95", "alignment_nees_per_dof", "duplicate_share")
+FUSER_METRICS += ("alignment_error_m", "alignment_error_rad")
+FUSER_METRICS += ("alignment_sigma_m", "alignment_sigma_rad")
+# Of each aligner, under its name.
+ALIGNER_METRICS = (
+    "refined_oracle_distance_m",
+    "refined_over_oracle",
+    "estimated_over_oracle",
+    "estimated_translation_m",
+    "lead_over_others",
+    "scatter_m",
+    "false_merges",
+    "missed_merges",
+)
+
+
+def known_metrics(aligners: Sequence[str], fusers: Sequence[str]) -> list[str]:
+    """Return every metric name that a scenario with these aligners and fusers may use."""
+    of_fusers = [f"{fuser}.{name}" for fuser in fusers for name in FUSER_METRICS]
+    of_aligners = [f"{aligner}.{name}" for aligner in aligners for name in ALIGNER_METRICS]
+    return [*RUN_METRICS, *of_fusers, *of_aligners]
+
+
+def why_unknown(name: str, aligners: Sequence[str], fusers: Sequence[str]) -> str:
+    """Return the reason why a scenario may not expect a metric of this name; empty if it may."""
+    known = known_metrics(aligners, fusers)
+    if name in known:
+        return ""
+    method, _, of_method = name.rpartition(".")
+    if method and of_method in ALIGNER_METRICS:
+        return f"unknown aligner {method}; align.aligners has {', '.join(aligners)}"
+    if method and of_method in FUSER_METRICS:
+        return f"unknown fuser {method}; fuse.fusers has {', '.join(fusers)}"
+    forms = ", ".join((*RUN_METRICS, "ALIGNER.NAME", "FUSER.NAME"))
+    return f"unknown{did_you_mean(name, known) or f'; known: {forms}'}"
+
 
 # Of whatever metrics measure; beyond, the screens' numbers say nothing.
 MetricValue = Annotated[float, Range(-1e9, 1e9, "the metric's")]

@@ -9,9 +9,9 @@ from typing import Any
 
 from experiments.scenario.loading import OWN, SHIPPED, default_settings, load_scenario
 from experiments.scenario.settings import Recording, Scenario
-from experiments.scenario.yaml_input import read_mapping
+from experiments.scenario.yaml_files import read_mapping
 from mapfusion.errors import InputError, did_you_mean
-from mapfusion.storage import write_whole
+from mapfusion.files import write_whole
 
 SUFFIXES = {".yaml", ".yml", ".json"}  # a JSON file is YAML too: a result's scenario.json
 

@@ -1,12 +1,17 @@
-"""What the methods that judge by covariances share: parameters, and settling on the support."""
+"""Consensus of pairs: pairwise consistency, and the support that robust methods share.
 
+A rigid motion keeps distances, so two true correspondences agree in them but for the landmarks'
+noise, whatever the motion (Mangelson et al. 2018, PCM; Lusk et al. 2021, CLIPPER).
+"""
+
+import math
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
+from mapfusion.align.alignment import Pairs
 from mapfusion.align.correspondences import HeightGate
-from mapfusion.align.degeneracy import why_one_place
 from mapfusion.align.drift import DRIFT_FLOOR_M
 from mapfusion.align.mahalanobis_gate import (
     PlanarPairs,
@@ -14,11 +19,202 @@ from mapfusion.align.mahalanobis_gate import (
     mean_variances,
     settle_at_best_scale,
 )
-from mapfusion.align.method import Fit, Undetermined
-from mapfusion.align.pairs import Pairs
-from mapfusion.arguments import Probability, Range, require_in_range
-from mapfusion.chi_square import chi_square_bound
-from mapfusion.se2 import Float
+from mapfusion.align.method import Fit, Undetermined, why_one_place
+from mapfusion.geometry.numerics import (
+    WORD,
+    Float,
+    chi_square_bound,
+    inner_kernel,
+    kernel,
+    kernel_part,
+    mirror,
+    packed,
+    trailing_zeros,
+)
+from mapfusion.parameters import Probability, Range, require_in_range
+
+# What single precision may add to the difference of two distances: coordinates of at most 1, read
+# to 2^-25, subtracted, squared and added, in two maps, make 15 roundings of 2^-24.
+_ROUNDING = 16 * 2.0**-24
+# (d + r)^2 is at most (1 + s) d^2 + (1 + 1 / s) r^2: a small share s of the pairs looked at more
+# closely pays for a rounding r that is larger than it.
+_SHARE = 1 / 16
+_LEAST_EXTENT_M = 1e-6  # of a map: all its landmarks in one place must not divide by zero
+
+
+class _Coarse(NamedTuple):
+    """N correspondences (N,) in single precision, in units of the larger map's extent.
+
+    Attributes:
+        ax, ay, bx, by: positions about the first pair's.
+        most: what each adds to the most that the squared difference of two distances may be.
+    """
+
+    ax: np.ndarray
+    ay: np.ndarray
+    bx: np.ndarray
+    by: np.ndarray
+    most: np.ndarray
+
+
+@kernel_part
+def _worst(xx: float, xy: float, yy: float) -> float:
+    """Larger eigenvalue of a covariance: the variance in the worst direction."""
+    return (xx + yy) / 2 + math.hypot((xx - yy) / 2, xy)
+
+
+@kernel_part
+def _coarse(rows: Float, variance_m2: float, bound: float) -> _Coarse:
+    """The pairs under their landmarks' worst variances, so that rounding loses none."""
+    n, extent = len(rows), _LEAST_EXTENT_M
+    for i in range(n):
+        for k in range(4):
+            extent = max(extent, abs(rows[i, k] - rows[0, k]))
+    coarse = _Coarse(
+        np.empty(n, np.float32),
+        np.empty(n, np.float32),
+        np.empty(n, np.float32),
+        np.empty(n, np.float32),
+        np.empty(n, np.float32),
+    )
+    for i in range(n):
+        coarse.ax[i] = (rows[i, 0] - rows[0, 0]) / extent
+        coarse.ay[i] = (rows[i, 1] - rows[0, 1]) / extent
+        coarse.bx[i] = (rows[i, 2] - rows[0, 2]) / extent
+        coarse.by[i] = (rows[i, 3] - rows[0, 3]) / extent
+        worst = _worst(rows[i, 4], rows[i, 5], rows[i, 6])
+        worst += _worst(rows[i, 7], rows[i, 8], rows[i, 9])
+        most = bound * (worst + variance_m2) / (extent * extent)
+        coarse.most[i] = (1 + _SHARE) * most + (1 + 1 / _SHARE) * _ROUNDING * _ROUNDING / 2
+    return coarse
+
+
+@kernel_part
+def _mark_near(
+    ax: np.ndarray,
+    ay: np.ndarray,
+    bx: np.ndarray,
+    by: np.ndarray,
+    most: np.ndarray,
+    at: tuple[float, float, float, float, float],
+    near: np.ndarray,
+) -> None:
+    """Mark in `near` (n,) those with (d_a - d_b)^2 <= m, the sum of two `most`, without a root.
+
+    With p = d_a^2 and q = d_b^2 that is (p - q)^2 <= m (2 (p + q) - m) where m <= p + q, and
+    always so beyond. Written so that the compiler compares several at once: no index but the loop's
+    own, no branch.
+    """
+    ax0, ay0, bx0, by0, most0 = at
+    for j in range(len(near)):
+        dx, dy, ex, ey = ax[j] - ax0, ay[j] - ay0, bx[j] - bx0, by[j] - by0
+        p, q = dx * dx + dy * dy, ex * ex + ey * ey
+        m = min(most[j] + most0, p + q)
+        near[j] = (p - q) * (p - q) <= m * (p + q + (p + q) - m)
+
+
+@inner_kernel(error_model="numpy")
+def _variance_along(dx: float, dy: float, square: float, xx: float, xy: float, yy: float) -> float:
+    """Variance along the line (dx, dy) of this squared length; 0 where there is no line."""
+    along = dx * dx * xx + 2 * dx * dy * xy + dy * dy * yy
+    return along / square if square > 0 else 0.0
+
+
+@inner_kernel(error_model="numpy")
+def _needed(one: tuple[float, ...], other: tuple[float, ...], bound: float) -> float:
+    """`drift_needed` of two correspondences, each a row of `in_rows`."""
+    ax, ay, bx, by = other[0] - one[0], other[1] - one[1], other[2] - one[2], other[3] - one[3]
+    p, q = ax * ax + ay * ay, bx * bx + by * by
+    difference = math.sqrt(p) - math.sqrt(q)
+    v = _variance_along(ax, ay, p, one[4] + other[4], one[5] + other[5], one[6] + other[6])
+    v += _variance_along(bx, by, q, one[7] + other[7], one[8] + other[8], one[9] + other[9])
+    return (difference * difference / bound - v) / 2
+
+
+def in_rows(pairs: PlanarPairs) -> Float:
+    """The pairs (N, 10): p_a, p_b, and xx, xy, yy of S_a and of S_b; a row is read as one piece."""
+    rows = np.empty((len(pairs.p_a), 10))
+    rows[:, :2], rows[:, 2:4] = pairs.p_a, pairs.p_b
+    for k, S in ((4, pairs.S_a), (7, pairs.S_b)):
+        rows[:, k], rows[:, k + 1], rows[:, k + 2] = S[:, 0, 0], S[:, 0, 1], S[:, 1, 1]
+    return rows
+
+
+@inner_kernel
+def _numbers(rows: Float, i: int) -> tuple[float, ...]:
+    r = rows[i]
+    return r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9]
+
+
+@kernel_part
+def drift_needed(rows: Float, i: int, j: int, bound: float) -> float:
+    """s_drift^2 from which on correspondences i and j of `in_rows` agree; negative: even without.
+
+    To first order the difference of the two distances has the variance v that the four landmarks
+    have along the lines between them, and s_drift^2 for each correspondence.
+    """
+    return _needed(_numbers(rows, i), _numbers(rows, j), bound)
+
+
+@kernel_part
+def _agreeing(
+    near: np.uint64,
+    first: int,
+    one: tuple[float, ...],
+    rows: Float,
+    scales_m2: tuple[float, float],
+    bound: float,
+) -> tuple[np.uint64, np.uint64]:
+    """Which of the 64 correspondences from `first` on agree with `one` at two s_drift^2.
+
+    Only those in the set `near` are looked at.
+    """
+    low = high = np.uint64(0)
+    while near:
+        needed = _needed(one, _numbers(rows, first + trailing_zeros(near)), bound)
+        rest = near & (near - np.uint64(1))
+        low |= near ^ rest if needed <= scales_m2[0] else np.uint64(0)
+        high |= near ^ rest if needed <= scales_m2[1] else np.uint64(0)
+        near = rest
+    return low, high
+
+
+@kernel
+def consistency(rows: Float, scales_m2: tuple[float, float], bound: float) -> np.ndarray:
+    """Graphs of consistent correspondences, for a small and a large s_drift.
+
+    Every two are first compared coarsely, under the landmarks' worst variances; only the few that
+    pass are looked at along their own lines.
+
+    Args:
+        rows: N correspondences as `in_rows` has them.
+        scales_m2: two s_drift^2, the smaller one first.
+        bound: most for the squared difference of distances over its variance.
+
+    Returns:
+        (2, N, ceil(N / 64)) uint64: bit j of row i tells whether i and j agree; symmetric, without
+        the diagonal.
+    """
+    n = len(rows)
+    words = (n + WORD - 1) // WORD
+    graphs = np.zeros((2, n, words), np.uint64)
+    eights = np.zeros(words * WORD // 8, np.uint64)
+    near = eights.view(np.uint8)
+    ax, ay, bx, by, most = _coarse(rows, scales_m2[1], bound)
+    for i in range(n - 1):
+        at = ax[i], ay[i], bx[i], by[i], most[i]
+        _mark_near(ax[i:], ay[i:], bx[i:], by[i:], most[i:], at, near[i:n])
+        near[i] = 0
+        one = _numbers(rows, i)
+        for w in range(i // WORD, words):
+            word = packed(eights, w)
+            if word:
+                low, high = _agreeing(word, w * WORD, one, rows, scales_m2, bound)
+                graphs[0, i, w], graphs[1, i, w] = low, high
+    mirror(graphs[0])
+    mirror(graphs[1])
+    return graphs
+
 
 # Shares of the largest s_drift that are tried as well: maps without drift deserve the narrow gate
 # that their covariances allow, and half-way steps lose little between.

@@ -1,4 +1,4 @@
-"""s_drift: how far two maps disagree beyond their landmarks' own covariances.
+"""Drift of two maps beyond their landmarks' covariances, and its share in an alignment's.
 
 A landmark's covariance in the best particle's map is conditional on that one path, so between two
 maps the residuals of true pairs have the covariance S_a + R S_b R^T + s_drift^2 I.
@@ -8,8 +8,10 @@ import math
 
 import numpy as np
 
-from mapfusion.kernels import inner_kernel, kernel, kernel_part
-from mapfusion.se2 import Float
+from mapfusion.align.alignment import Pairs
+from mapfusion.align.rigid_motion import motion_jacobian, residual_covariances
+from mapfusion.geometry.numerics import Float, inner_kernel, kernel, kernel_part
+from mapfusion.geometry.se2 import rotation
 
 # Below this nothing is measured: it only keeps the weights of noise-free data finite.
 DRIFT_FLOOR_M = 1e-6
@@ -103,3 +105,51 @@ def estimate_drift_m(residual_m: Float, covariance_m2: Float, gate_m: float = ma
         return DRIFT_FLOOR_M
     start = max(float(np.mean(residual_m**2)), DRIFT_FLOOR_M**2)
     return math.sqrt(_climb(residual_m, covariance_m2, start, gate_m))
+
+
+def whole_map_covariance(
+    T_a_b: Float, covariance: Float, drift_sigma_m: float, p_a: Float
+) -> Float:
+    """(3, 3) of an alignment with what drift has in common over a map, which leaves no residual.
+
+    The pairs, at p_a (n, 2) in the frame of a, are off by s_drift each; if neighbours are alike,
+    as they are where a path bends, all of them shift by as much, and turn by as much as that is
+    seen from their middle. An alignment's own covariance takes them for independent.
+    """
+    if drift_sigma_m == 0 or not len(p_a):
+        return covariance
+    middle = p_a.mean(axis=0)
+    arm_m2 = np.sum((p_a - middle) ** 2, axis=1).mean()
+    turn = np.array([middle[1] - T_a_b[1], T_a_b[0] - middle[0], 1.0])  # about the middle
+    common = np.diag([1.0, 1.0, 0.0]) + np.outer(turn, turn) / max(arm_m2, drift_sigma_m**2)
+    return covariance + drift_sigma_m**2 * common
+
+
+def calibration_part(T_a_b: Float, pairs: Pairs, drift_sigma_m: float) -> Float:
+    """Covariance (3, 3) that T_a_b has of it, beside that of independent residuals.
+
+    To first order: an error that moves all points of a map at once moves the least squares of
+    residuals p_a - T p_b, weighed by (S_a + R S_b R^T + s_drift^2 I)^-1, by the sum of their gains.
+    The errors of two maps are independent, unless both are of one camera.
+
+    Args:
+        T_a_b: (3,) the motion.
+        pairs: N that made it, not all in one place; of fewer than two nothing is said.
+        drift_sigma_m: s_drift.
+    """
+    of_maps = pairs.map_a.calibration, pairs.map_b.calibration
+    if all(each.is_none for each in of_maps) or len(pairs) < 2:
+        return np.zeros((3, 3))
+    S = residual_covariances(T_a_b, pairs.covariance_a, pairs.covariance_b)
+    W = np.linalg.inv(S + drift_sigma_m**2 * np.eye(2))
+    J = motion_jacobian(T_a_b, pairs.p_b)
+    weighted = np.swapaxes(J, 1, 2) @ W
+    gain = np.linalg.solve(np.sum(weighted @ J, axis=0), weighted)
+    by_a, by_b = (
+        own.moves_m(p)[:, :, :2] for own, p in zip(of_maps, (pairs.p_a, pairs.p_b), strict=True)
+    )
+    by_b = -by_b @ rotation(T_a_b[2]).T
+    alike = of_maps[0].is_of_one_camera(of_maps[1])
+    moved = by_a + by_b if alike else np.concatenate([by_a, by_b], axis=1)
+    by = np.einsum("nij,nkj->ik", gain, moved)
+    return by @ by.T

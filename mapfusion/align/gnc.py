@@ -6,14 +6,13 @@ from typing import ClassVar
 
 import numpy as np
 
+from mapfusion.align.alignment import Pairs
 from mapfusion.align.consensus import Consensus
 from mapfusion.align.mahalanobis_gate import PlanarPairs, mean_variances
 from mapfusion.align.method import Fit, Undetermined
-from mapfusion.align.pairs import Pairs
-from mapfusion.align.rigid import fit_weighted
-from mapfusion.kernels import kernel
-from mapfusion.planar import residual
-from mapfusion.se2 import Float
+from mapfusion.align.rigid_motion import fit_weighted
+from mapfusion.geometry.numerics import Float, kernel
+from mapfusion.geometry.se2 import residual
 
 _MU_FACTOR = 1.4  # Yang et al. 2020, remark 5
 _MAX_ROUNDS = 1000  # from a residual of 1 km at 1 mm of noise it takes 90

@@ -1,8 +1,14 @@
-"""Which pairs support a motion: a gate from the landmarks' covariances, and the chance of it.
+"""Mahalanobis gate: the pairs that support a motion, given the landmarks' covariances.
 
 The residual of a true pair has the covariance C = S_a + R S_b R^T + s_drift^2 I, so it lies inside
 e^T C^-1 e <= chi-square with a stated probability. How large s_drift is, nobody says; of a few the
 one is taken under which the residuals, true and false ones mixed, are most likely.
+
+Kernels that look at pairs within a gate, round after round, need not look at the others as long as
+the motion has not gone farther than a margin.
+
+A false pair far from all others turns the map about them and finds itself confirmed: its residual
+is small because the motion follows it.
 """
 
 import math
@@ -10,10 +16,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapfusion.align.rigid import fit_weighted
-from mapfusion.kernels import inner_kernel, kernel, kernel_part
-from mapfusion.planar import add_turned, residual
-from mapfusion.se2 import Float
+from mapfusion.align.rigid_motion import fit_weighted, residual_covariances
+from mapfusion.geometry.numerics import Float, inner_kernel, kernel, kernel_part, source_of
+from mapfusion.geometry.se2 import add_turned, lever, residual, transform_points
 
 _ROUNDS = 20  # of fit and support; two to five are the rule
 # e^T C^-1 e from which on a density, e^-100 of its peak, is lost in rounding beside the false ones'
@@ -208,3 +213,177 @@ def settle_at_best_scale(
             for i in range(n):
                 inside[i] = marks[i]
     return best, best_level
+
+
+_MARGIN = 0.25  # of a gate; a motion that has found its pairs goes less far
+_ROUNDING = 1e-6  # of a gate, more than rounding may move a point by
+
+
+class NearPairs(NamedTuple):
+    """n pairs in reach of a gate, and room for what is worked out of each.
+
+    Attributes:
+        rows: (n,) among all pairs.
+        pairs: themselves.
+        e: (n, 2) residuals.
+        S: (n, 2, 2) their covariances.
+        inside: (n,) bool, whether they lie within the gate.
+        truth: (n,) probabilities of being true; 0 at first.
+    """
+
+    rows: np.ndarray
+    pairs: PlanarPairs
+    e: Float
+    S: Float
+    inside: np.ndarray
+    truth: Float
+
+
+@kernel
+def near_pairs(T_a_b: Float, pairs: PlanarPairs, gate_m: float, inside: np.ndarray) -> NearPairs:
+    """The pairs in reach under a motion, and those `inside` (N,) already, which stay so."""
+    rows = rows_in_reach(T_a_b, pairs, gate_m, inside)
+    n = len(rows)
+    room = np.empty((n, 2)), np.empty((n, 2, 2)), np.empty(n, np.bool_), np.zeros(n)
+    near = NearPairs(rows, those_of(pairs, rows), room[0], room[1], room[2], room[3])
+    for k in range(n):
+        near.inside[k] = inside[rows[k]]
+    return near
+
+
+@inner_kernel
+def at_rows(values: np.ndarray, rows: np.ndarray, among: np.ndarray) -> None:
+    """Put values (n,) at rows (n,) of others (N,)."""
+    for k in range(len(rows)):
+        among[rows[k]] = values[k]
+
+
+@kernel_part
+def rows_in_reach(T_a_b: Float, pairs: PlanarPairs, gate_m: float, also: np.ndarray) -> np.ndarray:
+    """Rows (n,) of pairs that lie within the gate or its margin, and of those marked (N,)."""
+    p_a, p_b = pairs.p_a, pairs.p_b
+    cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+    rows, n, reach_m = np.empty(len(p_a), np.int64), 0, (1 + _MARGIN + _ROUNDING) * gate_m
+    for i in range(len(p_a)):
+        ex, ey = residual(T_a_b, cos, sin, p_a, p_b, i)
+        if also[i] or ex * ex + ey * ey <= reach_m * reach_m:
+            rows[n] = i
+            n += 1
+    return rows[:n]
+
+
+@kernel_part
+def those_of(pairs: PlanarPairs, rows: np.ndarray) -> PlanarPairs:
+    """Some of the pairs, by their rows (n,)."""
+    p_a, p_b, S_a, S_b = pairs
+    n = len(rows)
+    some = PlanarPairs(np.empty((n, 2)), np.empty((n, 2)), np.empty((n, 2, 2)), np.empty((n, 2, 2)))
+    for m in range(n):
+        i = rows[m]
+        for k in range(2):
+            some.p_a[m, k], some.p_b[m, k] = p_a[i, k], p_b[i, k]
+            for j in range(2):
+                some.S_a[m, k, j], some.S_b[m, k, j] = S_a[i, k, j], S_b[i, k, j]
+    return some
+
+
+@inner_kernel
+def farthest_m(p: Float) -> float:
+    """Distance from the origin of the farthest of points (N, 2)."""
+    square = 0.0
+    for i in range(len(p)):
+        square = max(square, p[i, 0] * p[i, 0] + p[i, 1] * p[i, 1])
+    return math.sqrt(square)
+
+
+@kernel_part
+def leaves_margin(T_a_b: Float, before: Float, gate_m: float, farthest_m: float) -> bool:
+    """Whether two motions may lay a point no farther off than that apart by more than the margin.
+
+    Pairs beyond the margin of a gate under the one may then lie within the gate under the other.
+    """
+    dx, dy, turned = T_a_b[0] - before[0], T_a_b[1] - before[1], abs(T_a_b[2] - before[2])
+    return math.sqrt(dx * dx + dy * dy) + turned * farthest_m > _MARGIN * gate_m
+
+
+@kernel_part
+def mark_inside(e: Float, gate_m: float, inside: np.ndarray) -> None:
+    """Mark which residuals (n, 2) lie within the gate."""
+    for i in range(len(e)):
+        inside[i] = e[i, 0] * e[i, 0] + e[i, 1] * e[i, 1] <= gate_m * gate_m
+
+
+# How seldom a true pair may be called false, among all pairs of two maps: as seldom as the test
+# against chance accepts a false alignment.
+_CALLED_FALSE = 1e-3
+
+
+def is_unlike_the_others(
+    T_without: Float, covariance: Float, variance_m2: float, pairs: PlanarPairs, left_out: int
+) -> bool:
+    """Whether a pair lies farther from where the others put it than they explain.
+
+    Its squared distance D under the motion without it, in units of S + s_drift^2 I + J cov J' with
+    an s_drift that m = 2 (n - 1) - 3 numbers of the others leave, is 2 F(2, m) for a true pair
+    (the externally studentised residual; Cook and Weisberg 1982), beyond D with the probability
+    (1 + D / m)^(-m / 2). Any of the n pairs might have been the one.
+    """
+    _, p_b, S_a, S_b = pairs
+    cos, sin = math.cos(T_without[2]), math.sin(T_without[2])
+    m = 2 * (len(p_b) - 1) - 3
+    if m < 1:
+        return False
+    J = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    J[:, 2] = source_of(lever)(cos, sin, p_b, left_out)
+    (S,) = residual_covariances(T_without, S_a[left_out, None], S_b[left_out, None])
+    e = np.array(source_of(residual)(T_without, cos, sin, pairs.p_a, p_b, left_out))
+    D = e @ np.linalg.solve(S + variance_m2 * np.eye(2) + J @ covariance @ J.T, e)
+    return -m / 2 * math.log1p(D / m) < math.log(_CALLED_FALSE / len(p_b))
+
+
+def why_one_pair(
+    T_a_b: Float, T_without: Float | None, pairs: PlanarPairs, truth: Float, gate_m: float
+) -> str:
+    """Why the motion rests on the pair of most leverage; empty when it does not.
+
+    Left out, it must not let the motion go further than the gate: other pairs would be true then.
+    T_without is None where the others determine no motion; `truth` (N,) is the probability of being
+    true, `gate_m` the distance up to which pairs take part.
+    """
+    if T_without is None:
+        return "rests on one correspondence: without it there is no motion"
+    p_b = pairs.p_b[truth > 0.5]
+    apart = transform_points(T_a_b, p_b) - transform_points(T_without, p_b)
+    moved_m = float(np.sqrt(np.max(np.sum(apart**2, axis=1))))
+    if moved_m <= gate_m:
+        return ""
+    return f"rests on one correspondence: without it landmarks move by {moved_m:.2g} m"
+
+
+@kernel_part
+def most_leverage(
+    T_a_b: Float, pairs: PlanarPairs, variance_m2: float, truth: Float, covariance: Float
+) -> int:
+    """The pair whose residual moves its own fit most: the largest trace of J cov J' W.
+
+    The hat matrix of weighted least squares (Hoaglin and Welsch 1978), with W = truth C^-1 and
+    C = S_a + R S_b R^T + s_drift^2 I.
+    `truth` (N,) is the probability of being true, `covariance` (3, 3) that of T_a_b.
+    """
+    _, p_b, S_a, S_b = pairs
+    cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+    cxx, cxy, cyy = covariance[0, 0], covariance[0, 1], covariance[1, 1]
+    cxt, cyt, ctt = covariance[0, 2], covariance[1, 2], covariance[2, 2]
+    most, found = -1.0, 0
+    for i in range(len(p_b)):
+        xx, xy, yy = residual_covariance(cos, sin, S_a, S_b, i, variance_m2)
+        jx, jy = lever(cos, sin, p_b, i)
+        # J cov J': what the motion's own uncertainty makes of this point
+        txx = cxx + 2 * jx * cxt + jx * jx * ctt
+        tyy = cyy + 2 * jy * cyt + jy * jy * ctt
+        txy = cxy + jx * cyt + jy * cxt
+        txy += jx * jy * ctt
+        leverage = truth[i] * (txx * yy - 2 * txy * xy + tyy * xx) / (xx * yy - xy * xy)
+        if leverage > most:
+            most, found = leverage, i
+    return found

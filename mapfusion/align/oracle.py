@@ -5,11 +5,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from mapfusion.align.pairs import MIN_PAIRS, Pairs, undetermined, why_too_few
-from mapfusion.align.refine import Refinement
-from mapfusion.align.result import Alignment
-from mapfusion.align.rigid import fit_rigid
-from mapfusion.arguments import require_shape
+from mapfusion.align.alignment import MIN_PAIRS, Alignment, Pairs, undetermined, why_too_few
+from mapfusion.align.refinement import Refinement
+from mapfusion.align.rigid_motion import fit_rigid
+from mapfusion.parameters import require_shape
 
 
 @dataclass(frozen=True)

@@ -6,14 +6,13 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
+from mapfusion.align.alignment import Pairs
 from mapfusion.align.correspondences import HeightGate
 from mapfusion.align.method import Fit, Undetermined
-from mapfusion.align.pairs import Pairs
-from mapfusion.align.rigid import fit_rigid, fit_two
-from mapfusion.arguments import Probability, Range, require_in_range
-from mapfusion.kernels import inner_kernel, kernel, kernel_part
-from mapfusion.planar import residual
-from mapfusion.se2 import Float
+from mapfusion.align.rigid_motion import fit_rigid, fit_two
+from mapfusion.geometry.numerics import Float, inner_kernel, kernel, kernel_part
+from mapfusion.geometry.se2 import residual
+from mapfusion.parameters import Probability, Range, require_in_range
 
 _LOCAL_ROUNDS = 10  # of fit and support; two or three are the rule
 

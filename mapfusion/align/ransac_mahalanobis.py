@@ -6,17 +6,14 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from mapfusion.align.consensus import Consensus, spread_of
-from mapfusion.align.consistency import drift_needed, in_rows
+from mapfusion.align.alignment import Pairs
+from mapfusion.align.consensus import Consensus, drift_needed, in_rows, spread_of
 from mapfusion.align.mahalanobis_gate import PlanarPairs, mark_supporters, settle
 from mapfusion.align.method import Fit, Undetermined
-from mapfusion.align.pairs import Pairs
 from mapfusion.align.ransac import draw_pair
-from mapfusion.align.rigid import fit_two
-from mapfusion.arguments import Probability, Range
-from mapfusion.chi_square import chi_square_bound
-from mapfusion.kernels import kernel
-from mapfusion.se2 import Float
+from mapfusion.align.rigid_motion import fit_two
+from mapfusion.geometry.numerics import Float, chi_square_bound, kernel
+from mapfusion.parameters import Probability, Range
 
 
 @dataclass(frozen=True)

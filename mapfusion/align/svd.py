@@ -6,9 +6,10 @@ from typing import ClassVar, Literal, get_args
 
 import numpy as np
 
+from mapfusion.align.alignment import MIN_PAIRS, Pairs
 from mapfusion.align.method import Fit, Needs
-from mapfusion.align.pairs import MIN_PAIRS, Pairs
-from mapfusion.se2 import Float, rotation
+from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.se2 import rotation
 
 Translation = Literal["printed", "solved"]
 

@@ -10,13 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapfusion.fastslam.boxes import touches
+from mapfusion.fastslam.landmarks import Estimates, Slots, touches
+from mapfusion.fastslam.measurement import DROPPED, NEW, Sightings, innovation, quadratic_form
 from mapfusion.fastslam.particles import ParticleMaps
-from mapfusion.fastslam.sensor import Sightings, innovation, quadratic_form
-from mapfusion.fastslam.slots import Estimates, Slots
-from mapfusion.fastslam.update import DROPPED, NEW
-from mapfusion.kernels import inner_kernel, kernel, kernel_part
-from mapfusion.se2 import Float
+from mapfusion.geometry.numerics import Float, inner_kernel, kernel, kernel_part
 
 _PART = 16  # entries of a descriptor that are compared at a time
 

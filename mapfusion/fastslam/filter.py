@@ -1,4 +1,4 @@
-"""FastSLAM 1.0: a particle for each path, a Kalman filter for each particle and landmark.
+"""FastSLAM 1.0 particle filter: one path per particle, one Kalman filter per particle and landmark.
 
 Montemerlo, Thrun, Koller, Wegbreit (2002), in the paper's form (eq. 1-10) with these additions:
 association per particle, a density for observations that match nothing, weights that are
@@ -6,11 +6,11 @@ multiplied until a resampling, resampling by effective sample size, and paths th
 loop closes.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 
-from mapfusion.arguments import require_finite, require_shape
 from mapfusion.fastslam.association import (
     Association,
     choose,
@@ -18,25 +18,76 @@ from mapfusion.fastslam.association import (
     pairs_of_labels,
     sources,
 )
-from mapfusion.fastslam.bends import Bends
-from mapfusion.fastslam.closing import Seen, close_loops, motion_by_odometry
-from mapfusion.fastslam.history import History
-from mapfusion.fastslam.motion import sample_motion
-from mapfusion.fastslam.parameters import FastSlamParameters
-from mapfusion.fastslam.particles import ParticleMaps
-from mapfusion.fastslam.proposal import Proposal, informed_disturbance, widened
-from mapfusion.fastslam.resampling import (
-    effective_sample_size,
-    normalised,
-    systematic_ancestors,
+from mapfusion.fastslam.landmarks import Tracked
+from mapfusion.fastslam.loop_closing import Bends, Seen, close_loops, motion_by_odometry
+from mapfusion.fastslam.measurement import (
+    Sightings,
+    log_density_at_gate,
+    sightings,
+    update_landmarks,
 )
-from mapfusion.fastslam.sensor import Sightings, log_density_at_gate, sightings
-from mapfusion.fastslam.tracked import Tracked
-from mapfusion.fastslam.update import update_landmarks
+from mapfusion.fastslam.motion import MotionNoise, sample_motion
+from mapfusion.fastslam.particles import History, ParticleMaps
+from mapfusion.fastslam.proposal import Proposal, informed_disturbance, widened
+from mapfusion.fastslam.resampling import effective_sample_size, normalised, systematic_ancestors
+from mapfusion.geometry.numerics import Float, chi_square_bound
+from mapfusion.geometry.se2 import compose
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.looks import NO_LABEL
-from mapfusion.robot_log import Observations
-from mapfusion.se2 import Float, compose
+from mapfusion.parameters import Probability, Range, require_finite, require_in_range, require_shape
+from mapfusion.robot_log import FILTERED_STRAY_M, Observations
+from mapfusion.tables import NO_LABEL
+
+
+@dataclass(frozen=True)
+class FastSlamParameters:
+    """Settings of the filter; the defaults are the recommended ones.
+
+    Attributes:
+        n_particles: M.
+        motion: noise of the odometry.
+        proposal: what particles are drawn from. `motion` is the paper's eq. 3, which leaves few of
+            them where observations are far sharper than the odometry.
+        association: what decides among the landmarks inside the gate.
+        gate_probability: share of true matches that the gate lets pass (chi-square quantile). Close
+            to 1, as a landmark's covariance leaves out the drift since it was last seen; among
+            those inside, the descriptors decide.
+        descriptor_threshold: largest Euclidean distance of matching descriptors (unit vectors).
+        resample_fraction: resample when the effective sample size is at most this share of M;
+            0 never, 1 in every step.
+        stray_m: standard deviation, along each axis, by which the point that one track of
+            observations is of lies beside the landmark; the next track's lies elsewhere.
+        close_loops: bend the path so far, and the map that hangs on it, where landmarks come back
+            into view (see `bends.py`); with the informed proposal alone.
+        noise_floor_m: standard deviation added to each coordinate of an observation.
+        log_new_landmark_density: log of p_new in 1/m^3 (1/m^2 in planar data), the density of an
+            observation that matches nothing; None: that of a match exactly at the gate, with the
+            covariance of a landmark seen once, and its stray if it has a track.
+        planar: z carries no information; gates and weights have 2 degrees of freedom. None: as the
+            log says; of a filter without a log, no.
+    """
+
+    n_particles: Annotated[int, Range(1, 10_000, "particles")] = 200
+    motion: MotionNoise = field(default_factory=MotionNoise)
+    proposal: Proposal = Proposal.INFORMED
+    association: Association = Association.DESCRIPTOR
+    gate_probability: Probability = 0.9999
+    descriptor_threshold: Annotated[float, Range(1e-3, 2, "1")] = 0.5
+    resample_fraction: Annotated[float, Range(0, 1, "1")] = 0.5
+    stray_m: Annotated[float, Range(0, 10, "m")] = FILTERED_STRAY_M
+    close_loops: bool = True
+    noise_floor_m: Annotated[float, Range(0, 10, "m")] = 0.0
+    log_new_landmark_density: Annotated[float, Range(-100, 100, "ln 1/m^3")] | None = None
+    planar: bool | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "proposal", Proposal(self.proposal))
+        object.__setattr__(self, "association", Association(self.association))
+        require_in_range(self)
+
+    @property
+    def gate(self) -> float:
+        """Largest squared Mahalanobis distance of a match."""
+        return chi_square_bound(self.gate_probability, 2 if self.planar else 3)
 
 
 @dataclass(frozen=True)

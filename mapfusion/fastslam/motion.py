@@ -5,8 +5,9 @@ from typing import Annotated
 
 import numpy as np
 
-from mapfusion.arguments import Range, require_in_range
-from mapfusion.se2 import Float, compose
+from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.se2 import compose
+from mapfusion.parameters import Range, require_in_range
 
 
 @dataclass(frozen=True)

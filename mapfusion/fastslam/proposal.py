@@ -15,11 +15,16 @@ from enum import StrEnum
 
 import numpy as np
 
-from mapfusion.fastslam.sensor import Sightings, innovation, quadratic_form
-from mapfusion.fastslam.slots import LANES, Slots
-from mapfusion.kernels import kernel, kernel_part
-from mapfusion.se2 import Float
-from mapfusion.symmetric import cholesky, solve_lower, solve_upper
+from mapfusion.fastslam.landmarks import LANES, Slots
+from mapfusion.fastslam.measurement import Sightings, innovation, quadratic_form
+from mapfusion.geometry.numerics import (
+    Float,
+    cholesky,
+    kernel,
+    kernel_part,
+    solve_lower,
+    solve_upper,
+)
 
 # Gauss-Newton steps; the turn of a frame is off by 0.1 rad at most, which the second step makes
 # 0.005 and the third nothing.

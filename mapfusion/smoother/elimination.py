@@ -1,24 +1,309 @@
-"""The normal equations solved: landmarks and their tracks are eliminated first, or all poses.
+"""Solution of the normal equations, and marginal covariances of poses and landmarks.
+
+It takes the fewer of them the nearer a preconditioner is to the matrix's inverse.
+
+Its matrix is large and has a factor; a product with it needs neither: it goes from the poses to the
+points that they saw, and back. From one step to the next the matrix changes little, so that with
+the factor of a step before a few products solve for a step.
+
+With L the factor of the poses' information, C the poses' blocks with the landmarks and A the
+landmarks' covariances if the path were known, the landmarks' joint covariance is A beside Y' Y with
+Y = L^-1 C A. It has as many columns as there are coordinates of landmarks; C A has few entries.
 
 Both are exact. With the landmarks gone a sparse system of the poses is left; with the poses gone,
 which are a chain, a dense one of the landmarks and tracks. The one that takes fewer products is
 solved. The first pose is the frame and no unknown.
 """
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
+from scipy.sparse import csr_array
 
-from mapfusion.joint_covariance import RANK, KnownErrors, SharedErrors
-from mapfusion.se2 import Float
-from mapfusion.smoother.landmark_elimination import along_way
+from mapfusion.geometry.joint_covariance import RANK, KnownErrors, SharedErrors
+from mapfusion.geometry.numerics import Float, kernel, kernel_part
+from mapfusion.smoother.cholesky import Envelope, Factor, factor_in_envelope
 from mapfusion.smoother.normal_equations import Estimate, NormalEquations, Weights, point_equations
-from mapfusion.smoother.offsets import Points, known_points, moved_points, without_offsets
-from mapfusion.smoother.path_errors import PathErrors
-from mapfusion.smoother.reduced_poses import ReducedPoses
-from mapfusion.smoother.sightings import Sightings
-from mapfusion.smoother.skyline import Envelope, Factor, factor_in_envelope
+from mapfusion.smoother.problem import Sightings
+from mapfusion.smoother.schur_complement import (
+    Points,
+    Reduced,
+    along_points,
+    along_way,
+    known_points,
+    left_couplings,
+    moved_points,
+    subtract_points,
+    without_offsets,
+)
+
+
+def solved_by_products(
+    times: Callable[[Float], Float],
+    preconditioned: Callable[[Float], Float],
+    right: Float,
+    share: float,
+    most: int,
+) -> Float | None:
+    """The x that the positive definite matrix turns into `right`, both of any shape.
+
+    Args:
+        times: the matrix times an x.
+        preconditioned: about its inverse times a right side; positive definite, too.
+        right: what the product is to be.
+        share: of x that it may be off by, in the norm of the matrix.
+        most: products that are tried.
+
+    Returns:
+        x; None where it took more, or the matrix is not positive definite.
+    """
+    x, residual = np.zeros_like(right), right.copy()
+    news = direction = preconditioned(residual)
+    square = float(np.vdot(residual, news))
+    enough = share**2 * square
+    for _ in range(most):
+        if square <= enough:
+            return x
+        product = times(direction)
+        curvature = float(np.vdot(direction, product))
+        if not curvature > 0:
+            return None
+        x += square / curvature * direction
+        residual -= square / curvature * product
+        news, before = preconditioned(residual), square
+        square = float(np.vdot(residual, news))
+        direction = news + square / before * direction
+    return x if square <= enough else None
+
+
+# What a step may be off by, as a share of it, both in sigmas: what the last ones, of hundredths of
+# a sigma, leave of it is nothing, and they mend what those before left. As each leaves a third and
+# more for weights that follow it, to be closer makes no step needless.
+_OFF = 1e-2
+# A factor of its own costs as much as this many products and more.
+_MOST_PRODUCTS = 15
+
+
+@dataclass(frozen=True)
+class ReducedPoses:
+    """The equations of T poses, of which the first is known: its rows are zero.
+
+    Attributes:
+        seen: the observations.
+        equations: all of them.
+        left: once the offsets are eliminated.
+    """
+
+    seen: Sightings
+    equations: NormalEquations
+    left: Reduced
+
+    def gradient(self) -> Float:
+        """(T, 3)."""
+        still = np.zeros_like(self.equations.points.track_gradient)
+        return self._with_points(self.equations.pose_gradient, self.left, still)
+
+    def times(self, way: Float) -> Float:
+        """(T, 3) the matrix times a way (T, 3) of the poses."""
+        link, gained = self.equations.link, np.zeros_like(self.left.pull)
+        product = np.einsum("kij,kj->ki", self.equations.pose_block, way)
+        product[1:] += np.einsum("kij,kj->ki", link, way[:-1])
+        product[:-1] += np.einsum("kji,kj->ki", link, way[1:])
+        along = along_way(self.seen, self.equations.coupling, way)
+        unpulled = np.zeros_like(self.left.point_gradient)
+        still = self.left._replace(pull=gained, point_gradient=unpulled)
+        return self._with_points(product, still, along)
+
+    def factor(self) -> Factor:
+        """Of the matrix without the first pose, the others in their order.
+
+        Raises:
+            LinAlgError: the matrix is not positive definite.
+        """
+        envelope = self.seen.order.envelope
+        S = envelope.zeros()
+        _put_poses(S, envelope, self.seen.pose_place[1:] - 1, self.equations)
+        subtract_points(self.seen, self.equations, self.left, S)
+        return factor_in_envelope(S, envelope)
+
+    def solved(self, factor: Factor, right: Float) -> Float:
+        """(T, 3) what a matrix with this factor turns into `right` (T, 3)."""
+        solved = factor.solve_transposed(factor.solve(self._ordered(right)))
+        return self.by_frame(solved)
+
+    def solved_nearby(self, factor: Factor, right: Float) -> Float | None:
+        """(T, 3) what the matrix turns into `right` (T, 3), by a factor that is nearly its own.
+
+        None where that is too far off.
+        """
+
+        def roughly(rest: Float) -> Float:
+            return self.by_frame(factor.solve_both_roughly(self._ordered(rest)))
+
+        return solved_by_products(self.times, roughly, right, _OFF, _MOST_PRODUCTS)
+
+    def _ordered(self, of_poses: Float) -> Float:
+        """(3 (T - 1),) values (T, 3) of the unknown poses, in their order."""
+        ordered = np.empty((len(of_poses) - 1, 3))
+        ordered[self.seen.pose_place[1:] - 1] = of_poses[1:]
+        return ordered.ravel()
+
+    def by_frame(self, ordered: Float) -> Float:
+        """(T, 3) the same by frame; zero for the first pose."""
+        place = self.seen.pose_place
+        found = np.zeros((len(place), 3))
+        found[1:] = ordered.reshape(-1, 3)[place[1:] - 1]
+        return found
+
+    def _with_points(self, of_poses: Float, left: Reduced, along: Float) -> Float:
+        """With what points add that follow the poses."""
+        moved = moved_points(self.seen, self.equations.points, left, along)
+        total = of_poses + along_points(self.seen, self.equations.coupling, *moved)
+        total[0] = 0.0
+        return total
+
+
+def _put_poses(S: Float, envelope: Envelope, place: np.ndarray, equations: NormalEquations) -> None:
+    """What odometry and the poses' own observations say, by the `place` of each unknown pose."""
+    S[envelope.where(place, place)] = equations.pose_block[1:]
+    after, before, link = place[1:], place[:-1], equations.link[1:]
+    link = np.where((after > before)[:, None, None], link, np.swapaxes(link, 1, 2))
+    S[envelope.where(np.maximum(after, before), np.minimum(after, before))] = link
+
+
+@dataclass(frozen=True)
+class PathErrors:
+    """Y (R, 3L), of the R coordinates of the unknown poses in their order.
+
+    Attributes:
+        seen: the observations.
+        factor: L.
+        moved: (N, 3, 3) entries of C A, by observation.
+    """
+
+    seen: Sightings
+    factor: Factor
+    moved: Float
+
+    @classmethod
+    def of(
+        cls, seen: Sightings, equations: NormalEquations, own_m2: Float, factor: Factor
+    ) -> "PathErrors":
+        """Of equations that are solved, the landmarks first: with their `own_m2` and the factor."""
+        left = without_offsets(seen, equations.points)
+        coupling = left_couplings(seen, equations.coupling, left)
+        return cls(seen, factor, coupling @ own_m2[seen.landmark])
+
+    def __len__(self) -> int:
+        return len(self.factor)
+
+    def rows_by_all(self, rows: np.ndarray) -> Float:
+        """(R, r) columns of Y Y', those of `rows` (r,)."""
+        chosen = np.zeros((len(self), len(rows)))
+        chosen[rows, np.arange(len(rows))] = 1.0
+        return self.gram(chosen)
+
+    def gram(self, columns: Float) -> Float:
+        """Y Y' times columns (R, c), in single precision."""
+        moving = self._moving_roughly
+        by_landmark = moving @ self.factor.solve_transposed(columns.astype(np.float32))
+        return self.factor.solve(moving.T @ by_landmark).astype(np.float64)
+
+    def spread(self, columns: Float) -> Float:
+        """(3L, c) Y' times columns (R, c)."""
+        return self._moving @ self.factor.solve_transposed(columns)
+
+    def gathered(self, by_landmark: Float) -> Float:
+        """Return (R, c) Y times columns (3L, c)."""
+        return self.factor.solve(self._moving.T @ by_landmark)
+
+    def squares(self) -> Float:
+        """(L, 3, 3) blocks of Y' Y, each landmark's with itself."""
+        total = np.zeros((self.seen.n_landmarks, 3, 3))
+        covariance, offset = self.factor.inverse, self.factor.envelope.offset
+        place = self.seen.unknown_place
+        _add_squares(self.seen.starts, place, self.moved, offset, covariance, total)
+        return total + np.swapaxes(total, 1, 2)
+
+    @cached_property
+    def _moving(self) -> csr_array:
+        """(3L, R) A C', of which each observation is a block."""
+        place, each = self.seen.unknown_place, np.arange(3)
+        known = place >= 0
+        rows = 3 * self.seen.landmark[known, None] + each
+        columns = 3 * place[known, None] + each
+        rows, columns = np.broadcast_arrays(rows[:, None, :], columns[:, :, None])
+        shape = 3 * self.seen.n_landmarks, len(self)
+        return csr_array((self.moved[known].ravel(), (rows.ravel(), columns.ravel())), shape)
+
+    @cached_property
+    def _moving_roughly(self) -> csr_array:
+        """The same in single precision."""
+        known = self._moving
+        entries = known.data.astype(np.float32), known.indices, known.indptr
+        return csr_array(entries, known.shape)
+
+
+@kernel
+def _add_squares(
+    starts: np.ndarray,
+    place: np.ndarray,
+    moved: Float,
+    offset: np.ndarray,
+    Z: Float,
+    total: Float,
+) -> None:
+    """Of each landmark what, with its transpose, is moved' Z moved of all that saw it."""
+    of_pose = np.empty((3, 3))
+    for j in range(len(starts) - 1):
+        for i in range(starts[j], starts[j + 1]):
+            if place[i] < 0:
+                continue
+            for r in range(3):
+                for q in range(3):
+                    of_pose[r, q] = 0.0
+            for k in range(starts[j], i + 1):
+                if place[k] >= 0:
+                    share = 0.5 if k == i else 1.0
+                    _add_part(Z, offset, 3 * place[i], 3 * place[k], share, moved, k, of_pose)
+            for r in range(3):
+                for q in range(3):
+                    total[j, r, q] += (
+                        moved[i, 0, r] * of_pose[0, q]
+                        + moved[i, 1, r] * of_pose[1, q]
+                        + moved[i, 2, r] * of_pose[2, q]
+                    )
+
+
+@kernel_part
+def _add_part(
+    Z: Float,
+    offset: np.ndarray,
+    row: int,
+    column: int,
+    share: float,
+    moved: Float,
+    k: int,
+    total: Float,
+) -> None:
+    """Add a share of the poses' covariance times what moves observation k's landmark."""
+    above = row < column  # its mirror image is stored
+    down, across = (column, row) if above else (row, column)
+    at0, at1, at2 = offset[down] + across, offset[down + 1] + across, offset[down + 2] + across
+    for q in range(3):
+        x, y, z = share * moved[k, 0, q], share * moved[k, 1, q], share * moved[k, 2, q]
+        if above:
+            for r in range(3):
+                total[r, q] += Z[at0 + r] * x + Z[at1 + r] * y + Z[at2 + r] * z
+        else:
+            total[0, q] += Z[at0] * x + Z[at0 + 1] * y + Z[at0 + 2] * z
+            total[1, q] += Z[at1] * x + Z[at1 + 1] * y + Z[at1 + 2] * z
+            total[2, q] += Z[at2] * x + Z[at2 + 1] * y + Z[at2 + 2] * z
+
 
 _GB = 1e9
 _ITEM = np.dtype(np.float64).itemsize

@@ -19,8 +19,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapfusion.se2 import Float, rotation, wrap
-from mapfusion.smoother.landmark_elimination import along_way
+from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.se2 import rotation, wrap
+from mapfusion.smoother.elimination import ReducedPoses
 from mapfusion.smoother.normal_equations import (
     Estimate,
     NormalEquations,
@@ -29,10 +30,9 @@ from mapfusion.smoother.normal_equations import (
     disturbances,
     normal_equations,
 )
-from mapfusion.smoother.offsets import moved_points, without_offsets
-from mapfusion.smoother.reduced_poses import ReducedPoses
-from mapfusion.smoother.robust import informative
-from mapfusion.smoother.settle import Problem, Settled, factored, solved
+from mapfusion.smoother.optimizer import Problem, Settled, factored, solved
+from mapfusion.smoother.robust_loss import informative
+from mapfusion.smoother.schur_complement import along_way, moved_points, without_offsets
 
 # Draws. The square of one normal error is the worst case: its mean square over so many is known to
 # a third of itself. The errors that count are of several directions, whose sum is known better.

@@ -6,9 +6,8 @@ from typing import Annotated
 import cv2
 import numpy as np
 
-from mapfusion.arguments import Range, require_in_range
-from mapfusion.kernels import kernel
-from mapfusion.se2 import Float
+from mapfusion.geometry.numerics import Float, kernel
+from mapfusion.parameters import Range, require_in_range
 
 _SOBEL_APERTURE_PX = 3
 _SOBEL_GAIN = 2.0  # OpenCV divides its Sobel sum, 8 times the slope per pixel, by 4

@@ -7,15 +7,13 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from mapfusion.kernels import kernel
-from mapfusion.se2 import Float
-from sim.raycast.levels import Way, fill, row_depth_m, texels, ways
-from sim.raycast.plan import NONE, Pinhole, Plan, anywhere, look
-from sim.raycast.robots import cast, draw
+from mapfusion.geometry.numerics import Float, kernel
+from sim.raycast.floor_and_ceiling import Way, fill, row_depth_m, texels, ways
+from sim.raycast.robots import Body, by_distance, cast, draw, is_hidden, place, within_view
 from sim.raycast.scene import Level, Scene, Walls
 from sim.raycast.solids import Solids
+from sim.raycast.visible_walls import NONE, Pinhole, Plan, anywhere, look
 from sim.raycast.wall_columns import draw_walls
-from sim.raycast.windows import Body, by_distance, is_hidden, place, within_view
 
 
 class Sight(NamedTuple):

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 
 from mapfusion.errors import DamagedFileError, InputError
-from mapfusion.se2 import Float
-from mapfusion.sealed import read_sealed
+from mapfusion.files import read_sealed
+from mapfusion.geometry.numerics import Float
 from sim.world import CORNERS, face_files, read_corners
 
 REFUSED = "render.renderer: raycast cannot draw {what}; renderer: tiny can"

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull
 
-from mapfusion.se2 import Float
+from mapfusion.geometry.numerics import Float
 
 MARGIN_M = 0.001  # by which PyBullet shows cylinders too large
 

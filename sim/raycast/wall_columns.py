@@ -10,10 +10,9 @@ its arrays by themselves: to hold on to them while it calls others would take as
 
 import numpy as np
 
-from mapfusion.kernels import kernel, kernel_part
-from mapfusion.se2 import Float
-from sim.raycast.plan import NONE, Pinhole, Plan
+from mapfusion.geometry.numerics import Float, kernel, kernel_part
 from sim.raycast.scene import Walls
+from sim.raycast.visible_walls import NONE, Pinhole, Plan
 
 # A wall's level lines cross a column at a slope, which cuts a footprint's corners. A strip is cut
 # into so many that lines cross each by no more than this: of cuts twice as fine the picture differs

@@ -16,16 +16,15 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.judge.smoothed_robots import path_rmse_m
-from experiments.judge.truth import PathTruth
+from experiments.evaluation.smoothed_robots import path_rmse_m
+from experiments.evaluation.truth import PathTruth
 from experiments.methods.threads import single_threaded
-from experiments.run.pipeline import smoother_parameters
-from experiments.run.stages.smooth import log_until
+from experiments.pipeline.pipeline import smoother_parameters
+from experiments.pipeline.stages.smooth import log_until
 from experiments.scenario.loading import load_scenario
 from mapfusion.attitude import read_attitude
-from mapfusion.fastslam.run import run_log
-from mapfusion.odometry_covariance import read_odometry_covariance
-from mapfusion.robot_log import read_log, read_truth
+from mapfusion.fastslam.mapping import run_log
+from mapfusion.robot_log import read_log, read_odometry_covariance, read_truth
 from mapfusion.smoother.smooth import smooth
 
 REPOSITORY = Path(__file__).parents[2]

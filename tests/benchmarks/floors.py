@@ -14,10 +14,10 @@ import cv2
 import numpy as np
 from numba import njit
 
-from mapfusion.camera import StereoCamera
-from mapfusion.se2 import Float
+from mapfusion.geometry.camera import StereoCamera
+from mapfusion.geometry.numerics import Float
 from mapfusion.vision.harris import HarrisParameters
-from mapfusion.vision.usurf import LENGTH
+from mapfusion.vision.surf import LENGTH
 from sim.p3at import P3at
 from sim.world import PHYSICS_HZ, World
 

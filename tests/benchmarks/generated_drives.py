@@ -23,12 +23,12 @@ from typing import cast
 from unittest.mock import patch
 
 from experiments.methods.threads import single_threaded
-from experiments.run.pipeline import lay_out
-from experiments.run.stages import drive
+from experiments.pipeline.pipeline import lay_out
+from experiments.pipeline.stages import drive
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.seeds import parse_seeds
 from mapfusion.errors import InputError
-from sim.right_of_way import hold_for
+from sim.routes import hold_for
 from tests.benchmarks.generated_runs import REPOSITORY, generated_scenarios
 from tests.helpers.wheels_alone import wheels_alone
 

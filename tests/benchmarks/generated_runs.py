@@ -33,8 +33,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import NoReturn
 
-from experiments.judge.tables import ALL
-from experiments.scenario.yaml_input import read_mapping
+from experiments.evaluation.tables import ALL
+from experiments.scenario.yaml_files import read_mapping
 
 REPOSITORY = Path(__file__).parents[2]
 # The suite's references use seeds below 1000, as do the tests.

@@ -15,12 +15,11 @@ import time
 import numpy as np
 
 from mapfusion.fastslam.association import Association
-from mapfusion.fastslam.filter import FastSlam
+from mapfusion.fastslam.filter import FastSlam, FastSlamParameters
+from mapfusion.fastslam.mapping import run_log
 from mapfusion.fastslam.motion import MotionNoise
-from mapfusion.fastslam.parameters import FastSlamParameters
-from mapfusion.fastslam.run import run_log
+from mapfusion.geometry.se2 import compose, inverse, transform_points
 from mapfusion.robot_log import Observations, RobotLog
-from mapfusion.se2 import compose, inverse, transform_points
 
 ROOM_M, ROOMS_A_ROW = 8.0, 16
 STEP_M, TURN_STEPS = 0.1, 10  # a quarter turn takes so many frames

@@ -16,13 +16,14 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.judge.map_consistency import COVERED, fitted, relative_consistency
+from experiments.evaluation.map_consistency import COVERED, fitted, relative_consistency
 from experiments.scenario.loading import load_scenario
-from mapfusion.align.rigid import fit_rigid
-from mapfusion.fastslam.run import build_map
+from mapfusion.align.rigid_motion import fit_rigid
+from mapfusion.fastslam.mapping import build_map
+from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.se2 import transform_points
 from mapfusion.landmark_map import LandmarkMap, read_map
 from mapfusion.robot_log import read_log
-from mapfusion.se2 import Float, transform_points
 
 # A batch smoother with labels and a Cauchy loss, robots 1 to 5, metres: GTSAM, not ours.
 BATCH_M = {

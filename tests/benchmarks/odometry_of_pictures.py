@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.judge.map_consistency import fitted, relative_consistency
+from experiments.evaluation.map_consistency import fitted, relative_consistency
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import Simulation
 from experiments.scenario.suite import one_scenario

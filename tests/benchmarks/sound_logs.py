@@ -13,10 +13,10 @@ import argparse
 import sys
 from pathlib import Path
 
-from experiments.judge.findings import finding_of_truth
-from experiments.judge.judging import truth_of
+from experiments.evaluation.evaluated_run import finding_of_truth
+from experiments.evaluation.pair_evaluation import truth_of
+from mapfusion.datasets.log_consistency import Finding, check_log
 from mapfusion.fastslam.motion import MotionNoise
-from mapfusion.log_consistency import Finding, check_log
 from mapfusion.robot_log import read_log
 
 

@@ -14,11 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapfusion.one_thread import one_blas_thread
-from mapfusion.se2 import Float, compose, wrap
+from mapfusion.geometry.numerics import Float, one_blas_thread
+from mapfusion.geometry.se2 import compose, wrap
 from mapfusion.smoother.elimination import memory_bytes, pose_covariances
 from mapfusion.smoother.normal_equations import information_under
-from mapfusion.smoother.settle import Problem, factored, solved
+from mapfusion.smoother.optimizer import Problem, factored, solved
 from mapfusion.smoother.smooth import Smoothed, SmootherParameters, smooth
 from tests.helpers.synthetic_drives import SHAPES, Drive, drive
 

@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 
-from mapfusion.team.team_graph import TeamParameters, Unconfirmed, team_graph
+from mapfusion.fusion.team_graph import TeamParameters, Unconfirmed, team_graph
 from tests.mapfusion.team.teams import falsely_placed, team
 
 

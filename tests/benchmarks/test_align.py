@@ -9,15 +9,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapfusion import se2
-from mapfusion.align.acceptance import Acceptance
+from mapfusion.align.aligners import ALIGNERS, make_aligner
+from mapfusion.align.alignment import Pairs
 from mapfusion.align.correspondences import Correspondences, match
-from mapfusion.align.pairs import Pairs
 from mapfusion.align.ransac import Ransac
-from mapfusion.align.refine import Refinement
-from mapfusion.align.registration import as_aligner
-from mapfusion.align.registry import ALIGNERS, make_aligner
+from mapfusion.align.refinement import Refinement
+from mapfusion.geometry import se2
 from mapfusion.landmark_map import LandmarkMap
+from mapfusion.registration import as_aligner
+from mapfusion.verification.false_alarms import Acceptance
 
 SIZE_M = np.array([20.0, 20.0, 2.5])
 NOISE_M = 0.05

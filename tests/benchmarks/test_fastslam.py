@@ -17,12 +17,11 @@ import numpy as np
 import pytest
 
 from mapfusion.fastslam.association import Association
-from mapfusion.fastslam.filter import FastSlam
+from mapfusion.fastslam.filter import FastSlam, FastSlamParameters
 from mapfusion.fastslam.motion import MotionNoise
-from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.fastslam.proposal import Proposal
+from mapfusion.geometry.se2 import compose, inverse, transform_points
 from mapfusion.robot_log import Observations
-from mapfusion.se2 import compose, inverse, transform_points
 
 SIGMA_M = 0.05
 ROAD_M = 6.0  # landmarks stand up to half of this to the left and to the right

@@ -6,29 +6,28 @@ from pathlib import Path
 from distributed import Client
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from experiments.judge import tables
-from experiments.run import dask_worker
-from experiments.run.dask_cluster import connected
-from experiments.run.frames import TEXT
-from experiments.run.tasks import Task
-from experiments.study.sweep.combinations import SweepRun
-from experiments.study.sweep.joined_tables import JoinedTables, open_dataset
-from experiments.study.sweep.sweep_dataset import SweepDataset
+from experiments.evaluation import tables
+from experiments.pipeline import cluster
+from experiments.pipeline.cluster import connected
+from experiments.pipeline.tables import TEXT
+from experiments.pipeline.tasks import Task
+from experiments.studies.sweep_combinations import SweepRun
+from experiments.studies.sweep_tables import JoinedTables, SweepDataset, open_dataset
 
 N_TASKS, N_RUNS = 200, 500
 
 
 def test_handing_out_200_tasks_that_do_nothing(benchmark: BenchmarkFixture, tmp_path: Path) -> None:
-    terms = dask_worker.Terms(tmp_path, 3, dask_worker.code_version())
+    terms = cluster.Terms(tmp_path, 3, cluster.code_version())
     with connected(1, None) as client:
         _hand_out(client, terms)  # the worker imports what it needs
         benchmark.pedantic(_hand_out, (client, terms), rounds=5)
 
 
-def _hand_out(client: Client, terms: dask_worker.Terms) -> None:
+def _hand_out(client: Client, terms: cluster.Terms) -> None:
     tasks = [Task(f"nothing/{number}", "nothing", int, (), ()) for number in range(N_TASKS)]
     futures = [
-        client.submit(dask_worker.perform, task.name, pickle.dumps(task), terms, pure=False)
+        client.submit(cluster.perform, task.name, pickle.dumps(task), terms, pure=False)
         for task in tasks
     ]
     client.gather(futures)

@@ -9,11 +9,10 @@ from pathlib import Path
 import cv2
 import pytest
 
-from mapfusion.recordings.registry import read_recording
-from mapfusion.recordings.stereo_import import StereoImport
-from mapfusion.vision import tracks
-from mapfusion.vision.frontend import FrontEnd
-from mapfusion.vision.observing import Observer
+from mapfusion.datasets.formats import read_recording
+from mapfusion.datasets.stereo_import import StereoImport
+from mapfusion.vision import tracking
+from mapfusion.vision.front_end import FrontEnd, Observer
 from tests.mapfusion.recordings.extracts import laid_out_as_kitti, needs_recordings
 
 # of the processor: others may be at work on the machine
@@ -35,8 +34,8 @@ def test_front_end(benchmark, work: StereoImport) -> None:
 
 def test_links_in_space(benchmark, work: StereoImport, monkeypatch: pytest.MonkeyPatch) -> None:
     given = []
-    links = tracks.rigid_links
-    monkeypatch.setattr(tracks, "rigid_links", lambda *own: given.append(own) or links(*own))
+    links = tracking.rigid_links
+    monkeypatch.setattr(tracking, "rigid_links", lambda *own: given.append(own) or links(*own))
     front_end, observer = FrontEnd(work.camera, work.vision), Observer.of(work.camera, work.vision)
     for k in (10, 11):
         observer.observe(front_end.extract(*work.rectified(k)))

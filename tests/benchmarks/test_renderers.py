@@ -17,17 +17,17 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 from scipy.ndimage import map_coordinates
 
-from experiments.run.stages.walls import Walls
+from experiments.pipeline.stages.walls import Walls
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import Simulation
-from mapfusion.camera import StereoCamera
 from mapfusion.errors import InputError
-from mapfusion.se2 import compose
-from mapfusion.vision.frontend import FrontEnd, FrontEndParameters, observable
-from mapfusion.vision.tracks import Tracker
-from sim.radiometry import RadiometricNoise
+from mapfusion.geometry.camera import StereoCamera
+from mapfusion.geometry.se2 import compose
+from mapfusion.vision.front_end import FrontEnd, FrontEndParameters, observable
+from mapfusion.vision.tracking import Tracker
 from sim.recorder import FrameSource
 from sim.renderer import Renderer
+from sim.stereo_head import RadiometricNoise
 from sim.world import write_faces
 
 CAMERA = StereoCamera()

@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from mapfusion.camera import StereoCamera
+from mapfusion.geometry.camera import StereoCamera
 from sim.driver import DriverSettings, drive
-from sim.exposure import expose
 from sim.floorplan import FloorPlan, Wall
-from sim.radiometry import RadiometricNoise
 from sim.recorder import FrameSource
-from sim.route import Route
+from sim.routes import Route
+from sim.stereo_head import RadiometricNoise, expose
 from sim.world import write_faces
 
 

@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mapfusion.align.alignment import Pairs
 from mapfusion.align.correspondences import match
 from mapfusion.align.oracle import Oracle
-from mapfusion.align.pairs import Pairs
-from mapfusion.evidence.judge import Judge
+from mapfusion.verification.verdict import Judge
 from tests.mapfusion.evidence.two_rooms import Wall, mapped
 
 PER_M = 40  # landmarks along a wall, as in rooms

@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 import pytest
 
-from mapfusion.camera import StereoCamera
-from mapfusion.vision.frontend import FrontEnd
+from mapfusion.geometry.camera import StereoCamera
+from mapfusion.vision.front_end import FrontEnd
 from mapfusion.vision.harris import HarrisParameters, detect
 from mapfusion.vision.stereo import StereoParameters, match
-from mapfusion.vision.tracks import TrackParameters, link
-from mapfusion.vision.usurf import describe
+from mapfusion.vision.surf import describe
+from mapfusion.vision.tracking import TrackParameters, link
 
 KEYPOINTS = 1000
 CAMERA = StereoCamera()

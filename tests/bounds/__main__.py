@@ -3,7 +3,7 @@
 import importlib
 import sys
 
-from experiments.run.code_version import SOURCE_ROOT
+from experiments.pipeline.code_version import SOURCE_ROOT
 from tests.bounds.interpreted import interpret_kernels
 
 
@@ -11,7 +11,7 @@ def main() -> int:
     calls = interpret_kernels()
     for package in ("mapfusion", "experiments", "sim"):
         for path in sorted((SOURCE_ROOT / package).rglob("*.py")):
-            if "from mapfusion.kernels" in path.read_text(encoding="utf-8"):
+            if "from mapfusion.geometry.numerics" in path.read_text(encoding="utf-8"):
                 of_root = path.relative_to(SOURCE_ROOT).with_suffix("")
                 importlib.import_module(".".join(of_root.parts))
     importlib.import_module("tests.bounds.all_kernels").call_all()

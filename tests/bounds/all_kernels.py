@@ -7,23 +7,21 @@ from pathlib import Path
 
 import numpy as np
 
+from mapfusion.align.aligners import ALIGNERS, make_aligner
+from mapfusion.align.clique import everyone, larger_clique
 from mapfusion.align.correspondences import match
-from mapfusion.align.max_clique import everyone, larger_clique
-from mapfusion.align.registration import Registration
-from mapfusion.align.registry import ALIGNERS, make_aligner
-from mapfusion.camera import StereoCamera
-from mapfusion.se3 import in_space
-from mapfusion.smoother.smoothed_map import condensed_points
-from mapfusion.vision.frontend import FrontEnd, FrontEndParameters
+from mapfusion.geometry.camera import StereoCamera
+from mapfusion.geometry.se3 import in_space
+from mapfusion.registration import Registration
+from mapfusion.smoother.smooth import condensed_points
+from mapfusion.vision.disparity_tests import window_sums
+from mapfusion.vision.front_end import FrontEnd, FrontEndParameters
 from mapfusion.vision.harris import HarrisParameters
-from mapfusion.vision.noise_model import measured_noise
-from mapfusion.vision.tracks import Tracker, TrackParameters
-from mapfusion.vision.window_sums import window_sums
-from sim.depth_image import depth_at
-from sim.exposure import expose
+from mapfusion.vision.stereo_noise import measured_noise
+from mapfusion.vision.tracking import Tracker, TrackParameters
 from sim.floorplan import FloorPlan, Wall
-from sim.radiometry import RadiometricNoise
 from sim.raycast.caster import RayCaster
+from sim.stereo_head import RadiometricNoise, depth_at, expose
 from sim.world import write_faces
 from tests.experiments.study.refusal.test_refusal import (
     test_calibration_counts_every_motion_of_two_pairs,

@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from mapfusion.errors import InputError, UnsealedWarning
-from mapfusion.sealed import LINE, NO_DIGEST, SEAL, parquet_with_seal, seal
+from mapfusion.files import LINE, NO_DIGEST, SEAL, parquet_with_seal, seal
 from tests.campaign.doors import Door, doors, doors_of_others
 from tests.campaign.parts import Found
 

@@ -9,16 +9,16 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from experiments.judge import tables
-from experiments.judge.result_files import read_provenance
-from experiments.run.store import StageFolder
-from experiments.show.figures.result_tables import ResultTables
-from experiments.study.statistics.run_tables import find_runs
-from experiments.study.sweep.combinations import SweepRun
-from experiments.study.sweep.joined_tables import JoinedTables, open_dataset
-from experiments.study.sweep.sweep_dataset import SweepDataset
+from experiments.evaluation import tables
+from experiments.evaluation.result_files import read_provenance
+from experiments.pipeline.store import StageFolder
+from experiments.reports.figures.result_tables import ResultTables
+from experiments.studies.run_tables import find_runs
+from experiments.studies.sweep_combinations import SweepRun
+from experiments.studies.sweep_tables import JoinedTables, SweepDataset, open_dataset
+from mapfusion.datasets.mrclam import MrclamSettings, import_mrclam
+from mapfusion.files import read_sealed, write_json
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map
-from mapfusion.recordings.mrclam import MrclamSettings, import_mrclam
 from mapfusion.robot_log import (
     Observations,
     RobotLog,
@@ -28,8 +28,6 @@ from mapfusion.robot_log import (
     write_truth_points,
     write_truth_poses,
 )
-from mapfusion.sealed import read_sealed
-from mapfusion.storage import write_json
 from sim.floorplan import FloorPlan, Wall
 from sim.trajectory import Trajectory, read_trajectory, write_trajectory
 from sim.world import CORNERS, face_files, read_corners, write_faces

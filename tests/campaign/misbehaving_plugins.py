@@ -10,11 +10,9 @@ from typing import Any
 import numpy as np
 
 from experiments.methods.aligner_calls import callable_aligner, end_children, require_usable
-from experiments.run.estimates import estimate_row
-from experiments.run.frames import read_rows, write_rows
-from experiments.run.stage_tables import ESTIMATES
-from mapfusion.align.registration import Registration
-from mapfusion.align.result import Status
+from experiments.pipeline.tables import ESTIMATES, estimate_row, read_rows, write_rows
+from mapfusion.align.alignment import Status
+from mapfusion.registration import Registration
 from tests.campaign import misbehaviours as kinds
 from tests.campaign.parts import Found
 from tests.helpers.made_up_maps import landmark_map, paired

@@ -6,7 +6,7 @@ import stat, struct, sys, threading, time
 from dataclasses import dataclass, replace
 import numpy as np
 from mapfusion.align.method import Fit, Undetermined
-from mapfusion.align.result import Alignment, Status, degenerate
+from mapfusion.align.alignment import Alignment, Status, degenerate
 
 T, COVARIANCE = np.array([1.0, 2.0, 0.5]), np.diag([1.0, 4.0, 0.01])
 

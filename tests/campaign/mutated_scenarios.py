@@ -18,10 +18,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.judge.expectations import load_checked
+from experiments.evaluation.checks import load_checked
+from experiments.reports.figures import drawing
 from experiments.scenario.settings import AnyScenario, Simulation
-from experiments.scenario.yaml_input import read_mapping
-from experiments.show.figures import drawing
+from experiments.scenario.yaml_files import read_mapping
 from mapfusion.errors import MOST_CHARACTERS, InputError
 from tests.campaign.parts import Found
 from tests.helpers.tiny_scenario import SHORT
@@ -180,7 +180,7 @@ def run_fault(path: Path, results: Path, figures: Sequence[str]) -> str:
 # What takes longest in a tiny run is to import all and to draw all. So each run is in a process
 # of its own that has all imported, as nothing else has used it yet; and draws some figures, by lot.
 _FRESH = multiprocessing.get_context("forkserver")
-_FRESH.set_forkserver_preload(["tests.campaign.mutated_scenarios", "experiments.judge.result"])
+_FRESH.set_forkserver_preload(["tests.campaign.mutated_scenarios", "experiments.evaluation.result"])
 _FIGURES_A_RUN = 2
 
 

@@ -14,11 +14,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 from experiments.cli.main import app
-from experiments.judge import tables
-from experiments.show.exported import export_result
-from experiments.show.report.contents import contents_of
-from experiments.study.compare.versions import compare
-from experiments.study.statistics.run_tables import find_runs
+from experiments.evaluation import tables
+from experiments.reports.report.contents import contents_of
+from experiments.reports.result_export import export_result
+from experiments.studies.comparison import compare
+from experiments.studies.run_tables import find_runs
 from mapfusion.errors import InputError
 from tests.campaign.parts import Found
 

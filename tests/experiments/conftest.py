@@ -7,14 +7,14 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from experiments.judge.judged_run import JudgedRun
-from experiments.judge.result import run_scenario
+from experiments.evaluation.evaluated_run import JudgedRun
+from experiments.evaluation.result import run_scenario
 from experiments.methods.threads import single_threaded
-from experiments.run import workers
-from experiments.run.store import Store
+from experiments.pipeline import workers
+from experiments.pipeline.store import Store
+from experiments.reports.figures import drawing
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import Scenario, Simulation
-from experiments.show.figures import drawing
 from tests.helpers.shared_folder import shared_folder
 from tests.helpers.tiny_scenario import TINY, TRIO
 

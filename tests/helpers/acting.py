@@ -4,9 +4,9 @@ import os
 import signal
 from pathlib import Path
 
-from mapfusion import sealed
+from mapfusion import files
 from mapfusion.errors import InputError
-from mapfusion.storage import write_sealed
+from mapfusion.files import write_sealed
 from tests.helpers.waiting import wait_until
 
 
@@ -58,8 +58,8 @@ def wait_for(path: Path, output: Path) -> None:
 
 
 def write_with_seal(path: Path) -> None:
-    write_sealed(path, sealed.LINE + b"made")
+    write_sealed(path, files.LINE + b"made")
 
 
 def read_with_seal(path: Path, output: Path) -> None:
-    write(output, sealed.read_sealed(path, "test").decode())
+    write(output, files.read_sealed(path, "test").decode())

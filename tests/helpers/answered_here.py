@@ -9,8 +9,8 @@ import numpy as np
 
 from experiments.methods.answers import read
 from experiments.methods.isolated_child import _Served
+from mapfusion.align.alignment import Alignment
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.result import Alignment
 from mapfusion.landmark_map import LandmarkMap
 
 

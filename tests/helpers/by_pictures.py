@@ -5,20 +5,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from experiments.judge.judged_run import JudgedRun
-from experiments.judge.written_drives import write_drives
-from experiments.run.store import Store
+from experiments.evaluation.dataset_export import write_drives
+from experiments.evaluation.evaluated_run import JudgedRun
+from experiments.pipeline.store import Store
 from experiments.scenario.settings import Simulation
-from experiments.scenario.yaml_input import read_calibration
-from mapfusion.calibration_error import EXACT
-from mapfusion.fastslam.run import run_log
+from experiments.scenario.yaml_files import read_calibration
+from mapfusion.datasets.formats import read_recording
+from mapfusion.datasets.stereo_import import Cut, StereoImport
+from mapfusion.fastslam.mapping import run_log
+from mapfusion.geometry.camera import EXACT
+from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.recordings.registry import read_recording
-from mapfusion.recordings.stereo_import import Cut, StereoImport
 from mapfusion.robot_log import read_truth
-from mapfusion.se2 import Float
-from mapfusion.smoother.smooth import SmootherParameters, smooth
-from mapfusion.smoother.smoothed_map import smoothed_map
+from mapfusion.smoother.smooth import SmootherParameters, smooth, smoothed_map
 
 
 class Mapped(NamedTuple):

@@ -6,7 +6,7 @@ from typing import Any
 
 from numba import njit
 
-from mapfusion.kernels import source_of
+from mapfusion.geometry.numerics import source_of
 
 
 @cache

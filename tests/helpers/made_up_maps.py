@@ -3,15 +3,15 @@
 import numpy as np
 import pandas as pd
 
-from experiments.judge.errors import EvaluatedRobot
-from experiments.judge.truth import PathTruth
-from experiments.run.stage_tables import RIVALS
-from mapfusion import se2
-from mapfusion.align.acceptance import Verdict
+from experiments.evaluation.alignment_errors import EvaluatedRobot
+from experiments.evaluation.truth import PathTruth
+from experiments.pipeline.tables import RIVALS
+from mapfusion.align.alignment import Status
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.result import Status
+from mapfusion.geometry import se2
+from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.se2 import Float
+from mapfusion.verification.false_alarms import Verdict
 
 ITERATION = 7
 ACCEPTED = Verdict(Status.ACCEPTED, -50.0)

@@ -8,7 +8,7 @@ MODULE = """
 import ctypes, os, signal, sys, time
 import numpy as np
 from dataclasses import replace
-from mapfusion.align.result import Alignment, Status, degenerate
+from mapfusion.align.alignment import Alignment, Status, degenerate
 
 GOOD_T, GOOD_COVARIANCE = np.array([1.0, 2.0, 0.5]), np.diag([1.0, 4.0, 0.01])
 

@@ -9,8 +9,8 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from experiments.judge import tables
-from experiments.judge.judged_maps import ERROR_COLUMNS
+from experiments.evaluation import tables
+from experiments.evaluation.alignment_summary import ERROR_COLUMNS
 
 Tables = dict[str, pd.DataFrame]
 ITERATIONS = (25, 50, 75, 100)

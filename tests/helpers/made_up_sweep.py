@@ -7,8 +7,8 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
-from experiments.judge import tables
-from mapfusion.storage import schema, write_table
+from experiments.evaluation import tables
+from mapfusion.files import schema, write_table
 
 KEY = "slam.filter.n_particles"
 _RUN = ("run_id", "scenario", "seed", KEY)

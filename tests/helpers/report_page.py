@@ -4,9 +4,9 @@ import json
 from html.parser import HTMLParser
 from pathlib import Path
 
-from experiments.judge import tables
-from experiments.show.report.document import write_report
-from mapfusion.storage import read_json, write_json
+from experiments.evaluation import tables
+from experiments.reports.report.document import write_report
+from mapfusion.files import read_json, write_json
 
 HOSTILE = '<img src=x onerror=alert(1)></script><script>alert("2")</script>'
 

@@ -6,8 +6,9 @@ from typing import NamedTuple
 import numpy as np
 
 from mapfusion.fastslam.motion import MotionNoise
+from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.se2 import compose, rotation
 from mapfusion.robot_log import Observations, RobotLog
-from mapfusion.se2 import Float, compose, rotation
 
 STATED = MotionNoise()
 STEP_M = 0.1

@@ -8,8 +8,8 @@ import pandas as pd
 import pytest
 
 from experiments.cli import main as cli
-from experiments.judge import tables
-from mapfusion.storage import read_json, write_json
+from experiments.evaluation import tables
+from mapfusion.files import read_json, write_json
 
 TINY = """
 schema_version: 1

@@ -12,7 +12,7 @@ from unittest.mock import patch
 
 import numpy as np
 
-from mapfusion.se2 import Float
+from mapfusion.geometry.numerics import Float
 from sim.p3at import SKID_TRACK_M, WHEEL_RADIUS_M, WIDTH_M, Pose
 from sim.world import PHYSICS_HZ
 
@@ -75,7 +75,7 @@ class _Robot:
 
 
 class _NoWalls:
-    """Stands in for `sim.solid_walls.SolidWalls`."""
+    """Stands in for `sim.driver.SolidWalls`."""
 
     def __init__(self, *_: object) -> None:
         pass

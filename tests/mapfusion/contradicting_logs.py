@@ -4,9 +4,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from mapfusion.log_consistency import chained
+from mapfusion.datasets.log_consistency import chained
+from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.se2 import between, inverse, rotation
 from mapfusion.robot_log import Observations, RobotLog
-from mapfusion.se2 import Float, between, inverse, rotation
 
 STEP = np.array([0.1, 0.0, 0.05])
 SIGMA_M = 0.05

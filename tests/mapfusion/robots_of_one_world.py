@@ -2,15 +2,14 @@
 
 import numpy as np
 
-from mapfusion import se2
+from mapfusion.align.alignment import Alignment, Status
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.result import Alignment, Status
-from mapfusion.aligned_landmarks import ABSENT
-from mapfusion.fuse.kalman_drift import KalmanDrift
-from mapfusion.fuse.parameters import MergeParameters
-from mapfusion.fused_map import AlignedPair
+from mapfusion.fusion.aligned_landmarks import ABSENT
+from mapfusion.fusion.fused_map import AlignedPair, MergeParameters
+from mapfusion.fusion.kalman import KalmanDrift
+from mapfusion.fusion.merge import merge
+from mapfusion.geometry import se2
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.merge import merge
 from tests.mapfusion.align.map_pairs import covariances
 
 DRIFT_M = 0.05

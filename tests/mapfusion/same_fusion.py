@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from mapfusion import se2
-from mapfusion.aligned_landmarks import ABSENT
-from mapfusion.se2 import transform_points
+from mapfusion.fusion.aligned_landmarks import ABSENT
+from mapfusion.geometry import se2
+from mapfusion.geometry.se2 import transform_points
 
 
 def clusters(fused, order):

@@ -7,8 +7,8 @@ from typing import Annotated
 import numpy as np
 import pytest
 
-from mapfusion.arguments import Range, require_in_range, require_no_twins
 from mapfusion.errors import MOST_CHARACTERS, InputError, OutOfRangeError, did_you_mean, one_line
+from mapfusion.parameters import Range, require_in_range, require_no_twins
 
 Side = Annotated[float, Range(1, 5, "m")]
 

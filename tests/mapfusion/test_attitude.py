@@ -7,9 +7,9 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mapfusion import se3
 from mapfusion.attitude import FILE, Attitude, levelled, moved, read_attitude, write_attitude
 from mapfusion.errors import InputError
+from mapfusion.geometry import se3
 from mapfusion.robot_log import Observations
 
 

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from mapfusion import se2
-from mapfusion.attitude import Attitude
-from mapfusion.attitude_drift import shared_heights
+from mapfusion.attitude import Attitude, shared_heights
+from mapfusion.geometry import se2
 
 N_FRAMES, N_LANDMARKS = 40, 5
 FIRST, STEP = np.array([0.01, 0.0]), np.array([2e-4, 1e-3])  # sigma of tilts (rad), heights (m)

@@ -7,10 +7,15 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from mapfusion import se2
-from mapfusion.calibration_error import EXACT, CalibrationError, calibration_from, usual_calibration
-from mapfusion.camera import StereoCamera
 from mapfusion.errors import InputError
+from mapfusion.geometry import se2
+from mapfusion.geometry.camera import (
+    EXACT,
+    CalibrationError,
+    StereoCamera,
+    calibration_from,
+    usual_calibration,
+)
 from mapfusion.landmark_map import read_map, write_map
 from mapfusion.robot_log import Observations, RobotLog, read_log, write_log
 from tests.mapfusion.align.map_pairs import landmarks

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from mapfusion.camera import StereoCamera
+from mapfusion.geometry.camera import StereoCamera
 
 CAMERA = StereoCamera()
 in_view = st.lists(

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from mapfusion.chi_square import chi_square_bound
+from mapfusion.geometry.numerics import chi_square_bound
 
 
 def test_two_degrees_of_freedom_have_a_closed_form() -> None:

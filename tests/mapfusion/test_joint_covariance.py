@@ -3,8 +3,13 @@
 import numpy as np
 import pytest
 
-from mapfusion import joint_covariance
-from mapfusion.joint_covariance import JointCovariance, KnownErrors, StackedErrors, condensed
+from mapfusion.geometry import joint_covariance
+from mapfusion.geometry.joint_covariance import (
+    JointCovariance,
+    KnownErrors,
+    StackedErrors,
+    condensed,
+)
 
 
 def _parts(

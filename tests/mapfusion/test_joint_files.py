@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from mapfusion.errors import InputError
-from mapfusion.joint_covariance import JointCovariance
-from mapfusion.joint_files import joint_path
-from mapfusion.landmark_map import LandmarkMap, read_map, write_map
+from mapfusion.geometry.joint_covariance import JointCovariance
+from mapfusion.landmark_map import LandmarkMap, joint_path, read_map, write_map
 
 
 def joint_map(n: int = 5, rank: int = 4, seed: int = 0) -> LandmarkMap:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import mapfusion
-from mapfusion.se2 import between, wrap
+from mapfusion.geometry.se2 import between, wrap
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "experiments" / "docs" / "library.md"

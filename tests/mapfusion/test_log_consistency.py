@@ -5,12 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapfusion.align.rigid import fit_rigid
-from mapfusion.fastslam.association import Association
-from mapfusion.fastslam.motion import MotionNoise
-from mapfusion.fastslam.parameters import FastSlamParameters
-from mapfusion.fastslam.run import Frame, run_log
-from mapfusion.log_consistency import (
+from mapfusion.align.rigid_motion import fit_rigid
+from mapfusion.datasets.log_consistency import (
     Stated,
     agreement,
     chained,
@@ -25,10 +21,14 @@ from mapfusion.log_consistency import (
     truth_finding,
     without_jumps,
 )
-from mapfusion.log_part import first_frames
-from mapfusion.robot_log import Observations, RobotLog
-from mapfusion.se2 import Float, between, compose, inverse, rotation, transform_points, wrap
-from mapfusion.se3 import from_planar, from_quaternions
+from mapfusion.fastslam.association import Association
+from mapfusion.fastslam.filter import FastSlamParameters
+from mapfusion.fastslam.mapping import Frame, run_log
+from mapfusion.fastslam.motion import MotionNoise
+from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.se2 import between, compose, inverse, rotation, transform_points, wrap
+from mapfusion.geometry.se3 import from_planar, from_quaternions
+from mapfusion.robot_log import Observations, RobotLog, first_frames
 from mapfusion.smoother.smooth import SmootherParameters, smooth
 from tests.mapfusion.contradicting_logs import (
     JUMPS,

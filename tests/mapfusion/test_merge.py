@@ -4,16 +4,13 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from mapfusion import se2
+from mapfusion.align.alignment import degenerate
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.result import degenerate
-from mapfusion.aligned_landmarks import ABSENT
-from mapfusion.fuse.kalman import Kalman
-from mapfusion.fuse.kalman_drift import KalmanDrift
-from mapfusion.fuse.parameters import MergeParameters
-from mapfusion.fused_map import AlignedPair
-from mapfusion.merge import merge
-from mapfusion.same_point import one_to_one
+from mapfusion.fusion.aligned_landmarks import ABSENT, one_to_one
+from mapfusion.fusion.fused_map import AlignedPair, MergeParameters
+from mapfusion.fusion.kalman import Kalman, KalmanDrift
+from mapfusion.fusion.merge import merge
+from mapfusion.geometry import se2
 from tests.mapfusion.robots_of_one_world import DRIFT_M, Robots
 
 

@@ -6,13 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapfusion import se2
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.fuse.parameters import MergeParameters
-from mapfusion.fuse.registry import FUSERS, make_fuser
-from mapfusion.fused_map import AlignedPair
-from mapfusion.merge import merge
-from mapfusion.team.team_graph import TeamParameters, Unconfirmed
+from mapfusion.fusion.fused_map import AlignedPair, MergeParameters
+from mapfusion.fusion.fusers import FUSERS, make_fuser
+from mapfusion.fusion.merge import merge
+from mapfusion.fusion.team_graph import TeamParameters, Unconfirmed
+from mapfusion.geometry import se2
 from tests.mapfusion.robots_of_one_world import Robots
 from tests.mapfusion.same_fusion import assert_same_map, assert_same_points, clusters
 

@@ -4,13 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapfusion import se2
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.fuse.kalman_drift import KalmanDrift
-from mapfusion.fuse.parameters import MergeParameters
-from mapfusion.fused_map import AlignedPair
-from mapfusion.merge import merge
-from mapfusion.team.team_graph import Place, TeamParameters, Unconfirmed
+from mapfusion.fusion.fused_map import AlignedPair, MergeParameters
+from mapfusion.fusion.kalman import KalmanDrift
+from mapfusion.fusion.merge import merge
+from mapfusion.fusion.team_graph import Place, TeamParameters, Unconfirmed
+from mapfusion.geometry import se2
 from tests.mapfusion.robots_of_one_world import Robots
 
 

@@ -6,11 +6,7 @@ import numpy as np
 import pytest
 
 from mapfusion.errors import InputError
-from mapfusion.odometry_covariance import (
-    FILE,
-    read_odometry_covariance,
-    write_odometry_covariance,
-)
+from mapfusion.robot_log import FILE, read_odometry_covariance, write_odometry_covariance
 
 
 def test_what_is_written_is_read(tmp_path: Path) -> None:

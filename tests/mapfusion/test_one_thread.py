@@ -7,10 +7,10 @@ import pytest
 import scipy.linalg  # noqa: F401  brings a BLAS of its own
 from threadpoolctl import threadpool_info, threadpool_limits
 
-import mapfusion.fuse.joint
+import mapfusion.fusion.joint
 import mapfusion.smoother.smooth
-from mapfusion.fuse.parameters import MergeParameters
-from mapfusion.one_thread import one_blas_thread
+from mapfusion.fusion.fused_map import MergeParameters
+from mapfusion.geometry.numerics import one_blas_thread
 
 
 def blas_threads() -> list[int]:
@@ -43,8 +43,8 @@ def test_smoothing_runs_on_one_thread(monkeypatch):
 
 
 def test_joint_fusion_runs_on_one_thread(monkeypatch):
-    monkeypatch.setattr(mapfusion.fuse.joint, "_inliers", reached)
+    monkeypatch.setattr(mapfusion.fusion.joint, "_inliers", reached)
     component: Any = SimpleNamespace(planar=False, drift_sigma_m=[], members=[], maps=[])
     with threadpool_limits(2, user_api="blas"), pytest.raises(ReachedError) as found:
-        mapfusion.fuse.joint.JointFuser().fuse(component, MergeParameters())
+        mapfusion.fusion.joint.JointFuser().fuse(component, MergeParameters())
     assert set(found.value.args[0]) == {1}

@@ -5,10 +5,9 @@ import pytest
 from scipy.stats import chi2
 
 from mapfusion.align.correspondences import HeightGate
-from mapfusion.aligned_landmarks import ABSENT, AlignedLandmarks
-from mapfusion.fuse.kalman import kalman_fused
-from mapfusion.looks import NO_LABEL
-from mapfusion.same_point import SamePoint
+from mapfusion.fusion.aligned_landmarks import ABSENT, AlignedLandmarks, SamePoint
+from mapfusion.fusion.kalman import kalman_fused
+from mapfusion.tables import NO_LABEL
 
 
 def drawn(seed: int, n: int, n_labels: int) -> AlignedLandmarks:

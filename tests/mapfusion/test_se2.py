@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from mapfusion import se2
+from mapfusion.geometry import se2
 
 metres = st.floats(-100, 100)
 # whole turns and their neighbourhood included

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mapfusion import se2, se3
+from mapfusion.geometry import se2, se3
 
 
 def test_motions_of_the_plane_are_those_of_space() -> None:

@@ -10,9 +10,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from mapfusion import sealed
+from mapfusion import files
 from mapfusion.errors import DamagedFileError, UnsealedWarning
-from mapfusion.storage import (
+from mapfusion.files import (
     float_fields,
     read_json,
     read_parquet,
@@ -52,8 +52,8 @@ def test_every_bit_of_a_table_is_guarded(table):
 
 def test_the_digest_is_that_of_the_file_with_zeros_in_its_place(table):
     data = table.read_bytes()
-    assert data.count(sealed.SEAL.encode()) == 1
-    at = data.index(sealed.SEAL.encode()) + len(sealed.SEAL) + 1
+    assert data.count(files.SEAL.encode()) == 1
+    at = data.index(files.SEAL.encode()) + len(files.SEAL) + 1
     empty = data[:at] + b"0" * 64 + data[at + 64 :]
     assert hashlib.sha256(empty).hexdigest().encode() == data[at : at + 64]
 
@@ -83,9 +83,9 @@ def test_without_a_digest_the_checksums_of_pages_tell_of_damage(table, tmp_path)
 
 def test_what_only_looks_like_a_seal_does_no_harm(tmp_path):
     path = tmp_path / "x.json"
-    text = f'{sealed.SEAL}": "{"5" * 64}'
-    write_json(path, {"text": text, sealed.SEAL + " ": "6" * 64})
-    assert read_json(path, "test") == {"text": text, sealed.SEAL + " ": "6" * 64}
+    text = f'{files.SEAL}": "{"5" * 64}'
+    write_json(path, {"text": text, files.SEAL + " ": "6" * 64})
+    assert read_json(path, "test") == {"text": text, files.SEAL + " ": "6" * 64}
     path.write_bytes(path.read_bytes().replace(b"555", b"565", 1))
     with pytest.raises(DamagedFileError):
         read_json(path, "test")
@@ -100,7 +100,7 @@ def test_json_that_is_no_object(text, tmp_path):
 
 
 def test_without_a_digest_it_is_said_once(tmp_path, monkeypatch):
-    monkeypatch.setattr(sealed, "_told", [])
+    monkeypatch.setattr(files, "_told", [])
     for name in ("a.parquet", "b.parquet"):
         pd.DataFrame({"x_m": [1.0]}).to_parquet(tmp_path / name)
     with pytest.warns(UnsealedWarning, match=r"a\.parquet: carries no digest"):
@@ -109,15 +109,15 @@ def test_without_a_digest_it_is_said_once(tmp_path, monkeypatch):
         warnings.simplefilter("error")
         assert read_parquet(tmp_path / "b.parquet", "table").num_rows == 1
     with pytest.raises(DamagedFileError):  # of a kind that no other program writes
-        sealed.read_sealed(tmp_path / "a.parquet", "table", only_ours=True)
+        files.read_sealed(tmp_path / "a.parquet", "table", only_ours=True)
 
 
 def test_a_damaged_file_is_known_in_other_processes(tmp_path):
     path = tmp_path / "x.txt"
-    write_sealed(path, sealed.LINE + b"text")
+    write_sealed(path, files.LINE + b"text")
     path.write_bytes(path.read_bytes()[:-1])
     with pytest.raises(DamagedFileError) as raised:
-        sealed.read_sealed(path, "text")
+        files.read_sealed(path, "text")
     error = pickle.loads(pickle.dumps(raised.value))
     assert (error.path, str(error)) == (path, str(raised.value))
     assert "damaged" in str(error)

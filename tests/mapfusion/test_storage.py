@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from mapfusion.errors import DamagedFileError, InputError
-from mapfusion.storage import (
+from mapfusion.files import (
     column,
     point_columns,
     point_fields,
@@ -134,7 +134,7 @@ def test_a_full_disk_is_told_with_the_name_of_the_file(tmp_path):
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from mapfusion.storage import write_whole
+from mapfusion.files import write_whole
 write_whole(Path(sys.argv[1]), lambda temporary: os.kill(os.getpid(), signal.SIGKILL))
 """
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mapfusion.symmetric import cholesky, cofactors, solve_lower, solve_upper
+from mapfusion.geometry.numerics import cholesky, cofactors, solve_lower, solve_upper
 from tests.helpers.inner_kernels import from_python
 
 

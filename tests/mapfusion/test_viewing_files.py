@@ -8,7 +8,7 @@ import pytest
 
 from mapfusion.errors import InputError
 from mapfusion.landmark_map import read_map, write_map
-from mapfusion.viewing_files import viewing_paths
+from mapfusion.viewing import viewing_paths
 from tests.mapfusion.evidence.two_rooms import Wall, mapped
 
 MAP = mapped(Wall(6, seed=3), 1, 4, seed=4)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapfusion.align.method import Needs, supported
-from mapfusion.align.rigid import fit_rigid
+from mapfusion.align.rigid_motion import fit_rigid
 
 
 @dataclass(frozen=True)

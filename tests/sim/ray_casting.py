@@ -5,10 +5,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mapfusion.camera import StereoCamera
-from mapfusion.se2 import transform_points
+from mapfusion.geometry.camera import StereoCamera
+from mapfusion.geometry.se2 import transform_points
 from sim.floorplan import Face, FloorPlan
-from sim.radiometry import RadiometricNoise
+from sim.stereo_head import RadiometricNoise
 from sim.world import face_files
 
 CAMERA = StereoCamera()

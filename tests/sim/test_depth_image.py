@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sim.depth_image import SAME_SURFACE, depth_at
+from sim.stereo_head import SAME_SURFACE, depth_at
 
 
 def in_numpy(depth_m: np.ndarray, uv_px: np.ndarray) -> np.ndarray:

@@ -7,13 +7,13 @@ from typing import cast
 import numpy as np
 import pytest
 
-from mapfusion import se2
 from mapfusion.errors import InputError
+from mapfusion.geometry import se2
 from sim.driver import DriverSettings, _Driver, _Other, drive
 from sim.floorplan import FloorPlan, Wall
 from sim.odometry import calibrated_track_m, encoder_increments
 from sim.p3at import OUTER_RADIUS_M, WIDTH_M, P3at
-from sim.route import Route, check_routes
+from sim.routes import Route, check_routes
 from sim.trajectory import Trajectory
 
 HALL = FloorPlan(

@@ -3,8 +3,7 @@ import pytest
 from scipy.stats import kstest, norm
 
 from mapfusion.errors import InputError
-from sim.exposure import VALUES, draw_bits, expose, normal_values
-from sim.radiometry import RadiometricNoise
+from sim.stereo_head import VALUES, RadiometricNoise, draw_bits, expose, normal_values
 
 
 def test_the_table_is_the_normal_law() -> None:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mapfusion.se2 import Float
+from mapfusion.geometry.numerics import Float
 from sim.floorplan import FloorPlan, Wall, wall_shape
 from sim.world import face_files, write_faces
 

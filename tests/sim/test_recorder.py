@@ -9,15 +9,14 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from mapfusion.camera import StereoCamera
 from mapfusion.errors import InputError
-from mapfusion.se2 import transform_points
-from mapfusion.se3 import in_space
+from mapfusion.geometry.camera import StereoCamera
+from mapfusion.geometry.se2 import transform_points
+from mapfusion.geometry.se3 import in_space
 from sim.p3at import LENGTH_M
-from sim.radiometry import RadiometricNoise
 from sim.recorder import FrameSource, truth_behind
 from sim.renderer import Renderer
-from sim.stereo_head import StereoFrame
+from sim.stereo_head import RadiometricNoise, StereoFrame
 
 CAMERA = StereoCamera(320, 240, 288.0)
 NOISE = RadiometricNoise()

@@ -13,8 +13,7 @@ from mapfusion.errors import InputError
 from sim.driver import DriverSettings, _Driver, _others, drive
 from sim.floorplan import FloorPlan, Wall
 from sim.p3at import OUTER_RADIUS_M, P3at
-from sim.right_of_way import Driven, Hold, Holding, Passage, Progress, circle_among, hold_for
-from sim.route import Route
+from sim.routes import Driven, Hold, Holding, Passage, Progress, Route, circle_among, hold_for
 from sim.trajectory import Trajectory
 from tests.helpers.wheels_alone import wheels_alone
 

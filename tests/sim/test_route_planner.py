@@ -9,17 +9,17 @@ import pytest
 from mapfusion.errors import InputError
 from sim.driver import DriverSettings, drive
 from sim.floorplan import FloorPlan, Wall
-from sim.plan_generator import PlanParameters
-from sim.route import Route, check_routes
-from sim.route_planner import (
+from sim.plan_generator import (
     GROUND_HALF_WIDTH_M,
     TOLERANCE,
     GeneratedWorld,
+    PlanParameters,
     RouteParameters,
     generate_world,
     ground_overlap,
     length_m,
 )
+from sim.routes import Route, check_routes
 
 
 @functools.cache

@@ -3,11 +3,10 @@ import math
 import numpy as np
 import pytest
 
-from sim import solid_walls
-from sim.driver import DriverSettings, drive
+from sim import driver
+from sim.driver import NEAR_M, WITHIN_REACH_M, DriverSettings, SolidWalls, drive
 from sim.floorplan import FloorPlan, Wall, segment_distance_m
-from sim.route import Route
-from sim.solid_walls import NEAR_M, WITHIN_REACH_M, SolidWalls
+from sim.routes import Route
 from sim.world import World
 
 HALL = FloorPlan(
@@ -62,7 +61,7 @@ def test_motions_are_those_among_all_walls(monkeypatch: pytest.MonkeyPatch) -> N
         Route("b", np.array([6, 5, 3.0]), np.array([[1, 5.2], [6, 5]]), loop=True),
     ]
     among_near = drive(HALL, routes, DriverSettings(), 120, 0.2)
-    monkeypatch.setattr(solid_walls, "NEAR_M", math.inf)
+    monkeypatch.setattr(driver, "NEAR_M", math.inf)
     among_all = drive(HALL, routes, DriverSettings(), 120, 0.2)
     np.testing.assert_array_equal(among_near.T_world_robot, among_all.T_world_robot)
     np.testing.assert_array_equal(among_near.wheel_rad, among_all.wheel_rad)

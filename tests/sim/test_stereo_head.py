@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mapfusion.camera import StereoCamera
+from mapfusion.geometry.camera import StereoCamera
 from sim.floorplan import FloorPlan
-from sim.radiometry import RadiometricNoise
-from sim.stereo_head import StereoFrame, camera_pose, render_stereo
+from sim.stereo_head import RadiometricNoise, StereoFrame, camera_pose, render_stereo
 from sim.world import World
 from tests.sim.ray_casting import CAMERA, NO_NOISE, POSE, off_surface_m, ray_cast
 

@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from mapfusion.errors import InputError
-from mapfusion.se3 import in_space
+from mapfusion.geometry.se3 import in_space
 from sim.trajectory import TRAJECTORY, Trajectory, read_trajectory, write_trajectory
 
 RNG = np.random.default_rng(0)

@@ -5,11 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapfusion.camera import StereoCamera
+from mapfusion.geometry.camera import StereoCamera
 from sim.floorplan import FloorPlan, Wall
-from sim.radiometry import RadiometricNoise
-from sim.stereo_head import render_stereo
-from sim.visibility import Visibility
+from sim.recorder import Visibility
+from sim.stereo_head import RadiometricNoise, render_stereo
 from sim.world import World, write_faces
 
 CAMERA = StereoCamera(200, 150, 180.0)

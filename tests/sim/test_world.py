@@ -6,21 +6,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapfusion.camera import StereoCamera
+from mapfusion.geometry.camera import StereoCamera
 from sim.floorplan import FloorPlan, Wall
-from sim.radiometry import RadiometricNoise
-from sim.stereo_head import render_stereo
+from sim.stereo_head import RadiometricNoise, render_stereo
 from sim.world import World, silence, write_faces
 
 EVERYTHING = """
 import sys
 from pathlib import Path
 import numpy as np
-from mapfusion.camera import StereoCamera
+from mapfusion.geometry.camera import StereoCamera
 from sim.driver import DriverSettings, drive
 from sim.floorplan import FloorPlan, Wall
 from sim.recorder import FrameSource
-from sim.route import Route
+from sim.routes import Route
 from sim.stereo_head import RadiometricNoise
 
 square = np.array([[0, 0], [5, 0], [5, 4], [0, 4], [0, 0]])

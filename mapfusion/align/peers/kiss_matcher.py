@@ -7,10 +7,10 @@ from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
+from mapfusion.align.alignment import Pairs
 from mapfusion.align.method import Fit, Undetermined, supported
-from mapfusion.align.pairs import Pairs
-from mapfusion.arguments import Range, require_in_range
-from mapfusion.se2 import transform_points
+from mapfusion.geometry.se2 import transform_points
+from mapfusion.parameters import Range, require_in_range
 
 _SMALLEST_BOUND_M = 5e-3  # the package raises below
 

@@ -6,10 +6,10 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
+from mapfusion.align.alignment import Pairs
 from mapfusion.align.method import Fit, Undetermined, supported
-from mapfusion.align.pairs import Pairs
-from mapfusion.arguments import Probability, Range, require_in_range
-from mapfusion.se2 import rotation, transform_points
+from mapfusion.geometry.se2 import rotation, transform_points
+from mapfusion.parameters import Probability, Range, require_in_range
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from experiments.scenario.loading import load_scenario
-from experiments.scenario.yaml_input import parse_value, read_mapping
+from experiments.scenario.yaml_files import parse_value, read_mapping
 from mapfusion.errors import InputError
 from tests.helpers.tiny_scenario import TINY, assert_refused, command
 

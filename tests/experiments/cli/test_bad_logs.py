@@ -95,7 +95,7 @@ def test_a_damaged_stage_is_named_and_made_again(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("experiments.show.figures.drawing.FIGURES", ())  # drawn in other tests
+    monkeypatch.setattr("experiments.reports.figures.drawing.FIGURES", ())  # drawn in other tests
     shutil.copytree(tiny_result.parent / "store", tmp_path / "store")
     for stage in left_out:
         shutil.rmtree(tmp_path / "store" / stage)

@@ -49,7 +49,7 @@ def test_corrected_logs_are_what_the_constants_say(
 def test_rounds_that_end_before_their_time_say_so(
     raw: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mapfusion.smoother.calibrate._MOST_ROUNDS", 1)
+    monkeypatch.setattr("mapfusion.smoother.odometry_calibration._MOST_ROUNDS", 1)
     assert "not settled" in command(capsys, "study", "calibrate", raw).out
     found = json.loads(command(capsys, "study", "calibrate", raw, "--json").out)
     assert (found["n_rounds"], found["settled"]) == (1, False)

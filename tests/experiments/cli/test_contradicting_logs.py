@@ -10,10 +10,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import read_map
-from mapfusion.open_tables import HEIGHT
 from mapfusion.robot_log import read_log, write_log, write_truth_poses
-from mapfusion.se2 import Float
+from mapfusion.tables import HEIGHT
 from tests.helpers.tiny_scenario import Reply, assert_refused, command
 from tests.mapfusion.contradicting_logs import JUMPS, MISTAKES, circling_log, true_poses
 from tests.mapfusion.recordings.written_layouts import (
@@ -94,9 +94,9 @@ def test_a_run_keeps_and_tells_what_logs_say_against_themselves(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A jump of one robot, whose truth is in millimetres; the other, as CSV, has such odometry."""
-    from experiments.judge import tables
+    from experiments.evaluation import tables
 
-    monkeypatch.setattr("experiments.show.figures.drawing.FIGURES", ())  # drawn in other tests
+    monkeypatch.setattr("experiments.reports.figures.drawing.FIGURES", ())  # drawn in other tests
     log = circling_log(30)
     jumped = replace(log, odometry=log.odometry + 3.0 * (np.arange(30)[:, None] == 20) * [1, 0, 0])
     write_log(tmp_path / "R1", jumped)

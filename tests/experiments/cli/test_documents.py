@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mapfusion import se2
+from mapfusion.geometry import se2
 from mapfusion.landmark_map import write_map
 from tests.helpers.made_up_maps import landmark_map
 from tests.helpers.made_up_runs import write_sweep

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.cli.outputs import require_file, require_folder, require_map_file
-from mapfusion import se2
+from experiments.cli.options import require_file, require_folder, require_map_file
 from mapfusion.errors import InputError
-from mapfusion.joint_covariance import JointCovariance
+from mapfusion.geometry import se2
+from mapfusion.geometry.joint_covariance import JointCovariance
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map
 from tests.helpers.made_up_maps import landmark_map
 from tests.helpers.tiny_scenario import assert_refused, command

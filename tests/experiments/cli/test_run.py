@@ -9,12 +9,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.judge import tables
-from experiments.judge.judged_run import JudgedRun
-from experiments.judge.result import run_scenario
-from experiments.run.job import Job
-from experiments.run.pipeline import lay_out
-from experiments.run.store import Store
+from experiments.evaluation import tables
+from experiments.evaluation.evaluated_run import JudgedRun
+from experiments.evaluation.result import run_scenario
+from experiments.pipeline.pipeline import lay_out
+from experiments.pipeline.stage import Job
+from experiments.pipeline.store import Store
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import Recording, Simulation
 from mapfusion.landmark_map import read_map
@@ -113,7 +113,7 @@ def test_ctrl_c_before_the_command_starts(
     def press() -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("experiments.run.kernel_cache.use_kernel_cache", press)
+    monkeypatch.setattr("experiments.pipeline.code_version.use_kernel_cache", press)
     reply = command(capsys, "scenarios", "--schema")
     assert reply.code == 130
     assert len(reply.err.splitlines()) == 1
@@ -282,7 +282,7 @@ def test_run_shows_the_aligners(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("experiments.show.figures.drawing.FIGURES", ())  # drawn in other tests
+    monkeypatch.setattr("experiments.reports.figures.drawing.FIGURES", ())  # drawn in other tests
     reply = command(capsys, "run", tiny_path, "--jobs", 1, "--results", tiny_results_copy)
     assert reply.code == 0
     assert all(name in reply.out for name in ("ransac", "svd", "icp", "oracle", "R1", "R2"))
@@ -314,7 +314,7 @@ def test_runs_with_little_to_go_on(
     overrides: list[str],
 ) -> None:
     if name == "nothing alike":  # differs from a usual run in its tables alone
-        monkeypatch.setattr("experiments.show.figures.drawing.FIGURES", ())
+        monkeypatch.setattr("experiments.reports.figures.drawing.FIGURES", ())
     path = tmp_path / "tiny.yaml"
     path.write_text(TINY, encoding="utf-8")
     changes = [part for override in overrides for part in ("--set", override)]

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.judge.judged_run import JudgedRun
-from experiments.judge.tables import UNKNOWN
-from experiments.run.store import Store
+from experiments.evaluation.evaluated_run import JudgedRun
+from experiments.evaluation.tables import UNKNOWN
+from experiments.pipeline.store import Store
+from experiments.reports.figures.result_tables import ResultTables
 from experiments.scenario.settings import Simulation
-from experiments.show.figures.result_tables import ResultTables
 from tests.helpers.report_page import page_of
 from tests.helpers.tiny_scenario import assert_refused, command, estimated_tables
 

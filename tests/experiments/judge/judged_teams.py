@@ -1,11 +1,11 @@
 """Drawn maps of several robots with their truth, fused and ready to be judged."""
 
-from experiments.judge.errors import EvaluatedRobot
-from experiments.judge.judged_fusers import GivenMap, JudgedFusion
-from experiments.judge.truth import PathTruth
-from mapfusion.fuse.parameters import MergeParameters
-from mapfusion.fuse.registry import make_fuser
-from mapfusion.merge import merge
+from experiments.evaluation.alignment_errors import EvaluatedRobot
+from experiments.evaluation.fused_map_errors import GivenMap, JudgedFusion
+from experiments.evaluation.truth import PathTruth
+from mapfusion.fusion.fused_map import MergeParameters
+from mapfusion.fusion.fusers import make_fuser
+from mapfusion.fusion.merge import merge
 from mapfusion.robot_log import RobotTruth
 from tests.mapfusion.fuse.drawn_maps import DrawnTeam
 

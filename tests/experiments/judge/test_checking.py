@@ -5,7 +5,7 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from experiments.judge.checking import check_all
+from experiments.evaluation.checks import check_all
 from experiments.scenario.settings import AnyScenario
 from mapfusion.errors import InputError
 from tests.helpers.tiny_scenario import TINY, command
@@ -37,9 +37,9 @@ def test_one_that_cannot_run_ends_itself_alone(
             raise InputError("scenario b: R1[/b]: the way leads through a wall\x1b")
         return tmp_path
 
-    monkeypatch.setattr("experiments.judge.result.run_scenario", run)
-    monkeypatch.setattr("experiments.judge.checking.check", lambda *_: [])
-    monkeypatch.setattr("experiments.judge.checking.nothing_merged", lambda _: None)
+    monkeypatch.setattr("experiments.evaluation.result.run_scenario", run)
+    monkeypatch.setattr("experiments.evaluation.checks.check", lambda *_: [])
+    monkeypatch.setattr("experiments.evaluation.checks.nothing_merged", lambda _: None)
     out = tmp_path / "deep" / "junit.xml"
     reply = command(capsys, "check", *three, "--seeds", "0..2", "--junit", out)
     assert reply.code == 2

@@ -5,20 +5,20 @@ import pandas as pd
 import pytest
 from scipy.stats import chi2
 
-from experiments.judge.errors import EvaluatedRobot
-from experiments.judge.fused_landmarks import (
+from experiments.evaluation.alignment_errors import EvaluatedRobot
+from experiments.evaluation.fused_landmarks import (
     FusedTeam,
     landmark_nees,
     landmark_nees_rows,
     mean_nees_band,
 )
-from mapfusion import se2
+from mapfusion.align.alignment import Alignment, Status
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.result import Alignment, Status
-from mapfusion.fuse.kalman_drift import KalmanDrift
-from mapfusion.fused_map import AlignedPair
-from mapfusion.merge import merge
-from mapfusion.se2 import Float
+from mapfusion.fusion.fused_map import AlignedPair
+from mapfusion.fusion.kalman import KalmanDrift
+from mapfusion.fusion.merge import merge
+from mapfusion.geometry import se2
+from mapfusion.geometry.numerics import Float
 from tests.helpers.made_up_maps import ITERATION, landmark_map, robot
 
 SIGMA_M = 0.02

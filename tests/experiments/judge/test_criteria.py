@@ -3,8 +3,8 @@
 import pandas as pd
 import pytest
 
-from experiments.judge import criteria
-from experiments.judge.judged_maps import maps_of
+from experiments.evaluation import criteria
+from experiments.evaluation.alignment_summary import maps_of
 from tests.helpers.made_up_runs import many_errors
 
 

@@ -3,19 +3,19 @@ import pandas as pd
 import pytest
 from scipy.stats import chi2
 
-from experiments.judge.errors import (
+from experiments.evaluation.alignment_errors import (
     EvaluatedRobot,
     alignment_nees,
     error_rows,
     met_maps,
 )
-from experiments.judge.path_errors import robot_paths
-from experiments.judge.truth import PathTruth
-from experiments.run.estimates import alignment_of, estimate_row, unpacked
-from mapfusion import se2
-from mapfusion.align.acceptance import Verdict
-from mapfusion.align.result import Alignment, Status, degenerate
-from mapfusion.evidence.judge import Judge
+from experiments.evaluation.path_errors import robot_paths
+from experiments.evaluation.truth import PathTruth
+from experiments.pipeline.tables import alignment_of, estimate_row, unpacked
+from mapfusion.align.alignment import Alignment, Status, degenerate
+from mapfusion.geometry import se2
+from mapfusion.verification.false_alarms import Verdict
+from mapfusion.verification.verdict import Judge
 from tests.helpers.made_up_maps import ACCEPTED, ITERATION, NO_RIVALS, offered, paired, robot
 
 T_WORLD_A = np.array([1.0, 2.0, 0.3])

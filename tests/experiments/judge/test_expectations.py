@@ -4,8 +4,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from experiments.judge import metrics, tables
-from experiments.judge.expectations import Outcome, check
+from experiments.evaluation import metrics, tables
+from experiments.evaluation.checks import Outcome, check
 from experiments.scenario.settings import Bound, Scenario
 
 

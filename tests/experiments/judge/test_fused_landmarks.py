@@ -4,21 +4,20 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.judge.errors import EvaluatedRobot, MetMaps, met_maps
-from experiments.judge.fused_landmarks import (
+from experiments.evaluation.alignment_errors import EvaluatedRobot, MetMaps, met_maps
+from experiments.evaluation.fused_landmarks import (
     FusedTeam,
     MergeSettings,
     fused_motion_rows,
     fusion_rows,
     map_fit_rows,
 )
-from experiments.run.estimates import estimate_row
-from mapfusion import se2
-from mapfusion.align.acceptance import Verdict
-from mapfusion.align.result import Alignment, Status
-from mapfusion.aligned_landmarks import ABSENT
-from mapfusion.fuse.parameters import MergeParameters
-from mapfusion.fused_map import FusedMap, Fusion
+from experiments.pipeline.tables import estimate_row
+from mapfusion.align.alignment import Alignment, Status
+from mapfusion.fusion.aligned_landmarks import ABSENT
+from mapfusion.fusion.fused_map import FusedMap, Fusion, MergeParameters
+from mapfusion.geometry import se2
+from mapfusion.verification.false_alarms import Verdict
 from tests.helpers.made_up_maps import ACCEPTED, ITERATION, NO_RIVALS, offered, paired, robot
 
 T_WORLD_A = np.array([1.0, 2.0, 0.3])

@@ -8,9 +8,16 @@ import pandas as pd
 import pytest
 from scipy.stats import chi2
 
-from experiments.judge import tables
-from experiments.judge.fuser_coverage import FILTERED, FUSED, NOMINAL, SMOOTHED, coverage_rows
-from experiments.judge.judged_fusers import GivenMap, JudgedFusion
+from experiments.evaluation import tables
+from experiments.evaluation.fused_map_errors import (
+    FILTERED,
+    FUSED,
+    NOMINAL,
+    SMOOTHED,
+    GivenMap,
+    JudgedFusion,
+    coverage_rows,
+)
 from mapfusion.landmark_map import LandmarkMap
 from tests.experiments.judge.judged_teams import BENT_M, PARTS, K, evaluated_robots, judged_team
 from tests.mapfusion.fuse.drawn_maps import DrawnTeam

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from experiments.judge.errors import EvaluatedRobot
-from experiments.judge.judged_fusers import GivenMap, JudgedFusion
-from experiments.judge.smoothed_robots import SmoothedRobot
-from mapfusion import se2
-from mapfusion.aligned_landmarks import ABSENT
-from mapfusion.merge import merge
+from experiments.evaluation.alignment_errors import EvaluatedRobot
+from experiments.evaluation.fused_map_errors import GivenMap, JudgedFusion
+from experiments.evaluation.smoothed_robots import SmoothedRobot
+from mapfusion.fusion.aligned_landmarks import ABSENT
+from mapfusion.fusion.merge import merge
+from mapfusion.geometry import se2
 from tests.experiments.judge.judged_teams import BENT_M, PARTS, K, evaluated_robots, judged_team
 from tests.mapfusion.fuse.drawn_maps import DrawnTeam
 

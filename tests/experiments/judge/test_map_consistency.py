@@ -6,17 +6,16 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from experiments.judge.map_consistency import (
+from experiments.evaluation.map_consistency import (
     GROSS_M,
     both_consistencies,
     fitted,
     relative_consistency,
 )
-from mapfusion import se2
-from mapfusion.chi_square import chi_square_bound
-from mapfusion.joint_covariance import JointCovariance
+from mapfusion.geometry import se2
+from mapfusion.geometry.joint_covariance import JointCovariance
+from mapfusion.geometry.numerics import Float, chi_square_bound
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.se2 import Float
 
 SHARED_SIGMA_M, OWN_SIGMA_M = 0.008, 0.005  # so small that no error is gross
 

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from experiments.judge import tables
-from experiments.run.estimates import unpacked
-from mapfusion import se2
+from experiments.evaluation import tables
+from experiments.pipeline.tables import unpacked
+from mapfusion.geometry import se2
 
 PLAN = ["x_m", "y_m", "cov_xx_m2", "cov_xy_m2", "cov_yy_m2"]
 

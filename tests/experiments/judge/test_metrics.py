@@ -9,16 +9,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.judge import metrics
-from experiments.judge.criteria import is_false_merge
-from experiments.judge.metrics import (
-    ALIGNER_METRICS,
-    METRICS,
-    compute,
-)
-from experiments.scenario import expected
-from experiments.scenario.expected import FUSER_METRICS, known_metrics
-from mapfusion.fuse.registry import FUSERS
+from experiments.evaluation import metrics
+from experiments.evaluation.criteria import is_false_merge
+from experiments.evaluation.metrics import ALIGNER_METRICS, METRICS, compute
+from experiments.scenario import settings
+from experiments.scenario.settings import FUSER_METRICS, known_metrics
+from mapfusion.fusion.fusers import FUSERS
 
 
 def error(
@@ -202,8 +198,8 @@ def test_no_metric_is_left_untested() -> None:
     of_methods = {name.rpartition(".")[2] for name in KNOWN.keys() - METRICS.keys()}
     assert set(METRICS) <= set(KNOWN)
     assert set(ALIGNER_METRICS) | set(FUSER_METRICS) == of_methods
-    assert set(METRICS) == set(expected.RUN_METRICS)
-    assert set(ALIGNER_METRICS) == set(expected.ALIGNER_METRICS)
+    assert set(METRICS) == set(settings.RUN_METRICS)
+    assert set(ALIGNER_METRICS) == set(settings.ALIGNER_METRICS)
     assert set(known_metrics(["ransac", "svd"], FUSERS)) >= set(KNOWN)
 
 

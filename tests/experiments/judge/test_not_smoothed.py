@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from experiments.judge import tables
-from experiments.judge.result import run_scenario
-from experiments.run.stages import smooth
+from experiments.evaluation import tables
+from experiments.evaluation.result import run_scenario
+from experiments.pipeline.stages import smooth
+from experiments.reports.report.document import write_report
+from experiments.reports.terminal.run_screen import print_result
 from experiments.scenario.loading import load_scenario
-from experiments.show.report.document import write_report
-from experiments.show.terminal.run_screen import print_result
 
 EARLY, LAST = 40, 43  # iterations that maps of the tiny scenario are fused at
 BOTH = ("R1", "R2")

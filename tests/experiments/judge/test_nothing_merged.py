@@ -6,11 +6,10 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from experiments.judge import tables
-from experiments.judge.checking import CheckedScenario, check_all
-from experiments.judge.expectations import load_checked
-from experiments.judge.metrics import USED_TABLES
-from experiments.judge.nothing_merged import nothing_merged
+from experiments.evaluation import tables
+from experiments.evaluation.checks import CheckedScenario, check_all, load_checked
+from experiments.evaluation.criteria import nothing_merged
+from experiments.evaluation.metrics import USED_TABLES
 from mapfusion.errors import InputError
 from tests.helpers.made_up_runs import complete
 from tests.helpers.tiny_scenario import TINY, command
@@ -102,7 +101,7 @@ def test_check_says_so_in_one_line_and_exits_with_1(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     result = write_run(tmp_path / "result", 2, 1, (40,))
-    monkeypatch.setattr("experiments.judge.result.run_scenario", lambda *_: result)
+    monkeypatch.setattr("experiments.evaluation.result.run_scenario", lambda *_: result)
     path = tmp_path / "tiny.yaml"
     path.write_text(TINY.partition("expect:")[0], encoding="utf-8")
     junit = tmp_path / "junit.xml"

@@ -4,7 +4,7 @@ import pytest
 from evo.core import metrics
 from evo.core.trajectory import PosePath3D
 
-from experiments.judge.path_errors import (
+from experiments.evaluation.path_errors import (
     SOURCES,
     STATISTICS,
     ate_m,
@@ -15,8 +15,8 @@ from experiments.judge.path_errors import (
     rpe,
     seven_statistics,
 )
-from mapfusion import se2
-from mapfusion.se2 import Float
+from mapfusion.geometry import se2
+from mapfusion.geometry.numerics import Float
 
 
 def wander(rng: np.random.Generator, n: int) -> tuple[Float, Float]:

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.judge import tables
-from experiments.judge.judged_run import JudgedRun
-from experiments.judge.result import run_scenario
-from experiments.run.stages.snapshots import stored_maps
-from experiments.run.store import Store
+from experiments.evaluation import tables
+from experiments.evaluation.evaluated_run import JudgedRun
+from experiments.evaluation.result import run_scenario
+from experiments.pipeline.stages.snapshots import stored_maps
+from experiments.pipeline.store import Store
 from experiments.scenario.settings import Simulation
 from mapfusion.landmark_map import read_map
 

@@ -8,14 +8,14 @@ import pandas as pd
 import pyarrow as pa
 import pytest
 
-from experiments.judge import tables
-from experiments.judge.result import require_result
-from experiments.judge.result_files import read_provenance, read_scenario, read_world
-from experiments.show.exported import export_result
-from experiments.show.figures.result_tables import ResultTables
-from experiments.show.report.contents import contents_of
-from experiments.study.compare.versions import compare
-from experiments.study.statistics.run_tables import find_runs
+from experiments.evaluation import tables
+from experiments.evaluation.result import require_result
+from experiments.evaluation.result_files import read_provenance, read_scenario, read_world
+from experiments.reports.figures.result_tables import ResultTables
+from experiments.reports.report.contents import contents_of
+from experiments.reports.result_export import export_result
+from experiments.studies.comparison import compare
+from experiments.studies.run_tables import find_runs
 from mapfusion.errors import InputError
 
 READERS: dict[str, Callable[[Path], object]] = {

@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from experiments.judge.errors import EvaluatedRobot
-from experiments.judge.shared_ground import first_shared_iteration
-from experiments.judge.truth import PathTruth
+from experiments.evaluation.alignment_errors import EvaluatedRobot, first_shared_iteration
+from experiments.evaluation.truth import PathTruth
 from tests.helpers.made_up_maps import landmark_map
 
 RADIUS_M = 0.1

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from experiments.judge.map_consistency import fitted, relative_consistency
-from experiments.judge.smoothed_robots import SmoothedRobot, smoothed_path_rows, smoother_rows
+from experiments.evaluation.map_consistency import fitted, relative_consistency
+from experiments.evaluation.smoothed_robots import SmoothedRobot, smoothed_path_rows, smoother_rows
 from tests.helpers.made_up_maps import ITERATION, landmark_map, robot
 
 POINTS = np.random.default_rng(0).uniform(-4, 4, (30, 3))

@@ -10,21 +10,21 @@ from evo.core import metrics as evo_metrics
 from evo.core.trajectory import PosePath3D
 from scipy.optimize import least_squares
 
-from experiments.judge.errors import EvaluatedRobot, MetMaps
-from experiments.judge.fused_landmarks import FusedTeam
-from experiments.judge.path_errors import STATISTICS, path_statistics_rows
-from experiments.judge.team_figures import (
+from experiments.evaluation.alignment_errors import EvaluatedRobot, MetMaps
+from experiments.evaluation.fused_landmarks import FusedTeam
+from experiments.evaluation.path_errors import STATISTICS, path_statistics_rows
+from experiments.evaluation.team_errors import (
     edge_precision,
     edge_recall,
     team_pair_rows,
     team_rows,
 )
-from experiments.judge.truth import PathTruth
-from mapfusion import se2
+from experiments.evaluation.truth import PathTruth
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.fused_map import FusedMap, Fusion
-from mapfusion.se2 import Float
-from mapfusion.team.team_graph import Place
+from mapfusion.fusion.fused_map import FusedMap, Fusion
+from mapfusion.fusion.team_graph import Place
+from mapfusion.geometry import se2
+from mapfusion.geometry.numerics import Float
 from tests.helpers.made_up_maps import ITERATION, NO_RIVALS, landmark_map
 
 NAMES = ("x_m", "y_m", "theta_rad")

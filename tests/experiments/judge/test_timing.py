@@ -7,10 +7,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.judge import aligner_timing
-from experiments.judge.aligner_timing import AlignerTiming
-from experiments.judge.errors import EvaluatedRobot, MetMaps
-from experiments.judge.truth import PathTruth
+from experiments.evaluation import alignment_errors
+from experiments.evaluation.alignment_errors import AlignerTiming, EvaluatedRobot, MetMaps
+from experiments.evaluation.truth import PathTruth
 from mapfusion.align.correspondences import Correspondences
 from tests.helpers.made_up_maps import landmark_map
 
@@ -49,7 +48,7 @@ def test_compilation_does_not_count_and_first_and_last_maps_do(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     clocks = {"icp": Clockwork(), "svd": Clockwork()}
-    monkeypatch.setattr(aligner_timing, "callable_aligner", lambda method, *_: clocks[method])
+    monkeypatch.setattr(alignment_errors, "callable_aligner", lambda method, *_: clocks[method])
     evaluate = SimpleNamespace(timing_points=3, timing_repeats=11, true_pair_radius_m=0.1)
     entries = [
         SimpleNamespace(name=name, method=name, parameters={}, time_limit_s=1.0) for name in clocks

@@ -3,15 +3,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from experiments.judge.truth import (
+from experiments.evaluation.truth import (
     PathTruth,
     common_landmarks,
     fit_rmse_m,
     landmark_truth,
     true_pairs,
 )
-from experiments.run.stages.snapshots import Associations
-from mapfusion import se2
+from experiments.pipeline.stages.snapshots import Associations
+from mapfusion.geometry import se2
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import RobotTruth
 from tests.helpers.made_up_maps import landmark_map

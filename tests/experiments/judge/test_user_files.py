@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.judge.user_files import align, merge
+from experiments.evaluation.single_steps import align, merge
 from experiments.scenario.loading import default_settings
+from mapfusion.align.alignment import Pairs
 from mapfusion.align.icp import Icp
-from mapfusion.align.pairs import Pairs
 from mapfusion.landmark_map import write_map
 from tests.mapfusion.robots_of_one_world import Robots
 from tests.mapfusion.same_fusion import assert_same_points

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapfusion.align.pairs import gather, undetermined, why_too_few
-from mapfusion.align.rigid import fit_rigid
-from mapfusion.align.supported import supported_by
+from mapfusion.align.alignment import gather, undetermined, why_too_few
+from mapfusion.align.rigid_motion import fit_rigid
+from mapfusion.registration import supported_by
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ import pytest
 from experiments.methods.aligner_calls import callable_aligner, end_children, require_usable
 from experiments.methods.answers import NonsenseError, checked_answer
 from experiments.methods.catalogue import make_method
-from mapfusion import se2
-from mapfusion.align.registration import Registration, as_aligner
-from mapfusion.align.result import Alignment, Status
+from mapfusion.align.alignment import Alignment, Status
+from mapfusion.geometry import se2
+from mapfusion.registration import Registration, as_aligner
 from tests.helpers.answered_here import answered_here
 from tests.helpers.made_up_maps import landmark_map, paired
 from tests.helpers.made_up_plugin import install, look_again

@@ -20,9 +20,9 @@ from experiments.methods.aligner_calls import (
     end_children,
     require_usable,
 )
-from experiments.scenario.randomness import generator
-from mapfusion.align.registration import Registration
-from mapfusion.align.result import Alignment, Status
+from experiments.scenario.seeds import generator
+from mapfusion.align.alignment import Alignment, Status
+from mapfusion.registration import Registration
 from tests.helpers.answered_here import answered_here
 from tests.helpers.made_up_maps import landmark_map, paired
 from tests.helpers.made_up_plugin import install, look_again

@@ -17,10 +17,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.judge import tables
+from experiments.evaluation import tables
 from experiments.methods.aligner_calls import end_children
-from experiments.show.figures import drawing
-from mapfusion import se2
+from experiments.reports.figures import drawing
+from mapfusion.geometry import se2
 from mapfusion.landmark_map import write_map
 from tests.helpers.made_up_maps import landmark_map
 from tests.helpers.made_up_plugin import install, look_again

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.run import code_version
+from experiments.pipeline import code_version
 
 FILES = {
     "ours/__init__.py": "",

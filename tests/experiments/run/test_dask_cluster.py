@@ -2,7 +2,7 @@
 
 import pytest
 
-from experiments.run import dask_cluster
+from experiments.pipeline import cluster
 from mapfusion.errors import InputError
 
 
@@ -23,12 +23,12 @@ class Killed:
 @pytest.mark.parametrize("failures", [0, 1, 2])
 def test_it_is_started_again(monkeypatch: pytest.MonkeyPatch, failures: int) -> None:
     killed = Killed(failures)
-    monkeypatch.setattr(dask_cluster, "LocalCluster", killed)
-    assert dask_cluster._started(2) == "a cluster"
+    monkeypatch.setattr(cluster, "LocalCluster", killed)
+    assert cluster._started(2) == "a cluster"
     assert killed.started == failures + 1
 
 
 def test_three_times_in_a_row_is_no_accident(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dask_cluster, "LocalCluster", Killed(99))
+    monkeypatch.setattr(cluster, "LocalCluster", Killed(99))
     with pytest.raises(InputError, match="--jobs 2: 2 workers could not be started, 3 times"):
-        dask_cluster._started(2)
+        cluster._started(2)

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from experiments.run.dask_worker import (
+from experiments.pipeline.cluster import (
     TaskFailedError,
     Terms,
     UnfitWorkerError,
     code_version,
     perform,
 )
-from experiments.run.tasks import Task
+from experiments.pipeline.tasks import Task
 from tests.helpers import acting
 
 
@@ -64,7 +64,7 @@ def test_a_task_that_kills_its_worker_is_begun_only_so_often(terms: Terms, tmp_p
     script.write_text(
         "import pickle, sys\n"
         f"sys.path[:0] = {sys.path!r}\n"
-        "from experiments.run.dask_worker import perform\n"
+        "from experiments.pipeline.cluster import perform\n"
         f"perform('drive/k', {task!r}, pickle.loads({pickle.dumps(terms)!r}))\n"
     )
     for _ in range(1 + terms.retries):

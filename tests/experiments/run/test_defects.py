@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from experiments.cli import main as cli
-from experiments.run.defects import saved_defect
-from experiments.run.workers import workers
+from experiments.pipeline.workers import saved_defect, workers
 from tests.helpers import acting
 from tests.helpers.tiny_scenario import command
 

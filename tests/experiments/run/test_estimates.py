@@ -3,11 +3,10 @@
 import numpy as np
 import pandas as pd
 
-from experiments.run.estimates import evidence_of, rival_rows
-from experiments.run.frames import at_iteration
+from experiments.pipeline.tables import at_iteration, evidence_of, rival_rows
+from mapfusion.align.alignment import Pairs
 from mapfusion.align.correspondences import match
-from mapfusion.align.pairs import Pairs
-from mapfusion.evidence.judge import Judge
+from mapfusion.verification.verdict import Judge
 from tests.mapfusion.evidence.two_rooms import Wall, mapped
 
 

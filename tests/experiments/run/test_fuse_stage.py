@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.run.stages.fuse import fused_map_files, read_fusions, write_fusions
-from mapfusion.fuse.parameters import MergeParameters
-from mapfusion.fuse.registry import FUSERS, make_fuser
+from experiments.pipeline.stages.fuse import fused_map_files, read_fusions, write_fusions
+from mapfusion.fusion.fused_map import MergeParameters
+from mapfusion.fusion.fusers import FUSERS, make_fuser
+from mapfusion.fusion.merge import merge
 from mapfusion.landmark_map import read_map
-from mapfusion.merge import merge
 from tests.mapfusion.fuse.drawn_maps import DrawnTeam
 
 NAMES = ("R1", "R2", "R3", "R4")

@@ -7,10 +7,10 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from experiments.run.pipeline import lay_out
-from experiments.run.stages.drive import DriveSettings, driven
+from experiments.pipeline.pipeline import lay_out
+from experiments.pipeline.stages.drive import DriveSettings, driven
 from experiments.scenario.loading import load_scenario
-from sim.right_of_way import hold_for
+from sim.routes import hold_for
 from tests.helpers.wheels_alone import wheels_alone
 
 ROOMS_LOW = Path(__file__).parents[3] / "scenarios" / "rooms_low.yaml"

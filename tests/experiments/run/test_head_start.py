@@ -5,14 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.judge.judged_run import JudgedRun
-from experiments.run.head_start import head_start, with_head_start
-from experiments.run.job import Job
-from experiments.run.pipeline import lay_out
-from experiments.run.stages import drive
-from experiments.run.stages.features import FRAMES_PER_CHUNK
-from experiments.run.store import Store
-from experiments.run.tasks import unfinished
+from experiments.evaluation.evaluated_run import JudgedRun
+from experiments.pipeline.head_start import head_start, with_head_start
+from experiments.pipeline.pipeline import lay_out
+from experiments.pipeline.stage import Job
+from experiments.pipeline.stages import drive
+from experiments.pipeline.stages.features import FRAMES_PER_CHUNK
+from experiments.pipeline.store import Store
+from experiments.pipeline.tasks import unfinished
 from experiments.scenario.settings import Simulation
 from sim.trajectory import read_trajectory
 

@@ -7,7 +7,7 @@ import sys
 import threading
 from pathlib import Path
 
-from experiments.run.interrupts import held_back_interrupts
+from experiments.pipeline.workers import held_back_interrupts
 
 ASK = "import signal; print(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, []))"
 
@@ -34,7 +34,7 @@ def test_processes_started_meanwhile_never_see_it() -> None:
 
 FIRST_OF_ALL = """
 import multiprocessing, sys
-from experiments.run.interrupts import held_back_interrupts
+from experiments.pipeline.workers import held_back_interrupts
 from tests.experiments.run.test_interrupts import tell
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.run.kept_logs import KeptLogs
+from experiments.pipeline.kept_logs import KeptLogs
 from mapfusion.robot_log import RobotLog, read_log, write_log
 from tests.mapfusion.smoother.white_noise_logs import white_noise_log
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.run.code_version import PACKAGES, SOURCE_ROOT
+from experiments.pipeline.code_version import PACKAGES, SOURCE_ROOT
 
 KERNELS = {
     "callee": "@njit(cache=True)\ndef callee(x):\n    return x + 1\n",
@@ -20,7 +20,7 @@ KERNELS = {
 }
 CALL = """
 import importlib, json
-from experiments.run.kernel_cache import use_kernel_cache
+from experiments.pipeline.code_version import use_kernel_cache
 use_kernel_cache()
 told = {}
 for name in ("caller", "apart"):

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from experiments.run.memory import memory_bytes, needs, require_memory
-from experiments.run.pipeline import lay_out
+from experiments.pipeline.memory import memory_bytes, needs, require_memory
+from experiments.pipeline.pipeline import lay_out
 from experiments.scenario.loading import load_scenario
 from mapfusion.errors import InputError
-from mapfusion.fastslam.slots import allocate
+from mapfusion.fastslam.landmarks import allocate
 from tests.helpers.tiny_scenario import assert_refused, command
 
 GB = 1e9

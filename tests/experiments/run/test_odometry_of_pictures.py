@@ -5,19 +5,15 @@ import pytest
 from scipy.spatial import KDTree
 from scipy.stats import chi2
 
-from experiments.judge.map_consistency import (
-    Consistency,
-    fitted,
-    relative_consistency,
-)
+from experiments.evaluation.map_consistency import Consistency, fitted, relative_consistency
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import Simulation
-from mapfusion import se2
+from mapfusion.align.alignment import Alignment, Status
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.result import Alignment, Status
-from mapfusion.aligned_landmarks import ABSENT
-from mapfusion.fused_map import AlignedPair
-from mapfusion.merge import merge
+from mapfusion.fusion.aligned_landmarks import ABSENT
+from mapfusion.fusion.fused_map import AlignedPair
+from mapfusion.fusion.merge import merge
+from mapfusion.geometry import se2
 from tests.helpers.by_pictures import Mapped, mapped_by_pictures
 from tests.helpers.tiny_scenario import TINY
 

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from experiments.judge.judged_run import JudgedRun
-from experiments.run import rehearsal
-from experiments.run.code_version import SOURCE_ROOT
-from experiments.run.kernel_cache import kernel_folder
-from experiments.run.store import Store
+from experiments.evaluation.evaluated_run import JudgedRun
+from experiments.pipeline import rehearsal
+from experiments.pipeline.code_version import SOURCE_ROOT, kernel_folder
+from experiments.pipeline.store import Store
 from experiments.scenario.settings import Recording, Simulation
 from tests.helpers.tiny_scenario import TINY
 
@@ -20,11 +19,11 @@ from tests.helpers.tiny_scenario import TINY
 CALLED = """
 import gc, json, sys
 from pathlib import Path
-from experiments.run.kernel_cache import use_kernel_cache
+from experiments.pipeline.code_version import use_kernel_cache
 use_kernel_cache()
 from numba.core.dispatcher import Dispatcher
-from experiments.judge.result import run_scenario
-from experiments.run.rehearsal import rehearse_maps, rehearse_pictures
+from experiments.evaluation.result import run_scenario
+from experiments.pipeline.rehearsal import rehearse_maps, rehearse_pictures
 from experiments.scenario.loading import load_scenario
 
 def called():

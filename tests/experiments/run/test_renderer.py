@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from experiments.judge.judged_run import JudgedRun
-from experiments.judge.result import provenance
-from experiments.run.store import Store
+from experiments.evaluation.evaluated_run import JudgedRun
+from experiments.evaluation.result import provenance
+from experiments.pipeline.store import Store
 from experiments.scenario.loading import load_scenario
 from sim import renderer
 from sim.renderer import egl_driver

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from experiments.run.stages.slam import _step, evaluated_iterations
+from experiments.pipeline.stages.slam import _step, evaluated_iterations
 from mapfusion.fastslam.filter import StepResult
 
 

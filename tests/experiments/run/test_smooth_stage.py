@@ -7,11 +7,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.run.frames import write_rows
-from experiments.run.job import Job
-from experiments.run.kept_logs import kept_log
-from experiments.run.stages.slam import ASSOCIATIONS, FINDINGS, POSES
-from experiments.run.stages.smooth import (
+from experiments.pipeline.kept_logs import kept_log
+from experiments.pipeline.stage import Job
+from experiments.pipeline.stages.slam import ASSOCIATIONS, FINDINGS, POSES
+from experiments.pipeline.stages.smooth import (
     WRITES,
     SmoothSettings,
     fused_iterations,
@@ -24,13 +23,18 @@ from experiments.run.stages.smooth import (
     read_smoothed_path,
     run,
 )
-from experiments.run.stages.snapshots import Associations
+from experiments.pipeline.stages.snapshots import Associations
+from experiments.pipeline.tables import write_rows
 from mapfusion.errors import DamagedFileError
-from mapfusion.odometry_covariance import read_odometry_covariance, write_odometry_covariance
-from mapfusion.robot_log import RobotLog, read_log, write_log
-from mapfusion.smoother.smooth import SmootherParameters, smooth
-from mapfusion.smoother.smoothed_map import smoothed_map
-from mapfusion.storage import POSE_FIELDS
+from mapfusion.files import POSE_FIELDS
+from mapfusion.robot_log import (
+    RobotLog,
+    read_log,
+    read_odometry_covariance,
+    write_log,
+    write_odometry_covariance,
+)
+from mapfusion.smoother.smooth import SmootherParameters, smooth, smoothed_map
 from tests.mapfusion.smoother.white_noise_logs import dead_reckoned, white_noise_log
 
 N_FRAMES, CHANGED_AT = 40, 20

@@ -11,19 +11,18 @@ import numpy as np
 import pytest
 from pydantic_core import to_jsonable_python
 
-from experiments.judge.judged_run import JudgedRun
+from experiments.evaluation.evaluated_run import JudgedRun
 from experiments.methods.catalogue import find_method
-from experiments.run import stage as stage_module
-from experiments.run.code_version import imported_sources
-from experiments.run.job import Job
-from experiments.run.pipeline import lay_out
-from experiments.run.stage import RecordedLog, Stage, with_those_before
-from experiments.run.store import Store
+from experiments.pipeline import stage as stage_module
+from experiments.pipeline.code_version import imported_sources
+from experiments.pipeline.pipeline import lay_out
+from experiments.pipeline.stage import Job, RecordedLog, Stage, with_those_before
+from experiments.pipeline.store import Store
 from experiments.scenario.loading import load_scenario, scenario_of
 from experiments.scenario.settings import Simulation
-from mapfusion.align.registry import ALIGNERS
+from mapfusion.align.aligners import ALIGNERS
 from mapfusion.errors import InputError
-from mapfusion.fuse.registry import FUSERS
+from mapfusion.fusion.fusers import FUSERS
 from mapfusion.robot_log import Observations, RobotLog, write_log
 from sim.renderer import egl_driver
 from tests.helpers.tiny_scenario import TINY
@@ -207,7 +206,7 @@ def work(settings: Any, job: Job) -> None:
     """Of made-up stages."""
 
 
-work.__module__ = "experiments.run.job"  # a key covers the source of the harness alone
+work.__module__ = "experiments.pipeline.stage"  # a key covers the source of the harness alone
 
 
 def made_up(name: str = "one", settings: Any = None, **more: Any) -> Stage:
@@ -282,7 +281,7 @@ def test_keys_cover_all_the_source_a_stage_runs(resolved: dict[str, Any]) -> Non
     assert isinstance(scenario, Simulation)
     for stage in stages_of(scenario):
         covered = {part.removesuffix(".py").replace("/", ".") for part in stage.sources}
-        by_name = frozenset({"mapfusion.align.registry"})  # stands for whatever it is asked for
+        by_name = frozenset({"mapfusion.align.aligners"})  # stands for whatever it is asked for
         expected = reached(stage.work.__module__, *stage.loads, without=by_name)
         packages = {name for name in expected if f"{name}.__init__" in covered or "." not in name}
         assert expected - packages <= covered, stage.name

@@ -2,11 +2,9 @@ from pathlib import Path
 
 import pytest
 
-from experiments.run.job import Job
-from experiments.run.stage import Stage
-from experiments.run.store import Store
-from experiments.run.store_files import link_or_copy
-from experiments.run.tasks import tasks_of
+from experiments.pipeline.stage import Job, Stage
+from experiments.pipeline.store import Store, link_or_copy
+from experiments.pipeline.tasks import tasks_of
 from mapfusion.errors import DamagedFileError
 
 
@@ -15,7 +13,7 @@ def work(settings: int, job: Job) -> dict[str, float]:
     return {"extra_s": 2.0}
 
 
-work.__module__ = "experiments.run.job"  # a key covers the source of the harness alone
+work.__module__ = "experiments.pipeline.stage"  # a key covers the source of the harness alone
 
 
 def test_a_stage_is_finished_once_all_its_parts_are(tmp_path: Path) -> None:

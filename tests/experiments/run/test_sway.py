@@ -6,13 +6,13 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from experiments.judge.judged_run import JudgedRun
-from experiments.judge.judging import load_robot
-from experiments.judge.truth import fit_rmse_m
-from experiments.run.store import Store
+from experiments.evaluation.evaluated_run import JudgedRun
+from experiments.evaluation.pair_evaluation import load_robot
+from experiments.evaluation.truth import fit_rmse_m
+from experiments.pipeline.store import Store
 from experiments.scenario.loading import load_scenario
-from mapfusion import se2
 from mapfusion.attitude import read_attitude
+from mapfusion.geometry import se2
 from mapfusion.robot_log import read_log, read_truth
 from sim.trajectory import read_trajectory
 from tests.helpers.tiny_scenario import TINY

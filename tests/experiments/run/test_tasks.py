@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from experiments.run.tasks import Task, run_tasks, unfinished
-from experiments.run.workers import workers
+from experiments.pipeline.tasks import Task, run_tasks, unfinished
+from experiments.pipeline.workers import workers
 
 
 def _append(journal: Path, name: str, output: Path) -> None:

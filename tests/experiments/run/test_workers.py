@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.run.workers import workers
+from experiments.pipeline.workers import workers
 from mapfusion.errors import InputError
 from tests.helpers.waiting import has_ended, wait_until
 
@@ -24,13 +24,13 @@ def test_a_killed_worker_is_told_in_one_line() -> None:
 
 READY = """
 import importlib, os, sys
-from experiments.run.workers import workers
+from experiments.pipeline.workers import workers
 
 def told():
-    return os.getppid(), "experiments.scenario.schema" in sys.modules
+    return os.getppid(), "experiments.scenario.loading" in sys.modules
 
 if __name__ == "__main__":
-    importlib.import_module("experiments.scenario.schema")  # the server imports it, too
+    importlib.import_module("experiments.scenario.loading")  # the server imports it, too
     with workers(2) as pool:
         for tag in range(8):
             pool.submit(tag, told)
@@ -54,7 +54,7 @@ def test_workers_are_forked_from_a_server_with_what_is_imported_here(tmp_path: P
 
 FORKED = """
 import os, sys, threading
-from experiments.run.workers import make_ready, workers
+from experiments.pipeline.workers import make_ready, workers
 
 def told():
     return os.getppid(), made_here
@@ -106,7 +106,7 @@ def test_a_server_is_forked_from_a_command_that_has_begun_nothing(
 
 PARENT = """
 import os, sys, time
-from experiments.run.workers import make_ready, workers
+from experiments.pipeline.workers import make_ready, workers
 if __name__ == "__main__":
     make_ready(int(sys.argv[1]))
     with workers(2) as pool:

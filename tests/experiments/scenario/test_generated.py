@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from experiments.judge.judged_run import JudgedRun
-from experiments.run.store import Store
+from experiments.evaluation.evaluated_run import JudgedRun
+from experiments.pipeline.store import Store
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import AnyScenario, Simulation
 from mapfusion.errors import InputError

@@ -1,7 +1,7 @@
 import numpy as np
 from scipy.stats import pearsonr
 
-from experiments.scenario.randomness import generator
+from experiments.scenario.seeds import generator
 
 
 def draw(seed: int, *purpose: str | int) -> list[float]:

@@ -7,8 +7,7 @@ from typing import Any
 
 import pytest
 
-from experiments.scenario.loading import scenario_of
-from experiments.scenario.schema import schema_text
+from experiments.scenario.loading import scenario_of, schema_text
 from mapfusion.errors import InputError
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"

@@ -10,7 +10,7 @@ import pytest
 
 from experiments.scenario.loading import default_settings, load_scenario
 from experiments.scenario.seeds import parse_seeds
-from experiments.scenario.yaml_input import apply_overrides, parse_value, read_mapping
+from experiments.scenario.yaml_files import apply_overrides, parse_value, read_mapping
 from mapfusion.errors import InputError, InputErrors
 from tests.helpers.tiny_scenario import TINY
 
@@ -169,7 +169,7 @@ def test_json_is_read_as_yaml_is(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("text", ["[1, 2]", "5", "null", '"x"'])
 def test_a_result_file_that_is_no_object_says_what_it_holds(tmp_path: Path, text: str) -> None:
-    from mapfusion.storage import read_json
+    from mapfusion.files import read_json
 
     path = tmp_path / "scenario.json"
     path.write_text(text)

@@ -10,9 +10,9 @@ from evo.core.geometry import umeyama_alignment
 from evo.core.metrics import APE, PoseRelation
 from evo.tools.file_interface import read_kitti_poses_file, read_tum_trajectory_file
 
-from experiments.judge import tables
-from experiments.show.figures.result_tables import ResultTables
-from mapfusion import se2
+from experiments.evaluation import tables
+from experiments.reports.figures.result_tables import ResultTables
+from mapfusion.geometry import se2
 from mapfusion.landmark_map import read_map
 from tests.helpers.tiny_scenario import assert_refused, command, without_tables
 

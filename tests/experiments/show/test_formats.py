@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 import mapfusion
-from experiments.show import formats
+from experiments.reports import export
 from mapfusion.landmark_map import read_map
 from tests.helpers.tiny_scenario import command
 
 
 def test_the_page_is_what_the_schemas_say() -> None:
-    text = formats.PAGE.read_text(encoding="utf-8")
-    assert text == formats.page(text), "run: python -m experiments.show.formats"
+    text = export.PAGE.read_text(encoding="utf-8")
+    assert text == export.page(text), "run: python -m experiments.reports.export"
     assert "| `cov_xy_m2` | double | m² | required |" in text
     assert "| `label` | int32 |  | -1 | known identity" in text
 
@@ -23,7 +23,7 @@ def test_maps_made_as_the_page_says_align_and_merge(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    _, code = re.split("```python\n", formats.PAGE.read_text(encoding="utf-8"))
+    _, code = re.split("```python\n", export.PAGE.read_text(encoding="utf-8"))
     exec(code.partition("```")[0], {})
     maps = [read_map(Path(name)) for name in ("north.parquet", "south.parquet")]
     pairs = mapfusion.match(*maps)

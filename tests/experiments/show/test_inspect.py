@@ -8,9 +8,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from experiments.judge import tables
-from experiments.show.inspect import contents_of, unit_of
-from mapfusion.storage import read_json, schema, write_json, write_table
+from experiments.evaluation import tables
+from experiments.reports.inspect import contents_of, unit_of
+from mapfusion.files import read_json, schema, write_json, write_table
 from tests.helpers.tiny_scenario import command
 
 

@@ -2,10 +2,9 @@ import math
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
-from experiments.judge.checking import CheckedScenario
-from experiments.judge.expectations import Outcome
+from experiments.evaluation.checks import CheckedScenario, Outcome
+from experiments.reports.junit import write_junit
 from experiments.scenario.settings import Bound
-from experiments.show.junit import write_junit
 
 
 def test_junit_is_read_back(tmp_path: Path) -> None:

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments.run.estimates import alignment_of
-from experiments.show import rerun_recording
-from experiments.show.figures.result_tables import ResultTables, of_pair
+from experiments.pipeline.tables import alignment_of
+from experiments.reports import rerun_recording
+from experiments.reports.figures.result_tables import ResultTables, of_pair
 from tests.helpers.tiny_scenario import assert_refused, command
 
 Logged = dict[str, dict[int, Any]]  # by entity and frame

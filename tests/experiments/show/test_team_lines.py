@@ -4,8 +4,8 @@ import math
 
 import pandas as pd
 
-from experiments.judge import tables
-from experiments.show.team_lines import edge_lines, team_lines
+from experiments.evaluation import tables
+from experiments.reports.team_text import edge_lines, team_lines
 from tests.helpers.made_up_runs import complete
 
 

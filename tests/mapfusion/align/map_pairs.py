@@ -4,10 +4,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mapfusion import se2
 from mapfusion.align.correspondences import Correspondences
+from mapfusion.geometry import se2
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.looks import DESCRIPTOR_LENGTH
+from mapfusion.tables import DESCRIPTOR_LENGTH
 
 SIZE_M = np.array([20.0, 20.0, 2.5])
 

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from mapfusion.align.rigid import residual_covariances, residuals
+from mapfusion.align.rigid_motion import residual_covariances, residuals
 
 _WORD = 2**64 - 1
 

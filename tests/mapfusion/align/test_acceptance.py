@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
-from mapfusion import se2
-from mapfusion.align.acceptance import Acceptance, Verdict
+from mapfusion.align.alignment import Alignment, Pairs, Status, degenerate
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.pairs import Pairs
 from mapfusion.align.ransac import Ransac
-from mapfusion.align.refine import Refinement
-from mapfusion.align.registration import as_aligner
-from mapfusion.align.result import Alignment, Status, degenerate
+from mapfusion.align.refinement import Refinement
+from mapfusion.geometry import se2
+from mapfusion.registration import as_aligner
+from mapfusion.verification.false_alarms import Acceptance, Verdict
 from tests.mapfusion.align.map_pairs import given_pairs, landmarks, motion, moved, swapped
 
 GATES_M = np.array([0.05, 0.1, 0.2, 0.4])

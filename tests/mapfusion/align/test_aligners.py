@@ -5,15 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapfusion import se2
+from mapfusion.align.aligners import ALIGNERS, make_aligner
+from mapfusion.align.alignment import Pairs, Status
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.oracle import Oracle
-from mapfusion.align.pairs import Pairs
-from mapfusion.align.refine import Refinement
-from mapfusion.align.registration import as_aligner
-from mapfusion.align.registry import ALIGNERS, make_aligner
-from mapfusion.align.result import Status
+from mapfusion.align.refinement import Refinement
 from mapfusion.align.svd import Svd
+from mapfusion.geometry import se2
+from mapfusion.registration import as_aligner
 from tests.mapfusion.align.map_pairs import (
     MapPair,
     error,

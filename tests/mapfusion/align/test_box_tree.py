@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from mapfusion.align.box_tree import POINTS_PER_LEAF, BoxTree
+from mapfusion.align.nearest_neighbours import POINTS_PER_LEAF, BoxTree
 from tests.mapfusion.align.test_closest import points
 
 KINDS = ["spread", "one wall", "far outlier", "one place", "two"]

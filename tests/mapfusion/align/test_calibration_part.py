@@ -5,17 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapfusion import se2
-from mapfusion.align.calibration_part import calibration_part
-from mapfusion.align.pairs import Pairs
-from mapfusion.align.refine import Refinement
-from mapfusion.align.registration import Registration
-from mapfusion.align.registry import make_aligner
-from mapfusion.calibration_error import EXACT, CalibrationError
-from mapfusion.fuse.registry import make_fuser
-from mapfusion.fused_map import AlignedPair
+from mapfusion.align.aligners import make_aligner
+from mapfusion.align.alignment import Pairs
+from mapfusion.align.drift import calibration_part
+from mapfusion.align.refinement import Refinement
+from mapfusion.fusion.fused_map import AlignedPair
+from mapfusion.fusion.fusers import make_fuser
+from mapfusion.fusion.merge import merge
+from mapfusion.geometry import se2
+from mapfusion.geometry.camera import EXACT, CalibrationError
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.merge import merge
+from mapfusion.registration import Registration
 from tests.mapfusion.align.map_pairs import MapPair, given_pairs, stretched
 
 OF_A, OF_B = CalibrationError(0.002, 0.003), CalibrationError(0.001, 0.004)

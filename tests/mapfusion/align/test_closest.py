@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from mapfusion.align.closest import Grid, runs_about
+from mapfusion.align.nearest_neighbours import Grid, runs_about
 from tests.helpers.inner_kernels import from_python
 
 

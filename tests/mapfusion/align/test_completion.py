@@ -4,13 +4,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from mapfusion.align.completion import Completion
+from mapfusion.align.aligners import make_aligner
+from mapfusion.align.alignment import Pairs, Status
 from mapfusion.align.method import Fit
-from mapfusion.align.pairs import Pairs
-from mapfusion.align.registration import PairRegistration, Registration, as_aligner
-from mapfusion.align.registry import make_aligner
-from mapfusion.align.result import Status
-from mapfusion.evidence.judge import Judge
+from mapfusion.registration import Completion, PairRegistration, Registration, as_aligner
+from mapfusion.verification.verdict import Judge
 from tests.mapfusion.align.map_pairs import given_pairs
 from tests.mapfusion.align.test_registration import (
     Answers,

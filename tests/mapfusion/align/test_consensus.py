@@ -11,20 +11,19 @@ from hypothesis import strategies as st
 from scipy.stats import chi2
 from scipy.stats import f as f_distribution
 
-from mapfusion import se2
+from mapfusion.align.aligners import make_aligner
+from mapfusion.align.alignment import Pairs, Status
 from mapfusion.align.clique import Clique, CliqueSearch
-from mapfusion.align.consistency import in_rows
+from mapfusion.align.consensus import in_rows
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.gnc import Gnc
 from mapfusion.align.mahalanobis_gate import mean_variances, settle
 from mapfusion.align.method import Fit
 from mapfusion.align.oracle import Oracle
-from mapfusion.align.pairs import Pairs
 from mapfusion.align.ransac_mahalanobis import RansacMahalanobis, least_truncated_squares
-from mapfusion.align.registration import as_aligner
-from mapfusion.align.registry import make_aligner
-from mapfusion.align.result import Status
-from mapfusion.align.rigid import fit_rigid
+from mapfusion.align.rigid_motion import fit_rigid
+from mapfusion.geometry import se2
+from mapfusion.registration import as_aligner
 from tests.mapfusion.align.map_pairs import blurred, error, given_pairs, landmarks, moved, swapped
 from tests.mapfusion.align.slow_twins import draw, slow_consistency, slow_squares
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from mapfusion.align.consistency import consistency, in_rows
-from mapfusion.align.pairs import Pairs
+from mapfusion.align.alignment import Pairs
+from mapfusion.align.consensus import consistency, in_rows
 from tests.mapfusion.align.map_pairs import blurred, given_pairs, motion, moved
 from tests.mapfusion.align.slow_twins import slow_consistency
 

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapfusion.align import nearest_descriptors as module
+from mapfusion.align import correspondences as module
 from mapfusion.align.correspondences import (
     Correspondences,
     HeightGate,
@@ -11,7 +11,7 @@ from mapfusion.align.correspondences import (
     match,
     scale_note,
 )
-from mapfusion.looks import NO_LABEL
+from mapfusion.tables import NO_LABEL
 from tests.mapfusion.align.map_pairs import landmarks, unit_vectors
 
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from mapfusion.align import degeneracy as module
+from mapfusion.align import method as module
+from mapfusion.align.alignment import Pairs
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.degeneracy import SHAPE_FALSE_ALARM, lacks_extent, why_one_place
-from mapfusion.align.pairs import Pairs
+from mapfusion.align.method import SHAPE_FALSE_ALARM, lacks_extent, why_one_place
 from tests.mapfusion.align.map_pairs import covariances, landmarks
 
 

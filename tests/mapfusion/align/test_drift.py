@@ -4,7 +4,7 @@ from scipy.optimize import brentq, minimize_scalar
 from scipy.stats import chi2
 
 from mapfusion.align.drift import DRIFT_FLOOR_M, estimate_drift_m
-from mapfusion.se2 import rotation
+from mapfusion.geometry.se2 import rotation
 
 
 def residuals_with(rng, n, drift_m):

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from mapfusion import se2
-from mapfusion.align.false_alarms import (
+from mapfusion.geometry import se2
+from mapfusion.verification.false_alarms import (
     agreeing_repairings,
     chance_of_agreeing,
     fewest_false_alarms,

@@ -2,15 +2,13 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from mapfusion import se2
+from mapfusion.align.aligners import make_aligner
+from mapfusion.align.alignment import Pairs, Status
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.icp import ClosestPoints, Icp
-from mapfusion.align.impicp import ImpIcp
-from mapfusion.align.pairs import Pairs
-from mapfusion.align.registration import as_aligner
-from mapfusion.align.registry import make_aligner
-from mapfusion.align.result import Status
-from mapfusion.align.rigid import fit_rigid
+from mapfusion.align.icp import ClosestPoints, Icp, ImpIcp
+from mapfusion.align.rigid_motion import fit_rigid
+from mapfusion.geometry import se2
+from mapfusion.registration import as_aligner
 from tests.mapfusion.align.map_pairs import error, given_pairs, landmarks
 
 

@@ -4,14 +4,12 @@ import numpy as np
 import pytest
 from scipy.stats import f
 
-from mapfusion import se2
+from mapfusion.align.alignment import Pairs, Status
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.leverage import is_unlike_the_others, most_leverage
-from mapfusion.align.mahalanobis_gate import PlanarPairs
-from mapfusion.align.pairs import Pairs
-from mapfusion.align.refine import Refinement
-from mapfusion.align.result import Status
-from mapfusion.align.rigid import fit_rigid, motion_jacobian, residual_covariances
+from mapfusion.align.mahalanobis_gate import PlanarPairs, is_unlike_the_others, most_leverage
+from mapfusion.align.refinement import Refinement
+from mapfusion.align.rigid_motion import fit_rigid, motion_jacobian, residual_covariances
+from mapfusion.geometry import se2
 from mapfusion.landmark_map import LandmarkMap
 
 T_TRUE = np.array([1.0, -2.0, 0.7])

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, multivariate_normal
 
+from mapfusion.align.alignment import Pairs
 from mapfusion.align.mahalanobis_gate import (
     Spread,
     log_likelihood,
@@ -13,8 +14,7 @@ from mapfusion.align.mahalanobis_gate import (
     settle_at_best_scale,
     spread_area_m2,
 )
-from mapfusion.align.pairs import Pairs
-from mapfusion.align.rigid import fit_weighted
+from mapfusion.align.rigid_motion import fit_weighted
 from tests.helpers.inner_kernels import from_python
 from tests.mapfusion.align.map_pairs import blurred, error, given_pairs, stretched
 from tests.mapfusion.align.slow_twins import slow_squares

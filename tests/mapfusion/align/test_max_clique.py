@@ -3,13 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mapfusion.align.max_clique import (
-    everyone,
-    greedy_clique,
-    keep_core,
-    larger_clique,
-    may_hold,
-)
+from mapfusion.align.clique import everyone, greedy_clique, keep_core, larger_clique, may_hold
 
 UNLIMITED = 1_000_000
 

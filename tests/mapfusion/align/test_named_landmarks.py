@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from mapfusion import se2
-from mapfusion.align.acceptance import Acceptance
+from mapfusion.align.aligners import make_aligner
+from mapfusion.align.alignment import Status
 from mapfusion.align.correspondences import match
-from mapfusion.align.named_landmarks import named_false_alarms
-from mapfusion.align.registration import Registration
-from mapfusion.align.registry import make_aligner
-from mapfusion.align.result import Status
-from mapfusion.align.rigid import fit_rigid
+from mapfusion.align.rigid_motion import fit_rigid
+from mapfusion.geometry import se2
 from mapfusion.landmark_map import LandmarkMap
+from mapfusion.registration import Registration
+from mapfusion.verification.false_alarms import Acceptance, named_false_alarms
 
 GATES_M = np.array(sorted(Acceptance().gates_m))
 T_A_B = np.array([1.0, -2.0, 0.7])

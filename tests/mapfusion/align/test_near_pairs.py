@@ -2,9 +2,14 @@
 
 import numpy as np
 
-from mapfusion import se2
-from mapfusion.align.mahalanobis_gate import PlanarPairs
-from mapfusion.align.near_pairs import farthest_m, leaves_margin, rows_in_reach, those_of
+from mapfusion.align.mahalanobis_gate import (
+    PlanarPairs,
+    farthest_m,
+    leaves_margin,
+    rows_in_reach,
+    those_of,
+)
+from mapfusion.geometry import se2
 from tests.helpers.inner_kernels import from_python
 
 

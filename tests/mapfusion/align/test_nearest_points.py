@@ -2,9 +2,14 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from mapfusion import se2
-from mapfusion.align.box_tree import BoxTree
-from mapfusion.align.nearest_points import GROUP, Groups, look_up_group, room_for_groups
+from mapfusion.align.nearest_neighbours import (
+    GROUP,
+    BoxTree,
+    Groups,
+    look_up_group,
+    room_for_groups,
+)
+from mapfusion.geometry import se2
 from tests.helpers.inner_kernels import from_python
 from tests.mapfusion.align.test_box_tree import KINDS
 from tests.mapfusion.align.test_closest import points

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from mapfusion import se2
+from mapfusion.align.aligners import make_aligner
+from mapfusion.align.alignment import Status
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.registration import as_aligner
-from mapfusion.align.registry import make_aligner
-from mapfusion.align.result import Status
-from mapfusion.align.rigid import fit_rigid
+from mapfusion.align.rigid_motion import fit_rigid
+from mapfusion.geometry import se2
+from mapfusion.registration import as_aligner
 from tests.mapfusion.align.map_pairs import error, given_pairs, landmarks, swapped
 
 pytest.importorskip("kiss_matcher")

@@ -5,14 +5,13 @@ import numpy as np
 import pytest
 from scipy.stats import chisquare
 
-from mapfusion import se2
+from mapfusion.align.alignment import Pairs, Status
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.oracle import Oracle
-from mapfusion.align.pairs import Pairs
 from mapfusion.align.ransac import Ransac, draw_pair, list_supporters, most_supported
-from mapfusion.align.refine import Refinement
-from mapfusion.align.registration import as_aligner
-from mapfusion.align.result import Status
+from mapfusion.align.refinement import Refinement
+from mapfusion.geometry import se2
+from mapfusion.registration import as_aligner
 from tests.helpers.inner_kernels import from_python
 from tests.mapfusion.align.map_pairs import error, given_pairs, landmarks
 from tests.mapfusion.align.slow_twins import draw

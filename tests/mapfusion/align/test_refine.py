@@ -6,13 +6,12 @@ import pytest
 from scipy.stats import chi2
 from scipy.stats import f as f_distribution
 
-from mapfusion import se2
+from mapfusion.align.alignment import Pairs, Status
 from mapfusion.align.drift import drift_step
 from mapfusion.align.mahalanobis_gate import PlanarPairs
-from mapfusion.align.pairs import Pairs
-from mapfusion.align.refine import Refinement, maximise_likelihood
-from mapfusion.align.result import Status
-from mapfusion.align.rigid import motion_jacobian, residual_covariances, residuals
+from mapfusion.align.refinement import Refinement, maximise_likelihood
+from mapfusion.align.rigid_motion import motion_jacobian, residual_covariances, residuals
+from mapfusion.geometry import se2
 from tests.mapfusion.align.map_pairs import error, given_pairs, stretched
 
 

@@ -6,23 +6,22 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from mapfusion.align.acceptance import Acceptance, Verdict
+from mapfusion.align.aligners import ALIGNERS, make_aligner
+from mapfusion.align.alignment import Alignment, Pairs, Status, without_answer
 from mapfusion.align.correspondences import Correspondences, HeightGate
 from mapfusion.align.method import Fit, Needs, Undetermined, supported
-from mapfusion.align.pairs import Pairs
 from mapfusion.align.ransac import Ransac
-from mapfusion.align.refine import Refinement
-from mapfusion.align.registration import Registered, Registration, as_aligner
-from mapfusion.align.registry import ALIGNERS, make_aligner
-from mapfusion.align.result import Alignment, Status, without_answer
-from mapfusion.align.rigid import (
+from mapfusion.align.refinement import Refinement
+from mapfusion.align.rigid_motion import (
     fit_rigid,
     least_squares_gain,
     motion_covariance,
     motion_jacobian,
     residual_covariances,
 )
-from mapfusion.evidence.judge import Judge
+from mapfusion.registration import Registered, Registration, as_aligner
+from mapfusion.verification.false_alarms import Acceptance, Verdict
+from mapfusion.verification.verdict import Judge
 from tests.mapfusion.align.map_pairs import given_pairs, landmarks
 
 

@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from mapfusion import se2
-from mapfusion.align.rigid import (
+from mapfusion.align.rigid_motion import (
     fit_rigid,
     fit_two,
     fit_weighted,
@@ -13,6 +12,7 @@ from mapfusion.align.rigid import (
     residual_covariances,
     residuals,
 )
+from mapfusion.geometry import se2
 from tests.helpers.inner_kernels import from_python
 from tests.mapfusion.align.map_pairs import covariances, error, motion
 

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from mapfusion.align.closest import Grid
-from mapfusion.evidence.copies import BETWEEN, Copies, about_each, laid_on_like, of_others
-from mapfusion.evidence.parameters import EvidenceParameters
-from mapfusion.evidence.regions import Witness, Witnesses
+from mapfusion.align.nearest_neighbours import Grid
+from mapfusion.verification.parameters import EvidenceParameters
+from mapfusion.verification.regions import Witness, Witnesses
+from mapfusion.verification.rivals import BETWEEN, Copies, about_each, laid_on_like, of_others
 from tests.mapfusion.evidence.two_rooms import Wall, between, mapped
 
 

@@ -6,12 +6,11 @@ import math
 import numpy as np
 import pytest
 
-from mapfusion.evidence.expected import LEAST_FRAMES, MAY, MUST, UNSEEN, Seen, how_seen
-from mapfusion.evidence.regions import Witness
-from mapfusion.evidence.watch import Watch
-from mapfusion.fastslam.run import run_log
+from mapfusion.fastslam.mapping import run_log
+from mapfusion.verification.regions import Witness
+from mapfusion.verification.visibility import LEAST_FRAMES, MAY, MUST, UNSEEN, Seen, Watch, how_seen
 from mapfusion.viewing import BEARINGS, RANGES, FieldOfView, Viewing
-from mapfusion.vision.tracks import TrackParameters
+from mapfusion.vision.tracking import TrackParameters
 from tests.mapfusion.evidence.two_rooms import Wall, between, mapped
 
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from mapfusion.align.closest import Grid
-from mapfusion.evidence.found import Gates, Looks, has
+from mapfusion.align.nearest_neighbours import Grid
+from mapfusion.verification.regions import Gates, Looks, has
 
 
 def looks(rng: np.random.Generator, p: np.ndarray) -> Looks:

@@ -7,20 +7,17 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-from mapfusion.align.acceptance import Acceptance, Verdict
+from mapfusion.align.alignment import Alignment, Pairs, Status
 from mapfusion.align.clique import Clique
 from mapfusion.align.correspondences import match
-from mapfusion.align.pairs import Pairs
-from mapfusion.align.registration import Registration
-from mapfusion.align.result import Alignment, Status
-from mapfusion.evidence import pair_evidence
-from mapfusion.evidence.copies import BETWEEN, Copies
-from mapfusion.evidence.judge import Judge
-from mapfusion.evidence.pair_evidence import RivalMotion
-from mapfusion.evidence.parameters import EvidenceParameters
-from mapfusion.evidence.regions import Witness
-from mapfusion.evidence.rivals import self_motions
 from mapfusion.landmark_map import LandmarkMap
+from mapfusion.registration import Registration
+from mapfusion.verification import verdict
+from mapfusion.verification.false_alarms import Acceptance, Verdict
+from mapfusion.verification.parameters import EvidenceParameters
+from mapfusion.verification.regions import Witness
+from mapfusion.verification.rivals import BETWEEN, Copies, self_motions
+from mapfusion.verification.verdict import Judge, RivalMotion
 from tests.mapfusion.evidence.two_rooms import Wall, between, mapped
 
 JUDGE = Judge()
@@ -190,7 +187,7 @@ def test_a_map_in_several_pairs_is_asked_once_and_says_the_same(monkeypatch) -> 
         asked.append(landmarks.name)
         return self_motions(landmarks, *settings)
 
-    monkeypatch.setattr(pair_evidence, "self_motions", counted)
+    monkeypatch.setattr(verdict, "self_motions", counted)
     for _ in range(2):
         for a, b in itertools.permutations(range(3), 2):
             pairs = Pairs(maps[a], maps[b], match(maps[a], maps[b]))

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import beta, betabinom
 
-from mapfusion.evidence.fitted_twins import WHOLE
-from mapfusion.evidence.likelihood import (
+from mapfusion.verification.fitted_twins import WHOLE
+from mapfusion.verification.likelihood import (
     CHANGED,
     PART,
     RIGHT,

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from mapfusion import se2
-from mapfusion.evidence.precision import laid_sigma_m
+from mapfusion.geometry import se2
+from mapfusion.verification.verdict import laid_sigma_m
 
 COVARIANCE = np.array([[4.0, 1.0, -0.6], [1.0, 3.0, 0.5], [-0.6, 0.5, 0.4]]) * 1e-4
 P_B = np.random.default_rng(0).uniform([2, -9], [12, 3], (40, 2))

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from mapfusion.evidence import probability as model
-from mapfusion.evidence.probability import Signs, probability
+from mapfusion.verification import likelihood as model
+from mapfusion.verification.likelihood import Signs, probability
 
 FAIR = Signs(-20.0, 1.0, 4, 0, 50, 8.0, repeats=False, one_place=False)
 

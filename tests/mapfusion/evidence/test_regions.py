@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from mapfusion import se2
-from mapfusion.evidence.copies import BETWEEN, Copies
-from mapfusion.evidence.fitted_twins import WHOLE
-from mapfusion.evidence.likelihood import COPIED, OWN, TwinShares, log10_ratio
-from mapfusion.evidence.pair_evidence import _twin_shares
-from mapfusion.evidence.parameters import EvidenceParameters
-from mapfusion.evidence.regions import Regions, Squares, Witness, Witnesses
+from mapfusion.geometry import se2
+from mapfusion.verification.fitted_twins import WHOLE
+from mapfusion.verification.likelihood import COPIED, OWN, TwinShares, log10_ratio
+from mapfusion.verification.parameters import EvidenceParameters
+from mapfusion.verification.regions import Regions, Squares, Witness, Witnesses
+from mapfusion.verification.rivals import BETWEEN, Copies
+from mapfusion.verification.verdict import _twin_shares
 from tests.mapfusion.evidence.two_rooms import Wall, between, mapped
 
 WALL = Wall(16, seed=1)

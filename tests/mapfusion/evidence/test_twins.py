@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from scipy.cluster.hierarchy import fcluster, linkage
 
-from mapfusion.align.acceptance import Acceptance
-from mapfusion.align.refine import Refinement
-from mapfusion.evidence.rivals import apart_m, self_motions
-from mapfusion.evidence.twins import largest_patch_m, twins
+from mapfusion.align.refinement import Refinement
 from mapfusion.landmark_map import LandmarkMap
+from mapfusion.verification.false_alarms import Acceptance
+from mapfusion.verification.rivals import apart_m, largest_patch_m, self_motions, twins
 from tests.mapfusion.evidence.two_rooms import Wall, mapped
 
 

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from mapfusion import se2
+from mapfusion.geometry import se2
+from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import Observations, RobotLog
-from mapfusion.se2 import Float
 from mapfusion.viewing import viewing_of
 
 HALF_VIEW_RAD, FARTHEST_M = 0.45, 8.0

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import multivariate_normal
 
+from mapfusion.fastslam.filter import FastSlamParameters
 from mapfusion.fastslam.motion import sample_motion
-from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.fastslam.resampling import systematic_ancestors
+from mapfusion.geometry.se2 import compose, rotation_about_z, transform_points
 from mapfusion.robot_log import Observations
-from mapfusion.se2 import compose, rotation_about_z, transform_points
 
 
 @dataclass

@@ -4,11 +4,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mapfusion.fastslam.filter import FastSlamParameters
 from mapfusion.fastslam.motion import MotionNoise
-from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.fastslam.proposal import Proposal
+from mapfusion.geometry.se2 import compose, inverse, transform_points
 from mapfusion.robot_log import Observations
-from mapfusion.se2 import compose, inverse, transform_points
 
 SIGMA_M = 0.03
 EXACT_MOTION = MotionNoise(0, 0, 0, 0, 0, lateral_m_per_sqrt_m=0, lateral_slip_m_per_rad=0)

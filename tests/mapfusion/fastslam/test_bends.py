@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from mapfusion.fastslam.bends import SPACING, Bends
-from mapfusion.se2 import Float
+from mapfusion.fastslam.loop_closing import SPACING, Bends
+from mapfusion.geometry.numerics import Float
 
 SURE = 1 - 1e-12  # every closure is believed
 FAR = np.array([1e3, 1e3])  # where the least turn moves a robot by a millimetre

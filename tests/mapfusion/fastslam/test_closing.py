@@ -5,17 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapfusion.fastslam.bends import SPACING, Bends
-from mapfusion.fastslam.closing import Seen, close_loops, motion_by_odometry
 from mapfusion.fastslam.filter import FastSlam
-from mapfusion.fastslam.genealogy import MEMORY
-from mapfusion.fastslam.history import History
+from mapfusion.fastslam.loop_closing import SPACING, Bends, Seen, close_loops, motion_by_odometry
+from mapfusion.fastslam.measurement import DROPPED, NEW, sightings
 from mapfusion.fastslam.motion import MotionNoise
-from mapfusion.fastslam.particles import ParticleMaps
-from mapfusion.fastslam.sensor import sightings
-from mapfusion.fastslam.update import DROPPED, NEW
+from mapfusion.fastslam.particles import History, ParticleMaps
+from mapfusion.fastslam.resampling import MEMORY
+from mapfusion.geometry.se2 import between, compose, inverse, rotation_about_z, transform_points
 from mapfusion.robot_log import Observations
-from mapfusion.se2 import between, compose, inverse, rotation_about_z, transform_points
 from tests.mapfusion.fastslam.landmark_worlds import drive, nothing, parameters
 
 GATE, SIGMA = 16.0, np.array([0.05, 0.03, 0.02])

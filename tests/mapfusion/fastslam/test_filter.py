@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapfusion.fastslam.filter import FastSlam
+from mapfusion.fastslam.filter import FastSlam, FastSlamParameters
 from mapfusion.fastslam.motion import MotionNoise
-from mapfusion.fastslam.parameters import FastSlamParameters
+from mapfusion.geometry.se2 import compose, inverse, rotation_about_z, transform_points, wrap
 from mapfusion.robot_log import Observations
-from mapfusion.se2 import compose, inverse, rotation_about_z, transform_points, wrap
 from tests.mapfusion.fastslam.landmark_worlds import (
     EXACT_MOTION,
     drive,

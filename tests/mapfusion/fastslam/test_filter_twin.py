@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from mapfusion.fastslam.filter import FastSlam
-from mapfusion.fastslam.genealogy import MEMORY
-from mapfusion.se2 import between
+from mapfusion.fastslam.resampling import MEMORY
+from mapfusion.geometry.se2 import between
 from tests.mapfusion.fastslam.copying_filter import CopyingFilter
 from tests.mapfusion.fastslam.landmark_worlds import drive, nothing, observe, parameters
 

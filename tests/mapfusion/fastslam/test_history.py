@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from mapfusion.fastslam.history import History
+from mapfusion.fastslam.particles import History
 
 
 def lives(n_particles: int, n_steps: int, resampled_every: int) -> tuple[History, list]:

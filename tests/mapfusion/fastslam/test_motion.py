@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mapfusion.fastslam.motion import MotionNoise, sample_motion
-from mapfusion.se2 import between, compose
+from mapfusion.geometry.se2 import between, compose
 
 NOISE = MotionNoise(
     0.02,

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from mapfusion.fastslam.filter import FastSlam
-from mapfusion.fastslam.parameters import FastSlamParameters
+from mapfusion.fastslam.filter import FastSlam, FastSlamParameters
 from mapfusion.robot_log import Observations
 from tests.mapfusion.fastslam.landmark_worlds import EXACT_MOTION, parameters, unit
 

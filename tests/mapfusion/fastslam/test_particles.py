@@ -1,10 +1,9 @@
 import numpy as np
 
-from mapfusion.fastslam.genealogy import MEMORY
+from mapfusion.fastslam.landmarks import BLOCK, FREE, allocate
+from mapfusion.fastslam.measurement import DROPPED, NEW, sightings
 from mapfusion.fastslam.particles import ParticleMaps
-from mapfusion.fastslam.sensor import sightings
-from mapfusion.fastslam.slots import BLOCK, FREE, allocate
-from mapfusion.fastslam.update import DROPPED, NEW
+from mapfusion.fastslam.resampling import MEMORY
 from mapfusion.robot_log import Observations
 
 

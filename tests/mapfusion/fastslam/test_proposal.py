@@ -5,15 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapfusion.fastslam.filter import FastSlam
+from mapfusion.fastslam.filter import FastSlam, FastSlamParameters
+from mapfusion.fastslam.landmarks import LANES, Slots
+from mapfusion.fastslam.measurement import Sightings, sightings
 from mapfusion.fastslam.motion import MotionNoise
-from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.fastslam.particles import ParticleMaps
 from mapfusion.fastslam.proposal import Proposal, informed_disturbance, widened
-from mapfusion.fastslam.sensor import Sightings, sightings
-from mapfusion.fastslam.slots import LANES, Slots
+from mapfusion.geometry.se2 import compose, transform_points
 from mapfusion.robot_log import Observations
-from mapfusion.se2 import compose, transform_points
 from tests.mapfusion.fastslam.landmark_worlds import drive, observe, unit
 
 MOTION = MotionNoise(0.1, 0.05, 0.1, 0, 0, lateral_m_per_sqrt_m=0.1, lateral_slip_m_per_rad=0.03)

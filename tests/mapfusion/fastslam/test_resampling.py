@@ -1,11 +1,7 @@
 import numpy as np
 import pytest
 
-from mapfusion.fastslam.resampling import (
-    effective_sample_size,
-    normalised,
-    systematic_ancestors,
-)
+from mapfusion.fastslam.resampling import effective_sample_size, normalised, systematic_ancestors
 
 
 def test_normalised_weights_sum_to_one_where_plain_ones_underflow():

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from mapfusion.errors import InputError
-from mapfusion.fastslam.filter import FastSlam
-from mapfusion.fastslam.parameters import FastSlamParameters
-from mapfusion.fastslam.run import build_map, run_log
+from mapfusion.fastslam.filter import FastSlam, FastSlamParameters
+from mapfusion.fastslam.mapping import build_map, run_log
 from mapfusion.robot_log import Observations, RobotLog
 from tests.mapfusion.fastslam.landmark_worlds import drive
 

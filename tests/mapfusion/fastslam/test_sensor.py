@@ -2,16 +2,16 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, multivariate_normal
 
-from mapfusion.fastslam.parameters import FastSlamParameters
-from mapfusion.fastslam.sensor import (
+from mapfusion.fastslam.filter import FastSlamParameters
+from mapfusion.fastslam.landmarks import Estimates
+from mapfusion.fastslam.measurement import (
     Sightings,
     innovation,
     log_density_at_gate,
     quadratic_form,
     sightings,
 )
-from mapfusion.fastslam.slots import Estimates
-from mapfusion.se2 import rotation_about_z, transform_points
+from mapfusion.geometry.se2 import rotation_about_z, transform_points
 from tests.helpers.inner_kernels import from_python
 
 UPPER = np.triu_indices(3)

@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 
 from mapfusion.fastslam.filter import FastSlam
+from mapfusion.fastslam.landmarks import FREE, Tracked
+from mapfusion.fastslam.measurement import DROPPED, NEW, sightings
 from mapfusion.fastslam.particles import ParticleMaps
-from mapfusion.fastslam.sensor import sightings
-from mapfusion.fastslam.slots import FREE
-from mapfusion.fastslam.tracked import Tracked
-from mapfusion.fastslam.update import DROPPED, NEW
 from mapfusion.robot_log import Observations
 from tests.mapfusion.fastslam.landmark_worlds import EXACT_MOTION, nothing, parameters
 

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapfusion import se2
+from mapfusion.align.alignment import Alignment, Status
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.result import Alignment, Status
-from mapfusion.fused_map import AlignedPair
-from mapfusion.joint_covariance import JointCovariance
+from mapfusion.fusion.fused_map import AlignedPair
+from mapfusion.geometry import se2
+from mapfusion.geometry.joint_covariance import JointCovariance
 from mapfusion.landmark_map import LandmarkMap
 
 OWN_M = 0.01  # of landmarks' own errors

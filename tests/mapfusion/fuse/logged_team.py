@@ -5,17 +5,15 @@ from itertools import combinations
 
 import numpy as np
 
-from mapfusion import se2
+from mapfusion.align.alignment import Alignment, Status
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.result import Alignment, Status
-from mapfusion.fuse.component import Component
-from mapfusion.fused_map import AlignedPair, FusedMap
+from mapfusion.fusion.fused_map import AlignedPair, Component, FusedMap
+from mapfusion.geometry import se2
+from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import RobotLog
-from mapfusion.se2 import Float
-from mapfusion.smoother.recording import Recording
-from mapfusion.smoother.smooth import SmootherParameters, smooth
-from mapfusion.smoother.smoothed_map import smoothed_map
+from mapfusion.smoother.joint_smoothing import Recording
+from mapfusion.smoother.smooth import SmootherParameters, smooth, smoothed_map
 from tests.mapfusion.smoother.white_noise_logs import (
     Known,
     dead_reckoned,

@@ -7,15 +7,15 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
-from mapfusion.aligned_landmarks import ABSENT
-from mapfusion.fuse.batch import Batch
-from mapfusion.fuse.joint import JointFuser
-from mapfusion.fuse.parameters import MergeParameters
-from mapfusion.fused_map import FusedMap
-from mapfusion.merge import connect
+from mapfusion.fusion.aligned_landmarks import ABSENT
+from mapfusion.fusion.batch import Batch
+from mapfusion.fusion.fused_map import FusedMap, MergeParameters
+from mapfusion.fusion.joint import JointFuser
+from mapfusion.fusion.merge import connect
+from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.se2 import between, compose, rotation, wrap
 from mapfusion.robot_log import NO_TRACK
-from mapfusion.se2 import Float, between, compose, rotation, wrap
-from mapfusion.smoother.together import SmoothedTogether, smooth_together
+from mapfusion.smoother.joint_smoothing import SmoothedTogether, smooth_together
 from tests.mapfusion.fuse.logged_team import STRAY_M, LoggedTeam, labels, log_labels
 from tests.mapfusion.smoother.white_noise_logs import NOISE, Known
 

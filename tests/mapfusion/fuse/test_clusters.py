@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 
-from mapfusion.fuse.clusters import Pair, joined
+from mapfusion.fusion.aligned_landmarks import Pair, joined
 
 SIZES = [12, 9, 11]
 

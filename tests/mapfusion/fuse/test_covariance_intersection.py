@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mapfusion.fuse.covariance_intersection import intersected
+from mapfusion.fusion.covariance_intersection import intersected
 from tests.mapfusion.align.map_pairs import covariances
 
 

@@ -7,18 +7,16 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
-from mapfusion import se2
-from mapfusion.aligned_landmarks import ABSENT
-from mapfusion.calibration_error import CalibrationError
-from mapfusion.fuse.joint import JointFuser
-from mapfusion.fuse.joint_estimate import estimate_jointly
-from mapfusion.fuse.joint_map import JointMap
-from mapfusion.fuse.kalman_drift import KalmanDrift
-from mapfusion.fuse.parameters import MergeParameters
-from mapfusion.fused_map import FusedMap
+from mapfusion.fusion.aligned_landmarks import ABSENT
+from mapfusion.fusion.fused_map import FusedMap, MergeParameters
+from mapfusion.fusion.joint import JointFuser
+from mapfusion.fusion.joint_estimate import JointMap, estimate_jointly
+from mapfusion.fusion.kalman import KalmanDrift
+from mapfusion.fusion.merge import connect, merge
+from mapfusion.geometry import se2
+from mapfusion.geometry.camera import CalibrationError
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.merge import connect, merge
-from mapfusion.smoother.student import information_share
+from mapfusion.smoother.robust_loss import information_share
 from tests.mapfusion.fuse.drawn_maps import BENT_M, DrawnTeam
 
 OPPOSITE = [slice(0, 40), slice(25, 65), slice(50, 90)]  # the first and the last share nothing
@@ -284,7 +282,7 @@ def test_covariances_that_cannot_be_computed_with_are_told(monkeypatch: pytest.M
     def fails(*_: object) -> None:
         raise np.linalg.LinAlgError
 
-    monkeypatch.setattr("mapfusion.fuse.joint.estimate_jointly", fails)
+    monkeypatch.setattr("mapfusion.fusion.joint.estimate_jointly", fails)
     team = DrawnTeam([slice(0, 40), slice(20, 60)], 4)
     found, instead = _fused(team), _fused(team, team.pairs, KalmanDrift())
     np.testing.assert_array_equal(found.landmarks.position_m, instead.landmarks.position_m)

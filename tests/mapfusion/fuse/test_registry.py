@@ -4,9 +4,9 @@ from importlib.metadata import EntryPoint
 
 import pytest
 
-from mapfusion.fuse import registry
-from mapfusion.fuse.joint import JointFuser
-from mapfusion.fuse.registry import FUSERS, GROUP, make_fuser
+from mapfusion.fusion import fusers
+from mapfusion.fusion.fusers import FUSERS, GROUP, make_fuser
+from mapfusion.fusion.joint import JointFuser
 
 
 class Other:
@@ -32,7 +32,7 @@ def offered(monkeypatch: pytest.MonkeyPatch) -> None:
         EntryPoint("none", f"{__name__}:NoFuser", GROUP),
         EntryPoint("gone", f"{__name__}:Gone", GROUP),
     ]
-    monkeypatch.setattr(registry, "entry_points", lambda group: entries)
+    monkeypatch.setattr(fusers, "entry_points", lambda group: entries)
 
 
 @pytest.mark.parametrize("name", FUSERS)

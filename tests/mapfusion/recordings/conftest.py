@@ -2,9 +2,9 @@
 
 import pytest
 
-from mapfusion.recordings.registry import read_recording
-from mapfusion.recordings.stereo_import import Imported, StereoImport
-from mapfusion.recordings.stereo_recording import StereoRecording
+from mapfusion.datasets.formats import read_recording
+from mapfusion.datasets.stereo_import import Imported, StereoImport
+from mapfusion.datasets.stereo_recording import StereoRecording
 from tests.mapfusion.recordings.extracts import WHOLE, laid_out_as_kitti
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapfusion import se2
-from mapfusion.recordings.stereo_import import Cut
+from mapfusion.datasets.stereo_import import Cut
+from mapfusion.geometry import se2
 
 RECORDINGS = Path(os.environ.get("MAPFUSION_RECORDINGS", "none"))
 WHOLE = Cut("R1", slice(None))

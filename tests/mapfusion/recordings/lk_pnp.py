@@ -3,9 +3,9 @@
 import cv2
 import numpy as np
 
-from mapfusion import se3
-from mapfusion.recordings.lens import R_ROBOT_OPTICAL
-from mapfusion.recordings.stereo_import import StereoImport
+from mapfusion.datasets.camera_calibration import R_ROBOT_OPTICAL
+from mapfusion.datasets.stereo_import import StereoImport
+from mapfusion.geometry import se3
 
 _FOLLOW = {"winSize": (21, 21), "maxLevel": 4}
 _LEAST_DISPARITY_PX = 2.0

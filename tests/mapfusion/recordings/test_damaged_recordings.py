@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
+from mapfusion.datasets.formats import import_recording
 from mapfusion.errors import InputError
-from mapfusion.recordings.registry import import_recording
 from tests.mapfusion.recordings.written_layouts import (
     WRITERS,
     Pair,

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from mapfusion import se3
-from mapfusion.camera import StereoCamera
-from mapfusion.recordings.derived_vision import derived_vision, strays_px, with_window_for
-from mapfusion.vision.frontend import FrontEndParameters
-from mapfusion.vision.rigid_links import RigidMotion
-from mapfusion.vision.tracks import Tracks
+from mapfusion.datasets.stereo_import import derived_vision, strays_px, with_window_for
+from mapfusion.geometry import se3
+from mapfusion.geometry.camera import StereoCamera
+from mapfusion.vision.front_end import FrontEndParameters
+from mapfusion.vision.tracking import Tracks
+from mapfusion.vision.visual_odometry import RigidMotion
 
 
 @pytest.mark.parametrize(("focal_px", "baseline_m"), [(577, 0.09), (707, 0.54), (300, 0.05)])

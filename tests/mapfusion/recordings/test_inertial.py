@@ -7,13 +7,12 @@ import pytest
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from mapfusion import se3
+from mapfusion.datasets.formats import read_recording
+from mapfusion.datasets.imu import SHARED_RAD, Inertial
+from mapfusion.datasets.stereo_import import Cut, StereoImport
 from mapfusion.errors import InputError
-from mapfusion.recordings.inertial import SHARED_RAD, Inertial
-from mapfusion.recordings.registry import read_recording
-from mapfusion.recordings.stereo_import import Cut, StereoImport
-from mapfusion.vision.attitude_filter import Measured
-from mapfusion.vision.levelling import Levelling
+from mapfusion.geometry import se3
+from mapfusion.vision.attitude_filter import Levelling, Measured
 from tests.mapfusion.recordings.written_layouts import START_NS, TIMES_S, drive, read_yaml
 from tests.mapfusion.recordings.written_layouts import write_euroc as write_pictures
 from tests.mapfusion.vision.test_levelling import measured_motion

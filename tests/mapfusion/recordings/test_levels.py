@@ -6,20 +6,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapfusion import se3
 from mapfusion.attitude import read_attitude
-from mapfusion.camera import StereoCamera
+from mapfusion.datasets.formats import read_recording
+from mapfusion.datasets.imu import Inertial
+from mapfusion.datasets.levelling import Floor, Levels, floor_of, known_from
+from mapfusion.datasets.stereo_import import Cut, StereoImport, write_imported
+from mapfusion.datasets.stereo_recording import StereoRecording
+from mapfusion.datasets.tum import TimedPoses
 from mapfusion.errors import InputError
-from mapfusion.recordings.floor import Floor, floor_of
-from mapfusion.recordings.inertial import Inertial
-from mapfusion.recordings.levels import Levels, known_from
-from mapfusion.recordings.registry import read_recording
-from mapfusion.recordings.stereo_import import Cut, StereoImport, write_imported
-from mapfusion.recordings.stereo_recording import StereoRecording
-from mapfusion.recordings.timed_poses import TimedPoses
+from mapfusion.geometry import se3
+from mapfusion.geometry.camera import StereoCamera
 from mapfusion.robot_log import Observations
 from mapfusion.vision.features import Features
-from mapfusion.vision.frontend import FrontEndParameters
+from mapfusion.vision.front_end import FrontEndParameters
 from tests.mapfusion.recordings.written_layouts import POSES, drive, write_kitti
 
 HEIGHT_M = 1.65

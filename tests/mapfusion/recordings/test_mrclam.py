@@ -5,15 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mapfusion.datasets.formats import import_recording, settings_class
+from mapfusion.datasets.mrclam import MrclamSettings, import_mrclam
 from mapfusion.errors import InputError
+from mapfusion.fastslam.filter import FastSlamParameters
+from mapfusion.fastslam.mapping import run_log
 from mapfusion.fastslam.motion import MotionNoise
-from mapfusion.fastslam.parameters import FastSlamParameters
 from mapfusion.fastslam.proposal import Proposal
-from mapfusion.fastslam.run import run_log
-from mapfusion.recordings.mrclam import MrclamSettings, import_mrclam
-from mapfusion.recordings.registry import import_recording, settings_class
+from mapfusion.geometry.se2 import between, compose, inverse, transform_points, wrap
 from mapfusion.robot_log import read_log, read_truth
-from mapfusion.se2 import between, compose, inverse, transform_points, wrap
 
 START_S = 1_248_446_182.0
 LANDMARKS = {6: (1.5, 1.0), 7: (2.0, -0.8), 8: (-0.5, 2.0), 20: (0.5, 3.0)}

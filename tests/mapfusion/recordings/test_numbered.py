@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mapfusion.datasets.kitti import numbered_shots
 from mapfusion.errors import InputError
-from mapfusion.recordings.numbered import numbered_shots
 
 
 def test_a_missing_number_leaves_the_others_their_times(tmp_path: Path) -> None:

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from mapfusion import se3
-from mapfusion.camera import StereoCamera
-from mapfusion.recordings.lens import R_ROBOT_OPTICAL
-from mapfusion.recordings.mount import MountSettings, level_mount, levelled, robot_in_body
-from mapfusion.recordings.timed_poses import TimedPoses
+from mapfusion.datasets.camera_calibration import R_ROBOT_OPTICAL
+from mapfusion.datasets.levelling import MountSettings, level_mount, levelled, robot_in_body
+from mapfusion.datasets.tum import TimedPoses
+from mapfusion.geometry import se3
+from mapfusion.geometry.camera import StereoCamera
 from mapfusion.robot_log import Observations
 
 TIMES_NS = np.array([0, 10, 20, 60]) * 100_000_000

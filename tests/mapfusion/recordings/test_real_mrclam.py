@@ -14,20 +14,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapfusion import se2
+from mapfusion.align.aligners import make_aligner
 from mapfusion.align.correspondences import match
-from mapfusion.align.registration import Registration
-from mapfusion.align.registry import make_aligner
-from mapfusion.align.rigid import fit_rigid
+from mapfusion.align.rigid_motion import fit_rigid
+from mapfusion.datasets.mrclam import MrclamSettings, import_mrclam
 from mapfusion.fastslam.association import Association
+from mapfusion.fastslam.filter import FastSlamParameters
+from mapfusion.fastslam.mapping import run_log
 from mapfusion.fastslam.motion import MotionNoise
-from mapfusion.fastslam.parameters import FastSlamParameters
-from mapfusion.fastslam.run import run_log
+from mapfusion.geometry import se2
+from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.log_part import first_frames
-from mapfusion.recordings.mrclam import MrclamSettings, import_mrclam
-from mapfusion.robot_log import read_log, read_truth
-from mapfusion.se2 import Float
+from mapfusion.registration import Registration
+from mapfusion.robot_log import first_frames, read_log, read_truth
 
 DATASET = Path(os.environ.get("MAPFUSION_RECORDINGS", "none")) / "MRCLAM_Dataset7"
 pytestmark = pytest.mark.skipif(

@@ -3,14 +3,13 @@
 import numpy as np
 import pytest
 
-from mapfusion import se2, se3
-from mapfusion.fastslam.parameters import FastSlamParameters
-from mapfusion.fastslam.run import run_log
-from mapfusion.recordings.stereo_import import Cut, Imported, StereoImport
-from mapfusion.recordings.stereo_recording import StereoRecording
-from mapfusion.vision import tracks
-from mapfusion.vision.frontend import FrontEnd
-from mapfusion.vision.observing import Observer
+from mapfusion.datasets.stereo_import import Cut, Imported, StereoImport
+from mapfusion.datasets.stereo_recording import StereoRecording
+from mapfusion.fastslam.filter import FastSlamParameters
+from mapfusion.fastslam.mapping import run_log
+from mapfusion.geometry import se2, se3
+from mapfusion.vision import tracking
+from mapfusion.vision.front_end import FrontEnd, Observer
 from tests.mapfusion.recordings import lk_pnp
 from tests.mapfusion.recordings.extracts import dead_reckoned, needs_recordings
 
@@ -134,13 +133,13 @@ def test_kitti_s_right_links_are_kept(
 ) -> None:
     """Links that lie within 1.5 px, 1 px in disparity, of where the true motion takes them."""
     calls = []
-    found_by = tracks.rigid_links
+    found_by = tracking.rigid_links
 
     def seen(*given):
         calls.append((given, found_by(*given)))
         return calls[-1][1]
 
-    monkeypatch.setattr(tracks, "rigid_links", seen)
+    monkeypatch.setattr(tracking, "rigid_links", seen)
     front_end, observer = FrontEnd(work.camera, work.vision), Observer.of(work.camera, work.vision)
     for k in range(len(kitti)):
         observer.observe(front_end.extract(*work.rectified(k)))

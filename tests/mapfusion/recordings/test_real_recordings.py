@@ -4,19 +4,19 @@ import cv2
 import numpy as np
 import pytest
 
-from mapfusion import se2, se3
+from mapfusion.align.aligners import make_aligner
 from mapfusion.align.correspondences import match
-from mapfusion.align.registration import Registration
-from mapfusion.align.registry import make_aligner
+from mapfusion.datasets.camera_calibration import Lens, StereoCalibration
+from mapfusion.datasets.formats import read_recording
+from mapfusion.datasets.stereo_import import Cut, Imported, StereoImport
+from mapfusion.datasets.stereo_recording import StereoRecording
 from mapfusion.errors import InputError
-from mapfusion.fastslam.parameters import FastSlamParameters
-from mapfusion.fastslam.run import build_map
+from mapfusion.fastslam.filter import FastSlamParameters
+from mapfusion.fastslam.mapping import build_map
+from mapfusion.geometry import se2, se3
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.recordings.lens import Lens, StereoCalibration
-from mapfusion.recordings.registry import read_recording
-from mapfusion.recordings.stereo_import import Cut, Imported, StereoImport
-from mapfusion.recordings.stereo_recording import StereoRecording
-from mapfusion.vision.frontend import FrontEnd
+from mapfusion.registration import Registration
+from mapfusion.vision.front_end import FrontEnd
 from tests.mapfusion.recordings.extracts import (
     RECORDINGS,
     WHOLE,

@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from mapfusion.datasets.camera_calibration import (
+    R_ROBOT_OPTICAL,
+    Lens,
+    Rectification,
+    StereoCalibration,
+)
 from mapfusion.errors import InputError
-from mapfusion.recordings.lens import R_ROBOT_OPTICAL, Lens, StereoCalibration
-from mapfusion.recordings.rectify import Rectification
 
 BROWN = (-0.28, 0.07, 2e-4, 2e-5)
 KANNALA = (-0.01, 0.02, -0.01, 0.002)

@@ -9,12 +9,11 @@ import pytest
 from rosbags.rosbag2 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from mapfusion.datasets.camera_calibration import R_ROBOT_OPTICAL
+from mapfusion.datasets.export import StereoDrive
+from mapfusion.datasets.formats import export_drive, read_recording
+from mapfusion.datasets.rosbag import RosbagSettings, chained, picture
 from mapfusion.errors import InputError
-from mapfusion.recordings.lens import R_ROBOT_OPTICAL
-from mapfusion.recordings.registry import export_drive, read_recording
-from mapfusion.recordings.ros_messages import chained, picture
-from mapfusion.recordings.rosbag import RosbagSettings
-from mapfusion.recordings.stereo_drive import StereoDrive
 from tests.mapfusion.recordings.written_layouts import CAMERA, POSES, TIMES_S, drive
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)

@@ -7,16 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mapfusion import se2, se3
-from mapfusion.camera import StereoCamera
+from mapfusion.datasets.export import StereoDrive
+from mapfusion.datasets.formats import EXPORTERS, export_drive, read_recording, settings_class
+from mapfusion.datasets.levelling import MountSettings
+from mapfusion.datasets.stereo_import import Cut, Imported, StereoImport
+from mapfusion.datasets.stereo_recording import StereoRecording
 from mapfusion.errors import InputError
-from mapfusion.recordings.mount import MountSettings
-from mapfusion.recordings.registry import EXPORTERS, export_drive, read_recording, settings_class
-from mapfusion.recordings.stereo_drive import StereoDrive
-from mapfusion.recordings.stereo_import import Cut, Imported, StereoImport
-from mapfusion.recordings.stereo_recording import StereoRecording
-from mapfusion.vision.frontend import FrontEnd, FrontEndParameters
-from mapfusion.vision.observing import Observer, joined
+from mapfusion.geometry import se2, se3
+from mapfusion.geometry.camera import StereoCamera
+from mapfusion.vision.front_end import FrontEnd, FrontEndParameters, Observer, joined
 from tests.mapfusion.recordings.written_layouts import drive, read_yaml
 
 CAMERA = StereoCamera(width_px=240, height_px=180, focal_px=216.0)  # ahead of the axles

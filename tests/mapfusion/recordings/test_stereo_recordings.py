@@ -9,14 +9,14 @@ import cv2
 import numpy as np
 import pytest
 
-from mapfusion import se2, se3
+from mapfusion.datasets.formats import import_recording, read_recording, settings_class
+from mapfusion.datasets.levelling import MountSettings
+from mapfusion.datasets.stereo_import import Cut, Imported, StereoImport
+from mapfusion.datasets.stereo_recording import Shot, paired
 from mapfusion.errors import InputError
-from mapfusion.recordings.mount import MountSettings
-from mapfusion.recordings.registry import import_recording, read_recording, settings_class
-from mapfusion.recordings.stereo_import import Cut, Imported, StereoImport
-from mapfusion.recordings.stereo_recording import Shot, paired
+from mapfusion.geometry import se2, se3
 from mapfusion.robot_log import read_log
-from mapfusion.vision.frontend import FrontEndParameters
+from mapfusion.vision.front_end import FrontEndParameters
 from tests.mapfusion.recordings.written_layouts import (
     CAMERA,
     POSES,

@@ -5,12 +5,11 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mapfusion import se3
 from mapfusion.attitude import Attitude
-from mapfusion.camera import StereoCamera
-from mapfusion.recordings.visual_odometry import visual_odometry
-from mapfusion.se2 import between
-from mapfusion.vision.rigid_links import RigidMotion
+from mapfusion.geometry import se3
+from mapfusion.geometry.camera import StereoCamera
+from mapfusion.geometry.se2 import between
+from mapfusion.vision.visual_odometry import RigidMotion, visual_odometry
 
 CAMERA = StereoCamera()
 MOUNT = se3.pose(Rotation.from_euler("ZYX", [0.2, 0.1, -0.05]).as_matrix(), [0.4, 0.1, 1.2])

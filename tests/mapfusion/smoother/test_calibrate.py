@@ -7,18 +7,16 @@ import pytest
 
 from mapfusion.errors import InputError
 from mapfusion.fastslam.motion import MotionNoise
+from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.se2 import compose, rotation
 from mapfusion.robot_log import Observations, RobotLog
-from mapfusion.se2 import Float, compose, rotation
-from mapfusion.smoother.calibrate import Calibration, calibrate
 from mapfusion.smoother.elimination import pose_point_blocks
-from mapfusion.smoother.motion_posterior import (
+from mapfusion.smoother.noise_estimation import (
+    LEVELS,
     MotionPosterior,
+    Told,
     disturbance_variances,
     motion_posterior,
-)
-from mapfusion.smoother.noise_levels import (
-    LEVELS,
-    Told,
     pooled,
     relative_errors,
     told,
@@ -27,12 +25,18 @@ from mapfusion.smoother.noise_levels import (
 from mapfusion.smoother.normal_equations import (
     Estimate,
     disturbance_jacobians,
+    first_points,
     odometry_information,
 )
-from mapfusion.smoother.odometry_error import HALF_TRACK_M, OdometryError, sensitivity
-from mapfusion.smoother.residuals import first_points
-from mapfusion.smoother.settle import Problem, settled
-from mapfusion.smoother.sightings import sightings_of
+from mapfusion.smoother.odometry_calibration import (
+    HALF_TRACK_M,
+    Calibration,
+    OdometryError,
+    calibrate,
+    sensitivity,
+)
+from mapfusion.smoother.optimizer import Problem, settled
+from mapfusion.smoother.problem import sightings_of
 from mapfusion.smoother.smooth import SmootherParameters
 from tests.mapfusion.smoother.white_noise_logs import dead_reckoned, white_noise_log
 

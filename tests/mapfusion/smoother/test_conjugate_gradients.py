@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from mapfusion.se2 import Float
-from mapfusion.smoother.conjugate_gradients import solved_by_products
+from mapfusion.geometry.numerics import Float
+from mapfusion.smoother.elimination import solved_by_products
 
 N = 40
 

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from mapfusion.joint_covariance import KnownErrors, condensed
+from mapfusion.geometry.joint_covariance import KnownErrors, condensed
+from mapfusion.geometry.numerics import Float, inverses, put_inverse
+from mapfusion.geometry.se2 import between, rotation, wrap
 from mapfusion.robot_log import RobotLog
-from mapfusion.se2 import Float, between, rotation, wrap
-from mapfusion.smoother import reduced_poses
-from mapfusion.smoother.blocks import inverses, put_inverse
+from mapfusion.smoother import elimination
+from mapfusion.smoother.cholesky import factor_in_envelope
 from mapfusion.smoother.elimination import (
     Solution,
     _landmarks_first,
@@ -27,12 +28,11 @@ from mapfusion.smoother.normal_equations import (
     NormalEquations,
     Shares,
     Weights,
+    first_points,
     normal_equations,
     odometry_information,
 )
-from mapfusion.smoother.residuals import first_points
-from mapfusion.smoother.sightings import Sightings, sightings_of
-from mapfusion.smoother.skyline import factor_in_envelope
+from mapfusion.smoother.problem import Sightings, sightings_of
 from tests.helpers.inner_kernels import from_python
 from tests.mapfusion.smoother.white_noise_logs import (
     NOISE,
@@ -196,12 +196,12 @@ def test_errors_of_the_path_are_those_of_their_large_matrix(planar: bool, tracks
 
 @pytest.mark.parametrize("planar", [False, True])
 @pytest.mark.parametrize("tracks", [False, True])
-@pytest.mark.parametrize("share", [reduced_poses._OFF, 1e-4])
+@pytest.mark.parametrize("share", [elimination._OFF, 1e-4])
 def test_a_step_by_the_factor_of_another_is_the_same(
     planar: bool, tracks: bool, share: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of other weights and another path; covariances are of the equations' own factor."""
-    monkeypatch.setattr(reduced_poses, "_OFF", share)
+    monkeypatch.setattr(elimination, "_OFF", share)
     log, seen, weights, _, _ = solved_densely(planar, tracks)
     information, path = odometry_information(log.odometry, NOISE), dead_reckoned(log)
     at = Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))

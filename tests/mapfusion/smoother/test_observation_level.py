@@ -5,18 +5,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.se2 import rotation
 from mapfusion.robot_log import RobotLog
-from mapfusion.se2 import Float, rotation
-from mapfusion.smoother import levels
+from mapfusion.smoother import noise_estimation
 from mapfusion.smoother.elimination import pose_covariances, solve_points
-from mapfusion.smoother.levels import Levels, settled_with_levels
-from mapfusion.smoother.normal_equations import Estimate, odometry_information
-from mapfusion.smoother.observation_level import _LEAST_M
-from mapfusion.smoother.residuals import first_points, squared_distances, squares_of_points
-from mapfusion.smoother.robust import NO_TAILS, unweighted
-from mapfusion.smoother.settle import Problem, Settled, followed, stretched
-from mapfusion.smoother.sightings import sightings_of
-from mapfusion.smoother.student import fitted_dof, student_weights
+from mapfusion.smoother.noise_estimation import _LEAST_M, Levels, settled_with_levels
+from mapfusion.smoother.normal_equations import (
+    Estimate,
+    first_points,
+    odometry_information,
+    squared_distances,
+    squares_of_points,
+)
+from mapfusion.smoother.optimizer import Problem, Settled, followed, stretched
+from mapfusion.smoother.problem import sightings_of
+from mapfusion.smoother.robust_loss import NO_TAILS, fitted_dof, student_weights, unweighted
 from tests.mapfusion.smoother.white_noise_logs import (
     NOISE,
     dead_reckoned,
@@ -99,8 +103,8 @@ def test_steps_end_where_more_of_them_would(monkeypatch: pytest.MonkeyPatch) -> 
     reckoned = dead_reckoned(log)
     found, told = settled_from(log, reckoned)
     for name, value in (("CONVERGED", 1e-12), ("_CLOSE", 1e-8), ("_SETTLED", 1e-6)):
-        monkeypatch.setattr(levels, name, value)
-    monkeypatch.setattr(levels, "_FOLLOWED", 1e-8)
+        monkeypatch.setattr(noise_estimation, name, value)
+    monkeypatch.setattr(noise_estimation, "_FOLLOWED", 1e-8)
     end, at_end = settled_from(log, reckoned)
     monkeypatch.undo()
     again, told_again = settled_from(log, end.estimate.path)
@@ -127,7 +131,7 @@ def test_the_level_is_known_before_the_first_step(factor: float) -> None:
         STRAY_M**-2,
     )
     at, weights, tails = followed(problem, end.estimate)
-    first = levels.first_observation_level(problem, at, weights, tails)
+    first = noise_estimation.first_observation_level(problem, at, weights, tails)
     assert first * factor == pytest.approx(1, abs=0.15)
 
 
@@ -155,9 +159,9 @@ def test_stretched_steps_end_where_others_do(monkeypatch: pytest.MonkeyPatch) ->
     rows = rng.choice(len(wrong), len(wrong) // 5, replace=False)
     wrong[rows, :2] += rng.normal(0, 0.2, (len(rows), 2))
     log = replace(log, observations=replace(log.observations, position_m=wrong))
-    monkeypatch.setattr(levels, "CONVERGED", 1e-10)
+    monkeypatch.setattr(noise_estimation, "CONVERGED", 1e-10)
     found, told = settled_from(log, dead_reckoned(log))
-    monkeypatch.setattr(levels, "stretched", lambda before, end: 1.0)
+    monkeypatch.setattr(noise_estimation, "stretched", lambda before, end: 1.0)
     slow, told_slowly = settled_from(log, dead_reckoned(log))
     assert found.n_steps < slow.n_steps
     np.testing.assert_allclose(found.estimate.path, slow.estimate.path, rtol=0, atol=1e-5)
@@ -179,7 +183,7 @@ def test_what_weights_leave_of_a_track_tells_its_point() -> None:
     at = Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
     weights = unweighted(seen)
     weights.observation[::2] = 0.1
-    found = levels.first_observation_level(problem, at, weights, NO_TAILS)
+    found = noise_estimation.first_observation_level(problem, at, weights, NO_TAILS)
     rows = seen.strays[seen.track]
     known = seen.n_dimensions * (rows.sum() - seen.strays.sum())
     _, points = solve_points(seen, at, weights, problem.stray_information)

@@ -6,20 +6,19 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
+from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.se2 import compose, rotation
 from mapfusion.robot_log import RobotLog
-from mapfusion.se2 import Float, compose, rotation
-from mapfusion.smoother.levels import settled_with_levels
-from mapfusion.smoother.noise_levels import LEAST_TOLD
+from mapfusion.smoother.noise_estimation import LEAST_DISTURBANCES, Untold, settled_with_levels
 from mapfusion.smoother.normal_equations import (
     Estimate,
+    first_points,
     information_under,
     least_levels,
     odometry_information,
 )
-from mapfusion.smoother.odometry_levels import Untold
-from mapfusion.smoother.residuals import first_points
-from mapfusion.smoother.settle import Problem
-from mapfusion.smoother.sightings import sightings_of
+from mapfusion.smoother.optimizer import Problem
+from mapfusion.smoother.problem import sightings_of
 from tests.mapfusion.smoother.white_noise_logs import NOISE, Known, dead_reckoned, white_noise_log
 
 SEEN_M = 0.0003  # a fifth of what a step's odometry errs by across the motion
@@ -120,7 +119,9 @@ def test_disturbances_that_are_missing_count_as_stated() -> None:
     untold = Untold(share, np.ones(3))
     levels = untold.told_levels(problem, path, np.ones(3))
     told = untold.known(levels)[1]
-    assert levels[1] == pytest.approx((3 * told + (LEAST_TOLD - told)) / LEAST_TOLD, rel=1e-4)
+    assert levels[1] == pytest.approx(
+        (3 * told + (LEAST_DISTURBANCES - told)) / LEAST_DISTURBANCES, rel=1e-4
+    )
     assert 1 < levels[1] < 3
     assert levels[2] == 1.0
 
@@ -135,7 +136,7 @@ def test_exact_odometry_ends_where_its_noise_could_still_be_told(n: int) -> None
     for _ in range(50):
         levels = untold.told_levels(problem, path, levels)
     known = np.sum(1 - 1 / (1 + J * v * levels), axis=0)
-    np.testing.assert_allclose(known, LEAST_TOLD * (1 - levels), rtol=1e-3)
+    np.testing.assert_allclose(known, LEAST_DISTURBANCES * (1 - levels), rtol=1e-3)
     assert np.all(levels < 12 / n)
 
 

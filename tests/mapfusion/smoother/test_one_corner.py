@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.se2 import rotation
 from mapfusion.robot_log import NO_TRACK, Observations, RobotLog
-from mapfusion.se2 import Float, rotation
-from mapfusion.smoother import one_corner
-from mapfusion.smoother.one_corner import parted
-from mapfusion.smoother.sightings import sightings_of
+from mapfusion.smoother import smooth
+from mapfusion.smoother.problem import sightings_of
+from mapfusion.smoother.smooth import parted
 
 STRAY_M, SIGMA_M, N_SEEN = 0.002, 0.001, 4
 
@@ -142,7 +143,7 @@ def test_pairs_of_tracks_that_are_apart_are_those_of_looking_at_each(
     monkeypatch: pytest.MonkeyPatch, at_once: int
 ) -> None:
     """However many are looked at together; a landmark's tracks with no other landmark's."""
-    monkeypatch.setattr(one_corner, "_PAIRS_AT_ONCE", at_once)
+    monkeypatch.setattr(smooth, "_PAIRS_AT_ONCE", at_once)
     rng = np.random.default_rng(0)
     first = np.array([0, 1, 9, 9, 11, 30])
     point, root = rng.normal(size=(30, 3)), rng.normal(size=(30, 3, 3))
@@ -156,5 +157,5 @@ def test_pairs_of_tracks_that_are_apart_are_those_of_looking_at_each(
                 known = np.linalg.matrix_rank(S) == 3
                 apart += [(i, j)] if known and off @ np.linalg.solve(S, off) > 0.5 else []
     assert 20 < len(apart) < 180
-    found = one_corner._apart(first, point, covariance, 0.5)
+    found = smooth._apart(first, point, covariance, 0.5)
     np.testing.assert_array_equal(found.T, apart)

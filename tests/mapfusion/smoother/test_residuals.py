@@ -3,10 +3,14 @@
 import numpy as np
 import pytest
 
-from mapfusion.se2 import rotation
-from mapfusion.smoother.normal_equations import Estimate
-from mapfusion.smoother.residuals import first_points, squared_distances, squares_of_points
-from mapfusion.smoother.sightings import sightings_of
+from mapfusion.geometry.se2 import rotation
+from mapfusion.smoother.normal_equations import (
+    Estimate,
+    first_points,
+    squared_distances,
+    squares_of_points,
+)
+from mapfusion.smoother.problem import sightings_of
 from tests.mapfusion.smoother.white_noise_logs import white_noise_log, with_tracks
 
 

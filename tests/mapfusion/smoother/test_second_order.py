@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from mapfusion.fastslam.motion import MotionNoise
+from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.se2 import between, compose
 from mapfusion.robot_log import Observations, RobotLog
-from mapfusion.se2 import Float, between, compose
 from mapfusion.smoother import second_order
 from mapfusion.smoother.normal_equations import Estimate
+from mapfusion.smoother.optimizer import Problem, Settled, factored, settled, solved
+from mapfusion.smoother.problem import sightings_of
 from mapfusion.smoother.second_order import second_order_errors
-from mapfusion.smoother.settle import Problem, Settled, factored, settled, solved
-from mapfusion.smoother.sightings import sightings_of
-from mapfusion.smoother.smooth import Smoothed, SmootherParameters, smooth
-from mapfusion.smoother.smoothed_map import condensed_points
+from mapfusion.smoother.smooth import Smoothed, SmootherParameters, condensed_points, smooth
 from tests.benchmarks.synthetic_drives import reckoned
 from tests.helpers.synthetic_drives import Drive, drive
 

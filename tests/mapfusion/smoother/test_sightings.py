@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapfusion.smoother.residuals import known_dimensions
-from mapfusion.smoother.sightings import Sightings, sightings_of
+from mapfusion.smoother.normal_equations import known_dimensions
+from mapfusion.smoother.problem import Sightings, sightings_of
 from tests.mapfusion.smoother.white_noise_logs import white_noise_log, with_tracks
 
 

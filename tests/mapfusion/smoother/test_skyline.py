@@ -6,9 +6,14 @@ import scipy.linalg
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from mapfusion.smoother import skyline
-from mapfusion.smoother.envelope_order import envelope_order, first_entries
-from mapfusion.smoother.skyline import Envelope, Factor, factor_in_envelope
+from mapfusion.smoother import cholesky
+from mapfusion.smoother.cholesky import (
+    Envelope,
+    Factor,
+    envelope_order,
+    factor_in_envelope,
+    first_entries,
+)
 
 
 def entries_seen(A: np.ndarray) -> Envelope:
@@ -47,7 +52,7 @@ def matrix_of_groups(rng: np.random.Generator, n: int, n_groups: int) -> np.ndar
 def test_factor_is_that_of_the_dense_matrix(n, n_groups):
     A = matrix_of_groups(np.random.default_rng(n), n, n_groups if n > 2 else 0)
     given = A.copy()
-    given[np.triu_indices(n, skyline._BLOCK)] = 0  # only the lower half is read
+    given[np.triu_indices(n, cholesky._BLOCK)] = 0  # only the lower half is read
     factor = factor_of(given)
     found = factor.dense()
     np.testing.assert_array_equal(

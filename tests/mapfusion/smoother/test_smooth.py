@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from mapfusion.geometry.numerics import Float
 from mapfusion.robot_log import RobotLog
-from mapfusion.se2 import Float
-from mapfusion.smoother.normal_equations import Estimate
-from mapfusion.smoother.residuals import first_points
-from mapfusion.smoother.settle import Problem, Settled, settled
-from mapfusion.smoother.sightings import sightings_of
+from mapfusion.smoother.normal_equations import Estimate, first_points
+from mapfusion.smoother.optimizer import Problem, Settled, settled
+from mapfusion.smoother.problem import sightings_of
 from mapfusion.smoother.smooth import Smoothed, SmootherParameters, smooth
 from tests.mapfusion.smoother.white_noise_logs import (
     Known,

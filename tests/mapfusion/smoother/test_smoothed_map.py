@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapfusion.smoother.smooth import SmootherParameters, smooth
-from mapfusion.smoother.smoothed_map import smoothed_map
-from mapfusion.stray import STRAY_M
+from mapfusion.robot_log import STRAY_M
+from mapfusion.smoother.smooth import SmootherParameters, smooth, smoothed_map
 from tests.mapfusion.fastslam.landmark_worlds import unit
 from tests.mapfusion.smoother.white_noise_logs import dead_reckoned, white_noise_log, with_tracks
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
-from mapfusion.smoother.student import (
+from mapfusion.smoother.robust_loss import (
     LEAST_DOF,
     MOST_DOF,
     fitted_dof,

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from mapfusion.smoother.elimination import memory_bytes
-from mapfusion.smoother.sightings import Sightings, sightings_of
-from mapfusion.smoother.smoothed_map import condensed_points
+from mapfusion.smoother.problem import Sightings, sightings_of
+from mapfusion.smoother.smooth import condensed_points
 from tests.benchmarks.synthetic_drives import LANDMARK_LIMITS, MOST_PATH, nees, smoothed
 from tests.helpers.synthetic_drives import Drive, drive
 from tests.mapfusion.smoother.white_noise_logs import white_noise_log

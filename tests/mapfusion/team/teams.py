@@ -4,9 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapfusion.se2 import Float, between, compose, wrap
-from mapfusion.team.relations import Relations
-from mapfusion.team.team_graph import TeamGraph
+from mapfusion.fusion.pose_graph import Relations
+from mapfusion.fusion.team_graph import TeamGraph
+from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.se2 import between, compose, wrap
 
 SIDE_M = 20.0
 SIGMA = np.array([0.03, 0.03, 0.005])

@@ -3,11 +3,17 @@
 import numpy as np
 import pytest
 
-from mapfusion.se2 import Float, between
-from mapfusion.team.alternatives import told_apart
-from mapfusion.team.readings import LoopTest
-from mapfusion.team.relations import Relations
-from mapfusion.team.team_graph import Place, TeamParameters, Unconfirmed, team_graph
+from mapfusion.fusion.pose_graph import Relations
+from mapfusion.fusion.team_graph import (
+    LoopTest,
+    Place,
+    TeamParameters,
+    Unconfirmed,
+    team_graph,
+    told_apart,
+)
+from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.se2 import between
 from tests.mapfusion.team.teams import SIDE_M, all_pairs, falsely_placed, measured, poses
 
 BOTH = [TeamParameters(each) for each in Unconfirmed]

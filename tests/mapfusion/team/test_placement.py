@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from mapfusion.se2 import between, compose, wrap
-from mapfusion.team.placement import placed
-from mapfusion.team.relations import Motions
+from mapfusion.fusion.pose_graph import Motions, placed
+from mapfusion.geometry.se2 import between, compose, wrap
 from tests.mapfusion.team.teams import SIGMA, all_pairs, measured, poses
 
 

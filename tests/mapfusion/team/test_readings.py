@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from mapfusion.se2 import between
-from mapfusion.team.readings import LoopTest, Team
+from mapfusion.fusion.team_graph import LoopTest, Team
+from mapfusion.geometry.se2 import between
 from tests.mapfusion.team.teams import SIGMA, measured, poses
 
 

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from mapfusion.se2 import compose, inverse
-from mapfusion.team.relations import Motions, Relations, whole_map_covariance
+from mapfusion.align.drift import whole_map_covariance
+from mapfusion.fusion.pose_graph import Motions, Relations
+from mapfusion.geometry.se2 import compose, inverse
 
 T = np.array([[1.0, -2.0, 0.7], [-3.0, 0.5, -2.5]])
 L = np.array([[3e-3, 0, 0], [1e-3, 2e-3, 0], [5e-4, -4e-4, 1e-3]])

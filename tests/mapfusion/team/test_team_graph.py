@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapfusion.se2 import between, compose
-from mapfusion.team.relations import Relations
-from mapfusion.team.team_graph import Place, TeamParameters, Unconfirmed, team_graph
+from mapfusion.fusion.pose_graph import Relations
+from mapfusion.fusion.team_graph import Place, TeamParameters, Unconfirmed, team_graph
+from mapfusion.geometry.se2 import between, compose
 from tests.mapfusion.team.teams import all_pairs, falsely_placed, measured, poses, team
 
 DROP, KEEP = TeamParameters(Unconfirmed.DROP), TeamParameters(Unconfirmed.KEEP)

@@ -3,9 +3,8 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mapfusion.chi_square import chi_square_bound
-from mapfusion.se2 import Float
-from mapfusion.vision.rigid_links import (
+from mapfusion.geometry.numerics import Float, chi_square_bound
+from mapfusion.vision.visual_odometry import (
     _ALL_AFTER,
     _OPEN,
     _STEPS,

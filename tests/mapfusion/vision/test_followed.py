@@ -5,13 +5,11 @@ from collections import defaultdict
 import numpy as np
 import pytest
 
-from mapfusion.camera import StereoCamera
-from mapfusion.se2 import transform_points
-from mapfusion.vision.features import Features
-from mapfusion.vision.followed import bend_of
-from mapfusion.vision.frontend import FrontEnd
-from mapfusion.vision.patches import PATCH_SIDE_PX
-from mapfusion.vision.tracks import Tracker, TrackParameters
+from mapfusion.geometry.camera import StereoCamera
+from mapfusion.geometry.se2 import transform_points
+from mapfusion.vision.features import PATCH_SIDE_PX, Features
+from mapfusion.vision.front_end import FrontEnd
+from mapfusion.vision.tracking import Tracker, TrackParameters, bend_of
 from tests.mapfusion.vision.rendered_scene import render, wall
 from tests.mapfusion.vision.shifted_pictures import Picture
 

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapfusion.camera import StereoCamera
+from mapfusion.geometry.camera import StereoCamera
+from mapfusion.geometry.se2 import transform_points
 from mapfusion.robot_log import Observations
-from mapfusion.se2 import transform_points
 from mapfusion.vision.features import Features
-from mapfusion.vision.frontend import FrontEnd, FrontEndParameters, observable
-from mapfusion.vision.tracks import Tracker, TrackParameters
-from mapfusion.vision.usurf import USurfParameters
+from mapfusion.vision.front_end import FrontEnd, FrontEndParameters, observable
+from mapfusion.vision.surf import USurfParameters
+from mapfusion.vision.tracking import Tracker, TrackParameters
 from tests.mapfusion.vision.rendered_scene import Plane, render, wall
 
 CAMERA = StereoCamera()

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mapfusion import se3
-from mapfusion.vision.gyroscope import Gyroscope
-from mapfusion.vision.rigid_links import RigidMotion
+from mapfusion.geometry import se3
+from mapfusion.vision.attitude_filter import Gyroscope
+from mapfusion.vision.visual_odometry import RigidMotion
 
 STEP_S = 0.05
 NOISE_RAD = 1e-3 * np.sqrt(STEP_S)  # of one step, as is stated

@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mapfusion import se3
-from mapfusion.camera import StereoCamera
+from mapfusion.geometry import se3
+from mapfusion.geometry.camera import StereoCamera
 from mapfusion.robot_log import Observations
-from mapfusion.vision.attitude_filter import AttitudeFilter, Measured
-from mapfusion.vision.gyroscope import LOST_M
-from mapfusion.vision.levelling import Levelling
-from mapfusion.vision.rigid_links import RigidMotion
+from mapfusion.vision.attitude_filter import LOST_M, AttitudeFilter, Levelling, Measured
+from mapfusion.vision.visual_odometry import RigidMotion
 
 INCLINOMETER = np.array([0.0052, 0.0052, 0.0])
 TURN_SIGMA, STEP_SIGMA = 0.0004, 0.002

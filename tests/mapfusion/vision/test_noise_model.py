@@ -7,9 +7,8 @@ import pytest
 from scipy.stats import chi2
 
 from mapfusion.vision.harris import HarrisParameters
-from mapfusion.vision.noise_model import NoiseModel, limits_for, measured_noise
-from mapfusion.vision.stereo import StereoParameters, match
-from mapfusion.vision.verdict import Verdict
+from mapfusion.vision.stereo import StereoParameters, Verdict, match
+from mapfusion.vision.stereo_noise import NoiseModel, limits_for, measured_noise
 from tests.mapfusion.vision.shifted_pictures import CAMERA, grid, pair
 
 HARRIS = HarrisParameters(max_corners=400)

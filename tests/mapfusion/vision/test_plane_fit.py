@@ -5,9 +5,8 @@ import pytest
 from scipy.ndimage import map_coordinates
 from scipy.optimize import least_squares
 
-from mapfusion.vision.plane_fit import fit_planes
-from mapfusion.vision.silhouette_test import disagrees
-from mapfusion.vision.window_sums import window_sums
+from mapfusion.vision.disparity_tests import disagrees, window_sums
+from mapfusion.vision.subpixel import fit_planes
 from tests.mapfusion.vision.shifted_pictures import grid, pair
 
 

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import binom, chi2, kstest, ncx2
 
-from mapfusion.vision.plane_fit import fit_planes
-from mapfusion.vision.plane_test import FURTHER_TERMS
-from mapfusion.vision.window_sums import window_sums
+from mapfusion.vision.disparity_tests import FURTHER_TERMS, window_sums
+from mapfusion.vision.subpixel import fit_planes
 from tests.mapfusion.vision.shifted_pictures import Picture, pair
 
 HALF, NOISE, D = 8, 2.0, 8

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mapfusion import se3
-from mapfusion.camera import StereoCamera
-from mapfusion.se2 import transform_points
-from mapfusion.vision.rigid_links import rigid_links
+from mapfusion.geometry import se3
+from mapfusion.geometry.camera import StereoCamera
+from mapfusion.geometry.se2 import transform_points
+from mapfusion.vision.visual_odometry import rigid_links
 from tests.mapfusion.vision.rigid_links_twin import rigid_links_twin
 
 CAMERA = StereoCamera()

@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from mapfusion.camera import StereoCamera
+from mapfusion.geometry.camera import StereoCamera
 from mapfusion.vision.harris import HarrisParameters
-from mapfusion.vision.row_errors import offsets
+from mapfusion.vision.stereo_noise import offsets
 from tests.mapfusion.vision.rendered_scene import render, wall
 
 CAMERA = StereoCamera(width_px=320, height_px=240, focal_px=290.0)

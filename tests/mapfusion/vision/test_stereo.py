@@ -8,9 +8,7 @@ from scipy.ndimage import maximum_filter
 from scipy.stats import binom, chi2
 
 from mapfusion.vision.harris import HarrisParameters, detect
-from mapfusion.vision.row_search import search_rows
-from mapfusion.vision.stereo import StereoParameters, match
-from mapfusion.vision.verdict import Verdict
+from mapfusion.vision.stereo import StereoParameters, Verdict, match, search_rows
 from tests.mapfusion.vision.rendered_scene import Plane, render, wall
 from tests.mapfusion.vision.shifted_pictures import CAMERA, Picture, grid, pair
 

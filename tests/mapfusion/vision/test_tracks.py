@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapfusion.camera import StereoCamera
-from mapfusion.se2 import transform_points
+from mapfusion.geometry.camera import StereoCamera
+from mapfusion.geometry.se2 import transform_points
 from mapfusion.vision.features import Features
-from mapfusion.vision.tracks import Tracker, TrackParameters, link
+from mapfusion.vision.tracking import Tracker, TrackParameters, link
 
 
 def unit(rng: np.random.Generator, n: int) -> np.ndarray:

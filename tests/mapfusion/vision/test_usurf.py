@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mapfusion.vision.usurf import USurfParameters, describe
+from mapfusion.vision.surf import USurfParameters, describe
 
 
 def overlap(low: float, high: float, first: int, count: int) -> np.ndarray:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mapfusion.vision.window_sums import window_sums
+from mapfusion.vision.disparity_tests import window_sums
 from tests.mapfusion.vision.shifted_pictures import pair
 
 # none of them meets a border of the pictures at a pixel, where rounding decides

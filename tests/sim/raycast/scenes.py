@@ -4,13 +4,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from mapfusion.camera import StereoCamera
-from mapfusion.se2 import compose
+from mapfusion.geometry.camera import StereoCamera
+from mapfusion.geometry.se2 import compose
 from sim.p3at import URDF
 from sim.raycast.picture import filtered, sight
-from sim.raycast.plan import Pinhole
 from sim.raycast.scene import Scene, make_scene
 from sim.raycast.solids import read_solids
+from sim.raycast.visible_walls import Pinhole
 
 NOBODY = np.zeros((0, 3))
 SOLIDS = read_solids(URDF)

@@ -7,16 +7,13 @@ import cv2
 import numpy as np
 import pytest
 
-from mapfusion.camera import StereoCamera
 from mapfusion.errors import InputError
-from mapfusion.se3 import in_space
-from sim.depth_image import depth_at
+from mapfusion.geometry.camera import StereoCamera
+from mapfusion.geometry.se3 import in_space
 from sim.floorplan import FloorPlan, Wall
-from sim.radiometry import RadiometricNoise
-from sim.raycast.caster import RayCaster
-from sim.raycast.tilted import TiltedView
+from sim.raycast.caster import RayCaster, TiltedView
 from sim.recorder import FrameSource
-from sim.stereo_head import StereoFrame, camera_pose
+from sim.stereo_head import RadiometricNoise, StereoFrame, camera_pose, depth_at
 from sim.world import write_faces
 
 CAMERA = StereoCamera(320, 240, 288.5)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from mapfusion.camera import StereoCamera
+from mapfusion.geometry.camera import StereoCamera
 from sim.raycast.scene import make_scene
 from tests.sim.raycast.scenes import TEXELS_PER_M, along_m, look, one_wall, pinhole, slanted
 

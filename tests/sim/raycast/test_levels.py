@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from mapfusion.camera import StereoCamera
-from sim.raycast.levels import BACKGROUND, fill, footprints, row_depth_m
-from sim.raycast.plan import Pinhole
+from mapfusion.geometry.camera import StereoCamera
+from sim.raycast.floor_and_ceiling import BACKGROUND, fill, footprints, row_depth_m
 from sim.raycast.scene import make_scene
+from sim.raycast.visible_walls import Pinhole
 from tests.sim.raycast.scenes import pinhole
 
 # wide, so that a row is drawn in pieces; coarse, so that it needs smaller copies of the picture

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from sim.raycast.outline import fill_coverage, fill_least
+from sim.raycast.robots import fill_coverage, fill_least
 
 
 def outline(points: np.ndarray) -> np.ndarray:

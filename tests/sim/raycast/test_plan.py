@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from mapfusion.camera import StereoCamera
+from mapfusion.geometry.camera import StereoCamera
 from sim.floorplan import FloorPlan, Wall
-from sim.raycast.plan import NONE, Pinhole, look
 from sim.raycast.scene import Walls, make_scene
+from sim.raycast.visible_walls import NONE, Pinhole, look
 from tests.sim.raycast.scenes import pinhole
 
 CAMERA = StereoCamera(160, 120, 144.0)

@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 
-from mapfusion.se2 import transform_points
+from mapfusion.geometry.se2 import transform_points
 from sim.p3at import URDF
-from sim.raycast.plan import Pinhole
-from sim.raycast.robots import cast
+from sim.raycast.robots import Body, cast, place, within_view
 from sim.raycast.solids import read_solids
-from sim.raycast.windows import Body, place, within_view
+from sim.raycast.visible_walls import Pinhole
 from sim.stereo_head import NEAR_M
 
 # A wide lens low above the floor, which has something of a robot beside it in view.

@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.judge import tables
-from experiments.show.figures import (
+from experiments.evaluation import tables
+from experiments.reports.figures import (
     fig04_translation_error,
     fig05_rotation_error,
     fig06_aligner_time,
 )
-from experiments.show.figures.result_tables import ResultTables
+from experiments.reports.figures.result_tables import ResultTables
 
 MEASURED = {
     "errors": [

@@ -14,18 +14,12 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from experiments.judge import tables
-from experiments.show.figures import drawing, fig02_two_maps, fig11_fusers, fig12_coverage
-from experiments.show.figures.drawing import (
-    FIGURES,
-    Drawing,
-    draw_all,
-    draw_figure,
-    save_figure,
-)
-from experiments.show.figures.fig03_dispersion import choose_moments, spread_over_time
-from experiments.show.figures.result_tables import ResultTables
-from experiments.show.figures.style import aligner_styles, house_style
+from experiments.evaluation import tables
+from experiments.reports.figures import drawing, fig02_two_maps, fig11_fusers, fig12_coverage
+from experiments.reports.figures.drawing import FIGURES, Drawing, draw_all, draw_figure, save_figure
+from experiments.reports.figures.fig03_dispersion import choose_moments, spread_over_time
+from experiments.reports.figures.result_tables import ResultTables
+from experiments.reports.figures.style import aligner_styles, house_style
 from mapfusion.errors import InputError
 
 MAX_SVG_BYTES = 1_000_000

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from experiments.show.figures.floor_plan import add_ellipses, semi_axes
+from experiments.reports.figures.floor_plan import add_ellipses, semi_axes
 
 LEVEL = 0.95
 # Chi-square with two degrees of freedom is an exponential: its quantile needs no table.

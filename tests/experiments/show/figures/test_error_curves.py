@@ -10,12 +10,12 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from experiments.judge import tables
-from experiments.judge.criteria import ANSWERABLE_PAIRS
-from experiments.show.figures import fig04_translation_error, fig05_rotation_error
-from experiments.show.figures.result_tables import ResultTables
-from experiments.show.figures.style import aligner_styles
-from experiments.study.statistics.error_bands import error_bands
+from experiments.evaluation import tables
+from experiments.evaluation.criteria import ANSWERABLE_PAIRS
+from experiments.reports.figures import fig04_translation_error, fig05_rotation_error
+from experiments.reports.figures.result_tables import ResultTables
+from experiments.reports.figures.style import aligner_styles
+from experiments.studies.error_bands import error_bands
 
 COLUMNS = {
     fig04_translation_error: ("translation_error_m", "refined_translation_error_m"),

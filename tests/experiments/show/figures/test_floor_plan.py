@@ -5,7 +5,7 @@ import pytest
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
-from experiments.show.figures import floor_plan
+from experiments.reports.figures import floor_plan
 
 
 def test_strays_are_out_of_view_and_counted() -> None:

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import pdist
 
-from experiments.judge import tables
-from experiments.show.figures.drawing import draw_figure
-from experiments.show.figures.fig08_fused_landmark import choose_landmark
-from experiments.show.figures.fig09_aligned_maps import choose_zoom
-from experiments.show.figures.result_tables import (
+from experiments.evaluation import tables
+from experiments.reports.figures.drawing import draw_figure
+from experiments.reports.figures.fig08_fused_landmark import choose_landmark
+from experiments.reports.figures.fig09_aligned_maps import choose_zoom
+from experiments.reports.figures.result_tables import (
     FusedPairs,
     NothingToDraw,
     ResultTables,

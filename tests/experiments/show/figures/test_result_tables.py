@@ -4,11 +4,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.judge import tables
-from experiments.show.figures.fig07_correspondences import judge_correspondences
-from experiments.show.figures.result_tables import ResultTables
+from experiments.evaluation import tables
+from experiments.reports.figures.fig07_correspondences import judge_correspondences
+from experiments.reports.figures.result_tables import ResultTables
 from mapfusion.errors import InputError
-from mapfusion.sealed import SEAL
+from mapfusion.files import SEAL
 
 PAIR = ("R1", "R2")
 ALIGNERS = ["ransac", "svd", "icp", "impicp"]

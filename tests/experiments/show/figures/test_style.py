@@ -3,7 +3,7 @@
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from experiments.show.figures.style import write_plainly
+from experiments.reports.figures.style import write_plainly
 
 
 def labels_between_powers(least: float, most: float) -> list[str]:

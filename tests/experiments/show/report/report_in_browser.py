@@ -16,9 +16,9 @@ import pandas as pd
 import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
 
-from experiments.judge import tables
-from experiments.show.figures.drawing import draw_all
-from experiments.show.report.document import write_report
+from experiments.evaluation import tables
+from experiments.reports.figures.drawing import draw_all
+from experiments.reports.report.document import write_report
 from tests.helpers.report_page import HOSTILE, hostile
 
 CHROMIUM = os.environ.get("CHROMIUM", "/usr/bin/chromium")

@@ -4,8 +4,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.judge.judged_maps import maps_of
-from experiments.show.report.charts import (
+from experiments.evaluation.alignment_summary import maps_of
+from experiments.reports.report.charts import (
     error_curves,
     rounded,
     success_curves,

@@ -10,11 +10,11 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from experiments.judge import tables
-from experiments.show.figures.drawing import draw_figure
-from experiments.show.figures.result_tables import ResultTables
-from experiments.show.report.document import write_report
-from mapfusion.storage import read_json, write_json
+from experiments.evaluation import tables
+from experiments.reports.figures.drawing import draw_figure
+from experiments.reports.figures.result_tables import ResultTables
+from experiments.reports.report.document import write_report
+from mapfusion.files import read_json, write_json
 from tests.helpers.report_page import HOSTILE, Page, hostile, page_of
 from tests.helpers.tiny_scenario import command, without_tables
 

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments.judge.tables import table_path
-from experiments.show.figures.floor_plan import semi_axes
-from experiments.show.figures.result_tables import ResultTables, of_pair
-from experiments.show.report import map_view as module
-from experiments.show.report.map_view import (
+from experiments.evaluation.tables import table_path
+from experiments.reports.figures.floor_plan import semi_axes
+from experiments.reports.figures.result_tables import ResultTables, of_pair
+from experiments.reports.report import map_view as module
+from experiments.reports.report.map_view import (
     ELLIPSE_MAX_M,
     ELLIPSE_MIN_M,
     map_view,

@@ -3,9 +3,9 @@
 import re
 from pathlib import Path
 
-from experiments.judge import tables
-from experiments.show.figures.result_tables import ResultTables
-from experiments.show.report.places import verdicts_and_places
+from experiments.evaluation import tables
+from experiments.reports.figures.result_tables import ResultTables
+from experiments.reports.report.contents import verdicts_and_places
 from tests.helpers.report_page import page_of
 
 

@@ -8,11 +8,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.judge import tables
-from experiments.show.report.charts import rounded
-from experiments.show.report.contents import contents_of
-from experiments.study.statistics.run_tables import find_runs
-from experiments.study.statistics.summary import Summary, summarise
+from experiments.evaluation import tables
+from experiments.reports.report.charts import rounded
+from experiments.reports.report.contents import contents_of
+from experiments.studies.run_tables import find_runs
+from experiments.studies.statistics import Summary, summarise
 
 SUCCESS_TABLES = {
     "true pairs among the correspondences": "success_by_true_pairs",

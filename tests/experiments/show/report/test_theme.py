@@ -2,8 +2,8 @@
 
 import pytest
 
-from experiments.show.figures.style import aligner_styles
-from experiments.show.report.theme import MIN_CONTRAST, chart_style, contrast, lightened, palette
+from experiments.reports.figures.style import aligner_styles
+from experiments.reports.report.theme import MIN_CONTRAST, chart_style, contrast, lightened, palette
 
 NAMES = ["ransac", "svd", "svd-solved", "icp", "impicp", "gnc", "clique", "opencv"]
 NAMES += ["ransac_mahalanobis", "kiss_matcher", "oracle", *(f"plug-in {k}" for k in range(12))]

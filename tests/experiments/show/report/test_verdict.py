@@ -5,8 +5,8 @@ from dataclasses import replace
 
 from markupsafe import Markup
 
-from experiments.show.report.document import templates
-from experiments.study.statistics.standing import Recommendation, Standing
+from experiments.reports.report.document import templates
+from experiments.studies.method_comparison import Recommendation, Standing
 
 GOOD = Standing(
     aligner="good",

@@ -10,12 +10,12 @@ from typing import BinaryIO
 import pandas as pd
 import pytest
 
-from experiments.judge import tables
-from experiments.show.plain_text import plain
-from experiments.show.terminal import layout
-from experiments.show.terminal.layout import print_lines, print_table
-from experiments.show.terminal.run_screen import not_run_lines, print_result
-from experiments.study.statistics.standing import aligner_summary
+from experiments.evaluation import tables
+from experiments.reports.formatting import plain
+from experiments.reports.terminal import layout
+from experiments.reports.terminal.layout import print_lines, print_table
+from experiments.reports.terminal.run_screen import not_run_lines, print_result
+from experiments.studies.method_comparison import aligner_summary
 
 
 def rows(aligner: str, *statuses: tuple[str, str]) -> pd.DataFrame:

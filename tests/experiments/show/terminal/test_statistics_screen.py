@@ -4,9 +4,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.show.terminal.statistics_screen import print_comparison, print_summary
-from experiments.study.compare.versions import VersionComparison
-from experiments.study.statistics.summary import Summary
+from experiments.reports.terminal.statistics_screen import print_comparison, print_summary
+from experiments.studies.comparison import VersionComparison
+from experiments.studies.statistics import Summary
 
 
 @pytest.fixture(autouse=True)

@@ -9,22 +9,23 @@ import pandas as pd
 import pytest
 
 from experiments.methods import catalogue
-from experiments.run.job import Job
-from experiments.run.store import Store
+from experiments.pipeline.stage import Job
+from experiments.pipeline.store import Store
+from experiments.reports.study_files import benchmark_markdown, cell_text, draw
 from experiments.scenario.settings import AlignerEntry
-from experiments.show.benchmark_files import cell_text, draw, markdown
-from experiments.study.benchmark import cells as benchmark
-from experiments.study.benchmark.cells import (
+from experiments.studies import benchmark as benchmark
+from experiments.studies.benchmark import (
     SUMMARY,
+    TRIALS,
     BenchmarkDesign,
+    CellSettings,
     entries_of,
     run_benchmark,
     summarise,
 )
-from experiments.study.benchmark.trials import TRIALS, CellSettings
 from mapfusion.align.peers.kiss_matcher import KissMatcher
 from mapfusion.errors import InputError
-from mapfusion.storage import read_table
+from mapfusion.files import read_table
 from tests.helpers.tiny_scenario import command
 
 SMALL = BenchmarkDesign(
@@ -153,7 +154,7 @@ def test_an_absent_package_is_no_failure(tmp_path: Path, monkeypatch: pytest.Mon
     assert (far["status"], far["n_failed"], far["n_wrong"]) == ("absent", 0, 0)
     assert np.isnan(far["success"])
     assert cell_text(far) == "absent"
-    assert "| far      | absent " in markdown(plan, summary)
+    assert "| far      | absent " in benchmark_markdown(plan, summary)
     low, high = draw(summary).axes[1].get_ylim()  # although no ratio is drawn
     assert 0.1 < low < 1 < high < 100
     labels = [text.get_text() for text in draw(summary).legends[0].get_texts()]

@@ -4,15 +4,10 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
 
-from experiments.scenario.randomness import generator
-from experiments.study.benchmark.synthetic_pairs import (
-    SIGMA_M,
-    SIZE_M,
-    synthetic_pair,
-    true_pairs_of,
-)
-from mapfusion import se2
-from mapfusion.align.rigid import residual_covariances
+from experiments.scenario.seeds import generator
+from experiments.studies.benchmark import SIGMA_M, SIZE_M, synthetic_pair, true_pairs_of
+from mapfusion.align.rigid_motion import residual_covariances
+from mapfusion.geometry import se2
 
 
 def residuals(pair):

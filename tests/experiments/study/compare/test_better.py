@@ -3,12 +3,7 @@
 import numpy as np
 import pytest
 
-from experiments.study.statistics.better import (
-    change_of_each_run,
-    holm,
-    log_ratio,
-    mean_change,
-)
+from experiments.studies.intervals import change_of_each_run, holm, log_ratio, mean_change
 
 
 def test_ratios_of_equals_are_none_whatever_they_are() -> None:

@@ -5,11 +5,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.judge.judged_maps import ERROR_COLUMNS
-from experiments.study.compare.versions import BETTER, NOISE, SAME, WORSE, compare
-from experiments.study.statistics.better import holm
+from experiments.evaluation.alignment_summary import ERROR_COLUMNS
+from experiments.studies.comparison import BETTER, NOISE, SAME, WORSE, compare
+from experiments.studies.intervals import holm
 from mapfusion.errors import InputError
-from mapfusion.storage import read_json, write_json
+from mapfusion.files import read_json, write_json
 from tests.helpers.made_up_runs import (
     Tables,
     errors_of,

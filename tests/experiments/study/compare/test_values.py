@@ -4,8 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.study.compare.quantities import READ
-from experiments.study.compare.versions import VersionComparison, compare
+from experiments.studies.comparison import READ, VersionComparison, compare
 from tests.helpers.made_up_runs import Tables, tables_of, two_sweeps
 
 

@@ -7,25 +7,25 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.judge import tables
-from experiments.judge.judged_run import JudgedRun
-from experiments.run.frames import read_rows
-from experiments.run.stages.fuse import read_fusions
-from experiments.run.store import Store
+from experiments.evaluation import tables
+from experiments.evaluation.evaluated_run import JudgedRun
+from experiments.pipeline.stages.fuse import read_fusions
+from experiments.pipeline.store import Store
+from experiments.pipeline.tables import read_rows
+from experiments.reports.figures.independence_figure import draw, since_shared_ground
+from experiments.reports.figures.result_tables import NothingToDraw
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import Simulation
-from experiments.show.figures.independence_figure import draw, since_shared_ground
-from experiments.show.figures.result_tables import NothingToDraw
-from experiments.study.independence.independence_trial import (
+from experiments.studies.independence.independence_trial import (
     COSTS,
     TEAMS,
     Independence,
     at_the_end,
     run_independence,
 )
-from experiments.study.independence.recorded_teams import team_of, team_sizes
-from mapfusion import se2
+from experiments.studies.independence.recorded_teams import team_of, team_sizes
 from mapfusion.errors import InputError
+from mapfusion.geometry import se2
 from tests.helpers.tiny_scenario import assert_refused, command
 
 

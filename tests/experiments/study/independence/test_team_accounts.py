@@ -6,13 +6,13 @@ from typing import Any
 
 import pytest
 
-from experiments.run.frames import write_rows
-from experiments.study.independence.measured_work import COSTS_FILE, WORK_COSTS
-from experiments.study.independence.pair_costs import ALIGNMENT
-from experiments.study.independence.robot_costs import FILTER, SENT, SENT_FILE, SMOOTHING
-from experiments.study.independence.strategies import FILTER_MAP, LOG, SMOOTHED_MAP, STRATEGIES
-from experiments.study.independence.team_accounts import cost_rows, sent_rows
-from experiments.study.independence.team_costs import FUSION
+from experiments.pipeline.tables import write_rows
+from experiments.studies.independence.measured_work import COSTS_FILE, WORK_COSTS
+from experiments.studies.independence.pair_costs import ALIGNMENT
+from experiments.studies.independence.robot_costs import FILTER, SENT, SENT_FILE, SMOOTHING
+from experiments.studies.independence.strategies import FILTER_MAP, LOG, SMOOTHED_MAP, STRATEGIES
+from experiments.studies.independence.team_accounts import cost_rows, sent_rows
+from experiments.studies.independence.team_costs import FUSION
 
 ITERATIONS = (10, 20, 30)
 FIRST, LAST = 10, 30

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from experiments.study.refusal.fit_rates import fit
-from mapfusion.evidence.likelihood import BetaRate, Rates
+from experiments.studies.refusal.fit_rates import fit
+from mapfusion.verification.likelihood import BetaRate, Rates
 
 RIGHT = BetaRate(12.0, 2.5), BetaRate(1.8, 2.9)
 WRONG = BetaRate(1.0, 15.0), BetaRate(0.9, 16.0)

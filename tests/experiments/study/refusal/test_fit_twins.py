@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from experiments.study.refusal.fit_twins import fit
-from mapfusion.evidence.likelihood import PART, RIGHT, WRONG
-from mapfusion.evidence.regions import Regions
+from experiments.studies.refusal.fit_twins import fit
+from mapfusion.verification.likelihood import PART, RIGHT, WRONG
+from mapfusion.verification.regions import Regions
 
 SHARES = 0.15, 0.25, 0.6
 

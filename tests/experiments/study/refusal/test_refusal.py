@@ -10,28 +10,27 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.judge.result import run_scenario
-from experiments.run.frames import read_rows
-from experiments.scenario.sections import Render
+from experiments.evaluation.result import run_scenario
+from experiments.pipeline.tables import read_rows
+from experiments.reports.figures.drawing import save_figure
+from experiments.reports.figures.refusal_figures import draw
+from experiments.reports.study_files import KINDS
 from experiments.scenario.settings import Simulation
-from experiments.show.figures.drawing import save_figure
-from experiments.show.figures.refusal_figures import draw
-from experiments.show.refusal_files import KINDS
-from experiments.study.refusal import cases
-from experiments.study.refusal import refusal_trial as results
-from experiments.study.refusal.calibration import (
+from experiments.scenario.world_settings import Render
+from experiments.studies.refusal import cases
+from experiments.studies.refusal import refusal_trial as results
+from experiments.studies.refusal.rates import Rate, summary, swept
+from experiments.studies.refusal.refusal_trial import (
     STATED,
     accepted_motions,
     calibrate,
     points_on_walls,
 )
-from experiments.study.refusal.refusal_rates import Rate, summary, swept
-from mapfusion import se2
-from mapfusion.align.acceptance import Acceptance
 from mapfusion.align.correspondences import MatchParameters
-from mapfusion.align.false_alarms import fewest_false_alarms, independent_pairs
-from mapfusion.align.rigid import fit_rigid
-from mapfusion.looks import DESCRIPTOR_LENGTH
+from mapfusion.align.rigid_motion import fit_rigid
+from mapfusion.geometry import se2
+from mapfusion.tables import DESCRIPTOR_LENGTH
+from mapfusion.verification.false_alarms import Acceptance, fewest_false_alarms, independent_pairs
 from tests.helpers.made_up_maps import ITERATION, robot
 from tests.helpers.tiny_scenario import command
 

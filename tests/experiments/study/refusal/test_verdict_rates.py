@@ -8,19 +8,21 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.show.figures.drawing import save_figure
-from experiments.show.figures.verdict_figures import draw_kinds, draw_reliability, draw_roc
-from experiments.show.terminal.refusal_screen import print_kinds, print_reliability
-from experiments.study.refusal.kind_rates import (
+from experiments.reports.figures.drawing import save_figure
+from experiments.reports.figures.verdict_figures import draw_kinds, draw_reliability, draw_roc
+from experiments.reports.terminal.study_screen import print_kinds, print_reliability
+from experiments.studies.refusal.rates import (
+    N_BINS,
+    Rate,
     by_kind,
     first_of_ordinary,
+    judged_answers,
     of_any_method,
     pooled,
+    reliability,
     worst,
 )
-from experiments.study.refusal.refusal_rates import Rate
-from experiments.study.refusal.refusal_trial import crossings_of
-from experiments.study.refusal.reliability import N_BINS, judged_answers, reliability
+from experiments.studies.refusal.refusal_trial import crossings_of
 
 COLUMNS = ["world_a", "world_b", "iteration", "n_common", "n_true", "status", "beats", "error"]
 # Two runs of common ground (the second's is found late), and a crossing of them.

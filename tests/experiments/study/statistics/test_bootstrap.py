@@ -3,7 +3,7 @@ import pandas as pd
 import pytest
 import scipy.stats
 
-from experiments.study.statistics.intervals import (
+from experiments.studies.intervals import (
     MAPS_OF_ONE_RUN,
     RUN,
     Clusters,
@@ -41,7 +41,7 @@ def test_weighted_medians_are_the_same_in_however_many_parts(
     median = WeightedMedian(rng.normal(size=50), rng.integers(0, 10, 50))
     counts = rng.multinomial(10, np.full(10, 0.1), size=40)
     whole = median(counts)
-    monkeypatch.setattr("experiments.study.statistics.intervals._MAX_CELLS", 60)
+    monkeypatch.setattr("experiments.studies.intervals._MAX_CELLS", 60)
     np.testing.assert_array_equal(median(counts), whole)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.study.statistics.paths_and_nees import fuser_summary
+from experiments.studies.statistics import fuser_summary
 
 
 def made_up() -> pd.DataFrame:

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binomtest
 
-from experiments.study.statistics.intervals import CONFIDENCE, effective_trials, wilson
+from experiments.studies.intervals import CONFIDENCE, effective_trials, wilson
 
 
 @given(n=st.integers(1, 5000), share=st.floats(0, 1))

@@ -5,19 +5,24 @@ import pandas as pd
 import pytest
 import scipy.stats
 
-from experiments.judge.criteria import RICH_PAIRS
-from experiments.judge.judged_maps import maps_of
-from experiments.judge.metrics import compute
-from experiments.study.statistics.better import change_of_each_run, holm, mean_change
-from experiments.study.statistics.error_bands import (
+from experiments.evaluation.alignment_summary import maps_of
+from experiments.evaluation.criteria import RICH_PAIRS
+from experiments.evaluation.metrics import compute
+from experiments.studies.error_bands import (
     BAND,
     error_bands,
     medians_of_run,
     scarce_spans,
     time_bands,
 )
-from experiments.study.statistics.intervals import clusters_of, median_interval
-from experiments.study.statistics.methods_compared import compare_methods, oracle_ratios
+from experiments.studies.intervals import (
+    change_of_each_run,
+    clusters_of,
+    holm,
+    mean_change,
+    median_interval,
+)
+from experiments.studies.method_comparison import compare_methods, oracle_ratios
 from tests.helpers.made_up_runs import many_errors
 
 

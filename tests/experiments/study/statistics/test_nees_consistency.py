@@ -3,7 +3,7 @@ import pandas as pd
 import pytest
 from scipy.stats import chi2
 
-from experiments.study.statistics.paths_and_nees import nees_of_maps, nees_of_pairs, path_summary
+from experiments.studies.statistics import nees_of_maps, nees_of_pairs, path_summary
 
 
 def made_up(n_runs: int, factor: float, drift: float = 0.0) -> pd.DataFrame:

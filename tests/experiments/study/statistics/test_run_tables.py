@@ -6,12 +6,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from experiments.judge import tables
-from experiments.judge.judged_maps import setting_columns
-from experiments.study.statistics import run_tables
-from experiments.study.statistics.run_tables import find_runs
+from experiments.evaluation import tables
+from experiments.evaluation.alignment_summary import setting_columns
+from experiments.studies import run_tables
+from experiments.studies.run_tables import find_runs
 from mapfusion.errors import InputError
-from mapfusion.storage import write_table
+from mapfusion.files import write_table
 from tests.helpers.made_up_runs import errors_of, tables_of, write_result, write_rows, write_sweep
 
 

@@ -4,9 +4,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.judge.judged_maps import maps_of
-from experiments.judge.tables import SHOWN, Shown
-from experiments.study.statistics.standing import aligner_summary, recommend
+from experiments.evaluation.alignment_summary import maps_of
+from experiments.evaluation.tables import SHOWN, Shown
+from experiments.studies.method_comparison import aligner_summary, recommend
 from tests.helpers.made_up_runs import many_errors
 
 

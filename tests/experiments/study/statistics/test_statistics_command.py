@@ -7,12 +7,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.show import statistics_files
-from experiments.show.export import to_latex, to_markdown, write_tables
-from experiments.show.figures.result_tables import ResultTables
-from experiments.study.statistics.error_bands import medians_of_run, time_bands
-from experiments.study.statistics.run_tables import find_runs
-from experiments.study.statistics.summary import ALL_SCENARIOS, summarise
+from experiments.reports import study_files
+from experiments.reports.export import to_latex, to_markdown, write_tables
+from experiments.reports.figures.result_tables import ResultTables
+from experiments.studies.error_bands import medians_of_run, time_bands
+from experiments.studies.run_tables import find_runs
+from experiments.studies.statistics import ALL_SCENARIOS, summarise
 from tests.helpers.made_up_runs import (
     ITERATIONS,
     METHODS,
@@ -68,7 +68,7 @@ def test_eighty_columns_hold_everything(tmp_path: Path, capsys: pytest.CaptureFi
 def test_several_scenarios_and_settings(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(statistics_files, "_FIGURES", ("fig05_rotation_error",))  # one will do
+    monkeypatch.setattr(study_files, "_FIGURES", ("fig05_rotation_error",))  # one will do
     settings = [{"slam.particles": "50"}, {"slam.particles": "200"}]
     sweep = write_sweep(tmp_path / "sweep", range(2), settings, ("hall", "maze"))
     reply = command(capsys, "statistics", sweep, "-o", tmp_path / "out")
@@ -150,7 +150,7 @@ def test_exported_tables_can_be_read_back_and_names_are_escaped(tmp_path: Path) 
 
 
 def test_curves_over_runs_are_medians_of_run_medians(tmp_path: Path) -> None:
-    from experiments.show.figures import fig04_translation_error, fig06_aligner_time
+    from experiments.reports.figures import fig04_translation_error, fig06_aligner_time
 
     folders = [write_result(tmp_path, seed, tables_of(seed)) for seed in range(5)]
     errors = find_runs(folders).read("errors")

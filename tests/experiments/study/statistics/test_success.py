@@ -5,13 +5,13 @@ import pandas as pd
 import pytest
 from scipy.stats import binomtest
 
-from experiments.judge.criteria import RIGHT_WITHIN_M, RIGHT_WITHIN_RAD, that_ever_meet
-from experiments.judge.judged_maps import maps_of
-from experiments.study.statistics.intervals import MAPS_OF_ONE_RUN, RUN, wilson
-from experiments.study.statistics.run_tables import find_runs
-from experiments.study.statistics.success_rates import LAST, success_rates
-from experiments.study.statistics.summary import with_overlap_share
-from mapfusion.align.refine import Refinement
+from experiments.evaluation.alignment_summary import maps_of
+from experiments.evaluation.criteria import RIGHT_WITHIN_M, RIGHT_WITHIN_RAD, that_ever_meet
+from experiments.studies.intervals import MAPS_OF_ONE_RUN, RUN, wilson
+from experiments.studies.method_comparison import LAST, success_rates
+from experiments.studies.run_tables import find_runs
+from experiments.studies.statistics import with_overlap_share
+from mapfusion.align.refinement import Refinement
 from tests.helpers.made_up_runs import (
     ITERATIONS,
     LOST_M,

@@ -6,11 +6,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.judge.path_errors import STATISTICS
-from experiments.study.compare.versions import compare
-from experiments.study.statistics.intervals import wilson
-from experiments.study.statistics.team_statistics import team_alignments, team_paths
-from mapfusion.team.team_graph import Place
+from experiments.evaluation.path_errors import STATISTICS
+from experiments.studies.comparison import compare
+from experiments.studies.intervals import wilson
+from experiments.studies.statistics import team_alignments, team_paths
+from mapfusion.fusion.team_graph import Place
 from tests.helpers import made_up_runs
 from tests.helpers.made_up_runs import Tables, two_sweeps
 from tests.helpers.tiny_scenario import command

@@ -9,18 +9,18 @@ import duckdb
 import pandas as pd
 import pytest
 
-from experiments.study.statistics.run_tables import find_runs
-from experiments.study.sweep import joined_tables as joined_module
-from experiments.study.sweep import sweep_dataset as dataset_module
-from experiments.study.sweep.combinations import SweepRun
-from experiments.study.sweep.joined_tables import (
+from experiments.studies import sweep_tables as dataset_module
+from experiments.studies import sweep_tables as joined_module
+from experiments.studies.run_tables import find_runs
+from experiments.studies.sweep_combinations import SweepRun
+from experiments.studies.sweep_tables import (
     JoinedTables,
+    SweepDataset,
     open_dataset,
     written_by_nobody_else,
 )
-from experiments.study.sweep.sweep_dataset import SweepDataset
 from mapfusion.errors import InputError, MendedWarning
-from mapfusion.storage import write_json
+from mapfusion.files import write_json
 
 KEYS = ("slam.min_count",)
 STAGES = ["drive/1", "judge/2"]

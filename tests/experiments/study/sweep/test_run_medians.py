@@ -5,11 +5,15 @@ from pathlib import Path
 
 import pyarrow as pa
 
-from experiments.judge import tables
-from experiments.study.sweep.combinations import SweepRun
-from experiments.study.sweep.joined_tables import open_dataset
-from experiments.study.sweep.run_medians import ERRORS, GIVEN, medians_over_runs
-from experiments.study.sweep.sweep_dataset import SweepDataset
+from experiments.evaluation import tables
+from experiments.studies.sweep_combinations import SweepRun
+from experiments.studies.sweep_tables import (
+    ERRORS,
+    GIVEN,
+    SweepDataset,
+    medians_over_runs,
+    open_dataset,
+)
 
 EMPTY = {pa.string(): "", pa.bool_(): False}
 

@@ -13,11 +13,10 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
-from experiments.judge import tables
-from experiments.study.sweep.joined_tables import JoinedTables
-from experiments.study.sweep.sweep_dataset import RUN_TIMES
-from experiments.study.sweep.sweep_driver import execute
-from experiments.study.sweep.sweep_plan import planned, prepare
+from experiments.evaluation import tables
+from experiments.studies.sweep import execute
+from experiments.studies.sweep_plan import planned, prepare
+from experiments.studies.sweep_tables import RUN_TIMES, JoinedTables
 from tests.helpers.killing import KilledCommand, same_rows
 from tests.helpers.tiny_scenario import SHORT, command
 
@@ -92,7 +91,7 @@ def test_a_run_of_the_sweep_is_the_same_as_the_run_alone(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr("experiments.show.figures.drawing.FIGURES", ())
+    monkeypatch.setattr("experiments.reports.figures.drawing.FIGURES", ())
     arguments = ("--set", "slam.filter.n_particles=5", "--set", "align.repetitions=1")
     reply = command(
         capsys, "run", short_path, "--seed", 1, *arguments, "--jobs", 1, "--results", tmp_path
@@ -171,7 +170,7 @@ def test_a_run_that_needs_more_memory_than_there_is_is_a_row(
     short_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two workers need 0.3 GB each before they begin; other machines have what they have."""
-    monkeypatch.setattr("experiments.run.memory.memory_bytes", lambda: 0.6e9)
+    monkeypatch.setattr("experiments.pipeline.memory.memory_bytes", lambda: 0.6e9)
     asked = prepare([short_path], [0], [], tmp_path)
     (reason,) = execute(asked, 2, None, lambda _: None).failed.values()
     assert "in each of 2 processes (--jobs 1 needs least), this machine has 0.6 GB" in reason

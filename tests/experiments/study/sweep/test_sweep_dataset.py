@@ -6,9 +6,9 @@ import pandas as pd
 import pyarrow as pa
 import pytest
 
-from experiments.judge import tables
-from experiments.study.sweep.combinations import SweepRun
-from experiments.study.sweep.sweep_dataset import SweepDataset, read_waiting
+from experiments.evaluation import tables
+from experiments.studies.sweep_combinations import SweepRun
+from experiments.studies.sweep_tables import SweepDataset, read_waiting
 from mapfusion.errors import DamagedFileError
 
 RUN = SweepRun(Path("x.yaml"), "x", 7, (("slam.min_count", "2"), ("align.repetitions", "1")))

@@ -17,18 +17,16 @@ import pytest
 from distributed import Client, LocalCluster
 from distributed.security import Security
 
-from experiments.run.dask_cluster import connected
-from experiments.run.dask_worker import Terms, code_version
-from experiments.run.store import Store
-from experiments.run.tasks import Task, unfinished
-from experiments.study.sweep import sweep_driver as driver_module
-from experiments.study.sweep import sweep_plan as plan_module
-from experiments.study.sweep.combinations import SweepRun
-from experiments.study.sweep.joined_tables import JoinedTables, open_dataset
-from experiments.study.sweep.sweep_dataset import SweepDataset
-from experiments.study.sweep.sweep_driver import OnSweepProgress, SweepDriver, SweepProgress
-from experiments.study.sweep.sweep_plan import PlannedRun, Sweep
-from mapfusion import sealed
+from experiments.pipeline.cluster import Terms, code_version, connected
+from experiments.pipeline.store import Store
+from experiments.pipeline.tasks import Task, unfinished
+from experiments.studies import sweep as driver_module
+from experiments.studies import sweep_plan as plan_module
+from experiments.studies.sweep import OnSweepProgress, SweepDriver, SweepProgress
+from experiments.studies.sweep_combinations import SweepRun
+from experiments.studies.sweep_plan import PlannedRun, Sweep
+from experiments.studies.sweep_tables import JoinedTables, SweepDataset, open_dataset
+from mapfusion import files
 from mapfusion.errors import InputError, MendedWarning
 from tests.helpers import acting
 
@@ -152,7 +150,7 @@ def test_a_damaged_stage_is_made_again_for_all_that_read_it(scene: Scene, client
 def test_a_file_that_is_always_damaged_fails_its_runs(scene: Scene, client: Client) -> None:
     made = scene.folder / "drive" / "k" / "data"
     scene.tasks[0] = [
-        Task("drive/k", "drive", acting.write, (made, sealed.LINE.decode()), (made,)),
+        Task("drive/k", "drive", acting.write, (made, files.LINE.decode()), (made,)),
         Task(
             "slam/0",
             "slam",
@@ -281,7 +279,7 @@ def test_an_existing_cluster_of_unfit_workers_ends_the_sweep(scene: Scene, tmp_p
 
 
 def test_no_scheduler_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("experiments.run.dask_cluster.CONNECT_TIMEOUT_S", 0.2)
+    monkeypatch.setattr("experiments.pipeline.cluster.CONNECT_TIMEOUT_S", 0.2)
     for address in ("tcp://127.0.0.1:1", "nonsense://x", "tls://127.0.0.1:1"):
         with pytest.raises(InputError, match=f"--scheduler {address}"), connected(1, address):
             pass

@@ -1,0 +1,149 @@
+"""The memory a run will need, estimated before it starts: it is refused where the machine has less.
+
+Estimates are upper bounds of what grows with the settings, good to a factor of two or so: they are
+to catch a slip of the keyboard, not to plan a cluster.
+"""
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pyarrow.parquet as pq
+
+from experiments.pipeline.kept_logs import MOST_BYTES
+from experiments.pipeline.pipeline import Pipeline, RobotStages
+from experiments.pipeline.stage import RecordedLog
+from experiments.scenario.settings import Scenario, SimulatedScenario, Simulation
+from mapfusion.errors import InputError
+from mapfusion.tables import is_csv, table_path
+from sim.textures import STYLES
+
+_GB = 1e9
+_PROCESS_BYTES = 300e6  # a worker with the numerical libraries and compiled kernels
+# A landmark's row holds a mean (3 numbers), a covariance (6) and a count for each particle; while
+# rows are doubled the old half is there too, so half as much again. Its slot has a descriptor.
+_ROW_BYTES, _SLOT_BYTES = 1.5 * (9 * 8 + 4), 1.5 * 400
+# Of the corners seen in a frame so many are taken for new landmarks: 0.5 to 2 % in the suite.
+_NEW_SHARE = 0.02
+_POSE_BYTES = 3 * 8 + 4  # kept of each particle and frame: its pose and its ancestor
+_ASSOCIATION_BYTES = 4  # and of each observation: the landmark it went into
+# Both are kept of all particles only since these had one ancestor. That is 2 M resamplings ago on
+# average where weights differ little, fewer elsewhere, and each takes ten frames or more.
+_FRAMES_A_PARTICLE = 30
+# An observation of a log: position, covariance, descriptor, label, pixels, frame.
+_OBSERVATION_BYTES = 3 * 8 + 9 * 8 + 64 * 4 + 4 + 3 * 4 + 4
+# Two images with their depth, noise and corner responses: 60 to 80 bytes measured at 2048 x 2048.
+_PIXEL_BYTES = 100
+# The renderer's copy of a texture, and what one face needs while it is painted.
+_TEXEL_BYTES, _PAINTED_BYTES = 4, 20
+# A landmark of an evaluated map is a row of twelve numbers, and there once more when it is written.
+_EVALUATED_BYTES = 2 * 12 * 8
+_CGROUP_LIMITS = ("memory.max", "memory/memory.limit_in_bytes")  # of version 2 and 1
+
+
+@dataclass(frozen=True)
+class Need:
+    """Memory of one process, and which setting it grows with."""
+
+    n_bytes: float
+    setting: str
+    why: str
+
+
+def require_memory(pipeline: Pipeline, jobs: int, machine_bytes: float | None = None) -> None:
+    """Raise InputError, naming the setting, where the machine has less than the run will need.
+
+    `machine_bytes` is what this machine has, unless it is given.
+    """
+    has = memory_bytes() if machine_bytes is None else machine_bytes
+    need = max(needs(pipeline), key=lambda need: need.n_bytes)
+    wanted = jobs * (need.n_bytes + _PROCESS_BYTES + MOST_BYTES)
+    if wanted > has:
+        processes = f" in each of {jobs} processes (--jobs 1 needs least)" if jobs > 1 else ""
+        raise InputError(
+            f"{need.setting}: {need.why} take about {need.n_bytes / _GB:.1f} GB{processes}, this "
+            f"machine has {has / _GB:.1f} GB"
+        )
+
+
+def needs(pipeline: Pipeline) -> Iterator[Need]:
+    """Yield what the tasks that need most of a process need.
+
+    The smoother is not among them: its need depends on what was seen. It is bounded when the log is
+    there, by `smooth.max_memory_gb` (`mapfusion.smoother.elimination.memory_bytes`).
+    """
+    scenario = pipeline.scenario
+    for robot in pipeline.robots:
+        yield from _of_filter(scenario, robot)
+    if isinstance(scenario, Simulation):
+        camera = scenario.camera
+        pixels = camera.width_px * camera.height_px
+        why = f"images of {camera.width_px} x {camera.height_px} pixels"
+        yield Need(_PIXEL_BYTES * pixels, "camera.width_px", why)
+        yield _of_textures(scenario)
+
+
+def _n_rows(path: Path) -> int:
+    """Return the number of rows of a log's table, Parquet or CSV, without reading the table."""
+    if is_csv(path):
+        with path.open("rb") as file:
+            return max(sum(1 for _ in file) - 1, 0)
+    return pq.read_metadata(path).num_rows
+
+
+def _of_filter(scenario: Scenario, robot: RobotStages) -> Iterator[Need]:
+    """The log, its landmarks, and of late: particles x landmarks, frames and observations."""
+    settings = scenario.slam.filter
+    n_frames = n_observations = robot.n_frames
+    where = "drive.frames"
+    if isinstance(robot.log, RecordedLog):
+        n_observations = _n_rows(table_path(robot.log.path, "observations"))
+        where = "logs"
+    elif isinstance(scenario, SimulatedScenario):
+        n_observations = n_frames * scenario.vision.harris.max_corners
+    n_landmarks, late = _NEW_SHARE * n_observations, 1.0  # share of frames since particles differ
+    if settings.resample_fraction > 0:
+        late = min(1.0, _FRAMES_A_PARTICLE * settings.n_particles / max(n_frames, 1))
+    a_particle = late * (
+        n_landmarks * _ROW_BYTES + n_observations * _ASSOCIATION_BYTES + n_frames * _POSE_BYTES
+    )
+    once = n_observations * _OBSERVATION_BYTES + n_landmarks * _SLOT_BYTES
+    of_particles = settings.n_particles * a_particle
+    setting = "slam.filter.n_particles" if of_particles > once else where
+    why = f"{n_observations} observations in {n_frames} frames"
+    yield Need(of_particles + once, setting, f"{settings.n_particles} particles with {why}")
+    # maps grow from nothing, so their mean is half of the last
+    n_rows = n_frames / scenario.evaluate.every * n_landmarks / 2
+    often = f"maps each {scenario.evaluate.every} of {n_frames} frames"
+    yield Need(n_rows * _EVALUATED_BYTES, "evaluate.every", often)
+
+
+def _of_textures(scenario: Simulation) -> Need:
+    """Texels of all faces: walls have two sides, floor and ceiling reach around them."""
+    world = scenario.world
+    corners = [point for wall in world.walls for point in wall.points]
+    wide, deep = (max(axis) - min(axis) for axis in zip(*corners, strict=True))
+    lengths = [
+        ((x1 - x0) ** 2 + (y1 - y0) ** 2) ** 0.5
+        for wall in world.walls
+        for (x0, y0), (x1, y1) in zip(wall.points, wall.points[1:], strict=False)
+    ]
+    upright, level = STYLES["wall"].texels_per_m ** 2, STYLES["floor"].texels_per_m ** 2
+    faces = [2 * length * world.wall_height_m * upright for length in lengths]
+    plans = [2 * wide * deep * level]
+    painted = max(max(faces), *plans) / 2
+    n_bytes = _TEXEL_BYTES * (sum(faces) + sum(plans)) + _PAINTED_BYTES * painted
+    why = f"walls of {sum(lengths):.0f} m around {wide:.0f} m x {deep:.0f} m, painted,"
+    return Need(n_bytes, "world.walls", why)
+
+
+def memory_bytes() -> float:
+    """What this machine, or the container this process is confined to, has in all."""
+    has = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    for name in _CGROUP_LIMITS:
+        try:
+            has = min(has, float((Path("/sys/fs/cgroup") / name).read_text()))
+        except (OSError, ValueError):  # no such confinement; "max" is none either
+            continue
+    return has

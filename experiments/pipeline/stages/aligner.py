@@ -1,0 +1,88 @@
+"""Stage: one aligner's estimates for one pair of robots, refined and held against chance.
+
+Each aligner apart, so a run in which one has changed takes all others' estimates as they are.
+"""
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from experiments.methods.aligner_calls import callable_aligner
+from experiments.pipeline.stage import Job
+from experiments.pipeline.stages import match
+from experiments.pipeline.tables import (
+    CORRESPONDENCES,
+    ESTIMATES,
+    RIVALS,
+    at_iteration,
+    correspondences_of,
+    estimate_row,
+    evidence_of,
+    read_rows,
+    write_rows,
+)
+from experiments.scenario.seeds import generator
+from mapfusion.align.alignment import Pairs
+from mapfusion.align.refinement import Refinement
+from mapfusion.registration import Completion, PairRegistration
+from mapfusion.verification.false_alarms import Acceptance
+from mapfusion.verification.parameters import EvidenceParameters
+from mapfusion.verification.verdict import Judge
+
+LABEL, WRITES = match.LABEL, match.WRITES[:1]
+_BATCHES_KEPT = 2  # by a process: that of the aligners that go on, and of those that begin
+
+
+@dataclass(frozen=True)
+class AlignerSettings:
+    """All that an aligner's estimates depend on, beside the maps and the correspondences."""
+
+    seed: int
+    name: str
+    method: str
+    parameters: dict[str, Any]
+    time_limit_s: float
+    origin: dict[str, str]  # package, version and files of a method that is not ours
+    repetitions: int
+    refinement: Refinement
+    acceptance: Acceptance
+    evidence: EvidenceParameters
+    iterations: tuple[int, ...]
+
+
+def run(settings: AlignerSettings, job: Job) -> None:
+    """Let the aligner estimate at one batch of iterations, on what the match stage offers."""
+    aligner = callable_aligner(settings.method, settings.parameters, settings.time_limit_s)
+    judge = Judge(settings.acceptance, settings.evidence, settings.refinement)
+    inputs = tuple(job.inputs.items())
+    rows = []
+    for k, completion in _completions(inputs, job.part, judge, settings.iterations):
+        pairs, on_pair = completion.pairs, PairRegistration(aligner, completion)
+        for repetition in range(settings.repetitions if aligner.randomised else 1):
+            names = {"robot_a": pairs.map_a.name, "robot_b": pairs.map_b.name, "iteration": k}
+            names |= {"aligner": settings.name, "repetition": repetition}
+            done = on_pair.register(generator(settings.seed, "align", *names.values()))
+            rows.append(names | estimate_row(len(pairs), *done))
+    write_rows(match.batch_path(job.output, job.part), ESTIMATES, rows)
+
+
+@functools.lru_cache(maxsize=_BATCHES_KEPT)
+def _completions(
+    inputs: tuple[tuple[str, Path], ...], part: str, judge: Judge, iterations: tuple[int, ...]
+) -> Sequence[tuple[int, Completion]]:
+    """Iterations of a batch, and what completes an estimate there, whichever aligner made it.
+
+    One aligner's task follows on another's, so the last ones stay in memory. What is in a folder
+    follows from its name.
+    """
+    job = Job(dict(inputs), Path(), part)
+    offered = read_rows(match.batch_path(job.inputs["match"], part), CORRESPONDENCES)
+    rivals = read_rows(match.rivals_path(job.inputs["match"], part), RIVALS)
+    completions = []
+    for k, map_a, map_b in match.pairs_of_maps(job, iterations):
+        pairs = Pairs(map_a, map_b, correspondences_of(at_iteration(offered, k)))
+        evidence = evidence_of(at_iteration(rivals, k), (map_a, map_b), judge.evidence)
+        completions.append((k, Completion(pairs, judge.refinement, judge, evidence)))
+    return completions

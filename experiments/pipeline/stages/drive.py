@@ -1,0 +1,71 @@
+"""Stage: physics, all robots in one world, once. Writes the trajectory."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from experiments.pipeline.stage import Job
+from experiments.pipeline.stages.walls import Walls
+from experiments.scenario.seeds import generator
+from sim.driver import DriverSettings, Route, drive
+from sim.sway import BodySway
+from sim.trajectory import Trajectory, write_trajectory
+
+LABEL = "drive the robots"
+TRAJECTORY_FILE = "trajectory.parquet"
+WRITES = (TRAJECTORY_FILE,)
+
+
+@dataclass(frozen=True)
+class DrivenRobot:
+    """Where a robot starts (x_m, y_m, theta_rad in the world) and which points it visits."""
+
+    name: str
+    start: tuple[float, float, float]
+    route: Sequence[tuple[float, float]]
+    loop: bool
+    tire_friction: float
+
+
+@dataclass(frozen=True)
+class DriveSettings:
+    """All that the robots' ways depend on; sensors are no part of it."""
+
+    seed: int
+    walls: Walls
+    robots: tuple[DrivenRobot, ...]
+    frames: int
+    frame_interval_s: float
+    start_jitter_m: float
+    start_jitter_rad: float
+    control: DriverSettings
+    body_sway: BodySway
+
+
+def run(settings: DriveSettings, job: Job) -> None:
+    """Drive, and write the trajectory."""
+    write_trajectory(job.output / TRAJECTORY_FILE, driven(settings))
+
+
+def driven(settings: DriveSettings) -> Trajectory:
+    """Drive, from the scenario's starts moved by the seed within the jitter; bodies sway on top.
+
+    Raises:
+        InputError: a route that fails.
+    """
+    span = np.array([settings.start_jitter_m] * 2 + [settings.start_jitter_rad])
+    routes = []
+    for robot in settings.robots:
+        jitter = generator(settings.seed, "start", robot.name).uniform(-span, span)
+        start, route = np.array(robot.start) + jitter, np.array(robot.route)
+        routes.append(Route(robot.name, start, route, robot.loop, robot.tire_friction))
+    plan, interval_s = settings.walls.floor_plan(), settings.frame_interval_s
+    trajectory = drive(plan, routes, settings.control, settings.frames, interval_s)
+    if settings.body_sway.sigma_rad:
+        tilts = [
+            settings.body_sway.tilts(trajectory.time_s, generator(settings.seed, "sway", robot))
+            for robot in trajectory.robots
+        ]
+        trajectory = replace(trajectory, tilt_rad=np.stack(tilts))
+    return trajectory

@@ -1,0 +1,189 @@
+"""Stage: one robot's stereo images, rendered and turned into features, frame by frame.
+
+Frames do not depend on each other, so they are made in parallel, in chunks; a chunk on disk is
+never made again. Images are kept for a few frames only (for figure 1).
+"""
+
+import itertools
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import pyarrow as pa
+
+from experiments.pipeline.stage import Job
+from experiments.pipeline.stages.drive import TRAJECTORY_FILE
+from experiments.scenario.seeds import generator
+from mapfusion.files import (
+    LINE,
+    POSITION_FIELDS,
+    column,
+    columns,
+    float_fields,
+    named_columns,
+    read_table,
+    schema,
+    write_sealed,
+    write_table,
+)
+from mapfusion.geometry.camera import StereoCamera
+from mapfusion.geometry.numerics import Float
+from mapfusion.robot_log import with_rows
+from mapfusion.tables import DESCRIPTOR_LENGTH
+from mapfusion.vision.features import PATCH_SIDE_PX, Features
+from mapfusion.vision.front_end import FrontEnd, FrontEndParameters
+from sim.recorder import FrameSource, truth_behind
+from sim.renderer import Renderer
+from sim.stereo_head import RadiometricNoise, StereoFrame
+from sim.trajectory import read_trajectory
+
+# Frames a task: about two seconds of work, so little is lost when a run is interrupted.
+FRAMES_PER_CHUNK = 20
+
+_PIXEL = ["u_px", "v_px"]
+_ONE_EACH = ["disparity_px", "sigma_disparity_px"]
+_SLOPE = ["disparity_per_u", "disparity_per_v"]
+_NUMBER = np.dtype("<f4")  # of a descriptor
+FEATURES = schema(
+    "features",
+    3,
+    [
+        pa.field("iteration", pa.int32()),
+        *float_fields([*_PIXEL, "disparity_px", "sigma_disparity_px", *_SLOPE]),
+        # as bytes: lists are written, and read, number by number
+        pa.field("descriptor", pa.binary(_NUMBER.itemsize * DESCRIPTOR_LENGTH)),
+        pa.field("patch", pa.binary(PATCH_SIDE_PX**2)),
+    ],
+)
+# Row i is the world point behind row i of the features, and how it moves with the pixel. Kept
+# apart: estimators never read it.
+_POINT_SLOPE = [f"{name}_per_{axis}" for name in POSITION_FIELDS for axis in "uv"]
+TRUTH = schema("features.truth", 2, float_fields([*POSITION_FIELDS, *_POINT_SLOPE]))
+
+LABEL = "render and find features"
+WRITES = ("truth_{part}.parquet", "features_{part}.parquet")
+
+
+@dataclass(frozen=True)
+class FeatureSettings:
+    """All that a robot's features depend on, beside the way and the walls."""
+
+    seed: int
+    robot: str
+    camera: StereoCamera
+    radiometry: RadiometricNoise
+    renderer: Renderer
+    drawn_by: str  # what the renderer is on this machine
+    vision: FrontEndParameters  # corners, stereo and descriptors; the rest stays at its defaults
+    images_at: int
+    images: int
+
+
+def chunks(n_frames: int) -> tuple[str, ...]:
+    """The parts of the stage: each is named after its first frame."""
+    return tuple(f"{start:06d}" for start in range(0, n_frames, FRAMES_PER_CHUNK))
+
+
+def _chunk(part: str, n_frames: int) -> range:
+    return range(int(part), min(int(part) + FRAMES_PER_CHUNK, n_frames))
+
+
+# The world this process last rendered from: loading one takes seconds, so it stays open.
+_open: dict[tuple[object, ...], FrameSource] = {}
+
+
+# The stage's tasks for one robot, and mostly those for all of them, read the same way.
+_trajectory = lru_cache(maxsize=1)(read_trajectory)
+
+
+def _world(settings: FeatureSettings, faces: Path, robots: tuple[str, ...]) -> FrameSource:
+    world = (faces, settings.camera, robots, settings.renderer)
+    if world not in _open:
+        while _open:
+            _open.popitem()[1].close()
+        _open[world] = FrameSource(*world)
+    return _open[world]
+
+
+def run(settings: FeatureSettings, job: Job) -> dict[str, float]:
+    """Render and extract the frames of one chunk.
+
+    Returns:
+        How long the rendering took, with the world opened for it.
+    """
+    trajectory = _trajectory(job.inputs["drive"] / TRAJECTORY_FILE)
+    started = time.perf_counter()
+    source = _world(settings, job.inputs["faces"], trajectory.robots)
+    rendering_s = time.perf_counter() - started
+    front_end = FrontEnd(settings.camera, settings.vision)
+    robot, features, truth = settings.robot, [], []
+    frames = _chunk(job.part, len(trajectory))
+    for iteration in frames:
+        poses = trajectory.bodies(iteration)
+        started = time.perf_counter()
+        frame = rendered(settings, source, poses, iteration)
+        rendering_s += time.perf_counter() - started
+        found = front_end.extract(frame.left, frame.right)
+        own_pose = poses[trajectory.index(robot)]
+        features.append(found)
+        points, slopes = truth_behind(settings.camera, frame.depth_m, found.uv_px, own_pose)
+        truth.append(np.concatenate([points, slopes.reshape(-1, len(_POINT_SLOPE))], axis=1))
+        if 0 <= iteration - settings.images_at < settings.images:
+            encoded = cv2.imencode(".png", frame.left)[1].tobytes()
+            write_sealed(job.output / f"image_{iteration:06d}.png", encoded + LINE)
+    truth_path, features_path = (job.output / name.format(part=job.part) for name in WRITES)
+    joined = {
+        name: np.concatenate([getattr(found, name) for found in features])
+        for name in ("uv_px", "slope", "descriptor", "patch", *_ONE_EACH)
+    }
+    joined["descriptor"] = joined["descriptor"].astype(_NUMBER, copy=False).view(np.uint8)
+    joined |= named_columns(_PIXEL, joined["uv_px"]) | named_columns(_SLOPE, joined["slope"])
+    joined["iteration"] = np.repeat(np.array(frames), [len(found) for found in features])
+    write_table(truth_path, named_columns(TRUTH.names, np.concatenate(truth)), TRUTH)
+    write_table(features_path, joined, FEATURES)
+    return {"rendering_s": rendering_s}
+
+
+def rendered(
+    settings: FeatureSettings, source: FrameSource, poses: Float, iteration: int
+) -> StereoFrame:
+    """One frame of a robot, without colour, with the robots at poses (R, 3) or (R, 4, 4)."""
+    rng = generator(settings.seed, "radiometry", settings.robot, iteration)
+    return source.render(poses, settings.robot, settings.radiometry, rng, colour=False)
+
+
+class TruePoints(NamedTuple):
+    """World points (N, 3) behind features, and their derivatives (N, 3, 2) by the pixel."""
+
+    point_m: Float
+    slope: Float
+
+    def at(self, shift_px: Float) -> Float:
+        """World points (N, 3) behind pixels that are shifted by (N, 2) on the same surface."""
+        return self.point_m + np.einsum("nij,nj->ni", self.slope, shift_px)
+
+
+def read_features(folder: Path, n_frames: int) -> Iterator[tuple[Features, TruePoints]]:
+    """Features and what is truly behind them, frame by frame, in order."""
+    for part in chunks(n_frames):
+        truth_path, features_path = (folder / name.format(part=part) for name in WRITES)
+        table, _ = read_table(features_path, FEATURES)
+        found = Features(
+            columns(table, _PIXEL),
+            **{name: column(table, name) for name in _ONE_EACH},
+            descriptor=column(table, "descriptor").view(_NUMBER),
+            slope=columns(table, _SLOPE),
+            patch=column(table, "patch").reshape(-1, PATCH_SIDE_PX, PATCH_SIDE_PX),
+        )
+        true_table, _ = read_table(truth_path, TRUTH)
+        point = columns(true_table, POSITION_FIELDS)
+        slope = columns(true_table, _POINT_SLOPE).reshape(-1, 3, 2)
+        frames = _chunk(part, n_frames)
+        ends = np.searchsorted(column(table, "iteration"), [*frames, frames.stop]).tolist()
+        for rows in itertools.starmap(slice, itertools.pairwise(ends)):
+            yield with_rows(found, rows), TruePoints(point[rows], slope[rows])

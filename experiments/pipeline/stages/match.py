@@ -1,0 +1,110 @@
+"""Stage: correspondences and rival motions of two robots' maps, a batch of iterations at a time.
+
+What matching and aligning read, they read here.
+"""
+
+import functools
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import pandas as pd
+import pyarrow as pa
+
+from experiments.pipeline.stage import Job
+from experiments.pipeline.stages.slam import RobotFolders, folders_of_both
+from experiments.pipeline.stages.snapshots import ROBOTS_KEPT, Snapshots, stored_maps
+from experiments.pipeline.tables import CORRESPONDENCES, RIVALS, read_rows, rival_rows, write_rows
+from mapfusion.align.alignment import Pairs
+from mapfusion.align.correspondences import MatchParameters, match
+from mapfusion.align.refinement import Refinement
+from mapfusion.landmark_map import LandmarkMap
+from mapfusion.verification.false_alarms import Acceptance
+from mapfusion.verification.parameters import EvidenceParameters
+from mapfusion.verification.regions import Witness
+from mapfusion.verification.verdict import Judge, why_not_sought
+
+# Evaluated iterations a part: small enough that an interruption loses little and two cores end
+# at about the same time, large enough that reading the maps costs little beside aligning them.
+_ITERATIONS_PER_BATCH = 12
+_Known = TypeVar("_Known")
+LABEL = "align the maps"
+WRITES = ("batch_{part}.parquet", "rivals_{part}.parquet")
+
+
+@dataclass(frozen=True)
+class MatchSettings:
+    """All that correspondences and rivals depend on, beside the maps."""
+
+    match: MatchParameters
+    acceptance: Acceptance
+    evidence: EvidenceParameters
+    refinement: Refinement
+    iterations: tuple[int, ...]
+
+
+def run(settings: MatchSettings, job: Job) -> None:
+    """Find the correspondences of one batch of iterations, and what they say of rival motions."""
+    made, rivals = [], []
+    judge = Judge(settings.acceptance, settings.evidence, settings.refinement)
+    for k, map_a, map_b in pairs_of_maps(job, settings.iterations):
+        pairs = match(map_a, map_b, settings.match)
+        names = {"robot_a": map_a.name, "robot_b": map_b.name, "iteration": k}
+        witnesses = None
+        if not why_not_sought(map_a, map_b):
+            a, b = folders_of_both(job)
+            witnesses = _witness(a, k), _witness(b, k)
+        if evidence := judge.on(Pairs(map_a, map_b, pairs), witnesses=witnesses).evidence:
+            rivals += rival_rows(names, evidence)
+        columns = names | {"index_a": pairs.index_a, "index_b": pairs.index_b}
+        made.append(pd.DataFrame(columns | {"descriptor_distance": pairs.distance}))
+    write_rows(batch_path(job.output, job.part), CORRESPONDENCES, pd.concat(made))
+    write_rows(rivals_path(job.output, job.part), RIVALS, rivals)
+
+
+@functools.lru_cache(maxsize=ROBOTS_KEPT * _ITERATIONS_PER_BATCH)
+def _witness(folders: RobotFolders, iteration: int) -> Witness:
+    """A robot's map, with what it was asked: it is in as many pairs as there are other robots."""
+    return Witness(known_at(stored_maps(folders), iteration))
+
+
+def batches(iterations: tuple[int, ...]) -> tuple[str, ...]:
+    """The parts of the stage and of the aligners', numbered."""
+    return tuple(f"{i:03d}" for i in range(-(-len(iterations) // _ITERATIONS_PER_BATCH)))
+
+
+def batch_path(folder: Path, part: str) -> Path:
+    """Where a stage keeps one batch."""
+    return folder / WRITES[0].format(part=part)
+
+
+def read_batches(folder: Path, table_schema: pa.Schema) -> pd.DataFrame:
+    """All batches of this stage's or an aligner's folder, in their order."""
+    paths = sorted(folder.glob(WRITES[0].format(part="*")))
+    return pd.concat([read_rows(path, table_schema) for path in paths], ignore_index=True)
+
+
+def rivals_path(folder: Path, part: str) -> Path:
+    """Where the stage keeps the rivals of one batch."""
+    return folder / WRITES[1].format(part=part)
+
+
+def maps_of_both(job: Job) -> list[Snapshots]:
+    """All maps of the job's two robots, by iteration."""
+    return [stored_maps(folders) for folders in folders_of_both(job)]
+
+
+def pairs_of_maps(
+    job: Job, iterations: tuple[int, ...]
+) -> Iterator[tuple[int, LandmarkMap, LandmarkMap]]:
+    """(iteration, map a, map b) of the job's batch."""
+    a, b = maps_of_both(job)
+    start = int(job.part) * _ITERATIONS_PER_BATCH
+    for k in iterations[start : start + _ITERATIONS_PER_BATCH]:
+        yield k, known_at(a, k), known_at(b, k)
+
+
+def known_at(known: Mapping[int, _Known], iteration: int) -> _Known:
+    """A robot's map, or what belongs to it, at an iteration: the last of a log that ended."""
+    return known[max((k for k in known if k <= iteration), default=min(known))]

@@ -1,0 +1,227 @@
+"""Stage: one robot's FastSLAM over its log, with its map at each evaluated iteration."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+
+from experiments.pipeline.kept_logs import kept_log
+from experiments.pipeline.stage import Job
+from experiments.pipeline.tables import BOOL, FLOAT, INT, TEXT, fields, read_rows
+from experiments.scenario.seeds import generator
+from mapfusion.attitude import read_attitude
+from mapfusion.datasets.log_consistency import Finding, Jump, check_log, gate_finding, without_jumps
+from mapfusion.fastslam.filter import FastSlamParameters, StepResult
+from mapfusion.fastslam.mapping import run_log
+from mapfusion.files import (
+    POSE_FIELDS,
+    column,
+    columns,
+    covariance_columns,
+    covariances_from,
+    float_fields,
+    named_columns,
+    point_columns,
+    point_fields,
+    read_table,
+    schema,
+    write_table,
+)
+from mapfusion.geometry.numerics import Float
+from mapfusion.robot_log import RobotLog, read_odometry_covariance
+
+_ONLINE, _FINAL = ([f"{path}_{name}" for name in POSE_FIELDS] for path in ("online", "final"))
+_ITERATION = fields(iteration=INT)
+_SOURCES = fields(count=INT, source_observation=pa.int64())
+SNAPSHOTS = schema("slam.snapshots", 1, [*_ITERATION, *point_fields(), *_SOURCES])
+# From this iteration on, the observation counts for the landmark that came from source_observation
+# (-1: for none). Only changes are listed.
+ASSOCIATIONS = schema(
+    "slam.associations", 1, fields(from_iteration=INT, observation=INT, source_observation=INT)
+)
+_STEP = fields(effective_sample_size=FLOAT, resampled=BOOL, n_landmarks=INT, spread_m=FLOAT)
+POSES = schema("slam.poses", 1, [*_ITERATION, *float_fields(_ONLINE + _FINAL), *_STEP])
+_PARTICLE = fields(iteration=INT, particle=INT)
+CLOUDS = schema("slam.clouds", 1, [*_PARTICLE, *float_fields([*POSE_FIELDS, "log_weight"])])
+# The most probable particle's path at each evaluated iteration, which its map was made along.
+# What a log says against itself (mapfusion/datasets/log_consistency.py): a line each, the iteration of a
+# jump or -1, and of jumps the motion that the observations show in place of the odometry.
+_OBSERVED = [f"observed_{name}" for name in POSE_FIELDS]
+_OBSERVED_COVARIANCE = ["cov_xx", "cov_xy", "cov_xt", "cov_yy", "cov_yt", "cov_tt"]
+FINDINGS = schema(
+    "slam.findings",
+    1,
+    [
+        *fields(check=TEXT, iteration=INT, finding=TEXT),
+        *float_fields([*_OBSERVED, *_OBSERVED_COVARIANCE]),
+    ],
+)
+PATHS = schema("slam.paths", 1, [*fields(evaluated=INT), *_ITERATION, *float_fields(POSE_FIELDS)])
+
+LABEL = "FastSLAM"
+WRITES = (
+    "snapshots.parquet",
+    "associations.parquet",
+    "poses.parquet",
+    "clouds.parquet",
+    "paths.parquet",
+    "findings.parquet",
+)
+
+
+@dataclass(frozen=True)
+class SlamSettings:
+    """All that a robot's maps depend on, beside its log."""
+
+    seed: int
+    filter: FastSlamParameters
+    min_count: int
+    every: int
+    clouds_every: int
+
+
+class RobotFolders(NamedTuple):
+    """Where a robot's log (with its truth) and its SLAM result lie."""
+
+    log: Path
+    slam: Path
+
+
+def folders_of_both(job: Job) -> list[RobotFolders]:
+    """Those of the two robots that a job of a pair is handed."""
+    return [RobotFolders(job.inputs[f"log_{side}"], job.inputs[f"slam_{side}"]) for side in "ab"]
+
+
+def evaluated_iterations(n_frames: int, every: int) -> list[int]:
+    """Each multiple of `every` from the first on, and the last frame."""
+    return sorted({*range(every, n_frames, every), n_frames - 1})
+
+
+def run(settings: SlamSettings, job: Job) -> None:
+    """Run the filter over a log and write maps, poses, associations and particle clouds."""
+    log = kept_log(job.inputs["log"])
+    found = check_log(log, settings.filter.motion)
+    known = read_odometry_covariance(job.inputs["log"], len(log))
+    log, covariance = without_jumps(log, found.jumps, known)
+    last = len(log) - 1
+    steps = list[dict[str, float]]()
+    maps, associations, clouds, paths = _Rows(), _Rows(), _Rows(), _Rows()
+    counted = np.empty(0, dtype=np.int64)
+    iterations = evaluated_iterations(len(log), settings.every)
+    rng = generator(settings.seed, "slam", log.robot)
+    told = covariance, read_attitude(job.inputs["log"], len(log))
+    filtered = run_log(
+        log, settings.filter, rng, iterations, settings.min_count, *told, viewing=False
+    )
+    for frame in filtered:
+        k, result = frame.iteration, frame.result
+        steps.append(_step(result))
+        if k % settings.clouds_every == 0 or k == last:
+            cloud = {"particle": np.arange(len(result.cloud)), "log_weight": result.log_weights}
+            clouds.add(named_columns(POSE_FIELDS, result.cloud) | cloud, iteration=k)
+        if frame.landmarks is not None:
+            assert frame.path is not None
+            assert frame.associations is not None
+            seen, origin = frame.landmarks, frame.landmarks.source_observation
+            points = point_columns(seen.position_m, seen.covariance_m2)
+            maps.add(points | {"count": seen.count, "source_observation": origin}, iteration=k)
+            counts_for = frame.associations
+            new = np.full(len(counts_for) - len(counted), -1)
+            changed = np.flatnonzero(counts_for != np.concatenate([counted, new]))
+            changes = {"observation": changed, "source_observation": counts_for[changed]}
+            associations.add(changes, from_iteration=k)
+            counted, path = counts_for, frame.path
+            rows = {"iteration": np.arange(len(path))} | named_columns(POSE_FIELDS, path)
+            paths.add(rows, evaluated=k)
+    poses = {name: np.array([step[name] for step in steps]) for name in steps[0]}
+    poses |= {"iteration": np.arange(len(steps))} | named_columns(_FINAL, path)
+    # An empty map has no row: the list tells that its iteration was evaluated all the same.
+    evaluated = {"iterations": ",".join(map(str, iterations))}
+    tables = (maps.columns, associations.columns, poses, clouds.columns, paths.columns)
+    schemas = (SNAPSHOTS, ASSOCIATIONS, POSES, CLOUDS, PATHS)
+    for file, table_schema, rows in zip(WRITES[:-1], schemas, tables, strict=True):
+        write_table(job.output / file, rows, table_schema, evaluated)
+    gate = gate_finding(log, counted)
+    findings = [*found.findings, *([] if gate is None else [gate])]
+    write_table(job.output / WRITES[-1], _finding_columns(findings, found.jumps), FINDINGS)
+
+
+def _finding_columns(
+    findings: Sequence[Finding], jumps: Sequence[Jump]
+) -> Mapping[str, np.ndarray | list[str]]:
+    observed, covariance = (
+        np.full((len(findings), 3), np.nan),
+        np.full((len(findings), 3, 3), np.nan),
+    )
+    row = {finding.frame: n for n, finding in enumerate(findings) if finding.kind == "jump"}
+    for jump in jumps:
+        observed[row[jump.frame]], covariance[row[jump.frame]] = jump.observed, jump.covariance
+    return {
+        "check": [finding.kind for finding in findings],
+        "iteration": np.array([finding.frame for finding in findings], dtype=np.int32),
+        "finding": [finding.text for finding in findings],
+        **named_columns(_OBSERVED, observed),
+        **covariance_columns(_OBSERVED_COVARIANCE, covariance),
+    }
+
+
+def read_findings(slam: Path) -> pd.DataFrame:
+    """Read the findings about a robot's log."""
+    return read_rows(slam / WRITES[-1], FINDINGS)
+
+
+def log_as_filtered(log: Path, slam: Path) -> tuple[RobotLog, Float | None]:
+    """A log as the filter took it, without jumps, and the covariance of its odometry if known."""
+    table, _ = read_table(slam / WRITES[-1], FINDINGS)
+    recorded = kept_log(log)
+    observed, covariance = columns(table, _OBSERVED), covariances_from(table, _OBSERVED_COVARIANCE)
+    jumps = [
+        Jump(int(k), observed[n], covariance[n], recorded.odometry[k])
+        for n, k in enumerate(column(table, "iteration"))
+        if k >= 0
+    ]
+    return without_jumps(recorded, jumps, read_odometry_covariance(log))
+
+
+class _Rows:
+    """Rows of a table, a part of them at a time."""
+
+    def __init__(self) -> None:
+        self._parts = list[Mapping[str, np.ndarray]]()
+
+    def add(self, columns: Mapping[str, np.ndarray], **same: int) -> None:
+        """Further rows, by column, and what is the same in all of them."""
+        n = len(next(iter(columns.values())))
+        self._parts.append(
+            dict(columns) | {name: np.full(n, value) for name, value in same.items()}
+        )
+
+    @property
+    def columns(self) -> dict[str, np.ndarray]:
+        """All rows, by column."""
+        return {
+            name: np.concatenate([part[name] for part in self._parts]) for name in self._parts[0]
+        }
+
+
+def _step(result: StepResult) -> dict[str, float]:
+    weights = np.exp(result.log_weights - result.log_weights.max())
+    weights /= weights.sum()
+    centred = result.cloud[:, :2] - weights @ result.cloud[:, :2]
+    return {
+        **dict(zip(_ONLINE, result.best_pose, strict=True)),
+        "effective_sample_size": result.effective_sample_size,
+        "resampled": result.resampled,
+        "n_landmarks": result.n_landmarks,
+        # root of the trace of the particles' weighted position covariance
+        "spread_m": float(np.sqrt(weights @ np.sum(centred**2, axis=1))),
+    }
+
+
+def final_path(slam: Path) -> Float:
+    """(T, 3) the most probable particle's whole path, at the end."""
+    return read_rows(slam / "poses.parquet", POSES)[_FINAL].to_numpy(np.float64)

@@ -1,0 +1,147 @@
+"""What maps seen from above share: equal scales, walls, error ellipses, a view without strays."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.collections import EllipseCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from experiments.reports.figures.result_tables import ResultTables
+from experiments.reports.figures.style import BLACK, PAGE_WIDTH_IN, WALL_GRAY
+from mapfusion.geometry.numerics import Float, chi_square_bound
+
+LEVEL_TEXT = "95 %"
+_LEVEL, _PLANE_DIMENSIONS = 0.95, 2
+ELLIPSE_BOUND = chi_square_bound(_LEVEL, _PLANE_DIMENSIONS)  # squared Mahalanobis distance
+_MAGNIFICATIONS = (1, 2, 5, 10, 20, 50, 100)
+_WIDEST_SHARE = 1 / 10  # of the map's extent that the widest drawn particle set may take
+_STRAY_SHARE = 0.005  # a stray landmark tens of metres off, on each side, must not shrink the map
+_SURROUNDINGS = 1.0  # walls are shown so far around a map, as a multiple of its extent
+_MARGIN, _MIN_MARGIN_M = 0.05, 0.3  # of the view's extent
+_LABELS_WIDTH_IN, _LABELS_HEIGHT_IN = 0.55, 0.65  # what labels and titles take beside each panel
+_LEGEND_ROW_IN, _LEGEND_FRAME_IN = 0.16, 0.2
+
+
+def start_plan(axes: Axes, data: ResultTables, robot: str) -> list[Float]:
+    """Label a plan in a robot's map frame and draw the walls' faces faintly; returns the lines."""
+    label_plan(axes, robot)
+    walls = data.walls_in_frame_of(robot)
+    for wall in walls:
+        axes.plot(*wall.T, color=WALL_GRAY, linewidth=0.7, zorder=0.8)
+    return walls
+
+
+def label_plan(axes: Axes, frame: str) -> None:
+    """Label both axes with their unit and the frame they belong to."""
+    axes.set(xlabel=f"x in {frame}'s frame (m)", ylabel=f"y in {frame}'s frame (m)")
+
+
+def add_points(axes: Axes, points: Float, **style: Any) -> None:
+    """Draw points (N, 2 or more) as pixels: as outlines they would make an SVG of megabytes."""
+    axes.plot(*points[:, :2].T, linestyle="none", rasterized=True, **style)
+
+
+def add_frame(axes: Axes, length_m: float = 1.0) -> None:
+    """Draw the frame's x and y axis at its origin, the robot's start pose."""
+    arrow = {"arrowstyle": "-|>", "color": BLACK, "linewidth": 1.2, "shrinkA": 0}
+    for tip, name in (((length_m, 0.0), "x"), ((0.0, length_m), "y")):
+        axes.annotate("", xy=tip, xytext=(0.0, 0.0), arrowprops=arrow, zorder=6)
+        axes.annotate(name, xy=tip, xytext=(3, -4), textcoords="offset points", zorder=6)
+
+
+def magnification(extent_m: float, widest_m: float) -> int:
+    """The largest round factor at which particle sets still look like spots in a map."""
+    share = _WIDEST_SHARE * extent_m
+    return max((m for m in _MAGNIFICATIONS if m * widest_m <= share), default=1)
+
+
+def semi_axes(covariance_m2: Float, level: float = _LEVEL) -> tuple[Float, Float, Float]:
+    """Ellipses of covariances (N, 2+, 2+) that hold `level` of a plane normal distribution.
+
+    The squared Mahalanobis distance of a normal point is chi-square with two degrees of freedom, so
+    the semi-axes are sqrt(eigenvalue * quantile), along the eigenvectors. Returns semi-major and
+    semi-minor axes (N,) in metres and the major axis' direction (N,) in rad.
+    """
+    values, vectors = np.linalg.eigh(covariance_m2[:, :2, :2])
+    lengths = np.sqrt(np.maximum(values, 0.0) * chi_square_bound(level, _PLANE_DIMENSIONS))
+    direction = np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
+    return lengths[:, 1], lengths[:, 0], direction
+
+
+def add_ellipses(axes: Axes, position_m: Float, covariance_m2: Float, **style: Any) -> None:
+    """Draw 95 % ellipses to scale, from positions (N, 2+) and covariances (N, 2+, 2+)."""
+    major, minor, direction = semi_axes(covariance_m2)
+    place = {"units": "xy", "offsets": position_m[:, :2], "offset_transform": axes.transData}
+    sizes = (2 * major, 2 * minor, np.degrees(direction))
+    collection = EllipseCollection(*sizes, facecolors="none", **place, **style)
+    axes.add_collection(collection, autolim=False)
+
+
+def ellipse_handle(colour: str) -> Line2D:
+    """What stands for the ellipses in a legend, and says their level."""
+    style = {"marker": "o", "markerfacecolor": "none", "markersize": 7, "linestyle": "none"}
+    return Line2D([], [], color=colour, label=f"{LEVEL_TEXT} ellipses, to scale", **style)
+
+
+def set_view(axes: Axes, landmarks_m: Float, path_m: Float, walls_m: Sequence[Float] = ()) -> str:
+    """Show a path, the landmarks but for strays, and the walls around both, at equal scales.
+
+    A house is shown whole unless it is much larger than what was mapped of it. Returns in words how
+    many landmarks there are, and how many of them are out of view.
+    """
+    plan = landmarks_m[:, :2]
+    core = [path_m[:, :2]] if len(path_m) else []
+    if len(plan):
+        core.append(np.quantile(plan, [_STRAY_SHARE, 1 - _STRAY_SHARE], axis=0))
+    low, high = _bounds(core or walls_m)
+    if core and len(walls_m):
+        reach = _SURROUNDINGS * float((high - low).max())
+        walls_low, walls_high = _bounds(walls_m)
+        low = np.minimum(low, np.maximum(walls_low, low - reach))
+        high = np.maximum(high, np.minimum(walls_high, high + reach))
+    margin = max(_MARGIN * float((high - low).max()), _MIN_MARGIN_M)
+    low, high = low - margin, high + margin
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+    outside = np.any((plan < low) | (plan > high), axis=1).sum()
+    return f"{len(plan)} landmarks" + (f", {outside} out of view" if outside else "")
+
+
+def _bounds(lines: Sequence[Float]) -> tuple[Float, Float]:
+    """Lowest and highest coordinates (2,) of lines (n, 2); the origin where there is none."""
+    points = np.concatenate(lines) if len(lines) else np.zeros((1, 2))
+    return np.nanmin(points, axis=0), np.nanmax(points, axis=0)
+
+
+def set_one_scale(panels: Sequence[Axes]) -> None:
+    """Widen the views of panels of one size to the largest of them: one scale for all."""
+    views = np.array([[axes.get_xlim(), axes.get_ylim()] for axes in panels])
+    half = np.ptp(views, axis=2).max(axis=0) / 2
+    for axes, middle in zip(panels, views.mean(axis=2), strict=True):
+        (x0, y0), (x1, y1) = middle - half, middle + half
+        axes.set(xlim=(x0, x1), ylim=(y0, y1))
+
+
+def set_square(axes: Axes, centre: Float, reach_m: float) -> None:
+    """Show so far around a point, at equal scales."""
+    (x0, y0), (x1, y1) = centre - reach_m, centre + reach_m
+    axes.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal")
+
+
+def height_of_row(panels: Sequence[Axes], width_in: float) -> float:
+    """Inches that a row of plans needs, their views set, when each is given so much width."""
+    ratio = max(np.ptp(axes.get_ylim()) / np.ptp(axes.get_xlim()) for axes in panels)
+    return (width_in - _LABELS_WIDTH_IN) * float(ratio) + _LABELS_HEIGHT_IN
+
+
+def finish_plans(
+    figure: Figure, panels: Sequence[Axes], handles: Sequence[Artist], columns: int, **legend: Any
+) -> None:
+    """Put a legend below one row of plans and make the figure as high as both need."""
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns, **legend)
+    rows = -(-len(handles) // columns) + ("title" in legend)
+    plans_in = height_of_row(panels, PAGE_WIDTH_IN / len(panels))
+    figure.set_figheight(plans_in + (_LEGEND_ROW_IN * rows + _LEGEND_FRAME_IN))

@@ -1,0 +1,140 @@
+"""One look for all figures: legible in print, safe for colour-blind readers, reproducible."""
+
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
+from itertools import cycle
+from typing import Any
+
+import matplotlib.style
+from matplotlib.artist import Artist
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogFormatter
+
+from experiments.evaluation.criteria import ORACLE
+from experiments.evaluation.fused_map_errors import FILTERED, SMOOTHED
+from mapfusion.fusion.fusers import REFERENCE
+
+PAGE_WIDTH_IN = 7.2  # two columns of a journal page
+# Okabe and Ito (2008): told apart by readers with any common colour blindness. Their yellow is left
+# out: too pale for lines on white.
+BLUE, VERMILLION, GREEN = "#0072B2", "#D55E00", "#009E73"
+PURPLE, ORANGE, SKY = "#CC79A7", "#E69F00", "#56B4E9"
+# Four of Tol's (2021) muted scheme, darker or duller than those, where more methods are compared.
+INDIGO, WINE, OLIVE, TEAL = "#332288", "#882255", "#999933", "#44AA99"
+BLACK, GRAY, WALL_GRAY, PALE_GRAY = "#000000", "#7F7F7F", "#A8A8A8", "#C8C8C8"
+
+_RC: dict[str, Any] = {
+    "font.family": "DejaVu Sans",  # comes with matplotlib: the same on every machine
+    "font.size": 8.0,
+    "axes.titlesize": 8.5,
+    "axes.labelsize": 8.0,
+    "legend.fontsize": 7.5,
+    "legend.framealpha": 0.9,
+    "xtick.labelsize": 7.5,
+    "ytick.labelsize": 7.5,
+    "axes.linewidth": 0.6,
+    "lines.linewidth": 1.1,
+    "lines.markersize": 3.5,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.titley": 1.0,  # else each drawing looks for what may be in the way: nothing is up there
+    "grid.alpha": 0.35,
+    "grid.linewidth": 0.4,
+    "figure.constrained_layout.use": True,
+    "svg.fonttype": "path",
+    "svg.hashsalt": "mapfusion",  # else every SVG gets element ids of its own
+}
+# Colour, dashes and marker: lines also differ in print in gray. A known method always looks alike.
+_KNOWN_ALIGNERS: dict[str, tuple[Any, ...]] = {
+    "ransac": (BLUE, "-", "o"),
+    "svd": (VERMILLION, (0, (6, 1, 1, 1)), "s"),
+    "svd-solved": (ORANGE, (0, (1, 1)), "D"),
+    "icp": (GREEN, (0, (5, 1)), "^"),
+    "impicp": (PURPLE, (0, (3, 1, 1, 1, 1, 1)), "v"),
+    "gnc": (SKY, (0, (8, 2)), "P"),
+    "clique": (INDIGO, "-", "*"),
+    "ransac_mahalanobis": (WINE, (0, (6, 1, 1, 1)), "X"),
+    "opencv": (OLIVE, (0, (3, 1)), "<"),
+    "kiss_matcher": (TEAL, (0, (3, 1, 1, 1, 1, 1)), ">"),
+    ORACLE: (BLACK, (0, (4, 2)), "x"),
+}
+# What fusers make of maps, solid and dark where it is to be read first, and what they are given.
+_KNOWN_FUSERS: dict[str, tuple[Any, ...]] = {
+    "kalman": (ORANGE, (0, (1, 1)), "D"),
+    "kalman-drift": (VERMILLION, (0, (6, 1, 1, 1)), "s"),
+    "covariance_intersection": (GREEN, (0, (5, 1)), "^"),
+    "joint": (BLUE, "-", "o"),
+    REFERENCE: (BLACK, (0, (4, 2)), "x"),
+}
+GIVEN_STYLES: dict[str, dict[str, Any]] = {
+    FILTERED: {"color": GRAY, "linestyle": (0, (3, 1, 1, 1)), "marker": "v"},
+    SMOOTHED: {"color": GRAY, "linestyle": "-", "marker": "P"},
+}
+# All others (plug-ins, names of a scenario's own) by their place among themselves. The lengths have
+# no common factor, so 99 styles come before one repeats.
+_OTHER_COLOURS = (INDIGO, OLIVE, BLUE, WINE, TEAL, VERMILLION, SKY, ORANGE, PURPLE, GREEN, GRAY)
+_DASHES_AND_GAPS = [(2, 2), (9, 1, 2, 1), (), (4, 1, 1, 1), (1, 2), (7, 3)]
+_DASHES_AND_GAPS += [(5, 1, 1, 1, 1, 1, 1, 1), (3, 3), (10, 2, 4, 2)]
+_OTHER_DASHES = [(0, lengths) if lengths else "-" for lengths in _DASHES_AND_GAPS]
+_OTHER_MARKERS = ("p", "h", "d", "8", "H", "1", "2", "3", "4")
+ROBOT_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
+FUSED_COLOUR = BLACK
+
+
+class _Between(LogFormatter):
+    """Between powers of ten: numbers where Matplotlib writes some, on axes with few powers."""
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        return _plain(x) if super().__call__(x, pos) else ""
+
+
+def plain_numbers() -> FuncFormatter:
+    """Ticks of logarithmic axes as people read them: 0.01, 0.1, 1, 10."""
+    return FuncFormatter(lambda value, _: _plain(value))
+
+
+def write_plainly(axis: Axis) -> None:
+    """Give a logarithmic axis plain numbers, also between the powers of ten."""
+    axis.set_major_formatter(plain_numbers())
+    axis.set_minor_formatter(_Between())
+
+
+def _plain(value: float) -> str:
+    return f"{value:g}".replace("-", "−")
+
+
+def house_style() -> AbstractContextManager[None]:
+    """Matplotlib's defaults and ours, whatever the user's own settings; those come back after."""
+    return matplotlib.style.context(["default", _RC])
+
+
+def aligner_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Line style of each aligner: its own if it has one, else by its place among those without."""
+    return _styles(_KNOWN_ALIGNERS, names)
+
+
+def fuser_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Line style of each fuser, likewise."""
+    return _styles(_KNOWN_FUSERS, names)
+
+
+def _styles(
+    known: Mapping[str, tuple[Any, ...]], names: Sequence[str]
+) -> dict[str, dict[str, Any]]:
+    others = [name for name in names if name not in known]
+    looks = zip(cycle(_OTHER_COLOURS), cycle(_OTHER_DASHES), cycle(_OTHER_MARKERS), strict=False)
+    chosen = {**known} | dict(zip(others, looks, strict=False))
+    parts = ("color", "linestyle", "marker")
+    return {name: dict(zip(parts, look, strict=True)) for name, look in chosen.items()}
+
+
+def aligner_legend(
+    figure: Figure, looks: Mapping[str, dict[str, Any]], columns: int, others: Sequence[Artist] = ()
+) -> None:
+    """Put a legend of aligners, styles by label, and what else it explains above a figure."""
+    lines = [Line2D([], [], label=label, **look) for label, look in looks.items()]
+    handles = [*lines, *others]
+    place = {"loc": "outside upper center", "ncols": min(len(handles), columns)}
+    figure.legend(handles=handles, handlelength=3.2, **place)

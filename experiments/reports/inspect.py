@@ -1,0 +1,196 @@
+"""`mapfusion inspect`: what a file or folder is, of which version, and what it holds."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pandas as pd
+import pyarrow as pa
+
+from experiments.evaluation import tables
+from experiments.reports.terminal.layout import print_lines, print_table
+from experiments.scenario.loading import load_scenario
+from mapfusion import attitude, landmark_map, robot_log
+from mapfusion.errors import InputError
+from mapfusion.files import read_json, read_parquet, read_table, text_attributes
+from mapfusion.tables import is_csv, read_open_table
+from sim import trajectory
+
+_PREFIX, _KIND, _VERSION = "mapfusion.", "kind", "schema_version"
+# What people bring or take away is checked; tables of stages and studies tell what they are.
+_SCHEMAS = [*tables.ALL.values(), landmark_map.LANDMARKS, trajectory.TRAJECTORY]
+_SCHEMAS += [robot_log.FRAMES, robot_log.OBSERVATIONS, robot_log.ODOMETRY_COVARIANCE]
+_SCHEMAS += [attitude.ATTITUDE]
+_SCHEMAS += [robot_log.TRUTH_POSES, robot_log.TRUTH_POINTS]
+# Tables that anybody may write; without metadata their file's name tells which one it is.
+_OPEN = {
+    "frames": robot_log.FRAMES,
+    "observations": robot_log.OBSERVATIONS,
+    "truth_poses": robot_log.TRUTH_POSES,
+    "truth_points": robot_log.TRUTH_POINTS,
+}
+_CHECKED = {each.metadata[f"{_PREFIX}{_KIND}".encode()].decode(): each for each in _SCHEMAS}
+_UNITS = {"m": "m", "m2": "m²", "rad": "rad", "s": "s", "ms": "ms", "px": "px"}
+# the upper triangle of an alignment's covariance names its axes instead
+_OF_AXES = {"xx": "m²", "xy": "m²", "yy": "m²", "xt": "m rad", "yt": "m rad", "tt": "rad²"}
+_RESOLVED, _RESULT, _LOG = "scenario, resolved", "result of a run", "robot log"
+_JSON_KEYS = {
+    _RESOLVED: {_VERSION, "align", "slam", "evaluate"},
+    "provenance of a result": {_VERSION, "stages", "libraries"},
+    "world: walls and the robots' true starts": {"walls", "robots"},
+    "sweep": {"kind", "settings"},
+    "finished stage": {"stage", "key"},
+    "times of a part of a stage": {"elapsed_s"},
+}
+_NAMES_SHOWN = 10
+_DESCRIPTIONS = ("sweep.json", "scenario.json", "provenance.json", "done.json")
+# The first that a folder holds tells its kind.
+_FOLDER_MARKS = {
+    "sweep.json": "sweep",
+    "scenario.json": _RESULT,
+    "done.json": "finished stage",
+    "frames.parquet": _LOG,
+    "frames.csv": _LOG,
+    "*/*/done.json": "store of stages",
+    "*/frames.parquet": "folder of robot logs",
+    "*/frames.csv": "folder of robot logs",
+    "*.parquet": "folder of tables",
+}
+
+
+class Contents(NamedTuple):
+    """What is known of a file or folder: its kind in words, facts by name, its columns or files."""
+
+    kind: str
+    facts: dict[str, Any]
+    parts: pd.DataFrame = pd.DataFrame()
+
+
+def inspect(path: Path) -> None:
+    """Print what a file or folder is and holds; raises InputError as `contents_of` does."""
+    found = contents_of(path)
+    facts = {name: f"  {name}: {value}" for name, value in found.facts.items()}
+    version = f", schema version {found.facts[_VERSION]}" if facts.pop(_VERSION, "") else ""
+    print_lines([f"{path}: {found.kind}{version}", *facts.values()])
+    if len(found.parts):
+        numbers = set(found.parts.select_dtypes("number"))
+        columns = [(str(name), "d" if name in numbers else "") for name in found.parts]
+        print_table(columns, found.parts.itertuples(index=False))
+
+
+def contents_of(path: Path) -> Contents:
+    """What a file or folder is; raises InputError if missing, damaged, or none of mapfusion's."""
+    if path.is_dir():
+        return _folder(path)
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder")
+    if path.suffix.lower() in landmark_map.MAP_ENDINGS:
+        return _table(path)
+    if path.suffix in {".yaml", ".yml"}:
+        return Contents("scenario", _brief(load_scenario(path).resolved()))
+    if path.suffix != ".json":
+        raise InputError(f"{path}: no file of mapfusion's (known: .parquet, .csv, .yaml, .json)")
+    found = _json(path)
+    if found.kind == _RESOLVED:
+        load_scenario(path)  # raises where it is none of this program's
+    return found
+
+
+def unit_of(name: str) -> str:
+    """The unit that a column's name ends in; empty for none."""
+    stem, _, end = name.rpartition("_")
+    return (_OF_AXES if stem == "cov" else _UNITS).get(end, "") if stem else ""
+
+
+def _table(path: Path) -> Contents:
+    if is_csv(path):
+        return _open_table(path, _open_schema(path))
+    table = read_parquet(path, "table")
+    facts: dict[str, Any] = dict(text_attributes(path, table))
+    kind = facts.pop(_KIND, None)
+    table_schema = _CHECKED.get(kind or "")
+    if kind is None:
+        table_schema = _open_schema(path)
+        if not set(table_schema.names) & set(table.column_names):
+            raise InputError(f"{path}: none of mapfusion's (no mapfusion.kind in its metadata)")
+    if table_schema in (landmark_map.LANDMARKS, *_OPEN.values()):
+        return _open_table(path, table_schema)
+    if table_schema is not None:
+        read_table(path, table_schema)  # raises where version or columns are others
+    return _of_table(path, str(kind), table, facts)
+
+
+def _of_table(path: Path, kind: str, table: pa.Table, facts: dict[str, Any]) -> Contents:
+    facts = facts | {"rows": table.num_rows, "MB": f"{path.stat().st_size / 1e6:.2f}"}
+    columns = {"column": table.column_names, "type": map(str, table.schema.types)}
+    return Contents(kind, facts, pd.DataFrame(columns | {"unit": map(unit_of, table.column_names)}))
+
+
+def _open_schema(path: Path) -> pa.Schema:
+    """Return which table a file without metadata is read as."""
+    return _OPEN.get(path.stem, landmark_map.LANDMARKS)
+
+
+def _open_table(path: Path, table_schema: pa.Schema) -> Contents:
+    """A table whoever wrote it, read as `align`, `merge` and `slam` do; raises InputError."""
+    table, facts = read_open_table(path, table_schema)
+    kind = table_schema.metadata[f"{_PREFIX}{_KIND}".encode()].decode()
+    known: dict[str, Any] = {name: value for name, value in facts.items() if name != _KIND}
+    if table_schema is landmark_map.LANDMARKS:
+        landmarks = landmark_map.read_map(path)
+        known |= {"name": landmarks.name, "planar": str(landmarks.planar).lower()}
+        looks = {"descriptors": landmarks.descriptor, "labels": landmarks.label}
+        there = [name for name, values in looks.items() if values is not None]
+        known["matched by"] = " and ".join(there) or "nothing: neither descriptors nor labels"
+    return _of_table(path, kind, table, known)
+
+
+def _json(path: Path) -> Contents:
+    found = read_json(path, "file of mapfusion's")
+    for kind, keys in _JSON_KEYS.items():
+        if keys <= set(found):
+            return Contents(kind, _brief(found))
+    raise InputError(f"{path}: no file of mapfusion's (known: {'; '.join(_JSON_KEYS)})")
+
+
+def _brief(found: dict[str, Any]) -> dict[str, Any]:
+    """What can be read at a glance: single values and names; the file itself shows the rest."""
+    facts = {}
+    for name, value in found.items():
+        is_names = isinstance(value, list) and all(isinstance(each, str) for each in value)
+        shown = _listed(value) if is_names else value
+        if name != _KIND and isinstance(shown, str | float | int) and shown != "":
+            facts[name] = shown
+    return facts
+
+
+def _listed(names: list[str]) -> str:
+    if len(names) > _NAMES_SHOWN:
+        return f"{len(names)}, from {names[0]} to {names[-1]}"
+    return ", ".join(names)
+
+
+def _folder(path: Path) -> Contents:
+    kind = next((kind for mark, kind in _FOLDER_MARKS.items() if any(path.glob(mark))), None)
+    if kind is None:
+        known = ", ".join(dict.fromkeys(_FOLDER_MARKS.values()))
+        raise InputError(f"{path}: no folder of mapfusion's (known: {known})")
+    if kind == _LOG:
+        log = robot_log.read_log(path)
+        facts: dict[str, Any] = {"robot": log.robot, "planar": log.planar}
+    else:
+        told = [_json(path / name) for name in _DESCRIPTIONS if (path / name).is_file()]
+        facts = {name: value for each in told for name, value in each.facts.items()}
+    n_levels = 2 if kind == _RESULT else 1
+    files = sorted(path.rglob("[!.]*.parquet"))
+    csv = [file for name in _OPEN for file in path.rglob(f"{name}.csv")]
+    files += sorted(file for file in csv if file.with_suffix(".parquet") not in files)
+    inside = [file.relative_to(path).with_suffix("").parts[:n_levels] for file in files]
+    n_rows = [_n_rows(file) for file in files]
+    parts = pd.DataFrame({"holds": map("/".join, inside), "files": 1, "rows": n_rows})
+    return Contents(kind, facts, parts.groupby("holds", sort=False, as_index=False).sum())
+
+
+def _n_rows(path: Path) -> int:
+    if is_csv(path):
+        return read_open_table(path, _open_schema(path))[0].num_rows
+    return read_parquet(path, "table").num_rows

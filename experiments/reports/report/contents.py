@@ -1,0 +1,237 @@
+"""Contents of a report of one or several runs, as values for the template."""
+
+import base64
+import importlib
+import io
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from PIL import Image
+from ruamel.yaml import YAML
+
+from experiments.evaluation import metrics
+from experiments.evaluation.alignment_summary import methods_in, setting_columns
+from experiments.evaluation.checks import Outcome
+from experiments.evaluation.criteria import that_ever_meet
+from experiments.evaluation.evaluated_run import lines_of
+from experiments.evaluation.fused_map_errors import last_fused
+from experiments.evaluation.path_errors import path_rms
+from experiments.evaluation.result import require_result
+from experiments.reports.figures.drawing import FIGURES
+from experiments.reports.figures.result_tables import Pair, ResultTables, of_pair
+from experiments.reports.figures.style import aligner_styles
+from experiments.reports.report.charts import error_curves, success_curves, time_curves
+from experiments.reports.report.map_view import MAP_TABLES, map_view
+from experiments.reports.report.origin import natural, provenance_of, stage_times
+from experiments.reports.report.theme import chart_style
+from experiments.reports.team_text import team_lines
+from experiments.scenario.settings import Bound
+from experiments.studies.method_comparison import recommend
+from experiments.studies.run_tables import Runs, find_runs
+from experiments.studies.statistics import ALL_SCENARIOS, configurations, reduced_errors
+from mapfusion.errors import InputError
+from mapfusion.files import read_sealed
+
+_BETWEEN = "a b"  # of rivals; the others lay a map onto itself
+_MOTION = ("tx_m", "ty_m", "theta_rad")
+
+
+def verdicts_and_places(data: ResultTables) -> Iterator[dict[str, Any]]:
+    """For each two robots, of the aligner that maps are fused by: verdict, reason, places.
+
+    Places are the distinct motions that correspondences support, the best first.
+    """
+    estimates, rivals = data.rows("estimates"), data.rows("rivals")
+    used = data.scenario["merge"]["aligner"]
+    estimates = estimates[(estimates["aligner"] == used) & (estimates["repetition"] == 0)]
+    for robot_a, robot_b in data.pairs:
+        pair = (robot_a, robot_b)
+        last = _last(of_pair(estimates, pair))
+        if last.empty:
+            continue
+        answer = last.iloc[0]
+        yield {
+            "robots": f"{robot_a} – {robot_b}",
+            "verdict": str(answer["verdict"]).replace("_", " "),
+            "probability": answer["probability"],
+            "n_confirmed": answer["n_confirmed"],
+            "n_contradicted": answer["n_contradicted"],
+            "reason": answer["acceptance_reason"] or answer["refined_reason"] or answer["reason"],
+            "places": _places(_last(of_pair(rivals, pair))),
+        }
+
+
+def _last(rows: pd.DataFrame) -> pd.DataFrame:
+    return rows[rows["iteration"] == rows["iteration"].max()]
+
+
+def _places(rivals: pd.DataFrame) -> list[dict[str, Any]]:
+    between = rivals[rivals["of"] == _BETWEEN].sort_values("log10_false_alarms", kind="stable")
+    columns = [*_MOTION, "n_support", "n_confirmed", "n_contradicted"]
+    return between[columns].to_dict("records")  # pyright: ignore[reportReturnType]
+
+
+# Figures that stand beside the table of fusers, and how they are to be read.
+_OF_FUSERS = {
+    "fig11_fusers": "Lower is better. A map can be right as such and still lie askew in its frame:"
+    " the fit takes that away, so the two panels differ by it. A median (thin) far below the RMS"
+    " tells of a few landmarks that are much worse than the others.",
+    "fig12_coverage": "On the gray diagonal as many true points lie inside the ellipses as these"
+    " say. Below it a map is too sure of itself, above it less sure than it may be.",
+}
+_TABLES = tuple(dict.fromkeys((*MAP_TABLES, *metrics.USED_TABLES, "timings")))
+
+
+def contents_of(path: Path) -> dict[str, Any]:
+    """What the report of a result folder, or of a sweep, shows.
+
+    Raises InputError where the path is neither, or a table is damaged.
+    """
+    runs = find_runs(path)
+    if not runs.sweeps:
+        require_result(path)
+    if not runs.has("errors") or (reduced := reduced_errors(runs)).maps.empty:
+        if runs.sweeps or not (data := ResultTables(path)).no_truth:
+            raise InputError(f"{path}: no pair of maps was aligned, there is nothing to report on")
+        return _without_truth(path, runs, data)
+    maps = reduced.maps
+    if runs.sweeps:
+        own, groups = _of_sweep(path, maps), _by_configuration(reduced.medians)
+    else:
+        data = ResultTables(path)
+        own, groups = _of_result(data), _by_robots(runs.read("errors"), data.pairs)
+    aligners = methods_in(maps, oracle=True)
+    styles = aligner_styles(aligners)
+    timings = runs.read("aligner_timings") if runs.has("aligner_timings") else pd.DataFrame()
+    provenance, stages = provenance_of(path, runs)
+    return own | {
+        "no_truth": False,
+        "ranking": recommend(maps, timings, aligners),
+        "n_robot_pairs": len(maps[["scenario", "robot_a", "robot_b"]].drop_duplicates()),
+        "settings": setting_columns(maps),
+        "aligners": [{"name": name, **chart_style(styles[name])} for name in aligners],
+        "groups": [{"label": label, "curves": error_curves(r, aligners)} for label, r in groups],
+        "success": success_curves(maps, aligners),
+        "times": time_curves(timings, aligners) if len(timings) else {},
+        "absent": reduced.absent,
+        "provenance": provenance,
+        "stages": stages,
+        "stage_times": stage_times(runs),
+        "failed": runs.failed.to_dict("records"),
+    }
+
+
+def _without_truth(path: Path, runs: Runs, data: ResultTables) -> dict[str, Any]:
+    """What a result shows whose answers cannot be judged: all but errors and success."""
+    styles, timings = data.styles, runs.read("aligner_timings")
+    provenance, stages = provenance_of(path, runs)
+    return _of_result(data) | {
+        "no_truth": True,
+        "outcomes": (),
+        "ranking": None,
+        "aligners": [{"name": name, **chart_style(styles[name])} for name in data.aligners],
+        "groups": [],
+        "success": [],
+        "times": time_curves(timings, data.aligners),
+        "absent": [name for name, label in data.labels.items() if label != name],
+        "provenance": provenance,
+        "stages": stages,
+        "stage_times": stage_times(runs),
+        "failed": [],
+    }
+
+
+def _of_sweep(path: Path, maps: pd.DataFrame) -> dict[str, Any]:
+    """Title of a sweep, and the sections that it has not."""
+    none = ("outcomes", "robots", "fits", "smoother", "team", "edges", "figures", "missing")
+    none += ("scenario_text", "fusers", "fuser_figures", "places", "findings")
+    return dict.fromkeys(none, ()) | {
+        "title": f"{path.name}, {maps['run_id'].nunique()} runs",
+        "description": ", ".join(maps["scenario"].unique()),
+        "spread_text": "runs; each run is the median of its repetitions",
+        "map": None,
+        "robot_colours": {},
+    }
+
+
+def _by_configuration(spread: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Runs of each scenario and setting, with a label each."""
+    ordered = sorted(configurations(spread), key=lambda each: [*map(natural, each[0].values())])
+    for labels, rows in ordered:
+        scenario = labels.pop("scenario")
+        if scenario == ALL_SCENARIOS:
+            n_before, rows = len(rows), that_ever_meet(rows)
+            scenario = "(all)" if len(rows) == n_before else "(all with common ground)"
+        settings = [f"{name.rpartition('.')[2]} {value}" for name, value in labels.items()]
+        yield ", ".join([scenario, *settings]), rows
+
+
+def _of_result(data: ResultTables) -> dict[str, Any]:
+    """Title and sections of a result; what builds on tables that it does not hold is empty."""
+    return {
+        "title": f"{data.scenario['name']}, seed {data.scenario['seed']}",
+        "description": data.scenario.get("description", ""),
+        "spread_text": "repetitions on the same maps",
+        "map": map_view(data),
+        "robot_colours": data.colours,
+        "outcomes": list(_outcomes(data)),
+        "findings": list(lines_of(data.rows("findings"))),
+        "robots": path_rms(data.table("robots")).to_dict("records"),
+        "fits": data.rows("map_fits").to_dict("records"),
+        "smoother": data.rows("smoother").to_dict("records"),
+        "team": list(team_lines(*map(data.rows, ("fused_motions", "team", "team_pairs")))),
+        "edges": data.rows("team_pairs").to_dict("records"),
+        "places": list(verdicts_and_places(data)),
+        "fusers": last_fused(data.rows("fusers")).to_dict("records"),
+        "fuser_figures": list(_pictures(data.folder, _OF_FUSERS)),
+        "figures": list(_pictures(data.folder, [n for n in FIGURES if n not in _OF_FUSERS])),
+        "scenario_text": _as_yaml(data.scenario),
+        "missing": [name for name in _TABLES if not data.has(name)],
+    }
+
+
+def _by_robots(errors: pd.DataFrame, pairs: list[Pair]) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Errors of each pair of robots, and of all together, with a label each."""
+    for a, b in pairs:
+        yield f"{a} – {b}", of_pair(errors, (a, b))
+    if len(pairs) > 1:
+        yield "all pairs", errors
+
+
+def _outcomes(data: ResultTables) -> Iterator[Outcome]:
+    """The scenario's expectations, measured on this run alone."""
+    needed = set(metrics.USED_TABLES) - {"smoother", "fusers"}  # which older results lack
+    if all(map(data.has, needed)):
+        used = {name: data.rows(name).assign(seed=0) for name in metrics.USED_TABLES}
+        for metric, bound in data.scenario.get("expect", {}).items():
+            value, limits = metrics.compute(metric, used), Bound.model_validate(bound)
+            yield Outcome(data.scenario["name"], metric, value, limits, {0: value})
+
+
+def _pictures(folder: Path, names: Collection[str]) -> Iterator[dict[str, Any]]:
+    """Those of the figures that are drawn; a reference folder keeps them beside its tables."""
+    for name in names:
+        files = (folder / "figures" / f"{name}.png", folder / f"{name}.png")
+        if file := next(filter(Path.is_file, files), None):
+            about = importlib.import_module(f"experiments.reports.figures.{name}").__doc__ or name
+            data = read_sealed(file, "figure")
+            try:
+                with Image.open(io.BytesIO(data)) as picture:  # so that the page does not jump
+                    size = dict(zip(("width", "height"), picture.size, strict=True))
+            except (OSError, SyntaxError, ValueError) as error:  # how Pillow reports damaged files
+                raise InputError(f"{file}: not a readable PNG image ({error})") from error
+            png = base64.b64encode(data).decode()
+            how = _OF_FUSERS.get(name, "")
+            yield {"about": about.splitlines()[0], "how": how, "png": png, **size}
+
+
+def _as_yaml(scenario: dict[str, Any]) -> str:
+    stream = io.StringIO()
+    yaml = YAML(typ="safe", pure=True)
+    yaml.default_flow_style = None
+    yaml.width = 100
+    yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
+    yaml.dump(scenario, stream)
+    return stream.getvalue()

@@ -1,0 +1,87 @@
+"""Where a report's numbers come from: runs, versions, stages and their times."""
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from experiments.evaluation.result_files import read_provenance
+from experiments.reports.figures.result_tables import json_object
+from experiments.studies.run_tables import Runs, setting_columns
+
+_SOURCE_DIGITS = 16
+
+
+def natural(text: object) -> tuple[float, str]:
+    """A sorting key that puts 50 before 200."""
+    try:
+        return float(str(text)), ""
+    except ValueError:
+        return math.inf, str(text)
+
+
+def provenance_of(path: Path, runs: Runs) -> tuple[dict[str, str], list[str]]:
+    """Seeds, settings, versions, renderer and sources of the finished runs; all where they differ.
+
+    Texts by name, and the keys of the stages of a single run; raises InputError where a
+    description is damaged.
+    """
+    found: dict[str, dict[str, None]] = {}
+    stages: list[str] = []
+    for described in _descriptions(path, runs):
+        stages += described.pop("stages", {})
+        for name, value in _flat(described):
+            found.setdefault(name, {})[value] = None
+    return {name: _joined(sorted(texts, key=natural)) for name, texts in found.items()}, stages
+
+
+def _joined(texts: list[str]) -> str:
+    """Three or more consecutive whole numbers as `--seeds` takes them, or all texts."""
+    if len(texts) > 2 and all(text.isdigit() for text in texts):
+        first, last = int(texts[0]), int(texts[-1])
+        if last - first == len(texts) - 1:
+            return f"{first}..{last}"
+    return ", ".join(texts)
+
+
+def _descriptions(path: Path, runs: Runs) -> Iterator[dict[str, Any]]:
+    """What is said of each finished run."""
+    file = path / "provenance.json"
+    if runs.has("runs"):
+        rows = runs.read("runs", ["status", "renderer", "source_hash", "libraries"])
+        for row in rows[rows["status"] == "finished"].to_dict("records"):
+            yield {
+                "seed": row["seed"],
+                "settings": {name: row[name] for name in setting_columns(rows)},
+                "renderer": row["renderer"],
+                "source_hash": str(row["source_hash"])[:_SOURCE_DIGITS],
+                "libraries": json_object(str(row["libraries"]), path / "runs"),
+            }
+    elif not runs.sweeps and file.is_file():
+        yield {name: said for name, said in read_provenance(file).items() if name != "tables"}
+
+
+def _flat(described: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """Names and values; those of a mapping (libraries, aligners) under their own names."""
+    for name, value in described.items():
+        if isinstance(value, dict):
+            for key, inner in value.items():
+                texts = inner.values() if isinstance(inner, dict) else [inner]
+                yield key, ", ".join(map(str, texts))
+        else:
+            yield name.replace("_", " "), str(value)
+
+
+def stage_times(runs: Runs) -> list[dict[Any, Any]]:
+    """Seconds of work by stage, all its tasks together; a stage that runs share counts once."""
+    if runs.has("timings"):
+        rows = runs.read("timings", ["stage", "name", "elapsed_s"])
+        rows[["key", "figure"]] = rows["name"].str.rpartition(":")[[0, 2]]
+        rows = rows.rename(columns={"elapsed_s": "seconds"})
+    elif runs.has("run_times"):
+        rows = runs.read("run_times", ["stage", "key", "figure", "seconds"])
+    else:
+        return []
+    rows = rows[rows["figure"] == "elapsed_s"].drop_duplicates(["stage", "key"])
+    stages = rows.groupby("stage", sort=False)["seconds"]
+    return stages.agg(seconds="sum", tasks="count").reset_index().to_dict("records")

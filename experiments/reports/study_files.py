@@ -1,0 +1,388 @@
+"""Files that studies write: tables and figures."""
+
+import math
+import platform
+import re
+from collections.abc import Iterator, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
+
+from experiments.evaluation.criteria import RIGHT_WITHIN_M, RIGHT_WITHIN_RAD
+from experiments.evaluation.tables import table_path
+from experiments.methods.catalogue import find_method
+from experiments.pipeline.code_version import library_versions
+from experiments.pipeline.tables import FLOAT, INT, TEXT, fields, write_rows
+from experiments.reports.export import to_markdown, write_tables, write_text
+from experiments.reports.figures import independence_figure, refusal_figures, style, verdict_figures
+from experiments.reports.figures.drawing import draw_figure, save_figure
+from experiments.reports.figures.result_tables import NothingToDraw, ResultTables
+from experiments.reports.json_document import publish
+from experiments.reports.terminal.statistics_screen import print_summary
+from experiments.scenario.settings import AnyScenario
+from experiments.studies.benchmark import SIGMA_M, SIZE_M, SUMMARY, TRIALS, BenchmarkDesign
+from experiments.studies.independence.independence_trial import (
+    COSTS,
+    TEAMS,
+    Independence,
+    at_the_end,
+)
+from experiments.studies.independence.strategies import STRATEGIES
+from experiments.studies.refusal.rates import (
+    VERDICTS,
+    Rate,
+    Reliability,
+    first_of_ordinary,
+    of_any_method,
+    ordinary,
+)
+from experiments.studies.run_tables import find_runs
+from experiments.studies.statistics import ALL_SCENARIOS, Summary, configurations, summarise
+from mapfusion.align.alignment import Status
+from mapfusion.errors import InputError
+from mapfusion.files import schema, write_json
+
+_FIGURES = ("fig04_translation_error", "fig05_rotation_error", "fig06_aligner_time")
+
+
+def run_statistics(paths: Sequence[Path], output: Path | None, as_json: bool = False) -> None:
+    """Show the main tables; write all, and figures 4 to 6, where an output folder is given.
+
+    As JSON, all tables are shown.
+
+    Raises InputError where a path holds no runs, no run knows the truth, or a table is damaged.
+    """
+    summary = summarise(find_runs(paths))
+    if not {"success_at_the_end", "paths"} & summary.tables.keys():
+        where = ", ".join(map(str, paths))
+        raise InputError(f"{where}: no truth is known, so there are no errors to count")
+    skipped: list[str] = []
+    if output is not None:
+        write_tables(output, summary.tables)
+        skipped += _draw_over_runs(summary, output / "figures")
+    if as_json:
+        told = {"n_runs": summary.n_runs, "n_configurations": summary.n_configurations}
+        told |= {"missing_tables": summary.missing, "failed_runs": summary.failed}
+        publish("statistics", told | {"written": output, "tables": summary.tables}, shown=True)
+    else:
+        print_summary(summary, output, skipped)
+
+
+def _draw_over_runs(summary: Summary, folder: Path) -> Iterator[str]:
+    """Draw what several runs of each scenario and setting share; yields what was not drawn.
+
+    With one such configuration the pictures go to `folder`, with more to a folder each in it.
+    """
+    drawn = {
+        "-".join([labels.pop("scenario"), *(f"{key}={labels[key]}" for key in labels)]): medians
+        for labels, medians in configurations(summary.run_medians)
+        if labels["scenario"] != ALL_SCENARIOS
+    }
+    for name, medians in drawn.items():
+        runs, timings = medians["run_id"].unique(), summary.timings
+        if len(runs) < 2:
+            yield f"{name}: one run alone; `mapfusion report --figures` draws it"
+            continue
+        if len(timings):
+            timings = timings[timings["run_id"].isin(runs)]
+        # Settings may hold anything; file names may not.
+        target = folder if len(drawn) == 1 else folder / re.sub(r"[^\w.=-]", "_", name)[:120]
+        data = ResultTables(target, {"errors": medians, "aligner_timings": timings})
+        for figure in _FIGURES:
+            yield from (f"{name}, {line}" for line in draw_figure(data, figure, target).skipped)
+
+
+SCHEMA_VERSION = 1
+_BAND_ALPHA = 0.14
+_DODGE = 0.45  # of the distance between two shares, over which the methods are spread
+_MIN_SUCCESSES = 10  # the median error of fewer says little
+_RATIO_TICKS = (1, 2, 5, 10, 20, 50, 100)
+_RATIO_RANGE = (0.9, 11.0)  # shown at least
+_MARGIN = 1.15  # about what is drawn
+_ROWS = ("success (%)", "error over the oracle's", "time of one call (ms)")
+
+
+def write_benchmark(
+    folder: Path, design: BenchmarkDesign, trials: pd.DataFrame, summary: pd.DataFrame
+) -> None:
+    """Write `trials`, `summary` (Parquet and CSV), `summary.md`, `benchmark.*` and provenance."""
+    write_rows(folder / "trials.parquet", TRIALS, trials)
+    write_rows(folder / "summary.parquet", SUMMARY, summary)
+    write_text(folder / "summary.csv", summary.to_csv(index=False))
+    write_text(folder / "summary.md", benchmark_markdown(design, summary))
+    provenance = {
+        "schema_version": SCHEMA_VERSION,
+        "seed": design.seed,
+        "trials": design.trials,
+        "budget_s": design.budget_s,
+        "aligners": [
+            entry.model_dump(mode="json") | {"origin": find_method(entry.method).origin()}
+            for entry in design.aligners
+        ],
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "libraries": library_versions(),
+        "written": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    write_json(folder / "provenance.json", provenance)
+    save_figure(folder, "benchmark", draw, summary)
+
+
+def benchmark_markdown(design: BenchmarkDesign, summary: pd.DataFrame) -> str:
+    """The whole table for people: one section for each number of pairs."""
+    parts = [
+        f"# Aligners on made-up maps\n\n"
+        f"Planar maps of landmarks uniform in {SIZE_M:g} x {SIZE_M:g} m, residuals of true pairs "
+        f"{SIGMA_M:g} m per axis, false pairs uniform; {design.trials} trials a cell, seed "
+        f"{design.seed}, the same maps for all methods.\n\n"
+        f"Each cell: successes in % (accepted and within {RIGHT_WITHIN_M:g} m and "
+        f"{RIGHT_WITHIN_RAD:g} rad as estimated) with Wilson's 95 % interval; the median "
+        "translation error of the successes over the oracle's (least squares on the true pairs) on "
+        "the same maps, as estimated / after the common least squares; the median time of one "
+        "call, serial and warmed. `wrong` counts, where there are any, trials accepted though "
+        "outside the tolerance. Below 3 true pairs no motion is determined: there the right answer "
+        "is a refusal.\n"
+    ]
+    for n_pairs, rows in summary.groupby("n_pairs", sort=False):
+        columns = {
+            f"{share:.0%} outliers ({cells['n_true'].iloc[0]} true)": cells.set_index(
+                "method"
+            ).apply(cell_text, axis=1)
+            for share, cells in rows.groupby("outlier_share", sort=False)
+        }
+        table = pd.DataFrame(columns).reset_index(names="method")
+        parts += [f"## {n_pairs} pairs\n", to_markdown(table)]
+    return "\n".join(parts)
+
+
+def cell_text(cell: pd.Series) -> str:
+    """One cell in words: success, error over the oracle, time."""
+    if cell["status"] == Status.ABSENT:
+        return "absent"
+    low, high = (f"{100 * cell[name]:.0f}" for name in ("success_low", "success_high"))
+    parts = [f"**{100 * cell['success']:.0f}** ({low}-{high})"]
+    if cell["n_success"]:
+        ratios = (cell["ratio_m"], cell["refined_ratio_m"])
+        parts.append(" / ".join("-" if math.isnan(r) else f"{r:.2f}" for r in ratios))
+    if not math.isnan(cell["elapsed_s"]):
+        elapsed_ms = 1e3 * cell["elapsed_s"]
+        parts.append(f"{elapsed_ms:.0f} ms" if elapsed_ms >= 100 else f"{elapsed_ms:.3g} ms")
+    parts += [f"{cell[f'n_{what}']} {what}" for what in ("wrong", "failed") if cell[f"n_{what}"]]
+    return ", ".join(parts)
+
+
+def draw(summary: pd.DataFrame) -> Figure:
+    """One column of panels for each number of pairs; the rows as in `_ROWS`.
+
+    Bands: Wilson's 95 % interval of the success, 10-90 % of the trials' times. The shares are
+    spaced evenly and the methods set a little apart, as most lie on one another.
+    """
+    counts = summary["n_pairs"].unique()
+    methods = summary["method"].unique().tolist()
+    styles = style.aligner_styles(methods)
+    shares = sorted(summary["outlier_share"].unique())
+    figure = Figure(figsize=(style.PAGE_WIDTH_IN, 6.6))
+    panels = figure.subplots(len(_ROWS), len(counts), sharex=True, sharey="row", squeeze=False)
+    ran = summary[summary["status"] != Status.ABSENT].sort_values("outlier_share")
+    for column, count in zip(panels.T, counts, strict=True):
+        for place, method in enumerate(methods):
+            own = ran[(ran["n_pairs"] == count) & (ran["method"] == method)]
+            offset = _DODGE * ((place + 0.5) / len(methods) - 0.5)
+            x = np.searchsorted(shares, own["outlier_share"]) + offset
+            _add_method(column, x, own, styles[method])
+        column[0].set_title(f"{count} pairs")
+        column[-1].set_xlabel("outliers (%)")
+    _lay_out(panels, shares)
+    absent = set(summary["method"][summary["status"] == Status.ABSENT])
+    looks = {f"{m} (absent)" if m in absent else m: styles[m] for m in methods}
+    style.aligner_legend(figure, looks, columns=5)
+    return figure
+
+
+def _add_method(axes: np.ndarray, x: np.ndarray, own: pd.DataFrame, line: dict) -> None:
+    success, ratio, elapsed = axes
+    line = line | {"linewidth": 0.8, "markersize": 2.8}
+    ends = (100 * own["success_low"], 100 * own["success_high"])
+    success.vlines(x, *ends, color=line["color"], linewidth=2.2, alpha=0.35)
+    success.plot(x, 100 * own["success"], **line)
+    ratio.plot(x, own["ratio_m"].where(own["n_success"] >= _MIN_SUCCESSES), **line)
+    ends = (1e3 * own["elapsed_low_s"], 1e3 * own["elapsed_high_s"])
+    elapsed.fill_between(x, *ends, color=line["color"], alpha=_BAND_ALPHA, linewidth=0)
+    elapsed.plot(x, 1e3 * own["elapsed_s"], **line)
+
+
+def _lay_out(panels: np.ndarray, shares: list[float]) -> None:
+    axes: Axes
+    for row, label in zip(panels, _ROWS, strict=True):
+        row[0].set_ylabel(label)
+        for axes in row:
+            axes.set_xticks(range(len(shares)), [f"{100 * share:g}" for share in shares])
+            axes.grid(visible=False, axis="x")
+    panels[0, 0].set_ylim(-3, 103)
+    for axes in panels[1:].flat:
+        axes.set_yscale("log")
+        style.write_plainly(axes.yaxis)
+    drawn = [line.get_ydata() for axes in panels[1] for line in axes.get_lines()]
+    ratios = np.concatenate([*drawn, _RATIO_RANGE])
+    panels[1, 0].set_yticks(_RATIO_TICKS)
+    panels[1, 0].set_ylim(np.nanmin(ratios) / _MARGIN, np.nanmax(ratios) * _MARGIN)
+    panels[1, 0].yaxis.set_minor_locator(NullLocator())
+
+
+FIGURE = "independence"
+# Columns of `at_the_end` that people are shown: headings of a page and of a screen.
+SHOWN = {
+    "robots_s": ("robots' own work, CPU s", "robots'\nCPU s"),
+    "busiest_robot_s": ("of the busiest robot", "busiest\nCPU s"),
+    "team_s": ("team's work, CPU s", "team's\nCPU s"),
+    "robot_peak_mb": ("peak of a robot, MB", "robot\nMB"),
+    "team_peak_mb": ("peak of the team's, MB", "team\nMB"),
+    "sent_mb": ("sent by all, MB", "sent\nMB"),
+    "landmark_rmse_m": ("map in its frame, mm", "map\nmm"),
+    "fitted_rmse_m": ("map after a fit, mm", "fitted\nmm"),
+    "path_rmse_m": ("paths after a fit, mm", "paths\nmm"),
+}
+_MM_A_M = 1000.0
+
+
+def write_independence(
+    folder: Path, scenarios: Sequence[AnyScenario], found: Independence
+) -> list[str]:
+    """Write `teams`, `costs` (Parquet), `summary` (CSV, Markdown), the figure and provenance.
+
+    Returns why there is no figure, if there is none.
+    """
+    summary = at_the_end(found)
+    write_rows(folder / "teams.parquet", TEAMS, found.teams)
+    write_rows(folder / "costs.parquet", COSTS, found.costs)
+    write_text(folder / "summary.csv", summary.to_csv(index=False))
+    write_text(folder / "summary.md", independence_markdown(scenarios, summary))
+    write_json(folder / "provenance.json", _provenance(scenarios))
+    try:
+        save_figure(folder, FIGURE, independence_figure.draw, found.teams, found.costs)
+    except NothingToDraw as reason:
+        return [f"{FIGURE}: {reason}"]
+    return []
+
+
+def _provenance(scenarios: Sequence[AnyScenario]) -> dict[str, object]:
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "scenarios": [scenario.resolved() for scenario in scenarios],
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "libraries": library_versions(),
+        "written": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+
+
+def independence_markdown(scenarios: Sequence[AnyScenario], summary: pd.DataFrame) -> str:
+    """The table for people: one section for each size of team."""
+    seeds = ", ".join(str(scenario.seed) for scenario in scenarios)
+    parts = [
+        f"# What independence costs\n\n"
+        f"Scenario {scenarios[0].name}, seeds {seeds}: medians over the seeds, of the map at the "
+        "last iteration. Each team is the first robots of the scenario. CPU times and memory are "
+        f"those of one machine ({platform.machine()}), measured one piece of work after the other; "
+        "compare them with each other. Errors are root mean squares, of landmarks without the "
+        "gross ones. `experiments/docs/independence.md` defines all of it.\n"
+    ]
+    for n_robots, rows in summary.groupby("n_robots"):
+        whole, n = rows["n_whole"].min(), rows["n_seeds"].max()
+        parts += [
+            f"## {n_robots} robots\n",
+            f"All robots' maps became one in {whole} of {n} runs.\n",
+            to_markdown(_for_people(rows)),
+        ]
+    return "\n".join(parts)
+
+
+def _for_people(rows: pd.DataFrame) -> pd.DataFrame:
+    labels = {strategy.name: strategy.label for strategy in STRATEGIES}
+    shown = {heading: shown_numbers(rows, name) for name, (heading, _) in SHOWN.items()}
+    return pd.DataFrame({"way to one map": rows["strategy"].map(labels)} | shown)
+
+
+def shown_numbers(rows: pd.DataFrame, name: str) -> pd.Series:
+    """A column of `SHOWN` in the unit of its headings: errors in mm."""
+    return rows[name] * (_MM_A_M if name.endswith("rmse_m") else 1.0)
+
+
+_RATES = ("false_runs", "false_pairs", "false_by_chance", "wrong_pairs", "on_ground", "ambiguous")
+_RATES += tuple(f"right_{verdict}" for verdict in VERDICTS)
+_FIRST = ("first_iteration", "first_true_pairs")
+# A row for each kind of world and method: NAME of NAME_of, with Wilson's interval (`kind_rates`).
+KINDS = schema(
+    "refusal.kinds",
+    1,
+    fields(
+        **dict.fromkeys(("kind", "aligner"), TEXT),
+        **{
+            f"{name}{end}": kind
+            for name in _RATES
+            for end, kind in (("", INT), ("_of", INT), ("_low", FLOAT), ("_high", FLOAT))
+        },
+        **dict.fromkeys([*_FIRST, *(f"{name}_by_chance" for name in _FIRST)], FLOAT),
+    ),
+)
+
+
+def write_kinds(folder: Path, refusals: pd.DataFrame, rows: list[dict[str, Any]]) -> Path:
+    """Write rows of `kind_rates.by_kind` as the table `kinds` and, for people, `kinds.md`.
+
+    The page begins with what any method does (`of_any_method`), and how early ordinary worlds are
+    come upon (`first_of_ordinary`).
+    """
+    write_rows(table_path(folder, "kinds"), KINDS, [_flat(row) for row in rows])
+    page, text = folder / "kinds.md", "# Verdicts by kind of world\n"
+    parts = {"Any method": of_any_method(refusals)}
+    if first := first_of_ordinary(refusals):
+        parts["First right answers in worlds that do not repeat themselves"] = first
+    parts["Each method"] = rows
+    for title, part in parts.items():
+        shown = [{name: _told(value) for name, value in row.items()} for row in part]
+        text += f"\n## {title}\n\n{to_markdown(pd.DataFrame(shown))}\n"
+    write_text(page, text)
+    return page
+
+
+def _flat(row: dict[str, Any]) -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in row.items():
+        if isinstance(value, Rate):
+            low, high = value.interval
+            flat |= {name: value.hits, f"{name}_of": value.n}
+            flat |= {f"{name}_low": low, f"{name}_high": high}
+        else:
+            flat[name] = value
+    return flat
+
+
+def _told(value: Any) -> Any:
+    return f"{value.hits}/{value.n}" if isinstance(value, Rate) else value
+
+
+def draw_refusals(
+    folder: Path,
+    refusals: pd.DataFrame,
+    calibration: pd.DataFrame,
+    false_alarms: float,
+    held: Reliability | None,
+) -> list[Path]:
+    """Draw the figures that there is data for; returns their files."""
+    place, files = folder / "figures", []
+    if len(ordinary(refusals)):
+        data = (refusals, calibration, false_alarms)
+        files += save_figure(place, "refusal", refusal_figures.draw, *data)
+    files += save_figure(place, "refusal_kinds", verdict_figures.draw_kinds, refusals)
+    files += save_figure(place, "refusal_roc", verdict_figures.draw_roc, refusals)
+    if held is not None:
+        draw = verdict_figures.draw_reliability
+        files += save_figure(place, "refusal_reliability", draw, held)
+    return files

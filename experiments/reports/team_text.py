@@ -1,0 +1,44 @@
+"""Sentences about a team, for screens and reports."""
+
+from collections.abc import Iterator
+
+import pandas as pd
+
+from experiments.evaluation.criteria import has_common_ground, merged_robots, right_refined
+from experiments.evaluation.team_errors import believed
+from experiments.reports.formatting import listed, two_digits
+from mapfusion.fusion.team_graph import Place
+
+
+def team_lines(motions: pd.DataFrame, team: pd.DataFrame, pairs: pd.DataFrame) -> Iterator[str]:
+    """From the tables `fused_motions`, `team` and `team_pairs` of one run; nothing of one robot.
+
+    Without truth the last two have no rows, and what they tell is not said.
+    """
+    final = team[team["source"] == "final"]
+    for row in final[final["n_team"] > 1].to_dict("records"):
+        which = "are merged" if row["component"] == 1 else "make a map of their own"
+        off = f"their paths err by {two_digits(row['rmse'])} m (ATE, one rigid fit for all)"
+        yield f"{row['n_robots']} of {row['n_team']} robots {which}: {off}"
+    if len(motions) and not merged_robots(motions["tx_m"]):
+        alone = motions.loc[motions["tx_m"].notna(), "robot"].tolist()
+        yield f"no two maps were merged, the fused map is that of {listed(alone)}"
+    for robot, why in motions[["robot", "left_out"]].itertuples(index=False):
+        if why:
+            yield f"{robot} is left out of the fused map: {why}"
+    if len(pairs):
+        met, used, right = has_common_ground(pairs), believed(pairs), right_refined(pairs)
+        found = (used & met & right).sum()
+        yield (
+            f"alignments believed: {used.sum()}, right: {found}; "
+            f"pairs with common ground: {met.sum()}, found: {found}"
+        )
+
+
+def edge_lines(edges: pd.DataFrame) -> Iterator[str]:
+    """From `team_edges`, what the others say of some alignments; of two robots nobody else is."""
+    if len(edges) > 1:
+        told = edges[edges["place"] != Place.REFUSED]
+        for place, rows in told.groupby("place", sort=True):
+            names = (rows["robot_a"] + "-" + rows["robot_b"]).tolist()
+            yield f"alignments {place}: {listed(names)}"

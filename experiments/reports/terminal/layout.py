@@ -1,0 +1,168 @@
+"""How tables look, and what commands show while they work and when they are done.
+
+All that is printed goes through `_console`: it takes nothing for markup, whoever a text is from.
+"""
+
+import time
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from rich import box
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+from rich.text import Text
+
+from experiments.reports.formatting import UNKNOWN, interval, number, plain
+
+Column = tuple[str, str]  # heading and format
+_LEAST_TEXT = 8  # characters: a name that is folded can still be read
+NO_ESTIMATE = "given: share with an estimate; without one the error is infinite"
+_GAP = 2  # characters between columns
+
+
+OnProgress = Callable[[str, int, int], None]
+_LINE_EVERY_S = 30.0  # of progress in a log file: an hour's run stays below some hundred lines
+
+
+def _console(stderr: bool = False) -> Console:
+    """Nothing in a text is a style, a link or a picture's name, and no line is cut."""
+    return Console(stderr=stderr, markup=False, emoji=False, highlight=False, soft_wrap=True)
+
+
+@contextmanager
+def progress() -> Iterator[OnProgress]:
+    """A progress display on stderr; yields the function to tell (label, done, total).
+
+    Bars on a terminal, lines elsewhere.
+    """
+    console = _console(stderr=True)
+    if not console.is_terminal:
+        yield _progress_lines(console)
+        return
+    bars: dict[str, TaskID] = {}
+    with Progress(
+        TextColumn("{task.description:<26}", markup=False),
+        BarColumn(),
+        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        console=console,
+    ) as display:
+
+        def show(label: str, done: int, total: int) -> None:
+            if label not in bars or (done == 0 and display.tasks[bars[label]].finished):
+                bars[label] = display.add_task(label, total=total)
+            display.update(bars[label], completed=done, total=total)
+
+        yield show
+
+
+def _progress_lines(console: Console) -> OnProgress:
+    """A line when something begins, when it is done, and now and then between."""
+    told: dict[str, tuple[int, float]] = {}
+
+    def show(label: str, done: int, total: int) -> None:
+        now_s = time.monotonic()
+        last, at_s = told.get(label, (-1, -_LINE_EVERY_S))
+        if done != last and (done in (0, total) or now_s - at_s >= _LINE_EVERY_S):
+            console.print(Text(plain(f"{label}: {done}/{total}")))
+            told[label] = done, now_s
+
+    return show
+
+
+def print_table(
+    columns: Collection[Column], rows: Iterable[Sequence[Any]], title: str = "", note: str = ""
+) -> None:
+    """Print a table, if it has any rows, with a title above and a note below.
+
+    A heading may have two lines; without a format its column is text. A cell is None or NaN where
+    nothing is known, (value, low, high) with an interval, or styled text. Where the screen is
+    narrow text gives way, and never a number: what is too wide even then goes beyond the edge.
+    """
+    layouts = [layout for _, layout in columns]
+    cells = [[*map(_cell, row, layouts)] for row in rows]
+    if not cells:
+        return
+    # Plain rules and narrow gaps: all columns should fit into 80 characters.
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
+    needed = wanted = 0
+    for place, (heading, layout) in enumerate(columns):
+        shown = Text(plain(heading))
+        widest = max(*map(len, heading.split("\n")), *(row[place].cell_len for row in cells))
+        if layout:
+            table.add_column(shown, justify="right", no_wrap=True, min_width=widest)
+        else:
+            table.add_column(shown, overflow="fold")
+        needed += (widest if layout else min(widest, _LEAST_TEXT)) + 1
+        wanted += widest + _GAP
+    for row in cells:
+        table.add_row(*row)
+    console = _console()
+    if wanted > console.width:
+        table.padding = 0
+    console.width = max(console.width, needed)
+    if title:
+        console.print(Text(plain(title), "bold"))
+    console.print(table)
+    console.print(Text(f"{plain(note)}\n" if note else "", "dim"), soft_wrap=False)
+
+
+def columns(layout: str, **headings: str) -> dict[str, Column]:
+    """Columns of one format, by their names in a frame."""
+    return {name: (heading, layout) for name, heading in headings.items()}
+
+
+def print_frame(
+    frame: pd.DataFrame, shown: Mapping[str, Column], title: str = "", note: str = ""
+) -> None:
+    """Print columns of a frame by name, with the intervals in their NAME_low and NAME_high."""
+    if frame.empty:  # a table that could not be made has no columns either
+        return
+    cells = [
+        frame[[name, f"{name}_low", f"{name}_high"]].itertuples(index=False, name=None)
+        if f"{name}_low" in frame
+        else frame[name]
+        for name in shown
+    ]
+    print_table(shown.values(), zip(*cells, strict=True), title, note)
+
+
+def _cell(value: Any, layout: str) -> Text:
+    if isinstance(value, Text):
+        return value
+    if value is None:
+        return Text(UNKNOWN)
+    if isinstance(value, tuple):
+        return Text(interval(*value, layout=layout))
+    text = number(value, layout) if isinstance(value, float) else format(value, layout)
+    return Text(plain(text))
+
+
+def print_lines(lines: Iterable[str]) -> None:
+    """Print lines as they are, however long."""
+    console = _console()
+    for line in lines:
+        console.print(Text(plain(line)))
+
+
+def print_paths(folder: Path, paths: Sequence[Path], skipped: Sequence[str] = ()) -> None:
+    """Where files were written."""
+    print_lines([f"{len(paths)} written to {folder}"])
+    print_skipped(skipped)
+
+
+def print_skipped(skipped: Sequence[str]) -> None:
+    """A line for each figure that could not be drawn."""
+    print_lines(f"  not drawn: {line}" for line in skipped)

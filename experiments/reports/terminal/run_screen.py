@@ -1,0 +1,322 @@
+"""Screens of `run`, `check`, `align`, `merge` and `import`."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from rich.text import Text
+
+from experiments.evaluation import tables
+from experiments.evaluation.alignment_summary import methods_in
+from experiments.evaluation.checks import CheckedScenario
+from experiments.evaluation.criteria import ANSWERABLE_PAIRS, ORACLE, answerable, at_the_end
+from experiments.evaluation.fused_map_errors import last_fused
+from experiments.evaluation.map_consistency import GROSS_M
+from experiments.evaluation.path_errors import path_rms
+from experiments.evaluation.single_steps import Merged, verdict_on
+from experiments.evaluation.tables import SHOWN
+from experiments.pipeline.stereo_import import ImportedRecording
+from experiments.pipeline.tables import covariances_of
+from experiments.reports.formatting import two_digits
+from experiments.reports.team_text import edge_lines, team_lines
+from experiments.reports.terminal.layout import (
+    NO_ESTIMATE,
+    columns,
+    print_frame,
+    print_lines,
+    print_skipped,
+    print_table,
+)
+from experiments.studies.error_bands import ROBOT_PAIR, error_bands
+from experiments.studies.method_comparison import aligner_summary
+from mapfusion.align.alignment import NOT_RUN, Status
+from mapfusion.datasets.stereo_import import Imported
+from mapfusion.fusion.fused_map import FusedMap
+from mapfusion.geometry.se2 import motion_sigma
+
+_SEEDS_SHOWN = 3  # one by one, in a table of checks
+
+
+def print_result(result: Path, skipped_figures: Sequence[str]) -> None:
+    """The table of all aligners, and where everything is."""
+
+    def table(name: str) -> pd.DataFrame:
+        return tables.read(tables.table_path(result, name), name)
+
+    errors = table("errors")
+    aligners = methods_in(errors, oracle=True)
+    if aligners:  # else a robot that was alone
+        _print_aligners(errors, aligner_summary(errors, table("aligner_timings"), aligners))
+        print_lines(f"  {line}" for line in not_run_lines(errors))
+        _print_pairs(errors, aligners[0])
+    elif len(estimates := table("estimates")):
+        _print_answers(estimates)
+        print_lines(f"  {line}" for line in not_run_lines(estimates))
+    shown = columns("", robot="robot") | columns(".3f", path_m="FastSLAM, m")
+    shown |= columns(".3f", odometry_m="odometry, m") | columns(".2f", over_odometry="ratio")
+    shown |= columns("d", n_landmarks="landmarks\never seen")
+    paths = path_rms(table("robots"))
+    known = paths["path_m"].notna().any()
+    print_frame(paths, shown, "Position errors (RMS)" if known else "Robots (no truth: no errors)")
+    print_lines(
+        ["  Maps and figures hold the landmarks that were seen often enough (slam.min_count)."]
+    )
+    _print_smoother(table("smoother"))
+    _print_fusers(table("fusers"))
+    pairs = table("team_pairs")
+    _print_team_pairs(pairs)
+    told = team_lines(table("fused_motions"), table("team"), pairs)
+    print_lines(f"  {line}" for line in (*told, *edge_lines(table("team_edges"))))
+    print_lines([f"Figures: {result / 'figures'}   tables: {result / 'tables'}"])
+    print_skipped(skipped_figures)
+
+
+def _print_smoother(rows: pd.DataFrame) -> None:
+    smoothed = rows[rows["not_smoothed"] == ""]
+    if smoothed["path_rmse_m"].notna().any() or smoothed["landmark_rmse_m"].notna().any():
+        shown = columns("", robot="robot") | columns(".3f", path_rmse_m="path, m")
+        shown |= columns(".1f", filter_over_smoother="FastSLAM's\nover it")
+        shown |= columns(".3f", landmark_rmse_m="landmarks\nm")
+        shown |= columns(".3f", filter_landmark_rmse_m="FastSLAM's\nm")
+        shown |= columns(".1%", gross_share="gross\n") | columns(".2f", nees_per_dof="NEES\n/ dof")
+        shown |= columns(".0%", coverage_95="in\n95 %")
+        note = f"paths from the start; landmarks fitted, without gross ones (over {GROSS_M} m)"
+        print_frame(smoothed, shown, "Batch smoother: what the filter loses against it", note)
+    reasons = rows[["robot", "not_smoothed"]].itertuples(index=False)
+    print_lines(f"  {robot} is not smoothed: {why}" for robot, why in reasons if why)
+
+
+def _print_fusers(rows: pd.DataFrame) -> None:
+    shown = columns("", fuser="fuser") | columns(".3f", landmark_rmse_m="frame\nm")
+    shown |= columns(".3f", fitted_rmse_m="fitted\nm") | columns(".1%", gross_share="gross\n")
+    shown |= columns(".2f", over_better_parent="over\nparent", over_better_filter="over\nfilter")
+    shown |= columns(".2f", nees_per_dof="NEES\n/ dof") | columns(".0%", coverage_95="in\n95 %")
+    shown |= columns(".3f", alignment_error_m="T_a_b\nm", alignment_sigma_m="sigma\nm")
+    note = f"RMS errors in the map's frame and fitted, without gross ones (over {GROSS_M} m)\n"
+    note += "over: fitted error over the better of the maps given, and of FastSLAM's\n"
+    note += "T_a_b: error of the other robots' places, median, with the sigma that is stated"
+    last = last_fused(rows)
+    print_frame(last, shown, "Fusers: maps of all robots together, at the end", note)
+    reasons = last[["fuser", "fallback"]].itertuples(index=False)
+    print_lines(f"  {fuser}: {why}" for fuser, why in reasons if why)
+
+
+def _print_team_pairs(pairs: pd.DataFrame) -> None:
+    """Of three robots or more: T_a_b by the pair's own alignment, and by all of the team."""
+    if len(pairs) > 1:
+        names = pairs["robot_a"] + " - " + pairs["robot_b"]
+        shown = columns("", pair="pair", place="its alignment")
+        shown |= columns(".3f", refined_translation_error_m="alone\nm")
+        shown |= columns("+.4f", refined_rotation_error_rad="\nrad")
+        shown |= columns(".3f", team_translation_error_m="in the team\nm")
+        shown |= columns("+.4f", team_rotation_error_rad="\nrad") | columns("d", n_common="common")
+        note = "its alignment: what loops of the others say of it; common: landmarks of both maps"
+        print_frame(pairs.assign(pair=names), shown, "Pairs as the team places them", note)
+
+
+def _print_answers(estimates: pd.DataFrame) -> None:
+    """Without truth: how often each aligner answered, was refined and was accepted."""
+    by_aligner = estimates.groupby("aligner", sort=False)
+    shares = {
+        name: by_aligner[column].agg(lambda told: (told == Status.ACCEPTED).mean())
+        for name, column in (("estimated", "status"), ("refined", "refined_status"))
+    }
+    rows = pd.DataFrame(shares | {"accepted": by_aligner["accepted"].mean()}).reset_index()
+    shown = columns("", aligner="aligner")
+    shown |= columns(".0%", estimated="estimated", refined="refined", accepted="accepted")
+    note = "share of all maps and repetitions; accepted: more than chance, and not contradicted"
+    print_frame(rows, shown, "Answers (no truth: errors are unknown)", note)
+
+
+def not_run_lines(errors: pd.DataFrame) -> list[str]:
+    """One line for each aligner, and each reason, that did not run."""
+    not_run = errors[errors["status"].isin(NOT_RUN)]
+    n_rows = errors.groupby("aligner").size().to_dict()
+    lines, causes = [], ["aligner", "status", "reason"]
+    for (aligner, status, reason), rows in not_run.groupby(causes, sort=False):
+        share = "" if status == Status.ABSENT else f" in {len(rows)} of {n_rows[aligner]} rows"
+        lines.append(f"{aligner}: {status}{share}: {reason}")
+    return lines
+
+
+def _print_aligners(errors: pd.DataFrame, summary: pd.DataFrame) -> None:
+    shown = columns("", aligner="aligner")
+    shown |= {name: (column.label, column.layout) for name, column in SHOWN.items()}
+    shown |= columns(".3f", spread_m="spread\nm") | columns(".2f", time_ms="time\nms")
+    maps = answerable(errors)
+    note = f"{NO_ESTIMATE}\n"
+    note += "spread: 10-90 % of the repetitions; ok: accepted"
+    if len(maps):
+        n_offered = maps["n_correspondences"]
+        share = (maps["n_true"] / n_offered).median()
+        note += f"\npairs offered: {n_offered.median():.0f}, {share:.0%} of them true"
+    title = f"Alignment errors: medians over iterations with {ANSWERABLE_PAIRS}+ true pairs"
+    print_frame(summary, shown, title, note)
+
+
+def _print_pairs(errors: pd.DataFrame, aligner: str) -> None:
+    """Each pair at its last iteration: the first aligner, refined, beside the oracle."""
+    shown = [("pair", "")]
+    for whose in ("error", "oracle"):
+        shown += [(f"{whose}, m", ".3f"), (f"{whose}, rad", "+.4f")]
+    names = [f"refined_{quantity}" for quantity in ("translation_error_m", "rotation_error_rad")]
+    bands = at_the_end(error_bands(errors)).set_index([*ROBOT_PAIR, "aligner"])
+    medians = bands[names].T.to_dict("list")
+    rows = []
+    for last in at_the_end(errors).drop_duplicates(ROBOT_PAIR).to_dict("records"):
+        pair = (last["robot_a"], last["robot_b"])
+        found = (*medians[(*pair, aligner)], *medians[(*pair, ORACLE)])
+        rows.append([" - ".join(pair), *found, f"{last['n_true']} of {last['n_correspondences']}"])
+    title = f"Pairs at the last iteration, {aligner} refined"
+    print_table([*shown, ("true pairs", ">")], rows, title)
+
+
+def print_checks(checks: Sequence[CheckedScenario]) -> None:
+    """The table of a check."""
+    outcomes = [outcome for check in checks for outcome in check.outcomes]
+    shown = columns("", scenario="scenario", metric="metric") | columns(".4g", value="measured")
+    shown |= columns("", bound_text="expected", seeds="by seed", verdict="")
+    rows = []
+    for outcome in outcomes:
+        seeds = _by_seed(list(outcome.per_seed.values()))
+        verdict = Text("pass", "green") if outcome.passed else Text("FAIL", "bold red")
+        what = (outcome.scenario, outcome.metric, outcome.value, outcome.bound_text)
+        rows.append((*what, seeds, verdict))
+    print_table(shown.values(), rows, "Checks against the truth")
+    print_lines(
+        f"{check.scenario}, seed {seed}: {nothing.text}"
+        for check in checks
+        for seed, nothing in check.unmerged.items()
+    )
+    n_passed = sum(outcome.passed for outcome in outcomes)
+    n_failed = len(outcomes) - n_passed + sum(len(check.unmerged) for check in checks)
+    not_run = sum(bool(check.error) for check in checks)
+    of_all = f"{not_run} of {len(checks)} scenarios"
+    errors = f"; {of_all} could not be checked" if not_run else ""
+    print_lines([f"{n_passed} passed, {n_failed} failed{errors}"])
+
+
+def _by_seed(values: Sequence[float]) -> str:
+    """Each seed's value; of more than a line holds the smallest and the largest."""
+    if len(values) <= _SEEDS_SHOWN:
+        return "  ".join(f"{value:.3g}" for value in values)
+    return f"{min(values):.3g} to {max(values):.3g}"
+
+
+_MOTIONS = columns("", aligner="aligner")
+_MOTIONS |= columns(".3f", tx_m="estim.\ntx, m", ty_m="\nty, m")
+_MOTIONS |= columns(".4f", theta_rad="\ntheta, rad")
+_MOTIONS |= columns(".3f", refined_tx_m="refined\ntx, m", refined_ty_m="\nty, m")
+_MOTIONS |= columns(".4f", refined_theta_rad="\ntheta, rad")
+_MOTIONS |= columns(".3f", sigma_m="sigma\nm") | columns(".4f", sigma_rad="\nrad")
+_VERDICTS = columns("", aligner="aligner", verdict="verdict") | columns(">", inliers="inliers")
+_VERDICTS |= columns(".0f", log10_false_alarms="NFA\nlog10")
+_VERDICTS |= columns("+.1f", log10_evidence="evidence\nlog10")
+_VERDICTS |= columns(".2f", probability="prob.\nright") | columns(">", time="time\nms")
+
+
+def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
+    """Estimates of all aligners on two maps, and what is to be said of each."""
+    found = pd.DataFrame(rows)
+    sigma_m, sigma_rad = motion_sigma(covariances_of(found))
+    stated = found.assign(sigma_m=sigma_m, sigma_rad=sigma_rad)
+    note = "sigma: as stated for the refined one, of the distance and of the angle"
+    print_frame(stated, _MOTIONS, "T_a_b, as estimated and refined", note)
+    inliers = found["n_inliers"].map(str) + "/" + found["n_correspondences"].map(str)
+    verdicts = [verdict_on(row) for row in rows]
+    times = (1e3 * found["elapsed_s"]).map(two_digits)
+    print_frame(
+        found.assign(inliers=inliers, time=times, verdict=[str(status) for status, _ in verdicts]),
+        _VERDICTS,
+        "Verdicts on the refined ones",
+        "NFA: expected number of alignments that chance alone supports as well; evidence:\n"
+        "how much likelier what both robots saw is if it is right; time: of the estimate",
+    )
+    for row, (status, why) in zip(rows, verdicts, strict=True):
+        if reason := why or row["reason"]:
+            print_lines([f"  {row['aligner']}: {status}: {reason}"])
+
+
+def print_fused(path: Path, fused: FusedMap, maps: Sequence[Path]) -> None:
+    """What a fused map was made of."""
+    several = int(((fused.parents >= 0).sum(axis=1) > 1).sum())
+    n_maps = len(fused.members)
+    lines = [
+        f"{len(fused.landmarks)} landmarks in {path}: fused from {n_maps} maps; {several} "
+        f"landmarks are of several maps, {fused.duplicate_share:.1%} look like duplicates that "
+        "remain"
+    ]
+    sigmas = zip(*motion_sigma(fused.motion_covariance), strict=True)
+    for name, (x_m, y_m, theta_rad), sigma in zip(maps, fused.T_first_map, sigmas, strict=True):
+        if not math.isnan(x_m):
+            stated = f"sigma {sigma[0]:.3f} m, {sigma[1]:.4f} rad" if any(sigma) else "the frame"
+            T = f"({x_m:.3f} m, {y_m:.3f} m, {theta_rad:.4f} rad)"
+            lines.append(f"  {name}: T_first_map = {T}, {stated}")
+    lines += [f"  {name}: left out ({reason})" for name, reason in fused.left_out]
+    print_lines(lines)
+
+
+def print_unmerged(merged: Merged, maps: Sequence[Path]) -> None:
+    """Why each two maps were not merged."""
+    print_lines(
+        f"  {maps[a]} and {maps[b]}: not merged: {reason}"
+        for (a, b), reason in merged.reasons().items()
+    )
+
+
+_MOST_DROPPED = 5  # pictures that are named one by one
+_COLUMNS = [
+    ("robot", ""),
+    ("frames", "d"),
+    ("seconds", ".1f"),
+    ("way, m", ".1f"),
+    ("observations\na frame", ".0f"),
+    ("\nat least", "d"),
+    ("linked\n%", ".0f"),
+    ("odometry", ""),
+    ("truth", ""),
+]
+
+
+def print_imported(recordings: Sequence[ImportedRecording], folders: Sequence[Path]) -> None:
+    """The cameras, a line a robot, what was dropped, and where the logs are."""
+    print_lines(one.about for one in recordings)
+    note = "median over the frames; linked: share of the features of the frame before"
+    print_table(_COLUMNS, [_row(log) for one in recordings for log in one.robots], "", note)
+    print_lines(
+        f"  {log.log.robot}: guessed motions: {log.guessed}, its map may break there; "
+        "odometry of the wheels would tell them"
+        for one in recordings
+        for log in one.robots
+        if log.guessed
+    )
+    dropped = [text for one in recordings for text in one.dropped]
+    print_lines(f"  dropped: {each}" for each in dropped[:_MOST_DROPPED])
+    if len(dropped) > _MOST_DROPPED:
+        print_lines([f"  dropped: {len(dropped) - _MOST_DROPPED} more"])
+    print_lines(map(str, folders))
+
+
+def _row(one: Imported) -> tuple[object, ...]:
+    log, seen = one.log, one.observations
+    known = 0 if one.truth is None else int(np.isfinite(one.truth).all(axis=1).sum())
+    return (
+        log.robot,
+        len(log),
+        float(log.time_s[-1] - log.time_s[0]),
+        float(np.hypot(*log.odometry[:, :2].T).sum()),
+        float(np.median(seen)),
+        int(seen[np.argmax(seen > 0) :].min()),  # tracks must last before any is observed
+        100 * float(np.nanmedian(one.linked)),
+        _odometry(one),
+        f"{known} frames" if known else "none",
+    )
+
+
+def _odometry(one: Imported) -> str:
+    if one.odometry_covariance is None:
+        return "recorded"
+    return f"pictures, {one.guessed} guessed" if one.guessed else "pictures"

@@ -1,0 +1,304 @@
+"""Screens of `study`, `sweep`, `calibrate` and `scenarios`."""
+
+import itertools
+import math
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from ruamel.yaml import YAML
+
+from experiments.evaluation.criteria import (
+    ANSWERABLE_PAIRS,
+    MERGEABLE_PAIRS,
+    RIGHT_WITHIN_M,
+    RIGHT_WITHIN_RAD,
+)
+from experiments.evaluation.odometry_calibration import filter_settings
+from experiments.methods.catalogue import known_methods, name_clashes
+from experiments.reports.formatting import interval, two_digits
+from experiments.reports.study_files import SHOWN, shown_numbers
+from experiments.reports.terminal.layout import (
+    NO_ESTIMATE,
+    Column,
+    columns,
+    print_frame,
+    print_lines,
+    print_skipped,
+    print_table,
+)
+from experiments.studies.independence.strategies import STRATEGIES
+from experiments.studies.refusal.rates import VERDICTS, Rate, Reliability, pooled, worst
+from experiments.studies.sweep import SweepProgress
+from experiments.studies.sweep_combinations import SweepRun
+from experiments.studies.sweep_plan import Survey
+from experiments.studies.sweep_tables import ERRORS, GIVEN, SweepDataset, medians_over_runs
+from mapfusion.align.alignment import Status
+from mapfusion.smoother.noise_estimation import LEVELS
+from mapfusion.smoother.odometry_calibration import Calibration
+
+
+def print_benchmark(folder: Path, summary: pd.DataFrame) -> None:
+    """Successes and times for each number of pairs, and where the rest is."""
+    for n_pairs, rows in summary.groupby("n_pairs", sort=False):
+        shares = rows["outlier_share"].drop_duplicates()
+        shown = [("outliers", ""), *((f"{100 * share:g} %", ">") for share in shares)]
+        cells = [
+            [method, *(_benchmark_cell(row) for row in own.to_dict("records"))]
+            for method, own in rows.groupby("method", sort=False)
+        ]
+        print_table(shown, cells, f"{n_pairs} pairs: success in %, time in ms")
+    failed = summary.groupby("method", sort=False)["n_failed"].sum()
+    print_lines(
+        f"  {method}: failed in {n} trials, see trials.parquet"
+        for method, n in failed[failed > 0].items()
+    )
+    print_lines([f"Table and figure: {folder}"])
+
+
+def _benchmark_cell(row: dict[Any, Any]) -> str:
+    if row["status"] == Status.ABSENT:
+        return "absent"
+    return f"{100 * row['success']:.0f}, {two_digits(1e3 * row['elapsed_s'])}"
+
+
+def print_independence(folder: Path, summary: pd.DataFrame, skipped: Sequence[str]) -> None:
+    """Costs and errors of each way to one map (rows of `at_the_end`), and where the rest is."""
+    headings = [("way", ""), *((heading, ">") for _, heading in SHOWN.values())]
+    note = "; ".join(f"{strategy.name}: {strategy.label}" for strategy in STRATEGIES)
+    for n_robots, rows in summary.groupby("n_robots"):
+        numbers = (shown_numbers(rows, name).map(two_digits) for name in SHOWN)
+        cells = zip(rows["strategy"], *numbers, strict=True)
+        whole = f"{rows['n_whole'].min()} of {rows['n_seeds'].max()} runs"
+        title = f"{n_robots} robots, at the end (one map of all in {whole})"
+        print_table(headings, cells, title, note)
+    print_lines([f"Tables and figure: {folder}"])
+    print_skipped(skipped)
+
+
+def print_methods() -> None:
+    """Every alignment method by name, whose it is, and what is wrong where something is."""
+    methods = known_methods().values()
+    rows = [
+        (each.name, each.kind, each.distribution, "absent" if each.absence else each.version)
+        for each in methods
+    ]
+    headings = ("method", "whose", "package", "version")
+    print_table([(heading, "") for heading in headings], rows, "Alignment methods")
+    absent = [f"{each.name}: {each.absence}" for each in methods if each.absence]
+    print_lines(f"  {line}" for line in (*absent, *name_clashes().values()))
+
+
+def print_scenarios(entries: Sequence[dict[str, Any]]) -> None:
+    """The scenarios of a folder."""
+    shown = columns("", name="scenario", tags="tags") | columns("d", robots="robots")
+    shown |= columns(">", iterations="iterations") | columns(".2f", overlap="overlap")
+    shown |= columns("", description="what it is")
+    frame = pd.DataFrame(entries)
+    iterations = [str(each["iterations"] or "recorded") for each in entries]
+    print_frame(frame.assign(tags=frame["tags"].map(" ".join), iterations=iterations), shown)
+
+
+MAX_ROWS_SHOWN = 60
+MAX_FAILURES_SHOWN = 10
+
+
+def shown_by(show: Callable[[str, int, int], None]) -> Callable[[SweepProgress], None]:
+    """One progress bar of runs, one of each stage."""
+
+    def show_sweep(now: SweepProgress) -> None:
+        show("runs", now.done, now.runs)
+        if now.failed:
+            show("runs that failed", len(now.failed), now.runs)
+        for label, total in now.tasks.items():
+            show(label, now.tasks_done[label], total)
+
+    return show_sweep
+
+
+def print_survey(found: Survey) -> None:
+    """How many tasks there are, by stage."""
+    refused = f", {found.runs_refused} that cannot be run" if found.runs_refused else ""
+    print_lines([f"{found.runs} runs, {found.runs_finished} of them finished{refused}"])
+    headings = [("stage", ""), *((name, "d") for name in ("wanted", "shared", "finished", "to do"))]
+    rows = []
+    for label, wanted in found.wanted.items():
+        done, left = found.finished[label], found.left[label]
+        rows.append((label, wanted, wanted - done - left, done, left))
+    print_table(headings, rows, "Tasks", "shared: wanted by several runs, done once")
+
+
+def print_sweep(dataset: SweepDataset, runs: Sequence[SweepRun], failed: Mapping[str, str]) -> None:
+    """Medians over the runs, and the failures."""
+    finished = [run for run in runs if run.run_id not in failed]
+    lines = []
+    if finished:
+        summary = medians_over_runs(dataset, finished)
+        keys = (key.rpartition(".")[2] for key in dataset.keys)
+        shown = columns("", setting=" ".join(("scenario", *keys)), aligner="aligner")
+        for error, given, stage in zip(ERRORS, GIVEN, ("estim.", "refined"), strict=True):
+            shown |= columns(".3f", **{error: f"{stage}\nm"})
+            shown |= columns(".0%", **{given: "\ngiven"})
+        shown |= columns("d", runs="runs")
+        title = f"Median translation errors over runs, {ANSWERABLE_PAIRS}+ true pairs"
+        print_frame(summary.head(MAX_ROWS_SHOWN), shown, title, NO_ESTIMATE)
+        if len(summary) > MAX_ROWS_SHOWN:
+            lines.append(f"... and {len(summary) - MAX_ROWS_SHOWN} more rows")
+    shown = sorted(failed)[:MAX_FAILURES_SHOWN]
+    lines += [f"  {run_id} failed: {failed[run_id]}" for run_id in shown]
+    if len(failed) > MAX_FAILURES_SHOWN:
+        lines.append(f"  ... and {len(failed) - MAX_FAILURES_SHOWN} more failed")
+    print_lines([*lines, f"{len(finished)} of {len(runs)} runs finished; tables: {dataset.folder}"])
+
+
+_CONSTANTS = ("distance", "turn", "late_turn", "bias_rad_per_m", "in_place")
+_TITLES = ("distance\n%", "turn\n%", "late turn\n%", "bias\nmrad/m", "in place\n%")
+_UNITS = (100.0, 100.0, 100.0, 1000.0, 100.0)
+_SHOWN = columns("", robot="robot") | columns(">", **dict(zip(_CONSTANTS, _TITLES, strict=True)))
+
+
+def calibration_rows(calibration: Calibration) -> list[dict[str, Any]]:
+    """Each robot's constants with their standard errors."""
+    return [
+        {"robot": each.robot}
+        | dict(zip(_CONSTANTS, each.error.constants.tolist(), strict=True))
+        | {
+            f"{name}_sigma": float(sigma)
+            for name, sigma in zip(_CONSTANTS, each.standard_errors, strict=True)
+        }
+        for each in calibration.robots
+    ]
+
+
+def document(calibration: Calibration, written: Sequence[Path]) -> dict[str, Any]:
+    """What `--json` prints."""
+    errors = zip(LEVELS, calibration.relative_errors, strict=True)
+    return {
+        "robots": calibration_rows(calibration),
+        "settings": filter_settings(calibration),
+        "relative_errors": {name: float(value) for name, value in errors},
+        "n_rounds": calibration.n_rounds,
+        "settled": calibration.settled,
+        "logs": [str(path) for path in written],
+    }
+
+
+def print_calibration(calibration: Calibration, written: Sequence[Path]) -> None:
+    """Constants, levels, and the section for a scenario."""
+    rows = []
+    for each in calibration.robots:
+        values = zip(each.error.constants, each.standard_errors, _UNITS, strict=True)
+        texts = (f"{unit * value:+.1f} ± {unit * sigma:.1f}" for value, sigma, unit in values)
+        rows.append({"robot": each.robot} | dict(zip(_CONSTANTS, texts, strict=True)))
+    print_frame(
+        pd.DataFrame(rows),
+        _SHOWN,
+        "What the odometry has to be corrected by",
+        "late turn: share of the turn before that is only made now; in place: turns on the spot,\n"
+        "beside those while driving",
+    )
+    if not calibration.settled:
+        n_rounds = calibration.n_rounds
+        print_lines([f"  not settled: constants or levels still change after {n_rounds} rounds"])
+    print_lines([f"  {path}: corrected" for path in written])
+    if written:
+        print_lines(["For a scenario with the corrected logs:"])
+        YAML().dump(filter_settings(calibration), sys.stdout)
+
+
+_RATES = columns(
+    ">",
+    false="false\nmerges",
+    wrong="wrong\n",
+    missed="missed\nof all",
+    missed_though_right="of right",
+    few_missed_though_right="20 true:\nmissed",
+    few_wrong="wrong",
+)
+
+
+def print_refusals(rows: Sequence[dict[str, Any]], false_alarms: float) -> None:
+    """False and missed merges of each aligner in ordinary worlds (rows of `refusal_rates`)."""
+    if not rows:  # all worlds repeat themselves
+        return
+    _print_rates(
+        rows,
+        _RATES,
+        f"Accepted where chance gives at most {false_alarms:g} a pair of maps",
+        "false: accepted without common ground; wrong: accepted with some, "
+        f"{RIGHT_WITHIN_M:g} m or {RIGHT_WITHIN_RAD:g} rad off; missed: refused with "
+        f"{MERGEABLE_PAIRS} or more true pairs, of all and of those right; 20 true: just 20 in "
+        "one corner are left",
+    )
+    wide = {
+        name: f"{2 * float(name.removeprefix('poster_')):g} m\nwide"
+        for name in rows[0]
+        if name.startswith("poster_")
+    }
+    hung = {name: column for name, column in columns(">", **wide).items() if rows[0][name].n}
+    if hung:
+        what = "Accepted though wrong: one picture in two worlds"
+        _print_rates(rows, hung, what, "wide: the picture hung in both")
+
+
+def print_kinds(rows: Sequence[dict[str, Any]]) -> None:
+    """What verdicts make of each kind of world (rows of `kind_rates.by_kind`)."""
+    grouped = itertools.groupby(rows, key=lambda row: row["kind"])
+    kinds = {kind: list(own) for kind, own in grouped}
+    false = []
+    for kind, own in kinds.items():
+        (who, runs), (_, pairs) = (worst(own, name) for name in ("false_runs", "false_pairs"))
+        false.append([kind, _hits(runs), _hits(pairs), who if runs.hits else ""])
+    shown = columns(">", runs="runs", pairs="pairs of maps\nwithout common ground")
+    print_table(
+        [("kind of world", ""), *shown.values(), ("worst method\nof runs", "")],
+        false,
+        "Accepted though wrong, by kind of world",
+        "of the method that is worst; runs: any of their maps",
+    )
+    found = [[kind, *_right(own)] for kind, own in kinds.items()]
+    shown = columns(">", kept="accepted", ambiguous="ambi-\nguous", uncertain="too un-\ncertain")
+    shown |= columns(">", refused="refused", first="first at\niteration", chance="by\nchance")
+    print_table(
+        [("kind of world", ""), *shown.values()],
+        [row for row in found if row[1:] != ["–"] * (len(row) - 1)],
+        "Right answers, by kind of world",
+        f"of all methods, with {MERGEABLE_PAIRS} or more true pairs; first: a run's first right "
+        f"answer that is accepted (median, {rows[0]['aligner']}), and by the test against chance "
+        "alone",
+    )
+
+
+def _right(own: list[dict[str, Any]]) -> list[str]:
+    """What becomes of the right answers of one kind, and when the first is accepted."""
+    shares = [_hits(pooled(own, f"right_{verdict}")) for verdict in VERDICTS]
+    first = [own[0][name] for name in ("first_iteration", "first_iteration_by_chance")]
+    return [*shares, *("–" if math.isnan(value) else f"{value:.0f}" for value in first)]
+
+
+def _hits(rate: Rate) -> str:
+    return f"{rate.hits}/{rate.n}" if rate.n else "–"
+
+
+def print_reliability(found: Reliability) -> None:
+    """How the probability that verdicts state compares with what is right."""
+    support, wrong = found.brier_of_support, f"{found.n_wrong} of {found.n} wrong"
+    print_frame(
+        found.bins,
+        {"n": ("answers", "d"), "stated": ("stated", ".3f"), "right": ("right", ".3f")},
+        f"Probability that an answer is right ({wrong})",
+        f"calibration error {interval(*found.calibration_error, layout='.3f')}; Brier score "
+        f"{interval(*found.brier, layout='.4f')}"
+        + ("" if math.isnan(support) else f", of support alone {support:.4f}"),
+    )
+
+
+def _print_rates(
+    rows: Sequence[dict[str, Any]], shown: Mapping[str, Column], title: str, note: str
+) -> None:
+    cells = [
+        [row["aligner"], *(f"{row[name].hits}/{row[name].n}" for name in shown)] for row in rows
+    ]
+    print_table([("aligner", ""), *shown.values()], cells, title, note)

@@ -1,0 +1,323 @@
+"""Benchmark of aligners on synthetic pairs of maps: success, error and time.
+
+Cells run one after the other in this process, warmed, so that times can be compared; each is kept
+under a key of all it depends on, so an interrupted benchmark goes on where it was and a new method
+costs only its own.
+"""
+
+import itertools
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from experiments.evaluation.criteria import is_right
+from experiments.methods.aligner_calls import callable_aligner
+from experiments.methods.catalogue import find_method, known_methods
+from experiments.methods.threads import single_threaded
+from experiments.pipeline.stage import Job, Stage
+from experiments.pipeline.store import Store
+from experiments.pipeline.tables import FLOAT, INT, TEXT, fields, read_rows, write_rows
+from experiments.pipeline.tasks import OnProgress, run_tasks, tasks_of
+from experiments.pipeline.workers import workers
+from experiments.scenario.seeds import generator
+from experiments.scenario.settings import AlignerEntry
+from experiments.scenario.suite import settings_of
+from experiments.studies.intervals import wilson
+from mapfusion.align.alignment import NOT_RUN, Status
+from mapfusion.align.correspondences import Correspondences
+from mapfusion.align.rigid_motion import fit_rigid
+from mapfusion.errors import InputError
+from mapfusion.files import schema
+from mapfusion.geometry import se2
+from mapfusion.geometry.numerics import Float
+from mapfusion.landmark_map import LandmarkMap
+from mapfusion.registration import Registration
+
+# Fixed, so that the tables of different versions can be compared.
+SIZE_M = 20.0  # side of the square that holds the landmarks
+SIGMA_M = 0.05  # of a true pair's residual, per axis
+_OBSERVATIONS = 5  # that each landmark claims to be made of; no aligner asks
+
+
+@dataclass(frozen=True)
+class SyntheticPair:
+    """Two planar maps of N landmarks each and N correspondences between them, in no order.
+
+    Attributes:
+        T_a_b: (3,) the truth.
+        is_true: (N,) bool, which correspondences are one point of the world.
+    """
+
+    map_a: LandmarkMap
+    map_b: LandmarkMap
+    correspondences: Correspondences
+    T_a_b: Float
+    is_true: np.ndarray
+
+    def least_squares(self) -> Float:
+        """T_a_b (3,) that fits the true pairs best: all noise is equal, so weights are, too."""
+        c = self.correspondences
+        p_a, p_b = self.map_a.position_m[c.index_a], self.map_b.position_m[c.index_b]
+        return np.array(fit_rigid(p_a, p_b, np.flatnonzero(self.is_true)))
+
+
+def true_pairs_of(n_pairs: int, outlier_share: float) -> int:
+    """Number of true ones among n pairs."""
+    return round((1 - outlier_share) * n_pairs)
+
+
+def synthetic_pair(n_pairs: int, outlier_share: float, rng: np.random.Generator) -> SyntheticPair:
+    """Draw a world, two maps of it, the motion between them and the correspondences.
+
+    Landmarks are uniform in a square about the origin of frame b, so the translation's error is the
+    displacement of the world's middle. Both landmarks of a false pair are uniform, independently.
+    The residual's variance is shared equally between the maps, whose covariances say so.
+    """
+    half_m = SIZE_M / 2
+    T_a_b = np.array([*rng.uniform(-half_m, half_m, 2), rng.uniform(-math.pi, math.pi)])
+    p_b = rng.uniform(-half_m, half_m, (n_pairs, 2))
+    p_a = p_b.copy()
+    is_true = np.arange(n_pairs) < true_pairs_of(n_pairs, outlier_share)
+    p_a[~is_true] = rng.uniform(-half_m, half_m, (np.count_nonzero(~is_true), 2))
+    own_m = SIGMA_M / math.sqrt(2)
+    p_a = se2.transform_points(T_a_b, p_a) + rng.normal(0, own_m, p_a.shape)
+    p_b = p_b + rng.normal(0, own_m, p_b.shape)
+    index_a, index_b, order = (rng.permutation(n_pairs) for _ in range(3))
+    distance = rng.uniform(0, 0.3, n_pairs)  # as what matching lets through: they tell nothing
+    map_a, map_b = _map(p_a, index_a, own_m, "a"), _map(p_b, index_b, own_m, "b")
+    pairs = Correspondences(index_a[order], index_b[order], distance)
+    return SyntheticPair(map_a, map_b, pairs, T_a_b, is_true[order])
+
+
+def _map(points_m: Float, rows: np.ndarray, sigma_m: float, name: str) -> LandmarkMap:
+    """The map whose landmark `rows[i]` is point i (N, 2)."""
+    n = len(points_m)
+    position = np.zeros((n, 3))
+    position[rows, :2] = points_m
+    return LandmarkMap(
+        position,
+        np.tile(np.diag([sigma_m**2, sigma_m**2, 0.0]), (n, 1, 1)),
+        np.full(n, _OBSERVATIONS, np.int32),
+        np.arange(n, dtype=np.int64),
+        planar=True,
+        name=name,
+    )
+
+
+TRIALS_FILE = "trials.parquet"
+CELL = {"method": TEXT, "n_pairs": INT, "outlier_share": FLOAT}
+
+# One row a trial. All but the time are the same at every run.
+TRIALS = schema(
+    "benchmark.trials",
+    1,
+    fields(
+        **CELL,
+        trial=INT,
+        status=TEXT,
+        reason=TEXT,
+        error_m=FLOAT,  # of the translation, at the middle of the world
+        error_rad=FLOAT,
+        refined_status=TEXT,
+        refined_error_m=FLOAT,
+        refined_error_rad=FLOAT,
+        oracle_error_m=FLOAT,  # least squares on the true pairs
+        oracle_error_rad=FLOAT,
+        elapsed_s=FLOAT,
+    ),
+)
+
+
+@dataclass(frozen=True)
+class CellSettings:
+    """All that one method's trials in one cell depend on, among it an aligner as scenarios have."""
+
+    name: str
+    method: str
+    parameters: dict[str, Any]
+    time_limit_s: float
+    origin: dict[str, str]
+    n_pairs: int
+    outlier_share: float
+    trials: int
+    seed: int
+    budget_s: float
+
+
+def run_cell(settings: CellSettings, job: Job) -> None:
+    """Run the trials of one cell and write them."""
+    single_threaded()
+    started = time.perf_counter()
+    n_pairs, share = settings.n_pairs, settings.outlier_share
+    aligner = callable_aligner(settings.method, settings.parameters, settings.time_limit_s)
+    registration = Registration(aligner, judge=None)  # methods are ranked by what they find
+    cell = {"method": settings.name, "n_pairs": n_pairs, "outlier_share": share}
+    rows: list[dict[str, Any]] = []
+    for trial in range(settings.trials):
+        maps = ("benchmark", n_pairs, f"{share:g}", trial)
+        pair = synthetic_pair(n_pairs, share, generator(settings.seed, *maps))
+        for _ in range(2 if trial == 0 else 1):  # the first one compiles, imports and fills caches
+            answer = _trial(registration, pair, generator(settings.seed, *maps, settings.name))
+        rows.append(cell | {"trial": trial} | answer)
+        if time.perf_counter() - started > settings.budget_s:
+            break
+    write_rows(job.output / TRIALS_FILE, TRIALS, rows)
+
+
+def _trial(
+    registration: Registration, pair: SyntheticPair, rng: np.random.Generator
+) -> dict[str, Any]:
+    estimated, refined, _ = registration.register(pair.map_a, pair.map_b, pair.correspondences, rng)
+    row = {
+        "status": str(estimated.status),
+        "reason": estimated.reason,
+        "refined_status": str(refined.status),
+        "elapsed_s": estimated.elapsed_s,
+    }
+    oracle = pair.least_squares() if pair.is_true.sum() >= 2 else np.full(3, np.nan)
+    for prefix, T in (("", estimated.T_a_b), ("refined_", refined.T_a_b), ("oracle_", oracle)):
+        x, y, theta = T - pair.T_a_b
+        row[f"{prefix}error_m"] = float(np.hypot(x, y))
+        row[f"{prefix}error_rad"] = abs(float(se2.wrap(theta)))
+    return row
+
+
+OUTLIER_SHARES = (0.5, 0.8, 0.9, 0.95, 0.99)
+PAIR_COUNTS = (60, 200, 1000, 5000)
+
+# One row a cell. n_success: accepted, and right as estimated, with Wilson's 95 % interval; n_wrong:
+# accepted, and not right; n_failed: raised, hung or answered nonsense. Errors: medians over the
+# successes; ratios: of those to the oracle's on the same maps, as estimated and after the common
+# least squares; oracle_error: medians over all trials; elapsed: median, 10th and 90th percentile.
+SUMMARY = schema(
+    "benchmark.summary",
+    1,
+    fields(
+        **CELL,
+        n_true=INT,
+        n_trials=INT,
+        status=TEXT,  # "absent" where the package is, else "ran"
+        n_success=INT,
+        **dict.fromkeys(("success", "success_low", "success_high"), FLOAT),
+        n_wrong=INT,
+        n_failed=INT,
+        **dict.fromkeys(("error_m", "error_rad", "ratio_m", "ratio_rad"), FLOAT),
+        **dict.fromkeys(("refined_ratio_m", "refined_ratio_rad"), FLOAT),
+        **dict.fromkeys(("oracle_error_m", "oracle_error_rad"), FLOAT),
+        **dict.fromkeys(("elapsed_s", "elapsed_low_s", "elapsed_high_s"), FLOAT),
+    ),
+)
+
+
+@dataclass(frozen=True)
+class BenchmarkDesign:
+    """What is measured: methods, each on the same maps, in all cells of these counts and shares.
+
+    Each of a cell's trials is on maps of its own; a cell that has taken longer than its budget ends
+    with the trials it has. The seed is of maps and methods.
+    """
+
+    aligners: tuple[AlignerEntry, ...]
+    trials: int = 100
+    seed: int = 0
+    budget_s: float = 600.0
+    pair_counts: tuple[int, ...] = PAIR_COUNTS
+    outlier_shares: tuple[float, ...] = OUTLIER_SHARES
+
+
+def entries_of(
+    methods: Sequence[str], scenario: str | Path | None = None
+) -> tuple[AlignerEntry, ...]:
+    """The methods of these names, with their default parameters, or a scenario's aligners.
+
+    With both, the scenario's aligners of these names; with neither, all known methods.
+
+    Raises:
+        InputError: a name or the scenario is unknown or unusable.
+    """
+    names = list(dict.fromkeys(methods))
+    if scenario is not None:
+        entries = {entry.name: entry for entry in settings_of(scenario).align.aligners}
+        for name in names:
+            if name not in entries:
+                raise InputError(f"{scenario}: align.aligners: none is named {name}")
+        return tuple(entries[name] for name in names or entries)
+    try:
+        for name in names:
+            find_method(name)
+    except ValueError as error:
+        raise InputError(f"--method: {error}") from error
+    return tuple(AlignerEntry(name=name, method=name) for name in names or known_methods())
+
+
+def run_benchmark(design: BenchmarkDesign, store: Store, on_progress: OnProgress) -> pd.DataFrame:
+    """All trials of all cells (TRIALS), from the store where they are there."""
+    cells = itertools.product(design.aligners, design.pair_counts, design.outlier_shares)
+    stages = [_stage(design, *cell) for cell in cells]
+    with workers(1) as this_process:
+        run_tasks(list(tasks_of(stages, store).values()), this_process, on_progress)
+    trials = [read_rows(store.path(stage) / TRIALS_FILE, TRIALS) for stage in stages]
+    return pd.concat(trials, ignore_index=True)
+
+
+def _stage(design: BenchmarkDesign, entry: AlignerEntry, n_pairs: int, share: float) -> Stage:
+    method = find_method(entry.method)
+    settings = CellSettings(
+        **dict(entry),
+        origin=method.origin(),
+        n_pairs=n_pairs,
+        outlier_share=share,
+        trials=design.trials,
+        seed=design.seed,
+        budget_s=design.budget_s,
+    )
+    loads, label = (method.target.partition(":")[0],), "measure the aligners"
+    return Stage("benchmark", label, settings, run_cell, (TRIALS_FILE,), loads=loads)
+
+
+def summarise(trials: pd.DataFrame) -> pd.DataFrame:
+    """One row a cell (see SUMMARY), in the order of the trials."""
+    keys = [trials[name] for name in CELL]
+
+    def by_cell(column: pd.Series) -> "pd.api.typing.SeriesGroupBy":
+        return column.groupby(keys, sort=False)
+
+    status = trials["status"]
+    good = {
+        prefix: (trials[f"{prefix}status"] == Status.ACCEPTED)
+        & is_right(trials[f"{prefix}error_m"], trials[f"{prefix}error_rad"])
+        for prefix in ("", "refined_")
+    }
+    absent = by_cell(status == Status.ABSENT).any()
+    n, n_success = by_cell(status).size(), by_cell(good[""]).sum()
+    low, high = wilson(n_success, n)
+    elapsed = by_cell(trials["elapsed_s"].mask(status.isin(NOT_RUN)))
+    columns = {
+        "n_trials": n,
+        "status": absent.map({True: str(Status.ABSENT), False: "ran"}),
+        "n_success": n_success,
+        "success": (n_success / n).mask(absent),
+        "success_low": pd.Series(low, n.index).mask(absent),
+        "success_high": pd.Series(high, n.index).mask(absent),
+        "n_wrong": by_cell((status == Status.ACCEPTED) & ~good[""]).sum(),
+        "n_failed": by_cell(status == Status.FAILED).sum(),
+        "elapsed_s": elapsed.median(),
+        "elapsed_low_s": elapsed.quantile(0.1),
+        "elapsed_high_s": elapsed.quantile(0.9),
+    }
+    for unit in ("m", "rad"):
+        oracle = trials[f"oracle_error_{unit}"]
+        columns[f"oracle_error_{unit}"] = by_cell(oracle).median()
+        columns[f"error_{unit}"] = by_cell(trials[f"error_{unit}"].where(good[""])).median()
+        for prefix, own in good.items():
+            error = by_cell(trials[f"{prefix}error_{unit}"].where(own)).median()
+            columns[f"{prefix}ratio_{unit}"] = error / by_cell(oracle.where(own)).median()
+    cells = pd.DataFrame(columns).reset_index()
+    cells["n_true"] = list(map(true_pairs_of, cells["n_pairs"], cells["outlier_share"]))
+    return cells[SUMMARY.names]

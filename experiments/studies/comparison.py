@@ -1,0 +1,359 @@
+"""Comparison of two versions on the same runs: changes that exceed noise.
+
+Only what both have counts: the same scenario, seed and settings (but for those left out by name),
+robot pair, iteration and aligner.
+"""
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from experiments.evaluation import alignment_summary
+from experiments.evaluation.alignment_summary import MAP_KEYS, MAP_PAIR, setting_columns
+from experiments.evaluation.criteria import (
+    ANSWERABLE_PAIRS,
+    COMMON_LANDMARKS,
+    ORACLE,
+    RICH_PAIRS,
+    is_false_merge,
+    right_refined,
+)
+from experiments.evaluation.fused_map_errors import last_fused
+from experiments.evaluation.path_errors import path_rms
+from experiments.evaluation.result_files import read_scenario
+from experiments.evaluation.team_errors import believed
+from experiments.studies import intervals
+from experiments.studies.error_bands import ROBOT_PAIR
+from experiments.studies.intervals import MAPS_OF_ONE_RUN, RUN
+from experiments.studies.run_tables import RunPath, Runs, find_runs, match_names
+from mapfusion.errors import InputError
+
+EACH_METHOD = "each method"  # fusers too
+_ROBOT = ("run_id", "robot")
+_NEES, _REFINED = "nees_with_drift", "refined_translation_error_m"
+
+
+class Quantity(NamedTuple):
+    """What two versions are compared in: a column of the rows of a table, or of those `where`.
+
+    Their counts are the lesser ones of the two versions. A change is told as a ratio b / a, as a
+    difference of shares, or as one of distances from consistency |ln(NEES per degree of freedom)|.
+    It is `of` each method, of the oracle, or of no aligner. What is timed depends on the machine
+    and its load, which runs share.
+    """
+
+    table: str
+    metric: str
+    column: str
+    scale: Literal["ratio", "share", "ln"] = "ratio"
+    of: str = ""
+    higher_is_better: bool = False
+    where: str = ""
+    timed: bool = False
+
+
+def _maps_over_oracle(errors: pd.DataFrame) -> pd.DataFrame:
+    """Rows of `maps_of`, with each map's refined error over the oracle's there."""
+    maps = alignment_summary.maps_of(errors)
+    of_oracle = maps.assign(oracle=maps[_REFINED].where(maps["aligner"] == ORACLE))
+    reference = of_oracle.groupby(MAP_PAIR)["oracle"].transform("first")
+    return maps.assign(over_oracle=maps[_REFINED] / reference)
+
+
+def _nees_per_dof(fusion: pd.DataFrame) -> pd.DataFrame:
+    true = fusion[fusion["true_pair"]]
+    per_dof = true.assign(nees=true[_NEES] / true["degrees_of_freedom"])
+    return per_dof.groupby(["run_id", *ROBOT_PAIR], sort=False)["nees"].mean().reset_index()
+
+
+def _fused_last(fusers: pd.DataFrame) -> pd.DataFrame:
+    """Each fuser's last map, as of a method."""
+    return last_fused(fusers).drop(columns="iteration").rename(columns={"fuser": "aligner"})
+
+
+def _team_alignments(pairs: pd.DataFrame) -> pd.DataFrame:
+    used, right = believed(pairs), right_refined(pairs)
+    false = is_false_merge(pairs) & used
+    off_m = pairs["team_translation_error_m"]
+    return pairs.assign(found=(right & used).astype(float), false=false.astype(float), off_m=off_m)
+
+
+_SMOOTHER = ("path_rmse_m", "landmark_rmse_m", "nees_per_dof")
+_FUSERS = ("landmark_rmse_m", "over_better_filter", "nees_per_dof", "coverage_95")
+# What is read of each table, what older runs may lack of it, and how a run's rows are reduced.
+READ: dict[str, tuple[Sequence[str] | None, Sequence[str], Callable[..., pd.DataFrame]]] = {
+    "errors": (alignment_summary.NEEDED, alignment_summary.OPTIONAL, _maps_over_oracle),
+    "robots": (["robot", "path_error_m", "odometry_error_m"], (), partial(path_rms, by=_ROBOT)),
+    "map_fits": (["map", "rmse_m"], (), pd.DataFrame),
+    "smoother": (["robot", *_SMOOTHER], (), pd.DataFrame),
+    "fusers": (["fuser", "iteration", *_FUSERS], (), _fused_last),
+    "team": (["component", "source", "rmse"], (), pd.DataFrame),
+    "team_pairs": (None, (), _team_alignments),
+    "fusion": ([*ROBOT_PAIR, "true_pair", _NEES, "degrees_of_freedom"], (), _nees_per_dof),
+    "aligner_timings": ([*MAP_KEYS, "aligner", "elapsed_s"], (), pd.DataFrame),
+}
+_GROUND = f"n_common >= {COMMON_LANDMARKS}"
+_ENOUGH, _RICH = f"n_true >= {ANSWERABLE_PAIRS}", f"n_true >= {RICH_PAIRS}"
+_OFFERED = f"aligner == '{ORACLE}' and {_ENOUGH}"
+QUANTITIES = (
+    Quantity("errors", "success estimated", "estimated_success", "share", EACH_METHOD, True),
+    Quantity("errors", "success refined", "refined_success", "share", EACH_METHOD, True),
+    Quantity("errors", "wrongly accepted", "false_accepted", "share", EACH_METHOD),
+    Quantity("errors", "accepted", "accepted", "share", EACH_METHOD, True, _GROUND),
+    Quantity("errors", "estimated error, m", "translation_error_m", of=EACH_METHOD, where=_ENOUGH),
+    Quantity("errors", "refined / oracle", "over_oracle", of=EACH_METHOD, where=_RICH),
+    Quantity("errors", "refined error, m", _REFINED, of=ORACLE, where=_ENOUGH),
+    Quantity("errors", "true pairs", "n_true", higher_is_better=True, where=_OFFERED),
+    Quantity("robots", "path RMSE, m", "path_m"),
+    Quantity("robots", "odometry RMSE, m", "odometry_m"),
+    Quantity("map_fits", "landmark RMSE, m", "rmse_m", where="map != 'fused'"),
+    Quantity("map_fits", "fused RMSE, m", "rmse_m", where="map == 'fused'"),
+    Quantity("smoother", "smoothed path RMSE, m", _SMOOTHER[0]),
+    Quantity("smoother", "smoothed landmark RMSE, m", _SMOOTHER[1]),
+    Quantity("smoother", "smoothed NEES / dof", _SMOOTHER[2], "ln"),
+    Quantity("fusers", "fused landmarks, m", _FUSERS[0], of=EACH_METHOD),
+    Quantity("fusers", "fused over filter", _FUSERS[1], of=EACH_METHOD),
+    Quantity("fusers", "fuser's NEES / dof", _FUSERS[2], "ln", EACH_METHOD),
+    Quantity("fusers", "fused in 95 %", _FUSERS[3], "share", EACH_METHOD, True),
+    Quantity("team", "team ATE, m", "rmse", where="component == 1 and source == 'final'"),
+    Quantity("team_pairs", "team's T_a_b, m", "off_m"),
+    Quantity("team_pairs", "team edges found", "found", "share", "", True, _GROUND),
+    Quantity("team_pairs", "team edges false", "false", "share"),
+    Quantity("fusion", "fused NEES / dof", "nees", "ln"),
+    Quantity("aligner_timings", "time, s", "elapsed_s", of=EACH_METHOD, timed=True),
+)
+
+
+# A change of less than one percent (or percentage point) matters to nobody who picks a method.
+LEAST_CHANGE = 0.01
+BETTER, WORSE, SAME = "better", "worse", "identical"
+NOISE, UNKNOWN = "no difference beyond noise", "cannot be judged"
+_SHOWN_NAMES = 3
+_NOT_SHOWN = ["table", "column", "of", "where", "higher_is_better"]
+_KEYS = (*MAP_PAIR, "aligner", "robot", "map", "component", "source")
+
+
+class VersionComparison(NamedTuple):
+    """What two versions differ in.
+
+    Attributes:
+        table: one row a metric; a and b are medians over all rows, means of shares; change is a
+            factor b / a, or a difference.
+        unit: what n_units counts, "run" or "maps of one run".
+        n_runs: matched.
+        notes: what a reader must know, one line each.
+    """
+
+    table: pd.DataFrame
+    unit: str
+    n_runs: int
+    notes: tuple[str, ...]
+
+    @property
+    def worse(self) -> bool:
+        """Whether anything got worse beyond noise. Times do not count: see `_notes_on`."""
+        return bool(((self.table["verdict"] == WORSE) & ~self.table["timed"]).any())
+
+
+def compare(path_a: Path, path_b: Path, apart_from: Sequence[str] = ()) -> VersionComparison:
+    """Compare the result or sweep folders of two versions.
+
+    Args:
+        path_a: of the first.
+        path_b: of the second.
+        apart_from: settings that sweeps varied, in which matched runs may differ.
+
+    Raises:
+        InputError: the two have no run in common, or no table; or such a setting is none that a
+            sweep varied, or tells two runs of one side apart.
+    """
+    a, b = find_runs(path_a), find_runs(path_b)
+    notes = _apart_from(a, b, apart_from)
+    runs_a, runs_b = (_names(*side, apart_from) for side in ((path_a, a), (path_b, b)))
+    common = runs_a & runs_b
+    if not common:
+        raise InputError(
+            f"{path_a} and {path_b}: no run in common (same scenario, seed and settings); "
+            f"the first has {_some(runs_a)}, the second {_some(runs_b)}"
+        )
+    unit = RUN if len(common) > 1 else MAPS_OF_ONE_RUN
+    rows = [_judged(*each, len(common)) for each in _all_values(a, b, apart_from)]
+    if not rows:
+        raise InputError(f"{path_a} and {path_b}: their common runs have no rows in common")
+    table = pd.DataFrame(rows)
+    table["p_holm"] = intervals.holm(table["p"].to_numpy())
+    table["verdict"] = [_verdict(row) for row in table.to_dict("records")]
+    notes += _differing_settings(a, b)
+    for names, which in ((runs_a - runs_b, "first"), (runs_b - runs_a, "second")):
+        if names:
+            runs = f"{len(names)} run{'s' * (len(names) > 1)} of the {which}"
+            notes.append(f"left out: {runs} that the other has not ({_some(names)})")
+    is_common = match_names(a.described, apart_from).isin(common)
+    worlds = a.described.loc[is_common, ["scenario", "seed"]].drop_duplicates()
+    notes += _notes_on(table, unit, len(common), len(worlds))
+    return VersionComparison(table.drop(columns=_NOT_SHOWN), unit, len(common), tuple(notes))
+
+
+def _names(path: Path, runs: Runs, apart_from: Sequence[str]) -> set[str]:
+    """What the runs of one side are matched by."""
+    names = match_names(runs.described, apart_from)
+    several = names[names.duplicated()]
+    if apart_from and len(several):
+        settings = " and ".join(apart_from)
+        raise InputError(
+            f"{path}: {several.iloc[0]} is there more than once, with other values of {settings}; "
+            "each side may have one"
+        )
+    return set(names)
+
+
+def _apart_from(a: Runs, b: Runs, settings: Sequence[str]) -> list[str]:
+    """What each side has of the settings that runs are not matched by."""
+    notes = []
+    varied = [runs.described[setting_columns(runs.described)] for runs in (a, b)]
+    for setting in settings:
+        values = [sorted(each[setting].unique()) if setting in each else [] for each in varied]
+        if not any(values):
+            known = ", ".join(sorted({str(name) for each in varied for name in each})) or "none"
+            raise InputError(f"apart from {setting}: no sweep varied this setting; known: {known}")
+        first, second = (" and ".join(each) or "as the scenario says" for each in values)
+        notes.append(f"matched apart from {setting}: {first} in the first, {second} in the second")
+    return notes
+
+
+def _judged(quantity: Quantity, method: str, values: pd.DataFrame, n_runs: int) -> dict[str, Any]:
+    """One row of the table, verdict and correction apart."""
+    is_share = quantity.scale == "share"
+    of_maps, run_id = values["change"].to_numpy(), values["run_id"]
+    changes = intervals.change_of_each_run(of_maps, run_id, n_runs, is_share)
+    found = intervals.mean_change(changes)
+    told = np.exp(found[:3]) if quantity.scale == "ratio" else found[:3]
+    a, b = values[["a", "b"]].agg("mean" if is_share else "median")
+    row = {"metric": quantity.metric, "method": method} | quantity._asdict() | {"a": a, "b": b}
+    row |= dict(zip(("change", "low", "high"), told, strict=True))
+    row |= {"n_units": len(changes), "n_rows": len(values), "p": found.p}
+    return row | {"identical": not values["change"].any()}
+
+
+def _verdict(row: dict[Any, Any]) -> str:
+    if row["identical"]:
+        return SAME
+    if row["n_units"] < 2:
+        return UNKNOWN
+    change, least = row["change"], LEAST_CHANGE
+    if row["scale"] == "ratio":
+        change, least = np.log(change), np.log1p(least)
+    if not row["p_holm"] <= intervals.SIGNIFICANCE or abs(change) < least:
+        return NOISE
+    return BETTER if (change > 0) == row["higher_is_better"] else WORSE
+
+
+def _some(names: set[str]) -> str:
+    shown = ", ".join(islice(sorted(names), _SHOWN_NAMES))
+    return shown + (f" and {len(names) - _SHOWN_NAMES} more" if len(names) > _SHOWN_NAMES else "")
+
+
+def _notes_on(table: pd.DataFrame, unit: str, n_runs: int, n_worlds: int) -> list[str]:
+    notes = []
+    if unit == MAPS_OF_ONE_RUN:
+        notes.append(
+            "weak: one run each. The noise is that between the robots and maps of this run, which "
+            "depend on each other; another seed may say otherwise. Compare six seeds or more"
+        )
+    elif n_worlds < intervals.FEW_RUNS:
+        worlds = f"{n_worlds} world{'s' * (n_worlds > 1)} (scenario and seed)"
+        notes.append(
+            f"weak: {n_runs} runs in {worlds}. The test takes the changes for normally "
+            f"distributed, which so few cannot show; compare {intervals.FEW_RUNS} seeds or more"
+        )
+    if table["timed"].any():
+        notes.append(
+            "times: all runs of a version share its machine and load, which no resampling of runs "
+            "can tell from a change of the program; they never count for --fail-if-worse"
+        )
+    return notes
+
+
+def _differing_settings(a: Runs, b: Runs) -> list[str]:
+    """Settings in which the scenarios of matched results differ."""
+    found: dict[str, str] = {}
+    for x, y in ((x, y) for x in a.results for y in b.results if x.run == y.run):
+        both = pd.DataFrame([_flat(x), _flat(y)]).fillna("absent")
+        for key, (old, new) in both.sort_index(axis=1).items():
+            if old != new:
+                found[str(key)] = f"{key} is {old} in the first and {new} in the second"
+    shown = [f"the scenarios differ: {text}" for text in islice(found.values(), _SHOWN_NAMES)]
+    more = len(found) - len(shown)
+    return [*shown, f"the scenarios differ in {more} more settings"] if more else shown
+
+
+def _flat(result: RunPath) -> dict[str, str]:
+    """Settings by dotted name, as JSON."""
+    scenario = read_scenario(result.path / "scenario.json")
+    settings = pd.json_normalize(scenario).to_dict("records")[0]
+    return {str(name): json.dumps(value) for name, value in settings.items()}
+
+
+def _all_values(
+    a: Runs, b: Runs, apart_from: Sequence[str]
+) -> Iterator[tuple[Quantity, str, pd.DataFrame]]:
+    """All quantities that both have tables for, the method, and columns run_id, a, b, change."""
+    for table in READ:
+        if not (a.has(table) and b.has(table)):
+            continue
+        rows = _joined(a, b, table, apart_from)
+        for method in [
+            *(alignment_summary.methods_in(rows, oracle=True) if "aligner" in rows else []),
+            "",
+        ]:
+            own = rows[rows["aligner"] == method] if method else rows
+            of = method if method in ("", ORACLE) else EACH_METHOD
+            for quantity in QUANTITIES:
+                if (quantity.table, quantity.of) == (table, of):
+                    values = _changes(quantity, own)
+                    if len(values):
+                        yield quantity, method, values
+
+
+def _joined(a: Runs, b: Runs, table: str, apart_from: Sequence[str]) -> pd.DataFrame:
+    """Rows of both by run and keys, values with the suffixes _a and _b; the lesser counts."""
+    columns, optional, reduce = READ[table]
+    frames = []
+    for runs in (a, b):
+        parts = []
+        for rows in runs.batches(table, columns, optional):
+            named = rows.drop(
+                columns=[*alignment_summary.RUN_KEYS, *alignment_summary.setting_columns(rows)]
+            )
+            parts.append(reduce(named.assign(run_id=match_names(rows, apart_from))))
+        # a run of one robot has no rows, and must not decide the columns' types
+        parts = [part for part in parts if len(part)] or parts[:1]
+        frames.append(pd.concat(parts, ignore_index=True))
+    keys = [name for name in _KEYS if name in frames[0]]
+    joined = frames[0].merge(frames[1], on=keys, suffixes=("_a", "_b"))
+    lesser = {
+        name: joined.filter(like=name).min(axis=1)
+        for name in alignment_summary.COUNTS
+        if name in frames[0]
+    }
+    return joined.assign(**lesser)
+
+
+def _changes(quantity: Quantity, rows: pd.DataFrame) -> pd.DataFrame:
+    """Where both versions have a value and the change is finite; success tells the rest."""
+    rows = rows.query(quantity.where) if quantity.where else rows
+    a, b = (rows[f"{quantity.column}_{side}"].to_numpy(dtype=np.float64) for side in "ab")
+    if quantity.scale == "ln":  # too small a covariance is as wrong as one too large
+        change = np.abs(intervals.log_ratio(b, np.ones(1))) - np.abs(
+            intervals.log_ratio(a, np.ones(1))
+        )
+    else:
+        change = b - a if quantity.scale == "share" else intervals.log_ratio(b, a)
+    frame = pd.DataFrame({"run_id": rows["run_id"], "a": a, "b": b, "change": change})
+    return frame[np.isfinite(a) & np.isfinite(change)]

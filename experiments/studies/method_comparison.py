@@ -1,0 +1,395 @@
+"""Comparison of aligners: success rates, paired comparison, and a recommendation.
+
+Rows of one run depend on each other: its maps grow from one another, its pairs share robots, the
+repetitions share maps. So the trials of Wilson's interval are runs (`effective_trials`).
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import combinations, compress, pairwise
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from experiments.evaluation.alignment_summary import (
+    ERROR_COLUMNS,
+    MAP_PAIR,
+    error_over_oracle,
+    maps_of,
+    methods_in,
+)
+from experiments.evaluation.criteria import ORACLE, answerable, at_the_end, has_common_ground, rich
+from experiments.evaluation.metrics import repetition_spread_m
+from experiments.evaluation.tables import SHOWN
+from experiments.studies import intervals
+from experiments.studies.intervals import (
+    RUN,
+    Interval,
+    WeightedMedian,
+    change_of_each_run,
+    clusters_of,
+    effective_trials,
+    holm,
+    log_ratio,
+    mean_change,
+    wilson,
+)
+from mapfusion.align.alignment import Status
+from mapfusion.geometry.numerics import Float
+
+LAST = "last"
+# Counts roughly double or treble from bin to bin; shares lie dense where methods begin to fail.
+# Below 3 true pairs not even the oracle has an answer worth the name.
+_COUNT_EDGES = (0, 3, 10, 30, 100, 300, 1000, np.inf)
+EDGES: dict[str, tuple[float, ...]] = {
+    "n_common": _COUNT_EDGES,
+    "n_true": _COUNT_EDGES,
+    "overlap_share": (0, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1),
+    "outlier_share": (0, 0.2, 0.5, 0.7, 0.8, 0.9, 0.95, 0.99, 1),
+    LAST: (0, np.inf),
+}
+BY = ("iteration", *EDGES)
+_ITERATION_BINS = 8
+_WITHOUT_TEST = ("estimated_success", "refined_success")
+_WITH_TEST = (*_WITHOUT_TEST, "accepted", "false_accepted", "refused_apart")
+
+
+def success_rates(
+    maps: pd.DataFrame, by: str, edges: Sequence[float] | None = None
+) -> pd.DataFrame:
+    """Success rates of each method over rows of `maps_of`, binned.
+
+    Args:
+        maps: for overlap_share, only rows that `with_overlap_share` went over.
+        by: iteration, n_common (landmarks that truly correspond), overlap_share (n_common over
+            the smaller map's landmarks), n_true (true pairs among the correspondences),
+            outlier_share (1 - n_true / n_correspondences) or last (the last iteration of each
+            robot pair alone).
+        edges: of the bins, rising; each holds its lower edge, the last one both.
+
+    Returns:
+        One row per bin and method: from, to, aligner, n_runs, n_maps, n_apart (those without common
+        ground), unit, and shares with their 95 % interval (_low, _high): of the maps with
+        common ground estimated_success, refined_success and accepted; of all false_accepted; of
+        those without common ground refused_apart. Without a test of acceptance the first two.
+
+    Raises:
+        ValueError: an unknown `by`, or edges that do not rise.
+    """
+    if by not in BY:
+        raise ValueError(f"by: is {by}, expected one of {', '.join(BY)}")
+    if by != LAST and by not in maps:
+        raise ValueError(f"by: these rows have no {by}")
+    used = at_the_end(maps) if by == LAST else maps
+    clusters = clusters_of(used)
+    # of LAST a single bin holds all
+    values = used["n_common" if by == LAST else by].to_numpy(dtype=np.float64)
+    chosen = np.asarray(_edges(by, values) if edges is None else edges, dtype=np.float64)
+    if len(chosen) < 2 or np.any(np.diff(chosen) <= 0):
+        raise ValueError("edges: must be two or more that rise")
+    place = np.searchsorted(chosen, values, side="right") - 1
+    place[values == chosen[-1]] = len(chosen) - 2
+    rows = []
+    for number, limits in enumerate(pairwise(chosen)):
+        for aligner in methods_in(maps, oracle=True):
+            inside = (place == number) & (used["aligner"] == aligner).to_numpy()
+            if inside.any():
+                row = dict(zip(("from", "to"), limits, strict=True)) | {"aligner": aligner}
+                row |= _rates(used[inside], clusters.codes[inside])
+                rows.append(row | {"unit": clusters.unit})
+    rates = pd.DataFrame(rows)
+    return rates.drop(columns=["from", "to"]) if by == LAST else rates
+
+
+def _edges(by: str, values: Float) -> Sequence[float]:
+    if by != "iteration":
+        return EDGES[by]
+    iterations = np.unique(values)
+    groups = np.array_split(iterations, min(_ITERATION_BINS, len(iterations)))
+    return [*(group[0] for group in groups), values.max() + 1]
+
+
+def _rates(rows: pd.DataFrame, codes: np.ndarray) -> dict[str, Any]:
+    """Shares of one bin and method, with their intervals."""
+    ground = has_common_ground(rows).to_numpy()
+    found: dict[str, Any] = {"n_runs": rows["run_id"].nunique(), "n_maps": len(rows)}
+    found |= {"n_apart": int(np.count_nonzero(~ground))}
+    for name in _WITH_TEST if rows["accepted"].notna().any() else _WITHOUT_TEST:
+        known = rows[name].notna().to_numpy() & (ground if name == "accepted" else True)
+        share = low = high = np.nan
+        if known.any():
+            n = effective_trials(np.unique(codes[known], return_counts=True)[1])
+            share = float(rows[name][known].mean())
+            low, high = map(float, wilson(share * n, n))
+        found |= {name: share, f"{name}_low": low, f"{name}_high": high}
+    return found
+
+
+STAGES = {"estimated": "translation_error_m", "refined": "refined_translation_error_m"}
+
+
+def oracle_ratios(maps: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
+    """Median translation error over the oracle's, for each method, as estimated and refined.
+
+    On the rich ones of rows of `maps_of`: `error_over_oracle` with intervals. Medians run over
+    runs, robot pairs and iterations; whole runs are resampled, the same for method and oracle.
+
+    Returns:
+        One row a method: aligner, n_runs, n_maps, unit, and for estimated and refined the share of
+        answers with an estimate (_share; without one the error is infinite), the median error in
+        metres (_m), the ratio (_ratio) and its interval (_ratio_low, _ratio_high).
+    """
+    maps = rich(maps)
+    clusters = clusters_of(maps)
+
+    def median(aligner: str, column: str) -> WeightedMedian:
+        own = (maps["aligner"] == aligner).to_numpy()
+        return WeightedMedian(maps[column].to_numpy()[own], clusters.codes[own])
+
+    below = median(ORACLE, STAGES["refined"])
+    rows = []
+    for aligner in methods_in(maps, oracle=True):
+        own = maps[maps["aligner"] == aligner]
+        row: dict[str, Any] = {"aligner": aligner, "n_runs": own["run_id"].nunique()}
+        row |= {"n_maps": len(own), "unit": clusters.unit}
+        for stage, column in STAGES.items():
+            ratio = partial(_ratio, median(aligner, column), below)
+            interval = intervals.percentile_interval(ratio, clusters.n, rng)
+            row |= {f"{stage}_share": own[f"{stage}_share"].mean()}
+            row |= {f"{stage}_m": own[column].median()} | interval.columns(f"{stage}_ratio")
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _ratio(above: WeightedMedian, below: WeightedMedian, counts: Float) -> Float:
+    divisor = below(counts)
+    return above(counts) / np.where(divisor > 0, divisor, np.nan)
+
+
+def compare_methods(maps: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
+    """Every two methods on the same rich maps: ratio of their errors, and who is nearer how often.
+
+    A method without an estimate on a map is infinitely far off there; where both have none it is a
+    draw. Compared are translation errors as estimated.
+
+    Returns:
+        One row per pair of methods: first, second, n_runs, n_maps, unit; ratio, the median over the
+        maps of the first one's error over the second's, with its interval (whole runs resampled);
+        first_wins, the share of maps on which the first is nearer (draws count half), likewise;
+        p, of the runs' median log ratios (NaN for a single run), and p_holm, corrected for the
+        number of pairs.
+    """
+    frame = paired_values(rich(maps), "translation_error_m").reset_index()
+    clusters = clusters_of(frame)
+    rows = []
+    for first, second in combinations(methods_in(rich(maps)), 2):
+        known = frame[[first, second]].notna().all(axis=1).to_numpy()
+        both, judged = frame[known], clusters._replace(codes=clusters.codes[known])
+        change = log_ratio(both[first].to_numpy(), both[second].to_numpy())
+        ratio = intervals.median_interval(change, judged, rng)
+        won = (change < 0) + 0.5 * (change == 0)
+        wins = intervals.weighted_mean_interval(won, np.ones(len(won)), judged, rng)
+        row: dict[str, Any] = {"first": first, "second": second}
+        row |= {"n_runs": both["run_id"].nunique(), "n_maps": len(both), "unit": clusters.unit}
+        row |= Interval(*np.exp(ratio)).columns("ratio") | wins.columns("first_wins")
+        of_runs = change_of_each_run(change, both["run_id"], clusters.n)
+        rows.append(row | {"p": mean_change(of_runs).p if clusters.unit == RUN else np.nan})
+    compared = pd.DataFrame(rows)
+    return compared.assign(p_holm=holm(compared["p"].to_numpy())) if rows else compared
+
+
+def paired_values(maps: pd.DataFrame, column: str) -> pd.DataFrame:
+    """A column of `maps_of`: one row per pair of maps, one column a method."""
+    return maps.pivot_table(index=MAP_PAIR, columns="aligner", values=column, dropna=False)
+
+
+# Aligners are equal if the test does not tell them apart and what was measured lies no farther
+# apart than this: what few runs cannot prove they do not disprove either. Shares: by one map, which
+# chance decides, or of many by one in twenty: the robots go on and meet there again, and a merge
+# that now and then comes later costs less than larger errors or more time everywhere.
+_EQUAL_SHARE = 0.05
+_ROUNDING = 1e-9  # in sums of repetitions' shares
+# Errors: by the median map, which a lost one does not move. Good estimates are a few decimetres
+# off: a tenth of that is less than the maps' own drift, and the refinement evens it out.
+_EQUAL_LOG_RATIO = math.log(1.1)
+
+# The names that a `Standing` has for columns of `SHOWN`, and for the rates' of `success_rates`.
+_ERRORS = dict(
+    zip(ERROR_COLUMNS, ("estimated_m", "estimated_rad", "refined_m", "refined_rad"), strict=True)
+)
+_RATES = {"refined_success": "rate", "refined_success_low": "low", "refined_success_high": "high"}
+
+
+@dataclass(frozen=True)
+class Standing:
+    """One aligner's record.
+
+    On `n_maps` pairs of maps with common ground it was right, refined, at the `rate`, with its 95 %
+    Wilson interval (trials are runs, or the maps of one run). Errors are medians over answerable
+    maps, infinite where more than half have no estimate; over the oracle's refined ones on rich
+    maps. On all maps `n_accepted` estimates were accepted, `n_false` of them wrongly. `shown` are
+    the further columns of `SHOWN`.
+    """
+
+    aligner: str
+    n_maps: int
+    rate: float
+    low: float
+    high: float
+    estimated_m: float
+    estimated_rad: float
+    refined_m: float
+    refined_rad: float
+    over_oracle: float
+    n_accepted: int
+    n_false: int
+    time_ms: float
+    shown: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Recommendation:
+    """Which aligner to use.
+
+    `best` is None where no aligner was ever right; these data cannot tell the `equals` from it.
+    `standings` are all aligners but the oracle, the best first. Of `n_maps` pairs of maps
+    `n_common` have common ground. Runs of different worlds are the only things here that are
+    independent of each other; runs of one scenario and seed share their world.
+    """
+
+    best: Standing | None
+    equals: tuple[str, ...]
+    standings: tuple[Standing, ...]
+    n_maps: int
+    n_common: int
+    n_runs: int
+    n_worlds: int
+    n_scenarios: int
+    oracle_m: float
+    oracle_rad: float
+
+
+def aligner_summary(
+    errors: pd.DataFrame, timings: pd.DataFrame, aligners: Sequence[str]
+) -> pd.DataFrame:
+    """The shown columns of the table `errors`, reduced as `tables.Shown` says, for each aligner.
+
+    With spread_m, the 10-90 % range of the repetitions, and time_ms, where there are timings.
+    """
+    errors = errors[errors["status"] != Status.ABSENT]
+    own = {name: answerable(errors[errors["aligner"] == name]) for name in aligners}
+    shown = _shown_columns(maps_of(errors)).reindex(pd.Index(aligners, name="aligner"))
+    spread_m = [repetition_spread_m(rows) for rows in own.values()]
+    return shown.assign(spread_m=spread_m, time_ms=_median_times_ms(timings)).reset_index()
+
+
+def _shown_columns(maps: pd.DataFrame) -> pd.DataFrame:
+    """By aligner, the columns of `SHOWN` from rows of `maps_of`; NaN where these have none."""
+    names = {
+        kind: [name for name, how in SHOWN.items() if how.kind == kind and name in maps]
+        for kind in ("error", "given", "share")
+    }
+    answers = answerable(maps).groupby("aligner", sort=False)
+    ground = maps[has_common_ground(maps)].groupby("aligner", sort=False)
+    parts = [answers[names["error"]].median(), answers[names["given"]].mean()]
+    return pd.concat([*parts, ground[names["share"]].mean()], axis=1).reindex(columns=list(SHOWN))
+
+
+def _median_times_ms(timings: pd.DataFrame) -> pd.Series:
+    """Median time of one alignment, by aligner."""
+    if timings.empty:
+        return pd.Series(dtype=np.float64)
+    return 1e3 * timings.groupby("aligner")["elapsed_s"].median()
+
+
+def recommend(maps: pd.DataFrame, timings: pd.DataFrame, aligners: list[str]) -> Recommendation:
+    """Rank the aligners, given in display order, by rows of `maps_of` and of `aligner_timings`.
+
+    First by the share of right results; among those equal to the first, by the error as estimated,
+    pair of maps by pair of maps; among those still equal, by time, where there are timings.
+    `better` tells what the test takes for a unit; of a single run the ranking is a hint.
+    """
+    ground = maps[has_common_ground(maps)]
+    standings = _standings(maps, timings, [name for name in aligners if name != ORACLE])
+    ranked, equals = _ranked(standings, ground)
+    best = ranked[0] if ranked and ranked[0].rate > 0 else None
+    oracle = answerable(maps[maps["aligner"] == ORACLE])
+    return Recommendation(
+        best,
+        equals if best else (),
+        tuple(ranked),
+        len(maps.drop_duplicates(MAP_PAIR)),
+        len(ground.drop_duplicates(MAP_PAIR)),
+        maps["run_id"].nunique(),
+        len(maps[["scenario", "seed"]].drop_duplicates()),
+        maps["scenario"].nunique(),
+        float(oracle["refined_translation_error_m"].median()),
+        float(oracle["refined_rotation_error_rad"].median()),
+    )
+
+
+def _standings(maps: pd.DataFrame, timings: pd.DataFrame, aligners: list[str]) -> list[Standing]:
+    is_ground = has_common_ground(maps)
+    times = maps[["accepted", "false_accepted"]].mul(maps["n_repetitions"], axis=0)
+    counted = times.set_axis(["n_accepted", "n_false"], axis=1).assign(n_maps=is_ground)
+    counts = counted.groupby(maps["aligner"]).sum().round()
+    shown = _shown_columns(maps)
+    found = shown[list(_ERRORS)].rename(columns=_ERRORS).reindex(aligners)
+    found = found.assign(
+        over_oracle=error_over_oracle(rich(maps), "refined_translation_error_m"),
+        time_ms=_median_times_ms(timings),
+        **dict.fromkeys(_RATES.values(), math.nan),
+    )
+    if is_ground.any():
+        rates = success_rates(maps[is_ground], "n_common", (0, math.inf)).set_index("aligner")
+        found = found.assign(**{name: rates[column] for column, name in _RATES.items()})
+    rows: Any = found.join(counts.reindex(aligners, fill_value=0).astype(int)).to_dict("index")
+    further: Any = shown.drop(columns=list(_ERRORS)).to_dict("index")
+    return [Standing(aligner=name, shown=further.get(name, {}), **rows[name]) for name in aligners]
+
+
+def _ranked(
+    standings: list[Standing], ground: pd.DataFrame
+) -> tuple[list[Standing], tuple[str, ...]]:
+    """All standings, the best first, and who is equal to the best."""
+    by_rate = sorted(
+        standings, key=lambda s: (-_or_last(s.rate, 0.0), _or_last(s.estimated_m), s.time_ms)
+    )
+    if not by_rate or ground.empty:
+        return by_rate, ()
+    contenders = _equal_to_first(by_rate, ground, "refined_success")
+    contenders.sort(key=lambda s: _or_last(s.estimated_m))
+    equal = _equal_to_first(contenders, ground, "translation_error_m")
+    equal.sort(key=lambda s: _or_last(s.time_ms))
+    rest = [s for s in contenders if s not in equal]
+    others = [s for s in by_rate if s not in contenders]
+    return [*equal, *rest, *others], tuple(s.aligner for s in equal[1:])
+
+
+def _or_last(value: float, missing: float = math.inf) -> float:
+    """A sorting key for what may not have been measured."""
+    return missing if math.isnan(value) else value
+
+
+def _equal_to_first(standings: list[Standing], maps: pd.DataFrame, column: str) -> list[Standing]:
+    """The first, and those that neither the test nor the band tells from it in this column."""
+    values, is_share = paired_values(maps, column), column == "refined_success"
+    p_values, near = [], []
+    for standing in standings[1:]:
+        judged = values[[standings[0].aligner, standing.aligner]].dropna()  # by both
+        n, (first, own) = len(judged), judged.to_numpy(np.float64).T
+        changes = own - first if is_share else intervals.log_ratio(own, first)
+        run_id = judged.index.get_level_values("run_id")
+        n_runs = maps["run_id"].nunique()
+        of_runs = intervals.change_of_each_run(changes, run_id, n_runs, is_share)
+        p_values.append(intervals.mean_change(of_runs).p)
+        apart = pd.Series(changes).clip(-intervals.LARGEST_LOG_RATIO, intervals.LARGEST_LOG_RATIO)
+        if is_share:
+            near.append(abs(apart.mean()) * n <= max(1, _EQUAL_SHARE * n) + _ROUNDING)
+        else:
+            near.append(abs(apart.median()) <= _EQUAL_LOG_RATIO)
+    same = np.array(near, bool) & ~(intervals.holm(np.array(p_values)) <= intervals.SIGNIFICANCE)
+    return [standings[0], *compress(standings[1:], same)]

@@ -1,0 +1,18 @@
+"""What the commands that fit numbers of the verdict are asked: worlds, seeds, where they lie."""
+
+import argparse
+from pathlib import Path
+
+from experiments.scenario.seeds import parse_seeds
+from experiments.studies.refusal.cases import MappedWorld, worlds_of
+
+
+def worlds_asked_for(description: str | None) -> tuple[list[MappedWorld], dict[str, str]]:
+    """The worlds of this process's arguments, and how a written file names them."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("worlds", nargs="+")
+    parser.add_argument("--seeds", default="0")
+    parser.add_argument("--results", type=Path, default=Path("results"))
+    given = parser.parse_args()
+    worlds = worlds_of(given.worlds, parse_seeds(given.seeds), given.results)
+    return worlds, {"seeds": given.seeds.replace("..", " to "), "worlds": ", ".join(given.worlds)}

@@ -1,0 +1,323 @@
+"""Refusal study: every aligner on maps with and without common ground.
+
+All correspondences are false and independent: what the bound promises can be counted. Every motion
+that two correspondences determine is judged, which is more than any estimator tries.
+"""
+
+import functools
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from experiments.evaluation.tables import table_path
+from experiments.methods.aligner_calls import callable_aligner
+from experiments.pipeline.stages.match import known_at
+from experiments.pipeline.tables import BOOL, FLOAT, INT, TEXT, fields, read_rows, write_rows
+from experiments.pipeline.tasks import OnProgress
+from experiments.pipeline.workers import workers
+from experiments.scenario.seeds import generator
+from experiments.scenario.settings import Simulation
+from experiments.studies.refusal import cases
+from experiments.studies.refusal.cases import Case, MappedWorld
+from mapfusion.align.alignment import Pairs
+from mapfusion.align.rigid_motion import fit_rigid
+from mapfusion.files import schema
+from mapfusion.geometry import se2
+from mapfusion.geometry.numerics import Float, kernel
+from mapfusion.registration import Registration
+from mapfusion.verification.false_alarms import (
+    Acceptance,
+    IndependentPairs,
+    fewest_false_alarms,
+    independent_pairs,
+)
+
+N_PAIRS_OF_MAPS = 5000
+N_CORRESPONDENCES = 40
+SIZE_M = (13.0, 7.0)  # as quick.yaml's hall
+N_WALLS = 8
+STATED = (1e-3, 1e-2, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
+
+
+def points_on_walls(rng: np.random.Generator, n: int) -> Float:
+    """Points (n, 2) on random walls parallel to the axes, wall against wall as rooms have them."""
+    corners = rng.uniform(0, SIZE_M, (N_WALLS, 2))
+    length_m = rng.uniform(1.0, 6.0, N_WALLS)
+    along_x = rng.random(N_WALLS) < 0.5
+    wall = rng.integers(N_WALLS, size=n)
+    offset = rng.random(n) * length_m[wall]
+    return corners[wall] + np.where(along_x[wall, None], [1.0, 0.0], [0.0, 1.0]) * offset[:, None]
+
+
+def calibrate(acceptance: Acceptance, rng: np.random.Generator, n_pairs: int) -> pd.DataFrame:
+    """Rows of the table `calibration`, of so many pairs of maps."""
+    gates = np.array(sorted(acceptance.gates_m))
+    bounds = np.log10(STATED)
+    counts = np.zeros((n_pairs, len(STATED)), np.int64)
+    for k in range(n_pairs):
+        p_a, p_b = points_on_walls(rng, N_CORRESPONDENCES), points_on_walls(rng, N_CORRESPONDENCES)
+        pairs = independent_pairs(p_a, p_b, np.zeros((N_CORRESPONDENCES, 4)))
+        counts[k] = accepted_motions(pairs, gates, bounds)
+    columns = {"stated": STATED, "motions_a_pair": counts.mean(axis=0)}
+    columns |= {"n_accepted": np.count_nonzero(counts, axis=0), "n_pairs": n_pairs}
+    return pd.DataFrame(columns)
+
+
+@kernel
+def accepted_motions(pairs: IndependentPairs, gates_m: Float, bounds_log10: Float) -> np.ndarray:
+    """How many motions of two of the pairs have an NFA up to each bound (S,)."""
+    p_a, p_b = pairs.p_a, pairs.p_b
+    counts = np.zeros(len(bounds_log10), np.int64)
+    T_a_b = np.empty(3)
+    two = np.empty(2, np.int64)
+    for j in range(len(p_a)):
+        for i in range(j):
+            two[0], two[1] = i, j
+            T_a_b[0], T_a_b[1], T_a_b[2] = fit_rigid(p_a, p_b, two)
+            log10, _, _, _ = fewest_false_alarms(pairs, T_a_b, gates_m)
+            for s in range(len(bounds_log10)):
+                counts[s] += log10 <= bounds_log10[s]
+    return counts
+
+
+REPEATED_PER_WORLDS = 9  # posters hung in each pair of worlds
+REPEATED_WORLDS = 35  # pairs of worlds that posters are hung in
+# Two worlds that are crossed give so many pairs of maps: few, as those of two worlds are alike.
+MEETINGS_PER_WORLDS = 10
+# The kind of maps of two kinds of worlds: of ordinary ones, and where either repeats itself.
+CROSSED, CROSSED_REPEATING = "crossed", "crossed_repeating"
+
+# In `FOLDER/tables/`.
+TABLES = {
+    # One row per (pair of maps, aligner); errors are NaN for maps of two worlds.
+    "refusals": schema(
+        "refusal.refusals",
+        2,
+        fields(
+            kind=TEXT,  # scenario of both worlds; crossed or crossed_repeating, of two
+            repeats=BOOL,  # pictures of either world are found in several places
+            ground=TEXT,  # apart, common, few or repeated (see cases.py)
+            poster_radius_m=FLOAT,  # NaN without a poster
+            **dict.fromkeys(("world_a", "robot_a", "world_b", "robot_b"), TEXT),
+            iteration=INT,
+            aligner=TEXT,
+            **dict.fromkeys(("n_correspondences", "n_true", "n_common"), INT),
+            n_inliers=INT,  # of the refined alignment: what a threshold on support would go by
+            status=TEXT,  # the verdict on the refined alignment
+            accepted=BOOL,
+            beats_chance=BOOL,  # passes the test against chance, whatever else is said
+            log10_false_alarms=FLOAT,
+            probability=FLOAT,  # that it is right, as the verdict states it; NaN where it does not
+            refined_translation_error_m=FLOAT,
+            refined_rotation_error_rad=FLOAT,
+        ),
+    ),
+    # The test itself on made-up maps of walls with random pairs, over every motion of two pairs.
+    "calibration": schema(
+        "refusal.calibration",
+        1,
+        fields(
+            stated=FLOAT,  # expected number of false alarms accepted
+            motions_a_pair=FLOAT,  # mean number of motions accepted on a pair of maps
+            n_accepted=INT,  # pairs of maps with at least one
+            n_pairs=INT,
+        ),
+    ),
+}
+
+Rows = list[dict[str, Any]]
+Meeting = tuple[str, str, int]  # a robot of each of two worlds, at one iteration
+
+
+class Crossing(NamedTuple):
+    """Two worlds of different seeds, and what is done with their maps.
+
+    Attributes:
+        a: whose maps are the first of each pair.
+        b: whose are the second.
+        meetings: pairs of maps.
+        hung: whether posters of a are hung in b.
+    """
+
+    a: MappedWorld
+    b: MappedWorld
+    meetings: list[Meeting]
+    hung: bool
+
+
+class PairsDrawn(NamedTuple):
+    """How many pairs of maps are judged.
+
+    Attributes:
+        n_apart: of those that worlds of different seeds have, for each kind of world, and as many
+            of worlds of two kinds.
+        every: of each run the maps at its last iteration and at each so many before it: those of
+            neighbouring iterations say the same.
+    """
+
+    n_apart: int
+    every: int = 1
+
+
+def read(folder: Path, name: str) -> pd.DataFrame:
+    """Read the table of that name; raises InputError that names the file."""
+    return read_rows(table_path(folder, name), TABLES[name])
+
+
+def run(
+    worlds: Sequence[MappedWorld],
+    output: Path,
+    drawn: PairsDrawn,
+    jobs: int,
+    on_progress: OnProgress,
+) -> float:
+    """Write the tables into a folder; returns the number of false alarms that was accepted.
+
+    The first world's scenario gives methods.
+    """
+    scenario = worlds[0].scenario
+    crossings = crossings_of(worlds, drawn.n_apart, generator(scenario.seed, "refusal"))
+    done: dict[tuple[str, str], Rows] = {}
+    with workers(jobs) as pool:
+        for world in worlds:
+            pool.submit((world.name, ""), common_rows, scenario, world, drawn.every)
+        for each in crossings:
+            pool.submit((each.a.name, each.b.name), apart_rows, scenario, each)
+        for names, rows in pool.completed():
+            done[names] = rows
+            on_progress("cross the worlds", len(done), len(worlds) + len(crossings))
+    acceptance, rng = scenario.align.acceptance, generator(scenario.seed, "calibration")
+    made = {
+        "refusals": [row for names in sorted(done) for row in done[names]],
+        "calibration": calibrate(acceptance, rng, N_PAIRS_OF_MAPS),
+    }
+    for name, rows in made.items():
+        write_rows(table_path(output, name), TABLES[name], rows)
+    return acceptance.false_alarms
+
+
+def crossings_of(worlds: Sequence[MappedWorld], n: int, rng: np.random.Generator) -> list[Crossing]:
+    """Pairs of worlds of different seeds, with the pairs of maps drawn from each.
+
+    Of each kind n pairs of maps, and n of different kinds, or all there are in the pairs of worlds
+    drawn. Posters hang in pairs of worlds that do not repeat themselves.
+    """
+    strangers = [
+        (a, b) for a, b in itertools.combinations(worlds, 2) if a.scenario.seed != b.scenario.seed
+    ]
+    hung = _drawn(
+        [k for k, pair in enumerate(strangers) if not _repeats(*pair)], REPEATED_WORLDS, rng
+    )
+    meetings: dict[int, list[Meeting]] = {k: [] for k in hung}
+    kinds = [_kind(a, b) for a, b in strangers]
+    for kind in sorted(set(kinds)):
+        of_kind = [k for k, name in enumerate(kinds) if name == kind]
+        met = _drawn(of_kind, -(-n // MEETINGS_PER_WORLDS), rng)
+        possible = [(k, meeting) for k in met for meeting in _possible(*strangers[k])]
+        for place in _drawn(range(len(possible)), n, rng):
+            k, meeting = possible[place]
+            meetings.setdefault(k, []).append(meeting)
+    return [Crossing(*strangers[k], meetings[k], k in hung) for k in sorted(meetings)]
+
+
+def _drawn(items: Sequence[int], n: int, rng: np.random.Generator) -> list[int]:
+    """At most n of the items, in their order."""
+    return [items[k] for k in np.sort(rng.permutation(len(items))[:n])]
+
+
+def _possible(a: MappedWorld, b: MappedWorld) -> list[Meeting]:
+    both = sorted({*a.iterations} & {*b.iterations})
+    return list(itertools.product(a.folders, b.folders, both))
+
+
+def _kind(a: MappedWorld, b: MappedWorld) -> str:
+    if a.kind == b.kind:
+        return a.kind
+    return CROSSED_REPEATING if _repeats(a, b) else CROSSED
+
+
+def _repeats(a: MappedWorld, b: MappedWorld) -> bool:
+    return a.repeats or b.repeats
+
+
+def common_rows(scenario: Simulation, world: MappedWorld, every: int) -> Rows:
+    """COMMON pairs of one world, and FEW ones unless it repeats itself."""
+    matching, radius_m = scenario.align.match, scenario.evaluate.true_pair_radius_m
+    rows: Rows = []
+    for (a, b), iteration in itertools.product(
+        itertools.combinations(world.robots(), 2), world.iterations[::-1][::every][::-1]
+    ):
+        met = [cases.common(a, b, iteration, matching, radius_m)]
+        if not world.repeats:
+            rng = generator(scenario.seed, "few", world.name, a.name, b.name, iteration)
+            met += filter(None, [cases.few(met[0], rng)])
+        for case in met:
+            rows += _answers(scenario, case, (world, world), iteration)
+    return rows
+
+
+def apart_rows(scenario: Simulation, crossing: Crossing) -> Rows:
+    """APART and REPEATED pairs of two worlds."""
+    worlds, matching = (crossing.a, crossing.b), scenario.align.match
+    of_a, of_b = functools.cache(crossing.a.maps), functools.cache(crossing.b.maps)
+    rows: Rows = []
+    for robot_a, robot_b, iteration in crossing.meetings:
+        maps = known_at(of_a(robot_a), iteration), known_at(of_b(robot_b), iteration)
+        rows += _answers(scenario, cases.apart(*maps, matching), worlds, iteration)
+    if len(crossing.a.folders) < 2 or not crossing.hung:  # no partner has seen what robot a saw
+        return rows
+    in_a, in_b = ({robot.name: robot for robot in world.robots()} for world in worlds)
+    last = min(world.iterations[-1] for world in worlds)
+    first, partner, *_ = in_a.values()
+    source = cases.common(first, partner, last, matching, scenario.evaluate.true_pair_radius_m)
+    others = [known_at(robot.maps, last) for robot in in_b.values()]
+    for number in range(REPEATED_PER_WORLDS):
+        each, size = divmod(number, len(cases.POSTER_RADII_M))  # each robot meets each size
+        rng = generator(scenario.seed, "poster", crossing.a.name, crossing.b.name, number)
+        other, radius_m = others[each % len(others)], cases.POSTER_RADII_M[size]
+        case = cases.repeated(source, other, radius_m, matching, rng)
+        if case is not None:
+            rows += _answers(scenario, case, worlds, last)
+    return rows
+
+
+def _answers(
+    scenario: Simulation, case: Case, worlds: tuple[MappedWorld, MappedWorld], iteration: int
+) -> Rows:
+    """One row an aligner: its refined alignment, judged."""
+    settings = scenario.align
+    names: dict[str, Any] = {"kind": _kind(*worlds), "repeats": _repeats(*worlds)}
+    names |= {"ground": case.ground, "poster_radius_m": case.poster_radius_m}
+    names |= {"world_a": worlds[0].name, "robot_a": case.map_a.name}
+    names |= {"world_b": worlds[1].name, "robot_b": case.map_b.name, "iteration": iteration}
+    bound = np.log10(settings.acceptance.false_alarms)
+    pairs = Pairs(case.map_a, case.map_b, case.pairs)
+    judged = settings.judge.on(pairs)  # evidence is sought once, where an answer beats chance
+    rows = []
+    for entry in settings.aligners:
+        rng = generator(scenario.seed, *map(str, names.values()), entry.name)
+        aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
+        registration = Registration(aligner, settings.refinement, judge=None)
+        refined = registration.register(case.map_a, case.map_b, case.pairs, rng).refined
+        verdict = judged.judge(refined)
+        error = refined.T_a_b - case.T_true
+        found = {
+            "aligner": entry.name,
+            "n_correspondences": len(case.pairs),
+            "n_true": int(case.is_true.sum()),
+            "n_common": case.n_common,
+            "n_inliers": int(refined.inlier.sum()),
+            "status": str(verdict.status),
+            "accepted": verdict.accepted,
+            "beats_chance": bool(verdict.log10_false_alarms <= bound),
+            "log10_false_alarms": verdict.log10_false_alarms,
+            "probability": verdict.probability,
+            "refined_translation_error_m": np.hypot(error[0], error[1]),
+            "refined_rotation_error_rad": float(se2.wrap(error[2])),
+        }
+        rows.append(names | found)
+    return rows

@@ -1,0 +1,347 @@
+"""Statistics over many runs: all tables, by name."""
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from experiments.evaluation.alignment_summary import (
+    MAP_KEYS,
+    NEEDED,
+    OPTIONAL,
+    maps_of,
+    setting_columns,
+)
+from experiments.evaluation.criteria import (
+    has_common_ground,
+    is_false_merge,
+    right_refined,
+    that_ever_meet,
+)
+from experiments.evaluation.fused_landmarks import mean_nees_band
+from experiments.evaluation.fused_map_errors import last_fused
+from experiments.evaluation.path_errors import STATISTICS
+from experiments.evaluation.team_errors import believed
+from experiments.scenario.seeds import generator
+from experiments.studies import intervals
+from experiments.studies.error_bands import ROBOT_PAIR, error_bands, medians_of_run, time_bands
+from experiments.studies.method_comparison import (
+    LAST,
+    compare_methods,
+    oracle_ratios,
+    success_rates,
+)
+from experiments.studies.run_tables import Runs
+from mapfusion.align.alignment import Status
+
+FUSION_COLUMNS = ("nees_with_drift", "nees_without_drift", "degrees_of_freedom", "true_pair")
+SMOOTHER_COLUMNS = ("path_rmse_m", "filter_over_smoother", "landmark_rmse_m", "gross_share")
+SMOOTHER_COLUMNS += ("nees_per_dof", "coverage_95")
+_FUSER_FIGURES = ("landmark_rmse_m", "over_better_filter", "nees_per_dof", "coverage_95")
+FUSER_COLUMNS = ("fuser", "iteration", *_FUSER_FIGURES)
+_PATH_KEYS = ["source", "quantity", "delta", "delta_unit"]
+
+
+def path_summary(path_statistics: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
+    """One row per source (final, online, odometry) and quantity (ATE, RPE).
+
+    Returns:
+        source, quantity, delta, delta_unit, n_runs, n_paths, the seven statistics that evo reports
+        (medians over the paths), and the interval of the median rmse, whole runs resampled.
+    """
+    rows = []
+    for keys, own in path_statistics.groupby(_PATH_KEYS, sort=False, dropna=False):
+        runs = intervals.clusters_of(own)
+        row = dict(zip(_PATH_KEYS, keys, strict=True)) | {"n_runs": runs.n, "n_paths": len(own)}
+        row |= dict(own[list(STATISTICS)].median())
+        _, low, high = intervals.median_interval(own["rmse"].to_numpy(), runs, rng)
+        rows.append(row | {"rmse_low": low, "rmse_high": high})
+    return pd.DataFrame(rows)
+
+
+def nees_of_maps(landmark_nees: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
+    """Mean NEES per degree of freedom, before merging and after.
+
+    Returns:
+        One row per kind of landmark (see `judge.tables`): landmarks, n_runs, n_landmarks,
+        nees_per_dof with its interval over the runs, band_low and band_high (where the mean of so
+        many independent landmarks would lie 95 times of 100), share_in_gate (0.95 if consistent)
+        with its interval. Landmarks of one map drift together, so a mean outside the band alone is
+        no proof for a single map; the interval over runs is the one to trust.
+    """
+    rows = []
+    known = landmark_nees[landmark_nees["n_landmarks"] > 0]
+    for kind, own in known.groupby("landmarks", sort=False):
+        runs, weight = intervals.clusters_of(own), own["n_landmarks"].to_numpy(dtype=np.float64)
+        dof, share = own["degrees_of_freedom"].to_numpy(), own["share_in_gate"].to_numpy()
+        per_dof = own["nees_mean"].to_numpy() / dof
+        nees = intervals.weighted_mean_interval(per_dof, dof * weight, runs, rng)
+        inside = intervals.weighted_mean_interval(share, weight, runs, rng)
+        # the degrees of freedom of a sum add up
+        band = dict(zip(("band_low", "band_high"), mean_nees_band(dof @ weight, 1), strict=True))
+        row = {"landmarks": kind, "n_runs": runs.n, "n_landmarks": int(weight.sum())}
+        row |= nees.columns("nees_per_dof") | band | inside.columns("share_in_gate")
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def nees_of_pairs(fusion: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
+    """The same of landmarks fused pair by pair (table `fusion`), with s_drift and without.
+
+    True pairs only; the share in the gate is not kept there, and left NaN.
+    """
+    labels = {name: f"fused in pairs, {name[5:].replace('_', ' ')}" for name in FUSION_COLUMNS[:2]}
+    true = fusion[fusion["true_pair"]].rename(columns=labels)
+    keys, values = ["run_id", "degrees_of_freedom"], list(labels.values())
+    known = true.melt(keys, values, "landmarks", "nees_mean").dropna(subset="nees_mean")
+    return nees_of_maps(known.assign(n_landmarks=1, share_in_gate=np.nan), rng)
+
+
+def smoother_summary(smoother: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
+    """One row: the batch smoother beside the filter (table `smoother`), medians over the robots.
+
+    Returns:
+        n_runs, n_robots, and each column of numbers with the interval of its median over the runs.
+    """
+    about = {"n_runs": intervals.clusters_of(smoother).n, "n_robots": len(smoother)}
+    return pd.DataFrame([about | _medians(smoother, SMOOTHER_COLUMNS, rng)])
+
+
+def fuser_summary(fusers: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
+    """One row per fuser (table `fusers`): medians over the runs, each at its last iteration.
+
+    Returns:
+        fuser, n_runs, and each column of numbers with the interval of its median over the runs.
+    """
+    rows = []
+    for fuser, own in last_fused(fusers).groupby("fuser", sort=False):
+        about = {"fuser": fuser, "n_runs": intervals.clusters_of(own).n}
+        rows.append(about | _medians(own, _FUSER_FIGURES, rng))
+    return pd.DataFrame(rows)
+
+
+def _medians(
+    rows: pd.DataFrame, names: Sequence[str], rng: np.random.Generator
+) -> dict[str, float]:
+    runs, found = intervals.clusters_of(rows), dict[str, float]()
+    for name in names:
+        values = intervals.median_interval(rows[name].to_numpy(), runs, rng)
+        found |= dict(zip((name, f"{name}_low", f"{name}_high"), values, strict=True))
+    return found
+
+
+_ERRORS = {
+    "alone_m": "refined_translation_error_m",
+    "alone_rad": "refined_rotation_error_rad",
+    "team_m": "team_translation_error_m",
+    "team_rad": "team_rotation_error_rad",
+}
+
+
+def team_paths(team: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
+    """One row per source (final, online, odometry), of each run's largest set of merged robots.
+
+    Returns:
+        source, n_runs, n_robots of n_team (sums over the runs), evo's seven statistics of all
+        their positions under one rigid fit (medians over the runs), and the interval of the median
+        rmse.
+    """
+    rows = []
+    for source, own in team[team["component"] == 1].groupby("source", sort=False):
+        row: dict[str, Any] = {"source": source, "n_runs": len(own)}
+        row |= dict(own[["n_robots", "n_team"]].sum()) | dict(own[list(STATISTICS)].median())
+        runs = intervals.clusters_of(own)
+        _, low, high = intervals.median_interval(own["rmse"].to_numpy(), runs, rng)
+        rows.append(row | {"rmse_low": low, "rmse_high": high})
+    return pd.DataFrame(rows)
+
+
+def team_alignments(pairs: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
+    """One row: what became of the alignments of all pairs of robots.
+
+    Returns:
+        n_runs, n_pairs, n_met (with common ground), n_believed; precision, the share of right ones
+        of the believed, and recall, the share of those that met whose alignment is right and
+        believed, with Wilson's intervals; medians over the pairs placed in one map of the errors of
+        T_a_b, aligned alone (alone_m, alone_rad) and placed by all (team_m, team_rad), with
+        intervals, whole runs resampled.
+    """
+    used, met = believed(pairs), has_common_ground(pairs)
+    right = pd.Series(right_refined(pairs) & used)
+    row: dict[str, Any] = {"n_runs": pairs["run_id"].nunique(), "n_pairs": len(pairs)}
+    row |= {"n_met": int(met.sum()), "n_believed": int(used.sum())}
+    row |= _share("precision", pairs[used], ~is_false_merge(pairs[used]))
+    row |= _share("recall", pairs[met], right[met])
+    placed = pairs[pairs["team_translation_error_m"].notna()]
+    runs = intervals.clusters_of(placed)
+    for name, column in _ERRORS.items():
+        values = placed[column].abs().to_numpy()
+        row |= intervals.median_interval(values, runs, rng).columns(name)
+    return pd.DataFrame([row])
+
+
+def _share(name: str, rows: pd.DataFrame, holds: pd.Series) -> dict[str, float]:
+    """A share of rows with its interval; all rows of a run may share one fate."""
+    if rows.empty:
+        return intervals.Interval(np.nan, np.nan, np.nan).columns(name)
+    n = intervals.effective_trials(rows.groupby("run_id").size())
+    share = float(holds.mean())
+    low, high = map(float, intervals.wilson(share * n, n))
+    return intervals.Interval(share, low, high).columns(name)
+
+
+ALL_SCENARIOS = "(all)"
+_FILE_NAMES = {
+    "n_common": "success_by_overlap",
+    "overlap_share": "success_by_overlap_share",
+    "n_true": "success_by_true_pairs",
+    "outlier_share": "success_by_outliers",
+    "iteration": "success_by_iteration",
+    LAST: "success_at_the_end",
+}
+_TIMING_COLUMNS = (*MAP_KEYS, "aligner", "n_correspondences", "n_common", "elapsed_s")
+# Of tables that not every run has: what is read, under what name which statistics go, their seed.
+_FURTHER: dict[str, tuple[Any, str, Callable[..., pd.DataFrame], str]] = {
+    "aligner_timings": (_TIMING_COLUMNS, "time_by_overlap", time_bands, ""),
+    "path_statistics": (None, "paths", path_summary, "paths"),
+    "team": (None, "team", team_paths, "team"),
+    "team_pairs": (None, "team_pairs", team_alignments, "team_pairs"),
+    "landmark_nees": (None, "nees", nees_of_maps, "nees"),
+    "smoother": (
+        SMOOTHER_COLUMNS,
+        "smoother",
+        smoother_summary,
+        "smoother",
+    ),
+    "fusers": (FUSER_COLUMNS, "fusers", fuser_summary, "fusers"),
+    "fusion": (FUSION_COLUMNS, "nees", nees_of_pairs, "fusion"),
+}
+
+
+class Summary(NamedTuple):
+    """Statistics over some runs.
+
+    Attributes:
+        tables: by file name, each with scenario and settings in front; "(all)" is all scenarios.
+        run_medians: each run's medians over its repetitions, for figures 4 and 5.
+        timings: the rows of figure 6.
+        missing: tables that no run had.
+        failed: runs that failed, with their reason.
+    """
+
+    n_runs: int
+    n_worlds: int
+    tables: dict[str, pd.DataFrame]
+    run_medians: pd.DataFrame
+    timings: pd.DataFrame
+    missing: tuple[str, ...]
+    failed: pd.DataFrame
+
+    @property
+    def n_configurations(self) -> int:
+        """How many settings the sweeps tried (1 without sweeps)."""
+        settings = setting_columns(self.run_medians)
+        return len(self.run_medians[settings].drop_duplicates()) if settings else 1
+
+
+def configurations(frame: pd.DataFrame) -> Iterator[tuple[dict[str, Any], pd.DataFrame]]:
+    """Labels and rows by scenario and settings; also of all scenarios, if several."""
+    names = ["scenario", *setting_columns(frame)]
+    pooled = frame.assign(scenario=ALL_SCENARIOS)
+    for each in [frame, pooled] if len(frame["scenario"].unique()) > 1 else [frame]:
+        for keys, rows in each.groupby(names, sort=False, dropna=False):
+            yield dict(zip(names, keys, strict=True)), rows
+
+
+def summarise(runs: Runs) -> Summary:
+    """Everything there is to say about these runs; a table that none of them has is left out."""
+    reduced = reduced_errors(runs)
+    maps, medians = reduced.maps, reduced.medians
+    made = {name: _each(maps, partial(success_rates, by=by)) for by, name in _FILE_NAMES.items()}
+    made["error_over_oracle"] = _each(maps, oracle_ratios, "oracle")
+    made["methods_compared"] = _each(maps, compare_methods, "paired")
+    made["errors_by_iteration"] = _each(medians, _error_bands)
+    timings = pd.DataFrame()
+    missing = tuple(table for table in _FURTHER if not runs.has(table))
+    for table, (columns, name, made_of, seed) in _FURTHER.items():
+        if table not in missing:
+            rows = runs.read(table, columns)
+            parts = [made.get(name), _each(rows, made_of, seed)]
+            made[name] = pd.concat(parts, ignore_index=True)
+            timings = rows if table == "aligner_timings" else timings
+    made = {name: table for name, table in made.items() if len(table)}
+    worlds = runs.described[["scenario", "seed"]].drop_duplicates()
+    return Summary(len(runs.described), len(worlds), made, medians, timings, missing, runs.failed)
+
+
+class ReducedErrors(NamedTuple):
+    """The errors of some runs, read and reduced batch by batch to `maps_of` and `medians_of_run`.
+
+    The absent aligners are those whose package is not installed, which is no failure.
+    """
+
+    maps: pd.DataFrame
+    medians: pd.DataFrame
+    absent: list[str]
+
+
+def reduced_errors(runs: Runs) -> ReducedErrors:
+    """All that statistics, figures and reports say of errors starts from these rows."""
+    maps, medians, every = [], [], []
+    for whole in runs.batches("errors", NEEDED, ("status", *OPTIONAL)):
+        every += whole["aligner"].unique().tolist()
+        errors = whole[whole["status"] != Status.ABSENT]
+        if len(errors):
+            maps.append(maps_of(errors))
+            medians.append(medians_of_run(errors))
+    if not maps:  # robots that were alone
+        nothing = pd.DataFrame(columns=["run_id", "scenario", "aligner"])
+        return ReducedErrors(nothing, nothing, list(dict.fromkeys(every)))
+    joined = with_overlap_share(pd.concat(maps, ignore_index=True), runs)
+    absent = [name for name in dict.fromkeys(every) if name not in set(joined["aligner"])]
+    return ReducedErrors(joined, pd.concat(medians, ignore_index=True), absent)
+
+
+def with_overlap_share(maps: pd.DataFrame, runs: Runs) -> pd.DataFrame:
+    """Rows of `maps_of` with overlap_share: n_common over the landmarks of the smaller map.
+
+    NaN where the runs have no table `robots`. A robot whose log ended earlier keeps its last map.
+    """
+    if not runs.has("robots"):
+        return maps.assign(overlap_share=np.nan)
+    iterations, parts = np.unique(maps["iteration"]), []
+    for rows in runs.batches("robots", ["robot", "iteration", "n_landmarks"]):
+        sizes = rows.pivot_table("n_landmarks", "iteration", ["run_id", "robot"]).ffill()
+        at = sizes.reindex(pd.Index(iterations, name="iteration"), method="ffill")
+        parts.append(at.melt(ignore_index=False).set_index(["run_id", "robot"], append=True))
+    sizes = pd.concat(parts)["value"]
+    places = (maps[["iteration", "run_id", robot]] for robot in ROBOT_PAIR)
+    a, b = (sizes.reindex(pd.MultiIndex.from_frame(own)).to_numpy() for own in places)
+    smaller = pd.Series(np.fmin(a, b), maps.index)
+    # a common landmark at least is in both; maps without any have nothing in common
+    share = (maps["n_common"] / smaller.where(smaller > 0)).where(smaller != 0, 0.0)
+    return maps.assign(overlap_share=share)
+
+
+def _error_bands(rows: pd.DataFrame) -> pd.DataFrame:
+    is_pooled = (rows["scenario"] == ALL_SCENARIOS).all()
+    return error_bands(that_ever_meet(rows) if is_pooled else rows)
+
+
+def _each(
+    frame: pd.DataFrame, made_of: Callable[..., pd.DataFrame], seed: str = ""
+) -> pd.DataFrame:
+    """A table of each configuration, one below the other, its labels in front.
+
+    A statistic that draws, and so has a seed, gets a generator of its own for each.
+    """
+    parts = []
+    for labels, rows in configurations(frame):
+        drawn = [generator(0, seed, *map(str, labels.values()))] if seed else []
+        part = made_of(rows, *drawn)
+        for place, (name, value) in enumerate(labels.items()):
+            part.insert(place, name, value)
+        parts.append(part)
+    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()

@@ -1,1 +1,0 @@
-"""Every method on made-up pairs of maps: success, error and time."""

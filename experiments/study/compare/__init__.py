@@ -1,1 +1,0 @@
-"""Two versions of the same runs in, what got better or worse out."""

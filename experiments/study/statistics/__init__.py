@@ -1,1 +1,0 @@
-"""Tables of many runs reduced to what people quote."""

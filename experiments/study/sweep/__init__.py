@@ -1,1 +1,0 @@
-"""All combinations of settings and seeds, on all cores or a cluster."""

@@ -1,0 +1,154 @@
+"""Rigid motions of the plane from paired points: closed form, residuals, covariance."""
+
+import math
+
+import numpy as np
+
+from mapfusion.geometry.numerics import Float, inner_kernel, kernel, source_of
+from mapfusion.geometry.se2 import add_turned, lever, residual, rotation
+
+_ALL = slice(None)  # as the number of a pair: of all of them at once, in NumPy
+
+
+@inner_kernel
+def _fit_rows(
+    p_a: Float, p_b: Float, rows: np.ndarray, weight: Float
+) -> tuple[float, float, float]:
+    """tx, ty, theta that minimise the sum of weight times |p_a - T p_b|^2 in the plane.
+
+    The closed form for the plane (Arun et al. 1987): theta from the summed dot and cross products
+    about the centroids. Rows (n,) are the pairs to use, each with its weight (n,).
+    """
+    total = ax = ay = bx = by = 0.0
+    for k in range(len(rows)):
+        i, w = rows[k], weight[k]
+        total += w
+        ax += w * p_a[i, 0]
+        ay += w * p_a[i, 1]
+        bx += w * p_b[i, 0]
+        by += w * p_b[i, 1]
+    ax, ay, bx, by = ax / total, ay / total, bx / total, by / total
+    dot = cross = 0.0
+    for k in range(len(rows)):
+        i, w = rows[k], weight[k]
+        dx, dy, ex, ey = p_a[i, 0] - ax, p_a[i, 1] - ay, p_b[i, 0] - bx, p_b[i, 1] - by
+        dot += w * (dx * ex + dy * ey)
+        cross += w * (dy * ex - dx * ey)
+    theta = math.atan2(cross, dot)
+    cos, sin = math.cos(theta), math.sin(theta)
+    return ax - cos * bx + sin * by, ay - sin * bx - cos * by, theta
+
+
+@kernel
+def fit_rigid(p_a: Float, p_b: Float, rows: np.ndarray) -> tuple[float, float, float]:
+    """tx, ty, theta that minimise the summed squared distance in the plane of p_a to T p_b.
+
+    Points are (N, 2 or more), rows (n,) the pairs to use.
+    """
+    return _fit_rows(p_a, p_b, rows, np.ones(len(rows)))
+
+
+@kernel
+def fit_weighted(p_a: Float, p_b: Float, weight: Float, T_a_b: Float) -> None:
+    """Fill T_a_b (3,) that minimises the sum of weight (N,) times |p_a - T p_b|^2."""
+    T_a_b[0], T_a_b[1], T_a_b[2] = _fit_rows(p_a, p_b, np.arange(len(weight)), weight)
+
+
+@inner_kernel
+def fit_two(p_a: Float, p_b: Float, i: int, j: int, T_a_b: Float) -> float:
+    """Fill T_a_b (3,) with the motion of pairs i and j; returns the shorter of their distances."""
+    ax, ay = p_a[j, 0] - p_a[i, 0], p_a[j, 1] - p_a[i, 1]
+    bx, by = p_b[j, 0] - p_b[i, 0], p_b[j, 1] - p_b[i, 1]
+    theta = math.atan2(ay * bx - ax * by, ax * bx + ay * by)
+    cos, sin = math.cos(theta), math.sin(theta)
+    mid_bx, mid_by = (p_b[i, 0] + p_b[j, 0]) / 2, (p_b[i, 1] + p_b[j, 1]) / 2
+    T_a_b[0] = (p_a[i, 0] + p_a[j, 0]) / 2 - cos * mid_bx + sin * mid_by
+    T_a_b[1] = (p_a[i, 1] + p_a[j, 1]) / 2 - sin * mid_bx - cos * mid_by
+    T_a_b[2] = theta
+    return math.sqrt(min(ax * ax + ay * ay, bx * bx + by * by))
+
+
+def residuals(T_a_b: Float, p_a: Float, p_b: Float) -> Float:
+    """p_a - T_a_b p_b in the plane (N, 2)."""
+    cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+    return np.stack(source_of(residual)(T_a_b, cos, sin, p_a, p_b, _ALL), axis=1)
+
+
+def residual_covariances(T_a_b: Float, covariance_a: Float, covariance_b: Float) -> Float:
+    """S_a + R S_b R^T in the plane (N, 2, 2): what the landmarks' own noise makes of a residual."""
+    cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+    a, b = (S.T[[0, 0, 1], [0, 1, 1]] for S in (covariance_a, covariance_b))
+    xx, xy, yy = source_of(add_turned)(*a, cos, sin, *b)
+    found = np.empty((len(xx), 2, 2))
+    found[:, 0, 0], found[:, 1, 1] = xx, yy
+    found[:, 0, 1] = found[:, 1, 0] = xy
+    return found
+
+
+def least_squares_gain(T_a_b: Float, p_b: Float, weight: Float | None = None) -> Float:
+    """How much each residual moves the motion that minimises sum of weight |p_a - T p_b|^2.
+
+    To first order T_a_b's error is the sum of the gains (N, 3, 2) times the residuals.
+    p_b are (N, 2 or more), not all in one place; weights (N,) are all equal by default.
+    """
+    given = np.ones(len(p_b)) if weight is None else weight
+    inverse: Float = np.linalg.inv(_normal_matrix(T_a_b, p_b, given)).astype(np.float64, copy=False)
+    return _gain(T_a_b, p_b, given, inverse)
+
+
+@kernel
+def _normal_matrix(T_a_b: Float, p_b: Float, weight: Float) -> Float:
+    """Sum of weight J'J (3, 3), J the `motion_jacobian` of a point."""
+    cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+    total = x = y = square = 0.0
+    for i in range(len(p_b)):
+        jx, jy = lever(cos, sin, p_b, i)
+        total += weight[i]
+        x += weight[i] * jx
+        y += weight[i] * jy
+        square += weight[i] * (jx * jx + jy * jy)
+    return np.array([[total, 0.0, x], [0.0, total, y], [x, y, square]])
+
+
+@kernel
+def _gain(T_a_b: Float, p_b: Float, weight: Float, inverse: Float) -> Float:
+    """Weight times the normal matrix' inverse (3, 3) times J' (N, 3, 2)."""
+    cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+    gain = np.empty((len(p_b), 3, 2))
+    for i in range(len(p_b)):
+        jx, jy = lever(cos, sin, p_b, i)
+        for k in range(3):
+            gain[i, k, 0] = weight[i] * (inverse[k, 0] + inverse[k, 2] * jx)
+            gain[i, k, 1] = weight[i] * (inverse[k, 1] + inverse[k, 2] * jy)
+    return gain
+
+
+@kernel
+def motion_covariance(gain: Float, covariance_m2: Float) -> Float:
+    """Covariance (3, 3) of a motion from its gains (N, 3, 2) and independent residuals' (N, 2, 2).
+
+    Weights that are not the inverse covariances make it larger than the inverse of the normal
+    matrix: this is the sandwich of the two.
+    """
+    total = np.zeros((3, 3))
+    for i in range(len(gain)):
+        xx, xy, yy = covariance_m2[i, 0, 0], covariance_m2[i, 0, 1], covariance_m2[i, 1, 1]
+        for k in range(3):
+            x, y = gain[i, k, 0], gain[i, k, 1]
+            along_x, along_y = x * xx + y * xy, x * xy + y * yy
+            for j in range(k + 1):
+                total[k, j] += along_x * gain[i, j, 0] + along_y * gain[i, j, 1]
+    for k in range(3):
+        for j in range(k):
+            total[j, k] = total[k, j]
+    return total
+
+
+def motion_jacobian(T_a_b: Float, p_b: Float) -> Float:
+    """d(T_a_b p_b) / d(tx, ty, theta) in the plane (N, 2, 3)."""
+    turned = p_b[:, :2] @ rotation(T_a_b[2]).T
+    jacobian = np.zeros((len(p_b), 2, 3))
+    jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
+    jacobian[:, 0, 2] = -turned[:, 1]
+    jacobian[:, 1, 2] = turned[:, 0]
+    return jacobian

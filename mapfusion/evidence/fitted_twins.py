@@ -1,9 +1,0 @@
-"""Of `likelihood.py`: the share of twins' regions that are their like throughout.
-
-Written by `python -m experiments.study.refusal.fit_twins`.
-
-Of 2247 regions under wrong motions of seeds 0 to 4 of
-posters_apart, alias_posters_apart: 4.7% are twins throughout, 6.5% in part.
-"""
-
-WHOLE = 0.42

@@ -1,0 +1,259 @@
+"""Measurement model and Kalman update of a landmark in a particle (eq. 4-10).
+
+The observation model g maps a landmark into the robot frame: a rigid motion, whose Jacobian G is a
+rotation. Everything here is turned by the transpose of G into the map frame, where G is the
+identity: innovation z - z_hat becomes (observed point in the map) - (landmark), Z becomes
+Sigma + R_map, and determinants and Mahalanobis distances stay what they are.
+
+Symmetric matrices are their six upper entries: xx, xy, xz, yy, yz, zz.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from mapfusion.fastslam.landmarks import LANES, Estimates, Slots
+from mapfusion.geometry.numerics import Float, cofactors, inner_kernel, kernel, kernel_part
+from mapfusion.geometry.se2 import add_turned
+
+Vector = tuple[float, float, float]
+Upper = tuple[float, float, float, float, float, float]  # xx, xy, xz, yy, yz, zz
+
+
+class Sightings(NamedTuple):
+    """K observations of one frame, as each of M particles sees them in its map."""
+
+    point_m: Float  # (K, M, 3)
+    covariance_m2: Float  # (K, M, 6)
+
+
+def sightings(
+    T_map_robot: Float, position_m: Float, covariance_m2: Float, planar: bool
+) -> Sightings:
+    """Observations (K, 3), (K, 3, 3) of the robot frame in the maps of poses (M, 3)."""
+    shape = (len(position_m), len(T_map_robot))
+    seen = Sightings(np.empty((*shape, 3)), np.empty((*shape, 6)))
+    position, covariance = np.ascontiguousarray(position_m), np.ascontiguousarray(covariance_m2)
+    turn = T_map_robot[:, 2]
+    _turn_into_map(T_map_robot, np.cos(turn), np.sin(turn), position, covariance, planar, seen)
+    return seen
+
+
+@kernel(error_model="numpy")
+def _turn_into_map(
+    T_map_robot: Float,
+    cos: Float,
+    sin: Float,
+    position: Float,
+    covariance: Float,
+    planar: bool,
+    seen: Sightings,
+) -> None:
+    for k in range(len(position)):
+        x, y, z = position[k, 0], position[k, 1], position[k, 2]
+        xx, xy, xz = covariance[k, 0, 0], covariance[k, 0, 1], covariance[k, 0, 2]
+        yy, yz, zz = covariance[k, 1, 1], covariance[k, 1, 2], covariance[k, 2, 2]
+        if planar:
+            z = xz = yz = zz = 0.0
+        point, turned = seen.point_m[k], seen.covariance_m2[k]
+        for m in range(len(T_map_robot)):
+            c, s = cos[m], sin[m]
+            point[m, 0] = T_map_robot[m, 0] + c * x - s * y
+            point[m, 1] = T_map_robot[m, 1] + s * x + c * y
+            point[m, 2] = z
+            turned[m, 0], turned[m, 1], turned[m, 3] = add_turned(0.0, 0.0, 0.0, c, s, xx, xy, yy)
+            turned[m, 2] = c * xz - s * yz
+            turned[m, 4] = s * xz + c * yz
+            turned[m, 5] = zz
+
+
+# Division is NumPy's in the filter's kernels (`error_model`): a check for zero at each one keeps
+# LLVM from inlining what divides. No Z is singular: a frame with a singular R_t is refused.
+@inner_kernel(error_model="numpy")
+def inverse_and_determinant(
+    xx: float, xy: float, xz: float, yy: float, yz: float, zz: float
+) -> tuple[Upper, float]:
+    """Inverse and determinant of a symmetric 3x3 matrix, by cofactors."""
+    axx, axy, axz, ayy, ayz, azz, determinant = cofactors(xx, xy, xz, yy, yz, zz)
+    f = 1.0 / determinant
+    return (f * axx, f * axy, f * axz, f * ayy, f * ayz, f * azz), determinant
+
+
+@inner_kernel(error_model="numpy")
+def innovation(
+    seen: Sightings, k: int, own: Estimates, r: int, m: int, planar: bool
+) -> tuple[Vector, Upper, float]:
+    """Innovation, inverse of Z (eq. 6) and |Z| of observation k and the landmark of row r.
+
+    Both as particle m has them. In planar data the height says nothing: its innovation is 0 and its
+    variance in Z 1, so that it leaves the Mahalanobis distance and the determinant alone.
+    """
+    point, noise, mean, covariance = seen.point_m, seen.covariance_m2, own.mean_m, own.covariance_m2
+    xx = covariance[r, m, 0] + noise[k, m, 0]
+    xy = covariance[r, m, 1] + noise[k, m, 1]
+    xz = covariance[r, m, 2] + noise[k, m, 2]
+    yy = covariance[r, m, 3] + noise[k, m, 3]
+    yz = covariance[r, m, 4] + noise[k, m, 4]
+    zz = covariance[r, m, 5] + noise[k, m, 5]
+    dz = point[k, m, 2] - mean[r, m, 2]
+    if planar:  # after the reads: a branch between them costs as much as all the arithmetic
+        xz = yz = dz = 0.0
+        zz = 1.0
+    inverse, determinant = inverse_and_determinant(xx, xy, xz, yy, yz, zz)
+    difference = (point[k, m, 0] - mean[r, m, 0], point[k, m, 1] - mean[r, m, 1], dz)
+    return difference, inverse, determinant
+
+
+@inner_kernel(error_model="numpy")
+def quadratic_form(difference: Vector, inverse: Upper) -> float:
+    """Squared Mahalanobis distance: d^T Z^-1 d."""
+    dx, dy, dz = difference
+    ixx, ixy, ixz, iyy, iyz, izz = inverse
+    return (
+        ixx * dx * dx
+        + iyy * dy * dy
+        + izz * dz * dz
+        + 2.0 * (ixy * dx * dy + ixz * dx * dz + iyz * dy * dz)
+    )
+
+
+def log_density_at_gate(covariance_m2: Float, gate: float, planar: bool) -> Float:
+    """Log of p_new (K,): the density of a match exactly at the gate of a landmark seen once.
+
+    Such a landmark has the observation's own covariance R, so Z = 2 R. The density carries the
+    unit 1/m^3 (1/m^2 in the plane) of a match's, so a change of units cancels in the weights.
+
+    Raises:
+        ValueError: a covariance (K, 3, 3) is not positive definite.
+    """
+    dimensions = 2 if planar else 3
+    try:
+        root = np.linalg.cholesky(2.0 * covariance_m2[:, :dimensions, :dimensions])
+    except np.linalg.LinAlgError as error:
+        raise ValueError("covariance_m2: an observation's is not positive definite") from error
+    half_log_det = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+    return -0.5 * (gate + dimensions * np.log(2 * np.pi)) - half_log_det
+
+
+NEW = -1  # the particle has no such landmark yet
+DROPPED = -2  # the observation is used for nothing
+# Rows of what particles have that are taken together: squared distance, |Z|, then from these on the
+# mean, the innovation, and the upper entries of the landmark's covariance and of the observation's.
+_MEAN, _OFF, _SIGMA, _NOISE, _ROWS = 2, 5, 8, 14, 20
+
+
+@kernel(error_model="numpy")
+def update_landmarks(
+    slots: Slots, chosen: np.ndarray, seen: Sightings, log_new: Float, planar: bool
+) -> Float:
+    """Correct the landmarks that were chosen, in place, and tell what the observations say.
+
+    `chosen` (K, M) is a slot, NEW or DROPPED, `log_new` (K,) the log density of an observation that
+    matches nothing. Returns (M,) log likelihood: the product of eq. 10 over the observations.
+    """
+    n_observations, n_particles = chosen.shape
+    log_two_pi = (2.0 if planar else 3.0) * np.log(2.0 * np.pi)
+    log_likelihood, rows = np.zeros(n_particles), np.zeros(_ROWS * LANES)
+    for k in range(n_observations):
+        for first in range(0, n_particles, LANES):
+            end = min(first + LANES, n_particles)
+            _gather(slots, chosen, seen, k, first, end, rows)
+            _correct(rows, planar)
+            for m in range(first, end):
+                s, lane = chosen[k, m], m - first
+                if s < 0:
+                    log_likelihood[m] += log_new[k]
+                    continue
+                distance, log_determinant = rows[lane], np.log(rows[LANES + lane])
+                log_likelihood[m] -= 0.5 * (distance + log_two_pi + log_determinant)  # eq. 10
+                _put_back(slots.own, int(slots.row[s]), m, lane, rows)
+    return log_likelihood
+
+
+@kernel_part(error_model="numpy")
+def _gather(
+    slots: Slots,
+    chosen: np.ndarray,
+    seen: Sightings,
+    k: int,
+    first: int,
+    end: int,
+    rows: Float,
+) -> None:
+    """What the particles from `first` to `end` have of the landmark and of the observation."""
+    mean, sigma = slots.own.mean_m, slots.own.covariance_m2
+    point, noise = seen.point_m, seen.covariance_m2
+    for m in range(first, end):
+        s, lane = chosen[k, m], m - first
+        if s < 0:
+            continue
+        r = int(slots.row[s])
+        for i in range(3):
+            rows[(_MEAN + i) * LANES + lane] = mean[r, m, i]
+            rows[(_OFF + i) * LANES + lane] = point[k, m, i] - mean[r, m, i]
+        for i in range(6):
+            rows[(_SIGMA + i) * LANES + lane] = sigma[r, m, i]
+            rows[(_NOISE + i) * LANES + lane] = noise[k, m, i]
+
+
+@kernel_part(error_model="numpy")
+def _put_back(own: Estimates, r: int, m: int, lane: int, rows: Float) -> None:
+    for i in range(3):
+        own.mean_m[r, m, i] = rows[(_MEAN + i) * LANES + lane]
+    for i in range(6):
+        own.covariance_m2[r, m, i] = rows[(_SIGMA + i) * LANES + lane]
+    own.count[r, m] += 1
+
+
+@kernel_part(error_model="numpy")
+def _correct(rows: Float, planar: bool) -> None:
+    """Equations 7 to 9 with G = I, and the squared distance and |Z|, in all lanes.
+
+    Eq. 9, (I - K) Sigma, equals K R. The product has no difference of near equal numbers in it, so
+    the covariance stays positive however often a landmark is seen. Lanes of particles that do not
+    have the landmark hold anything, and come to anything.
+    """
+    for m in range(LANES):
+        sxx, sxy = rows[_SIGMA * LANES + m], rows[(_SIGMA + 1) * LANES + m]
+        sxz, syy = rows[(_SIGMA + 2) * LANES + m], rows[(_SIGMA + 3) * LANES + m]
+        syz, szz = rows[(_SIGMA + 4) * LANES + m], rows[(_SIGMA + 5) * LANES + m]
+        rxx, rxy = rows[_NOISE * LANES + m], rows[(_NOISE + 1) * LANES + m]
+        rxz, ryy = rows[(_NOISE + 2) * LANES + m], rows[(_NOISE + 3) * LANES + m]
+        ryz, rzz = rows[(_NOISE + 4) * LANES + m], rows[(_NOISE + 5) * LANES + m]
+        dx, dy = rows[_OFF * LANES + m], rows[(_OFF + 1) * LANES + m]
+        dz, zxz, zyz, zzz = rows[(_OFF + 2) * LANES + m], sxz + rxz, syz + ryz, szz + rzz
+        if planar:  # see `innovation`
+            dz = zxz = zyz = 0.0
+            zzz = 1.0
+        inverse, determinant = inverse_and_determinant(
+            sxx + rxx, sxy + rxy, zxz, syy + ryy, zyz, zzz
+        )
+        rows[m], rows[LANES + m] = quadratic_form((dx, dy, dz), inverse), determinant
+        ixx, ixy, ixz, iyy, iyz, izz = inverse
+        # K = Sigma Z^-1 (eq. 7)
+        k00 = sxx * ixx + sxy * ixy + sxz * ixz
+        k01 = sxx * ixy + sxy * iyy + sxz * iyz
+        k02 = sxx * ixz + sxy * iyz + sxz * izz
+        k10 = sxy * ixx + syy * ixy + syz * ixz
+        k11 = sxy * ixy + syy * iyy + syz * iyz
+        k12 = sxy * ixz + syy * iyz + syz * izz
+        k20 = sxz * ixx + syz * ixy + szz * ixz
+        k21 = sxz * ixy + syz * iyy + szz * iyz
+        k22 = sxz * ixz + syz * iyz + szz * izz
+        # eq. 8
+        rows[_MEAN * LANES + m] += k00 * dx + k01 * dy + k02 * dz
+        rows[(_MEAN + 1) * LANES + m] += k10 * dx + k11 * dy + k12 * dz
+        rows[(_MEAN + 2) * LANES + m] += k20 * dx + k21 * dy + k22 * dz
+        # eq. 9; the mean of mirrored entries keeps rounding from making it unsymmetric
+        rows[_SIGMA * LANES + m] = k00 * rxx + k01 * rxy + k02 * rxz
+        rows[(_SIGMA + 3) * LANES + m] = k10 * rxy + k11 * ryy + k12 * ryz
+        rows[(_SIGMA + 5) * LANES + m] = k20 * rxz + k21 * ryz + k22 * rzz
+        rows[(_SIGMA + 1) * LANES + m] = 0.5 * (
+            (k00 * rxy + k01 * ryy + k02 * ryz) + (k10 * rxx + k11 * rxy + k12 * rxz)
+        )
+        rows[(_SIGMA + 2) * LANES + m] = 0.5 * (
+            (k00 * rxz + k01 * ryz + k02 * rzz) + (k20 * rxx + k21 * rxy + k22 * rxz)
+        )
+        rows[(_SIGMA + 4) * LANES + m] = 0.5 * (
+            (k10 * rxz + k11 * ryz + k12 * rzz) + (k20 * rxy + k21 * ryy + k22 * ryz)
+        )

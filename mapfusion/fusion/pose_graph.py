@@ -1,0 +1,214 @@
+"""Pose graph of a team: alignments as edges, robot poses by least squares.
+
+Grisetti, Kuemmerle, Stachniss, Burgard (2010), "A tutorial on graph-based SLAM", with the residual
+T_a_b(x) - T_a_b in the frame of a, whose covariance is the alignment's.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.se2 import IDENTITY, between, compose, inverse, rotation, wrap
+from mapfusion.parameters import require_finite, require_shape
+
+
+@dataclass(frozen=True)
+class Relations:
+    """E alignments between N robots' maps.
+
+    Attributes:
+        n_robots: N.
+        robots: (E, 2) a and b of each, two different ones of 0 to N - 1.
+        T_a_b: (E, 3).
+        covariance: (E, 3, 3) of T_a_b.
+        log10_false_alarms: (E,) of each alignment by itself, the lower the surer.
+    """
+
+    n_robots: int
+    robots: np.ndarray
+    T_a_b: Float
+    covariance: Float
+    log10_false_alarms: Float
+
+    def __post_init__(self) -> None:
+        n = len(self.robots)
+        require_shape("robots", self.robots, (n, 2))
+        require_shape("T_a_b", self.T_a_b, (n, 3))
+        require_shape("covariance", self.covariance, (n, 3, 3))
+        require_shape("log10_false_alarms", self.log10_false_alarms, (n,))
+        require_finite("T_a_b", self.T_a_b)
+        require_finite("covariance", self.covariance)
+        if np.any((self.robots < 0) | (self.robots >= self.n_robots)):
+            raise ValueError(f"robots: outside 0 to {self.n_robots - 1}")
+        if np.any(self.robots[:, 0] == self.robots[:, 1]):
+            raise ValueError("robots: an alignment of a map with itself")
+
+    def __len__(self) -> int:
+        return len(self.robots)
+
+    def __getitem__(self, rows: np.ndarray) -> "Relations":
+        """Some of them."""
+        parts = (self.robots, self.T_a_b, self.covariance, self.log10_false_alarms)
+        return Relations(self.n_robots, *(part[rows] for part in parts))
+
+    def joined(self, other: "Relations") -> "Relations":
+        """With others between the same robots behind them."""
+        names = ("robots", "T_a_b", "covariance", "log10_false_alarms")
+        both = (np.concatenate([getattr(self, n), getattr(other, n)]) for n in names)
+        return Relations(self.n_robots, *both)
+
+    def reach_m(self) -> float:
+        """The farthest that any of them moves a map."""
+        return float(np.linalg.norm(self.T_a_b[:, :2], axis=1).max(initial=0.0))
+
+
+@dataclass(frozen=True)
+class Motions:
+    """Motions (n, 3) with their covariances (n, 3, 3)."""
+
+    T: Float
+    covariance: Float
+
+    def __getitem__(self, rows: np.ndarray) -> "Motions":
+        return Motions(self.T[rows], self.covariance[rows])
+
+    def inverse(self) -> "Motions":
+        """The way back, to first order."""
+        back = inverse(self.T)
+        cos, sin = np.cos(self.T[:, 2]), np.sin(self.T[:, 2])
+        J = np.zeros((len(back), 3, 3))
+        J[:, 0, 0] = J[:, 1, 1] = -cos
+        J[:, 1, 0], J[:, 0, 1] = sin, -sin
+        J[:, 0, 2], J[:, 1, 2], J[:, 2, 2] = back[:, 1], -back[:, 0], -1.0
+        return Motions(back, J @ self.covariance @ J.swapaxes(1, 2))
+
+    def then(self, other: "Motions") -> "Motions":
+        """Chained with motions that are independent of these, to first order."""
+        cos, sin = np.cos(self.T[:, 2]), np.sin(self.T[:, 2])
+        x, y = other.T[:, 0], other.T[:, 1]
+        by_first = np.tile(np.eye(3), (len(x), 1, 1))
+        by_first[:, 0, 2], by_first[:, 1, 2] = -sin * x - cos * y, cos * x - sin * y
+        by_second = np.zeros((len(x), 3, 3))
+        by_second[:, 0, 0] = by_second[:, 1, 1] = cos
+        by_second[:, 1, 0], by_second[:, 0, 1], by_second[:, 2, 2] = sin, -sin, 1.0
+        covariance = by_first @ self.covariance @ by_first.swapaxes(1, 2)
+        covariance += by_second @ other.covariance @ by_second.swapaxes(1, 2)
+        return Motions(compose(self.T, other.T), covariance)
+
+
+# Gauss-Newton steps; what agrees is off by a few deviations, which leaves nothing after the third.
+_STEPS = 4
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where robots' maps lie in the frame of one of them.
+
+    Attributes:
+        row: (N,) place of each robot of the team below, -1 for those that are not placed.
+        T_root_robot: (n, 3); the first is the root, at the identity.
+        covariance: (n, n, 3, 3) of all poses jointly; zero for the root.
+    """
+
+    row: np.ndarray
+    T_root_robot: Float
+    covariance: Float
+
+    def holds(self, robots: np.ndarray) -> np.ndarray:
+        """Whether robots (...) are placed."""
+        return self.row[robots] >= 0
+
+    def squared_distances(self, robots: np.ndarray, motions: Motions) -> tuple[Float, Float]:
+        """(n,) Mahalanobis distances of motions between placed robots (n, 2); the S behind them.
+
+        The motions are independent of the placement.
+        """
+        a, b = self.row[robots[:, 0]], self.row[robots[:, 1]]
+        e, before, after = _residuals(self.T_root_robot, a, b, motions.T)
+        P = self.covariance
+        S = motions.covariance + before @ P[a, a] @ before.swapaxes(1, 2)
+        S = S + after @ P[b, b] @ after.swapaxes(1, 2)
+        cross = before @ P[a, b] @ after.swapaxes(1, 2)
+        S = S + cross + cross.swapaxes(1, 2)
+        return np.einsum("ni,ni->n", e, np.linalg.solve(S, e[:, :, None])[:, :, 0]), S
+
+    def relative(self, robots: np.ndarray) -> Motions:
+        """T_a_b of pairs (n, 2) of placed robots."""
+        a, b = self.row[robots[:, 0]], self.row[robots[:, 1]]
+        T = between(self.T_root_robot[a], self.T_root_robot[b])
+        _, S = self.squared_distances(robots, Motions(T, np.zeros((len(T), 3, 3))))
+        return Motions(T, S)
+
+
+def placed(relations: Relations, which: np.ndarray, root: int | None = None) -> Placement:
+    """Place the robots that alignments `which` (rows) connect, in the frame of one of them.
+
+    That is the first, unless a root is named.
+
+    Raises:
+        ValueError: they do not connect their robots.
+    """
+    robots = np.unique(relations.robots[which])
+    if root is not None:
+        robots = np.concatenate([[root], robots[robots != root]])
+    row = np.full(relations.n_robots, -1)
+    row[robots] = np.arange(len(robots))
+    a, b = row[relations.robots[which]].T
+    T, covariance = relations.T_a_b[which], relations.covariance[which]
+    at = _chained(len(robots), a, b, T)
+    information = np.asarray(np.linalg.inv(covariance), np.float64)
+    for _ in range(_STEPS):
+        normal, right = _equations(at, a, b, T, information)
+        step = np.linalg.solve(normal, right).reshape(-1, 3)
+        at[1:] += step
+        at[:, 2] = wrap(at[:, 2])
+    n = len(robots)
+    P = np.zeros((n, n, 3, 3))
+    joint = np.linalg.inv(_equations(at, a, b, T, information)[0])
+    P[1:, 1:] = joint.reshape(n - 1, 3, n - 1, 3).swapaxes(1, 2)
+    return Placement(row, at, P)
+
+
+def _chained(n: int, a: np.ndarray, b: np.ndarray, T_a_b: Float) -> Float:
+    """(n, 3) poses along some alignments from the first."""
+    at = np.full((n, 3), np.nan)
+    at[0] = IDENTITY
+    for _ in range(n):
+        known = np.isfinite(at[:, 0])
+        if known.all():
+            return at
+        on, back = known[a] & ~known[b], known[b] & ~known[a]
+        at[b[on]] = compose(at[a[on]], T_a_b[on])
+        at[a[back]] = compose(at[b[back]], inverse(T_a_b[back]))
+    raise ValueError("which: these alignments do not connect their robots")
+
+
+def _residuals(at: Float, a: np.ndarray, b: np.ndarray, T_a_b: Float) -> tuple[Float, Float, Float]:
+    """Residuals (n, 3) and their derivatives (n, 3, 3) by the poses of a and of b."""
+    n = len(a)
+    e = between(at[a], at[b]) - T_a_b
+    e[:, 2] = wrap(e[:, 2])
+    to_a = rotation(at[a, 2]).swapaxes(1, 2)
+    way = at[b, :2] - at[a, :2]
+    before, after = np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
+    after[:, :2, :2], after[:, 2, 2] = to_a, 1.0
+    before[:, :2, :2], before[:, 2, 2] = -to_a, -1.0
+    before[:, :2, 2] = np.einsum("nij,nj->ni", to_a, np.stack([way[:, 1], -way[:, 0]], 1))
+    return e, before, after
+
+
+def _equations(
+    at: Float, a: np.ndarray, b: np.ndarray, T_a_b: Float, information: Float
+) -> tuple[Float, Float]:
+    """Normal matrix and right side of a step of all poses but the first."""
+    n = len(at)
+    e, before, after = _residuals(at, a, b, T_a_b)
+    normal, right = np.zeros((n, n, 3, 3)), np.zeros((n, 3))
+    for i, J in ((a, before), (b, after)):
+        weighted = J.swapaxes(1, 2) @ information
+        np.add.at(right, i, -np.einsum("nij,nj->ni", weighted, e))
+        for k, K in ((a, before), (b, after)):
+            np.add.at(normal, (i, k), weighted @ K)
+    size = 3 * (n - 1)
+    return normal[1:, 1:].swapaxes(1, 2).reshape(size, size), right[1:].ravel()

@@ -1,0 +1,1 @@
+"""Geometry and numerical building blocks that all other packages use."""

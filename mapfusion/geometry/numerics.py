@@ -1,0 +1,312 @@
+"""Numerical building blocks: compiled kernels, 3 x 3 matrices, bit sets, chi-square bounds.
+
+NumPy and SciPy bring a BLAS each, with threads of its own, and those of the one wait in a loop
+while the other computes. Where blocks of some ten rows go to both in turn, as in a factorisation by
+envelope, that takes several times as long as one thread does.
+"""
+
+import math
+from collections.abc import Callable
+from functools import cache, partial
+from typing import Any, cast
+
+import numpy as np
+from numba import njit, types
+from numba.core.registry import CPUDispatcher
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+Float = NDArray[np.float64]
+
+# Compiled once for each version of its source and kept on disk. A wrapper for callers in C would
+# be compiled with it; nobody here is one.
+_OPTIONS: dict[str, Any] = {"cache": True, "no_cfunc_wrapper": True}
+kernel: Callable[..., Any] = partial(njit, **_OPTIONS)
+
+
+class _Inner(CPUDispatcher):
+    """Has no wrapper for callers in Python, without which a call ends the process."""
+
+    def __call__(self, *arguments: object) -> Any:
+        raise TypeError(f"{self.py_func.__name__}: only kernels can call it")
+
+
+def inner_kernel(function: Any = None, **options: Any) -> Any:
+    """For what is called by kernels alone, at several places.
+
+    The wrapper for callers in Python, which is up to half of what is compiled for a short one, is
+    left out; tests take what `tests.helpers.inner_kernels` makes of it. Such a kernel makes no
+    arrays: what Numba compiles for that, it would compile once more for these.
+    """
+    if function is None:
+        return partial(inner_kernel, **options)
+    made = kernel(function, no_cpython_wrapper=True, **options)
+    if isinstance(made, CPUDispatcher):  # not so with NUMBA_DISABLE_JIT
+        made.__class__ = _Inner
+    return made
+
+
+def source_of(compiled: Callable[..., Any]) -> Callable[..., Any]:
+    """The function that a kernel was made of, which NumPy's arrays may be given to as well."""
+    return getattr(compiled, "py_func", compiled)
+
+
+# For what is called by kernels alone and at one place, or is short: its lines are put into its
+# caller before that is compiled, which is less to compile than both apart. Both have the same
+# `error_model`: once inside, a part divides by zero as its caller does. Called from Python, as
+# tests do, it is compiled by itself.
+kernel_part: Callable[..., Any] = partial(kernel, inline="always")
+
+
+one_blas_thread = threadpool_limits.wrap(limits=1, user_api="blas")
+"""Decorator: BLAS has one thread while the function runs, and then what it had before."""
+
+
+@cache  # a filter asks for its gate in every step
+def chi_square_bound(probability: float, degrees_of_freedom: float) -> float:
+    """The value that a chi-square variable stays below with this probability.
+
+    Its distribution function is P(k / 2, x / 2), the regularised incomplete gamma function, whose
+    inverse comes without scipy.stats: that alone takes half a second to import, in every worker.
+    """
+    # Here, so that a process without gates does not pay for it.
+    from scipy.special import gammaincinv
+
+    return 2.0 * float(gammaincinv(degrees_of_freedom / 2, probability))
+
+
+_SINGULAR = 1e-12  # determinant of a matrix scaled to a unit diagonal that is rounding error
+
+
+@inner_kernel
+def cofactors(
+    xx: float, xy: float, xz: float, yy: float, yz: float, zz: float
+) -> tuple[float, float, float, float, float, float, float]:
+    """Cofactors (six upper entries) and determinant of a symmetric 3x3 matrix."""
+    axx, axy, axz = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+    ayy, ayz, azz = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
+    return axx, axy, axz, ayy, ayz, azz, xx * axx + xy * axy + xz * axz
+
+
+@inner_kernel
+def invert(matrix: Float, inverse: Float) -> bool:
+    """Fill the inverse (3, 3) of a symmetric matrix; False unless positive definite."""
+    a, d, f = matrix[0, 0], matrix[1, 1], matrix[2, 2]
+    axx, axy, axz, ayy, ayz, azz, det = cofactors(a, matrix[0, 1], matrix[0, 2], d, matrix[1, 2], f)
+    positive = a > 0 and azz > 0  # with det > 0 the leading minors (Sylvester)
+    if not (positive and det > _SINGULAR * a * d * f):
+        return False
+    inverse[0, 0], inverse[1, 1], inverse[2, 2] = axx / det, ayy / det, azz / det
+    inverse[0, 1] = inverse[1, 0] = axy / det
+    inverse[0, 2] = inverse[2, 0] = axz / det
+    inverse[1, 2] = inverse[2, 1] = ayz / det
+    return True
+
+
+@inner_kernel
+def copy_lower(matrix: Float, copy: Float) -> None:
+    """Put the lower half of a matrix into another, which Numba's `copy[:] = matrix` would, too.
+
+    That compiles what says in words how shapes differ, which takes seconds.
+    """
+    for i in range(len(matrix)):
+        for j in range(i + 1):
+            copy[i, j] = matrix[i, j]
+
+
+@inner_kernel
+def cholesky(matrix: Float, singular: float) -> bool:
+    """Lower factor of a symmetric matrix in place, of which the lower half is read.
+
+    Returns:
+        False when it is not positive definite: a pivot is `singular` of its diagonal entry or less.
+    """
+    for i in range(len(matrix)):
+        for j in range(i + 1):
+            rest = matrix[i, j]
+            for k in range(j):
+                rest -= matrix[i, k] * matrix[j, k]
+            if i > j:
+                matrix[i, j] = rest / matrix[j, j]
+            elif rest > singular * matrix[i, i]:
+                matrix[i, i] = math.sqrt(rest)
+            else:
+                return False
+    return True
+
+
+@inner_kernel
+def solve_lower(factor: Float, x: Float) -> None:
+    """Solve factor y = x in place."""
+    for i in range(len(x)):
+        for k in range(i):
+            x[i] -= factor[i, k] * x[k]
+        x[i] /= factor[i, i]
+
+
+@inner_kernel
+def solve_upper(factor: Float, x: Float) -> None:
+    """Solve factor^T y = x in place."""
+    for i in range(len(x) - 1, -1, -1):
+        for k in range(i + 1, len(x)):
+            x[i] -= factor[k, i] * x[k]
+        x[i] /= factor[i, i]
+
+
+# Of tables of blocks they take all and a row: views of rows are counted, which takes longer than
+# the sums.
+@inner_kernel
+def put_along(A: Float, row: int, x: Float, product: Float) -> None:
+    """A[row] x."""
+    for r in range(3):
+        product[r] = A[row, r, 0] * x[0] + A[row, r, 1] * x[1] + A[row, r, 2] * x[2]
+
+
+@inner_kernel
+def add_along(A: Float, row: int, x: Float, total: Float) -> None:
+    """Add A[row] x."""
+    for r in range(3):
+        total[r] += A[row, r, 0] * x[0] + A[row, r, 1] * x[1] + A[row, r, 2] * x[2]
+
+
+@inner_kernel
+def put_inverse(A: Float, inverse: Float) -> bool:
+    """Inverse of a symmetric positive definite A = L D L', of which the lower half is read.
+
+    Returns:
+        False when A is not positive definite.
+    """
+    positive, entries = _inverse_entries(A[0, 0], A[1, 0], A[1, 1], A[2, 0], A[2, 1], A[2, 2])
+    inverse[0, 0], inverse[1, 1], inverse[2, 2] = entries[0], entries[2], entries[5]
+    inverse[0, 1] = inverse[1, 0] = entries[1]
+    inverse[0, 2] = inverse[2, 0] = entries[3]
+    inverse[1, 2] = inverse[2, 1] = entries[4]
+    return positive
+
+
+@inner_kernel(error_model="numpy")
+def _inverse_entries(a00: Any, a10: Any, a11: Any, a20: Any, a21: Any, a22: Any) -> Any:
+    """Whether A = L D L' is positive definite, and the lower half of its inverse, row by row.
+
+    Of one matrix, or in NumPy of as many as there are in arrays of entries.
+    """
+    l10, l20 = a10 / a00, a20 / a00
+    d1 = a11 - l10 * a10
+    rest = a21 - l20 * a10
+    l21 = rest / d1
+    d2 = a22 - l20 * a20 - l21 * rest
+    m20 = l10 * l21 - l20  # of L^-1, whose other entries are -l10 and -l21
+    entries = (
+        1 / a00 + l10 * l10 / d1 + m20 * m20 / d2,
+        -l10 / d1 - m20 * l21 / d2,
+        1 / d1 + l21 * l21 / d2,
+        m20 / d2,
+        -l21 / d2,
+        1 / d2,
+    )
+    return (a00 > 0) & (d1 > 0) & (d2 > 0), entries
+
+
+def inverses(blocks: Float) -> Float:
+    """(N, D, D) inverses of symmetric positive definite blocks (N, D, D), D two or three.
+
+    Raises:
+        LinAlgError: one is not positive definite.
+    """
+    n, dimensions = blocks.shape[:2]
+    entries = np.zeros((6, n))  # the lower half of each, of two dimensions with a third by itself
+    entries[5] = 1.0
+    pairs = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2))
+    for k, (r, q) in enumerate(pairs):
+        if r < dimensions:
+            entries[k] = blocks[:, r, q]
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        positive, inverse = source_of(_inverse_entries)(*entries)
+    if not positive.all():
+        raise np.linalg.LinAlgError("a block is not positive definite")
+    found = np.empty(blocks.shape)
+    for (r, q), entry in zip(pairs, inverse, strict=True):
+        if r < dimensions:
+            found[:, r, q] = found[:, q, r] = entry
+    return found
+
+
+WORD = 64
+
+# Times eight bytes of 0 or 1: bit 56 + k of the product is byte k (a sum of shifts by 7 to 56).
+_GATHER = np.uint64(0x0102040810204080)
+
+# Two instructions of every processor that Numba has no name for.
+
+
+@intrinsic
+def _trailing_zeros(typing_context: Any, word: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        del signature
+        return builder.cttz(arguments[0], context.get_constant(types.boolean, True))
+
+    del typing_context, word
+    return types.int64(types.uint64), generate
+
+
+@intrinsic
+def _ones(typing_context: Any, word: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        del context, signature
+        return builder.ctpop(arguments[0])
+
+    del typing_context, word
+    return types.int64(types.uint64), generate
+
+
+# inside kernels only: number of the lowest bit set of a word that is not 0, and number of bits set
+trailing_zeros = cast(Callable[[Any], int], _trailing_zeros)
+ones = cast(Callable[[Any], int], _ones)
+
+
+@inner_kernel
+def count_common(first: np.ndarray, second: np.ndarray) -> int:
+    """Size of the intersection of two sets (W,) uint64."""
+    count = 0
+    for w in range(len(first)):
+        count += ones(first[w] & second[w])
+    return count
+
+
+@inner_kernel
+def packed(eights: np.ndarray, w: int) -> np.uint64:
+    """Word w of a set whose members are bytes of 1, the others 0; `eights` are eight bytes each."""
+    word = np.uint64(0)
+    for k in range(8):
+        word |= ((eights[8 * w + k] * _GATHER) >> np.uint64(56)) << np.uint64(8 * k)
+    return word
+
+
+@kernel_part
+def transpose(square: np.ndarray) -> None:
+    """Exchange rows and columns of 64 words: halves of halves change places (Warren 2012, 7-3)."""
+    size, low = WORD // 2, np.uint64(0xFFFFFFFF)
+    while size:
+        shift = np.uint64(size)
+        for first in range(0, WORD, 2 * size):
+            for k in range(first, first + size):
+                differs = ((square[k] >> shift) ^ square[k + size]) & low
+                square[k] ^= differs << shift
+                square[k + size] ^= differs
+        size //= 2
+        low ^= low << np.uint64(size)
+
+
+@kernel
+def mirror(graph: np.ndarray) -> None:
+    """Make a graph (N, W) symmetric of which only the edges to later vertices are there."""
+    n, words = graph.shape
+    square = np.empty(WORD, np.uint64)
+    for r in range(words):
+        for c in range(r, words):
+            for k in range(WORD):
+                square[k] = graph[r * WORD + k, c] if r * WORD + k < n else np.uint64(0)
+            transpose(square)
+            for k in range(min(WORD, n - c * WORD)):
+                graph[c * WORD + k, r] |= square[k]

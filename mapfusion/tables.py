@@ -1,0 +1,330 @@
+"""Tables of maps and logs, written by this program, by pandas, or as CSV.
+
+A file of another program needs no metadata and may leave out what has a default. Numbers may be of
+any width, lists of any list type; in CSV a list is columns NAME_0, NAME_1, ... (or from 1 on).
+Without any height (z_m and its covariances) data are planar. A column that has nearly the name of a
+known one is refused, since a column left out may change what the data mean.
+`experiments/docs/formats.md` lists all columns.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.csv
+
+from mapfusion.errors import InputError
+from mapfusion.files import (
+    UNREADABLE,
+    column,
+    read_parquet,
+    require_cells,
+    require_kind,
+    text_attributes,
+)
+
+_ABOUT, _DEFAULT = b"about", b"default"
+HEIGHT = ("z_m", "cov_xz_m2", "cov_yz_m2", "cov_zz_m2")
+# Other names that heights have, without their units.
+_HEIGHT_NAMES = ("z", "height", "elevation", "altitude", "alt", "pos_z", "position_z", "p_z", "pz")
+_UNIT = re.compile(r"_?(\[.*\]|\(.*\)|[mc]?m2?|met(er|re)s?|ft|feet|m?s|rad|deg|px)$")
+_MOST_NAMED = 3  # columns of other names in one line
+_SEPARATORS = {";": "';'", "\t": "tabs", "|": "'|'", " ": "blanks"}
+
+
+def told(field: pa.Field, about: str, default: float | None = None) -> pa.Field:
+    """A field with what it means, and with its value where a file lacks it."""
+    metadata = {_ABOUT: about.encode()}
+    if default is not None:
+        metadata[_DEFAULT] = str(default).encode()
+    return field.with_metadata(metadata)
+
+
+def about(field: pa.Field) -> str:
+    """What `told` was told of a field; empty where nothing was."""
+    return (field.metadata or {}).get(_ABOUT, b"").decode()
+
+
+def default_of(field: pa.Field) -> float | None:
+    """What a file that lacks the column stands for; None where it must not."""
+    text = (field.metadata or {}).get(_DEFAULT)
+    return None if text is None else float(text)
+
+
+def table_path(folder: Path, name: str) -> Path:
+    """Where a folder keeps a table: NAME.csv if there is no NAME.parquet."""
+    parquet, csv = (folder / f"{name}.{kind}" for kind in ("parquet", "csv"))
+    return csv if csv.is_file() and not parquet.is_file() else parquet
+
+
+def is_csv(path: Path) -> bool:
+    """Return True for a file that is read and written as CSV, by its name."""
+    return path.suffix.lower() == ".csv"
+
+
+def csv_bytes(columns: Mapping[str, np.ndarray]) -> bytes:
+    """Return columns as CSV that `read_open_table` reads as they are, to the last bit.
+
+    A column (N, k) becomes k columns NAME_0, NAME_1, ...; NaN is an empty cell.
+    """
+    apart = {
+        name if values.ndim == 1 else f"{name}_{place}": each
+        for name, values in columns.items()
+        for place, each in enumerate([values] if values.ndim == 1 else values.T)
+    }
+    table = pa.table({name: pa.array(each, from_pandas=True) for name, each in apart.items()})
+    text = pa.BufferOutputStream()
+    pyarrow.csv.write_csv(table, text, pyarrow.csv.WriteOptions(include_header=False))
+    return f"{','.join(apart)}\n".encode() + text.getvalue().to_pybytes()
+
+
+def read_open_table(path: Path, table_schema: pa.Schema) -> tuple[pa.Table, dict[str, str]]:
+    """Read a table whoever wrote it.
+
+    Args:
+        path: of the file; one that ends in `.csv` is CSV, others are Parquet.
+        table_schema: columns that the table needs, or may have.
+
+    Returns:
+        The table with the columns of the schema, and its text attributes; `planar` is among them
+        for a table without heights.
+
+    Raises:
+        InputError: it is missing, damaged, of another kind, lacks a column, has one under another
+            name, or has text or an empty cell where a number must be.
+    """
+    kind = table_schema.metadata[b"mapfusion.kind"].decode()
+    table = _read_csv(path, table_schema) if is_csv(path) else read_parquet(path, f"{kind} table")
+    attributes = text_attributes(path, table)
+    if "kind" in attributes and not _is_earlier(attributes, table_schema):
+        require_kind(path, table, attributes, table_schema)
+    names = table.column_names
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise InputError(f"{path}: has two columns {', '.join(twice)}")
+    meant = _meant(names, table_schema)
+    planar = not set(HEIGHT) & set(names)
+    found = {field.name: _column(path, table, field, planar) for field in table_schema}
+    if missing := [name for name, values in found.items() if values is None]:
+        remedy = f"add to this {kind} table what experiments/docs/formats.md says of them"
+        if here := [f"{name} for {meant[name]}" for name in missing if name in meant]:
+            more = ", ..." if len(here) > _MOST_NAMED else ""
+            remedy = f"did you mean {', '.join(here[:_MOST_NAMED])}{more}?"
+        raise InputError(f"{path}: has no column {', '.join(missing)}; {remedy}")
+    if meant:
+        asked = " and ".join(f"{there} to {name}" for name, there in meant.items())
+        reason = "a column of an unknown name is left out"
+        raise InputError(f"{path}: rename column {asked} (mind the unit), or remove it: {reason}")
+    if planar:
+        attributes = {"planar": "true"} | attributes
+    plain = [pa.field(field.name, field.type) for field in table_schema]
+    columns = pa.table(found, schema=pa.schema(plain))
+    return columns, attributes
+
+
+def _meant(names: Sequence[str], table_schema: pa.Schema) -> dict[str, str]:
+    """Return unknown columns that have nearly the name of a known one, by the known name.
+
+    Names are alike that differ in letter case, blanks and hyphens alone, or that lack the unit. All
+    names of heights stand for z_m, as without it data would be taken for planar.
+    """
+    known = {_plain_name(field.name): field.name for field in table_schema}
+    known = {_UNIT.sub("", name): field for name, field in known.items()} | known
+    if "z_m" in table_schema.names and "z_m" not in names:
+        known |= dict.fromkeys(_HEIGHT_NAMES, "z_m")
+    meant: dict[str, str] = {}
+    for name in names:
+        if name in table_schema.names:
+            continue
+        plain = _plain_name(name)
+        like = known.get(plain) or known.get(_UNIT.sub("", plain))
+        if like is not None and like not in names:
+            meant.setdefault(like, name)
+    return meant
+
+
+def _plain_name(name: str) -> str:
+    return re.sub(r"[\s-]+", "_", name.strip().lower())
+
+
+def _is_earlier(attributes: Mapping[str, str], table_schema: pa.Schema) -> bool:
+    """Whether an earlier version of this program wrote it; later columns have defaults."""
+    wanted = (
+        table_schema.metadata[f"mapfusion.{key}".encode()] for key in ("kind", "schema_version")
+    )
+    kind, version = (text.decode() for text in wanted)
+    found = attributes.get("schema_version", "")
+    return attributes["kind"] == kind and found.isdecimal() and 0 < int(found) < int(version)
+
+
+def _read_csv(path: Path, table_schema: pa.Schema) -> pa.Table:
+    """Read a CSV file, its names without blanks around them; raises InputError."""
+    kind = table_schema.metadata[b"mapfusion.kind"].decode()
+    if not path.is_file():
+        raise InputError(f"{path}: no such file (expected a {kind} table)")
+    data = path.read_bytes()
+    try:
+        table = pyarrow.csv.read_csv(pa.BufferReader(data))
+        names = [name.strip() for name in table.column_names]  # they may be no UTF-8
+    except UNREADABLE as error:
+        _require_dialect(path, data, table_schema)
+        raise InputError(f"{path}: not readable as CSV ({error})") from error
+    if not set(names) & set(table_schema.names):
+        _require_dialect(path, data, table_schema)
+    return table.rename_columns(names)
+
+
+def _require_dialect(path: Path, data: bytes, table_schema: pa.Schema) -> None:
+    """Raise InputError if the first line of a CSV file has another separator, or holds no names."""
+    first = data.split(b"\n", 1)[0].decode("utf-8-sig", "replace").strip()
+    for separator, called in _SEPARATORS.items():
+        names = {_plain_name(each.strip("\"'")) for each in first.split(separator)}
+        if len(names) > 1 and names & set(table_schema.names):
+            raise InputError(f"{path}: is separated by {called}; write it with commas")
+    cells = [each for each in re.split(r"[,;\s]+", first.replace('"', "")) if each]
+    if cells and all(_is_number(each) for each in cells):
+        required = ", ".join(f.name for f in table_schema if default_of(f) is None)
+        wanted = f"put one with the columns' names above the numbers ({required}, ...)"
+        raise InputError(f"{path}: has no header line; {wanted}")
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _column(path: Path, table: pa.Table, field: pa.Field, planar: bool) -> pa.Array | None:
+    """A column in the type of the schema; its default where it is not there, None without."""
+    default = 0.0 if planar and field.name in HEIGHT else default_of(field)
+    try:
+        if pa.types.is_fixed_size_list(field.type):
+            return _rows_of_numbers(path, table, field)
+        if field.name not in table.column_names:
+            filled = None if default is None else np.full(table.num_rows, default)
+            return None if filled is None else pa.array(filled).cast(field.type)
+        values = table.column(field.name).combine_chunks()
+        is_number = pa.types.is_integer(values.type) or pa.types.is_floating(values.type)
+        if not is_number and values.null_count < len(values):
+            raise InputError(f"{path}: column {field.name} {_no_number(values)}")
+        is_float = pa.types.is_floating(field.type)
+        if pa.types.is_floating(values.type) and not is_float:  # as pandas makes of gaps
+            values = pa.array(values.to_numpy(zero_copy_only=False), from_pandas=True)
+        empty = np.nan if is_float else default  # pandas stores NaN as an empty cell
+        if values.null_count and empty is None:
+            row = values.is_null().to_pylist().index(True)
+            raise InputError(f"{path}: column {field.name} is empty in row {row}")
+        values = values.cast(field.type)
+        return values.fill_null(pa.scalar(empty, field.type)) if values.null_count else values
+    except pa.ArrowException as error:
+        reason = f"{' '.join(str(error).split())} (expected {field.type})"
+        raise InputError(f"{path}: column {field.name}: {reason}") from error
+
+
+def _no_number(values: pa.Array) -> str:
+    """Return which cell of a column of another type holds no number."""
+    if pa.types.is_string(values.type) or pa.types.is_large_string(values.type):
+        for row, cell in enumerate(values.to_pylist()):
+            if cell is not None and not _is_number(cell):
+                return f"holds {cell!r} in row {row}, expected a number"
+    return f"holds {values.type}, not numbers"
+
+
+def _call(name: str, values: pa.Array) -> pa.Array:
+    return pc.call_function(name, [values])
+
+
+def _rows_of_numbers(path: Path, table: pa.Table, field: pa.Field) -> pa.Array:
+    """A column of lists, (N, k) of NaN where there is none; also of columns NAME_0, NAME_1, ..."""
+    width, n = field.type.list_size, table.num_rows
+    apart, values = _columns_apart(path, table, field), None
+    if not apart and field.name in table.column_names:
+        values = table.column(field.name).combine_chunks()
+        if values.type == field.type and not values.null_count and not values.flatten().null_count:
+            return values
+    matrix = np.full((n, width), np.nan)
+    for i, name in enumerate(apart):
+        cells = table.column(name).combine_chunks()
+        if cells.null_count == n:
+            continue
+        if pa.types.is_string(cells.type):
+            raise InputError(f"{path}: column {name} {_no_number(cells)}")
+        matrix[:, i] = cells.cast(pa.float64()).fill_null(np.nan).to_numpy(zero_copy_only=False)
+    if values is not None and values.null_count < n:
+        lengths = _call("list_value_length", values).drop_null().unique().to_pylist()
+        if lengths != [width]:
+            raise pa.ArrowInvalid(f"lists of {sorted(lengths)} numbers")
+        there = ~values.is_null().to_numpy(zero_copy_only=False)
+        flat = _call("list_flatten", values).cast(pa.float64()).fill_null(np.nan)
+        matrix[there] = flat.to_numpy(zero_copy_only=False).reshape(-1, width)
+    flat = pa.array(matrix.ravel().astype(field.type.value_type.to_pandas_dtype()))
+    return pa.FixedSizeListArray.from_arrays(flat, type=field.type)
+
+
+def _columns_apart(path: Path, table: pa.Table, field: pa.Field) -> list[str]:
+    """Return the columns NAME_0, NAME_1, ... (or from 1 on) of a list, in order; none without any.
+
+    Raises:
+        InputError: there are some, but not one for each number of the list.
+    """
+    pattern = re.compile(re.escape(field.name) + r"_?(\d{1,9})", re.IGNORECASE)
+    numbered = {
+        int(match[1]): name for name in table.column_names if (match := pattern.fullmatch(name))
+    }
+    width, order = field.type.list_size, sorted(numbered)
+    if order and order not in (list(range(width)), list(range(1, width + 1))):
+        first, last = numbered[order[0]], numbered[order[-1]]
+        found = f"has {len(order)} columns {first} to {last}" if first != last else f"has {first}"
+        wanted = f"{field.name}_0 to {field.name}_{width - 1}, {width} of them"
+        raise InputError(f"{path}: {found}; expected {wanted}")
+    return [numbered[k] for k in order]
+
+
+DESCRIPTOR_LENGTH = 64
+NO_LABEL = -1
+LOOK_FIELDS = [
+    told(pa.field("label", pa.int32()), "known identity of the landmark, -1 for none", NO_LABEL),
+    told(
+        pa.field("descriptor", pa.list_(pa.float32(), DESCRIPTOR_LENGTH)),
+        "what it looks like (U-SURF or another), NaN for none",
+        np.nan,
+    ),
+]
+
+
+def look_columns(
+    n: int, descriptor: np.ndarray | None, label: np.ndarray | None
+) -> dict[str, np.ndarray]:
+    """By what n points are recognised, as the columns of `LOOK_FIELDS`."""
+    if descriptor is None:
+        descriptor = np.full((n, DESCRIPTOR_LENGTH), np.nan)
+    if label is None:
+        label = np.full(n, NO_LABEL)
+    return {"label": label.astype(np.int32), "descriptor": descriptor.astype(np.float32)}
+
+
+def looks_from(table: pa.Table) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Descriptors and labels of a table, None where no row has any."""
+    descriptor, label = column(table, "descriptor"), column(table, "label")
+    return (
+        None if np.isnan(descriptor).all() else descriptor,
+        None if np.all(label == NO_LABEL) else label,
+    )
+
+
+def require_looks(path: Path, table: pa.Table) -> None:
+    """Raise InputError for the first row whose label or descriptor is not as documented."""
+    known_label = f"labels are {NO_LABEL} for none, or 0 and more"
+    require_cells(path, table, ["label"], lambda label: label >= NO_LABEL, known_label)
+    descriptor = column(table, "descriptor")
+    unusable = ~np.isfinite(descriptor).all(1) & ~np.isnan(descriptor).all(1)
+    if unusable.any():
+        row = np.flatnonzero(unusable)[0]
+        k = np.flatnonzero(~np.isfinite(descriptor[row]))[0]
+        found = f"number {k} is {descriptor[row, k]} in row {row}"
+        remedy = "give finite numbers, or leave the whole cell empty"
+        raise InputError(f"{path}: column descriptor: {found}; {remedy}")

@@ -1,1 +1,0 @@
-"""Any number of robots: which of the alignments of their maps can be true together."""

@@ -1,0 +1,209 @@
+"""Rival motions, and repeated structure: landmarks and regions that occur more than once."""
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from mapfusion.align.alignment import MIN_PAIRS, Pairs
+from mapfusion.align.clique import Clique
+from mapfusion.align.correspondences import Correspondences, HeightGate, nearest_both_ways
+from mapfusion.align.method import Undetermined
+from mapfusion.align.nearest_neighbours import Grid, runs_about
+from mapfusion.align.refinement import Refinement
+from mapfusion.geometry.numerics import Float, kernel
+from mapfusion.geometry.se2 import transform_points
+from mapfusion.landmark_map import LandmarkMap
+from mapfusion.verification.false_alarms import Acceptance
+
+# A place is that of a landmark, as far about it as the smallest posters are wide (half a metre):
+# neighbouring corners of one picture.
+_PLACE_M = 0.5
+# It is laid on its like where so many landmarks of it are found, as a region needs to count, and so
+# large a share: from about there on it is ten times likelier that a copy was seen from elsewhere
+# than that chance found as many (`fitted_rates.py`, what may be seen: 7 of 20, 17 of 60).
+_LEAST, _LEAST_SHARE = 5, 0.3
+
+
+BETWEEN = "a b"  # of a motion between two maps; of one map onto itself: a, b
+
+
+class Copies(NamedTuple):
+    """Which landmarks of two maps lie in places that may be copies: bool (N_a,) and (N_b,)."""
+
+    in_a: np.ndarray
+    in_b: np.ndarray
+
+    @classmethod
+    def none(cls, n_a: int, n_b: int) -> "Copies":
+        """Of maps in which nothing is held twice."""
+        return cls(np.zeros(n_a, np.bool_), np.zeros(n_b, np.bool_))
+
+    def joined(self, others: Iterable["Copies"]) -> "Copies":
+        """Those of any of several motions."""
+        in_a, in_b = self.in_a.copy(), self.in_b.copy()
+        for other in others:
+            in_a |= other.in_a
+            in_b |= other.in_b
+        return Copies(in_a, in_b)
+
+
+def of_others(copies: Sequence[Copies], own: int) -> Copies:
+    """What motions but one of them lay on its like."""
+    first = Copies.none(len(copies[own].in_a), len(copies[own].in_b))
+    return first.joined(each for k, each in enumerate(copies) if k != own)
+
+
+@kernel
+def about_each(counted: np.ndarray, near: Grid) -> np.ndarray:
+    """How many of the landmarks about each (N,) are `counted` (N,), itself among them."""
+    p, row_of = near.p, near.row
+    n = np.zeros(len(counted), np.int64)
+    runs = np.empty((near.shape[1], 2), np.int64)
+    for k in range(len(p)):
+        if not counted[row_of[k]]:
+            continue
+        for run in range(runs_about(p[k, 0], p[k, 1], _PLACE_M, near, runs)):
+            for m in range(runs[run, 0], runs[run, 1]):
+                dx, dy = p[m, 0] - p[k, 0], p[m, 1] - p[k, 1]
+                n[row_of[m]] += dx * dx + dy * dy <= _PLACE_M * _PLACE_M
+    return n
+
+
+def laid_on_like(found: np.ndarray, crowd: np.ndarray, near: Grid) -> np.ndarray:
+    """Which landmarks (N,) lie where enough of those about them are `found` (N,) elsewhere.
+
+    Of `crowd` (N,) is how many there are about each.
+    """
+    hits = about_each(found, near)
+    return (hits >= _LEAST) & (hits >= _LEAST_SHARE * crowd)
+
+
+# What lies nearer is of one place: neighbouring corners share most of their descriptors' windows,
+# and one point may be in a map twice.
+_ELSEWHERE_M = 1.0
+_UNLIKE = 0.6  # of descriptors, at the most: as landmarks of two maps are paired
+
+
+def twins(landmarks: LandmarkMap) -> Correspondences:
+    """Landmarks that are each other's most alike among those elsewhere, each pair both ways.
+
+    A motion under which such pairs agree lays one part of the map on its like. Maps without
+    descriptors have none.
+    """
+    n = len(landmarks)
+    if landmarks.descriptor is None or n < 2:
+        return Correspondences(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
+    height = HeightGate()
+    bound = math.inf if landmarks.planar else height.bound
+    gates = bound, height.floor_m**2, _ELSEWHERE_M
+    nearest, distance2, _ = nearest_both_ways(landmarks, landmarks, *gates)
+    rows = np.arange(n)
+    unlike = np.sqrt(np.maximum(distance2, 0.0))
+    kept = (nearest >= 0) & (nearest[nearest] == rows) & (unlike <= _UNLIKE)
+    return Correspondences(rows[kept], nearest[kept], unlike[kept])
+
+
+@kernel
+def largest_patch_m(p: Float, reach_m: float, least: int) -> float:
+    """The longest side of the largest patch of points (n, 2), 0 of none.
+
+    Points that are less than `reach_m` apart are of one patch, which has `least` points or more.
+    """
+    n = len(p)
+    patch, queue, longest = np.full(n, -1), np.empty(n, np.int64), 0.0
+    for start in range(n):
+        if patch[start] >= 0:
+            continue
+        head, tail = 0, 1
+        queue[0], patch[start] = start, start
+        low, high = p[start].copy(), p[start].copy()
+        while head < tail:
+            i = queue[head]
+            head += 1
+            for axis in range(2):
+                low[axis], high[axis] = min(low[axis], p[i, axis]), max(high[axis], p[i, axis])
+            for j in range(n):
+                dx, dy = p[i, 0] - p[j, 0], p[i, 1] - p[j, 1]
+                if patch[j] < 0 and dx * dx + dy * dy < reach_m * reach_m:
+                    patch[j] = start
+                    queue[tail] = j
+                    tail += 1
+        if tail >= least:
+            longest = max(longest, high[0] - low[0], high[1] - low[1])
+    return longest
+
+
+# Motions that move the landmarks less far apart, RMS, are one: twice what a right one may be off.
+DISTINCT_M = 1.0
+_LEAST_PAIRS = 6  # among fewer no motion is more than chance
+
+
+class Supported(NamedTuple):
+    """A motion, and what of the correspondences supports it.
+
+    Attributes:
+        T_a_b: (3,).
+        log10_false_alarms: as the test against chance has it; infinite where it has no answer.
+        inlier: (N,) bool, the pairs within the widest gate of the test.
+    """
+
+    T_a_b: Float
+    log10_false_alarms: float
+    inlier: np.ndarray
+
+
+def apart_m(T_a_b: Float, other: Float, p_b: Float) -> float:
+    """How far apart two motions (3,) move points (n, 2), RMS."""
+    apart = transform_points(T_a_b, p_b) - transform_points(other, p_b)
+    return float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
+
+
+def distinct_motions(
+    pairs: Pairs, most: int, acceptance: Acceptance, refinement: Refinement
+) -> list[Supported]:
+    """Up to `most` motions, that of the largest clique first, then that of what it leaves, ...
+
+    Each is refined on all pairs, and held against chance with them.
+    """
+    found: list[Supported] = []
+    chance, method = acceptance.on(pairs), Clique()
+    p_a, p_b = pairs.p_a[:, :2], pairs.p_b[:, :2]
+    rows, widest_m = np.arange(len(pairs)), max(acceptance.gates_m)
+    tries = 2 * most  # what the refinement moves onto one found before is none
+    while len(rows) >= _LEAST_PAIRS and len(found) < most and tries > 0:
+        tries -= 1
+        fit = method.find(pairs[rows], np.random.default_rng(0))  # which draws nothing
+        if isinstance(fit, Undetermined) or np.count_nonzero(fit.inlier) < MIN_PAIRS:
+            break
+        refined = refinement.refine(pairs, fit.T_a_b)
+        T = refined.T_a_b if np.isfinite(refined.T_a_b).all() else fit.T_a_b
+        if not any(apart_m(T, each.T_a_b, p_b) < DISTINCT_M for each in found):
+            log10 = chance.judge(refined).log10_false_alarms
+            found.append(Supported(T, log10, _within(T, p_a, p_b, widest_m)))
+        rows = rows[~(fit.inlier | _within(fit.T_a_b, p_a[rows], p_b[rows], widest_m))]
+    return found
+
+
+def self_motions(
+    landmarks: LandmarkMap, most: int, acceptance: Acceptance, refinement: Refinement
+) -> tuple[Pairs, list[Supported]]:
+    """The twins of a map, and motions that lay parts of it on their like."""
+    pairs = Pairs(landmarks, landmarks, twins(landmarks))
+    back = np.searchsorted(pairs.index_a, pairs.index_b)  # rows ascend, and each pair is both ways
+    found = []
+    for each in distinct_motions(pairs, most, acceptance, refinement):
+        # a motion that undoes itself brings both orders of a pair together: they are one
+        again = each.inlier & each.inlier[back] & (pairs.index_a > pairs.index_b)
+        once = pairs[~again]
+        log10 = each.log10_false_alarms
+        if again.any():
+            refined = refinement.refine(once, each.T_a_b)
+            log10 = acceptance.judge(once, refined).log10_false_alarms
+        found.append(each._replace(log10_false_alarms=log10))
+    return pairs, found
+
+
+def _within(T_a_b: Float, p_a: Float, p_b: Float, gate_m: float) -> np.ndarray:
+    return np.hypot(*(p_a - transform_points(T_a_b, p_b)).T) <= gate_m

@@ -1,0 +1,346 @@
+"""Visual odometry: the rigid camera motion that explains tracks between two frames.
+
+A corner may jump along an edge, sit where one wall ends before another, or belong to something that
+moves. Such links look like the others, descriptor by descriptor, and err by several pixels where
+the rest errs by a tenth; one in twenty is enough to turn a map. The world stands still, so all true
+links agree on one motion in space: what it is, with its covariance, is visual odometry.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapfusion.attitude import Attitude
+from mapfusion.geometry import se3
+from mapfusion.geometry.camera import StereoCamera
+from mapfusion.geometry.numerics import (
+    Float,
+    chi_square_bound,
+    cholesky,
+    cofactors,
+    copy_lower,
+    kernel,
+    kernel_part,
+    solve_lower,
+    solve_upper,
+)
+from mapfusion.geometry.se3 import inverse
+
+MIN_LINKS = 4  # three links determine a motion; one slip among four is the first that shows
+# Added to the noise: from a tolerance beside which all points are equally certain to none.
+_TOLERANCES_M = (1.0, 0.25, 0.06, 0.015, 0.004, 0.001, 0.0)
+_ALL_AFTER = 3  # place in it after which all links are used, whatever the start left out
+_STEPS = 2  # of Gauss-Newton at each tolerance; the answer of the one before is near
+_PARTS = 3  # near, middle and far links; each start but one leaves one of them out
+_SIZE = 6  # of a motion's change: shift along the axes before, and turn about them
+# Added to a normal matrix, as a share of its diagonal: what the links leave open (a turn about the
+# line that all lie on) stays as it is. Rounding is far below, what they do tell far above.
+_OPEN = 1e-10
+# Residuals of true links, in standard deviations: half of them lie below this squared distance.
+_MEDIAN_SQUARE = chi_square_bound(0.5, 3)
+
+
+@dataclass(frozen=True)
+class RigidMotion:
+    """How the camera moved from one frame to the next, by what it sees.
+
+    Attributes:
+        T_before_after: (4, 4).
+        covariance: (6, 6) of its error: a shift along the axes of the frame before, and a turn
+            about them through its origin, in that order. As large as the residuals say, where these
+            exceed what is stated of the points.
+        n_links: how many links agree with it.
+    """
+
+    T_before_after: Float
+    covariance: Float
+    n_links: int
+
+    def of(self, T_body_camera: Float) -> "RigidMotion":
+        """The motion of a body that the camera is fixed to, at (4, 4)."""
+        T = T_body_camera @ self.T_before_after @ inverse(T_body_camera)
+        turn, arm = T_body_camera[:3, :3], T[:3, :3] @ T_body_camera[:3, 3]
+        # T = (R, turn t + p - R p): a turn w of the camera's R shifts the body by (R p) x w
+        jacobian = np.zeros((6, 6))
+        jacobian[:3, :3] = jacobian[3:, 3:] = turn
+        jacobian[:3, 3:] = np.cross(arm, np.eye(3)).T @ turn
+        return RigidMotion(T, jacobian @ self.covariance @ jacobian.T, self.n_links)
+
+
+def rigid_links(
+    p_before_m: Float,
+    covariance_before_m2: Float,
+    p_after_m: Float,
+    covariance_after_m2: Float,
+    probability: float,
+) -> tuple[np.ndarray, RigidMotion | None]:
+    """Links (N,) bool that agree with the motion on which most agree, and that motion.
+
+    Least squares over the links inside the gate, again and again, while a tolerance that is added
+    to all covariances falls from far above the noise to nothing. At first every link has one vote;
+    at last each counts by its own precision. That finds the motion in spite of slips anywhere, but
+    not always of another robot nearby: some points known to a millimetre pull at one end, where a
+    wall at one distance leaves open whether the robot turned or slid. So there are four starts, of
+    all links and without the near, the middle and the far third; that with most links wins.
+    Points (N, 3) are in the robot frame of either frame. Fewer than four links leave nothing to
+    compare: all True then, and no motion; none either where fewer than four agree.
+    """
+    n = len(p_before_m)
+    if n < MIN_LINKS:
+        return np.ones(n, dtype=bool), None
+    gate = chi_square_bound(probability, 3)
+    start = starts(p_before_m)
+    agree, T = start.copy(), np.zeros((len(start), 4, 4))
+    T[:, range(4), range(4)] = 1.0
+    square, normal = np.empty((len(start), n)), np.empty((len(start), _SIZE, _SIZE))
+    points = (p_before_m, covariance_before_m2, p_after_m, covariance_after_m2)
+    _narrow(start, agree, *points, gate, T, square, normal)
+    best = int(np.argmax(agree.sum(axis=1)))
+    own = agree[best]
+    n_links = int(own.sum())
+    if n_links < MIN_LINKS:
+        return own, None
+    # The median of what has passed the gate lies a little low, by less than a part in a hundred.
+    ranked = np.sort(square[best][own])
+    median = (ranked[(n_links - 1) // 2] + ranked[n_links // 2]) / 2
+    excess = max(median / _MEDIAN_SQUARE, 1.0)
+    covariance = excess * np.linalg.inv(normal[best])
+    return own, RigidMotion(T[best], (covariance + covariance.T) / 2, n_links)
+
+
+def starts(p_before_m: Float) -> np.ndarray:
+    """Links (4, N) bool that each start uses: all, and without a third by distance."""
+    n = len(p_before_m)
+    by_distance = np.argsort(np.linalg.norm(p_before_m, axis=1), kind="stable")
+    part = np.empty(n, dtype=np.int64)
+    part[by_distance] = np.arange(n) * _PARTS // n
+    return np.not_equal(part, np.array([-1, *range(_PARTS)])[:, None])
+
+
+@kernel(error_model="numpy")
+def _narrow(
+    start: np.ndarray,
+    agree: np.ndarray,
+    p_before: Float,
+    S_before: Float,
+    p_after: Float,
+    S_after: Float,
+    gate: float,
+    T: Float,
+    square: Float,
+    normal: Float,
+) -> None:
+    """Fill in what agrees in the end (B, N), from the links of the starts (B, N).
+
+    And of each start the motion (B, 4, 4), the squared distances (B, N), the normal matrix
+    (B, 6, 6), damped.
+    """
+    n = start.shape[1]
+    lever, residual, information = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 6))
+    step, factor = np.zeros(_SIZE), np.empty((_SIZE, _SIZE))
+    for b in range(len(start)):
+        for i in range(len(_TOLERANCES_M)):
+            variance = _TOLERANCES_M[i] ** 2
+            for _ in range(_STEPS):
+                _differences(T[b], p_before, p_after, lever, residual)
+                _information(T[b], variance, S_before, S_after, information)
+                _normal_equations(lever, residual, information, agree[b], normal[b], step)
+                copy_lower(normal[b], factor)
+                if cholesky(factor, 0.0):
+                    solve_lower(factor, step)
+                    solve_upper(factor, step)
+                else:  # no link is in use
+                    step[:] = 0.0
+                _move(T[b], step)
+            for j in range(n):
+                square[b, j] = _square(lever[j], residual[j], information[j], step)
+                agree[b, j] = square[b, j] <= gate and (i >= _ALL_AFTER or start[b, j])
+
+
+@kernel_part(error_model="numpy")
+def _differences(T: Float, p_before: Float, p_after: Float, lever: Float, residual: Float) -> None:
+    """Before minus after (N, 3) under a motion, and the turned points (N, 3), which are levers."""
+    for j in range(len(residual)):
+        x, y, z = p_after[j, 0], p_after[j, 1], p_after[j, 2]
+        for k in range(3):
+            lever[j, k] = T[k, 0] * x + T[k, 1] * y + T[k, 2] * z
+            residual[j, k] = p_before[j, k] - lever[j, k] - T[k, 3]
+
+
+@kernel_part(error_model="numpy")
+def _information(
+    T: Float, variance: float, S_before: Float, S_after: Float, information: Float
+) -> None:
+    """Of the differences: the inverse covariances' upper entries (N, 6) under a motion."""
+    a, b, c = T[0, 0], T[0, 1], T[0, 2]
+    d, e, f = T[1, 0], T[1, 1], T[1, 2]
+    g, h, i = T[2, 0], T[2, 1], T[2, 2]
+    for j in range(len(information)):
+        before, after = S_before[j], S_after[j]
+        xx, xy, xz = after[0, 0], after[0, 1], after[0, 2]
+        yy, yz, zz = after[1, 1], after[1, 2], after[2, 2]
+        # rows of R S, then R S R^T
+        ax, ay, az = a * xx + b * xy + c * xz, a * xy + b * yy + c * yz, a * xz + b * yz + c * zz
+        dx, dy, dz = d * xx + e * xy + f * xz, d * xy + e * yy + f * yz, d * xz + e * yz + f * zz
+        gx, gy, gz = g * xx + h * xy + i * xz, g * xy + h * yy + i * yz, g * xz + h * yz + i * zz
+        axx, axy, axz, ayy, ayz, azz, determinant = cofactors(
+            before[0, 0] + variance + ax * a + ay * b + az * c,
+            before[0, 1] + ax * d + ay * e + az * f,
+            before[0, 2] + ax * g + ay * h + az * i,
+            before[1, 1] + variance + dx * d + dy * e + dz * f,
+            before[1, 2] + dx * g + dy * h + dz * i,
+            before[2, 2] + variance + gx * g + gy * h + gz * i,
+        )
+        own, scale = information[j], 1 / determinant
+        own[0], own[1], own[2] = scale * axx, scale * axy, scale * axz
+        own[3], own[4], own[5] = scale * ayy, scale * ayz, scale * azz
+
+
+@kernel_part(error_model="numpy")
+def _normal_equations(
+    lever: Float, residual: Float, information: Float, used: np.ndarray, normal: Float, right: Float
+) -> None:
+    """Sums of J^T I J (6, 6) and J^T I r (6,) over the links in use, J = (1, -[lever]x)."""
+    normal[:], right[:] = 0.0, 0.0
+    for j in range(len(used)):
+        if not used[j]:
+            continue
+        xx, xy, xz = information[j, 0], information[j, 1], information[j, 2]
+        yy, yz, zz = information[j, 3], information[j, 4], information[j, 5]
+        x, y, z = lever[j, 0], lever[j, 1], lever[j, 2]
+        # I J of the turn, column by column: about x, y and z
+        u0, u1, u2 = xz * y - xy * z, yz * y - yy * z, zz * y - yz * z
+        v0, v1, v2 = xx * z - xz * x, xy * z - yz * x, xz * z - zz * x
+        w0, w1, w2 = xy * x - xx * y, yy * x - xy * y, yz * x - xz * y
+        normal[0, 0] += xx
+        normal[1, 0] += xy
+        normal[1, 1] += yy
+        normal[2, 0] += xz
+        normal[2, 1] += yz
+        normal[2, 2] += zz
+        normal[3, 0] += u0
+        normal[3, 1] += u1
+        normal[3, 2] += u2
+        normal[4, 0] += v0
+        normal[4, 1] += v1
+        normal[4, 2] += v2
+        normal[5, 0] += w0
+        normal[5, 1] += w1
+        normal[5, 2] += w2
+        normal[3, 3] += u2 * y - u1 * z
+        normal[4, 3] += u0 * z - u2 * x
+        normal[4, 4] += v0 * z - v2 * x
+        normal[5, 3] += u1 * x - u0 * y
+        normal[5, 4] += v1 * x - v0 * y
+        normal[5, 5] += w1 * x - w0 * y
+        rx, ry, rz = residual[j, 0], residual[j, 1], residual[j, 2]
+        right[0] += xx * rx + xy * ry + xz * rz
+        right[1] += xy * rx + yy * ry + yz * rz
+        right[2] += xz * rx + yz * ry + zz * rz
+        right[3] += u0 * rx + u1 * ry + u2 * rz
+        right[4] += v0 * rx + v1 * ry + v2 * rz
+        right[5] += w0 * rx + w1 * ry + w2 * rz
+    for r in range(_SIZE):
+        for c in range(r):
+            normal[c, r] = normal[r, c]
+        normal[r, r] *= 1 + _OPEN
+
+
+@kernel_part(error_model="numpy")
+def _move(T: Float, step: Float) -> None:
+    """Shift, and turn about the origin's axes by the step's rotation vector (Rodrigues)."""
+    x, y, z = step[3], step[4], step[5]
+    angle = math.sqrt(x * x + y * y + z * z)
+    # sin(a) / a and (1 - cos(a)) / a^2, exact through zero
+    sine = math.sin(angle) / angle if angle > 0 else 1.0
+    half = math.sin(angle / 2) / angle if angle > 0 else 0.5
+    versine = 2 * half * half
+    for c in range(3):
+        a, b, d = T[0, c], T[1, c], T[2, c]
+        cx, cy, cz = y * d - z * b, z * a - x * d, x * b - y * a
+        T[0, c] += sine * cx + versine * (y * cz - z * cy)
+        T[1, c] += sine * cy + versine * (z * cx - x * cz)
+        T[2, c] += sine * cz + versine * (x * cy - y * cx)
+    for k in range(3):
+        T[k, 3] += step[k]
+
+
+@kernel_part(error_model="numpy")
+def _square(lever: Float, residual: Float, information: Float, step: Float) -> float:
+    """Squared distance of a link's points, in standard deviations, after the step."""
+    xx, xy, xz = information[0], information[1], information[2]
+    yy, yz, zz = information[3], information[4], information[5]
+    x = residual[0] - step[0] - (step[4] * lever[2] - step[5] * lever[1])
+    y = residual[1] - step[1] - (step[5] * lever[0] - step[3] * lever[2])
+    z = residual[2] - step[2] - (step[3] * lever[1] - step[4] * lever[0])
+    return xx * x * x + yy * y * y + zz * z * z + 2 * (xy * x * y + xz * x * z + yz * y * z)
+
+
+_PLANE = [0, 1, 5]  # x, y and the turn about z, of shifts and turns in space
+# A motion that no links told is one that went on as before, or stopped, or turned: it errs by as
+# much as the motion itself and the largest step that was told so far, together. A robot begins with
+# what one of the simulated kind does from frame to frame at most, m and rad.
+_FIRST_STEP = np.array([0.1, 0.1, 0.1])
+
+
+@dataclass(frozen=True)
+class VisualOdometry:
+    """Motion since the frame before.
+
+    Attributes:
+        increments: (T, 3) in the plane, in the robot frame of the frame before; the first is zero.
+        covariance: (T, 3, 3) of their errors; the first is zero.
+        guessed: (T,) bool, motions that too few links told: the robot is taken to go on as before.
+    """
+
+    increments: Float
+    covariance: Float
+    guessed: np.ndarray
+
+
+def visual_odometry(
+    motions: Sequence[RigidMotion | None],
+    steps: Float,
+    camera: StereoCamera,
+    T_robot_camera: Float,
+    attitude: Attitude | None = None,
+) -> VisualOdometry:
+    """What the links of a log's frames say of the robot's way.
+
+    Args:
+        motions: T of them, as `Tracks.motion` has them, of a camera that was taken for level.
+        steps: (T,) usual steps of time since the frame before.
+        camera: the pair, with the mount that it was taken to have.
+        T_robot_camera: (4, 4) the mount that it has; axes x ahead, y left, z up.
+        attitude: of the T frames; None: the body is level.
+    """
+    n = len(motions)
+    increments, covariance = np.zeros((n, 3)), np.zeros((n, 3, 3))
+    guessed = np.array([motion is None for motion in motions])
+    guessed[0] = False
+    by_robot = robot_motions(motions, camera, T_robot_camera)
+    speed, widest = np.zeros(3), _FIRST_STEP  # a step
+    for k in range(1, n):
+        own = by_robot[k]
+        if own is None:
+            increments[k] = steps[k] * speed
+            covariance[k] = np.diag((np.abs(increments[k]) + steps[k] * widest) ** 2)
+        else:
+            level = np.eye(3) if attitude is None else se3.tilt(*attitude.value[k - 1, :2])
+            increments[k] = se3.planar(se3.pose(level, np.zeros(3)) @ own.T_before_after)
+            turned = np.kron(np.eye(2), level)
+            covariance[k] = (turned @ own.covariance @ turned.T)[np.ix_(_PLANE, _PLANE)]
+            speed = increments[k] / steps[k]
+            widest = np.maximum(widest, np.abs(speed))
+    return VisualOdometry(increments, covariance, guessed)
+
+
+def robot_motions(
+    motions: Sequence[RigidMotion | None], camera: StereoCamera, T_robot_camera: Float
+) -> list[RigidMotion | None]:
+    """Motions of the robot's body by those of a camera that was taken for level, see above."""
+    taken = se3.pose(np.eye(3), camera.p_robot_left)
+    T_robot_taken = T_robot_camera @ se3.inverse(taken)
+    return [None if motion is None else motion.of(T_robot_taken) for motion in motions]

@@ -1,0 +1,274 @@
+"""Floor and ceiling: mean texture over the footprint of each pixel.
+
+A row of a level camera's picture shows a level plane at one depth, Z = h f / |v - c|. A footprint
+is Z / f wide and Z^2 / (h f) deep: far off it is long and narrow, turned against the picture's
+texels: it is filled with bilinear samples all along it, from the copy whose texels are as
+large as it is wide (Heckbert 1989, section 3; McCormack et al. 1999, Feline).
+"""
+
+import functools
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mapfusion.geometry.numerics import Float, kernel, kernel_part
+from sim.raycast.scene import Level
+from sim.raycast.visible_walls import Pinhole, anywhere
+
+BACKGROUND = 255.0  # grey level of what is nowhere, as PyBullet has it
+MOST_SAMPLES = 64  # along a footprint
+STEP_TEXELS = 2.0  # between samples; floors are painted with a low pass of one texel
+# Places are whole numbers of 2^-22 cells, shares of a cell of 2^-8, sums of 2^-16 grey levels: so
+# loops take half the time. 2 x MOST_SAMPLES values of 255 still fit into 32 bits,
+# and so does the way of PIECE pixels, of two cells each at most.
+PLACE_BITS, SHARE_BITS, PIECE = 22, 8, 128
+PLACE_UNIT, SUM_UNIT = 1 << PLACE_BITS, 1 << 2 * SHARE_BITS
+MOST_CELLS = 2 * PIECE
+TO_SHARE = np.uint32(PLACE_BITS - SHARE_BITS)
+WHOLE_SHARE, LOW_SHARE = np.uint32(1 << SHARE_BITS), np.uint32((1 << SHARE_BITS) - 1)
+FIRST_AND_THIRD = np.uint32(0x00FF00FF)  # bytes of a cell
+BYTE, HALF, LOW_HALF = np.uint32(8), np.uint32(16), np.uint32(0xFFFF)
+
+Way = tuple[float, float, float]
+Line = tuple[float, float, float, float]  # x, y and their steps from pixel to pixel
+Size = tuple[int, int]  # of a copy of the picture: rows and columns
+
+
+def row_depth_m(camera: Pinhole, height_m: ArrayLike, v: ArrayLike) -> Float:
+    """Depths (N,) at which rays through rows (N,) meet level planes; infinity if they do not."""
+    down = (np.asarray(v) - camera.center_v) / camera.focal_px
+    drop = camera.eye_z_m - np.asarray(height_m)
+    with np.errstate(divide="ignore"):
+        return np.where(drop * down > 0, drop / down, np.inf)
+
+
+def footprints(camera: Pinhole, level: Level) -> np.ndarray:
+    """How each row is sampled (H, 3) int64: samples along, samples across, copy of the picture."""
+    per_m = float(level.shape[0, 1] / level.size_m[0])
+    return _footprints(anywhere(camera), level.height_m, per_m, len(level.first))
+
+
+@functools.lru_cache(maxsize=8)
+def _footprints(camera: Pinhole, height_m: float, per_m: float, copies: int) -> np.ndarray:
+    """The same of a picture with so many texels per metre and so many copies."""
+    edges_m = row_depth_m(camera, height_m, np.arange(camera.height_px + 1) - 0.5)
+    z = row_depth_m(camera, height_m, np.arange(camera.height_px))
+    seen = np.isfinite(edges_m[:-1]) & np.isfinite(edges_m[1:])
+    along = np.abs(edges_m[1:][seen] - edges_m[:-1][seen]) * per_m
+    across = z[seen] / camera.focal_px * per_m
+    # halved until they are at most two texels wide, as far as there are copies
+    mantissa, halvings = np.frexp(across)
+    k = np.clip(halvings - np.where(mantissa > 0.5, 1, 2), 0, copies - 1)
+    across, along = np.ldexp(across, -k), np.ldexp(along, -k)
+    plan = np.zeros((camera.height_px, 3), dtype=np.int64)
+    plan[seen, 0] = np.clip(np.ceil(along / STEP_TEXELS), 1, MOST_SAMPLES)
+    plan[seen, 1] = np.where(across <= 1, 1, 2)
+    plan[seen, 2] = k
+    return plan
+
+
+def ways(camera: Pinhole, level: Level) -> tuple[Way, Way]:
+    """How rays go over a picture: right = a + (b + c u) Z, and up likewise, both 0 to 1 on it."""
+    cos, sin = math.cos(camera.theta), math.sin(camera.theta)
+    left = camera.center_u / camera.focal_px
+    corner_x, corner_y = level.corner_m.tolist()
+    x0, y0 = camera.eye_x_m - corner_x, camera.eye_y_m - corner_y
+    dx, dy = cos - left * sin, sin + left * cos
+
+    def along(x: float, y: float) -> Way:
+        return x * x0 + y * y0, x * dx + y * dy, (x * sin - y * cos) / camera.focal_px
+
+    return along(*level.right_per_m2.tolist()), along(*level.up_per_m2.tolist())
+
+
+def fill(
+    camera: Pinhole, level: Level, is_above: bool, open_rows: np.ndarray, picture: np.ndarray
+) -> None:
+    """Draw floor or ceiling where walls leave pixels open on its side of the horizon.
+
+    Args:
+        camera: level.
+        level: floor or ceiling.
+        is_above: whether it lies above the horizon.
+        open_rows: (W,) so many rows of each column, from the picture's edge on, are open.
+        picture: (H, W) uint8, changed.
+    """
+    plan, way = footprints(camera, level), ways(camera, level)
+    rise = (camera.eye_z_m - level.height_m) * camera.focal_px
+    texels = level.shape, level.first, level.cells
+    _fill(*texels, plan, way, rise, camera.center_v, is_above, open_rows, picture)
+
+
+@kernel
+def _fill(
+    shape: np.ndarray,
+    firsts: np.ndarray,
+    cells: np.ndarray,
+    plan: np.ndarray,
+    way: tuple[Way, Way],
+    rise: float,
+    center_v: float,
+    is_above: bool,
+    open_rows: np.ndarray,
+    picture: np.ndarray,
+) -> None:
+    """Row by row: there the depth is one, and footprints lie side by side on a line."""
+    height, width = picture.shape
+    place, cell = np.empty((3, PIECE), dtype=np.int32), np.empty(PIECE, dtype=np.uint32)
+    sums = np.empty(PIECE, dtype=np.uint32)
+    for first in range(0, width, PIECE):
+        last = min(first + PIECE, width)
+        least = most = open_rows[first]
+        for j in range(first, last):
+            least, most = min(least, open_rows[j]), max(most, open_rows[j])
+        for row in range(most):
+            v = row if is_above else height - 1 - row
+            n, across, k = plan[v, 0], plan[v, 1], plan[v, 2]
+            size, corner = (shape[k, 0], shape[k, 1]), int(firsts[k])
+            end = first
+            while end < last:
+                begin, end = end, last
+                if row >= least:  # the next columns that are open
+                    while begin < last and row >= open_rows[begin]:
+                        begin += 1
+                    end = begin
+                    while end < last and row < open_rows[end]:
+                        end += 1
+                count = end - begin
+                _start(sums, count, SUM_UNIT * int(BACKGROUND) if n == 0 else 0)
+                for side in range(across):
+                    u = begin + (0.0 if across == 1 else side / 2 - 0.25)
+                    for s in range(n if count else 0):
+                        z = rise / (v - 0.5 + (s + 0.5) / n - center_v)
+                        line = _line(way, u, z, size)
+                        lowest, leftmost = _lowest_cell(line, count, size)
+                        if lowest < 0:
+                            _add_at_the_edge(cells, corner, line, size, count, sums)
+                        else:
+                            wide = size[1] + 1
+                            _walk(line, lowest, leftmost, wide, count, place)
+                            _look_up(cells, corner + lowest * wide + leftmost, place, count, cell)
+                            _add_between(cell, place, count, sums)
+                _show(sums, max(n * across, 1), v, begin, count, picture)
+
+
+@kernel_part
+def _start(sums: np.ndarray, count: int, value: int) -> None:
+    for i in range(count):
+        sums[i] = value
+
+
+@kernel_part
+def _show(
+    sums: np.ndarray, samples: int, v: int, begin: int, count: int, picture: np.ndarray
+) -> None:
+    """Draw means of samples, rounded, into a row's pixels from `begin` on."""
+    scale, at = np.float32(1 / (SUM_UNIT * samples)), np.uintp(begin)
+    for i in range(count):
+        shown = np.int32(scale * np.float32(sums[i]) + np.float32(0.5))
+        picture[v, at + np.uintp(i)] = np.uint8(shown)
+
+
+@kernel_part
+def _line(way: tuple[Way, Way], u: float, z: float, size: Size) -> Line:
+    """Where a row's pixels lie on a copy of the picture, in cells, from the one at `u` on.
+
+    Cells lie between the middles of texels.
+    """
+    (right_0, right_z, right_zu), (up_0, up_z, up_zu) = way
+    height, width = size
+    x = (right_0 + (right_z + right_zu * u) * z) * width + 0.5
+    y = (up_0 + (up_z + up_zu * u) * z) * height + 0.5
+    return x, y, right_zu * z * width, up_zu * z * height
+
+
+@kernel_part
+def _lowest_cell(line: Line, count: int, size: Size) -> tuple[int, int]:
+    """Row and column that none of a line's cells is below or to the left of.
+
+    -1: near the edge, or too far.
+    """
+    x, y, x_step, y_step = line
+    height, width = size
+    x_last, y_last = x + (count - 1) * x_step, y + (count - 1) * y_step
+    left, right = min(x, x_last), max(x, x_last)
+    low, high = min(y, y_last), max(y, y_last)
+    inside = left >= 0.5 and right < width + 0.5 and low >= 0.5 and high < height + 0.5
+    if not inside or max(right - left, high - low) >= MOST_CELLS:
+        return -1, -1
+    return int(low), int(left)
+
+
+# Of the loops that follow each does one thing: those that only look up and those that only reckon
+# run in the processor's vectors, one that does both does not. They are functions of their own,
+# whose arrays need not be held on to: that takes longer than such a loop.
+
+
+@kernel_part
+def _walk(line: Line, lowest: int, leftmost: int, wide: int, count: int, place: np.ndarray) -> None:
+    """Fill in places: along x and y from the lowest cell, and in cells from it."""
+    x, y, x_step, y_step = line
+    first_x, first_y = x - leftmost, y - lowest
+    from_x, step_x = np.int32(first_x * PLACE_UNIT), np.int32(x_step * PLACE_UNIT)
+    from_y, step_y = np.int32(first_y * PLACE_UNIT), np.int32(y_step * PLACE_UNIT)
+    across = np.int32(wide)
+    for i in range(count):
+        at_x = np.int32(from_x + np.int32(step_x * np.int32(i)))
+        at_y = np.int32(from_y + np.int32(step_y * np.int32(i)))
+        place[0, i], place[1, i] = at_x, at_y
+        place[2, i] = np.int32((at_y >> PLACE_BITS) * across) + (at_x >> PLACE_BITS)
+
+
+@kernel_part
+def _look_up(
+    cells: np.ndarray, lowest: int, place: np.ndarray, count: int, cell: np.ndarray
+) -> None:
+    corner = np.uint64(lowest)
+    for i in range(count):
+        cell[i] = cells[corner + np.uint64(place[2, i])]
+
+
+@kernel_part
+def _add_between(cell: np.ndarray, place: np.ndarray, count: int, sums: np.ndarray) -> None:
+    for i in range(count):
+        sums[i] += _between(cell[i], np.uint32(place[0, i]), np.uint32(place[1, i]))
+
+
+@kernel_part
+def _between(cell: np.uint32, x: np.uint32, y: np.uint32) -> np.uint32:
+    """What lies between a cell's corners, the bytes of one number, in 2^-16 grey levels."""
+    right, up = (x >> TO_SHARE) & LOW_SHARE, (y >> TO_SHARE) & LOW_SHARE
+    # lower and upper edge at once, in the halves of one number
+    lefts, rights = cell & FIRST_AND_THIRD, (cell >> BYTE) & FIRST_AND_THIRD
+    edges = np.uint32(np.uint32(lefts * (WHOLE_SHARE - right)) + np.uint32(rights * right))
+    lower, upper = edges & LOW_HALF, edges >> HALF
+    return np.uint32(np.uint32(lower * (WHOLE_SHARE - up)) + np.uint32(upper * up))
+
+
+@kernel_part
+def _add_at_the_edge(
+    cells: np.ndarray, corner: int, line: Line, size: Size, count: int, sums: np.ndarray
+) -> None:
+    """Add samples anywhere; beside the picture there is nothing."""
+    height, width = size
+    for i in range(count):
+        x, y = line[0] + i * line[2], line[1] + i * line[3]
+        if 0.5 <= x < width + 0.5 and 0.5 <= y < height + 0.5:
+            column, row = int(x), int(y)
+            cell = np.uint32(cells[corner + row * (width + 1) + column])
+            part_x, part_y = np.uint32((x - column) * PLACE_UNIT), np.uint32((y - row) * PLACE_UNIT)
+            sums[i] += _between(cell, part_x, part_y)
+        else:
+            sums[i] += np.uint32(SUM_UNIT * int(BACKGROUND))
+
+
+def texels(level: Level, right: Float, up: Float) -> np.ndarray:
+    """The texels (...) that points of the picture lie on; the background beside it."""
+    inside = (right >= 0) & (right < 1) & (up >= 0) & (up < 1)
+    height, width = level.shape[0]
+    # it is the first corner of the cell to the right of its middle and above it
+    row, column = (up[inside] * height).astype(int) + 1, (right[inside] * width).astype(int) + 1
+    found = np.full(inside.shape, BACKGROUND)
+    found[inside] = level.cells[row * (width + 1) + column] & 0xFF
+    return found
