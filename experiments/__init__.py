@@ -1,1 +1,1 @@
-"""The harness: scenarios in, tables, figures and checks out."""
+"""Evaluation harness: scenarios in; tables, figures, reports and checks out."""

@@ -12,30 +12,67 @@ import importlib
 from typing import Any
 
 _NAMES_OF = {
-    "align.acceptance": ("Acceptance",),
-    "align.correspondences": ("Correspondences", "MatchParameters", "match"),
-    "align.refine": ("Refinement",),
-    "align.registration": ("Aligner", "Registered", "Registration"),
-    "align.registry": ("make_aligner",),
-    "align.result": ("Alignment", "Status"),
+    "align.aligners": ("make_aligner",),
+    "align.alignment": (
+        "Alignment",
+        "Status",
+    ),
+    "align.correspondences": (
+        "Correspondences",
+        "MatchParameters",
+        "match",
+    ),
+    "align.refinement": ("Refinement",),
+    "datasets.formats": (
+        "import_recording",
+        "read_recording",
+    ),
     "errors": ("InputError",),
-    "evidence.judge": ("Judge",),
-    "evidence.parameters": ("EvidenceParameters",),
     "fastslam.association": ("Association",),
-    "fastslam.filter": ("FastSlam", "StepResult"),
+    "fastslam.filter": (
+        "FastSlam",
+        "FastSlamParameters",
+        "StepResult",
+    ),
+    "fastslam.mapping": (
+        "build_map",
+        "run_log",
+    ),
     "fastslam.motion": ("MotionNoise",),
-    "fastslam.parameters": ("FastSlamParameters",),
     "fastslam.proposal": ("Proposal",),
-    "fastslam.run": ("build_map", "run_log"),
-    "fused_map": ("AlignedPair", "FusedMap", "Fusion"),
-    "landmark_map": ("LandmarkMap", "read_map", "write_map"),
-    "fuse.parameters": ("MergeParameters",),
-    "fuse.registry": ("make_fuser",),
-    "merge": ("merge_maps",),
-    "team.team_graph": ("Place", "TeamParameters", "Unconfirmed"),
-    "recordings.registry": ("import_recording", "read_recording"),
-    "smoother.recording": ("Recording",),
-    "robot_log": ("Observations", "RobotLog", "read_log", "write_log"),
+    "fusion.fused_map": (
+        "AlignedPair",
+        "FusedMap",
+        "Fusion",
+        "MergeParameters",
+    ),
+    "fusion.fusers": ("make_fuser",),
+    "fusion.merge": ("merge_maps",),
+    "fusion.team_graph": (
+        "Place",
+        "TeamParameters",
+        "Unconfirmed",
+    ),
+    "landmark_map": (
+        "LandmarkMap",
+        "read_map",
+        "write_map",
+    ),
+    "registration": (
+        "Aligner",
+        "Registered",
+        "Registration",
+    ),
+    "robot_log": (
+        "Observations",
+        "RobotLog",
+        "read_log",
+        "write_log",
+    ),
+    "smoother.joint_smoothing": ("Recording",),
+    "verification.false_alarms": ("Acceptance",),
+    "verification.parameters": ("EvidenceParameters",),
+    "verification.verdict": ("Judge",),
 }
 _MODULE_OF = {name: module for module, names in _NAMES_OF.items() for name in names}
 _CALLED_THERE = {"merge_maps": "merge"}

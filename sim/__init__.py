@@ -1,1 +1,1 @@
-"""The simulator: textured worlds, P3-AT robots, a stereo head; it knows the truth."""
+"""Simulator: textured worlds, P3-AT robots, stereo heads, and the truth about them."""

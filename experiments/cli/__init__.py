@@ -1,1 +1,1 @@
-"""The command `mapfusion`: words in, exit codes out. Heavy imports sit inside the commands."""
+"""Command line `mapfusion`. Heavy imports sit inside the commands."""

@@ -1,1 +1,1 @@
-"""Finished stages and the truth in, judged tables out: what is right is decided here alone."""
+"""Evaluation: finished stages and the truth in, tables of errors out."""

@@ -63,7 +63,7 @@ _COLUMNS = {
     # When the frames of `paths` were, by the robot's log.
     "frame_times": "robot iteration time_s",
     # What the filter loses against a batch: each robot's log smoothed whole, its last map and path;
-    # see experiments/evaluation/smoothed_robots.py and map_consistency.py. Paths from the same start;
+    # see evaluation/smoothed_robots.py and map_consistency.py. Paths from the same start;
     # landmarks after the best rigid fit without the gross ones, which are counted; their
     # consistency with the gauge removed. filter_: of FastSLAM's last map and final path. The
     # degrees of freedom are of the Student-t's that observations and tracks' offsets were found to
@@ -73,7 +73,7 @@ _COLUMNS = {
         landmark_rmse_m gross_share filter_landmark_rmse_m filter_gross_share
         nees_per_dof marginal_nees_per_dof coverage_95
         n_steps observation_dof offset_dof observation_level not_smoothed""",
-    # What each robot's log says against itself, see mapfusion/datasets/log_consistency.py. check: odometry
+    # What each robot's log says against itself, see datasets/log_consistency.py. check: odometry
     # (as a whole), truth, jump (a single increment, which is not used) or gate (most observations
     # fell outside that of their landmark); iteration: of a jump, else -1.
     "findings": "robot check iteration finding",
@@ -93,7 +93,7 @@ _COLUMNS = {
     "fused_map": f"""landmark {_POINT} n_parents robot_a landmark_a robot_b landmark_b
         truth_x_m truth_y_m truth_z_m""",
     # One row per (fuser, iteration): the map of the most robots against the truth; see
-    # experiments/evaluation/fused_map_errors.py and map_consistency.py. landmark_rmse_m: in the frame of
+    # evaluation/fused_map_errors.py and map_consistency.py. landmark_rmse_m: in the frame of
     # the first robot in it; fitted: after the best rigid fit; gross landmarks are left out of both
     # and counted. over_better_parent: landmarks that two robots have, over the better of the maps
     # that the fuser was given, over_better_filter: of FastSLAM's, each map fitted for itself;
@@ -152,7 +152,7 @@ _COLUMNS = {
     "path_statistics": """robot source quantity delta delta_unit n
         rmse mean median std min max sse""",
     # NEES of each map's landmarks (map: a robot, or "fused"), before merging and after; see
-    # experiments/evaluation/fused_landmarks.py. landmarks: own, all of a robot's map; before fusing,
+    # evaluation/fused_landmarks.py. landmarks: own, all of a robot's map; before fusing,
     # those of them that were truly fused; fused, of the merged map, with several parents; carried
     # over, with one. n_landmarks: with a known truth. share_in_gate: of 95 %.
     "landmark_nees": """map landmarks n_landmarks degrees_of_freedom

@@ -1,1 +1,1 @@
-"""Scenarios in, finished stages out: what a stage is, the store, tasks, and who does them."""
+"""Pipeline: stages of a scenario, their store, and the workers that run them."""

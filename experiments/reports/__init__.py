@@ -1,1 +1,1 @@
-"""Tables and summaries in; screens, figures, reports and files out. Decides nothing."""
+"""Reports: screens, figures, HTML reports and exports of finished results."""

@@ -1,1 +1,1 @@
-"""Scenario files in, validated values out: settings, generated worlds, the suite."""
+"""Scenarios: YAML files, validated settings, generated worlds, the suite."""

@@ -1,1 +1,1 @@
-"""Many runs in, summaries out: sweeps, statistics, comparisons, refusal, the benchmark."""
+"""Studies over many runs: sweeps, statistics, comparisons, refusal, benchmark."""

@@ -1,1 +1,1 @@
-"""Map alignment: pairs of landmarks, a method a file, and `Registration` around them."""
+"""Map alignment: correspondences, one module per aligner, and least-squares refinement."""

@@ -1,1 +1,1 @@
-"""Recordings of others as robot logs: one importer a file, each named once in `registry.py`."""
+"""Datasets: importers and exporters, one module per format, listed in `formats.py`."""

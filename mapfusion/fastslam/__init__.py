@@ -1,1 +1,1 @@
-"""FastSLAM: one robot, M particles, a Kalman filter per particle and landmark (eq. 1-10)."""
+"""FastSLAM 1.0: M particles, each with one Kalman filter per landmark (eq. 1-10)."""

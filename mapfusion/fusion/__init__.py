@@ -1,1 +1,1 @@
-"""Fusers: how aligned maps become one. One file each, found by name (`registry.py`)."""
+"""Fusion of aligned maps: pose graph of the robots, one module per fuser, and the merge."""

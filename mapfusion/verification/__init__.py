@@ -1,1 +1,1 @@
-"""Evidence for and against an alignment, from what both robots looked at, and the verdict on it."""
+"""Verification of an alignment: evidence for and against it, and the verdict."""

@@ -1,1 +1,1 @@
-"""The stages from world to estimates, one a file."""
+"""Stages from the simulated world to the aligners' estimates, one per module."""

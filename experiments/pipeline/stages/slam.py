@@ -48,7 +48,7 @@ POSES = schema("slam.poses", 1, [*_ITERATION, *float_fields(_ONLINE + _FINAL), *
 _PARTICLE = fields(iteration=INT, particle=INT)
 CLOUDS = schema("slam.clouds", 1, [*_PARTICLE, *float_fields([*POSE_FIELDS, "log_weight"])])
 # The most probable particle's path at each evaluated iteration, which its map was made along.
-# What a log says against itself (mapfusion/datasets/log_consistency.py): a line each, the iteration of a
+# What a log says against itself (datasets/log_consistency.py): a line each, the iteration of a
 # jump or -1, and of jumps the motion that the observations show in place of the odometry.
 _OBSERVED = [f"observed_{name}" for name in POSE_FIELDS]
 _OBSERVED_COVARIANCE = ["cov_xx", "cov_xy", "cov_xt", "cov_yy", "cov_yt", "cov_tt"]

@@ -1,1 +1,1 @@
-"""Figures 1 to 12, drawn from a result's stored tables and key frames alone."""
+"""Figures 1 to 12 and those of studies, drawn from stored tables and key frames alone."""

@@ -1,1 +1,1 @@
-"""What the terminal shows."""
+"""Terminal screens of the commands."""

@@ -1,1 +1,1 @@
-"""What independence costs: maps made alone and fused, beside one smoother over all logs."""
+"""Costs of independence: maps fused from independent robots, against one smoother over all logs."""

@@ -1,1 +1,1 @@
-"""Maps of different worlds crossed: are those refused, and only those?"""
+"""Refusal study: maps with and without common ground, and the verdicts on them."""

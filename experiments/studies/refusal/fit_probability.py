@@ -1,7 +1,8 @@
 """Fit the probability that an alignment is right, over worlds whose maps a sweep left in a store.
 
-`python -m experiments.studies.refusal.fit_probability alias full posters posters_apart --seeds 0..9`
-writes `mapfusion/verification/fitted.py`, and says how well kinds of world that were left out are told.
+`python -m experiments.studies.refusal.fit_probability alias full posters --seeds 0..9` writes
+`mapfusion/verification/fitted.py`. It prints how well the fit predicts kinds of world that were left
+out.
 """
 
 import itertools

@@ -1,8 +1,8 @@
 """Fit how often regions are seen again, under right motions and under wrong ones.
 
 `python -m experiments.studies.refusal.fit_rates full alias_light alias_light_apart --seeds 0..4`
-writes `mapfusion/verification/fitted_rates.py`. Right motions are the oracle's in worlds that do not
-repeat themselves; wrong ones those that two maps without a common landmark support best.
+writes `mapfusion/verification/fitted_rates.py`. Right motions are the oracle's in worlds that
+do not repeat themselves; wrong ones those that two maps without a common landmark support best.
 """
 
 import itertools

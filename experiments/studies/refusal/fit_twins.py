@@ -1,8 +1,8 @@
 """Fit how often a twin, where a wrong motion lays a region on its like, is so throughout.
 
 `python -m experiments.studies.refusal.fit_twins posters_apart alias_posters_apart --seeds 0..4`
-writes `mapfusion/verification/fitted_twins.py`. Wrong motions are those that two maps without a common
-landmark support best, in worlds that repeat themselves.
+writes `mapfusion/verification/fitted_twins.py`. Wrong motions are those that two maps
+without a common landmark support best, in worlds that repeat themselves.
 """
 
 import itertools

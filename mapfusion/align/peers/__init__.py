@@ -1,1 +1,1 @@
-"""Other people's aligners: one thin adapter a file, behind the extra `[peers]`."""
+"""Adapters for other people's aligners, one per module (extra `[peers]`)."""

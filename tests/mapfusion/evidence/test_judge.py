@@ -12,7 +12,7 @@ from mapfusion.align.clique import Clique
 from mapfusion.align.correspondences import match
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.registration import Registration
-from mapfusion.verification import verdict
+from mapfusion.verification import verdict as verdict_module
 from mapfusion.verification.false_alarms import Acceptance, Verdict
 from mapfusion.verification.parameters import EvidenceParameters
 from mapfusion.verification.regions import Witness
@@ -187,7 +187,7 @@ def test_a_map_in_several_pairs_is_asked_once_and_says_the_same(monkeypatch) -> 
         asked.append(landmarks.name)
         return self_motions(landmarks, *settings)
 
-    monkeypatch.setattr(verdict, "self_motions", counted)
+    monkeypatch.setattr(verdict_module, "self_motions", counted)
     for _ in range(2):
         for a, b in itertools.permutations(range(3), 2):
             pairs = Pairs(maps[a], maps[b], match(maps[a], maps[b]))
