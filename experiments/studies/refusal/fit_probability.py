@@ -1,8 +1,8 @@
 """Fit the probability that an alignment is right, over worlds whose maps a sweep left in a store.
 
 `python -m experiments.studies.refusal.fit_probability alias full posters --seeds 0..9` writes
-`mapfusion/verification/fitted.py`. It prints how well the fit predicts kinds of world that were left
-out.
+`mapfusion/verification/fitted.py`. It prints how well the fit predicts kinds of world that were
+left out.
 """
 
 import itertools
