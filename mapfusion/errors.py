@@ -64,10 +64,6 @@ class TellingWarning(UserWarning):
     """Something a user should know, in one line; the command shows it as it is."""
 
 
-class UnsealedWarning(TellingWarning):
-    """A file carries no digest of itself."""
-
-
 class MendedWarning(TellingWarning):
     """A damaged stage of the store is made again."""
 

@@ -1,21 +1,20 @@
 """Files on disk: written whole, with an explicit schema, a kind and a version.
 
-A file of ours holds `mapfusion.sha256` and 64 hexadecimal digits: the SHA-256 of the whole file
-with these digits as zeros. Where it stands is up to the format, always where other readers pass it
-by: between the pages and the footer of Parquet (so that a table which another program reads and
-writes again keeps no stale one), as the first field of JSON, behind the end of PNG, BMP and NPY, in
-the first line of OBJ.
+Damage to a file is noticed when it is read. A table has the checksums of Parquet: one for each page
+of values. Its footer has none, but Arrow writes the schema into it twice, and the two must agree. A
+JSON object holds the SHA-256 of its file.
 """
 
+import base64
 import errno
 import hashlib
+import itertools
 import json
 import os
 import platform
 import re
 import shutil
 import tempfile
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -24,129 +23,43 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from mapfusion.errors import DamagedFileError, InputError, UnsealedWarning
-
-SEAL = "mapfusion.sha256"
-NO_DIGEST = "0" * 64
-LINE = f"{SEAL} {NO_DIGEST}\n".encode()  # an empty seal, for formats that pass over bytes or lines
-_SEAL = re.compile(re.escape(SEAL.encode()) + rb'[": ]+(?=(.{64}))', re.DOTALL)
-_PARQUET_TAIL = 8  # bytes: the length of the footer, and the magic number
-_told: list[Path] = []  # the file that was said to carry no digest, once a process
-
-
-def seal(data: bytes) -> bytes:
-    """Fill in the digest of a file's bytes, which hold an empty seal."""
-    return b"".join(sealed_pieces(data))
-
-
-def sealed_pieces(data: bytes) -> tuple[memoryview, bytes, memoryview]:
-    """The same as what comes before the digest, the digest, and what comes after."""
-    empty, view = NO_DIGEST.encode(), memoryview(data)
-    at = next(at for at in _digests(data) if view[at : at + len(empty)] == empty)
-    return view[:at], hashlib.sha256(data).hexdigest().encode(), view[at + len(empty) :]
-
-
-def _digests(data: bytes) -> Iterator[int]:
-    """Where digests begin, from the last to the first: tables and pictures have theirs at the end.
-
-    To look for a text from the end is also much faster than what a pattern's search is.
-    """
-    name, end = SEAL.encode(), len(data)
-    while (end := data.rfind(name, 0, end)) >= 0:
-        if match := _SEAL.match(data, end):
-            yield match.start(1)
-
-
-def is_intact(data: bytes) -> bool | None:
-    """Whether a file's bytes are those that were sealed; None where they carry no seal.
-
-    One seal that fits is enough: a text in a table may look like one.
-    """
-    found = None
-    for at in _digests(data):
-        digest = hashlib.sha256(memoryview(data)[:at])
-        digest.update(NO_DIGEST.encode())
-        digest.update(memoryview(data)[at + len(NO_DIGEST) :])
-        if digest.hexdigest().encode() == data[at : at + len(NO_DIGEST)]:
-            return True
-        found = False
-    return found
-
-
-def carries_seal(data: bytes) -> bool:
-    """Whether a file's bytes carry a seal, fitting or not."""
-    return next(_digests(data), None) is not None
-
-
-def read_sealed(path: Path, what: str, only_ours: bool = False) -> bytes:
-    """A file's bytes, checked before anybody looks at them.
-
-    Args:
-        path: of the file.
-        what: is expected there, for messages.
-        only_ours: no other program writes such files: one without digest is damaged.
-
-    Raises:
-        DamagedFileError: it is missing, or not as it was written.
-    """
-    if not path.is_file():
-        raise DamagedFileError(path, f"no such file (expected a {what})")
-    data = path.read_bytes()
-    intact = is_intact(data)
-    if intact is False or (intact is None and only_ours):
-        by_hand = f"or changed by other means: then take {SEAL} out of it"
-        raise DamagedFileError(path, f"damaged, it does not fit its digest ({by_hand})")
-    return data
-
-
-def tell_unsealed(path: Path, data: bytes) -> None:
-    """Warn, once a process, that a file which could be read is of unknown soundness."""
-    if not _told and not carries_seal(data):
-        _told.append(path)
-        why = "made by another program or an earlier version, so damage to it may go unseen"
-        text = f"{path}: carries no digest ({why}); said of the first such file alone"
-        warnings.warn(text, UnsealedWarning, stacklevel=2)
-
-
-def say_again() -> None:
-    """Let `tell_unsealed` warn once more: a new command begins."""
-    _told.clear()
-
-
-def parquet_with_seal(data: bytes | memoryview) -> bytes:
-    """A Parquet file with an empty seal in front of its footer, which points at nothing behind."""
-    view = memoryview(data)
-    footer = _PARQUET_TAIL + int.from_bytes(view[-_PARQUET_TAIL:][:4], "little")
-    return b"".join((view[:-footer], LINE, view[-footer:]))
-
+from mapfusion.errors import DamagedFileError, InputError
 
 _KIND = b"mapfusion.kind"
 _VERSION = b"mapfusion.schema_version"
 _PREFIX = "mapfusion."
-# What Arrow raises on bytes that it cannot read, some of it from Python code that it calls.
+_OURS = _PREFIX.encode()
+_ARROW_SCHEMA = b"ARROW:schema"
+_FOOTER_END = 8  # bytes after the footer of Parquet: its length, and the magic number
+# Programs that write the schema twice, and columns one after the other: Arrow's C++ library.
+_ARROW = "parquet-cpp-arrow"
+DIGEST = "mapfusion.sha256"  # first field of a JSON object: the SHA-256 of the file with zeros here
+_NO_DIGEST = "0" * 64
+# Errors that Arrow raises on bytes that it cannot read, some of them from Python code it calls.
 UNREADABLE = (pa.ArrowException, OSError, ValueError, MemoryError, OverflowError)
 PART = ".part"
 _WRITER = re.compile(rf"\.{re.escape(platform.node())}-(?P<pid>\d+)\.[^.]+\.part$")
 
 
-# Fills a file of this path; None stands for a file that is to be removed.
+# Writes a file at the path that it is called with; None stands for a file to remove.
 Write = Callable[[Path], object] | None
 
 
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
-    """Let `write` fill a temporary file beside `path`, then rename it: nobody sees half a file.
+    """Call `write` with a temporary file beside `path`, and then rename that file to `path`.
 
-    The temporary name ends in `.part`, so that no pattern like `*.parquet` finds it, also where a
-    killed process left it behind; see `remove_abandoned`. An OSError names `path`.
+    No reader sees half a file. The temporary name ends in `.part`, so that patterns like
+    `*.parquet` do not find a file that a killed process left behind (see `remove_abandoned`). An
+    OSError names `path`.
     """
     write_together({path: write})
 
 
 def write_together(writes: Mapping[Path, Write]) -> None:
-    """Write files that belong together as `write_whole` does, and remove those of None.
+    """Write files that belong together as `write_whole` does; remove those whose value is None.
 
-    All are filled before the first is renamed or removed: if one of them cannot be written, what
-    was there stays as it was.
+    All are filled before the first is renamed or removed. If one cannot be written, all files stay
+    as they were.
     """
     filled: dict[Path, Path] = {}
     try:
@@ -185,38 +98,42 @@ def _filled_beside(path: Path, write: Callable[[Path], object]) -> Path:
 
 
 def temporary_prefix(name: str) -> str:
-    """How temporary files, or folders, of this process begin; they end in `.part`."""
+    """Return how the names of temporary files and folders of this process begin.
+
+    They end in `.part`.
+    """
     return f".{name}.{platform.node()}-{os.getpid()}."
 
 
-def write_sealed(path: Path, data: bytes) -> None:
-    """Fill in the empty seal that a file's bytes hold, and write them whole."""
-    write_whole(path, sealed_write(data))
+def digest_of(path: Path) -> str:
+    """Return the SHA-256 of a file, as hexadecimal digits."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def sealed_write(data: bytes) -> Callable[[Path], object]:
-    """Return what writes a file's bytes with the empty seal in them filled in."""
-    pieces = sealed_pieces(data)
-
-    def write(temporary: Path) -> None:
-        with temporary.open("wb") as file:
-            file.writelines(pieces)
-
-    return write
+def json_bytes(content: Mapping[str, Any]) -> bytes:
+    """Return a JSON object as text, with the digest of the text as its first field."""
+    text = json.dumps({DIGEST: _NO_DIGEST, **content}, indent=1).encode()
+    return text.replace(_NO_DIGEST.encode(), hashlib.sha256(text).hexdigest().encode(), 1)
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write a JSON object, its digest as first field."""
-    write_sealed(path, json.dumps({SEAL: NO_DIGEST, **content}, indent=1).encode())
+    """Write a JSON object with the digest of its file."""
+    write_whole(path, lambda temporary: temporary.write_bytes(json_bytes(content)))
 
 
 def read_json(path: Path, what: str) -> dict[str, Any]:
-    """A JSON object without its digest; `what` it is, for messages.
+    """Read a JSON object, and check its digest if it has one; the digest is not returned.
+
+    Args:
+        path: of the file.
+        what: the file should be, for messages.
 
     Raises:
-        DamagedFileError: the file is missing or damaged, or holds something else.
+        DamagedFileError: the file is missing or damaged, or holds no JSON object.
     """
-    data = read_sealed(path, what)
+    require_file(path, what)
+    data = path.read_bytes()
     try:
         found = json.loads(data.decode())
     except (ValueError, RecursionError) as error:
@@ -224,12 +141,21 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
     if not isinstance(found, dict):
         held = "null" if found is None else f"a {type(found).__name__}"
         raise DamagedFileError(path, f"no JSON object (it holds {held}), expected a {what}")
-    tell_unsealed(path, data)
     name, value = next(iter(found.items()), ("", ""))
-    if name != SEAL and re.fullmatch("[0-9a-f]{64}", str(value)):
-        raise DamagedFileError(path, f"damaged, its first field {name!r} should be {SEAL}")
-    found.pop(SEAL, None)
+    # a damaged name is noticed, too: no other first field is a digest
+    if name == DIGEST or re.fullmatch("[0-9a-f]{64}", str(value)):
+        without = data.replace(str(value).encode(), _NO_DIGEST.encode(), 1)
+        if name != DIGEST or hashlib.sha256(without).hexdigest() != value:
+            edited = f"if you edited it, remove its field {DIGEST}"
+            raise DamagedFileError(path, f"damaged, it does not fit its digest ({edited})")
+        del found[name]
     return found
+
+
+def require_file(path: Path, what: str) -> None:
+    """Raise DamagedFileError unless there is a file at `path`, which should be a `what`."""
+    if not path.is_file():
+        raise DamagedFileError(path, f"no such file (expected a {what})")
 
 
 def require_version(path: Path, content: Mapping[str, Any], known: int) -> None:
@@ -244,10 +170,7 @@ def require_version(path: Path, content: Mapping[str, Any], known: int) -> None:
 
 
 def remove_abandoned(folder: Path) -> None:
-    """Remove what processes that were killed left below a folder, named by `temporary_prefix`.
-
-    What is of other machines, and of processes that live, stays.
-    """
+    """Remove temporary files that killed processes of this machine left below a folder."""
     for path in list(folder.rglob(f".*{PART}")):
         writer = _WRITER.search(path.name)
         if not writer or _lives(int(writer["pid"])):
@@ -269,16 +192,16 @@ def _lives(pid: int) -> bool:
 
 
 def name_in_text(name: str) -> str:
-    """Return a file's name as text that every file can hold.
+    """Return the name of a file as text that can be encoded as UTF-8.
 
-    A locale without UTF-8 leaves Python the bytes of a name in place of its characters: they are
-    read as UTF-8. What is none is replaced.
+    Without a UTF-8 locale, Python holds the bytes of a name as surrogates. They are decoded as
+    UTF-8; invalid bytes are replaced.
     """
     return name.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
 
 
 def require_writable(folder: Path) -> None:
-    """Raise InputError, which says why, unless files can be put into a folder, there yet or not."""
+    """Raise InputError unless files can be written into a folder, which need not exist yet."""
     there = folder
     while not there.exists() and there != there.parent:
         there = there.parent
@@ -289,7 +212,7 @@ def require_writable(folder: Path) -> None:
 
 
 def schema(kind: str, version: int, fields: list[pa.Field]) -> pa.Schema:
-    """A schema that carries its kind (what the table is) and its version."""
+    """Return a schema with the kind of the table and its version in the metadata."""
     return pa.schema(fields, metadata={_KIND: kind.encode(), _VERSION: str(version).encode()})
 
 
@@ -299,7 +222,7 @@ def write_table(
     table_schema: pa.Schema,
     attributes: Mapping[str, str] | None = None,
 ) -> None:
-    """Write columns (arrays by name, all the schema names) with further text attributes."""
+    """Write columns (arrays by name) as a table of a schema, with further text attributes."""
     write_whole(path, table_write(columns, table_schema, attributes))
 
 
@@ -308,35 +231,27 @@ def table_write(
     table_schema: pa.Schema,
     attributes: Mapping[str, str] | None = None,
 ) -> Callable[[Path], object]:
-    """Return what writes a table, with arguments as `write_table` has them."""
+    """Return a function that writes a table to a path; the arguments are those of `write_table`."""
     metadata = dict(table_schema.metadata)
     metadata |= {f"{_PREFIX}{k}".encode(): v.encode() for k, v in (attributes or {}).items()}
     arrays = [_to_arrow(columns[field.name], field.type) for field in table_schema]
     own = pa.schema([field.remove_metadata() for field in table_schema], metadata=metadata)
     table = pa.Table.from_arrays(arrays, schema=own)
     buffer = pa.BufferOutputStream()
-    # measured values and pixels hardly repeat: a dictionary of them takes as long as all the rest
-    repeats = [field.name for field in table_schema if not _is_measured(field.type)]
-    # what packs them smaller takes far longer to pack and to unpack, and nothing packs pixels
-    packed = {
-        _leaf(field): "none" if pa.types.is_fixed_size_binary(field.type) else "lz4"
-        for field in table_schema
-    }
-    options = {"compression": packed, "use_dictionary": repeats}
-    pq.write_table(table, buffer, **options, write_page_checksum=True)
-    return sealed_write(parquet_with_seal(memoryview(buffer.getvalue())))
-
-
-def _leaf(field: pa.Field) -> str:
-    """What Parquet calls the column that holds a field's values."""
-    is_list = pa.types.is_fixed_size_list(field.type)
-    return f"{field.name}.list.element" if is_list else field.name
-
-
-def _is_measured(kind: pa.DataType) -> bool:
-    if pa.types.is_fixed_size_list(kind):
-        kind = kind.value_type
-    return pa.types.is_floating(kind) or pa.types.is_fixed_size_binary(kind)
+    repeats, packed = list[str](), dict[str, str]()
+    for field in table_schema:
+        is_list = pa.types.is_fixed_size_list(field.type)
+        kind = field.type.value_type if is_list else field.type
+        is_bytes = pa.types.is_fixed_size_binary(kind)
+        # nothing packs pixels; what packs numbers smaller takes far longer
+        leaf = f"{field.name}.list.element" if is_list else field.name
+        packed[leaf] = "none" if is_bytes else "lz4"
+        # a dictionary of values that hardly repeat takes as long as all the rest
+        if not (is_bytes or pa.types.is_floating(kind)):
+            repeats.append(field.name)
+    options = {"compression": packed, "use_dictionary": repeats, "write_page_checksum": True}
+    pq.write_table(table, buffer, **options, write_statistics=False)  # damaged ones would mislead
+    return lambda temporary: temporary.write_bytes(buffer.getvalue())
 
 
 def _to_arrow(values: Any, kind: pa.DataType) -> pa.Array:
@@ -352,29 +267,91 @@ def _to_arrow(values: Any, kind: pa.DataType) -> pa.Array:
 
 
 def read_parquet(path: Path, what: str, columns: Sequence[str] | None = None) -> pa.Table:
-    """Any Parquet table, all its columns or some, its bytes checked; `what` it is, for messages.
+    """Read any Parquet table, all its columns or some; arguments and errors are of `row_groups`."""
+    return pa.concat_tables(row_groups(path, what, lambda _: columns))
+
+
+def row_groups(
+    path: Path, what: str, choose: Callable[[pa.Schema], Sequence[str] | None] = lambda _: None
+) -> Iterator[pa.Table]:
+    """Yield the row groups of any Parquet table, checked; one empty table if it has none.
+
+    Args:
+        path: of the file.
+        what: the file should be, for messages.
+        choose: returns the columns to read, given the schema of the file; None for all.
 
     Raises:
         DamagedFileError: the file is missing or damaged.
     """
-    data = read_sealed(path, what)
+    require_file(path, what)
+    data, n_rows = path.read_bytes(), 0
     try:
-        # Arrow's `read_table` looks at a file as at a data set, which takes longer than to read it
-        # and the checksums of its pages say again what a seal that fits has said of all its bytes
-        by_page = not carries_seal(data)
-        file = pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=by_page)
-        names = None if columns is None else list(columns)
-        table = file.read(names, use_threads=False)
-        table = table if names is None else table.select(names)
-    except (*UNREADABLE, KeyError) as error:  # the latter of a column that is not there
+        # `pq.read_table` would treat the file as a data set, which takes longer than to read it
+        file = pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True)
+        _require_sound_schema(file, data)
+        names = choose(file.schema_arrow)
+        if not file.num_row_groups:
+            table = file.schema_arrow.empty_table()
+            yield table if names is None else table.select(names)
+        for number in range(file.num_row_groups):
+            table = file.read_row_group(number, names, use_threads=False)
+            _require_sound_places(file, number, table)
+            n_rows += len(table)
+            yield table if names is None else table.select(names)
+        if n_rows != file.metadata.num_rows:
+            raise ValueError(f"it has {n_rows} rows in place of {file.metadata.num_rows}")
+    except (*UNREADABLE, KeyError) as error:  # KeyError: a column is missing
+        if isinstance(error, InputError):
+            raise
         reason = " ".join(str(error).split()) or type(error).__name__
         raise DamagedFileError(path, f"damaged or not a Parquet file ({reason})") from error
-    tell_unsealed(path, data)
-    return table
+
+
+def _require_sound_schema(file: pq.ParquetFile, data: bytes) -> None:
+    """Raise ValueError unless both copies of the schema agree in a file of ours."""
+    found = file.metadata.metadata or {}
+    footer = data[-_FOOTER_END - int.from_bytes(data[-_FOOTER_END:][:4], "little") :]
+    if _KIND in footer and _KIND not in found:
+        raise ValueError("its metadata cannot be read")
+    if not file.metadata.created_by.startswith(_ARROW):
+        return
+    stored = base64.b64decode(found.get(_ARROW_SCHEMA, b""))
+    copy = pa.ipc.read_schema(pa.py_buffer(stored)) if stored else pa.schema([])
+    ours, again = (
+        {name: text for name, text in (metadata or {}).items() if name.startswith(_OURS)}
+        for metadata in (found, copy.metadata)
+    )
+    if ours != again or (ours and not copy.equals(file.schema_arrow)):
+        raise ValueError("the two copies of its schema differ")
+
+
+def _require_sound_places(file: pq.ParquetFile, number: int, table: pa.Table) -> None:
+    """Raise ValueError if columns of a row group overlap in a file that Arrow has written.
+
+    The table must be that of the row group: on a footer that Arrow cannot read, what it shows to
+    Python ends the process.
+    """
+    group = file.metadata.row_group(number)
+    if group.num_rows != len(table):
+        raise ValueError(f"it has {len(table)} rows in place of {group.num_rows}")
+    if not len(table) or not file.metadata.created_by.startswith(_ARROW):
+        return
+    places, names = [], set(table.column_names)
+    for k in range(group.num_columns):
+        path = file.schema.column(k).path  # NAME, or NAME.list.element
+        if {path, path.partition(".")[0]} & names:
+            chunk = group.column(k)
+            begin = chunk.data_page_offset
+            if chunk.has_dictionary_page:
+                begin = min(begin, chunk.dictionary_page_offset)
+            places.append((begin, begin + chunk.total_compressed_size))
+    if any(end > begin for (_, end), (begin, _) in itertools.pairwise(sorted(places))):
+        raise ValueError("two of its columns overlap")
 
 
 def read_table(path: Path, table_schema: pa.Schema) -> tuple[pa.Table, dict[str, str]]:
-    """Read a table written by `write_table`.
+    """Read a table that `write_table` wrote.
 
     Returns:
         The table and its text attributes.
@@ -407,7 +384,7 @@ def require_kind(
 
 
 def text_attributes(path: Path, table: pa.Table) -> dict[str, str]:
-    """What `write_table` stored beside the columns, kind and version among it."""
+    """Return the text attributes of a table, with its kind and version."""
     try:
         texts = {k.decode(): v.decode() for k, v in (table.schema.metadata or {}).items()}
     except UnicodeDecodeError as error:
@@ -416,7 +393,7 @@ def text_attributes(path: Path, table: pa.Table) -> dict[str, str]:
 
 
 def column(table: pa.Table, name: str) -> np.ndarray:
-    """One column as an array: (N,), or (N, k) for fixed-size lists, and for k bytes each."""
+    """Return a column as an array: (N,), or (N, k) for lists of k numbers or for k bytes."""
     chunked = table.column(name)
     values = chunked.chunk(0) if chunked.num_chunks == 1 else chunked.combine_chunks()
     if pa.types.is_fixed_size_binary(values.type):
@@ -436,13 +413,13 @@ def require_cells(
     is_right: Callable[[np.ndarray], np.ndarray],
     remedy: str,
 ) -> None:
-    """Raise InputError that names file, column and row of the first cell that is not right.
+    """Raise InputError for the first wrong cell; it names the file, the column and the row.
 
     Args:
         path: of the table, for the message.
-        table: with one number a cell in these columns.
+        table: holds one number a cell in these columns.
         names: of the columns.
-        is_right: from the values (N,) of a column to (N,) bool.
+        is_right: returns (N,) bool for the values (N,) of a column.
         remedy: end of the message: what the cells must hold, or what to do.
     """
     for name in names:
@@ -469,17 +446,17 @@ def require_one_row_a_frame(path: Path, table: pa.Table, n_frames: int | None = 
 
 
 def columns(table: pa.Table, names: Sequence[str]) -> np.ndarray:
-    """Several columns as one array (N, len(names))."""
+    """Return several columns as one array (N, len(names))."""
     return np.stack([column(table, name) for name in names], -1)
 
 
 def named_columns(names: Sequence[str], values: np.ndarray) -> dict[str, np.ndarray]:
-    """The inverse of `columns`."""
+    """Return an array (N, len(names)) as columns by name; the inverse of `columns`."""
     return dict(zip(names, values.T, strict=True))
 
 
 def float_fields(names: Sequence[str]) -> list[pa.Field]:
-    """Schema fields of columns of numbers."""
+    """Return schema fields of float64 columns."""
     return [pa.field(name, pa.float64()) for name in names]
 
 
@@ -490,23 +467,23 @@ _UPPER = np.triu_indices(3)
 
 
 def point_columns(position_m: np.ndarray, covariance_m2: np.ndarray) -> dict[str, np.ndarray]:
-    """Positions (N, 3) and covariances (N, 3, 3) as the nine flat columns they are stored in."""
+    """Return positions (N, 3) and covariances (N, 3, 3) as nine columns by name."""
     upper = covariance_columns(COVARIANCE_FIELDS, covariance_m2)
     return named_columns(POSITION_FIELDS, position_m) | upper
 
 
 def points_from(table: pa.Table) -> tuple[np.ndarray, np.ndarray]:
-    """The inverse of `point_columns`."""
+    """Return positions and covariances of a table; the inverse of `point_columns`."""
     return columns(table, POSITION_FIELDS), covariances_from(table, COVARIANCE_FIELDS)
 
 
 def covariance_columns(names: Sequence[str], covariance_m2: np.ndarray) -> dict[str, np.ndarray]:
-    """Covariances (N, 3, 3) as six flat columns of these names, the upper halves row by row."""
+    """Return the upper triangles of covariances (N, 3, 3), row by row, as six columns by name."""
     return named_columns(names, covariance_m2[:, _UPPER[0], _UPPER[1]])
 
 
 def covariances_from(table: pa.Table, names: Sequence[str]) -> np.ndarray:
-    """The inverse of `covariance_columns`."""
+    """Return covariances (N, 3, 3) of a table; the inverse of `covariance_columns`."""
     covariance = np.empty((table.num_rows, 3, 3))
     for name, i, j in zip(names, *_UPPER, strict=True):
         covariance[:, i, j] = covariance[:, j, i] = column(table, name)
@@ -514,5 +491,5 @@ def covariances_from(table: pa.Table, names: Sequence[str]) -> np.ndarray:
 
 
 def point_fields() -> list[pa.Field]:
-    """Schema fields of `point_columns`."""
+    """Return the schema fields of `point_columns`."""
     return float_fields(POSITION_FIELDS + COVARIANCE_FIELDS)

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from mapfusion.errors import DamagedFileError
-from mapfusion.files import LINE, name_in_text, read_sealed, write_sealed
+from mapfusion.files import name_in_text, require_file, write_whole
 from mapfusion.geometry.numerics import Float
 from sim.floorplan import Face, FloorPlan
 from sim.renderer import BulletRenderer, egl_driver, load_egl
@@ -167,7 +167,7 @@ class World:
         with silence():
             for i in range(len(corners_m)):
                 mesh, picture = face_files(folder, i)
-                read_sealed(mesh, "mesh", only_ours=True)  # Bullet reads the file by itself
+                require_file(mesh, "mesh")  # which Bullet reads by itself
                 shape = p.createVisualShape(
                     p.GEOM_MESH, fileName=name_in_text(str(mesh)), physicsClientId=client
                 )
@@ -185,12 +185,9 @@ class World:
         bytes: of any other width a picture comes out sheared.
         """
         p, client = self.bullet, self.client
-        data = read_sealed(picture, "picture", only_ours=True)
+        image = read_picture(picture)
         if self.renderer == "tiny":
             return p.loadTexture(name_in_text(str(picture)), physicsClientId=client)
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-        if image is None:
-            raise DamagedFileError(picture, "is no picture")
         size = (-(-image.shape[1] // GL_ROW_TEXELS) * GL_ROW_TEXELS, image.shape[0])
         with tempfile.TemporaryDirectory() as folder:
             fitting = str(Path(folder) / "texture.bmp")
@@ -228,11 +225,11 @@ def write_faces(
         picture = cv2.cvtColor(shown, cv2.COLOR_RGB2BGR)
         encoded = cv2.imencode(PICTURE, picture)[1].tobytes()
         # whole: another run may be painting, or looking at, the same walls
-        write_sealed(path, encoded + LINE)
-        write_sealed(mesh, b"# " + LINE + _mesh(face).encode("ascii"))
+        write_whole(path, lambda file, data=encoded: file.write_bytes(data))
+        write_whole(mesh, lambda file, face=face: file.write_text(_mesh(face), "ascii"))
     corners = io.BytesIO()
     np.save(corners, np.stack([face.corners_m for face in faces]))
-    write_sealed(folder / CORNERS, corners.getvalue() + LINE)
+    write_whole(folder / CORNERS, lambda file: file.write_bytes(corners.getvalue()))
 
 
 def read_corners(path: Path) -> Float:
@@ -241,15 +238,28 @@ def read_corners(path: Path) -> Float:
     Raises:
         DamagedFileError: they are missing or damaged.
     """
-    data = read_sealed(path, "array of faces' corners")
+    require_file(path, "array of faces' corners")
     try:
-        corners_m = np.asarray(np.load(io.BytesIO(data)), dtype=np.float64)
+        corners_m = np.asarray(np.load(io.BytesIO(path.read_bytes())), dtype=np.float64)
     except Exception as error:  # numpy has Python parse the header, which may raise anything
         reason = " ".join(str(error).split())
         raise DamagedFileError(path, f"is no array ({reason})") from error
     if corners_m.shape[1:] != (4, 3) or not np.isfinite(corners_m).all():
         raise DamagedFileError(path, "holds no corners (F, 4, 3) of faces")
     return corners_m
+
+
+def read_picture(path: Path) -> np.ndarray:
+    """Return the picture of a face, (H, W, 3) uint8 in the order of OpenCV: blue, green, red.
+
+    Raises:
+        DamagedFileError: it is missing or damaged.
+    """
+    require_file(path, "picture")
+    image = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR)
+    if image is None:
+        raise DamagedFileError(path, "is no picture")
+    return image
 
 
 def face_files(folder: Path, i: int) -> tuple[Path, Path]:

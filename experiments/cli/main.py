@@ -66,7 +66,7 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ["MPLBACKEND"] = "agg"  # figures go to files; a name unknown here ends the import
     _mend_thread_counts()
-    unsealed = _tell_warnings()
+    _tell_warnings()
     try:
         use_kernel_cache()
         code = app(prog_name="mapfusion", standalone_mode=False) or 0
@@ -96,8 +96,6 @@ def main() -> None:
             if message():  # empty where the help was shown instead
                 complain(f"{message()} (see mapfusion --help)")
             code = EXIT_BAD_INPUT
-    for text in unsealed if code in {0, EXIT_FAILED} else ():
-        complain(f"warning: {text}")
     if code == EXIT_INTERRUPTED:
         complain("interrupted; what was finished is kept, the same command goes on from there")
     sys.exit(code)
@@ -120,29 +118,20 @@ def _mend_thread_counts() -> None:
             complain(f"warning: {name}={one_line(given)}: is no number of threads; 1 is taken")
 
 
-def _tell_warnings() -> list[str]:
-    """Ours in one line each; others keep Python's own form.
+def _tell_warnings() -> None:
+    """Show each of our warnings in one line; others keep Python's own form."""
+    from mapfusion.errors import TellingWarning
 
-    Returns:
-        What is to be said of files without digest, once all else has gone well.
-    """
-    from mapfusion.errors import TellingWarning, UnsealedWarning
-    from mapfusion.files import say_again
-
-    show, unsealed = warnings.showwarning, list[str]()
-    say_again()
+    show = warnings.showwarning
 
     def tell(message: Warning | str, category: type[Warning], *rest: Any) -> None:
-        if issubclass(category, UnsealedWarning):
-            unsealed.append(str(message))
-        elif issubclass(category, TellingWarning):
+        if issubclass(category, TellingWarning):
             complain(f"warning: {message}")
         else:
             show(message, category, *rest)
 
     warnings.showwarning = tell
     warnings.simplefilter("always", TellingWarning)  # two stages may be damaged in one way
-    return unsealed
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ from experiments.pipeline.stages.fuse import read_fusions
 from experiments.pipeline.stages.match import known_at
 from experiments.pipeline.stages.slam import RobotFolders, read_findings
 from experiments.pipeline.stages.snapshots import stored_maps
-from experiments.pipeline.store import StageFolder, Store
+from experiments.pipeline.store import StageFolder, Store, require_sound
 from experiments.pipeline.tasks import OnProgress, Task, run_tasks, task_names, tasks_of, unfinished
 from experiments.pipeline.workers import workers
 from experiments.scenario.settings import AnyScenario, Recording
@@ -176,6 +176,13 @@ class JudgedRun:
         parts = [tables.read(self.store.path(s) / f"{name}.parquet", name) for s in made]
         return pd.concat(parts, ignore_index=True) if parts else tables.framed(name, [])
 
+    def _collected(self) -> list[Stage]:
+        """Return the stages whose files the tables and maps of a result are made from."""
+        found = [each for robot in self.pipeline.robots for each in (robot.slam, robot.smooth)]
+        found += [each for robot in self.pipeline.simulated for each in (robot.observed, robot.log)]
+        found += [pair.estimates for pair in self.pipeline.pairs]
+        return [*found, *self.judgements, *self.pipeline.fusers.values()]
+
     def execute(self, jobs: int, on_progress: OnProgress, only: Sequence[Stage] = ()) -> None:
         """Do what is not in the store yet, in `jobs` processes; of `only` these stages, if any.
 
@@ -184,6 +191,7 @@ class JudgedRun:
         Raises:
             InputError: something that was given cannot be used, or this machine has too little
                 memory for it.
+            DamagedFileError: a file of the store is not as it was written.
         """
         require_memory(self.pipeline, jobs)
         wanted = only or self.stages()
@@ -201,6 +209,8 @@ class JudgedRun:
         for folder in map(self.store.folder, wanted):
             if not folder.finished:
                 raise InputError(f"{folder.path}: was removed while it was being made; run again")
+        for stage in only or self._collected():
+            require_sound(self.store.path(stage))
 
 
 def _judgement(settings: JudgeSettings, pair: PairStages) -> Stage:

@@ -37,7 +37,7 @@ from experiments.pipeline.head_start import head_start
 from experiments.pipeline.stages import slam
 from experiments.pipeline.stages.fuse import fused_map_files
 from experiments.pipeline.stages.smooth import map_files, read_smoothed_path
-from experiments.pipeline.store import Store, link_or_copy, mending
+from experiments.pipeline.store import Store, file_entries, link_or_copy, mending, require_sound
 from experiments.pipeline.tables import read_rows
 from experiments.pipeline.tasks import OnProgress
 from experiments.scenario.settings import AnyScenario, Simulation
@@ -257,6 +257,7 @@ def write_result(
     """
     team = run.team
     measure_aligners(run)
+    (folder / "provenance.json").unlink(missing_ok=True)  # it lists the files of an earlier run
     for outdated in ("maps", "keyframes"):  # of robots or frames that are no longer there
         shutil.rmtree(folder / outdated, ignore_errors=True)
     _write_images(run, folder)
@@ -273,7 +274,10 @@ def write_result(
     on_written(folder, "scenario")
     write_tables(others)
     _write_maps(run, folder / "maps")
-    about = provenance(run) | {"tables": sorted([*of_figures, *others])}
+    names = sorted([*of_figures, *others])
+    made = [folder / "scenario.json", folder / "world.json", *(folder / "maps").glob("*")]
+    made += [tables.table_path(folder, name) for name in names]
+    about = provenance(run) | {"tables": names, "files": file_entries(folder, made)}
     write_json(folder / "provenance.json", about)
 
 
@@ -349,6 +353,7 @@ def provenance(run: JudgedRun) -> dict[str, Any]:
 
 def _write_images(run: JudgedRun, folder: Path) -> None:
     for robot in run.pipeline.simulated:
+        require_sound(run.store.path(robot.features), "image_*.png")
         for path in sorted(run.store.path(robot.features).glob("image_*.png")):
             iteration = int(path.stem.removeprefix("image_"))
             link_or_copy(path, folder / "keyframes" / f"{robot.name}_{iteration:05d}.png")

@@ -1,4 +1,4 @@
-"""The JSON files of a result folder, each held to what its readers take from it."""
+"""Read the JSON files of a result folder, and check that its files are as the run wrote them."""
 
 from pathlib import Path
 from typing import Any
@@ -6,6 +6,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from experiments.evaluation.tables import table_path
+from experiments.pipeline.store import FileEntry, require_unchanged
 from experiments.scenario.settings import Bound
 from mapfusion.errors import DamagedFileError, InputError
 from mapfusion.files import read_json, require_version
@@ -29,28 +30,29 @@ class _World(BaseModel):
 class _Provenance(BaseModel):
     stages: dict[str, Any] = {}
     tables: list[str] = []
+    files: dict[str, FileEntry] = {}  # none in results of earlier versions
     libraries: dict[str, str] = {}
 
 
 def read_scenario(path: Path) -> dict[str, Any]:
-    """A result's `scenario.json`; raises DamagedFileError."""
+    """Return `scenario.json` of a result; raises DamagedFileError."""
     return _checked(path, "resolved scenario", _ResolvedScenario)
 
 
 def read_world(path: Path) -> dict[str, Any]:
-    """A result's `world.json`; raises DamagedFileError."""
+    """Return `world.json` of a result; raises DamagedFileError."""
     return _checked(path, "world of a result", _World)
 
 
 def read_provenance(path: Path) -> dict[str, Any]:
-    """A result's `provenance.json`; raises DamagedFileError."""
+    """Return `provenance.json` of a result; raises DamagedFileError."""
     return _checked(path, "provenance of a result", _Provenance)
 
 
 def require_tables(result: Path) -> None:
-    """Raise InputError if a table is gone that the run wrote into its result folder.
+    """Raise InputError if a table is missing that the run wrote into its result folder.
 
-    Results of earlier versions do not say which tables they have.
+    Results of earlier versions do not list their tables.
     """
     path = result / "provenance.json"
     written = read_provenance(path).get("tables", ()) if path.is_file() else ()
@@ -60,6 +62,13 @@ def require_tables(result: Path) -> None:
         remedy = "put it back, or run the scenario again"
         missing = table_path(result, gone[0])
         raise InputError(f"{missing}: is missing{others}, but the run wrote it; {remedy}")
+
+
+def require_as_written(result: Path) -> None:
+    """Raise DamagedFileError if a table, map or description is not as the run wrote it."""
+    path = result / "provenance.json"
+    if path.is_file():
+        require_unchanged(result, _Provenance.model_validate(read_provenance(path)).files)
 
 
 def _checked(path: Path, what: str, model: type[BaseModel]) -> dict[str, Any]:

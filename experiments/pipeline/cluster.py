@@ -12,7 +12,6 @@ import pickle
 import platform
 import threading
 import traceback
-import warnings
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
@@ -24,7 +23,7 @@ from distributed.security import Security
 
 from experiments.pipeline.code_version import library_versions, source_hash, use_kernel_cache
 from experiments.pipeline.workers import described, held_back_interrupts
-from mapfusion.errors import DamagedFileError, InputError, UnsealedWarning
+from mapfusion.errors import DamagedFileError, InputError
 
 # Tasks keep state of their process (the open PyBullet world, OpenCV's threads), so a worker that
 # was started with several threads works with one at a time.
@@ -73,7 +72,6 @@ def code_version() -> str:
 def _prepare() -> None:
     """Once a process, before anything is imported that computes."""
     use_kernel_cache()
-    warnings.simplefilter("ignore", UnsealedWarning)  # the command says it
     from experiments.methods.threads import single_threaded
 
     single_threaded()

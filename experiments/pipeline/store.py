@@ -1,27 +1,84 @@
-"""Store of finished stages, so that nothing is computed twice."""
+"""Store of finished stages, so that nothing is computed twice.
+
+A stage has a folder. When a part of the stage is finished, a file `done.json`, or `done_PART.json`,
+lists the files of the part with their sizes and digests. What reads the stage checks them first.
+"""
 
 import shutil
+import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from fnmatch import fnmatch
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import BaseModel, ValidationError
 
 from experiments.pipeline.stage import RecordedLog, Stage
 from mapfusion.errors import DamagedFileError, MendedWarning
-from mapfusion.files import is_intact, read_json, read_sealed, write_json, write_whole
+from mapfusion.files import PART, digest_of, read_json, require_file, write_json, write_whole
+
+# A process keeps the digests of so many files, those of some thousand stages.
+_DIGESTS_KEPT = 100_000
+# A file may change again without another time of change: clocks of file systems have coarse ticks,
+# up to 2 s (FAT).
+_NEW_NS = 2_000_000_000
+
+
+class FileEntry(BaseModel):
+    """A file as it was written: its size in bytes and its SHA-256 in hexadecimal digits."""
+
+    size: int
+    sha256: str
+
+
+def file_entries(folder: Path, files: Iterable[Path]) -> dict[str, dict[str, object]]:
+    """Return the entry of each file, as JSON can hold it, by its path within the folder."""
+    entries = {}
+    for path in sorted(files):
+        entry = {"size": path.stat().st_size, "sha256": digest_of(path)}
+        entries[path.relative_to(folder).as_posix()] = entry
+    return entries
+
+
+def require_unchanged(folder: Path, entries: Mapping[str, FileEntry], pattern: str = "*") -> None:
+    """Check the files of a folder against their entries.
+
+    Args:
+        folder: which the entries are of.
+        entries: by path within the folder.
+        pattern: of the paths to check.
+
+    Raises:
+        DamagedFileError: a file is missing, or is not as its entry says.
+    """
+    for name, entry in entries.items():
+        if not fnmatch(name, pattern):
+            continue
+        path = folder / name
+        require_file(path, "file that was written")
+        found = path.stat()
+        is_new = time.time_ns() - found.st_mtime_ns < _NEW_NS
+        digest = digest_of(path) if is_new else _known_digest(path, found.st_mtime_ns)
+        if (found.st_size, digest) != (entry.size, entry.sha256):
+            raise DamagedFileError(path, "damaged, it is not as it was written")
+
+
+@lru_cache(maxsize=_DIGESTS_KEPT)
+def _known_digest(path: Path, changed_ns: int) -> str:
+    return digest_of(path)
 
 
 def link_or_copy(source: Path, target: Path) -> None:
-    """Put a finished, immutable file at a second place without a second copy where possible.
+    """Put a finished file at a second place, without a second copy where the disk allows it.
 
     Raises:
-        DamagedFileError: there is none, or it is not as it was written.
+        DamagedFileError: there is no such file.
     """
-    read_sealed(source, "finished file")
+    require_file(source, "finished file")
 
     def place(temporary: Path) -> None:
         temporary.unlink()
@@ -34,53 +91,84 @@ def link_or_copy(source: Path, target: Path) -> None:
 
 
 _MARK = "done"
-_FIGURES = TypeAdapter(dict[str, float])
-_DEPTH = 3  # a stage's file is STAGE/KEY/FILE
-# A disk that damages every file is none that the store can mend.
+_DEPTH = 3  # the file of a stage is STAGE/KEY/FILE
+# A file is made again this often in one command; a disk that damages it each time needs a person.
 _MENDED_AT_MOST = 2
 _TOLD_LATE_AT_MOST = 1000  # more tasks than a sweep has at work at one time
 T = TypeVar("T")
 
 
+class _Mark(BaseModel):
+    """What the mark of a finished part holds."""
+
+    figures: dict[str, float]
+    files: dict[str, FileEntry]
+
+
 @dataclass(frozen=True)
 class StageFolder:
-    """Where one stage keeps what it made."""
+    """The folder of one stage."""
 
     path: Path
     name: str
     key: str
-    outputs: Mapping[str, tuple[Path, ...]]  # by part; the last of each is the mark of its end
+    outputs: Mapping[str, tuple[Path, ...]]  # by part; the last file of each is its mark
 
     @property
     def finished(self) -> bool:
-        """Whether all it writes is there."""
+        """Whether all files are there."""
         return all(file.is_file() for files in self.outputs.values() for file in files)
 
     def finish(self, part: str, figures: Mapping[str, float]) -> None:
-        """Mark a part as finished, with figures about the work (times; never results)."""
-        told = {"stage": self.name, "key": self.key, "figures": dict(figures)}
-        write_json(self.outputs[part][-1], told)
+        """Mark a part as finished, with figures about the work (times; never results).
+
+        The mark lists all files that are there, except the outputs of other parts.
+        """
+        mark, others = (
+            self.outputs[part][-1],
+            {file for each, files in self.outputs.items() if each != part for file in files},
+        )
+        made = set(self.path.iterdir()) - others - {mark}
+        entries = file_entries(self.path, (file for file in made if file.suffix != PART))
+        known = {"stage": self.name, "key": self.key}
+        write_json(mark, {**known, "figures": dict(figures), "files": entries})
 
     def figures(self) -> dict[str, Any]:
-        """What `finish` was given, summed over the parts that are finished.
+        """Return what `finish` was given, summed over the finished parts.
 
         Raises:
-            DamagedFileError: a mark is no such file.
+            DamagedFileError: a mark is damaged.
         """
         total = Counter[str]()
         for *_, mark in self.outputs.values():
             if mark.is_file():
-                total.update(_figures(mark))
+                total.update(_read_mark(mark).figures)
         return dict(total)
 
     def discard(self) -> None:
-        """Forget the stage's results."""
+        """Remove the results of the stage."""
         shutil.rmtree(self.path, ignore_errors=True)
+
+
+def require_sound(stage: Path, pattern: str = "*") -> None:
+    """Check the files in the folder of a stage against the marks of its finished parts.
+
+    A folder without marks, such as a log of the user's, is not checked.
+
+    Args:
+        stage: its folder.
+        pattern: of the names of the files to check.
+
+    Raises:
+        DamagedFileError: a file or a mark is missing or damaged.
+    """
+    for mark in sorted(stage.glob(f"{_MARK}*.json")):
+        require_unchanged(stage, _read_mark(mark).files, pattern)
 
 
 @dataclass(frozen=True)
 class Store:
-    """All stage folders below one root."""
+    """The folders of all stages, below one root."""
 
     root: Path
 
@@ -90,27 +178,28 @@ class Store:
         return cls(results / "store")
 
     def path(self, stage: Stage | RecordedLog) -> Path:
-        """Where what a stage made is or will be."""
+        """Return the folder of a stage."""
         return stage.path if isinstance(stage, RecordedLog) else self.root / stage.name / stage.key
 
     def discard_damaged(self, error: DamagedFileError, mended: Counter[Path]) -> bool:
-        """Forget the stage that a damaged file belongs to, and warn.
+        """Remove the stage that a damaged file belongs to, and warn.
 
-        Others may have read the file before that and tell later: then there is nothing to do.
+        Nothing is done if another task has reported the same damage before, and the stage has been
+        made again since.
 
         Args:
-            error: what was read.
-            mended: counts, over the calls of one command.
+            error: names the damaged file.
+            mended: how often each file has been made again in this command; it is updated.
 
         Returns:
-            False for a file that no stage made, or one that was damaged too often.
+            False if no stage made the file, or if it has been damaged too often.
         """
         path, root = error.path.resolve(), self.root.resolve()
         parts = path.relative_to(root).parts if path.is_relative_to(root) else ()
         if len(parts) < _DEPTH:
             return False
         stage = root.joinpath(*parts[:2])
-        if mended[path] and (not path.is_file() or is_intact(path.read_bytes())):
+        if mended[path] and (not path.is_file() or _is_sound(stage)):
             mended[stage] += 1
             return mended[stage] <= _TOLD_LATE_AT_MOST
         mended[path] += 1
@@ -122,7 +211,7 @@ class Store:
         return True
 
     def folder(self, stage: Stage) -> StageFolder:
-        """The same with all that is known of it."""
+        """Return the folder of a stage with the names of its outputs."""
         path = self.path(stage)
         outputs = {}
         for part in stage.parts:
@@ -132,20 +221,28 @@ class Store:
         return StageFolder(path, stage.name, stage.key, outputs)
 
 
-def _figures(mark: Path) -> dict[str, float]:
+def _read_mark(path: Path) -> _Mark:
     try:
-        return _FIGURES.validate_python(read_json(mark, "mark of a finished stage").get("figures"))
+        return _Mark.model_validate(read_json(path, "mark of a finished stage"))
     except ValidationError as error:
-        raise DamagedFileError(mark, "holds no figures about a finished stage") from error
+        raise DamagedFileError(path, "is not the mark of a finished stage") from error
+
+
+def _is_sound(stage: Path) -> bool:
+    try:
+        require_sound(stage)
+    except DamagedFileError:
+        return False
+    return True
 
 
 def mending(store: Store, work: Callable[[], T]) -> T:
-    """What `work` gives, called again after each damaged stage of the store that it comes across.
+    """Return the result of `work`; call it again if it has read a damaged stage of the store.
 
-    `work` makes again what is no longer there. What it finds is told as a warning.
+    The stage is removed with a warning, and `work` has to make it again.
 
     Raises:
-        DamagedFileError: a file outside the store, or one that is damaged again and again.
+        DamagedFileError: a file outside the store is damaged, or one that was damaged too often.
     """
     mended = Counter[Path]()
     while True:

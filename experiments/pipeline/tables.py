@@ -1,26 +1,16 @@
 """Tables that stages write, with their schemas; none of them contains the truth."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from mapfusion.align.alignment import Alignment, Status
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.errors import DamagedFileError
-from mapfusion.files import (
-    UNREADABLE,
-    covariances_from,
-    read_sealed,
-    read_table,
-    schema,
-    tell_unsealed,
-    write_table,
-)
+from mapfusion.files import covariances_from, read_table, schema, write_table
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification.false_alarms import Verdict
@@ -65,43 +55,6 @@ def records(rows: pd.DataFrame) -> list[dict[str, Any]]:
     names = rows.columns.tolist()
     columns = (rows[name].tolist() for name in names)
     return [dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True)]
-
-
-def row_groups(
-    path: Path, what: str, choose: Callable[[pa.Schema], Sequence[str] | None] = lambda _: None
-) -> Iterator[pa.Table]:
-    """Any Parquet table, one row group after the other; one without rows as one empty piece.
-
-    Args:
-        path: of the file, whose bytes are checked.
-        what: it is, for messages.
-        choose: which columns, by the schema that the file has; None for all.
-
-    Raises:
-        DamagedFileError: the file is missing or damaged.
-    """
-    source = pa.BufferReader(data := read_sealed(path, what))
-    try:
-        file = pq.ParquetFile(source, page_checksum_verification=True)
-        found, n_groups = file.schema_arrow, file.num_row_groups
-    except UNREADABLE as error:
-        raise _damaged(path, error) from error
-    tell_unsealed(path, data)
-    names = choose(found)
-    if not n_groups:
-        empty = found.empty_table()
-        yield empty if names is None else empty.select(names)
-    for number in range(n_groups):
-        try:
-            piece = file.read_row_group(number, names)
-        except UNREADABLE as error:
-            raise _damaged(path, error) from error
-        yield piece if names is None else piece.select(names)
-
-
-def _damaged(path: Path, error: Exception) -> DamagedFileError:
-    reason = " ".join(str(error).split()) or type(error).__name__
-    return DamagedFileError(path, f"damaged or not a Parquet file ({reason})")
 
 
 MOTION = ("tx_m", "ty_m", "theta_rad")

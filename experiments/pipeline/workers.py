@@ -17,7 +17,6 @@ import sys
 import tempfile
 import threading
 import traceback
-import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -30,7 +29,7 @@ from typing import Any, NoReturn
 
 from experiments.methods.aligner_calls import end_children
 from experiments.methods.threads import single_threaded
-from mapfusion.errors import InputError, UnsealedWarning
+from mapfusion.errors import InputError
 
 
 @contextmanager
@@ -153,7 +152,6 @@ def _ensure_server() -> None:
 
 def _start_worker() -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    warnings.simplefilter("ignore", UnsealedWarning)  # the parent says it
     single_threaded()
 
 

@@ -7,6 +7,7 @@ import pandas as pd
 import pyarrow as pa
 
 from experiments.evaluation import tables
+from experiments.evaluation.result_files import require_as_written
 from experiments.reports.terminal.layout import print_lines, print_table
 from experiments.scenario.loading import load_scenario
 from mapfusion import attitude, landmark_map, robot_log
@@ -180,6 +181,8 @@ def _folder(path: Path) -> Contents:
     else:
         told = [_json(path / name) for name in _DESCRIPTIONS if (path / name).is_file()]
         facts = {name: value for each in told for name, value in each.facts.items()}
+    if kind == _RESULT:
+        require_as_written(path)
     n_levels = 2 if kind == _RESULT else 1
     files = sorted(path.rglob("[!.]*.parquet"))
     csv = [file for name in _OPEN for file in path.rglob(f"{name}.csv")]

@@ -13,10 +13,10 @@ import numpy as np
 import pandas as pd
 
 from experiments.pipeline.tables import alignment_of
-from experiments.reports.figures.result_tables import Pair, ResultTables, of_pair
+from experiments.reports.figures.result_tables import Pair, ResultTables, of_pair, read_png
 from experiments.reports.figures.style import FUSED_COLOUR
 from mapfusion.errors import InputError
-from mapfusion.files import read_sealed, write_whole
+from mapfusion.files import write_whole
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import transform_points
 
@@ -104,7 +104,7 @@ def _add_images(recording: _Recording, data: ResultTables, robot: str) -> None:
         iteration = int(path.stem.removeprefix(f"{robot}_"))
         now = tracks[tracks["iteration"] == iteration]
         recording.at(iteration)
-        recording.image(f"images/{robot}", read_sealed(path, "key frame"))
+        recording.image(f"images/{robot}", read_png(path))
         labels = [
             f"track {t}, {n} frames" for t, n in zip(now["track"], now["length"], strict=True)
         ]

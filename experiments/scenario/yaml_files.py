@@ -10,7 +10,7 @@ from ruamel.yaml.composer import Composer, MaxDepthExceededError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode
 
 from mapfusion.errors import InputError
-from mapfusion.files import SEAL
+from mapfusion.files import DIGEST
 
 _MOST_BYTES = 4_000_000  # the largest resolved scenario of ours takes 0.03 of that
 _MOST_VALUES = 200_000  # with every alias written out
@@ -58,7 +58,7 @@ def read_mapping(
     if not isinstance(value, dict):
         found = "nothing" if value is None else f"a {type(value).__name__}"
         raise InputError(f"{path}: holds {found}, expected a mapping of {keys}")
-    value.pop(SEAL, None)  # of a result's scenario.json, which may have been edited
+    value.pop(DIGEST, None)  # of a result's scenario.json, which may have been edited
     return value
 
 

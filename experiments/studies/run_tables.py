@@ -17,10 +17,9 @@ import pyarrow as pa
 from experiments.evaluation import tables
 from experiments.evaluation.alignment_summary import RUN_KEYS, setting_columns
 from experiments.evaluation.result_files import read_scenario, require_tables
-from experiments.pipeline.tables import row_groups
 from experiments.studies.sweep_tables import SCHEMA_VERSION
 from mapfusion.errors import InputError
-from mapfusion.files import read_json, require_version, text_attributes
+from mapfusion.files import read_json, require_version, row_groups, text_attributes
 
 _VERSION = b"mapfusion.schema_version"
 _TOLD = ("status", "reason")  # of each run of a sweep

@@ -36,24 +36,23 @@ from pydantic import BaseModel, ValidationError
 from experiments.evaluation import tables
 from experiments.evaluation.criteria import answerable, how_far_off
 from experiments.pipeline.code_version import library_versions, source_hash
-from experiments.pipeline.tables import FLOAT, TEXT, fields, row_groups
+from experiments.pipeline.tables import FLOAT, TEXT, fields
 from experiments.studies.sweep_combinations import SweepRun
 from mapfusion.errors import DamagedFileError, InputError, MendedWarning
 from mapfusion.files import (
-    LINE,
     UNREADABLE,
-    parquet_with_seal,
     read_json,
     read_parquet,
-    read_sealed,
+    require_file,
+    row_groups,
     schema,
     text_attributes,
     write_json,
-    write_sealed,
     write_whole,
 )
 
 SCHEMA_VERSION = 2
+_DIGEST_BYTES = hashlib.sha256().digest_size
 RUNS, RUN_TIMES, ALIGNER_TIMINGS = "runs", "run_times", "aligner_timings"
 Rows = pd.DataFrame | list[dict[str, Any]]
 
@@ -148,15 +147,21 @@ class SweepDataset:
             table = self.rows(name, run, rows)
             with pa.ipc.new_stream(buffer, table.schema) as stream:
                 stream.write_table(table)
-        write_sealed(self.waiting_path(run), buffer.getvalue().to_pybytes() + LINE)
+        rows = buffer.getvalue().to_pybytes()
+        whole = rows + hashlib.sha256(rows).digest()  # Arrow's streams have no checksums
+        write_whole(self.waiting_path(run), lambda file: file.write_bytes(whole))
 
 
 def read_waiting(path: Path) -> dict[str, pa.Table]:
     """The rows of one run by table; raises DamagedFileError."""
-    data = read_sealed(path, "file of rows that wait", only_ours=True)
-    source, found = pa.BufferReader(data), dict[str, pa.Table]()
+    require_file(path, "file of rows that wait")
+    whole = path.read_bytes()
+    rows, digest = whole[:-_DIGEST_BYTES], whole[-_DIGEST_BYTES:]
+    if hashlib.sha256(rows).digest() != digest:
+        raise DamagedFileError(path, "damaged, it does not fit its digest")
+    source, found = pa.BufferReader(rows), dict[str, pa.Table]()
     try:
-        while source.tell() < len(data) - len(LINE):
+        while source.tell() < len(rows):
             with pa.ipc.open_stream(source) as stream:
                 table = stream.read_all()
             kind = text_attributes(path, table).get("kind", "")
@@ -254,7 +259,7 @@ class JoinedTables:
             return {}
         try:
             for file in files:
-                read_sealed(file, "table of a sweep")
+                read_parquet(file, "table of a sweep")
             return _digests(read_parquet(path, RUNS, ["run_id", *_TOLD]))
         except DamagedFileError as error:
             told = f"{error}; the runs in it are made again, when a sweep asks for them"
@@ -406,7 +411,7 @@ def _write(path: Path, table_schema: pa.Schema, parts: Iterable[pa.Table]) -> No
                 group, n_rows = [], 0
         if group:
             writer.write_table(pa.concat_tables(group).combine_chunks())
-    write_sealed(path, parquet_with_seal(memoryview(buffer.getvalue())))
+    write_whole(path, lambda temporary: temporary.write_bytes(buffer.getvalue()))
 
 
 def _fitted(rows: pa.Table, table_schema: pa.Schema) -> pa.Table:

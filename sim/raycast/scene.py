@@ -8,10 +8,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from mapfusion.errors import DamagedFileError, InputError
-from mapfusion.files import read_sealed
+from mapfusion.errors import InputError
 from mapfusion.geometry.numerics import Float
-from sim.world import CORNERS, face_files, read_corners
+from sim.world import CORNERS, face_files, read_corners, read_picture
 
 REFUSED = "render.renderer: raycast cannot draw {what}; renderer: tiny can"
 
@@ -136,11 +135,8 @@ def _require_drawable(corners_m: Float, is_wall: np.ndarray, top_m: float) -> No
 
 def _read_picture(path: Path, channel: int | None) -> np.ndarray:
     """(H, W) uint8, its first row along the lower edge."""
-    data = np.frombuffer(read_sealed(path, "picture", only_ours=True), np.uint8)
-    image = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB)
-    if image is None:
-        raise DamagedFileError(path, "is no picture")
-    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if channel is None else image[:, :, channel]
+    image = read_picture(path)
+    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if channel is None else image[:, :, 2 - channel]
     return np.ascontiguousarray(grey[::-1])
 
 

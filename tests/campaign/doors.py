@@ -11,13 +11,13 @@ import pandas as pd
 
 from experiments.evaluation import tables
 from experiments.evaluation.result_files import read_provenance
-from experiments.pipeline.store import StageFolder
+from experiments.pipeline.store import StageFolder, require_sound
 from experiments.reports.figures.result_tables import ResultTables
 from experiments.studies.run_tables import find_runs
 from experiments.studies.sweep_combinations import SweepRun
 from experiments.studies.sweep_tables import JoinedTables, SweepDataset, open_dataset
 from mapfusion.datasets.mrclam import MrclamSettings, import_mrclam
-from mapfusion.files import read_sealed, write_json
+from mapfusion.files import write_json
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map
 from mapfusion.robot_log import (
     Observations,
@@ -30,7 +30,7 @@ from mapfusion.robot_log import (
 )
 from sim.floorplan import FloorPlan, Wall
 from sim.trajectory import Trajectory, read_trajectory, write_trajectory
-from sim.world import CORNERS, face_files, read_corners, write_faces
+from sim.world import CORNERS, face_files, read_corners, read_picture, write_faces
 
 
 class Door(NamedTuple):
@@ -47,7 +47,7 @@ def doors(folder: Path) -> list[Door]:
 
 
 def doors_of_others(folder: Path) -> list[Door]:
-    """Files as other programs write them, which carry no digest: a changed number goes unseen."""
+    """Write files without checksums, as other programs do: a changed number goes unnoticed."""
     plain, log, recording = folder / "plain.csv", folder / "csv", folder / "MRCLAM"
     rng, n = np.random.default_rng(1), 12
     place = pd.DataFrame(rng.normal(size=(n, 3)), columns=pd.Index(["x_m", "y_m", "z_m"]))
@@ -71,11 +71,14 @@ def doors_of_others(folder: Path) -> list[Door]:
         text = "".join(" ".join(map(str, row)) + "\n" for row in rows)
         (recording / f"{name}.dat").write_text(text)
     settings = MrclamSettings()
+    plan = FloorPlan((Wall(np.array([[0.0, 0.0], [0.4, 0.0], [0.4, 0.4]]), 0.3),))
+    write_faces(folder, plan, rng)
     imported = partial(import_mrclam, recording, folder / "imported", settings)
     return [
         Door(plain, partial(read_map, plain)),
         *(Door(log / f"{name}.csv", partial(read_log, log)) for name in ("frames", "observations")),
         *(Door(recording / f"{name}.dat", imported) for name in tables),
+        Door(folder / CORNERS, partial(read_corners, folder / CORNERS)),
     ]
 
 
@@ -128,21 +131,25 @@ def _start(result: Path) -> Any:
 
 
 def _of_the_store(folder: Path, rng: np.random.Generator) -> list[Door]:
-    stage, faces = folder / "store" / "slam" / "k", folder / "faces"
-    mark, drive = stage / "done.json", folder / "trajectory.parquet"
-    made = StageFolder(stage, "slam", "k", {"": (mark,)})
-    made.finish("", {"elapsed_s": 1.5})
+    faces, drive = folder / "store" / "faces" / "k", folder / "trajectory.parquet"
     driven = Trajectory(("R1",), np.arange(5.0), rng.normal(size=(1, 5, 3)), np.zeros((1, 5, 2)))
     write_trajectory(drive, driven)
     corner = np.array([[0.0, 0.0], [0.4, 0.0], [0.4, 0.4]])
     write_faces(faces, FloorPlan((Wall(corner, 0.3),)), rng)
-    mesh, picture = face_files(faces, 0)
+    made = StageFolder(faces, "faces", "k", {"": (faces / "done.json",)})
+    made.finish("", {"elapsed_s": 1.5})
+
+    def read() -> Any:
+        """Read a stage as the one after it does."""
+        require_sound(faces)
+        meshes = [file.read_bytes() for file in sorted(faces.glob("*.obj"))]
+        pictures = [read_picture(file) for file in sorted(faces.glob("*.bmp"))]
+        return made.figures(), read_corners(faces / CORNERS), pictures, meshes
+
     return [
-        Door(mark, made.figures),
         Door(drive, partial(read_trajectory, drive)),
-        Door(faces / CORNERS, partial(read_corners, faces / CORNERS)),
-        Door(mesh, partial(read_sealed, mesh, "mesh", only_ours=True)),
-        Door(picture, partial(read_sealed, picture, "picture", only_ours=True)),
+        *(Door(each, read) for each in (faces / "done.json", faces / CORNERS)),
+        *(Door(each, read) for each in face_files(faces, 0)),
     ]
 
 

@@ -4,9 +4,9 @@ import os
 import signal
 from pathlib import Path
 
-from mapfusion import files
+from experiments.pipeline.store import StageFolder, require_sound
 from mapfusion.errors import InputError
-from mapfusion.files import write_sealed
+from mapfusion.files import require_file
 from tests.helpers.waiting import wait_until
 
 
@@ -57,9 +57,15 @@ def wait_for(path: Path, output: Path) -> None:
     write(output, "done")
 
 
-def write_with_seal(path: Path) -> None:
-    write_sealed(path, files.LINE + b"made")
+def write_stage(path: Path, text: str = "made") -> None:
+    """Write a file and mark its folder as that of a finished stage, in which it holds `made`."""
+    write(path, "made")
+    StageFolder(path.parent, "drive", "k", {"": (path.parent / "done.json",)}).finish("", {})
+    if text != "made":
+        write(path, text)
 
 
-def read_with_seal(path: Path, output: Path) -> None:
-    write(output, files.read_sealed(path, "test").decode())
+def read_stage(path: Path, output: Path) -> None:
+    require_sound(path.parent)
+    require_file(path, "test")  # the stage may have been discarded meanwhile
+    write(output, path.read_text())

@@ -1,5 +1,8 @@
 import errno
+import hashlib
+import json
 import os
+import pickle
 import subprocess
 import sys
 
@@ -11,15 +14,19 @@ import pytest
 
 from mapfusion.errors import DamagedFileError, InputError
 from mapfusion.files import (
+    DIGEST,
     column,
+    float_fields,
     point_columns,
     point_fields,
     points_from,
+    read_json,
     read_parquet,
     read_table,
     remove_abandoned,
     require_writable,
     schema,
+    write_json,
     write_table,
     write_whole,
 )
@@ -265,3 +272,145 @@ def test_flipped_bytes_never_pass_unnoticed_as_another_error(tmp_path, position)
     except InputError:
         return
     assert table.schema.equals(THINGS, check_metadata=False)
+
+
+def test_a_flipped_bit_of_a_table_is_noticed_or_changes_no_value(tmp_path):
+    """Every seventh byte is tried; the campaign tries thousands of bits in all kinds of files."""
+    path = tmp_path / "things.parquet"
+    write_table(path, COLUMNS, THINGS, {"robot": "north"})
+    data, before, told = path.read_bytes(), read_table(path, THINGS), 0
+    for at in range(0, len(data), 7):
+        flipped = bytearray(data)
+        flipped[at] ^= 1 << at % 8
+        path.write_bytes(flipped)
+        try:
+            table, attributes = read_table(path, THINGS)
+        except InputError as error:
+            told += str(error).startswith(str(path))
+            continue
+        assert column(table, "name").tolist() == ["a", "b"]
+        for name in ("weight_kg", "code"):
+            assert column(table, name).tobytes() == COLUMNS[name].tobytes()
+        assert attributes == before[1]
+    assert told > len(data) / 14
+
+
+def test_pages_carry_checksums_and_others_can_read_and_write_the_table_again(tmp_path):
+    path, again = tmp_path / "things.parquet", tmp_path / "again.parquet"
+    write_table(path, COLUMNS, THINGS)
+    pq.write_table(pq.read_table(path), again)
+    assert column(read_table(again, THINGS)[0], "name").tolist() == ["a", "b"]
+    data, first = bytearray(path.read_bytes()), pq.read_metadata(path).row_group(0).column(0)
+    data[first.dictionary_page_offset + first.total_compressed_size - 1] ^= 1
+    with pytest.raises(OSError, match="CRC"):
+        pq.read_table(pa.BufferReader(bytes(data)), page_checksum_verification=True)
+    path.write_bytes(data)
+    with pytest.raises(DamagedFileError, match=r"things\.parquet: damaged.*CRC"):
+        read_table(path, THINGS)
+
+
+def zigzag(number):
+    """An integer as Thrift writes it: 7 bits a byte, the last ones first."""
+    number, coded = 2 * number, b""
+    while number > 127:
+        coded += bytes([number & 127 | 128])
+        number >>= 7
+    return coded + bytes([number])
+
+
+def test_a_column_that_shows_the_values_of_another_is_noticed(tmp_path):
+    """Its page has a checksum that fits, so that Arrow reads it."""
+    path, things = tmp_path / "xy.parquet", schema("test.xy", 1, float_fields("xyz"))
+    write_table(path, {name: np.arange(40.0) + ord(name) for name in "xyz"}, things)
+    group = pq.read_metadata(path).row_group(0)
+    y, z = (b"\x26" + zigzag(group.column(k).data_page_offset) for k in (1, 2))
+    data = path.read_bytes()
+    assert (len(y), data.count(z)) == (len(z), 1)
+    path.write_bytes(data.replace(z, y))
+    wrong = pq.read_table(path, page_checksum_verification=True)
+    assert wrong["z"].equals(wrong["y"])
+    with pytest.raises(DamagedFileError, match="two of its columns overlap"):
+        read_table(path, things)
+    path.write_bytes(data)
+    read_table(path, things)
+
+
+def test_attributes_that_differ_between_the_copies_of_the_schema(tmp_path):
+    path = tmp_path / "things.parquet"
+    write_table(path, COLUMNS, THINGS, {"robot": "north"})
+    data = path.read_bytes()
+    path.write_bytes(data.replace(b"north", b"nortH"))
+    with pytest.raises(DamagedFileError, match="two copies of its schema differ"):
+        read_table(path, THINGS)
+
+
+def test_metadata_that_is_lost_makes_no_table_of_another_program(tmp_path):
+    path = tmp_path / "things.parquet"
+    write_table(path, COLUMNS, THINGS, {"robot": "north"})
+    data, end = path.read_bytes(), b"\x00\x19\x4c"  # of the row groups; then four texts follow
+    assert data.count(end) == 1
+    path.write_bytes(data.replace(end, b"\x01\x19\x4c"))
+    assert not pq.read_metadata(path).metadata
+    with pytest.raises(DamagedFileError, match="damaged"):
+        read_parquet(path, "table")
+
+
+def sealed_as_before(data, at):
+    """A file's bytes with a digest at a place, as they were written before 2026-11."""
+    line = b"mapfusion.sha256 " + b"0" * 64 + b"\n"
+    whole = data[:at] + line + data[at:]
+    return whole.replace(b"0" * 64, hashlib.sha256(whole).hexdigest().encode(), 1)
+
+
+def test_tables_with_a_digest_before_their_footer_are_read(tmp_path):
+    path = tmp_path / "things.parquet"
+    write_table(path, COLUMNS, THINGS, {"robot": "north"})
+    data, before = path.read_bytes(), read_table(path, THINGS)
+    footer = len(data) - 8 - int.from_bytes(data[-8:][:4], "little")
+    path.write_bytes(sealed_as_before(data, footer))
+    assert len(path.read_bytes()) > len(data)
+    table, attributes = read_table(path, THINGS)
+    assert attributes == before[1]
+    assert table["code"].equals(before[0]["code"])
+
+
+@pytest.mark.parametrize("text", ["null", "[1]", "3", '{"a": ', "\xff", "[" * 100_000])
+def test_json_that_is_no_object(text, tmp_path):
+    path = tmp_path / "x.json"
+    path.write_bytes(text.encode("latin-1"))
+    with pytest.raises(DamagedFileError, match=r"x\.json: .*expected a test"):
+        read_json(path, "test")
+
+
+def test_a_flipped_bit_of_a_json_object_is_noticed(tmp_path):
+    path, content = tmp_path / "x.json", {"a": [1.5, None], DIGEST + " ": "6" * 64, "\ud800": {}}
+    write_json(path, content)
+    assert read_json(path, "test") == content
+    data = path.read_bytes()
+    assert json.loads(data)[DIGEST] == next(iter(json.loads(data).values()))
+    for at in range(0, len(data), 3):
+        flipped = bytearray(data)
+        flipped[at] ^= 1 << at % 8
+        path.write_bytes(flipped)
+        with pytest.raises(DamagedFileError) as raised:
+            read_json(path, "test")
+        assert raised.value.path == path
+
+
+def test_json_that_somebody_edited_is_read_without_its_digest(tmp_path):
+    path = tmp_path / "x.json"
+    write_json(path, {"a": 1})
+    path.write_text(path.read_text().replace('"a": 1', '"a": 2'))
+    with pytest.raises(DamagedFileError, match="if you edited it, remove its field"):
+        read_json(path, "test")
+    path.write_text('{"a": 2}')
+    assert read_json(path, "test") == {"a": 2}
+
+
+def test_a_damaged_file_is_known_in_other_processes(tmp_path):
+    path = tmp_path / "x.json"
+    path.write_text("{")
+    with pytest.raises(DamagedFileError) as raised:
+        read_json(path, "text")
+    error = pickle.loads(pickle.dumps(raised.value))
+    assert (error.path, str(error)) == (path, str(raised.value))

@@ -20,7 +20,6 @@ from experiments.pipeline.stage import Job
 from experiments.pipeline.stages.drive import TRAJECTORY_FILE
 from experiments.scenario.seeds import generator
 from mapfusion.files import (
-    LINE,
     POSITION_FIELDS,
     column,
     columns,
@@ -28,8 +27,8 @@ from mapfusion.files import (
     named_columns,
     read_table,
     schema,
-    write_sealed,
     write_table,
+    write_whole,
 )
 from mapfusion.geometry.camera import StereoCamera
 from mapfusion.geometry.numerics import Float
@@ -135,7 +134,8 @@ def run(settings: FeatureSettings, job: Job) -> dict[str, float]:
         truth.append(np.concatenate([points, slopes.reshape(-1, len(_POINT_SLOPE))], axis=1))
         if 0 <= iteration - settings.images_at < settings.images:
             encoded = cv2.imencode(".png", frame.left)[1].tobytes()
-            write_sealed(job.output / f"image_{iteration:06d}.png", encoded + LINE)
+            picture = job.output / f"image_{iteration:06d}.png"
+            write_whole(picture, lambda path, encoded=encoded: path.write_bytes(encoded))
     truth_path, features_path = (job.output / name.format(part=job.part) for name in WRITES)
     joined = {
         name: np.concatenate([getattr(found, name) for found in features])

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from experiments.pipeline.workers import Workers, workers
 from experiments.reports.figures.result_tables import NothingToDraw, ResultTables
 from experiments.reports.figures.style import house_style
-from mapfusion.files import LINE, write_sealed, write_whole
+from mapfusion.files import write_whole
 
 # Each is a module `figNN_NAME` with a function `draw`; its docstring is the caption, and `READS`
 # names what it takes of a result: tables, and `scenario`.
@@ -114,10 +114,7 @@ def save_figure(folder: Path, name: str, draw: Callable[..., Figure], *data: Any
             figure.set_layout_engine(None)
             for file, kind in zip(files, _DPI, strict=True):
                 picture = _picture(figure, kind)
-                if kind == "png":
-                    write_sealed(file, picture + LINE)
-                else:
-                    write_whole(file, lambda path, picture=picture: path.write_bytes(picture))
+                write_whole(file, lambda path, picture=picture: path.write_bytes(picture))
     return files
 
 

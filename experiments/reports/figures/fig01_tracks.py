@@ -15,10 +15,8 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from experiments.reports.figures.result_tables import NothingToDraw, ResultTables
+from experiments.reports.figures.result_tables import NothingToDraw, ResultTables, read_png
 from experiments.reports.figures.style import PAGE_WIDTH_IN
-from mapfusion.errors import InputError
-from mapfusion.files import read_sealed
 
 READS = ("robots", "tracks")
 _MAX_FRAMES, _TRAIL_FRAMES = 4, 5
@@ -67,11 +65,7 @@ def _consecutive_frames(data: ResultTables) -> tuple[str, dict[int, Path]]:
 
 
 def _show_image(axes: Axes, path: Path) -> None:
-    data = read_sealed(path, "key frame")
-    try:
-        image = matplotlib.image.imread(io.BytesIO(data))
-    except (OSError, SyntaxError, ValueError) as error:  # how Pillow reports damaged files
-        raise InputError(f"{path}: not a readable PNG image ({error})") from error
+    image = matplotlib.image.imread(io.BytesIO(read_png(path)))
     axes.imshow(image, cmap="gray", vmin=0, vmax=1)
     axes.autoscale(enable=False)  # points near the border must not widen the view
     axes.grid(visible=False)

@@ -1,5 +1,6 @@
 """What a result folder holds, read when a figure asks for it."""
 
+import io
 import json
 from collections.abc import Collection, Mapping
 from functools import cached_property
@@ -10,14 +11,15 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 import pyarrow as pa
+from PIL import Image
 
 from experiments.evaluation.alignment_summary import methods_in
 from experiments.evaluation.result_files import read_scenario, read_world
 from experiments.evaluation.tables import ALL, read, table_path
 from experiments.reports.figures.style import FUSED_COLOUR, ROBOT_COLOURS, aligner_styles
 from mapfusion.align.alignment import Status
-from mapfusion.errors import InputError
-from mapfusion.files import COVARIANCE_FIELDS, POSITION_FIELDS, points_from
+from mapfusion.errors import DamagedFileError, InputError
+from mapfusion.files import COVARIANCE_FIELDS, POSITION_FIELDS, points_from, require_file
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import between, inverse, transform_covariances, transform_points
 
@@ -26,6 +28,22 @@ Pair = tuple[str, str]
 
 class NothingToDraw(Exception):  # noqa: N818  # no error: the result simply holds no such data
     """A figure has nothing to show; the text says why, in one line."""
+
+
+def read_png(path: Path) -> bytes:
+    """Return the bytes of a PNG picture, each part of which has a checksum.
+
+    Raises:
+        DamagedFileError: the file is missing or damaged.
+    """
+    require_file(path, "PNG picture")
+    data = path.read_bytes()
+    try:
+        with Image.open(io.BytesIO(data), formats=["PNG"]) as picture:
+            picture.verify()
+    except (OSError, SyntaxError, ValueError) as error:  # as Pillow tells damage
+        raise DamagedFileError(path, "damaged or not a PNG picture") from error
+    return data
 
 
 class FusedPairs(NamedTuple):

@@ -20,7 +20,7 @@ from experiments.evaluation.fused_map_errors import last_fused
 from experiments.evaluation.path_errors import path_rms
 from experiments.evaluation.result import require_result
 from experiments.reports.figures.drawing import FIGURES
-from experiments.reports.figures.result_tables import Pair, ResultTables, of_pair
+from experiments.reports.figures.result_tables import Pair, ResultTables, of_pair, read_png
 from experiments.reports.figures.style import aligner_styles
 from experiments.reports.report.charts import error_curves, success_curves, time_curves
 from experiments.reports.report.map_view import MAP_TABLES, map_view
@@ -32,7 +32,6 @@ from experiments.studies.method_comparison import recommend
 from experiments.studies.run_tables import Runs, find_runs
 from experiments.studies.statistics import ALL_SCENARIOS, configurations, reduced_errors
 from mapfusion.errors import InputError
-from mapfusion.files import read_sealed
 
 _BETWEEN = "a b"  # of rivals; the others lay a map onto itself
 _MOTION = ("tx_m", "ty_m", "theta_rad")
@@ -216,12 +215,9 @@ def _pictures(folder: Path, names: Collection[str]) -> Iterator[dict[str, Any]]:
         files = (folder / "figures" / f"{name}.png", folder / f"{name}.png")
         if file := next(filter(Path.is_file, files), None):
             about = importlib.import_module(f"experiments.reports.figures.{name}").__doc__ or name
-            data = read_sealed(file, "figure")
-            try:
-                with Image.open(io.BytesIO(data)) as picture:  # so that the page does not jump
-                    size = dict(zip(("width", "height"), picture.size, strict=True))
-            except (OSError, SyntaxError, ValueError) as error:  # how Pillow reports damaged files
-                raise InputError(f"{file}: not a readable PNG image ({error})") from error
+            data = read_png(file)
+            with Image.open(io.BytesIO(data)) as picture:  # so that the page does not jump
+                size = dict(zip(("width", "height"), picture.size, strict=True))
             png = base64.b64encode(data).decode()
             how = _OF_FUSERS.get(name, "")
             yield {"about": about.splitlines()[0], "how": how, "png": png, **size}

@@ -58,7 +58,8 @@ def _descriptions(path: Path, runs: Runs) -> Iterator[dict[str, Any]]:
                 "libraries": json_object(str(row["libraries"]), path / "runs"),
             }
     elif not runs.sweeps and file.is_file():
-        yield {name: said for name, said in read_provenance(file).items() if name != "tables"}
+        listed = {"tables", "files"}
+        yield {name: told for name, told in read_provenance(file).items() if name not in listed}
 
 
 def _flat(described: dict[str, Any]) -> Iterator[tuple[str, str]]:

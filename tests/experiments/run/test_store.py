@@ -1,11 +1,13 @@
+from collections import Counter
 from pathlib import Path
 
 import pytest
 
 from experiments.pipeline.stage import Job, Stage
-from experiments.pipeline.store import Store, link_or_copy
+from experiments.pipeline.store import Store, link_or_copy, require_sound
 from experiments.pipeline.tasks import tasks_of
-from mapfusion.errors import DamagedFileError
+from mapfusion.errors import DamagedFileError, MendedWarning
+from mapfusion.files import write_json
 
 
 def work(settings: int, job: Job) -> dict[str, float]:
@@ -37,6 +39,89 @@ def test_a_stage_is_finished_once_all_its_parts_are(tmp_path: Path) -> None:
     assert not folder.finished
     assert not folder.path.exists()
     folder.discard()
+
+
+def finished_stage(root: Path) -> tuple[Path, dict[str, Path]]:
+    """The folder of a stage of two parts, each with a file of its own and one beside it."""
+    stage = Stage("slam", "FastSLAM", 1, work, ("half_{part}",), parts=("a", "b"))
+    folder = Store(root).folder(stage)
+    folder.path.mkdir(parents=True)
+    for part, (half, _) in folder.outputs.items():
+        half.write_bytes(b"half " + part.encode())
+        (folder.path / f"picture_{part}.png").write_bytes(b"picture " + part.encode())
+        (folder.path / ".half.part").write_bytes(b"of another process")
+        folder.finish(part, {"elapsed_s": 1.5})
+    (folder.path / ".half.part").unlink()
+    return folder.path, {path.name: path for path in folder.path.iterdir()}
+
+
+def test_a_flipped_bit_of_a_finished_stage_is_noticed(tmp_path: Path) -> None:
+    folder, files = finished_stage(tmp_path)
+    require_sound(folder)
+    assert len(files) == 6
+    for path in files.values():
+        data = path.read_bytes()
+        for at in range(0, len(data), 5):
+            flipped = bytearray(data)
+            flipped[at] ^= 1 << at % 8
+            path.write_bytes(flipped)
+            with pytest.raises(DamagedFileError) as raised:
+                require_sound(folder)
+            assert raised.value.path == path
+        path.write_bytes(data)
+        require_sound(folder)
+
+
+@pytest.mark.parametrize("data", [None, b"", b"half", b"half a!"])
+def test_a_file_of_a_stage_that_is_missing_or_cut_is_named(
+    tmp_path: Path, data: bytes | None
+) -> None:
+    folder, files = finished_stage(tmp_path)
+    half = files["half_a"]
+    half.unlink() if data is None else half.write_bytes(data)
+    with pytest.raises(DamagedFileError, match=r"half_a: (damaged|no such file)"):
+        require_sound(folder)
+    require_sound(folder, "picture_*.png")
+
+
+def test_what_is_added_to_a_finished_stage_later_is_not_checked(tmp_path: Path) -> None:
+    folder, _ = finished_stage(tmp_path)
+    (folder / "aligner_timings.parquet").write_bytes(b"")
+    require_sound(folder)
+    require_sound(tmp_path / "log of a user")
+
+
+@pytest.mark.parametrize("files", [None, [], {"half_a": 3}, {"half_a": {"size": -1}}])
+def test_a_mark_that_lists_no_files_is_named(tmp_path: Path, files: object) -> None:
+    folder, paths = finished_stage(tmp_path)
+    write_json(paths["done_a.json"], {"figures": {}, "files": files})
+    with pytest.raises(DamagedFileError, match=r"done_a\.json: is not the mark of a finished"):
+        require_sound(folder)
+
+
+def test_a_stage_is_made_from_sound_inputs_alone(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    first = Stage("drive", "drive", 1, work, ("half_",))
+    second = Stage("slam", "FastSLAM", 1, work, ("half_",), {"drive": first})
+    tasks = tasks_of([first, second], store)
+    for stage in (first, second):
+        store.path(stage).mkdir(parents=True)
+    one, two = tasks.values()
+    one.run()
+    damaged = store.path(first) / "half_"
+    damaged.write_text("2")
+    with pytest.raises(DamagedFileError) as raised:
+        two.run()
+    assert raised.value.path == damaged
+    mended = Counter[Path]()
+    with pytest.warns(MendedWarning, match="the stage drive is discarded"):
+        assert store.discard_damaged(raised.value, mended)
+    assert not damaged.exists()
+    store.path(first).mkdir(parents=True)
+    one.run()
+    assert store.discard_damaged(raised.value, mended)  # told late: it is sound again
+    assert damaged.exists()
+    two.run()
 
 
 def test_links_share_what_they_can_and_replace_what_was_there(tmp_path: Path) -> None:

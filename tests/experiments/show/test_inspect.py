@@ -194,7 +194,7 @@ def picture(result: Path, folder: Path) -> Path:
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (truncated, "damaged, it does not fit its digest"),
+        (truncated, "damaged or not a Parquet file"),
         (foreign, "none of mapfusion's"),
         (of_another_version, "schema_version is 99"),
         (with_a_column_less, "columns are not those of result.errors"),

@@ -187,7 +187,7 @@ def test_missing_table_is_an_error_that_names_the_file(trio_copy: Path) -> None:
 
 def test_damaged_key_frame_is_an_error_that_names_the_file(trio_copy: Path) -> None:
     next((trio_copy / "keyframes").glob("R1_*")).write_bytes(b"no picture")
-    with pytest.raises(InputError, match=r"R1_\d{5}\.png: not a readable PNG image"):
+    with pytest.raises(InputError, match=r"R1_\d{5}\.png: damaged or not a PNG picture"):
         draw_figure(ResultTables(trio_copy), "fig01_tracks")
 
 

@@ -8,7 +8,7 @@ from experiments.evaluation import tables
 from experiments.reports.figures.fig07_correspondences import judge_correspondences
 from experiments.reports.figures.result_tables import ResultTables
 from mapfusion.errors import InputError
-from mapfusion.files import SEAL
+from mapfusion.files import DIGEST
 
 PAIR = ("R1", "R2")
 ALIGNERS = ["ransac", "svd", "icp", "impicp"]
@@ -59,7 +59,7 @@ def test_walls_are_drawn_where_their_faces_stand(trio_copy: Path) -> None:
     np.testing.assert_allclose(inner, room - 0.06 * outward, atol=1e-9)
     np.testing.assert_allclose(outer, room + 0.06 * outward, atol=1e-9)
     world = json.loads((trio_copy / "world.json").read_text())
-    del world["faces"], world[SEAL]  # as results were before
+    del world["faces"], world[DIGEST]  # as results were before
     (trio_copy / "world.json").write_text(json.dumps(world))
     np.testing.assert_array_equal(ResultTables(trio_copy).walls, [room])
 
