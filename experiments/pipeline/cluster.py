@@ -74,7 +74,7 @@ def _prepare() -> None:
     """Once a process, before anything is imported that computes."""
     use_kernel_cache()
     warnings.simplefilter("ignore", UnsealedWarning)  # the command says it
-    from experiments.methods.threads import single_threaded
+    from experiments.pipeline.workers import single_threaded
 
     single_threaded()
 
