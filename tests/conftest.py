@@ -8,8 +8,8 @@ import scipy.linalg  # noqa: F401  # its threads are limited only once it is the
 from hypothesis import HealthCheck, settings
 from xdist.scheduler import LoadFileScheduling
 
-from experiments.methods.threads import single_threaded
 from experiments.pipeline.code_version import use_kernel_cache
+from experiments.pipeline.workers import single_threaded
 
 # No test may depend on how fast the machine is; by default an example may take 0.2 s.
 settings.register_profile("any_speed", deadline=None, suppress_health_check=[HealthCheck.too_slow])

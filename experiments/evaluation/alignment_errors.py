@@ -16,7 +16,6 @@ from experiments.evaluation.truth import (
     squared_mahalanobis,
     true_pairs,
 )
-from experiments.methods.aligner_calls import callable_aligner
 from experiments.pipeline.stages.match import known_at
 from experiments.pipeline.tables import (
     MOTION,
@@ -26,6 +25,7 @@ from experiments.pipeline.tables import (
     evidence_of,
     records,
 )
+from experiments.plugins.discovery import callable_aligner
 from experiments.scenario.seeds import generator
 from experiments.scenario.settings import AnyScenario
 from mapfusion.align.alignment import Pairs

@@ -31,7 +31,6 @@ from experiments.evaluation.path_errors import path_statistics_rows, robot_paths
 from experiments.evaluation.result_files import RESULT_SCHEMA_VERSION, require_tables
 from experiments.evaluation.smoothed_robots import SmoothedRobot, smoothed_path_rows, smoother_rows
 from experiments.evaluation.team_errors import team_pair_rows, team_rows
-from experiments.methods.catalogue import find_method
 from experiments.pipeline.code_version import library_versions
 from experiments.pipeline.head_start import head_start
 from experiments.pipeline.stages import slam
@@ -40,6 +39,7 @@ from experiments.pipeline.stages.smooth import map_files, read_smoothed_path
 from experiments.pipeline.store import Store, file_entries, link_or_copy, mending, require_sound
 from experiments.pipeline.tables import read_rows
 from experiments.pipeline.tasks import OnProgress
+from experiments.plugins.discovery import find_method
 from experiments.scenario.settings import AnyScenario, Simulation
 from mapfusion.errors import InputError
 from mapfusion.files import (

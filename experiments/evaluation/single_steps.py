@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from experiments.evaluation.evaluated_run import JudgedRun, finding_of_truth
-from experiments.methods.aligner_calls import callable_aligner
 from experiments.pipeline.store import Store, link_or_copy, mending
 from experiments.pipeline.tables import estimate_row
 from experiments.pipeline.tasks import OnProgress
+from experiments.plugins.discovery import callable_aligner
 from experiments.scenario.seeds import generator
 from experiments.scenario.settings import Align, AlignerEntry, AnyScenario, Recording, Scenario
 from mapfusion.align.alignment import NOT_RUN, Pairs, Status

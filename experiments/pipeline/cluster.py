@@ -72,7 +72,7 @@ def code_version() -> str:
 def _prepare() -> None:
     """Once a process, before anything is imported that computes."""
     use_kernel_cache()
-    from experiments.methods.threads import single_threaded
+    from experiments.pipeline.workers import single_threaded
 
     single_threaded()
 

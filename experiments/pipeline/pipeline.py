@@ -12,7 +12,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from experiments.methods.catalogue import Kind, find_method, fingerprint
 from experiments.pipeline.stage import RecordedLog, Stage, with_those_before
 from experiments.pipeline.stages import (
     align,
@@ -28,6 +27,7 @@ from experiments.pipeline.stages import (
     smooth,
 )
 from experiments.pipeline.stages.walls import Walls
+from experiments.plugins.discovery import Kind, find_method, fingerprint
 from experiments.scenario.settings import AnyScenario, Recording, Scenario, Simulation
 from experiments.scenario.world_settings import NAME_PATTERN, TAKEN_NAMES, Section
 from mapfusion.errors import InputError

@@ -27,8 +27,9 @@ from multiprocessing.connection import (
 )
 from typing import Any, NoReturn
 
-from experiments.methods.aligner_calls import end_children
-from experiments.methods.threads import single_threaded
+from threadpoolctl import threadpool_limits
+
+from experiments.plugins.isolated_process import end_children
 from mapfusion.errors import InputError
 
 
@@ -55,6 +56,19 @@ def held_back_interrupts() -> Iterator[Callable[[], None]]:
         yield let_them_come
     finally:
         let_them_come()
+
+
+def single_threaded() -> None:
+    """Limit BLAS and OpenCV to one thread: the order of sums depends on the number of threads.
+
+    Only loaded libraries can be limited, and SciPy has a BLAS of its own.
+    """
+    import cv2
+    import numpy as np  # noqa: F401
+    import scipy.linalg  # noqa: F401
+
+    cv2.setNumThreads(1)
+    threadpool_limits(1)
 
 
 # What a process pool puts in place of the traceback of a worker, as text.

@@ -16,9 +16,9 @@ from matplotlib.ticker import NullLocator
 
 from experiments.evaluation.criteria import RIGHT_WITHIN_M, RIGHT_WITHIN_RAD
 from experiments.evaluation.tables import table_path
-from experiments.methods.catalogue import find_method
 from experiments.pipeline.code_version import library_versions
 from experiments.pipeline.tables import FLOAT, INT, TEXT, fields, write_rows
+from experiments.plugins.discovery import find_method
 from experiments.reports.export import to_markdown, write_tables, write_text
 from experiments.reports.figures import independence_figure, refusal_figures, style, verdict_figures
 from experiments.reports.figures.drawing import draw_figure, save_figure

@@ -16,7 +16,7 @@ from pydantic.dataclasses import dataclass
 from pydantic.json_schema import GenerateJsonSchema
 from pydantic_core import to_jsonable_python
 
-from experiments.methods.catalogue import name_clashes
+from experiments.plugins.discovery import name_clashes
 from experiments.scenario.settings import (
     Align,
     AnyScenario,

@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from experiments.methods.aligner_calls import require_usable
+from experiments.plugins.discovery import require_usable
 from experiments.scenario.world_settings import (
     MAX_COUNT,
     MAX_NAMED,

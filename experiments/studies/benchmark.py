@@ -17,14 +17,12 @@ import numpy as np
 import pandas as pd
 
 from experiments.evaluation.criteria import is_right
-from experiments.methods.aligner_calls import callable_aligner
-from experiments.methods.catalogue import find_method, known_methods
-from experiments.methods.threads import single_threaded
 from experiments.pipeline.stage import Job, Stage
 from experiments.pipeline.store import Store
 from experiments.pipeline.tables import FLOAT, INT, TEXT, fields, read_rows, write_rows
 from experiments.pipeline.tasks import OnProgress, run_tasks, tasks_of
-from experiments.pipeline.workers import workers
+from experiments.pipeline.workers import single_threaded, workers
+from experiments.plugins.discovery import callable_aligner, find_method, known_methods
 from experiments.scenario.seeds import generator
 from experiments.scenario.settings import AlignerEntry
 from experiments.scenario.suite import settings_of

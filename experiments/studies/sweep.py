@@ -20,11 +20,11 @@ from distributed.scheduler import KilledWorker
 
 from experiments.evaluation.evaluated_run import JudgedRun
 from experiments.evaluation.result import measure_aligners
-from experiments.methods.threads import single_threaded
 from experiments.pipeline import cluster
 from experiments.pipeline.cluster import connected
 from experiments.pipeline.store import mending
 from experiments.pipeline.tasks import OnProgress, Task
+from experiments.pipeline.workers import single_threaded
 from experiments.studies.sweep_combinations import SweepRun
 from experiments.studies.sweep_plan import PlannedRun, Sweep, planned
 from experiments.studies.sweep_tables import (

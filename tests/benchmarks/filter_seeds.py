@@ -18,9 +18,9 @@ import numpy as np
 
 from experiments.evaluation.smoothed_robots import path_rmse_m
 from experiments.evaluation.truth import PathTruth
-from experiments.methods.threads import single_threaded
 from experiments.pipeline.pipeline import smoother_parameters
 from experiments.pipeline.stages.smooth import log_until
+from experiments.pipeline.workers import single_threaded
 from experiments.scenario.loading import load_scenario
 from mapfusion.attitude import read_attitude
 from mapfusion.fastslam.mapping import run_log

@@ -22,9 +22,9 @@ from pathlib import Path
 from typing import cast
 from unittest.mock import patch
 
-from experiments.methods.threads import single_threaded
 from experiments.pipeline.pipeline import lay_out
 from experiments.pipeline.stages import drive
+from experiments.pipeline.workers import single_threaded
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.seeds import parse_seeds
 from mapfusion.errors import InputError

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from experiments.methods.aligner_calls import callable_aligner, end_children, require_usable
 from experiments.pipeline.tables import ESTIMATES, estimate_row, read_rows, write_rows
+from experiments.plugins.discovery import callable_aligner, require_usable
+from experiments.plugins.isolated_process import end_children
 from mapfusion.align.alignment import Status
 from mapfusion.registration import Registration
 from tests.campaign import misbehaviours as kinds

@@ -84,6 +84,15 @@ OF_ALIGN = {
     "writes a frame that claims memory": "send(struct.pack('!16sQ', b'', 2**63))",
     "writes an answer of its own": "send(struct.pack('!16sQ', b'', 2) + b'{}')",
     "writes an old length and a pickle": "send(struct.pack('!i', 2**31 - 1) + pickle.dumps(1))",
+    "writes a line of JSON": 'send(b\'{"token": "", "error": "no"}\\n\')',
+    "writes a pickle and ends the line": "send(pickle.dumps(good) + b'\\n')",
+    "eats memory until none is left": (
+        "pages = int(open('/proc/self/statm').read().split()[0])\n"
+        "        most = pages * resource.getpagesize() + 2**28\n"
+        "        resource.setrlimit(resource.RLIMIT_AS, (most, most))\n"
+        "        kept = []\n"
+        "        while True: kept.append(np.ones(2**20))"
+    ),
     "writes megabytes": (
         "threading.Thread(target=send, args=(bytes(2**24),), daemon=True).start()\n"
         "        time.sleep(0.1)"
@@ -171,11 +180,12 @@ SLOW = {
     "sleeps": "time.sleep(600)",
     "sleeps with the lock held": "ctypes.PyDLL(None).sleep(600)",
     "works for ever": "while True: pass",
+    "writes a byte now and then": "while True: send(b'x'); time.sleep(0.1)",
     "stops its process": "os.kill(os.getpid(), signal.SIGSTOP)",
     "stops its process between two calls": (
         "threading.Timer(0.02, os.kill, (os.getpid(), signal.SIGSTOP)).start()"
     ),
-    "reads the next request": (
+    "reads requests between two calls": (
         "threading.Thread(target=lambda: [os.read(k, 9) for k in sockets()], daemon=True).start()"
     ),
     "writes half a frame and sleeps": "send(b'12345'); time.sleep(600)",

@@ -9,9 +9,9 @@ from PIL import Image
 
 from experiments.evaluation.evaluated_run import JudgedRun
 from experiments.evaluation.result import run_scenario
-from experiments.methods.threads import single_threaded
 from experiments.pipeline import workers
 from experiments.pipeline.store import Store
+from experiments.pipeline.workers import single_threaded
 from experiments.reports.figures import drawing
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import Scenario, Simulation

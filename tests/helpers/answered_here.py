@@ -1,4 +1,4 @@
-"""A plug-in's answer as its process would give it, worked out in this one: no process to start."""
+"""The answer of a plug-in without the start of a process."""
 
 import json
 import pickle
@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from experiments.methods.answers import read
-from experiments.methods.isolated_child import _Served
+from experiments.plugins.answers import alignment_from_json
+from experiments.plugins.process_main import MethodRunner
 from mapfusion.align.alignment import Alignment
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.landmark_map import LandmarkMap
@@ -20,9 +20,9 @@ def answered_here(
     maps: tuple[LandmarkMap, LandmarkMap, Correspondences],
     rng: np.random.Generator,
 ) -> Alignment:
-    """The answer after both checks, in the plug-in's process and in that of the one who asked."""
-    served = _Served()
-    assert isinstance(json.loads(served.make(name, parameters)), bool)
+    """Return the answer as an isolated process would give it, validated twice."""
+    runner = MethodRunner()
+    assert "error" not in runner.answer("make", name, parameters)
     with warnings.catch_warnings(action="ignore"):  # which are errors in tests alone
-        answer = served.align(pickle.dumps(maps), rng)
-    return read(answer.encode("ascii"), len(maps[2]))
+        answer = runner.answer("align", pickle.dumps(maps), rng)
+    return alignment_from_json(json.loads(json.dumps(answer)), len(maps[2]))

@@ -1,11 +1,11 @@
-"""Plug-ins made up for a test: a module and the metadata by which it counts as catalogue."""
+"""Plug-ins for tests: a module, and the metadata of an installed package."""
 
 from pathlib import Path
 
-from experiments.methods import catalogue
+from experiments.plugins import discovery
 
 MODULE = """
-import ctypes, os, signal, sys, time
+import ctypes, os, pickle, signal, socket, sys, time
 import numpy as np
 from dataclasses import replace
 from mapfusion.align.alignment import Alignment, Status, degenerate
@@ -39,6 +39,11 @@ class Method:
         time.sleep(self.seconds)
         if what == "good":
             return good
+        if what == "counts its threads":
+            import cv2, scipy.linalg, threadpoolctl
+
+            threads = [library["num_threads"] for library in threadpoolctl.threadpool_info()]
+            return replace(good, T_a_b=np.array([cv2.getNumThreads(), max(threads), 0.0]))
         if what == "grows":
             self.kept = getattr(self, "kept", []) + [np.ones(2**18)]  # 2 MB
             return good
@@ -62,6 +67,20 @@ class Method:
             time.sleep(100_000)
         if what == "hangs with the lock held":
             ctypes.PyDLL(None).sleep(100_000)
+        if what == "writes a byte now and then":
+            for octet in b"x" * 20 + b"\\n":  # longer than the limit, each byte in time
+                os.write(int(sys.argv[1]), bytes([octet]))
+                time.sleep(0.1)
+        if what == "shuts its side of the connection":
+            socket.socket(fileno=os.dup(int(sys.argv[1]))).shutdown(socket.SHUT_WR)
+            time.sleep(100_000)
+        if what == "writes a pickle":
+            call = type("Call", (), {"__reduce__": lambda self: (print, ("unpickled",))})()
+            os.write(int(sys.argv[1]), pickle.dumps(call) + b"\\n")
+            time.sleep(100_000)
+        if what == "answers another request":
+            os.write(int(sys.argv[1]), b'{"token": "another", "error": "no"}\\n')
+            time.sleep(100_000)
         if what == "closes everything":
             os.closerange(0, 64)
             time.sleep(100_000)
@@ -107,11 +126,11 @@ def install(
     info.mkdir()
     metadata = f"Metadata-Version: 2.1\nName: {package}\nVersion: {version}\n"
     (info / "METADATA").write_text(metadata, encoding="utf-8")
-    points = f"[{catalogue.ENTRY_POINTS}]\n{name} = {target}\n"
+    points = f"[{discovery.ENTRY_POINTS}]\n{name} = {target}\n"
     (info / "entry_points.txt").write_text(points, encoding="utf-8")
 
 
 def look_again() -> None:
-    """Forget which packages were found catalogue."""
-    catalogue.declared.cache_clear()
-    catalogue.fingerprint.cache_clear()
+    """Forget the installed packages and their hashes."""
+    discovery.declared.cache_clear()
+    discovery.fingerprint.cache_clear()

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from experiments.methods.aligner_calls import callable_aligner
 from experiments.pipeline.stage import Job
 from experiments.pipeline.stages import match
 from experiments.pipeline.tables import (
@@ -23,6 +22,7 @@ from experiments.pipeline.tables import (
     read_rows,
     write_rows,
 )
+from experiments.plugins.discovery import callable_aligner
 from experiments.scenario.seeds import generator
 from mapfusion.align.alignment import Pairs
 from mapfusion.align.refinement import Refinement

@@ -17,7 +17,7 @@ from experiments.evaluation.criteria import (
     RIGHT_WITHIN_RAD,
 )
 from experiments.evaluation.odometry_calibration import filter_settings
-from experiments.methods.catalogue import known_methods, name_clashes
+from experiments.plugins.discovery import known_methods, name_clashes
 from experiments.reports.formatting import interval, two_digits
 from experiments.reports.study_files import SHOWN, shown_numbers
 from experiments.reports.terminal.layout import (

@@ -2,12 +2,12 @@
 
 from dataclasses import dataclass
 
-from experiments.methods.aligner_calls import callable_aligner
-from experiments.methods.threads import single_threaded
 from experiments.pipeline.stage import Job
 from experiments.pipeline.stages.aligner import AlignerSettings
 from experiments.pipeline.stages.match import known_at, maps_of_both
 from experiments.pipeline.tables import write_rows
+from experiments.pipeline.workers import single_threaded
+from experiments.plugins.discovery import callable_aligner
 from experiments.scenario.seeds import generator
 from experiments.studies.independence.measured_work import (
     COSTS_FILE,

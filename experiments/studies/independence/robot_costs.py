@@ -13,12 +13,12 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
-from experiments.methods.threads import single_threaded
 from experiments.pipeline.stage import Job
 from experiments.pipeline.stages import smooth
 from experiments.pipeline.stages.slam import SlamSettings
 from experiments.pipeline.stages.smooth import SmoothSettings
 from experiments.pipeline.tables import INT, TEXT, fields, read_rows, write_rows
+from experiments.pipeline.workers import single_threaded
 from experiments.scenario.seeds import generator
 from experiments.studies.independence.measured_work import (
     COSTS_FILE,

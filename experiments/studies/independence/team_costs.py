@@ -7,11 +7,11 @@ from collections.abc import Sequence
 
 import pandas as pd
 
-from experiments.methods.threads import single_threaded
 from experiments.pipeline.stage import Job
 from experiments.pipeline.stages import fuse
 from experiments.pipeline.stages.fuse import FuseSettings
 from experiments.pipeline.tables import write_rows
+from experiments.pipeline.workers import single_threaded
 from experiments.studies.independence.measured_work import COSTS_FILE, WORK_COSTS, Meter, cost_row
 from experiments.studies.independence.pair_costs import LABEL as LABEL
 from experiments.studies.independence.robot_costs import PATHS, PATHS_FILE, path_rows

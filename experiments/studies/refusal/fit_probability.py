@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from experiments.evaluation.criteria import RIGHT_WITHIN_M, RIGHT_WITHIN_RAD
-from experiments.methods.aligner_calls import callable_aligner
+from experiments.plugins.discovery import callable_aligner
 from experiments.scenario.seeds import generator
 from experiments.studies.refusal import cases
 from experiments.studies.refusal.cases import MappedWorld

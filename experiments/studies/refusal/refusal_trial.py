@@ -14,11 +14,11 @@ import numpy as np
 import pandas as pd
 
 from experiments.evaluation.tables import table_path
-from experiments.methods.aligner_calls import callable_aligner
 from experiments.pipeline.stages.match import known_at
 from experiments.pipeline.tables import BOOL, FLOAT, INT, TEXT, fields, read_rows, write_rows
 from experiments.pipeline.tasks import OnProgress
 from experiments.pipeline.workers import workers
+from experiments.plugins.discovery import callable_aligner
 from experiments.scenario.seeds import generator
 from experiments.scenario.settings import Simulation
 from experiments.studies.refusal import cases

@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.methods import catalogue
 from experiments.pipeline.stage import Job
 from experiments.pipeline.store import Store
+from experiments.plugins import discovery
 from experiments.reports.study_files import benchmark_markdown, cell_text, draw
 from experiments.scenario.settings import AlignerEntry
 from experiments.studies import benchmark as benchmark
@@ -145,8 +145,8 @@ def test_what_counts_as_success() -> None:
 def test_an_absent_package_is_no_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     target = f"{KissMatcher.__module__}:KissMatcher"
     packages = ("far-package", "no_such_module_far")
-    far = catalogue.KnownMethod("far", catalogue.Kind.PEER, target, *packages)
-    monkeypatch.setitem(catalogue._OWN_METHODS, "far", far)
+    far = discovery.KnownMethod("far", discovery.Kind.PEER, target, *packages)
+    monkeypatch.setitem(discovery._OWN_METHODS, "far", far)
     entries = entries_of(["far", "ransac"])
     plan = BenchmarkDesign(entries, 2, pair_counts=(60,), outlier_shares=(0.5,))
     summary = summarise(run_benchmark(plan, Store(tmp_path), quiet))

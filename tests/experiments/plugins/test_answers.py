@@ -1,4 +1,4 @@
-"""Both interfaces of a method from outside: `find`, and `align` of packages written before it."""
+"""Validation of both interfaces of a plug-in: `find`, and `align` of older packages."""
 
 import importlib
 import re
@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.methods.aligner_calls import callable_aligner, end_children, require_usable
-from experiments.methods.answers import NonsenseError, checked_answer
-from experiments.methods.catalogue import make_method
+from experiments.plugins.answers import InvalidAnswerError, checked_alignment
+from experiments.plugins.discovery import callable_aligner, make_method, require_usable
+from experiments.plugins.isolated_process import end_children
 from mapfusion.align.alignment import Alignment, Status
 from mapfusion.geometry import se2
 from mapfusion.registration import Registration, as_aligner
@@ -137,7 +137,7 @@ def test_either_is_called_in_place_as_in_a_process_of_its_own(name: str) -> None
         ("weights of another length", r"^weight is an array \(21,\) of float64, expected an array"),
         ("gain of another shape", r"^gain is an array \(20, 3\) of float64, expected an array"),
         ("infinite weights", "^covariance is not finite$"),
-        ("fitted to what", "^fitted is list, expected Pairs$"),
+        ("fitted to what", "^fitted is list, expected Pairs or None$"),
         ("refusal is no text", "^refusal is int, expected str$"),
         ("theta out of range", "^theta is 4 rad, expected -pi to pi$"),
     ],
@@ -173,7 +173,7 @@ def test_what_is_no_method_is_told_before_a_run(name: str, parameters: dict, rea
 def _checked(covariance: np.ndarray) -> Alignment:
     inlier, text = np.ones(4, dtype=bool), ""
     given = Alignment(T_A_B, covariance, inlier, 0.0, Status.ACCEPTED, text, 0.05)
-    return checked_answer(given, 4, 0.0)
+    return checked_alignment(given, 4, 0.0)
 
 
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
@@ -187,7 +187,7 @@ def test_a_covariance_is_judged_by_its_own_size(scale: float) -> None:
         np.testing.assert_array_equal(_checked(scale * each).covariance, scale * each)
     skewed, negative = good.copy(), good - 1.0 * np.eye(3)
     skewed[0, 1] *= 1.001
-    with pytest.raises(NonsenseError, match="covariance is not symmetric"):
+    with pytest.raises(InvalidAnswerError, match="covariance is not symmetric"):
         _checked(scale * skewed)
-    with pytest.raises(NonsenseError, match="covariance has a negative variance"):
+    with pytest.raises(InvalidAnswerError, match="covariance has a negative variance"):
         _checked(scale * negative)

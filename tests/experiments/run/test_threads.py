@@ -6,7 +6,7 @@ import sys
 
 _SCRIPT = """
 import json
-from experiments.methods.threads import single_threaded
+from experiments.pipeline.workers import single_threaded
 single_threaded()
 import numba, scipy.linalg, scipy.sparse.linalg, scipy.optimize
 from threadpoolctl import threadpool_info

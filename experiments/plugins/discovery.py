@@ -1,12 +1,13 @@
-"""Every method that can be named: built in, peers (`[peers]`), and those of installed plug-ins.
+"""Discovery of alignment methods by name: built in, peers (`[peers]`) and installed plug-ins.
 
-Nothing of a plug-in is imported until it is made: its package may do anything when it is.
+Discovery reads the metadata of packages. It imports no plug-in, since an import may run any code.
 """
 
 import functools
 import hashlib
 import importlib.metadata
 import importlib.util
+import json
 from dataclasses import dataclass
 from enum import StrEnum
 from importlib import import_module
@@ -15,10 +16,16 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
+from experiments.plugins.isolated_process import (
+    IsolatedAligner,
+    ProcessFailedError,
+    process_for,
+)
 from mapfusion.align.aligners import ALIGNERS, PEERS, construct
 from mapfusion.errors import did_you_mean
+from mapfusion.registration import Aligner, as_aligner
 
-ENTRY_POINTS = "mapfusion.aligners"  # the group by which an installed package declares aligners
+ENTRY_POINTS = "mapfusion.aligners"  # group of the entry points that declare aligners
 _CODE_SUFFIXES = (".py", ".so", ".pyd")
 _PEER_PACKAGES = {  # distribution and import package
     "opencv": ("opencv-python-headless", "cv2"),
@@ -27,7 +34,7 @@ _PEER_PACKAGES = {  # distribution and import package
 
 
 class Kind(StrEnum):
-    """Whose method it is."""
+    """Origin of a method."""
 
     BUILT_IN = "built in"
     PEER = "peer"
@@ -36,14 +43,14 @@ class Kind(StrEnum):
 
 @dataclass(frozen=True)
 class KnownMethod:
-    """An alignment method that can be named.
+    """Alignment method and the package that provides it.
 
     Attributes:
-        name: as scenarios give it.
-        kind: whose it is.
-        target: `module:class` of what is constructed with the parameters.
-        distribution: what is installed for it; empty for built-in ones.
-        package: whose files the results depend on, beside our own source; empty for built-in ones.
+        name: name in scenarios.
+        kind: origin of the method.
+        target: `module:class`; the class is constructed with the parameters.
+        distribution: name of the distribution to install; empty for built-in methods.
+        package: import package of the distribution; empty for built-in methods.
     """
 
     name: str
@@ -54,7 +61,7 @@ class KnownMethod:
 
     @property
     def version(self) -> str:
-        """Installed version of the distribution; empty for built-in and absent ones."""
+        """Installed version of the distribution; empty for built-in and absent methods."""
         try:
             return importlib.metadata.version(self.distribution) if self.distribution else ""
         except importlib.metadata.PackageNotFoundError:
@@ -62,8 +69,8 @@ class KnownMethod:
 
     @property
     def absence(self) -> str:
-        """Why it cannot run, and what would help; empty where it can."""
-        if self.kind is not Kind.PEER or _find(self.package) is not None:
+        """Reason why a peer cannot run, with a remedy; empty if the method can run."""
+        if self.kind is not Kind.PEER or _find_spec(self.package) is not None:
             return ""
         return (
             f"the package {self.distribution} is not installed; "
@@ -71,7 +78,7 @@ class KnownMethod:
         )
 
     def origin(self) -> dict[str, str]:
-        """What else than parameters and our own source its results depend on, for stage keys."""
+        """Return the code that results depend on, beside our own, for the keys of stages."""
         origin = {"target": self.target}
         if self.kind is not Kind.BUILT_IN:
             origin |= {"distribution": self.distribution, "version": self.version}
@@ -92,10 +99,10 @@ _OWN_METHODS = {
 
 @functools.cache
 def declared() -> dict[str, list[KnownMethod]]:
-    """The aligners that installed packages declare, by name; packages are read once."""
+    """Return the aligners that installed packages declare, by name, in alphabetical order."""
     found: dict[str, list[KnownMethod]] = {}
     for entry in importlib.metadata.entry_points(group=ENTRY_POINTS):
-        target = entry.value.partition("[")[0].strip()  # without the extras it may ask for
+        target = entry.value.partition("[")[0].strip()  # without extras
         distribution = entry.dist.name if entry.dist is not None else "an unnamed package"
         package = target.partition(":")[0].strip().partition(".")[0]
         method = KnownMethod(entry.name, Kind.PLUG_IN, target, distribution, package)
@@ -104,16 +111,16 @@ def declared() -> dict[str, list[KnownMethod]]:
 
 
 def known_methods() -> dict[str, KnownMethod]:
-    """Every method that can be named, built-in ones first."""
+    """Return all methods by name, built-in methods first."""
     clashes = name_clashes()
     plug_ins = {name: methods[0] for name, methods in declared().items() if name not in clashes}
     return _OWN_METHODS | plug_ins
 
 
 def name_clashes() -> dict[str, str]:
-    """For each name that is not one plug-in's alone: one line that says whose it is.
+    """Return a one-line explanation for each name that more than one package claims.
 
-    Our own names stay ours; a name that two packages declare is nobody's.
+    Our own methods keep their names. A name that two plug-ins declare cannot be used.
     """
     lines = {}
     for name, methods in declared().items():
@@ -124,14 +131,14 @@ def name_clashes() -> dict[str, str]:
                 "declares under the same name is not"
             )
         elif len(packages) > 1:
-            they = " and by ".join(packages)
-            lines[name] = f"aligner {name}: declared by {they}; uninstall all but one"
+            together = " and by ".join(packages)
+            lines[name] = f"aligner {name}: declared by {together}; uninstall all but one"
     return lines
 
 
 def find_method(name: str) -> KnownMethod:
-    """The method of that name; raises ValueError for nobody's, or that of several plug-ins."""
-    # ours need no look at installed packages
+    """Return the method of a name; raise ValueError if none or several plug-ins declare it."""
+    # Our own methods need no search of installed packages.
     known = _OWN_METHODS if name in _OWN_METHODS else known_methods()
     if name not in known:
         unknown = (
@@ -142,7 +149,7 @@ def find_method(name: str) -> KnownMethod:
 
 
 def make_method(name: str, /, **parameters: Any) -> Any:
-    """Build a method by name, in this process; it has `find`, or `align` in older packages.
+    """Construct a method in this process; it has `find`, or `align` in older packages.
 
     Raises:
         ValueError: the name or a parameter is unknown, or a parameter is out of range.
@@ -151,18 +158,58 @@ def make_method(name: str, /, **parameters: Any) -> Any:
     return construct(name, attrgetter(names)(import_module(module)), parameters)
 
 
-def _find(package: str) -> ModuleSpec | None:
-    """Where a top-level package lies; it is not imported."""
+def callable_aligner(method: str, parameters: dict[str, Any], time_limit_s: float) -> Aligner:
+    """Return an aligner that runs in this process if it is built in, else in an isolated one.
+
+    Args:
+        method: name of the method.
+        parameters: its parameters.
+        time_limit_s: wall-clock limit of each call in an isolated process.
+
+    Raises:
+        ValueError: the name is unknown, or a parameter is not usable.
+    """
+    found = find_method(method)
+    if found.kind is Kind.BUILT_IN:
+        return as_aligner(make_method(method, **parameters))
+    return IsolatedAligner(method, _as_json(method, parameters), time_limit_s, found.absence)
+
+
+def require_usable(method: str, parameters: dict[str, Any]) -> None:
+    """Construct the method once, a plug-in in its own process; raise ValueError if that fails."""
+    if find_method(method).kind is Kind.PLUG_IN:
+        _require_made(method, _as_json(method, parameters))
+    else:
+        make_method(method, **parameters)
+
+
+@functools.cache  # a sweep validates the same methods many times
+def _require_made(method: str, parameters: str) -> None:
+    try:
+        process_for(method, parameters)
+    except ProcessFailedError as error:
+        raise ValueError(f"plug-in {method}: {error}") from error
+
+
+def _as_json(method: str, parameters: dict[str, Any]) -> str:
+    try:
+        return json.dumps(parameters, sort_keys=True, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"parameters: {method}: {error}") from error
+
+
+def _find_spec(package: str) -> ModuleSpec | None:
+    """Return the location of a top-level package without importing it; None if it is absent."""
     try:
         return importlib.util.find_spec(package)
-    except (ImportError, ValueError):  # no name that a module can have
+    except (ImportError, ValueError):  # not a valid module name
         return None
 
 
 @functools.cache
 def fingerprint(package: str) -> str:
-    """Hash of the code files of an installed top-level package or module; empty when absent."""
-    spec = _find(package)
+    """Return a hash of the code files of a top-level package or module; empty if it is absent."""
+    spec = _find_spec(package)
     if spec is None:
         return ""
     roots = [Path(folder) for folder in spec.submodule_search_locations or ()]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.methods.aligner_calls import end_children
+from experiments.plugins.isolated_process import end_children
 from tests.campaign import misbehaving_plugins as campaign
 from tests.helpers.made_up_plugin import look_again
 

@@ -5,8 +5,8 @@ import sys
 
 import pytest
 
-from experiments.methods import catalogue
-from experiments.methods.catalogue import (
+from experiments.plugins import discovery
+from experiments.plugins.discovery import (
     Kind,
     KnownMethod,
     find_method,
@@ -26,8 +26,8 @@ def site(tmp_path, monkeypatch):
 
 
 def forget():
-    catalogue.declared.cache_clear()
-    catalogue.fingerprint.cache_clear()
+    discovery.declared.cache_clear()
+    discovery.fingerprint.cache_clear()
     importlib.invalidate_caches()
 
 
@@ -69,7 +69,7 @@ def test_our_own_names_stay_ours(site):
     assert find_method("ransac").kind is Kind.BUILT_IN
     assert find_method("opencv").kind is Kind.PEER
     assert type(make_method("ransac")).__module__ == "mapfusion.align.ransac"
-    assert catalogue.name_clashes()["ransac"] == (
+    assert discovery.name_clashes()["ransac"] == (
         "aligner ransac: mapfusion's own is used, the one that some_package declares under the "
         "same name is not"
     )
@@ -86,7 +86,7 @@ def test_a_name_of_two_packages_is_nobodys(site):
 
 def test_no_clash_without_a_second_claim(site):
     install(site, "package", "theirs = m:A")
-    assert catalogue.name_clashes() == {}
+    assert discovery.name_clashes() == {}
 
 
 @pytest.mark.parametrize("points", ["theirs = nothing here!", "theirs = no.such.module:Method"])

@@ -12,14 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.methods import aligner_calls
-from experiments.methods.aligner_calls import (
-    Spec,
-    callable_aligner,
-    child_for,
-    end_children,
-    require_usable,
-)
+from experiments.plugins import isolated_process
+from experiments.plugins.discovery import callable_aligner, require_usable
+from experiments.plugins.isolated_process import end_children, process_for
 from experiments.scenario.seeds import generator
 from mapfusion.align.alignment import Alignment, Status
 from mapfusion.registration import Registration
@@ -37,7 +32,7 @@ def _plug_in(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     install(folder)
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(folder)
-        patch.setattr(aligner_calls, "_END_LIMIT_S", PATIENCE_S)
+        patch.setattr(isolated_process, "_END_LIMIT_S", PATIENCE_S)
         importlib.invalidate_caches()
         look_again()
         yield
@@ -118,10 +113,10 @@ def test_misbehaviour_is_a_status_with_a_reason(what: str, reason: str) -> None:
         ("asymmetric covariance", "^covariance is not symmetric$"),
         ("negative variance", "^covariance has a negative variance$"),
         ("covariance of the plane", r"^covariance is an array \(2, 2\)"),
-        ("claims to have failed", "^status is .*failed.*, expected one of accepted, refused"),
+        ("claims to have failed", "^status is .*failed.*, expected accepted or refused"),
         ("refuses without a reason", "^refused without a reason$"),
         ("reason is no text", "^reason is int, expected str$"),
-        ("drift is no number", "^drift_sigma_m is NoneType, expected float$"),
+        ("drift is no number", "^drift_sigma_m is NoneType, expected float or floating$"),
         ("degenerate with a motion", "^T_a_b is not NaN, but degenerate$"),
     ],
 )
@@ -132,22 +127,54 @@ def test_nonsense_is_a_status_with_a_reason(what: str, reason: str) -> None:
     assert np.isnan(found.T_a_b).all()
 
 
-@pytest.mark.parametrize("what", ["hangs", "hangs with the lock held"])
+@pytest.mark.parametrize(
+    "what",
+    ["hangs", "hangs with the lock held", "closes everything", "writes a byte now and then"],
+)
 def test_a_hanging_plug_in_is_ended(what: str) -> None:
-    child = child_for(Spec("made_up", f'{{"what": "{what}"}}'))
+    process = process_for("made_up", f'{{"what": "{what}"}}')
     found = answer(what, limit_s=0.3)
     assert (found.status, found.reason) == (Status.FAILED, "gave no answer within 0.3 s")
-    assert not child.alive
+    assert not process.alive
     assert answer("good").status is Status.ACCEPTED
 
 
 def test_a_plug_in_that_cuts_the_connection_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(aligner_calls, "_END_LIMIT_S", 0.2)
-    found = answer("closes everything")
+    monkeypatch.setattr(isolated_process, "_END_LIMIT_S", 0.2)
+    found = answer("shuts its side of the connection")
     assert (found.status, found.reason) == (
         Status.FAILED,
         "closed the connection to its process",
     )
+
+
+def test_an_answer_is_never_unpickled(capsys: pytest.CaptureFixture[str]) -> None:
+    found = answer("writes a pickle")
+    assert found.status is Status.FAILED
+    assert found.reason.startswith("sent an invalid answer: ")
+    assert "unpickled" not in capsys.readouterr().out
+
+
+def test_an_answer_to_another_request_is_a_failure() -> None:
+    found = answer("answers another request")
+    assert (found.status, found.reason) == (
+        Status.FAILED,
+        "sent an invalid answer: it does not belong to the request",
+    )
+
+
+def test_a_process_that_cannot_start_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    end_children()
+    monkeypatch.setattr(sys, "executable", "/no/such/interpreter")
+    found = answer("good")
+    assert (found.status, found.reason) == (
+        Status.FAILED,
+        "cannot start a process: No such file or directory",
+    )
+
+
+def test_numerical_libraries_use_one_thread() -> None:
+    assert answer("counts its threads").T_a_b.tolist() == [1.0, 1.0, 0.0]
 
 
 def test_it_is_not_called_for_ever_after_it_hung() -> None:
@@ -187,14 +214,14 @@ def test_one_process_serves_all_calls_of_one_method_with_its_parameters() -> Non
 
 
 def test_no_more_than_a_few_processes_live() -> None:
-    children = [child_for(Spec("made_up", f'{{"seconds": {k}}}')) for k in range(6)]
-    assert [child.alive for child in children] == [False, False, True, True, True, True]
+    pids = [process_for("made_up", f'{{"seconds": {k}}}')._process.pid for k in range(6)]
+    assert [has_ended(pid) for pid in pids] == [True, True, False, False, False, False]
     end_children()
-    assert not any(child.alive for child in children)
+    assert all(map(has_ended, pids))
 
 
 def test_a_process_that_keeps_its_memory_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(aligner_calls, "_MOST_GROWTH_BYTES", 2**25)
+    monkeypatch.setattr(isolated_process, "_MAX_GROWTH_BYTES", 2**25)
     calls = [answer("grows").T_a_b[0] for _ in range(40)]
     assert all(answer_ > 1 for answer_ in calls)
     starts = np.flatnonzero(np.diff(calls) < -1)  # it counts its calls from the start again
@@ -208,7 +235,7 @@ def test_a_process_that_keeps_its_memory_is_replaced(monkeypatch: pytest.MonkeyP
         ({"wat": 1}, "plug-in made_up: parameters: made_up: .*unexpected keyword argument 'wat'"),
         ({"what": "cannot be made"}, "plug-in made_up: raised RuntimeError: no licence"),
         ({"what": "dies when made"}, "plug-in made_up: ended its process with exit code 4"),
-        ({"what": "randomised is no bool"}, "randomised is str, expected a bool"),
+        ({"what": "randomised is no bool"}, "randomised is str, expected bool"),
         ({"what": {1, 2}}, "parameters: made_up: .*not JSON serializable"),
     ],
 )
@@ -220,22 +247,31 @@ def test_parameters_are_tried_before_a_run(parameters: dict, reason: str) -> Non
 PARENT = """
 from tests.helpers.made_up_maps import landmark_map, paired
 import numpy as np, sys
-from experiments.methods.aligner_calls import Spec, callable_aligner, child_for
+from experiments.plugins.discovery import callable_aligner
+from experiments.plugins.isolated_process import process_for
 points = np.random.default_rng(0).uniform(0, 10, (12, 3))
 maps = landmark_map(points), landmark_map(points)
 what = sys.argv[1]
-print(child_for(Spec("made_up", '{"what": "%s"}' % what))._process.pid, flush=True)
+print(process_for("made_up", '{"what": "%s"}' % what)._process.pid, flush=True)
 callable_aligner("made_up", {"what": what}, 500.0).align(
     *maps, paired([0, 1, 2], [0, 1, 2]), np.random.default_rng(0))
 """
 
 
 def test_its_process_ends_with_a_killed_parent(tmp_path: Path) -> None:
+    """It also starts in a folder whose files have the names of standard modules."""
+    (tmp_path / "work").mkdir()
+    for name in ("json", "socket", "numpy"):
+        (tmp_path / "work" / f"{name}.py").write_text("1 / 0", encoding="utf-8")
     script = tmp_path / "parent.py"
     script.write_text(PARENT, encoding="utf-8")
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     with subprocess.Popen(
-        [sys.executable, str(script), "hangs"], env=environment, stdout=subprocess.PIPE, text=True
+        [sys.executable, str(script), "hangs"],
+        env=environment,
+        cwd=tmp_path / "work",
+        stdout=subprocess.PIPE,
+        text=True,
     ) as run:
         assert run.stdout is not None
         child = int(run.stdout.readline())

@@ -18,7 +18,7 @@ import pandas as pd
 import pytest
 
 from experiments.evaluation import tables
-from experiments.methods.aligner_calls import end_children
+from experiments.plugins.isolated_process import end_children
 from experiments.reports.figures import drawing
 from mapfusion.geometry import se2
 from mapfusion.landmark_map import write_map

@@ -1,0 +1,248 @@
+"""Isolated processes that run the methods of plug-ins and peers.
+
+A plug-in may raise, hang, end its process or return an invalid answer. Each of these becomes a
+failed alignment with a reason, and the next call starts a new process if necessary. A process runs
+one method with one set of parameters, so that static state of a library (OpenCV's generator,
+variables of C++) does not depend on other methods. It serves many calls because a start takes much
+longer than a call. Requests are pickles; answers are JSON, because unpickling runs any code.
+"""
+
+import functools
+import json
+import os
+import pickle
+import secrets
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+import weakref
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.plugins.answers import alignment_from_json
+from mapfusion.align.alignment import Alignment, Status, without_answer
+from mapfusion.align.correspondences import Correspondences
+from mapfusion.errors import one_line
+from mapfusion.landmark_map import LandmarkMap
+
+_START_LIMIT_S = 120.0  # imports take about a second, much longer from a cold network disk
+_END_LIMIT_S = 5.0  # from the end of a connection to the end of its process
+_MAX_PROCESSES = 4  # of each worker; numerical libraries take 200 MB in each
+_MAX_ANSWER_BYTES = 2**26  # enough for ten million correspondences
+# A process that has grown by this much is replaced: KISS-Matcher 1.0.2 leaks 53 MB in each call
+# with 5000 pairs.
+_MAX_GROWTH_BYTES = 2**30
+# A call that loses the process costs the time limit or a start of the process. The second one is
+# for a machine that was busy.
+_MAX_LOST_ON_MAPS = 2
+_MAX_TIME_OUTS = 2  # in a row, on any maps
+_ONE_THREAD = dict.fromkeys(  # the order of sums depends on the number of threads
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1"
+)
+
+Maps = tuple[LandmarkMap, LandmarkMap, Correspondences]
+
+
+class ProcessFailedError(Exception):
+    """The process gave no valid answer; the text says why."""
+
+
+class TimedOutError(ProcessFailedError):
+    """The process gave no answer within the time limit."""
+
+
+class IsolatedProcess:
+    """Process that runs a method with parameters (JSON); it is started again after it ended."""
+
+    def __init__(self, method: str, parameters: str) -> None:
+        self._make = ("make", method, json.loads(parameters))
+        self._lock = threading.Lock()
+        self._start()
+
+    @property
+    def alive(self) -> bool:
+        """Whether the process is ready for a request."""
+        return self.end.alive and self._process.poll() is None
+
+    def align(self, maps: Maps, rng: np.random.Generator, limit_s: float) -> Alignment:
+        """Return the answer of the method; raise ProcessFailedError if there is none.
+
+        The maps are sent again only if they are another object than in the last call.
+        """
+        with self._lock:
+            if not self.alive:
+                self.end()
+                self._start()
+            sent = None if maps is self._maps else pickle.dumps(maps, pickle.HIGHEST_PROTOCOL)
+            self._maps = maps
+            read = functools.partial(alignment_from_json, n_correspondences=len(maps[2]))
+            alignment = self._ask(read, limit_s, "align", sent, rng)
+            if self._memory_bytes() > self._memory_at_start_bytes + _MAX_GROWTH_BYTES:
+                self.end()
+            return alignment
+
+    def _start(self) -> None:
+        self._maps: Maps | None = None
+        self._socket, other_end = socket.socketpair()
+        path = os.pathsep.join(map(os.path.abspath, sys.path))
+        with other_end:
+            fd = other_end.fileno()
+            try:
+                self._process = subprocess.Popen(  # noqa: S603  # our own interpreter and module
+                    # -P: files in the working folder must not hide the standard library
+                    [sys.executable, "-P", "-m", "experiments.plugins.process_main", str(fd)],
+                    env=os.environ | _ONE_THREAD | {"PYTHONPATH": path},
+                    pass_fds=[fd],
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    stderr=subprocess.DEVNULL,
+                    start_new_session=True,  # Ctrl-C does not reach it; `_end` ends its children
+                )
+            except OSError as error:
+                raise ProcessFailedError(f"cannot start a process: {error.strerror}") from None
+        # Called on failure, when this object is no longer referenced, and at exit.
+        self.end = weakref.finalize(self, _end, self._process, self._socket)
+        made = self._ask(dict, _START_LIMIT_S, *self._make)
+        if not isinstance(made.get("randomised"), bool):
+            self.end()
+            raise ProcessFailedError(one_line(str(made.get("error", "sent an invalid answer"))))
+        self.randomised: bool = made["randomised"]
+        self._memory_at_start_bytes = self._memory_bytes()
+
+    def _ask(self, read: Callable[[dict[str, Any]], Any], limit_s: float, *request: Any) -> Any:
+        """Return what `read` makes of the answer to a request; end the process on failure."""
+        # The answer repeats the token: an answer to an earlier request is not taken for this one.
+        token, deadline_s, line = secrets.token_hex(), time.monotonic() + limit_s, b""
+        packed = pickle.dumps((token, limit_s, *request), pickle.HIGHEST_PROTOCOL)
+        try:
+            self._socket.settimeout(limit_s)
+            self._socket.sendall(packed)
+            while not line.endswith(b"\n"):
+                self._socket.settimeout(max(deadline_s - time.monotonic(), 1e-6))
+                part = self._socket.recv(2**20)
+                line += part
+                if not part:
+                    raise EOFError
+                if len(line) > _MAX_ANSWER_BYTES:
+                    raise ValueError("it is too long")
+            answer = json.loads(line)
+            if answer.pop("token") != token:
+                raise ValueError("it does not belong to the request")
+            return read(answer)
+        except TimeoutError:
+            failure = TimedOutError(f"gave no answer within {limit_s:g} s")
+        except (EOFError, OSError):
+            failure = ProcessFailedError(self._why_disconnected())
+        except Exception as error:
+            failure = ProcessFailedError(f"sent an invalid answer: {one_line(str(error))}")
+        except BaseException:  # Ctrl-C
+            self.end()
+            raise
+        self.end()
+        raise failure
+
+    def _why_disconnected(self) -> str:
+        try:
+            code = self._process.wait(_END_LIMIT_S)
+        except subprocess.TimeoutExpired:
+            return "closed the connection to its process"
+        if code >= 0:
+            return f"ended its process with exit code {code}"
+        names = {each.value: each.name for each in signal.Signals}  # not of all real-time signals
+        return f"ended its process with {names.get(-code, f'signal {-code}')}"
+
+    def _memory_bytes(self) -> int:
+        """Return the resident memory of the process, 0 if the system does not tell."""
+        try:
+            statm = Path(f"/proc/{self._process.pid}/statm").read_text(encoding="ascii")
+        except OSError:
+            return 0
+        return int(statm.split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def _end(process: subprocess.Popen, connection: socket.socket) -> None:
+    """End a process and those that it started."""
+    connection.close()
+    with suppress(ProcessLookupError):  # while a process of the group lives, its number is not free
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+
+
+@functools.lru_cache(_MAX_PROCESSES)
+def process_for(method: str, parameters: str) -> IsolatedProcess:
+    """Return the process of a method with parameters (JSON).
+
+    Raises:
+        ProcessFailedError: the method cannot be constructed.
+    """
+    return IsolatedProcess(method, parameters)
+
+
+def end_children() -> None:
+    """End all processes; a later call starts new ones."""
+    process_for.cache_clear()
+
+
+class IsolatedAligner:
+    """Aligner that calls a method in an isolated process.
+
+    Args:
+        method: name of the method.
+        parameters: its parameters as JSON.
+        time_limit_s: wall-clock limit of each call.
+        absence: why the method cannot run; empty if it can.
+    """
+
+    def __init__(
+        self, method: str, parameters: str, time_limit_s: float, absence: str = ""
+    ) -> None:
+        self._method, self._parameters = method, parameters
+        self._time_limit_s, self._absence = time_limit_s, absence
+        self._maps: Maps | None = None
+        self._lost_on_maps = self._time_outs = 0
+        self._last_failure = ""
+
+    @property
+    def randomised(self) -> bool:
+        """Whether the answer depends on the generator; False if the method cannot be made."""
+        try:
+            return not self._absence and process_for(self._method, self._parameters).randomised
+        except ProcessFailedError:
+            return False
+
+    def align(
+        self,
+        map_a: LandmarkMap,
+        map_b: LandmarkMap,
+        correspondences: Correspondences,
+        rng: np.random.Generator,
+    ) -> Alignment:
+        """Estimate T_a_b; the status is `failed` or `absent` if there is no answer.
+
+        The method is not called again on the same maps after it lost its process twice on them, and
+        on no maps after two time-outs in a row.
+        """
+        maps, n = (map_a, map_b, correspondences), len(correspondences)
+        if self._absence:
+            return without_answer(Status.ABSENT, self._absence, n)
+        if self._maps is None or any(a is not b for a, b in zip(maps, self._maps, strict=True)):
+            self._maps, self._lost_on_maps = maps, 0
+        if self._lost_on_maps == _MAX_LOST_ON_MAPS or self._time_outs == _MAX_TIME_OUTS:
+            return without_answer(Status.FAILED, f"not called again: {self._last_failure}", n)
+        try:
+            process = process_for(self._method, self._parameters)
+            alignment = process.align(self._maps, rng, self._time_limit_s)
+        except ProcessFailedError as error:
+            self._lost_on_maps += 1
+            self._time_outs = self._time_outs + 1 if isinstance(error, TimedOutError) else 0
+            self._last_failure = str(error)
+            return without_answer(Status.FAILED, self._last_failure, n)
+        self._time_outs = self._lost_on_maps = 0
+        return alignment
