@@ -1,1 +1,1 @@
-"""Scenario files in, validated values out: settings, generated worlds, the suite."""
+"""Scenarios: settings, validation, generated worlds and the suite."""
