@@ -2,16 +2,18 @@
 
 import functools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from numbers import Integral, Real
 from types import NoneType
 from typing import Annotated, Any, get_args, get_type_hints
 
 import numpy as np
+from annotated_types import BaseMetadata, Ge, GroupedMetadata, Le
 
 from mapfusion.errors import OutOfRangeError
 
-# Beyond these the squares and determinants behind a gate lose the digits that it needs.
+# Above these limits the squares and determinants of a gate lose too many digits.
 LARGEST_POSITION_M = 1e7
 LARGEST_SIGMA_M = 1e5
 
@@ -23,7 +25,7 @@ def require_finite(name: str, values: np.ndarray) -> None:
 
 
 def require_shape(name: str, values: np.ndarray, shape: tuple[int | None, ...]) -> None:
-    """Raise ValueError when `values` has another shape; None stands for any length."""
+    """Raise ValueError when `values` has another shape; None matches any length."""
     fits = values.ndim == len(shape) and all(
         want is None or have == want for have, want in zip(values.shape, shape, strict=True)
     )
@@ -33,10 +35,10 @@ def require_shape(name: str, values: np.ndarray, shape: tuple[int | None, ...]) 
 
 
 def require_points(position_m: np.ndarray, covariance_m2: np.ndarray, planar: bool) -> None:
-    """Raise ValueError for points (N, 3) that nothing can be computed with, naming the row.
+    """Raise ValueError for points (N, 3) that cannot be used; the message names the row.
 
-    They and their covariances (N, 3, 3; of planar data without z) must be of a size that a robot
-    measures, the covariances positive definite, and no point may be there twice.
+    Coordinates and covariances (N, 3, 3) are limited in size, and covariances must be positive
+    definite. The z coordinate of planar data is not checked.
     """
     size = 2 if planar else 3
     used = covariance_m2[:, :size, :size]
@@ -47,15 +49,15 @@ def require_points(position_m: np.ndarray, covariance_m2: np.ndarray, planar: bo
     try:
         np.linalg.cholesky(used)
     except np.linalg.LinAlgError:
-        # the limit of what a decomposition of 64 bits can tell from zero
+        # the smallest eigenvalue that differs from zero in 64 bits
         low, high = np.linalg.eigvalsh(used)[:, [0, -1]].T
         _refuse("covariance_m2", low <= np.finfo(float).eps * high, "not positive definite")
 
 
 def require_no_twins(name: str, *columns: np.ndarray) -> None:
-    """Raise ValueError when two of N rows are the same in all columns (N,) or (N, k)."""
+    """Raise ValueError when two of N rows are equal in all columns (N,) or (N, k)."""
     rows = np.column_stack(columns)
-    # one column that repeats nothing says it: to put rows in order by all takes far longer
+    # a column without repetitions is enough, and far faster than sorting rows by all columns
     if any(len(np.unique(column)) == len(rows) for column in rows.T[::-1]):
         return
     order = np.lexsort(rows.T)
@@ -71,22 +73,44 @@ def _refuse(name: str, wrong: np.ndarray | np.bool, what: str) -> None:
 
 
 @dataclass(frozen=True)
-class Range:
-    """Values that a numeric setting may have, and its unit: `Annotated[float, Range(0, 5, "m")]`.
-
-    Stated once, in the annotation: `require_in_range` refuses what lies outside (NaN does), and
-    JSON schemas tell it. The ends are what mathematics and memory allow, and where these allow all,
-    a hundred times beyond anything of use: so that squares and products of settings stay numbers.
+class Unit(BaseMetadata):
+    """Unit of a setting, as an annotation that JSON schemas show.
 
     Attributes:
-        low: the least value, itself allowed.
-        high: the largest value, itself allowed.
-        unit: as people write it; "1" of shares, factors and numbers of things.
+        unit: symbol or plural noun; "1" for shares and factors.
+    """
+
+    unit: str
+
+    def __get_pydantic_json_schema__(self, core_schema: Any, handler: Any) -> dict[str, Any]:
+        """Add the unit to the JSON schema; pydantic calls this method."""
+        return handler(core_schema) | {"unit": self.unit}
+
+
+@dataclass(frozen=True)
+class Range(GroupedMetadata):
+    """Range and unit of a numeric setting: `Annotated[float, Range(0, 5, "m")]`.
+
+    The annotation consists of `annotated_types` constraints, which pydantic reads.
+    `require_in_range` checks them without pydantic. The limits are those of the mathematics and of
+    memory. Other limits are a hundred times larger than useful values, so that squares and
+    products of settings stay finite.
+
+    Attributes:
+        low: the smallest allowed value.
+        high: the largest allowed value.
+        unit: symbol or plural noun; "1" for shares and factors.
     """
 
     low: float
     high: float
     unit: str
+
+    def __iter__(self) -> Iterator[BaseMetadata]:
+        """Yield the constraints."""
+        yield Ge(self.low)
+        yield Le(self.high)
+        yield Unit(self.unit)
 
     def problem(self, number: float) -> str:
         """Return what is wrong with a number outside the range; empty for one inside."""
@@ -96,17 +120,13 @@ class Range:
         finite = "" if math.isfinite(number) else "finite and "
         return f"is {number}, must be {finite}in [{self.low:.15g}, {self.high:.15g}]{unit}"
 
-    def __get_pydantic_json_schema__(self, core_schema: Any, handler: Any) -> dict[str, Any]:
-        """What pydantic asks for; nothing of it is needed here."""
-        return handler(core_schema) | {"minimum": self.low, "maximum": self.high, "unit": self.unit}
 
-
-# Of 1 a chi-square quantile is infinite, of 0 nothing passes.
+# The chi-square quantile of 1 is infinite; no distance passes the quantile of 0.
 Probability = Annotated[float, Range(1e-6, 1 - 1e-15, "1")]
 
 
 def require_in_range(settings: object) -> None:
-    """Raise OutOfRangeError for the settings of a class outside the `Range` they declare."""
+    """Raise OutOfRangeError if a setting of a dataclass is outside its `Range`."""
     wrong = list[OutOfRangeError]()
     for name, hint in _ranged(type(settings)).items():
         try:
@@ -120,12 +140,13 @@ def require_in_range(settings: object) -> None:
 
 @functools.cache
 def _ranged(settings: type) -> dict[str, Any]:
-    """Annotations of all settings that declare a range."""
+    """Return the annotations of all settings that have a range."""
     hints = get_type_hints(settings, include_extras=True)
     return {name: hint for name, hint in hints.items() if _declares(hint)}
 
 
 def _declares(hint: Any) -> bool:
+    """Return True if an annotation or a part of it has a range."""
     own = any(isinstance(each, Range) for each in getattr(hint, "__metadata__", ()))
     return own or any(map(_declares, get_args(hint)))
 
@@ -138,7 +159,7 @@ def _require_as_declared(name: str, value: Any, hint: Any) -> None:
                 _require_inside(name, value, hint.__origin__, bounds)
         _require_as_declared(name, value, parts[0])
     elif isinstance(value, tuple | list):
-        # a tuple's items have a range each, or one for all as those of a list have
+        # items of a tuple have one range each, or the same range as in a list
         one_each = len(parts) == len(value) and parts[-1] is not ...
         each = parts if one_each else parts[:1] * len(value)
         for i, (item, own) in enumerate(zip(value, each, strict=True)):

@@ -41,25 +41,25 @@ from mapfusion.errors import (
 )
 from mapfusion.parameters import Range
 
-SHIPPED = Path(__file__).with_name("shipped")  # the repository's scenarios/, also where installed
-OWN = Path("scenarios")  # what shipped files name lies beside it, as it does in the repository
+SHIPPED = Path(__file__).with_name("shipped")  # the repository's scenarios/, also when installed
+OWN = Path("scenarios")  # shipped files name their logs relative to this folder
 S = TypeVar("S")
-Location = tuple[int | str, ...]  # keys and places in lists, from a scenario's root
-Place = Callable[[Location], str]  # where the value at a location was given, behind a file's name
-_MOST_LINES = 20  # about one scenario
-_MOST_SUGGESTED = 3  # keys that an error message offers
+Location = tuple[int | str, ...]  # keys and list indices, from the root of a scenario
+Place = Callable[[Location], str]  # the line or override of the value at a location
+_MOST_LINES = 20  # error lines of one scenario
+_MOST_SUGGESTED = 3  # keys that an error message suggests
 _UNKNOWN = {"extra_forbidden", "unexpected_keyword_argument"}
-# Settings that were, and what says the same now.
+# Settings of earlier versions, with the settings that replace them.
 _RETIRED = {
     "slam.filter.noise_scale": "errors that are alike from frame to frame are "
     "slam.filter.stray_m, those of single observations vision.sigma_uv_px",
     "merge.parameters.use_drift": "every run has both fusers, kalman and kalman-drift",
 }
-_WORLD = {"world", "robots", "drive"}  # what a simulation must have and a recording cannot
-_LONG_NAME = 64 * "x"  # longer than that of any file of a log
+_WORLD = {"world", "robots", "drive"}  # required in a simulation, forbidden in a recording
+_LONG_NAME = 64 * "x"  # longer than the name of any file of a log
 _EITHER = "give either world, robots and drive, or logs; generate stands for world and robots"
 _FIELDS = GeneratedScenario.model_fields | Simulation.model_fields | Recording.model_fields
-# Resolved recordings of earlier versions name all sections, also a simulation's, which say nothing.
+# Resolved recordings of earlier versions also have the sections of simulations, without effect.
 _OF_ONE_KIND = _FIELDS.keys() - Scenario.model_fields.keys()
 _SIMULATION_S_OWN = {
     name: to_jsonable_python(field.default)
@@ -78,17 +78,17 @@ def load_scenario(
     seed: int | None = None,
     content: dict[str, Any] | None = None,
 ) -> AnyScenario:
-    """Read and validate a scenario, with entries `key.sub=value` and the seed replaced.
+    """Read and validate a scenario.
 
     Args:
-        path: of the file.
-        overrides: the entries.
-        seed: in place of the file's; None for that.
-        content: of the file, where it was read before; None to read it.
+        path: the file.
+        overrides: entries `key.sub=value` that replace values of the file.
+        seed: replaces the seed of the file; None keeps it.
+        content: content of the file if it has been read before; None reads it.
 
     Raises:
-        InputError: a line for each thing that is wrong, with the file, its line, the key and what
-            would be right.
+        InputError: the scenario is wrong. Each problem has one line with the file, its line, the
+            key and the allowed values.
     """
     _require_whole_paths(overrides)
     data = apply_overrides(read_mapping(path) if content is None else content, overrides)
@@ -103,12 +103,12 @@ def load_scenario(
     return scenario
 
 
-# Every wrong key of one file asks for them.
+# Each wrong key of a file needs the lines.
 _lines = functools.lru_cache(maxsize=1)(lines_of_keys)
 
 
 def _place(path: Path, overrides: Sequence[str], location: Location) -> str:
-    """Return where the value at a location was given: a line of the file, or an override."""
+    """Return the line of the file or the override that gives the value at a location."""
     for override in reversed(overrides):
         own = override.partition("=")[0].split(".")
         told = [str(part) for part in location[: len(own)]]
@@ -122,18 +122,26 @@ def _place(path: Path, overrides: Sequence[str], location: Location) -> str:
 def _resolved(path: Path, folder: Path, log: str) -> str:
     try:
         resolved = (folder / log).resolve()
-        (resolved / _LONG_NAME).exists()  # raises where a path is too long for the system
-    except (OSError, RuntimeError, ValueError) as error:  # a loop of links, a name too long
+        (resolved / _LONG_NAME).exists()  # raises if the path is too long for the system
+    except (OSError, RuntimeError, ValueError) as error:  # circular links, a long name
         reason = error.strerror if isinstance(error, OSError) else error
         raise InputError(f"{path}: logs: {log}: no folder has this path ({reason})") from error
     return str(resolved)
 
 
 def scenario_of(data: dict[str, Any], where: str, place: Place = _nowhere) -> AnyScenario:
-    """The simulation or the recording that the content of a file describes.
+    """Validate the content of a scenario file.
+
+    Args:
+        data: the content.
+        where: the file, with which error messages begin.
+        place: returns the line of the value at a location.
+
+    Returns:
+        a simulation or a recording; a generated world is drawn.
 
     Raises:
-        InputError: lines that begin with `where` and the `place` of the value at fault.
+        InputError: the scenario is wrong.
     """
     data = {k: v for k, v in data.items() if k not in _OF_ONE_KIND or v not in (None, [])}
     drawn, recorded = "generate" in data, "logs" in data
@@ -144,7 +152,7 @@ def scenario_of(data: dict[str, Any], where: str, place: Place = _nowhere) -> An
         raise InputError(f"{where}: give either generate, or world and robots, or logs")
     needed = {"drive"} if drawn else _WORLD
     unclear = bool(data.keys() & _WORLD) if recorded else not data.keys() >= needed
-    if unclear and data.keys() <= _FIELDS.keys():  # a misspelt name is the better explanation
+    if unclear and data.keys() <= _FIELDS.keys():  # otherwise report the unknown name
         raise InputError(f"{where}: {_EITHER}")
     if drawn:
         asked = _validated(where, GeneratedScenario, data, place)
@@ -160,29 +168,29 @@ def scenario_of(data: dict[str, Any], where: str, place: Place = _nowhere) -> An
 def made_settings(
     where: str, kind: type[S], overrides: Sequence[str], base: dict[str, Any] | None = None
 ) -> S:
-    """Settings of that kind alone: defaults, or what `base` says, with overrides.
+    """Return settings of a class: defaults or `base`, with overrides.
 
     Raises:
-        InputError: one line that begins with `where`.
+        InputError: a value is wrong; the message begins with `where`.
     """
     made = _validated(where, kind, apply_overrides(base or {}, overrides))
     if not is_dataclass(kind):
         return made
-    # of the class itself, which can be sent to another process; pydantic's own one cannot
+    # an instance of the class itself can be pickled, one of pydantic's subclass cannot
     return kind(**{own.name: getattr(made, own.name) for own in fields(kind)})
 
 
 class _StepSettings(Scenario):
-    """Settings of one step on files: aligning alone need not be able to merge."""
+    """Settings of a single step on files, without the rule about the merge."""
 
     RULES = tuple(rule for rule in Scenario.RULES if rule is not merged_by_what_is_aligned)
 
 
 def default_settings(overrides: Sequence[str] = (), seed: int | None = None) -> Scenario:
-    """What a scenario sets beside its world, for work on files: defaults, with overrides.
+    """Return the default settings of a scenario without its world, with overrides.
 
     Raises:
-        InputError: one line that names the key and what would be right.
+        InputError: a value is wrong; the message names the key and the allowed values.
     """
     _require_whole_paths(overrides)
     data = apply_overrides({"schema_version": 1, "name": "defaults"}, overrides)
@@ -192,7 +200,7 @@ def default_settings(overrides: Sequence[str] = (), seed: int | None = None) -> 
 
 
 def _require_whole_paths(overrides: Sequence[str]) -> None:
-    """Refuse a key that lacks its beginning, as `filter.n_particles` does."""
+    """Refuse a key without its first sections, such as `filter.n_particles`."""
     roots = _FIELDS.keys() | GeneratedScenario.model_fields.keys()
     for key in (override.partition("=")[0] for override in overrides):
         first, *rest = key.split(".")
@@ -211,10 +219,10 @@ def _warn_of_name_clashes(align: Align) -> None:
             warnings.warn(name_clashes()[method], NameClashWarning, stacklevel=3)
 
 
-@functools.cache  # a sweep and a campaign validate the same few kinds again and again
+@functools.cache  # a sweep validates the same classes many times
 def _known(kind: type[S]) -> TypeAdapter[S]:
     strict = kind
-    if is_dataclass(kind):  # an importer's settings; sections say themselves what they forbid
+    if is_dataclass(kind):  # settings of an importer; sections forbid unknown keys themselves
         strict = dataclass(kind, config=ConfigDict(extra="forbid"), frozen=True)
     return TypeAdapter(strict)
 
@@ -231,14 +239,14 @@ def _schema(kind: type[S]) -> dict[str, Any]:
 
 
 class Problem(NamedTuple):
-    """Return the reason why the value at a location is refused."""
+    """Reason why the value at a location is refused."""
 
     location: Location
     text: str
 
 
 def _validated(where: str, kind: type[S], data: dict[str, Any], place: Place = _nowhere) -> S:
-    """A section of that kind; raises InputErrors with a line for each thing that is wrong."""
+    """Validate a section of a class; raise InputErrors with one line for each problem."""
     schema = _schema(kind)
     problems = list(_unfit(schema, schema, data, ()))
     unfit = {problem.location for problem in problems}
@@ -268,8 +276,8 @@ def _reaches(location: Location, others: Collection[Location]) -> bool:
 
 
 def _refused(kind: type, error: ValidationError) -> Iterator[Problem]:
-    """All that the validation of a section of that kind refused."""
-    # An unknown name explains the missing one that follows from it, so it goes first.
+    """Yield the problems of a failed validation."""
+    # An unknown name comes first: it often explains a missing one.
     for each in sorted(
         error.errors(include_url=False), key=lambda problem: problem["type"] not in _UNKNOWN
     ):
@@ -291,7 +299,7 @@ def _refused(kind: type, error: ValidationError) -> Iterator[Problem]:
 def _contradictions(
     kind: type[Scenario], data: dict[str, Any], wrong: Collection[Location]
 ) -> Iterator[Problem]:
-    """Contradictions between those sections of a scenario that are right by themselves."""
+    """Yield contradictions between sections that are valid by themselves."""
     sections = {}
     for name in sections_of(kind.RULES) & kind.model_fields.keys():
         field = kind.model_fields[name]
@@ -307,7 +315,7 @@ def _contradictions(
 
 
 def _told(line: str) -> Problem:
-    """The key that a line about a scenario begins with, and the rest."""
+    """Split a line of a rule into the key at its beginning and the text."""
     name, _, text = line.partition(": ")
     section, _, metric = name.partition(".")
     return Problem((section, metric) if section == "expect" else _parts(name), text)
@@ -330,9 +338,9 @@ _KINDS = {
 def _unfit(
     root: dict[str, Any], node: dict[str, Any], value: Any, location: Location
 ) -> Iterator[Problem]:
-    """Values of another type or range than the JSON schema `root` says, at and below a node.
+    """Yield values below a node that do not match the types and ranges of the JSON schema `root`.
 
-    A whole number may be written 5.0, as in any JSON schema; a text or a truth value is no number.
+    As in any JSON schema, an integer may be written 5.0. Texts and truth values are not numbers.
     """
     options = list(_options(root, node))
     allowed = {option["type"] for option in options if "type" in option}
@@ -361,7 +369,7 @@ def _unfit(
 
 
 def _kind_of(value: Any) -> str:
-    """The type of a value, as JSON schemas call it."""
+    """Return the type of a value in the terms of JSON schemas."""
     if value is None:
         return "null"
     if isinstance(value, bool):
@@ -372,7 +380,7 @@ def _kind_of(value: Any) -> str:
 
 
 def _options(root: dict[str, Any], node: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """The schemas that a node of a JSON schema stands for, any of which a value may follow."""
+    """Yield the alternatives of a node of a JSON schema."""
     if "$ref" in node:
         yield from _options(root, root["$defs"][node["$ref"].rsplit("/", 1)[1]])
     elif "anyOf" in node:
@@ -383,7 +391,7 @@ def _options(root: dict[str, Any], node: dict[str, Any]) -> Iterator[dict[str, A
 
 
 def _about_unknown(location: tuple[int | str, ...], known: list[tuple[str, ...]]) -> str:
-    """The names that would have been right there, and those that may have been meant."""
+    """Return a message with the known names and the most similar ones."""
     if told := _RETIRED.get(".".join(map(str, location))):
         return f"retired; {told}"
     *above, wrong = location
@@ -393,7 +401,7 @@ def _about_unknown(location: tuple[int | str, ...], known: list[tuple[str, ...]]
     here = sorted({path[-1] for path in beside})
     message = f"unknown key; known here: {', '.join(here)}"
     meant = did_you_mean(str(wrong), here)
-    # else a key of another section, of which the wrong one is a word
+    # otherwise suggest keys of other sections that contain the word
     like = [".".join(p) for p in known if wrong in p[-1].split("_") and "*" not in p]
     if like and not meant:
         meant = f"; did you mean {' or '.join(like[:_MOST_SUGGESTED])}?"
@@ -401,7 +409,7 @@ def _about_unknown(location: tuple[int | str, ...], known: list[tuple[str, ...]]
 
 
 def _keys(root: dict[str, Any], node: dict[str, Any], *above: str) -> Iterator[tuple[str, ...]]:
-    """All keys below a node; `*` stands for places in lists and for free keys, as in `expect`."""
+    """Yield all keys below a node; `*` stands for list indices and free keys, as in `expect`."""
     node = next((option for option in node.get("anyOf", []) if "$ref" in option), node)
     if "$ref" in node:
         node = root["$defs"][node["$ref"].rsplit("/", 1)[1]]
@@ -413,12 +421,12 @@ def _keys(root: dict[str, Any], node: dict[str, Any], *above: str) -> Iterator[t
             yield from _keys(root, children, *above, "*")
 
 
-# "name, other: text", further lines indented.
+# "name, other: text", with further lines indented
 _ENTRY = re.compile(r"^    (\w+(?:, \w+)*): (.+(?:\n {5,}.+)*)", re.MULTILINE)
 
 
 class _Described(GenerateJsonSchema):
-    """Adds to each field what its class says of it under `Attributes:`, and its unit."""
+    """Schema generator that adds to each field its docstring entry and its unit."""
 
     def model_schema(self, schema: Any) -> dict[str, Any]:
         return _described(super().model_schema(schema), schema["cls"])
@@ -428,7 +436,7 @@ class _Described(GenerateJsonSchema):
 
 
 def schema_text() -> str:
-    """The schema, as JSON that ends with a line break."""
+    """Return the schema as JSON text with a final line break."""
     kinds = TypeAdapter[object](Simulation | GeneratedScenario | Recording)
     schema = kinds.json_schema(schema_generator=_Described)
     return json.dumps(schema, indent=1) + "\n"
@@ -441,12 +449,12 @@ def _described(schema: dict[str, Any], owner: type) -> dict[str, Any]:
         units = dict.fromkeys(_units(field))
         unit = f" [{', '.join(units)}]" if units else ""
         field["description"] = described[name] + unit
-        field.pop("title", None)  # the name once more
+        field.pop("title", None)  # pydantic repeats the name
     return schema
 
 
 def attributes_of(owner: type) -> dict[str, str]:
-    """What the docstrings of a class and its bases say of each attribute, on one line each."""
+    """Return the docstring entry of each attribute of a class and its bases, as one line."""
     found: dict[str, str] = {}
     for kind in reversed(owner.__mro__):
         text = inspect.cleandoc(kind.__doc__ or "").partition("Attributes:\n")[2]
@@ -456,7 +464,7 @@ def attributes_of(owner: type) -> dict[str, str]:
 
 
 def _units(node: Any) -> list[str]:
-    """Units of all numbers in a field, which the ranges leave in its schema."""
+    """Remove the units from the schema of a field and return them."""
     if isinstance(node, list):
         return [unit for each in node for unit in _units(each)]
     if not isinstance(node, dict):

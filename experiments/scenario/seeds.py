@@ -8,16 +8,19 @@ from mapfusion.errors import InputError
 
 
 def generator(seed: int, *purpose: str | int) -> np.random.Generator:
-    """A generator for one purpose, for example ("odometry", "R1"), under the scenario's seed."""
+    """Return the generator for a purpose, for example ("odometry", "R1").
+
+    Its numbers do not depend on other generators.
+    """
     key = tuple(zlib.crc32(str(part).encode()) for part in purpose)
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
 
 
-MAX_SEEDS = 1000  # days of computing: more is a slip of the keyboard
+MAX_SEEDS = 1000  # days of computation; more is probably a typing error
 
 
 def parse_seeds(text: str) -> list[int]:
-    """Seeds from `3`, `0..4` (both ends included) or `0,2,5`; raises InputError."""
+    """Parse `3`, `0..4` (both ends included) or `0,2,5`; raise InputError for other texts."""
     try:
         if ".." in text:
             first, last = (int(part) for part in text.split(".."))

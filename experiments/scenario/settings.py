@@ -1,9 +1,9 @@
 """Scenario: one validated, frozen value from one YAML file.
 
-`experiments/evaluation/metrics.py` computes them; here they are known before anything is computed.
+`experiments/evaluation/metrics.py` computes them. The names are checked before a run.
 
-The stages' own parameter classes (`FrontEndParameters`, `FastSlamParameters`, ...) are used as they
-are: pydantic validates them in place, so a parameter is named and explained once, where it is used.
+Sections contain the parameter classes of the library (`FrontEndParameters`, `FastSlamParameters`,
+...), so each parameter is defined and documented once.
 """
 
 import inspect
@@ -45,7 +45,7 @@ from sim.odometry import OdometryNoise
 from sim.stereo_head import RadiometricNoise
 from sim.sway import AttitudeNoise
 
-# Of a whole run.
+# Metrics of a whole run.
 RUN_METRICS = ("path_rmse_m", "odometry_rmse_m", "path_over_odometry")
 RUN_METRICS += tuple(
     f"smoother.{name}"
@@ -69,13 +69,13 @@ RUN_METRICS += (
     "team.edge_precision",
     "team.edge_recall",
 )
-# Of each fuser that runs, under its name: columns of the table `fusers`.
+# Metrics of each fuser, after its name: columns of the table `fusers`.
 FUSER_METRICS = ("landmark_rmse_m", "gross_share", "fitted_rmse_m", "fitted_median_m")
 FUSER_METRICS += ("over_better_parent", "over_better_filter", "nees_per_dof", "frame_nees_per_dof")
 FUSER_METRICS += ("coverage_95", "frame_coverage_95", "alignment_nees_per_dof", "duplicate_share")
 FUSER_METRICS += ("alignment_error_m", "alignment_error_rad")
 FUSER_METRICS += ("alignment_sigma_m", "alignment_sigma_rad")
-# Of each aligner, under its name.
+# Metrics of each aligner, after its name.
 ALIGNER_METRICS = (
     "refined_oracle_distance_m",
     "refined_over_oracle",
@@ -89,14 +89,14 @@ ALIGNER_METRICS = (
 
 
 def known_metrics(aligners: Sequence[str], fusers: Sequence[str]) -> list[str]:
-    """Return every metric name that a scenario with these aligners and fusers may use."""
+    """Return all metric names for these aligners and fusers."""
     of_fusers = [f"{fuser}.{name}" for fuser in fusers for name in FUSER_METRICS]
     of_aligners = [f"{aligner}.{name}" for aligner in aligners for name in ALIGNER_METRICS]
     return [*RUN_METRICS, *of_fusers, *of_aligners]
 
 
 def why_unknown(name: str, aligners: Sequence[str], fusers: Sequence[str]) -> str:
-    """Return the reason why a scenario may not expect a metric of this name; empty if it may."""
+    """Return the reason why a metric name is unknown; empty if it is known."""
     known = known_metrics(aligners, fusers)
     if name in known:
         return ""
@@ -109,20 +109,19 @@ def why_unknown(name: str, aligners: Sequence[str], fusers: Sequence[str]) -> st
     return f"unknown{did_you_mean(name, known) or f'; known: {forms}'}"
 
 
-# Of whatever metrics measure; beyond, the screens' numbers say nothing.
+# Larger values do not fit on screens.
 MetricValue = Annotated[float, Range(-1e9, 1e9, "the metric's")]
 
 
 class AlignerEntry(Section):
-    """An aligner under the name that tables and figures use.
+    """Aligner with a name.
 
     Attributes:
-        name: what tables and figures call it.
-        method: an alignment method, built in or of an installed package.
-        parameters: the method's own.
-        time_limit_s: of one call of an aligner that is not our own. TEASER++ takes 0.6 s for 5000
-            pairs: a hundred times that, so that a busy machine is not taken for a method that
-            hangs.
+        name: name of the aligner in tables and figures.
+        method: alignment method, built in or from an installed package.
+        parameters: parameters of the method.
+        time_limit_s: time limit for one call of an aligner from another package. The default is
+            long enough for slow methods on a busy machine.
     """
 
     name: Annotated[Name, AfterValidator(free)]
@@ -152,16 +151,16 @@ DEFAULT_ALIGNERS = [
 
 
 class Align(Section):
-    """Correspondences, the aligners on them, the least squares after each, the verdict on each.
+    """Alignment: correspondences, aligners, refinement and verification.
 
     Attributes:
-        match: how landmarks are paired.
-        aligners: the aligners that are compared.
-        also: aligners beside those of `aligners`, which need not be repeated then.
-        refinement: least squares after each aligner.
-        acceptance: the test of each alignment against chance.
-        evidence: what both robots saw, for and against it, and how sure it has to be.
-        repetitions: of randomised aligners on each pair of maps, so that their own spread is seen.
+        match: matching of landmarks.
+        aligners: aligners that are compared.
+        also: aligners in addition to those of `aligners`.
+        refinement: least-squares refinement after each aligner.
+        acceptance: test of each alignment against chance.
+        evidence: test of each alignment with the observations of both robots.
+        repetitions: runs of each randomised aligner on a pair of maps, to measure its spread.
     """
 
     match: MatchParameters = MatchParameters()
@@ -176,12 +175,12 @@ class Align(Section):
 
     @property
     def judge(self) -> Judge:
-        """What gives the verdict on each alignment."""
+        """Return the judge of alignments with these settings."""
         return Judge(self.acceptance, self.evidence, self.refinement)
 
     @model_validator(mode="after")
     def _unique(self) -> Self:
-        # One list from here on; pydantic freezes models for their users, not for their validators.
+        # merge both lists; `object.__setattr__` because the model is frozen
         aligners = different([*self.aligners, *self.also], "aligners: ")
         object.__setattr__(self, "aligners", aligners)
         object.__setattr__(self, "also", [])
@@ -189,13 +188,13 @@ class Align(Section):
 
 
 class Merge(Section):
-    """The fused map.
+    """Fused map of a result.
 
     Attributes:
-        aligner: whose refined result the maps are merged with; a name of `align.aligners`.
-        fuser: whose map is the fused one, of figure 10 and of `maps/fused.parquet`; a name of
+        aligner: aligner whose refined alignments are used; a name of `align.aligners`.
+        fuser: fuser whose map is in figure 10 and in `maps/fused.parquet`; a name of
             `fuse.fusers`.
-        parameters: how they are merged.
+        parameters: parameters of the fusion.
     """
 
     aligner: Name = "ransac"
@@ -204,13 +203,14 @@ class Merge(Section):
 
 
 class Evaluate(Section):
-    """When aligners are compared, and what counts as truly the same landmark.
+    """Evaluation of aligners.
 
     Attributes:
-        every: maps are aligned and judged at every so-manieth frame, and at the last.
-        true_pair_radius_m: landmarks whose true points lie this near are one.
-        timing_points: pairs of maps, evenly spread over the run, on which aligners are timed.
-        timing_repeats: timings on each.
+        every: interval between frames at which maps are aligned and evaluated; the last frame is
+            always evaluated.
+        true_pair_radius_m: distance of true points below which two landmarks are the same.
+        timing_points: number of pairs of maps for timing aligners, evenly spread over the run.
+        timing_repeats: number of timings on each pair.
     """
 
     every: Annotated[int, Range(1, MAX_COUNT, "frames")] = 25
@@ -220,11 +220,11 @@ class Evaluate(Section):
 
 
 class Bound(Section):
-    """The range a metric must lie in; both ends included.
+    """Range of a metric, including both ends.
 
     Attributes:
-        min: the least value that passes.
-        max: the largest value that passes.
+        min: smallest value that passes.
+        max: largest value that passes.
     """
 
     min: MetricValue | None = None
@@ -239,22 +239,21 @@ class Bound(Section):
         return self
 
 
-# Errors in pictures that PyBullet samples without a filter: edges are staircases, a wall that is
-# seen straight on locks onto its texels (4 mm; two or three to a pixel at usual distances): all of
-# a window then matches the better the more it is off. With these, standard deviations hold against
-# rendered depth, and most windows of one plane pass, though fewer than of white noise would.
+# Stereo errors in images that PyBullet renders without texture filtering: edges are staircases, and
+# matches of a wall seen at right angles lock onto its texels. With these values the stated standard
+# deviations agree with the rendered depth, and most windows of a plane pass.
 _UNFILTERED = {"plane_misfit_px": 0.7, "residual_correlation_px": 3.0, "sigma_floor_px": 0.06}
-# Corners, too, settle on texels.
+# Corners lock onto texels, too.
 _UNFILTERED_STRAY_M = 0.003
 
 
-# A rule about several sections: its arguments are sections by their names, its answers are lines
-# that begin with the key at fault.
+# A rule about several sections. Its arguments are the sections by name. It yields lines that begin
+# with the wrong key.
 Rule = Callable[..., Iterator[str]]
 
 
-class ContradictingSections(ValueError):  # noqa: N818  # pydantic calls it an error itself
-    """Sections that are right by themselves contradict each other; `problems` has a line each."""
+class ContradictingSections(ValueError):  # noqa: N818  # pydantic names the error
+    """Contradiction of valid sections; `problems` has one line for each."""
 
     def __init__(self, problems: Sequence[str]) -> None:
         super().__init__("; ".join(problems))
@@ -262,12 +261,12 @@ class ContradictingSections(ValueError):  # noqa: N818  # pydantic calls it an e
 
 
 def sections_of(rules: Sequence[Rule]) -> set[str]:
-    """Return the names of the sections that some of the rules need."""
+    """Return the names of the sections that the rules use."""
     return {name for rule in rules for name in inspect.signature(rule).parameters}
 
 
 def broken_rules(rules: Sequence[Rule], sections: Mapping[str, Any]) -> list[str]:
-    """Apply the rules whose sections are all there; return the lines of those broken."""
+    """Apply the rules whose sections are all given; return the lines of broken rules."""
     broken = []
     for rule in rules:
         needed = sections_of([rule])
@@ -277,7 +276,7 @@ def broken_rules(rules: Sequence[Rule], sections: Mapping[str, Any]) -> list[str
 
 
 def merged_by_what_is_aligned(align: Align, merge: Merge, fuse: Fuse) -> Iterator[str]:
-    """Tell if the merge builds on an aligner or a fuser that does not run."""
+    """Yield lines if the merge uses an aligner or a fuser that does not run."""
     aligners = [entry.name for entry in align.aligners]
     if merge.aligner not in aligners:
         known = f"is not among align.aligners ({', '.join(aligners)})"
@@ -310,22 +309,22 @@ def _drawn_from_below_the_walls(
 
 
 class Scenario(Section):
-    """What a simulation and a recording have in common.
+    """Settings of simulations and recordings.
 
     Attributes:
-        schema_version: of this file's format.
-        name: of the result's folder.
-        description: one line for people.
-        tags: words that commands take in place of this scenario's name.
-        seed: of all that is random.
-        slam: how maps are made.
-        smooth: the batch smoother beside it.
+        schema_version: version of the file format.
+        name: name of the scenario and of its results.
+        description: short description.
+        tags: words that commands accept instead of the scenario's name.
+        seed: seed of all random numbers.
+        slam: filter and map.
+        smooth: batch smoother.
         align: alignment of two maps.
-        merge: the fused map.
-        fuse: when maps are fused.
-        evaluate: when and how it is judged.
-        keep: what is kept for the figures.
-        expect: bounds by metric, which `mapfusion check` holds runs to.
+        merge: fused map.
+        fuse: fusers and their frames.
+        evaluate: evaluation of aligners.
+        keep: data that is stored for figures.
+        expect: bounds of metrics, which `mapfusion check` tests.
     """
 
     schema_version: Literal[1]
@@ -355,33 +354,33 @@ class Scenario(Section):
         return self
 
     def resolved(self) -> dict[str, Any]:
-        """All settings, defaults filled in, as JSON-able values."""
+        """Return all settings with defaults as JSON values."""
         return self.model_dump(mode="json")
 
 
 class Recording(Scenario):
-    """An experiment on recorded logs.
+    """Experiment on recorded logs.
 
     Attributes:
-        logs: folders of robots' logs, relative to the scenario's file.
+        logs: folders of robots' logs, relative to the scenario file.
     """
 
     logs: Annotated[list[str], Field(min_length=1, max_length=MAX_NAMED), AfterValidator(different)]
 
 
 class SimulatedScenario(Scenario):
-    """What simulations have in common, whoever draws their world.
+    """Settings of simulations in given and generated worlds.
 
     Attributes:
-        drive: how the robots drive.
-        render: what draws the images.
-        camera: the stereo head of all robots.
+        drive: drive of the robots.
+        render: renderer of the images.
+        camera: stereo camera of all robots.
         radiometry: noise of the images.
-        odometry: noise of the wheels' counts.
-        attitude: what robots whose bodies sway are told of their roll and pitch.
-        vision: from images to observations. Where a renderer without filter draws (tiny, egl) and
-            they are not named, `stereo.plane_misfit_px` is 0.7, `residual_correlation_px` 3 and
-            `sigma_floor_px` 0.06.
+        odometry: noise of the wheel encoders.
+        attitude: noise of the measured roll and pitch of swaying robots.
+        vision: front end, from images to observations. With a renderer without texture filtering
+            (tiny, egl) the defaults of `stereo.plane_misfit_px`, `residual_correlation_px` and
+            `sigma_floor_px` are 0.7, 3 and 0.06.
     """
 
     drive: Drive
@@ -401,7 +400,7 @@ class SimulatedScenario(Scenario):
         renderer = (
             render.get("renderer", Render().renderer)
             if isinstance(render, dict)
-            else getattr(render, "renderer", None)  # what else is no section is refused later
+            else getattr(render, "renderer", None)  # other types are refused later
         )
         if renderer not in ("tiny", "egl"):
             return given
@@ -415,11 +414,11 @@ class SimulatedScenario(Scenario):
 
 
 class GeneratedScenario(SimulatedScenario):
-    """A simulation as its file has it, whose world and robots the seed draws.
+    """Simulation whose world and robots are drawn from the seed.
 
     Attributes:
-        generate: what is drawn.
-        render: what draws the images; drawn worlds are many, so the fast one unless it is named.
+        generate: parameters of the random world.
+        render: renderer of the images; raycast by default, because generated worlds are many.
     """
 
     generate: Generate
@@ -427,12 +426,12 @@ class GeneratedScenario(SimulatedScenario):
 
 
 class Generated(Section):
-    """Where a generated world came from; written by the program, read by nobody but people.
+    """Origin of a generated world, for information only.
 
     Attributes:
-        plan_seed: what the plan was drawn from.
-        overlap_asked: of the `generate` section.
-        overlap: the one achieved: ground that two robots both visit over the ground that either
+        plan_seed: seed of the floor plan.
+        overlap_asked: overlap in the `generate` section.
+        overlap: overlap achieved: area that both of two robots visit over the area that either
             visits, mean over pairs.
     """
 
@@ -442,12 +441,12 @@ class Generated(Section):
 
 
 class Simulation(SimulatedScenario):
-    """An experiment in a simulated world.
+    """Experiment in a simulated world.
 
     Attributes:
-        world: walls and how they are painted.
+        world: walls and textures.
         robots: the robots.
-        generated: where a drawn world came from.
+        generated: origin of a generated world.
     """
 
     world: World

@@ -1,6 +1,6 @@
-"""The scenario suite, found by path, by name or by tag: shipped files, and those in ./scenarios.
+"""Scenario suite: shipped scenarios and those in ./scenarios, found by path, name or tag.
 
-One in ./scenarios takes the place of the shipped one of its name: who edits a copy runs the copy.
+A scenario in ./scenarios replaces the shipped scenario of the same name.
 """
 
 from collections.abc import Sequence
@@ -17,13 +17,15 @@ SUFFIXES = {".yaml", ".yml", ".json"}  # a JSON file is YAML too: a result's sce
 
 
 def scenarios_of(names_or_tags: Sequence[str | Path], folder: Path | None = None) -> list[Path]:
-    """Scenario files, in the order asked for and each once.
+    """Return the scenario files of some names or tags, in this order and without repetition.
 
-    Each is asked for by its path, by the name of a scenario in `folder` (of the suite by default),
-    or by a tag, which stands for all scenarios that carry it (in the order of their files' names).
+    Args:
+        names_or_tags: paths, names of scenarios, or tags. A tag stands for all scenarios that have
+            it, sorted by file name.
+        folder: where names and tags are searched; the suite by default.
 
     Raises:
-        InputError: nothing of that name; lists the names and tags there are.
+        InputError: a name is unknown; the message lists the known names and tags.
     """
     found: list[Path] = []
     for wanted in names_or_tags:
@@ -36,7 +38,7 @@ def scenarios_of(names_or_tags: Sequence[str | Path], folder: Path | None = None
 
 
 def one_scenario(word: str | Path, folder: Path | None = None) -> Path:
-    """The file of a scenario asked for by path or name; raises InputError for a tag of several."""
+    """Return the file of one scenario; raise InputError for a tag of several scenarios."""
     found = scenarios_of([word], folder)
     if len(found) != 1:
         names = ", ".join(path.stem for path in found)
@@ -47,7 +49,7 @@ def one_scenario(word: str | Path, folder: Path | None = None) -> Path:
 def settings_of(
     word: str | Path | None, overrides: Sequence[str] = (), seed: int | None = None
 ) -> Scenario:
-    """What a scenario sets, or the defaults without one; raises InputError."""
+    """Load a scenario, or the default settings for None; raise InputError if it is wrong."""
     if word is None:
         return default_settings(overrides, seed)
     return load_scenario(one_scenario(word), overrides, seed)
@@ -56,7 +58,7 @@ def settings_of(
 def _named(wanted: str, folder: Path | None) -> list[Path]:
     files = _files(folder)
     if any(path.stem == wanted for path in files):
-        # all of them take a third of a second to read; who else has the name has its letters
+        # reading all files is slow: read only those that contain the name
         files = [path for path in files if path.stem == wanted or _mentions(path, wanted)]
     known = {path: read_mapping(path) for path in files}
     by_name = [path for path, data in known.items() if wanted in (data.get("name"), path.stem)]
@@ -76,14 +78,14 @@ def _mentions(path: Path, word: str) -> bool:
     try:
         return word.encode("utf-8", "surrogateescape") in path.read_bytes()
     except OSError:
-        return True  # to be told by who reads it
+        return True  # the reader reports the error
 
 
 def copy_to_edit(name: str) -> Path:
-    """Copy a shipped scenario to ./scenarios and give the copy's path.
+    """Copy a shipped scenario to ./scenarios and return the path of the copy.
 
     Raises:
-        InputError: there is none of that name, or a file is in the way.
+        InputError: the name is unknown, or the file exists.
     """
     shipped = {path.stem: path for path in _files(SHIPPED)}
     if name not in shipped:
@@ -97,7 +99,7 @@ def copy_to_edit(name: str) -> Path:
 
 
 def _files(folder: Path | None) -> list[Path]:
-    """Scenario files in the order of their names; of the suite where there is no folder."""
+    """Return the scenario files of a folder, sorted by name; those of the suite for None."""
     if folder is None:
         by_name = {path.stem: path for each in (SHIPPED, OWN) for path in _files(each)}
         return [by_name[name] for name in sorted(by_name)]
@@ -110,13 +112,13 @@ def _tags(data: dict) -> list[str]:
 
 
 def entries(folder: Path | None = None) -> list[dict[str, Any]]:
-    """What a listing tells of a folder's scenarios, or the suite's, in the order of their names.
+    """Return one row for each scenario of a folder or of the suite, sorted by name.
 
-    `iterations` are frames a robot, None for recorded logs; `overlap` is that of the robots'
-    ground, None where the world was not generated.
+    `iterations` is the number of frames of a robot, None for recorded logs. `overlap` is the
+    overlap of the robots' ground, None if the world was not generated.
 
     Raises:
-        InputError: the folder holds none, or one of them is wrong.
+        InputError: the folder has no scenario, or a scenario is wrong.
     """
     files = _files(folder)
     if not files:

@@ -11,7 +11,7 @@ from experiments.scenario.seeds import generator
 from mapfusion.fastslam.filter import FastSlamParameters
 from mapfusion.fusion.fusers import FUSERS, REFERENCE, target_of
 from mapfusion.geometry.numerics import Float
-from mapfusion.parameters import Range, require_in_range
+from mapfusion.parameters import Range
 from mapfusion.robot_log import STRAY_M
 from sim.driver import DriverSettings
 from sim.floorplan import wall_shape
@@ -26,11 +26,11 @@ from sim.textures import Texture
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid", allow_inf_nan=False))
 class Generate(RouteParameters, PlanParameters):
-    """A floor plan and routes drawn from a seed.
+    """Random floor plan and routes.
 
     Attributes:
-        plan_seed: draws the plan; None: the scenario's seed does.
-        world: whatever of the world is not drawn (heights, textures).
+        plan_seed: seed of the plan; None: the seed of the scenario.
+        world: settings of the world that are not drawn (heights, textures).
     """
 
     plan_seed: Annotated[int, Range(0, 2**32 - 1, "1")] | None = None
@@ -44,7 +44,7 @@ class Generate(RouteParameters, PlanParameters):
 
 
 def expanded(settings: Generate, seed: int) -> dict[str, Any]:
-    """The scenario keys that a `generate` section stands for; raises InputError."""
+    """Draw the world and robots of a `generate` section; raise InputError if none is found."""
     plan_seed = seed if settings.plan_seed is None else settings.plan_seed
     made = generate_world(settings, settings, generator(plan_seed, "plan"))
     robots = [
@@ -62,22 +62,22 @@ def expanded(settings: Generate, seed: int) -> dict[str, Any]:
     }
 
 
-NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,40}$"  # names become parts of file names
-TAKEN_NAMES = {"fused", "oracle"}  # of a map and of an estimate beside the robots' and aligners'
-MAX_FRAMES = 100_000  # five hours and a half at five frames a second
-MAX_COUNT = 1_000_000  # of frames or sightings in a log: a day at ten a second
-MAX_POINTS = 1000  # of one wall or route
-MAX_NAMED = 100  # things with names of their own: more do not fit into any table or figure
-# Metres and radians by which walls of one look may differ; corners are written to millimetres.
+NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,40}$"  # names are parts of file names
+TAKEN_NAMES = {"fused", "oracle"}  # names of maps and estimates in every result
+MAX_FRAMES = 100_000  # five and a half hours at five frames per second
+MAX_COUNT = 1_000_000  # frames or sightings in a log: a day at ten per second
+MAX_POINTS = 1000  # points of a wall or route
+MAX_NAMED = 100  # named items; more do not fit into a table or figure
+# Tolerance, in m and rad, of the shapes of walls with the same look; corners have millimetres.
 SAME_SHAPE = 0.002
 T = TypeVar("T")
 Name = Annotated[str, Field(pattern=NAME_PATTERN)]
-Coordinate = Annotated[float, Range(-500, 500, "m")]  # beyond any building
+Coordinate = Annotated[float, Range(-500, 500, "m")]  # larger than any building
 Point = tuple[Coordinate, Coordinate]
 
 
 def different(items: list[T], prefix: str = "") -> list[T]:
-    """Refuse two of one name; the items are names or have one."""
+    """Refuse repeated names; the items are names or have a `name`."""
     names = [getattr(item, "name", item) for item in items]
     for name in names:
         if names.count(name) > 1:
@@ -86,30 +86,27 @@ def different(items: list[T], prefix: str = "") -> list[T]:
 
 
 def free(name: str) -> str:
-    """Refuse a name that the evaluation uses itself."""
+    """Refuse a name that the evaluation uses."""
     if name in TAKEN_NAMES:
         raise ValueError(f"the name {name} is taken by the evaluation")
     return name
 
 
 class Section(BaseModel):
-    """Frozen; unknown keys, NaN, infinity and what lies outside a declared range are refused."""
+    """Frozen section that forbids unknown keys, NaN, infinity and values out of range."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    @model_validator(mode="after")
-    def _in_range(self) -> Self:
-        require_in_range(self)
-        return self
 
 
 class Wall(Section):
     """A wall.
 
     Attributes:
-        points: corners x, y of the polyline it stands on, in the world's frame.
-        look: a name; walls of one have one shape and carry the same pictures. Empty: its own.
-        mirrored: whether it is the mirror image of other walls of its look, points and pictures.
+        points: corners x, y of the wall's polyline, in the world's frame.
+        look: name of a texture; walls with the same look have the same shape and pictures. Empty:
+            the wall has its own pictures.
+        mirrored: true if the wall is the mirror image of other walls of its look, with its points
+            and pictures.
     """
 
     points: Annotated[list[Point], Field(min_length=2, max_length=MAX_POINTS)]
@@ -124,13 +121,13 @@ class Wall(Section):
 
 
 class World(Section):
-    """Walls, all of one height and thickness, under one ceiling.
+    """World of walls with the same height and thickness, under a ceiling.
 
     Attributes:
         walls: the walls.
-        wall_height_m: of all of them, and of the ceiling; the cameras look from 0.45 m.
-        wall_thickness_m: of all of them.
-        texture: how the world is painted.
+        wall_height_m: height of the walls and of the ceiling; the cameras are at 0.45 m.
+        wall_thickness_m: thickness of the walls.
+        texture: textures of walls, floor and ceiling.
     """
 
     walls: Annotated[list[Wall], Field(min_length=1, max_length=1000)]
@@ -154,17 +151,17 @@ class World(Section):
 
 
 class Robot(Section):
-    """One robot.
+    """Robot with its route.
 
     Attributes:
-        name: of its map and tables.
+        name: name of the robot in maps and tables.
         start: x, y and heading in the world's frame.
-        route: points x, y that it visits, in the world's frame.
-        loop: whether it goes on from the last point to the first, or parks.
-        odometry: in place of the scenario's.
-        radiometry: in place of the scenario's.
-        tire_friction: of its wheels against the ground, the coefficient; on a slippery floor they
-            spin as it speeds up.
+        route: points x, y that the robot visits, in the world's frame.
+        loop: true to drive from the last point to the first again, false to park.
+        odometry: replaces the odometry noise of the scenario.
+        radiometry: replaces the image noise of the scenario.
+        tire_friction: friction coefficient of the wheels; on a slippery floor they spin when the
+            robot accelerates.
     """
 
     name: Annotated[Name, AfterValidator(free)]
@@ -177,15 +174,15 @@ class Robot(Section):
 
 
 class Drive(Section):
-    """How long and how the robots drive.
+    """Drive of all robots.
 
     Attributes:
-        frames: pairs of images that each robot takes.
-        frame_interval_s: between two of them.
-        start_jitter_m: by which the seed moves each start at most, along x and along y.
-        start_jitter_rad: by which the seed turns each start at most.
-        control: how the robots are driven.
-        body_sway: how their bodies pitch and roll meanwhile.
+        frames: number of stereo images of each robot.
+        frame_interval_s: time between two frames.
+        start_jitter_m: largest random offset of each start along x and y.
+        start_jitter_rad: largest random rotation of each start.
+        control: controller of the robots.
+        body_sway: pitch and roll of the robots' bodies.
     """
 
     frames: Annotated[int, Range(2, MAX_FRAMES, "frames")]
@@ -197,23 +194,23 @@ class Drive(Section):
 
 
 class Render(Section):
-    """What draws the images.
+    """Renderer of the images.
 
     Attributes:
-        renderer: tiny is PyBullet's own in software, egl the system's OpenGL, raycast our own:
-            filtered, and many times as fast.
+        renderer: tiny is PyBullet's software renderer, egl the system's OpenGL, and raycast our
+            own renderer, which filters textures and is many times faster.
     """
 
     renderer: Renderer = "tiny"
 
 
 class Keep(Section):
-    """What is kept for the figures beyond the tables.
+    """Data that is stored for figures in addition to the tables.
 
     Attributes:
-        images_at: first frame of each robot whose images are kept.
-        images: how many frames from there on.
-        clouds_every: the particles are kept at every so-manieth frame.
+        images_at: first frame of each robot whose images are stored.
+        images: number of frames whose images are stored.
+        clouds_every: interval between frames whose particles are stored.
     """
 
     images_at: Annotated[int, Range(0, MAX_FRAMES, "frames")] = 60
@@ -222,11 +219,11 @@ class Keep(Section):
 
 
 class Slam(Section):
-    """Mapping.
+    """FastSLAM filter and its map.
 
     Attributes:
-        filter: the filter's settings.
-        min_count: sightings that a landmark needs to enter the map.
+        filter: settings of the filter.
+        min_count: number of sightings that a landmark in the map needs.
     """
 
     filter: FastSlamParameters = FastSlamParameters()
@@ -234,17 +231,17 @@ class Slam(Section):
 
 
 class Smooth(Section):
-    """The batch smoother, beside the filter.
+    """Batch smoother, which runs in addition to the filter.
 
     Attributes:
-        stray_m: standard deviation, along each axis, of where the point that a track is of lies
-            beside its landmark, as usual cameras see it; of coarse ones, whose pixels show more of
-            a wall, it is larger. Tracks that the filter took for one landmark and that lie farther
-            apart are parted. The filter's own (`slam.filter.stray_m`) is larger: along its path
-            they cannot be told apart.
-        max_memory_gb: of one robot's smoothing. It grows with the log, and with how much of it saw
-            the same places. A robot is not smoothed beyond the iteration where it may take more; 0
-            for no robot at all.
+        stray_m: standard deviation, along each axis, of the offset between the point of a track and
+            its landmark, for usual cameras. It is larger for coarse cameras, whose pixels show
+            more of a wall. Tracks of one landmark that lie farther apart become several landmarks.
+            The filter's value (`slam.filter.stray_m`) is larger, because its path is less
+            accurate.
+        max_memory_gb: memory for smoothing one robot's log. The need grows with the length of the
+            log and with repeated views of the same places. Iterations that may need more memory
+            are not smoothed. 0: no smoothing.
     """
 
     stray_m: Annotated[float, Range(0, 10, "m")] = STRAY_M
@@ -255,20 +252,20 @@ _FUSERS = tuple(name for name in FUSERS if name != REFERENCE)
 
 
 def _known_fusers(names: list[str]) -> list[str]:
-    """Refuse a fuser that nobody has, or that is named twice."""
+    """Refuse unknown and repeated fusers."""
     for name in names:
         target_of(name)
     return different(names, "fusers: ")
 
 
 class Fuse(Section):
-    """How and when robots' maps are fused to one, so that fusers can be compared.
+    """Fusion of the robots' maps with several fusers.
 
     Attributes:
-        fusers: names; all are given the same maps and alignments. All of ours but `batch`, which
-            smooths all logs as one and takes long, are in every run.
-        every: at every so-manieth frame, a multiple of `evaluate.every`, and at the last. None: at
-            the last, and at four evaluated iterations evenly spread before it.
+        fusers: names of the fusers; all get the same maps and alignments. The default is all fusers
+            except `batch`, which smooths all logs together and takes long.
+        every: interval between fused frames, a multiple of `evaluate.every`; the last frame is
+            always fused. None: the last frame and four evaluated frames evenly spread before it.
     """
 
     fusers: Annotated[list[Name], AfterValidator(_known_fusers)] = [

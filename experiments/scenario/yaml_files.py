@@ -12,19 +12,19 @@ from ruamel.yaml.nodes import MappingNode, Node, ScalarNode
 from mapfusion.errors import InputError
 from mapfusion.files import DIGEST
 
-_MOST_BYTES = 4_000_000  # the largest resolved scenario of ours takes 0.03 of that
-_MOST_VALUES = 200_000  # with every alias written out
-# The reader takes a second for 5 000 to 10 000 values; the 1000 walls that a world may have, of two
-# points each, are 9 000. JSON is read a hundred times as fast, and has no such limit.
+_MOST_BYTES = 4_000_000  # 30 times the largest resolved scenario of the suite
+_MOST_VALUES = 200_000  # values with all aliases expanded
+# Values in a YAML file. The largest world (1000 walls of two points) needs 9 000. The YAML reader
+# is slow: more values take several seconds. The JSON reader is fast and has no such limit.
 _MOST_WRITTEN = 20_000
-_MOST_DEPTH = 50  # a scenario needs 8
+_MOST_DEPTH = 50  # nested levels; a scenario needs 8
 _TOO_DEEP = "nested too deeply, or holds itself"
-_OPENCV_HEADER = "%YAML:1.0"  # of its own dialect, which only looks like a YAML directive
-_LARGEST_INTEGER = 2**63  # what tables and other people's readers of JSON can hold
+_OPENCV_HEADER = "%YAML:1.0"  # OpenCV's files begin so; it is not a valid YAML directive
+_LARGEST_INTEGER = 2**63  # the limit of tables and of most JSON readers
 
 
 class _Counting(Composer):
-    """Gives up after so many values, before it has read all of a long text."""
+    """Composer that stops reading after `_MOST_WRITTEN` values."""
 
     n_values = 0
 
@@ -39,13 +39,18 @@ class _Counting(Composer):
 def read_mapping(
     path: Path, what: str = "a scenario, for example quick.yaml", keys: str = "scenario keys"
 ) -> dict[str, Any]:
-    """Read one YAML mapping, of `what` with its `keys`.
+    """Read one mapping from a YAML or JSON file.
+
+    Args:
+        path: the file.
+        what: the expected content, for error messages.
+        keys: the expected keys, for error messages.
 
     Raises:
-        InputError: names the file and the line.
+        InputError: the file cannot be read; names the file and the line.
     """
     try:
-        with path.open("rb") as file:  # not by its size: a pipe has none
+        with path.open("rb") as file:  # a pipe has no size to check
             data = file.read(_MOST_BYTES + 1)
         text = data.decode("utf-8")
     except FileNotFoundError:
@@ -58,36 +63,44 @@ def read_mapping(
     if not isinstance(value, dict):
         found = "nothing" if value is None else f"a {type(value).__name__}"
         raise InputError(f"{path}: holds {found}, expected a mapping of {keys}")
-    value.pop(DIGEST, None)  # of a result's scenario.json, which may have been edited
+    value.pop(DIGEST, None)  # the digest of a result's scenario.json, which may have been edited
     return value
 
 
 def read_calibration(path: Path) -> dict[str, Any]:
-    """Read a camera's calibration; raises InputError that names the file and the line."""
+    """Read a camera calibration from a YAML or JSON file.
+
+    Raises:
+        InputError: the file cannot be read; names the file and the line.
+    """
     return read_mapping(path, "a calibration in YAML", "a calibration's keys")
 
 
 def parse_value(text: str, where: str) -> Any:
-    """Read one YAML value: mappings with texts as keys, lists, texts, numbers, truth values, null.
+    """Read one YAML or JSON value: mappings, lists, texts, numbers, true, false or null.
+
+    Args:
+        text: the text to read.
+        where: the source of the text, with which error messages begin.
 
     Raises:
-        InputError: one line that begins with `where`.
+        InputError: the text is not plain YAML, or it is too large.
     """
-    known, value = _as_json(text)
-    if known:
+    is_json, value = _as_json(text)
+    if is_json:
         return _plain(value, where, ())
     reader = _reader()
     try:
         node = reader.compose(text)
         if node is None:
             return None
-        _measured(node, {})
+        _count_values(node, {})
         value = reader.constructor.construct_document(node)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
     except MaxDepthExceededError as error:
         raise InputError(f"{where}: {_TOO_DEEP}") from error
-    except Exception as error:  # the reader leaves by any door where a tag does not fit its value
+    except Exception as error:  # the reader raises many types if a tag does not fit its value
         mark = getattr(error, "problem_mark", None)
         line = f", line {mark.line + 1}" if mark is not None else ""
         problem = str(getattr(error, "problem", None) or error).partition("\n")[0]
@@ -98,15 +111,15 @@ def parse_value(text: str, where: str) -> Any:
 def _reader() -> YAML:
     reader = YAML(typ="safe", pure=True)
     reader.Composer = _Counting
-    reader.max_depth = _MOST_DEPTH  # given up there: to read all of a deep text takes seconds
+    reader.max_depth = _MOST_DEPTH
     return reader
 
 
 def _as_json(text: str) -> tuple[bool, Any]:
-    """Read a text as a JSON object, if it is one.
+    """Read a text that is a JSON object; return True and its value.
 
-    All other texts are left to the reader of YAML, with what only that one refuses: keys that are
-    there twice, deep nesting, numbers that JSON does not know.
+    Return False for all other texts: the YAML reader accepts or refuses them. These include objects
+    with repeated keys, very deep nesting and numbers that are not JSON.
     """
     if not text.lstrip().startswith("{"):
         return False, None
@@ -124,37 +137,23 @@ def _as_json(text: str) -> tuple[bool, Any]:
         value = json.loads(text, object_pairs_hook=object_of, parse_constant=no_number)
     except (ValueError, RecursionError):
         return False, None
-    return _depth_of(value) <= _MOST_DEPTH, value
-
-
-def _depth_of(value: Any) -> int:
-    """Levels of mappings and lists, as far as they count."""
-    level, depth = [value], 0
-    while level and depth <= _MOST_DEPTH:
-        depth += 1
-        level = [
-            below
-            for each in level
-            if isinstance(each, dict | list)
-            for below in (each.values() if isinstance(each, dict) else each)
-        ]
-    return depth
+    return True, value
 
 
 def lines_of_keys(path: Path) -> dict[tuple[str | int, ...], int]:
-    """Line number of each key and list item of a YAML file, by its path; none if unreadable."""
-    if not path.is_file():  # a pipe, which can be read once only
+    """Return the line number of each key and list item; empty if the file cannot be read."""
+    if not path.is_file():  # a pipe can be read only once
         return {}
     try:
         text = path.read_text(encoding="utf-8").removeprefix(_OPENCV_HEADER)
         node = _reader().compose(text)
         return {} if node is None else dict(_marked(node, ()))
-    except Exception:  # what cannot be read has been refused before, or is too long
+    except Exception:  # unreadable files have been refused before
         return {}
 
 
 def _marked(node: Node, path: tuple[str | int, ...]) -> Iterator[tuple[tuple[str | int, ...], int]]:
-    """Paths and lines of all keys and items below a node; of an alias, those of its anchor."""
+    """Yield the path and line of each key and item below a node; an alias has its anchor's."""
     if isinstance(node, MappingNode):
         items = [(key.value, key, value) for key, value in node.value]
     else:
@@ -165,24 +164,25 @@ def _marked(node: Node, path: tuple[str | int, ...]) -> Iterator[tuple[tuple[str
             yield from _marked(value, (*path, name))
 
 
-def _measured(node: Node, known: dict[int, tuple[int, int]], depth: int = 0) -> tuple[int, int]:
-    """How many values a node stands for, and how deep they are nested, before any is made.
+def _count_values(node: Node, counts: dict[int, int]) -> int:
+    """Count the values of a node with all aliases expanded, before any value is made.
 
-    `known` keeps what was counted, by the nodes' ids: an alias is its anchor's node once more.
+    Args:
+        node: the node.
+        counts: counts of earlier nodes by their ids; an alias is the node of its anchor.
 
     Raises:
-        InputError: too many or too deep.
+        InputError: there are too many values, or the node contains itself.
     """
-    if id(node) not in known and depth <= _MOST_DEPTH:
-        below = [_measured(each, known, depth + 1) for each in _children(node)]
-        size, height = 1 + sum(n for n, _ in below), 1 + max((h for _, h in below), default=0)
-        known[id(node)] = size, height
-    size, height = known.get(id(node), (0, _MOST_DEPTH + 1))
-    if height > _MOST_DEPTH:
+    if id(node) not in counts:
+        counts[id(node)] = 0  # not known yet
+        counts[id(node)] = 1 + sum(_count_values(each, counts) for each in _children(node))
+    n_values = counts[id(node)]
+    if n_values == 0:
         raise InputError(_TOO_DEEP)
-    if size > _MOST_VALUES:
+    if n_values > _MOST_VALUES:
         raise InputError(f"holds more than {_MOST_VALUES} values, aliases written out")
-    return size, height
+    return n_values
 
 
 def _children(node: Node) -> Iterator[Node]:
@@ -194,7 +194,9 @@ def _children(node: Node) -> Iterator[Node]:
 
 
 def _plain(value: Any, where: str, path: tuple[str, ...]) -> Any:
-    """A copy without aliases; raises InputError for what JSON, tables and names cannot hold."""
+    """Copy a value without aliases; raise InputError for values that JSON or tables cannot hold."""
+    if len(path) > _MOST_DEPTH:
+        raise InputError(f"{where}: {_TOO_DEEP}")
     place = f"{where}: {'.'.join(path)}" if path else where
     if isinstance(value, dict):
         for key in value:
@@ -220,7 +222,13 @@ def _require_text(text: str, place: str) -> None:
 
 
 def apply_overrides(data: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
-    """Return a copy with `key.sub=value` entries set; values are YAML, list items go by index."""
+    """Return a copy with each override `key.sub=value` applied.
+
+    Values are YAML. List items are named by their index.
+
+    Raises:
+        InputError: an override has no value or names a missing list item.
+    """
     result = _plain(data, "scenario", ())
     for override in overrides:
         dotted, separator, value = override.partition("=")
@@ -242,7 +250,7 @@ def _assign(data: dict[str, Any], dotted: str, value: Any) -> None:
 
 
 def _key(node: Any, name: str, dotted: str) -> str | int:
-    """What a part of a dotted name stands for: a mapping's key, or the place in a list."""
+    """Return the mapping key or list index of one part of a dotted name."""
     if isinstance(node, dict):
         return name
     if isinstance(node, list):

@@ -154,28 +154,27 @@ def solve_upper(factor: Float, x: Float) -> None:
         x[i] /= factor[i, i]
 
 
-# Of tables of blocks they take all and a row: views of rows are counted, which takes longer than
-# the sums.
+# Kernels take an array of blocks and a row: a view of a row costs more than the sums.
 @inner_kernel
 def put_along(A: Float, row: int, x: Float, product: Float) -> None:
-    """A[row] x."""
+    """Write A[row] x to `product`."""
     for r in range(3):
         product[r] = A[row, r, 0] * x[0] + A[row, r, 1] * x[1] + A[row, r, 2] * x[2]
 
 
 @inner_kernel
 def add_along(A: Float, row: int, x: Float, total: Float) -> None:
-    """Add A[row] x."""
+    """Add A[row] x to `total`."""
     for r in range(3):
         total[r] += A[row, r, 0] * x[0] + A[row, r, 1] * x[1] + A[row, r, 2] * x[2]
 
 
 @inner_kernel
 def put_inverse(A: Float, inverse: Float) -> bool:
-    """Inverse of a symmetric positive definite A = L D L', of which the lower half is read.
+    """Write the inverse of a symmetric positive definite A = L D L'; read only its lower half.
 
     Returns:
-        False when A is not positive definite.
+        False if A is not positive definite.
     """
     positive, entries = _inverse_entries(A[0, 0], A[1, 0], A[1, 1], A[2, 0], A[2, 1], A[2, 2])
     inverse[0, 0], inverse[1, 1], inverse[2, 2] = entries[0], entries[2], entries[5]
@@ -187,9 +186,9 @@ def put_inverse(A: Float, inverse: Float) -> bool:
 
 @inner_kernel(error_model="numpy")
 def _inverse_entries(a00: Any, a10: Any, a11: Any, a20: Any, a21: Any, a22: Any) -> Any:
-    """Whether A = L D L' is positive definite, and the lower half of its inverse, row by row.
+    """Return if A = L D L' is positive definite, and the lower half of its inverse row by row.
 
-    Of one matrix, or in NumPy of as many as there are in arrays of entries.
+    In NumPy the entries may be arrays of many matrices.
     """
     l10, l20 = a10 / a00, a20 / a00
     d1 = a11 - l10 * a10
@@ -209,13 +208,13 @@ def _inverse_entries(a00: Any, a10: Any, a11: Any, a20: Any, a21: Any, a22: Any)
 
 
 def inverses(blocks: Float) -> Float:
-    """(N, D, D) inverses of symmetric positive definite blocks (N, D, D), D two or three.
+    """Invert symmetric positive definite blocks (N, D, D), where D is two or three.
 
     Raises:
-        LinAlgError: one is not positive definite.
+        LinAlgError: a block is not positive definite.
     """
     n, dimensions = blocks.shape[:2]
-    entries = np.zeros((6, n))  # the lower half of each, of two dimensions with a third by itself
+    entries = np.zeros((6, n))  # lower halves; blocks of two dimensions get a third one
     entries[5] = 1.0
     pairs = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2))
     for k, (r, q) in enumerate(pairs):

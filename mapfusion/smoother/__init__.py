@@ -1,5 +1,5 @@
-"""Batch smoother: one robot's whole log at once, its path and landmarks with all correlations.
+"""Batch smoother: maximum a posteriori path and landmarks of a whole log.
 
-In come a log, which landmark each observation is of, and a first guess of the path (FastSLAM gives
-both); out go the most probable path and landmarks, and the joint covariance of the landmarks.
+Input: a log, the landmark of each observation and an initial path (from FastSLAM). Output: path,
+landmarks and the joint covariance of the landmarks.
 """

@@ -1,15 +1,14 @@
 """Sparse Cholesky factorisation in skyline storage, and an ordering that keeps it sparse.
 
-Poses that saw no landmark in common have a zero between them. In such an order what is not zero
-lies near the diagonal, and a factor has no more than zeros before the first entry of each row (the
+The matrix has zero blocks for poses without a common landmark. A good order has all other blocks
+near the diagonal. The Cholesky factor has only zeros before the first entry of each row (the
 envelope: George and Liu 1981, "Computer Solution of Large Sparse Positive Definite Systems", ch.
-4). Orders are that of Cuthill and McKee (1969), those of searches like theirs that begin at other
-poses, spread over the log, and what comes of them when each pose is drawn to the mean of those that
-it has to do with; while nothing was seen again that of time is as good.
+4). Candidates are the order of Cuthill and McKee (1969), breadth-first searches from other poses,
+sweeps that move each pose to the mean place of its neighbours, and the order of time.
 
-A factor has no more than zeros before the first entry of each row (the envelope, see
-`envelope_order.py`). Rows are stored by blocks, each from the first entry of its rows on to its
-diagonal block, and the work is done by products of parts of them.
+The factor has only zeros before the first entry of each row (the envelope, see
+`envelope_order.py`). Rows are stored by blocks, from the first entry of the block to its diagonal
+block. The factorisation consists of dense matrix products of blocks.
 """
 
 from dataclasses import dataclass
@@ -23,18 +22,17 @@ from scipy.sparse.csgraph import breadth_first_order, reverse_cuthill_mckee
 
 from mapfusion.geometry.numerics import Float
 
-# Members that an order is sought from, and sweeps over the best of those: more make it better by a
-# tenth, and a factor with half the entries is worth some dozen milliseconds of search.
+# Number of breadth-first searches, and of sweeps over the best order. More make it hardly better.
 _BEGINS, _SWEEPS = 16, 4
 
 
 def envelope_order(group: np.ndarray, member: np.ndarray, n_members: int) -> np.ndarray:
-    """(n_members,) place of each in an order that has those of one group near each other.
+    """Return the place of each member in an order with related members close together.
 
     Args:
-        group: (N,) numbers of groups; each of its members has to do with all others of it.
-        member: (N,) who is in it.
-        n_members: neighbours by number have to do with each other, too.
+        group: group numbers, shape (N,); the members of a group are related.
+        member: the member in each of these groups, shape (N,).
+        n_members: number of members; successive members are related, too.
     """
     by_number = np.arange(n_members)
     if n_members < 2:
@@ -43,7 +41,7 @@ def envelope_order(group: np.ndarray, member: np.ndarray, n_members: int) -> np.
     starts, column = related.indptr[:-1], related.indices.astype(np.int64)
 
     def work(place: np.ndarray) -> int:
-        """What a factor costs: the squares of its rows' lengths."""
+        """Return the cost of a factor: the sum of squared row lengths."""
         return int(np.sum((place - np.minimum.reduceat(place[column], starts)) ** 2))
 
     begins = np.unique(np.linspace(0, n_members - 1, _BEGINS).round().astype(np.int64))
@@ -59,7 +57,7 @@ def envelope_order(group: np.ndarray, member: np.ndarray, n_members: int) -> np.
 
 
 def _related(group: np.ndarray, member: np.ndarray, n_members: int) -> csr_matrix:
-    """(n_members, n_members) ones where two have to do with each other, each with itself."""
+    """Return a matrix of ones for related members, including each with itself."""
     chain = np.arange(n_members - 1)
     n_groups = int(group.max(initial=-1)) + 1
     groups = np.concatenate([group, n_groups + chain, n_groups + chain])
@@ -72,14 +70,14 @@ def _related(group: np.ndarray, member: np.ndarray, n_members: int) -> csr_matri
 
 
 def _places(order: np.ndarray) -> np.ndarray:
-    """(n,) place of each member in an order (n,) of all members."""
+    """Return the place (n,) of each member in an order (n,) of all members."""
     place = np.empty(len(order), dtype=np.int64)
     place[order] = np.arange(len(order))
     return place
 
 
 def first_entries(group: np.ndarray, member: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """(n,) by place: the first place that each has to do with, its own if there is none before it.
+    """Return the first related place of each place, shape (n,); its own if there is none before.
 
     Groups and members are those of `envelope_order`, `place` (n,) is what it gave.
     """
@@ -91,19 +89,18 @@ def first_entries(group: np.ndarray, member: np.ndarray, place: np.ndarray) -> n
     return first
 
 
-# Rows and columns that are taken at once: enough for products of matrices to be at their speed, few
-# enough to follow the envelope.
+# Size of a block: large enough for fast matrix products, small enough to follow the envelope.
 _BLOCK = 48
-# LAPACK's own, without what SciPy looks at first: blocks are many and small.
+# LAPACK functions without SciPy's checks, because blocks are many and small.
 _cholesky, _inverted = get_lapack_funcs(("potrf", "trtri"), dtype=np.float64)
 
 
 @dataclass(frozen=True)
 class Envelope:
-    """Where the entries of the lower half of a matrix (n, n) are stored.
+    """Storage of the lower half of a matrix (n, n).
 
     Attributes:
-        first: (n,) the column of each row's first entry, or one before it.
+        first: column of each row's first entry, or an earlier one, shape (n,).
     """
 
     first: np.ndarray
@@ -113,26 +110,26 @@ class Envelope:
 
     @cached_property
     def blocks(self) -> list[slice]:
-        """The blocks of rows, and of columns."""
+        """Blocks of rows and of columns."""
         n = len(self)
         return [slice(begin, min(begin + _BLOCK, n)) for begin in range(0, n, _BLOCK)]
 
     @cached_property
     def starts(self) -> list[int]:
-        """Of each block of rows the block of columns in which their first entry lies."""
+        """Block of columns of the first entry of each block of rows."""
         return [int(self.first[rows].min()) // _BLOCK for rows in self.blocks]
 
     @cached_property
     def below(self) -> list[list[int]]:
-        """Of each block of columns the blocks of rows below the diagonal that reach it."""
+        """Blocks of rows below the diagonal with entries in each block of columns."""
         n = len(self.blocks)
         return [[i for i in range(j + 1, n) if self.starts[i] <= j] for j in range(n)]
 
     @cached_property
     def offset(self) -> np.ndarray:
-        """(n + 1,) the entry in row r and column c is stored at offset[r] + c; of n, their number.
+        """Offsets, shape (n + 1,): row r and column c are stored at offset[r] + c.
 
-        Those of a block on the diagonal are stored all.
+        offset[n] is the number of entries. Diagonal blocks are stored in full.
         """
         first_column = np.repeat(np.array(self.starts, np.int64) * _BLOCK, self._sizes)
         end = np.repeat(np.array([rows.stop for rows in self.blocks], np.int64), self._sizes)
@@ -144,18 +141,18 @@ class Envelope:
         return np.array([rows.stop - rows.start for rows in self.blocks], np.int64)
 
     def zeros(self) -> Float:
-        """Entries (E,) as they are stored, all zero."""
+        """Return zero entries, shape (E,)."""
         return np.zeros(self.offset[-1])
 
     def of(self, A: Float) -> Float:
-        """The entries (E,) of a matrix (n, n) in the envelope, of which the lower half is read."""
+        """Return the entries (E,) of a matrix (n, n); only its lower half is read."""
         entries = self.zeros()
         for rows, start, panel in self.panels(entries):
             panel[:] = A[rows, start : rows.stop]
         return entries
 
     def panels(self, entries: Float) -> list[tuple[slice, int, Float]]:
-        """Each block of rows, the first column stored of it, and its entries from there on."""
+        """Return each block of rows with its first stored column and its entries."""
         found = []
         for rows, start in zip(self.blocks, self.starts, strict=True):
             first, height = start * _BLOCK, rows.stop - rows.start
@@ -165,22 +162,22 @@ class Envelope:
         return found
 
     def where(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """(m, 3, 3) where blocks of three by three are stored, by their numbers (m,).
+        """Return where blocks of three by three are stored, shape (m, 3, 3).
 
-        No column's number is above the row's.
+        `rows` and `columns` (m,) are block numbers with column <= row.
         """
         each = np.arange(3)
         by_row = self.offset[3 * rows[:, None] + each]
         return by_row[:, :, None] + (3 * columns[:, None] + each)[:, None, :]
 
     def between(self, entries: Float, rows: np.ndarray, columns: np.ndarray) -> Float:
-        """(m, 3, 3) blocks of three by three of a symmetric matrix, by their numbers (m,)."""
+        """Return blocks (m, 3, 3) of a symmetric matrix by their block numbers (m,)."""
         found = entries[self.where(np.maximum(rows, columns), np.minimum(rows, columns))]
         return np.where((rows < columns)[:, None, None], np.swapaxes(found, 1, 2), found)
 
 
 class _Part(NamedTuple):
-    """Of a block of rows of L the columns before it, L there, and the inverse of its own block."""
+    """Block of rows of L: columns before it, L there, and the inverse of the diagonal block."""
 
     rows: slice
     before: slice
@@ -190,12 +187,12 @@ class _Part(NamedTuple):
 
 @dataclass(frozen=True)
 class Factor:
-    """The lower Cholesky factor L of a matrix (n, n).
+    """Lower Cholesky factor L of a matrix (n, n).
 
     Attributes:
-        envelope: of the matrix.
-        lower: entries of L; what lies above the diagonal means nothing.
-        inverses: of the blocks of L on the diagonal.
+        envelope: envelope of the matrix.
+        lower: entries of L; entries above the diagonal are undefined.
+        inverses: inverses of the diagonal blocks of L.
     """
 
     envelope: Envelope
@@ -206,34 +203,29 @@ class Factor:
         return len(self.envelope)
 
     def dense(self) -> Float:
-        """(n, n) L."""
+        """Return L, shape (n, n)."""
         found = np.zeros((len(self), len(self)))
         for rows, first, L in self.envelope.panels(self.lower):
             found[rows, first : rows.stop] = L
         return np.tril(found)
 
     def solve(self, right: np.ndarray) -> np.ndarray:
-        """L^-1 right (n,) or (n, m), in the precision of `right`."""
+        """Return L^-1 right, where `right` is (n,) or (n, m), in the precision of `right`."""
         x = right.copy()
         for rows, before, L, inverse in self._parts(right):
             x[rows] = inverse @ (x[rows] - L @ x[before])
         return x
 
     def solve_transposed(self, right: np.ndarray) -> np.ndarray:
-        """L'^-1 right (n,) or (n, m), in the precision of `right`."""
+        """Return L'^-1 right, where `right` is (n,) or (n, m), in the precision of `right`."""
         x = right.copy()
         for rows, before, L, inverse in reversed(self._parts(right)):
             x[rows] = inverse.T @ x[rows]
             x[before] -= L.T @ x[rows]
         return x
 
-    def solve_both_roughly(self, right: Float) -> Float:
-        """(L L')^-1 right (n,), in single precision: half as much to be read from memory."""
-        found = self.solve_transposed(self.solve(right.astype(np.float32)))
-        return found.astype(np.float64)
-
     def _parts(self, right: np.ndarray) -> list[_Part]:
-        """In the precision of `right`."""
+        """Return the blocks in the precision of `right`."""
         return self._single if right.dtype == np.float32 else self._double
 
     @cached_property
@@ -254,9 +246,9 @@ class Factor:
 
     @cached_property
     def inverse(self) -> Float:
-        """Entries of the inverse of L L'; those of the blocks on the diagonal are symmetric.
+        """Entries of the inverse of L L' in the envelope; diagonal blocks are symmetric.
 
-        From the last block of columns on (Takahashi et al. 1973).
+        Computed from the last block of columns to the first (Takahashi et al. 1973).
         """
         found = np.empty_like(self.lower)
         lower, panels = self.envelope.panels(self.lower), self.envelope.panels(found)
@@ -264,7 +256,7 @@ class Factor:
             (columns, first, _), inverse = lower[j], self.inverses[j]
             own = inverse.T @ inverse
             if below:
-                # of the rows from the next block on; zero where they do not reach these columns
+                # rows after this block; zero for rows without entries in these columns
                 follows = np.zeros((lower[below[-1]][0].stop - columns.stop, len(inverse)))
                 with_it = np.zeros_like(follows)
                 for i in below:
@@ -284,7 +276,7 @@ class Factor:
 
 
 def _of_columns(panel: tuple[slice, int, Float], columns: slice) -> tuple[slice, Float]:
-    """Where the rows of a panel lie after a block of columns, and their entries in it."""
+    """Return the rows of a panel relative to the end of a block of columns, and their entries."""
     rows, first, entries = panel
     return _after(rows, columns), entries[:, columns.start - first : columns.stop - first]
 
@@ -294,10 +286,14 @@ def _after(rows: slice, columns: slice) -> slice:
 
 
 def factor_in_envelope(entries: Float, envelope: Envelope) -> Factor:
-    """The Cholesky factor of a matrix by its entries, in their place.
+    """Factor a matrix in place.
+
+    Args:
+        entries: entries of the matrix, which are overwritten.
+        envelope: their envelope.
 
     Raises:
-        LinAlgError: it is not positive definite.
+        LinAlgError: the matrix is not positive definite.
     """
     panels, inverses = envelope.panels(entries), list[Float]()
     for j, below in enumerate(envelope.below):
@@ -313,7 +309,7 @@ def factor_in_envelope(entries: Float, envelope: Envelope) -> Factor:
                 left[:], failed = _cholesky(left, lower=1)
                 if failed:
                     raise np.linalg.LinAlgError("the matrix is not positive definite")
-                # many products with it are faster than as many times solving
+                # products with the inverse are faster than triangular solutions
                 inverses.append(_inverted(left, lower=1)[0])
             else:
                 left[:] = left @ inverses[j].T

@@ -1,21 +1,14 @@
 """Solution of the normal equations, and marginal covariances of poses and landmarks.
 
-It takes the fewer of them the nearer a preconditioner is to the matrix's inverse.
-
-Its matrix is large and has a factor; a product with it needs neither: it goes from the poses to the
-points that they saw, and back. From one step to the next the matrix changes little, so that with
-the factor of a step before a few products solve for a step.
-
 With L the factor of the poses' information, C the poses' blocks with the landmarks and A the
-landmarks' covariances if the path were known, the landmarks' joint covariance is A beside Y' Y with
-Y = L^-1 C A. It has as many columns as there are coordinates of landmarks; C A has few entries.
+landmarks' covariances for a known path, the landmarks' joint covariance is A + Y' Y with
+Y = L^-1 C A. Y is large and dense, but C A is sparse.
 
-Both are exact. With the landmarks gone a sparse system of the poses is left; with the poses gone,
-which are a chain, a dense one of the landmarks and tracks. The one that takes fewer products is
-solved. The first pose is the frame and no unknown.
+Eliminating landmarks and tracks leaves a sparse system of the poses. Eliminating the poses, which
+are a chain, leaves a dense system of landmarks and tracks. Both are exact; the system with fewer
+multiplications is solved. The first pose is the frame and is known.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -42,60 +35,14 @@ from mapfusion.smoother.schur_complement import (
 )
 
 
-def solved_by_products(
-    times: Callable[[Float], Float],
-    preconditioned: Callable[[Float], Float],
-    right: Float,
-    share: float,
-    most: int,
-) -> Float | None:
-    """The x that the positive definite matrix turns into `right`, both of any shape.
-
-    Args:
-        times: the matrix times an x.
-        preconditioned: about its inverse times a right side; positive definite, too.
-        right: what the product is to be.
-        share: of x that it may be off by, in the norm of the matrix.
-        most: products that are tried.
-
-    Returns:
-        x; None where it took more, or the matrix is not positive definite.
-    """
-    x, residual = np.zeros_like(right), right.copy()
-    news = direction = preconditioned(residual)
-    square = float(np.vdot(residual, news))
-    enough = share**2 * square
-    for _ in range(most):
-        if square <= enough:
-            return x
-        product = times(direction)
-        curvature = float(np.vdot(direction, product))
-        if not curvature > 0:
-            return None
-        x += square / curvature * direction
-        residual -= square / curvature * product
-        news, before = preconditioned(residual), square
-        square = float(np.vdot(residual, news))
-        direction = news + square / before * direction
-    return x if square <= enough else None
-
-
-# What a step may be off by, as a share of it, both in sigmas: what the last ones, of hundredths of
-# a sigma, leave of it is nothing, and they mend what those before left. As each leaves a third and
-# more for weights that follow it, to be closer makes no step needless.
-_OFF = 1e-2
-# A factor of its own costs as much as this many products and more.
-_MOST_PRODUCTS = 15
-
-
 @dataclass(frozen=True)
 class ReducedPoses:
-    """The equations of T poses, of which the first is known: its rows are zero.
+    """Equations of T poses. The first pose is known, so its rows are zero.
 
     Attributes:
         seen: the observations.
-        equations: all of them.
-        left: once the offsets are eliminated.
+        equations: the equations of poses, landmarks and offsets.
+        left: the equations after the offsets are eliminated.
     """
 
     seen: Sightings
@@ -103,23 +50,18 @@ class ReducedPoses:
     left: Reduced
 
     def gradient(self) -> Float:
-        """(T, 3)."""
-        still = np.zeros_like(self.equations.points.track_gradient)
-        return self._with_points(self.equations.pose_gradient, self.left, still)
-
-    def times(self, way: Float) -> Float:
-        """(T, 3) the matrix times a way (T, 3) of the poses."""
-        link, gained = self.equations.link, np.zeros_like(self.left.pull)
-        product = np.einsum("kij,kj->ki", self.equations.pose_block, way)
-        product[1:] += np.einsum("kij,kj->ki", link, way[:-1])
-        product[:-1] += np.einsum("kji,kj->ki", link, way[1:])
-        along = along_way(self.seen, self.equations.coupling, way)
-        unpulled = np.zeros_like(self.left.point_gradient)
-        still = self.left._replace(pull=gained, point_gradient=unpulled)
-        return self._with_points(product, still, along)
+        """Return the gradient, shape (T, 3)."""
+        equations = self.equations
+        still = np.zeros_like(equations.points.track_gradient)
+        moved = moved_points(self.seen, equations.points, self.left, still)
+        total = equations.pose_gradient + along_points(self.seen, equations.coupling, *moved)
+        total[0] = 0.0
+        return total
 
     def factor(self) -> Factor:
-        """Of the matrix without the first pose, the others in their order.
+        """Return the Cholesky factor of the matrix without the first pose.
+
+        Its rows are in the order of `Sightings.pose_place`.
 
         Raises:
             LinAlgError: the matrix is not positive definite.
@@ -131,44 +73,27 @@ class ReducedPoses:
         return factor_in_envelope(S, envelope)
 
     def solved(self, factor: Factor, right: Float) -> Float:
-        """(T, 3) what a matrix with this factor turns into `right` (T, 3)."""
-        solved = factor.solve_transposed(factor.solve(self._ordered(right)))
-        return self.by_frame(solved)
-
-    def solved_nearby(self, factor: Factor, right: Float) -> Float | None:
-        """(T, 3) what the matrix turns into `right` (T, 3), by a factor that is nearly its own.
-
-        None where that is too far off.
-        """
-
-        def roughly(rest: Float) -> Float:
-            return self.by_frame(factor.solve_both_roughly(self._ordered(rest)))
-
-        return solved_by_products(self.times, roughly, right, _OFF, _MOST_PRODUCTS)
-
-    def _ordered(self, of_poses: Float) -> Float:
-        """(3 (T - 1),) values (T, 3) of the unknown poses, in their order."""
-        ordered = np.empty((len(of_poses) - 1, 3))
-        ordered[self.seen.pose_place[1:] - 1] = of_poses[1:]
-        return ordered.ravel()
+        """Solve for x (T, 3) with the matrix of this factor and the right side (T, 3)."""
+        ordered = np.empty((len(right) - 1, 3))
+        ordered[self.seen.pose_place[1:] - 1] = right[1:]
+        return self.by_frame(factor.solve_transposed(factor.solve(ordered.ravel())))
 
     def by_frame(self, ordered: Float) -> Float:
-        """(T, 3) the same by frame; zero for the first pose."""
+        """Return the values (3 (T - 1),) of the ordered poses by frame (T, 3), zero for the first.
+
+        The order is that of the rows of `factor`.
+        """
         place = self.seen.pose_place
         found = np.zeros((len(place), 3))
         found[1:] = ordered.reshape(-1, 3)[place[1:] - 1]
         return found
 
-    def _with_points(self, of_poses: Float, left: Reduced, along: Float) -> Float:
-        """With what points add that follow the poses."""
-        moved = moved_points(self.seen, self.equations.points, left, along)
-        total = of_poses + along_points(self.seen, self.equations.coupling, *moved)
-        total[0] = 0.0
-        return total
-
 
 def _put_poses(S: Float, envelope: Envelope, place: np.ndarray, equations: NormalEquations) -> None:
-    """What odometry and the poses' own observations say, by the `place` of each unknown pose."""
+    """Write the blocks of odometry and of each pose's own observations into S.
+
+    `place` (T - 1,) is the row of each unknown pose.
+    """
     S[envelope.where(place, place)] = equations.pose_block[1:]
     after, before, link = place[1:], place[:-1], equations.link[1:]
     link = np.where((after > before)[:, None, None], link, np.swapaxes(link, 1, 2))
@@ -177,7 +102,7 @@ def _put_poses(S: Float, envelope: Envelope, place: np.ndarray, equations: Norma
 
 @dataclass(frozen=True)
 class PathErrors:
-    """Y (R, 3L), of the R coordinates of the unknown poses in their order.
+    """Y (R, 3L) for the R coordinates of the unknown poses in their order.
 
     Attributes:
         seen: the observations.
@@ -193,7 +118,7 @@ class PathErrors:
     def of(
         cls, seen: Sightings, equations: NormalEquations, own_m2: Float, factor: Factor
     ) -> "PathErrors":
-        """Of equations that are solved, the landmarks first: with their `own_m2` and the factor."""
+        """Return Y for equations whose landmarks are eliminated, with `own_m2` and the factor."""
         left = without_offsets(seen, equations.points)
         coupling = left_couplings(seen, equations.coupling, left)
         return cls(seen, factor, coupling @ own_m2[seen.landmark])
@@ -202,27 +127,27 @@ class PathErrors:
         return len(self.factor)
 
     def rows_by_all(self, rows: np.ndarray) -> Float:
-        """(R, r) columns of Y Y', those of `rows` (r,)."""
+        """Return the columns `rows` (r,) of Y Y', shape (R, r)."""
         chosen = np.zeros((len(self), len(rows)))
         chosen[rows, np.arange(len(rows))] = 1.0
         return self.gram(chosen)
 
     def gram(self, columns: Float) -> Float:
-        """Y Y' times columns (R, c), in single precision."""
+        """Return Y Y' times columns (R, c), computed in single precision."""
         moving = self._moving_roughly
         by_landmark = moving @ self.factor.solve_transposed(columns.astype(np.float32))
         return self.factor.solve(moving.T @ by_landmark).astype(np.float64)
 
     def spread(self, columns: Float) -> Float:
-        """(3L, c) Y' times columns (R, c)."""
+        """Return Y' times columns (R, c), shape (3L, c)."""
         return self._moving @ self.factor.solve_transposed(columns)
 
     def gathered(self, by_landmark: Float) -> Float:
-        """Return (R, c) Y times columns (3L, c)."""
+        """Return Y times columns (3L, c), shape (R, c)."""
         return self.factor.solve(self._moving.T @ by_landmark)
 
     def squares(self) -> Float:
-        """(L, 3, 3) blocks of Y' Y, each landmark's with itself."""
+        """Return the diagonal blocks of Y' Y, shape (L, 3, 3)."""
         total = np.zeros((self.seen.n_landmarks, 3, 3))
         covariance, offset = self.factor.inverse, self.factor.envelope.offset
         place = self.seen.unknown_place
@@ -231,7 +156,7 @@ class PathErrors:
 
     @cached_property
     def _moving(self) -> csr_array:
-        """(3L, R) A C', of which each observation is a block."""
+        """A C' with one block for each observation, shape (3L, R)."""
         place, each = self.seen.unknown_place, np.arange(3)
         known = place >= 0
         rows = 3 * self.seen.landmark[known, None] + each
@@ -242,7 +167,7 @@ class PathErrors:
 
     @cached_property
     def _moving_roughly(self) -> csr_array:
-        """The same in single precision."""
+        """A C' in single precision."""
         known = self._moving
         entries = known.data.astype(np.float32), known.indices, known.indptr
         return csr_array(entries, known.shape)
@@ -257,7 +182,7 @@ def _add_squares(
     Z: Float,
     total: Float,
 ) -> None:
-    """Of each landmark what, with its transpose, is moved' Z moved of all that saw it."""
+    """Write matrices whose sum with their transposes is moved' Z moved of each landmark."""
     of_pose = np.empty((3, 3))
     for j in range(len(starts) - 1):
         for i in range(starts[j], starts[j + 1]):
@@ -307,28 +232,27 @@ def _add_part(
 
 _GB = 1e9
 _ITEM = np.dtype(np.float64).itemsize
-# Arrays that are there at once. In the envelope: the factor of a step before with its inverse and
-# its copy in single precision, and those of the next. Of points: blocks with the poses as they are
-# made, in rows, solved, and LAPACK's copies; and the points' own.
-_FACTORS, _WIDE, _SQUARE = 5.5, 5.0, 6.0
+# Number of arrays in memory at the same time. In the envelope: factor and inverse of two successive
+# steps. Of the points: their blocks with the poses as built, in rows, solved and as LAPACK copies
+# them; and the points' own blocks.
+_FACTORS, _WIDE, _SQUARE = 4.0, 5.0, 6.0
 _BLOCK, _BLOCKS = 9, 12  # entries of a block of three by three; blocks of a pose, sighting, track
 _CONDENSED = 6.0  # arrays of the map's shared directions
 _BAND = 5  # below the diagonal of a chain of poses of three coordinates
 
 
 class Solution(NamedTuple):
-    """A step, and what the landmarks' joint covariance is: block diagonal plus common' common.
+    """Step and factors of the covariance.
 
     Attributes:
-        step: of the poses, the first one's zero, of the landmarks and of the offsets.
-        moved: how far the step moves what was eliminated last, in squared sigmas.
-        own_m2: (L, 3, 3) covariance of each landmark if the path were known.
-        offset_m2: (B, 3, 3) of each track's offset, likewise.
-        track_m2: (B, 3, 3) of each track's point, likewise.
-        factor: Cholesky factor of the information of what was eliminated last; None where
-            that of a step before was enough (`own_factor`).
-        landmarks_first: whether these are the poses, in the order of `pose_place` (else the offsets
-            and, after them, landmarks).
+        step: step of the poses (zero for the first), landmarks and offsets.
+        moved: squared length of the step of the reduced system, in sigmas.
+        own_m2: covariance of each landmark for a known path, shape (L, 3, 3).
+        offset_m2: covariance of each track's offset for a known path, shape (B, 3, 3).
+        track_m2: covariance of each track's point for a known path, shape (B, 3, 3).
+        factor: Cholesky factor of the reduced system.
+        landmarks_first: true if the reduced system is that of the poses, in the order of
+            `pose_place`; false if it is that of the offsets and, after them, the landmarks.
     """
 
     step: Estimate
@@ -336,34 +260,21 @@ class Solution(NamedTuple):
     own_m2: Float
     offset_m2: Float
     track_m2: Float
-    factor: Factor | None
+    factor: Factor
     landmarks_first: bool
 
 
-def solve(seen: Sightings, equations: NormalEquations, nearby: Factor | None = None) -> Solution:
-    """The step that solves the equations; by the factor of a step before, if that is near enough.
-
-    Args:
-        seen: the observations.
-        equations: what they say.
-        nearby: factor that was found for the same observations at a step before.
-    """
+def solve(seen: Sightings, equations: NormalEquations) -> Solution:
+    """Solve the equations of these observations for the next step."""
     if _is_landmarks_first(seen):
-        return _landmarks_first(seen, equations, nearby)
+        return _landmarks_first(seen, equations)
     return _poses_first(seen, equations)
-
-
-def own_factor(seen: Sightings, equations: NormalEquations, solution: Solution) -> Factor:
-    """The factor of the equations themselves; of a step that another one was enough for, anew."""
-    if solution.factor is not None:
-        return solution.factor
-    return ReducedPoses(seen, equations, without_offsets(seen, equations.points)).factor()
 
 
 def solve_points(
     seen: Sightings, at: Estimate, weights: Weights, stray_information: float
 ) -> tuple[Estimate, Points]:
-    """The step of landmarks and offsets that is left on a path, and what is known of them there."""
+    """Return the step of landmarks and offsets for a fixed path, and their covariances."""
     equations = point_equations(seen, at, weights, stray_information)
     left = without_offsets(seen, equations)
     still = np.zeros_like(equations.track_gradient)
@@ -374,8 +285,8 @@ def solve_points(
 def memory_bytes(seen: Sightings) -> float:
     """Return an upper bound of the memory that smoothing these observations takes, in bytes.
 
-    It counts what is there at once when most is: the matrices of `solve` and of the covariances,
-    the observations' and tracks' blocks, and the map's joint covariance.
+    It counts the matrices of `solve` and of the covariances, the blocks of observations and tracks,
+    and the map's joint covariance.
     """
     n_poses, n_landmarks = 3 * seen.order.n_poses, 3 * seen.n_landmarks
     if _is_landmarks_first(seen):
@@ -389,7 +300,7 @@ def memory_bytes(seen: Sightings) -> float:
 
 
 def require_memory(seen: Sightings, max_memory_gb: float) -> None:
-    """Raise MemoryError if smoothing these observations may take more."""
+    """Raise MemoryError if smoothing these observations may take more memory."""
     needed_gb = memory_bytes(seen) / _GB
     if needed_gb > max_memory_gb:
         raise MemoryError(f"may take {needed_gb:.2g} GB, more than it is given")
@@ -404,49 +315,45 @@ def _n_points(seen: Sightings) -> int:
 
 
 def shared_errors(seen: Sightings, equations: NormalEquations, solution: Solution) -> SharedErrors:
-    """Y (R, 3L): the landmarks' joint covariance is block diagonal of `own_m2` plus Y' Y."""
-    factor = own_factor(seen, equations, solution)
+    """Return Y (R, 3L); the landmarks' joint covariance is block diagonal of `own_m2` plus Y' Y."""
     if solution.landmarks_first:
-        return PathErrors.of(seen, equations, solution.own_m2, factor)
-    return KnownErrors(_beside_own(solution.own_m2, factor.dense()))
+        return PathErrors.of(seen, equations, solution.own_m2, solution.factor)
+    return KnownErrors(_beside_own(solution.own_m2, solution.factor.dense()))
 
 
 def pose_covariances(
     seen: Sightings, equations: NormalEquations, solution: Solution, frames: np.ndarray
 ) -> Float:
-    """(n, 3, 3) covariance of each pose of these frames (n,), none the first."""
+    """Return the covariances (n, 3, 3) of the poses of some frames (n,) after the first."""
     n_unknown, n = len(equations.pose_block) - 1, len(frames)
     chosen = np.zeros((n_unknown, 3, n, 3))
     row = seen.pose_place[frames] if solution.landmarks_first else frames
     chosen[row - 1, :, np.arange(n)] = np.eye(3)
     right, alone = chosen.reshape(3 * n_unknown, 3 * n), 0.0
-    if not solution.landmarks_first:  # the errors of the path if all points were known, and theirs
+    if (
+        not solution.landmarks_first
+    ):  # errors of the path for known points, and errors from the points
         solved = scipy.linalg.cho_solve_banded((chain_factor(equations), True), right)
         right, alone = pose_point_blocks(seen, equations)[0].T @ solved, right.T @ solved
-    root = own_factor(seen, equations, solution).solve(right)
+    root = solution.factor.solve(right)
     return (root.T @ root + alone).reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
 
 
 def _beside_own(own_m2: Float, lower: Float) -> Float:
-    """Y (3L, 3L) from the landmarks' information: what the path's errors add to `own_m2`."""
+    """Return Y (3L, 3L) from the factor of the landmarks' information."""
     n, each = len(own_m2), np.arange(len(own_m2))
-    lower = lower[-3 * n :, -3 * n :]  # the last rows are that of what is left
+    lower = lower[-3 * n :, -3 * n :]  # landmarks are last
     joint = scipy.linalg.cho_solve((lower, True), np.eye(3 * n), check_finite=False)
     joint.reshape(n, 3, n, 3)[each, :, each, :] -= own_m2
     variance, direction = np.linalg.eigh(joint)
     return (np.sqrt(np.maximum(variance, 0.0)) * direction).T[::-1]
 
 
-def _landmarks_first(
-    seen: Sightings, equations: NormalEquations, nearby: Factor | None = None
-) -> Solution:
+def _landmarks_first(seen: Sightings, equations: NormalEquations) -> Solution:
     left = without_offsets(seen, equations.points)
-    poses, factor = ReducedPoses(seen, equations, left), None
-    gradient = poses.gradient()
-    way = None if nearby is None else poses.solved_nearby(nearby, -gradient)
-    if way is None:
-        factor = poses.factor()
-        way = poses.solved(factor, -gradient)
+    poses = ReducedPoses(seen, equations, left)
+    gradient, factor = poses.gradient(), poses.factor()
+    way = poses.solved(factor, -gradient)
     along = along_way(seen, equations.coupling, way)
     step = Estimate(way, *moved_points(seen, equations.points, left, along))
     moved, known = -float(np.vdot(gradient, way)), known_points(seen, left)
@@ -476,7 +383,7 @@ def _poses_first(seen: Sightings, equations: NormalEquations) -> Solution:
 
 
 def pose_point_blocks(seen: Sightings, equations: NormalEquations) -> tuple[Float, Float, Float]:
-    """Of the offsets and, after them, the landmarks: block with the poses, own block, gradient."""
+    """Return the points' block with the poses, their own block and gradient; offsets come first."""
     strays, n_poses = seen.strays, len(equations.pose_block)
     row, stray = strays[seen.track], np.cumsum(strays) - 1
     n, n_points = np.count_nonzero(strays), np.count_nonzero(strays) + seen.n_landmarks
@@ -518,7 +425,7 @@ def chain_factor(equations: NormalEquations) -> Float:
 
 
 def _regular(seen: Sightings, point_block: Float) -> Float:
-    """The landmarks' blocks; in planar data, which say nothing of z, it has a block of its own."""
+    """Return the landmarks' blocks; in planar data z, which is not observed, has information 1."""
     if seen.n_dimensions == 3:
         return point_block
     regular = point_block.copy()

@@ -1,8 +1,8 @@
 """Joint smoothing of several robots' logs that share landmarks.
 
-The logs are put one after the other. Between the last frame of one and the first of the next the
-odometry says nothing, so where a robot began is only known by what it saw; the first robot's first
-pose is the frame.
+The logs are concatenated. The odometry between the last frame of one log and the first frame of the
+next is unknown, so only observations determine where a robot began. The frame is the first pose of
+the first robot.
 """
 
 from collections.abc import Sequence
@@ -17,21 +17,22 @@ from mapfusion.robot_log import NO_TRACK, Observations, RobotLog
 from mapfusion.smoother.elimination import pose_covariances, require_memory
 from mapfusion.smoother.noise_estimation import AS_STATED, settled_with_levels
 from mapfusion.smoother.normal_equations import Estimate, first_points
-from mapfusion.smoother.optimizer import Problem, factored, settled
+from mapfusion.smoother.optimizer import Problem, settled
 from mapfusion.smoother.problem import sightings_of
 from mapfusion.smoother.smooth import Smoothed, SmootherParameters
 
 
 @dataclass(frozen=True)
 class Recording:
-    """A robot's log, and what is known of it.
+    """Log of a robot with data association and path.
 
     Attributes:
         log: T frames with N observations.
-        landmark: (N,) `source_observation` of the map's landmark that each observation is of;
+        landmark: `source_observation` of the map's landmark for each observation, shape (N,);
             negative for none.
-        path: (T, 3) a good guess, as of the smoother; its first pose is the map's frame.
-        parameters: of the smoother.
+        path: approximate path, shape (T, 3), for example smoothed; its first pose is the frame of
+            the map.
+        parameters: parameters of the smoother.
     """
 
     log: RobotLog
@@ -44,19 +45,19 @@ class Recording:
         require_shape("path", self.path, (len(self.log), 3))
 
 
-_NOTHING = np.zeros((1, 3))  # what odometry says of the way from one robot's end to another's start
+_NOTHING = np.zeros((1, 3))  # information of the motion between two logs
 
 
 @dataclass(frozen=True)
 class SmoothedTogether:
-    """What K logs say, all at once, in the frame of the first robot's first pose.
+    """Result of smoothing K logs, in the frame of the first robot's first pose.
 
     Attributes:
-        smoothed: poses of one log after the other, points and their joint covariance.
-        points: (L,) their numbers, as they were given.
-        T_first_robot: (K, 3) first pose of each robot.
-        motion_covariance: (K, 3, 3) theirs; zero for the first.
-        paths: (T_k, 3) of each robot.
+        smoothed: poses of all logs, points and their joint covariance.
+        points: number of each point as given, shape (L,).
+        T_first_robot: first pose of each robot, shape (K, 3).
+        motion_covariance: covariances of the first poses, shape (K, 3, 3); zero for the first.
+        paths: path of each robot, shape (T_k, 3).
     """
 
     smoothed: Smoothed
@@ -72,19 +73,17 @@ def smooth_together(
     T_first_robot: Float,
     max_memory_gb: float,
 ) -> SmoothedTogether:
-    """The most probable paths and points of K robots whose tracks stray and wheels err alike.
-
-    It starts near where it ends, so there is no round of thinking the observations worse.
+    """Compute the most probable paths and points of K robots with equal noise levels.
 
     Args:
-        recordings: K of them; `stray_m` is that of the first.
-        points: of each, (N_k,) which point each observation is of, whoever saw it; negative for
-            none.
-        T_first_robot: (K, 3) where the robots' frames lie in the first one's, to start from.
-        max_memory_gb: smoothing is refused where it may take more.
+        recordings: K recordings; `stray_m` is that of the first.
+        points: point number of each observation of each log, shape (N_k,); the same number in two
+            logs is the same point; negative for none.
+        T_first_robot: initial poses of the robots' frames in the first one, shape (K, 3).
+        max_memory_gb: smoothing that may take more memory is refused.
 
     Raises:
-        LinAlgError: nothing says where a robot is.
+        LinAlgError: the pose of a robot is not determined.
         MemoryError: it may take more than `max_memory_gb`.
     """
     log, point = _one_log([each.log for each in recordings]), np.concatenate(points)
@@ -98,7 +97,7 @@ def smooth_together(
             for T, each in zip(T_first_robot, recordings, strict=True)
         ]
     )
-    path[0] = IDENTITY  # but for rounding it is that already
+    path[0] = IDENTITY  # removes rounding errors
     information = [
         np.concatenate([each.parameters.odometry_information(each.log), _NOTHING])
         for each in recordings
@@ -110,7 +109,7 @@ def smooth_together(
         end, levels = settled_with_levels(problem, start)
     else:
         end, levels = settled(problem, start), AS_STATED
-    end, covariance = factored(end), np.zeros((len(starts), 3, 3))
+    covariance = np.zeros((len(starts), 3, 3))
     covariance[1:] = pose_covariances(seen, end.equations, end.solution, starts[1:])
     names = point[seen.row[seen.starts[:-1]]]
     paths = tuple(np.split(end.estimate.path, starts[1:]))
@@ -121,7 +120,7 @@ def smooth_together(
 
 
 def _one_log(logs: Sequence[RobotLog]) -> RobotLog:
-    """One after the other; no two have a track in common."""
+    """Concatenate the logs; they have no common tracks."""
     n_before = np.cumsum([0, *(len(log) for log in logs[:-1])])
     tracks, first_free = [], 0
     for log in logs:

@@ -4,44 +4,40 @@ With d = D x - u and the poses' information H, landmarks eliminated, the disturb
 covariance D H^-1 D'. With the poses gone first, H is a chain C less a matrix of low rank, so
 H^-1 = C^-1 + X K^-1 X' with X = C^-1 B and K the landmarks' information (Woodbury).
 
-The variance of a disturbance is a sum of levels, each times what the robot moved by: v = sum q_j
-a_j. With the disturbances' means d and variances C given all observations, a level is right where
+The variance of a disturbance is a sum of levels times amounts of motion: v = sum q_j a_j. With the
+posterior means d and variances C of the disturbances, the stationary point is
 
     sum of s_j d^2 / v = sum of s_j (1 - C / v),      s_j = q_j a_j / v,
 
-the share of it in v: what is found, squared and in sigmas, is as much as the observations can tell.
-The right side counts the disturbances that they do tell. Each round multiplies a level by the ratio
-of the two (MacKay 1992, "Bayesian interpolation"), which ends where the marginal
-likelihood is stationary, in far fewer rounds than EM.
+where s_j is the share of level j in v. The right side counts the disturbances that observations
+determine. Each round multiplies a level by the ratio of both sides (MacKay 1992, "Bayesian
+interpolation"), which converges in far fewer rounds than EM.
 
-A sensor states its errors for any texture and any distance, and with what lasts while a track does.
-What lasts is in the tracks' offsets here; the rest differs from one sighting to the next, and the
-log tells how much it is. Of squared Mahalanobis distances s of the observations from where they
-should be, each of n coordinates, with the weights w that gross ones lose, the level q is
+Stated errors of a sensor include errors that are constant along a track. Here the tracks' offsets
+model the constant part, and the level is that of the rest. With squared Mahalanobis distances s of
+the residuals in n coordinates and robust weights w, the level q is
 
     q = sum of w s / sum of (n - c),
 
-c what of an observation's coordinates went into its track's point: the same that tells the levels
-of the odometry (MacKay 1992; `odometry_levels.py`). Without tracks nobody can tell what lasts from
-what does not, and what is stated holds.
+where c is the number of an observation's coordinates that determine its track's point (MacKay 1992;
+`odometry_levels.py`). Without tracks the level cannot be estimated and is 1.
 
-What is stated of an odometry has to hold for any floor and any turn; on one drive wheels may slip
-sideways by a fifth of it. Where a robot saw little the path is as sure as its odometry, and so are
-maps that are laid over each other by what was seen at the two ends. With the disturbances' means d
-and variances C given all observations, and v as stated, the variances are v_j q_j along axis j:
+Stated errors of an odometry have to hold for any floor, and on one drive they may be much smaller
+or larger. Let d be the posterior means and C the posterior variances of the disturbances, and v the
+stated variances. The variances are v_j q_j along axis j:
 
     sum of d^2 / v_j = q_j sum of (1 - C / (v_j q_j)),
 
-the level q_j under which what was smoothed is most likely (MacKay 1992; `noise_levels.py`).
+where q_j is the level of maximum marginal likelihood (MacKay 1992; `noise_levels.py`).
 
-The variances C take a factor of the poses' information and its inverse, the means d nothing. So
-levels follow each step with C as it was told once, or nearly: of a disturbance that observations
-tell with information J whatever the others are, the share C / v that is left untold is
+The variances C need the inverse of the poses' information, the means d do not. So levels follow
+each step with C from an earlier step. If observations determine a disturbance with information J,
+the share C / v that remains unknown is
 
     u = 1 / (1 + J v q),    so that under other levels    1 / u - 1    is as many times as much.
 
-Odometry and observations are smoothed with what they state, the levels follow from what was found,
-and again, until these change no more.
+A level is a factor on the stated variances. The iteration starts from the stated noise and
+alternates between steps and new levels until neither changes.
 """
 
 from collections.abc import Sequence
@@ -54,7 +50,7 @@ from scipy.optimize import root_scalar
 
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.geometry.numerics import Float, kernel
-from mapfusion.smoother.elimination import chain_factor, own_factor, pose_point_blocks, solve_points
+from mapfusion.smoother.elimination import chain_factor, pose_point_blocks, solve_points
 from mapfusion.smoother.normal_equations import (
     Estimate,
     Weights,
@@ -69,25 +65,24 @@ from mapfusion.smoother.optimizer import (
     CONVERGED,
     Problem,
     Settled,
-    factored,
     finished,
     followed,
     solved,
     stepped,
-    stretched,
 )
 from mapfusion.smoother.problem import Sightings
 from mapfusion.smoother.robust_loss import NO_TAILS, Tails, fitted_dof, student_weights, unweighted
 
 
 class MotionPosterior(NamedTuple):
-    """Of the increments after the first, T - 1 of them.
+    """Posterior of the T - 1 disturbances after the first frame.
 
     Attributes:
-        mean: (T - 1, 3) the disturbances on the smoothed path.
-        variance: (T - 1, 3) theirs.
-        constants_information: (C, C) of constants that the increments depend on, all else unknown.
-        constants_gradient: (C,) of their log likelihood.
+        mean: disturbances on the smoothed path, shape (T - 1, 3).
+        variance: their variances, shape (T - 1, 3).
+        constants_information: marginal information of constants that the increments depend on,
+            shape (C, C).
+        constants_gradient: gradient of their log likelihood, shape (C,).
     """
 
     mean: Float
@@ -99,13 +94,13 @@ class MotionPosterior(NamedTuple):
 def motion_posterior(
     end: Settled, odometry: Float, information: Float, by_constants: Float
 ) -> MotionPosterior:
-    """Disturbances given the observations, and what they tell of constants.
+    """Return the posterior of the disturbances and of constants.
 
     Args:
-        end: where smoothing ended.
-        odometry: (T, 3) increments, as they were smoothed.
-        information: (T - 1, 3) theirs after the first.
-        by_constants: (T - 1, 3, C) how the increments after the first change with the constants.
+        end: the smoothed state.
+        odometry: increments that were smoothed, shape (T, 3).
+        information: information of the increments after the first, shape (T - 1, 3).
+        by_constants: derivatives of these increments by the constants, shape (T - 1, 3, C).
     """
     path, n = end.estimate.path, len(odometry) - 1
     factor, spread = _covariance_factors(end)
@@ -124,7 +119,7 @@ def motion_posterior(
 
 
 def _covariance_factors(end: Settled) -> tuple[Float, Float]:
-    """C's factor, and what is to be added to C^-1: X K^-1 X' as a product of columns."""
+    """Return the factor of C, and columns whose products are X K^-1 X'."""
     factor = chain_factor(end.equations)
     B, K, _ = pose_point_blocks(end.seen, end.equations)
     X = scipy.linalg.cho_solve_banded((factor, True), B, check_finite=False)
@@ -133,7 +128,7 @@ def _covariance_factors(end: Settled) -> tuple[Float, Float]:
 
 
 def disturbance_variances(end: Settled) -> Float:
-    """(T - 1, 3) of the disturbances, whatever was eliminated first."""
+    """Return the variances of the disturbances, shape (T - 1, 3)."""
     before, after = disturbance_jacobians(end.estimate.path)
     if end.solution.landmarks_first:
         return _from_poses(end, before, after)
@@ -143,8 +138,8 @@ def disturbance_variances(end: Settled) -> Float:
 
 
 def _from_poses(end: Settled, before: Float, after: Float) -> Float:
-    """From the inverse of the poses' information, in their order."""
-    factor = own_factor(end.seen, end.equations, end.solution)
+    """Return the variances from the inverse of the poses' information."""
+    factor = end.solution.factor
     Z, between = factor.inverse, factor.envelope.between
     place = end.seen.pose_place[1:] - 1
     own, link = between(Z, place, place), between(Z, place[:-1], place[1:])
@@ -152,7 +147,7 @@ def _from_poses(end: Settled, before: Float, after: Float) -> Float:
 
 
 def _difference(before: Float, after: Float, of_poses: Float) -> Float:
-    """D of columns (3 (T - 1), R) of the poses but the first: (T - 1, 3, R)."""
+    """Return D times columns (3 (T - 1), R) of the unknown poses, shape (T - 1, 3, R)."""
     blocks = of_poses.reshape(len(after), 3, -1)
     made = after @ blocks
     made[1:] += before[1:] @ blocks[:-1]
@@ -160,14 +155,14 @@ def _difference(before: Float, after: Float, of_poses: Float) -> Float:
 
 
 def _transposed_difference(before: Float, after: Float, of_increments: Float) -> Float:
-    """D' of columns (T - 1, 3, C): (3 (T - 1), C)."""
+    """Return D' times columns (T - 1, 3, C), shape (3 (T - 1), C)."""
     made = np.swapaxes(after, 1, 2) @ of_increments
     made[:-1] += np.swapaxes(before[1:], 1, 2) @ of_increments[1:]
     return made.reshape(-1, of_increments.shape[2])
 
 
 def _of_differences(before: Float, after: Float, own: Float, link: Float) -> Float:
-    """(T - 1, 3) variances of D x from covariances of the poses and of each with the next."""
+    """Return the variances (T - 1, 3) of D x from the covariances of poses and successive pairs."""
     made = np.einsum("kij,kjl,kil->ki", after, own, after)
     made[1:] += np.einsum("kij,kjl,kil->ki", before[1:], own[:-1], before[1:])
     made[1:] += 2 * np.einsum("kij,kjl,kil->ki", before[1:], link, after[1:])
@@ -175,7 +170,7 @@ def _of_differences(before: Float, after: Float, own: Float, link: Float) -> Flo
 
 
 def _chain_covariances(factor: Float, n: int) -> tuple[Float, Float]:
-    """(n, 3, 3) covariances of a chain of n poses, (n - 1, 3, 3) of each with the next."""
+    """Return the covariances (n, 3, 3) of a chain and (n - 1, 3, 3) of successive poses."""
     diagonal, below = np.zeros((n, 3, 3)), np.zeros((max(n - 1, 0), 3, 3))
     for r in range(3):
         for q in range(3):
@@ -189,7 +184,7 @@ def _chain_covariances(factor: Float, n: int) -> tuple[Float, Float]:
 
 @kernel
 def _selected_inverse(diagonal: Float, below: Float, own: Float, link: Float) -> None:
-    """The blocks of the inverse on and beside the diagonal (Takahashi et al. 1973)."""
+    """Write the blocks of the inverse on and beside the diagonal (Takahashi et al. 1973)."""
     for k in range(len(diagonal) - 1, -1, -1):
         inverse = np.linalg.inv(diagonal[k])
         own[k] = inverse.T @ inverse
@@ -200,22 +195,22 @@ def _selected_inverse(diagonal: Float, below: Float, own: Float, link: Float) ->
 
 
 LEVELS = ("translation_m_per_sqrt_m", "rotation_rad_per_sqrt_m", "rotation_rad_per_sqrt_rad")
-# A round changes a level's square by no more than this: far off, the counts say too little.
+# Largest factor on a level's square in one round; the counts are inaccurate far from the solution.
 _MOST_CHANGE = 4.0
-# Below, a level is nothing to the filter, and its share can no longer be told from none.
+# Smaller levels have no effect in the filter, and their shares cannot be estimated.
 _LEAST_LEVEL = 1e-4
-# Disturbances that have to be told before a level is: of fewer its relative error is above 0.3.
+# Number of determined disturbances that a level needs; with fewer its relative error exceeds 0.3.
 LEAST_DISTURBANCES = 5.0
 
 
 class Told(NamedTuple):
-    """What a smoothed log tells of the levels, in the order of `LEVELS`.
+    """Statistics of a smoothed log for the levels, in the order of `LEVELS`.
 
     Attributes:
-        found: (3,) left sides: squares, in sigmas.
-        known: (3,) right sides: disturbances that the observations tell.
-        information: (3, 3) of the levels' logarithms: of each disturbance, 2 k^2 s_i s_j with the
-            share k = 1 - C / v of it that the observations tell.
+        found: left sides, squares in sigmas, shape (3,).
+        known: right sides, numbers of determined disturbances, shape (3,).
+        information: information of the levels' logarithms, shape (3, 3): the sum of 2 k^2 s_i s_j
+            over the disturbances, with k = 1 - C / v.
     """
 
     found: Float
@@ -224,12 +219,12 @@ class Told(NamedTuple):
 
 
 def pooled(of_each: Sequence[Told]) -> Told:
-    """What several logs tell together."""
+    """Add the statistics of several logs."""
     return Told(*(np.sum(np.stack(values), axis=0) for values in zip(*of_each, strict=True)))
 
 
 def plain(motion: MotionNoise) -> MotionNoise:
-    """Random walks alone, alike along and across: systematic errors are estimated, not covered."""
+    """Return the noise without systematic errors, with equal levels along and across."""
     across = motion.translation_m_per_sqrt_m
     return replace(
         motion,
@@ -243,13 +238,13 @@ def plain(motion: MotionNoise) -> MotionNoise:
 def told(
     posterior: MotionPosterior, odometry: Float, information: Float, motion: MotionNoise
 ) -> Told:
-    """What the disturbances of a log tell.
+    """Return the statistics of a log's disturbances.
 
     Args:
-        posterior: the disturbances.
-        odometry: (T, 3) increments.
-        information: (T - 1, 3) that they were smoothed with.
-        motion: the levels that it came from.
+        posterior: posterior of the disturbances.
+        odometry: increments, shape (T, 3).
+        information: information that they were smoothed with, shape (T - 1, 3).
+        motion: the levels of this information.
     """
     distance, angle = np.hypot(odometry[1:, 0], odometry[1:, 1]), np.abs(odometry[1:, 2])
     amounts = np.stack([distance, distance, angle], axis=1)
@@ -268,7 +263,7 @@ def told(
 
 
 def updated(motion: MotionNoise, of_all: Told) -> MotionNoise:
-    """The levels after a round; those that nothing is told about stay as they are."""
+    """Return the levels after a round; levels without information do not change."""
     levels = {}
     for name, found, known in zip(LEVELS, of_all.found, of_all.known, strict=True):
         before, ratio = getattr(motion, name), found / max(known, LEAST_DISTURBANCES)
@@ -281,30 +276,30 @@ def updated(motion: MotionNoise, of_all: Told) -> MotionNoise:
 
 
 def relative_errors(of_all: Told) -> Float:
-    """(3,) standard errors of the levels, as shares of them; 1 of what nothing is told about."""
+    """Return the relative standard errors of the levels, shape (3,); 1 without information."""
     return np.sqrt(np.diag(np.linalg.inv(of_all.information + np.eye(3))))
 
 
-# Coordinates that have to be told before a level is taken from them: a standard deviation is then
-# known to a tenth of itself, 1 / sqrt(2 n).
+# Number of coordinates that a level needs. The relative error of a standard deviation,
+# 1 / sqrt(2 n), is then a tenth.
 LEAST_COORDINATES = 50.0
-# Observations that agree to the last digit, as simulated without noise, have a level of zero. None
-# is taken to be closer, in m, than this: a tenth of what holds a robot that stands still.
+# Smallest standard deviation of an observation, in m: a tenth of that of a robot that stands still.
+# Without it observations without noise would have the level zero.
 _LEAST_M = 1e-5
 
 
 def told_observation_level(end: Settled, level: float) -> float:
-    """The level q of the stated covariances of observations on tracks that stray.
+    """Return the level q of observations on tracks with offsets.
 
-    What is gross is so beside what is stated, or found if that is more: tails that are fitted on
-    ever smaller levels grow heavier with each, and call gross what any sensor does at times.
+    Residuals are gross relative to the stated errors, or to the estimated ones if these are larger.
+    Tails that are fitted at ever smaller levels would become heavier each time.
 
     Args:
-        end: where steps ended.
-        level: that the stated covariances were multiplied by.
+        end: the current state.
+        level: the current factor on the stated covariances.
 
     Returns:
-        q; 1 where fewer than `LEAST_TOLD` coordinates are told.
+        q; 1 if it depends on fewer than `LEAST_TOLD` coordinates.
     """
     return _level(end.seen, end.estimate, end.weights, end.tails, end.solution.track_m2, level)
 
@@ -312,7 +307,7 @@ def told_observation_level(end: Settled, level: float) -> float:
 def first_observation_level(
     problem: Problem, at: Estimate, weights: Weights, tails: Tails
 ) -> float:
-    """The level q of what is stated, before any step from an estimate."""
+    """Return the level q before the first step from an estimate."""
     _, known = solve_points(problem.seen, at, weights, problem.stray_information)
     return _level(problem.seen, at, weights, tails, known.track_m2, 1.0)
 
@@ -335,16 +330,16 @@ def _level(
     return max(float(level * np.sum(found * square) / known), least)
 
 
-_NONE_TOLD = 1e-9  # disturbances; fewer are none, but for rounding
-_LEVEL_TO = 1e-6  # share of itself that a level is solved to, far below its own error
+_NONE_TOLD = 1e-9  # disturbances; fewer are rounding errors
+_LEVEL_TO = 1e-6  # relative tolerance of a level, far below its statistical error
 
 
 class Untold(NamedTuple):
-    """What observations leave open of disturbances, under some levels.
+    """Posterior shares of the disturbances' variances.
 
     Attributes:
-        share: (T - 1, 3) of their variances; 1 where nothing is said of them.
-        levels: (3,) that the stated variances were multiplied by.
+        share: posterior over prior variance, shape (T - 1, 3); 1 without any observation.
+        levels: levels of the prior variances, shape (3,).
     """
 
     share: Float
@@ -352,14 +347,14 @@ class Untold(NamedTuple):
 
     @classmethod
     def of(cls, problem: Problem, end: Settled, levels: Float) -> "Untold":
-        """Where steps ended under these levels, those of the problem being as stated."""
+        """Return the shares for a state with these levels; `problem` is as stated."""
         information = information_under(problem.information, levels)
         share = np.clip(disturbance_variances(end) * information, 0, 1)
-        # nothing is said of the way from one robot's log to another's
+        # the motion from one robot's log to the next is unknown
         return cls(np.where(problem.information > 0, share, 1.0), levels)
 
     def known(self, levels: Float) -> Float:
-        """Return how many disturbances (3,) are told under other levels, by each axis."""
+        """Return the number of disturbances that observations determine, by axis, shape (3,)."""
         return np.array([self._known(axis, level) for axis, level in enumerate(levels)])
 
     def _known(self, axis: int, level: float) -> float:
@@ -369,15 +364,14 @@ class Untold(NamedTuple):
     def told_levels(self, problem: Problem, path: Float, levels: Float) -> Float:
         """Return the levels (3,) of the variances along, across and in the heading.
 
-        Where fewer than `LEAST_TOLD` disturbances are told, those missing count as found at the
-        stated variance, as under a scaled inverse chi-square prior. So a level is as stated where
-        nothing is told. It cannot fall below the level at which the noise of `LEAST_TOLD`
-        disturbances can still be told from none, which bounds the odometry's information.
+        If fewer than `LEAST_TOLD` disturbances are determined, the missing ones count with the
+        stated variance, as under a scaled inverse chi-square prior. So a level is 1 without
+        information. It has a lower limit, which bounds the odometry's information.
 
         Args:
-            problem: with the odometry's information as stated.
-            path: (T, 3) as it was found.
-            levels: (3,) under which it was found.
+            problem: problem with the stated information of the odometry.
+            path: current path, shape (T, 3).
+            levels: current levels, shape (3,).
         """
         found = np.sum(disturbances(path, problem.odometry) ** 2 * problem.information, axis=0)
         told = found / np.maximum(self.known(levels), _NONE_TOLD)
@@ -385,10 +379,10 @@ class Untold(NamedTuple):
         return np.array([self._with_missing(axis, level) for axis, level in enumerate(told)])
 
     def _with_missing(self, axis: int, told: float) -> float:
-        """Return the level q of an axis where what is told says `told`.
+        """Return the level q of an axis with the estimate `told` and the missing disturbances.
 
         q (known(q) + missing(q)) = told known(q) + missing(q) has its root between `told` and 1.
-        It is solved for q on both sides: to repeat q = f(q) would end in a cycle of two levels.
+        A root finder solves it, because the iteration q = f(q) may oscillate.
         """
 
         def excess(level: float) -> float:
@@ -403,26 +397,24 @@ class Untold(NamedTuple):
         return float(found.root)
 
 
-# Where steps end the odometry's levels are told anew, until no standard deviation is off by more
-# than this share from what it was or was once before: those of motions that are hardly told may
-# come and go.
-_SETTLED = 0.05
-# They are told first where the next step may move the path by so much, in squared sigmas a
-# coordinate: what observations leave open of it changes little by that.
+# When the steps have converged the odometry's levels are computed again, with new covariances. The
+# iteration ends if every standard deviation changes by less than this share. It also ends if the
+# levels return to an earlier value, because levels with little information may oscillate.
+_SETTLED = 0.01
+# The odometry's levels are computed first when the next step moves the path by less than this, in
+# squared sigmas a coordinate. The covariances change little after that.
 _NEAR = 1.0
-# Steps are stretched where each moves the path by less.
-_CLOSE = 1e-3
 # The last step changes the observations' variances by no more than this share.
 _FOLLOWED = 2e-3
 _MOST_STEPS = 100
 
 
 class Levels(NamedTuple):
-    """Factors on stated variances; 1 where too little is told.
+    """Factors on the stated variances; 1 if the log has too little information.
 
     Attributes:
-        odometry: (3,) along, across and in the heading.
-        observation: of observations on tracks.
+        odometry: factors along, across and in the heading, shape (3,).
+        observation: factor for observations on tracks.
     """
 
     odometry: Float
@@ -439,42 +431,48 @@ def settled_with_levels(
     tails: Tails = NO_TAILS,
     odometry: Float = AS_STATED.odometry,
 ) -> tuple[Settled, Levels]:
-    """Where steps end under the levels that the log tells, for the rest as `settled`.
+    """Take steps until the estimate and the noise levels converge (see `settled`).
 
-    The observations' costs little to tell and follows each step, as the tails do. The odometry's
-    takes the variances of what was found: these are told once steps are near their end, levels
-    follow each step from there on, and where steps end it shows whether they are right. The factor
-    and its inverse that this takes are those of the covariances. `odometry` (3,) are its levels to
-    begin with.
+    The observations' level is cheap and is updated after each step, as the tails are. The
+    odometry's levels need the covariances of the motions, which are computed when steps are close
+    to convergence. The levels then follow each step. New covariances at the end of the steps show
+    if the levels are right.
+
+    Args:
+        problem: the least-squares problem, with noise as stated.
+        at: the initial estimate.
+        weights: the initial robust weights; all ones by default.
+        tails: the initial tails of the Student-t distributions.
+        odometry: the initial levels of the odometry, shape (3,).
+
+    Returns:
+        the state after the last step, and the levels.
     """
     weights = unweighted(problem.seen) if weights is None else weights
     levels = Levels(odometry, first_observation_level(problem, at, weights, tails))
-    told, untold, known, before, n_steps = [odometry], None, False, None, 0
-    stretch = 1.0  # of the step before: that the one after a stretched one is short, tells no end
+    told, untold, known, n_steps = [odometry], None, False, 0
     under = _under(problem, levels, problem.seen.on_level(levels.observation))
     at, weights, tails = followed(under, at, weights, tails)
     while True:
-        end = solved(under, at, weights, tails, n_steps, None if before is None else before.nearby)
+        end = solved(under, at, weights, tails, n_steps)
         observation, odometry = told_observation_level(end, levels.observation), levels.odometry
         follows = _differ(observation, levels.observation) < _FOLLOWED
-        at_end = follows and stretch == 1 and end.is_within(CONVERGED)
+        at_end = follows and end.is_within(CONVERGED)
         if n_steps == _MOST_STEPS or (known and at_end):
             return finished(under, end), levels
         if at_end or (untold is None and end.is_within(_NEAR)):
-            end = factored(end)
             untold = Untold.of(problem, end, odometry)
             anew = untold.told_levels(problem, at.path, odometry)
             if at_end and _are_alike(anew, odometry):
                 return finished(under, end), levels
             known = at_end and any(_are_alike(anew, each) for each in told)
             told.append(anew)
-        stretch = stretched(before, end) if before and end.is_within(_CLOSE) else 1.0
         seen = problem.seen.on_level(observation)
-        at, weights, tails = stepped(under, end, seen, stretch)
+        at, weights, tails = stepped(under, end, seen)
         if untold is not None:
             odometry = untold.told_levels(problem, at.path, odometry)
         levels = Levels(odometry, observation)
-        under, before, n_steps = _under(problem, levels, seen), end, n_steps + 1
+        under, n_steps = _under(problem, levels, seen), n_steps + 1
 
 
 def _are_alike(levels: Float, others: Float) -> bool:
@@ -482,11 +480,11 @@ def _are_alike(levels: Float, others: Float) -> bool:
 
 
 def _differ(levels: Float | float, others: Float | float) -> float:
-    """The most that a logarithm of them differs by."""
+    """Return the largest absolute difference of the logarithms."""
     return float(np.max(np.abs(np.log(levels / others))))
 
 
 def _under(problem: Problem, levels: Levels, seen: Sightings) -> Problem:
-    """The problem under levels, those of the observations being in `seen`."""
+    """Return the problem with scaled odometry and the scaled observations `seen`."""
     information = information_under(problem.information, levels.odometry)
     return problem._replace(seen=seen, information=information)

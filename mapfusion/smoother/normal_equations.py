@@ -1,10 +1,10 @@
 """Residuals and normal equations of a log, linearised about path, landmarks and tracks.
 
 An observation z of landmark l on track t from pose x = (p, theta) is of the point l + b_t, and has
-the residual e = R (R^T (l + b_t - p) - z), turned into the map frame, so that de/dl = de/db_t = I
-and de/dx = J = [-I, lever]. The lever arm of the rotation is where the point is thought to be: with
-the observed point instead, whose error is also in z, rotations are biased. With W the information
-in the map frame and P_t that of the offset b_t the equations of a step are
+the residual e = R (R^T (l + b_t - p) - z) in the map frame, so that de/dl = de/db_t = I and
+de/dx = J = [-I, lever]. The lever arm is that of the estimated point. The lever arm of the observed
+point has the same error as z and would bias rotations. With the information W in the map frame and
+P_t of the offset b_t, the equations of a step are
 
     pose_block dx + link dx' + sum coupling (dl + db_t) = -pose_gradient,     coupling = J' W
     sum over tracks of (coupling' dx + track_block (dl + db_t)) = -sum track_gradient
@@ -22,8 +22,8 @@ from mapfusion.geometry.numerics import Float, inner_kernel, kernel
 from mapfusion.geometry.se2 import between, rotation, wrap
 from mapfusion.smoother.problem import Sightings
 
-# Wheels that do not turn hold the robot, but no closer than this: far below what any sensor of a
-# robot tells, and far above what rounding leaves of a system of a thousand poses.
+# Standard deviation of the odometry of a robot that stands still: far below the errors of any
+# sensor, and far above the rounding errors of a system of a thousand poses.
 _STILL = np.array([1e-4, 1e-4, 1e-5])  # m, m, rad
 
 
@@ -36,11 +36,11 @@ class Estimate(NamedTuple):
 
 
 class Weights(NamedTuple):
-    """What robust losses make of the information: factors on it.
+    """Robust weights: factors on the information.
 
     Attributes:
-        observation: (N,) of each observation.
-        offset: (B,) of each track's offset.
+        observation: weight of each observation, shape (N,).
+        offset: weight of each track's offset, shape (B,).
     """
 
     observation: Float
@@ -48,7 +48,7 @@ class Weights(NamedTuple):
 
 
 class Shares(NamedTuple):
-    """What of the weighted information of all observations, and of all offsets, counts as such."""
+    """Expected shares of the weighted information of observations and of offsets."""
 
     observation: float
     offset: float
@@ -58,13 +58,13 @@ WHOLE = Shares(1.0, 1.0)
 
 
 class PointEquations(NamedTuple):
-    """Of B tracks on a path that is known.
+    """Equations of B tracks for a known path.
 
     Attributes:
-        track_block: (B, 3, 3).
-        track_gradient: (B, 3).
-        offset_information: (B,) P_t, the same along each axis.
-        offset_gradient: (B, 3) P_t b_t.
+        track_block: shape (B, 3, 3).
+        track_gradient: shape (B, 3).
+        offset_information: P_t along each axis, shape (B,).
+        offset_gradient: P_t b_t, shape (B, 3).
     """
 
     track_block: Float
@@ -74,14 +74,14 @@ class PointEquations(NamedTuple):
 
 
 class NormalEquations(NamedTuple):
-    """Of T poses, L landmarks and B tracks, by blocks.
+    """Blocks of the equations of T poses, L landmarks and B tracks.
 
     Attributes:
-        pose_block: (T, 3, 3).
-        link: (T - 1, 3, 3) each pose's block with the pose before it.
-        pose_gradient: (T, 3).
-        coupling: (N, 3, 3) a pose's block with a landmark, by observation.
-        points: the rest.
+        pose_block: shape (T, 3, 3).
+        link: each pose's block with the pose before it, shape (T - 1, 3, 3).
+        pose_gradient: shape (T, 3).
+        coupling: block of pose and landmark of each observation, shape (N, 3, 3).
+        points: equations of the tracks.
     """
 
     pose_block: Float
@@ -92,20 +92,20 @@ class NormalEquations(NamedTuple):
 
 
 def odometry_information(odometry: Float, noise: MotionNoise) -> Float:
-    """(T - 1, 3) inverse variances of the increments (T, 3) after the first, which is no motion."""
+    """Return the inverse variances (T - 1, 3) of the increments (T, 3) after the first."""
     sigma = np.array([noise.standard_deviations(each) for each in odometry[1:]]).reshape(-1, 3)
     return information_of(sigma)
 
 
 def information_of(sigma: Float) -> Float:
-    """Inverse variances (N, 3) of motions with standard deviations (N, 3), bounded."""
+    """Return bounded inverse variances (N, 3) of motions with standard deviations (N, 3)."""
     return 1.0 / (sigma**2 + _STILL**2)
 
 
 def information_under(information: Float, levels: Float) -> Float:
     """Return the information (N, 3) of motions whose variances are multiplied by `levels` (3,).
 
-    It stays bounded as in `information_of`: the bound is no noise that a level could scale.
+    It has the bound of `information_of`, which levels do not scale.
     """
     return np.minimum(information / levels, _STILL**-2)
 
@@ -120,19 +120,19 @@ def least_levels(information: Float) -> Float:
 
 
 def turns(path: Float) -> Float:
-    """(T, 2) cosine and sine of each heading."""
+    """Return cosine and sine of each heading, shape (T, 2)."""
     return np.stack([np.cos(path[:, 2]), np.sin(path[:, 2])], axis=1)
 
 
 def disturbances(path: Float, odometry: Float) -> Float:
-    """(T - 1, 3) d of eq. 3 on this path: x_k = x_(k-1) + (u_k + d)."""
+    """Return the disturbances d of eq. 3, x_k = x_(k-1) + (u_k + d), shape (T - 1, 3)."""
     found = between(path[:-1], path[1:]) - odometry[1:]
     found[:, 2] = wrap(found[:, 2])
     return found
 
 
 def disturbance_jacobians(path: Float) -> tuple[Float, Float]:
-    """(T - 1, 3, 3) of each disturbance by the pose before it, and by the one after it."""
+    """Return the Jacobians (T - 1, 3, 3) of each disturbance by the pose before and after it."""
     n = len(path) - 1
     to_robot = np.swapaxes(rotation(path[:-1, 2]), 1, 2)
     way = path[1:, :2] - path[:-1, :2]
@@ -152,16 +152,16 @@ def normal_equations(
     information: Float,
     shares: Shares = WHOLE,
 ) -> NormalEquations:
-    """The equations of the next step.
+    """Return the equations of the next step.
 
     Args:
         seen: the observations.
-        at: where is linearised.
-        weights: of observations and offsets.
-        stray_information: of an offset along each axis, in 1/m^2.
-        odometry: (T, 3) increments.
-        information: (T - 1, 3) theirs.
-        shares: of observations and offsets in the matrix; the gradient is of all of it.
+        at: the estimate.
+        weights: weights of observations and offsets.
+        stray_information: information of an offset along each axis, in 1/m^2.
+        odometry: increments, shape (T, 3).
+        information: information of the increments, shape (T - 1, 3).
+        shares: shares of observations and offsets in the matrix; the gradient is not scaled.
     """
     n_poses = len(at.path)
     made = NormalEquations(
@@ -180,7 +180,7 @@ def normal_equations(
 def point_equations(
     seen: Sightings, at: Estimate, weights: Weights, stray_information: float
 ) -> PointEquations:
-    """Those of the points alone, the path staying as it is; arguments of `normal_equations`."""
+    """Return the equations of the points for a fixed path; arguments as in `normal_equations`."""
     made = _no_observations(at, weights, stray_information, WHOLE)
     _add_to_points(seen.arrays, at, turns(at.path), weights.observation, made)
     return made
@@ -270,7 +270,7 @@ def _add_to_track(W: Float, e: Float, share: float, made: PointEquations, t: int
 
 @inner_kernel
 def _put_in_map_frame(turn: Float, information: Float, weight: float, W: Float) -> None:
-    """The information of an observation, in the map frame: weight R information R'."""
+    """Write the information of an observation in the map frame: weight R information R'."""
     c, s = turn[0], turn[1]
     along, across, mixed = information[0, 0], information[1, 1], information[0, 1]
     W[0, 0] = weight * (c * c * along - 2 * c * s * mixed + s * s * across)
@@ -285,14 +285,14 @@ def _put_in_map_frame(turn: Float, information: Float, weight: float, W: Float) 
 def _put_residual(
     pose: Float, x: float, y: float, z: float, turn: Float, seen_at: Float, e: Float
 ) -> None:
-    """The residual of one observation of (x, y, z), in the map frame."""
+    """Write the residual of an observation of (x, y, z) in the map frame."""
     e[0] = x - pose[0] - (turn[0] * seen_at[0] - turn[1] * seen_at[1])
     e[1] = y - pose[1] - (turn[1] * seen_at[0] + turn[0] * seen_at[1])
     e[2] = z - seen_at[2]
 
 
 def first_points(seen: Sightings, path: Float) -> Float:
-    """(L, 3) where the observations of each landmark lie in the mean, on this path."""
+    """Return the mean observed position of each landmark for a path, shape (L, 3)."""
     pose, position = path[seen.frame], seen.position_m.copy()
     turned = np.einsum("nij,nj->ni", rotation(pose[:, 2]), position[:, :2])
     position[:, :2] = pose[:, :2] + turned
@@ -300,21 +300,21 @@ def first_points(seen: Sightings, path: Float) -> Float:
 
 
 def squared_distances(seen: Sightings, at: Estimate) -> Float:
-    """(N,) squared Mahalanobis distances of the observations from where they should be."""
+    """Return the squared Mahalanobis distances of the residuals, shape (N,)."""
     squares = np.empty(len(seen))
     _put_squares(seen.arrays, at, turns(at.path), squares)
     return squares
 
 
 def squares_of_points(seen: Sightings, path: Float, covariance_m2: Float) -> Float:
-    """(N,) what squared distances are expected to be more by, about the tracks' true points.
+    """Return how much larger the expected squares about the true points are, shape (N,).
 
-    Those about points that were fitted to the same observations are smaller.
+    Squares about points that were fitted to the same observations are smaller.
 
     Args:
         seen: the observations.
-        path: (T, 3).
-        covariance_m2: (B, 3, 3) of the tracks' points.
+        path: poses, shape (T, 3).
+        covariance_m2: covariances of the tracks' points, shape (B, 3, 3).
     """
     squares = np.empty(len(seen))
     _put_traces(seen.arrays, turns(path), covariance_m2, squares)
@@ -328,7 +328,7 @@ def _put_squares(
     turn: Float,
     squares: Float,
 ) -> None:
-    """In the robot's frame, where the information is: r' W r with r = R'(l + b - p) - z."""
+    """Write r' W r with r = R'(l + b - p) - z in the robot frame."""
     starts, owner, frame, position, W = seen
     for t in range(len(starts) - 1):
         j = owner[t]
@@ -355,7 +355,7 @@ def _put_traces(
     covariance_m2: Float,
     squares: Float,
 ) -> None:
-    """The trace of W R' C R."""
+    """Write the trace of W R' C R."""
     starts, _, frame, _, W = seen
     for t in range(len(starts) - 1):
         xx, xy, xz = covariance_m2[t, 0, 0], covariance_m2[t, 0, 1], covariance_m2[t, 0, 2]
@@ -376,22 +376,22 @@ def _put_traces(
 
 
 def offset_squares(seen: Sightings, at: Estimate, stray_information: float) -> Float:
-    """Squared Mahalanobis distances of the offsets of the tracks that stray from none."""
+    """Return the squared Mahalanobis distances of the offsets from zero."""
     offset = at.offset_m[seen.strays, : seen.n_dimensions]
     return stray_information * np.sum(offset**2, axis=1)
 
 
 def known_dimensions(seen: Sightings, offset_m2: Float, information: Float) -> Float:
-    """In how many dimensions the data tell where the offsets lie of the tracks that stray.
+    """Return the number of dimensions of each offset that the data determine.
 
-    Of the only track of a landmark they tell nothing, it is 0; of one track among many it is
-    nearly n. It is also the square, in sigmas, that the estimate is expected to have: the trace of
-    1 - P C, with the offset's covariance C and what was known before of it.
+    It is the trace of 1 - P C, with the offset's covariance C and its prior information P. It is
+    also the expected squared Mahalanobis distance of the estimate. It is 0 for the only track of a
+    landmark, and nearly n for one track among many.
 
     Args:
         seen: the observations.
-        offset_m2: (B, 3, 3) C.
-        information: (B,) P, the same along each axis.
+        offset_m2: C, shape (B, 3, 3).
+        information: P along each axis, shape (B,).
     """
     n, strays = seen.n_dimensions, seen.strays
     unknown = information[strays] * np.trace(offset_m2[strays, :n, :n], axis1=1, axis2=2)

@@ -5,19 +5,17 @@ An increment (x, y, theta) of the log stands for the motion
     ((1 + distance) x, (1 + distance) y,
      (1 + turn + in_place s) theta + late_turn theta_before + bias |(x, y)|)
 
-with the heading increment before it, theta_before: a late_turn beside a turn of its negative is a
-delay of the odometry. In place a robot turns by another share of what is counted than while it
-drives: wheels that run against each other slip otherwise, and motors that are near their limit
-cannot add a turn to a motion. s is the share of a turn that is made in place,
+with the heading increment theta_before of the frame before. A late_turn together with its negative
+as turn is a delay of the odometry. Turns in place have an additional error, because wheels that run
+in opposite directions slip more. s is the share of a turn in place,
 
     s = max(0, 1 - |(x, y)| / (r |theta|)),
 
-1 of a turn on the spot, 0 of one with a radius of r and more, with which no wheel runs backwards.
-All is linear in the constants, so their estimate is a least squares.
+1 for a turn on the spot and 0 for a radius of r and more, at which no wheel runs backwards. The
+model is linear in the constants.
 
-By turns the logs are smoothed, the constants take a Gauss-Newton step on the likelihood that the
-poses and landmarks have been integrated out of, and the noise levels a step of `noise_levels`. What
-robots saw again tells their odometry's errors; no truth is needed.
+Each round smooths the logs, takes a Gauss-Newton step of the constants on the marginal likelihood
+and a step of the noise levels (`noise_levels.py`). No true poses are needed.
 """
 
 from collections.abc import Callable, Sequence
@@ -59,13 +57,13 @@ HALF_TRACK_M = 0.15
 
 @dataclass(frozen=True)
 class OdometryError:
-    """The constants of one robot.
+    """Constant odometry errors of a robot.
 
     Attributes:
         distance: relative error of distances.
         turn: relative error of the turns.
-        late_turn: share of the turn before that is only made now.
-        bias_rad_per_m: turn with the way that wheels of unequal size do not count.
+        late_turn: share of the previous turn that is made in this frame.
+        bias_rad_per_m: turn per distance that is not measured, due to wheels of unequal size.
         in_place: relative error of turns in place, beside `turn`.
     """
 
@@ -77,24 +75,24 @@ class OdometryError:
 
     @classmethod
     def of(cls, constants: Float) -> "OdometryError":
-        """From an array (5,) in the order of the attributes."""
+        """Return the errors of an array (5,) in the order of the attributes."""
         require_shape("constants", constants, (N_CONSTANTS,))
         require_finite("constants", constants)
         return cls(*map(float, constants))
 
     @property
     def constants(self) -> Float:
-        """(5,) in the order of the attributes."""
+        """Array (5,) in the order of the attributes."""
         return np.array(astuple(self))
 
     def corrected(self, odometry: Float) -> Float:
-        """The increments (T, 3) without these errors."""
+        """Return the increments (T, 3) without these errors."""
         moved = odometry + np.einsum("kdc,c->kd", sensitivity(odometry), self.constants)
         moved[:, 2] = wrap(moved[:, 2])
         return moved
 
     def corrected_log(self, log: RobotLog) -> RobotLog:
-        """The log with its increments corrected."""
+        """Return the log with corrected increments."""
         return replace(log, odometry=self.corrected(log.odometry))
 
 
@@ -102,7 +100,7 @@ N_CONSTANTS = len(fields(OdometryError))
 
 
 def sensitivity(odometry: Float) -> Float:
-    """(T, 3, 5) by how much each constant changes the increments (T, 3)."""
+    """Return the derivatives (T, 3, 5) of the increments (T, 3) by the constants."""
     by = np.zeros((len(odometry), 3, N_CONSTANTS))
     way, turn = np.hypot(odometry[:, 0], odometry[:, 1]), odometry[:, 2]
     by[:, :2, 0] = odometry[:, :2]
@@ -114,36 +112,36 @@ def sensitivity(odometry: Float) -> Float:
     return by
 
 
-# What is known of any odometry before: standard deviations of its constants. They hold those that
-# a log says nothing about, as of a robot that never turns, and weigh nothing beside one that does.
-# Wheels are measured to a hundredth; ranges with lasting errors would claim more than that.
+# Prior standard deviations of the constants. They matter only for constants without information,
+# such as those of turns for a robot that never turns. Wheels are measured to 1 %; without this
+# prior, constant range errors would look like errors of distances.
 _PRIOR = np.array([0.01, 0.5, 0.5, 0.3, 0.5])
-# A robot that spins while it sees nothing may have made a turn more or less than it is taken to
-# have made, and what in_place goes with that is a maximum of the likelihood of its own. So a path
-# is looked for from each of these, and within this deviation of it; the likeliest goes on.
+# A robot that spins without observations may have made one more or one less turn, and each has a
+# local maximum of the likelihood in `in_place`. A path is computed from each of these values, with
+# this prior standard deviation; the most likely one is used.
 _IN_PLACE_STARTS, _IN_PLACE_SIGMA = (0.0, 0.4, -0.4), 0.2
-# Where smoothing starts: noise that most wheels stay below.
+# Initial noise, larger than that of most wheels.
 _FIRST = MotionNoise(0.05, 0.1, 0.3, 0, 0, lateral_slip_m_per_rad=0)
-_CLOSE = 1e-5  # squared sigmas a coordinate that the next step of a round would move the path by
-# Rounds for each part of a log on the way to a first path: constants are soon well enough known.
+_CLOSE = 1e-5  # tolerance of the smoother in a round, in squared sigmas a coordinate
+# Rounds for each part of a log while the initial path is extended.
 _PART_ROUNDS = 3
 _MOST_ROUNDS = 40
-# Rounds end where none changes a constant by more than this many of its standard errors, or a
-# level by more than this share of it.
+# Rounds end if constants change by less than this many standard errors, and levels by less than
+# this share.
 _SETTLED = 0.1
-# A path is found first for so many frames with observations, then for so many times as many.
+# Number of frames with observations in the first part of a log, and the growth of further parts.
 _FIRST_FRAMES, _GROWTH = 30, 1.4
 
 
 @dataclass(frozen=True)
 class RobotCalibration:
-    """One robot's odometry.
+    """Calibrated odometry of a robot.
 
     Attributes:
-        robot: its name.
-        error: its constant errors.
-        standard_errors: (5,) theirs.
-        path: (T, 3) smoothed with them.
+        robot: name of the robot.
+        error: constant errors.
+        standard_errors: standard errors of the constants, shape (5,).
+        path: path smoothed with these constants, shape (T, 3).
     """
 
     robot: str
@@ -154,15 +152,15 @@ class RobotCalibration:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What logs tell of their odometry.
+    """Result of the calibration.
 
     Attributes:
-        robots: in the order of the logs.
-        motion: noise of the corrected odometry, one for all robots.
-        relative_errors: (3,) of its levels in the order of `LEVELS`, standard errors
-            as shares of them.
-        n_rounds: that it took.
-        settled: whether rounds ended as nothing changed any more; else there were too many.
+        robots: robots in the order of the logs.
+        motion: noise of the corrected odometry of all robots.
+        relative_errors: relative standard errors of the levels in the order of `LEVELS`, shape
+            (3,).
+        n_rounds: number of rounds.
+        settled: true if the rounds converged.
     """
 
     robots: tuple[RobotCalibration, ...]
@@ -174,7 +172,7 @@ class Calibration:
 
 @dataclass
 class _Robot:
-    """A log as it is being calibrated."""
+    """State of a log during the calibration."""
 
     log: RobotLog
     seen: Sightings
@@ -188,13 +186,13 @@ class _Robot:
 
     @classmethod
     def of(cls, log: RobotLog, seen: Sightings, stray_information: float, path: Float) -> "_Robot":
-        """With nothing known of the odometry but what is known of any."""
+        """Return the initial state with the prior of any odometry."""
         nothing = np.zeros(N_CONSTANTS)
         covariance = np.diag(_PRIOR**2)
         return cls(log, seen, stray_information, path, nothing, covariance, nothing, _PRIOR)
 
     def round(self, motion: MotionNoise) -> tuple[Told, float]:
-        """Smooth, step the constants: what is told of the noise, and the step in sigmas."""
+        """Smooth and step the constants; return noise statistics and the step in sigmas."""
         odometry = OdometryError.of(self.constants).corrected(self.log.odometry)
         information = odometry_information(odometry, motion)
         problem = Problem(self.seen, odometry, information, self.stray_information)
@@ -219,19 +217,19 @@ def calibrate(
     parameters: SmootherParameters,
     on_round: Callable[[int, int], None] = lambda done, most: None,
 ) -> Calibration:
-    """The most likely constants and noise levels.
+    """Estimate the constants and noise levels of maximum likelihood.
 
     Args:
-        logs: of one robot each; the noise levels are common to all.
-        landmarks: of each, (N,) which landmark each observation is of, negative for none.
-        paths: of each, (T, 3) where to start from; None: found from the log, by smoothing more and
-            more of it, which needs landmarks that are known for sure.
-        parameters: of the smoother; what they say of the odometry is not used.
-        on_round: told the rounds done, and how many there are at most.
+        logs: a log of each robot; the noise levels are common to all.
+        landmarks: landmark of each observation of each log, shape (N,); negative for none.
+        paths: initial path of each log, shape (T, 3). None: computed by smoothing increasing parts
+            of the log, which needs landmarks without wrong associations.
+        parameters: parameters of the smoother; the odometry noise is not used.
+        on_round: called with the number of rounds and their largest number.
 
     Raises:
-        InputError: a log has too little motion or too few observations to tell.
-        ValueError: shapes that do not fit.
+        InputError: a log has too little motion or too few observations.
+        ValueError: an array has a wrong shape.
     """
     motion = plain(_FIRST)
     robots = [
@@ -261,12 +259,12 @@ def calibrate(
 
 
 def _change(before: MotionNoise, after: MotionNoise) -> float:
-    """The largest relative change of a level."""
+    """Return the largest relative change of a level."""
     return max(abs(getattr(after, name) / getattr(before, name) - 1) for name in LEVELS)
 
 
 def _deviance(problem: Problem, end: Settled) -> float:
-    """Of what was smoothed: of the odometry, and of the observations with the tails they have."""
+    """Return the deviance of odometry and observations with fitted tails."""
     walked = disturbances(end.estimate.path, problem.odometry)
     squares, n = squared_distances(problem.seen, end.estimate), problem.seen.n_dimensions
     seen = student_deviance(squares, fitted_dof(squares, n), n)
@@ -299,7 +297,7 @@ def _grown(
     motion: MotionNoise,
     in_place: float,
 ) -> _Robot:
-    """With a path that was found by smoothing more and more of the log."""
+    """Return the state after smoothing increasing parts of the log."""
     observed, stray = np.unique(log.iteration), parameters.stray_information
     grown = _Robot.of(log, sightings_of(log, landmark, 1, stray=False), stray, IDENTITY[None])
     grown.likeliest = OdometryError(in_place=in_place).constants
@@ -325,7 +323,7 @@ def _grown(
 
 
 def _extended(path: Float, odometry: Float) -> Float:
-    """A path, and how the odometry (T, 3) goes on from its end."""
+    """Extend a path by the odometry (T, 3)."""
     made = np.concatenate([path, np.empty((len(odometry) - len(path), 3))])
     for k in range(len(path), len(odometry)):
         made[k] = compose(made[k - 1], odometry[k])

@@ -13,11 +13,11 @@ from mapfusion.smoother.cholesky import Envelope, envelope_order, first_entries
 
 @dataclass(frozen=True)
 class PoseOrder:
-    """In what order the poses of T frames are solved for, by the landmarks that they saw.
+    """Elimination order of T poses.
 
     Attributes:
-        landmark: (N,) of each observation.
-        frame: (N,) that each was made in.
+        landmark: landmark of each observation, shape (N,).
+        frame: frame of each observation, shape (N,).
         n_poses: T.
     """
 
@@ -27,7 +27,7 @@ class PoseOrder:
 
     @cached_property
     def place(self) -> np.ndarray:
-        """(T,) of each pose; the first, which is known, comes first."""
+        """Return the place of each pose in the order, shape (T,); the known first pose is first."""
         place, later = np.zeros(self.n_poses, dtype=np.int64), self.frame > 0
         unknown = self.frame[later] - 1
         place[1:] = 1 + envelope_order(self.landmark[later], unknown, self.n_poses - 1)
@@ -35,7 +35,7 @@ class PoseOrder:
 
     @cached_property
     def envelope(self) -> Envelope:
-        """Of what is between the unknown poses, three rows of each by their places."""
+        """Return the envelope of the unknown poses' matrix, with three rows per pose."""
         later = self.frame > 0
         chosen = (self.landmark[later], self.frame[later] - 1, self.place[1:] - 1)
         return Envelope(np.repeat(3 * first_entries(*chosen), 3))
@@ -43,8 +43,8 @@ class PoseOrder:
     def is_sparser_than(self, n_points: int) -> bool:
         """Return True if a factor of the poses takes fewer products than one of `n_points` points.
 
-        These are multiplications of floating-point numbers: the poses' factor takes half the
-        squares of its rows' lengths, the points' a product with all poses and a dense factor.
+        The factor of the poses takes half the sum of squared row lengths. The factor of the points
+        takes a product with all poses and a dense Cholesky factor.
         """
         n_rows, n = 3 * self.n_poses, 3 * n_points
         of_points = n_rows * n**2 + n**3 / 6
@@ -58,9 +58,9 @@ class PoseOrder:
 
     @cached_property
     def _least_products(self) -> float:
-        """Return a lower bound of `_products` in any order: poses of one landmark are all related.
+        """Return a lower bound of `_products` for any order.
 
-        Where this is too much already, no order has to be found.
+        All poses of a landmark are related. If the bound is too large no order has to be found.
         """
         pairs = np.unique(self.landmark * np.int64(self.n_poses) + self.frame)
         most = np.bincount(pairs // self.n_poses).max(initial=0)
@@ -71,20 +71,21 @@ class PoseOrder:
 class Sightings:
     """N observations of L landmarks from T poses, ordered by landmark, track and frame.
 
-    All observations of a track are of one point, which lies beside the landmark. A track that went
-    into several landmarks is one for each of them. What a landmark was observed without a track
-    counts as one track, which is of the landmark itself.
+    All observations of a track are of one point, which has an offset from the landmark. A track
+    that is part of several landmarks counts as one track of each. Observations of a landmark
+    without a track count as one track without an offset.
 
     Attributes:
-        starts: (L + 1,) row of each landmark's first observation.
-        track_starts: (B + 1,) row of each track's first observation.
-        strays: (B,) whether the track's point lies beside the landmark.
-        frame: (N,) frame that each observation was made in.
-        position_m: (N, 3) in the robot frame.
-        information: (N, 3, 3) inverse of the stated covariances, in 1/m^2; zero in z if planar.
-        row: (N,) row in the log.
+        starts: row of each landmark's first observation, shape (L + 1,).
+        track_starts: row of each track's first observation, shape (B + 1,).
+        strays: true for tracks with an offset, shape (B,).
+        frame: frame of each observation, shape (N,).
+        position_m: observed positions in the robot frame, shape (N, 3).
+        information: inverses of the stated covariances, in 1/m^2, shape (N, 3, 3); zero in z if
+            planar.
+        row: row in the log, shape (N,).
         n_dimensions: 3, or 2 if planar.
-        order: of the poses; it is the same whatever the information is.
+        order: elimination order of the poses; it does not depend on the information.
     """
 
     starts: np.ndarray
@@ -102,32 +103,32 @@ class Sightings:
 
     @property
     def n_landmarks(self) -> int:
-        """L."""
+        """Number of landmarks L."""
         return len(self.starts) - 1
 
     @property
     def pose_place(self) -> np.ndarray:
-        """(T,) order in which poses are solved for; the first, which is known, comes first."""
+        """Place of each pose in the elimination order, shape (T,); the first pose is first."""
         return self.order.place
 
     @cached_property
     def unknown_place(self) -> np.ndarray:
-        """(N,) of each observation's pose among those that are unknown; -1 for the first pose."""
+        """Place of each observation's pose among the unknown ones, shape (N,); -1 for the first."""
         return self.pose_place[self.frame] - 1
 
     @cached_property
     def first_track(self) -> np.ndarray:
-        """(L + 1,) track of each landmark's first observation."""
+        """Track of each landmark's first observation, shape (L + 1,)."""
         return np.searchsorted(self.track_starts, self.starts)
 
     @property
     def by_landmark(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What kernels take: by landmark its first row and its first track, by track its rows."""
+        """Arrays for kernels: first row and track of each landmark, first row of each track."""
         return self.starts, self.first_track, self.track_starts
 
     @property
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, Float, Float]:
-        """What kernels take: by track its rows and landmark, by row what was observed."""
+        """Arrays for kernels: rows and landmark of each track, frame and data of each row."""
         return (
             self.track_starts,
             self.landmark_of_track,
@@ -137,7 +138,7 @@ class Sightings:
         )
 
     def on_level(self, level: float) -> "Sightings":
-        """With stated covariances of observations on tracks that stray multiplied by `level`."""
+        """Multiply the stated covariances of observations on tracks with offsets by `level`."""
         if level == 1:
             return self
         share = np.where(self.strays[self.track], 1 / level, 1.0)
@@ -145,29 +146,29 @@ class Sightings:
 
     @cached_property
     def landmark(self) -> np.ndarray:
-        """(N,) the landmark of each observation: 0, 1, ..."""
+        """Landmark of each observation, from 0, shape (N,)."""
         return np.repeat(np.arange(self.n_landmarks), np.diff(self.starts))
 
     @cached_property
     def track(self) -> np.ndarray:
-        """(N,) the track of each observation: 0, 1, ..."""
+        """Track of each observation, from 0, shape (N,)."""
         return np.repeat(np.arange(len(self.strays)), np.diff(self.track_starts))
 
     @cached_property
     def landmark_of_track(self) -> np.ndarray:
-        """(B,)."""
+        """Landmark of each track, shape (B,)."""
         return self.landmark[self.track_starts[:-1]]
 
     def sum_by_landmark(self, values: Float) -> Float:
-        """(L, ...) sums of values (N, ...) over the observations of each landmark."""
+        """Sum values (N, ...) over the observations of each landmark, shape (L, ...)."""
         return _sums(values, self.starts)
 
     def sum_by_track(self, values: Float) -> Float:
-        """(B, ...) sums of values (N, ...) over the observations of each track."""
+        """Sum values (N, ...) over the observations of each track, shape (B, ...)."""
         return _sums(values, self.track_starts)
 
     def sum_tracks(self, values: Float) -> Float:
-        """(L, ...) sums of values (B, ...) over the tracks of each landmark."""
+        """Sum values (B, ...) over the tracks of each landmark, shape (L, ...)."""
         return _sums(values, self.first_track)
 
 
@@ -178,18 +179,18 @@ def _sums(values: Float, starts: np.ndarray) -> Float:
 
 
 def sightings_of(log: RobotLog, landmark: np.ndarray, min_count: int, *, stray: bool) -> Sightings:
-    """The observations of landmarks that were seen at least `min_count` times.
+    """Order the observations of landmarks that were seen at least `min_count` times.
 
     Args:
-        log: what the robot measured.
-        landmark: (N,) number of the landmark that each observation of the log is of, any integers;
-            negative for none.
-        min_count: observations that a landmark needs.
-        stray: whether tracks are of points beside their landmarks, else of the landmarks.
+        log: the log.
+        landmark: number of each observation's landmark, any integers, shape (N,); negative for
+            none.
+        min_count: number of observations that a landmark needs.
+        stray: true if tracks have offsets from their landmarks.
 
     Raises:
-        ValueError: `landmark` is not of the log's length.
-        LinAlgError: an observation's covariance is not positive definite.
+        ValueError: the length of `landmark` differs from the log's.
+        LinAlgError: the covariance of an observation is not positive definite.
     """
     require_shape("landmark", landmark, (len(log.observations),))
     names, inverse, count = np.unique(landmark, return_inverse=True, return_counts=True)

@@ -1,13 +1,13 @@
 """Robust losses: Student-t weights of observations and of track offsets.
 
-A share of the observations is of corners that are none, or of other landmarks. A Student-t gives
-them less weight the farther off they are, and its degrees of freedom, found from the residuals
-themselves, say how many there are: of Gaussian residuals they grow without limit and all weights
-are one. Lange, Little, Taylor (1989), "Robust statistical modeling using the t distribution".
+Some observations are of false corners or of other landmarks. A Student-t distribution gives large
+residuals less weight. Its degrees of freedom are estimated from the residuals. For Gaussian
+residuals they are very large and all weights are one. Lange, Little, Taylor (1989), "Robust
+statistical modeling using the t distribution".
 
-A gross observation loses its weight and its track keeps the rest. A track that as a whole is of
-another landmark has an offset far beyond all others: it no longer pulls at the landmark, and still
-holds the poses that saw it together, as it is one point all the same.
+A gross observation loses its weight; the other observations of its track keep theirs. A track of
+another landmark has a very large offset. It then has no weight for the landmark, but it still
+constrains the poses that observed it.
 """
 
 import functools
@@ -31,49 +31,48 @@ from mapfusion.smoother.normal_equations import (
 from mapfusion.smoother.problem import Sightings
 from mapfusion.smoother.schur_complement import Points
 
-# Tails heavier than the first give (a Cauchy's are at 1) are no sensor's; above the second nobody
-# can tell it from a Gaussian.
+# Limits of the degrees of freedom. A Cauchy distribution has 1; no sensor has heavier tails than
+# the lower limit. Above the upper limit the distribution is Gaussian for all purposes.
 LEAST_DOF, MOST_DOF = 0.5, 1e4
-# Degrees of freedom are found to this share of themselves: far closer than any number of errors
-# tells them.
+# Relative tolerance of the degrees of freedom, far below their statistical error.
 _FOUND_TO = 1e-6
-# Beside where they were before they are looked for by secants: the first is of a place this share
-# aside, about what they change by from step to step.
+# The secant method starts at the earlier value and at one that differs by this share, the typical
+# change between two steps.
 _ASIDE, _MOST_SECANTS = 0.01, 6
 
-# Numbers that are multiplied before a logarithm is taken of them.
+# Number of values that are multiplied before the logarithm.
 _MULTIPLIED = 8
 
 
 def student_weights(squares: Float, dof: float, n_dimensions: Float | int) -> Float:
-    """Weights (N,) of errors at these squared Mahalanobis distances (N,), in n dimensions each."""
+    """Return the weights of squared Mahalanobis distances (N,) in n dimensions."""
     return (dof + n_dimensions) / (dof + squares)
 
 
 def information_share(dof: float, n_dimensions: Float | int) -> Float | float:
-    """What of the weighted information is there in truth: (dof + n) / (dof + n + 2).
+    """Return the expected share of the weighted information: (dof + n) / (dof + n + 2).
 
-    The weights' mean is 1, as if their scales were known; but they are told from the same errors,
-    and where the cost is flatter than a Gaussian's an estimate is less certain: this is the
-    expected information of a multivariate t's location (Lange et al.). Of Gaussian errors it is 1.
+    The mean of the weights is 1, as if their scales were known. They are estimated from the same
+    errors, so the estimate is less certain. The share is that of the expected information of the
+    location of a multivariate t distribution (Lange et al.). It is 1 for Gaussian errors.
     """
     return (dof + n_dimensions) / (dof + n_dimensions + 2)
 
 
 def student_cost(squares: Float, dof: float, n_dimensions: Float | int) -> float:
-    """Twice the negative log likelihood, up to what does not depend on the distances."""
+    """Return twice the negative log likelihood without terms that depend only on `dof`."""
     return float(np.sum((dof + n_dimensions) * np.log1p(squares / dof)))
 
 
 def student_deviance(squares: Float, dof: float, n_dimensions: Float | int) -> float:
-    """Twice the negative log likelihood, up to a constant."""
+    """Return twice the negative log likelihood up to a constant."""
     n = np.broadcast_to(np.asarray(n_dimensions, dtype=np.float64), len(squares))
     normal = gammaln((dof + n) / 2) - gammaln(dof / 2) - n / 2 * np.log(dof)
     return student_cost(squares, dof, n) - 2 * float(np.sum(normal))
 
 
 def student_bound(probability: float, dof: float, n_dimensions: int) -> float:
-    """The squared Mahalanobis distance that errors stay below with this probability.
+    """Return the quantile of the squared Mahalanobis distance for a probability.
 
     The square over the number of dimensions has an F distribution with (n, dof).
     """
@@ -81,7 +80,7 @@ def student_bound(probability: float, dof: float, n_dimensions: int) -> float:
 
 
 def student_slope(squares: Float, dof: float, n_dimensions: Float | int) -> float:
-    """How `student_deviance` changes with the logarithm of the degrees of freedom."""
+    """Return the derivative of `student_deviance` by the logarithm of the degrees of freedom."""
     n, dims = len(squares), np.asarray(n_dimensions, dtype=np.float64)
     beside = squares * (1 / dof)
     beside += 1
@@ -89,27 +88,27 @@ def student_slope(squares: Float, dof: float, n_dimensions: Float | int) -> floa
     np.reciprocal(beside, out=beside)
     of_weights = np.sum((dof + dims) * (1 - beside))
     of_normal = dof * (psi((dof + dims) / 2) - psi(dof / 2)) - dims
-    share = 1 if of_normal.ndim else n  # the same for all where all have the same dimensions
+    share = 1 if of_normal.ndim else n  # equal terms if all dimensions are equal
     return float(of_tails - of_weights - share * np.sum(of_normal))
 
 
 def _sum_of_logs(values: Float) -> float:
-    """Of values (N,) from 1 to 10^38: logarithms of products, which take less time than those."""
+    """Sum the logarithms of values from 1 to 10^38, by logarithms of products, which is faster."""
     n = len(values) // _MULTIPLIED * _MULTIPLIED
     products = np.multiply.reduce(values[:n].reshape(_MULTIPLIED, -1), axis=0)
     return float(np.sum(np.log(products)) + np.sum(np.log(values[n:])))
 
 
 def fitted_dof(squares: Float, n_dimensions: Float | int, near: float = MOST_DOF) -> float:
-    """The degrees of freedom under which these squared distances (N,) are most likely.
+    """Return the maximum likelihood degrees of freedom of squared distances.
 
     Args:
-        squares: theirs.
-        n_dimensions: one for all, or (N,).
-        near: where they are looked for first.
+        squares: squared Mahalanobis distances, shape (N,).
+        n_dimensions: one number, or shape (N,).
+        near: where the search starts.
     """
 
-    @functools.cache  # searches look at their ends again
+    @functools.cache  # root finders evaluate the ends again
     def slope(log_dof: float) -> float:
         return student_slope(squares, float(np.exp(log_dof)), n_dimensions)
 
@@ -151,7 +150,7 @@ def _root_nearby(
 
 
 class Tails(NamedTuple):
-    """Degrees of freedom of the Student-t's of observations and offsets."""
+    """Degrees of freedom of the Student-t distributions of observations and offsets."""
 
     observation: float
     offset: float
@@ -161,12 +160,12 @@ NO_TAILS = Tails(MOST_DOF, MOST_DOF)
 
 
 def informative(tails: Tails, n_dimensions: int) -> Shares:
-    """What of the weighted information is there in truth."""
+    """Return the shares of the weighted information that are expected (`information_share`)."""
     return Shares(*(float(information_share(dof, n_dimensions)) for dof in tails))
 
 
 def unweighted(seen: Sightings) -> Weights:
-    """All ones; tracks that do not stray have no offsets that anything could be known about."""
+    """Return weights of one; tracks without an offset have the offset weight zero."""
     return Weights(np.ones(len(seen)), seen.strays.astype(np.float64))
 
 
@@ -178,11 +177,20 @@ def reweighted(
     known: Points,
     stray_information: float,
 ) -> tuple[Weights, Tails]:
-    """New weights and tails, given those so far and what is known of points under them.
+    """Compute new weights and tails from the current estimate.
 
-    Of observations the squares are those expected about the true points (the E step of Lange et
-    al.). Offsets have a Student-t in as many dimensions as they are known in, else those of
-    landmarks with a single track, which look perfectly average, would hide the tails of the rest.
+    The squares of observations are expected values about the true points (the E step of Lange et
+    al.). The dimension of each offset's distribution is the number of dimensions that the data
+    determine. Otherwise landmarks with a single track, whose offset is always zero, would hide the
+    tails of the other tracks.
+
+    Args:
+        seen: the observations.
+        at: the estimate.
+        weights: the current weights.
+        tails: the current tails.
+        known: covariances of the points under the current weights.
+        stray_information: information of an offset along each axis, in 1/m^2.
     """
     n, new = seen.n_dimensions, unweighted(seen)
     squares = squared_distances(seen, at)

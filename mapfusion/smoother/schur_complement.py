@@ -1,18 +1,18 @@
 """Schur complements: eliminate track offsets and landmarks from the normal equations.
 
-With S the track block, P the information of the offset and G = (S + P)^-1 its covariance if path
-and landmark were known, eliminating b_t leaves (a Schur complement)
+Let S be the track block, P the information of the offset and G = (S + P)^-1 its covariance for a
+known path and landmark. Eliminating b_t leaves the Schur complement
 
     coupling (1 - G S)                  of pose and landmark
     - coupling G coupling'              between all poses that saw the track
     sum over tracks of S (1 - G S)      of the landmark
 
-and likewise the gradients. Poses that share a track are so tied to each other more than to the
-landmark. A track that does not stray has G = 0. As P is the same along each axis, 1 - G S = P G.
+and the corresponding gradients. A track without an offset has G = 0. As P is the same along each
+axis, 1 - G S = P G.
 
-With H_i an observation's block of pose and point, G_t the covariance of its track's offset if path
-and landmark were known, K_t = 1 - G_t S_t, and A the covariance of its landmark if the path were
-known, observations i, k of tracks t, u of one landmark take from what their poses have in common
+Let H_i be the block of pose and point of observation i, G_t the covariance of its track's offset
+for a known path and landmark, K_t = 1 - G_t S_t, and A the covariance of its landmark for a known
+path. Observations i, k of tracks t, u of one landmark subtract from the block of their poses
 
     H_i (K_t A K_u' + G_t if t = u) H_k'.
 """
@@ -35,16 +35,15 @@ from mapfusion.smoother.problem import Sightings
 
 
 class Reduced(NamedTuple):
-    """The equations without the offsets, but for what is between poses.
+    """Equations after the offsets are eliminated, without the blocks of two poses.
 
     Attributes:
-        own_m2: (B, 3, 3) G of each track.
-        pull: (B, 3) the gradient of each offset.
-        kept: (B, 3, 3) 1 - G S, the share of a landmark's motion that its track's point takes part
-            in.
-        point_gradient: (L, 3).
-        landmark_m2: (L, 3, 3) covariance of each landmark if the path were known; in planar data,
-            which say nothing of z, that has a variance of 1 of its own.
+        own_m2: G of each track, shape (B, 3, 3).
+        pull: gradient of each offset, shape (B, 3).
+        kept: 1 - G S, the derivative of the track's point by the landmark, shape (B, 3, 3).
+        point_gradient: shape (L, 3).
+        landmark_m2: covariance of each landmark for a known path, shape (L, 3, 3); in planar data z
+            is not observed and has variance 1.
     """
 
     own_m2: Float
@@ -55,10 +54,10 @@ class Reduced(NamedTuple):
 
 
 def without_offsets(seen: Sightings, equations: PointEquations) -> Reduced:
-    """Eliminate the offsets; the blocks between poses are left to do, with `own_m2` and `pull`.
+    """Eliminate the offsets.
 
     Raises:
-        LinAlgError: what is known of some point, is not to be inverted.
+        LinAlgError: the information of a point is singular.
     """
     n_tracks, n_landmarks = len(seen.strays), seen.n_landmarks
     left = Reduced(
@@ -70,7 +69,7 @@ def without_offsets(seen: Sightings, equations: PointEquations) -> Reduced:
     )
     planar = seen.n_dimensions == 2
     if not _reduce(seen.by_landmark, seen.strays, planar, equations, left):
-        raise np.linalg.LinAlgError("what is known of a point is singular")
+        raise np.linalg.LinAlgError("the information of a point is singular")
     return left
 
 
@@ -82,7 +81,7 @@ def _reduce(
     equations: PointEquations,
     left: Reduced,
 ) -> bool:
-    """Put what is left; False where some block is singular."""
+    """Write the reduced equations; return False if a block is singular."""
     _, first_track, _ = rows
     block, known, inverse = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     S, P, G, K = equations.track_block, equations.offset_information, left.own_m2, left.kept
@@ -117,7 +116,7 @@ def _reduce(
 
 @kernel_part
 def _add_track(equations: PointEquations, left: Reduced, j: int, t: int, block: Float) -> None:
-    """Add what is left of a track to its landmark's block and gradient."""
+    """Add the reduced equations of a track to its landmark's block and gradient."""
     S, gradient, G, K = equations.track_block, equations.track_gradient, left.own_m2, left.kept
     a, b, c = left.pull[t, 0], left.pull[t, 1], left.pull[t, 2]
     x = G[t, 0, 0] * a + G[t, 0, 1] * b + G[t, 0, 2] * c
@@ -133,13 +132,13 @@ def _add_track(equations: PointEquations, left: Reduced, j: int, t: int, block: 
 def moved_points(
     seen: Sightings, equations: PointEquations, left: Reduced, along: Float
 ) -> tuple[Float, Float]:
-    """The step of landmarks (L, 3) and offsets (B, 3).
+    """Return the steps of landmarks (L, 3) and offsets (B, 3).
 
     Args:
         seen: the observations.
-        equations: theirs.
-        left: once the offsets are eliminated.
-        along: (B, 3) what the step of the path asks of each track, sum of coupling' dx.
+        equations: the equations of the points.
+        left: the equations after the offsets are eliminated.
+        along: sum of coupling' dx for each track, where dx is the step of the path, shape (B, 3).
     """
     points, offsets = np.empty((seen.n_landmarks, 3)), np.empty((len(seen.strays), 3))
     _put_moved(seen.first_track, equations.track_block, left, along, points, offsets)
@@ -176,11 +175,11 @@ def _put_moved(
 
 
 class Points(NamedTuple):
-    """Covariances if the path were known.
+    """Covariances for a known path.
 
     Attributes:
-        offset_m2: (B, 3, 3) of each track's offset.
-        track_m2: (B, 3, 3) of each track's point.
+        offset_m2: covariance of each track's offset, shape (B, 3, 3).
+        track_m2: covariance of each track's point, shape (B, 3, 3).
     """
 
     offset_m2: Float
@@ -188,7 +187,7 @@ class Points(NamedTuple):
 
 
 def known_points(seen: Sightings, left: Reduced) -> Points:
-    """What is known of offsets and tracks' points, their landmark's own covariance in it."""
+    """Return the covariances of offsets and tracks' points for a known path."""
     made = np.empty((2, *left.own_m2.shape))
     _put_known(seen.landmark_of_track, left, made)
     return Points(made[0], made[1])
@@ -196,7 +195,7 @@ def known_points(seen: Sightings, left: Reduced) -> Points:
 
 @kernel
 def _put_known(landmark: np.ndarray, left: Reduced, made: Float) -> None:
-    """What is known of a track, and what its landmark's covariance does by a symmetric matrix."""
+    """Write G plus the propagated covariance of the landmark, for offsets and for points."""
     A, G, kept = left.landmark_m2, left.own_m2, left.kept
     follows, half = np.empty((3, 3)), np.empty((3, 3))
     for which in range(2):
@@ -219,13 +218,13 @@ def _put_known(landmark: np.ndarray, left: Reduced, made: Float) -> None:
 
 
 def subtract_points(seen: Sightings, equations: NormalEquations, left: Reduced, S: Float) -> None:
-    """Take what goes by offsets and landmarks from what is between poses.
+    """Subtract the terms of offsets and landmarks from the matrix of the poses.
 
     Args:
         seen: the observations.
-        equations: all of them.
-        left: once the offsets are eliminated.
-        S: entries of what is between the unknown poses, in `seen.order.envelope`.
+        equations: the normal equations.
+        left: the equations after the offsets are eliminated.
+        S: entries of the matrix of the unknown poses, in `seen.order.envelope`.
     """
     coupling, offset = equations.coupling, seen.order.envelope.offset
     couplings = coupling, left_couplings(seen, coupling, left)
@@ -256,7 +255,7 @@ def _subtract(
                 _subtract_own(by_track, coupling, i, 3 * place[i], offset, S)
 
 
-# Kernels take arrays and rows of them: views of rows are counted, which takes longer than the sums.
+# Kernels take an array and a row: a view of a row costs more than the sums.
 @kernel_part
 def _put_gains(
     left: Reduced,
@@ -296,7 +295,7 @@ def _subtract_rows(
     offset: np.ndarray,
     S: Float,
 ) -> None:
-    """X coupling' between the pose of observation i and those of the rows `begin` to `end`."""
+    """Subtract X coupling' from the blocks of observation i with rows `begin` to `end`."""
     x00, x01, x02 = X[0, 0], X[0, 1], X[0, 2]  # `S` may not be where `X` is, no compiler knows
     x10, x11, x12 = X[1, 0], X[1, 1], X[1, 2]
     x20, x21, x22 = X[2, 0], X[2, 1], X[2, 2]
@@ -334,7 +333,7 @@ def _subtract_own(
 
 
 def left_couplings(seen: Sightings, coupling: Float, left: Reduced) -> Float:
-    """(N, 3, 3) a pose's block with a landmark once offsets are eliminated, by observation."""
+    """Return the blocks (N, 3, 3) of pose and landmark after the offsets are eliminated."""
     made = np.empty_like(coupling)
     _put_left(seen.track_starts, coupling, left.kept, made)
     return made
@@ -351,7 +350,7 @@ def _put_left(track_starts: np.ndarray, coupling: Float, kept: Float, made: Floa
 
 
 def along_way(seen: Sightings, coupling: Float, way: Float) -> Float:
-    """(B, 3) sum of coupling' way over the observations of each track; `way` (T, 3) by frame."""
+    """Sum coupling' way over the observations of each track, shape (B, 3); `way` is (T, 3)."""
     total = np.zeros((len(seen.strays), 3))
     _add_along_way(seen.track_starts, seen.frame, coupling, way, total)
     return total
@@ -370,13 +369,13 @@ def _add_along_way(
 
 
 def along_points(seen: Sightings, coupling: Float, point: Float, offset: Float) -> Float:
-    """(T, 3) sum of coupling (point + offset) over the observations of each frame.
+    """Sum coupling (point + offset) over the observations of each frame, shape (T, 3).
 
     Args:
         seen: the observations.
-        coupling: (N, 3, 3) of each.
-        point: (L, 3) way of each landmark.
-        offset: (B, 3) way of each track's offset.
+        coupling: blocks of pose and landmark, shape (N, 3, 3).
+        point: step of each landmark, shape (L, 3).
+        offset: step of each track's offset, shape (B, 3).
     """
     total = np.zeros((seen.order.n_poses, 3))
     _add_along_points(

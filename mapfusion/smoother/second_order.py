@@ -1,8 +1,8 @@
-"""Errors of path and landmarks of second order, beside those of the linearised equations.
+"""Second-order errors of path and landmarks, in addition to those of the linearised equations.
 
-Where the heading is off by e, a path of length s ends s e to the side, and it ends s e^2 / 2 short.
-The linearised equations know of the first alone. Along a long path little else is uncertain, so
-that the second can exceed all that they state.
+With an error e of the heading, a path of length s ends s e to the side and s e^2 / 2 short. The
+linearised equations have only the first error. On a long path the second can exceed the stated
+standard deviation.
 
 With the residuals r(x + d) = r + J d + rho(d) to second order in an error d, and their information
 W, the estimate that fits the same data as x + d is off by a further
@@ -30,49 +30,49 @@ from mapfusion.smoother.normal_equations import (
     disturbances,
     normal_equations,
 )
-from mapfusion.smoother.optimizer import Problem, Settled, factored, solved
+from mapfusion.smoother.optimizer import Problem, Settled, solved
 from mapfusion.smoother.robust_loss import informative
 from mapfusion.smoother.schur_complement import along_way, moved_points, without_offsets
 
-# Draws. The square of one normal error is the worst case: its mean square over so many is known to
-# a third of itself. The errors that count are of several directions, whose sum is known better.
+# Number of draws. The relative error of the mean square is a third in the worst case, the square of
+# one normal variable. Usually several directions contribute and it is smaller.
 _DRAWS = 100
-# Errors of second order matter where they add more than this share to the covariance of some pose,
-# which is a fortieth of a standard deviation. A bound tells first, and then a few draws.
+# Second-order errors are ignored if they add less than this share to the covariance of every pose
+# (2.5 % of a standard deviation). A bound is tested first, and then a few draws.
 _FIRST_DRAWS, _NEGLIGIBLE = 4, 0.05
 _SEED = 0
 
 
 class SecondOrder(NamedTuple):
-    """Independent errors, each of which adds its square to the covariance.
+    """Independent errors whose squares add to the covariance.
 
     Attributes:
-        path: (S, T, 3) of the poses.
-        point_m: (S, L, 3) of the landmarks.
+        path: errors of the poses, shape (S, T, 3).
+        point_m: errors of the landmarks, shape (S, L, 3).
     """
 
     path: Float
     point_m: Float
 
     def pose_covariances(self, frames: np.ndarray) -> Float:
-        """Return (n, 3, 3) what is added to the covariances of the poses of these frames (n,)."""
+        """Return the second-order covariances (n, 3, 3) of the poses of some frames (n,)."""
         chosen = self.path[:, frames]
         return np.einsum("sni,snj->nij", chosen, chosen)
 
 
 def second_order_errors(problem: Problem, end: Settled) -> SecondOrder | None:
-    """Return the errors of second order about where steps ended; None where they do not matter.
+    """Return the second-order errors of an estimate; None if they are negligible.
 
-    Where all poses see the same few landmarks, these hold the headings, and the poses are
-    eliminated first (`elimination.py`). No errors are drawn there.
+    If the poses are eliminated first (`elimination.py`), all poses see the same few landmarks,
+    which determine the headings. There are no second-order errors then.
 
     Args:
-        problem: under the levels that steps ended with.
-        end: where they ended.
+        problem: the problem with the final noise levels.
+        end: the smoothed state.
     """
     if not end.solution.landmarks_first or len(end.estimate.path) < 2:
         return None
-    end, problem = factored(end), problem._replace(seen=end.seen)
+    problem = problem._replace(seen=end.seen)
     covariance = _pose_covariances(end)
     if np.max(_bound(end.estimate.path, covariance)) < _NEGLIGIBLE:
         return None
@@ -88,14 +88,13 @@ def second_order_errors(problem: Problem, end: Settled) -> SecondOrder | None:
 
 
 def _pose_covariances(end: Settled) -> Float:
-    """Return (T - 1, 3, 3) those of the poses after the first under the linearised equations."""
+    """Return the linearised covariances (T - 1, 3, 3) of the poses after the first."""
     factor, place = end.solution.factor, end.seen.pose_place[1:] - 1
-    assert factor is not None
     return factor.envelope.between(factor.inverse, place, place)
 
 
 def _bound(path: Float, covariance: Float) -> Float:
-    """Return (T - 1,) what the mean squares of each pose are at most, a coordinate, in sigmas.
+    """Return an upper bound of `_squared_sigmas`, shape (T - 1,).
 
     If every error of the heading shortened its part of the way, and none of it were mended by
     observations, a pose would be off by b, the sum of length * variance / 2. The mean square of
@@ -109,7 +108,7 @@ def _bound(path: Float, covariance: Float) -> Float:
 
 
 def _squared_sigmas(path: Float, covariance: Float) -> Float:
-    """Return (T - 1,) the mean square of errors (S, T, 3) of each pose, a coordinate, in sigmas."""
+    """Return the mean square of errors (S, T, 3) in sigmas a coordinate, shape (T - 1,)."""
     squares = np.einsum("ski,skj->kij", path[:, 1:], path[:, 1:]) / len(path)
     return np.trace(np.linalg.solve(covariance, squares), axis1=1, axis2=2) / 3
 
@@ -119,7 +118,7 @@ class _Drawing(NamedTuple):
 
     Attributes:
         problem: what is explained.
-        end: where steps ended, with its own factor.
+        end: where steps ended.
         at: the estimate there.
         weights: that the matrix of the equations is of.
         poses: the equations of the poses.
@@ -162,7 +161,6 @@ class _Drawing(NamedTuple):
         The points' own errors if the path were known turn no lever and are left out.
         """
         factor, left = self.end.solution.factor, self.poses.left
-        assert factor is not None
         normal = rng.standard_normal(len(factor))
         way = self.poses.by_frame(factor.solve_transposed(normal))
         still = left._replace(
@@ -175,7 +173,6 @@ class _Drawing(NamedTuple):
     def _further(self, error: Estimate) -> tuple[Float, Float]:
         """Return q of path and landmarks for an error d."""
         equations, seen, factor = self._equations(error), self.end.seen, self.end.solution.factor
-        assert factor is not None
         left = without_offsets(seen, equations.points)
         gradient = ReducedPoses(seen, equations, left).gradient()
         way = self.poses.solved(factor, -gradient)

@@ -1,13 +1,13 @@
 """Batch smoother: most probable path and landmarks of a whole log.
 
-A filter joins what it sees to its landmarks while its path is uncertain, and on a textured wall the
-next corner is often nearer than that. Along a smoothed path it shows: two tracks i, j of one corner
-have their points p, told by their own observations with covariances W, apart by no more than
+The filter associates observations while its path is uncertain, and neighbouring corners of a
+textured wall are often closer than that. On the smoothed path two tracks i, j of one corner, with
+points p and covariances W from their own observations, have the squared distance
 
     (p_i - p_j)' (W_i + W_j + 2 s^2)^-1 (p_i - p_j),
 
-chi-square distributed if each strays from the corner by s. The path was fitted to the same tracks,
-so what it is off by draws them together and not apart. A landmark becomes as many as it needs.
+which is chi-square distributed if the offsets from the corner have the standard deviation s. The
+path was fitted to the same tracks, so its errors do not increase the distance.
 """
 
 from dataclasses import dataclass, field, replace
@@ -40,30 +40,31 @@ from mapfusion.smoother.normal_equations import (
     information_under,
     odometry_information,
 )
-from mapfusion.smoother.optimizer import Problem, Settled, factored, finished, followed, settled
+from mapfusion.smoother.optimizer import Problem, Settled, finished, followed, settled
 from mapfusion.smoother.problem import Sightings, sightings_of
 from mapfusion.smoother.robust_loss import MOST_DOF, Tails
 from mapfusion.smoother.second_order import SecondOrder, second_order_errors
 from mapfusion.viewing import viewing_of
 
-# Of two tracks of one corner so many stay together; what is parted by mistake is seen twice.
+# Probability that two tracks of one corner are not split.
 _TOGETHER = 0.999
-_SINGULAR = 1e-12  # pivot, as a share of its diagonal element, that is rounding error
-# Pairs of tracks that are looked at together: some hundred bytes each. A landmark may have
-# thousands of tracks, all of whose pairs would not fit into memory.
+_SINGULAR = 1e-12  # pivot over diagonal element that is a rounding error
+# Number of pairs of tracks that are compared at the same time, to limit the memory: a landmark may
+# have thousands of tracks.
 _PAIRS_AT_ONCE = 100_000
 
 
 def parted(seen: Sightings, landmark: np.ndarray, path: Float, stray_m: float) -> np.ndarray:
-    """(N,) which landmark each observation is of, where those of several corners are several.
+    """Split landmarks of several corners; return the landmark of each observation, shape (N,).
 
-    The corner that holds the observation which a landmark is numbered after keeps the number, else
-    that with the most. Others are named after the first of their own that names no other landmark.
+    The corner with the observation after which a landmark is numbered keeps the number. Without it
+    the corner with the most observations does. Other corners get the number of their first
+    observation that is not the number of another landmark.
 
     Args:
-        seen: what the landmarks were seen by.
-        landmark: (N,) which one each observation of the log is of.
-        path: (T, 3) along which it was observed.
+        seen: the observations.
+        landmark: landmark of each observation of the log, shape (N,).
+        path: path of the robot, shape (T, 3).
         stray_m: s.
     """
     made = landmark.copy()
@@ -89,7 +90,7 @@ def parted(seen: Sightings, landmark: np.ndarray, path: Float, stray_m: float) -
 
 
 def _track_points(seen: Sightings, path: Float) -> tuple[Float, Float]:
-    """Of B tracks the points (B, 3) that their observations tell, and their covariances."""
+    """Return the points (B, 3) of the tracks from their own observations, and covariances."""
     pose, R = path[seen.frame], np.zeros((len(seen), 3, 3))
     R[:, :2, :2], R[:, 2, 2] = rotation(pose[:, 2]), 1.0
     point = np.einsum("nij,nj->ni", R, seen.position_m)
@@ -105,9 +106,10 @@ def _track_points(seen: Sightings, path: Float) -> tuple[Float, Float]:
 def _corners(
     first: np.ndarray, counts: np.ndarray, point: Float, covariance: Float, bound: float
 ) -> np.ndarray:
-    """(B,) the corner of each landmark that each of its tracks is of: 0, 1, ...
+    """Return the corner of each track within its landmark, from 0, shape (B,).
 
-    Again and again the track that the most observations agree with takes those tracks along.
+    Repeatedly the track with the most agreeing observations forms a corner with the tracks that
+    agree with it.
     """
     corner, of = np.zeros(len(point), dtype=np.int64), _landmarks(first)
     i, j = _apart(first, point, covariance, bound)
@@ -127,12 +129,12 @@ def _corners(
 
 
 def _landmarks(first: np.ndarray) -> np.ndarray:
-    """(B,) which landmark each track is of, of landmarks whose tracks begin at `first` (L + 1,)."""
+    """Return the landmark of each track (B,); `first` (L + 1,) are the landmarks' first tracks."""
     return np.repeat(np.arange(len(first) - 1), np.diff(first))
 
 
 def _apart(first: np.ndarray, point: Float, covariance: Float, bound: float) -> np.ndarray:
-    """(2, A) the tracks of one landmark that are of two corners, in the order of the first one."""
+    """Return pairs (2, A) of tracks of one landmark that disagree, ordered by the first track."""
     begin = first[_landmarks(first)]
     before = np.arange(len(point)) - begin  # tracks of the same landmark before each
     part = np.cumsum(before) // _PAIRS_AT_ONCE
@@ -148,9 +150,9 @@ def _apart(first: np.ndarray, point: Float, covariance: Float, bound: float) -> 
 
 
 def _squares(S: Float, off: Float) -> Float:
-    """(P,) squared Mahalanobis distances of (n, P), 0 where S (n, n, P) is singular.
+    """Return squared Mahalanobis distances (P,) of `off` (n, P); 0 for singular S (n, n, P).
 
-    By S = L D L'; both are changed.
+    Uses S = L D L' and overwrites both arguments.
     """
     total, regular = np.zeros(S.shape[-1]), np.ones(S.shape[-1], dtype=bool)
     least = [_SINGULAR * S[k, k] for k in range(len(S))]
@@ -164,16 +166,16 @@ def _squares(S: Float, off: Float) -> Float:
     return np.where(regular, total, 0.0)
 
 
-# Factor on the observations' standard deviations in a first round (graduated non-convexity): where
-# the path to start from is far off, most observations look gross and lose the weight to mend it.
-# It need not end closer than this, in squared sigmas a coordinate, to where the next one goes on.
+# Factor on the observations' standard deviations in a first round (graduated non-convexity). With a
+# poor initial path most observations look gross and would lose their weights. The second value is
+# the tolerance of this round, in squared sigmas a coordinate.
 _THOUGHT_WORSE, _CLOSE = 4.0, 3e-2
-# Where odometry is this many times worse than stated (level of its variances), observations that
-# contradict it look gross before the level is known. They are then judged anew, under the level.
+# If the odometry's variances exceed the stated ones by this factor, good observations look gross
+# until the level is known. The weights are then computed again with the level.
 _FAR_WORSE = 4.0
-# Of a motion that nothing but observations tells: what a robot does between frames is less.
+# Standard deviations of an unknown motion between two frames.
 _UNTOLD_M, _UNTOLD_RAD = 10.0, 1.0
-_LEAST_SEEN = 3  # observations that fix a pose, with one to spare
+_LEAST_SEEN = 3  # two observations determine a pose; one is redundant
 
 
 @dataclass(frozen=True)
@@ -181,14 +183,14 @@ class SmootherParameters:
     """Settings of the smoother.
 
     Attributes:
-        motion: noise of the odometry as stated; how much of it there is the log tells.
-        stray_m: standard deviation, along each axis, of where the point that a track is of lies
-            beside the landmark; 0: it is the landmark.
-        min_count: observations that a landmark needs.
-        odometry_covariance: (T, 3, 3) or longer, of odometry that was taken from what the log
-            observes and must not count twice: it says only how to come to frames that see too
-            little to tell, and from them. None, or NaN at a frame: the odometry is a source of its
-            own.
+        motion: stated noise of the odometry; the smoother estimates its level.
+        stray_m: standard deviation, along each axis, of the offset between a track's point and its
+            landmark; 0: no offset.
+        min_count: number of observations that a landmark needs.
+        odometry_covariance: covariances of visual odometry, shape (T, 3, 3) or longer. It comes
+            from the observations themselves and must not count twice, so it is used only beside
+            frames with too few observations. None, or NaN at a frame: the odometry is independent
+            of the observations.
     """
 
     motion: MotionNoise = field(default_factory=MotionNoise)
@@ -201,17 +203,17 @@ class SmootherParameters:
 
     @property
     def stray_information(self) -> float:
-        """Of a track's offset along each axis, in 1/m^2; 0 where there are no offsets."""
+        """Information of a track's offset along each axis, in 1/m^2; 0 without offsets."""
         return 1 / self.stray_m**2 if self.stray_m else 0.0
 
     @property
     def has_own_odometry(self) -> bool:
-        """Whether any odometry is a source of its own, so that its noise can be learned."""
+        """True if some odometry is independent, so that its noise can be estimated."""
         known = self.odometry_covariance
         return known is None or bool(np.isnan(known).any())
 
     def odometry_information(self, log: RobotLog) -> Float:
-        """(T - 1, 3) inverse variances of the log's increments after the first."""
+        """Return the inverse variances of the increments after the first, shape (T - 1, 3)."""
         if self.odometry_covariance is None:
             return odometry_information(log.odometry, self.motion)
         blind = np.diff(log.frame_starts()) < _LEAST_SEEN
@@ -227,23 +229,21 @@ class SmootherParameters:
 
 @dataclass(frozen=True)
 class Smoothed:
-    """What a log says, all at once.
+    """Result of the smoother.
 
     Attributes:
-        landmark: (N,) which landmark each observation of the log is of, negative for none.
+        landmark: landmark of each observation of the log, shape (N,); negative for none.
         estimate: path, landmarks and tracks' offsets.
-        seen: the observations that went into them, their information on this level.
-        weights: of observations and offsets.
-        tails: of their Student-t's.
-        observation_level: factor on the stated covariances of observations on tracks, as the log
-            tells it.
-        odometry_level: (3,) factors on the odometry's stated variances along, across and in the
-            heading, likewise.
-        n_steps: Gauss-Newton steps that were taken.
-        own_m2: (L, 3, 3), see `common`.
+        seen: the observations, with information scaled by the level.
+        weights: weights of observations and offsets.
+        tails: tails of their Student-t distributions.
+        observation_level: estimated factor on the stated covariances of observations on tracks.
+        odometry_level: estimated factors on the odometry's stated variances along, across and in
+            the heading, shape (3,).
+        n_steps: number of Gauss-Newton steps.
+        own_m2: see `common`, shape (L, 3, 3).
         common: Y (R, 3L): the landmarks' joint covariance is block diagonal of `own_m2` plus Y' Y.
-        second_order: errors of second order, which `common` has among its own; None where they do
-            not matter.
+        second_order: second-order errors, which are part of `common`; None if negligible.
     """
 
     landmark: np.ndarray
@@ -267,11 +267,15 @@ class Smoothed:
         levels: Levels = AS_STATED,
         steps_before: int = 0,
     ) -> "Smoothed":
-        """Where steps ended under some levels, after some of earlier rounds.
+        """Return the result for the final state of the steps.
 
-        The problem's odometry is as stated.
+        Args:
+            problem: the problem with the stated odometry.
+            end: the final state.
+            landmark: landmark of each observation of the log, shape (N,).
+            levels: the estimated levels.
+            steps_before: number of steps in earlier rounds.
         """
-        end = factored(end)
         common = shared_errors(end.seen, end.equations, end.solution)
         information = information_under(problem.information, levels.odometry)
         further = second_order_errors(problem._replace(information=information), end)
@@ -284,7 +288,7 @@ class Smoothed:
         return cls(landmark, *found, n_steps, own_m2, common, further)
 
     def joint_covariance(self) -> Float:
-        """(3L, 3L), dense: for small maps."""
+        """Return the dense joint covariance (3L, 3L), for small maps."""
         common, n = self.common.spread(np.eye(len(self.common))), len(self.own_m2)
         joint = common @ common.T
         each = np.arange(n)
@@ -300,21 +304,21 @@ def smooth(
     parameters: SmootherParameters,
     max_memory_gb: float = np.inf,
 ) -> Smoothed:
-    """The most probable path and landmarks.
+    """Compute the most probable path and landmarks.
 
-    Landmarks that were seen as several corners become several (`one_corner.py`).
+    Landmarks whose tracks are of several corners are split (`one_corner.py`).
 
     Args:
-        log: what the robot measured.
-        landmark: (N,) which landmark each observation is of, negative for none.
-        path: (T, 3) where to start from; its first pose is the map's frame.
+        log: the log.
+        landmark: landmark of each observation, shape (N,); negative for none.
+        path: initial path, shape (T, 3); its first pose is the frame of the map.
         parameters: settings.
-        max_memory_gb: smoothing is refused where it may take more.
+        max_memory_gb: smoothing that may take more memory is refused.
 
     Raises:
-        LinAlgError: the equations cannot be solved.
+        LinAlgError: the equations are singular.
         MemoryError: it may take more than `max_memory_gb`.
-        ValueError: shapes that do not fit.
+        ValueError: an array has a wrong shape.
     """
     require_shape("path", path, (len(log), 3))
     information, path = parameters.odometry_information(log), between(path[0], path)
@@ -330,19 +334,19 @@ def smooth(
         end, levels = settled_with_levels(known, *start)
         if levels.odometry.max() > _FAR_WORSE and end.tails.observation < MOST_DOF:
             path, n_steps = end.estimate.path, n_steps + end.n_steps
-            del end  # its factors take as much memory as all else
+            del end  # frees the memory of its factors
             under = information_under(information, levels.odometry)
             start, n_again = _without_gross(known._replace(information=under), path)
             n_steps += n_again
             end, levels = settled_with_levels(known, *start, levels.odometry)
-    else:  # odometry that pictures told is used where these say nothing: they tell no level
+    else:  # visual odometry has no level of its own
         at, weights, tails = start
         end, levels = settled(known, at, weights=weights, tails=tails), AS_STATED
     return Smoothed.of(known, end, parts, levels, n_steps)
 
 
 def _without_gross(problem: Problem, path: Float) -> tuple[tuple[Estimate, Weights, Tails], int]:
-    """Return where a round ends in which observations are thought worse than stated; its steps."""
+    """Return the start of the next round after a round with larger errors, and its steps."""
     seen = problem.seen
     worse = replace(seen, information=seen.information / _THOUGHT_WORSE**2)
     blurred = problem._replace(seen=worse)
@@ -368,14 +372,13 @@ def smoothed_map(
     rank: int = RANK,
     attitude: Attitude | None = None,
 ) -> LandmarkMap:
-    """The landmarks in the frame of the first pose.
+    """Return the landmarks as a map in the frame of the first pose.
 
     Args:
-        log: what was smoothed.
-        smoothed: what came out. Where landmarks were named by rows of the log, these tell what
-            they came from.
-        rank: shared variables that are kept.
-        attitude: by which the observations were levelled; None: of a level body.
+        log: the smoothed log.
+        smoothed: the result of the smoother, with landmarks numbered by rows of the log.
+        rank: number of shared variables of the joint covariance.
+        attitude: attitude that the observations were levelled with; None for a level body.
     """
     seen, landmark = smoothed.seen, smoothed.landmark
     if attitude is not None and seen.n_dimensions > 2:
@@ -391,7 +394,7 @@ def smoothed_map(
 
 @one_blas_thread
 def condensed_points(smoothed: Smoothed, rank: int = RANK) -> tuple[Float, JointCovariance]:
-    """Landmarks (L, 3) and what is kept of their joint covariance; of planar ones z is known."""
+    """Return the landmarks (L, 3) and their condensed joint covariance; planar z is zero."""
     point = smoothed.estimate.point_m.copy()
     joint = condensed(smoothed.own_m2, smoothed.common, rank)
     if smoothed.seen.n_dimensions == 2:
@@ -401,7 +404,7 @@ def condensed_points(smoothed: Smoothed, rank: int = RANK) -> tuple[Float, Joint
 
 
 def _with_attitude(smoothed: Smoothed, attitude: Attitude) -> Smoothed:
-    """With what is not known of the attitude among the landmarks' shared errors."""
+    """Add the errors of the attitude to the landmarks' shared errors."""
     seen, estimate = smoothed.seen, smoothed.estimate
     lifted = shared_heights(attitude, estimate.path, seen.frame, seen.landmark, estimate.point_m)
     moved = np.zeros((*lifted.shape, 3))

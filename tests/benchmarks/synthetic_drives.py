@@ -18,7 +18,7 @@ from mapfusion.geometry.numerics import Float, one_blas_thread
 from mapfusion.geometry.se2 import compose, wrap
 from mapfusion.smoother.elimination import memory_bytes, pose_covariances
 from mapfusion.smoother.normal_equations import information_under
-from mapfusion.smoother.optimizer import Problem, factored, solved
+from mapfusion.smoother.optimizer import Problem, solved
 from mapfusion.smoother.smooth import Smoothed, SmootherParameters, smooth
 from tests.helpers.synthetic_drives import SHAPES, Drive, drive
 
@@ -70,7 +70,7 @@ def _pose_covariances(driven: Drive, found: Smoothed, frames: np.ndarray) -> Flo
     parameters, log = SmootherParameters(stray_m=STRAY_M), driven.log
     information = information_under(parameters.odometry_information(log), found.odometry_level)
     problem = Problem(found.seen, log.odometry, information, parameters.stray_information)
-    end = factored(solved(problem, found.estimate, found.weights, found.tails))
+    end = solved(problem, found.estimate, found.weights, found.tails)
     covariance = pose_covariances(end.seen, end.equations, end.solution, frames)
     further = found.second_order
     return covariance if further is None else covariance + further.pose_covariances(frames)

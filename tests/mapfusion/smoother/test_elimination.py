@@ -13,13 +13,10 @@ from mapfusion.geometry.joint_covariance import KnownErrors, condensed
 from mapfusion.geometry.numerics import Float, inverses, put_inverse
 from mapfusion.geometry.se2 import between, rotation, wrap
 from mapfusion.robot_log import RobotLog
-from mapfusion.smoother import elimination
-from mapfusion.smoother.cholesky import factor_in_envelope
 from mapfusion.smoother.elimination import (
     Solution,
     _landmarks_first,
     _poses_first,
-    own_factor,
     shared_errors,
     solve_points,
 )
@@ -192,52 +189,6 @@ def test_errors_of_the_path_are_those_of_their_large_matrix(planar: bool, tracks
     by_both = [condensed(solution.own_m2, known, rank=6) for known in (errors, KnownErrors(Y))]
     for one, other in zip(*((each.own_m2, each.marginal_m2) for each in by_both), strict=True):
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-6 * squares.max())
-
-
-@pytest.mark.parametrize("planar", [False, True])
-@pytest.mark.parametrize("tracks", [False, True])
-@pytest.mark.parametrize("share", [elimination._OFF, 1e-4])
-def test_a_step_by_the_factor_of_another_is_the_same(
-    planar: bool, tracks: bool, share: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of other weights and another path; covariances are of the equations' own factor."""
-    monkeypatch.setattr(elimination, "_OFF", share)
-    log, seen, weights, _, _ = solved_densely(planar, tracks)
-    information, path = odometry_information(log.odometry, NOISE), dead_reckoned(log)
-    at = Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
-    given = STRAY_M**-2, log.odometry, information
-    before = _landmarks_first(seen, normal_equations(seen, at, weights, *given))
-    other = Estimate(*(old + new for old, new in zip(at, before.step, strict=True)))
-    less = Weights(weights.observation**0.9, weights.offset)
-    equations = normal_equations(seen, other, less, *given)
-    own = _landmarks_first(seen, equations)
-    found = _landmarks_first(seen, equations, before.factor)
-    assert found.factor is None
-    assert own.factor is not None
-    off = (found.step.path - own.step.path)[seen.pose_place.argsort()][1:].ravel()
-    lower = own.factor.dense()
-    assert np.linalg.norm(lower.T @ off) < 2 * share * np.sqrt(own.moved)
-    assert found.moved == pytest.approx(own.moved, rel=4 * share**2)
-    for one, another in zip(found.step, own.step, strict=True):
-        np.testing.assert_allclose(one, another, rtol=0, atol=10 * share * np.abs(another).max())
-    np.testing.assert_array_equal(own_factor(seen, equations, found).lower, own.factor.lower)
-    expected = shared_errors(seen, equations, own).squares()
-    np.testing.assert_array_equal(shared_errors(seen, equations, found).squares(), expected)
-
-
-@pytest.mark.parametrize("planar", [False, True])
-def test_a_factor_that_is_too_far_off_is_not_used(planar: bool) -> None:
-    log, seen, weights, _, _ = solved_densely(planar, tracks=True)
-    information, path = odometry_information(log.odometry, NOISE), dead_reckoned(log)
-    at = Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
-    equations = normal_equations(seen, at, weights, STRAY_M**-2, log.odometry, information)
-    own = _landmarks_first(seen, equations)
-    assert own.factor is not None
-    envelope, wide = own.factor.envelope, np.diag(np.logspace(-9, 9, len(own.factor)))
-    far = factor_in_envelope(envelope.of(wide), envelope)
-    found = _landmarks_first(seen, equations, far)
-    assert found.factor is not None
-    np.testing.assert_array_equal(found.step.path, own.step.path)
 
 
 @pytest.mark.parametrize("planar", [False, True])

@@ -18,7 +18,7 @@ from mapfusion.smoother.normal_equations import (
     squared_distances,
     squares_of_points,
 )
-from mapfusion.smoother.optimizer import Problem, Settled, followed, stretched
+from mapfusion.smoother.optimizer import Problem, Settled, followed
 from mapfusion.smoother.problem import sightings_of
 from mapfusion.smoother.robust_loss import NO_TAILS, fitted_dof, student_weights, unweighted
 from tests.mapfusion.smoother.white_noise_logs import (
@@ -98,11 +98,11 @@ def test_a_log_that_tells_nothing_stays_as_stated() -> None:
 
 
 def test_steps_end_where_more_of_them_would(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wherever they begin: levels to less than their errors, poses to a tenth of theirs."""
+    """Wherever they begin: levels to less than their errors, poses to a fiftieth of theirs."""
     log = stated(tracked_log(0), 4.0)
     reckoned = dead_reckoned(log)
     found, told = settled_from(log, reckoned)
-    for name, value in (("CONVERGED", 1e-12), ("_CLOSE", 1e-8), ("_SETTLED", 1e-6)):
+    for name, value in (("CONVERGED", 1e-12), ("_SETTLED", 1e-6)):
         monkeypatch.setattr(noise_estimation, name, value)
     monkeypatch.setattr(noise_estimation, "_FOLLOWED", 1e-8)
     end, at_end = settled_from(log, reckoned)
@@ -112,10 +112,10 @@ def test_steps_end_where_more_of_them_would(monkeypatch: pytest.MonkeyPatch) -> 
     covariance = pose_covariances(end.seen, end.equations, end.solution, frames)
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     for each, its in ((found, told), (again, told_again)):
-        assert its.observation == pytest.approx(at_end.observation, rel=5e-3)
-        np.testing.assert_allclose(its.odometry, at_end.odometry, rtol=0.35)
+        assert its.observation == pytest.approx(at_end.observation, rel=3e-3)
+        np.testing.assert_allclose(its.odometry, at_end.odometry, rtol=0.1)
         off = (each.estimate.path - end.estimate.path)[1:] / sigma
-        assert np.sqrt(np.mean(off**2)) < 0.1
+        assert np.sqrt(np.mean(off**2)) < 0.02
         assert each.n_steps < end.n_steps
 
 
@@ -133,39 +133,6 @@ def test_the_level_is_known_before_the_first_step(factor: float) -> None:
     at, weights, tails = followed(problem, end.estimate)
     first = noise_estimation.first_observation_level(problem, at, weights, tails)
     assert first * factor == pytest.approx(1, abs=0.15)
-
-
-def test_a_step_is_stretched_by_how_much_shorter_it_is() -> None:
-    log = tracked_log(1)
-    before, _ = settled_from(log, dead_reckoned(log))
-
-    def followed_by(share: float, turn_rad: float = 0.0) -> float:
-        solution = before.solution
-        path = share * solution.step.path
-        path[:, :2] = path[:, :2] @ rotation(turn_rad)
-        step = solution.step._replace(path=path)
-        return stretched(before, before._replace(solution=solution._replace(step=step)))
-
-    assert followed_by(0.5) == pytest.approx(1.5)  # half of 1/2 + 1/4 + ... more
-    assert followed_by(0.75) == pytest.approx(2.5)
-    assert followed_by(-0.5) == followed_by(0.5, turn_rad=1.0) == followed_by(0.95) == 1.0
-
-
-def test_stretched_steps_end_where_others_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    """And are fewer."""
-    log = stated(tracked_log(0), 4.0)
-    rng = np.random.default_rng(0)
-    wrong = log.observations.position_m.copy()
-    rows = rng.choice(len(wrong), len(wrong) // 5, replace=False)
-    wrong[rows, :2] += rng.normal(0, 0.2, (len(rows), 2))
-    log = replace(log, observations=replace(log.observations, position_m=wrong))
-    monkeypatch.setattr(noise_estimation, "CONVERGED", 1e-10)
-    found, told = settled_from(log, dead_reckoned(log))
-    monkeypatch.setattr(noise_estimation, "stretched", lambda before, end: 1.0)
-    slow, told_slowly = settled_from(log, dead_reckoned(log))
-    assert found.n_steps < slow.n_steps
-    np.testing.assert_allclose(found.estimate.path, slow.estimate.path, rtol=0, atol=1e-5)
-    assert told.observation == pytest.approx(told_slowly.observation, rel=1e-4)
 
 
 def test_what_weights_leave_of_a_track_tells_its_point() -> None:

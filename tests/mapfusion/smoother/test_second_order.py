@@ -11,7 +11,7 @@ from mapfusion.geometry.se2 import between, compose
 from mapfusion.robot_log import Observations, RobotLog
 from mapfusion.smoother import second_order
 from mapfusion.smoother.normal_equations import Estimate
-from mapfusion.smoother.optimizer import Problem, Settled, factored, settled, solved
+from mapfusion.smoother.optimizer import Problem, Settled, settled, solved
 from mapfusion.smoother.problem import sightings_of
 from mapfusion.smoother.second_order import second_order_errors
 from mapfusion.smoother.smooth import Smoothed, SmootherParameters, condensed_points, smooth
@@ -53,7 +53,7 @@ def solved_chain() -> tuple[Problem, Settled]:
     point_m = driven.log.observations.position_m.copy()
     point_m[:, :2] = compose(path, np.c_[point_m[:, :2], np.zeros(len(path))])[:, :2]
     at = Estimate(path, point_m, np.zeros((len(seen.strays), 3)))
-    return problem, factored(settled(problem, at))
+    return problem, settled(problem, at)
 
 
 def test_mean_squares_are_those_of_chains_that_are_composed() -> None:
@@ -86,7 +86,7 @@ def test_is_off_by_what_fits_the_same_data() -> None:
     assert found.second_order is None  # the path is short
     information = SmootherParameters().odometry_information(driven.log) / found.odometry_level
     problem = Problem(found.seen, driven.log.odometry, information, 0.0)
-    end = factored(solved(problem, found.estimate, found.weights, found.tails))
+    end = solved(problem, found.estimate, found.weights, found.tails)
     drawing, at, small = second_order._Drawing.of(problem, end), end.estimate, 1e-3
     error = drawing._drawn(np.random.default_rng(0))
     path, point_m = drawing._further(error)
@@ -141,7 +141,7 @@ def test_is_that_of_the_estimate_whatever_equations_led_to_it() -> None:
     problem, end = solved_chain()
     error = second_order._Drawing.of(problem, end)._drawn(np.random.default_rng(0))
     at = _moved(end.estimate, error, 0.1)
-    fresh = factored(solved(problem, at, end.weights, end.tails))
+    fresh = solved(problem, at, end.weights, end.tails)
     found = second_order_errors(problem, end._replace(estimate=at))
     expected = second_order_errors(problem, fresh)
     assert found is not None
@@ -154,4 +154,4 @@ def test_a_path_that_turns_nowhere_has_none() -> None:
     problem, end = solved_chain()
     information = problem.information * [1, 1, 1e6]
     problem = problem._replace(information=information)
-    assert second_order_errors(problem, factored(settled(problem, end.estimate))) is None
+    assert second_order_errors(problem, settled(problem, end.estimate)) is None
