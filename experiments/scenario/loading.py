@@ -31,7 +31,13 @@ from experiments.scenario.settings import (
     sections_of,
 )
 from experiments.scenario.world_settings import expanded
-from experiments.scenario.yaml_files import apply_overrides, lines_of_keys, read_mapping
+from experiments.scenario.yaml_files import (
+    OWN,
+    SHIPPED,
+    apply_overrides,
+    lines_of_keys,
+    read_mapping,
+)
 from mapfusion.errors import (
     InputError,
     InputErrors,
@@ -41,8 +47,6 @@ from mapfusion.errors import (
 )
 from mapfusion.parameters import Range
 
-SHIPPED = Path(__file__).with_name("shipped")  # the repository's scenarios/, also where installed
-OWN = Path("scenarios")  # what shipped files name lies beside it, as it does in the repository
 S = TypeVar("S")
 Location = tuple[int | str, ...]  # keys and places in lists, from a scenario's root
 Place = Callable[[Location], str]  # where the value at a location was given, behind a file's name

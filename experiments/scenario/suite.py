@@ -3,15 +3,18 @@
 One in ./scenarios takes the place of the shipped one of its name: who edits a copy runs the copy.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from experiments.scenario.loading import OWN, SHIPPED, default_settings, load_scenario
-from experiments.scenario.settings import Recording, Scenario
-from experiments.scenario.yaml_files import read_mapping
+from experiments.scenario.yaml_files import OWN, SHIPPED, read_mapping
 from mapfusion.errors import InputError, did_you_mean
 from mapfusion.files import write_whole
+
+if TYPE_CHECKING:
+    from experiments.scenario.settings import Scenario
 
 SUFFIXES = {".yaml", ".yml", ".json"}  # a JSON file is YAML too: a result's scenario.json
 
@@ -48,6 +51,9 @@ def settings_of(
     word: str | Path | None, overrides: Sequence[str] = (), seed: int | None = None
 ) -> Scenario:
     """What a scenario sets, or the defaults without one; raises InputError."""
+    # Settings import all that has some: not for a search by name or a listing.
+    from experiments.scenario.loading import default_settings, load_scenario
+
     if word is None:
         return default_settings(overrides, seed)
     return load_scenario(one_scenario(word), overrides, seed)
@@ -110,13 +116,14 @@ def _tags(data: dict) -> list[str]:
 
 
 def entries(folder: Path | None = None) -> list[dict[str, Any]]:
-    """What a listing tells of a folder's scenarios, or the suite's, in the order of their names.
+    """Return what the files of a folder, or the suite's, say, in the order of their names.
 
-    `iterations` are frames a robot, None for recorded logs; `overlap` is that of the robots'
-    ground, None where the world was not generated.
+    `iterations` are frames a robot, None for recorded logs; `overlap` is the overlap of the robots'
+    ground that is asked for, None where the world is not generated. Settings are not checked here:
+    a value of another type than expected is None.
 
     Raises:
-        InputError: the folder holds none, or one of them is wrong.
+        InputError: the folder holds no scenario, or a file is no mapping.
     """
     files = _files(folder)
     if not files:
@@ -127,10 +134,32 @@ def entries(folder: Path | None = None) -> list[dict[str, Any]]:
 
 
 def _entry(path: Path) -> dict[str, Any]:
-    scenario = load_scenario(path)
-    row = {name: getattr(scenario, name) for name in ("name", "tags", "description")}
-    if isinstance(scenario, Recording):
-        return row | {"robots": len(scenario.logs), "iterations": None, "overlap": None}
-    overlap = scenario.generated.overlap if scenario.generated else None
-    frames = scenario.drive.frames
-    return row | {"robots": len(scenario.robots), "iterations": frames, "overlap": overlap}
+    from sim.plan_generator import RouteParameters
+
+    data = read_mapping(path)
+    generate, generated, drive = (
+        _section(data, name) for name in ("generate", "generated", "drive")
+    )
+    robots, overlap = data.get("logs", data.get("robots")), generated.get("overlap_asked")
+    n_robots = len(robots) if isinstance(robots, list) else None
+    if "generate" in data:
+        n_robots = generate.get("robots", RouteParameters.robots)
+        overlap = generate.get("overlap", RouteParameters.overlap)
+    return {
+        "name": str(data.get("name", path.stem)),
+        "tags": _tags(data),
+        "description": str(data.get("description", "")),
+        "recorded": "logs" in data,
+        "robots": _number(n_robots),
+        "iterations": _number(drive.get("frames")),
+        "overlap": _number(overlap),
+    }
+
+
+def _section(data: dict[str, Any], name: str) -> dict[str, Any]:
+    found = data.get(name)
+    return found if isinstance(found, dict) else {}
+
+
+def _number(value: Any) -> float | None:
+    return value if isinstance(value, int | float) else None

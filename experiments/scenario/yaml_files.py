@@ -12,6 +12,8 @@ from ruamel.yaml.nodes import MappingNode, Node, ScalarNode
 from mapfusion.errors import InputError
 from mapfusion.files import SEAL
 
+SHIPPED = Path(__file__).with_name("shipped")  # the repository's scenarios/, also where installed
+OWN = Path("scenarios")  # what shipped files name lies beside it, as it does in the repository
 _MOST_BYTES = 4_000_000  # the largest resolved scenario of ours takes 0.03 of that
 _MOST_VALUES = 200_000  # with every alias written out
 # The reader takes a second for 5 000 to 10 000 values; the 1000 walls that a world may have, of two

@@ -1,6 +1,5 @@
 import io
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -10,21 +9,12 @@ from PIL import Image
 from experiments.evaluation.evaluated_run import JudgedRun
 from experiments.evaluation.result import run_scenario
 from experiments.methods.threads import single_threaded
-from experiments.pipeline import workers
 from experiments.pipeline.store import Store
 from experiments.reports.figures import drawing
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import Scenario, Simulation
 from tests.helpers.shared_folder import shared_folder
 from tests.helpers.tiny_scenario import TINY, TRIO
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _no_server_is_forked_from_here() -> Iterator[None]:
-    """Unlike a command, this process has begun to work, and what tests replace would stay so."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(workers, "make_ready", lambda jobs: None)
-        yield
 
 
 @pytest.fixture(scope="session")
