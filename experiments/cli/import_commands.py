@@ -105,7 +105,6 @@ def _stereo_command(format_name: str) -> Callable[..., None]:
     ) -> None:
         from experiments.cli.options import require_folder
         from experiments.pipeline.stereo_import import Source, import_stereo, vision_of
-        from experiments.pipeline.workers import make_ready
         from experiments.reports.terminal.layout import progress
         from experiments.reports.terminal.run_screen import print_imported
         from experiments.scenario.loading import made_settings
@@ -120,7 +119,6 @@ def _stereo_command(format_name: str) -> Callable[..., None]:
         sources = [
             Source(format_name, folder, settings, odometry, truth, *given) for folder in folders
         ]
-        make_ready(jobs)
         with progress() as show:
             done, written = import_stereo(
                 sources, output, lambda one: _cuts(robot_name(one.name), frames or ()), jobs, show

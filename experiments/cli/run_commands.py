@@ -1,5 +1,6 @@
 """Commands that run scenarios and show their results."""
 
+import time
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -44,18 +45,19 @@ def run(
     # What draws takes time to import: a scenario is refused before.
     from experiments.evaluation.criteria import nothing_merged
     from experiments.evaluation.evaluated_run import finding_lines, has_usable_map
-    from experiments.evaluation.result import run_scenario
-    from experiments.pipeline.workers import make_ready, workers
+    from experiments.evaluation.result import add_times, run_scenario
+    from experiments.pipeline.workers import workers
     from experiments.reports.figures.drawing import Drawing
     from experiments.reports.terminal import layout, run_screen
 
-    make_ready(jobs)
     unusable = False
+    start = {"start": {"run": time.process_time()}}  # shared by all scenarios
     for loaded in checked:
         with layout.progress() as show, workers(jobs) as pool:
             drawing = Drawing(pool)
             folder = run_scenario(loaded, results, jobs, show, fresh, output, drawing.written)
             drawn = drawing.finish(folder, partial(show, _DRAWING))
+        add_times(folder, start | {"figures": drawn.elapsed_s})
         run_screen.print_result(folder, drawn.skipped)
         for line in finding_lines(folder):
             options.complain(f"warning: {line}")
@@ -84,7 +86,6 @@ def report(
     """Show a result in one HTML file that works offline: `mapfusion report results/quick-0`."""
     from experiments.cli.options import REPORT, require_file
     from experiments.evaluation.result import require_result
-    from experiments.pipeline.workers import make_ready
     from experiments.reports.figures.drawing import draw_all
     from experiments.reports.report.document import write_report
     from experiments.reports.terminal import layout
@@ -92,10 +93,9 @@ def report(
     require_file("--output", output, REPORT)
     if figures:
         require_result(result)
-        make_ready(jobs)
         with layout.progress() as show:
             drawn = draw_all(result, jobs, partial(show, _DRAWING))
-        layout.print_paths(result / "figures", *drawn)
+        layout.print_paths(result / "figures", drawn.files, drawn.skipped)
     path = write_report(result, output)
     layout.print_lines([f"{path} ({path.stat().st_size / 1e6:.1f} MB)"])
 
@@ -162,9 +162,7 @@ def check(
 
     def run_one(scenario: AnyScenario) -> Path:
         from experiments.evaluation.result import run_scenario  # as in `run`
-        from experiments.pipeline.workers import make_ready
 
-        make_ready(jobs)
         with layout.progress() as show:
             return run_scenario(scenario, results, jobs, show, fresh)
 
@@ -203,13 +201,14 @@ def list_scenarios(
     ] = False,
 ) -> None:
     """List the suite, with the tags that `run` and `check` take: `mapfusion scenarios`."""
-    from experiments.scenario.loading import schema_text
     from experiments.scenario.suite import copy_to_edit, entries
 
     if copy is not None:
         typer.echo(copy_to_edit(copy))
         return
     if schema:
+        from experiments.scenario.loading import schema_text
+
         typer.echo(schema_text(), nl=False)
         return
     from experiments.reports.terminal import study_screen

@@ -30,13 +30,11 @@ def record(
     from experiments.evaluation import single_steps as single
     from experiments.evaluation.checks import load_checked
     from experiments.evaluation.dataset_export import write_drives
-    from experiments.pipeline.workers import make_ready
     from experiments.reports.terminal.layout import print_paths, progress
     from experiments.scenario.suite import one_scenario
 
     require_folder(output, [scenario])
     loaded = load_checked(one_scenario(scenario), overrides, seed)
-    make_ready(jobs)
     with progress() as show:
         if kind == "log":
             paths = single.record(loaded, output, results, jobs, show)

@@ -42,7 +42,6 @@ def refusal(
     import numpy as np
 
     from experiments.cli.options import require_folder
-    from experiments.pipeline.workers import make_ready
     from experiments.reports.study_files import draw_refusals, write_kinds
     from experiments.reports.terminal import layout, study_screen
     from experiments.scenario.seeds import parse_seeds
@@ -52,7 +51,6 @@ def refusal(
     from experiments.studies.refusal.refusal_trial import PairsDrawn
 
     require_folder(output, worlds)
-    make_ready(jobs)
     mapped, drawn = worlds_of(worlds, parse_seeds(seeds), results), PairsDrawn(pairs, every)
     with layout.progress() as show:
         false_alarms = refusal_trial.run(mapped, output, drawn, jobs, show)

@@ -1,6 +1,9 @@
 """Run with its evaluation: all stages of a scenario, the store, and findings about its logs."""
 
+import time
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,8 +19,6 @@ from experiments.evaluation.fused_map_errors import GivenMap, JudgedFusion
 from experiments.evaluation.pair_evaluation import ALIGNED, JudgeSettings
 from experiments.evaluation.smoothed_robots import SmoothedRobot, load_smoothed
 from experiments.evaluation.truth import why_no_truth
-from experiments.pipeline.head_start import with_head_start
-from experiments.pipeline.kept_logs import kept_log
 from experiments.pipeline.memory import require_memory
 from experiments.pipeline.pipeline import PairStages, Pipeline, RobotStages, lay_out
 from experiments.pipeline.rehearsal import rehearsals
@@ -42,8 +43,9 @@ from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.fusion.fusers import make_fuser
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.robot_log import RobotLog, read_true_poses
+from mapfusion.robot_log import RobotLog, read_log, read_true_poses
 
+TABLES_PART = "tables"  # of a run outside its stages
 _JUDGED = {"errors", "fusion"}  # the other tables of pairs come from the aligners
 
 
@@ -95,7 +97,7 @@ class JudgedRun:
     def logs(self) -> dict[str, RobotLog]:
         """All robots' logs by name."""
         folders = {robot.name: self.robot_folders(robot) for robot in self.pipeline.robots}
-        return {name: kept_log(each.log) for name, each in folders.items()}
+        return {name: read_log(each.log) for name, each in folders.items()}
 
     def load_robots(self) -> list[EvaluatedRobot]:
         """All robots' maps joined with the truth, without viewing evidence: no table reads it."""
@@ -139,6 +141,20 @@ class JudgedRun:
         return FusedTeam.of(robots, met, self.settings.merge)
 
     @cached_property
+    def outside_s(self) -> defaultdict[str, float]:
+        """Seconds of work outside the stages so far, by the part of the run."""
+        return defaultdict(float)
+
+    @contextmanager
+    def timed(self, part: str) -> Iterator[None]:
+        """Count the seconds of a `with` block to a part of the run outside its stages."""
+        started_s = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.outside_s[part] += time.perf_counter() - started_s
+
+    @cached_property
     def team(self) -> FusedTeam:
         """What `load_team` gives; it stays in memory."""
         return self.load_team()
@@ -160,9 +176,10 @@ class JudgedRun:
 
     def _load(self) -> None:
         """Have in memory what is wanted when all tasks are done."""
-        _ = self.team
-        if any(self.untimed()):
-            _ = self.timings
+        with self.timed(TABLES_PART):
+            _ = self.team
+            if any(self.untimed()):
+                _ = self.timings
 
     def _load_task(self) -> Task:
         read = [robot.slam for robot in self.pipeline.robots]
@@ -197,7 +214,6 @@ class JudgedRun:
         wanted = only or self.stages()
         left = unfinished(self.tasks, [name for stage in wanted for name in task_names(stage)])
         if jobs > 1:
-            left = with_head_start(self.pipeline, self.store, left)
             left = [*rehearsals(self.scenario, left), *left]
         try:
             with workers(jobs) as pool:

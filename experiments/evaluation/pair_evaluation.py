@@ -11,12 +11,11 @@ from experiments.evaluation import tables
 from experiments.evaluation.alignment_errors import EvaluatedRobot, error_rows, met_maps
 from experiments.evaluation.fused_landmarks import MergeSettings, fusion_rows
 from experiments.evaluation.truth import PathTruth, landmark_truth
-from experiments.pipeline.kept_logs import kept_log
 from experiments.pipeline.stage import Job
 from experiments.pipeline.stages.slam import RobotFolders, folders_of_both
 from experiments.pipeline.stages.snapshots import ROBOTS_KEPT, stored_maps
 from mapfusion.errors import InputError
-from mapfusion.robot_log import TRUTH_TABLES, RobotLog, RobotTruth, read_truth
+from mapfusion.robot_log import TRUTH_TABLES, RobotLog, RobotTruth, read_log, read_truth
 from mapfusion.tables import table_path
 from mapfusion.verification.verdict import Judge
 
@@ -46,7 +45,7 @@ def load_robot(folders: RobotFolders, viewing: bool = True) -> EvaluatedRobot:
 
     They stay in memory as `stored_maps` do, with or without viewing evidence.
     """
-    log = kept_log(folders.log)
+    log = read_log(folders.log)
     truth = truth_of(folders.log, log)
     poses, points = (truth.T_world_robot, log), (truth.point_world_m, log.observations)
     for file, (true, logged) in (("truth_poses", poses), ("truth_points", points)):

@@ -18,7 +18,7 @@ import pandas as pd
 
 from experiments.evaluation import fused_landmarks, tables
 from experiments.evaluation.alignment_errors import EvaluatedRobot
-from experiments.evaluation.evaluated_run import JudgedRun, finding_rows
+from experiments.evaluation.evaluated_run import TABLES_PART, JudgedRun, finding_rows
 from experiments.evaluation.fused_landmarks import (
     FusedTeam,
     fused_history_rows,
@@ -32,12 +32,11 @@ from experiments.evaluation.result_files import RESULT_SCHEMA_VERSION, require_t
 from experiments.evaluation.smoothed_robots import SmoothedRobot, smoothed_path_rows, smoother_rows
 from experiments.evaluation.team_errors import team_pair_rows, team_rows
 from experiments.pipeline.code_version import library_versions
-from experiments.pipeline.head_start import head_start
 from experiments.pipeline.stages import slam
 from experiments.pipeline.stages.fuse import fused_map_files
 from experiments.pipeline.stages.smooth import map_files, read_smoothed_path
 from experiments.pipeline.store import Store, file_entries, link_or_copy, mending, require_sound
-from experiments.pipeline.tables import read_rows
+from experiments.pipeline.tables import read_rows, records
 from experiments.pipeline.tasks import OnProgress
 from experiments.plugins.discovery import find_method
 from experiments.scenario.settings import AnyScenario, Simulation
@@ -132,11 +131,7 @@ def makers(run: JudgedRun, team: FusedTeam) -> dict[str, Maker]:
         "findings": lambda: finding_rows(run),
         "smoother": lambda: smoother_rows(smoothed()),
         "team_edges": lambda: fused_landmarks.team_edge_rows(team),
-        "timings": lambda: [
-            {"stage": stage.name, "name": f"{stage.key}:{name}", "elapsed_s": seconds}
-            for stage in run.folders()
-            for name, seconds in stage.figures().items()
-        ],
+        "timings": lambda: _timings(run),
     }
 
 
@@ -150,6 +145,20 @@ def history_makers(run: JudgedRun, team: FusedTeam) -> dict[str, Maker]:
         "map_history": lambda: map_history_rows(team),
         "fused_history": lambda: fused_history_rows(team, run.settings.merge),
     } | no_truth
+
+
+def timing_row(stage: str, part: str, seconds: float, figure: str = "elapsed_s") -> dict[str, Any]:
+    """Return a row of the table `timings`, of a part of a stage, or of what is outside them."""
+    return {"stage": stage, "name": f"{part}:{figure}", "elapsed_s": seconds}
+
+
+def _timings(run: JudgedRun) -> list[dict[str, Any]]:
+    of_stages = [
+        timing_row(stage.name, stage.key, seconds, figure)
+        for stage in run.folders()
+        for figure, seconds in stage.figures().items()
+    ]
+    return of_stages + [timing_row(part, "run", s) for part, s in run.outside_s.items()]
 
 
 def _fused_map_rows(run: JudgedRun, fusions: Sequence[JudgedFusion]) -> pd.DataFrame:
@@ -233,9 +242,8 @@ def run_scenario(
         require_writable(place)
     remove_abandoned(folder)
     if fresh:
-        head = head_start(run.pipeline)
-        for stage in [*run.stages(), *([head] if head else [])]:
-            run.store.folder(stage).discard()
+        for folder_of_stage in run.folders():
+            folder_of_stage.discard()
 
     def make() -> None:
         run.execute(jobs, on_progress)
@@ -255,9 +263,25 @@ def write_result(
     `on_written` is told (folder, part) of each table, and of `scenario`, when it is there. World
     and images are there before the first of them.
     """
-    team = run.team
+    with run.timed(TABLES_PART):
+        team = run.team
     measure_aligners(run)
     (folder / "provenance.json").unlink(missing_ok=True)  # it lists the files of an earlier run
+    with run.timed(TABLES_PART):
+        made = _write_parts(run, team, folder, on_written)
+    # Times are added to this table later, so the list of files leaves it out.
+    files = [folder / "scenario.json", folder / "world.json", *(folder / "maps").glob("*")]
+    files += [tables.table_path(folder, name) for name in made if name != "timings"]
+    tables.write(tables.table_path(folder, "timings"), "timings", made["timings"]())
+    on_written(folder, "timings")
+    about = provenance(run) | {"tables": sorted(made), "files": file_entries(folder, files)}
+    write_json(folder / "provenance.json", about)
+
+
+def _write_parts(
+    run: JudgedRun, team: FusedTeam, folder: Path, on_written: OnWritten
+) -> dict[str, Maker]:
+    """Write images, maps and all tables but `timings`; return the makers of all tables by name."""
     for outdated in ("maps", "keyframes"):  # of robots or frames that are no longer there
         shutil.rmtree(folder / outdated, ignore_errors=True)
     _write_images(run, folder)
@@ -272,13 +296,25 @@ def write_result(
     write_tables(of_figures)
     write_json(folder / "scenario.json", run.scenario.resolved())
     on_written(folder, "scenario")
-    write_tables(others)
+    write_tables({name: make for name, make in others.items() if name != "timings"})
     _write_maps(run, folder / "maps")
-    names = sorted([*of_figures, *others])
-    made = [folder / "scenario.json", folder / "world.json", *(folder / "maps").glob("*")]
-    made += [tables.table_path(folder, name) for name in names]
-    about = provenance(run) | {"tables": names, "files": file_entries(folder, made)}
-    write_json(folder / "provenance.json", about)
+    return of_figures | others
+
+
+def add_times(folder: Path, seconds: Mapping[str, Mapping[str, float]]) -> None:
+    """Add the times of what follows the tables to the table `timings`.
+
+    Args:
+        folder: of a result.
+        seconds: of work, by the part of the run and by what it made.
+    """
+    path = tables.table_path(folder, "timings")
+    more = [
+        timing_row(part, name, value)
+        for part, by_name in seconds.items()
+        for name, value in by_name.items()
+    ]
+    tables.write(path, "timings", [*records(tables.read(path, "timings")), *more])
 
 
 def measure_aligners(run: JudgedRun) -> None:
@@ -287,9 +323,10 @@ def measure_aligners(run: JudgedRun) -> None:
     Serially, when all else is done: nothing else may be running.
     """
     for pair, path in run.untimed():
-        timing = run.timings[pair.a.name, pair.b.name]
-        remove_abandoned(path.parent)
-        tables.write(path, "aligner_timings", timing.rows())
+        with run.timed("timing the aligners"):
+            timing = run.timings[pair.a.name, pair.b.name]
+            remove_abandoned(path.parent)
+            tables.write(path, "aligner_timings", timing.rows())
 
 
 def _write_maps(run: JudgedRun, folder: Path) -> None:

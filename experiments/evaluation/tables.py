@@ -6,15 +6,19 @@ bit for bit, whenever the scenario and the seed are. A column's type follows fro
 means the same in all tables: what is not listed in `_NAMES` is a float.
 """
 
-from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from __future__ import annotations
 
-import pandas as pd
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
 import pyarrow as pa
 
 from experiments.pipeline import tables
 from experiments.pipeline.tables import CORRESPONDENCES, ESTIMATES, RIVALS, TRACKS
 from mapfusion.files import COVARIANCE_FIELDS, POSITION_FIELDS, schema
+
+if TYPE_CHECKING:  # as in `frames`
+    import pandas as pd
 
 # Names that are no floats.
 _NAMES = {
@@ -157,7 +161,8 @@ _COLUMNS = {
     # over, with one. n_landmarks: with a known truth. share_in_gate: of 95 %.
     "landmark_nees": """map landmarks n_landmarks degrees_of_freedom
         nees_mean nees_median share_in_gate""",
-    # Seconds of work by stage.
+    # Seconds of work by stage; what a run needs beside its stages (start, tables, timing the
+    # aligners, figures) has rows named like stages.
     "timings": "stage name elapsed_s",
     # Serial, warmed, repeated: figure 6. Median of the repeats, 10th and 90th percentile; n_common
     # is -1 where the truth is unknown.
@@ -209,6 +214,8 @@ def table_path(result: Path, name: str) -> Path:
 
 def framed(name: str, rows: pd.DataFrame | list[dict[str, Any]]) -> pd.DataFrame:
     """Rows with the columns of the table of that name alone; of no rows, columns of any type."""
+    import pandas as pd
+
     return pd.DataFrame(rows if len(rows) else [], columns=pd.Index(ALL[name].names))
 
 
@@ -220,3 +227,13 @@ def write(path: Path, name: str, rows: pd.DataFrame | list[dict[str, Any]]) -> N
 def read(path: Path, name: str) -> pd.DataFrame:
     """Read the table of that name; raises InputError that names the file."""
     return tables.read_rows(path, ALL[name])
+
+
+def work_by_stage(timings: pd.DataFrame) -> pd.DataFrame:
+    """Return seconds of work and the number of tasks by stage, from rows of `timings`.
+
+    A task that several runs share counts once. Columns: `stage`, `seconds`, `tasks`.
+    """
+    works = timings[timings["name"].str.endswith(":elapsed_s")].drop_duplicates(["stage", "name"])
+    stages = works.groupby("stage", sort=False)["elapsed_s"]
+    return stages.agg(seconds="sum", tasks="count").reset_index()

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 
-from experiments.pipeline.kept_logs import MOST_BYTES
 from experiments.pipeline.pipeline import Pipeline, RobotStages
 from experiments.pipeline.stage import RecordedLog
 from experiments.scenario.settings import Scenario, SimulatedScenario, Simulation
@@ -58,7 +57,7 @@ def require_memory(pipeline: Pipeline, jobs: int, machine_bytes: float | None = 
     """
     has = memory_bytes() if machine_bytes is None else machine_bytes
     need = max(needs(pipeline), key=lambda need: need.n_bytes)
-    wanted = jobs * (need.n_bytes + _PROCESS_BYTES + MOST_BYTES)
+    wanted = jobs * (need.n_bytes + _PROCESS_BYTES)
     if wanted > has:
         processes = f" in each of {jobs} processes (--jobs 1 needs least)" if jobs > 1 else ""
         raise InputError(

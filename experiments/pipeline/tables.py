@@ -1,8 +1,10 @@
 """Tables that stages write, with their schemas; none of them contains the truth."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -19,6 +21,10 @@ from mapfusion.verification.parameters import EvidenceParameters
 from mapfusion.verification.rivals import Copies
 from mapfusion.verification.verdict import PairEvidence, RivalMotion
 
+if TYPE_CHECKING:
+    import pandas as pd
+
+
 TEXT, INT, FLOAT, BOOL = pa.string(), pa.int32(), pa.float64(), pa.bool_()
 
 
@@ -34,6 +40,8 @@ def write_rows(
     attributes: Mapping[str, str] | None = None,
 ) -> None:
     """Write rows as a table of that schema, with further text attributes."""
+    import pandas as pd
+
     frame = pd.DataFrame(rows, columns=pd.Index(table_schema.names))
     columns = {column: frame[column].to_numpy() for column in frame}
     write_table(path, columns, table_schema, attributes)

@@ -1,18 +1,15 @@
 """Worker processes that run tasks; results do not depend on their number.
 
-Where Python can do so safely, they are forked from a server: a process that has imported what they
-need, once for all of them, and has done nothing else. OpenCV's and Numba's threads do not survive a
-fork, so nothing is forked that has begun to work. A command that has imported all it needs forks
-the server from itself, with `make_ready`; else the server imports it all anew.
+On Linux the processes are forked from multiprocessing's fork server, which imports our modules once
+for all of them. Elsewhere, where libraries hold threads or handles from their import on, each
+process starts anew.
 """
 
 import functools
-import gc
 import multiprocessing
 import os
 import re
 import signal
-import socket
 import sys
 import tempfile
 import threading
@@ -21,15 +18,11 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from multiprocessing import connection, forkserver, resource_tracker
-from multiprocessing.connection import (
-    arbitrary_address,  # pyright: ignore[reportAttributeAccessIssue]  # of which it is not told
-)
-from typing import Any, NoReturn
+from multiprocessing import connection, resource_tracker
+from typing import Any
 
 from threadpoolctl import threadpool_limits
 
-from experiments.plugins.isolated_process import end_children
 from mapfusion.errors import InputError
 
 
@@ -104,64 +97,8 @@ def saved_defect(error: BaseException) -> str:
 # order they were submitted, though a later one may be what others wait for.
 TASKS_PER_PROCESS = 2
 
-# On other systems libraries hold threads or handles from their import on.
-_FORKED = sys.platform == "linux"
+_START_METHOD = "forkserver" if sys.platform == "linux" else "spawn"
 _OURS = ("experiments.", "mapfusion.", "sim.")
-
-
-def make_ready(jobs: int) -> None:
-    """Fork the server from this process, if there are to be workers.
-
-    To be called by a command that has imported what they need, and has begun nothing yet. Only the
-    first call counts.
-    """
-    gc.freeze()  # what is imported stays: nobody is to look through it for garbage
-    server: Any = forkserver._forkserver
-    if jobs == 1 or not _FORKED or server._forkserver_pid is not None:
-        return
-    if threading.active_count() > 1:  # one of them may hold a lock, which nobody would open
-        return
-    end_children()  # of plug-ins that were looked at: they would be nobody's and everybody's
-    from numba.core.registry import cpu_target
-
-    # What Numba does before its first kernel, which takes it tenths of a second in each process.
-    contexts: Any = cpu_target
-    contexts.typing_context.refresh()
-    contexts.target_context.refresh()
-    sys.stdout.flush()  # else each process would write what is left there
-    sys.stderr.flush()
-    with held_back_interrupts(), socket.socket(socket.AF_UNIX) as listener:
-        # as `ensure_running` does, but for starting Python anew
-        address = arbitrary_address("AF_UNIX")
-        listener.bind(address)
-        os.chmod(address, 0o600)
-        listener.listen()
-        ended, alive = os.pipe()
-        process = os.fork()
-        if process == 0:
-            os.close(alive)
-            _serve(listener.fileno(), ended)
-        os.close(ended)
-    server._forkserver_address = address
-    server._forkserver_alive_fd = alive
-    server._forkserver_pid = process
-
-
-def _serve(listener: int, ended: int) -> NoReturn:
-    """Fork workers until the end of this process's parent and of all workers."""
-    try:
-        forkserver.main(listener, ended, [])
-    finally:
-        os._exit(0)
-
-
-def _ensure_server() -> None:
-    """Unless there is a server, start one that imports our modules that are imported here."""
-    multiprocessing.set_forkserver_preload(
-        [name for name in list(sys.modules) if name.startswith(_OURS)]
-    )
-    with held_back_interrupts():
-        forkserver.ensure_running()
 
 
 def _start_worker() -> None:
@@ -178,29 +115,40 @@ def _end_with_parent() -> None:
 
 
 class Workers:
-    """A pool of processes, or this process alone without one.
+    """A pool of processes, or this process alone for one job.
 
     Tasks are submitted with a tag; `completed` gives (tag, result) as they end, and more tasks may
-    be submitted meanwhile.
+    be submitted meanwhile. No process is started before the first task.
     """
 
-    def __init__(self, jobs: int, pool: ProcessPoolExecutor | None) -> None:
-        self._pool = pool
-        self._wanted = 1 if pool is None else TASKS_PER_PROCESS * jobs
+    def __init__(self, jobs: int) -> None:
+        self._jobs = jobs
+        self._pool: ProcessPoolExecutor | None = None
+        self._others: set[Any] = set()  # this process's children before the pool
         self._pending: dict[Any, Any] = {}  # tags, by futures or what is to be called
 
     def submit(self, tag: Any, function: Callable[..., Any], *arguments: Any) -> None:
         """Have `function(*arguments)` called, after what was submitted before."""
-        if self._pool is None:
+        if self._jobs == 1:
             self._pending[functools.partial(function, *arguments)] = tag
             return
-        with held_back_interrupts():  # the first task starts the processes
+        with held_back_interrupts():  # a task may start a process
+            if self._pool is None:
+                self._pool = self._started()
             self._pending[self._pool.submit(function, *arguments)] = tag
+
+    def _started(self) -> ProcessPoolExecutor:
+        context = multiprocessing.get_context(_START_METHOD)
+        # Only the first call of a command counts: the server starts with the first process.
+        context.set_forkserver_preload([name for name in [*sys.modules] if name.startswith(_OURS)])
+        self._others = {*multiprocessing.active_children()}
+        return ProcessPoolExecutor(self._jobs, context, initializer=_start_worker)
 
     @property
     def room(self) -> int:
         """How many more tasks are wanted, so that no process has to wait for its next one."""
-        return max(self._wanted - len(self._pending), 0)
+        wanted = 1 if self._jobs == 1 else TASKS_PER_PROCESS * self._jobs
+        return max(wanted - len(self._pending), 0)
 
     def completed(self) -> Iterator[tuple[Any, Any]]:
         """(tag, result) of each task as it ends; a task's error is raised here."""
@@ -213,6 +161,18 @@ class Workers:
             # In order of submission: what follows from them is then submitted in a fixed order.
             for future in [future for future in self._pending if future in done]:
                 yield self._pending.pop(future), _result(future)
+
+    def end(self) -> None:
+        """Wait for the tasks, then end the processes."""
+        if self._pool is not None:
+            self._pool.shutdown()
+
+    def kill(self) -> None:
+        """End the processes at once, those at work too."""
+        if self._pool is not None:
+            self._pool.shutdown(wait=False, cancel_futures=True)
+            for process in {*multiprocessing.active_children()} - self._others:
+                process.kill()
 
 
 def _result(future: Future) -> Any:
@@ -229,19 +189,10 @@ def _result(future: Future) -> Any:
 def workers(jobs: int) -> Iterator[Workers]:
     """A pool for the length of a `with` block; an error or Ctrl-C ends it at once."""
     single_threaded()
-    if jobs == 1:
-        yield Workers(1, None)
-        return
-    if _FORKED:
-        _ensure_server()
-    context = multiprocessing.get_context("forkserver" if _FORKED else "spawn")
-    pool = ProcessPoolExecutor(jobs, context, initializer=_start_worker)
+    pool = Workers(jobs)
     try:
-        yield Workers(jobs, pool)
+        yield pool
     except BaseException:
-        processes = list((pool._processes or {}).values())
-        pool.shutdown(wait=False, cancel_futures=True)
-        for process in processes:  # also those at work
-            process.kill()
+        pool.kill()
         raise
-    pool.shutdown()
+    pool.end()

@@ -1,14 +1,15 @@
 """`mapfusion inspect`: what a file or folder is, of which version, and what it holds."""
 
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import pandas as pd
 import pyarrow as pa
 
 from experiments.evaluation import tables
 from experiments.evaluation.result_files import require_as_written
-from experiments.reports.terminal.layout import print_lines, print_table
+from experiments.reports.terminal.layout import Column, print_lines, print_table
 from experiments.scenario.loading import load_scenario
 from mapfusion import attitude, landmark_map, robot_log
 from mapfusion.errors import InputError
@@ -59,11 +60,12 @@ _FOLDER_MARKS = {
 
 
 class Contents(NamedTuple):
-    """What is known of a file or folder: its kind in words, facts by name, its columns or files."""
+    """Kind of a file or folder in words, facts by name, and a table of its columns or files."""
 
     kind: str
     facts: dict[str, Any]
-    parts: pd.DataFrame = pd.DataFrame()
+    columns: Sequence[Column] = ()
+    rows: Sequence[tuple[Any, ...]] = ()
 
 
 def inspect(path: Path) -> None:
@@ -72,10 +74,7 @@ def inspect(path: Path) -> None:
     facts = {name: f"  {name}: {value}" for name, value in found.facts.items()}
     version = f", schema version {found.facts[_VERSION]}" if facts.pop(_VERSION, "") else ""
     print_lines([f"{path}: {found.kind}{version}", *facts.values()])
-    if len(found.parts):
-        numbers = set(found.parts.select_dtypes("number"))
-        columns = [(str(name), "d" if name in numbers else "") for name in found.parts]
-        print_table(columns, found.parts.itertuples(index=False))
+    print_table(found.columns, found.rows)
 
 
 def contents_of(path: Path) -> Contents:
@@ -87,13 +86,19 @@ def contents_of(path: Path) -> Contents:
     if path.suffix.lower() in landmark_map.MAP_ENDINGS:
         return _table(path)
     if path.suffix in {".yaml", ".yml"}:
-        return Contents("scenario", _brief(load_scenario(path).resolved()))
+        return Contents("scenario", _brief(_resolved(path)))
     if path.suffix != ".json":
         raise InputError(f"{path}: no file of mapfusion's (known: .parquet, .csv, .yaml, .json)")
     found = _json(path)
     if found.kind == _RESOLVED:
-        load_scenario(path)  # raises where it is none of this program's
+        _resolved(path)  # raises where it is none of this program's
     return found
+
+
+def _resolved(path: Path) -> dict[str, Any]:
+    """Return all settings of a scenario; raises InputError."""
+
+    return load_scenario(path).resolved()
 
 
 def unit_of(name: str) -> str:
@@ -122,8 +127,8 @@ def _table(path: Path) -> Contents:
 
 def _of_table(path: Path, kind: str, table: pa.Table, facts: dict[str, Any]) -> Contents:
     facts = facts | {"rows": table.num_rows, "MB": f"{path.stat().st_size / 1e6:.2f}"}
-    columns = {"column": table.column_names, "type": map(str, table.schema.types)}
-    return Contents(kind, facts, pd.DataFrame(columns | {"unit": map(unit_of, table.column_names)}))
+    rows = [(field.name, str(field.type), unit_of(field.name)) for field in table.schema]
+    return Contents(kind, facts, [(name, "") for name in ("column", "type", "unit")], rows)
 
 
 def _open_schema(path: Path) -> pa.Schema:
@@ -188,9 +193,12 @@ def _folder(path: Path) -> Contents:
     csv = [file for name in _OPEN for file in path.rglob(f"{name}.csv")]
     files += sorted(file for file in csv if file.with_suffix(".parquet") not in files)
     inside = [file.relative_to(path).with_suffix("").parts[:n_levels] for file in files]
-    n_rows = [_n_rows(file) for file in files]
-    parts = pd.DataFrame({"holds": map("/".join, inside), "files": 1, "rows": n_rows})
-    return Contents(kind, facts, parts.groupby("holds", sort=False, as_index=False).sum())
+    n_files, n_rows = Counter[str](), Counter[str]()
+    for name, file in zip(map("/".join, inside), files, strict=True):
+        n_files[name] += 1
+        n_rows[name] += _n_rows(file)
+    rows = [(name, n, n_rows[name]) for name, n in n_files.items()]
+    return Contents(kind, facts, [("holds", ""), ("files", "d"), ("rows", "d")], rows)
 
 
 def _n_rows(path: Path) -> int:

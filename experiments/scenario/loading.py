@@ -31,7 +31,13 @@ from experiments.scenario.settings import (
     sections_of,
 )
 from experiments.scenario.world_settings import expanded
-from experiments.scenario.yaml_files import apply_overrides, lines_of_keys, read_mapping
+from experiments.scenario.yaml_files import (
+    OWN,
+    SHIPPED,
+    apply_overrides,
+    lines_of_keys,
+    read_mapping,
+)
 from mapfusion.errors import (
     InputError,
     InputErrors,
@@ -41,8 +47,6 @@ from mapfusion.errors import (
 )
 from mapfusion.parameters import Range
 
-SHIPPED = Path(__file__).with_name("shipped")  # the repository's scenarios/, also when installed
-OWN = Path("scenarios")  # shipped files name their logs relative to this folder
 S = TypeVar("S")
 Location = tuple[int | str, ...]  # keys and list indices, from the root of a scenario
 Place = Callable[[Location], str]  # the line or override of the value at a location

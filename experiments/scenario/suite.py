@@ -3,15 +3,18 @@
 A scenario in ./scenarios replaces the shipped scenario of the same name.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from experiments.scenario.loading import OWN, SHIPPED, default_settings, load_scenario
-from experiments.scenario.settings import Recording, Scenario
-from experiments.scenario.yaml_files import read_mapping
+from experiments.scenario.yaml_files import OWN, SHIPPED, read_mapping
 from mapfusion.errors import InputError, did_you_mean
 from mapfusion.files import write_whole
+
+if TYPE_CHECKING:
+    from experiments.scenario.settings import Scenario
 
 SUFFIXES = {".yaml", ".yml", ".json"}  # a JSON file is YAML too: a result's scenario.json
 
@@ -50,6 +53,9 @@ def settings_of(
     word: str | Path | None, overrides: Sequence[str] = (), seed: int | None = None
 ) -> Scenario:
     """Load a scenario, or the default settings for None; raise InputError if it is wrong."""
+    # Settings import all packages that have some: not for a search by name or a listing.
+    from experiments.scenario.loading import default_settings, load_scenario
+
     if word is None:
         return default_settings(overrides, seed)
     return load_scenario(one_scenario(word), overrides, seed)
@@ -115,10 +121,11 @@ def entries(folder: Path | None = None) -> list[dict[str, Any]]:
     """Return one row for each scenario of a folder or of the suite, sorted by name.
 
     `iterations` is the number of frames of a robot, None for recorded logs. `overlap` is the
-    overlap of the robots' ground, None if the world was not generated.
+    requested overlap of the robots' ground, None if the world is not generated. Settings are not
+    checked: a value of an unexpected type is None.
 
     Raises:
-        InputError: the folder has no scenario, or a scenario is wrong.
+        InputError: the folder has no scenario, or a file is not a mapping.
     """
     files = _files(folder)
     if not files:
@@ -129,10 +136,32 @@ def entries(folder: Path | None = None) -> list[dict[str, Any]]:
 
 
 def _entry(path: Path) -> dict[str, Any]:
-    scenario = load_scenario(path)
-    row = {name: getattr(scenario, name) for name in ("name", "tags", "description")}
-    if isinstance(scenario, Recording):
-        return row | {"robots": len(scenario.logs), "iterations": None, "overlap": None}
-    overlap = scenario.generated.overlap if scenario.generated else None
-    frames = scenario.drive.frames
-    return row | {"robots": len(scenario.robots), "iterations": frames, "overlap": overlap}
+    from sim.plan_generator import RouteParameters
+
+    data = read_mapping(path)
+    generate, generated, drive = (
+        _section(data, name) for name in ("generate", "generated", "drive")
+    )
+    robots, overlap = data.get("logs", data.get("robots")), generated.get("overlap_asked")
+    n_robots = len(robots) if isinstance(robots, list) else None
+    if "generate" in data:
+        n_robots = generate.get("robots", RouteParameters.robots)
+        overlap = generate.get("overlap", RouteParameters.overlap)
+    return {
+        "name": str(data.get("name", path.stem)),
+        "tags": _tags(data),
+        "description": str(data.get("description", "")),
+        "recorded": "logs" in data,
+        "robots": _number(n_robots),
+        "iterations": _number(drive.get("frames")),
+        "overlap": _number(overlap),
+    }
+
+
+def _section(data: dict[str, Any], name: str) -> dict[str, Any]:
+    found = data.get(name)
+    return found if isinstance(found, dict) else {}
+
+
+def _number(value: Any) -> float | None:
+    return value if isinstance(value, int | float) else None

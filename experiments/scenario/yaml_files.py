@@ -12,6 +12,8 @@ from ruamel.yaml.nodes import MappingNode, Node, ScalarNode
 from mapfusion.errors import InputError
 from mapfusion.files import DIGEST
 
+SHIPPED = Path(__file__).with_name("shipped")  # the repository's scenarios/, also when installed
+OWN = Path("scenarios")  # shipped files name their logs relative to this folder
 _MOST_BYTES = 4_000_000  # 30 times the largest resolved scenario of the suite
 _MOST_VALUES = 200_000  # values with all aliases expanded
 # Values in a YAML file. The largest world (1000 walls of two points) needs 9 000. The YAML reader

@@ -6,8 +6,8 @@ runs the folders of their results.
 The floor is that of `floors`, measured where this runs.
 
 Seconds of work as the stages measured them: of one process where runs had `--jobs 1`, and longer
-where others worked beside them. What a run needs beyond its stages (starting, compiling what a
-stage does not, tables, figures) is in none of them.
+where others worked beside them. What single runs need beyond their stages (start, tables, timing
+the aligners, figures) has rows of its own. Sweeps do not measure it.
 """
 
 import argparse
@@ -34,6 +34,10 @@ _NAMES = {
     "smooth": "smooth the logs",
     "fuse": "all fusers",
     "judge": "compare with the truth",
+    "start": "start: imports, scenario",
+    "tables": "write the tables",
+    "timing the aligners": "time the aligners",
+    "figures": "draw the figures",
 }
 
 

@@ -1,6 +1,5 @@
 import io
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -9,7 +8,6 @@ from PIL import Image
 
 from experiments.evaluation.evaluated_run import JudgedRun
 from experiments.evaluation.result import run_scenario
-from experiments.pipeline import workers
 from experiments.pipeline.store import Store
 from experiments.pipeline.workers import single_threaded
 from experiments.reports.figures import drawing
@@ -17,14 +15,6 @@ from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import Scenario, Simulation
 from tests.helpers.shared_folder import shared_folder
 from tests.helpers.tiny_scenario import TINY, TRIO
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _no_server_is_forked_from_here() -> Iterator[None]:
-    """Unlike a command, this process has begun to work, and what tests replace would stay so."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(workers, "make_ready", lambda jobs: None)
-        yield
 
 
 @pytest.fixture(scope="session")

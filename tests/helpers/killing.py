@@ -146,13 +146,9 @@ class KilledCommand:
         return self.process.poll() is not None
 
     def workers(self) -> list[int]:
-        """Process ids of the workers: spawned by the command, or forked by its fork server.
-
-        The server was started by the command, or forked from it.
-        """
-        own = _command_line(self.process.pid)
+        """Process ids of the workers: spawned by the command, or forked by its fork server."""
         started = {pid: _command_line(pid) for pid in _children(self.process.pid)}
-        servers = [pid for pid, line in started.items() if line == own or b"forkserver" in line]
+        servers = [pid for pid, line in started.items() if b"forkserver" in line]
         spawned = [pid for pid, line in started.items() if b"spawn_main" in line]
         return [*spawned, *(pid for server in servers for pid in _children(server))]
 

@@ -9,7 +9,6 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
-from experiments.pipeline.kept_logs import kept_log
 from experiments.pipeline.stage import Job
 from experiments.pipeline.tables import BOOL, FLOAT, INT, TEXT, fields, read_rows
 from experiments.scenario.seeds import generator
@@ -32,7 +31,7 @@ from mapfusion.files import (
     write_table,
 )
 from mapfusion.geometry.numerics import Float
-from mapfusion.robot_log import RobotLog, read_odometry_covariance
+from mapfusion.robot_log import RobotLog, read_log, read_odometry_covariance
 
 _ONLINE, _FINAL = ([f"{path}_{name}" for name in POSE_FIELDS] for path in ("online", "final"))
 _ITERATION = fields(iteration=INT)
@@ -103,7 +102,7 @@ def evaluated_iterations(n_frames: int, every: int) -> list[int]:
 
 def run(settings: SlamSettings, job: Job) -> None:
     """Run the filter over a log and write maps, poses, associations and particle clouds."""
-    log = kept_log(job.inputs["log"])
+    log = read_log(job.inputs["log"])
     found = check_log(log, settings.filter.motion)
     known = read_odometry_covariance(job.inputs["log"], len(log))
     log, covariance = without_jumps(log, found.jumps, known)
@@ -177,7 +176,7 @@ def read_findings(slam: Path) -> pd.DataFrame:
 def log_as_filtered(log: Path, slam: Path) -> tuple[RobotLog, Float | None]:
     """A log as the filter took it, without jumps, and the covariance of its odometry if known."""
     table, _ = read_table(slam / WRITES[-1], FINDINGS)
-    recorded = kept_log(log)
+    recorded = read_log(log)
     observed, covariance = columns(table, _OBSERVED), covariances_from(table, _OBSERVED_COVARIANCE)
     jumps = [
         Jump(int(k), observed[n], covariance[n], recorded.odometry[k])

@@ -8,12 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.pipeline.kept_logs import kept_log
 from experiments.pipeline.stages.slam import ASSOCIATIONS, PATHS, SNAPSHOTS, RobotFolders
 from mapfusion.files import POSE_FIELDS, column, columns, points_from, read_table
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.robot_log import RobotLog, with_rows
+from mapfusion.robot_log import RobotLog, read_log, with_rows
 from mapfusion.viewing import SightLines, Viewing
 
 ROBOTS_KEPT = 4  # by a process; of a robot that drives for minutes they are tens of megabytes
@@ -128,7 +127,7 @@ def stored_maps(folders: RobotFolders, viewing: bool = True) -> Snapshots:
 
 @functools.lru_cache(maxsize=ROBOTS_KEPT)
 def _stored_maps(folders: RobotFolders, viewing: bool) -> Snapshots:
-    return Snapshots(folders.slam, kept_log(folders.log), viewing)
+    return Snapshots(folders.slam, read_log(folders.log), viewing)
 
 
 def _rows(iteration: np.ndarray, evaluated: str) -> dict[int, slice]:

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from experiments.evaluation import tables
 from experiments.evaluation.result_files import read_provenance
 from experiments.reports.figures.result_tables import json_object
 from experiments.studies.run_tables import Runs, setting_columns
@@ -77,12 +78,9 @@ def stage_times(runs: Runs) -> list[dict[Any, Any]]:
     """Seconds of work by stage, all its tasks together; a stage that runs share counts once."""
     if runs.has("timings"):
         rows = runs.read("timings", ["stage", "name", "elapsed_s"])
-        rows[["key", "figure"]] = rows["name"].str.rpartition(":")[[0, 2]]
-        rows = rows.rename(columns={"elapsed_s": "seconds"})
     elif runs.has("run_times"):
         rows = runs.read("run_times", ["stage", "key", "figure", "seconds"])
+        rows = rows.assign(name=rows["key"] + ":" + rows["figure"], elapsed_s=rows["seconds"])
     else:
         return []
-    rows = rows[rows["figure"] == "elapsed_s"].drop_duplicates(["stage", "key"])
-    stages = rows.groupby("stage", sort=False)["seconds"]
-    return stages.agg(seconds="sum", tasks="count").reset_index().to_dict("records")
+    return tables.work_by_stage(rows).to_dict("records")

@@ -3,13 +3,14 @@
 All that is printed goes through `_console`: it takes nothing for markup, whoever a text is from.
 """
 
+from __future__ import annotations
+
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import pandas as pd
 from rich import box
 from rich.console import Console
 from rich.progress import (
@@ -24,6 +25,9 @@ from rich.table import Table
 from rich.text import Text
 
 from experiments.reports.formatting import UNKNOWN, interval, number, plain
+
+if TYPE_CHECKING:  # listings have no frames, and do not wait for it
+    import pandas as pd
 
 Column = tuple[str, str]  # heading and format
 _LEAST_TEXT = 8  # characters: a name that is folded can still be read

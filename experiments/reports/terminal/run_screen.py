@@ -68,6 +68,7 @@ def print_result(result: Path, skipped_figures: Sequence[str]) -> None:
     _print_fusers(table("fusers"))
     pairs = table("team_pairs")
     _print_team_pairs(pairs)
+    _print_times(table("timings"))
     told = team_lines(table("fused_motions"), table("team"), pairs)
     print_lines(f"  {line}" for line in (*told, *edge_lines(table("team_edges"))))
     print_lines([f"Figures: {result / 'figures'}   tables: {result / 'tables'}"])
@@ -87,6 +88,17 @@ def _print_smoother(rows: pd.DataFrame) -> None:
         print_frame(smoothed, shown, "Batch smoother: what the filter loses against it", note)
     reasons = rows[["robot", "not_smoothed"]].itertuples(index=False)
     print_lines(f"  {robot} is not smoothed: {why}" for robot, why in reasons if why)
+
+
+def _print_times(timings: pd.DataFrame) -> None:
+    """Print the work of each stage, and of what a run does beside its stages."""
+    rows = tables.work_by_stage(timings)
+    rows["share"] = rows["seconds"] / rows["seconds"].sum()
+    shown = columns("", stage="stage") | columns(".1f", seconds="work, s")
+    shown |= columns(".0%", share="share") | columns("d", tasks="tasks")
+    note = "of one process at a time, also where it was done in an earlier run\n"
+    note += "start: imports and the scenario, of this command's own process"
+    print_frame(rows, shown, "Work by stage", note)
 
 
 def _print_fusers(rows: pd.DataFrame) -> None:

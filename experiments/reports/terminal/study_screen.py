@@ -1,11 +1,13 @@
 """Screens of `study`, `sweep`, `calibrate` and `scenarios`."""
 
+from __future__ import annotations
+
 import itertools
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 from ruamel.yaml import YAML
@@ -17,9 +19,7 @@ from experiments.evaluation.criteria import (
     RIGHT_WITHIN_RAD,
 )
 from experiments.evaluation.odometry_calibration import filter_settings
-from experiments.plugins.discovery import known_methods, name_clashes
 from experiments.reports.formatting import interval, two_digits
-from experiments.reports.study_files import SHOWN, shown_numbers
 from experiments.reports.terminal.layout import (
     NO_ESTIMATE,
     Column,
@@ -29,15 +29,19 @@ from experiments.reports.terminal.layout import (
     print_skipped,
     print_table,
 )
-from experiments.studies.independence.strategies import STRATEGIES
 from experiments.studies.refusal.rates import VERDICTS, Rate, Reliability, pooled, worst
 from experiments.studies.sweep import SweepProgress
 from experiments.studies.sweep_combinations import SweepRun
 from experiments.studies.sweep_plan import Survey
 from experiments.studies.sweep_tables import ERRORS, GIVEN, SweepDataset, medians_over_runs
-from mapfusion.align.alignment import Status
 from mapfusion.smoother.noise_estimation import LEVELS
 from mapfusion.smoother.odometry_calibration import Calibration
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+# A listing of scenarios needs neither methods nor studies: they are imported where they are shown.
 
 
 def print_benchmark(folder: Path, summary: pd.DataFrame) -> None:
@@ -59,6 +63,8 @@ def print_benchmark(folder: Path, summary: pd.DataFrame) -> None:
 
 
 def _benchmark_cell(row: dict[Any, Any]) -> str:
+    from mapfusion.align.alignment import Status
+
     if row["status"] == Status.ABSENT:
         return "absent"
     return f"{100 * row['success']:.0f}, {two_digits(1e3 * row['elapsed_s'])}"
@@ -66,6 +72,9 @@ def _benchmark_cell(row: dict[Any, Any]) -> str:
 
 def print_independence(folder: Path, summary: pd.DataFrame, skipped: Sequence[str]) -> None:
     """Costs and errors of each way to one map (rows of `at_the_end`), and where the rest is."""
+    from experiments.reports.study_files import SHOWN, shown_numbers
+    from experiments.studies.independence.strategies import STRATEGIES
+
     headings = [("way", ""), *((heading, ">") for _, heading in SHOWN.values())]
     note = "; ".join(f"{strategy.name}: {strategy.label}" for strategy in STRATEGIES)
     for n_robots, rows in summary.groupby("n_robots"):
@@ -80,6 +89,8 @@ def print_independence(folder: Path, summary: pd.DataFrame, skipped: Sequence[st
 
 def print_methods() -> None:
     """Every alignment method by name, whose it is, and what is wrong where something is."""
+    from experiments.methods.catalogue import known_methods, name_clashes
+
     methods = known_methods().values()
     rows = [
         (each.name, each.kind, each.distribution, "absent" if each.absence else each.version)
@@ -93,12 +104,20 @@ def print_methods() -> None:
 
 def print_scenarios(entries: Sequence[dict[str, Any]]) -> None:
     """The scenarios of a folder."""
-    shown = columns("", name="scenario", tags="tags") | columns("d", robots="robots")
-    shown |= columns(">", iterations="iterations") | columns(".2f", overlap="overlap")
-    shown |= columns("", description="what it is")
-    frame = pd.DataFrame(entries)
-    iterations = [str(each["iterations"] or "recorded") for each in entries]
-    print_frame(frame.assign(tags=frame["tags"].map(" ".join), iterations=iterations), shown)
+    shown = [("scenario", ""), ("tags", ""), ("robots", "g"), ("iterations", ">")]
+    shown += [("overlap", ".2f"), ("what it is", "")]
+    rows = [
+        (
+            each["name"],
+            " ".join(each["tags"]),
+            each["robots"],
+            "recorded" if each["recorded"] else each["iterations"],
+            each["overlap"],
+            each["description"],
+        )
+        for each in entries
+    ]
+    print_table(shown, rows)
 
 
 MAX_ROWS_SHOWN = 60

@@ -250,7 +250,7 @@ def test_figures(tiny_result: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
     copy = shutil.copytree(tiny_result, tmp_path / "result")
     reply = command(capsys, "report", copy, "--figures", "--jobs", 1)
     assert reply.code == 0
-    drawn = {path.name[:5] for path in (copy / "figures").iterdir()}
+    drawn = {path.name[:5] for path in (copy / "figures").glob("fig*")}
     skipped = {line.split()[2][:5] for line in reply.out.splitlines() if "not drawn" in line}
     assert drawn | skipped == {f"fig{number:02d}" for number in range(1, 13)}
     assert not drawn & skipped
@@ -288,6 +288,37 @@ def test_run_shows_the_aligners(
     assert all(name in reply.out for name in ("ransac", "svd", "icp", "oracle", "R1", "R2"))
     resolved = json.loads((tiny_results_copy / "tiny-3" / "scenario.json").read_text())
     assert resolved["slam"]["filter"]["n_particles"] == 30
+
+
+@pytest.mark.usefixtures("quick_save")
+def test_a_second_run_draws_nothing_starts_no_process_and_tells_where_time_went(
+    tiny_path: Path,
+    tiny_results_copy: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def refused(*_: object, **__: object) -> None:
+        raise AssertionError("something is left to do")
+
+    figures = ("fig08_fused_landmark", "fig10_fused_map")
+    monkeypatch.setattr("experiments.reports.figures.drawing.FIGURES", figures)
+    arguments = ("run", tiny_path, "--results", tiny_results_copy)
+    assert command(capsys, *arguments, "--jobs", 1).code == 0
+    monkeypatch.setattr("experiments.pipeline.workers.ProcessPoolExecutor", refused)
+    monkeypatch.setattr("experiments.reports.figures.drawing.draw_figure", refused)
+    reply = command(capsys, *arguments, "--jobs", 2)
+    assert reply.code == 0
+    timings = tables.read(
+        tables.table_path(tiny_results_copy / "tiny-3", "timings"), "timings"
+    ).set_index(["stage", "name"])["elapsed_s"]
+    outside = ["tables", "start", "figures"]
+    assert timings.index.unique("stage").tolist()[-3:] == outside
+    assert timings["figures"].index.tolist() == [f"{name}:elapsed_s" for name in figures]
+    assert (timings[outside] > 0).all()
+    # the table has one row for each of them, in whole seconds and tenths
+    shown = {line.split("  ")[0].strip(): line for line in reply.out.splitlines()}
+    assert set(outside) <= set(shown)
+    assert f"{timings['slam'].filter(like='elapsed_s').sum():.1f}" in shown["slam"]
 
 
 # in six frames robots see less than a room, one piece of wall, and nothing that must be seen again

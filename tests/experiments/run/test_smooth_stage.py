@@ -7,7 +7,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.pipeline.kept_logs import kept_log
 from experiments.pipeline.stage import Job
 from experiments.pipeline.stages.slam import ASSOCIATIONS, FINDINGS, POSES
 from experiments.pipeline.stages.smooth import (
@@ -29,7 +28,6 @@ from mapfusion.errors import DamagedFileError
 from mapfusion.files import POSE_FIELDS
 from mapfusion.robot_log import (
     RobotLog,
-    read_log,
     read_odometry_covariance,
     write_log,
     write_odometry_covariance,
@@ -69,19 +67,6 @@ def smoothed_at(
     settings = SmoothSettings(SmootherParameters(), 0.0, iterations, max_memory_gb)
     for part in parts(iterations):
         run(settings, Job(inputs, folder, part))
-
-
-def test_the_log_that_is_kept_stays_as_it_was(tmp_path: Path) -> None:
-    log = white_noise_log(np.random.default_rng(0), N_FRAMES, 25).log
-    inputs = filtered(tmp_path, log, owners(log))
-    kept = kept_log(inputs["log"])
-    smoothed_at(inputs, tmp_path / "out", N_FRAMES - 1)
-    assert kept_log(inputs["log"]) is kept
-    read = read_log(inputs["log"])
-    for values, others in ((kept, read), (kept.observations, read.observations)):
-        for name, value in vars(others).items():
-            if isinstance(value, np.ndarray):
-                np.testing.assert_array_equal(getattr(values, name), value)
 
 
 def test_it_is_the_smoother_on_the_log_so_far(tmp_path: Path) -> None:

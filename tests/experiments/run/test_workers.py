@@ -2,6 +2,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -52,63 +53,56 @@ def test_workers_are_forked_from_a_server_with_what_is_imported_here(tmp_path: P
     assert server != own
 
 
-FORKED = """
-import os, sys, threading
-from experiments.pipeline.workers import make_ready, workers
+NOTHING_TO_DO = """
+import os
+from pathlib import Path
+from experiments.pipeline.workers import workers
 
-def told():
-    return os.getppid(), made_here
+def children():
+    return Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
 
 if __name__ == "__main__":
-    made_here = "only a fork knows"
-    sys.stdout.write("once ")  # is not yet written, and not to be written by every process
-    stop = threading.Event()
-    if sys.argv[1] == "beside a thread":
-        threading.Thread(target=stop.wait).start()
-    make_ready(int(sys.argv[2]))
-    for _ in range(2):
-        with workers(2) as pool:
-            for tag in range(4):
-                pool.submit(tag, told)
-            for _, (parent, known) in pool.completed():
-                print(parent, known)
-    print(os.getpid())
-    stop.set()
-else:
-    made_here = "imported anew"
+    with workers(2) as pool:
+        assert list(pool.completed()) == []
+        print(children())
+        pool.submit("task", os.getpid)
+        assert list(pool.completed())
+        print(children() == [])
 """
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere they are spawned")
-@pytest.mark.parametrize(
-    ("moment", "jobs", "known"),
-    [
-        ("at first", 2, "only a fork knows"),
-        ("beside a thread", 2, "imported anew"),
-        ("at first", 1, "imported anew"),
-    ],
-)
-def test_a_server_is_forked_from_a_command_that_has_begun_nothing(
-    tmp_path: Path, moment: str, jobs: int, known: str
-) -> None:
-    script = tmp_path / "command.py"
-    script.write_text(FORKED)
-    command = [sys.executable, str(script), moment, str(jobs)]
-    ended = subprocess.run(command, capture_output=True, text=True, check=True)
-    once, *told, own, _ = ended.stdout.replace("once ", "once\n", 1).split("\n")
-    server = told[0].split()[0]
-    assert once == "once"
-    assert told == [f"{server} {known}"] * 8
-    assert server != own
-    assert not ended.stderr
-    assert wait_until(lambda: has_ended(int(server)))
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_no_process_is_started_before_the_first_task(tmp_path: Path) -> None:
+    script = tmp_path / "idle.py"
+    script.write_text(NOTHING_TO_DO)
+    command = [sys.executable, str(script)]
+    told = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split("\n")
+    assert told == ["[]", "False", ""]
+
+
+def _fail_beside_a_long_task(found: list[int]) -> None:
+    with workers(2) as pool:
+        pool.submit("at work", time.sleep, 100_000)
+        pool.submit("task", os.getpid)
+        found.append(next(pool.completed())[1])
+        raise ValueError("of a task")
+
+
+def test_an_error_ends_the_processes_at_work_and_no_others() -> None:
+    with workers(2) as outer:
+        outer.submit("outer", os.getpid)
+        ((_, of_outer),) = outer.completed()
+        found: list[int] = []
+        with pytest.raises(ValueError, match="of a task"):
+            _fail_beside_a_long_task(found)
+        assert wait_until(lambda: has_ended(found[0]))
+        assert not has_ended(of_outer)
 
 
 PARENT = """
-import os, sys, time
-from experiments.pipeline.workers import make_ready, workers
+import os, time
+from experiments.pipeline.workers import workers
 if __name__ == "__main__":
-    make_ready(int(sys.argv[1]))
     with workers(2) as pool:
         pool.submit("task", os.getpid)
         pool.submit("task", time.sleep, 100_000)
@@ -117,11 +111,10 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.parametrize("ready", [1, 2])
-def test_workers_end_with_a_killed_parent(tmp_path: Path, ready: int) -> None:
+def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
     script = tmp_path / "parent.py"
     script.write_text(PARENT)
-    command = [sys.executable, str(script), str(ready)]
+    command = [sys.executable, str(script)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as run:
         assert run.stdout is not None
         worker = int(run.stdout.readline())

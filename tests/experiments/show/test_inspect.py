@@ -32,8 +32,9 @@ def test_kind_version_rows_and_columns_are_those_of_the_table(tiny_result: Path)
     rows, found = tables.read(path, "errors"), contents_of(path)
     assert (found.kind, found.facts["schema_version"]) == ("result.errors", "4")
     assert found.facts["rows"] == len(rows)
-    assert found.parts["column"].tolist() == list(rows)
-    told = {name: (kind, unit) for name, kind, unit in found.parts.to_numpy()}
+    assert [name for name, _ in found.columns] == ["column", "type", "unit"]
+    told = {name: (kind, unit) for name, kind, unit in found.rows}
+    assert list(told) == list(rows)
     assert told["translation_error_m"] == ("double", "m")
     assert told["refined_rotation_error_rad"] == ("double", "rad")
     assert told["n_true"] == ("int32", "")
@@ -44,7 +45,7 @@ def test_a_result_tells_its_scenario_provenance_and_tables(tiny_result: Path) ->
     assert found.kind == "result of a run"
     assert (found.facts["name"], found.facts["seed"]) == ("tiny", 3)
     assert {"renderer", "python", "written"} <= set(found.facts)
-    rows = found.parts.set_index("holds")["rows"]
+    rows = {holds: n_rows for holds, _, n_rows in found.rows}
     for name in tables.ALL:
         table = tables.read(tables.table_path(tiny_result, name), name)
         assert rows[f"tables/{name}"] == len(table)

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from experiments.evaluation import tables
+from experiments.pipeline.workers import workers
 from experiments.reports.figures import drawing, fig02_two_maps, fig11_fusers, fig12_coverage
 from experiments.reports.figures.drawing import FIGURES, Drawing, draw_all, draw_figure, save_figure
 from experiments.reports.figures.fig03_dispersion import choose_moments, spread_over_time
@@ -31,7 +32,9 @@ def change(folder: Path, name: str, rows: pd.DataFrame) -> None:
 
 def test_all_figures_are_drawn(trio_copy: Path) -> None:
     done = []
-    files, skipped = draw_all(trio_copy, 1, lambda n, total: done.append((n, total)))
+    files, skipped, elapsed_s = draw_all(trio_copy, 1, lambda n, total: done.append((n, total)))
+    assert tuple(elapsed_s) == FIGURES
+    assert min(elapsed_s.values()) > 0
     assert [file.name for file in files] == [
         f"{name}.{kind}" for name in FIGURES for kind in ("png", "svg")
     ]
@@ -45,7 +48,7 @@ def test_all_figures_are_drawn(trio_copy: Path) -> None:
         else:
             assert file.stat().st_size < MAX_SVG_BYTES
     assert sorted(file.name for file in (trio_copy / "figures").iterdir()) == sorted(
-        file.name for file in files
+        [*(file.name for file in files), "drawn.json"]
     )
 
 
@@ -88,13 +91,13 @@ def test_users_settings_come_back() -> None:
 
 
 def skipped_figures(folder: Path) -> dict[str, str]:
-    files, lines = draw_all(folder, 1)
+    files, lines, _ = draw_all(folder, 1)
     reasons = dict(line.split(": ", 1) for line in lines)
     assert not any("\n" in line for line in lines)
     drawn = {file.stem for file in files}
     assert drawn | set(reasons) == set(FIGURES)
     assert drawn.isdisjoint(reasons)
-    assert {file.stem for file in (folder / "figures").iterdir()} == drawn
+    assert {file.stem for file in (folder / "figures").glob("fig*")} == drawn
     return reasons
 
 
@@ -189,6 +192,57 @@ def test_damaged_key_frame_is_an_error_that_names_the_file(trio_copy: Path) -> N
     next((trio_copy / "keyframes").glob("R1_*")).write_bytes(b"no picture")
     with pytest.raises(InputError, match=r"R1_\d{5}\.png: damaged or not a PNG picture"):
         draw_figure(ResultTables(trio_copy), "fig01_tracks")
+
+
+THREE = ("fig01_tracks", "fig08_fused_landmark", "fig10_fused_map")
+
+
+def redrawn(folder: Path) -> set[str]:
+    """Draw what has changed; the figures whose pictures were written again."""
+    before = {file: file.stat().st_mtime_ns for file in (folder / "figures").glob("fig*")}
+    with workers(1) as pool:
+        drawn = Drawing(pool).finish(folder)
+    assert [file.name for file in drawn.files] == [
+        f"{name}.{kind}" for name in drawing.FIGURES for kind in ("png", "svg")
+    ]
+    return {file.stem for file in drawn.files if file.stat().st_mtime_ns != before.get(file)}
+
+
+@pytest.mark.usefixtures("quick_save")
+def test_a_figure_is_drawn_again_only_if_what_it_depends_on_has_changed(
+    trio_copy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(drawing, "FIGURES", THREE)
+    assert redrawn(trio_copy) == set(THREE)
+    assert redrawn(trio_copy) == set()
+    fused = ResultTables(trio_copy).table("fused_map")
+    change(trio_copy, "fused_map", fused.assign(x_m=fused["x_m"] + 0.01))
+    assert redrawn(trio_copy) == {"fig10_fused_map"}
+    next((trio_copy / "keyframes").glob("*.png")).unlink()
+    assert redrawn(trio_copy) == set(THREE)  # the rule takes key frames for an input of each
+    (trio_copy / "figures" / "fig01_tracks.svg").unlink()
+    (trio_copy / "figures" / "fig08_fused_landmark.png").write_bytes(b"damaged")
+    assert redrawn(trio_copy) == {"fig01_tracks", "fig08_fused_landmark"}
+    monkeypatch.setattr(drawing, "source_hash", lambda parts: "of another version")
+    assert redrawn(trio_copy) == set(THREE)
+    for content in ("no JSON", "{}", '{"figures": [1]}', '{"figures": {"fig01_tracks": 1}}'):
+        (trio_copy / "figures" / "drawn.json").write_text(content)
+        assert redrawn(trio_copy) == set(THREE)
+    assert redrawn(trio_copy) == set()
+
+
+def test_a_figure_without_data_is_remembered_with_its_reason(
+    trio_copy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(drawing, "FIGURES", ("fig11_fusers",))
+    tables.table_path(trio_copy, "fusers").unlink()
+    told = []
+    for _ in range(2):
+        with workers(1) as pool:
+            told.append(Drawing(pool).finish(trio_copy))
+    assert told[0] == told[1]
+    assert told[0].files == []
+    assert len(told[0].skipped) == 1
 
 
 class _Asked:
