@@ -29,7 +29,7 @@ from experiments.reports.terminal.layout import (
     print_skipped,
     print_table,
 )
-from experiments.studies.independence.strategies import STRATEGIES
+from experiments.studies.independence.independence_trial import STRATEGIES
 from experiments.studies.refusal.rates import VERDICTS, Rate, Reliability, pooled, worst
 from experiments.studies.sweep import SweepProgress
 from experiments.studies.sweep_combinations import SweepRun
